@@ -1,0 +1,351 @@
+//! Row numbers, and the one hard kernel: adding many contributions to few rows, in parallel, always in the same order.
+//!
+//! The touches of a batch are grouped by bucket, a bucket being a range of rows whose values fit a core's cache. Each chunk of items
+//! sorts its own touches by bucket (counting sort, chunks of a size that does not depend on the threads); a bucket then belongs to one
+//! task, which takes the touches chunk after chunk, that is in the order of the items. No atomics, nothing shared for writing, and the same
+//! bits for any number of threads.
+
+use crate::gradients::RowSparse;
+use crate::parallel::{self, dispatched};
+use crate::pool::Buffer;
+use crate::real::Real;
+use std::ops::Deref;
+use std::sync::Arc;
+
+/// Row numbers, shared between the graph and whoever computed them.
+#[derive(Clone, Debug)]
+pub struct Indices(Arc<Buffer<u32>>);
+
+impl From<Vec<u32>> for Indices {
+    fn from(rows: Vec<u32>) -> Self {
+        Indices(Arc::new(rows.into()))
+    }
+}
+
+impl From<Buffer<u32>> for Indices {
+    fn from(rows: Buffer<u32>) -> Self {
+        Indices(Arc::new(rows))
+    }
+}
+
+impl Deref for Indices {
+    type Target = [u32];
+    fn deref(&self) -> &[u32] {
+        &self.0
+    }
+}
+
+/// Bytes of row values that one task works on: half of a usual second-level cache.
+const BUCKET_BYTES: usize = 256 * 1024;
+
+/// Which items touch which bucket of rows.
+struct Grouping {
+    /// A bucket is `1 << shift` rows; at least 64, so that buckets own whole words of a bitmap.
+    shift: u32,
+    buckets: usize,
+    /// Item numbers, sorted by bucket within each chunk of items.
+    entries: Buffer<u32>,
+    /// `starts[chunk][bucket]`: where the chunk's entries of a bucket begin in `entries`; one more at the end.
+    starts: Vec<Vec<u32>>,
+}
+
+/// Item `i` touches the rows `touch(i).0` with the weights `touch(i).1`.
+pub(crate) trait Touch<T, const K: usize>: Fn(usize) -> ([u32; K], [T; K]) + Sync {}
+impl<T, const K: usize, F: Fn(usize) -> ([u32; K], [T; K]) + Sync> Touch<T, K> for F {}
+
+impl Grouping {
+    fn new<T: Real, const K: usize>(table_rows: usize, width: usize, items: usize, touch: &impl Touch<T, K>) -> Self {
+        let fitting = BUCKET_BYTES / (width.max(1) * size_of::<T>());
+        let shift = fitting.max(64).ilog2();
+        let buckets = table_rows.div_ceil(1 << shift);
+        let chunk = items.div_ceil(64).max(4096);
+
+        let counts = parallel::map_chunks(items, chunk, |range| {
+            let mut counts = vec![0u32; buckets];
+            for i in range {
+                for_each_bucket(touch(i).0, shift, |b| counts[b] += 1);
+            }
+            counts
+        });
+        let totals: Vec<usize> = counts.iter().map(|c| c.iter().map(|&n| n as usize).sum()).collect();
+        let mut entries = Buffer::<u32>::stale(totals.iter().sum());
+        let mut begin = 0;
+        let mut starts = Vec::with_capacity(counts.len());
+        for chunk_counts in counts {
+            let mut s = Vec::with_capacity(buckets + 1);
+            for n in chunk_counts {
+                s.push(begin);
+                begin += n;
+            }
+            s.push(begin);
+            starts.push(s);
+        }
+        let slices = split_lengths(&mut entries, totals.iter().copied());
+        parallel::for_each_item(slices, |c, slice| {
+            let offset = starts[c][0];
+            let mut next: Vec<u32> = starts[c].iter().map(|s| s - offset).collect();
+            for i in c * chunk..((c + 1) * chunk).min(items) {
+                for_each_bucket(touch(i).0, shift, |b| {
+                    slice[next[b] as usize] = i as u32;
+                    next[b] += 1;
+                });
+            }
+        });
+        Grouping { shift, buckets, entries, starts }
+    }
+
+    /// The items that touch a bucket, in order.
+    fn items_of(&self, bucket: usize) -> impl Iterator<Item = &[u32]> {
+        self.starts.iter().map(move |s| &self.entries[s[bucket] as usize..s[bucket + 1] as usize])
+    }
+}
+
+/// Calls `f` once for each different bucket among the rows of one item.
+#[inline(always)]
+fn for_each_bucket<const K: usize>(rows: [u32; K], shift: u32, mut f: impl FnMut(usize)) {
+    for k in 0..K {
+        let bucket = rows[k] >> shift;
+        if (0..k).all(|j| rows[j] >> shift != bucket) {
+            f(bucket as usize);
+        }
+    }
+}
+
+fn split_lengths<E>(mut rest: &mut [E], lengths: impl Iterator<Item = usize>) -> Vec<&mut [E]> {
+    lengths
+        .map(|n| {
+            let (head, tail) = std::mem::take(&mut rest).split_at_mut(n);
+            rest = tail;
+            head
+        })
+        .collect()
+}
+
+/// Σ over items and k of weights[k] · values[item] into rows[k]: the rows that were touched, sorted, and their sums.
+pub(crate) fn sum_into_rows<T: Real, const K: usize>(shape: &[usize], items: usize, touch: impl Touch<T, K>, values: &[T]) -> RowSparse<T> {
+    let width: usize = shape[1..].iter().product();
+    let grouping = Grouping::new(shape[0], width, items, &touch);
+    let shift = grouping.shift;
+    let words_per_bucket = (1usize << shift) / 64;
+
+    let mut bitmap = Buffer::<u64>::zeros(grouping.buckets * words_per_bucket);
+    let counts: Vec<usize> = {
+        let words: Vec<&mut [u64]> = bitmap.chunks_mut(words_per_bucket).collect();
+        let mut counts = vec![0usize; grouping.buckets];
+        let work: Vec<_> = words.into_iter().zip(counts.iter_mut()).collect();
+        parallel::for_each_item(work, |b, (words, count)| {
+            for part in grouping.items_of(b) {
+                for &i in part {
+                    for row in touch(i as usize).0 {
+                        if (row >> shift) as usize == b {
+                            let local = row as usize & ((1 << shift) - 1);
+                            words[local / 64] |= 1 << (local % 64);
+                        }
+                    }
+                }
+            }
+            *count = words.iter().map(|w| w.count_ones() as usize).sum();
+        });
+        counts
+    };
+
+    let touched: usize = counts.iter().sum();
+    let mut rows = Buffer::<u32>::stale(touched);
+    let mut sums = Buffer::<T>::stale(touched * width);
+    let work: Vec<_> = split_lengths(&mut rows, counts.iter().copied())
+        .into_iter()
+        .zip(split_lengths(&mut sums, counts.iter().map(|n| n * width)))
+        .zip(bitmap.chunks(words_per_bucket))
+        .collect();
+    parallel::for_each_item(work, |b, ((rows, sums), words)| {
+        let mut rank = Vec::with_capacity(words.len());
+        let mut k = 0;
+        for (w, &word) in words.iter().enumerate() {
+            rank.push(k as u32);
+            let mut left = word;
+            while left != 0 {
+                rows[k] = ((b << shift) + w * 64) as u32 + left.trailing_zeros();
+                left &= left - 1;
+                k += 1;
+            }
+        }
+        sums.fill(T::zero());
+        let slot = |local: usize| {
+            let word = words[local / 64] & ((1 << (local % 64)) - 1);
+            rank[local / 64] as usize + word.count_ones() as usize
+        };
+        accumulate(&grouping, b, &touch, values, width, sums, &slot);
+    });
+    RowSparse::new(shape, rows, sums)
+}
+
+/// The same sums added to a dense table.
+pub(crate) fn add_into_table<T: Real, const K: usize>(table: &mut [T], width: usize, items: usize, touch: impl Touch<T, K>, values: &[T]) {
+    let grouping = Grouping::new(table.len() / width.max(1), width, items, &touch);
+    let parts: Vec<&mut [T]> = table.chunks_mut(width << grouping.shift).collect();
+    parallel::for_each_item(parts, |b, part| accumulate(&grouping, b, &touch, values, width, part, &|local| local));
+}
+
+/// Adds the touches of one bucket, in the order of the items. The widths of usual tables are compiled in: opacity and RGB, and the
+/// coefficients of degrees 1 and 2 with and without density.
+fn accumulate<T: Real, const K: usize>(
+    grouping: &Grouping,
+    bucket: usize,
+    touch: &impl Touch<T, K>,
+    values: &[T],
+    width: usize,
+    out: &mut [T],
+    slot: &impl Fn(usize) -> usize,
+) {
+    let args = Bucket { grouping, bucket, values, width };
+    match width {
+        1 => accumulate_rows::<T, K, 1, _, _>(args, touch, out, slot),
+        3 => accumulate_rows::<T, K, 3, _, _>(args, touch, out, slot),
+        4 => accumulate_rows::<T, K, 4, _, _>(args, touch, out, slot),
+        12 => accumulate_rows::<T, K, 12, _, _>(args, touch, out, slot),
+        27 => accumulate_rows::<T, K, 27, _, _>(args, touch, out, slot),
+        28 => accumulate_rows::<T, K, 28, _, _>(args, touch, out, slot),
+        48 => accumulate_rows::<T, K, 48, _, _>(args, touch, out, slot),
+        _ => accumulate_rows::<T, K, 0, _, _>(args, touch, out, slot),
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Bucket<'a, T> {
+    grouping: &'a Grouping,
+    bucket: usize,
+    values: &'a [T],
+    width: usize,
+}
+
+dispatched! {
+/// `W` is the width, or 0 for one only known at run time.
+fn accumulate_rows<T: Real, const K: usize, const W: usize, F: Touch<T, K>, S: Fn(usize) -> usize>(
+    args: Bucket<'_, T>,
+    touch: &F,
+    out: &mut [T],
+    slot: &S,
+) {
+    let Bucket { grouping, bucket, values, width } = args;
+    let width = if W == 0 { width } else { W };
+    let shift = grouping.shift;
+    for part in grouping.items_of(bucket) {
+        for &i in part {
+            let i = i as usize;
+            let (rows, weights) = touch(i);
+            let value = &values[i * width..][..width];
+            for k in 0..K {
+                if (rows[k] >> shift) as usize == bucket {
+                    let local = rows[k] as usize & ((1 << shift) - 1);
+                    let target = &mut out[slot(local) * width..][..width];
+                    if W == 0 {
+                        for (t, &v) in target.iter_mut().zip(value) {
+                            *t += weights[k] * v;
+                        }
+                    } else {
+                        for c in 0..W {
+                            target[c] += weights[k] * value[c];
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+}
+
+/// The union of two row gradients, values of common rows added.
+pub(crate) fn add_row_sparse<T: Real>(a: RowSparse<T>, b: RowSparse<T>) -> RowSparse<T> {
+    let shape = a.shape().to_vec();
+    let width = a.width();
+    let block = shape[0].div_ceil(64).max(1);
+    let ranges = |rows: &[u32]| -> Vec<usize> { (0..=shape[0].div_ceil(block)).map(|k| rows.partition_point(|&r| (r as usize) < k * block)).collect() };
+    let (cuts_a, cuts_b) = (ranges(a.rows()), ranges(b.rows()));
+    let counts: Vec<usize> = parallel::map_indices(cuts_a.len() - 1, |k| {
+        let mut n = 0;
+        merge_walk(&a.rows()[cuts_a[k]..cuts_a[k + 1]], &b.rows()[cuts_b[k]..cuts_b[k + 1]], |_, _, _| n += 1);
+        n
+    });
+    let total: usize = counts.iter().sum();
+    let (mut rows, mut values) = (Buffer::<u32>::stale(total), Buffer::<T>::stale(total * width));
+    let work: Vec<_> = split_lengths(&mut rows, counts.iter().copied())
+        .into_iter()
+        .zip(split_lengths(&mut values, counts.iter().map(|n| n * width)))
+        .collect();
+    parallel::for_each_item(work, |k, (rows, values)| {
+        let (base_a, base_b) = (cuts_a[k], cuts_b[k]);
+        let mut n = 0;
+        merge_walk(&a.rows()[base_a..cuts_a[k + 1]], &b.rows()[base_b..cuts_b[k + 1]], |row, i, j| {
+            rows[n] = row;
+            let out = &mut values[n * width..][..width];
+            match (i.map(|i| &a.data()[(base_a + i) * width..][..width]), j.map(|j| &b.data()[(base_b + j) * width..][..width])) {
+                (Some(x), Some(y)) => out.iter_mut().zip(x).zip(y).for_each(|((o, &x), &y)| *o = x + y),
+                (Some(x), None) | (None, Some(x)) => out.copy_from_slice(x),
+                (None, None) => unreachable!("a merged row comes from somewhere"),
+            }
+            n += 1;
+        });
+    });
+    RowSparse::new(&shape, rows, values)
+}
+
+/// Visits the union of two ascending lists: the row, and its place in each list that has it.
+fn merge_walk(a: &[u32], b: &[u32], mut visit: impl FnMut(u32, Option<usize>, Option<usize>)) {
+    let (mut i, mut j) = (0, 0);
+    while i < a.len() || j < b.len() {
+        let (x, y) = (a.get(i).copied().unwrap_or(u32::MAX), b.get(j).copied().unwrap_or(u32::MAX));
+        let row = x.min(y);
+        let (in_a, in_b) = (i < a.len() && x == row, j < b.len() && y == row);
+        visit(row, in_a.then_some(i), in_b.then_some(j));
+        i += usize::from(in_a);
+        j += usize::from(in_b);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A multiplicative congruential sequence: enough disorder for a test.
+    fn rows(n: usize, table: u32, seed: u64) -> Vec<u32> {
+        let mut s = seed;
+        (0..n)
+            .map(|_| {
+                s = s.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                ((s >> 33) as u32) % table
+            })
+            .collect()
+    }
+
+    #[test]
+    fn sums_into_rows_equal_a_plain_loop_for_every_width() {
+        for width in [1usize, 2, 3, 4, 12, 27, 28, 29, 48] {
+            let (table, n) = (50_000usize, 30_000usize);
+            let rows = rows(n, table as u32, 5);
+            let values: Vec<f64> = (0..n * width).map(|i| (i % 1000) as f64 - 500.0).collect();
+            let mut want = vec![0.0; table * width];
+            for (i, &r) in rows.iter().enumerate() {
+                for c in 0..width {
+                    want[r as usize * width + c] += values[i * width + c];
+                }
+            }
+            let got = sum_into_rows(&[table, width], n, |i| ([rows[i]], [1.0]), &values);
+            assert!(got.rows().is_sorted_by(|a, b| a < b));
+            assert_eq!(got.to_dense().data(), &want[..]);
+            let mut dense = vec![0.0; table * width];
+            add_into_table(&mut dense, width, n, |i| ([rows[i]], [1.0]), &values);
+            assert_eq!(dense, want);
+        }
+    }
+
+    #[test]
+    fn the_union_of_row_gradients_adds_common_rows() {
+        let make = |rows: Vec<u32>, x: f64| {
+            let values: Vec<f64> = rows.iter().map(|&r| f64::from(r) * x).collect();
+            RowSparse::new(&[100, 1], rows.into(), values.into())
+        };
+        let sum = add_row_sparse(make(vec![1, 5, 99], 1.0), make(vec![0, 5, 6], 10.0));
+        assert_eq!(sum.rows(), [0, 1, 5, 6, 99]);
+        assert_eq!(sum.data(), [0.0, 1.0, 55.0, 60.0, 99.0]);
+    }
+}

@@ -1,0 +1,25 @@
+//! Every op, by file. Each is a function on [`crate::Tensor`], a rule beside it, and a row of the table in `tests/gradcheck.rs`.
+//!
+//! | file | ops | gradient of the inputs |
+//! | --- | --- | --- |
+//! | [`arithmetic`] | `+ - * /` with tensors and numbers, `affine`, `maximum`, `minimum` | the textbook's; broadcasting is undone by the engine |
+//! | [`elementwise`] | `exp` `one_minus_exp_neg` `ln` `sqrt` `square` `abs` `sigmoid` `softplus` `relu` `clamp` `sin` `cos` `powi` | elementwise |
+//! | [`reduce`] | `sum` `mean` `max` `min`, over all or along an axis; `sum_to` | repeated; extrema share it among equals |
+//! | [`shape`] | `reshape` `unsqueeze` `broadcast_to` `permute` `transpose` `narrow` `index_axis` `pad` `concat` `stack` | moved back |
+//! | [`linalg`] | `matmul`, batched | products with the transposes |
+//! | [`scan`] | `cumsum` `exclusive_cumsum` | the running sum from the other end |
+//! | [`segment`] | `segment_sum` `segment_repeat` `segment_exclusive_sum` over packed rays | each other, and the sum from the other end |
+//! | [`lookup`] | `gather_rows` `scatter_rows` | each other; a gather's is row-sparse |
+//! | [`trilinear`] | `trilinear` (a kernel), `nearest` | row-sparse in the table; slopes in the positions |
+//! | [`select`] | `greater` `greater_equal` `equal` `masked` `where_` | masked |
+
+pub mod arithmetic;
+pub mod elementwise;
+pub mod linalg;
+pub mod lookup;
+pub mod reduce;
+pub mod scan;
+pub mod segment;
+pub mod select;
+pub mod shape;
+pub mod trilinear;

@@ -1,0 +1,148 @@
+//! Functions of one number, applied to each.
+
+use crate::op::{Cotangent, Keep, Op, Vjp};
+use crate::parallel;
+use crate::pool::Buffer;
+use crate::real::Real;
+use crate::tensor::Tensor;
+
+/// Function, rule and what the rule reads, in one place.
+macro_rules! elementwise {
+    ($($(#[$doc:meta])* $name:ident, $op:ident, $keep:expr, $f:expr, $rule:expr;)*) => {$(
+        #[derive(Debug)]
+        struct $op;
+        impl<T: Real> Op<T> for $op {
+            fn name(&self) -> &'static str {
+                stringify!($name)
+            }
+            fn keep(&self) -> Keep {
+                $keep
+            }
+            fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+                vec![cx.wrt(0, || ($rule)(cx))]
+            }
+        }
+        impl<T: Real> Tensor<T> {
+            $(#[$doc])*
+            pub fn $name(&self) -> Self {
+                unary(self, $op, $f)
+            }
+        }
+    )*};
+}
+
+elementwise! {
+    /// y = eˣ.   ∂L/∂x = ∂L/∂y · y
+    exp, Exp, Keep::OUTPUT, T::exp_, |cx: &Vjp<'_, T>| cx.cotangent() * cx.output();
+
+    /// y = 1 − e⁻ˣ, exact for small x: the opacity of an optical depth.   ∂L/∂x = ∂L/∂y · (1 − y)
+    one_minus_exp_neg, OneMinusExpNeg, Keep::OUTPUT, T::one_minus_exp_neg, |cx: &Vjp<'_, T>| cx.cotangent() * (1.0 - cx.output());
+
+    /// y = ln x, for x > 0.   ∂L/∂x = ∂L/∂y / x
+    ln, Ln, Keep::INPUTS, |x: T| x.ln(), |cx: &Vjp<'_, T>| cx.cotangent() / cx.input(0);
+
+    /// y = √x, for x >= 0; not differentiable at 0.   ∂L/∂x = ∂L/∂y / 2y
+    sqrt, Sqrt, Keep::OUTPUT, |x: T| x.sqrt(), |cx: &Vjp<'_, T>| cx.cotangent() / (2.0 * cx.output());
+
+    /// y = x².   ∂L/∂x = ∂L/∂y · 2x
+    square, Square, Keep::INPUTS, |x: T| x * x, |cx: &Vjp<'_, T>| cx.cotangent() * (2.0 * cx.input(0));
+
+    /// y = |x|; the gradient at 0 is 0.   ∂L/∂x = ∂L/∂y · sign x
+    abs, Abs, Keep::INPUTS, |x: T| x.abs(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sign();
+
+    /// y = 1 / (1 + e⁻ˣ).   ∂L/∂x = ∂L/∂y · y (1 − y)
+    sigmoid, Sigmoid, Keep::OUTPUT,
+    |x: T| {
+        // Computed from e^-|x|, which cannot overflow.
+        let e = (-x.abs()).exp_();
+        let small = e / (T::one() + e);
+        if x >= T::zero() { T::one() - small } else { small }
+    },
+    |cx: &Vjp<'_, T>| {
+        let y = cx.output();
+        cx.cotangent() * (&y * (1.0 - &y))
+    };
+
+    /// y = ln(1 + eˣ), computed as max(x, 0) + ln(1 + e^−|x|).   ∂L/∂x = ∂L/∂y · sigmoid x
+    softplus, Softplus, Keep::INPUTS, |x: T| x.max(T::zero()) + (-x.abs()).exp_().ln_1p(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sigmoid();
+
+    /// y = max(x, 0); the gradient passes where x >= 0.
+    relu, Relu, Keep::INPUTS, |x: T| if x >= T::zero() { x } else { T::zero() }, |cx: &Vjp<'_, T>| {
+        let x = cx.input(0).detach();
+        cx.cotangent() * x.greater_equal(&Tensor::scalar(T::zero()))
+    };
+
+    /// y = sin x.   ∂L/∂x = ∂L/∂y · cos x
+    sin, Sin, Keep::INPUTS, |x: T| x.sin(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).cos();
+
+    /// y = cos x.   ∂L/∂x = −∂L/∂y · sin x
+    cos, Cos, Keep::INPUTS, |x: T| x.cos(), |cx: &Vjp<'_, T>| -(cx.cotangent() * cx.input(0).sin());
+}
+
+/// y = xⁿ.   ∂L/∂x = ∂L/∂y · n xⁿ⁻¹
+#[derive(Debug)]
+struct Powi(i32);
+impl<T: Real> Op<T> for Powi {
+    fn name(&self) -> &'static str {
+        "powi"
+    }
+    fn keep(&self) -> Keep {
+        Keep::INPUTS
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        vec![cx.wrt(0, || match self.0 {
+            0 => Tensor::zeros(cx.cotangent().shape()),
+            n => cx.cotangent() * cx.input(0).powi(n - 1).affine(f64::from(n), 0.0),
+        })]
+    }
+}
+
+/// y = min(max(x, low), high); the gradient passes where low <= x <= high.
+#[derive(Debug)]
+struct Clamp {
+    low: f64,
+    high: f64,
+}
+impl<T: Real> Op<T> for Clamp {
+    fn name(&self) -> &'static str {
+        "clamp"
+    }
+    fn keep(&self) -> Keep {
+        Keep::INPUTS
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        let (low, high) = (T::lit(self.low), T::lit(self.high));
+        vec![cx.wrt(0, || cx.cotangent() * cx.input(0).constant_map(|x| if x >= low && x <= high { T::one() } else { T::zero() }))]
+    }
+}
+
+impl<T: Real> Tensor<T> {
+    /// y = xⁿ for an integer n, which may be negative.   ∂L/∂x = ∂L/∂y · n xⁿ⁻¹
+    pub fn powi(&self, n: i32) -> Self {
+        unary(self, Powi(n), move |x: T| x.powi(n))
+    }
+
+    /// y = min(max(x, low), high); the gradient passes where low <= x <= high.
+    pub fn clamp(&self, low: f64, high: f64) -> Self {
+        let (a, b) = (T::lit(low), T::lit(high));
+        unary(self, Clamp { low, high }, move |x: T| if x < a { a } else if x > b { b } else { x })
+    }
+
+    /// −1, 0 or 1: a constant, whatever `self` is.
+    pub fn sign(&self) -> Self {
+        self.constant_map(|x| if x > T::zero() { T::one() } else if x < T::zero() { -T::one() } else { T::zero() })
+    }
+
+    /// f(x), elementwise, as a constant that no gradient flows through: masks, roundings, signs.
+    pub fn constant_map(&self, f: impl Fn(T) -> T + Sync) -> Self {
+        let mut out = Buffer::stale(self.len());
+        parallel::map(self.data(), &mut out, f);
+        Tensor::from_buffer(out, self.shape())
+    }
+}
+
+fn unary<T: Real>(x: &Tensor<T>, op: impl Op<T>, f: impl Fn(T) -> T + Sync) -> Tensor<T> {
+    let mut out = Buffer::stale(x.len());
+    parallel::map(x.data(), &mut out, f);
+    Tensor::from_op(out, x.shape(), &[x], op)
+}

@@ -1,0 +1,312 @@
+//! Changes of shape.
+
+use super::arithmetic::{broadcast_shape, broadcast_strides};
+use crate::op::{Cotangent, Keep, Op, Vjp};
+use crate::parallel;
+use crate::pool::Buffer;
+use crate::real::Real;
+use crate::tensor::Tensor;
+use ndarray::{ArrayViewD, Axis, Dimension, IxDyn, Slice};
+
+/// The same values in another shape.   ∂L/∂x = ∂L/∂y in the old shape
+#[derive(Debug)]
+struct Reshape {
+    from: Vec<usize>,
+}
+impl<T: Real> Op<T> for Reshape {
+    fn name(&self) -> &'static str {
+        "reshape"
+    }
+    fn keep(&self) -> Keep {
+        Keep::NOTHING
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        vec![cx.wrt(0, || cx.cotangent().reshape(&self.from))]
+    }
+}
+
+/// Values repeated along new or unit dimensions.   ∂L/∂x = ∂L/∂y, summed over the repetitions (by the engine)
+#[derive(Debug)]
+struct Broadcast;
+impl<T: Real> Op<T> for Broadcast {
+    fn name(&self) -> &'static str {
+        "broadcast_to"
+    }
+    fn keep(&self) -> Keep {
+        Keep::NOTHING
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        vec![cx.wrt(0, || cx.cotangent().clone())]
+    }
+}
+
+/// y = x with dimensions in the order `axes`.   ∂L/∂x = ∂L/∂y in the inverse order
+#[derive(Debug)]
+struct Permute {
+    axes: Vec<usize>,
+}
+impl<T: Real> Op<T> for Permute {
+    fn name(&self) -> &'static str {
+        "permute"
+    }
+    fn keep(&self) -> Keep {
+        Keep::NOTHING
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        let mut inverse = vec![0; self.axes.len()];
+        for (to, &from) in self.axes.iter().enumerate() {
+            inverse[from] = to;
+        }
+        vec![cx.wrt(0, || cx.cotangent().permute(&inverse))]
+    }
+}
+
+/// y = x[…, start..start+len, …].   ∂L/∂x = ∂L/∂y between zeros
+#[derive(Debug)]
+struct Narrow {
+    axis: usize,
+    start: usize,
+}
+impl<T: Real> Op<T> for Narrow {
+    fn name(&self) -> &'static str {
+        "narrow"
+    }
+    fn keep(&self) -> Keep {
+        Keep::NOTHING
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        vec![cx.wrt(0, || cx.cotangent().pad(self.axis, self.start, cx.input_shape(0)[self.axis]))]
+    }
+}
+
+/// The adjoint of [`Narrow`].
+#[derive(Debug)]
+struct Pad {
+    axis: usize,
+    start: usize,
+    len: usize,
+}
+impl<T: Real> Op<T> for Pad {
+    fn name(&self) -> &'static str {
+        "pad"
+    }
+    fn keep(&self) -> Keep {
+        Keep::NOTHING
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        vec![cx.wrt(0, || cx.cotangent().narrow(self.axis, self.start, self.len))]
+    }
+}
+
+/// Tensors one after another along an axis.   Each gets its part of the cotangent.
+#[derive(Debug)]
+struct Concat {
+    axis: usize,
+}
+impl<T: Real> Op<T> for Concat {
+    fn name(&self) -> &'static str {
+        "concat"
+    }
+    fn keep(&self) -> Keep {
+        Keep::NOTHING
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        let parts = cx.node.inputs.len();
+        let mut start = 0;
+        (0..parts)
+            .map(|i| {
+                let len = cx.input_shape(i)[self.axis];
+                start += len;
+                cx.wrt(i, || cx.cotangent().narrow(self.axis, start - len, len))
+            })
+            .collect()
+    }
+}
+
+impl<T: Real> Tensor<T> {
+    /// The same values in another shape of as many elements; nothing is copied.
+    #[track_caller]
+    pub fn reshape(&self, shape: &[usize]) -> Self {
+        assert_eq!(shape.iter().product::<usize>(), self.len(), "reshape: {:?} has {} elements, {shape:?} another number", self.shape(), self.len());
+        if shape == self.shape() {
+            return self.clone();
+        }
+        let value = Tensor { data: self.data.clone(), shape: IxDyn(shape), node: None };
+        let from = self.shape().to_vec();
+        value.recorded(&[self], Keep::NOTHING, || crate::graph::Rule::Op(Box::new(Reshape { from })))
+    }
+
+    /// The same tensor with a dimension of size 1 inserted before `axis`.
+    #[track_caller]
+    pub fn unsqueeze(&self, axis: usize) -> Self {
+        assert!(axis <= self.ndim(), "unsqueeze: axis {axis} of a tensor of shape {:?}", self.shape());
+        let mut shape = self.shape().to_vec();
+        shape.insert(axis, 1);
+        self.reshape(&shape)
+    }
+
+    /// Values repeated to a larger shape by NumPy's rule.
+    #[track_caller]
+    pub fn broadcast_to(&self, shape: &[usize]) -> Self {
+        assert_eq!(broadcast_shape(self.shape(), shape).as_deref(), Some(shape), "broadcast_to: {:?} does not broadcast to {shape:?}", self.shape());
+        let mut out = Buffer::stale(shape.iter().product());
+        if self.len() == 1 {
+            parallel::fill(&mut out, self.data()[0]);
+        } else {
+            copy_strided(self.data(), &broadcast_strides(self.shape(), shape), shape, &mut out);
+        }
+        Tensor::from_op(out, shape, &[self], Broadcast)
+    }
+
+    /// Dimensions in another order: dimension `i` of the result is dimension `axes[i]` of this.
+    #[track_caller]
+    pub fn permute(&self, axes: &[usize]) -> Self {
+        let mut sorted = axes.to_vec();
+        sorted.sort_unstable();
+        assert!(sorted.into_iter().eq(0..self.ndim()), "permute: {axes:?} is no order of the dimensions of {:?}", self.shape());
+        let mut strides = vec![1; self.ndim()];
+        for i in (0..self.ndim().saturating_sub(1)).rev() {
+            strides[i] = strides[i + 1] * self.shape()[i + 1];
+        }
+        let shape: Vec<usize> = axes.iter().map(|&a| self.shape()[a]).collect();
+        let strides: Vec<usize> = axes.iter().map(|&a| strides[a]).collect();
+        let mut out = Buffer::stale(self.len());
+        copy_strided(self.data(), &strides, &shape, &mut out);
+        Tensor::from_op(out, &shape, &[self], Permute { axes: axes.to_vec() })
+    }
+
+    /// The last two dimensions exchanged.
+    #[track_caller]
+    pub fn transpose(&self) -> Self {
+        let n = self.ndim();
+        assert!(n >= 2, "transpose: shape {:?} has no two dimensions", self.shape());
+        let mut axes: Vec<usize> = (0..n).collect();
+        axes.swap(n - 2, n - 1);
+        self.permute(&axes)
+    }
+
+    /// `len` entries of one axis from `start` on.
+    #[track_caller]
+    pub fn narrow(&self, axis: usize, start: usize, len: usize) -> Self {
+        assert!(
+            axis < self.ndim() && start + len <= self.shape()[axis],
+            "narrow: {start}..{} of axis {axis} of a tensor of shape {:?}",
+            start + len,
+            self.shape()
+        );
+        let mut shape = self.shape().to_vec();
+        shape[axis] = len;
+        let inner: usize = shape[axis + 1..].iter().product();
+        let (from, to) = (self.shape()[axis] * inner, len * inner);
+        let mut out = Buffer::stale(shape.iter().product());
+        let x = self.data();
+        copy_rows(&mut out, to, |row| &x[row * from + start * inner..][..to]);
+        Tensor::from_op(out, &shape, &[self], Narrow { axis, start })
+    }
+
+    /// One entry of an axis, which disappears.
+    #[track_caller]
+    pub fn index_axis(&self, axis: usize, at: usize) -> Self {
+        let shape = self.shape_without("index_axis", axis);
+        self.narrow(axis, at, 1).reshape(&shape)
+    }
+
+    /// Zeros of length `total` along an axis, with this tensor from `start` on: the adjoint of [`Tensor::narrow`].
+    #[track_caller]
+    pub fn pad(&self, axis: usize, start: usize, total: usize) -> Self {
+        let len = self.shape()[axis];
+        assert!(start + len <= total, "pad: {len} entries from {start} on do not fit into {total}");
+        let mut shape = self.shape().to_vec();
+        shape[axis] = total;
+        let inner: usize = shape[axis + 1..].iter().product();
+        let (from, to) = (len * inner, total * inner);
+        let mut out = Buffer::stale(shape.iter().product());
+        let x = self.data();
+        parallel::for_each_rows(&mut out, to, |first, chunk| {
+            for (r, row) in chunk.chunks_exact_mut(to.max(1)).enumerate() {
+                row[..start * inner].fill(T::zero());
+                row[start * inner..][..from].copy_from_slice(&x[(first + r) * from..][..from]);
+                row[start * inner + from..].fill(T::zero());
+            }
+        });
+        Tensor::from_op(out, &shape, &[self], Pad { axis, start, len })
+    }
+
+    /// Tensors one after another along an existing axis. Panics if the other dimensions differ.
+    #[track_caller]
+    pub fn concat(parts: &[&Tensor<T>], axis: usize) -> Self {
+        assert!(!parts.is_empty(), "concat: no tensors");
+        let mut shape = parts[0].shape().to_vec();
+        assert!(axis < shape.len(), "concat: axis {axis} of tensors of shape {shape:?}");
+        for part in parts {
+            let same = part.ndim() == shape.len() && (0..shape.len()).all(|i| i == axis || part.shape()[i] == shape[i]);
+            assert!(same, "concat: shapes {:?} and {:?} differ beside axis {axis}", parts[0].shape(), part.shape());
+        }
+        shape[axis] = parts.iter().map(|p| p.shape()[axis]).sum();
+        let inner: usize = shape[axis + 1..].iter().product();
+        let width = shape[axis] * inner;
+        let mut out = Buffer::stale(shape.iter().product());
+        parallel::for_each_rows(&mut out, width, |first, chunk| {
+            for (r, row) in chunk.chunks_exact_mut(width.max(1)).enumerate() {
+                let mut at = 0;
+                for part in parts {
+                    let n = part.shape()[axis] * inner;
+                    row[at..at + n].copy_from_slice(&part.data()[(first + r) * n..][..n]);
+                    at += n;
+                }
+            }
+        });
+        Tensor::from_op(out, &shape, parts, Concat { axis })
+    }
+
+    /// Tensors of one shape along a new axis.
+    #[track_caller]
+    pub fn stack(parts: &[&Tensor<T>], axis: usize) -> Self {
+        let parts: Vec<Tensor<T>> = parts.iter().map(|p| p.unsqueeze(axis)).collect();
+        Self::concat(&parts.iter().collect::<Vec<_>>(), axis)
+    }
+
+    /// Part of the value along the first axis as an array view; for reading results.
+    pub fn rows_view(&self, range: std::ops::Range<usize>) -> ArrayViewD<'_, T> {
+        let mut view = self.value();
+        view.slice_axis_inplace(Axis(0), Slice::from(range));
+        view
+    }
+}
+
+fn copy_rows<'a, T: Real>(out: &mut [T], width: usize, row: impl Fn(usize) -> &'a [T] + Sync) {
+    parallel::for_each_rows(out, width, |first, chunk| {
+        for (r, target) in chunk.chunks_exact_mut(width.max(1)).enumerate() {
+            let source = row(first + r);
+            // A short copy inline is faster than a call of memcpy.
+            if width <= 4 { target.iter_mut().zip(source).for_each(|(t, &s)| *t = s) } else { target.copy_from_slice(source) }
+        }
+    });
+}
+
+/// out = x read with the given strides (0 repeats), in the order of `shape`.
+fn copy_strided<T: Real>(x: &[T], strides: &[usize], shape: &[usize], out: &mut [T]) {
+    let Some((&cols, outer)) = shape.split_last() else {
+        out.copy_from_slice(&x[..out.len()]);
+        return;
+    };
+    if cols == 0 {
+        return;
+    }
+    let step = strides[outer.len()];
+    let outer = IxDyn(outer);
+    parallel::for_each_rows(out, cols, |first, chunk| {
+        for (r, row) in chunk.chunks_exact_mut(cols).enumerate() {
+            let (mut rest, mut offset) = (first + r, 0);
+            for i in (0..outer.ndim()).rev() {
+                offset += rest % outer[i] * strides[i];
+                rest /= outer[i];
+            }
+            match step {
+                0 => row.fill(x[offset]),
+                1 => row.copy_from_slice(&x[offset..offset + cols]),
+                _ => row.iter_mut().enumerate().for_each(|(c, v)| *v = x[offset + c * step]),
+            }
+        }
+    });
+}

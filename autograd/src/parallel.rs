@@ -1,0 +1,147 @@
+//! The only place that knows rayon: fixed chunks, in-order reductions, loops compiled for several instruction sets.
+//!
+//! Chunk bounds depend on sizes and never on the number of threads, and partial sums are combined in chunk order, so every result has
+//! the same bits for any thread count.
+
+use crate::real::Real;
+use rayon::prelude::*;
+
+/// Compiles a function for several instruction sets and picks the best at run time. All of them round alike: see [`Real`].
+macro_rules! dispatched {
+    ($(#[$meta:meta])* $visibility:vis fn $($rest:tt)*) => {
+        $(#[$meta])*
+        #[multiversion::multiversion(targets(
+            "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
+            "x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
+            "aarch64+neon",
+        ))]
+        $visibility fn $($rest)*
+    };
+}
+pub(crate) use dispatched;
+
+/// Elements handed to a thread at a time: large enough to hide the hand-over, small enough to stay in a core's cache.
+pub const CHUNK: usize = 16 * 1024;
+
+/// Chunk length for rows of `width` elements, in rows.
+pub fn rows_per_chunk(width: usize) -> usize {
+    (CHUNK / width.max(1)).max(1)
+}
+
+/// Calls `f(first_row, rows)` for consecutive chunks of rows of `out`, in parallel.
+pub fn for_each_rows<E: Send>(out: &mut [E], width: usize, f: impl Fn(usize, &mut [E]) + Sync) {
+    let rows = rows_per_chunk(width);
+    for_each_chunk(out, rows * width.max(1), |start, chunk| f(start / width.max(1), chunk));
+}
+
+/// Calls `f(start, chunk)` for consecutive chunks of `size` elements of `out`, in parallel.
+pub fn for_each_chunk<E: Send>(out: &mut [E], size: usize, f: impl Fn(usize, &mut [E]) + Sync) {
+    if out.len() <= size {
+        if !out.is_empty() {
+            f(0, out);
+        }
+        return;
+    }
+    out.par_chunks_mut(size).enumerate().for_each(|(i, chunk)| f(i * size, chunk));
+}
+
+/// Calls `f(i)` for `0..n`, in parallel, and collects in order.
+pub fn map_indices<R: Send>(n: usize, f: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
+    if n <= 1 {
+        return (0..n).map(f).collect();
+    }
+    (0..n).into_par_iter().map(f).collect()
+}
+
+/// Calls `f(i, item)` for every item, in parallel, in no particular order.
+pub fn for_each_item<I: Send>(items: Vec<I>, f: impl Fn(usize, I) + Sync + Send) {
+    items.into_par_iter().enumerate().for_each(|(i, item)| f(i, item));
+}
+
+/// Calls `f(start..end)` for consecutive chunks of `0..n` and collects the results in chunk order.
+pub fn map_chunks<R: Send>(n: usize, size: usize, f: impl Fn(std::ops::Range<usize>) -> R + Sync + Send) -> Vec<R> {
+    let chunks = n.div_ceil(size);
+    map_indices(chunks, |i| f(i * size..((i + 1) * size).min(n)))
+}
+
+/// Fills a slice.
+pub fn fill<E: Copy + Send + Sync>(out: &mut [E], value: E) {
+    for_each_chunk(out, 4 * CHUNK, |_, chunk| chunk.fill(value));
+}
+
+/// Copies a slice.
+pub fn copy<E: Copy + Send + Sync>(source: &[E], out: &mut [E]) {
+    for_each_chunk(out, 4 * CHUNK, |start, chunk| chunk.copy_from_slice(&source[start..start + chunk.len()]));
+}
+
+/// out[i] = f(x[i])
+pub fn map<T: Real>(x: &[T], out: &mut [T], f: impl Fn(T) -> T + Sync) {
+    for_each_chunk(out, CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
+}
+
+/// out[i] = f(x[i], y[i])
+pub fn zip<T: Real>(x: &[T], y: &[T], out: &mut [T], f: impl Fn(T, T) -> T + Sync) {
+    for_each_chunk(out, CHUNK, |start, chunk| {
+        let range = start..start + chunk.len();
+        zip_loop(&x[range.clone()], &y[range], chunk, &f);
+    });
+}
+
+/// x[i] = f(x[i], y[i])
+pub fn zip_in_place<T: Real>(x: &mut [T], y: &[T], f: impl Fn(T, T) -> T + Sync) {
+    for_each_chunk(x, CHUNK, |start, chunk| zip_in_place_loop(chunk, &y[start..start + chunk.len()], &f));
+}
+
+/// Σ f(x[i]): sixteen running sums inside a chunk, chunk sums added in order.
+pub fn sum<T: Real>(x: &[T], f: impl Fn(T) -> T + Sync + Send) -> T {
+    map_chunks(x.len(), CHUNK, |range| sum_loop(&x[range], &f)).into_iter().sum()
+}
+
+dispatched! {
+fn map_loop<T: Real, F: Fn(T) -> T>(x: &[T], out: &mut [T], f: &F) {
+    for (o, &v) in out.iter_mut().zip(x) {
+        *o = f(v);
+    }
+}
+}
+
+dispatched! {
+fn zip_loop<T: Real, F: Fn(T, T) -> T>(x: &[T], y: &[T], out: &mut [T], f: &F) {
+    for ((o, &a), &b) in out.iter_mut().zip(x).zip(y) {
+        *o = f(a, b);
+    }
+}
+}
+
+dispatched! {
+fn zip_in_place_loop<T: Real, F: Fn(T, T) -> T>(x: &mut [T], y: &[T], f: &F) {
+    for (a, &b) in x.iter_mut().zip(y) {
+        *a = f(*a, b);
+    }
+}
+}
+
+dispatched! {
+fn sum_loop<T: Real, F: Fn(T) -> T>(x: &[T], f: &F) -> T {
+    const LANES: usize = 64;
+    let mut lanes = [T::zero(); LANES];
+    let (body, tail) = x.as_chunks::<LANES>();
+    for block in body {
+        for (lane, &v) in lanes.iter_mut().zip(block) {
+            *lane += f(v);
+        }
+    }
+    for (lane, &v) in lanes.iter_mut().zip(tail) {
+        *lane += f(v);
+    }
+    // Halving keeps the error small and the order fixed.
+    let mut width = LANES / 2;
+    while width > 0 {
+        for i in 0..width {
+            lanes[i] = lanes[i] + lanes[i + width];
+        }
+        width /= 2;
+    }
+    lanes[0]
+}
+}

@@ -1,0 +1,86 @@
+//! [`Param`]: a named leaf that an optimizer may change. [`Module`]: a set of them.
+
+use crate::pool::Buffer;
+use crate::real::Real;
+use crate::tensor::Tensor;
+use ndarray::{Array, Dimension};
+use std::sync::Arc;
+
+/// A named leaf. Its identity survives updates and not a change of shape, so state that an optimizer keeps for it cannot be applied to
+/// something else.
+#[derive(Debug)]
+pub struct Param<T: Real> {
+    name: String,
+    tensor: Tensor<T>,
+}
+
+impl<T: Real> Param<T> {
+    /// A parameter; names are what rates, schedules and checkpoints go by.
+    pub fn new<D: Dimension>(name: impl Into<String>, value: Array<T, D>) -> Self {
+        Param { name: name.into(), tensor: Tensor::variable(value) }
+    }
+
+    /// A parameter that takes over a tensor's value.
+    pub fn from_tensor(name: impl Into<String>, value: Tensor<T>) -> Self {
+        Param { name: name.into(), tensor: value.into_variable() }
+    }
+
+    /// The name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The leaf, to compute with.
+    pub fn tensor(&self) -> &Tensor<T> {
+        &self.tensor
+    }
+
+    /// The shape.
+    pub fn shape(&self) -> &[usize] {
+        self.tensor.shape()
+    }
+
+    /// Changes the values in place. If somebody still holds a graph or a clone with the old values, they keep them: the buffer is then
+    /// copied first, which is slower and never wrong.
+    pub fn update<R>(&mut self, f: impl FnOnce(&mut [T]) -> R) -> R {
+        f(Arc::<Buffer<T>>::make_mut(&mut self.tensor.data))
+    }
+
+    /// Takes a new value, of any shape, and a new identity.
+    pub fn replace(&mut self, value: Tensor<T>) {
+        self.tensor = value.into_variable();
+    }
+
+    pub(crate) fn id(&self) -> u64 {
+        self.tensor.id().expect("a parameter is a leaf")
+    }
+}
+
+/// Something with parameters.
+pub trait Module<T: Real> {
+    /// Visits every parameter, always in the same order.
+    fn visit(&self, f: &mut dyn FnMut(&Param<T>));
+
+    /// Visits every parameter for a change, in the same order.
+    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>));
+}
+
+impl<T: Real> Module<T> for Param<T> {
+    fn visit(&self, f: &mut dyn FnMut(&Param<T>)) {
+        f(self);
+    }
+
+    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>)) {
+        f(self);
+    }
+}
+
+impl<T: Real> Module<T> for Vec<Param<T>> {
+    fn visit(&self, f: &mut dyn FnMut(&Param<T>)) {
+        self.iter().for_each(f);
+    }
+
+    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>)) {
+        self.iter_mut().for_each(f);
+    }
+}

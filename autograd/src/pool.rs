@@ -1,0 +1,213 @@
+//! Large buffers, kept and handed out again.
+//!
+//! A training step allocates the same few dozen arrays every time. Taking them fresh from the system costs a page fault for every 4 KiB,
+//! which is more than most ops compute; so a dropped [`Buffer`] goes to a pool and the next one of about its size comes from there.
+//! Buffers that nobody asks for again are given back. On Linux new buffers ask for 2 MiB pages: random look-ups in a large table
+//! otherwise miss the TLB at every row.
+//!
+//! The contents of a recycled buffer are stale, never uninitialised: there is nothing unsafe here except the `madvise` call.
+
+use std::fmt::Debug;
+use std::ops::{Deref, DerefMut};
+use std::sync::Mutex;
+
+/// Below this the system allocator is as good.
+const SMALLEST: usize = 64 * 1024;
+/// A free buffer is given back after this many requests went by without it: several training steps.
+const LIFETIME: u64 = 1500;
+
+/// Buffers of one element type that are free at the moment.
+#[derive(Debug)]
+pub struct Pool<E> {
+    free: Vec<(u64, Vec<E>)>,
+    clock: u64,
+}
+
+impl<E> Pool<E> {
+    const fn new() -> Self {
+        Pool { free: Vec::new(), clock: 0 }
+    }
+}
+
+/// Element types with a pool of their own.
+pub trait Pooled: Copy + Default + Send + Sync + Debug + 'static {
+    #[doc(hidden)]
+    fn pool() -> &'static Mutex<Pool<Self>>;
+}
+
+macro_rules! pooled {
+    ($($t:ty),*) => {$(
+        impl Pooled for $t {
+            fn pool() -> &'static Mutex<Pool<Self>> {
+                static POOL: Mutex<Pool<$t>> = Mutex::new(Pool::new());
+                &POOL
+            }
+        }
+    )*};
+}
+pooled!(f32, f64, u32, u64);
+
+/// An owned array that returns to the pool when dropped.
+#[derive(Debug, Default)]
+pub struct Buffer<E: Pooled>(Vec<E>);
+
+impl<E: Pooled> Buffer<E> {
+    /// `len` elements of unspecified (but initialised) contents: for a caller who writes all of them.
+    pub fn stale(len: usize) -> Self {
+        match take::<E>(len) {
+            Some(mut v) => {
+                v.resize(len, E::default());
+                Buffer(v)
+            }
+            None => Buffer(fresh(len)),
+        }
+    }
+
+    /// `len` zeros.
+    pub fn zeros(len: usize) -> Self {
+        match take::<E>(len) {
+            Some(mut v) => {
+                v.resize(len, E::default());
+                crate::parallel::fill(&mut v, E::default());
+                Buffer(v)
+            }
+            None => Buffer(fresh(len)),
+        }
+    }
+
+    /// A copy of a slice.
+    pub fn copy_of(source: &[E]) -> Self {
+        let mut out = Self::stale(source.len());
+        crate::parallel::copy(source, &mut out);
+        out
+    }
+
+    /// Keeps the first `len` elements.
+    pub fn truncate(&mut self, len: usize) {
+        self.0.truncate(len);
+    }
+}
+
+impl<E: Pooled> From<Vec<E>> for Buffer<E> {
+    fn from(v: Vec<E>) -> Self {
+        Buffer(v)
+    }
+}
+
+impl<E: Pooled> Clone for Buffer<E> {
+    fn clone(&self) -> Self {
+        Self::copy_of(self)
+    }
+}
+
+impl<E: Pooled> Deref for Buffer<E> {
+    type Target = [E];
+    fn deref(&self) -> &[E] {
+        &self.0
+    }
+}
+
+impl<E: Pooled> DerefMut for Buffer<E> {
+    fn deref_mut(&mut self) -> &mut [E] {
+        &mut self.0
+    }
+}
+
+impl<E: Pooled> Drop for Buffer<E> {
+    fn drop(&mut self) {
+        let v = std::mem::take(&mut self.0);
+        if v.capacity() * size_of::<E>() >= SMALLEST {
+            let mut pool = E::pool().lock().unwrap_or_else(|e| e.into_inner());
+            let now = pool.clock;
+            pool.free.push((now, v));
+        }
+    }
+}
+
+/// Gives every free buffer back to the system: worthwhile when the sizes in use change for good, as after an upsampling.
+pub fn release_free_buffers() {
+    fn clear<E: Pooled>() {
+        let freed = std::mem::take(&mut E::pool().lock().unwrap_or_else(|e| e.into_inner()).free);
+        drop(freed);
+    }
+    clear::<f32>();
+    clear::<f64>();
+    clear::<u32>();
+    clear::<u64>();
+}
+
+/// The smallest free buffer that holds `len` elements and wastes at most a quarter.
+fn take<E: Pooled>(len: usize) -> Option<Vec<E>> {
+    if len * size_of::<E>() < SMALLEST {
+        return None;
+    }
+    let mut outdated = Vec::new();
+    let mut pool = E::pool().lock().unwrap_or_else(|e| e.into_inner());
+    pool.clock += 1;
+    let now = pool.clock;
+    let best = pool
+        .free
+        .iter()
+        .enumerate()
+        .filter(|(_, (_, v))| v.capacity() >= len && v.capacity() - len <= len / 4 + 1024)
+        .min_by_key(|(_, (_, v))| v.capacity())
+        .map(|(i, _)| i);
+    let found = best.map(|i| pool.free.swap_remove(i).1);
+    let mut i = 0;
+    while i < pool.free.len() {
+        if now - pool.free[i].0 > LIFETIME {
+            outdated.push(pool.free.swap_remove(i));
+        } else {
+            i += 1;
+        }
+    }
+    drop(pool);
+    drop(outdated);
+    found
+}
+
+/// Zeros from the system, with room for a slightly larger successor: sizes of packed samples change a little from step to step.
+fn fresh<E: Pooled>(len: usize) -> Vec<E> {
+    if len * size_of::<E>() < SMALLEST {
+        return vec![E::default(); len];
+    }
+    let mut v = vec![E::default(); len + len / 16];
+    advise_huge_pages(&v);
+    v.truncate(len);
+    v
+}
+
+#[cfg(target_os = "linux")]
+#[allow(unsafe_code)]
+fn advise_huge_pages<E>(v: &[E]) {
+    const HUGE: usize = 2 << 20;
+    let start = (v.as_ptr() as usize).next_multiple_of(HUGE);
+    let end = (v.as_ptr() as usize + size_of_val(v)) / HUGE * HUGE;
+    if start < end {
+        // SAFETY: the range lies inside the live allocation `v`, and MADV_HUGEPAGE changes no contents. A failure is only slower.
+        unsafe {
+            libc::madvise(start as *mut libc::c_void, end - start, libc::MADV_HUGEPAGE);
+        }
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn advise_huge_pages<E>(_: &[E]) {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dropped_buffer_is_handed_out_again_and_zeros_are_zeros() {
+        // A size no other test uses.
+        let len = 123_457;
+        let mut a = Buffer::<u64>::zeros(len);
+        a.fill(7);
+        let address = a.as_ptr();
+        drop(a);
+        let b = Buffer::<u64>::zeros(len - 5);
+        assert_eq!(b.as_ptr(), address);
+        assert!(b.iter().all(|&x| x == 0));
+    }
+}

@@ -1,0 +1,176 @@
+//! The one place for camera conventions.
+//!
+//! World coordinates are the dataset's own. Camera axes are OpenGL's: x right, y up, the camera looks along -z. Pixel
+//! coordinates run x right and y *down* from the top left corner of the image, so the centre of pixel (i, j) is
+//! (i + 0.5, j + 0.5). Rays are unit: t along a ray is world distance.
+
+use glam::{DAffine3, DMat3, DVec3};
+
+/// Pinhole intrinsics in pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Intrinsics {
+    /// Image width in pixels.
+    pub width: usize,
+    /// Image height in pixels.
+    pub height: usize,
+    /// Horizontal focal length in pixels.
+    pub fx: f64,
+    /// Vertical focal length in pixels.
+    pub fy: f64,
+    /// Horizontal principal point in pixels from the left edge.
+    pub cx: f64,
+    /// Vertical principal point in pixels from the top edge.
+    pub cy: f64,
+}
+
+impl Intrinsics {
+    /// Square pixels and a centred principal point from the horizontal field of view in radians:
+    /// f = W / (2 tan(fov / 2)), c = (W / 2, H / 2).
+    pub fn from_fov_x(width: usize, height: usize, fov_x: f64) -> Self {
+        let focal = 0.5 * width as f64 / (0.5 * fov_x).tan();
+        Intrinsics { width, height, fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 }
+    }
+
+    /// Horizontal field of view in radians, 2 atan(W / (2 fx)): the inverse of [`Intrinsics::from_fov_x`].
+    pub fn fov_x(&self) -> f64 {
+        2.0 * (0.5 * self.width as f64 / self.fx).atan()
+    }
+
+    /// The intrinsics of the image whose pixels are averages of `k` x `k` pixels of this one: everything divided by k. Rays
+    /// through pixel *centres* then belong to the averaged blocks' centres. `k` should divide width and height (else the
+    /// incomplete last blocks are dropped, as the integer division says) and must not be 0.
+    pub fn downscaled(&self, k: usize) -> Self {
+        let s = k as f64;
+        Intrinsics {
+            width: self.width / k,
+            height: self.height / k,
+            fx: self.fx / s,
+            fy: self.fy / s,
+            cx: self.cx / s,
+            cy: self.cy / s,
+        }
+    }
+}
+
+/// Half-line from a camera through a point of its image, in world coordinates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ray {
+    /// The camera's position.
+    pub origin: DVec3,
+    /// Unit direction.
+    pub direction: DVec3,
+    /// Length the direction had when its camera z was -1, so t / stretch is depth along the optical axis: 1 in the image
+    /// centre, more towards the corners.
+    pub stretch: f64,
+}
+
+/// A pinhole camera: intrinsics and where it stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// Image size, focal lengths, principal point.
+    pub intrinsics: Intrinsics,
+    /// Camera to world: a rotation whose columns are the camera's right, up and backward axes, and the camera's position.
+    pub camera_to_world: DAffine3,
+}
+
+impl Camera {
+    /// A camera at `eye` that sees `target` in the middle of its image, with `up` upwards in it. If `up` is parallel to the
+    /// line of sight, any perpendicular direction takes its place.
+    pub fn look_at(eye: DVec3, target: DVec3, up: DVec3, intrinsics: Intrinsics) -> Self {
+        let backward = (eye - target).normalize();
+        let right = up.cross(backward).try_normalize().unwrap_or_else(|| backward.any_orthonormal_vector());
+        let rotation = DMat3::from_cols(right, backward.cross(right), backward);
+        Camera { intrinsics, camera_to_world: DAffine3::from_mat3_translation(rotation, eye) }
+    }
+
+    /// The camera's position in the world.
+    pub fn position(&self) -> DVec3 {
+        self.camera_to_world.translation
+    }
+
+    /// The ray through the point (`x`, `y`) of the image, in pixel coordinates: the centre of pixel (i, j) is
+    /// `ray(i + 0.5, j + 0.5)`. d = R ((x - cx)/fx, -(y - cy)/fy, -1), made unit.
+    pub fn ray(&self, x: f64, y: f64) -> Ray {
+        let k = &self.intrinsics;
+        let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
+        let direction = self.camera_to_world.transform_vector3(direction);
+        let stretch = direction.length();
+        Ray { origin: self.camera_to_world.translation, direction: direction / stretch, stretch }
+    }
+
+    /// Where the world point `p` appears: `(x, y, depth)`, pixel coordinates and depth along the optical axis (the distance
+    /// along the ray is depth times its stretch). `None` for points beside or behind the camera, depth <= 0. Points outside
+    /// the image have coordinates outside of it.
+    pub fn project(&self, p: DVec3) -> Option<(f64, f64, f64)> {
+        let k = &self.intrinsics;
+        let local = self.camera_to_world.inverse().transform_point3(p);
+        let depth = -local.z;
+        (depth > 0.0).then(|| (k.cx + k.fx * local.x / depth, k.cy - k.fy * local.y / depth, depth))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn synthetic() -> Intrinsics {
+        Intrinsics::from_fov_x(800, 800, 0.6911112070083618)
+    }
+
+    #[test]
+    fn focal_length_of_the_synthetic_scenes_is_1111_pixels() {
+        // 400 / tan(0.3455556...) = 1111.111; the scenes were rendered with a 50 mm lens on a 36 mm sensor: 800 * 50 / 36.
+        assert!((synthetic().fx - 800.0 * 50.0 / 36.0).abs() < 1e-4);
+        assert!((synthetic().fov_x() - 0.6911112070083618).abs() < 1e-15);
+    }
+
+    #[test]
+    fn image_axes_follow_the_camera_axes() {
+        let camera = Camera { intrinsics: synthetic(), camera_to_world: DAffine3::IDENTITY };
+        assert_eq!(camera.ray(400.0, 400.0).direction, DVec3::NEG_Z);
+        let corner = camera.ray(0.0, 0.0); // top left: left is -x, up is +y
+        assert!(corner.direction.x < 0.0 && corner.direction.y > 0.0 && corner.direction.z < 0.0);
+        // At the corner both offsets are 400 / 1111.111 = 0.36: stretch = sqrt(1 + 2 * 0.36^2).
+        assert!((corner.stretch - (1.0 + 2.0 * 0.36_f64.powi(2)).sqrt()).abs() < 1e-7);
+        assert!((corner.direction.length() - 1.0).abs() < 1e-15);
+    }
+
+    #[test]
+    fn look_at_puts_the_target_in_the_middle_and_up_upwards() {
+        let camera = Camera::look_at(DVec3::new(3.0, -2.0, 1.5), DVec3::new(0.2, 0.1, -0.3), DVec3::Z, synthetic());
+        let (x, y, depth) = camera.project(DVec3::new(0.2, 0.1, -0.3)).unwrap();
+        assert!((x - 400.0).abs() < 1e-9 && (y - 400.0).abs() < 1e-9);
+        assert!((depth - DVec3::new(2.8, -2.1, 1.8).length()).abs() < 1e-12);
+        assert!(camera.project(DVec3::new(0.2, 0.1, 0.0)).unwrap().1 < 400.0);
+        assert!((camera.camera_to_world.matrix3.determinant() - 1.0).abs() < 1e-12);
+        assert_eq!(camera.project(DVec3::new(6.0, -4.0, 3.0)), None);
+    }
+
+    #[test]
+    fn looking_straight_down_is_a_proper_camera() {
+        let camera = Camera::look_at(DVec3::Z * 4.0, DVec3::ZERO, DVec3::Z, synthetic());
+        assert!((camera.camera_to_world.matrix3.determinant() - 1.0).abs() < 1e-12);
+        assert!((camera.ray(400.0, 400.0).direction - DVec3::NEG_Z).length() < 1e-12);
+    }
+
+    #[test]
+    fn a_point_on_a_ray_projects_to_the_pixel_of_the_ray() {
+        let camera = Camera::look_at(DVec3::new(-1.0, 3.5, 2.0), DVec3::ZERO, DVec3::Z, synthetic());
+        for (x, y) in [(0.5, 0.5), (799.5, 12.5), (321.25, 654.75)] {
+            let ray = camera.ray(x, y);
+            let (px, py, depth) = camera.project(ray.origin + 2.5 * ray.direction).unwrap();
+            assert!((px - x).abs() < 1e-9 && (py - y).abs() < 1e-9);
+            assert!((depth * ray.stretch - 2.5).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn downscaling_keeps_the_ray_through_the_middle_of_a_block() {
+        let camera = Camera::look_at(DVec3::new(2.0, 2.0, 2.0), DVec3::ZERO, DVec3::Z, synthetic());
+        let small = Camera { intrinsics: camera.intrinsics.downscaled(8), ..camera };
+        assert_eq!((small.intrinsics.width, small.intrinsics.height), (100, 100));
+        // Block (3, 5) covers x in [24, 32) and y in [40, 48): its middle is (28, 44).
+        let (a, b) = (small.ray(3.5, 5.5), camera.ray(28.0, 44.0));
+        assert!((a.direction - b.direction).length() < 1e-15);
+    }
+}

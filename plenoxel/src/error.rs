@@ -1,0 +1,98 @@
+//! What can go wrong between this crate and the world: files, settings, numbers.
+//!
+//! Mistakes of a programmer (shapes that do not fit) panic at the caller's line. Everything that comes from a file, a flag or
+//! the data is an [`Error`], and its message says where it happened, what was found, what is accepted and what to do.
+
+use std::path::PathBuf;
+
+/// Result with this crate's [`Error`].
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// Everything a user, a disk or a diverging training run can cause.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A file or folder does not hold what it should.
+    #[error("{}: {found}; {remedy}", path.display())]
+    Input {
+        /// The file or folder.
+        path: PathBuf,
+        /// What is there, with frame index, key or line where that helps.
+        found: String,
+        /// What is accepted, or what to do about it.
+        remedy: String,
+    },
+    /// A setting (flag or configuration key) has a value that cannot be used.
+    #[error("{key}: {found} cannot be used; accepted: {accepted}")]
+    Config {
+        /// Name of the setting as the user writes it.
+        key: String,
+        /// The value given.
+        found: String,
+        /// The values that would do.
+        accepted: String,
+    },
+    /// A computation left the finite numbers.
+    #[error("{place}: {found}; {remedy}")]
+    Numeric {
+        /// Step, tensor or formula where it was noticed.
+        place: String,
+        /// The value seen.
+        found: String,
+        /// What usually helps.
+        remedy: String,
+    },
+    /// The operating system refused to read or write.
+    #[error("{}: {source} while {doing}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// The reason the operating system gave.
+        source: std::io::Error,
+        /// The activity, as a participle: "writing the image".
+        doing: String,
+    },
+}
+
+impl Error {
+    /// Bad data in `path`.
+    pub fn input(path: impl Into<PathBuf>, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Error::Input { path: path.into(), found: found.into(), remedy: remedy.into() }
+    }
+
+    /// A setting that cannot be used.
+    pub fn config(key: impl Into<String>, found: impl ToString, accepted: impl Into<String>) -> Self {
+        Error::Config { key: key.into(), found: found.to_string(), accepted: accepted.into() }
+    }
+
+    /// A refusal of the operating system while `doing` something with `path`.
+    pub fn io(path: impl Into<PathBuf>, source: std::io::Error, doing: impl Into<String>) -> Self {
+        Error::Io { path: path.into(), source, doing: doing.into() }
+    }
+
+    /// Exit code of a process that ends with this error: 2 setting, 3 data, 4 numbers, 5 reading or writing.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Error::Config { .. } => 2,
+            Error::Input { .. } => 3,
+            Error::Numeric { .. } => 4,
+            Error::Io { .. } => 5,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_kind_of_error_has_its_own_exit_code_and_a_complete_sentence() {
+        let input = Error::input("a.json", "frames is empty", "list at least one frame");
+        assert_eq!((input.exit_code(), input.to_string().as_str()), (3, "a.json: frames is empty; list at least one frame"));
+        let config = Error::config("downscale", 3, "1, 2, 4");
+        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: 3 cannot be used; accepted: 1, 2, 4"));
+        let io = Error::io("out", std::io::Error::other("disk full"), "writing");
+        assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing"));
+        let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
+        assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
+    }
+}

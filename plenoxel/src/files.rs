@@ -1,0 +1,81 @@
+//! Files appear whole or not at all.
+//!
+//! Everything this crate writes goes through [`write_atomically`], so that an interrupted run, a full disk or a power cut
+//! leaves either the old file or the new one, never half of one.
+
+use crate::error::{Error, Result};
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Writes `bytes` to `path`, replacing what is there: a temporary file in the same folder is written, synced to disk and
+/// renamed. Other processes see the old content or the new, and nothing is left behind on failure.
+///
+/// Errors: [`Error::Io`] if the folder is missing or refuses the file.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    let temporary = temporary_name(path);
+    let written = File::create(&temporary)
+        .and_then(|mut file| {
+            file.write_all(bytes)?;
+            file.sync_all()
+        })
+        .and_then(|()| fs::rename(&temporary, path));
+    written.map_err(|source| {
+        // The write is what failed; a second failure while tidying up would only hide it.
+        let _ = fs::remove_file(&temporary);
+        Error::io(path, source, "writing the file")
+    })
+}
+
+/// Creates the folder `path` and the folders above it; one that exists already is fine.
+///
+/// Errors: [`Error::Io`] if it cannot be created, for instance because a file has that name.
+pub fn create_dir(path: &Path) -> Result<()> {
+    fs::create_dir_all(path).map_err(|source| Error::io(path, source, "creating the folder"))
+}
+
+/// A hidden name beside `path` that no other process and no other thread of this one uses. It does not contain the file's own
+/// name, which may already be as long as the file system allows.
+fn temporary_name(path: &Path) -> PathBuf {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    let unique = COUNTER.fetch_add(1, Ordering::Relaxed);
+    path.with_file_name(format!(".{}-{unique}.tmp", std::process::id()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("plenoxel-files-{}-{name}", std::process::id()));
+        create_dir(&path).unwrap();
+        path
+    }
+
+    #[test]
+    fn a_file_is_replaced_and_no_temporary_file_remains() {
+        let folder = folder("replace");
+        let path = folder.join("a.txt");
+        write_atomically(&path, b"old").unwrap();
+        write_atomically(&path, b"new").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_failed_write_names_the_file_and_leaves_nothing_behind() {
+        let folder = folder("fail");
+        // A folder cannot be replaced by a file: the rename fails after the temporary file was written.
+        let occupied = folder.join("occupied");
+        create_dir(&occupied.join("inner")).unwrap();
+        let error = write_atomically(&occupied, b"x").unwrap_err();
+        assert_eq!(error.exit_code(), 5);
+        assert!(error.to_string().contains("occupied"), "{error}");
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+        let error = write_atomically(&folder.join("missing/a.txt"), b"x").unwrap_err();
+        assert_eq!(error.exit_code(), 5);
+        fs::remove_dir_all(folder).unwrap();
+    }
+}
