@@ -69,10 +69,6 @@ impl<T: Real> RowSparse<T> {
         }
         Tensor::from_buffer(out, self.shape())
     }
-
-    pub(crate) fn into_parts(self) -> (Buffer<u32>, Buffer<T>) {
-        (self.rows, self.values)
-    }
 }
 
 impl<T: Real> Grad<T> {

@@ -6,7 +6,7 @@
 //! bits for any number of threads.
 
 use crate::gradients::RowSparse;
-use crate::parallel::{self, dispatched};
+use crate::parallel::{self, dispatched, split_lengths};
 use crate::pool::Buffer;
 use crate::real::Real;
 use std::ops::Deref;
@@ -109,16 +109,6 @@ fn for_each_bucket<const K: usize>(rows: [u32; K], shift: u32, mut f: impl FnMut
             f(bucket as usize);
         }
     }
-}
-
-fn split_lengths<E>(mut rest: &mut [E], lengths: impl Iterator<Item = usize>) -> Vec<&mut [E]> {
-    lengths
-        .map(|n| {
-            let (head, tail) = std::mem::take(&mut rest).split_at_mut(n);
-            rest = tail;
-            head
-        })
-        .collect()
 }
 
 /// Σ over items and k of weights[k] · values[item] into rows[k]: the rows that were touched, sorted, and their sums.

@@ -8,6 +8,7 @@ mod graph;
 mod index;
 mod op;
 pub mod ops;
+pub mod optim;
 pub mod parallel;
 mod param;
 mod pool;

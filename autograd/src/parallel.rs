@@ -64,6 +64,38 @@ pub fn map_chunks<R: Send>(n: usize, size: usize, f: impl Fn(std::ops::Range<usi
     map_indices(chunks, |i| f(i * size..((i + 1) * size).min(n)))
 }
 
+/// Cuts a slice into parts of the given lengths, which must not exceed it.
+pub fn split_lengths<E>(mut rest: &mut [E], lengths: impl Iterator<Item = usize>) -> Vec<&mut [E]> {
+    lengths
+        .map(|n| {
+            let (head, tail) = std::mem::take(&mut rest).split_at_mut(n);
+            rest = tail;
+            head
+        })
+        .collect()
+}
+
+/// Calls `f(k, row)` for the rows `rows[k]` of a table, in parallel. The row numbers are ascending and unique, so runs of them own
+/// disjoint parts of the table.
+pub fn for_each_table_row<E: Send>(table: &mut [E], width: usize, rows: &[u32], f: impl Fn(usize, &mut [E]) + Sync + Send) {
+    let run = rows_per_chunk(width);
+    let mut parts = Vec::with_capacity(rows.len().div_ceil(run));
+    let (mut rest, mut begin) = (table, 0);
+    for (i, rows) in rows.chunks(run).enumerate() {
+        let (first, last) = (rows[0] as usize, rows[rows.len() - 1] as usize);
+        let (_, tail) = std::mem::take(&mut rest).split_at_mut((first - begin) * width);
+        let (part, tail) = tail.split_at_mut((last + 1 - first) * width);
+        parts.push((i * run, rows, part));
+        (rest, begin) = (tail, last + 1);
+    }
+    for_each_item(parts, |_, (k, rows, part)| {
+        let first = rows[0] as usize;
+        for (i, &row) in rows.iter().enumerate() {
+            f(k + i, &mut part[(row as usize - first) * width..][..width]);
+        }
+    });
+}
+
 /// Fills a slice.
 pub fn fill<E: Copy + Send + Sync>(out: &mut [E], value: E) {
     for_each_chunk(out, 4 * CHUNK, |_, chunk| chunk.fill(value));
@@ -90,6 +122,68 @@ pub fn zip<T: Real>(x: &[T], y: &[T], out: &mut [T], f: impl Fn(T, T) -> T + Syn
 /// x[i] = f(x[i], y[i])
 pub fn zip_in_place<T: Real>(x: &mut [T], y: &[T], f: impl Fn(T, T) -> T + Sync) {
     for_each_chunk(x, CHUNK, |start, chunk| zip_in_place_loop(chunk, &y[start..start + chunk.len()], &f));
+}
+
+/// (x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i]): how an optimizer changes values and what it remembers of them.
+pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
+    fn halves<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], g: &[T], f: &F) {
+        if g.len() <= CHUNK {
+            return update_loop(x, g, f);
+        }
+        let middle = (g.len() / 2).next_multiple_of(CHUNK);
+        let (low, high) = split(x, middle);
+        rayon::join(|| halves(low, &g[..middle], f), || halves(high, &g[middle..], f));
+    }
+    halves(x, g, &f);
+}
+
+/// The same for some rows of tables of `width` columns. `rows` ascend without repetition and `g` has one row for each; other rows stay.
+pub fn update_rows<T: Real, const N: usize>(x: [&mut [T]; N], width: usize, rows: &[u32], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
+    update_part::<T, N, false, _>(x, TableRows { first: 0, width, rows, g }, &f);
+}
+
+/// The same for all rows, `g` being zero in those that `rows` does not list.
+pub fn update_all_rows<T: Real, const N: usize>(x: [&mut [T]; N], width: usize, rows: &[u32], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
+    update_part::<T, N, true, _>(x, TableRows { first: 0, width, rows, g }, &f);
+}
+
+/// A part of a table that begins at row `first`, and which of its rows have a gradient.
+#[derive(Clone, Copy)]
+struct TableRows<'a, T> {
+    first: usize,
+    width: usize,
+    rows: &'a [u32],
+    g: &'a [T],
+}
+
+/// Halves the work until it is a chunk. A half of the ascending rows lies in a part of the table of its own, so nothing is shared.
+/// `ALL` visits the rows without a gradient too.
+fn update_part<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
+    let TableRows { first, width, rows, g } = part;
+    let count = if ALL { x[0].len() / width.max(1) } else { rows.len() };
+    if count <= rows_per_chunk(width) {
+        return update_runs::<T, N, ALL, F>(x, part, f);
+    }
+    let cut = if ALL { first + count / 2 } else { rows[count / 2] as usize };
+    let middle = rows.partition_point(|&row| (row as usize) < cut);
+    let (low, high) = split(x, (cut - first) * width);
+    let ((low_rows, high_rows), (low_g, high_g)) = (rows.split_at(middle), g.split_at(middle * width));
+    rayon::join(
+        || update_part::<T, N, ALL, F>(low, TableRows { rows: low_rows, g: low_g, ..part }, f),
+        || update_part::<T, N, ALL, F>(high, TableRows { first: cut, rows: high_rows, g: high_g, ..part }, f),
+    );
+}
+
+fn split<T, const N: usize>(x: [&mut [T]; N], at: usize) -> ([&mut [T]; N], [&mut [T]; N]) {
+    let mut high = [const { None }; N];
+    let mut k = 0;
+    let low = x.map(|slice| {
+        let (a, b) = slice.split_at_mut(at);
+        high[k] = Some(b);
+        k += 1;
+        a
+    });
+    (low, high.map(Option::unwrap_or_default))
 }
 
 /// Σ f(x[i]): sixteen running sums inside a chunk, chunk sums added in order.
@@ -122,6 +216,48 @@ fn zip_in_place_loop<T: Real, F: Fn(T, T) -> T>(x: &mut [T], y: &[T], f: &F) {
 }
 
 dispatched! {
+fn update_loop<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]; N], g: &[T], f: &F) {
+    update_slices(x, g.len(), |i| g[i], f);
+}
+}
+
+dispatched! {
+/// Neighbouring rows are updated as one run.
+fn update_runs<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N]>(mut x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
+    let TableRows { first, width, rows, g } = part;
+    let mut done = 0;
+    let mut k = 0;
+    while k < rows.len() {
+        let run = (1..).take_while(|&n| rows.get(k + n).is_some_and(|&row| (row - rows[k]) as usize == n)).count() + 1;
+        let (start, len) = ((rows[k] as usize - first) * width, run * width);
+        if ALL {
+            update_slices(x.each_mut().map(|x| &mut x[done..start]), start - done, |_| T::zero(), f);
+            done = start + len;
+        }
+        let g = &g[k * width..][..len];
+        update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
+        k += run;
+    }
+    if ALL {
+        let len = x[0].len() - done;
+        update_slices(x.each_mut().map(|x| &mut x[done..]), len, |_| T::zero(), f);
+    }
+}
+}
+
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // N arrays are walked at once.
+fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl Fn(usize) -> T, f: &impl Fn([T; N], T) -> [T; N]) {
+    let x = x.map(|x| &mut x[..len]);
+    for i in 0..len {
+        let new = f(std::array::from_fn(|k| x[k][i]), g(i));
+        for k in 0..N {
+            x[k][i] = new[k];
+        }
+    }
+}
+
+dispatched! {
 fn sum_loop<T: Real, F: Fn(T) -> T>(x: &[T], f: &F) -> T {
     const LANES: usize = 64;
     let mut lanes = [T::zero(); LANES];
@@ -138,7 +274,7 @@ fn sum_loop<T: Real, F: Fn(T) -> T>(x: &[T], f: &F) -> T {
     let mut width = LANES / 2;
     while width > 0 {
         for i in 0..width {
-            lanes[i] = lanes[i] + lanes[i + width];
+            lanes[i] += lanes[i + width];
         }
         width /= 2;
     }

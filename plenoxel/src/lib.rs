@@ -12,3 +12,19 @@ pub mod dataset;
 pub mod camera;
 /// PSNR and SSIM.
 pub mod metrics;
+/// Random numbers as a function of what they are for.
+pub mod random;
+/// Training rays, made on the fly.
+pub mod rays;
+/// Where a ray looks at the field.
+pub mod sampling;
+/// What fills space.
+pub mod field;
+/// From rays to pixels.
+pub mod render;
+/// Losses and their weighted sum.
+pub mod loss;
+/// Training, coarse to fine.
+pub mod train;
+/// A trained grid on disk.
+pub mod checkpoint;

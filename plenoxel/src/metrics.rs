@@ -67,12 +67,7 @@ fn mean_ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>, pad: 
                         // Row `top + k` of the padded image; rows of zeros add nothing.
                         let Some(y) = (top + k).checked_sub(pad).filter(|y| *y < height) else { continue };
                         let span = y * stride + start..y * stride + end;
-                        for (i, (a, b)) in prediction[span.clone()].iter().zip(&target[span]).enumerate() {
-                            let (wa, wb) = (weight * a, weight * b);
-                            for (sum, value) in sums.iter_mut().zip([wa, wb, wa * a, wb * b, wa * b]) {
-                                sum[i] += value;
-                            }
-                        }
+                        add_moments(&mut sums, *weight, &prediction[span.clone()], &target[span]);
                     }
                     let shift = pad * channels;
                     for (moment, sum) in moments.iter_mut().zip(&sums) {
@@ -91,15 +86,31 @@ fn mean_ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>, pad: 
                         }
                     }
                     let [a, b, aa, bb, ab] = &sums;
-                    for i in 0..length {
-                        total += similarity(a[i], b[i], aa[i], bb[i], ab[i]);
-                    }
+                    let values: [f64; BLOCK] = std::array::from_fn(|i| similarity(a[i], b[i], aa[i], bb[i], ab[i]));
+                    total += values[..length].iter().sum::<f64>();
                 }
                 total
             },
         )
         .collect();
     row_sums.iter().sum::<f64>() / (rows * columns) as f64
+}
+
+/// Adds weight times a, b, a², b² and ab of a stretch of one image row to the five running sums.
+#[inline]
+fn add_moments(sums: &mut [[f64; BLOCK]; 5], weight: f64, a: &[f64], b: &[f64]) {
+    // Slices cut to one length let the compiler drop the bounds checks and use vector instructions.
+    let n = a.len().min(BLOCK);
+    let [sa, sb, saa, sbb, sab] = sums.each_mut().map(|sum| &mut sum[..n]);
+    let (a, b) = (&a[..n], &b[..n]);
+    for i in 0..n {
+        let (wa, wb) = (weight * a[i], weight * b[i]);
+        sa[i] += wa;
+        sb[i] += wb;
+        saa[i] += wa * a[i];
+        sbb[i] += wb * b[i];
+        sab[i] += wa * b[i];
+    }
 }
 
 /// SSIM of one window from its weighted means of a, b, a², b² and ab.
@@ -109,7 +120,8 @@ fn similarity(a: f64, b: f64, aa: f64, bb: f64, ab: f64) -> f64 {
     const C2: f64 = 0.03 * 0.03;
     let (variance_a, variance_b) = ((aa - a * a).max(0.0), (bb - b * b).max(0.0));
     let bound = (variance_a * variance_b).sqrt();
-    let covariance = (ab - a * b).clamp(-bound, bound);
+    // min and max, not clamp, which panics where the bound is NaN.
+    let covariance = (ab - a * b).min(bound).max(-bound);
     (2.0 * a * b + C1) * (2.0 * covariance + C2) / ((a * a + b * b + C1) * (variance_a + variance_b + C2))
 }
 

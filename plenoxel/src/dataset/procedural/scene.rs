@@ -3,7 +3,7 @@
 //! Chosen to exercise what voxel fields find easy and hard: stripes and checkers near the voxel size, dark and bright paint,
 //! rods and hoops about as thin as a pixel, hollows that no silhouette shows (a bowl, dimples in a block), and glossy
 //! spheres whose color changes with the direction of view, smoothly enough for spherical harmonics of degree 2. World z is
-//! up; everything lies within 1.25 of the origin. Light is the same in every picture and is not part of the scene's geometry.
+//! up; everything lies within 1.3 of the origin. Light is the same in every picture and is not part of the scene's geometry.
 
 use super::shapes::{Ball, Convex, Hit, Solid};
 use crate::camera::{Camera, Ray};
@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
 /// Height of the table's top.
-const TABLE: f64 = -0.47;
+const TABLE: f64 = -0.45;
 /// Distance by which a shadow ray starts off its surface.
 const OFFSET: f64 = 1e-6;
 
@@ -58,8 +58,9 @@ struct Paint {
 #[derive(Debug, Clone, Copy)]
 enum Pattern {
     Plain,
-    /// Cells of `side` along axes turned by `yaw` about the vertical through `center`; an infinite side makes stripes.
-    Checker { center: DVec3, yaw: f64, side: DVec3 },
+    /// Cells of `side` along axes turned about the vertical through `center`, of which `across` is the first; an infinite side
+    /// makes stripes.
+    Checker { center: DVec3, across: DVec3, side: DVec3 },
     /// Stripes that go `turns` times around the vertical through `center` and `rise` times per unit of height.
     Spiral { center: DVec3, turns: f64, rise: f64 },
     /// Meridians and parallels of a globe.
@@ -71,11 +72,12 @@ impl Pattern {
         let azimuth = |o: DVec3| o.y.atan2(o.x) / TAU;
         let cell = match *self {
             Pattern::Plain => 0.0,
-            Pattern::Checker { center, yaw, side } => {
-                let o = glam::DMat3::from_rotation_z(-yaw) * (p - center);
-                let cells = (o / side).floor();
+            Pattern::Checker { center, across, side } => {
+                let o = p - center;
+                let cells = (dvec3(across.dot(o), across.x * o.y - across.y * o.x, o.z) / side).floor();
                 cells.x + cells.y + cells.z
             }
+            Pattern::Spiral { center, turns: 0.0, rise } => (rise * (p.z - center.z)).floor(),
             Pattern::Spiral { center, turns, rise } => (turns * azimuth(p - center) + rise * (p.z - center.z)).floor(),
             Pattern::Globe { center, meridians, belts } => {
                 let o = p - center;
@@ -179,10 +181,18 @@ impl Scene {
     /// The first surface along the ray among the candidate objects.
     fn first(&self, origin: DVec3, direction: DVec3, candidates: u32) -> Option<Surface> {
         let mut nearest: Option<Surface> = None;
-        for (k, object) in self.objects.iter().enumerate().filter(|(k, _)| candidates >> k & 1 == 1) {
-            if let Some(hit) = object.solid.first_hit(origin, direction)
-                && nearest.is_none_or(|found| hit.t < found.hit.t)
+        let mut limit = f64::INFINITY;
+        let mut remaining = candidates;
+        while remaining != 0 {
+            let k = remaining.trailing_zeros() as usize;
+            remaining &= remaining - 1;
+            // More bits may be asked for than there are objects.
+            let (Some(object), Some(ball)) = (self.objects.get(k), self.bounds.get(k)) else { break };
+            if within(ball, origin, direction, limit)
+                && let Some(hit) = object.solid.first_hit(origin, direction)
+                && hit.t < limit
             {
+                limit = hit.t;
                 nearest = Some(Surface { hit, object: k });
             }
         }
@@ -191,13 +201,8 @@ impl Scene {
 
     /// True if anything lies between `point` and the key light.
     fn shadowed(&self, point: DVec3, light: DVec3) -> bool {
-        self.objects.iter().zip(&self.bounds).any(|(object, ball)| {
-            let to = ball.center - point;
-            let along = to.dot(light);
-            along > -ball.radius
-                && to.length_squared() - along * along <= ball.radius * ball.radius
-                && object.solid.first_hit(point, light).is_some()
-        })
+        let blocks = |(object, ball): (&Object, &Ball)| within(ball, point, light, f64::INFINITY) && object.solid.first_hit(point, light).is_some();
+        self.objects.iter().zip(&self.bounds).any(blocks)
     }
 
     /// Lambert under a key light with shadows, a fill light and a sky darkened by neighbours; on glossy paint, broad
@@ -218,10 +223,10 @@ impl Scene {
         let mut color = albedo * (ambient + diffuse);
         if paint.gloss > 0.0 {
             let facing = (-n.dot(direction)).max(0.0);
-            let highlight = |light: DVec3, power: f64| (light - direction).normalize().dot(n).max(0.0).powf(power);
+            let highlight = |light: DVec3, power: i32| (light - direction).normalize().dot(n).max(0.0).powi(power);
             let fresnel = 0.10 + 0.55 * (1.0 - facing).powi(3);
             let mirrored = sky_color((direction - 2.0 * n.dot(direction) * n).z);
-            let shine = lit * highlight(key, 16.0) * dvec3(0.85, 0.80, 0.72) + highlight(fill, 12.0) * dvec3(0.10, 0.13, 0.20);
+            let shine = lit * highlight(key, 16) * dvec3(0.85, 0.80, 0.72) + highlight(fill, 12) * dvec3(0.10, 0.13, 0.20);
             color = color * (1.0 - paint.gloss * fresnel) + paint.gloss * (fresnel * sky * mirrored + shine);
         }
         // A square root stands for the display's gamma: a picture stores values as the eye wants them.
@@ -237,12 +242,23 @@ impl Scene {
                 continue;
             }
             let to = ball.center - p;
-            let squared = to.length_squared();
-            let blocked = n.dot(to).max(0.0) * object.shade * object.shade / (squared * squared.sqrt());
-            open *= 1.0 - blocked.min(0.85);
+            let cosine = n.dot(to);
+            if cosine > 0.0 {
+                let squared = to.length_squared();
+                open *= 1.0 - (cosine * object.shade * object.shade / (squared * squared.sqrt())).min(0.85);
+            }
         }
         open
     }
+}
+
+/// True if the ray passes through the ball somewhere between its origin and the distance `limit`.
+#[inline]
+fn within(ball: &Ball, origin: DVec3, direction: DVec3, limit: f64) -> bool {
+    let to = ball.center - origin;
+    let along = to.dot(direction);
+    let squared = ball.radius * ball.radius;
+    along > -ball.radius && along - ball.radius < limit && to.length_squared() - along * along <= squared
 }
 
 /// The sky seen in a mirror that reflects into a direction of the given height (cosine to the vertical).
@@ -260,79 +276,96 @@ fn sky_color(height: f64) -> DVec3 {
 fn objects() -> Vec<Object> {
     let matt = |pattern, first: [f64; 3], second: [f64; 3]| Paint { pattern, colors: [first.into(), second.into()], gloss: 0.0 };
     let plain = |color: [f64; 3], gloss| Paint { pattern: Pattern::Plain, colors: [color.into(); 2], gloss };
-    let whole = |piece: Convex, skin: Paint, shade: f64| {
-        Object { solid: Solid::Carved { body: vec![piece], holes: vec![] }, skin, lining: skin, openness: 1.0, shade }
+    let whole = |piece: Convex, skin: Paint, shade: f64| Object {
+        solid: Solid::Carved { body: vec![piece], holes: vec![] },
+        skin,
+        lining: skin,
+        openness: 1.0,
+        shade,
     };
-    let ring = |center, axis: DVec3, radius, tube, skin: Paint| {
-        Object { solid: Solid::Torus { center, axis: axis.normalize(), radius, tube }, skin, lining: skin, openness: 1.0, shade: 0.0 }
+    let ring = |center, axis: DVec3, radius, tube, skin: Paint| Object {
+        solid: Solid::Torus { center, axis: axis.normalize(), radius, tube },
+        skin,
+        lining: skin,
+        openness: 1.0,
+        shade: 0.0,
     };
     let up = |x: f64, y: f64, above: f64| dvec3(x, y, TABLE + above);
+    let toward = |yaw: f64| dvec3(yaw.cos(), yaw.sin(), 0.0);
     let stripes = f64::INFINITY;
 
-    let bowl = up(-0.44, -0.36, 0.37);
-    let block = up(0.42, 0.46, 0.28);
-    let face = |angle: f64| block + 0.33 * dvec3(angle.cos(), angle.sin(), 0.0);
-    let dimple = |center| Convex::Sphere { center, radius: 0.19 };
-    let globe = dvec3(0.0, 0.08, 0.50);
+    let bowl = up(-0.47, -0.40, 0.42);
+    let yaw = 0.6;
+    let block = up(0.46, 0.50, 0.31);
+    let dimple = |side: DVec3| Convex::Sphere { center: block + 0.365 * side, radius: 0.21 };
+    let globe = dvec3(0.0, 0.08, 0.62);
     let brass = plain([0.62, 0.34, 0.05], 0.35);
-    let leg = |x: f64, y: f64| whole(Convex::Capsule { a: up(x, y, 0.02), b: globe, radius: 0.024 }, plain([0.05, 0.03, 0.02], 0.0), 0.0);
+    let leg = |x: f64, y: f64| whole(Convex::capsule(up(x, y, 0.02), globe, 0.025), plain([0.05, 0.03, 0.02], 0.0), 0.0);
 
     vec![
-        // The table: a round board with a checkered top and a striped edge.
+        // The table: a round board with a checkered top and edge.
         whole(
-            Convex::Cylinder { a: up(0.0, 0.0, -0.10), b: up(0.0, 0.0, 0.0), radius: 1.08 },
-            matt(Pattern::Checker { center: up(0.0, 0.0, -0.5), yaw: 0.35, side: dvec3(0.17, 0.17, stripes) }, [0.02, 0.13, 0.17], [0.74, 0.42, 0.10]),
+            Convex::cylinder(up(0.0, 0.0, -0.12), up(0.0, 0.0, 0.0), 1.14),
+            matt(
+                Pattern::Checker { center: up(0.0, 0.0, -0.5), across: toward(0.35), side: dvec3(0.19, 0.19, stripes) },
+                [0.02, 0.13, 0.17],
+                [0.74, 0.42, 0.10],
+            ),
             0.0,
         ),
         // The bowl: blue outside, a matt globe pattern inside.
         Object {
             solid: Solid::Carved {
-                body: vec![Convex::Sphere { center: bowl, radius: 0.40 }, Convex::Below { z: bowl.z + 0.02 }],
-                holes: vec![Convex::Sphere { center: bowl, radius: 0.345 }],
+                body: vec![Convex::Sphere { center: bowl, radius: 0.44 }, Convex::Below { z: bowl.z + 0.02 }],
+                holes: vec![Convex::Sphere { center: bowl, radius: 0.385 }],
             },
-            skin: matt(Pattern::Spiral { center: bowl, turns: 0.0, rise: 6.5 }, [0.03, 0.07, 0.36], [0.30, 0.46, 0.70]),
+            skin: matt(Pattern::Spiral { center: bowl, turns: 0.0, rise: 6.0 }, [0.03, 0.07, 0.36], [0.30, 0.46, 0.70]),
             lining: matt(Pattern::Globe { center: bowl, meridians: 12.0, belts: 8.0 }, [0.85, 0.22, 0.03], [0.95, 0.80, 0.45]),
-            openness: 0.53, // half the sphere, and the rim is 0.02 above its middle
-            shade: 0.34,
+            openness: 0.47, // half the sphere, less what the rim 0.02 above its middle hides
+            shade: 0.38,
         },
         // The glossy ball.
-        whole(Convex::Sphere { center: up(0.46, -0.40, 0.33), radius: 0.33 }, plain([0.36, 0.015, 0.03], 1.0), 0.33),
-        // The block with spherical dimples in two sides and the top.
+        whole(Convex::Sphere { center: up(0.50, -0.44, 0.37), radius: 0.37 }, plain([0.36, 0.015, 0.03], 1.0), 0.37),
+        // The block with spherical dimples in three sides and the top.
         Object {
             solid: Solid::Carved {
-                body: vec![Convex::Block { center: block, half: dvec3(0.28, 0.28, 0.28), yaw: 0.6 }],
-                holes: vec![dimple(face(0.6 - PI / 2.0)), dimple(face(0.6)), dimple(face(0.6 + PI)), dimple(block + DVec3::Z * 0.33)],
+                body: vec![Convex::block(block, DVec3::splat(0.31), yaw)],
+                holes: vec![dimple(toward(yaw - PI / 2.0)), dimple(toward(yaw)), dimple(toward(yaw + PI)), dimple(DVec3::Z)],
             },
-            skin: matt(Pattern::Checker { center: block + dvec3(0.0, 0.0, 0.07), yaw: 0.6, side: dvec3(stripes, stripes, 0.14) }, [0.20, 0.015, 0.26], [0.62, 0.16, 0.52]),
+            skin: matt(
+                Pattern::Checker { center: block + DVec3::Z * 0.08, across: toward(yaw), side: dvec3(stripes, stripes, 0.155) },
+                [0.20, 0.015, 0.26],
+                [0.62, 0.16, 0.52],
+            ),
             lining: plain([0.95, 0.70, 0.06], 0.0),
-            openness: 0.60, // caps of height 0.14 of a sphere of radius 0.19 open over most of a hemisphere
-            shade: 0.32,
+            openness: 0.63, // the hollow is 0.155 of the sphere's 0.42 high, so this share of the sphere is open
+            shade: 0.36,
         },
         // The cone with a spiral.
         whole(
-            Convex::Cone { base: up(-0.45, 0.45, 0.0), radius: 0.30, height: 0.92 },
-            matt(Pattern::Spiral { center: up(-0.45, 0.45, 0.0), turns: 2.0, rise: 6.0 }, [0.78, 0.05, 0.04], [0.92, 0.88, 0.80]),
-            0.26,
+            Convex::Cone { base: up(-0.48, 0.48, 0.0), radius: 0.34, height: 1.05 },
+            matt(Pattern::Spiral { center: up(-0.48, 0.48, 0.0), turns: 2.0, rise: 5.5 }, [0.78, 0.05, 0.04], [0.92, 0.88, 0.80]),
+            0.29,
         ),
-        // A globe on a tripod with two hoops: glossy and thin.
-        whole(Convex::Sphere { center: globe, radius: 0.15 }, plain([0.015, 0.16, 0.07], 1.0), 0.15),
-        leg(0.20, 0.04),
-        leg(-0.17, 0.25),
-        leg(-0.10, -0.14),
-        ring(globe, dvec3(0.25, -0.2, 1.0), 0.27, 0.020, brass),
-        ring(globe, dvec3(1.0, 0.3, 0.15), 0.235, 0.020, brass),
+        // A globe with two hoops on a tripod: glossy and thin.
+        whole(Convex::Sphere { center: globe, radius: 0.17 }, plain([0.015, 0.16, 0.07], 1.0), 0.17),
+        leg(0.21, 0.04),
+        leg(-0.18, 0.27),
+        leg(-0.11, -0.15),
+        ring(globe, dvec3(0.25, -0.2, 1.0), 0.30, 0.023, brass),
+        ring(globe, dvec3(1.0, 0.3, 0.15), 0.255, 0.023, brass),
         // A candle, a ring lying about, two marbles.
         whole(
-            Convex::Cylinder { a: up(0.04, -0.78, 0.0), b: up(0.04, -0.78, 0.42), radius: 0.10 },
-            matt(Pattern::Spiral { center: up(0.04, -0.78, 0.02), turns: 0.0, rise: 8.0 }, [0.02, 0.02, 0.025], [0.93, 0.66, 0.04]),
-            0.11,
+            Convex::cylinder(up(0.04, -0.84, 0.0), up(0.04, -0.84, 0.48), 0.12),
+            matt(Pattern::Spiral { center: up(0.04, -0.84, 0.02), turns: 0.0, rise: 7.5 }, [0.02, 0.02, 0.025], [0.93, 0.66, 0.04]),
+            0.13,
         ),
-        ring(up(0.80, 0.04, 0.045), DVec3::Z, 0.13, 0.045, plain([0.02, 0.30, 0.12], 0.0)),
-        whole(Convex::Sphere { center: up(-0.86, 0.10, 0.11), radius: 0.11 }, plain([0.04, 0.10, 0.42], 1.0), 0.11),
+        ring(up(0.86, 0.04, 0.05), DVec3::Z, 0.14, 0.05, plain([0.02, 0.30, 0.12], 0.0)),
+        whole(Convex::Sphere { center: up(-0.90, 0.10, 0.13), radius: 0.13 }, plain([0.04, 0.10, 0.42], 1.0), 0.13),
         whole(
-            Convex::Sphere { center: up(0.0, 0.78, 0.14), radius: 0.14 },
-            matt(Pattern::Globe { center: up(0.0, 0.78, 0.14), meridians: 6.0, belts: 4.0 }, [0.02, 0.02, 0.02], [0.90, 0.90, 0.86]),
-            0.14,
+            Convex::Sphere { center: up(0.0, 0.82, 0.16), radius: 0.16 },
+            matt(Pattern::Globe { center: up(0.0, 0.82, 0.16), meridians: 6.0, belts: 4.0 }, [0.02, 0.02, 0.02], [0.90, 0.90, 0.86]),
+            0.16,
         ),
     ]
 }
@@ -347,13 +380,13 @@ mod tests {
     }
 
     #[test]
-    fn the_scene_lies_within_a_ball_of_radius_one_and_a_quarter() {
+    fn the_scene_lies_within_a_ball_of_radius_1_3() {
         let scene = Scene::still_life();
         for k in 0..4000 {
             let z = 1.0 - 2.0 * (f64::from(k) + 0.5) / 4000.0;
             let (sin, cos) = (2.4 * f64::from(k)).sin_cos();
             let r = (1.0 - z * z).sqrt();
-            assert!(!scene.occupied(1.25 * dvec3(r * cos, r * sin, z)));
+            assert!(!scene.occupied(1.3 * dvec3(r * cos, r * sin, z)));
         }
         assert!(scene.objects.len() <= 32, "candidates are bits of a u32");
     }
@@ -361,8 +394,8 @@ mod tests {
     #[test]
     fn hollows_are_empty_although_no_silhouette_shows_it() {
         let scene = Scene::still_life();
-        assert!(!scene.occupied(dvec3(-0.44, -0.36, TABLE + 0.2)) && scene.occupied(dvec3(-0.44, -0.36, TABLE + 0.01)));
-        let block = dvec3(0.42, 0.46, TABLE + 0.28);
+        assert!(!scene.occupied(dvec3(-0.47, -0.40, TABLE + 0.2)) && scene.occupied(dvec3(-0.47, -0.40, TABLE + 0.01)));
+        let block = dvec3(0.46, 0.50, TABLE + 0.31);
         assert!(!scene.occupied(block + DVec3::Z * 0.2) && scene.occupied(block));
     }
 
@@ -410,7 +443,7 @@ mod tests {
             let (a, b) = (seen(target, a), seen(target, b));
             (0..3).map(|c| (a[c] - b[c]).abs()).fold(0.0, f64::max)
         };
-        let ball_top = dvec3(0.46, -0.40, TABLE + 0.66);
+        let ball_top = dvec3(0.50, -0.44, TABLE + 0.74);
         assert!(difference(ball_top, dvec3(0.6, -0.5, 1.0), dvec3(-0.8, 0.1, 1.0)) > 0.2);
         let table = dvec3(0.55, 0.02, TABLE);
         assert!(difference(table, dvec3(0.3, 0.0, 1.0), dvec3(0.1, 0.1, 1.0)) < 1e-9);

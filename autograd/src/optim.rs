@@ -1,0 +1,233 @@
+//! Optimizers: how parameters follow their gradients.
+//!
+//! An optimizer sees a [`Module`], its [`Gradients`] and the number of the step, and nothing of models or losses. It says what a row
+//! gradient means to it: [`Sgd`], [`Momentum`], [`RmsProp`] and lazy [`Adam`] visit the touched rows only and leave all others and
+//! what is remembered of them as they are. A parameter without a gradient in a step is left alone by all of them.
+//!
+//! What an optimizer remembers belongs to the identity of a parameter: after [`Param::replace`] it starts afresh, and what was
+//! remembered of an identity that the module no longer has is dropped. So an optimizer serves one module.
+//! Every update is elementwise and in place, with the same bits for any number of threads.
+
+mod adam;
+mod rmsprop;
+mod schedule;
+mod sgd;
+
+pub use adam::{Adam, AdamMode};
+pub use rmsprop::RmsProp;
+pub use schedule::{Exponential, Piecewise, Schedule, WarmUp};
+pub use sgd::{Momentum, Sgd};
+
+use crate::gradients::{Grad, Gradients};
+use crate::parallel;
+use crate::param::{Module, Param};
+use crate::pool::Buffer;
+use crate::real::Real;
+use std::collections::HashMap;
+
+/// Changes parameters by their gradients.
+pub trait Optimizer<T: Real>: Send {
+    /// One step. `step` counts from 0 and is what schedules go by.
+    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64);
+}
+
+/// Learning rates: a schedule for each parameter name, and one for the names that are not listed.
+///
+/// ```
+/// use autograd::optim::{Exponential, Rates};
+/// let rates = Rates::new(0.01).with("density", Exponential::new(30.0, 0.05, 250_000));
+/// assert_eq!(rates.at("density", 250_000), 0.05);
+/// assert_eq!(rates.at("color", 250_000), 0.01);
+/// ```
+#[derive(Debug)]
+pub struct Rates {
+    default: Box<dyn Schedule>,
+    by_name: Vec<(String, Box<dyn Schedule>)>,
+}
+
+impl Rates {
+    /// One schedule for all.
+    pub fn new(default: impl Schedule + 'static) -> Self {
+        Rates { default: Box::new(default), by_name: Vec::new() }
+    }
+
+    /// Another schedule for the parameter of this name; the last one counts.
+    pub fn with(mut self, name: impl Into<String>, schedule: impl Schedule + 'static) -> Self {
+        self.by_name.push((name.into(), Box::new(schedule)));
+        self
+    }
+
+    /// The rate of a parameter at a step.
+    pub fn at(&self, name: &str, step: u64) -> f64 {
+        let named = self.by_name.iter().rev().find(|(n, _)| n == name).map(|(_, schedule)| schedule);
+        named.unwrap_or(&self.default).at(step)
+    }
+}
+
+impl<S: Schedule + 'static> From<S> for Rates {
+    fn from(schedule: S) -> Self {
+        Rates::new(schedule)
+    }
+}
+
+/// What an optimizer remembers of each parameter: `N` numbers for each element, and how many updates it had.
+#[derive(Debug)]
+struct Memory<T: Real, const N: usize> {
+    by_id: HashMap<u64, Slot<T, N>>,
+    round: u64,
+}
+
+#[derive(Debug)]
+struct Slot<T: Real, const N: usize> {
+    state: Option<[Buffer<T>; N]>,
+    updates: u64,
+    last_seen: u64,
+}
+
+impl<T: Real, const N: usize> Memory<T, N> {
+    fn new() -> Self {
+        Memory { by_id: HashMap::new(), round: 0 }
+    }
+
+    /// Calls `f(parameter, gradient, state, updates)` for every parameter that has a gradient; `updates` counts this one, so it is at
+    /// least 1. The state is zeros the first time.
+    fn visit(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, mut f: impl FnMut(&mut Param<T>, &Grad<T>, &mut [Buffer<T>; N], u64)) {
+        self.round += 1;
+        let round = self.round;
+        module.visit_mut(&mut |param| {
+            let slot = self.by_id.entry(param.id()).or_insert(Slot { state: None, updates: 0, last_seen: round });
+            slot.last_seen = round;
+            if let Some(grad) = grads.of(param) {
+                let len = param.tensor().len();
+                let state = slot.state.get_or_insert_with(|| std::array::from_fn(|_| Buffer::zeros(len)));
+                slot.updates += 1;
+                f(param, grad, state, slot.updates);
+            }
+        });
+        self.by_id.retain(|_, slot| slot.last_seen == round);
+    }
+}
+
+/// Replaces the elements that have a gradient, and what is remembered of them, by `rule([θ, state…], g)`; untouched rows stay.
+fn update<T: Real, const N: usize>(tables: [&mut [T]; N], grad: &Grad<T>, rule: impl Fn([T; N], T) -> [T; N] + Sync) {
+    match grad {
+        Grad::Dense(g) => parallel::update(tables, g.data(), rule),
+        Grad::Rows(g) => parallel::update_rows(tables, g.width(), g.rows(), g.data(), rule),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::index::Indices;
+    use crate::tensor::Tensor;
+    use ndarray::{Array1, arr1};
+
+    fn all() -> Vec<(&'static str, Box<dyn Optimizer<f32>>)> {
+        vec![
+            ("sgd", Box::new(Sgd::new(0.1))),
+            ("momentum", Box::new(Momentum::new(0.1, 0.9))),
+            ("rmsprop", Box::new(RmsProp::new(0.1))),
+            ("adam, lazy", Box::new(Adam::new(0.1, AdamMode::Lazy))),
+            ("adam, dense", Box::new(Adam::new(0.1, AdamMode::Dense))),
+        ]
+    }
+
+    fn params(len: usize) -> Vec<Param<f32>> {
+        vec![Param::new("a", Array1::from_shape_fn(len, |i| (i % 101) as f32 * 0.01)), Param::new("b", arr1(&[1.0f32, 2.0]))]
+    }
+
+    /// Σ a[rows]² with every third row looked up.
+    fn gradients(params: &[Param<f32>]) -> Gradients<f32> {
+        let rows: Vec<u32> = (0..params[0].shape()[0] as u32).step_by(3).collect();
+        params[0].tensor().gather_rows(&Indices::from(rows)).square().sum().backward()
+    }
+
+    #[test]
+    fn a_parameter_without_a_gradient_and_untouched_rows_are_left_alone() {
+        for (name, mut optimizer) in all() {
+            let mut params = params(7);
+            let before: Vec<f32> = params[0].tensor().data().to_vec();
+            for step in 0..3 {
+                let grads = gradients(&params);
+                optimizer.step(&mut params, &grads, step);
+            }
+            let after = params[0].tensor().data();
+            for i in 0..7 {
+                // Row 0 is 0, where the gradient of the square is 0.
+                assert_eq!(before[i] != after[i], i % 3 == 0 && i > 0, "{name}, row {i}");
+            }
+            assert_eq!(params[1].tensor().data(), [1.0, 2.0], "{name}");
+        }
+    }
+
+    #[test]
+    fn a_replaced_parameter_starts_afresh() {
+        for ((name, mut used), (_, mut fresh)) in all().into_iter().zip(all()) {
+            let mut old = params(7);
+            for step in 0..5 {
+                let grads = gradients(&old);
+                used.step(&mut old, &grads, step);
+            }
+            let mut new = params(10);
+            old[0].replace(new[0].tensor().clone());
+            let (grads_old, grads_new) = (gradients(&old), gradients(&new));
+            used.step(&mut old, &grads_old, 5);
+            fresh.step(&mut new, &grads_new, 5);
+            assert_eq!(old[0].tensor().data(), new[0].tensor().data(), "{name}");
+        }
+    }
+
+    #[test]
+    fn what_is_remembered_of_a_vanished_parameter_is_dropped() {
+        let mut optimizer = RmsProp::new(0.1);
+        let mut params = params(7);
+        let grads = gradients(&params);
+        optimizer.step(&mut params, &grads, 0);
+        let id = params[0].id();
+        assert!(optimizer.memory.by_id.contains_key(&id));
+        let value = Tensor::zeros(&[3]);
+        params[0].replace(value);
+        let grads = gradients(&params);
+        optimizer.step(&mut params, &grads, 1);
+        assert!(!optimizer.memory.by_id.contains_key(&id));
+        assert_eq!(optimizer.memory.by_id.len(), 2);
+    }
+
+    #[test]
+    fn updates_are_in_place_and_have_the_same_bits_for_any_number_of_threads() {
+        // Several chunks, and a number of rows that no chunk size divides.
+        let len = 300_001;
+        let train = |threads: usize, optimizer: &mut dyn Optimizer<f32>| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
+            pool.install(|| {
+                let mut params = params(len);
+                let address = params[0].tensor().data().as_ptr();
+                for step in 0..4 {
+                    let grads = if step % 2 == 0 { gradients(&params) } else { params[0].tensor().powi(3).sum().backward() };
+                    optimizer.step(&mut params, &grads, step);
+                }
+                assert_eq!(address, params[0].tensor().data().as_ptr(), "the values moved");
+                params[0].tensor().data().to_vec()
+            })
+        };
+        for i in 0..all().len() {
+            let (name, mut optimizer) = all().swap_remove(i);
+            let want = train(1, &mut *optimizer);
+            for threads in [2, 3, 8] {
+                assert!(train(threads, &mut *all().swap_remove(i).1) == want, "{name} with {threads} threads");
+            }
+        }
+    }
+
+    #[test]
+    fn a_rate_goes_by_the_name_of_the_parameter_and_by_the_step() {
+        let mut optimizer = Sgd::new(Rates::new(1.0).with("b", Piecewise::new(0.0).then(1, 0.5)));
+        let mut params = vec![Param::new("a", arr1(&[1.0f64])), Param::new("b", arr1(&[1.0]))];
+        for (step, want) in [(0, [0.0, 1.0]), (1, [-1.0, 0.5])] {
+            let grads = (params[0].tensor() + params[1].tensor()).sum().backward();
+            optimizer.step(&mut params, &grads, step);
+            assert_eq!([params[0].tensor().item(), params[1].tensor().item()], want);
+        }
+    }
+}

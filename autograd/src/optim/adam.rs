@@ -1,0 +1,136 @@
+//! Adam, in the two algorithms that row gradients make of it.
+
+use super::{Memory, Optimizer, Rates, update};
+use crate::gradients::{Grad, Gradients};
+use crate::parallel;
+use crate::param::Module;
+use crate::real::Real;
+
+/// What happens to rows that a row gradient does not mention. These are different algorithms with different results.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum AdamMode {
+    /// They and their moments wait: cheap, and a row learns at the same pace however rarely it is seen (TensorFlow's `LazyAdam`,
+    /// PyTorch's `SparseAdam`).
+    Lazy,
+    /// They have a gradient of zero: their moments decay and they keep moving by what is left. Adam as published, at the price of
+    /// visiting the whole table in every step.
+    Dense,
+}
+
+/// m ← β₁ m + (1 − β₁) g;  v ← β₂ v + (1 − β₂) g²;  θ ← θ − lr · m̂ / (√v̂ + ε),  m̂ = m / (1 − β₁ᵏ), v̂ = v / (1 − β₂ᵏ) (Kingma & Ba 2015).
+///
+/// k is the number of updates the parameter has had since it got its identity, this one included. It is counted for the parameter and not
+/// for each row, in both modes: with [`AdamMode::Lazy`] a row touched for the first time after many steps has moments near zero and no
+/// correction left, so its first step is lr (1 − β₁) / √(1 − β₂), with the defaults lr as at the start. With β₂ = 0.999 it would be 3.2 lr.
+///
+/// A parameter that has no gradient at all in a step is left alone in both modes.
+#[derive(Debug)]
+pub struct Adam<T: Real> {
+    rates: Rates,
+    mode: AdamMode,
+    beta1: f64,
+    beta2: f64,
+    epsilon: f64,
+    memory: Memory<T, 2>,
+}
+
+impl<T: Real> Adam<T> {
+    /// With these learning rates, β₁ = 0.9, β₂ = 0.99 (Instant-NGP's; the paper has 0.999) and ε = 1e-8.
+    pub fn new(rates: impl Into<Rates>, mode: AdamMode) -> Self {
+        Adam { rates: rates.into(), mode, beta1: 0.9, beta2: 0.99, epsilon: 1e-8, memory: Memory::new() }
+    }
+
+    /// Other shares of the moments that stay in each step.
+    pub fn betas(mut self, beta1: f64, beta2: f64) -> Self {
+        (self.beta1, self.beta2) = (beta1, beta2);
+        self
+    }
+
+    /// Another ε.
+    pub fn epsilon(mut self, epsilon: f64) -> Self {
+        self.epsilon = epsilon;
+        self
+    }
+}
+
+impl<T: Real> Optimizer<T> for Adam<T> {
+    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
+        let (b1, b2, epsilon) = (T::lit(self.beta1), T::lit(self.beta2), T::lit(self.epsilon));
+        let (r1, r2) = (T::lit(1.0 - self.beta1), T::lit(1.0 - self.beta2));
+        self.memory.visit(module, grads, |param, grad, [m, v], updates| {
+            let left = |beta: f64| 1.0 - beta.powf(updates as f64);
+            let rate = T::lit(self.rates.at(param.name(), step) / left(self.beta1));
+            let scale = T::lit(1.0 / left(self.beta2).sqrt());
+            let rule = |[theta, m, v]: [T; 3], g: T| {
+                let m = b1 * m + r1 * g;
+                let v = b2 * v + r2 * g * g;
+                [theta - rate * m / (v.sqrt() * scale + epsilon), m, v]
+            };
+            param.update(|theta| match (self.mode, grad) {
+                (AdamMode::Dense, Grad::Rows(g)) => parallel::update_all_rows([theta, m, v], g.width(), g.rows(), g.data(), rule),
+                _ => update([theta, m, v], grad, rule),
+            });
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::index::Indices;
+    use crate::param::Param;
+    use crate::tensor::Tensor;
+    use approx::assert_relative_eq;
+    use ndarray::{arr1, arr2};
+
+    #[test]
+    fn the_first_two_steps_are_those_of_the_paper() {
+        let mut theta = Param::new("theta", arr1(&[1.0f64]));
+        let mut optimizer = Adam::new(0.1, AdamMode::Dense).betas(0.9, 0.999).epsilon(0.0);
+        let grads = (theta.tensor() * 3.0).sum().backward();
+        optimizer.step(&mut theta, &grads, 0);
+        // Corrected, m = g and v = g²: the step is the rate.
+        assert_relative_eq!(theta.tensor().item(), 0.9, max_relative = 1e-12);
+        let grads = (theta.tensor() * -1.0).sum().backward();
+        optimizer.step(&mut theta, &grads, 1);
+        // m = 0.9 · 0.3 − 0.1 = 0.17, v = 0.999 · 0.009 + 0.001 = 0.009991; corrected by 0.19 and 0.001999.
+        let step = 0.1 * (0.17 / 0.19) / (0.009_991f64 / 0.001_999).sqrt();
+        assert_relative_eq!(theta.tensor().item(), 0.9 - step, max_relative = 1e-12);
+    }
+
+    /// Looks up row 0, then row 1, then row 0, with a gradient of 1.
+    fn three_lookups(mode: AdamMode, as_rows: bool) -> Vec<f64> {
+        let mut table = Param::new("table", arr2(&[[0.0f64], [0.0], [0.0]]));
+        let mut optimizer = Adam::new(1.0, mode).betas(0.5, 0.75).epsilon(1e-30);
+        for (step, row) in [0, 1, 0].into_iter().enumerate() {
+            let tensor: Tensor<f64> = if as_rows { table.tensor().clone() } else { 1.0 * table.tensor() };
+            let grads = tensor.gather_rows(&Indices::from(vec![row, 2])).sum().backward();
+            drop(tensor);
+            assert_eq!(grads.of(&table).is_some_and(|g| g.as_rows().is_some()), as_rows);
+            optimizer.step(&mut table, &grads, step as u64);
+        }
+        table.tensor().data().to_vec()
+    }
+
+    #[test]
+    fn lazy_lets_the_moments_of_untouched_rows_wait_and_dense_moves_them_on() {
+        let (c1, c2) = ([0.5, 0.75, 0.875], [0.25f64, 0.4375, 0.578_125]);
+        let step = |k: usize, m: f64, v: f64| (m / c1[k]) / (v / c2[k]).sqrt();
+        let lazy = three_lookups(AdamMode::Lazy, true);
+        // Row 0: m = ½, then ¾ in the third step; v = ¼, then 7/16. The second step passes it by.
+        assert_relative_eq!(lazy[0], -step(0, 0.5, 0.25) - step(2, 0.75, 0.4375), max_relative = 1e-12);
+        // Row 1: its first gradient comes with the second correction.
+        assert_relative_eq!(lazy[1], -step(1, 0.5, 0.25), max_relative = 1e-12);
+        let dense = three_lookups(AdamMode::Dense, true);
+        // Row 0: m = ½, ¼, 5/8 and v = 1/4, 3/16, 25/64. Row 1: m = 0, ½, ¼ and v = 0, ¼, 3/16.
+        assert_relative_eq!(dense[0], -step(0, 0.5, 0.25) - step(1, 0.25, 0.1875) - step(2, 0.625, 0.390_625), max_relative = 1e-12);
+        assert_relative_eq!(dense[1], -step(1, 0.5, 0.25) - step(2, 0.25, 0.1875), max_relative = 1e-12);
+        // Row 2 has a gradient in every step: no difference.
+        assert_eq!(lazy[2], dense[2]);
+    }
+
+    #[test]
+    fn dense_mode_does_the_same_with_rows_and_with_the_dense_gradient() {
+        assert_eq!(three_lookups(AdamMode::Dense, true), three_lookups(AdamMode::Dense, false));
+    }
+}

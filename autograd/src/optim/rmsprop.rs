@@ -1,0 +1,110 @@
+//! RMSProp as Plenoxels use it.
+
+use super::{Memory, Optimizer, Rates, update};
+use crate::gradients::Gradients;
+use crate::param::Module;
+use crate::real::Real;
+
+/// v ← g² if v = 0, else β v + (1 − β) g²;  θ ← θ − lr · g / (√v + ε) (svox2).
+///
+/// The rule for v = 0 makes the first step of every element lr · sign g. Gradients of a mean over a batch of rays are so small that ε
+/// is not negligible: summing instead of averaging a loss, or another batch size, changes what is learned.
+///
+/// Of a row gradient only the touched rows are visited, all of their columns; that is why sparse grids are trained with this and not
+/// with Adam, whose moments would all have to decay in every step. A zero in a dense gradient moves nothing either, but it decays v, so
+/// an element that is often untouched takes larger steps with dense gradients than with rows.
+#[derive(Debug)]
+pub struct RmsProp<T: Real> {
+    rates: Rates,
+    beta: f64,
+    epsilon: f64,
+    pub(super) memory: Memory<T, 1>,
+}
+
+impl<T: Real> RmsProp<T> {
+    /// With these learning rates, β = 0.95 and ε = 1e-8 (svox2's).
+    pub fn new(rates: impl Into<Rates>) -> Self {
+        RmsProp { rates: rates.into(), beta: 0.95, epsilon: 1e-8, memory: Memory::new() }
+    }
+
+    /// Another share of v that stays in each step.
+    pub fn beta(mut self, beta: f64) -> Self {
+        self.beta = beta;
+        self
+    }
+
+    /// Another ε.
+    pub fn epsilon(mut self, epsilon: f64) -> Self {
+        self.epsilon = epsilon;
+        self
+    }
+}
+
+impl<T: Real> Optimizer<T> for RmsProp<T> {
+    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
+        let (beta, rest, epsilon) = (T::lit(self.beta), T::lit(1.0 - self.beta), T::lit(self.epsilon));
+        self.memory.visit(module, grads, |param, grad, [v], _| {
+            let rate = T::lit(self.rates.at(param.name(), step));
+            param.update(|theta| {
+                update([theta, v], grad, |[theta, v], g| {
+                    let v = if v == T::zero() { g * g } else { beta * v + rest * g * g };
+                    [theta - rate * g / (v.sqrt() + epsilon), v]
+                });
+            });
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::index::Indices;
+    use crate::param::Param;
+    use crate::tensor::Tensor;
+    use approx::assert_relative_eq;
+    use ndarray::{arr1, arr2};
+
+    #[test]
+    fn the_first_step_is_the_rate_and_the_second_the_published_rule() {
+        let mut theta = Param::new("theta", arr1(&[2.0f64, -3.0]));
+        let mut optimizer = RmsProp::new(0.1).epsilon(0.0);
+        let grads = theta.tensor().square().sum().backward();
+        optimizer.step(&mut theta, &grads, 0);
+        // v = g², so the step is 0.1 · sign g.
+        assert_relative_eq!(theta.tensor().data()[0], 1.9, max_relative = 1e-14);
+        assert_relative_eq!(theta.tensor().data()[1], -2.9, max_relative = 1e-14);
+        let grads = theta.tensor().square().sum().backward();
+        optimizer.step(&mut theta, &grads, 1);
+        // g = 3.8, v = 0.95 · 16 + 0.05 · 14.44 = 15.922
+        assert_relative_eq!(theta.tensor().data()[0], 1.9 - 0.1 * 3.8 / 15.922f64.sqrt(), max_relative = 1e-14);
+    }
+
+    #[test]
+    fn epsilon_damps_gradients_of_its_own_size() {
+        let mut theta = Param::new("theta", arr1(&[0.0f64]));
+        let grads = (theta.tensor() * 1e-8).sum().backward();
+        RmsProp::new(1.0).step(&mut theta, &grads, 0);
+        // 1e-8 / (1e-8 + 1e-8)
+        assert_relative_eq!(theta.tensor().item(), -0.5, max_relative = 1e-14);
+    }
+
+    /// Row 0 is looked up in every step and row 1 only in the first and third.
+    #[test]
+    fn rows_equal_dense_where_touched_and_an_untouched_row_keeps_its_v_while_a_dense_zero_decays_it() {
+        let value = arr2(&[[2.0f64], [2.0]]);
+        let (mut rows, mut dense) = (Param::new("rows", value.clone()), Param::new("dense", value));
+        let (mut by_rows, mut by_dense) = (RmsProp::new(0.1).epsilon(0.0), RmsProp::new(0.1).epsilon(0.0));
+        for (step, looked_up) in [vec![0, 1], vec![0], vec![0, 1]].into_iter().enumerate() {
+            let looked_up = Indices::from(looked_up);
+            let loss = |table: &Tensor<f64>| table.gather_rows(&looked_up).sum();
+            let grads = loss(rows.tensor()).backward();
+            by_rows.step(&mut rows, &grads, step as u64);
+            let grads = loss(&(1.0 * dense.tensor())).backward();
+            by_dense.step(&mut dense, &grads, step as u64);
+            assert_eq!(rows.tensor().data()[0], dense.tensor().data()[0]);
+        }
+        // g = 1, so v stays 1 and two steps of 0.1 are taken; the dense zero makes v = 0.95, then 0.95² + 0.05.
+        assert_relative_eq!(rows.tensor().data()[1], 1.8, max_relative = 1e-14);
+        assert_relative_eq!(dense.tensor().data()[1], 1.9 - 0.1 / (0.95f64 * 0.95 + 0.05).sqrt(), max_relative = 1e-14);
+    }
+}

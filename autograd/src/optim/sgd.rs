@@ -1,0 +1,109 @@
+//! Gradient descent, plain and with momentum.
+
+use super::{Memory, Optimizer, Rates, update};
+use crate::gradients::Gradients;
+use crate::param::Module;
+use crate::real::Real;
+
+/// θ ← θ − lr · g. Remembers nothing, so a row gradient and the dense one with its zeros do the same.
+#[derive(Debug)]
+pub struct Sgd {
+    rates: Rates,
+}
+
+impl Sgd {
+    /// With these learning rates.
+    pub fn new(rates: impl Into<Rates>) -> Self {
+        Sgd { rates: rates.into() }
+    }
+}
+
+impl<T: Real> Optimizer<T> for Sgd {
+    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
+        module.visit_mut(&mut |param| {
+            let Some(grad) = grads.of(param) else { return };
+            let rate = T::lit(self.rates.at(param.name(), step));
+            param.update(|theta| update([theta], grad, |[theta], g| [theta - rate * g]));
+        });
+    }
+}
+
+/// m ← μ m + g,  θ ← θ − lr · m (Polyak's heavy ball, as in PyTorch).
+///
+/// Of a row gradient only the touched rows are visited: the momentum of the others waits and moves nothing. That is another algorithm
+/// than with the dense gradient, where every row keeps rolling.
+#[derive(Debug)]
+pub struct Momentum<T: Real> {
+    rates: Rates,
+    momentum: f64,
+    memory: Memory<T, 1>,
+}
+
+impl<T: Real> Momentum<T> {
+    /// With these learning rates and this share μ of the previous direction, usually 0.9.
+    pub fn new(rates: impl Into<Rates>, momentum: f64) -> Self {
+        Momentum { rates: rates.into(), momentum, memory: Memory::new() }
+    }
+}
+
+impl<T: Real> Optimizer<T> for Momentum<T> {
+    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
+        let mu = T::lit(self.momentum);
+        self.memory.visit(module, grads, |param, grad, [m], _| {
+            let rate = T::lit(self.rates.at(param.name(), step));
+            param.update(|theta| {
+                update([theta, m], grad, |[theta, m], g| {
+                    let m = mu * m + g;
+                    [theta - rate * m, m]
+                });
+            });
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::index::Indices;
+    use crate::param::Param;
+    use approx::assert_relative_eq;
+    use ndarray::{arr1, arr2};
+
+    #[test]
+    fn plain_descent_takes_the_step_of_the_textbook() {
+        let mut theta = Param::new("theta", arr1(&[3.0f64, -1.0]));
+        let grads = theta.tensor().square().sum().backward();
+        Sgd::new(0.25).step(&mut theta, &grads, 0);
+        // g = 2θ, so θ − g/4 = θ/2.
+        assert_eq!(theta.tensor().data(), [1.5, -0.5]);
+    }
+
+    #[test]
+    fn plain_descent_does_the_same_with_rows_and_with_the_dense_gradient() {
+        let table = arr2(&[[1.0f64, 2.0], [3.0, 4.0], [5.0, 6.0]]);
+        let (mut rows, mut dense) = (Param::new("rows", table.clone()), Param::new("dense", table));
+        let looked_up = Indices::from(vec![2, 0, 2]);
+        let grads = rows.tensor().gather_rows(&looked_up).square().sum().backward();
+        assert!(grads.of(&rows).is_some_and(|g| g.as_rows().is_some()));
+        Sgd::new(0.1).step(&mut rows, &grads, 0);
+        // Through an op the row gradient becomes dense.
+        let grads = (1.0 * dense.tensor()).gather_rows(&looked_up).square().sum().backward();
+        assert!(grads.of(&dense).is_some_and(|g| g.as_dense().is_some()));
+        Sgd::new(0.1).step(&mut dense, &grads, 0);
+        assert_eq!(rows.tensor().data(), dense.tensor().data());
+        // Row 2 was looked up twice: 5 − 0.1 · 2 · (2 · 5) = 3.
+        assert_relative_eq!(rows.tensor().data()[4], 3.0, max_relative = 1e-14);
+    }
+
+    #[test]
+    fn momentum_carries_the_previous_direction() {
+        let mut theta = Param::new("theta", arr1(&[1.0f64]));
+        let mut optimizer = Momentum::new(0.1, 0.5);
+        for (step, want) in [0.9, 0.75, 0.575].into_iter().enumerate() {
+            // g = 1 always: m = 1, 1.5, 1.75.
+            let grads = theta.tensor().sum().backward();
+            optimizer.step(&mut theta, &grads, step as u64);
+            assert_relative_eq!(theta.tensor().item(), want, max_relative = 1e-14);
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! A trained grid on disk: a `safetensors` file that says what its numbers mean.
+//!
+//! Tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. The metadata hold the version and every convention
+//! a reader must know; [`FORMAT`] and [`CONVENTION`] are checked on reading.
+
+use crate::error::{Error, Result};
+use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::files::write_atomically;
+use autograd::{Real, Tensor};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
+use std::path::Path;
+
+/// Version of the format.
+pub const FORMAT: &str = "plenoxel 1";
+/// Where a voxel's value sits, in words.
+pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; sigma = max(0, density) after interpolation";
+
+/// Everything about a checkpoint but its tables.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Header {
+    /// Shape of the grid.
+    pub resolution: usize,
+    /// Half the side of the cube, in the dataset's units.
+    pub half_width: f64,
+    /// Look-up between centres.
+    pub interpolation: Interpolation,
+    /// `None` for RGB.
+    pub sh_degree: Option<usize>,
+    /// Color of zero coefficients.
+    pub sh_offset: f64,
+    /// Color behind the scene it was trained with.
+    pub background: [f32; 3],
+    /// Grid world to dataset world, a row-major 4 × 4 matrix: the identity as long as grids live in the dataset's own frame.
+    pub scene_transform: [[f64; 4]; 4],
+    /// Name of the scene.
+    pub scene: String,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Steps taken.
+    pub step: u64,
+    /// Program that wrote it.
+    pub writer: String,
+}
+
+impl Header {
+    /// The header of a grid.
+    pub fn new<T: Real>(grid: &VoxelGrid<T>, scene: &str, background: [f32; 3], seed: u64, step: u64) -> Self {
+        let shape = grid.shape();
+        let (sh_degree, sh_offset) = match shape.color {
+            Color::Rgb => (None, 0.0),
+            Color::Sh { degree, offset } => (Some(degree), offset),
+        };
+        let mut identity = [[0.0; 4]; 4];
+        (0..4).for_each(|i| identity[i][i] = 1.0);
+        Header {
+            resolution: shape.resolution,
+            half_width: shape.half_width,
+            interpolation: shape.interpolation,
+            sh_degree,
+            sh_offset,
+            background,
+            scene_transform: identity,
+            scene: scene.to_owned(),
+            seed,
+            step,
+            writer: concat!("plenoxel ", env!("CARGO_PKG_VERSION")).to_owned(),
+        }
+    }
+
+    /// Shape of the grid it describes.
+    pub fn shape(&self) -> GridShape {
+        let color = self.sh_degree.map_or(Color::Rgb, |degree| Color::Sh { degree, offset: self.sh_offset });
+        GridShape { resolution: self.resolution, half_width: self.half_width, interpolation: self.interpolation, color }
+    }
+}
+
+/// Writes a grid, whole or not at all.
+pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Result<()> {
+    let bytes = |table: &Tensor<T>| -> Vec<u8> { table.data().iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect() };
+    let (density, color) = (bytes(grid.density.tensor()), bytes(grid.color.tensor()));
+    let n = header.resolution;
+    let view = |shape: Vec<usize>, data| TensorView::new(Dtype::F32, shape, data).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"));
+    let tensors = [("density", view(vec![n, n, n], &density)?), ("color", view(vec![n, n, n, grid.shape().color.channels()], &color)?)];
+    let metadata = HashMap::from([
+        ("format".to_owned(), FORMAT.to_owned()),
+        ("convention".to_owned(), CONVENTION.to_owned()),
+        ("sh_convention".to_owned(), "svox2: R, G, B blocks; 1, -y, z, -x, xy, -yz, 2zz-xx-yy, -xz, xx-yy".to_owned()),
+        ("header".to_owned(), serde_json::to_string(header).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?),
+    ]);
+    let file = safetensors::serialize(tensors, Some(metadata)).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?;
+    write_atomically(path, &file)
+}
+
+/// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
+pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
+    let file = std::fs::read(path).map_err(|e| Error::io(path, e, "reading the checkpoint"))?;
+    let retrain = "train again, or use an undamaged copy";
+    let damaged = |e: safetensors::SafeTensorError| Error::input(path, format!("not a whole safetensors file ({e})"), retrain);
+    let tensors = SafeTensors::deserialize(&file).map_err(damaged)?;
+    let (_, metadata) = SafeTensors::read_metadata(&file).map_err(damaged)?;
+    let metadata = metadata.metadata().clone().unwrap_or_default();
+    match metadata.get("format").map(String::as_str) {
+        Some(FORMAT) => {}
+        Some(other) => return Err(Error::input(path, format!("format `{other}`"), format!("this program reads `{FORMAT}`; use the version that wrote the file"))),
+        None => return Err(Error::input(path, "a safetensors file without `format`", "give a checkpoint that this program wrote")),
+    }
+    let header = metadata.get("header").ok_or_else(|| Error::input(path, "no `header` in the metadata", retrain))?;
+    let header: Header = serde_json::from_str(header).map_err(|e| Error::input(path, format!("the header cannot be read ({e})"), retrain))?;
+    let degree_known = header.sh_degree.is_none_or(|d| d <= crate::field::sh::MAX_DEGREE);
+    if !(1..=4096).contains(&header.resolution) || !degree_known || !(header.half_width > 0.0 && header.half_width.is_finite()) {
+        return Err(Error::input(path, "a header with impossible values", retrain));
+    }
+    let shape = header.shape();
+    let n = header.resolution;
+    let table = |name: &str, channels: usize, expected: &[usize]| -> Result<Tensor<T>> {
+        let view = tensors.tensor(name).map_err(|_| Error::input(path, format!("no tensor `{name}`"), retrain))?;
+        if view.dtype() != Dtype::F32 || view.shape() != expected {
+            return Err(Error::input(path, format!("tensor `{name}` is {:?} {:?}", view.dtype(), view.shape()), format!("F32 {expected:?} is expected; {retrain}")));
+        }
+        let values = view.data().as_chunks::<4>().0.iter().map(|&b| T::lit(f64::from(f32::from_le_bytes(b)))).collect();
+        Ok(Tensor::from_vec(values, &[n * n * n, channels]))
+    };
+    let channels = shape.color.channels();
+    let grid = VoxelGrid::from_tables(shape, table("density", 1, &[n, n, n])?, table("color", channels, &[n, n, n, channels])?);
+    Ok((grid, header))
+}

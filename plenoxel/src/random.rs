@@ -1,0 +1,95 @@
+//! Random numbers as a function of what they are for: (seed, purpose, step, index), never of threads or of how many were drawn before.
+//! So a run can be cut anywhere and resumed, and any number of threads draws the same numbers.
+
+/// What a number is drawn for; different purposes are independent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// Order of the training rays within an epoch.
+    RayOrder = 1,
+    /// Offset of a ray's samples.
+    Jitter = 2,
+    /// Initial values of a grid.
+    Initial = 3,
+    /// Cells on which a regulariser is evaluated.
+    Cells = 4,
+}
+
+/// 64 random bits for (seed, purpose, step, index).
+pub fn bits(seed: u64, purpose: Purpose, step: u64, index: u64) -> u64 {
+    let key = mix(mix(seed ^ (purpose as u64) << 56) ^ step);
+    mix(key ^ mix(index))
+}
+
+/// A uniform number in [0, 1) for (seed, purpose, step, index).
+pub fn uniform(seed: u64, purpose: Purpose, step: u64, index: u64) -> f64 {
+    (bits(seed, purpose, step, index) >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
+}
+
+/// Stafford's variant 13 of the MurmurHash3 finaliser, as in SplitMix64.
+fn mix(x: u64) -> u64 {
+    let x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    let x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    let x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    x ^ (x >> 31)
+}
+
+/// A permutation of 0..n that needs no memory: a four-round Feistel network on the next even number of bits, walked until it lands
+/// inside (Black and Rogaway 2002).
+#[derive(Clone, Copy, Debug)]
+pub struct Permutation {
+    n: u64,
+    half_bits: u32,
+    keys: [u64; 4],
+}
+
+impl Permutation {
+    /// The permutation of 0..n for (seed, purpose, epoch).
+    pub fn new(n: u64, seed: u64, purpose: Purpose, epoch: u64) -> Self {
+        let half_bits = (64 - n.saturating_sub(1).leading_zeros()).div_ceil(2).max(1);
+        Permutation { n, half_bits, keys: [0, 1, 2, 3].map(|round| bits(seed, purpose, epoch, round)) }
+    }
+
+    /// Where `i` goes. Panics if `i` is not below n.
+    pub fn at(&self, i: u64) -> u64 {
+        assert!(i < self.n, "permutation of {} asked for {i}", self.n);
+        let mask = (1u64 << self.half_bits) - 1;
+        let mut x = i;
+        loop {
+            let (mut left, mut right) = (x >> self.half_bits, x & mask);
+            for key in self.keys {
+                (left, right) = (right, left ^ (mix(right ^ key) & mask));
+            }
+            x = left << self.half_bits | right;
+            if x < self.n {
+                return x;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_permutation_visits_everything_once() {
+        for n in [1u64, 2, 3, 17, 1000, 4097] {
+            let p = Permutation::new(n, 42, Purpose::RayOrder, 3);
+            let mut seen = vec![false; n as usize];
+            for i in 0..n {
+                assert!(!std::mem::replace(&mut seen[p.at(i) as usize], true), "n = {n}: {i} collides");
+            }
+        }
+    }
+
+    #[test]
+    fn numbers_are_spread_over_the_unit_interval_and_differ_by_purpose() {
+        let mut tenths = [0; 10];
+        for i in 0..10_000 {
+            tenths[(uniform(1, Purpose::Jitter, 5, i) * 10.0) as usize] += 1;
+        }
+        // 1000 expected in each, standard deviation 30.
+        assert!(tenths.iter().all(|&n| (850..1150).contains(&n)), "{tenths:?}");
+        assert_ne!(bits(1, Purpose::Jitter, 5, 0), bits(1, Purpose::Initial, 5, 0));
+    }
+}

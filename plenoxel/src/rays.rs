@@ -1,0 +1,95 @@
+//! Training rays, made on the fly: a ray is a view, a pixel and a camera, so a scene costs no more memory than its 8-bit images.
+
+use crate::camera::Ray;
+use crate::dataset::View;
+use crate::random::{Permutation, Purpose};
+use autograd::{Buffer, Real, Tensor, parallel};
+
+/// Rays with what the photographs show along them.
+#[derive(Debug, Clone)]
+pub struct RayBatch<T: Real> {
+    /// Origins and unit directions, world frame.
+    pub rays: Vec<Ray>,
+    /// `[n, 3]`, sRGB in [0, 1], composited over the background.
+    pub target: Tensor<T>,
+    /// `[n]`, in [0, 1]: how much of the pixel is object, where the images have an alpha channel; 1 where they have none.
+    pub alpha: Tensor<T>,
+}
+
+impl<T: Real> RayBatch<T> {
+    /// The number of rays.
+    pub fn len(&self) -> usize {
+        self.rays.len()
+    }
+
+    /// True if there are none.
+    pub fn is_empty(&self) -> bool {
+        self.rays.is_empty()
+    }
+}
+
+/// Every pixel of some views, in an order that is shuffled anew each epoch.
+#[derive(Debug)]
+pub struct RaySource<'a> {
+    views: &'a [View],
+    background: [f32; 3],
+    seed: u64,
+    /// `first[v]` is the number of pixels before view v.
+    first: Vec<u64>,
+}
+
+impl<'a> RaySource<'a> {
+    /// The pixels of `views` over a background.
+    pub fn new(views: &'a [View], background: [f32; 3], seed: u64) -> Self {
+        let mut first = vec![0];
+        for view in views {
+            let (w, h) = view.image.dimensions();
+            first.push(first[first.len() - 1] + u64::from(w) * u64::from(h));
+        }
+        RaySource { views, background, seed, first }
+    }
+
+    /// Rays in one epoch.
+    pub fn len(&self) -> u64 {
+        self.first[self.views.len()]
+    }
+
+    /// True if there are no pixels.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Rays number `from..from + n` of the endless sequence of epochs: a function of (seed, number) alone.
+    pub fn batch<T: Real>(&self, from: u64, n: usize) -> RayBatch<T> {
+        let total = self.len();
+        let epochs: Vec<Permutation> =
+            (from / total..=(from + n as u64 - 1) / total).map(|epoch| Permutation::new(total, self.seed, Purpose::RayOrder, epoch)).collect();
+        let parts = parallel::map_chunks(n, 1024, |range| {
+            range
+                .map(|i| {
+                    let number = from + i as u64;
+                    self.pixel(epochs[(number / total - from / total) as usize].at(number % total))
+                })
+                .collect::<Vec<_>>()
+        });
+        let mut batch = RayBatch { rays: Vec::with_capacity(n), target: Tensor::zeros(&[0]), alpha: Tensor::zeros(&[0]) };
+        let (mut target, mut alpha) = (Buffer::stale(3 * n), Buffer::stale(n));
+        for (i, (ray, color, a)) in parts.into_iter().flatten().enumerate() {
+            batch.rays.push(ray);
+            (0..3).for_each(|c| target[3 * i + c] = T::lit(f64::from(color[c])));
+            alpha[i] = T::lit(f64::from(a));
+        }
+        batch.target = Tensor::from_buffer(target, &[n, 3]);
+        batch.alpha = Tensor::from_buffer(alpha, &[n]);
+        batch
+    }
+
+    /// Ray, color over the background, and alpha of one pixel of the set.
+    fn pixel(&self, index: u64) -> (Ray, [f32; 3], f32) {
+        let v = self.first.partition_point(|&f| f <= index) - 1;
+        let view = &self.views[v];
+        let (pixel, width) = ((index - self.first[v]) as usize, view.image.width() as usize);
+        let (x, y) = (pixel % width, pixel / width);
+        (view.camera.ray(x as f64 + 0.5, y as f64 + 0.5), view.color(x, y, self.background), view.alpha(x, y))
+    }
+}

@@ -1,0 +1,71 @@
+//! **The specification**: emission and absorption along a ray (Max 1995), as a graph of small ops. When in doubt, this file is right.
+//!
+//! With optical depth τᵢ = σᵢ δᵢ per sample, transmittance before it Tᵢ = exp(−Σ_{j<i} τⱼ), weight wᵢ = Tᵢ (1 − e^{−τᵢ}) and
+//! T_N = exp(−Σ τⱼ) left for the background b:  C = Σ wᵢ cᵢ + T_N b,  depth = Σ wᵢ tᵢ,  opacity = 1 − T_N = Σ wᵢ.
+
+use crate::field::Radiance;
+use crate::sampling::Samples;
+use autograd::{Real, Tensor};
+
+/// Pixels of n rays, with what the losses may want. Columns that cost something are computed when asked for.
+#[derive(Debug, Clone)]
+pub struct Rendered<T: Real> {
+    /// `[n, 3]` color over the background.
+    pub rgb: Tensor<T>,
+    /// `[n]` in [0, 1]: 1 − T_N.
+    pub opacity: Tensor<T>,
+    /// `[n]` ln T_N <= 0.
+    pub log_transmittance: Tensor<T>,
+    /// The samples behind the pixels.
+    pub samples: PerSample<T>,
+}
+
+/// What is known of each of m samples.
+#[derive(Debug, Clone)]
+pub struct PerSample<T: Real> {
+    /// `[m]` wᵢ = Tᵢ (1 − e^{−σᵢδᵢ}), in [0, 1].
+    pub weights: Tensor<T>,
+    /// Density and color.
+    pub radiance: Radiance<T>,
+    /// Positions, intervals, and which ray they belong to.
+    pub samples: Samples<T>,
+}
+
+/// Pixels from samples. `background` is `[3]`, or `[n, 3]` for one color a ray.
+///
+/// Panics if radiance and samples differ in number.
+#[track_caller]
+pub fn composite<T: Real>(samples: Samples<T>, radiance: Radiance<T>, background: &Tensor<T>) -> Rendered<T> {
+    let offsets = &samples.offsets;
+    let tau = &radiance.sigma * &samples.delta;
+    let transmittance = (-tau.segment_exclusive_sum(offsets)).exp();
+    let weights = transmittance * tau.one_minus_exp_neg();
+    let depth_in_all = tau.segment_sum(offsets);
+    let opacity = depth_in_all.one_minus_exp_neg();
+    let log_transmittance = -depth_in_all;
+    let rgb = (weights.unsqueeze(1) * &radiance.rgb).segment_sum(offsets) + log_transmittance.exp().unsqueeze(1) * background;
+    Rendered { rgb, opacity, log_transmittance, samples: PerSample { weights, radiance, samples } }
+}
+
+impl<T: Real> Rendered<T> {
+    /// `[n]` Σ wᵢ tᵢ, world length. Not divided by opacity, so that it is smooth; pictures divide.
+    pub fn depth(&self) -> Tensor<T> {
+        let s = &self.samples;
+        (&s.weights * &s.samples.t).segment_sum(&s.samples.offsets)
+    }
+
+    /// `[n]` Σ ln(1 + 2σᵢ²): Cauchy sparsity (PlenOctrees, svox2).
+    pub fn sparsity(&self) -> Tensor<T> {
+        let s = &self.samples;
+        (2.0 * s.radiance.sigma.square() + 1.0).ln().segment_sum(&s.samples.offsets)
+    }
+
+    /// `[n]` Σᵢⱼ wᵢ wⱼ |tᵢ − tⱼ| + ⅓ Σ wᵢ² δᵢ, world length: the distortion of mip-NeRF 360 (eq. 15), in linear time by prefix sums
+    /// Wᵢ = Σ_{j<i} wⱼ, Mᵢ = Σ_{j<i} wⱼ tⱼ as Σ 2 wᵢ (tᵢ Wᵢ − Mᵢ) + wᵢ² δᵢ / 3.
+    pub fn distortion(&self) -> Tensor<T> {
+        let PerSample { weights: w, samples: s, .. } = &self.samples;
+        let before = w.segment_exclusive_sum(&s.offsets);
+        let moment = (w * &s.t).segment_exclusive_sum(&s.offsets);
+        (2.0 * w * (&s.t * before - moment) + w.square() * &s.delta / 3.0).segment_sum(&s.offsets)
+    }
+}

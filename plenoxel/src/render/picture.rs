@@ -1,0 +1,41 @@
+//! Whole images, in chunks of rays.
+
+use crate::camera::Camera;
+use crate::field::Field;
+use crate::render::{RenderOptions, render};
+use autograd::{Real, no_grad};
+use ndarray::{Array2, Array3};
+
+/// A rendered image.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    /// `[h, w, 3]` sRGB, not clamped.
+    pub rgb: Array3<f32>,
+    /// `[h, w]` Σ wᵢ tᵢ, world length.
+    pub depth: Array2<f32>,
+    /// `[h, w]` in [0, 1].
+    pub opacity: Array2<f32>,
+}
+
+/// Rays rendered at a time: bounds the memory.
+const CHUNK: usize = 8192;
+
+/// Renders what a camera sees.
+pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {
+    let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
+    let (mut rgb, mut depth, mut opacity) = (Vec::with_capacity(3 * w * h), Vec::with_capacity(w * h), Vec::with_capacity(w * h));
+    let as_f32 = |x: &T| x.as_f64() as f32;
+    for start in (0..w * h).step_by(CHUNK) {
+        let rays: Vec<_> = (start..(start + CHUNK).min(w * h)).map(|p| camera.ray((p % w) as f64 + 0.5, (p / w) as f64 + 0.5)).collect();
+        let rendered = no_grad(|| render(field, &rays, options));
+        rgb.extend(rendered.rgb.data().iter().map(as_f32));
+        depth.extend(rendered.depth().data().iter().map(as_f32));
+        opacity.extend(rendered.opacity.data().iter().map(as_f32));
+    }
+    let fits = "one number for each pixel";
+    Picture {
+        rgb: Array3::from_shape_vec((h, w, 3), rgb).expect(fits),
+        depth: Array2::from_shape_vec((h, w), depth).expect(fits),
+        opacity: Array2::from_shape_vec((h, w), opacity).expect(fits),
+    }
+}

@@ -1,0 +1,234 @@
+//! Training: batch → render → objective → gradients → optimizer → projection, coarse to fine.
+//!
+//! The trainer draws, computes and reports; it never prints and never reads a clock.
+
+pub mod config;
+
+use crate::dataset::View;
+use crate::error::{Error, Result};
+use crate::field::voxel_grid::VoxelGrid;
+use crate::loss::{Objective, Step};
+use crate::rays::RaySource;
+use crate::render::{RenderOptions, render};
+use crate::sampling::{Jitter, Occupancy};
+use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Rates, RmsProp, Schedule, Sgd};
+use autograd::{Real, parallel, release_free_buffers, value_and_grad};
+use config::{Config, OptimizerConfig, Stage, Weight};
+
+/// What one step did.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// Number of the step, from 0 over the whole run.
+    pub step: u64,
+    /// Stage it belongs to, from 0.
+    pub stage: usize,
+    /// True if it was the last of its stage.
+    pub ends_stage: bool,
+    /// The weighted sum that was minimised.
+    pub loss: f64,
+    /// Each loss by itself, unweighted.
+    pub losses: Vec<(String, f64)>,
+    /// −10 log₁₀ of the batch's mean squared error: of training rays, before the update.
+    pub psnr: f64,
+    /// Rays in the batch.
+    pub rays: usize,
+    /// Samples they took.
+    pub samples: usize,
+    /// Learning rate of the density.
+    pub density_rate: f64,
+    /// Learning rate of the colors.
+    pub color_rate: f64,
+}
+
+/// A stage with its place in the run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PlannedStage {
+    /// As configured.
+    pub stage: Stage,
+    /// Its first step.
+    pub first: u64,
+    /// How many steps it has.
+    pub steps: u64,
+}
+
+/// A grid in training.
+pub struct Trainer<'a, T: Real> {
+    config: Config,
+    plan: Vec<PlannedStage>,
+    rays: RaySource<'a>,
+    objective: Objective<T>,
+    grid: VoxelGrid<T>,
+    optimizer: Box<dyn Optimizer<T>>,
+    occupancy: Option<Occupancy>,
+    step: u64,
+}
+
+impl<'a, T: Real> Trainer<'a, T> {
+    /// A run from its beginning, with the losses that the config names.
+    pub fn new(config: Config, views: &'a [View]) -> Result<Self> {
+        let objective = objective(&config)?;
+        Self::with_objective(config, views, objective)
+    }
+
+    /// A run with an objective of one's own; the config's losses are not used.
+    pub fn with_objective(config: Config, views: &'a [View], objective: Objective<T>) -> Result<Self> {
+        config.validate()?;
+        let rays = RaySource::new(views, config.background, config.seed);
+        if rays.is_empty() {
+            return Err(Error::config("train views", "none", "at least one image to learn from"));
+        }
+        let mut first = 0;
+        let plan: Vec<PlannedStage> = config
+            .stages
+            .iter()
+            .map(|&stage| {
+                let steps = stage.step_count(rays.len(), config.rays_per_step);
+                first += steps;
+                PlannedStage { stage, first: first - steps, steps }
+            })
+            .collect();
+        let shape = config.grid_shape(plan[0].stage.resolution);
+        let initial = config.initial;
+        let grid = match initial.random {
+            true => VoxelGrid::random(shape, initial.density, initial.color, config.seed),
+            false => VoxelGrid::uniform(shape, initial.density, initial.color),
+        };
+        let optimizer = optimizer(&config, &plan[0]);
+        Ok(Trainer { config, plan, rays, objective, grid, optimizer, occupancy: None, step: 0 })
+    }
+
+    /// The grid as it is now.
+    pub fn grid(&self) -> &VoxelGrid<T> {
+        &self.grid
+    }
+
+    /// The trained grid.
+    pub fn into_grid(self) -> VoxelGrid<T> {
+        self.grid
+    }
+
+    /// The config.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// The stages with their steps.
+    pub fn plan(&self) -> &[PlannedStage] {
+        &self.plan
+    }
+
+    /// Steps of the whole run.
+    pub fn total_steps(&self) -> u64 {
+        self.plan.iter().map(|p| p.steps).sum()
+    }
+
+    /// Training rays of one epoch.
+    pub fn rays_per_epoch(&self) -> u64 {
+        self.rays.len()
+    }
+
+    /// Takes the next step; `None` when the run is over.
+    ///
+    /// Errors if the loss or the grid is no longer finite, naming the step.
+    pub fn step(&mut self) -> Result<Option<Report>> {
+        let Some(index) = self.plan.iter().position(|p| self.step < p.first + p.steps) else { return Ok(None) };
+        let plan = self.plan[index];
+        if self.step == plan.first {
+            self.begin(index);
+        }
+        let batch = self.rays.batch::<T>(self.step * self.config.rays_per_step as u64, self.config.rays_per_step);
+        let options = RenderOptions {
+            aabb: self.grid.aabb(),
+            spacing: plan.stage.sampling.spacing(self.grid.shape().voxel_side()),
+            jitter: if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None },
+            background: self.config.background,
+            occupancy: self.occupancy.as_ref(),
+        };
+        let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
+        let (loss, gradients) = value_and_grad(|| {
+            let rendered = render(&self.grid, &batch.rays, &options);
+            samples = rendered.samples.samples.len();
+            squared_error = mean_squared_error(rendered.rgb.data(), batch.target.data());
+            let step = Step { number: self.step, seed: self.config.seed, batch: &batch, rendered: &rendered, grid: &self.grid };
+            let (total, values) = self.objective.evaluate(&step);
+            losses = values.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
+            total
+        });
+        let loss = loss.as_f64();
+        if !loss.is_finite() {
+            let parts: Vec<String> = losses.iter().map(|(name, value)| format!("{name} {value}")).collect();
+            return Err(self.numeric(format!("the loss is {loss} ({})", parts.join(", "))));
+        }
+        let in_stage = self.step - plan.first;
+        self.optimizer.step(&mut self.grid, &gradients, in_stage);
+        if self.config.project {
+            self.grid.project(&gradients);
+        }
+        let ends_stage = in_stage + 1 == plan.steps;
+        if ends_stage && !self.grid.is_finite() {
+            return Err(self.numeric("the grid holds numbers that are not finite".to_owned()));
+        }
+        let report = Report {
+            step: self.step,
+            stage: index,
+            ends_stage,
+            loss,
+            losses,
+            psnr: -10.0 * squared_error.log10(),
+            rays: batch.len(),
+            samples,
+            density_rate: rate(&plan, plan.stage.density_rate).at(in_stage),
+            color_rate: rate(&plan, plan.stage.color_rate).at(in_stage),
+        };
+        self.step += 1;
+        Ok(Some(report))
+    }
+
+    /// What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
+    fn begin(&mut self, index: usize) {
+        let plan = &self.plan[index];
+        if plan.stage.resolution != self.grid.shape().resolution {
+            self.grid = self.grid.resample(plan.stage.resolution);
+            release_free_buffers();
+        }
+        self.optimizer = optimizer(&self.config, plan);
+        self.occupancy = None;
+        if self.config.prune_from_stage.is_some_and(|first| index >= first) {
+            let occupancy = self.grid.occupancy(self.config.prune_below);
+            self.grid.clear_outside(&occupancy);
+            self.occupancy = Some(occupancy);
+        }
+    }
+
+    fn numeric(&self, found: String) -> Error {
+        Error::Numeric { place: format!("step {}", self.step), found, remedy: "lower the learning rates of this stage".to_owned() }
+    }
+}
+
+/// The losses that a config names.
+pub fn objective<T: Real>(config: &Config) -> Result<Objective<T>> {
+    config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| match *weight {
+        Weight::Constant(weight) => objective.with_named(name, weight),
+        Weight::Exponential { from, to, steps } => objective.with_named(name, Exponential::new(from, to, steps)),
+    })
+}
+
+fn optimizer<T: Real>(config: &Config, plan: &PlannedStage) -> Box<dyn Optimizer<T>> {
+    let rates = || Rates::new(0.0).with("density", rate(plan, plan.stage.density_rate)).with("color", rate(plan, plan.stage.color_rate));
+    match config.optimizer {
+        OptimizerConfig::Sgd => Box::new(Sgd::new(rates())),
+        OptimizerConfig::Momentum { decay } => Box::new(Momentum::new(rates(), decay)),
+        OptimizerConfig::RmsProp { beta, epsilon } => Box::new(RmsProp::new(rates()).beta(beta).epsilon(epsilon)),
+        OptimizerConfig::LazyAdam { beta1, beta2, epsilon } => Box::new(Adam::new(rates(), AdamMode::Lazy).betas(beta1, beta2).epsilon(epsilon)),
+    }
+}
+
+/// The rate over the steps of a stage.
+fn rate(plan: &PlannedStage, start: f64) -> Box<dyn Schedule> {
+    if start == 0.0 || plan.stage.rate_decay == 1.0 { Box::new(start) } else { Box::new(Exponential::new(start, start * plan.stage.rate_decay, plan.steps)) }
+}
+
+fn mean_squared_error<T: Real>(x: &[T], y: &[T]) -> f64 {
+    let parts = parallel::map_chunks(x.len(), parallel::CHUNK, |range| x[range.clone()].iter().zip(&y[range]).map(|(&x, &y)| ((x - y) * (x - y)).as_f64()).sum::<f64>());
+    parts.into_iter().sum::<f64>() / x.len() as f64
+}

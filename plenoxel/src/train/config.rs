@@ -1,0 +1,271 @@
+//! Every knob of a run: its meaning, its unit, and what its default comes from.
+//!
+//! The same struct is the file `config.toml` of a run, a preset, and what flags change.
+
+use crate::error::{Error, Result};
+use crate::field::sh;
+use crate::field::voxel_grid::{Color, GridShape, Interpolation};
+use crate::loss;
+use crate::render::Engine;
+use crate::sampling::Spacing;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// A run, completely: the same config and the same data give the same bits.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Images are reduced by this factor, with a box filter.
+    pub downscale: usize,
+    /// Where a dataset has no validation file, every n-th training view is held out for validation; 0 holds out none.
+    pub validation_every: usize,
+    /// Color behind the scene, sRGB in [0, 1]. White is what published figures use.
+    pub background: [f32; 3],
+    /// Half the side of the cube in which the scene lies, in the dataset's units.
+    pub half_width: f64,
+    /// Look-up between voxel centres.
+    pub interpolation: Interpolation,
+    /// Meaning of a voxel's color.
+    pub color: ColorKind,
+    /// Degree of the harmonics, 0 to 3, where `color = "sh"`.
+    pub sh_degree: usize,
+    /// Color of zero coefficients: 0.5 in svox2, 0 in the source paper.
+    pub sh_offset: f64,
+    /// What computes the pixels of a training step.
+    pub engine: Engine,
+    /// Rays in a step.
+    pub rays_per_step: usize,
+    /// Shift the samples of each training ray by a random fraction of a step.
+    pub jitter: bool,
+    /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
+    pub project: bool,
+    /// From this stage on (counted from 0), voxels whose density is at most `prune_below` at the stage's start, with all their
+    /// neighbours, are never looked at again.
+    pub prune_from_stage: Option<usize>,
+    /// Density, 1 / world length, at which a voxel counts as empty when pruning.
+    pub prune_below: f64,
+    /// Values before the first step.
+    pub initial: Initial,
+    /// How gradients change the grid.
+    pub optimizer: OptimizerConfig,
+    /// Weight of each loss: a number, or `{ from, to, steps }` for an exponential change over the run.
+    pub losses: BTreeMap<String, Weight>,
+    /// Coarse to fine.
+    pub stages: Vec<Stage>,
+    /// Where samples lie when images are rendered for pictures and figures.
+    pub evaluation: Sampling,
+}
+
+/// Meaning of a voxel's color.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ColorKind {
+    /// Red, green, blue.
+    Rgb,
+    /// Spherical harmonics.
+    Sh,
+}
+
+/// Values before the first step.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Initial {
+    /// Density, 1 / world length.
+    pub density: f64,
+    /// Every color number.
+    pub color: f64,
+    /// Draw uniformly from [0, value) instead.
+    pub random: bool,
+}
+
+/// How gradients change the grid. Rates are of the stages.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
+pub enum OptimizerConfig {
+    /// θ ← θ − rate · g
+    Sgd,
+    /// Momentum of this decay.
+    Momentum {
+        /// Share of the velocity that stays.
+        decay: f64,
+    },
+    /// svox2's.
+    RmsProp {
+        /// Decay of the mean square.
+        beta: f64,
+        /// Added to its root.
+        epsilon: f64,
+    },
+    /// Adam on touched rows only.
+    LazyAdam {
+        /// Decay of the mean.
+        beta1: f64,
+        /// Decay of the mean square.
+        beta2: f64,
+        /// Added to its root.
+        epsilon: f64,
+    },
+}
+
+/// A weight of a loss.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Weight {
+    /// The same all the time.
+    Constant(f64),
+    /// Log-linear from one to the other over so many steps, then constant.
+    Exponential {
+        /// At step 0.
+        from: f64,
+        /// From `steps` on.
+        to: f64,
+        /// Length of the change.
+        steps: u64,
+    },
+}
+
+/// A resolution, and how long it is trained.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stage {
+    /// Voxels along each axis.
+    pub resolution: usize,
+    /// Length in epochs over all training pixels; exactly one of `epochs` and `steps` is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub epochs: Option<f64>,
+    /// Length in steps.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub steps: Option<u64>,
+    /// Where samples lie.
+    pub sampling: Sampling,
+    /// Learning rate of the density, at the stage's start.
+    pub density_rate: f64,
+    /// Learning rate of the colors, at the stage's start.
+    pub color_rate: f64,
+    /// Both rates fall exponentially to this share of themselves at the stage's end; 1 keeps them.
+    #[serde(default = "one")]
+    pub rate_decay: f64,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+/// Where samples lie along a ray.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged, deny_unknown_fields)]
+pub enum Sampling {
+    /// Steps of this many voxel sides through the box.
+    Step {
+        /// In voxel sides.
+        step: f64,
+    },
+    /// The source paper's: so many points over t ∈ [0, far] along the direction whose camera z is −1.
+    Points {
+        /// On the whole ray, in the box or not.
+        samples: usize,
+        /// Largest t.
+        far: f64,
+    },
+}
+
+impl Sampling {
+    /// The spacing for voxels of a side.
+    pub fn spacing(self, voxel_side: f64) -> Spacing {
+        match self {
+            Sampling::Step { step } => Spacing::Step(step * voxel_side),
+            Sampling::Points { samples, far } => Spacing::Points { samples, far },
+        }
+    }
+}
+
+impl Stage {
+    /// Steps of this stage when an epoch has `rays` rays.
+    pub fn step_count(&self, rays: u64, rays_per_step: usize) -> u64 {
+        match (self.steps, self.epochs) {
+            (Some(steps), _) => steps,
+            (None, Some(epochs)) => ((epochs * rays as f64 / rays_per_step as f64).round() as u64).max(1),
+            (None, None) => 0,
+        }
+    }
+}
+
+impl Config {
+    /// The grid of a stage.
+    pub fn grid_shape(&self, resolution: usize) -> GridShape {
+        let color = match self.color {
+            ColorKind::Rgb => Color::Rgb,
+            ColorKind::Sh => Color::Sh { degree: self.sh_degree, offset: self.sh_offset },
+        };
+        GridShape { resolution, half_width: self.half_width, interpolation: self.interpolation, color }
+    }
+
+    /// Checks every value; an error names the key as the file spells it.
+    pub fn validate(&self) -> Result<()> {
+        let positive = |key: &str, value: f64| check(value > 0.0 && value.is_finite(), key, value, "a number above 0");
+        check((1..=64).contains(&self.downscale), "downscale", self.downscale, "1 to 64")?;
+        check(self.background.iter().all(|c| (0.0..=1.0).contains(c)), "background", format!("{:?}", self.background), "three numbers in [0, 1]")?;
+        positive("half_width", self.half_width)?;
+        check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
+        check(self.sh_offset.is_finite(), "sh_offset", self.sh_offset, "a finite number")?;
+        check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
+        check(self.prune_below >= 0.0, "prune_below", self.prune_below, "a number of at least 0")?;
+        check(self.initial.density.is_finite() && self.initial.density >= 0.0, "initial.density", self.initial.density, "a number of at least 0")?;
+        check(self.initial.color.is_finite(), "initial.color", self.initial.color, "a finite number")?;
+        match self.optimizer {
+            OptimizerConfig::Sgd => {}
+            OptimizerConfig::Momentum { decay } => check((0.0..1.0).contains(&decay), "optimizer.decay", decay, "a number in [0, 1)")?,
+            OptimizerConfig::RmsProp { beta, epsilon } => {
+                check((0.0..1.0).contains(&beta), "optimizer.beta", beta, "a number in [0, 1)")?;
+                positive("optimizer.epsilon", epsilon)?;
+            }
+            OptimizerConfig::LazyAdam { beta1, beta2, epsilon } => {
+                check((0.0..1.0).contains(&beta1), "optimizer.beta1", beta1, "a number in [0, 1)")?;
+                check((0.0..1.0).contains(&beta2), "optimizer.beta2", beta2, "a number in [0, 1)")?;
+                positive("optimizer.epsilon", epsilon)?;
+            }
+        }
+        check(!self.losses.is_empty(), "losses", "no loss", "at least one, as in `mse = 1.0`")?;
+        for (name, weight) in &self.losses {
+            check(loss::NAMES.contains(&name.as_str()), &format!("losses.{name}"), "an unknown loss", &format!("one of {}", loss::NAMES.join(", ")))?;
+            let fits = match *weight {
+                Weight::Constant(w) => w.is_finite() && w >= 0.0,
+                Weight::Exponential { from, to, steps } => from > 0.0 && from.is_finite() && to > 0.0 && to.is_finite() && steps > 0,
+            };
+            check(fits, &format!("losses.{name}"), format!("{weight:?}"), "a number of at least 0, or { from, to, steps } above 0")?;
+        }
+        check(!self.stages.is_empty(), "stages", "no stage", "at least one")?;
+        for (i, stage) in self.stages.iter().enumerate() {
+            let key = |name: &str| format!("stages[{i}].{name}");
+            check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels a side")?;
+            let length = match (stage.epochs, stage.steps) {
+                (Some(epochs), None) => epochs > 0.0 && epochs.is_finite(),
+                (None, Some(steps)) => steps > 0,
+                _ => false,
+            };
+            check(length, &key("epochs"), format!("epochs {:?}, steps {:?}", stage.epochs, stage.steps), "exactly one of `epochs` and `steps`, above 0")?;
+            sampling(&key("sampling"), stage.sampling)?;
+            for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate)] {
+                check(rate.is_finite() && rate >= 0.0, &key(name), rate, "a number of at least 0")?;
+            }
+            positive(&key("rate_decay"), stage.rate_decay)?;
+        }
+        sampling("evaluation", self.evaluation)
+    }
+}
+
+fn sampling(key: &str, sampling: Sampling) -> Result<()> {
+    match sampling {
+        Sampling::Step { step } => check((0.01..=100.0).contains(&step), &format!("{key}.step"), step, "0.01 to 100 voxel sides"),
+        Sampling::Points { samples, far } => {
+            check((2..=100_000).contains(&samples), &format!("{key}.samples"), samples, "2 to 100000")?;
+            check(far > 0.0 && far.is_finite(), &format!("{key}.far"), far, "a number above 0")
+        }
+    }
+}
+
+fn check(fits: bool, key: &str, found: impl ToString, accepted: &str) -> Result<()> {
+    if fits { Ok(()) } else { Err(Error::config(key, found, accepted)) }
+}
