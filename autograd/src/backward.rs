@@ -5,7 +5,7 @@
 //! A kernel in a differentiable pass is replaced by its reference: the new nodes have the largest ids and are popped next.
 
 use crate::gradients::{Grad, Gradients, RowSparse};
-use crate::graph::{Node, Rule, no_grad};
+use crate::graph::{self, Node, Rule, no_grad};
 use crate::index::{self, Indices};
 use crate::op::{Cotangent, GradSink, KernelCall, Vjp};
 use crate::parallel;
@@ -31,7 +31,9 @@ use std::sync::Arc;
 pub fn grad<T: Real>(y: &Tensor<T>, wrt: &[&Tensor<T>]) -> Vec<Tensor<T>> {
     assert_eq!(y.len(), 1, "grad: expected a scalar, got shape {:?}", y.shape());
     let targets: Vec<Option<u64>> = wrt.iter().map(|x| x.id()).collect();
-    let mut pass = Pass { tracked: true, needed: Some(Needed::new(targets.iter().flatten().copied())), pending: HashMap::new(), heap: BinaryHeap::new() };
+    // Inside `no_grad` the result is constant: a kernel's reference would record nothing to go through.
+    let needed = Needed::new(targets.iter().flatten().copied());
+    let mut pass = Pass { tracked: graph::recording(), needed: Some(needed), pending: HashMap::new(), heap: BinaryHeap::new() };
     if let Some(root) = &y.node
         && pass.is_needed(root)
     {

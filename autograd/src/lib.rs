@@ -3,6 +3,8 @@
 #![warn(missing_docs)]
 
 mod backward;
+mod error;
+mod gradcheck;
 mod gradients;
 mod graph;
 mod index;
@@ -16,6 +18,8 @@ mod real;
 mod tensor;
 
 pub use backward::{grad, value_and_grad};
+pub use error::GradcheckError;
+pub use gradcheck::{Closeness, Gradcheck, KernelReport, Report, check_kernel, gradcheck};
 pub use gradients::{Grad, Gradients, RowSparse};
 pub use graph::no_grad;
 pub use index::Indices;

@@ -162,7 +162,12 @@ fn update_part<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T;
     let TableRows { first, width, rows, g } = part;
     let count = if ALL { x[0].len() / width.max(1) } else { rows.len() };
     if count <= rows_per_chunk(width) {
-        return update_runs::<T, N, ALL, F>(x, part, f);
+        return match width {
+            1 if !ALL => update_short_rows::<T, N, 1, F>(x, part, f),
+            3 if !ALL => update_short_rows::<T, N, 3, F>(x, part, f),
+            4 if !ALL => update_short_rows::<T, N, 4, F>(x, part, f),
+            _ => update_runs::<T, N, ALL, F>(x, part, f),
+        };
     }
     let cut = if ALL { first + count / 2 } else { rows[count / 2] as usize };
     let middle = rows.partition_point(|&row| (row as usize) < cut);
@@ -222,7 +227,27 @@ fn update_loop<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]
 }
 
 dispatched! {
-/// Neighbouring rows are updated as one run.
+/// Rows too short for a loop of their own are gathered, updated together and put back.
+fn update_short_rows<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
+    const TOGETHER: usize = 16;
+    let mut x = x.map(|x| x.as_chunks_mut::<W>().0);
+    let mut block = [[[T::zero(); W]; TOGETHER]; N];
+    for (rows, g) in part.rows.chunks(TOGETHER).zip(part.g.chunks(TOGETHER * W)) {
+        for (block, x) in block.iter_mut().zip(&x) {
+            block.iter_mut().zip(rows).for_each(|(to, &row)| *to = x[row as usize - part.first]);
+        }
+        let slices = block.each_mut().map(|b| b.as_flattened_mut());
+        // A constant length is worth a copy of the loop.
+        if g.len() == TOGETHER * W { update_slices(slices, TOGETHER * W, |i| g[i], f) } else { update_slices(slices, g.len(), |i| g[i], f) }
+        for (block, x) in block.iter().zip(&mut x) {
+            block.iter().zip(rows).for_each(|(&from, &row)| x[row as usize - part.first] = from);
+        }
+    }
+}
+}
+
+dispatched! {
+/// Neighbouring rows are updated as one run; `ALL` fills the gaps with zero gradients.
 fn update_runs<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N]>(mut x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
     let TableRows { first, width, rows, g } = part;
     let mut done = 0;

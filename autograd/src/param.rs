@@ -51,6 +51,16 @@ impl<T: Real> Param<T> {
         self.tensor = value.into_variable();
     }
 
+    /// Computes with `tensor` from now on and leaves it its place in a graph: gradients flow through the parameter to what the tensor came
+    /// from, be it another network's output or the input of a gradient check. The identity is the tensor's.
+    ///
+    /// Panics if the tensor is a constant.
+    #[track_caller]
+    pub fn bind(&mut self, tensor: Tensor<T>) {
+        assert!(tensor.is_tracked(), "bind: parameter `{}` was given a constant; use replace", self.name);
+        self.tensor = tensor;
+    }
+
     pub(crate) fn id(&self) -> u64 {
         self.tensor.id().expect("a parameter is a leaf")
     }

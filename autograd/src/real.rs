@@ -49,7 +49,8 @@ impl Real for f32 {
         let x = self.clamp(-104.0, 89.0);
         // Adding and subtracting 1.5·2²³ rounds to the nearest integer in any instruction set.
         const ROUND: f32 = 12_582_912.0;
-        let n = (x * std::f32::consts::LOG2_E + ROUND) - ROUND;
+        let rounded = x * std::f32::consts::LOG2_E + ROUND;
+        let n = rounded - ROUND;
         let r = (x - n * 0.693_359_4) - n * -2.121_944_4e-4;
         let p = 1.987_569_2e-4;
         let p = p * r + 1.398_2e-3;
@@ -58,11 +59,12 @@ impl Real for f32 {
         let p = p * r + 1.666_666_5e-1;
         let p = p * r + 5.000_000_3e-1;
         let y = p * (r * r) + r + 1.0;
-        // |n| <= 150, and NaN becomes 0 here but stays NaN in y.
-        let n = n as i32;
+        // The integer stands in the low bits of `rounded`; a conversion `as i32` would check its range and not vectorise. NaN gives some
+        // scale or other, and y is NaN.
+        let n = (rounded.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32);
         let half = n >> 1;
-        let scale = |k: i32| f32::from_bits(((k + 127) as u32) << 23);
-        y * scale(half) * scale(n - half)
+        let scale = |k: i32| f32::from_bits((k.wrapping_add(127) as u32) << 23);
+        y * scale(half) * scale(n.wrapping_sub(half))
     }
 
     #[inline(always)]

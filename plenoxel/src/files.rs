@@ -48,7 +48,8 @@ mod tests {
     use super::*;
 
     fn folder(name: &str) -> PathBuf {
-        let path = std::env::temp_dir().join(format!("plenoxel-files-{}-{name}", std::process::id()));
+        let path =
+            std::env::temp_dir().join(format!("plenoxel-files-{}-{name}", std::process::id()));
         create_dir(&path).unwrap();
         path
     }

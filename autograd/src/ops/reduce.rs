@@ -1,5 +1,6 @@
 //! Sums, means and extrema, over everything or along one axis.
 
+use crate::graph::Rule;
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::parallel::{self, CHUNK, dispatched};
 use crate::pool::Buffer;
@@ -20,6 +21,24 @@ impl<T: Real> Op<T> for SumTo {
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
         vec![cx.wrt(0, || cx.cotangent().broadcast_to(&self.from))]
+    }
+}
+
+/// y = the largest or smallest of x.   ∂L/∂x = ∂L/∂y · shares, which are equal among those that equal y and constant
+#[derive(Debug)]
+struct Extremum<T: Real> {
+    largest: bool,
+    shares: Tensor<T>,
+}
+impl<T: Real> Op<T> for Extremum<T> {
+    fn name(&self) -> &'static str {
+        if self.largest { "max" } else { "min" }
+    }
+    fn keep(&self) -> Keep {
+        Keep::NOTHING
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        vec![cx.wrt(0, || cx.cotangent() * &self.shares)]
     }
 }
 
@@ -133,10 +152,9 @@ impl<T: Real> Tensor<T> {
         if !self.is_tracked() {
             return value;
         }
-        // As a weighted sum with constant weights the gradient needs no rule of its own.
-        let chosen = self.equal(&value);
+        let chosen = self.detach().equal(&value);
         let ties = chosen.sum_to(&shape);
-        (self * (chosen / ties)).sum_to(&shape)
+        value.recorded(&[self], Keep::NOTHING, || Rule::Op(Box::new(Extremum { largest, shares: chosen / ties })))
     }
 
     #[track_caller]

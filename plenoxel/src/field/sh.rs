@@ -90,7 +90,7 @@ mod tests {
     fn signs_and_order_are_those_of_svox2() {
         // At (x, y, z) = (0.48, 0.6, 0.64): −y, z, −x in front of 0.4886; xy > 0, −yz < 0, 2z² − x² − y² = 0.2288, −xz < 0, x² − y² = −0.1296.
         let b = basis(&Tensor::from_vec(vec![0.48, 0.6, 0.64], &[1, 3]), 2);
-        let want = [0.282_095, -0.293_162, 0.312_706, -0.234_529, 0.314_654, -0.419_539, 0.072_162, -0.335_631, -0.070_797];
+        let want: [f64; 9] = [0.282_095, -0.293_162, 0.312_706, -0.234_529, 0.314_654, -0.419_539, 0.072_162, -0.335_631, -0.070_797];
         for (got, want) in b.data().iter().zip(want) {
             assert!((got - want).abs() < 1e-5, "{got} against {want}");
         }

@@ -1,0 +1,69 @@
+//! Single ops at the sizes of the scripts they are compared with: `fwd_ms` forward, `ms` forward and backward from a given cotangent.
+//!
+//!     cargo bench --bench ops
+//!     cargo bench --bench ops -- exp gather4 --repeats 21
+
+mod support;
+
+use autograd::{Buffer, Indices, Tensor, add_rows};
+use std::hint::black_box;
+use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat};
+
+const PICKS: usize = 1_000_000;
+const SIDE: usize = 128;
+const ROWS: usize = SIDE * SIDE * SIDE;
+
+fn tensor(shape: &[usize], seed: u64) -> Tensor<f32> {
+    // Through a pooled buffer, as the tables of a model are.
+    Tensor::from_buffer(Buffer::copy_of(&numbers(shape.iter().product(), seed)), shape)
+}
+
+fn row(args: &Arguments, name: &str, inputs: &[&[usize]], f: impl Fn(&[Tensor<f32>]) -> Tensor<f32>) {
+    if !args.wants(name) {
+        return;
+    }
+    let constants: Vec<_> = inputs.iter().enumerate().map(|(i, shape)| tensor(shape, i as u64)).collect();
+    let forward = repeat(args.repeats, || drop(black_box(f(&constants))));
+    let cotangent = tensor(f(&constants).shape(), 99);
+    let variables: Vec<_> = constants.into_iter().map(Tensor::into_variable).collect();
+    let mut form = "";
+    let both = repeat(args.repeats, || {
+        let gradients = f(&variables).backward_from(&cotangent);
+        form = if variables.iter().any(|v| gradients.get(v).is_some_and(|g| g.as_rows().is_some())) { "rows" } else { "dense" };
+        drop(black_box(gradients));
+    });
+    print(name, Some(median(&forward)), &both, form);
+}
+
+fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str) {
+    let row = serde_json::json!({
+        "workload": format!("op:{name}"), "fwd_ms": forward, "ms": median(both), "ms_min": both[0], "ms_max": both[both.len() - 1],
+        "n": both.len(), "gradient": form, "peak_rss_mb": peak_memory_mb(),
+    });
+    println!("{row}");
+}
+
+fn main() {
+    let args = arguments();
+    let picks: Indices = numbers(PICKS, 7).iter().map(|x| ((x * ROWS as f32) as u32).min(ROWS as u32 - 1)).collect::<Vec<_>>().into();
+    for width in [4, 28] {
+        row(&args, &format!("gather{width}"), &[&[ROWS, width]], |x| x[0].gather_rows(&picks));
+    }
+    let points = Tensor::from_vec(numbers(3 * PICKS, 8).iter().map(|x| x * (SIDE - 1) as f32).collect(), &[PICKS, 3]);
+    row(&args, "trilinear28", &[&[ROWS, 28]], |x| x[0].trilinear(&points, [SIDE; 3]));
+    row(&args, "excumsum_5000x200", &[&[5000, 200]], |x| x[0].exclusive_cumsum(1));
+    row(&args, "exp_5000x200", &[&[5000, 200]], |x| x[0].exp());
+    row(&args, "exp_16M", &[&[16_000_000]], |x| x[0].exp());
+    row(&args, "mulsum_5000x200x3", &[&[5000, 200], &[5000, 200, 3]], |x| (x[0].unsqueeze(2) * &x[1]).sum_axis(1));
+    row(&args, "matmul_1024", &[&[1024, 1024], &[1024, 1024]], |x| x[0].matmul(&x[1]));
+    row(&args, "matmul_65536x32x64", &[&[65536, 32], &[32, 64]], |x| x[0].matmul(&x[1]));
+    row(&args, "sum_16M", &[&[16_000_000]], |x| x[0].sum());
+    for width in [4, 28] {
+        let name = format!("scatter_add{width}");
+        if args.wants(&name) {
+            let (mut table, values) = (Buffer::zeros(ROWS * width), numbers(PICKS * width, 9));
+            let times = repeat(args.repeats, || add_rows(&mut table, width, &picks, &values));
+            print(&name, None, &times, "in place");
+        }
+    }
+}

@@ -1,0 +1,161 @@
+//! `plenoxel evaluate`: figures of a trained run on the views of a split.
+
+use super::train::load;
+use crate::data::DataSource;
+use crate::evaluation::{Scores, ViewScore, Viewer, with_samples};
+use crate::memory::{self, Estimate};
+use crate::progress::Console;
+use crate::run_folder::RunFolder;
+use clap::{Args, ValueHint};
+use plenoxel::dataset::Split;
+use plenoxel::error::{Error, Result};
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use std::time::Instant;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel evaluate runs/lego                      at the resolution it was trained at
+  plenoxel evaluate runs/lego --downscale 1        at full resolution
+  plenoxel evaluate runs/lego --split val --json
+
+PSNR and SSIM are means over views; predictions are clamped to [0, 1] and not rounded to 8 bits. ssim counts windows that
+lie inside the image, ssim_same pads with zeros as svox2 does. The last line on stdout is one JSON object.";
+
+/// Compute PSNR and SSIM of a trained run on the views of a split
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub struct EvaluateArgs {
+    /// Run folder that `plenoxel train` wrote
+    #[arg(value_hint = ValueHint::DirPath)]
+    run: PathBuf,
+
+    /// Where the dataset is now [default: where it was when training]
+    #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
+    data: Option<PathBuf>,
+
+    /// Views to compare with
+    #[arg(long, help_heading = "Scene", default_value_t = Split::Test, value_parser = super::split)]
+    split: Split,
+
+    /// Reduce the images by this factor [default: as in training]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::factor)]
+    downscale: Option<usize>,
+
+    /// Samples on a ray: on the longest one through the box, or on the source paper's fixed length where the run uses it
+    /// [default: the run's `evaluation` setting]
+    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = clap::value_parser!(u32).range(2..=100_000))]
+    samples: Option<u32>,
+
+    /// Print the JSON object alone
+    #[arg(long, help_heading = "Output")]
+    json: bool,
+}
+
+/// Evaluates a run.
+pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
+    let (folder, mut config, record) = RunFolder::open(&args.run)?;
+    config.downscale = args.downscale.unwrap_or(config.downscale);
+    let source = args.data.as_deref().map_or(record.data, DataSource::folder);
+    let start = Instant::now();
+    let dataset = source.reopen(&config)?;
+    let views = dataset.count(args.split);
+    if views == 0 {
+        let found = format!("{}, which has no views in {},", args.split, dataset.name());
+        let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
+        let others: Vec<String> = others.map(|split| split.to_string()).collect();
+        return Err(Error::config("--split", found, others.join(", ")));
+    }
+    let (grid, header) = folder.load()?;
+    let sampling = match args.samples {
+        Some(samples) => with_samples(config.evaluation, samples as usize, &grid),
+        None => config.evaluation,
+    };
+    let estimate =
+        Estimate::of_evaluation(&config, sampling, grid.shape(), &dataset, Some(args.split));
+    console.note(&estimate.describe());
+    estimate.check()?;
+    let views = load(console, &dataset, args.split, &source)?;
+    let seconds_load = start.elapsed().as_secs_f64();
+
+    let start = Instant::now();
+    let viewer = Viewer::new(&grid, sampling, config.background);
+    let count = console.count("evaluating", views.len());
+    let scores = viewer.compare(&views, |i, _, _, _| {
+        count.at(i + 1, views.len());
+        Ok(())
+    })?;
+    drop(count);
+
+    let (width, height) = dataset.size();
+    if !args.json {
+        for view in &scores.per_view {
+            let ssim = view.ssim.map_or("-".to_owned(), |ssim| format!("{ssim:.4}"));
+            console.result(&format!("{:24} {:7.2} dB  ssim {ssim}", view.name, view.psnr))?;
+        }
+        console.result(&sentence(&scores, args.split, width, height))?;
+    }
+    let trained = folder.result().unwrap_or(Value::Null);
+    let figures = Figures {
+        psnr: scores.psnr(),
+        ssim: scores.ssim(),
+        ssim_same: scores.ssim_same(),
+        split: args.split.to_string(),
+        views: views.len(),
+        width,
+        height,
+        background: config.background,
+        sampling: json!(sampling),
+        seconds: trained["seconds"].as_f64(),
+        seconds_load,
+        seconds_evaluate: start.elapsed().as_secs_f64(),
+        peak_memory_bytes: memory::peak(),
+        steps: header.step,
+        rays: trained["rays"].as_u64(),
+        resolution: header.resolution,
+        scene: header.scene,
+        preset: record.preset,
+        run: args.run.display().to_string(),
+        per_view: scores.per_view,
+    };
+    console.result(&json!(figures).to_string())
+}
+
+/// The figures as people say them.
+pub fn sentence(scores: &Scores, split: Split, width: usize, height: usize) -> String {
+    let Some(psnr) = scores.psnr() else {
+        return format!("no {split} views to evaluate on");
+    };
+    let ssim = match scores.ssim() {
+        Some(ssim) => format!(", SSIM {ssim:.4}"),
+        None => String::new(),
+    };
+    let views = scores.per_view.len();
+    format!("PSNR {psnr:.2} dB{ssim}: means over {views} {split} views of {width} x {height}")
+}
+
+/// What `evaluate` prints last. `seconds` is the training time that the run remembers.
+#[derive(Debug, Serialize)]
+struct Figures {
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    ssim_same: Option<f64>,
+    split: String,
+    views: usize,
+    width: usize,
+    height: usize,
+    background: [f32; 3],
+    sampling: Value,
+    seconds: Option<f64>,
+    seconds_load: f64,
+    seconds_evaluate: f64,
+    peak_memory_bytes: Option<u64>,
+    steps: u64,
+    rays: Option<u64>,
+    resolution: usize,
+    scene: String,
+    preset: Option<String>,
+    run: String,
+    per_view: Vec<ViewScore>,
+}

@@ -1,0 +1,154 @@
+//! `plenoxel info`: what a run, a checkpoint or a dataset is, and what machine this is.
+
+use crate::data::DataSource;
+use crate::machine;
+use crate::memory;
+use crate::progress::{Console, bytes, clock};
+use crate::run_folder::RunFolder;
+use clap::{Args, ValueHint};
+use plenoxel::checkpoint::{self, Header};
+use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
+use plenoxel::error::{Error, Result};
+use plenoxel::field::voxel_grid::VoxelGrid;
+use std::path::{Path, PathBuf};
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel info                                    this machine
+  plenoxel info data/lego                          a dataset
+  plenoxel info runs/lego                          a run
+  plenoxel info runs/lego/checkpoint.safetensors   a trained grid";
+
+/// Say what a run, a checkpoint or a dataset is: format, sizes, conventions, memory
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub struct InfoArgs {
+    /// Run folder, checkpoint, or folder of a dataset; without it, the machine alone
+    #[arg(value_hint = ValueHint::AnyPath)]
+    path: Option<PathBuf>,
+}
+
+/// Describes what is at a path.
+pub fn run(args: &InfoArgs, console: &Console<'_>) -> Result<()> {
+    if let Some(path) = &args.path {
+        let lines = describe(path)?;
+        lines.iter().try_for_each(|(key, value)| row(console, key, value))?;
+    }
+    row(console, "instructions", machine::instruction_set())?;
+    row(console, "threads", &machine::threads().to_string())?;
+    if let Some(available) = memory::available() {
+        row(console, "free memory", &bytes(available))?;
+    }
+    row(console, "program", crate::PROGRAM)
+}
+
+type Lines = Vec<(&'static str, String)>;
+
+fn row(console: &Console<'_>, key: &str, value: &str) -> Result<()> {
+    console.result(&format!("{key:14} {value}"))
+}
+
+fn describe(path: &Path) -> Result<Lines> {
+    if path.is_file() {
+        let (grid, header) = checkpoint::load(path)?;
+        let mut lines = vec![("checkpoint", path.display().to_string())];
+        lines.extend(of_grid(&grid, &header));
+        return Ok(lines);
+    }
+    if path.join("run.json").is_file() {
+        return of_run(path);
+    }
+    if path.is_dir() && !path.join("transforms_train.json").is_file() {
+        let opened = dataset::open(path, &OpenOptions::default());
+        return opened.map(|dataset| of_dataset(path, &dataset)).map_err(|e| match e {
+            Error::Input { path, found, remedy } => {
+                let found = format!("neither a run (no run.json) nor a dataset: {found}");
+                Error::input(path, found, remedy)
+            }
+            other => other,
+        });
+    }
+    let dataset = dataset::open(path, &OpenOptions::default())?;
+    Ok(of_dataset(path, &dataset))
+}
+
+fn of_run(path: &Path) -> Result<Lines> {
+    let (folder, config, record) = RunFolder::open(path)?;
+    let mut lines = vec![
+        ("run", path.display().to_string()),
+        ("scene", format!("{} ({})", record.scene, record.format)),
+        ("made by", format!("{} with {}", record.program, record.instruction_set)),
+        ("preset", record.preset.unwrap_or_else(|| "none".to_owned())),
+    ];
+    let data = match &record.data {
+        DataSource::Folder { path } if path.exists() => path.display().to_string(),
+        DataSource::Folder { path } => format!("{}, not there any more", path.display()),
+        DataSource::BuiltIn { width, height, train, val, test } => {
+            format!("built in, {width} x {height}, {train} train, {val} val, {test} test views")
+        }
+    };
+    lines.push(("data", data));
+    let stages = config.stages.iter().map(|stage| format!("{}³", stage.resolution));
+    lines.push(("stages", stages.collect::<Vec<_>>().join(", ")));
+    if folder.checkpoint().exists() {
+        let (grid, header) = folder.load()?;
+        lines.extend(of_grid(&grid, &header));
+    } else {
+        lines.push(("grid", "none: the run did not end".to_owned()));
+    }
+    if let Some(result) = folder.result() {
+        let number = |key: &str| result[key].as_f64();
+        if let (Some(psnr), Some(seconds)) = (number("psnr"), number("seconds")) {
+            let ssim = number("ssim").map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));
+            lines.push(("test", format!("PSNR {psnr:.2} dB{ssim}, trained in {}", clock(seconds))));
+        }
+    }
+    Ok(lines)
+}
+
+fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
+    let shape = grid.shape();
+    let n = shape.resolution;
+    let color = match header.sh_degree {
+        None => "RGB".to_owned(),
+        Some(degree) => format!("spherical harmonics of degree {degree}, offset {}", header.sh_offset),
+    };
+    let density = grid.density.tensor().data();
+    let matter = density.iter().filter(|d| **d > 0.0).count() as f64 / density.len() as f64;
+    let largest = density.iter().copied().fold(0.0, f32::max);
+    vec![
+        ("grid", format!("{n}³ voxels of side {:.5} in [-{w}, {w}]³", shape.voxel_side(), w = shape.half_width)),
+        ("convention", checkpoint::CONVENTION.to_owned()),
+        ("interpolation", format!("{:?}", shape.interpolation).to_lowercase()),
+        ("color", color),
+        ("density", format!("{:.1} % of voxels above 0, at most {largest:.1} per unit length", 100.0 * matter)),
+        ("background", format!("{:?}", header.background)),
+        ("memory", bytes(shape.bytes() as u64)),
+        ("trained", format!("{} steps on {}, seed {}, by {}", header.step, header.scene, header.seed, header.writer)),
+    ]
+}
+
+fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
+    let (width, height) = dataset.size();
+    let views = Split::ALL.map(|split| format!("{} {split}", dataset.count(split)));
+    let all: usize = Split::ALL.iter().map(|split| dataset.count(*split)).sum();
+    let mut lines = vec![
+        ("dataset", path.display().to_string()),
+        ("scene", dataset.name().to_owned()),
+        ("format", dataset.format().to_owned()),
+        ("views", views.join(", ")),
+        ("size", format!("{width} x {height} pixels")),
+        ("memory", format!("{} as 8-bit RGBA", bytes((4 * width * height * all) as u64))),
+        ("convention", "camera to world; camera axes x right, y up, z backwards (OpenGL); world z up".to_owned()),
+    ];
+    let cameras: Vec<_> = Split::ALL.iter().flat_map(|split| dataset.cameras(*split)).collect();
+    let distances = cameras.iter().map(|camera| camera.position().length());
+    let nearest = distances.clone().fold(f64::INFINITY, f64::min);
+    let farthest = distances.fold(0.0, f64::max);
+    if let Some(camera) = cameras.first() {
+        let k = &camera.intrinsics;
+        let fov = k.fov_x().to_degrees();
+        lines.push(("cameras", format!("focal length {:.2} pixels ({fov:.1}° across), {nearest:.3} to {farthest:.3} from the origin", k.fx)));
+    }
+    lines
+}

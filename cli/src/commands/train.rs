@@ -1,0 +1,330 @@
+//! `plenoxel train`: from photographs to a run folder.
+
+mod flags;
+mod pictures;
+
+use crate::config;
+use crate::curves::loss_svg;
+use crate::data::DataSource;
+use crate::evaluation::{self, Scores, ViewScore, Viewer};
+use crate::machine;
+use crate::memory::{self, Estimate};
+use crate::metrics_file::MetricsFile;
+use crate::progress::{Console, clock};
+use crate::run_folder::{RunFolder, RunRecord};
+pub use flags::{TrainArgs, size};
+use pictures::Pictures;
+use plenoxel::checkpoint::Header;
+use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::error::Result;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::train::config::Config;
+use plenoxel::train::Trainer;
+use serde::Serialize;
+use serde_json::json;
+use std::time::{Duration, Instant};
+
+/// Learns a scene and leaves a run folder.
+pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
+    let source = args.source();
+    let (config, preset) = args.config()?;
+    let mut clocks = Clocks::default();
+    let dataset = clocks.load.time(|| source.open(&config))?;
+    announce(console, &dataset, &config);
+    let estimate = Estimate::of_training(&config, &dataset);
+    console.note(&estimate.describe());
+    estimate.check()?;
+    let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
+    let views = clocks
+        .load
+        .time(|| load(console, &dataset, Split::Train, &source))?;
+
+    // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
+    folder.prepare()?;
+    folder.describe(&config, &record(&dataset, preset, &source))?;
+    console.note(&format!("run: {}", folder.path().display()));
+    let mut pictures = Pictures::new(&folder, &config, &dataset, !args.no_images)?;
+    let mut learned = learn(
+        &config,
+        &views,
+        &folder,
+        args.keeps_stages(),
+        console,
+        &mut clocks,
+        &mut pictures,
+    )?;
+    let header = Header::new(
+        &learned.grid,
+        dataset.name(),
+        config.background,
+        config.seed,
+        learned.steps,
+    );
+    folder.save(&learned.grid, &header)?;
+    let mean_image = evaluation::mean_image(&views, config.background);
+    drop(views);
+
+    let test = clocks
+        .load
+        .time(|| load(console, &dataset, Split::Test, &source))?;
+    for stage in &mut learned.stages {
+        if let Some(grid) = stage.grid.take() {
+            let viewer = Viewer::new(&grid, config.evaluation, config.background);
+            let scores = clocks
+                .evaluate
+                .time(|| viewer.compare(&test, |_, _, _, _| Ok(())))?;
+            stage.psnr = scores.psnr();
+        }
+    }
+    let viewer = Viewer::new(&learned.grid, config.evaluation, config.background);
+    let count = console.count("evaluating", test.len());
+    let start = Instant::now();
+    let mut drawing = Stopwatch::default();
+    let scores = viewer.compare(&test, |i, view, target, picture| {
+        count.at(i + 1, test.len());
+        drawing.time(|| pictures.panel(i, view, target, picture))
+    })?;
+    drop(count);
+    clocks.evaluate.0 += start.elapsed() - drawing.0;
+    pictures.strip(test.first(), config.background)?;
+    if let (Some(last), Some(psnr)) = (learned.stages.last_mut(), scores.psnr()) {
+        last.psnr = Some(psnr);
+    }
+
+    let (width, height) = dataset.size();
+    let summary = Summary {
+        psnr: scores.psnr(),
+        ssim: scores.ssim(),
+        ssim_same: scores.ssim_same(),
+        baseline_background_psnr: evaluation::background_psnr(&test, config.background),
+        baseline_mean_image_psnr: mean_image
+            .and_then(|image| evaluation::constant_psnr(&test, &image, config.background)),
+        views: test.len(),
+        width,
+        height,
+        background: config.background,
+        seconds: clocks.train.seconds(),
+        seconds_load: clocks.load.seconds(),
+        seconds_evaluate: clocks.evaluate.seconds(),
+        peak_memory_bytes: memory::peak(),
+        steps: learned.steps,
+        rays: learned.rays,
+        samples: learned.samples,
+        resolution: learned.grid.shape().resolution,
+        scene: dataset.name().to_owned(),
+        preset: preset.map(str::to_owned),
+        run: folder.path().display().to_string(),
+        stages: learned.stages,
+        per_view: scores.per_view.clone(),
+    };
+    folder.write_result(&summary)?;
+    learned.metrics.append(&json!({ "final": &summary }))?;
+    conclude(console, &folder, &summary, &scores, &pictures)
+}
+
+/// A trained grid and how it came about.
+struct Learned {
+    grid: VoxelGrid<f32>,
+    metrics: MetricsFile,
+    stages: Vec<StageSummary>,
+    steps: u64,
+    rays: u64,
+    samples: u64,
+}
+
+/// The training itself; only it is on the clock for training.
+fn learn(
+    config: &Config,
+    views: &[View],
+    folder: &RunFolder,
+    keep_stages: bool,
+    console: &Console<'_>,
+    clocks: &mut Clocks,
+    pictures: &mut Pictures<'_>,
+) -> Result<Learned> {
+    let clock = &mut clocks.train;
+    let mut trainer = clock.time(|| Trainer::<f32>::new(config.clone(), views))?;
+    let plan = trainer.plan().to_vec();
+    let total = trainer.total_steps();
+    let mut metrics = MetricsFile::create(&folder.metrics(), total)?;
+    let mut progress = console.training(&plan);
+    let (mut losses, mut stages) = (Vec::new(), Vec::new());
+    let title = format!("Training loss of {}", folder.path().display());
+    loop {
+        let report = match clock.time(|| trainer.step()) {
+            Ok(Some(report)) => report,
+            Ok(None) => break,
+            Err(e) => {
+                // The lines and the curve so far stay, to show how it came to this; there is no checkpoint.
+                metrics.append(&json!({ "step": losses.len(), "failure": e.to_string() }))?;
+                folder.write_loss(&loss_svg(&losses, &plan, &title))?;
+                return Err(e);
+            }
+        };
+        let seconds = clock.seconds();
+        losses.push(report.loss);
+        metrics.step(&report, &plan, seconds)?;
+        progress.step(&report, seconds);
+        if report.ends_stage {
+            folder.write_loss(&loss_svg(&losses, &plan, &title))?;
+            let grid = trainer.grid();
+            pictures.stage(report.stage, grid)?;
+            let last = report.step + 1 == total;
+            stages.push(StageSummary {
+                resolution: grid.shape().resolution,
+                steps: plan[report.stage].steps,
+                seconds,
+                psnr: None,
+                grid: (keep_stages && !last).then(|| copy(grid)),
+            });
+        }
+    }
+    drop(progress);
+    let (rays, samples) = metrics.counts();
+    Ok(Learned {
+        grid: trainer.into_grid(),
+        metrics,
+        stages,
+        steps: total,
+        rays,
+        samples,
+    })
+}
+
+/// A grid with the values that `grid` has now: the tables are shared until training changes them.
+fn copy(grid: &VoxelGrid<f32>) -> VoxelGrid<f32> {
+    let (density, color) = (grid.density.tensor().detach(), grid.color.tensor().detach());
+    VoxelGrid::from_tables(*grid.shape(), density, color)
+}
+
+/// Final figures, in the order in which people look for them.
+#[derive(Debug, Serialize)]
+struct Summary {
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    ssim_same: Option<f64>,
+    baseline_background_psnr: Option<f64>,
+    baseline_mean_image_psnr: Option<f64>,
+    views: usize,
+    width: usize,
+    height: usize,
+    background: [f32; 3],
+    seconds: f64,
+    seconds_load: f64,
+    seconds_evaluate: f64,
+    peak_memory_bytes: Option<u64>,
+    steps: u64,
+    rays: u64,
+    samples: u64,
+    resolution: usize,
+    scene: String,
+    preset: Option<String>,
+    run: String,
+    stages: Vec<StageSummary>,
+    per_view: Vec<ViewScore>,
+}
+
+/// A stage in the final figures.
+#[derive(Debug, Serialize)]
+struct StageSummary {
+    resolution: usize,
+    steps: u64,
+    /// Of training, when it ended.
+    seconds: f64,
+    /// Of the test views, if the grid was kept until they were read.
+    psnr: Option<f64>,
+    #[serde(skip)]
+    grid: Option<VoxelGrid<f32>>,
+}
+
+/// What time was spent on; pictures are on none of the clocks.
+#[derive(Debug, Default)]
+struct Clocks {
+    load: Stopwatch,
+    train: Stopwatch,
+    evaluate: Stopwatch,
+}
+
+#[derive(Debug, Default)]
+struct Stopwatch(Duration);
+
+impl Stopwatch {
+    fn time<R>(&mut self, f: impl FnOnce() -> R) -> R {
+        let start = Instant::now();
+        let result = f();
+        self.0 += start.elapsed();
+        result
+    }
+
+    fn seconds(&self) -> f64 {
+        self.0.as_secs_f64()
+    }
+}
+
+/// Reads or renders a split.
+pub fn load(
+    console: &Console<'_>,
+    dataset: &Dataset,
+    split: Split,
+    source: &DataSource,
+) -> Result<Vec<View>> {
+    let what = match source {
+        DataSource::Folder { .. } => format!("reading {split} images"),
+        DataSource::BuiltIn { .. } => format!("rendering {split} images of the built-in scene"),
+    };
+    let count = console.count(&what, dataset.count(split));
+    dataset.load(split, &|done, total| count.at(done, total))
+}
+
+fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
+    let (width, height) = dataset.size();
+    let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
+    console.note(&format!(
+        "scene: {} ({}), {train} train, {val} val, {test} test views of {width} x {height}, background {:?}, half width {}",
+        dataset.name(),
+        dataset.format(),
+        config.background,
+        config.half_width,
+    ));
+    console.note(&format!(
+        "machine: {}, {} threads",
+        machine::instruction_set(),
+        machine::threads()
+    ));
+}
+
+fn record(dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> RunRecord {
+    RunRecord {
+        program: crate::PROGRAM.to_owned(),
+        instruction_set: machine::instruction_set().to_owned(),
+        threads: machine::threads(),
+        scene: dataset.name().to_owned(),
+        format: dataset.format().to_owned(),
+        preset: preset.map(str::to_owned),
+        data: source.clone(),
+    }
+}
+
+fn conclude(
+    console: &Console<'_>,
+    folder: &RunFolder,
+    summary: &Summary,
+    scores: &Scores,
+    pictures: &Pictures<'_>,
+) -> Result<()> {
+    if let Some(note) = pictures.note() {
+        console.note(&note);
+    }
+    let decibels = |x: Option<f64>| x.map_or("none".to_owned(), |x| format!("{x:.2} dB"));
+    console.note(&format!(
+        "trained {} steps in {}; background alone {}, mean training image {}",
+        summary.steps,
+        clock(summary.seconds),
+        decibels(summary.baseline_background_psnr),
+        decibels(summary.baseline_mean_image_psnr),
+    ));
+    console.result(&super::evaluate::sentence(scores, Split::Test, summary.width, summary.height))?;
+    console.result(&format!("run folder: {}", folder.path().display()))?;
+    console.result(&json!(summary).to_string())
+}
+

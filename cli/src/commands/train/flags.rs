@@ -1,0 +1,237 @@
+//! The flags of `train`, and the configuration they amount to.
+
+use crate::config::{ConfigFile, Layers, PRESETS};
+use crate::data::DataSource;
+use clap::builder::PossibleValuesParser;
+use clap::{Args, ValueHint};
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::error::Result;
+use plenoxel::train::config::Config;
+use std::path::PathBuf;
+use toml::Value;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel train                                   the built-in scene, into runs/procedural-1
+  plenoxel train data/lego --out runs/lego         a NeRF-synthetic folder
+  plenoxel train data/lego --preset paper --tv 1e-4
+  plenoxel train data/lego --downscale 4 --half-width 1.3 --set stages[*].density_rate=30
+  plenoxel train data/lego --config runs/lego/config.toml --seed 7
+
+Settings are layered: defaults < preset < --config < flags. config.toml in the run folder lists all of them; --set
+reaches each by its path there, such as stages[0].sampling.step. The last line on stdout is one JSON object.";
+
+/// Learn a scene and leave a run folder with the trained grid, pictures and figures
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
+pub struct TrainArgs {
+    /// Folder of a dataset in the NeRF-synthetic format; without it, the built-in scene
+    #[arg(value_hint = ValueHint::DirPath)]
+    data: Option<PathBuf>,
+
+    /// Folder to write [default: runs/<scene>-<n>, the first free n]
+    #[arg(long, short, help_heading = "Output", value_hint = ValueHint::DirPath)]
+    pub out: Option<PathBuf>,
+
+    /// Overwrite the run in the folder
+    #[arg(long, help_heading = "Output")]
+    pub force: bool,
+
+    /// Write no pictures
+    #[arg(long, help_heading = "Output")]
+    pub no_images: bool,
+
+    /// Also compute the PSNR of the test views at the end of each earlier stage, which takes about as long as the final
+    /// evaluation [default: only for the built-in scene]
+    #[arg(long, help_heading = "Output")]
+    stage_psnr: bool,
+
+    /// Settings to start from [default: demo for the built-in scene, standard for a folder]
+    #[arg(long, help_heading = "Settings", value_parser = PossibleValuesParser::new(PRESETS.map(|(name, ..)| name)))]
+    preset: Option<String>,
+
+    /// TOML file that changes the preset; a complete one, such as the config.toml of a run, replaces it
+    #[arg(long, value_name = "FILE", help_heading = "Settings", value_hint = ValueHint::FilePath)]
+    config: Option<PathBuf>,
+
+    /// Set any key of the configuration; may be repeated. Nothing after the = removes an optional key
+    #[arg(long, value_name = "KEY=VALUE", help_heading = "Settings")]
+    set: Vec<String>,
+
+    /// Seed of everything random [default: 42]
+    #[arg(long, help_heading = "Settings", value_parser = clap::value_parser!(i64).range(0..))]
+    seed: Option<i64>,
+
+    /// Reduce the images by this factor, which must divide their width and height
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = clap::value_parser!(i64).range(1..=64))]
+    downscale: Option<i64>,
+
+    /// Color behind the scene: white, black, or three numbers r,g,b in [0, 1] [default: white]
+    #[arg(long, help_heading = "Scene", value_parser = background)]
+    background: Option<[f64; 3]>,
+
+    /// Half the side of the cube in which the scene lies, in the dataset's units [default: 1.5; preset paper: 1.4]
+    #[arg(long, value_name = "LENGTH", help_heading = "Scene")]
+    half_width: Option<f64>,
+
+    /// Size of the built-in scene's images in pixels, SIDE or WIDTHxHEIGHT [default: 200]
+    #[arg(long, value_name = "SIZE", help_heading = "Scene", value_parser = size, conflicts_with = "data")]
+    scene_size: Option<(usize, usize)>,
+
+    /// Number of training, validation and test views of the built-in scene [default: 100,10,25]
+    #[arg(long, value_name = "TRAIN,VAL,TEST", help_heading = "Scene", value_parser = three_counts, conflicts_with = "data")]
+    scene_views: Option<[usize; 3]>,
+
+    /// How values between voxel centres are found
+    #[arg(long, help_heading = "Model", value_parser = ["nearest", "trilinear"])]
+    interpolation: Option<String>,
+
+    /// Meaning of a voxel's color: one color, or spherical harmonics of the direction of view
+    #[arg(long, help_heading = "Model", value_parser = ["rgb", "sh"])]
+    color: Option<String>,
+
+    /// Degree of the spherical harmonics, 0 to 3; implies --color sh
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = clap::value_parser!(i64).range(0..=3))]
+    sh_degree: Option<i64>,
+
+    /// What computes the pixels of a training step
+    #[arg(long, help_heading = "Training", value_parser = ["graph"])]
+    engine: Option<String>,
+
+    /// Total variation over the whole grid at the source paper's weight: W (Σ over color channels / 3 + density) / 2, which is
+    /// tv_color = tv_density = W / 2, since tv_color is a mean over channels
+    #[arg(long, value_name = "W", help_heading = "Training", value_parser = weight)]
+    tv: Option<f64>,
+}
+
+impl TrainArgs {
+    /// Where the views come from.
+    pub fn source(&self) -> DataSource {
+        if let Some(path) = &self.data {
+            return DataSource::folder(path);
+        }
+        let default = ProceduralOptions::default();
+        let (width, height) = self.scene_size.unwrap_or((default.width, default.height));
+        let views = [default.train, default.val, default.test];
+        let [train, val, test] = self.scene_views.unwrap_or(views);
+        DataSource::built_in(&ProceduralOptions {
+            width,
+            height,
+            train,
+            val,
+            test,
+            ..default
+        })
+    }
+
+    /// True if the grids of earlier stages are evaluated too.
+    pub fn keeps_stages(&self) -> bool {
+        self.stage_psnr || self.data.is_none()
+    }
+
+    /// The configuration, and the preset it started from.
+    pub fn config(&self) -> Result<(Config, Option<&str>)> {
+        let file = self.config.as_deref().map(ConfigFile::read).transpose()?;
+        let complete = file.as_ref().is_some_and(ConfigFile::is_complete);
+        let default = if self.data.is_some() { "standard" } else { "demo" };
+        let preset = match &self.preset {
+            Some(preset) => Some(preset.as_str()),
+            None => (!complete).then_some(default),
+        };
+        let mut layers = Layers::defaults()?;
+        if let Some(preset) = preset {
+            layers.preset(preset)?;
+        }
+        if let Some(file) = &file {
+            layers.file(file)?;
+        }
+        self.flags(&mut layers)?;
+        Ok((layers.resolve()?, preset))
+    }
+
+    fn flags(&self, layers: &mut Layers) -> Result<()> {
+        let integer = |value: Option<i64>| value.map(Value::Integer);
+        let text = |value: &Option<String>| value.clone().map(Value::String);
+        let color = match (&self.color, self.sh_degree) {
+            (None, Some(_)) => Some(Value::String("sh".to_owned())),
+            (color, _) => text(color),
+        };
+        let background = self.background.map(|c| Value::Array(c.map(Value::Float).to_vec()));
+        let tv = self.tv.map(|weight| Value::Float(0.5 * weight));
+        for (flag, path, value) in [
+            ("--seed", "seed", integer(self.seed)),
+            ("--downscale", "downscale", integer(self.downscale)),
+            ("--background", "background", background),
+            ("--half-width", "half_width", self.half_width.map(Value::Float)),
+            ("--interpolation", "interpolation", text(&self.interpolation)),
+            ("--color", "color", color),
+            ("--sh-degree", "sh_degree", integer(self.sh_degree)),
+            ("--engine", "engine", text(&self.engine)),
+            ("--tv", "losses.tv_density", tv.clone()),
+            ("--tv", "losses.tv_color", tv),
+        ] {
+            if let Some(value) = value {
+                layers.set(path, Some(value), flag)?;
+            }
+        }
+        self.set.iter().try_for_each(|assignment| layers.assign(assignment))
+    }
+}
+
+fn background(text: &str) -> std::result::Result<[f64; 3], String> {
+    match text {
+        "white" => return Ok([1.0; 3]),
+        "black" => return Ok([0.0; 3]),
+        _ => {}
+    }
+    let accepted = "white, black, or three numbers in [0, 1] such as 0.2,0.5,1";
+    let numbers: Vec<f64> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
+    let color: [f64; 3] = numbers.try_into().map_err(|_| accepted)?;
+    match text.matches(',').count() == 2 && color.iter().all(|c| (0.0..=1.0).contains(c)) {
+        true => Ok(color),
+        false => Err(accepted.to_owned()),
+    }
+}
+
+/// Width and height from `SIDE` or `WIDTHxHEIGHT`.
+pub fn size(text: &str) -> std::result::Result<(usize, usize), String> {
+    let (width, height) = text.split_once('x').unwrap_or((text, text));
+    match (width.parse(), height.parse()) {
+        (Ok(width), Ok(height)) if width > 0 && height > 0 => Ok((width, height)),
+        _ => Err("a number of pixels, or WIDTHxHEIGHT such as 320x240".to_owned()),
+    }
+}
+
+fn three_counts(text: &str) -> std::result::Result<[usize; 3], String> {
+    let counts: Vec<usize> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
+    let fits = counts.len() == text.split(',').count();
+    let counts = counts.try_into().ok().filter(|_| fits);
+    counts.ok_or_else(|| "three numbers of views such as 100,10,25".to_owned())
+}
+
+fn weight(text: &str) -> std::result::Result<f64, String> {
+    let weight = text.parse().ok();
+    weight
+        .filter(|w: &f64| w.is_finite() && *w >= 0.0)
+        .ok_or_else(|| "a number of at least 0, such as 1e-4".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colors_sizes_and_counts_are_read_or_refused() {
+        assert_eq!(background("0.25, 0.5,1").unwrap(), [0.25, 0.5, 1.0]);
+        for wrong in ["gray", "1,2,3", "0.1,0.2", "0,0,0,0", "NaN,0,0", "0,0,x"] {
+            assert!(background(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!(size("32"), Ok((32, 32)));
+        assert_eq!(size("32x24"), Ok((32, 24)));
+        assert!(size("0").is_err() && size("3x").is_err() && size("-1").is_err());
+        assert_eq!(three_counts("6,1,3"), Ok([6, 1, 3]));
+        assert!(three_counts("6,1").is_err() && three_counts("6,x,3").is_err());
+        assert_eq!(weight("1e-4"), Ok(1e-4));
+        assert!(weight("-1").is_err() && weight("inf").is_err());
+    }
+}

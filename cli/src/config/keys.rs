@@ -1,0 +1,184 @@
+//! The keys that a configuration may have, so that a misspelled one is an error that names the right one.
+
+use plenoxel::error::{Error, Result};
+use plenoxel::loss;
+use toml::{Table, Value};
+
+/// Every table with its keys. In a path, `[]` stands for any index and `*` for any name.
+const TABLES: &[(&str, &[&str])] = &[
+    (
+        "",
+        &[
+            "seed",
+            "downscale",
+            "validation_every",
+            "background",
+            "half_width",
+            "interpolation",
+            "color",
+            "sh_degree",
+            "sh_offset",
+            "engine",
+            "rays_per_step",
+            "jitter",
+            "project",
+            "prune_from_stage",
+            "prune_below",
+            "initial",
+            "optimizer",
+            "losses",
+            "stages",
+            "evaluation",
+        ],
+    ),
+    ("initial", &["density", "color", "random"]),
+    (
+        "optimizer",
+        &["kind", "decay", "beta", "beta1", "beta2", "epsilon"],
+    ),
+    ("losses", &loss::NAMES),
+    ("losses.*", &["from", "to", "steps"]),
+    (
+        "stages[]",
+        &[
+            "resolution",
+            "epochs",
+            "steps",
+            "sampling",
+            "density_rate",
+            "color_rate",
+            "rate_decay",
+        ],
+    ),
+    ("stages[].sampling", &["step", "samples", "far"]),
+    ("evaluation", &["step", "samples", "far"]),
+];
+
+/// Checks every key of a table and of the tables in it. `place(path)` says where a path was written.
+///
+/// Errors: the first unknown key, with where it is and the nearest known one.
+pub fn check_table(table: &Table, place: &dyn Fn(&str) -> String) -> Result<()> {
+    walk("", "", &Value::Table(table.clone()), place)
+}
+
+/// Checks a path such as `stages[0].sampling.step`, which `place` describes.
+pub fn check_path(path: &str, place: &str) -> Result<()> {
+    let mut pattern = String::new();
+    for segment in path.split('.') {
+        let (name, index) = match segment.split_once('[') {
+            Some((name, _)) => (name, "[]"),
+            None => (segment, ""),
+        };
+        check_key(&pattern, name, place)?;
+        pattern = joined(&pattern, name) + index;
+    }
+    Ok(())
+}
+
+fn walk(path: &str, pattern: &str, value: &Value, place: &dyn Fn(&str) -> String) -> Result<()> {
+    match value {
+        Value::Table(table) => table.iter().try_for_each(|(key, value)| {
+            let inner = joined(path, key);
+            check_key(pattern, key, &place(&inner))?;
+            walk(&inner, &joined(pattern, key), value, place)
+        }),
+        Value::Array(values) => values.iter().enumerate().try_for_each(|(i, value)| {
+            walk(
+                &format!("{path}[{i}]"),
+                &format!("{pattern}[]"),
+                value,
+                place,
+            )
+        }),
+        _ => Ok(()),
+    }
+}
+
+fn joined(path: &str, key: &str) -> String {
+    match path {
+        "" => key.to_owned(),
+        path => format!("{path}.{key}"),
+    }
+}
+
+fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
+    let known = TABLES.iter().find(|(table, _)| {
+        *table == pattern
+            || table
+                .strip_suffix('*')
+                .is_some_and(|start| pattern.starts_with(start))
+    });
+    let Some((_, known)) = known else {
+        let found = format!("the key `{key}` below `{pattern}`, which is no table,");
+        return Err(Error::config(
+            place,
+            found,
+            format!("a value for `{pattern}`"),
+        ));
+    };
+    if known.contains(&key) {
+        return Ok(());
+    }
+    // The nearest in spelling, if it is near; a word that resembles nothing gets the whole list.
+    let nearest = known
+        .iter()
+        .min_by_key(|name| distance(key, name))
+        .filter(|name| distance(key, name) <= 2 + name.len() / 4);
+    let accepted = match nearest {
+        Some(name) => format!("the nearest known key is `{name}`"),
+        None => format!("one of {}", known.join(", ")),
+    };
+    Err(Error::config(
+        place,
+        format!("the unknown key `{key}`"),
+        accepted,
+    ))
+}
+
+/// Levenshtein's edit distance.
+fn distance(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, x) in a.chars().enumerate() {
+        let mut diagonal = std::mem::replace(&mut row[0], i + 1);
+        for (j, y) in b.iter().enumerate() {
+            let replaced = diagonal + usize::from(x != *y);
+            diagonal = row[j + 1];
+            row[j + 1] = replaced.min(row[j] + 1).min(row[j + 1] + 1);
+        }
+    }
+    row[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use plenoxel::train::config::Config;
+
+    #[test]
+    fn the_top_level_keys_are_those_of_the_library() {
+        // The library lists its fields when it meets one it does not know.
+        let message = toml::from_str::<Config>("zzz = 1").unwrap_err().to_string();
+        let listed: Vec<&str> = message.split('`').skip(3).step_by(2).collect();
+        assert_eq!(listed, TABLES[0].1, "{message}");
+    }
+
+    #[test]
+    fn edits_are_counted() {
+        assert_eq!(distance("half_widht", "half_width"), 2);
+        assert_eq!(distance("", "abc"), 3);
+        assert_eq!(distance("stages", "stages"), 0);
+        assert_eq!(distance("kitten", "sitting"), 3);
+    }
+
+    #[test]
+    fn a_misspelled_path_is_answered_with_the_nearest_key() {
+        let message = |path: &str| check_path(path, "--set").unwrap_err().to_string();
+        assert!(message("stages[0].rezolution").contains("the nearest known key is `resolution`"));
+        assert!(message("losses.tv_densty").contains("`tv_density`"));
+        assert!(message("zzzzzzzzzz").contains("one of seed, downscale"));
+        assert!(message("seed.more").contains("which is no table"));
+        assert!(check_path("losses.mse.from", "--set").is_ok());
+        assert!(check_path("stages[*].sampling.step", "--set").is_ok());
+    }
+}

@@ -1,0 +1,102 @@
+//! Where views come from: a folder, or the built-in scene; written down in a run so that it can be evaluated later.
+
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::dataset::{self, Dataset, OpenOptions, image};
+use plenoxel::error::{Error, Result};
+use plenoxel::train::config::Config;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Where views come from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "kind")]
+pub enum DataSource {
+    /// A folder on disk.
+    Folder {
+        /// Absolute, so that a run can be evaluated from anywhere.
+        path: PathBuf,
+    },
+    /// The procedural scene.
+    BuiltIn {
+        /// Image width before any reduction, pixels.
+        width: usize,
+        /// Image height before any reduction, pixels.
+        height: usize,
+        /// Training views.
+        train: usize,
+        /// Validation views.
+        val: usize,
+        /// Test views.
+        test: usize,
+    },
+}
+
+impl DataSource {
+    /// A folder as given on the command line.
+    pub fn folder(path: &Path) -> Self {
+        // A folder that does not exist keeps its name for the error that opening it will give.
+        let absolute = path.canonicalize().or_else(|_| std::path::absolute(path));
+        DataSource::Folder {
+            path: absolute.unwrap_or_else(|_| path.to_owned()),
+        }
+    }
+
+    /// The built-in scene.
+    pub fn built_in(options: &ProceduralOptions) -> Self {
+        DataSource::BuiltIn {
+            width: options.width,
+            height: options.height,
+            train: options.train,
+            val: options.val,
+            test: options.test,
+        }
+    }
+
+    /// Opens the views with the reduction and the validation split of a configuration. The built-in scene is rendered at the reduced
+    /// size right away.
+    pub fn open(&self, config: &Config) -> Result<Dataset> {
+        let downscale = config.downscale;
+        match self {
+            DataSource::Folder { path } => {
+                let validation_every = match config.validation_every {
+                    0 => None,
+                    every => Some(every),
+                };
+                let options = OpenOptions {
+                    downscale,
+                    validation_every,
+                };
+                dataset::open(path, &options)
+            }
+            &DataSource::BuiltIn {
+                width,
+                height,
+                train,
+                val,
+                test,
+            } => {
+                image::check_downscale(downscale, (width, height))?;
+                Dataset::procedural(ProceduralOptions {
+                    width: width / downscale,
+                    height: height / downscale,
+                    train,
+                    val,
+                    test,
+                    ..ProceduralOptions::default()
+                })
+            }
+        }
+    }
+
+    /// Opens the views a run remembers; a folder that has gone is reported with the flag that says where it is now.
+    pub fn reopen(&self, config: &Config) -> Result<Dataset> {
+        match self {
+            DataSource::Folder { path } if !path.exists() => Err(Error::input(
+                path,
+                "the dataset this run learned from is not there any more",
+                "say where it is now with --data DIR",
+            )),
+            _ => self.open(config),
+        }
+    }
+}

@@ -1,0 +1,192 @@
+//! Pictures of results: panels target | render | error | depth, strips, and the color maps behind them.
+
+use ndarray::{Array2, Array3, Axis, concatenate, s};
+use plenoxel::camera::Camera;
+use plenoxel::error::Result;
+use plenoxel::render::picture::Picture;
+use std::path::Path;
+
+/// The error that gets the brightest color: the absolute difference, averaged over channels.
+pub const ERROR_SCALE: f32 = 0.25;
+
+/// A picture with values in [0, 1], `[h, w, 3]`.
+pub type Rgb = Array3<f32>;
+
+/// Distances that share the color map of depth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DepthRange {
+    /// Gets the brightest color.
+    pub near: f64,
+    /// Gets the darkest.
+    pub far: f64,
+}
+
+impl DepthRange {
+    /// The range for a camera: the ball that touches the faces of the box from inside. Cameras at one distance share it.
+    pub fn of(camera: &Camera, half_width: f64) -> Self {
+        let distance = camera.position().length();
+        DepthRange {
+            near: (distance - half_width).max(0.0),
+            far: distance + half_width,
+        }
+    }
+}
+
+/// Target, render, error and depth side by side.
+pub fn panel(target: &Rgb, picture: &Picture, range: DepthRange) -> Rgb {
+    let error = error_map(target, picture);
+    strip(&[target, &picture.rgb, &error, &depth_map(picture, range)])
+}
+
+/// Pictures of one height side by side, with thin gaps.
+pub fn strip(pictures: &[&Rgb]) -> Rgb {
+    let Some(first) = pictures.first() else {
+        return Rgb::zeros((0, 0, 3));
+    };
+    let height = first.dim().0;
+    let gap = Rgb::from_elem((height, (height / 50).max(2), 3), 0.55);
+    let mut parts = vec![first.view()];
+    for picture in &pictures[1..] {
+        parts.extend([gap.view(), picture.slice(s![..height, .., ..])]);
+    }
+    concatenate(Axis(1), &parts).unwrap_or_else(|_| (*first).clone())
+}
+
+/// Mean absolute error over channels, black at 0 through red to pale yellow at [`ERROR_SCALE`] and above.
+pub fn error_map(target: &Rgb, picture: &Picture) -> Rgb {
+    let (h, w, _) = target.dim();
+    colored(h, w, |y, x| {
+        let error: f32 = (0..3)
+            .map(|c| (picture.rgb[[y, x, c]].clamp(0.0, 1.0) - target[[y, x, c]]).abs())
+            .sum();
+        color(&INFERNO, error / 3.0 / ERROR_SCALE)
+    })
+}
+
+/// Distance to what is seen, Σ wᵢ tᵢ / opacity, bright where near and dark where far, over white where nothing is seen.
+pub fn depth_map(picture: &Picture, range: DepthRange) -> Rgb {
+    let (h, w) = picture.depth.dim();
+    colored(h, w, |y, x| {
+        let opacity = picture.opacity[[y, x]].clamp(0.0, 1.0);
+        if opacity <= 0.0 {
+            return [1.0; 3];
+        }
+        let depth = f64::from(picture.depth[[y, x]] / opacity);
+        let place = (range.far - depth) / (range.far - range.near);
+        color(&VIRIDIS, place as f32).map(|c| c * opacity + 1.0 - opacity)
+    })
+}
+
+/// Opacity from black to white.
+pub fn opacity_map(picture: &Picture) -> Rgb {
+    let opacity: &Array2<f32> = &picture.opacity;
+    let (h, w) = opacity.dim();
+    colored(h, w, |y, x| [opacity[[y, x]]; 3])
+}
+
+/// Writes a picture as PNG.
+pub fn write(path: &Path, picture: &Rgb) -> Result<()> {
+    plenoxel::dataset::image::write_rgb(path, picture.view())
+}
+
+/// Numbers of at most `most` of `n` things, evenly spaced, the first and the last among them.
+pub fn evenly_spaced(n: usize, most: usize) -> Vec<usize> {
+    match n {
+        n if n <= most => (0..n).collect(),
+        n => (0..most).map(|i| i * (n - 1) / (most - 1).max(1)).collect(),
+    }
+}
+
+fn colored(h: usize, w: usize, color: impl Fn(usize, usize) -> [f32; 3]) -> Rgb {
+    let mut picture = Rgb::zeros((h, w, 3));
+    for y in 0..h {
+        for x in 0..w {
+            let color = color(y, x);
+            (0..3).for_each(|c| picture[[y, x, c]] = color[c]);
+        }
+    }
+    picture
+}
+
+/// Coefficients of a polynomial of degree 6 for red, green and blue, the constant first.
+type Map = [[f32; 3]; 7];
+
+/// A color map at `x`, which is brought into [0, 1].
+fn color(map: &Map, x: f32) -> [f32; 3] {
+    let x = if x.is_finite() { x.clamp(0.0, 1.0) } else { 1.0 };
+    let value = |c: usize| map.iter().rev().fold(0.0, |sum, k| sum * x + k[c]);
+    [0, 1, 2].map(|c| value(c).clamp(0.0, 1.0))
+}
+
+/// matplotlib's viridis, perceptually uniform and readable by the color-blind, in Zucker's polynomial fit.
+const VIRIDIS: Map = [
+    [0.277_727_33, 0.005_407_344_6, 0.334_099_8],
+    [0.105_093_04, 1.404_613_5, 1.384_590_1],
+    [-0.330_861_84, 0.214_847_56, 0.095_095_165],
+    [-4.634_230_6, -5.799_101, -19.332_441],
+    [6.228_27, 14.179_933, 56.690_55],
+    [4.776_385, -13.745_145, -65.353_03],
+    [-5.435_456, 4.645_852_6, 26.312_435],
+];
+
+/// matplotlib's inferno, likewise.
+const INFERNO: Map = [
+    [0.000_218_940_37, 0.001_651_004_6, -0.019_480_899],
+    [0.106_513_42, 0.563_956_44, 3.932_712_3],
+    [11.602_493, -3.972_854, -15.942_394],
+    [-41.703_995, 17.436_398, 44.354_145],
+    [77.162_94, -33.402_36, -81.807_31],
+    [-71.319_43, 32.626_064, 73.209_52],
+    [25.131_126, -12.242_669, -23.070_325],
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn near(a: [f32; 3], b: [f32; 3]) -> bool {
+        // The fits are good to about 1 %.
+        a.iter().zip(b).all(|(a, b)| (a - b).abs() < 0.02)
+    }
+
+    #[test]
+    fn color_maps_have_the_ends_and_middles_of_matplotlib() {
+        // viridis: #440154, #21918c, #fde725. inferno: #000004, #bc3754, #fcffa4.
+        assert!(near(color(&VIRIDIS, 0.0), [0.267, 0.005, 0.329]));
+        assert!(near(color(&VIRIDIS, 0.5), [0.128, 0.567, 0.551]));
+        assert!(near(color(&VIRIDIS, 1.0), [0.993, 0.906, 0.144]));
+        assert!(near(color(&INFERNO, 0.0), [0.001, 0.000, 0.014]));
+        assert!(near(color(&INFERNO, 0.5), [0.736, 0.216, 0.330]));
+        assert!(near(color(&INFERNO, 1.0), [0.988, 0.998, 0.645]));
+    }
+
+    #[test]
+    fn empty_pixels_are_white_and_full_ones_colored_by_distance() {
+        let picture = Picture {
+            rgb: Rgb::zeros((1, 3, 3)),
+            depth: ndarray::array![[0.0, 2.5, 2.75]],
+            opacity: ndarray::array![[0.0, 1.0, 0.5]],
+        };
+        let map = depth_map(&picture, DepthRange { near: 2.5, far: 5.5 });
+        let pixel = |x: usize| [0, 1, 2].map(|c| map[[0, x, c]]);
+        assert_eq!(pixel(0), [1.0; 3]);
+        assert_eq!(pixel(1), color(&VIRIDIS, 1.0));
+        // Half seen at 2.75 / 0.5 = 5.5: half the darkest color, half white.
+        assert!(near(pixel(2), color(&VIRIDIS, 0.0).map(|c| 0.5 * c + 0.5)));
+    }
+
+    #[test]
+    fn views_are_chosen_evenly_with_both_ends() {
+        assert_eq!(evenly_spaced(3, 25), [0, 1, 2]);
+        let chosen = evenly_spaced(200, 25);
+        assert_eq!((chosen.len(), chosen[0], chosen[24]), (25, 0, 199));
+        assert!(chosen.windows(2).all(|pair| pair[1] > pair[0]));
+    }
+
+    #[test]
+    fn a_strip_is_as_wide_as_its_pictures_and_gaps() {
+        let picture = Rgb::zeros((100, 40, 3));
+        assert_eq!(strip(&[&picture, &picture, &picture]).dim(), (100, 124, 3));
+        assert_eq!(strip(&[]).dim(), (0, 0, 3));
+    }
+}

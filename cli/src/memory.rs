@@ -1,0 +1,227 @@
+//! How much memory a command will take, said before it is taken.
+//!
+//! The parts are counted from what is known: images, tables, optimizer state, and the arrays that a training step keeps for its gradient.
+//! The last depends on how many samples the rays take, which is bounded by the longest chord through the box; pruning only lowers it.
+
+use crate::progress::bytes;
+use plenoxel::dataset::{Dataset, Split};
+use plenoxel::error::{Error, Result};
+use plenoxel::field::voxel_grid::GridShape;
+use plenoxel::train::config::{Config, OptimizerConfig, Sampling};
+
+/// Bytes by what they are for.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimate {
+    /// 8-bit images of the largest split, and full-size ones in decoding.
+    pub images: u64,
+    /// Tables of the finest grid, of the one before it, and of kept stages.
+    pub grid: u64,
+    /// The optimizer's state.
+    pub optimizer: u64,
+    /// Samples, intermediate values and gradients of one step.
+    pub step: u64,
+    /// Setting that counts most.
+    key: String,
+}
+
+/// Program, threads, buffers on their way: measured on small runs.
+const BASE: u64 = 30_000_000;
+/// Rays that are rendered at a time when evaluating.
+const EVALUATION_RAYS: u64 = 8192;
+
+impl Estimate {
+    /// A training run with everything around it.
+    pub fn of_training(config: &Config, dataset: &Dataset) -> Self {
+        let finest = config.stages.iter().enumerate();
+        let (index, resolution) = finest
+            .map(|(i, stage)| (i, stage.resolution))
+            .max_by_key(|(_, resolution)| *resolution)
+            .unwrap_or((0, 0));
+        let shape = config.grid_shape(resolution);
+        let tables = shape.bytes() as u64;
+        let earlier = config.stages.iter().map(|stage| stage.resolution);
+        let earlier: u64 = earlier
+            .filter(|n| *n < resolution)
+            .map(|n| config.grid_shape(n).bytes() as u64)
+            .sum();
+        let optimizer = tables
+            * match config.optimizer {
+                OptimizerConfig::Sgd => 0,
+                OptimizerConfig::Momentum { .. } | OptimizerConfig::RmsProp { .. } => 1,
+                OptimizerConfig::LazyAdam { .. } => 2,
+            };
+        let rays = config.rays_per_step as u64;
+        let step = config.stages.iter().map(|stage| {
+            let shape = config.grid_shape(stage.resolution);
+            let samples = rays * mean_samples(stage.sampling, &shape);
+            let gradient = match whole_grid_losses(config) {
+                // Dense gradients, and the roots that a total variation keeps for them.
+                true => 2 * shape.bytes() as u64,
+                false => 0,
+            };
+            samples * bytes_per_sample(&shape, true) + touched_rows(&shape, samples) + gradient
+        });
+        let evaluation = EVALUATION_RAYS
+            * mean_samples(config.evaluation, &shape)
+            * bytes_per_sample(&shape, false);
+        let estimate = Estimate {
+            images: images(dataset, config.downscale, &[Split::Train, Split::Test]),
+            grid: tables + earlier,
+            optimizer,
+            step: step.max().unwrap_or(0).max(evaluation),
+            key: String::new(),
+        };
+        let largest = estimate
+            .images
+            .max(estimate.step)
+            .max(estimate.grid + estimate.optimizer);
+        let key = match largest {
+            n if n == estimate.images => "downscale".to_owned(),
+            n if n == estimate.step => "rays_per_step".to_owned(),
+            _ => format!("stages[{index}].resolution"),
+        };
+        Estimate { key, ..estimate }
+    }
+
+    /// Rendering a trained grid, and comparing it with the views of a split where `compare` is set.
+    pub fn of_evaluation(
+        config: &Config,
+        sampling: Sampling,
+        shape: &GridShape,
+        dataset: &Dataset,
+        compare: Option<Split>,
+    ) -> Self {
+        let samples = EVALUATION_RAYS * mean_samples(sampling, shape);
+        Estimate {
+            images: compare.map_or(0, |split| images(dataset, config.downscale, &[split])),
+            // The file and the tables read from it.
+            grid: 2 * shape.bytes() as u64,
+            optimizer: 0,
+            step: samples * bytes_per_sample(shape, false),
+            key: "the checkpoint".to_owned(),
+        }
+    }
+
+    /// All of it.
+    pub fn total(&self) -> u64 {
+        BASE + self.images + self.grid + self.optimizer + self.step
+    }
+
+    /// One line for people.
+    pub fn describe(&self) -> String {
+        let part = |name: &str, n: u64| match n {
+            0 => String::new(),
+            n => format!(", {name} {}", bytes(n)),
+        };
+        format!(
+            "memory: about {} (images {}{}{}{})",
+            bytes(self.total()),
+            bytes(self.images),
+            part("grid", self.grid),
+            part("optimizer", self.optimizer),
+            part("step", self.step),
+        )
+    }
+
+    /// Refuses what does not fit into the memory that is free, naming the setting that counts most. Where the system does not say how
+    /// much is free, nothing is refused.
+    pub fn check(&self) -> Result<()> {
+        match available() {
+            Some(available) if self.total() > available => {
+                let found = format!(
+                    "a run that needs about {} of memory where {} are free",
+                    bytes(self.total()),
+                    bytes(available)
+                );
+                let accepted = match self.key.as_str() {
+                    "downscale" => "a larger factor, so that the images fit",
+                    "rays_per_step" => "fewer rays in a step",
+                    _ => "fewer voxels a side, or a lower sh_degree",
+                };
+                Err(Error::config(&self.key, found, accepted))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Bytes of memory that can be taken now: what Linux counts as available, within the limit of the control group; elsewhere unknown.
+pub fn available() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let free = kilobytes(&text, "MemAvailable:")?;
+    let number = |path: &str| -> Option<u64> {
+        std::fs::read_to_string(path).ok()?.trim().parse().ok()
+    };
+    let limit = number("/sys/fs/cgroup/memory.max");
+    let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0);
+    Some(limit.map_or(free, |limit| free.min(limit.saturating_sub(used))))
+}
+
+/// The most memory this process ever had at once, in bytes; `None` where the system does not say.
+pub fn peak() -> Option<u64> {
+    kilobytes(&std::fs::read_to_string("/proc/self/status").ok()?, "VmHWM:")
+}
+
+fn kilobytes(text: &str, key: &str) -> Option<u64> {
+    let line = text.lines().find_map(|line| line.strip_prefix(key))?;
+    let number: u64 = line.split_whitespace().next()?.parse().ok()?;
+    Some(1024 * number)
+}
+
+/// Images of the largest of some splits, with depth where the scene knows it, and the full-size ones that each thread decodes.
+fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
+    let (width, height) = dataset.size();
+    let pixels = (width * height) as u64;
+    let views = splits.iter().map(|split| dataset.count(*split)).max();
+    let per_pixel = if dataset.scene().is_some() { 8 } else { 4 };
+    let threads = crate::machine::threads() as u64;
+    // A file and its decoded pixels.
+    let decoding = threads * 8 * pixels * (downscale * downscale) as u64;
+    views.unwrap_or(0) as u64 * pixels * per_pixel + decoding
+}
+
+/// Samples a ray takes in the box, at the mean over rays that fill the frame: about the side of the box.
+fn mean_samples(sampling: Sampling, shape: &GridShape) -> u64 {
+    let side = 2.0 * shape.half_width;
+    let samples = match sampling {
+        Sampling::Step { step } => side / (step * shape.voxel_side()),
+        Sampling::Points { samples, far } => side / (far / samples as f64),
+    };
+    samples.ceil() as u64 + 1
+}
+
+/// Bytes kept for each sample. `training` keeps what the gradient needs, and what it hands back.
+fn bytes_per_sample(shape: &GridShape, training: bool) -> u64 {
+    let channels = shape.color.channels() as u64;
+    // Positions, distances, lengths, densities, depths, weights and colors.
+    let geometry = 24;
+    // Coefficients as read, the basis for each, and their product; plain colors need no basis.
+    let color = if channels == 3 { 3 } else { channels * 7 / 3 };
+    let forward = 4 * (geometry + color);
+    if training { 2 * forward } else { forward }
+}
+
+/// Rows that a step touches, with their gradients.
+fn touched_rows(shape: &GridShape, samples: u64) -> u64 {
+    let rows = (shape.voxels() as u64).min(8 * samples);
+    2 * rows * 4 * (2 + shape.color.channels() as u64)
+}
+
+/// True if a loss looks at the whole grid, so that gradients are dense.
+fn whole_grid_losses(config: &Config) -> bool {
+    ["tv_density", "tv_color"]
+        .iter()
+        .any(|name| config.losses.contains_key(*name))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_found_in_the_text_of_the_kernel() {
+        let text = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t 1 kB\n";
+        assert_eq!(kilobytes(text, "VmHWM:"), Some(2048 * 1024));
+        assert_eq!(kilobytes(text, "VmSwap:"), None);
+    }
+}

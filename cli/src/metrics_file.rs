@@ -1,0 +1,94 @@
+//! `metrics.jsonl`: what a run did, line by line, while it does it.
+
+use plenoxel::error::{Error, Result};
+use plenoxel::train::{PlannedStage, Report};
+use serde_json::{Map, Value, json};
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// About so many lines in a run: enough for any curve.
+const LINES: u64 = 1000;
+
+/// The file, which is only ever appended to, a whole line at a time.
+pub struct MetricsFile {
+    path: PathBuf,
+    file: File,
+    every: u64,
+    since: Sums,
+    rays: u64,
+    samples: u64,
+}
+
+/// Sums over the steps since the last line.
+#[derive(Default)]
+struct Sums {
+    steps: f64,
+    loss: f64,
+    squared_error: f64,
+    losses: Vec<(String, f64)>,
+}
+
+impl MetricsFile {
+    /// A new file for a run of so many steps.
+    pub fn create(path: &Path, total_steps: u64) -> Result<Self> {
+        let file = OpenOptions::new().append(true).create(true).open(path);
+        Ok(MetricsFile {
+            path: path.to_owned(),
+            file: file.map_err(|e| Error::io(path, e, "creating the metrics"))?,
+            every: (total_steps / LINES).max(1),
+            since: Sums::default(),
+            rays: 0,
+            samples: 0,
+        })
+    }
+
+    /// A step was taken; `seconds` of training have passed.
+    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seconds: f64) -> Result<()> {
+        self.rays += report.rays as u64;
+        self.samples += report.samples as u64;
+        let since = &mut self.since;
+        since.steps += 1.0;
+        since.loss += report.loss;
+        since.squared_error += 10f64.powf(-0.1 * report.psnr);
+        for (name, value) in &report.losses {
+            match since.losses.iter_mut().find(|(known, _)| known == name) {
+                Some((_, sum)) => *sum += value,
+                None => since.losses.push((name.clone(), *value)),
+            }
+        }
+        if !(report.step + 1).is_multiple_of(self.every) && !report.ends_stage {
+            return Ok(());
+        }
+        let since = std::mem::take(&mut self.since);
+        let mean = |sum: f64| sum / since.steps;
+        let losses = since.losses.iter();
+        let losses: Map<String, Value> = losses.map(|(k, v)| (k.clone(), mean(*v).into())).collect();
+        self.append(&json!({
+            "step": report.step,
+            "stage": report.stage,
+            "resolution": plan[report.stage].stage.resolution,
+            "ends_stage": report.ends_stage,
+            "loss": mean(since.loss),
+            "losses": losses,
+            "psnr": -10.0 * mean(since.squared_error).log10(),
+            "rays": self.rays,
+            "samples": self.samples,
+            "density_rate": report.density_rate,
+            "color_rate": report.color_rate,
+            "seconds": seconds,
+        }))
+    }
+
+    /// Appends a line.
+    pub fn append(&mut self, line: &Value) -> Result<()> {
+        let text = format!("{line}\n");
+        let written = self.file.write_all(text.as_bytes());
+        written.map_err(|e| Error::io(&self.path, e, "writing the metrics"))
+    }
+
+    /// Rays and samples since the start of training.
+    pub fn counts(&self) -> (u64, u64) {
+        (self.rays, self.samples)
+    }
+}

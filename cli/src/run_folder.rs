@@ -1,0 +1,277 @@
+//! A run folder, which explains itself: what each file in it is called, and when one may be overwritten.
+
+use crate::config;
+use crate::data::DataSource;
+use plenoxel::checkpoint::{self, Header};
+use plenoxel::error::{Error, Result};
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::files;
+use plenoxel::train::config::Config;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// What is true of a run and not of its configuration.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunRecord {
+    /// Program and version that made the run.
+    pub program: String,
+    /// Vector instructions it used: bits repeat on the same ones.
+    pub instruction_set: String,
+    /// Threads it ran on: bits do not depend on them.
+    pub threads: usize,
+    /// Name of the scene.
+    pub scene: String,
+    /// Format of its views, in words.
+    pub format: String,
+    /// Preset the configuration started from, if it did.
+    pub preset: Option<String>,
+    /// Where the views are.
+    pub data: DataSource,
+}
+
+/// The folder of a run.
+#[derive(Debug, Clone)]
+pub struct RunFolder {
+    path: PathBuf,
+}
+
+const CONFIG: &str = "config.toml";
+const RECORD: &str = "run.json";
+const METRICS: &str = "metrics.jsonl";
+const CHECKPOINT: &str = "checkpoint.safetensors";
+const LOSS: &str = "loss.svg";
+const RESULT: &str = "result.json";
+const README: &str = "README.md";
+const IMAGES: &str = "images";
+const RENDERS: &str = "renders";
+
+impl RunFolder {
+    /// The folder that a new run will have: the one asked for, or `runs/<scene>-<n>` with the first free n. Nothing is written yet.
+    ///
+    /// Errors: it has something in it and may not be overwritten, or it is a file.
+    pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
+        let Some(path) = out else {
+            return Ok(RunFolder {
+                path: first_free(Path::new("runs"), scene),
+            });
+        };
+        if path.exists() && !path.is_dir() {
+            let found = format!("{}, which is a file,", path.display());
+            return Err(Error::config("--out", found, "a folder"));
+        }
+        let occupied = std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some());
+        if occupied && !overwrite {
+            let found = format!("{}, which is not empty,", path.display());
+            return Err(Error::config(
+                "--out",
+                found,
+                "a new folder; or --force, which overwrites the run in it",
+            ));
+        }
+        Ok(RunFolder {
+            path: path.to_owned(),
+        })
+    }
+
+    /// Makes the folder. Of a run that is overwritten, the files go that this one may not write, so that nothing of it is mistaken for
+    /// the new one's; files of other kinds stay.
+    pub fn prepare(&self) -> Result<()> {
+        files::create_dir(&self.path)?;
+        for name in [CHECKPOINT, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
+            let path = self.path.join(name);
+            if path.exists() {
+                std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
+            }
+        }
+        for folder in [IMAGES, RENDERS].map(|name| self.path.join(name)) {
+            let Ok(entries) = std::fs::read_dir(&folder) else {
+                continue;
+            };
+            let pictures = entries.flatten().map(|entry| entry.path());
+            for path in pictures.filter(|path| path.extension().is_some_and(|e| e == "png")) {
+                std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes what is known before the first step.
+    pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
+        let origin = format!("Configuration of a run of {}.", record.program);
+        config::write(&self.path.join(CONFIG), config, &origin)?;
+        self.write_json(RECORD, record)?;
+        files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
+    }
+
+    /// Opens the folder of a run for reading.
+    ///
+    /// Errors: it is not the folder of a run.
+    pub fn open(path: &Path) -> Result<(Self, Config, RunRecord)> {
+        let remedy = "give the folder that `plenoxel train` wrote";
+        if !path.exists() {
+            return Err(Error::input(path, "there is no such run", remedy));
+        }
+        if !path.is_dir() {
+            let found = "this is a file, not the folder of a run";
+            return Err(Error::input(path, found, remedy));
+        }
+        let folder = RunFolder {
+            path: path.to_owned(),
+        };
+        let record = path.join(RECORD);
+        let text = std::fs::read_to_string(&record).map_err(|e| match e.kind() {
+            std::io::ErrorKind::NotFound => {
+                Error::input(path, format!("there is no {RECORD} in this folder"), remedy)
+            }
+            _ => Error::io(&record, e, "reading the run"),
+        })?;
+        let record = serde_json::from_str(&text).map_err(|e| {
+            let found = format!("this does not describe a run ({e})");
+            Error::input(&record, found, "train again, or use an undamaged copy")
+        })?;
+        Ok((folder, config::read(&path.join(CONFIG))?, record))
+    }
+
+    /// Writes the trained grid.
+    pub fn save(&self, grid: &VoxelGrid<f32>, header: &Header) -> Result<()> {
+        checkpoint::save(&self.checkpoint(), grid, header)
+    }
+
+    /// Reads the trained grid.
+    ///
+    /// Errors: there is none, because the run did not end well; or it is damaged.
+    pub fn load(&self) -> Result<(VoxelGrid<f32>, Header)> {
+        let path = self.checkpoint();
+        if !path.exists() {
+            let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
+            return Err(Error::input(&self.path, found, "train again"));
+        }
+        checkpoint::load(&path)
+    }
+
+    /// Writes the final figures.
+    pub fn write_result(&self, result: &impl Serialize) -> Result<()> {
+        self.write_json(RESULT, result)
+    }
+
+    /// Reads the final figures, as far as there are any.
+    pub fn result(&self) -> Option<serde_json::Value> {
+        let text = std::fs::read_to_string(self.path.join(RESULT)).ok()?;
+        serde_json::from_str(&text).ok()
+    }
+
+    /// Writes the picture of the loss.
+    pub fn write_loss(&self, svg: &str) -> Result<()> {
+        files::write_atomically(&self.path.join(LOSS), svg.as_bytes())
+    }
+
+    /// The folder itself.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The lines that grow during the run.
+    pub fn metrics(&self) -> PathBuf {
+        self.path.join(METRICS)
+    }
+
+    /// The trained grid.
+    pub fn checkpoint(&self) -> PathBuf {
+        self.path.join(CHECKPOINT)
+    }
+
+    /// A picture of the run.
+    pub fn image(&self, name: &str) -> PathBuf {
+        self.path.join(IMAGES).join(name)
+    }
+
+    /// A picture made later.
+    pub fn render(&self, name: &str) -> PathBuf {
+        self.path.join(RENDERS).join(name)
+    }
+
+    /// Makes the folder for the pictures of the run.
+    pub fn create_images(&self) -> Result<()> {
+        files::create_dir(&self.path.join(IMAGES))
+    }
+
+    /// Makes the folder for pictures made later, and says where it is.
+    pub fn create_renders(&self) -> Result<PathBuf> {
+        let path = self.path.join(RENDERS);
+        files::create_dir(&path)?;
+        Ok(path)
+    }
+
+    fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
+        let path = self.path.join(name);
+        let text = serde_json::to_string_pretty(value).map_err(|e| {
+            Error::input(&path, e.to_string(), "this is a defect of the program")
+        })?;
+        files::write_atomically(&path, (text + "\n").as_bytes())
+    }
+}
+
+/// The folder's own explanation.
+const EXPLANATION: &str = "\
+# A run of plenoxel
+
+- `config.toml`: every setting, resolved; `plenoxel train DATA --config config.toml` repeats the run.
+- `run.json`: the data, the program, the machine.
+- `metrics.jsonl`: one line every few steps and at every stage end, then one with the final figures. `loss`, `losses` and `psnr` are of
+  training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training.
+- `loss.svg`: the loss over the steps.
+- `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
+- `result.json`: the final figures. `seconds` are of training alone: making grids, steps, pruning, upsampling.
+- `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
+- `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
+  pale yellow at 0.25 and above. Depth is bright where near and dark where far, over the ball that the box contains; white is empty.
+- `renders/`: what `plenoxel render` wrote.
+";
+
+/// `root/<scene>-<n>` with the first n from 1 on that nothing has.
+fn first_free(root: &Path, scene: &str) -> PathBuf {
+    let plain = |c: char| {
+        let keep = c.is_alphanumeric() || matches!(c, '-' | '_' | '.');
+        if keep { c } else { '-' }
+    };
+    let scene: String = scene.chars().map(plain).collect();
+    let mut n = 1;
+    loop {
+        let path = root.join(format!("{scene}-{n}"));
+        // A dangling link exists too: nothing may be written through it.
+        if path.symlink_metadata().is_err() {
+            return path;
+        }
+        n += 1;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_free_number_is_taken_and_names_become_plain() {
+        let root = std::env::temp_dir().join(format!("plenoxel-runs-{}", std::process::id()));
+        std::fs::create_dir_all(root.join("my-lego-1")).unwrap();
+        std::fs::create_dir_all(root.join("my-lego-3")).unwrap();
+        assert_eq!(first_free(&root, "my lego"), root.join("my-lego-2"));
+        assert_eq!(first_free(&root, "../x"), root.join("..-x-1"));
+        std::fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn an_occupied_folder_is_refused_unless_forced_and_other_files_survive() {
+        let path = std::env::temp_dir().join(format!("plenoxel-occupied-{}", std::process::id()));
+        std::fs::create_dir_all(path.join(IMAGES)).unwrap();
+        for name in [CHECKPOINT, "notes.txt", "images/old.png"] {
+            std::fs::write(path.join(name), "x").unwrap();
+        }
+        let refused = RunFolder::choose(Some(&path), "x", false).unwrap_err();
+        assert!(refused.exit_code() == 2 && refused.to_string().contains("--force"));
+        RunFolder::choose(Some(&path), "x", true).unwrap().prepare().unwrap();
+        assert!(!path.join(CHECKPOINT).exists() && !path.join("images/old.png").exists());
+        assert!(path.join("notes.txt").exists());
+        std::fs::remove_dir_all(path).unwrap();
+    }
+}

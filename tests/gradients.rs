@@ -1,0 +1,129 @@
+//! Whole renders and every loss against finite differences, in f64, first and second derivatives.
+//!
+//! Kinks are avoided: densities are positive and harmonics small, so that no activation is at its corner, and targets keep off the
+//! rendered colors. Prints the table with `cargo test --test gradients -- --nocapture`.
+
+mod support;
+
+use autograd::{Gradcheck, Tensor, grad};
+use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation};
+use plenoxel::field::{Field, sh};
+use plenoxel::geometry::Aabb;
+use plenoxel::loss::{self, Cells, Step};
+use plenoxel::render::{RenderOptions, Rendered, render};
+use plenoxel::sampling::{Jitter, Spacing};
+use support::{batch, grid_of, numbers, rays, shape};
+
+fn options() -> RenderOptions<'static> {
+    RenderOptions {
+        aabb: Aabb::cube(1.0),
+        spacing: Spacing::Step(0.23),
+        jitter: Jitter::PerRay { seed: 1, step: 2 },
+        background: [1.0, 0.9, 0.8],
+        occupancy: None,
+    }
+}
+
+fn shapes() -> Vec<(String, GridShape)> {
+    let mut shapes = Vec::new();
+    for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+        shapes.push((format!("{interpolation:?} RGB"), shape(interpolation, Color::Rgb)));
+        for degree in 0..=sh::MAX_DEGREE {
+            shapes.push((format!("{interpolation:?} SH {degree}"), shape(interpolation, Color::Sh { degree, offset: 0.5 })));
+        }
+    }
+    shapes
+}
+
+/// Density and color tables off every kink.
+fn tables(shape: &GridShape) -> Vec<ndarray::ArrayD<f64>> {
+    let channels = shape.color.channels();
+    let color = match shape.color {
+        Color::Rgb => numbers(&[64, 3], 0.1, 0.9, 22),
+        Color::Sh { .. } => numbers(&[64, channels], -0.06, 0.06, 22),
+    };
+    vec![numbers(&[64, 1], 0.2, 2.0, 21), color]
+}
+
+type Column = fn(&Rendered<f64>) -> Tensor<f64>;
+
+#[test]
+fn every_column_of_a_whole_render_agrees_with_finite_differences() {
+    let columns: [(&str, Column); 6] = [
+        ("rgb", |r| r.rgb.clone()),
+        ("depth", Rendered::depth),
+        ("opacity", |r| r.opacity.clone()),
+        ("log transmittance", |r| r.log_transmittance.clone()),
+        ("sparsity", Rendered::sparsity),
+        ("distortion", Rendered::distortion),
+    ];
+    println!("| render | column | orders | worst relative error |\n| --- | --- | --- | --- |");
+    for (name, shape) in shapes() {
+        for (column, get) in columns {
+            let f = |x: &[Tensor<f64>]| get(&render(&grid_of(shape, &x[0], &x[1]), &rays(), &options()));
+            let report = Gradcheck::new(f, tables(&shape)).named(format!("{name}, {column}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
+            println!("| {name} | {column} | 1, 2 | {:.1e} |", report.worst_relative_error);
+        }
+    }
+}
+
+#[test]
+fn every_loss_agrees_with_finite_differences() {
+    println!("| loss | render | orders | worst relative error |\n| --- | --- | --- | --- |");
+    for (render_name, shape) in [
+        ("Nearest RGB", shape(Interpolation::Nearest, Color::Rgb)),
+        ("Trilinear SH 2", shape(Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 })),
+    ] {
+        for name in loss::NAMES {
+            // A closure over what a step needs, with sampled cells at a fixed place.
+            let objective = loss::Objective::<f64>::new().with_named(name, 1.0).expect("a loss of that name");
+            let f = |x: &[Tensor<f64>]| {
+                let (grid, batch) = (grid_of(shape, &x[0], &x[1]), batch());
+                let rendered = render(&grid, &batch.rays, &options());
+                objective.evaluate(&Step { number: 3, seed: 4, batch: &batch, rendered: &rendered, grid: &grid }).0
+            };
+            let report = Gradcheck::new(f, tables(&shape)).named(format!("{name}, {render_name}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
+            println!("| {name} | {render_name} | 1, 2 | {:.1e} |", report.worst_relative_error);
+        }
+    }
+}
+
+#[test]
+fn total_variation_over_all_cells_is_the_sampled_one_over_a_run_of_all() {
+    for nodes in [[4, 4, 4], [2, 5, 3], [1, 4, 4]] {
+        let table = numbers(&[nodes.iter().product(), 2], -1.0, 1.0, 31);
+        let cells: usize = nodes.iter().map(|n| n - 1).product();
+        let whole = |x: &[Tensor<f64>]| loss::total_variation(&x[0], nodes);
+        Gradcheck::new(whole, vec![table.clone()]).named("total variation").order(2).run().unwrap_or_else(|e| panic!("{e}"));
+        if cells == 0 {
+            continue;
+        }
+        let x = Tensor::variable(table);
+        let (a, b) = (loss::total_variation(&x, nodes), loss::sampled_total_variation(&x, nodes, cells - 1, cells));
+        approx::assert_relative_eq!(a.item(), b.item(), epsilon = 1e-12);
+        let (ga, gb) = (a.backward().array(&x), b.backward().array(&x));
+        assert!(ga.iter().zip(&gb).all(|(a, b)| (a - b).abs() < 1e-12));
+    }
+    assert_ne!(Cells::Whole, Cells::SAMPLED);
+}
+
+#[test]
+fn an_eikonal_penalty_is_differentiable_through_the_slope_of_the_density() {
+    let shape = shape(Interpolation::Trilinear, Color::Rgb);
+    // Points off the planes through voxel centres, where the slope jumps.
+    let points = numbers(&[40, 3], -0.72, 0.72, 41).mapv(|x| if ((x + 1.0) * 2.0 - 0.5).fract().abs() < 0.02 { x + 0.03 } else { x });
+    let f = |x: &[Tensor<f64>]| {
+        let grid = grid_of(shape, &x[0], &Tensor::zeros(&[64, 3]));
+        let at = Tensor::variable(points.clone());
+        let normal = &grad(&grid.density(&at).sum(), &[&at])[0];
+        (normal.square().sum_axis(1).sqrt() - 1.0).square().mean()
+    };
+    let report = Gradcheck::new(f, vec![numbers(&[64, 1], 0.2, 2.0, 42)]).named("eikonal").order(1).run().unwrap_or_else(|e| panic!("{e}"));
+    println!("| eikonal penalty | Trilinear density | 1 | {:.1e} |", report.worst_relative_error);
+}
+
+#[test]
+fn the_basis_is_differentiable_in_the_directions() {
+    let directions = numbers(&[7, 3], -1.0, 1.0, 51);
+    Gradcheck::new(|x: &[Tensor<f64>]| sh::basis(&x[0], 3), vec![directions]).named("sh basis").order(2).run().unwrap_or_else(|e| panic!("{e}"));
+}
