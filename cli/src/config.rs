@@ -15,21 +15,9 @@ use toml::{Table, Value};
 
 /// The presets by name: what they are for, and their text.
 pub const PRESETS: [(&str, &str, &str); 3] = [
-    (
-        "demo",
-        "the built-in scene in minutes",
-        include_str!("../presets/demo.toml"),
-    ),
-    (
-        "standard",
-        "a dataset of your own",
-        include_str!("../presets/standard.toml"),
-    ),
-    (
-        "paper",
-        "\"Plenoxels and extension to point clouds\", bugs repaired",
-        include_str!("../presets/paper.toml"),
-    ),
+    ("demo", "the built-in scene in minutes", include_str!("../presets/demo.toml")),
+    ("standard", "a dataset of your own", include_str!("../presets/standard.toml")),
+    ("paper", "\"Plenoxels and extension to point clouds\", bugs repaired", include_str!("../presets/paper.toml")),
 ];
 
 const DEFAULTS: &str = include_str!("../presets/defaults.toml");
@@ -45,10 +33,7 @@ pub struct Layers {
 impl Layers {
     /// The defaults alone.
     pub fn defaults() -> Result<Self> {
-        let mut layers = Layers {
-            table: Table::new(),
-            places: Vec::new(),
-        };
+        let mut layers = Layers { table: Table::new(), places: Vec::new() };
         layers.text(DEFAULTS, &|_| "the defaults".to_owned())?;
         Ok(layers)
     }
@@ -65,9 +50,7 @@ impl Layers {
 
     /// Lays a text over what is there, once `place` can say for each path where it stands.
     fn text(&mut self, text: &str, place: &dyn Fn(&str) -> String) -> Result<()> {
-        let layer: Table = text
-            .parse()
-            .map_err(|e: toml::de::Error| Error::config(place(""), e.message(), "valid TOML"))?;
+        let layer: Table = text.parse().map_err(|e: toml::de::Error| Error::config(place(""), e.message(), "valid TOML"))?;
         keys::check_table(&layer, place)?;
         leaves("", &Value::Table(layer.clone()), &mut |path| {
             self.places.push((path.to_owned(), place(path)));
@@ -98,19 +81,13 @@ impl Layers {
     pub fn assign(&mut self, assignment: &str) -> Result<()> {
         let Some((path, text)) = assignment.split_once('=') else {
             let found = format!("`{assignment}`");
-            return Err(Error::config(
-                "--set",
-                found,
-                "key=value, as in --set stages[0].epochs=4",
-            ));
+            return Err(Error::config("--set", found, "key=value, as in --set stages[0].epochs=4"));
         };
         let (path, text) = (path.trim(), text.trim());
         let value = match text {
             "" => None,
             text => Some(match format!("value = {text}").parse::<Table>() {
-                Ok(mut table) => table
-                    .remove("value")
-                    .unwrap_or_else(|| Value::String(text.to_owned())),
+                Ok(mut table) => table.remove("value").unwrap_or_else(|| Value::String(text.to_owned())),
                 Err(_) => Value::String(text.to_owned()),
             }),
         };
@@ -132,18 +109,12 @@ impl Layers {
             Some(place) => format!("{key} ({place})"),
             None => key.to_owned(),
         };
-        let config: Config = Value::Table(self.table)
-            .try_into()
-            .map_err(|e: toml::de::Error| {
-                let (key, accepted) = explain(&e.to_string());
-                Error::config(placed(&key), "the value", accepted)
-            })?;
+        let config: Config = Value::Table(self.table).try_into().map_err(|e: toml::de::Error| {
+            let (key, accepted) = explain(&e.to_string());
+            Error::config(placed(&key), "the value", accepted)
+        })?;
         config.validate().map_err(|e| match e {
-            Error::Config {
-                key,
-                found,
-                accepted,
-            } => Error::config(placed(&key), found, accepted),
+            Error::Config { key, found, accepted } => Error::config(placed(&key), found, accepted),
             other => other,
         })?;
         Ok(config)
@@ -165,13 +136,10 @@ impl ConfigFile {
         let remedy = "give the path of a TOML file, such as the config.toml of a run";
         let bytes = std::fs::read(path).map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => Error::input(path, "there is no such file", remedy),
-            std::io::ErrorKind::IsADirectory => {
-                Error::input(path, "this is a folder", remedy)
-            }
+            std::io::ErrorKind::IsADirectory => Error::input(path, "this is a folder", remedy),
             _ => Error::io(path, e, "reading the configuration"),
         })?;
-        let text = String::from_utf8(bytes)
-            .map_err(|_| Error::input(path, "this is not a text file", remedy))?;
+        let text = String::from_utf8(bytes).map_err(|_| Error::input(path, "this is not a text file", remedy))?;
         let mut lines = Vec::new();
         let line_of = |offset: usize| text[..offset].matches('\n').count() + 1;
         match DeTable::parse(&text) {
@@ -201,21 +169,15 @@ impl ConfigFile {
 
 /// Writes a configuration so that reading it gives the same one.
 pub fn write(path: &Path, config: &Config, origin: &str) -> Result<()> {
-    let text = toml::to_string(config)
-        .map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?;
-    let heading = format!(
-        "# {origin}\n# Complete: it needs no preset. `plenoxel train DATA --config THIS_FILE` repeats the run.\n\n"
-    );
+    let text = toml::to_string(config).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?;
+    let heading = format!("# {origin}\n# Complete: it needs no preset. `plenoxel train DATA --config THIS_FILE` repeats the run.\n\n");
     files::write_atomically(path, (heading + &text).as_bytes())
 }
 
 /// Reads what [`write`] wrote.
 pub fn read(path: &Path) -> Result<Config> {
     let file = ConfigFile::read(path)?;
-    let mut layers = Layers {
-        table: Table::new(),
-        places: Vec::new(),
-    };
+    let mut layers = Layers { table: Table::new(), places: Vec::new() };
     layers.file(&file)?;
     layers.resolve()
 }
@@ -260,18 +222,9 @@ fn spans(path: &str, table: &DeTable<'_>, f: &mut dyn FnMut(String, usize)) {
 /// Where the value at `key` was written last: `key` itself, or a part or the whole of it.
 fn place_of<'a>(places: &'a [(String, String)], key: &str) -> Option<&'a str> {
     // `stages[*]` on the command line stands for every entry.
-    let general: String = key
-        .split('[')
-        .map(|part| part.trim_start_matches(|c: char| c.is_ascii_digit()))
-        .collect::<Vec<_>>()
-        .join("[");
-    let inside = |part: &str, whole: &str| {
-        part.strip_prefix(whole)
-            .is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
-    };
-    let related = |path: &str| {
-        inside(path, key) || inside(key, path) || inside(path, &general) || inside(&general, path)
-    };
+    let general: String = key.split('[').map(|part| part.trim_start_matches(|c: char| c.is_ascii_digit())).collect::<Vec<_>>().join("[");
+    let inside = |part: &str, whole: &str| part.strip_prefix(whole).is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']));
+    let related = |path: &str| inside(path, key) || inside(key, path) || inside(path, &general) || inside(&general, path);
     let last = places.iter().rev().find(|(path, _)| related(path));
     last.map(|(_, place)| place.as_str())
 }

@@ -23,11 +23,7 @@ const CURVE: &str = "#1f5fa8";
 
 /// The picture of `losses`, one for each step from 0 on. `stages` may reach beyond them, if a run ended early.
 pub fn loss_svg(losses: &[f64], stages: &[PlannedStage], title: &str) -> String {
-    let steps = stages
-        .last()
-        .map_or(0, |stage| stage.first + stage.steps)
-        .max(losses.len() as u64)
-        .max(1);
+    let steps = stages.last().map_or(0, |stage| stage.first + stage.steps).max(losses.len() as u64).max(1);
     let x = |step: f64| LEFT + step / steps as f64 * (WIDTH - LEFT - RIGHT);
     let scale = Scale::of(losses);
     let mut svg = format!(
@@ -133,27 +129,15 @@ impl Scale {
         let low = finite().fold(f64::INFINITY, f64::min);
         let high = finite().fold(f64::NEG_INFINITY, f64::max);
         if low > high {
-            return Scale {
-                logarithmic: false,
-                low: 0.0,
-                high: 1.0,
-            };
+            return Scale { logarithmic: false, low: 0.0, high: 1.0 };
         }
         // A loss that touches 0, or a prior that is negative, has no logarithm.
         if low > 0.0 {
             let (low, high) = (low / 1.15, high * 1.15);
-            return Scale {
-                logarithmic: true,
-                low,
-                high,
-            };
+            return Scale { logarithmic: true, low, high };
         }
         let margin = 0.05 * (high - low).max(1e-12);
-        Scale {
-            logarithmic: false,
-            low: low - margin,
-            high: high + margin,
-        }
+        Scale { logarithmic: false, low: low - margin, high: high + margin }
     }
 
     fn y(&self, value: f64) -> f64 {
@@ -210,18 +194,11 @@ fn linear_ticks(low: f64, high: f64, most: usize) -> Vec<f64> {
 }
 
 fn line(svg: &mut String, [x1, y1, x2, y2]: [f64; 4], color: &str, more: &str) {
-    let _ = writeln!(
-        svg,
-        "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" stroke=\"{color}\"{more}/>"
-    );
+    let _ = writeln!(svg, "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" stroke=\"{color}\"{more}/>");
 }
 
 fn text(svg: &mut String, x: f64, y: f64, anchor: &str, text: &str) {
-    let _ = writeln!(
-        svg,
-        "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{}</text>",
-        escaped(text)
-    );
+    let _ = writeln!(svg, "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{}</text>", escaped(text));
 }
 
 fn escaped(text: &str) -> String {
@@ -243,11 +220,7 @@ mod tests {
             color_rate: 1.0,
             rate_decay: 1.0,
         };
-        let planned = |(i, resolution)| PlannedStage {
-            stage: stage(resolution),
-            first: 50 * i as u64,
-            steps: 50,
-        };
+        let planned = |(i, resolution)| PlannedStage { stage: stage(resolution), first: 50 * i as u64, steps: 50 };
         [16, 32].into_iter().enumerate().map(planned).collect()
     }
 

@@ -36,20 +36,12 @@ impl DataSource {
     pub fn folder(path: &Path) -> Self {
         // A folder that does not exist keeps its name for the error that opening it will give.
         let absolute = path.canonicalize().or_else(|_| std::path::absolute(path));
-        DataSource::Folder {
-            path: absolute.unwrap_or_else(|_| path.to_owned()),
-        }
+        DataSource::Folder { path: absolute.unwrap_or_else(|_| path.to_owned()) }
     }
 
     /// The built-in scene.
     pub fn built_in(options: &ProceduralOptions) -> Self {
-        DataSource::BuiltIn {
-            width: options.width,
-            height: options.height,
-            train: options.train,
-            val: options.val,
-            test: options.test,
-        }
+        DataSource::BuiltIn { width: options.width, height: options.height, train: options.train, val: options.val, test: options.test }
     }
 
     /// Opens the views with the reduction and the validation split of a configuration. The built-in scene is rendered at the reduced
@@ -62,19 +54,10 @@ impl DataSource {
                     0 => None,
                     every => Some(every),
                 };
-                let options = OpenOptions {
-                    downscale,
-                    validation_every,
-                };
+                let options = OpenOptions { downscale, validation_every };
                 dataset::open(path, &options)
             }
-            &DataSource::BuiltIn {
-                width,
-                height,
-                train,
-                val,
-                test,
-            } => {
+            &DataSource::BuiltIn { width, height, train, val, test } => {
                 image::check_downscale(downscale, (width, height))?;
                 Dataset::procedural(ProceduralOptions {
                     width: width / downscale,
@@ -91,11 +74,9 @@ impl DataSource {
     /// Opens the views a run remembers; a folder that has gone is reported with the flag that says where it is now.
     pub fn reopen(&self, config: &Config) -> Result<Dataset> {
         match self {
-            DataSource::Folder { path } if !path.exists() => Err(Error::input(
-                path,
-                "the dataset this run learned from is not there any more",
-                "say where it is now with --data DIR",
-            )),
+            DataSource::Folder { path } if !path.exists() => {
+                Err(Error::input(path, "the dataset this run learned from is not there any more", "say where it is now with --data DIR"))
+            }
             _ => self.open(config),
         }
     }

@@ -1,6 +1,7 @@
 //! A trained grid against photographs: PSNR and SSIM of each view, and their means.
 
 use ndarray::Array3;
+use plenoxel::camera::Camera;
 use plenoxel::dataset::View;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
@@ -10,7 +11,6 @@ use plenoxel::render::RenderOptions;
 use plenoxel::render::picture::{Picture, picture};
 use plenoxel::sampling::{Jitter, Occupancy};
 use plenoxel::train::config::Sampling;
-use plenoxel::camera::Camera;
 use serde::Serialize;
 
 /// A grid ready to be looked at: no jitter, empty cells left out, which changes no pixel.
@@ -24,12 +24,7 @@ pub struct Viewer<'a> {
 impl<'a> Viewer<'a> {
     /// A viewer of a grid over a background.
     pub fn new(grid: &'a VoxelGrid<f32>, sampling: Sampling, background: [f32; 3]) -> Self {
-        Viewer {
-            grid,
-            sampling,
-            background,
-            occupancy: grid.occupancy(0.0),
-        }
+        Viewer { grid, sampling, background, occupancy: grid.occupancy(0.0) }
     }
 
     /// What a camera sees.
@@ -46,11 +41,7 @@ impl<'a> Viewer<'a> {
     }
 
     /// Compares what is seen with each view. `seen(number, view, target, picture)` is called after each.
-    pub fn compare(
-        &self,
-        views: &[View],
-        mut seen: impl FnMut(usize, &View, &Array3<f32>, &Picture) -> Result<()>,
-    ) -> Result<Scores> {
+    pub fn compare(&self, views: &[View], mut seen: impl FnMut(usize, &View, &Array3<f32>, &Picture) -> Result<()>) -> Result<Scores> {
         let mut per_view = Vec::with_capacity(views.len());
         for (i, view) in views.iter().enumerate() {
             let picture = self.see(&view.camera);
@@ -134,9 +125,7 @@ pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]
 pub fn with_samples(sampling: Sampling, samples: usize, grid: &VoxelGrid<f32>) -> Sampling {
     match sampling {
         Sampling::Points { far, .. } => Sampling::Points { samples, far },
-        Sampling::Step { .. } => Sampling::Step {
-            step: 3f64.sqrt() * grid.shape().resolution as f64 / samples as f64,
-        },
+        Sampling::Step { .. } => Sampling::Step { step: 3f64.sqrt() * grid.shape().resolution as f64 / samples as f64 },
     }
 }
 

@@ -1,6 +1,6 @@
 //! Pictures of results: panels target | render | error | depth, strips, and the color maps behind them.
 
-use ndarray::{Array2, Array3, Axis, concatenate, s};
+use ndarray::{Array2, Array3, Axis, Slice, concatenate};
 use plenoxel::camera::Camera;
 use plenoxel::error::Result;
 use plenoxel::render::picture::Picture;
@@ -25,10 +25,7 @@ impl DepthRange {
     /// The range for a camera: the ball that touches the faces of the box from inside. Cameras at one distance share it.
     pub fn of(camera: &Camera, half_width: f64) -> Self {
         let distance = camera.position().length();
-        DepthRange {
-            near: (distance - half_width).max(0.0),
-            far: distance + half_width,
-        }
+        DepthRange { near: (distance - half_width).max(0.0), far: distance + half_width }
     }
 }
 
@@ -47,7 +44,7 @@ pub fn strip(pictures: &[&Rgb]) -> Rgb {
     let gap = Rgb::from_elem((height, (height / 50).max(2), 3), 0.55);
     let mut parts = vec![first.view()];
     for picture in &pictures[1..] {
-        parts.extend([gap.view(), picture.slice(s![..height, .., ..])]);
+        parts.extend([gap.view(), picture.slice_axis(Axis(0), Slice::from(..height))]);
     }
     concatenate(Axis(1), &parts).unwrap_or_else(|_| (*first).clone())
 }
@@ -56,9 +53,7 @@ pub fn strip(pictures: &[&Rgb]) -> Rgb {
 pub fn error_map(target: &Rgb, picture: &Picture) -> Rgb {
     let (h, w, _) = target.dim();
     colored(h, w, |y, x| {
-        let error: f32 = (0..3)
-            .map(|c| (picture.rgb[[y, x, c]].clamp(0.0, 1.0) - target[[y, x, c]]).abs())
-            .sum();
+        let error: f32 = (0..3).map(|c| (picture.rgb[[y, x, c]].clamp(0.0, 1.0) - target[[y, x, c]]).abs()).sum();
         color(&INFERNO, error / 3.0 / ERROR_SCALE)
     })
 }
@@ -162,11 +157,8 @@ mod tests {
 
     #[test]
     fn empty_pixels_are_white_and_full_ones_colored_by_distance() {
-        let picture = Picture {
-            rgb: Rgb::zeros((1, 3, 3)),
-            depth: ndarray::array![[0.0, 2.5, 2.75]],
-            opacity: ndarray::array![[0.0, 1.0, 0.5]],
-        };
+        let picture =
+            Picture { rgb: Rgb::zeros((1, 3, 3)), depth: ndarray::array![[0.0, 2.5, 2.75]], opacity: ndarray::array![[0.0, 1.0, 0.5]] };
         let map = depth_map(&picture, DepthRange { near: 2.5, far: 5.5 });
         let pixel = |x: usize| [0, 1, 2].map(|c| map[[0, x, c]]);
         assert_eq!(pixel(0), [1.0; 3]);

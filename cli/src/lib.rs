@@ -75,10 +75,7 @@ pub struct Streams<'a> {
 }
 
 /// Runs a command line, the program's name first, and returns the exit code.
-pub fn run<A: Into<OsString> + Clone>(
-    args: impl IntoIterator<Item = A>,
-    streams: Streams<'_>,
-) -> u8 {
+pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams: Streams<'_>) -> u8 {
     let cli = match Cli::try_parse_from(args) {
         Ok(cli) => cli,
         Err(answer) => return answer_to_arguments(&answer, streams),

@@ -8,10 +8,7 @@ pub const MOST_THREADS: usize = 1024;
 
 /// Calls `f` on a pool of so many threads; all cores if none are given. The number changes how long a command takes and no number it
 /// computes.
-pub fn with_threads<R: Send>(
-    threads: Option<usize>,
-    f: impl FnOnce() -> Result<R> + Send,
-) -> Result<R> {
+pub fn with_threads<R: Send>(threads: Option<usize>, f: impl FnOnce() -> Result<R> + Send) -> Result<R> {
     let available = std::thread::available_parallelism().map_or(1, NonZero::get);
     let threads = threads.unwrap_or(available);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();

@@ -33,17 +33,12 @@ impl Estimate {
     /// A training run with everything around it.
     pub fn of_training(config: &Config, dataset: &Dataset) -> Self {
         let finest = config.stages.iter().enumerate();
-        let (index, resolution) = finest
-            .map(|(i, stage)| (i, stage.resolution))
-            .max_by_key(|(_, resolution)| *resolution)
-            .unwrap_or((0, 0));
+        let (index, resolution) =
+            finest.map(|(i, stage)| (i, stage.resolution)).max_by_key(|(_, resolution)| *resolution).unwrap_or((0, 0));
         let shape = config.grid_shape(resolution);
         let tables = shape.bytes() as u64;
         let earlier = config.stages.iter().map(|stage| stage.resolution);
-        let earlier: u64 = earlier
-            .filter(|n| *n < resolution)
-            .map(|n| config.grid_shape(n).bytes() as u64)
-            .sum();
+        let earlier: u64 = earlier.filter(|n| *n < resolution).map(|n| config.grid_shape(n).bytes() as u64).sum();
         let optimizer = tables
             * match config.optimizer {
                 OptimizerConfig::Sgd => 0,
@@ -61,9 +56,7 @@ impl Estimate {
             };
             samples * bytes_per_sample(&shape, true) + touched_rows(&shape, samples) + gradient
         });
-        let evaluation = EVALUATION_RAYS
-            * mean_samples(config.evaluation, &shape)
-            * bytes_per_sample(&shape, false);
+        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * bytes_per_sample(&shape, false);
         let estimate = Estimate {
             images: images(dataset, config.downscale, &[Split::Train, Split::Test]),
             grid: tables + earlier,
@@ -71,10 +64,7 @@ impl Estimate {
             step: step.max().unwrap_or(0).max(evaluation),
             key: String::new(),
         };
-        let largest = estimate
-            .images
-            .max(estimate.step)
-            .max(estimate.grid + estimate.optimizer);
+        let largest = estimate.images.max(estimate.step).max(estimate.grid + estimate.optimizer);
         let key = match largest {
             n if n == estimate.images => "downscale".to_owned(),
             n if n == estimate.step => "rays_per_step".to_owned(),
@@ -84,13 +74,7 @@ impl Estimate {
     }
 
     /// Rendering a trained grid, and comparing it with the views of a split where `compare` is set.
-    pub fn of_evaluation(
-        config: &Config,
-        sampling: Sampling,
-        shape: &GridShape,
-        dataset: &Dataset,
-        compare: Option<Split>,
-    ) -> Self {
+    pub fn of_evaluation(config: &Config, sampling: Sampling, shape: &GridShape, dataset: &Dataset, compare: Option<Split>) -> Self {
         let samples = EVALUATION_RAYS * mean_samples(sampling, shape);
         Estimate {
             images: compare.map_or(0, |split| images(dataset, config.downscale, &[split])),
@@ -128,11 +112,7 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match available() {
             Some(available) if self.total() > available => {
-                let found = format!(
-                    "a run that needs about {} of memory where {} are free",
-                    bytes(self.total()),
-                    bytes(available)
-                );
+                let found = format!("a run that needs about {} of memory where {} are free", bytes(self.total()), bytes(available));
                 let accepted = match self.key.as_str() {
                     "downscale" => "a larger factor, so that the images fit",
                     "rays_per_step" => "fewer rays in a step",
@@ -149,9 +129,7 @@ impl Estimate {
 pub fn available() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let free = kilobytes(&text, "MemAvailable:")?;
-    let number = |path: &str| -> Option<u64> {
-        std::fs::read_to_string(path).ok()?.trim().parse().ok()
-    };
+    let number = |path: &str| -> Option<u64> { std::fs::read_to_string(path).ok()?.trim().parse().ok() };
     let limit = number("/sys/fs/cgroup/memory.max");
     let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0);
     Some(limit.map_or(free, |limit| free.min(limit.saturating_sub(used))))
@@ -209,9 +187,7 @@ fn touched_rows(shape: &GridShape, samples: u64) -> u64 {
 
 /// True if a loss looks at the whole grid, so that gradients are dense.
 fn whole_grid_losses(config: &Config) -> bool {
-    ["tv_density", "tv_color"]
-        .iter()
-        .any(|name| config.losses.contains_key(*name))
+    ["tv_density", "tv_color"].iter().any(|name| config.losses.contains_key(*name))
 }
 
 #[cfg(test)]

@@ -27,21 +27,14 @@ impl<'a> Console<'a> {
     /// A console on two streams. `quiet` leaves only errors and results.
     pub fn new(streams: Streams<'a>, quiet: bool) -> Self {
         let terminal = streams.terminal;
-        Console {
-            streams: Mutex::new(streams),
-            bar: Mutex::new(None),
-            terminal,
-            quiet,
-        }
+        Console { streams: Mutex::new(streams), bar: Mutex::new(None), terminal, quiet }
     }
 
     /// A line of results on stdout. A reader that has gone away is no failure: the results are in files too.
     pub fn result(&self, text: &str) -> Result<()> {
         let out = &mut lock(&self.streams).out;
         match writeln!(out, "{text}").and_then(|()| out.flush()) {
-            Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => {
-                Err(Error::io("stdout", e, "printing the result"))
-            }
+            Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Error::io("stdout", e, "printing the result")),
             _ => Ok(()),
         }
     }
@@ -70,10 +63,7 @@ impl<'a> Console<'a> {
 
     /// Progress of something that is counted, such as images read.
     pub fn count(&self, what: &str, total: usize) -> Count<'_, 'a> {
-        Count {
-            meter: Meter::new(self, total as u64),
-            what: what.to_owned(),
-        }
+        Count { meter: Meter::new(self, total as u64), what: what.to_owned() }
     }
 
     /// Progress of a training run.
@@ -107,17 +97,13 @@ struct Meter<'c, 'a> {
 impl<'c, 'a> Meter<'c, 'a> {
     fn new(console: &'c Console<'a>, total: u64) -> Self {
         let bar = (console.terminal && !console.quiet).then(|| {
-            let style = ProgressStyle::with_template("{bar:24} {percent:>3} %  {wide_msg}")
-                .unwrap_or_else(|_| ProgressStyle::default_bar());
+            let style =
+                ProgressStyle::with_template("{bar:24} {percent:>3} %  {wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
             ProgressBar::new(total).with_style(style)
         });
         lock(&console.bar).clone_from(&bar);
         let shown = Mutex::new(Instant::now());
-        Meter {
-            console,
-            bar,
-            shown,
-        }
+        Meter { console, bar, shown }
     }
 
     /// Shows a position, if it is time to or it must be.
@@ -174,11 +160,7 @@ struct Smoothed {
 
 impl Smoothed {
     fn new(share: f64) -> Self {
-        Smoothed {
-            share,
-            count: 0.0,
-            value: 0.0,
-        }
+        Smoothed { share, count: 0.0, value: 0.0 }
     }
 
     fn add(&mut self, value: f64) {
@@ -223,11 +205,7 @@ impl Training<'_, '_> {
         let stage = &self.plan[report.stage].stage;
         let pace = match self.step_seconds.value {
             0.0 => String::new(),
-            step => format!(
-                "{:.1} it/s  {}rays/s  ",
-                1.0 / step,
-                metric(report.rays as f64 / step)
-            ),
+            step => format!("{:.1} it/s  {}rays/s  ", 1.0 / step, metric(report.rays as f64 / step)),
         };
         format!(
             "stage {}/{} ({}³)  step {}/{}  loss {:.5}  psnr {:.2} dB  {pace}{:.0} samples/ray  ETA {}",
@@ -251,9 +229,7 @@ impl Training<'_, '_> {
             _ => self.step_seconds.value,
         };
         let here = (now.first + now.steps - report.step - 1) as f64;
-        let later = self.plan[report.stage + 1..].iter().map(|p| {
-            p.steps as f64 * p.stage.resolution as f64 / now.stage.resolution as f64
-        });
+        let later = self.plan[report.stage + 1..].iter().map(|p| p.steps as f64 * p.stage.resolution as f64 / now.stage.resolution as f64);
         step * (here + later.sum::<f64>())
     }
 }

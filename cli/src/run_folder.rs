@@ -51,9 +51,7 @@ impl RunFolder {
     /// Errors: it has something in it and may not be overwritten, or it is a file.
     pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
         let Some(path) = out else {
-            return Ok(RunFolder {
-                path: first_free(Path::new("runs"), scene),
-            });
+            return Ok(RunFolder { path: first_free(Path::new("runs"), scene) });
         };
         if path.exists() && !path.is_dir() {
             let found = format!("{}, which is a file,", path.display());
@@ -62,15 +60,9 @@ impl RunFolder {
         let occupied = std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some());
         if occupied && !overwrite {
             let found = format!("{}, which is not empty,", path.display());
-            return Err(Error::config(
-                "--out",
-                found,
-                "a new folder; or --force, which overwrites the run in it",
-            ));
+            return Err(Error::config("--out", found, "a new folder; or --force, which overwrites the run in it"));
         }
-        Ok(RunFolder {
-            path: path.to_owned(),
-        })
+        Ok(RunFolder { path: path.to_owned() })
     }
 
     /// Makes the folder. Of a run that is overwritten, the files go that this one may not write, so that nothing of it is mistaken for
@@ -115,14 +107,10 @@ impl RunFolder {
             let found = "this is a file, not the folder of a run";
             return Err(Error::input(path, found, remedy));
         }
-        let folder = RunFolder {
-            path: path.to_owned(),
-        };
+        let folder = RunFolder { path: path.to_owned() };
         let record = path.join(RECORD);
         let text = std::fs::read_to_string(&record).map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => {
-                Error::input(path, format!("there is no {RECORD} in this folder"), remedy)
-            }
+            std::io::ErrorKind::NotFound => Error::input(path, format!("there is no {RECORD} in this folder"), remedy),
             _ => Error::io(&record, e, "reading the run"),
         })?;
         let record = serde_json::from_str(&text).map_err(|e| {
@@ -204,9 +192,8 @@ impl RunFolder {
 
     fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
         let path = self.path.join(name);
-        let text = serde_json::to_string_pretty(value).map_err(|e| {
-            Error::input(&path, e.to_string(), "this is a defect of the program")
-        })?;
+        let text =
+            serde_json::to_string_pretty(value).map_err(|e| Error::input(&path, e.to_string(), "this is a defect of the program"))?;
         files::write_atomically(&path, (text + "\n").as_bytes())
     }
 }

@@ -1,7 +1,8 @@
 //! A trained grid on disk: a `safetensors` file that says what its numbers mean.
 //!
-//! Tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. The metadata hold the version and every convention
-//! a reader must know; [`FORMAT`] and [`CONVENTION`] are checked on reading.
+//! Tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. The metadata have one entry, `plenoxel`: a JSON object
+//! with the version and every convention a reader must know. (One entry, for several would be written in a random order, and equal grids
+//! are to be equal files.)
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -14,12 +15,20 @@ use std::path::Path;
 
 /// Version of the format.
 pub const FORMAT: &str = "plenoxel 1";
-/// Where a voxel's value sits, in words.
-pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; sigma = max(0, density) after interpolation";
+/// Where a voxel's value sits and what it means, in words.
+pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; \
+    sigma = max(0, density) after interpolation, per world length; \
+    harmonics as in svox2: R, G, B blocks; 1, -y, z, -x, xy, -yz, 2zz-xx-yy, -xz, xx-yy; max(0, offset + sum)";
+/// Key of the metadata.
+const KEY: &str = "plenoxel";
 
 /// Everything about a checkpoint but its tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
+    /// [`FORMAT`].
+    pub format: String,
+    /// [`CONVENTION`], for a human reader.
+    pub convention: String,
     /// Shape of the grid.
     pub resolution: usize,
     /// Half the side of the cube, in the dataset's units.
@@ -55,6 +64,8 @@ impl Header {
         let mut identity = [[0.0; 4]; 4];
         (0..4).for_each(|i| identity[i][i] = 1.0);
         Header {
+            format: FORMAT.to_owned(),
+            convention: CONVENTION.to_owned(),
             resolution: shape.resolution,
             half_width: shape.half_width,
             interpolation: shape.interpolation,
@@ -81,15 +92,11 @@ pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Resul
     let bytes = |table: &Tensor<T>| -> Vec<u8> { table.data().iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect() };
     let (density, color) = (bytes(grid.density.tensor()), bytes(grid.color.tensor()));
     let n = header.resolution;
-    let view = |shape: Vec<usize>, data| TensorView::new(Dtype::F32, shape, data).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"));
+    let defect = |e: &dyn std::fmt::Display| Error::input(path, format!("the checkpoint cannot be put together ({e})"), "this is a defect of the program");
+    let view = |shape: Vec<usize>, data| TensorView::new(Dtype::F32, shape, data).map_err(|e| defect(&e));
     let tensors = [("density", view(vec![n, n, n], &density)?), ("color", view(vec![n, n, n, grid.shape().color.channels()], &color)?)];
-    let metadata = HashMap::from([
-        ("format".to_owned(), FORMAT.to_owned()),
-        ("convention".to_owned(), CONVENTION.to_owned()),
-        ("sh_convention".to_owned(), "svox2: R, G, B blocks; 1, -y, z, -x, xy, -yz, 2zz-xx-yy, -xz, xx-yy".to_owned()),
-        ("header".to_owned(), serde_json::to_string(header).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?),
-    ]);
-    let file = safetensors::serialize(tensors, Some(metadata)).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?;
+    let metadata = HashMap::from([(KEY.to_owned(), serde_json::to_string(header).map_err(|e| defect(&e))?)]);
+    let file = safetensors::serialize(tensors, Some(metadata)).map_err(|e| defect(&e))?;
     write_atomically(path, &file)
 }
 
@@ -100,14 +107,16 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     let damaged = |e: safetensors::SafeTensorError| Error::input(path, format!("not a whole safetensors file ({e})"), retrain);
     let tensors = SafeTensors::deserialize(&file).map_err(damaged)?;
     let (_, metadata) = SafeTensors::read_metadata(&file).map_err(damaged)?;
-    let metadata = metadata.metadata().clone().unwrap_or_default();
-    match metadata.get("format").map(String::as_str) {
-        Some(FORMAT) => {}
-        Some(other) => return Err(Error::input(path, format!("format `{other}`"), format!("this program reads `{FORMAT}`; use the version that wrote the file"))),
-        None => return Err(Error::input(path, "a safetensors file without `format`", "give a checkpoint that this program wrote")),
+    let Some(text) = metadata.metadata().as_ref().and_then(|m| m.get(KEY)) else {
+        return Err(Error::input(path, format!("a safetensors file without `{KEY}` in its metadata"), "give a checkpoint that this program wrote"));
+    };
+    // The version first: a later one may have other fields.
+    let unreadable = |e: serde_json::Error| Error::input(path, format!("the header cannot be read ({e})"), retrain);
+    let format = serde_json::from_str::<serde_json::Value>(text).map_err(unreadable)?["format"].as_str().unwrap_or("none").to_owned();
+    if format != FORMAT {
+        return Err(Error::input(path, format!("format `{format}`"), format!("this program reads `{FORMAT}`; use the version that wrote the file")));
     }
-    let header = metadata.get("header").ok_or_else(|| Error::input(path, "no `header` in the metadata", retrain))?;
-    let header: Header = serde_json::from_str(header).map_err(|e| Error::input(path, format!("the header cannot be read ({e})"), retrain))?;
+    let header: Header = serde_json::from_str(text).map_err(unreadable)?;
     let degree_known = header.sh_degree.is_none_or(|d| d <= crate::field::sh::MAX_DEGREE);
     if !(1..=4096).contains(&header.resolution) || !degree_known || !(header.half_width > 0.0 && header.half_width.is_finite()) {
         return Err(Error::input(path, "a header with impossible values", retrain));

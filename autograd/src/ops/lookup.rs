@@ -47,7 +47,7 @@ impl<T: Real> Tensor<T> {
     /// Panics if a row number is R or more.
     #[track_caller]
     pub fn gather_rows(&self, rows: &Indices) -> Self {
-        check_rows("gather_rows", rows, self.shape()[0]);
+        check_rows("gather_rows", rows, self.first_len("gather_rows"));
         let width: usize = self.shape()[1..].iter().product();
         let mut shape = self.shape().to_vec();
         shape[0] = rows.len();
@@ -76,12 +76,21 @@ impl<T: Real> Tensor<T> {
     /// Panics if there is not one row number for each row, or one is too large.
     #[track_caller]
     pub fn scatter_rows(&self, rows: &Indices, table_rows: usize) -> Self {
-        assert_eq!(rows.len(), self.shape()[0], "scatter_rows: {} row numbers for a tensor of shape {:?}", rows.len(), self.shape());
+        assert_eq!(rows.len(), self.first_len("scatter_rows"), "scatter_rows: {} row numbers for a tensor of shape {:?}", rows.len(), self.shape());
         let mut shape = self.shape().to_vec();
         shape[0] = table_rows;
         let mut out = Buffer::zeros(shape.iter().product());
         add_rows(&mut out, self.shape()[1..].iter().product(), rows, self.data());
         Tensor::from_op(out, &shape, &[self], ScatterRows { rows: rows.clone() })
+    }
+}
+
+impl<T: Real> Tensor<T> {
+    /// The number of rows. Panics, naming the op, if there are none because this is a scalar.
+    #[track_caller]
+    pub(crate) fn first_len(&self, op: &str) -> usize {
+        assert!(self.ndim() > 0, "{op}: expected rows, got a tensor of shape []");
+        self.shape()[0]
     }
 }
 

@@ -65,16 +65,18 @@ impl<T: Real> Tensor<T> {
     /// Mean along one axis, which disappears.
     #[track_caller]
     pub fn mean_axis(&self, axis: usize) -> Self {
-        let n = *self.shape().get(axis).unwrap_or(&1);
-        self.sum_axis(axis) / n as f64
+        self.check_axis("mean_axis", axis);
+        self.sum_axis(axis) / self.shape()[axis] as f64
     }
 
     /// The largest element, a scalar. The gradient is shared by all that equal it: a kink.
+    #[track_caller]
     pub fn max(&self) -> Self {
         self.extremum(self.shape().iter().map(|_| 1).collect(), true).reshape(&[])
     }
 
     /// The smallest element, a scalar. The gradient is shared by all that equal it: a kink.
+    #[track_caller]
     pub fn min(&self) -> Self {
         self.extremum(self.shape().iter().map(|_| 1).collect(), false).reshape(&[])
     }
@@ -123,6 +125,7 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, shape, &[self], SumTo { from: from.to_vec() })
     }
 
+    #[track_caller]
     fn extremum(&self, shape: Vec<usize>, largest: bool) -> Self {
         assert!(!self.is_empty(), "{}: no elements", if largest { "max" } else { "min" });
         let axis = self.shape().iter().zip(&shape).rposition(|(a, b)| a != b);
@@ -158,8 +161,13 @@ impl<T: Real> Tensor<T> {
     }
 
     #[track_caller]
-    pub(crate) fn shape_without(&self, op: &str, axis: usize) -> Vec<usize> {
+    pub(crate) fn check_axis(&self, op: &str, axis: usize) {
         assert!(axis < self.ndim(), "{op}: axis {axis} of a tensor of shape {:?}", self.shape());
+    }
+
+    #[track_caller]
+    pub(crate) fn shape_without(&self, op: &str, axis: usize) -> Vec<usize> {
+        self.check_axis(op, axis);
         let mut shape = self.shape().to_vec();
         shape.remove(axis);
         shape

@@ -63,7 +63,7 @@ impl<T: Real> Tensor<T> {
     /// `[m, …]` to `[n, …]`: yᵣ = Σ of the rows of segment r; an empty segment gives 0. `offsets` has n + 1 entries, ascending from 0 to m.
     #[track_caller]
     pub fn segment_sum(&self, offsets: &Indices) -> Self {
-        let n = segments("segment_sum", offsets, self.shape()[0]);
+        let n = segments("segment_sum", offsets, self.first_len("segment_sum"));
         let width: usize = self.shape()[1..].iter().product();
         let mut shape = self.shape().to_vec();
         shape[0] = n;
@@ -98,7 +98,7 @@ impl<T: Real> Tensor<T> {
     pub fn segment_repeat(&self, offsets: &Indices) -> Self {
         let m = *offsets.last().expect("segment_repeat: offsets have at least one entry") as usize;
         let n = segments("segment_repeat", offsets, m);
-        assert_eq!(n, self.shape()[0], "segment_repeat: {n} segments for a tensor of shape {:?}", self.shape());
+        assert_eq!(n, self.first_len("segment_repeat"), "segment_repeat: {n} segments for a tensor of shape {:?}", self.shape());
         let width: usize = self.shape()[1..].iter().product();
         let mut shape = self.shape().to_vec();
         shape[0] = m;
@@ -123,7 +123,7 @@ impl<T: Real> Tensor<T> {
     /// `[m, …]` to `[m, …]`: yᵢ = Σ of the rows before i in its own segment; the first of a segment is 0.
     #[track_caller]
     pub fn segment_exclusive_sum(&self, offsets: &Indices) -> Self {
-        segments("segment_exclusive_sum", offsets, self.shape()[0]);
+        segments("segment_exclusive_sum", offsets, self.first_len("segment_exclusive_sum"));
         scan(self, offsets, false)
     }
 }

@@ -208,14 +208,16 @@ impl<T: Real> Tensor<T> {
     #[track_caller]
     pub fn index_axis(&self, axis: usize, at: usize) -> Self {
         let shape = self.shape_without("index_axis", axis);
+        assert!(at < self.shape()[axis], "index_axis: entry {at} of axis {axis} of a tensor of shape {:?}", self.shape());
         self.narrow(axis, at, 1).reshape(&shape)
     }
 
     /// Zeros of length `total` along an axis, with this tensor from `start` on: the adjoint of [`Tensor::narrow`].
     #[track_caller]
     pub fn pad(&self, axis: usize, start: usize, total: usize) -> Self {
+        self.check_axis("pad", axis);
         let len = self.shape()[axis];
-        assert!(start + len <= total, "pad: {len} entries from {start} on do not fit into {total}");
+        assert!(start + len <= total, "pad: axis {axis} of a tensor of shape {:?} from {start} on does not fit into {total}", self.shape());
         let mut shape = self.shape().to_vec();
         shape[axis] = total;
         let inner: usize = shape[axis + 1..].iter().product();
@@ -259,9 +261,12 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, parts, Concat { axis })
     }
 
-    /// Tensors of one shape along a new axis.
+    /// Tensors of one shape along a new axis. Panics if the shapes differ.
     #[track_caller]
     pub fn stack(parts: &[&Tensor<T>], axis: usize) -> Self {
+        for part in parts {
+            assert_eq!(part.shape(), parts[0].shape(), "stack: shapes {:?} and {:?} differ", parts[0].shape(), part.shape());
+        }
         let parts: Vec<Tensor<T>> = parts.iter().map(|p| p.unsqueeze(axis)).collect();
         Self::concat(&parts.iter().collect::<Vec<_>>(), axis)
     }

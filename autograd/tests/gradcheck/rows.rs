@@ -13,7 +13,7 @@ macro_rules! rows {
             double: $f,
             single: $f,
             inputs: vec![$($input),*],
-            kinks: [$($kinks as fn(&[Tensor<f64>]) -> Tensor<f64>)?].first().copied(),
+            kinks: [$($kinks as Function<f64>)?].first().copied(),
         }),*]
     };
 }

@@ -3,15 +3,17 @@
 use autograd::{Closeness, Gradcheck, Indices, Real, Tensor, grad};
 use ndarray::ArrayD;
 
+pub type Function<T> = fn(&[Tensor<T>]) -> Tensor<T>;
+
 /// A function in both precisions, and where to check it.
 pub struct Row {
     pub op: &'static str,
     pub case: &'static str,
-    pub double: fn(&[Tensor<f64>]) -> Tensor<f64>,
-    pub single: fn(&[Tensor<f32>]) -> Tensor<f32>,
+    pub double: Function<f64>,
+    pub single: Function<f32>,
     pub inputs: Vec<ArrayD<f64>>,
     /// Zero where the function has a kink.
-    pub kinks: Option<fn(&[Tensor<f64>]) -> Tensor<f64>>,
+    pub kinks: Option<Function<f64>>,
 }
 
 /// A gradient in `f32` is a handful of roundings away from that in `f64`.

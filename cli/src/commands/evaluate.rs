@@ -72,8 +72,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         Some(samples) => with_samples(config.evaluation, samples as usize, &grid),
         None => config.evaluation,
     };
-    let estimate =
-        Estimate::of_evaluation(&config, sampling, grid.shape(), &dataset, Some(args.split));
+    let estimate = Estimate::of_evaluation(&config, sampling, grid.shape(), &dataset, Some(args.split));
     console.note(&estimate.describe());
     estimate.check()?;
     let views = load(console, &dataset, args.split, &source)?;

@@ -148,7 +148,10 @@ fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
     if let Some(camera) = cameras.first() {
         let k = &camera.intrinsics;
         let fov = k.fov_x().to_degrees();
-        lines.push(("cameras", format!("focal length {:.2} pixels ({fov:.1}° across), {nearest:.3} to {farthest:.3} from the origin", k.fx)));
+        lines.push((
+            "cameras",
+            format!("focal length {:.2} pixels ({fov:.1}° across), {nearest:.3} to {farthest:.3} from the origin", k.fx),
+        ));
     }
     lines
 }

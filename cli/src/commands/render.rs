@@ -72,9 +72,7 @@ pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
     for (done, &number) in chosen.iter().enumerate() {
         let picture = viewer.see(&cameras[number]);
         let range = DepthRange::of(&cameras[number], config.half_width);
-        let file = |kind: &str| {
-            folder.render(&format!("{}_{number:03}_{}{kind}.png", args.split, names[number]))
-        };
+        let file = |kind: &str| folder.render(&format!("{}_{number:03}_{}{kind}.png", args.split, names[number]));
         images::write(&file(""), &picture.rgb)?;
         images::write(&file("_depth"), &images::depth_map(&picture, range))?;
         images::write(&file("_opacity"), &images::opacity_map(&picture))?;

@@ -3,7 +3,6 @@
 mod flags;
 mod pictures;
 
-use crate::config;
 use crate::curves::loss_svg;
 use crate::data::DataSource;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
@@ -18,8 +17,8 @@ use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::train::config::Config;
 use plenoxel::train::Trainer;
+use plenoxel::train::config::Config;
 use serde::Serialize;
 use serde_json::json;
 use std::time::{Duration, Instant};
@@ -35,44 +34,24 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     console.note(&estimate.describe());
     estimate.check()?;
     let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
-    let views = clocks
-        .load
-        .time(|| load(console, &dataset, Split::Train, &source))?;
+    let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
 
     // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
     folder.prepare()?;
     folder.describe(&config, &record(&dataset, preset, &source))?;
     console.note(&format!("run: {}", folder.path().display()));
     let mut pictures = Pictures::new(&folder, &config, &dataset, !args.no_images)?;
-    let mut learned = learn(
-        &config,
-        &views,
-        &folder,
-        args.keeps_stages(),
-        console,
-        &mut clocks,
-        &mut pictures,
-    )?;
-    let header = Header::new(
-        &learned.grid,
-        dataset.name(),
-        config.background,
-        config.seed,
-        learned.steps,
-    );
+    let mut learned = learn(&config, &views, &folder, args.keeps_stages(), console, &mut clocks, &mut pictures)?;
+    let header = Header::new(&learned.grid, dataset.name(), config.background, config.seed, learned.steps);
     folder.save(&learned.grid, &header)?;
     let mean_image = evaluation::mean_image(&views, config.background);
     drop(views);
 
-    let test = clocks
-        .load
-        .time(|| load(console, &dataset, Split::Test, &source))?;
+    let test = clocks.load.time(|| load(console, &dataset, Split::Test, &source))?;
     for stage in &mut learned.stages {
         if let Some(grid) = stage.grid.take() {
             let viewer = Viewer::new(&grid, config.evaluation, config.background);
-            let scores = clocks
-                .evaluate
-                .time(|| viewer.compare(&test, |_, _, _, _| Ok(())))?;
+            let scores = clocks.evaluate.time(|| viewer.compare(&test, |_, _, _, _| Ok(())))?;
             stage.psnr = scores.psnr();
         }
     }
@@ -97,8 +76,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
         ssim: scores.ssim(),
         ssim_same: scores.ssim_same(),
         baseline_background_psnr: evaluation::background_psnr(&test, config.background),
-        baseline_mean_image_psnr: mean_image
-            .and_then(|image| evaluation::constant_psnr(&test, &image, config.background)),
+        baseline_mean_image_psnr: mean_image.and_then(|image| evaluation::constant_psnr(&test, &image, config.background)),
         views: test.len(),
         width,
         height,
@@ -181,14 +159,7 @@ fn learn(
     }
     drop(progress);
     let (rays, samples) = metrics.counts();
-    Ok(Learned {
-        grid: trainer.into_grid(),
-        metrics,
-        stages,
-        steps: total,
-        rays,
-        samples,
-    })
+    Ok(Learned { grid: trainer.into_grid(), metrics, stages, steps: total, rays, samples })
 }
 
 /// A grid with the values that `grid` has now: the tables are shared until training changes them.
@@ -262,12 +233,7 @@ impl Stopwatch {
 }
 
 /// Reads or renders a split.
-pub fn load(
-    console: &Console<'_>,
-    dataset: &Dataset,
-    split: Split,
-    source: &DataSource,
-) -> Result<Vec<View>> {
+pub fn load(console: &Console<'_>, dataset: &Dataset, split: Split, source: &DataSource) -> Result<Vec<View>> {
     let what = match source {
         DataSource::Folder { .. } => format!("reading {split} images"),
         DataSource::BuiltIn { .. } => format!("rendering {split} images of the built-in scene"),
@@ -286,11 +252,7 @@ fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
         config.background,
         config.half_width,
     ));
-    console.note(&format!(
-        "machine: {}, {} threads",
-        machine::instruction_set(),
-        machine::threads()
-    ));
+    console.note(&format!("machine: {}, {} threads", machine::instruction_set(), machine::threads()));
 }
 
 fn record(dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> RunRecord {
@@ -305,13 +267,7 @@ fn record(dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> RunRe
     }
 }
 
-fn conclude(
-    console: &Console<'_>,
-    folder: &RunFolder,
-    summary: &Summary,
-    scores: &Scores,
-    pictures: &Pictures<'_>,
-) -> Result<()> {
+fn conclude(console: &Console<'_>, folder: &RunFolder, summary: &Summary, scores: &Scores, pictures: &Pictures<'_>) -> Result<()> {
     if let Some(note) = pictures.note() {
         console.note(&note);
     }
@@ -327,4 +283,3 @@ fn conclude(
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.result(&json!(summary).to_string())
 }
-

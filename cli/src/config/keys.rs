@@ -32,24 +32,10 @@ const TABLES: &[(&str, &[&str])] = &[
         ],
     ),
     ("initial", &["density", "color", "random"]),
-    (
-        "optimizer",
-        &["kind", "decay", "beta", "beta1", "beta2", "epsilon"],
-    ),
+    ("optimizer", &["kind", "decay", "beta", "beta1", "beta2", "epsilon"]),
     ("losses", &loss::NAMES),
     ("losses.*", &["from", "to", "steps"]),
-    (
-        "stages[]",
-        &[
-            "resolution",
-            "epochs",
-            "steps",
-            "sampling",
-            "density_rate",
-            "color_rate",
-            "rate_decay",
-        ],
-    ),
+    ("stages[]", &["resolution", "epochs", "steps", "sampling", "density_rate", "color_rate", "rate_decay"]),
     ("stages[].sampling", &["step", "samples", "far"]),
     ("evaluation", &["step", "samples", "far"]),
 ];
@@ -82,14 +68,9 @@ fn walk(path: &str, pattern: &str, value: &Value, place: &dyn Fn(&str) -> String
             check_key(pattern, key, &place(&inner))?;
             walk(&inner, &joined(pattern, key), value, place)
         }),
-        Value::Array(values) => values.iter().enumerate().try_for_each(|(i, value)| {
-            walk(
-                &format!("{path}[{i}]"),
-                &format!("{pattern}[]"),
-                value,
-                place,
-            )
-        }),
+        Value::Array(values) => {
+            values.iter().enumerate().try_for_each(|(i, value)| walk(&format!("{path}[{i}]"), &format!("{pattern}[]"), value, place))
+        }
         _ => Ok(()),
     }
 }
@@ -102,37 +83,22 @@ fn joined(path: &str, key: &str) -> String {
 }
 
 fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
-    let known = TABLES.iter().find(|(table, _)| {
-        *table == pattern
-            || table
-                .strip_suffix('*')
-                .is_some_and(|start| pattern.starts_with(start))
-    });
+    let known =
+        TABLES.iter().find(|(table, _)| *table == pattern || table.strip_suffix('*').is_some_and(|start| pattern.starts_with(start)));
     let Some((_, known)) = known else {
         let found = format!("the key `{key}` below `{pattern}`, which is no table,");
-        return Err(Error::config(
-            place,
-            found,
-            format!("a value for `{pattern}`"),
-        ));
+        return Err(Error::config(place, found, format!("a value for `{pattern}`")));
     };
     if known.contains(&key) {
         return Ok(());
     }
     // The nearest in spelling, if it is near; a word that resembles nothing gets the whole list.
-    let nearest = known
-        .iter()
-        .min_by_key(|name| distance(key, name))
-        .filter(|name| distance(key, name) <= 2 + name.len() / 4);
+    let nearest = known.iter().min_by_key(|name| distance(key, name)).filter(|name| distance(key, name) <= 2 + name.len() / 4);
     let accepted = match nearest {
         Some(name) => format!("the nearest known key is `{name}`"),
         None => format!("one of {}", known.join(", ")),
     };
-    Err(Error::config(
-        place,
-        format!("the unknown key `{key}`"),
-        accepted,
-    ))
+    Err(Error::config(place, format!("the unknown key `{key}`"), accepted))
 }
 
 /// Levenshtein's edit distance.

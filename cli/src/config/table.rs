@@ -5,13 +5,8 @@ use toml::{Table, Value};
 
 /// Keys of which one excludes the others: writing the first takes away the rest. They are the two ways to place samples and the two
 /// ways to give a stage its length.
-const ALTERNATIVES: [(&str, &[&str]); 5] = [
-    ("step", &["samples", "far"]),
-    ("samples", &["step"]),
-    ("far", &["step"]),
-    ("epochs", &["steps"]),
-    ("steps", &["epochs"]),
-];
+const ALTERNATIVES: [(&str, &[&str]); 5] =
+    [("step", &["samples", "far"]), ("samples", &["step"]), ("far", &["step"]), ("epochs", &["steps"]), ("steps", &["epochs"])];
 
 /// Lays `over` upon `base`, key by key: tables are merged, everything else, lists included, is replaced. A table with another
 /// `kind` replaces its predecessor, whose keys would mean nothing to it.
@@ -42,9 +37,7 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
             }
             return Ok(());
         };
-        let inner = table
-            .entry(segment)
-            .or_insert_with(|| Value::Table(Table::new()));
+        let inner = table.entry(segment).or_insert_with(|| Value::Table(Table::new()));
         // A number gives way to a table: `losses.tv.from` where `losses.tv` was a constant weight.
         if !inner.is_table() && !inner.is_array() {
             *inner = Value::Table(Table::new());
@@ -52,11 +45,7 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
         let found = format!("`{segment}`, which is a list,");
         return match inner.as_table_mut() {
             Some(inner) => set(inner, rest, value, place),
-            None => Err(Error::config(
-                place,
-                found,
-                format!("an index, as in {segment}[0].{rest}, or {segment}[*].{rest}"),
-            )),
+            None => Err(Error::config(place, found, format!("an index, as in {segment}[0].{rest}, or {segment}[*].{rest}"))),
         };
     };
     let length = table.get(name).and_then(Value::as_array).map_or(0, Vec::len);
@@ -84,11 +73,7 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
             (Some(rest), Value::Table(inner), value) => set(inner, rest, value, place)?,
             (None, entry, Some(value)) => *entry = value.clone(),
             _ => {
-                return Err(Error::config(
-                    place,
-                    format!("`{path}`"),
-                    format!("a key of a table, or a value for {name}[{index}]"),
-                ));
+                return Err(Error::config(place, format!("`{path}`"), format!("a key of a table, or a value for {name}[{index}]")));
             }
         }
     }

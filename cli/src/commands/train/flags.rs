@@ -114,14 +114,7 @@ impl TrainArgs {
         let (width, height) = self.scene_size.unwrap_or((default.width, default.height));
         let views = [default.train, default.val, default.test];
         let [train, val, test] = self.scene_views.unwrap_or(views);
-        DataSource::built_in(&ProceduralOptions {
-            width,
-            height,
-            train,
-            val,
-            test,
-            ..default
-        })
+        DataSource::built_in(&ProceduralOptions { width, height, train, val, test, ..default })
     }
 
     /// True if the grids of earlier stages are evaluated too.
@@ -211,9 +204,7 @@ fn three_counts(text: &str) -> std::result::Result<[usize; 3], String> {
 
 fn weight(text: &str) -> std::result::Result<f64, String> {
     let weight = text.parse().ok();
-    weight
-        .filter(|w: &f64| w.is_finite() && *w >= 0.0)
-        .ok_or_else(|| "a number of at least 0, such as 1e-4".to_owned())
+    weight.filter(|w: &f64| w.is_finite() && *w >= 0.0).ok_or_else(|| "a number of at least 0, such as 1e-4".to_owned())
 }
 
 #[cfg(test)]

@@ -27,12 +27,7 @@ pub struct Pictures<'a> {
 
 impl<'a> Pictures<'a> {
     /// Pictures for a run, or none at all.
-    pub fn new(
-        folder: &'a RunFolder,
-        config: &'a Config,
-        dataset: &Dataset,
-        wanted: bool,
-    ) -> Result<Self> {
+    pub fn new(folder: &'a RunFolder, config: &'a Config, dataset: &Dataset, wanted: bool) -> Result<Self> {
         let views = dataset.count(Split::Test);
         let first = |split| dataset.cameras(split).into_iter().next();
         if wanted {
@@ -88,11 +83,7 @@ impl<'a> Pictures<'a> {
     /// What is to be said about views without a picture.
     pub fn note(&self) -> Option<String> {
         let shown = self.panels.len();
-        (shown > 0 && shown < self.views).then(|| {
-            format!(
-                "images: panels of {shown} of the {} test views, evenly spaced; all of them are in the figures",
-                self.views
-            )
-        })
+        (shown > 0 && shown < self.views)
+            .then(|| format!("images: panels of {shown} of the {} test views, evenly spaced; all of them are in the figures", self.views))
     }
 }

@@ -1,0 +1,83 @@
+//! Grids on disk.
+
+use plenoxel::checkpoint::{self, Header};
+use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use std::path::PathBuf;
+
+fn folder(name: &str) -> PathBuf {
+    let path = std::env::temp_dir().join(format!("plenoxel-checkpoint-{}-{name}", std::process::id()));
+    std::fs::create_dir_all(&path).expect("a temporary folder");
+    path
+}
+
+fn grid() -> (VoxelGrid<f32>, Header) {
+    let shape = GridShape { resolution: 5, half_width: 1.4, interpolation: Interpolation::Trilinear, color: Color::Sh { degree: 2, offset: 0.5 } };
+    let grid = VoxelGrid::random(shape, 3.0, 1.0, 9);
+    let header = Header::new(&grid, "still life", [1.0, 1.0, 1.0], 42, 1234);
+    (grid, header)
+}
+
+#[test]
+fn a_grid_comes_back_as_it_was_with_all_that_explains_it() {
+    let path = folder("round-trip").join("checkpoint.safetensors");
+    let (grid, header) = grid();
+    checkpoint::save(&path, &grid, &header).expect("it is written");
+    let (read, read_header) = checkpoint::load::<f32>(&path).expect("it is read");
+    assert_eq!(read_header, header);
+    assert_eq!(read.shape(), grid.shape());
+    assert_eq!(read.density.tensor().data(), grid.density.tensor().data());
+    assert_eq!(read.color.tensor().data(), grid.color.tensor().data());
+    // The same file serves f64, and writing that again gives the same bytes.
+    let (double, _) = checkpoint::load::<f64>(&path).expect("it is read as f64");
+    let again = path.with_file_name("again.safetensors");
+    checkpoint::save(&again, &double, &header).expect("it is written");
+    assert!(std::fs::read(&path).unwrap() == std::fs::read(&again).unwrap());
+}
+
+#[test]
+fn a_damaged_or_foreign_file_is_named_with_what_is_wrong() {
+    let dir = folder("damaged");
+    let path = dir.join("checkpoint.safetensors");
+    let (grid, header) = grid();
+    checkpoint::save(&path, &grid, &header).expect("it is written");
+    let whole = std::fs::read(&path).unwrap();
+    let message = |bytes: &[u8]| {
+        std::fs::write(&path, bytes).unwrap();
+        let error = checkpoint::load::<f32>(&path).expect_err("it is damaged");
+        assert_eq!(error.exit_code(), 3, "{error}");
+        error.to_string()
+    };
+    for cut in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
+        assert!(message(&whole[..cut]).contains("not a whole safetensors file"), "cut to {cut} bytes");
+    }
+    let text = String::from_utf8_lossy(&whole).into_owned();
+    assert!(text.contains("plenoxel 1"));
+    let later: Vec<u8> = replace(&whole, b"plenoxel 1", b"plenoxel 9");
+    assert!(message(&later).contains("format `plenoxel 9`"));
+    assert!(message(&replace(&whole, br#"\"resolution\":5"#, br#"\"resolution\":7"#)).contains("expected"));
+    let foreign = safetensors_without_metadata();
+    assert!(message(&foreign).contains("without `plenoxel`"));
+    assert_eq!(checkpoint::load::<f32>(&dir.join("missing")).expect_err("there is none").exit_code(), 5);
+}
+
+fn replace(bytes: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {
+    let at = bytes.windows(from.len()).position(|w| w == from).expect("the text is there");
+    [&bytes[..at], to, &bytes[at + from.len()..]].concat()
+}
+
+/// A header of two bytes, `{}`, padded to eight, and nothing else.
+fn safetensors_without_metadata() -> Vec<u8> {
+    [&8u64.to_le_bytes()[..], b"{}      "].concat()
+}
+
+#[test]
+fn a_file_is_written_whole_or_not_at_all() {
+    let dir = folder("unwritable");
+    // The path is a folder: the rename fails, and nothing of the attempt stays.
+    let path = dir.join("taken");
+    std::fs::create_dir_all(path.join("inside")).unwrap();
+    let (grid, header) = grid();
+    let error = checkpoint::save(&path, &grid, &header).expect_err("a folder is in the way");
+    assert_eq!(error.exit_code(), 5);
+    assert_eq!(std::fs::read_dir(&dir).unwrap().count(), 1);
+}

@@ -1,0 +1,84 @@
+//! Reading a field at another resolution.
+
+mod support;
+
+use approx::assert_relative_eq;
+use autograd::{Tensor, no_grad};
+use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use support::numbers;
+
+/// Voxel centres of a grid of n³ in the cube ±1.
+fn centers(n: usize) -> Vec<[f64; 3]> {
+    let c = |k: usize| (k as f64 + 0.5) * 2.0 / n as f64 - 1.0;
+    (0..n * n * n).map(|r| [c(r / (n * n)), c(r / n % n), c(r % n)]).collect()
+}
+
+fn sampled(n: usize, f: impl Fn([f64; 3]) -> f64) -> VoxelGrid<f64> {
+    let shape = GridShape { resolution: n, half_width: 1.0, interpolation: Interpolation::Trilinear, color: Color::Rgb };
+    let values: Vec<f64> = centers(n).into_iter().map(f).collect();
+    let color = Tensor::stack(&[0.1, 0.2, 0.3].map(|s| Tensor::from_vec(values.iter().map(|v| s * v).collect(), &[n * n * n])).each_ref(), 1);
+    VoxelGrid::from_tables(shape, Tensor::from_vec(values, &[n * n * n, 1]), color)
+}
+
+#[test]
+fn resampling_a_trilinear_function_is_exact_between_the_old_centres() {
+    // f is trilinear over the whole cube, so it equals its interpolation inside the hull of the centres of any grid.
+    let f = |[x, y, z]: [f64; 3]| 2.0 + 0.3 * x - 0.2 * y + 0.1 * z + 0.4 * x * y - 0.3 * y * z + 0.2 * x * z + 0.25 * x * y * z;
+    let old = sampled(5, f);
+    for n in [3, 5, 8, 10] {
+        let new = old.resample(n);
+        // The hull of the old centres is ±0.8; beyond it the field repeats its border.
+        for (at, &got) in centers(n).into_iter().zip(new.density.tensor().data()) {
+            assert_relative_eq!(got, f(at.map(|x| x.clamp(-0.8, 0.8))), epsilon = 1e-12);
+        }
+        for (row, &d) in new.color.tensor().data().chunks(3).zip(new.density.tensor().data()) {
+            assert_relative_eq!(row[2], 0.3 * d, epsilon = 1e-12);
+        }
+    }
+}
+
+#[test]
+fn upsampling_keeps_the_field_at_the_old_centres_when_the_ratio_is_odd() {
+    // Three new voxels in each old one: the middle one has the old one's centre.
+    let old = VoxelGrid::<f64>::random(GridShape { resolution: 4, half_width: 1.3, interpolation: Interpolation::Nearest, color: Color::Rgb }, 1.0, 1.0, 3);
+    let new = old.resample(12);
+    for i in 0..4 {
+        for j in 0..4 {
+            for k in 0..4 {
+                let (was, is) = ((i * 4 + j) * 4 + k, ((3 * i + 1) * 12 + 3 * j + 1) * 12 + 3 * k + 1);
+                assert_relative_eq!(new.density.tensor().data()[is], old.density.tensor().data()[was], epsilon = 1e-12);
+            }
+        }
+    }
+}
+
+#[test]
+fn nearest_look_up_reads_the_voxel_a_point_lies_in() {
+    let shape = GridShape { resolution: 4, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Rgb };
+    let grid = VoxelGrid::from_tables(shape, Tensor::constant(numbers(&[64, 1], 0.0, 1.0, 1)), Tensor::zeros(&[64, 3]));
+    // Voxels are 1 wide: (−1.99, 0.5, 1.99) lies in (0, 2, 3); its faces belong to the next voxel.
+    for (at, row) in [([-1.99, 0.5, 1.99], 11), ([-2.0, -2.0, -2.0], 0), ([-1.0, 0.0, 1.0], 16 + 8 + 3), ([2.0, 2.0, 2.0], 63)] {
+        let read = no_grad(|| {
+            use plenoxel::field::Field;
+            grid.density(&Tensor::from_vec(at.to_vec(), &[1, 3]))
+        });
+        assert_eq!(read.data()[0], grid.density.tensor().data()[row], "at {at:?}");
+    }
+}
+
+#[test]
+fn clearing_outside_an_occupancy_keeps_what_is_visible() {
+    let mut grid = sampled(8, |[x, y, z]| if x * x + y * y + z * z < 0.3 { 3.0 } else { 0.01 });
+    let before: Vec<f64> = grid.density.tensor().data().to_vec();
+    let occupancy = grid.occupancy(0.1);
+    grid.clear_outside(&occupancy);
+    let after = grid.density.tensor().data();
+    for (b, a) in before.iter().zip(after) {
+        if *b > 0.1 {
+            assert_eq!(a, b);
+        }
+    }
+    assert!(after.iter().filter(|&&d| d == 0.0).count() > 100);
+    // A voxel beside a full one stays as it was: trilinear look-up reads it.
+    assert!(after.iter().any(|&d| d == 0.01));
+}
