@@ -59,7 +59,10 @@ impl fmt::Display for GradcheckError {
                     Some(index) => write!(f, " at {index:?}")?,
                     None => write!(f, " along a random direction")?,
                 }
-                write!(f, ": {pass} gives {analytic:.9e}, finite differences give {numeric:.9e} (relative error {relative_error:.1e}, allowed {tolerance:.1e})")?;
+                write!(
+                    f,
+                    ": {pass} gives {analytic:.9e}, finite differences give {numeric:.9e} (relative error {relative_error:.1e}, allowed {tolerance:.1e})"
+                )?;
                 if index.is_none() { write!(f, "; `.elementwise()` names the entry") } else { Ok(()) }
             }
             GradcheckError::Kink { name, input, distances: (before, after) } => write!(

@@ -163,7 +163,17 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
                         let relative_error = if distance == 0.0 { 0.0 } else { distance / magnitude.max(numeric.abs()).max(1e-5 * size) };
                         if relative_error.is_nan() || relative_error > self.tolerance {
                             let (name, tolerance) = (self.name.clone(), self.tolerance);
-                            return Err(GradcheckError::Derivative { name, input, index, order, pass, analytic, numeric, relative_error, tolerance });
+                            return Err(GradcheckError::Derivative {
+                                name,
+                                input,
+                                index,
+                                order,
+                                pass,
+                                analytic,
+                                numeric,
+                                relative_error,
+                                tolerance,
+                            });
                         }
                         worst = relative_error.max(worst);
                     }

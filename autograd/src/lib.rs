@@ -1,4 +1,20 @@
-//! Reverse-mode automatic differentiation over `ndarray`, small enough to read in an evening.
+#![doc = include_str!("../README.md")]
+//!
+//! # The tour, in the order to read the files
+//!
+//! 1. **Value.** [`Tensor`] (`tensor.rs`): a shared buffer, a shape and, if it depends on a variable, a node. [`Real`] (`real.rs`) are the two
+//!    scalar types; [`Buffer`] (`pool.rs`) recycles large arrays; [`parallel`] is the only file that knows of threads.
+//! 2. **Graph.** `graph.rs`: a node points at the nodes of its inputs and keeps what its rule reads ([`Keep`]). Nothing else holds a graph
+//!    together, so it lives as long as its last tensor. Ids grow with creation.
+//! 3. **Rule.** `op.rs`: an [`Op`] says in tensor ops how a cotangent goes back; a [`Kernel`] says it in a loop over arrays and names its
+//!    reference. All ops are in [`ops`], each beside its rule.
+//! 4. **Backward.** `backward.rs`: the largest id first, which is every node after all its users. [`Tensor::backward`] and
+//!    [`value_and_grad`] give numbers for an optimizer, [`grad`] gives tensors to go on computing with. [`Gradients`] (`gradients.rs`)
+//!    holds one [`Grad`] for each leaf, dense or rows.
+//! 5. **Gradcheck.** [`gradcheck`](gradcheck()) (`gradcheck.rs`) holds a rule to finite differences, [`check_kernel`] a kernel to its
+//!    reference; `tests/gradcheck` has a row for each op.
+//!
+//! Then [`Param`] and [`Module`] (`param.rs`), the leaves that training changes, and [`optim`], which changes them.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 

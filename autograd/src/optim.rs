@@ -91,7 +91,12 @@ impl<T: Real, const N: usize> Memory<T, N> {
 
     /// Calls `f(parameter, gradient, state, updates)` for every parameter that has a gradient; `updates` counts this one, so it is at
     /// least 1. The state is zeros the first time.
-    fn visit(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, mut f: impl FnMut(&mut Param<T>, &Grad<T>, &mut [Buffer<T>; N], u64)) {
+    fn visit(
+        &mut self,
+        module: &mut dyn Module<T>,
+        grads: &Gradients<T>,
+        mut f: impl FnMut(&mut Param<T>, &Grad<T>, &mut [Buffer<T>; N], u64),
+    ) {
         self.round += 1;
         let round = self.round;
         module.visit_mut(&mut |param| {

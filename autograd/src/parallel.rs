@@ -106,12 +106,12 @@ pub fn copy<E: Copy + Send + Sync>(source: &[E], out: &mut [E]) {
     for_each_chunk(out, 4 * CHUNK, |start, chunk| chunk.copy_from_slice(&source[start..start + chunk.len()]));
 }
 
-/// out[i] = f(x[i])
+/// `out[i] = f(x[i])`
 pub fn map<T: Real>(x: &[T], out: &mut [T], f: impl Fn(T) -> T + Sync) {
     for_each_chunk(out, CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
 }
 
-/// out[i] = f(x[i], y[i])
+/// `out[i] = f(x[i], y[i])`
 pub fn zip<T: Real>(x: &[T], y: &[T], out: &mut [T], f: impl Fn(T, T) -> T + Sync) {
     for_each_chunk(out, CHUNK, |start, chunk| {
         let range = start..start + chunk.len();
@@ -119,12 +119,12 @@ pub fn zip<T: Real>(x: &[T], y: &[T], out: &mut [T], f: impl Fn(T, T) -> T + Syn
     });
 }
 
-/// x[i] = f(x[i], y[i])
+/// `x[i] = f(x[i], y[i])`
 pub fn zip_in_place<T: Real>(x: &mut [T], y: &[T], f: impl Fn(T, T) -> T + Sync) {
     for_each_chunk(x, CHUNK, |start, chunk| zip_in_place_loop(chunk, &y[start..start + chunk.len()], &f));
 }
 
-/// (x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i]): how an optimizer changes values and what it remembers of them.
+/// `(x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i])`: how an optimizer changes values and what it remembers of them.
 pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
     fn halves<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], g: &[T], f: &F) {
         if g.len() <= CHUNK {
@@ -191,7 +191,7 @@ fn split<T, const N: usize>(x: [&mut [T]; N], at: usize) -> ([&mut [T]; N], [&mu
     (low, high.map(Option::unwrap_or_default))
 }
 
-/// Σ f(x[i]): sixteen running sums inside a chunk, chunk sums added in order.
+/// `Σ f(x[i])`: 64 running sums inside a chunk, chunk sums added in order.
 pub fn sum<T: Real>(x: &[T], f: impl Fn(T) -> T + Sync + Send) -> T {
     map_chunks(x.len(), CHUNK, |range| sum_loop(&x[range], &f)).into_iter().sum()
 }
@@ -305,4 +305,41 @@ fn sum_loop<T: Real, F: Fn(T) -> T>(x: &[T], f: &F) -> T {
     }
     lanes[0]
 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn updates_of_rows_equal_a_plain_loop_for_every_width_and_leave_the_other_rows_alone() {
+        let rule = |[x, v]: [f64; 2], g: f64| [x - g, 0.5 * v + g];
+        for width in [1usize, 2, 3, 4, 28] {
+            // Rows alone, rows in runs, and enough of both for several chunks.
+            let table = 100_000 / width.min(4);
+            let rows: Vec<u32> = (0..table as u32).filter(|r| r % 7 != 0 && (r % 64 < 20 || r % 3 == 0)).collect();
+            let g: Vec<f64> = (0..rows.len() * width).map(|i| (i % 1000) as f64 + 1.0).collect();
+            let start: Vec<f64> = (0..table * width).map(|i| i as f64).collect();
+
+            let (mut x, mut v) = (start.clone(), start.clone());
+            let mut dense = vec![0.0; table * width];
+            for (k, &row) in rows.iter().enumerate() {
+                for c in 0..width {
+                    let at = row as usize * width + c;
+                    dense[at] = g[k * width + c];
+                    [x[at], v[at]] = rule([x[at], v[at]], dense[at]);
+                }
+            }
+            let (mut got_x, mut got_v) = (start.clone(), start.clone());
+            update_rows([&mut got_x, &mut got_v], width, &rows, &g, rule);
+            assert!(got_x == x && got_v == v, "rows of width {width}");
+
+            let (mut x, mut v) = (start.clone(), start.clone());
+            update([&mut x, &mut v], &dense, rule);
+            let (mut got_x, mut got_v) = (start.clone(), start.clone());
+            update_all_rows([&mut got_x, &mut got_v], width, &rows, &g, rule);
+            assert!(got_x == x && got_v == v, "all rows of width {width}");
+            assert!(v.iter().zip(&start).zip(&dense).all(|((v, s), g)| *v == 0.5 * s + g));
+        }
+    }
 }

@@ -6,7 +6,26 @@ pub mod render;
 pub mod scene;
 pub mod train;
 
-use plenoxel::dataset::Split;
+use plenoxel::dataset::{Dataset, Split};
+use plenoxel::error::Error;
+use plenoxel::field::voxel_grid::GridShape;
+use plenoxel::train::config::Config;
+
+/// The grid that a configuration ends with.
+fn final_shape(config: &Config) -> GridShape {
+    config.grid_shape(config.stages.last().map_or(0, |stage| stage.resolution))
+}
+
+/// Refuses a split without views.
+fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
+    if dataset.count(split) > 0 {
+        return Ok(());
+    }
+    let found = format!("{split}, which has no views in {},", dataset.name());
+    let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
+    let others: Vec<String> = others.map(|split| split.to_string()).collect();
+    Err(Error::config("--split", found, others.join(", ")))
+}
 
 /// A split as the command line takes it.
 fn split(text: &str) -> Result<Split, String> {

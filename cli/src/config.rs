@@ -94,11 +94,6 @@ impl Layers {
         self.set(path, value, &format!("--set {path}"))
     }
 
-    /// The value at a top-level key, as far as it is known.
-    pub fn get(&self, key: &str) -> Option<&Value> {
-        self.table.get(key)
-    }
-
     /// The configuration, checked.
     ///
     /// Errors: a value of the wrong type or out of its range, with the place where it was written.

@@ -97,19 +97,22 @@ fn columns(losses: &[f64], stages: &[PlannedStage]) -> Vec<Column> {
     for (stage, planned) in stages.iter().enumerate() {
         let first = (planned.first as usize).min(losses.len());
         let end = ((planned.first + planned.steps) as usize).min(losses.len());
-        let mut mean = None;
+        let (mut mean, mut seen) = (0.0, 0.0);
         for (i, part) in losses[first..end].chunks(width).enumerate() {
-            for (k, loss) in part.iter().enumerate() {
-                let seen = (i * width + k + 1) as f64;
-                let mean = mean.get_or_insert(*loss);
-                *mean += (loss - *mean) * share.max(1.0 / seen);
+            let finite: Vec<f64> = part.iter().copied().filter(|loss| loss.is_finite()).collect();
+            for loss in &finite {
+                seen += 1.0;
+                mean += (loss - mean) * share.max(1.0 / seen);
+            }
+            if finite.is_empty() {
+                continue;
             }
             columns.push(Column {
                 step: (first + i * width) as f64 + 0.5 * part.len() as f64,
                 stage,
-                low: part.iter().copied().fold(f64::INFINITY, f64::min),
-                high: part.iter().copied().fold(f64::NEG_INFINITY, f64::max),
-                smooth: mean.unwrap_or_default(),
+                low: finite.iter().copied().fold(f64::INFINITY, f64::min),
+                high: finite.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+                smooth: mean,
             });
         }
     }

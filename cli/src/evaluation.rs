@@ -4,7 +4,7 @@ use ndarray::Array3;
 use plenoxel::camera::Camera;
 use plenoxel::dataset::View;
 use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
 use plenoxel::geometry::Aabb;
 use plenoxel::metrics;
 use plenoxel::render::RenderOptions;
@@ -122,10 +122,10 @@ pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]
 }
 
 /// `samples` points over the longest line through the box, or over the ray where the sampling is the source paper's.
-pub fn with_samples(sampling: Sampling, samples: usize, grid: &VoxelGrid<f32>) -> Sampling {
+pub fn with_samples(sampling: Sampling, samples: u32, shape: &GridShape) -> Sampling {
     match sampling {
-        Sampling::Points { far, .. } => Sampling::Points { samples, far },
-        Sampling::Step { .. } => Sampling::Step { step: 3f64.sqrt() * grid.shape().resolution as f64 / samples as f64 },
+        Sampling::Points { far, .. } => Sampling::Points { samples: samples as usize, far },
+        Sampling::Step { .. } => Sampling::Step { step: 3f64.sqrt() * shape.resolution as f64 / f64::from(samples) },
     }
 }
 

@@ -15,9 +15,9 @@ pub type Rgb = Array3<f32>;
 /// Distances that share the color map of depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthRange {
-    /// Gets the brightest color.
+    /// Gets the red end.
     pub near: f64,
-    /// Gets the darkest.
+    /// Gets the blue end.
     pub far: f64,
 }
 
@@ -58,7 +58,7 @@ pub fn error_map(target: &Rgb, picture: &Picture) -> Rgb {
     })
 }
 
-/// Distance to what is seen, Σ wᵢ tᵢ / opacity, bright where near and dark where far, over white where nothing is seen.
+/// Distance to what is seen, Σ wᵢ tᵢ / opacity, red where near and blue where far, over white where nothing is seen.
 pub fn depth_map(picture: &Picture, range: DepthRange) -> Rgb {
     let (h, w) = picture.depth.dim();
     colored(h, w, |y, x| {
@@ -68,7 +68,7 @@ pub fn depth_map(picture: &Picture, range: DepthRange) -> Rgb {
         }
         let depth = f64::from(picture.depth[[y, x]] / opacity);
         let place = (range.far - depth) / (range.far - range.near);
-        color(&VIRIDIS, place as f32).map(|c| c * opacity + 1.0 - opacity)
+        color(&TURBO, place as f32).map(|c| c * opacity + 1.0 - opacity)
     })
 }
 
@@ -113,18 +113,18 @@ fn color(map: &Map, x: f32) -> [f32; 3] {
     [0, 1, 2].map(|c| value(c).clamp(0.0, 1.0))
 }
 
-/// matplotlib's viridis, perceptually uniform and readable by the color-blind, in Zucker's polynomial fit.
-const VIRIDIS: Map = [
-    [0.277_727_33, 0.005_407_344_6, 0.334_099_8],
-    [0.105_093_04, 1.404_613_5, 1.384_590_1],
-    [-0.330_861_84, 0.214_847_56, 0.095_095_165],
-    [-4.634_230_6, -5.799_101, -19.332_441],
-    [6.228_27, 14.179_933, 56.690_55],
-    [4.776_385, -13.745_145, -65.353_03],
-    [-5.435_456, 4.645_852_6, 26.312_435],
+/// Google's turbo in Mikhailov's polynomial fit: the many hues tell small differences of distance apart, dark blue to dark red.
+const TURBO: Map = [
+    [0.135_721_38, 0.091_402_61, 0.106_673_3],
+    [4.615_392_6, 2.194_188_4, 12.641_946],
+    [-42.660_324, 4.842_966_6, -60.582_05],
+    [132.131_09, -14.185_033, 110.362_76],
+    [-152.942_4, 4.277_298_6, -89.903_11],
+    [59.286_38, 2.829_566, 27.348_25],
+    [0.0; 3],
 ];
 
-/// matplotlib's inferno, likewise.
+/// matplotlib's inferno in Zucker's polynomial fit: evenly brighter from black on.
 const INFERNO: Map = [
     [0.000_218_940_37, 0.001_651_004_6, -0.019_480_899],
     [0.106_513_42, 0.563_956_44, 3.932_712_3],
@@ -140,19 +140,26 @@ mod tests {
     use super::*;
 
     fn near(a: [f32; 3], b: [f32; 3]) -> bool {
-        // The fits are good to about 1 %.
+        // The fit of inferno is good to about 1 %.
         a.iter().zip(b).all(|(a, b)| (a - b).abs() < 0.02)
     }
 
     #[test]
-    fn color_maps_have_the_ends_and_middles_of_matplotlib() {
-        // viridis: #440154, #21918c, #fde725. inferno: #000004, #bc3754, #fcffa4.
-        assert!(near(color(&VIRIDIS, 0.0), [0.267, 0.005, 0.329]));
-        assert!(near(color(&VIRIDIS, 0.5), [0.128, 0.567, 0.551]));
-        assert!(near(color(&VIRIDIS, 1.0), [0.993, 0.906, 0.144]));
+    fn errors_go_from_black_through_red_to_pale_yellow() {
+        // matplotlib's table: #000004, #bc3754, #fcffa4.
         assert!(near(color(&INFERNO, 0.0), [0.001, 0.000, 0.014]));
         assert!(near(color(&INFERNO, 0.5), [0.736, 0.216, 0.330]));
         assert!(near(color(&INFERNO, 1.0), [0.988, 0.998, 0.645]));
+        assert_eq!(color(&INFERNO, f32::NAN), color(&INFERNO, 1.0));
+    }
+
+    #[test]
+    fn depths_go_from_blue_through_green_to_red() {
+        let strongest = |x: f32| {
+            let c = color(&TURBO, x);
+            (0..3).max_by(|&a, &b| c[a].total_cmp(&c[b]))
+        };
+        assert_eq!([0.15, 0.45, 0.85].map(strongest), [Some(2), Some(1), Some(0)]);
     }
 
     #[test]
@@ -162,9 +169,9 @@ mod tests {
         let map = depth_map(&picture, DepthRange { near: 2.5, far: 5.5 });
         let pixel = |x: usize| [0, 1, 2].map(|c| map[[0, x, c]]);
         assert_eq!(pixel(0), [1.0; 3]);
-        assert_eq!(pixel(1), color(&VIRIDIS, 1.0));
-        // Half seen at 2.75 / 0.5 = 5.5: half the darkest color, half white.
-        assert!(near(pixel(2), color(&VIRIDIS, 0.0).map(|c| 0.5 * c + 0.5)));
+        assert!(near(pixel(1), color(&TURBO, 1.0)));
+        // Half seen at 2.75 / 0.5 = 5.5: half the color of the far end, half white.
+        assert!(near(pixel(2), color(&TURBO, 0.0).map(|c| 0.5 * c + 0.5)));
     }
 
     #[test]

@@ -18,6 +18,7 @@ mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
 use commands::{evaluate, info, render, scene, train};
+use plenoxel::error::Error;
 use progress::Console;
 use std::ffi::OsString;
 use std::io::Write;
@@ -36,7 +37,7 @@ Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad i
 
 /// Voxel radiance fields from photographs with known cameras
 #[derive(Debug, Parser)]
-#[command(name = "plenoxel", version, about, after_help = EXAMPLES, max_term_width = 120, arg_required_else_help = true)]
+#[command(name = "plenoxel", version, after_help = EXAMPLES, max_term_width = 110, arg_required_else_help = true)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -111,6 +112,12 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
     }
     drop(write!(streams.out, "{text}"));
     0
+}
+
+/// A value as JSON on one line, its keys in the order of its fields. Numbers that are not finite become null.
+fn json_line(value: &impl serde::Serialize) -> Result<String, Error> {
+    let defect = |e: serde_json::Error| Error::input("result", e.to_string(), "this is a defect of the program");
+    serde_json::to_string(value).map_err(defect)
 }
 
 fn threads(text: &str) -> Result<usize, String> {

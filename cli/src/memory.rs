@@ -1,12 +1,12 @@
 //! How much memory a command will take, said before it is taken.
 //!
 //! The parts are counted from what is known: images, tables, optimizer state, and the arrays that a training step keeps for its gradient.
-//! The last depends on how many samples the rays take, which is bounded by the longest chord through the box; pruning only lowers it.
+//! The last depends on how many samples the rays take: about as many as cross the box from face to face, fewer after pruning.
 
 use crate::progress::bytes;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
-use plenoxel::field::voxel_grid::GridShape;
+use plenoxel::field::voxel_grid::{Color, GridShape};
 use plenoxel::train::config::{Config, OptimizerConfig, Sampling};
 
 /// Bytes by what they are for.
@@ -18,10 +18,11 @@ pub struct Estimate {
     pub grid: u64,
     /// The optimizer's state.
     pub optimizer: u64,
-    /// Samples, intermediate values and gradients of one step.
+    /// Samples, intermediate values and gradients of one step, or what evaluating or saving takes if that is more.
     pub step: u64,
-    /// Setting that counts most.
+    /// The setting that counts most, and what would help.
     key: String,
+    advice: &'static str,
 }
 
 /// Program, threads, buffers on their way: measured on small runs.
@@ -54,23 +55,23 @@ impl Estimate {
                 true => 2 * shape.bytes() as u64,
                 false => 0,
             };
-            samples * bytes_per_sample(&shape, true) + touched_rows(&shape, samples) + gradient
+            samples * training_bytes_per_sample(&shape) + touched_rows(&shape, samples) + gradient
         });
-        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * bytes_per_sample(&shape, false);
-        let estimate = Estimate {
-            images: images(dataset, config.downscale, &[Split::Train, Split::Test]),
-            grid: tables + earlier,
-            optimizer,
-            step: step.max().unwrap_or(0).max(evaluation),
-            key: String::new(),
-        };
-        let largest = estimate.images.max(estimate.step).max(estimate.grid + estimate.optimizer);
-        let key = match largest {
-            n if n == estimate.images => "downscale".to_owned(),
-            n if n == estimate.step => "rays_per_step".to_owned(),
-            _ => format!("stages[{index}].resolution"),
-        };
-        Estimate { key, ..estimate }
+        let step = step.max().unwrap_or(0);
+        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(&shape);
+        // The file is put together beside the tables, once in pieces and once whole.
+        let saving = 2 * tables;
+        let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
+        let grid = tables + earlier;
+        let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, or a lower sh_degree");
+        let parts = [
+            (images, ("downscale".to_owned(), "a larger factor, so that the images fit")),
+            (step, ("rays_per_step".to_owned(), "fewer rays in a step")),
+            (evaluation, ("evaluation".to_owned(), "fewer samples on a ray")),
+            (grid + optimizer + saving, voxels),
+        ];
+        let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
+        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), key, advice }
     }
 
     /// Rendering a trained grid, and comparing it with the views of a split where `compare` is set.
@@ -81,8 +82,9 @@ impl Estimate {
             // The file and the tables read from it.
             grid: 2 * shape.bytes() as u64,
             optimizer: 0,
-            step: samples * bytes_per_sample(shape, false),
-            key: "the checkpoint".to_owned(),
+            step: samples * evaluation_bytes_per_sample(shape),
+            key: "RUN".to_owned(),
+            advice: "a machine with more, or fewer --samples",
         }
     }
 
@@ -113,12 +115,7 @@ impl Estimate {
         match available() {
             Some(available) if self.total() > available => {
                 let found = format!("a run that needs about {} of memory where {} are free", bytes(self.total()), bytes(available));
-                let accepted = match self.key.as_str() {
-                    "downscale" => "a larger factor, so that the images fit",
-                    "rays_per_step" => "fewer rays in a step",
-                    _ => "fewer voxels a side, or a lower sh_degree",
-                };
-                Err(Error::config(&self.key, found, accepted))
+                Err(Error::config(&self.key, found, self.advice))
             }
             _ => Ok(()),
         }
@@ -168,21 +165,32 @@ fn mean_samples(sampling: Sampling, shape: &GridShape) -> u64 {
     samples.ceil() as u64 + 1
 }
 
-/// Bytes kept for each sample. `training` keeps what the gradient needs, and what it hands back.
-fn bytes_per_sample(shape: &GridShape, training: bool) -> u64 {
-    let channels = shape.color.channels() as u64;
-    // Positions, distances, lengths, densities, depths, weights and colors.
-    let geometry = 24;
-    // Coefficients as read, the basis for each, and their product; plain colors need no basis.
-    let color = if channels == 3 { 3 } else { channels * 7 / 3 };
-    let forward = 4 * (geometry + color);
-    if training { 2 * forward } else { forward }
+/// Bytes that a training step keeps for each sample, on the graph of small ops: numbers as counted on single stages of 96 voxels a side,
+/// harmonics of degree 0 and 2 and plain colors.
+fn training_bytes_per_sample(shape: &GridShape) -> u64 {
+    // Positions, distances, lengths, densities, optical depths, weights; then coefficients, the basis, their products, and gradients.
+    let geometry = 21;
+    let color = match shape.color {
+        Color::Rgb => 3,
+        Color::Sh { .. } => 5 * shape.color.channels() as u64,
+    };
+    4 * (geometry + color)
+}
+
+/// Bytes for each sample when nothing is kept for a gradient. Buffers that were free for a short time count too: pictures need them
+/// in many sizes, about twice what is in use.
+fn evaluation_bytes_per_sample(shape: &GridShape) -> u64 {
+    let color = match shape.color {
+        Color::Rgb => 3,
+        Color::Sh { .. } => 5 * shape.color.channels() as u64 / 2,
+    };
+    2 * 4 * (15 + color)
 }
 
 /// Rows that a step touches, with their gradients.
 fn touched_rows(shape: &GridShape, samples: u64) -> u64 {
     let rows = (shape.voxels() as u64).min(8 * samples);
-    2 * rows * 4 * (2 + shape.color.channels() as u64)
+    rows * 4 * (2 + shape.color.channels() as u64)
 }
 
 /// True if a loss looks at the whole grid, so that gradients are dense.

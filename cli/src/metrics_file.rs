@@ -2,7 +2,8 @@
 
 use plenoxel::error::{Error, Result};
 use plenoxel::train::{PlannedStage, Report};
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -18,6 +19,23 @@ pub struct MetricsFile {
     since: Sums,
     rays: u64,
     samples: u64,
+}
+
+/// A line: means of the losses and the PSNR since the line before, everything else as it is now.
+#[derive(Serialize)]
+struct Line<'a> {
+    step: u64,
+    stage: usize,
+    resolution: usize,
+    ends_stage: bool,
+    loss: f64,
+    losses: BTreeMap<&'a str, f64>,
+    psnr: f64,
+    rays: u64,
+    samples: u64,
+    density_rate: f64,
+    color_rate: f64,
+    seconds: f64,
 }
 
 /// Sums over the steps since the last line.
@@ -62,27 +80,25 @@ impl MetricsFile {
         }
         let since = std::mem::take(&mut self.since);
         let mean = |sum: f64| sum / since.steps;
-        let losses = since.losses.iter();
-        let losses: Map<String, Value> = losses.map(|(k, v)| (k.clone(), mean(*v).into())).collect();
-        self.append(&json!({
-            "step": report.step,
-            "stage": report.stage,
-            "resolution": plan[report.stage].stage.resolution,
-            "ends_stage": report.ends_stage,
-            "loss": mean(since.loss),
-            "losses": losses,
-            "psnr": -10.0 * mean(since.squared_error).log10(),
-            "rays": self.rays,
-            "samples": self.samples,
-            "density_rate": report.density_rate,
-            "color_rate": report.color_rate,
-            "seconds": seconds,
-        }))
+        self.append(&Line {
+            step: report.step,
+            stage: report.stage,
+            resolution: plan[report.stage].stage.resolution,
+            ends_stage: report.ends_stage,
+            loss: mean(since.loss),
+            losses: since.losses.iter().map(|(name, sum)| (name.as_str(), mean(*sum))).collect(),
+            psnr: -10.0 * mean(since.squared_error).log10(),
+            rays: self.rays,
+            samples: self.samples,
+            density_rate: report.density_rate,
+            color_rate: report.color_rate,
+            seconds,
+        })
     }
 
     /// Appends a line.
-    pub fn append(&mut self, line: &Value) -> Result<()> {
-        let text = format!("{line}\n");
+    pub fn append(&mut self, line: &impl Serialize) -> Result<()> {
+        let text = crate::json_line(line)? + "\n";
         let written = self.file.write_all(text.as_bytes());
         written.map_err(|e| Error::io(&self.path, e, "writing the metrics"))
     }

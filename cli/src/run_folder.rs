@@ -211,7 +211,7 @@ const EXPLANATION: &str = "\
 - `result.json`: the final figures. `seconds` are of training alone: making grids, steps, pruning, upsampling.
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
-  pale yellow at 0.25 and above. Depth is bright where near and dark where far, over the ball that the box contains; white is empty.
+  pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.
 - `renders/`: what `plenoxel render` wrote.
 ";
 

@@ -86,7 +86,9 @@ pub fn check_kernel<T: Real>(
     let inputs: Vec<Tensor<T>> = inputs.into().into_iter().map(Tensor::variable).collect();
     let fast = f(&inputs);
     let node = fast.node.as_ref().expect("check_kernel: the result does not depend on the inputs");
-    let Rule::Kernel(kernel) = &node.rule else { panic!("check_kernel: the result was made by the op {}, not by a kernel", node.rule.name()) };
+    let Rule::Kernel(kernel) = &node.rule else {
+        panic!("check_kernel: the result was made by the op {}, not by a kernel", node.rule.name())
+    };
     let operands: Vec<Tensor<T>> = (0..node.inputs.len()).map(|i| input(node, i, true)).collect();
     let slow = kernel.reference(&operands);
     assert_eq!(fast.shape(), slow.shape(), "{}: the reference has another shape than the kernel", kernel.name());

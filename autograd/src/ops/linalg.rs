@@ -1,6 +1,6 @@
 //! Matrix product, batched, by the `gemm` crate.
 //!
-//! The library takes pointers, hence the one unsafe call here, [`block`]; its safe twin is the triple loop in the tests. Threads are ours:
+//! The library takes pointers, hence the one unsafe call here, in `block`; its safe twin is the triple loop in the tests. Threads are ours:
 //! blocks of a fixed size, so that the bits do not depend on their number.
 #![allow(unsafe_code)]
 

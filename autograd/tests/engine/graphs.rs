@@ -163,7 +163,12 @@ impl Kernel<f64> for Cube {
 }
 
 fn cube(x: &Tensor<f64>, references: &Arc<AtomicUsize>) -> Tensor<f64> {
-    Tensor::from_kernel(x.data().iter().map(|x| x * x * x).collect::<Vec<_>>().into(), x.shape(), &[x], Cube { references: references.clone() })
+    Tensor::from_kernel(
+        x.data().iter().map(|x| x * x * x).collect::<Vec<_>>().into(),
+        x.shape(),
+        &[x],
+        Cube { references: references.clone() },
+    )
 }
 
 #[test]

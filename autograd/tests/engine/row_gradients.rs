@@ -44,9 +44,10 @@ fn rows_of_a_kernel_and_of_an_op_are_added() {
 #[test]
 fn rows_and_dense_are_dense_whichever_comes_first() {
     let want = [1.0, 1.0, 2.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0];
-    for (touched, values) in
-        [gradient(&table(), |t| t.gather_rows(&rows(&[1])).sum() + t.sum()), gradient(&table(), |t| t.sum() + t.gather_rows(&rows(&[1])).sum())]
-    {
+    for (touched, values) in [
+        gradient(&table(), |t| t.gather_rows(&rows(&[1])).sum() + t.sum()),
+        gradient(&table(), |t| t.sum() + t.gather_rows(&rows(&[1])).sum()),
+    ] {
         assert_eq!(touched, None);
         assert_eq!(values, want);
     }

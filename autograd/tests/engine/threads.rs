@@ -34,9 +34,13 @@ type Family = (&'static str, Vec<Tensor<f32>>, fn(&[Tensor<f32>]) -> Tensor<f32>
 fn families() -> Vec<Family> {
     const N: usize = 100_003;
     vec![
-        ("elementwise", vec![numbers(&[N], 1)], |x| (x[0].exp() + x[0].sigmoid() * x[0].softplus()).square().abs().sqrt() + x[0].sin().relu() + x[0].powi(3).clamp(-1.0, 1.0)),
+        ("elementwise", vec![numbers(&[N], 1)], |x| {
+            (x[0].exp() + x[0].sigmoid() * x[0].softplus()).square().abs().sqrt() + x[0].sin().relu() + x[0].powi(3).clamp(-1.0, 1.0)
+        }),
         ("opacity and logarithm", vec![numbers(&[N], 1)], |x| x[0].one_minus_exp_neg() + (x[0].square() + 1.0).ln() + x[0].cos()),
-        ("arithmetic", vec![numbers(&[N], 1), numbers(&[N], 2)], |x| (&x[0] * &x[1] - &x[0] / (x[1].square() + 1.0)).maximum(&x[1]).minimum(&x[0])),
+        ("arithmetic", vec![numbers(&[N], 1), numbers(&[N], 2)], |x| {
+            (&x[0] * &x[1] - &x[0] / (x[1].square() + 1.0)).maximum(&x[1]).minimum(&x[0])
+        }),
         ("broadcasting rows", vec![numbers(&[N / 3, 3], 1), numbers(&[3], 2), numbers(&[N / 3, 1], 3)], |x| (&x[0] + &x[1]) * &x[2]),
         ("broadcasting a scalar", vec![numbers(&[N], 1), numbers(&[], 2)], |x| &x[0] * &x[1]),
         ("broadcasting blocks", vec![numbers(&[40, 1, 700], 1), numbers(&[40, 9, 1], 2)], |x| &x[0] * &x[1]),
@@ -62,12 +66,16 @@ fn families() -> Vec<Family> {
             let rays = segments(N);
             x[0].segment_exclusive_sum(&rays) * x[0].segment_sum(&rays).segment_repeat(&rays)
         }),
-        ("look-ups", vec![numbers(&[20_011, 4], 1)], |x| x[0].gather_rows(&row_numbers(N, 20_011)) * x[0].gather_rows(&row_numbers(N, 9973))),
+        ("look-ups", vec![numbers(&[20_011, 4], 1)], |x| {
+            x[0].gather_rows(&row_numbers(N, 20_011)) * x[0].gather_rows(&row_numbers(N, 9973))
+        }),
         ("look-ups, dense in the end", vec![numbers(&[20_011, 5], 1)], |x| x[0].exp().gather_rows(&row_numbers(N, 20_011))),
         ("scattering", vec![numbers(&[N, 3], 1)], |x| x[0].scatter_rows(&row_numbers(N, 1009), 1009).square()),
         ("trilinear", vec![numbers(&[30 * 30 * 30, 4], 1), numbers(&[N, 3], 2)], |x| x[0].trilinear(&(15.0 + 0.5 * &x[1]), [30, 30, 30])),
         ("nearest", vec![numbers(&[30 * 30 * 30, 4], 1)], |x| x[0].nearest(&numbers(&[N, 3], 2), [30, 30, 30])),
-        ("masks", vec![numbers(&[N], 1), numbers(&[N], 2)], |x| Tensor::where_(&x[0].greater(&x[1]), &x[0], &x[1].square()).masked(&x[1].greater_equal(&x[0].detach().cos()))),
+        ("masks", vec![numbers(&[N], 1), numbers(&[N], 2)], |x| {
+            Tensor::where_(&x[0].greater(&x[1]), &x[0], &x[1].square()).masked(&x[1].greater_equal(&x[0].detach().cos()))
+        }),
     ]
 }
 

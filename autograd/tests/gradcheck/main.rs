@@ -34,11 +34,8 @@ fn every_op_has_right_derivatives_of_both_orders_and_in_both_precisions() {
 fn names_of_ops() -> Vec<String> {
     let list = include_str!("../../src/ops.rs");
     let cells = list.lines().filter_map(|line| line.strip_prefix("//! | [`")?.split(" | ").nth(1));
-    let mut names: Vec<String> = cells
-        .flat_map(|cell| cell.split('`').skip(1).step_by(2))
-        .flat_map(|code| code.split_whitespace())
-        .map(String::from)
-        .collect();
+    let mut names: Vec<String> =
+        cells.flat_map(|cell| cell.split('`').skip(1).step_by(2)).flat_map(|code| code.split_whitespace()).map(String::from).collect();
     assert!(names.len() > 40, "the list of ops was not understood: {names:?}");
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/ops");
     for file in folder.read_dir().expect("the folder of ops") {
@@ -61,7 +58,8 @@ fn every_op_has_a_row_in_the_table() {
 fn the_trilinear_kernel_is_what_its_reference_says_in_both_precisions() {
     for (width, nodes) in [1, 2, 3, 4, 12, 27, 28, 48].into_iter().zip([[3, 4, 5], [1, 4, 2], [2, 2, 2], [6, 1, 1]].into_iter().cycle()) {
         let inputs = [table::numbers(&[nodes.iter().product(), width], 1), table::positions(70, nodes)];
-        let report = check_kernel(|x: &[Tensor<f64>]| x[0].trilinear(&x[1], nodes), inputs.clone(), 1e-13).unwrap_or_else(|e| panic!("{e}"));
+        let report =
+            check_kernel(|x: &[Tensor<f64>]| x[0].trilinear(&x[1], nodes), inputs.clone(), 1e-13).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(report.gradients.len(), 2);
         let inputs = inputs.map(|x| x.mapv(|v| v as f32));
         check_kernel(|x: &[Tensor<f32>]| x[0].trilinear(&x[1], nodes), inputs, 2e-6).unwrap_or_else(|e| panic!("{e}"));

@@ -19,7 +19,10 @@ macro_rules! rows {
 }
 
 pub fn all() -> Vec<Row> {
-    [arithmetic(), elementwise(), reduce(), shape(), linalg(), scan(), segment(), lookup(), trilinear(), select(), compositions()].into_iter().flatten().collect()
+    [arithmetic(), elementwise(), reduce(), shape(), linalg(), scan(), segment(), lookup(), trilinear(), select(), compositions()]
+        .into_iter()
+        .flatten()
+        .collect()
 }
 
 fn arithmetic() -> Vec<Row> {

@@ -8,7 +8,7 @@ use crate::progress::Console;
 use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::Split;
-use plenoxel::error::{Error, Result};
+use plenoxel::error::Result;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -19,6 +19,9 @@ Examples:
   plenoxel evaluate runs/lego                      at the resolution it was trained at
   plenoxel evaluate runs/lego --downscale 1        at full resolution
   plenoxel evaluate runs/lego --split val --json
+
+--samples N places N samples on the longest line through the box, and as densely on shorter ones. Runs of the paper preset
+count samples from the camera to its far limit instead.
 
 PSNR and SSIM are means over views; predictions are clamped to [0, 1] and not rounded to 8 bits. ssim counts windows that
 lie inside the image, ssim_same pads with zeros as svox2 does. The last line on stdout is one JSON object.";
@@ -43,8 +46,7 @@ pub struct EvaluateArgs {
     #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::factor)]
     downscale: Option<usize>,
 
-    /// Samples on a ray: on the longest one through the box, or on the source paper's fixed length where the run uses it
-    /// [default: the run's `evaluation` setting]
+    /// Samples on the longest ray through the box (preset paper: on every ray) [default: as the run's `evaluation` setting says]
     #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = clap::value_parser!(u32).range(2..=100_000))]
     samples: Option<u32>,
 
@@ -60,21 +62,13 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let source = args.data.as_deref().map_or(record.data, DataSource::folder);
     let start = Instant::now();
     let dataset = source.reopen(&config)?;
-    let views = dataset.count(args.split);
-    if views == 0 {
-        let found = format!("{}, which has no views in {},", args.split, dataset.name());
-        let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
-        let others: Vec<String> = others.map(|split| split.to_string()).collect();
-        return Err(Error::config("--split", found, others.join(", ")));
-    }
-    let (grid, header) = folder.load()?;
-    let sampling = match args.samples {
-        Some(samples) => with_samples(config.evaluation, samples as usize, &grid),
-        None => config.evaluation,
-    };
-    let estimate = Estimate::of_evaluation(&config, sampling, grid.shape(), &dataset, Some(args.split));
+    super::check_split(&dataset, args.split)?;
+    let shape = super::final_shape(&config);
+    let sampling = args.samples.map_or(config.evaluation, |samples| with_samples(config.evaluation, samples, &shape));
+    let estimate = Estimate::of_evaluation(&config, sampling, &shape, &dataset, Some(args.split));
     console.note(&estimate.describe());
     estimate.check()?;
+    let (grid, header) = folder.load()?;
     let views = load(console, &dataset, args.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
 
@@ -118,7 +112,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         run: args.run.display().to_string(),
         per_view: scores.per_view,
     };
-    console.result(&json!(figures).to_string())
+    console.result(&crate::json_line(&figures)?)
 }
 
 /// The figures as people say them.

@@ -18,7 +18,7 @@ Examples:
   plenoxel render runs/lego --split train --downscale 4
 
 Writes RUN/renders/<split>_<number>_<name>.png with the colors over the run's background, and the same with _depth
-(bright near, dark far, white empty) and _opacity.";
+(red near, blue far, white empty) and _opacity.";
 
 /// Render the views of a trained run to PNG files
 #[derive(Debug, Args)]
@@ -44,7 +44,7 @@ pub struct RenderArgs {
     #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::factor)]
     downscale: Option<usize>,
 
-    /// Samples on a ray, as for evaluate [default: the run's `evaluation` setting]
+    /// Samples on the longest ray, as for evaluate [default: as the run's `evaluation` setting says]
     #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = clap::value_parser!(u32).range(2..=100_000))]
     samples: Option<u32>,
 }
@@ -55,15 +55,14 @@ pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
     config.downscale = args.downscale.unwrap_or(config.downscale);
     let source = args.data.as_deref().map_or(record.data, DataSource::folder);
     let dataset = source.reopen(&config)?;
+    super::check_split(&dataset, args.split)?;
     let chosen = choose(&dataset, args.split, &args.view)?;
-    let (grid, _) = folder.load()?;
-    let sampling = match args.samples {
-        Some(samples) => with_samples(config.evaluation, samples as usize, &grid),
-        None => config.evaluation,
-    };
-    let estimate = Estimate::of_evaluation(&config, sampling, grid.shape(), &dataset, None);
+    let shape = super::final_shape(&config);
+    let sampling = args.samples.map_or(config.evaluation, |samples| with_samples(config.evaluation, samples, &shape));
+    let estimate = Estimate::of_evaluation(&config, sampling, &shape, &dataset, None);
     console.note(&estimate.describe());
     estimate.check()?;
+    let (grid, _) = folder.load()?;
 
     let renders = folder.create_renders()?;
     let viewer = Viewer::new(&grid, sampling, config.background);
@@ -85,12 +84,6 @@ pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
 /// Numbers of the views that were asked for: all of the split unless some are named.
 fn choose(dataset: &Dataset, split: Split, asked: &[String]) -> Result<Vec<usize>> {
     let names = dataset.view_names(split);
-    if names.is_empty() {
-        let found = format!("{split}, which has no views in {},", dataset.name());
-        let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
-        let others: Vec<String> = others.map(|split| split.to_string()).collect();
-        return Err(Error::config("--split", found, others.join(", ")));
-    }
     if asked.is_empty() {
         return Ok((0..names.len()).collect());
     }

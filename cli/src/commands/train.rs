@@ -96,7 +96,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
         per_view: scores.per_view.clone(),
     };
     folder.write_result(&summary)?;
-    learned.metrics.append(&json!({ "final": &summary }))?;
+    learned.metrics.append(&Final { result: &summary })?;
     conclude(console, &folder, &summary, &scores, &pictures)
 }
 
@@ -195,6 +195,13 @@ struct Summary {
     per_view: Vec<ViewScore>,
 }
 
+/// The last line of the metrics.
+#[derive(Serialize)]
+struct Final<'a> {
+    #[serde(rename = "final")]
+    result: &'a Summary,
+}
+
 /// A stage in the final figures.
 #[derive(Debug, Serialize)]
 struct StageSummary {
@@ -281,5 +288,5 @@ fn conclude(console: &Console<'_>, folder: &RunFolder, summary: &Summary, scores
     ));
     console.result(&super::evaluate::sentence(scores, Split::Test, summary.width, summary.height))?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
-    console.result(&json!(summary).to_string())
+    console.result(&crate::json_line(summary)?)
 }

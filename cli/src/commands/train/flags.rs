@@ -41,8 +41,7 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     pub no_images: bool,
 
-    /// Also compute the PSNR of the test views at the end of each earlier stage, which takes about as long as the final
-    /// evaluation [default: only for the built-in scene]
+    /// Compute the test PSNR of each earlier stage too, which doubles the evaluation [default: for the built-in scene]
     #[arg(long, help_heading = "Output")]
     stage_psnr: bool,
 
@@ -86,7 +85,7 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Model", value_parser = ["nearest", "trilinear"])]
     interpolation: Option<String>,
 
-    /// Meaning of a voxel's color: one color, or spherical harmonics of the direction of view
+    /// One color a voxel, or spherical harmonics of the direction of view
     #[arg(long, help_heading = "Model", value_parser = ["rgb", "sh"])]
     color: Option<String>,
 
@@ -98,8 +97,9 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Training", value_parser = ["graph"])]
     engine: Option<String>,
 
-    /// Total variation over the whole grid at the source paper's weight: W (Σ over color channels / 3 + density) / 2, which is
-    /// tv_color = tv_density = W / 2, since tv_color is a mean over channels
+    /// Total variation of the whole grid, weighted as in the source paper: sets tv_density and tv_color to W / 2
+    // The paper adds W (Σ over color channels / channels + density) / (2 n³) of sums over cells. Ours are means over cells, and
+    // tv_color is one over channels too, so each gets W / 2.
     #[arg(long, value_name = "W", help_heading = "Training", value_parser = weight)]
     tv: Option<f64>,
 }
