@@ -176,8 +176,8 @@ pub(crate) fn add_into_table<T: Real, const K: usize>(table: &mut [T], width: us
     parallel::for_each_item(parts, |b, part| accumulate(&grouping, b, &touch, values, width, part, &|local| local));
 }
 
-/// Adds the touches of one bucket, in the order of the items. The widths of usual tables are compiled in: opacity and RGB, and the
-/// coefficients of degrees 1 and 2 with and without density.
+/// Adds the touches of one bucket, in the order of the items. The widths of usual tables are compiled in: density, RGB, harmonics of degree 2,
+/// and the two colors with density in the same row.
 fn accumulate<T: Real, const K: usize>(
     grouping: &Grouping,
     bucket: usize,
@@ -192,10 +192,8 @@ fn accumulate<T: Real, const K: usize>(
         1 => accumulate_rows::<T, K, 1, _, _>(args, touch, out, slot),
         3 => accumulate_rows::<T, K, 3, _, _>(args, touch, out, slot),
         4 => accumulate_rows::<T, K, 4, _, _>(args, touch, out, slot),
-        12 => accumulate_rows::<T, K, 12, _, _>(args, touch, out, slot),
         27 => accumulate_rows::<T, K, 27, _, _>(args, touch, out, slot),
         28 => accumulate_rows::<T, K, 28, _, _>(args, touch, out, slot),
-        48 => accumulate_rows::<T, K, 48, _, _>(args, touch, out, slot),
         _ => accumulate_rows::<T, K, 0, _, _>(args, touch, out, slot),
     }
 }

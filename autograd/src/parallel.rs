@@ -7,14 +7,16 @@ use crate::real::Real;
 use rayon::prelude::*;
 
 /// Compiles a function for several instruction sets and picks the best at run time. All of them round alike: see [`Real`].
+/// Builds with debug assertions, in which the tests run, have the portable version only, which gives the same bits: every crate that uses
+/// a generic loop compiles it anew, and four versions of each would take minutes.
 macro_rules! dispatched {
     ($(#[$meta:meta])* $visibility:vis fn $($rest:tt)*) => {
         $(#[$meta])*
-        #[multiversion::multiversion(targets(
+        #[cfg_attr(not(debug_assertions), multiversion::multiversion(targets(
             "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
             "x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
             "aarch64+neon",
-        ))]
+        )))]
         $visibility fn $($rest)*
     };
 }
@@ -143,7 +145,13 @@ pub fn update_rows<T: Real, const N: usize>(x: [&mut [T]; N], width: usize, rows
 }
 
 /// The same for all rows, `g` being zero in those that `rows` does not list.
-pub fn update_all_rows<T: Real, const N: usize>(x: [&mut [T]; N], width: usize, rows: &[u32], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
+pub fn update_all_rows<T: Real, const N: usize>(
+    x: [&mut [T]; N],
+    width: usize,
+    rows: &[u32],
+    g: &[T],
+    f: impl Fn([T; N], T) -> [T; N] + Sync,
+) {
     update_part::<T, N, true, _>(x, TableRows { first: 0, width, rows, g }, &f);
 }
 
@@ -158,7 +166,11 @@ struct TableRows<'a, T> {
 
 /// Halves the work until it is a chunk. A half of the ascending rows lies in a part of the table of its own, so nothing is shared.
 /// `ALL` visits the rows without a gradient too.
-fn update_part<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
+fn update_part<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N] + Sync>(
+    x: [&mut [T]; N],
+    part: TableRows<'_, T>,
+    f: &F,
+) {
     let TableRows { first, width, rows, g } = part;
     let count = if ALL { x[0].len() / width.max(1) } else { rows.len() };
     if count <= rows_per_chunk(width) {

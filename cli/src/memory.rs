@@ -26,7 +26,7 @@ pub struct Estimate {
 }
 
 /// Program, threads, buffers on their way: measured on small runs.
-const BASE: u64 = 30_000_000;
+const BASE: u64 = 60_000_000;
 /// Rays that are rendered at a time when evaluating.
 const EVALUATION_RAYS: u64 = 8192;
 

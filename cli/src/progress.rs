@@ -98,7 +98,7 @@ impl<'c, 'a> Meter<'c, 'a> {
     fn new(console: &'c Console<'a>, total: u64) -> Self {
         let bar = (console.terminal && !console.quiet).then(|| {
             let style =
-                ProgressStyle::with_template("{bar:24} {percent:>3} %  {wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
+                ProgressStyle::with_template("{bar:12} {percent:>3} %  {wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
             ProgressBar::new(total).with_style(style)
         });
         lock(&console.bar).clone_from(&bar);
@@ -208,16 +208,16 @@ impl Training<'_, '_> {
             step => format!("{:.1} it/s  {}rays/s  ", 1.0 / step, metric(report.rays as f64 / step)),
         };
         format!(
-            "stage {}/{} ({}³)  step {}/{}  loss {:.5}  psnr {:.2} dB  {pace}{:.0} samples/ray  ETA {}",
+            "stage {}/{} ({}³)  step {}/{}  ETA {}  loss {:.5}  psnr {:.2} dB  {pace}{:.0} samples/ray",
             report.stage + 1,
             self.plan.len(),
             stage.resolution,
             report.step + 1,
             self.total,
+            clock(self.remaining(report)),
             self.loss.value,
             -10.0 * self.mse.value.log10(),
             self.samples.value,
-            clock(self.remaining(report)),
         )
     }
 

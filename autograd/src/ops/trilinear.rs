@@ -154,10 +154,8 @@ impl<T: Real> Tensor<T> {
                 1 => interpolate::<T, 1>(table, cells, nodes, width, chunk),
                 3 => interpolate::<T, 3>(table, cells, nodes, width, chunk),
                 4 => interpolate::<T, 4>(table, cells, nodes, width, chunk),
-                12 => interpolate::<T, 12>(table, cells, nodes, width, chunk),
                 27 => interpolate::<T, 27>(table, cells, nodes, width, chunk),
                 28 => interpolate::<T, 28>(table, cells, nodes, width, chunk),
-                48 => interpolate::<T, 48>(table, cells, nodes, width, chunk),
                 _ => interpolate::<T, 0>(table, cells, nodes, width, chunk),
             }
         });

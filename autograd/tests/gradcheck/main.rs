@@ -25,7 +25,7 @@ fn every_op_has_right_derivatives_of_both_orders_and_in_both_precisions() {
             Err(error) => failures.push(error),
         }
     }
-    let ops: BTreeSet<&str> = rows::all().iter().map(|row| row.op).collect();
+    let ops: BTreeSet<&str> = rows::all().iter().map(|row| row.op).filter(|op| !op.starts_with('(')).collect();
     println!("| **worst of {} ops, {} rows** | | {:.0e} | {:.0e} | {:.0e} |", ops.len(), rows::all().len(), worst[0], worst[1], worst[2]);
     assert!(failures.is_empty(), "{}", failures.join("\n"));
 }

@@ -28,7 +28,7 @@ lie inside the image, ssim_same pads with zeros as svox2 does. The last line on 
 
 /// Compute PSNR and SSIM of a trained run on the views of a split
 #[derive(Debug, Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct EvaluateArgs {
     /// Run folder that `plenoxel train` wrote
     #[arg(value_hint = ValueHint::DirPath)]

@@ -21,7 +21,7 @@ Examples:
 
 /// Say what a run, a checkpoint or a dataset is: format, sizes, conventions, memory
 #[derive(Debug, Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct InfoArgs {
     /// Run folder, checkpoint, or folder of a dataset; without it, the machine alone
     #[arg(value_hint = ValueHint::AnyPath)]
@@ -76,7 +76,7 @@ fn of_run(path: &Path) -> Result<Lines> {
     let (folder, config, record) = RunFolder::open(path)?;
     let mut lines = vec![
         ("run", path.display().to_string()),
-        ("scene", format!("{} ({})", record.scene, record.format)),
+        ("scene", format!("{}, {}", record.scene, record.format)),
         ("made by", format!("{} with {}", record.program, record.instruction_set)),
         ("preset", record.preset.unwrap_or_else(|| "none".to_owned())),
     ];

@@ -22,7 +22,7 @@ Writes RUN/renders/<split>_<number>_<name>.png with the colors over the run's ba
 
 /// Render the views of a trained run to PNG files
 #[derive(Debug, Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct RenderArgs {
     /// Run folder that `plenoxel train` wrote
     #[arg(value_hint = ValueHint::DirPath)]

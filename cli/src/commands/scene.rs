@@ -19,7 +19,7 @@ beside the test views: 16 bits, thousandths of a world unit, 0 where there is no
 
 /// Write the built-in scene to a folder in the NeRF-synthetic format
 #[derive(Debug, Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct SceneArgs {
     /// Folder to write
     #[arg(value_hint = ValueHint::DirPath)]

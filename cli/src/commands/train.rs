@@ -48,28 +48,8 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     drop(views);
 
     let test = clocks.load.time(|| load(console, &dataset, Split::Test, &source))?;
-    for stage in &mut learned.stages {
-        if let Some(grid) = stage.grid.take() {
-            let viewer = Viewer::new(&grid, config.evaluation, config.background);
-            let scores = clocks.evaluate.time(|| viewer.compare(&test, |_, _, _, _| Ok(())))?;
-            stage.psnr = scores.psnr();
-        }
-    }
-    let viewer = Viewer::new(&learned.grid, config.evaluation, config.background);
-    let count = console.count("evaluating", test.len());
-    let start = Instant::now();
-    let mut drawing = Stopwatch::default();
-    let scores = viewer.compare(&test, |i, view, target, picture| {
-        count.at(i + 1, test.len());
-        drawing.time(|| pictures.panel(i, view, target, picture))
-    })?;
-    drop(count);
-    clocks.evaluate.0 += start.elapsed() - drawing.0;
+    let scores = evaluate(&mut learned, &test, &config, &pictures, console, &mut clocks)?;
     pictures.strip(test.first(), config.background)?;
-    if let (Some(last), Some(psnr)) = (learned.stages.last_mut(), scores.psnr()) {
-        last.psnr = Some(psnr);
-    }
-
     let (width, height) = dataset.size();
     let summary = Summary {
         psnr: scores.psnr(),
@@ -160,6 +140,46 @@ fn learn(
     drop(progress);
     let (rays, samples) = metrics.counts();
     Ok(Learned { grid: trainer.into_grid(), metrics, stages, steps: total, rays, samples })
+}
+
+/// Figures of the final grid, with panels, and of the grids of earlier stages that were kept.
+fn evaluate(
+    learned: &mut Learned,
+    test: &[View],
+    config: &Config,
+    pictures: &Pictures<'_>,
+    console: &Console<'_>,
+    clocks: &mut Clocks,
+) -> Result<Scores> {
+    let kept = learned.stages.iter().filter(|stage| stage.grid.is_some()).count();
+    let total = (kept + 1) * test.len();
+    let (count, mut done) = (console.count("evaluating", total), 0);
+    let mut advance = || {
+        done += 1;
+        count.at(done, total);
+    };
+    let start = Instant::now();
+    let mut drawing = Stopwatch::default();
+    for stage in &mut learned.stages {
+        if let Some(grid) = stage.grid.take() {
+            let viewer = Viewer::new(&grid, config.evaluation, config.background);
+            let scores = viewer.compare(test, |_, _, _, _| {
+                advance();
+                Ok(())
+            })?;
+            stage.psnr = scores.psnr();
+        }
+    }
+    let viewer = Viewer::new(&learned.grid, config.evaluation, config.background);
+    let scores = viewer.compare(test, |i, view, target, picture| {
+        advance();
+        drawing.time(|| pictures.panel(i, view, target, picture))
+    })?;
+    clocks.evaluate.0 += start.elapsed() - drawing.0;
+    if let Some(last) = learned.stages.last_mut() {
+        last.psnr = scores.psnr();
+    }
+    Ok(scores)
 }
 
 /// A grid with the values that `grid` has now: the tables are shared until training changes them.
@@ -253,7 +273,7 @@ fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
     let (width, height) = dataset.size();
     let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
     console.note(&format!(
-        "scene: {} ({}), {train} train, {val} val, {test} test views of {width} x {height}, background {:?}, half width {}",
+        "scene: {}, {}, {train} train, {val} val, {test} test views of {width} x {height}, background {:?}, half width {}",
         dataset.name(),
         dataset.format(),
         config.background,

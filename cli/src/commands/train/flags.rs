@@ -23,7 +23,7 @@ reaches each by its path there, such as stages[0].sampling.step. The last line o
 
 /// Learn a scene and leave a run folder with the trained grid, pictures and figures
 #[derive(Debug, Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct TrainArgs {
     /// Folder of a dataset in the NeRF-synthetic format; without it, the built-in scene
     #[arg(value_hint = ValueHint::DirPath)]
@@ -70,7 +70,7 @@ pub struct TrainArgs {
     background: Option<[f64; 3]>,
 
     /// Half the side of the cube in which the scene lies, in the dataset's units [default: 1.5; preset paper: 1.4]
-    #[arg(long, value_name = "LENGTH", help_heading = "Scene")]
+    #[arg(long, value_name = "LENGTH", help_heading = "Scene", allow_negative_numbers = true)]
     half_width: Option<f64>,
 
     /// Size of the built-in scene's images in pixels, SIDE or WIDTHxHEIGHT [default: 200]
@@ -100,7 +100,7 @@ pub struct TrainArgs {
     /// Total variation of the whole grid, weighted as in the source paper: sets tv_density and tv_color to W / 2
     // The paper adds W (Σ over color channels / channels + density) / (2 n³) of sums over cells. Ours are means over cells, and
     // tv_color is one over channels too, so each gets W / 2.
-    #[arg(long, value_name = "W", help_heading = "Training", value_parser = weight)]
+    #[arg(long, value_name = "W", help_heading = "Training", value_parser = weight, allow_negative_numbers = true)]
     tv: Option<f64>,
 }
 

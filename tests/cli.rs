@@ -1,0 +1,425 @@
+//! The command line, called like any function: what a user types, what comes back, what lies in the folder afterwards.
+
+use plenoxel::dataset::image;
+use plenoxel_cli::Streams;
+use serde_json::Value;
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// What a command line came to.
+struct Answer {
+    code: u8,
+    out: String,
+    err: String,
+}
+
+impl Answer {
+    /// The last line on stdout, which is JSON.
+    fn json(&self) -> Value {
+        assert_eq!(self.code, 0, "{}", self.err);
+        serde_json::from_str(self.out.lines().last().unwrap()).unwrap()
+    }
+
+    /// Checks the exit code and that stderr says all of `parts`.
+    #[track_caller]
+    fn refused(&self, code: u8, parts: &[&str]) {
+        assert_eq!(self.code, code, "{}", self.err);
+        assert!(parts.iter().all(|part| self.err.contains(part)), "{parts:?} in {}", self.err);
+        assert_eq!(self.err.matches("error: ").count(), 1, "one message: {}", self.err);
+    }
+}
+
+fn plenoxel(args: &[&str]) -> Answer {
+    let (mut out, mut err) = (Vec::new(), Vec::new());
+    let line = ["plenoxel"].iter().chain(args);
+    let code = plenoxel_cli::run(line, Streams { out: &mut out, err: &mut err, terminal: false });
+    Answer { code, out: String::from_utf8(out).unwrap(), err: String::from_utf8(err).unwrap() }
+}
+
+/// A folder of a test's own, removed when the test has passed.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("plenoxel-cli-{}-{name}", std::process::id()));
+        let _ = fs::remove_dir_all(&path);
+        fs::create_dir_all(&path).unwrap();
+        Folder(path)
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.join(name).display().to_string()
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+}
+
+/// Two short stages on a coarse grid.
+const SHORT: &str = "stages=[\
+    {resolution=8, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05},\
+    {resolution=12, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]";
+
+/// `train` on the built-in scene, tiny, into `out`.
+fn train(out: &str, more: &[&str]) -> Answer {
+    let tiny = ["train", "--scene-size", "24", "--scene-views", "6,1,3", "--set", SHORT, "--set", "rays_per_step=256", "--out", out];
+    plenoxel(&[&tiny, more].concat())
+}
+
+/// The built-in scene as files: 3 training views, 2 test views and no validation file, 16 x 16.
+fn scene(folder: &Folder) -> String {
+    let dir = folder.path("scene");
+    let answer = plenoxel(&["scene", &dir, "--size", "16", "--train", "3", "--val", "0", "--test", "2"]);
+    assert_eq!(answer.code, 0, "{}", answer.err);
+    dir
+}
+
+/// `train` on files, tiny, into `out`.
+fn train_on(data: &str, out: &str, more: &[&str]) -> Answer {
+    plenoxel(&[&["train", data, "--set", SHORT, "--set", "rays_per_step=256", "--no-images", "--quiet", "--out", out], more].concat())
+}
+
+fn names(folder: &str) -> Vec<String> {
+    let mut names: Vec<String> = fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn a_run_is_trained_evaluated_rendered_and_described() {
+    let folder = Folder::new("whole");
+    let run = folder.path("run");
+    let trained = train(&run, &[]);
+    let result = trained.json();
+    for key in
+        ["psnr", "ssim", "ssim_same", "seconds", "seconds_load", "seconds_evaluate", "baseline_background_psnr", "baseline_mean_image_psnr"]
+    {
+        assert!(result[key].is_f64(), "{key}: {result}");
+    }
+    assert_eq!((&result["views"], &result["width"], &result["height"]), (&3.into(), &24.into(), &24.into()));
+    assert_eq!((&result["steps"], &result["rays"], &result["resolution"]), (&10.into(), &2560.into(), &12.into()));
+    assert_eq!((&result["scene"], &result["preset"]), (&"procedural".into(), &"demo".into()));
+    assert_eq!(result["background"], serde_json::json!([1.0, 1.0, 1.0]));
+    assert!(cfg!(not(target_os = "linux")) || result["peak_memory_bytes"].as_u64().unwrap() > 1_000_000);
+    assert!(result["stages"][0]["psnr"].is_f64() && result["stages"][1]["psnr"] == result["psnr"]);
+    let per_view = result["per_view"].as_array().unwrap();
+    let mean = per_view.iter().map(|view| view["psnr"].as_f64().unwrap()).sum::<f64>() / 3.0;
+    assert!((mean - result["psnr"].as_f64().unwrap()).abs() < 1e-9);
+    // Something was learned: all of the object's color is not white.
+    assert!(result["psnr"].as_f64() > result["baseline_background_psnr"].as_f64(), "{result}");
+
+    // The folder explains itself.
+    let expected = ["README.md", "checkpoint.safetensors", "config.toml", "images", "loss.svg", "metrics.jsonl", "result.json", "run.json"];
+    assert_eq!(names(&run), expected);
+    let saved: Value = serde_json::from_str(&fs::read_to_string(format!("{run}/result.json")).unwrap()).unwrap();
+    assert_eq!(saved, result);
+    let metrics = fs::read_to_string(format!("{run}/metrics.jsonl")).unwrap();
+    let metrics: Vec<Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(metrics.len(), 10 + 1);
+    assert!(metrics[4]["ends_stage"] == true && metrics[4]["resolution"] == 8 && metrics[4]["rays"] == 5 * 256);
+    assert!(metrics[0]["losses"]["mse"] == metrics[0]["loss"] && metrics[9]["psnr"].is_f64());
+    assert_eq!(metrics[10]["final"], result);
+    let pictures = ["stage_1_8.png", "stage_2_12.png", "stages.png", "test_000_r_0.png", "test_001_r_1.png", "test_002_r_2.png"];
+    assert_eq!(names(&format!("{run}/images")), pictures);
+    // Two stages and the target, and four panels, of 24 pixels with gaps of 2.
+    let size = |name: &str| image::size(Path::new(&format!("{run}/images/{name}"))).unwrap();
+    assert_eq!((size("stages.png"), size("test_000_r_0.png")), ((3 * 24 + 2 * 2, 24), (4 * 24 + 3 * 2, 24)));
+    assert!(fs::read_to_string(format!("{run}/loss.svg")).unwrap().contains("12³"));
+    assert!(trained.err.contains("memory: about ") && trained.err.contains("stage 2/2 (12³)  step 10/10"), "{}", trained.err);
+
+    // The same views, the same figures.
+    let evaluated = plenoxel(&["evaluate", &run]).json();
+    for key in ["psnr", "ssim", "ssim_same", "per_view", "seconds", "rays", "views", "width", "background", "resolution"] {
+        assert_eq!(evaluated[key], result[key], "{key}");
+    }
+    let evaluated = plenoxel(&["evaluate", &run, "--split", "val", "--json", "--samples", "40"]);
+    assert_eq!(evaluated.out.lines().count(), 1);
+    assert_eq!((&evaluated.json()["views"], &evaluated.json()["split"]), (&1.into(), &"val".into()));
+    // 24 / 3 = 8 pixels are too few for a window of 11.
+    let small = plenoxel(&["evaluate", &run, "--downscale", "3"]).json();
+    assert!(small["width"] == 8 && small["ssim"].is_null() && small["ssim_same"].is_f64());
+
+    let rendered = plenoxel(&["render", &run, "--view", "2", "--view", "r_0"]);
+    assert_eq!(rendered.code, 0, "{}", rendered.err);
+    let pictures = ["test_000_r_0.png", "test_000_r_0_depth.png", "test_000_r_0_opacity.png"];
+    assert_eq!(names(&format!("{run}/renders"))[..3], pictures);
+    assert_eq!(names(&format!("{run}/renders")).len(), 6);
+    assert_eq!(plenoxel(&["render", &run, "--split", "train", "--downscale", "2", "-q"]).code, 0);
+    assert_eq!(image::size(Path::new(&format!("{run}/renders/train_005_r_5.png"))).unwrap(), (12, 12));
+
+    let described = plenoxel(&["info", &run]);
+    for part in ["12³ voxels", "trilinear", "demo", "built in, 24 x 24", "PSNR", "threads"] {
+        assert!(described.out.contains(part), "{part}: {}", described.out);
+    }
+    let checkpoint = plenoxel(&["info", &format!("{run}/checkpoint.safetensors")]);
+    assert!(checkpoint.out.contains("10 steps on procedural, seed 42"), "{}", checkpoint.out);
+}
+
+#[test]
+fn a_scene_on_disk_is_learned_and_its_configuration_repeats_the_run_to_the_bit() {
+    let folder = Folder::new("repeat");
+    let data = scene(&folder);
+    let described = plenoxel(&["info", &data]);
+    assert!(described.out.contains("3 train, 0 val, 2 test") && described.out.contains("16 x 16"), "{}", described.out);
+    let [a, b, c, d] = ["a", "b", "c", "d"].map(|name| folder.path(name));
+    let flags = ["--background", "0.3,0.2,0.1", "--half-width", "1.4", "--sh-degree", "1", "--tv", "1e-3", "--seed", "7", "--threads", "1"];
+    let first = train_on(&data, &a, &flags).json();
+    assert_eq!((&first["preset"], &first["views"]), (&"standard".into(), &2.into()));
+    assert_eq!(names(&a).iter().filter(|name| *name == "images").count(), 0);
+
+    // Another number of threads, and the resolved configuration instead of the flags.
+    assert_eq!(train_on(&data, &b, &[&flags[..10], &["--threads", "3"]].concat()).json()["psnr"], first["psnr"]);
+    let config = format!("{a}/config.toml");
+    let again = plenoxel(&["train", &data, "--config", &config, "--no-images", "--quiet", "--out", &c]).json();
+    assert_eq!((&again["psnr"], &again["preset"]), (&first["psnr"], &Value::Null));
+    assert_eq!(train_on(&data, &d, &[&flags[..8], &["--seed", "8"]].concat()).code, 0);
+    let [a, b, c, d] =
+        [a, b, c, d].map(|run| [format!("{run}/checkpoint.safetensors"), format!("{run}/config.toml")].map(|f| fs::read(f).unwrap()));
+    assert!(a == b && a == c, "threads or the file changed a bit");
+    assert!(a[0] != d[0], "the seed changed nothing");
+}
+
+#[test]
+fn a_run_remembers_its_data_until_the_data_moves() {
+    let folder = Folder::new("moved");
+    let (data, run, moved) = (scene(&folder), folder.path("run"), folder.path("moved"));
+    let trained = train_on(&data, &run, &[]).json();
+    assert_eq!(plenoxel(&["evaluate", &run]).json()["psnr"], trained["psnr"]);
+    fs::rename(&data, &moved).unwrap();
+    plenoxel(&["evaluate", &run]).refused(3, &[&data, "not there any more", "--data"]);
+    plenoxel(&["render", &run]).refused(3, &["--data"]);
+    assert_eq!(plenoxel(&["evaluate", &run, "--data", &moved]).json()["psnr"], trained["psnr"]);
+    plenoxel(&["evaluate", &run, "--data", &moved, "--split", "val"]).refused(2, &["--split", "val", "no views", "train, test"]);
+    plenoxel(&["render", &run, "--data", &moved, "--view", "r_9"]).refused(2, &["--view", "r_9", "r_0 to r_1"]);
+    plenoxel(&["evaluate", &run, "--data", &moved, "--downscale", "3"]).refused(2, &["downscale", "3", "1, 2, 4"]);
+}
+
+#[test]
+fn without_test_views_training_ends_well_and_has_no_figures() {
+    let folder = Folder::new("no-test");
+    // A flag that is given twice counts the last time.
+    let result = train(&folder.path("built-in"), &["--scene-views", "4,0,0"]).json();
+    assert!(result["psnr"].is_null() && result["views"] == 0 && result["stages"][0]["psnr"].is_null(), "{result}");
+    let pictures = names(&folder.path("built-in/images"));
+    assert_eq!(pictures, ["stage_1_8.png", "stage_2_12.png", "stages.png"]);
+    let data = scene(&folder);
+    fs::remove_file(format!("{data}/transforms_test.json")).unwrap();
+    let result = train_on(&data, &folder.path("run"), &["--set", "validation_every=3"]).json();
+    assert!(result["psnr"].is_null() && result["views"] == 0 && result["ssim"].is_null(), "{result}");
+    // Of three training views every third is held out.
+    let val = plenoxel(&["evaluate", &folder.path("run"), "--split", "val"]).json();
+    assert_eq!(val["views"], 1);
+}
+
+#[test]
+fn a_run_is_overwritten_only_when_forced_and_leaves_nothing_of_the_old_one() {
+    let folder = Folder::new("force");
+    let run = folder.path("run");
+    assert_eq!(train(&run, &["--quiet"]).code, 0);
+    assert_eq!(plenoxel(&["render", &run, "--view", "0", "--quiet"]).code, 0);
+    let before = fs::read(format!("{run}/checkpoint.safetensors")).unwrap();
+    train(&run, &[]).refused(2, &["--out", &run, "--force"]);
+    assert_eq!(fs::read(format!("{run}/checkpoint.safetensors")).unwrap(), before);
+    let forced = train(&run, &["--force", "--no-images", "--seed", "5", "--quiet"]);
+    assert!(forced.code == 0 && forced.err.is_empty(), "{}", forced.err);
+    assert_ne!(fs::read(format!("{run}/checkpoint.safetensors")).unwrap(), before);
+    assert!(names(&format!("{run}/images")).is_empty() && names(&format!("{run}/renders")).is_empty());
+    let metrics = fs::read_to_string(format!("{run}/metrics.jsonl")).unwrap();
+    assert_eq!(metrics.lines().count(), 11);
+
+    let data = scene(&folder);
+    plenoxel(&["scene", &data, "--size", "16"]).refused(2, &["--force"]);
+    assert_eq!(plenoxel(&["scene", &data, "--size", "8", "--train", "1", "--val", "0", "--test", "0", "--force"]).code, 0);
+    assert!(plenoxel(&["info", &data]).out.contains("1 train, 0 val, 0 test"));
+    fs::write(folder.path("file"), "x").unwrap();
+    plenoxel(&["scene", &folder.path("file")]).refused(2, &["which is a file"]);
+    train(&folder.path("file"), &["--force"]).refused(2, &["which is a file"]);
+    // A folder cannot be made below a file.
+    train(&folder.path("file/run"), &["--quiet"]).refused(5, &["file/run", "creating the folder"]);
+}
+
+#[test]
+fn each_broken_dataset_is_refused_with_the_place_and_the_remedy() {
+    let folder = Folder::new("broken");
+    let refused = |data: &str, parts: &[&str]| {
+        let run = folder.path("run");
+        train_on(data, &run, &[]).refused(3, parts);
+        assert!(!Path::new(&run).exists(), "bad input made a run folder");
+    };
+    refused(&folder.path("missing"), &["missing", "there is no such folder"]);
+    fs::write(folder.path("file"), "x").unwrap();
+    refused(&folder.path("file"), &["this is a file", "give the folder"]);
+    fs::create_dir(folder.path("empty")).unwrap();
+    refused(&folder.path("empty"), &["no transforms_train.json", "it is empty"]);
+
+    // Each of these breaks one file of a whole scene, which is then mended.
+    let data = scene(&folder);
+    let broken = |name: &str, content: Vec<u8>, parts: &[&str]| {
+        let path = format!("{data}/{name}");
+        let whole = fs::read(&path).unwrap();
+        fs::write(&path, content).unwrap();
+        refused(&data, &[&[name][..], parts].concat());
+        fs::write(&path, whole).unwrap();
+    };
+    let png = fs::read(format!("{data}/train/r_1.png")).unwrap();
+    broken("train/r_1.png", png[..png.len() / 2].to_vec(), &["cut short"]);
+    broken("train/r_1.png", b"\xff\xd8\xff\xe0 a photograph".to_vec(), &["JPEG", "convert it to PNG"]);
+    broken("train/r_1.png", Vec::new(), &["empty"]);
+    let other = folder.path("other");
+    assert_eq!(plenoxel(&["scene", &other, "--size", "20", "--train", "1", "--val", "0", "--test", "0"]).code, 0);
+    broken("test/r_1.png", fs::read(format!("{other}/train/r_0.png")).unwrap(), &["20 x 20", "16 x 16", "one size"]);
+
+    let json = fs::read_to_string(format!("{data}/transforms_train.json")).unwrap();
+    broken("transforms_train.json", json.as_bytes()[..json.len() / 2].to_vec(), &["ends early", "line"]);
+    let edit = |f: &dyn Fn(&mut Value)| {
+        let mut value: Value = serde_json::from_str(&json).unwrap();
+        f(&mut value);
+        value.to_string().into_bytes()
+    };
+    let broken = |content: Vec<u8>, parts: &[&str]| broken("transforms_train.json", content, parts);
+    broken(edit(&|v| drop(v.as_object_mut().unwrap().remove("camera_angle_x"))), &["camera_angle_x", "radians"]);
+    broken(edit(&|v| drop(v["frames"][1].as_object_mut().unwrap().remove("transform_matrix"))), &["frame 1", "transform_matrix"]);
+    broken(edit(&|v| drop(v["frames"][2]["transform_matrix"].as_array_mut().unwrap().pop())), &["frame 2", "3 rows"]);
+    broken(edit(&|v| v["frames"][0]["transform_matrix"][1][2] = Value::Null), &["frame 0", "null", "finite"]);
+    broken(edit(&|v| v["frames"][0]["file_path"] = "./train/r_77".into()), &["frame 0", "r_77", "does not exist"]);
+    broken(edit(&|v| v["frames"] = serde_json::json!([])), &["frames is empty", "at least one"]);
+    broken(json.replacen("0.", "1e999, 0.", 1).into_bytes(), &["transforms_train.json"]);
+    assert_eq!(train_on(&data, &folder.path("run"), &[]).code, 0, "the scene was mended");
+}
+
+#[test]
+fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
+    let folder = Folder::new("settings");
+    let run = folder.path("run");
+    let refused = |more: &[&str], parts: &[&str]| {
+        train(&run, more).refused(2, parts);
+        assert!(!Path::new(&run).exists());
+    };
+    refused(&["--downscale", "5"], &["downscale", "5", "24 x 24", "1, 2, 3, 4, 6, 8, 12, 24"]);
+    refused(&["--set", "stages[1].resolution=1024", "--sh-degree", "3"], &["stages[1].resolution", "GB of memory", "fewer voxels"]);
+    refused(&["--half-width", "-1"], &["half_width (--half-width)", "above 0"]);
+    refused(&["--set", "stages[0].rezolution=4"], &["--set stages[0].rezolution", "nearest known key is `resolution`"]);
+    refused(&["--set", "stages[4].resolution=4"], &["stages[0] to stages[1]"]);
+    refused(&["--set", "losses.tv=1"], &["unknown key `tv`"]);
+    refused(&["--set", "jitter=perhaps"], &["--set jitter", "boolean"]);
+    refused(&["--threads", "0"], &["--threads", "1 to 1024"]);
+    refused(&["--threads", "5000"], &["--threads"]);
+    refused(&["--sh-degree", "4"], &["--sh-degree", "0..=3"]);
+    refused(&["--background", "gray"], &["--background", "white, black"]);
+    refused(&["--preset", "best"], &["--preset", "demo", "paper"]);
+    refused(&["--engine", "magic"], &["--engine", "graph"]);
+    refused(&["--tv", "-1"], &["--tv"]);
+    refused(&["--colour", "sh"], &["--colour", "--color"]);
+    plenoxel(&["train", "somewhere", "--scene-size", "32"]).refused(2, &["--scene-size", "cannot be used with"]);
+    plenoxel(&["trian"]).refused(2, &["train"]);
+    assert_eq!(plenoxel(&[]).code, 2);
+
+    let config = folder.path("my.toml");
+    let with_file = |text: &str| {
+        fs::write(&config, text).unwrap();
+        train(&run, &["--config", &config])
+    };
+    with_file("seed = 3\n[initial]\ndensitty = 1\n").refused(2, &["my.toml, line 3", "`densitty`", "nearest known key is `density`"]);
+    with_file("seed = 3\nhalf_width = 0\n").refused(2, &["half_width", "my.toml, line 2", "above 0"]);
+    with_file("seed = \n").refused(3, &["my.toml", "line 1", "not TOML"]);
+    train(&run, &["--config", &folder.path("none.toml")]).refused(3, &["none.toml", "no such file"]);
+    train(&run, &["--config", &folder.path("")]).refused(3, &["this is a folder"]);
+    // What a file leaves open the preset fills in, and a flag goes before both.
+    let run_config = || fs::read_to_string(format!("{run}/config.toml")).unwrap();
+    fs::write(&config, "seed = 3\nsh_degree = 1\n[losses]\nsparsity = { from = 1e-4, to = 1e-6, steps = 10 }\n").unwrap();
+    assert_eq!(train(&run, &["--config", &config, "--seed", "9", "--quiet"]).code, 0);
+    for line in ["seed = 9\n", "sh_degree = 1\n", "mse = 1.0\n", "from = 0.0001\n", "rays_per_step = 256\n"] {
+        assert!(run_config().contains(line), "{line}{}", run_config());
+    }
+}
+
+#[test]
+fn numbers_that_are_not_finite_end_the_run_and_leave_the_metrics_but_no_checkpoint() {
+    let folder = Folder::new("nan");
+    let run = folder.path("run");
+    let diverging = ["--set", "optimizer={kind=\"sgd\"}", "--set", "stages[1].color_rate=1e38"];
+    train(&run, &diverging).refused(4, &["step ", "rates"]);
+    let metrics = fs::read_to_string(format!("{run}/metrics.jsonl")).unwrap();
+    assert!(metrics.lines().count() > 5, "the first stage is there");
+    let last: Value = serde_json::from_str(metrics.lines().last().unwrap()).unwrap();
+    assert!(last["failure"].as_str().unwrap().contains("step"), "{last}");
+    let left = names(&run);
+    assert!(
+        left.contains(&"loss.svg".to_owned()) && !left.iter().any(|name| name.contains("checkpoint") || name.contains("result")),
+        "{left:?}"
+    );
+    plenoxel(&["evaluate", &run]).refused(3, &["no checkpoint.safetensors", "did not end"]);
+    assert!(plenoxel(&["info", &run]).out.contains("the run did not end"));
+}
+
+#[test]
+fn a_damaged_run_is_refused() {
+    let folder = Folder::new("damaged");
+    let run = folder.path("run");
+    plenoxel(&["evaluate", &run]).refused(3, &["there is no such run"]);
+    plenoxel(&["info", &run]).refused(3, &["run"]);
+    plenoxel(&["render", &folder.path("")]).refused(3, &["no run.json"]);
+    assert_eq!(train(&run, &["--no-images", "--quiet"]).code, 0);
+    let checkpoint = format!("{run}/checkpoint.safetensors");
+    plenoxel(&["evaluate", &checkpoint]).refused(3, &["not the folder of a run"]);
+    let whole = fs::read(&checkpoint).unwrap();
+    fs::write(&checkpoint, &whole[..whole.len() - 9]).unwrap();
+    plenoxel(&["evaluate", &run]).refused(3, &["checkpoint.safetensors"]);
+    plenoxel(&["info", &checkpoint]).refused(3, &["checkpoint.safetensors"]);
+    fs::write(&checkpoint, whole).unwrap();
+    fs::write(format!("{run}/run.json"), "{}").unwrap();
+    plenoxel(&["evaluate", &run]).refused(3, &["run.json", "does not describe a run"]);
+}
+
+/// A stream that refuses everything.
+struct Closed(io::ErrorKind);
+
+impl Write for Closed {
+    fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+        Err(self.0.into())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Err(self.0.into())
+    }
+}
+
+#[test]
+fn a_reader_that_went_away_is_no_failure_and_a_full_disk_is() {
+    let info = |out: io::ErrorKind| {
+        let (mut out, mut err) = (Closed(out), Closed(io::ErrorKind::BrokenPipe));
+        plenoxel_cli::run(["plenoxel", "info"], Streams { out: &mut out, err: &mut err, terminal: false })
+    };
+    assert_eq!(info(io::ErrorKind::BrokenPipe), 0);
+    assert_eq!(info(io::ErrorKind::StorageFull), 5);
+}
+
+#[test]
+fn help_mentions_every_command_and_flag() {
+    let help = plenoxel(&["--help"]);
+    assert!(help.code == 0 && help.err.is_empty());
+    for part in ["train", "render", "evaluate", "info", "scene", "Exit codes"] {
+        assert!(help.out.contains(part), "{part}");
+    }
+    let version = plenoxel(&["--version"]);
+    assert!(version.code == 0 && version.out.starts_with("plenoxel 0."), "{}", version.out);
+    let flags = "--out --force --no-images --preset --config --set --seed --downscale --background --half-width --interpolation --color \
+        --sh-degree --engine --tv --threads --quiet --scene-size --scene-views Examples:";
+    for (command, flags) in [
+        ("train", flags),
+        ("render", "--split --view --downscale --data Examples:"),
+        ("evaluate", "--split --downscale --samples --json --data Examples:"),
+        ("info", "Examples:"),
+        ("scene", "--width --height --train --val --test --force Examples:"),
+    ] {
+        let help = plenoxel(&[command, "--help"]);
+        assert_eq!(help.code, 0);
+        assert!(flags.split_whitespace().all(|flag| help.out.contains(flag)), "{command}: {}", help.out);
+    }
+}
