@@ -86,8 +86,11 @@ struct Ball {
 
 impl Field<f64> for Ball {
     fn density(&self, positions: &Tensor<f64>) -> Tensor<f64> {
-        let inside: Vec<f64> =
-            positions.data().chunks(3).map(|p| if p.iter().map(|x| x * x).sum::<f64>() <= self.radius * self.radius { self.sigma } else { 0.0 }).collect();
+        let inside: Vec<f64> = positions
+            .data()
+            .chunks(3)
+            .map(|p| if p.iter().map(|x| x * x).sum::<f64>() <= self.radius * self.radius { self.sigma } else { 0.0 })
+            .collect();
         let m = inside.len();
         Tensor::from_vec(inside, &[m])
     }
@@ -110,7 +113,11 @@ fn a_ball_shows_the_chord_through_it() {
 
 #[test]
 fn an_empty_box_and_a_missed_box_show_the_background() {
-    let empty = VoxelGrid::<f64>::uniform(GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb }, 0.0, 0.7);
+    let empty = VoxelGrid::<f64>::uniform(
+        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb },
+        0.0,
+        0.7,
+    );
     let rendered: Rendered<f64> = no_grad(|| render(&empty, &rays(), &options(Spacing::Step(0.05), Jitter::None)));
     for pixel in rendered.rgb.data().chunks(3) {
         for c in 0..3 {
@@ -118,14 +125,23 @@ fn an_empty_box_and_a_missed_box_show_the_background() {
         }
     }
     assert!(rendered.opacity.data().iter().chain(rendered.depth().data()).all(|&x| x == 0.0));
-    let missed = render(&Fog { sigma: 9.0, color: [0.0; 3] }, &[ray([-3.0, 2.0, 0.0], [3.0, 2.0, 0.0])], &options(Spacing::Step(0.05), Jitter::None));
+    let missed = render(
+        &Fog { sigma: 9.0, color: [0.0; 3] },
+        &[ray([-3.0, 2.0, 0.0], [3.0, 2.0, 0.0])],
+        &options(Spacing::Step(0.05), Jitter::None),
+    );
     assert_eq!(missed.opacity.data(), [0.0]);
     assert_relative_eq!(missed.rgb.data()[1], f64::from(0.4f32));
 }
 
 #[test]
 fn distortion_in_linear_time_equals_the_double_sum() {
-    let grid = VoxelGrid::<f64>::random(GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb }, 2.0, 1.0, 5);
+    let grid = VoxelGrid::<f64>::random(
+        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb },
+        2.0,
+        1.0,
+        5,
+    );
     let rendered = render(&grid, &rays(), &options(Spacing::Step(0.2), Jitter::None));
     let s = &rendered.samples;
     let (w, t, d) = (s.weights.data(), s.samples.t.data(), s.samples.delta.data());

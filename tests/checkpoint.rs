@@ -11,7 +11,8 @@ fn folder(name: &str) -> PathBuf {
 }
 
 fn grid() -> (VoxelGrid<f32>, Header) {
-    let shape = GridShape { resolution: 5, half_width: 1.4, interpolation: Interpolation::Trilinear, color: Color::Sh { degree: 2, offset: 0.5 } };
+    let shape =
+        GridShape { resolution: 5, half_width: 1.4, interpolation: Interpolation::Trilinear, color: Color::Sh { degree: 2, offset: 0.5 } };
     let grid = VoxelGrid::random(shape, 3.0, 1.0, 9);
     let header = Header::new(&grid, "still life", [1.0, 1.0, 1.0], 42, 1234);
     (grid, header)

@@ -317,6 +317,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
     refused(&["--tv", "-1"], &["--tv"]);
     refused(&["--colour", "sh"], &["--colour", "--color"]);
     plenoxel(&["train", "somewhere", "--scene-size", "32"]).refused(2, &["--scene-size", "cannot be used with"]);
+    plenoxel(&["scene", &run, "--size", "16000", "--train", "1000"]).refused(2, &["GB of memory", "fewer or smaller views"]);
     plenoxel(&["trian"]).refused(2, &["train"]);
     assert_eq!(plenoxel(&[]).code, 2);
 

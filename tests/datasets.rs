@@ -14,11 +14,7 @@ struct Folder(PathBuf);
 impl Folder {
     fn new() -> Self {
         static COUNT: AtomicUsize = AtomicUsize::new(0);
-        let unique = format!(
-            "plenoxel-datasets-{}-{}",
-            std::process::id(),
-            COUNT.fetch_add(1, Ordering::Relaxed)
-        );
+        let unique = format!("plenoxel-datasets-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
         let path = std::env::temp_dir().join(unique);
         fs::create_dir_all(&path).unwrap();
         Folder(path)
@@ -31,10 +27,7 @@ impl Folder {
             for k in 0..count {
                 folder.image(&format!("{split}/r_{k}.png"), 4, 4, [10 * k, 20, 30, 255]);
             }
-            folder.write(
-                &format!("transforms_{split}.json"),
-                &transforms(split, count),
-            );
+            folder.write(&format!("transforms_{split}.json"), &transforms(split, count));
         }
         folder
     }
@@ -82,29 +75,18 @@ fn refused<T>(result: Result<T, Error>, code: u8, words: &[&str]) {
     let message = error.to_string();
     assert_eq!(error.exit_code(), code, "{message}");
     for word in words {
-        assert!(
-            message.contains(word),
-            "\"{word}\" is missing in: {message}"
-        );
+        assert!(message.contains(word), "\"{word}\" is missing in: {message}");
     }
 }
 
 /// Cameras at (0, 0, 4 + k) that look down.
 fn transforms(split: &str, count: u8) -> String {
     let frame = |k: u8| {
-        let pose = format!(
-            "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, {}], [0, 0, 0, 1]]",
-            4 + k
-        );
-        format!(
-            "{{ \"file_path\": \"./{split}/r_{k}\", \"rotation\": 0.1, \"transform_matrix\": {pose} }}"
-        )
+        let pose = format!("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, {}], [0, 0, 0, 1]]", 4 + k);
+        format!("{{ \"file_path\": \"./{split}/r_{k}\", \"rotation\": 0.1, \"transform_matrix\": {pose} }}")
     };
     let frames: Vec<String> = (0..count).map(frame).collect();
-    format!(
-        "{{\n \"camera_angle_x\": 0.6911112070083618,\n \"frames\": [\n{}\n]}}",
-        frames.join(",\n")
-    )
+    format!("{{\n \"camera_angle_x\": 0.6911112070083618,\n \"frames\": [\n{}\n]}}", frames.join(",\n"))
 }
 
 #[test]
@@ -113,14 +95,8 @@ fn a_complete_scene_has_its_views_in_the_order_of_the_files() {
     let dataset = folder.open().unwrap();
     assert_eq!(Split::ALL.map(|split| dataset.count(split)), [4, 1, 2]);
     assert_eq!(dataset.size(), (4, 4));
-    assert_eq!(
-        dataset.name(),
-        folder.0.file_name().unwrap().to_str().unwrap()
-    );
-    assert_eq!(
-        dataset.view_names(Split::Train),
-        ["r_0", "r_1", "r_2", "r_3"]
-    );
+    assert_eq!(dataset.name(), folder.0.file_name().unwrap().to_str().unwrap());
+    assert_eq!(dataset.view_names(Split::Train), ["r_0", "r_1", "r_2", "r_3"]);
     let views = dataset.load(Split::Train, &|_, _| ()).unwrap();
     for (k, view) in views.iter().enumerate() {
         assert_eq!(view.image.get_pixel(0, 0).0[0], 10 * k as u8);
@@ -137,12 +113,7 @@ fn a_complete_scene_has_its_views_in_the_order_of_the_files() {
 fn color_is_composited_over_the_background_that_is_asked_for() {
     let folder = Folder::scene();
     folder.image("train/r_0.png", 4, 4, [255, 0, 0, 51]); // alpha 0.2
-    let view = folder
-        .open()
-        .unwrap()
-        .load(Split::Train, &|_, _| ())
-        .unwrap()
-        .remove(0);
+    let view = folder.open().unwrap().load(Split::Train, &|_, _| ()).unwrap().remove(0);
     let close = |a: [f32; 3], b: [f32; 3]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6);
     assert!((view.alpha(0, 0) - 0.2).abs() < 1e-6);
     assert!(close(view.color(1, 1, [1.0; 3]), [1.0, 0.8, 0.8]));
@@ -156,10 +127,7 @@ fn file_paths_with_extension_or_relative_to_the_split_are_found_too() {
     folder.edit("./train/r_0", "./train/r_0.png");
     folder.edit("./train/r_1", "elsewhere/r_1");
     folder.edit("./train/r_2", "train\\\\r_2");
-    assert_eq!(
-        folder.open().unwrap().view_names(Split::Train),
-        ["r_0", "r_1", "r_2", "r_3"]
-    );
+    assert_eq!(folder.open().unwrap().view_names(Split::Train), ["r_0", "r_1", "r_2", "r_3"]);
 }
 
 #[test]
@@ -176,84 +144,33 @@ fn a_missing_validation_or_test_split_is_empty_and_views_can_be_held_out() {
     let folder = Folder::scene();
     fs::remove_file(folder.path("transforms_val.json")).unwrap();
     fs::remove_file(folder.path("transforms_test.json")).unwrap();
-    assert_eq!(
-        Split::ALL.map(|split| folder.open().unwrap().count(split)),
-        [4, 0, 0]
-    );
-    assert!(
-        folder
-            .open()
-            .unwrap()
-            .load(Split::Test, &|_, _| ())
-            .unwrap()
-            .is_empty()
-    );
+    assert_eq!(Split::ALL.map(|split| folder.open().unwrap().count(split)), [4, 0, 0]);
+    assert!(folder.open().unwrap().load(Split::Test, &|_, _| ()).unwrap().is_empty());
 
-    let options = OpenOptions {
-        validation_every: Some(2),
-        ..OpenOptions::default()
-    };
+    let options = OpenOptions { validation_every: Some(2), ..OpenOptions::default() };
     let dataset = dataset::open(&folder.0, &options).unwrap();
     assert_eq!(dataset.view_names(Split::Train), ["r_0", "r_2"]);
     assert_eq!(dataset.view_names(Split::Val), ["r_1", "r_3"]);
-    let options = OpenOptions {
-        validation_every: Some(1),
-        ..OpenOptions::default()
-    };
-    refused(
-        dataset::open(&folder.0, &options),
-        2,
-        &["validation_every", "2 or more"],
-    );
+    let options = OpenOptions { validation_every: Some(1), ..OpenOptions::default() };
+    refused(dataset::open(&folder.0, &options), 2, &["validation_every", "2 or more"]);
 
     // A validation file of the scene's own is left alone.
     folder.write("transforms_val.json", &transforms("val", 1));
-    let options = OpenOptions {
-        validation_every: Some(2),
-        ..OpenOptions::default()
-    };
+    let options = OpenOptions { validation_every: Some(2), ..OpenOptions::default() };
     let dataset = dataset::open(&folder.0, &options).unwrap();
-    assert_eq!(
-        (dataset.count(Split::Train), dataset.count(Split::Val)),
-        (4, 1)
-    );
+    assert_eq!((dataset.count(Split::Train), dataset.count(Split::Val)), (4, 1));
 }
 
 #[test]
 fn downscaling_reduces_images_and_intrinsics_alike() {
     let folder = Folder::scene();
-    let small = dataset::open(
-        &folder.0,
-        &OpenOptions {
-            downscale: 2,
-            ..OpenOptions::default()
-        },
-    )
-    .unwrap();
-    let (full, half) = (
-        folder.open().unwrap().cameras(Split::Train)[0].intrinsics,
-        small.cameras(Split::Train)[0].intrinsics,
-    );
-    assert_eq!(
-        (small.size(), half.fx, half.cx),
-        ((2, 2), full.fx / 2.0, 1.0)
-    );
-    assert_eq!(
-        small.load(Split::Train, &|_, _| ()).unwrap()[1]
-            .image
-            .dimensions(),
-        (2, 2)
-    );
+    let small = dataset::open(&folder.0, &OpenOptions { downscale: 2, ..OpenOptions::default() }).unwrap();
+    let (full, half) = (folder.open().unwrap().cameras(Split::Train)[0].intrinsics, small.cameras(Split::Train)[0].intrinsics);
+    assert_eq!((small.size(), half.fx, half.cx), ((2, 2), full.fx / 2.0, 1.0));
+    assert_eq!(small.load(Split::Train, &|_, _| ()).unwrap()[1].image.dimensions(), (2, 2));
     for downscale in [0, 3] {
-        let options = OpenOptions {
-            downscale,
-            ..OpenOptions::default()
-        };
-        refused(
-            dataset::open(&folder.0, &options),
-            2,
-            &["downscale", &downscale.to_string(), "accepted: 1, 2, 4"],
-        );
+        let options = OpenOptions { downscale, ..OpenOptions::default() };
+        refused(dataset::open(&folder.0, &options), 2, &["downscale", &downscale.to_string(), "accepted: 1, 2, 4"]);
     }
 }
 
@@ -261,41 +178,17 @@ fn downscaling_reduces_images_and_intrinsics_alike() {
 fn paths_that_are_no_scene_say_what_they_are() {
     let folder = Folder::scene();
     let open = |path: &Path| dataset::open(path, &OpenOptions::default());
-    refused(
-        open(&folder.path("nowhere")),
-        3,
-        &["nowhere", "no such folder"],
-    );
-    refused(
-        open(&folder.path("transforms_train.json")),
-        3,
-        &["this is a file", "folder"],
-    );
-    refused(
-        open(&folder.path("train")),
-        3,
-        &["no transforms_train.json", "r_0.png, r_1.png"],
-    );
+    refused(open(&folder.path("nowhere")), 3, &["nowhere", "no such folder"]);
+    refused(open(&folder.path("transforms_train.json")), 3, &["this is a file", "folder"]);
+    refused(open(&folder.path("train")), 3, &["no transforms_train.json", "r_0.png, r_1.png"]);
     let parent = Folder::new();
-    refused(
-        open(&parent.0),
-        3,
-        &["no transforms_train.json", "it is empty"],
-    );
+    refused(open(&parent.0), 3, &["no transforms_train.json", "it is empty"]);
     fs::create_dir(parent.path("lego")).unwrap();
     parent.write("lego/transforms_train.json", "{}");
-    refused(
-        open(&parent.0),
-        3,
-        &["it contains lego", "give one scene", "lego"],
-    );
+    refused(open(&parent.0), 3, &["it contains lego", "give one scene", "lego"]);
     let other = Folder::new();
     other.write("transforms.json", "{}");
-    refused(
-        open(&other.0),
-        3,
-        &["it contains transforms.json", "nerfstudio"],
-    );
+    refused(open(&other.0), 3, &["it contains transforms.json", "nerfstudio"]);
 }
 
 #[test]
@@ -303,16 +196,10 @@ fn json_cut_short_or_malformed_names_line_and_column() {
     let folder = Folder::scene();
     let text = fs::read_to_string(folder.path("transforms_train.json")).unwrap();
     folder.write("transforms_train.json", &text[..text.len() / 2]);
-    folder.refused(
-        3,
-        &["transforms_train.json", "ends early", "line 5, column"],
-    );
+    folder.refused(3, &["transforms_train.json", "ends early", "line 5, column"]);
     folder.write("transforms_train.json", "");
     folder.refused(3, &["transforms_train.json", "ends early"]);
-    folder.write(
-        "transforms_train.json",
-        "{\n \"camera_angle_x\": 0.7,\n oops }",
-    );
+    folder.write("transforms_train.json", "{\n \"camera_angle_x\": 0.7,\n oops }");
     folder.refused(3, &["not valid JSON", "line 3"]);
     folder.write("transforms_train.json", "[]");
     folder.refused(3, &["no key \"camera_angle_x\""]);
@@ -321,88 +208,22 @@ fn json_cut_short_or_malformed_names_line_and_column() {
 #[test]
 fn missing_or_wrong_keys_are_named_with_their_frame() {
     for (from, to, words) in [
-        (
-            "camera_angle_x",
-            "camera_angle",
-            ["no key \"camera_angle_x\"", "radians"],
-        ),
-        (
-            "\"frames\"",
-            "\"pictures\"",
-            ["no key \"frames\"", "transform_matrix"],
-        ),
-        (
-            "file_path",
-            "file",
-            ["frame 0 has no key \"file_path\"", "extension"],
-        ),
-        (
-            "\"./train/r_0\"",
-            "7",
-            ["file_path of frame 0 is 7", "extension"],
-        ),
-        (
-            "transform_matrix",
-            "matrix",
-            ["frame 0 has no key \"transform_matrix\"", "4 x 4"],
-        ),
-        (
-            "0.6911112070083618",
-            "0",
-            ["camera_angle_x is 0", "between 0 and pi"],
-        ),
-        (
-            "0.6911112070083618",
-            "3.2",
-            ["camera_angle_x is 3.2", "between 0 and pi"],
-        ),
-        (
-            "0.6911112070083618",
-            "null",
-            ["camera_angle_x is null", "between 0 and pi"],
-        ),
+        ("camera_angle_x", "camera_angle", ["no key \"camera_angle_x\"", "radians"]),
+        ("\"frames\"", "\"pictures\"", ["no key \"frames\"", "transform_matrix"]),
+        ("file_path", "file", ["frame 0 has no key \"file_path\"", "extension"]),
+        ("\"./train/r_0\"", "7", ["file_path of frame 0 is 7", "extension"]),
+        ("transform_matrix", "matrix", ["frame 0 has no key \"transform_matrix\"", "4 x 4"]),
+        ("0.6911112070083618", "0", ["camera_angle_x is 0", "between 0 and pi"]),
+        ("0.6911112070083618", "3.2", ["camera_angle_x is 3.2", "between 0 and pi"]),
+        ("0.6911112070083618", "null", ["camera_angle_x is null", "between 0 and pi"]),
         ("0.6911112070083618", "1e999", ["not valid JSON", "line 2"]),
-        (
-            ", [0, 0, 0, 1]]",
-            "]",
-            ["transform_matrix of frame 0 has 3 rows", "4 rows of 4"],
-        ),
-        (
-            "[0, 1, 0, 0]",
-            "[0, 1, 0]",
-            [
-                "transform_matrix of frame 0 has 3 numbers in row 1",
-                "4 rows of 4",
-            ],
-        ),
-        (
-            "[0, 1, 0, 0]",
-            "[0, 1, 0, null]",
-            [
-                "transform_matrix of frame 0 has null in row 1, column 3",
-                "finite",
-            ],
-        ),
-        (
-            "[0, 1, 0, 0]",
-            "[0, 1, 0, 1e999]",
-            ["not valid JSON", "out of range"],
-        ),
-        (
-            "[0, 1, 0, 0]",
-            "[0, 1, 0, NaN]",
-            ["not valid JSON", "finite"],
-        ),
-        (
-            "[0, 1, 0, 0]",
-            "[0, 2, 0, 0]",
-            ["transform_matrix of frame 0 is not a rotation", "scale"],
-        ),
-        (
-            "[0, 0, 0, 1]",
-            "[0, 0, 1, 1]",
-            ["transform_matrix of frame 0 has the last row", "0 0 0 1"],
-        ),
+        (", [0, 0, 0, 1]]", "]", ["transform_matrix of frame 0 has 3 rows", "4 rows of 4"]),
+        ("[0, 1, 0, 0]", "[0, 1, 0]", ["transform_matrix of frame 0 has 3 numbers in row 1", "4 rows of 4"]),
+        ("[0, 1, 0, 0]", "[0, 1, 0, null]", ["transform_matrix of frame 0 has null in row 1, column 3", "finite"]),
+        ("[0, 1, 0, 0]", "[0, 1, 0, 1e999]", ["not valid JSON", "out of range"]),
+        ("[0, 1, 0, 0]", "[0, 1, 0, NaN]", ["not valid JSON", "finite"]),
+        ("[0, 1, 0, 0]", "[0, 2, 0, 0]", ["transform_matrix of frame 0 is not a rotation", "scale"]),
+        ("[0, 0, 0, 1]", "[0, 0, 1, 1]", ["transform_matrix of frame 0 has the last row", "0 0 0 1"]),
     ] {
         let folder = Folder::scene();
         folder.edit(from, to);
@@ -413,10 +234,7 @@ fn missing_or_wrong_keys_are_named_with_their_frame() {
 #[test]
 fn a_training_split_without_frames_is_refused() {
     let folder = Folder::scene();
-    folder.write(
-        "transforms_train.json",
-        "{ \"camera_angle_x\": 0.7, \"frames\": [] }",
-    );
+    folder.write("transforms_train.json", "{ \"camera_angle_x\": 0.7, \"frames\": [] }");
     folder.refused(3, &["frames is empty", "at least one training view"]);
 }
 
@@ -424,15 +242,7 @@ fn a_training_split_without_frames_is_refused() {
 fn a_missing_image_is_named_with_its_frame_and_the_places_searched() {
     let folder = Folder::scene();
     fs::remove_file(folder.path("train/r_2.png")).unwrap();
-    folder.refused(
-        3,
-        &[
-            "transforms_train.json",
-            "\"./train/r_2\" of frame 2 does not exist",
-            "looked for",
-            "r_2.png",
-        ],
-    );
+    folder.refused(3, &["transforms_train.json", "\"./train/r_2\" of frame 2 does not exist", "looked for", "r_2.png"]);
 }
 
 #[test]
@@ -468,23 +278,12 @@ fn damage_inside_an_image_is_reported_when_it_is_decoded() {
     png[data + 6] ^= 0xff;
     fs::write(&path, png).unwrap();
     let dataset = folder.open().unwrap();
-    refused(
-        dataset.load(Split::Train, &|_, _| ()),
-        3,
-        &["r_1.png", "cannot be decoded"],
-    );
+    refused(dataset.load(Split::Train, &|_, _| ()), 3, &["r_1.png", "cannot be decoded"]);
 }
 
 #[test]
 fn the_built_in_scene_written_to_disk_reads_back_the_same() {
-    let options = ProceduralOptions {
-        width: 20,
-        height: 20,
-        train: 3,
-        val: 2,
-        test: 2,
-        supersample: 2,
-    };
+    let options = ProceduralOptions { width: 20, height: 20, train: 3, val: 2, test: 2, supersample: 2 };
     let built_in = Dataset::procedural(options).unwrap();
     let folder = Folder::new();
     built_in.write_blender(&folder.0, false).unwrap();
@@ -492,29 +291,15 @@ fn the_built_in_scene_written_to_disk_reads_back_the_same() {
     assert_eq!(read.size(), built_in.size());
     for split in Split::ALL {
         assert_eq!(read.view_names(split), built_in.view_names(split));
-        let (read, made) = (
-            read.load(split, &|_, _| ()).unwrap(),
-            built_in.load(split, &|_, _| ()).unwrap(),
-        );
+        let (read, made) = (read.load(split, &|_, _| ()).unwrap(), built_in.load(split, &|_, _| ()).unwrap());
         for (a, b) in read.iter().zip(&made) {
             assert!(a.image == b.image, "{split} {}", a.name);
-            assert!(
-                a.camera
-                    .camera_to_world
-                    .abs_diff_eq(b.camera.camera_to_world, 1e-9)
-            );
+            assert!(a.camera.camera_to_world.abs_diff_eq(b.camera.camera_to_world, 1e-9));
             assert!((a.camera.intrinsics.fx - b.camera.intrinsics.fx).abs() < 1e-9);
         }
     }
-    assert!(
-        folder.path("test/r_0_depth_0000.png").exists()
-            && !folder.path("train/r_0_depth_0000.png").exists()
-    );
+    assert!(folder.path("test/r_0_depth_0000.png").exists() && !folder.path("train/r_0_depth_0000.png").exists());
 
-    refused(
-        built_in.write_blender(&folder.0, false),
-        3,
-        &["not an empty folder"],
-    );
+    refused(built_in.write_blender(&folder.0, false), 3, &["not an empty folder"]);
     built_in.write_blender(&folder.0, true).unwrap();
 }

@@ -61,7 +61,8 @@ fn every_column_of_a_whole_render_agrees_with_finite_differences() {
     for (name, shape) in shapes() {
         for (column, get) in columns {
             let f = |x: &[Tensor<f64>]| get(&render(&grid_of(shape, &x[0], &x[1]), &rays(), &options()));
-            let report = Gradcheck::new(f, tables(&shape)).named(format!("{name}, {column}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
+            let report =
+                Gradcheck::new(f, tables(&shape)).named(format!("{name}, {column}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
             println!("| {name} | {column} | 1, 2 | {:.1e} |", report.worst_relative_error);
         }
     }
@@ -82,7 +83,8 @@ fn every_loss_agrees_with_finite_differences() {
                 let rendered = render(&grid, &batch.rays, &options());
                 objective.evaluate(&Step { number: 3, seed: 4, batch: &batch, rendered: &rendered, grid: &grid }).0
             };
-            let report = Gradcheck::new(f, tables(&shape)).named(format!("{name}, {render_name}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
+            let report =
+                Gradcheck::new(f, tables(&shape)).named(format!("{name}, {render_name}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
             println!("| {name} | {render_name} | 1, 2 | {:.1e} |", report.worst_relative_error);
         }
     }
@@ -125,5 +127,9 @@ fn an_eikonal_penalty_is_differentiable_through_the_slope_of_the_density() {
 #[test]
 fn the_basis_is_differentiable_in_the_directions() {
     let directions = numbers(&[7, 3], -1.0, 1.0, 51);
-    Gradcheck::new(|x: &[Tensor<f64>]| sh::basis(&x[0], 3), vec![directions]).named("sh basis").order(2).run().unwrap_or_else(|e| panic!("{e}"));
+    Gradcheck::new(|x: &[Tensor<f64>]| sh::basis(&x[0], 3), vec![directions])
+        .named("sh basis")
+        .order(2)
+        .run()
+        .unwrap_or_else(|e| panic!("{e}"));
 }

@@ -6,7 +6,7 @@ use autograd::optim::{Optimizer, Sgd};
 use autograd::{Grad, Tensor, value_and_grad};
 use plenoxel::field::voxel_grid::{Color, Interpolation, VoxelGrid};
 use plenoxel::geometry::Aabb;
-use plenoxel::loss::{total_variation, sampled_total_variation};
+use plenoxel::loss::{sampled_total_variation, total_variation};
 use plenoxel::render::{RenderOptions, render};
 use plenoxel::sampling::{Jitter, Spacing};
 use support::{batch, rays, shape};

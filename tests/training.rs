@@ -1,6 +1,5 @@
 //! Whole runs, small.
 
-
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Error;
@@ -15,7 +14,8 @@ use plenoxel::train::{Report, Trainer};
 use std::collections::BTreeMap;
 
 fn scene() -> Dataset {
-    Dataset::procedural(ProceduralOptions { width: 32, height: 32, train: 20, val: 0, test: 3, supersample: 2 }).expect("the built-in scene")
+    Dataset::procedural(ProceduralOptions { width: 32, height: 32, train: 20, val: 0, test: 3, supersample: 2 })
+        .expect("the built-in scene")
 }
 
 fn views(split: Split) -> Vec<View> {
@@ -149,7 +149,8 @@ fn a_loss_that_is_not_finite_stops_the_run_with_its_step() {
 #[test]
 fn a_config_with_an_impossible_value_names_its_key() {
     let train = views(Split::Train);
-    let broken: [(&str, fn(&mut Config)); 7] = [
+    type Break = fn(&mut Config);
+    let broken: [(&str, Break); 7] = [
         ("half_width", |c| c.half_width = 0.0),
         ("sh_degree", |c| c.sh_degree = 4),
         ("rays_per_step", |c| c.rays_per_step = 0),

@@ -126,7 +126,14 @@ impl<T: Real> Pass<T> {
             Rule::Leaf => return,
             Rule::Op(op) => {
                 let shares = op.vjp(&Vjp { node: &node, cotangent: &cotangent, needed: &needed, tracked: self.tracked });
-                assert_eq!(shares.len(), node.inputs.len(), "{}: the rule returned {} cotangents for {} inputs", op.name(), shares.len(), node.inputs.len());
+                assert_eq!(
+                    shares.len(),
+                    node.inputs.len(),
+                    "{}: the rule returned {} cotangents for {} inputs",
+                    op.name(),
+                    shares.len(),
+                    node.inputs.len()
+                );
                 shares
             }
             Rule::Kernel(kernel) if self.tracked => {
@@ -139,7 +146,10 @@ impl<T: Real> Pass<T> {
                 return;
             }
             Rule::Kernel(kernel) => {
-                let mut sink = GradSink { shapes: node.inputs.iter().map(|edge| edge.shape.clone()).collect(), slots: node.inputs.iter().map(|_| None).collect() };
+                let mut sink = GradSink {
+                    shapes: node.inputs.iter().map(|edge| edge.shape.clone()).collect(),
+                    slots: node.inputs.iter().map(|_| None).collect(),
+                };
                 kernel.vjp(&KernelCall { node: &node, cotangent: &cotangent, needed: &needed }, &mut sink);
                 sink.slots
             }
@@ -173,7 +183,9 @@ impl<T: Real> RowPart<T> {
     fn merged(self, shape: &IxDyn) -> RowSparse<T> {
         match self {
             RowPart::Merged(rows) => rows,
-            RowPart::Touches { rows, values } => index::sum_into_rows(shape.slice(), rows.len(), |i| ([rows[i]], [T::one()]), values.data()),
+            RowPart::Touches { rows, values } => {
+                index::sum_into_rows(shape.slice(), rows.len(), |i| ([rows[i]], [T::one()]), values.data())
+            }
         }
     }
 
@@ -202,7 +214,9 @@ impl<T: Real> Pending<T> {
     fn dense(self, shape: &IxDyn) -> Tensor<T> {
         match self {
             Pending::Dense(t) => t,
-            Pending::Rows(parts) => parts.into_iter().map(|p| p.dense(shape)).reduce(|a, b| &a + &b).unwrap_or_else(|| Tensor::zeros(shape.slice())),
+            Pending::Rows(parts) => {
+                parts.into_iter().map(|p| p.dense(shape)).reduce(|a, b| &a + &b).unwrap_or_else(|| Tensor::zeros(shape.slice()))
+            }
         }
     }
 
@@ -234,7 +248,9 @@ pub(crate) fn add_grads<T: Real>(a: Grad<T>, b: Grad<T>) -> Grad<T> {
     match (a, b) {
         (Grad::Rows(a), Grad::Rows(b)) => Grad::Rows(index::add_row_sparse(a, b)),
         (Grad::Dense(a), Grad::Dense(b)) => Grad::Dense(add_in_place(a, b)),
-        (Grad::Dense(dense), Grad::Rows(rows)) | (Grad::Rows(rows), Grad::Dense(dense)) => Grad::Dense(add_in_place(dense, rows.to_dense())),
+        (Grad::Dense(dense), Grad::Rows(rows)) | (Grad::Rows(rows), Grad::Dense(dense)) => {
+            Grad::Dense(add_in_place(dense, rows.to_dense()))
+        }
     }
 }
 

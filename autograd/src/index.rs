@@ -247,7 +247,9 @@ pub(crate) fn add_row_sparse<T: Real>(a: RowSparse<T>, b: RowSparse<T>) -> RowSp
     let shape = a.shape().to_vec();
     let width = a.width();
     let block = shape[0].div_ceil(64).max(1);
-    let ranges = |rows: &[u32]| -> Vec<usize> { (0..=shape[0].div_ceil(block)).map(|k| rows.partition_point(|&r| (r as usize) < k * block)).collect() };
+    let ranges = |rows: &[u32]| -> Vec<usize> {
+        (0..=shape[0].div_ceil(block)).map(|k| rows.partition_point(|&r| (r as usize) < k * block)).collect()
+    };
     let (cuts_a, cuts_b) = (ranges(a.rows()), ranges(b.rows()));
     let counts: Vec<usize> = parallel::map_indices(cuts_a.len() - 1, |k| {
         let mut n = 0;

@@ -165,7 +165,9 @@ impl<T: Real> KernelCall<'_, T> {
 
     /// The output as a constant. Panics, naming the kernel, if its [`Keep`] left it out.
     pub fn output(&self) -> Tensor<T> {
-        let Some(data) = &self.node.output else { panic!("{}: the adjoint reads its output, which `keep` left out", self.node.rule.name()) };
+        let Some(data) = &self.node.output else {
+            panic!("{}: the adjoint reads its output, which `keep` left out", self.node.rule.name())
+        };
         Tensor { data: data.clone(), shape: self.node.shape.clone(), node: None }
     }
 

@@ -22,6 +22,20 @@ macro_rules! dispatched {
 }
 pub(crate) use dispatched;
 
+/// True if the loops below run in a version that multiplies and adds in one instruction.
+pub fn fused() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    let available = std::is_x86_feature_detected!("avx2")
+        && std::is_x86_feature_detected!("fma")
+        && std::is_x86_feature_detected!("bmi1")
+        && std::is_x86_feature_detected!("bmi2")
+        && std::is_x86_feature_detected!("lzcnt")
+        && std::is_x86_feature_detected!("popcnt");
+    #[cfg(not(target_arch = "x86_64"))]
+    let available = cfg!(target_arch = "aarch64");
+    available && !cfg!(debug_assertions)
+}
+
 /// Elements handed to a thread at a time: large enough to hide the hand-over, small enough to stay in a core's cache.
 pub const CHUNK: usize = 16 * 1024;
 

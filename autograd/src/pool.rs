@@ -13,8 +13,8 @@ use std::sync::Mutex;
 
 /// Below this the system allocator is as good.
 const SMALLEST: usize = 64 * 1024;
-/// A free buffer is given back after this many requests went by without it: several training steps.
-const LIFETIME: u64 = 1500;
+/// A free buffer is given back after this many requests went by without it: a few training steps.
+const LIFETIME: u64 = 300;
 
 /// Buffers of one element type that are free at the moment.
 #[derive(Debug)]

@@ -43,7 +43,9 @@ pub fn arguments() -> Arguments {
     while let Some(word) = words.next() {
         match word.as_str() {
             "--bench" | "--test" => {}
-            "--repeats" => parsed.repeats = words.next().and_then(|n| n.parse().ok()).filter(|&n| n > 0).expect("--repeats takes a number above 0"),
+            "--repeats" => {
+                parsed.repeats = words.next().and_then(|n| n.parse().ok()).filter(|&n| n > 0).expect("--repeats takes a number above 0")
+            }
             "--data" => parsed.data = Some(words.next().expect("--data takes a folder")),
             name => parsed.names.push(name.to_owned()),
         }

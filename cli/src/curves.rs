@@ -1,8 +1,8 @@
 //! The loss over the steps of a run as an SVG, after figure 4 of the source paper: stages side by side, the loss on a logarithmic
 //! scale where all of it is positive.
 //!
-//! The pale band reaches from the lowest to the highest loss among the steps that share a column; the line is a running mean that starts
-//! anew at each stage, so that the jump after a subdivision stays visible.
+//! The pale band reaches from the lowest to the highest loss among the steps that share a column; the line is a mean over about 2 % of
+//! the run, never across the end of a stage, so that the jump after a subdivision stays visible.
 
 use plenoxel::train::PlannedStage;
 use std::fmt::Write;
@@ -15,6 +15,8 @@ const TOP: f64 = 64.0;
 const BOTTOM: f64 = 56.0;
 /// Points of the curve: one for each pixel across would be more than an eye can tell apart.
 const COLUMNS: usize = 400;
+/// Points to either side that smooth one: 1 % of the run.
+const REACH: usize = COLUMNS / 100;
 
 const INK: &str = "#222";
 const FAINT: &str = "#e4e4e4";
@@ -91,32 +93,36 @@ struct Column {
 
 fn columns(losses: &[f64], stages: &[PlannedStage]) -> Vec<Column> {
     let width = losses.len().div_ceil(COLUMNS).max(1);
-    // The running mean forgets over about 1 % of the run.
-    let share = (1.0 / (0.01 * losses.len() as f64)).min(1.0);
     let mut columns: Vec<Column> = Vec::new();
     for (stage, planned) in stages.iter().enumerate() {
         let first = (planned.first as usize).min(losses.len());
         let end = ((planned.first + planned.steps) as usize).min(losses.len());
-        let (mut mean, mut seen) = (0.0, 0.0);
+        let begin = columns.len();
         for (i, part) in losses[first..end].chunks(width).enumerate() {
             let finite: Vec<f64> = part.iter().copied().filter(|loss| loss.is_finite()).collect();
-            for loss in &finite {
-                seen += 1.0;
-                mean += (loss - mean) * share.max(1.0 / seen);
+            if !finite.is_empty() {
+                columns.push(Column {
+                    step: (first + i * width) as f64 + 0.5 * part.len() as f64,
+                    stage,
+                    low: finite.iter().copied().fold(f64::INFINITY, f64::min),
+                    high: finite.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+                    smooth: finite.iter().sum::<f64>() / finite.len() as f64,
+                });
             }
-            if finite.is_empty() {
-                continue;
-            }
-            columns.push(Column {
-                step: (first + i * width) as f64 + 0.5 * part.len() as f64,
-                stage,
-                low: finite.iter().copied().fold(f64::INFINITY, f64::min),
-                high: finite.iter().copied().fold(f64::NEG_INFINITY, f64::max),
-                smooth: mean,
-            });
         }
+        smooth(&mut columns[begin..]);
     }
     columns
+}
+
+/// Replaces each mean by that of its neighbourhood, which shrinks towards the ends so that it stays centred.
+fn smooth(columns: &mut [Column]) {
+    let means: Vec<f64> = columns.iter().map(|c| c.smooth).collect();
+    for (i, column) in columns.iter_mut().enumerate() {
+        let reach = REACH.min(i).min(means.len() - 1 - i);
+        let around = &means[i - reach..=i + reach];
+        column.smooth = around.iter().sum::<f64>() / around.len() as f64;
+    }
 }
 
 /// From losses to heights.
@@ -237,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn a_running_mean_starts_anew_with_each_stage() {
+    fn the_curve_is_not_smoothed_across_the_end_of_a_stage() {
         let losses: Vec<f64> = (0..100).map(|i| if i < 50 { 1.0 } else { 0.25 }).collect();
         let columns = columns(&losses, &stages());
         assert!(columns.iter().all(|c| c.smooth == if c.stage == 0 { 1.0 } else { 0.25 }));

@@ -28,7 +28,7 @@ pub struct Estimate {
 /// Program, threads, buffers on their way: measured on small runs.
 const BASE: u64 = 60_000_000;
 /// Rays that are rendered at a time when evaluating.
-const EVALUATION_RAYS: u64 = 8192;
+const EVALUATION_RAYS: u64 = 4096;
 
 impl Estimate {
     /// A training run with everything around it.
@@ -88,6 +88,12 @@ impl Estimate {
         }
     }
 
+    /// The images of the largest split alone.
+    pub fn of_images(dataset: &Dataset) -> Self {
+        let images = images(dataset, 1, &Split::ALL);
+        Estimate { images, grid: 0, optimizer: 0, step: 0, key: "DIR".to_owned(), advice: "fewer or smaller views" }
+    }
+
     /// All of it.
     pub fn total(&self) -> u64 {
         BASE + self.images + self.grid + self.optimizer + self.step
@@ -114,7 +120,7 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match available() {
             Some(available) if self.total() > available => {
-                let found = format!("a run that needs about {} of memory where {} are free", bytes(self.total()), bytes(available));
+                let found = format!("what would need about {} of memory, where {} are free,", bytes(self.total()), bytes(available));
                 Err(Error::config(&self.key, found, self.advice))
             }
             _ => Ok(()),

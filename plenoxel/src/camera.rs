@@ -28,14 +28,7 @@ impl Intrinsics {
     /// f = W / (2 tan(fov / 2)), c = (W / 2, H / 2).
     pub fn from_fov_x(width: usize, height: usize, fov_x: f64) -> Self {
         let focal = 0.5 * width as f64 / (0.5 * fov_x).tan();
-        Intrinsics {
-            width,
-            height,
-            fx: focal,
-            fy: focal,
-            cx: 0.5 * width as f64,
-            cy: 0.5 * height as f64,
-        }
+        Intrinsics { width, height, fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 }
     }
 
     /// Horizontal field of view in radians, 2 atan(W / (2 fx)): the inverse of [`Intrinsics::from_fov_x`].
@@ -48,14 +41,7 @@ impl Intrinsics {
     /// incomplete last blocks are dropped, as the integer division says) and must not be 0.
     pub fn downscaled(&self, k: usize) -> Self {
         let s = k as f64;
-        Intrinsics {
-            width: self.width / k,
-            height: self.height / k,
-            fx: self.fx / s,
-            fy: self.fy / s,
-            cx: self.cx / s,
-            cy: self.cy / s,
-        }
+        Intrinsics { width: self.width / k, height: self.height / k, fx: self.fx / s, fy: self.fy / s, cx: self.cx / s, cy: self.cy / s }
     }
 }
 
@@ -85,15 +71,9 @@ impl Camera {
     /// line of sight, any perpendicular direction takes its place.
     pub fn look_at(eye: DVec3, target: DVec3, up: DVec3, intrinsics: Intrinsics) -> Self {
         let backward = (eye - target).normalize();
-        let right = up
-            .cross(backward)
-            .try_normalize()
-            .unwrap_or_else(|| backward.any_orthonormal_vector());
+        let right = up.cross(backward).try_normalize().unwrap_or_else(|| backward.any_orthonormal_vector());
         let rotation = DMat3::from_cols(right, backward.cross(right), backward);
-        Camera {
-            intrinsics,
-            camera_to_world: DAffine3::from_mat3_translation(rotation, eye),
-        }
+        Camera { intrinsics, camera_to_world: DAffine3::from_mat3_translation(rotation, eye) }
     }
 
     /// The camera's position in the world.
@@ -108,11 +88,7 @@ impl Camera {
         let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
         let direction = self.camera_to_world.transform_vector3(direction);
         let stretch = direction.length();
-        Ray {
-            origin: self.camera_to_world.translation,
-            direction: direction / stretch,
-            stretch,
-        }
+        Ray { origin: self.camera_to_world.translation, direction: direction / stretch, stretch }
     }
 
     /// Where the world point `p` appears: `(x, y, depth)`, pixel coordinates and depth along the optical axis (the distance
@@ -122,13 +98,7 @@ impl Camera {
         let k = &self.intrinsics;
         let local = self.camera_to_world.inverse().transform_point3(p);
         let depth = -local.z;
-        (depth > 0.0).then(|| {
-            (
-                k.cx + k.fx * local.x / depth,
-                k.cy - k.fy * local.y / depth,
-                depth,
-            )
-        })
+        (depth > 0.0).then(|| (k.cx + k.fx * local.x / depth, k.cy - k.fy * local.y / depth, depth))
     }
 }
 
@@ -149,10 +119,7 @@ mod tests {
 
     #[test]
     fn image_axes_follow_the_camera_axes() {
-        let camera = Camera {
-            intrinsics: synthetic(),
-            camera_to_world: DAffine3::IDENTITY,
-        };
+        let camera = Camera { intrinsics: synthetic(), camera_to_world: DAffine3::IDENTITY };
         assert_eq!(camera.ray(400.0, 400.0).direction, DVec3::NEG_Z);
         let corner = camera.ray(0.0, 0.0); // top left: left is -x, up is +y
         assert!(corner.direction.x < 0.0 && corner.direction.y > 0.0 && corner.direction.z < 0.0);
@@ -163,12 +130,7 @@ mod tests {
 
     #[test]
     fn look_at_puts_the_target_in_the_middle_and_up_upwards() {
-        let camera = Camera::look_at(
-            DVec3::new(3.0, -2.0, 1.5),
-            DVec3::new(0.2, 0.1, -0.3),
-            DVec3::Z,
-            synthetic(),
-        );
+        let camera = Camera::look_at(DVec3::new(3.0, -2.0, 1.5), DVec3::new(0.2, 0.1, -0.3), DVec3::Z, synthetic());
         let (x, y, depth) = camera.project(DVec3::new(0.2, 0.1, -0.3)).unwrap();
         assert!((x - 400.0).abs() < 1e-9 && (y - 400.0).abs() < 1e-9);
         assert!((depth - DVec3::new(2.8, -2.1, 1.8).length()).abs() < 1e-12);
@@ -186,12 +148,7 @@ mod tests {
 
     #[test]
     fn a_point_on_a_ray_projects_to_the_pixel_of_the_ray() {
-        let camera = Camera::look_at(
-            DVec3::new(-1.0, 3.5, 2.0),
-            DVec3::ZERO,
-            DVec3::Z,
-            synthetic(),
-        );
+        let camera = Camera::look_at(DVec3::new(-1.0, 3.5, 2.0), DVec3::ZERO, DVec3::Z, synthetic());
         for (x, y) in [(0.5, 0.5), (799.5, 12.5), (321.25, 654.75)] {
             let ray = camera.ray(x, y);
             let (px, py, depth) = camera.project(ray.origin + 2.5 * ray.direction).unwrap();
@@ -202,20 +159,9 @@ mod tests {
 
     #[test]
     fn downscaling_keeps_the_ray_through_the_middle_of_a_block() {
-        let camera = Camera::look_at(
-            DVec3::new(2.0, 2.0, 2.0),
-            DVec3::ZERO,
-            DVec3::Z,
-            synthetic(),
-        );
-        let small = Camera {
-            intrinsics: camera.intrinsics.downscaled(8),
-            ..camera
-        };
-        assert_eq!(
-            (small.intrinsics.width, small.intrinsics.height),
-            (100, 100)
-        );
+        let camera = Camera::look_at(DVec3::new(2.0, 2.0, 2.0), DVec3::ZERO, DVec3::Z, synthetic());
+        let small = Camera { intrinsics: camera.intrinsics.downscaled(8), ..camera };
+        assert_eq!((small.intrinsics.width, small.intrinsics.height), (100, 100));
         // Block (3, 5) covers x in [24, 32) and y in [40, 48): its middle is (28, 44).
         let (a, b) = (small.ray(3.5, 5.5), camera.ray(28.0, 44.0));
         assert!((a.direction - b.direction).length() < 1e-15);

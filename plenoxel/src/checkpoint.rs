@@ -92,7 +92,9 @@ pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Resul
     let bytes = |table: &Tensor<T>| -> Vec<u8> { table.data().iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect() };
     let (density, color) = (bytes(grid.density.tensor()), bytes(grid.color.tensor()));
     let n = header.resolution;
-    let defect = |e: &dyn std::fmt::Display| Error::input(path, format!("the checkpoint cannot be put together ({e})"), "this is a defect of the program");
+    let defect = |e: &dyn std::fmt::Display| {
+        Error::input(path, format!("the checkpoint cannot be put together ({e})"), "this is a defect of the program")
+    };
     let view = |shape: Vec<usize>, data| TensorView::new(Dtype::F32, shape, data).map_err(|e| defect(&e));
     let tensors = [("density", view(vec![n, n, n], &density)?), ("color", view(vec![n, n, n, grid.shape().color.channels()], &color)?)];
     let metadata = HashMap::from([(KEY.to_owned(), serde_json::to_string(header).map_err(|e| defect(&e))?)]);
@@ -108,17 +110,25 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     let tensors = SafeTensors::deserialize(&file).map_err(damaged)?;
     let (_, metadata) = SafeTensors::read_metadata(&file).map_err(damaged)?;
     let Some(text) = metadata.metadata().as_ref().and_then(|m| m.get(KEY)) else {
-        return Err(Error::input(path, format!("a safetensors file without `{KEY}` in its metadata"), "give a checkpoint that this program wrote"));
+        return Err(Error::input(
+            path,
+            format!("a safetensors file without `{KEY}` in its metadata"),
+            "give a checkpoint that this program wrote",
+        ));
     };
     // The version first: a later one may have other fields.
     let unreadable = |e: serde_json::Error| Error::input(path, format!("the header cannot be read ({e})"), retrain);
     let format = serde_json::from_str::<serde_json::Value>(text).map_err(unreadable)?["format"].as_str().unwrap_or("none").to_owned();
     if format != FORMAT {
-        return Err(Error::input(path, format!("format `{format}`"), format!("this program reads `{FORMAT}`; use the version that wrote the file")));
+        return Err(Error::input(
+            path,
+            format!("format `{format}`"),
+            format!("this program reads `{FORMAT}`; use the version that wrote the file"),
+        ));
     }
     let header: Header = serde_json::from_str(text).map_err(unreadable)?;
     let degree_known = header.sh_degree.is_none_or(|d| d <= crate::field::sh::MAX_DEGREE);
-    if !(1..=4096).contains(&header.resolution) || !degree_known || !(header.half_width > 0.0 && header.half_width.is_finite()) {
+    if !((1..=4096).contains(&header.resolution) && degree_known && header.half_width > 0.0 && header.half_width.is_finite()) {
         return Err(Error::input(path, "a header with impossible values", retrain));
     }
     let shape = header.shape();
@@ -126,7 +136,11 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     let table = |name: &str, channels: usize, expected: &[usize]| -> Result<Tensor<T>> {
         let view = tensors.tensor(name).map_err(|_| Error::input(path, format!("no tensor `{name}`"), retrain))?;
         if view.dtype() != Dtype::F32 || view.shape() != expected {
-            return Err(Error::input(path, format!("tensor `{name}` is {:?} {:?}", view.dtype(), view.shape()), format!("F32 {expected:?} is expected; {retrain}")));
+            return Err(Error::input(
+                path,
+                format!("tensor `{name}` is {:?} {:?}", view.dtype(), view.shape()),
+                format!("F32 {expected:?} is expected; {retrain}"),
+            ));
         }
         let values = view.data().as_chunks::<4>().0.iter().map(|&b| T::lit(f64::from(f32::from_le_bytes(b)))).collect();
         Ok(Tensor::from_vec(values, &[n * n * n, channels]))

@@ -47,9 +47,7 @@ impl std::str::FromStr for Split {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        let known = Split::ALL
-            .into_iter()
-            .find(|split| split.to_string() == text);
+        let known = Split::ALL.into_iter().find(|split| split.to_string() == text);
         known.ok_or_else(|| Error::config("split", format!("\"{text}\""), "train, val, test"))
     }
 }
@@ -99,10 +97,7 @@ pub struct OpenOptions {
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        OpenOptions {
-            downscale: 1,
-            validation_every: None,
-        }
+        OpenOptions { downscale: 1, validation_every: None }
     }
 }
 
@@ -128,13 +123,8 @@ struct Frame {
 
 #[derive(Debug, Clone)]
 enum Source {
-    Files {
-        downscale: usize,
-    },
-    Procedural {
-        scene: Arc<procedural::Scene>,
-        supersample: usize,
-    },
+    Files { downscale: usize },
+    Procedural { scene: Arc<procedural::Scene>, supersample: usize },
 }
 
 /// Opens the dataset in the folder `path`. The one format so far is NeRF-synthetic ([`blender`]), recognized by its
@@ -146,19 +136,13 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
         return Err(Error::config("validation_every", every, "2 or more"));
     }
     let metadata = std::fs::metadata(path).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound => Error::input(
-            path,
-            "there is no such folder",
-            "give the folder that contains transforms_train.json",
-        ),
+        std::io::ErrorKind::NotFound => {
+            Error::input(path, "there is no such folder", "give the folder that contains transforms_train.json")
+        }
         _ => Error::io(path, source, "opening the dataset"),
     })?;
     if !metadata.is_dir() {
-        return Err(Error::input(
-            path,
-            "this is a file",
-            "give the folder that contains transforms_train.json",
-        ));
+        return Err(Error::input(path, "this is a file", "give the folder that contains transforms_train.json"));
     }
     if !path.join("transforms_train.json").is_file() {
         return Err(unrecognized(path));
@@ -197,18 +181,12 @@ impl Dataset {
 
     /// The cameras of a split, in the order of its views.
     pub fn cameras(&self, split: Split) -> Vec<Camera> {
-        self.frames(split)
-            .iter()
-            .map(|frame| frame.camera)
-            .collect()
+        self.frames(split).iter().map(|frame| frame.camera).collect()
     }
 
     /// The names of a split's views, in their order.
     pub fn view_names(&self, split: Split) -> Vec<&str> {
-        self.frames(split)
-            .iter()
-            .map(|frame| frame.name.as_str())
-            .collect()
+        self.frames(split).iter().map(|frame| frame.name.as_str()).collect()
     }
 
     /// The analytic scene behind a procedural dataset, for exact answers about space.
@@ -223,11 +201,7 @@ impl Dataset {
     /// after each view, from any thread, with `done` from 1 to `total` not necessarily in order.
     ///
     /// Memory: 4 bytes a pixel, and 4 more where depth is known. Errors: the first view, in order, that cannot be read.
-    pub fn load(
-        &self,
-        split: Split,
-        progress: &(dyn Fn(usize, usize) + Sync),
-    ) -> Result<Vec<View>> {
+    pub fn load(&self, split: Split, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<Vec<View>> {
         let frames = self.frames(split);
         let done = AtomicUsize::new(0);
         let views: Vec<Result<View>> = frames
@@ -260,35 +234,15 @@ impl Dataset {
         match &self.source {
             Source::Files { downscale } => {
                 let full = image::read(&frame.path)?;
-                if (full.width() as usize, full.height() as usize)
-                    != (self.size.0 * downscale, self.size.1 * downscale)
-                {
-                    return Err(Error::input(
-                        &frame.path,
-                        "the image changed its size after the dataset was opened",
-                        "open it again",
-                    ));
+                if (full.width() as usize, full.height() as usize) != (self.size.0 * downscale, self.size.1 * downscale) {
+                    return Err(Error::input(&frame.path, "the image changed its size after the dataset was opened", "open it again"));
                 }
-                let image = if *downscale == 1 {
-                    full
-                } else {
-                    image::downscale(&full, *downscale)
-                };
-                Ok(View {
-                    name,
-                    camera,
-                    image,
-                    depth: None,
-                })
+                let image = if *downscale == 1 { full } else { image::downscale(&full, *downscale) };
+                Ok(View { name, camera, image, depth: None })
             }
             Source::Procedural { scene, supersample } => {
                 let (image, depth) = scene.render(&camera, *supersample);
-                Ok(View {
-                    name,
-                    camera,
-                    image,
-                    depth: Some(depth),
-                })
+                Ok(View { name, camera, image, depth: Some(depth) })
             }
         }
     }
@@ -297,10 +251,7 @@ impl Dataset {
 /// Says what is in a folder that has no transforms_train.json, and guesses what the user meant.
 fn unrecognized(path: &Path) -> Error {
     let mut names: Vec<String> = match std::fs::read_dir(path) {
-        Ok(entries) => entries
-            .flatten()
-            .map(|entry| entry.file_name().to_string_lossy().into_owned())
-            .collect(),
+        Ok(entries) => entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect(),
         Err(source) => return Error::io(path, source, "listing the folder"),
     };
     names.sort();
@@ -310,16 +261,12 @@ fn unrecognized(path: &Path) -> Error {
         n => format!("it contains {} and {} more", names[..8].join(", "), n - 8),
     };
     let has = |name: &str| names.iter().any(|found| found == name);
-    let below = names
-        .iter()
-        .find(|name| path.join(name).join("transforms_train.json").is_file());
+    let below = names.iter().find(|name| path.join(name).join("transforms_train.json").is_file());
     let remedy = if let Some(scene) = below {
-        format!(
-            "give one scene, for instance {}",
-            path.join(scene).display()
-        )
+        format!("give one scene, for instance {}", path.join(scene).display())
     } else if has("transforms.json") {
-        "a single transforms.json (instant-ngp, nerfstudio) is not read yet; split it into transforms_train.json and transforms_test.json".into()
+        "a single transforms.json (instant-ngp, nerfstudio) is not read yet; split it into transforms_train.json and transforms_test.json"
+            .into()
     } else if has("poses_bounds.npy") {
         "LLFF captures (poses_bounds.npy) are not read yet; NeRF-synthetic folders are".into()
     } else if has("sparse") {
@@ -327,11 +274,7 @@ fn unrecognized(path: &Path) -> Error {
     } else {
         "a NeRF-synthetic folder has transforms_train.json and the images it lists".into()
     };
-    Error::input(
-        path,
-        format!("no transforms_train.json in this folder, {listed}"),
-        remedy,
-    )
+    Error::input(path, format!("no transforms_train.json in this folder, {listed}"), remedy)
 }
 
 #[cfg(test)]
@@ -344,9 +287,6 @@ mod tests {
             assert_eq!(split.to_string().parse::<Split>().unwrap(), split);
         }
         let error = "valid".parse::<Split>().unwrap_err();
-        assert_eq!(
-            error.to_string(),
-            "split: \"valid\" cannot be used; accepted: train, val, test"
-        );
+        assert_eq!(error.to_string(), "split: \"valid\" cannot be used; accepted: train, val, test");
     }
 }

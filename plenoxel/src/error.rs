@@ -55,38 +55,18 @@ pub enum Error {
 
 impl Error {
     /// Bad data in `path`.
-    pub fn input(
-        path: impl Into<PathBuf>,
-        found: impl Into<String>,
-        remedy: impl Into<String>,
-    ) -> Self {
-        Error::Input {
-            path: path.into(),
-            found: found.into(),
-            remedy: remedy.into(),
-        }
+    pub fn input(path: impl Into<PathBuf>, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Error::Input { path: path.into(), found: found.into(), remedy: remedy.into() }
     }
 
     /// A setting that cannot be used.
-    pub fn config(
-        key: impl Into<String>,
-        found: impl ToString,
-        accepted: impl Into<String>,
-    ) -> Self {
-        Error::Config {
-            key: key.into(),
-            found: found.to_string(),
-            accepted: accepted.into(),
-        }
+    pub fn config(key: impl Into<String>, found: impl ToString, accepted: impl Into<String>) -> Self {
+        Error::Config { key: key.into(), found: found.to_string(), accepted: accepted.into() }
     }
 
     /// A refusal of the operating system while `doing` something with `path`.
     pub fn io(path: impl Into<PathBuf>, source: std::io::Error, doing: impl Into<String>) -> Self {
-        Error::Io {
-            path: path.into(),
-            source,
-            doing: doing.into(),
-        }
+        Error::Io { path: path.into(), source, doing: doing.into() }
     }
 
     /// Exit code of a process that ends with this error: 2 setting, 3 data, 4 numbers, 5 reading or writing.
@@ -107,28 +87,12 @@ mod tests {
     #[test]
     fn each_kind_of_error_has_its_own_exit_code_and_a_complete_sentence() {
         let input = Error::input("a.json", "frames is empty", "list at least one frame");
-        assert_eq!(
-            (input.exit_code(), input.to_string().as_str()),
-            (3, "a.json: frames is empty; list at least one frame")
-        );
+        assert_eq!((input.exit_code(), input.to_string().as_str()), (3, "a.json: frames is empty; list at least one frame"));
         let config = Error::config("downscale", 3, "1, 2, 4");
-        assert_eq!(
-            (config.exit_code(), config.to_string().as_str()),
-            (2, "downscale: 3 cannot be used; accepted: 1, 2, 4")
-        );
+        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: 3 cannot be used; accepted: 1, 2, 4"));
         let io = Error::io("out", std::io::Error::other("disk full"), "writing");
-        assert_eq!(
-            (io.exit_code(), io.to_string().as_str()),
-            (5, "out: disk full while writing")
-        );
-        let numeric = Error::Numeric {
-            place: "step 7".into(),
-            found: "loss is NaN".into(),
-            remedy: "lower the learning rate".into(),
-        };
-        assert_eq!(
-            (numeric.exit_code(), numeric.to_string().as_str()),
-            (4, "step 7: loss is NaN; lower the learning rate")
-        );
+        assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing"));
+        let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
+        assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }
 }

@@ -48,8 +48,7 @@ mod tests {
     use super::*;
 
     fn folder(name: &str) -> PathBuf {
-        let path =
-            std::env::temp_dir().join(format!("plenoxel-files-{}-{name}", std::process::id()));
+        let path = std::env::temp_dir().join(format!("plenoxel-files-{}-{name}", std::process::id()));
         create_dir(&path).unwrap();
         path
     }

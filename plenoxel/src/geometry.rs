@@ -14,10 +14,7 @@ pub struct Aabb {
 impl Aabb {
     /// The cube from -`half_width` to `half_width` on every axis.
     pub fn cube(half_width: f64) -> Self {
-        Aabb {
-            min: DVec3::splat(-half_width),
-            max: DVec3::splat(half_width),
-        }
+        Aabb { min: DVec3::splat(-half_width), max: DVec3::splat(half_width) }
     }
 
     /// True for points inside or on a face.
@@ -33,12 +30,7 @@ impl Aabb {
     pub fn intersect(&self, origin: DVec3, direction: DVec3) -> Option<(f64, f64)> {
         let (mut enter, mut exit) = (0.0_f64, f64::INFINITY);
         for axis in 0..3 {
-            let (o, d, min, max) = (
-                origin[axis],
-                direction[axis],
-                self.min[axis],
-                self.max[axis],
-            );
+            let (o, d, min, max) = (origin[axis], direction[axis], self.min[axis], self.max[axis]);
             if d == 0.0 {
                 if o < min || o > max {
                     return None;
@@ -62,65 +54,36 @@ mod tests {
     fn ray_from_outside_enters_and_leaves() {
         let t = Aabb::cube(1.5).intersect(DVec3::new(-4.0, 0.5, 0.0), DVec3::X);
         assert_eq!(t, Some((2.5, 5.5))); // -4 + 2.5 = -1.5 and -4 + 5.5 = 1.5
-        let diagonal = Aabb::cube(1.0)
-            .intersect(DVec3::splat(2.0), DVec3::splat(-1.0).normalize())
-            .unwrap();
+        let diagonal = Aabb::cube(1.0).intersect(DVec3::splat(2.0), DVec3::splat(-1.0).normalize()).unwrap();
         // From corner (1,1,1), sqrt(3) away, to corner (-1,-1,-1), 3 sqrt(3) away.
-        assert!(
-            (diagonal.0 - 3f64.sqrt()).abs() < 1e-12
-                && (diagonal.1 - 3.0 * 3f64.sqrt()).abs() < 1e-12
-        );
+        assert!((diagonal.0 - 3f64.sqrt()).abs() < 1e-12 && (diagonal.1 - 3.0 * 3f64.sqrt()).abs() < 1e-12);
     }
 
     #[test]
     fn ray_from_inside_starts_at_zero() {
-        assert_eq!(
-            Aabb::cube(1.0).intersect(DVec3::ZERO, DVec3::NEG_Z),
-            Some((0.0, 1.0))
-        );
+        assert_eq!(Aabb::cube(1.0).intersect(DVec3::ZERO, DVec3::NEG_Z), Some((0.0, 1.0)));
     }
 
     #[test]
     fn ray_that_misses_or_looks_away_finds_nothing() {
         let cube = Aabb::cube(1.0);
         assert_eq!(cube.intersect(DVec3::new(-4.0, 1.2, 0.0), DVec3::X), None);
-        assert_eq!(
-            cube.intersect(DVec3::new(-4.0, 0.0, 0.0), DVec3::NEG_X),
-            None
-        );
-        assert_eq!(
-            cube.intersect(
-                DVec3::new(-4.0, 0.0, 0.0),
-                DVec3::new(1.0, 1.0, 0.0).normalize()
-            ),
-            None
-        );
+        assert_eq!(cube.intersect(DVec3::new(-4.0, 0.0, 0.0), DVec3::NEG_X), None);
+        assert_eq!(cube.intersect(DVec3::new(-4.0, 0.0, 0.0), DVec3::new(1.0, 1.0, 0.0).normalize()), None);
     }
 
     #[test]
     fn zero_components_and_negative_zero_do_not_divide() {
         let cube = Aabb::cube(1.0);
-        assert_eq!(
-            cube.intersect(DVec3::new(1.0, 1.0, -3.0), DVec3::new(0.0, -0.0, 1.0)),
-            Some((2.0, 4.0))
-        );
-        assert_eq!(
-            cube.intersect(
-                DVec3::new(1.0 + 1e-12, 0.0, -3.0),
-                DVec3::new(-0.0, 0.0, 1.0)
-            ),
-            None
-        );
+        assert_eq!(cube.intersect(DVec3::new(1.0, 1.0, -3.0), DVec3::new(0.0, -0.0, 1.0)), Some((2.0, 4.0)));
+        assert_eq!(cube.intersect(DVec3::new(1.0 + 1e-12, 0.0, -3.0), DVec3::new(-0.0, 0.0, 1.0)), None);
         assert_eq!(cube.intersect(DVec3::ZERO, DVec3::ZERO), None);
     }
 
     #[test]
     fn faces_belong_to_the_box() {
         let cube = Aabb::cube(1.0);
-        assert!(
-            cube.contains(DVec3::new(1.0, -1.0, 0.0))
-                && !cube.contains(DVec3::new(1.0 + 1e-9, 0.0, 0.0))
-        );
+        assert!(cube.contains(DVec3::new(1.0, -1.0, 0.0)) && !cube.contains(DVec3::new(1.0 + 1e-9, 0.0, 0.0)));
         assert!(!cube.contains(DVec3::new(f64::NAN, 0.0, 0.0)));
     }
 }

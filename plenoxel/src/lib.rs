@@ -1,30 +1,34 @@
-//! Voxel radiance fields: differentiable rendering, training, and what surrounds it.
+#![doc = include_str!("../README.md")]
+//!
+//! # The straight line
+//!
+//! | module | what it does |
+//! | --- | --- |
+//! | [`dataset`] | photographs with known cameras, in three splits |
+//! | [`camera`], [`geometry`] | pixel to ray; the box that rays are clipped to |
+//! | [`rays`] | training rays, made on the fly |
+//! | [`sampling`] | where a ray looks at the field |
+//! | [`field`] | what fills space: density and radiance |
+//! | [`render`] | from samples to pixels; [`render::composite`](mod@render::composite) is the specification |
+//! | [`loss`] | losses and their weighted sum |
+//! | [`train`] | batch → render → loss → gradients → optimizer, coarse to fine |
+//! | [`checkpoint`] | a trained grid on disk |
+//! | [`metrics`] | PSNR and SSIM |
+//! | [`random`], [`files`], [`error`] | numbers by purpose, files whole or not at all, what can go wrong |
+#![deny(unsafe_code)]
+#![warn(missing_docs)]
 
-/// One enum for everything a user, a disk or a diverging run can cause.
-pub mod error;
-/// Files that appear whole or not at all.
-pub mod files;
-/// The axis-aligned box that rays are clipped to.
-pub mod geometry;
-/// Photographs with known cameras, in three splits.
-pub mod dataset;
-/// Intrinsics and pose; pixel to ray: the one place for camera conventions.
 pub mod camera;
-/// PSNR and SSIM.
-pub mod metrics;
-/// Random numbers as a function of what they are for.
-pub mod random;
-/// Training rays, made on the fly.
-pub mod rays;
-/// Where a ray looks at the field.
-pub mod sampling;
-/// What fills space.
-pub mod field;
-/// From rays to pixels.
-pub mod render;
-/// Losses and their weighted sum.
-pub mod loss;
-/// Training, coarse to fine.
-pub mod train;
-/// A trained grid on disk.
 pub mod checkpoint;
+pub mod dataset;
+pub mod error;
+pub mod field;
+pub mod files;
+pub mod geometry;
+pub mod loss;
+pub mod metrics;
+pub mod random;
+pub mod rays;
+pub mod render;
+pub mod sampling;
+pub mod train;

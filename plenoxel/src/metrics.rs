@@ -17,20 +17,12 @@ const BLOCK: usize = 64;
 ///
 /// Both are [height, width, 3]; panics if the shapes differ.
 pub fn psnr(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 {
-    assert_eq!(
-        prediction.shape(),
-        target.shape(),
-        "psnr: prediction and target differ in shape"
-    );
+    assert_eq!(prediction.shape(), target.shape(), "psnr: prediction and target differ in shape");
     let row_sums: Vec<f64> = (0..target.shape()[0])
         .into_par_iter()
         .map(|y| {
-            let (prediction, target) = (
-                prediction.index_axis(Axis(0), y),
-                target.index_axis(Axis(0), y),
-            );
-            let squared =
-                |(p, t): (&f32, &f32)| (f64::from(p.clamp(0.0, 1.0)) - f64::from(*t)).powi(2);
+            let (prediction, target) = (prediction.index_axis(Axis(0), y), target.index_axis(Axis(0), y));
+            let squared = |(p, t): (&f32, &f32)| (f64::from(p.clamp(0.0, 1.0)) - f64::from(*t)).powi(2);
             prediction.iter().zip(&target).map(squared).sum()
         })
         .collect();
@@ -56,23 +48,13 @@ pub fn ssim_same(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -
 /// SSIM with `pad` rows and columns of zeros on every side. The filter is separable, so each row of windows takes a weighted
 /// sum of 11 image rows first, then of 11 neighbours in it; channels stay interleaved and a neighbour is `channels` away.
 fn mean_ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>, pad: usize) -> f64 {
-    assert_eq!(
-        prediction.shape(),
-        target.shape(),
-        "ssim: prediction and target differ in shape"
-    );
+    assert_eq!(prediction.shape(), target.shape(), "ssim: prediction and target differ in shape");
     let (height, width, channels) = target.dim();
-    let prediction: Vec<f64> = prediction
-        .iter()
-        .map(|value| f64::from(value.clamp(0.0, 1.0)))
-        .collect();
+    let prediction: Vec<f64> = prediction.iter().map(|value| f64::from(value.clamp(0.0, 1.0))).collect();
     let target: Vec<f64> = target.iter().map(|value| f64::from(*value)).collect();
     let weights = gaussian();
     let stride = width * channels;
-    let (rows, columns) = (
-        height + 2 * pad + 1 - WINDOW,
-        (width + 2 * pad + 1 - WINDOW) * channels,
-    );
+    let (rows, columns) = (height + 2 * pad + 1 - WINDOW, (width + 2 * pad + 1 - WINDOW) * channels);
     let row_sums: Vec<f64> = (0..rows)
         .into_par_iter()
         .map_init(
@@ -100,17 +82,13 @@ fn mean_ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>, pad: 
                     let mut sums = [[0.0; BLOCK]; 5];
                     for (sum, moment) in sums.iter_mut().zip(moments.iter()) {
                         for (k, weight) in weights.iter().enumerate() {
-                            for (to, value) in sum[..length]
-                                .iter_mut()
-                                .zip(&moment[start + k * channels..])
-                            {
+                            for (to, value) in sum[..length].iter_mut().zip(&moment[start + k * channels..]) {
                                 *to += weight * value;
                             }
                         }
                     }
                     let [a, b, aa, bb, ab] = &sums;
-                    let values: [f64; BLOCK] =
-                        std::array::from_fn(|i| similarity(a[i], b[i], aa[i], bb[i], ab[i]));
+                    let values: [f64; BLOCK] = std::array::from_fn(|i| similarity(a[i], b[i], aa[i], bb[i], ab[i]));
                     total += values[..length].iter().sum::<f64>();
                 }
                 total
@@ -146,14 +124,12 @@ fn similarity(a: f64, b: f64, aa: f64, bb: f64, ab: f64) -> f64 {
     let bound = (variance_a * variance_b).sqrt();
     // min and max, not clamp, which panics where the bound is NaN.
     let covariance = (ab - a * b).min(bound).max(-bound);
-    (2.0 * a * b + C1) * (2.0 * covariance + C2)
-        / ((a * a + b * b + C1) * (variance_a + variance_b + C2))
+    (2.0 * a * b + C1) * (2.0 * covariance + C2) / ((a * a + b * b + C1) * (variance_a + variance_b + C2))
 }
 
 /// The window's weights along one axis: exp(-x² / (2 · 1.5²)) at x = -5 ... 5, normalised to sum 1.
 fn gaussian() -> [f64; WINDOW] {
-    let raw: [f64; WINDOW] =
-        std::array::from_fn(|k| (-(k as f64 - 5.0).powi(2) / (2.0 * 1.5 * 1.5)).exp());
+    let raw: [f64; WINDOW] = std::array::from_fn(|k| (-(k as f64 - 5.0).powi(2) / (2.0 * 1.5 * 1.5)).exp());
     let sum: f64 = raw.iter().sum();
     raw.map(|weight| weight / sum)
 }
@@ -167,8 +143,7 @@ mod tests {
     fn picture(height: usize, width: usize, phase: f32) -> Array3<f32> {
         Array3::from_shape_fn((height, width, 3), |(y, x, c)| {
             let hash = (y * 7919 + x * 104729 + c * 1299709) % 997;
-            0.5 + 0.3 * (0.4 * x as f32 + 0.3 * y as f32 + c as f32 + phase).sin()
-                + 0.2 * (hash as f32 / 997.0 - 0.5)
+            0.5 + 0.3 * (0.4 * x as f32 + 0.3 * y as f32 + c as f32 + phase).sin() + 0.2 * (hash as f32 / 997.0 - 0.5)
         })
     }
 
@@ -177,34 +152,24 @@ mod tests {
         let (height, width, channels) = a.dim();
         let at = |image: &Array3<f32>, y: isize, x: isize, c: usize| {
             let inside = y >= 0 && x >= 0 && y < height as isize && x < width as isize;
-            if inside {
-                f64::from(image[[y as usize, x as usize, c]])
-            } else {
-                0.0
-            }
+            if inside { f64::from(image[[y as usize, x as usize, c]]) } else { 0.0 }
         };
         let weight = |y: isize, x: isize| (-((y * y + x * x) as f64) / 4.5).exp();
-        let offsets: Vec<(isize, isize)> = (-5..=5)
-            .flat_map(|y| (-5..=5).map(move |x| (y, x)))
-            .collect();
+        let offsets: Vec<(isize, isize)> = (-5..=5).flat_map(|y| (-5..=5).map(move |x| (y, x))).collect();
         let norm: f64 = offsets.iter().map(|&(y, x)| weight(y, x)).sum();
         let (mut total, mut count) = (0.0, 0);
         for c in 0..channels {
             for y in 5 - pad..height as isize - 5 + pad {
                 for x in 5 - pad..width as isize - 5 + pad {
                     let mean = |f: &dyn Fn(isize, isize) -> f64| -> f64 {
-                        offsets
-                            .iter()
-                            .map(|&(dy, dx)| weight(dy, dx) / norm * f(y + dy, x + dx))
-                            .sum()
+                        offsets.iter().map(|&(dy, dx)| weight(dy, dx) / norm * f(y + dy, x + dx)).sum()
                     };
                     let ma = mean(&|y, x| at(a, y, x, c));
                     let mb = mean(&|y, x| at(b, y, x, c));
                     let va = mean(&|y, x| (at(a, y, x, c) - ma).powi(2));
                     let vb = mean(&|y, x| (at(b, y, x, c) - mb).powi(2));
                     let cov = mean(&|y, x| (at(a, y, x, c) - ma) * (at(b, y, x, c) - mb));
-                    total += (2.0 * ma * mb + 1e-4) * (2.0 * cov + 9e-4)
-                        / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4));
+                    total += (2.0 * ma * mb + 1e-4) * (2.0 * cov + 9e-4) / ((ma * ma + mb * mb + 1e-4) * (va + vb + 9e-4));
                     count += 1;
                 }
             }
@@ -220,24 +185,15 @@ mod tests {
         // Error 0.5 in one channel of three: mse = 0.25 / 3.
         let mut prediction = target.clone();
         prediction.index_axis_mut(Axis(2), 1).fill(0.75);
-        assert!(
-            (psnr(prediction.view(), target.view()) + 10.0 * (0.25_f64 / 3.0).log10()).abs()
-                < 1e-12
-        );
+        assert!((psnr(prediction.view(), target.view()) + 10.0 * (0.25_f64 / 3.0).log10()).abs() < 1e-12);
         assert_eq!(psnr(target.view(), target.view()), f64::INFINITY);
     }
 
     #[test]
     fn predictions_outside_the_unit_interval_are_clamped_before_comparing() {
         let target = Array3::from_elem((3, 3, 3), 1.0_f32);
-        assert_eq!(
-            psnr(Array3::from_elem((3, 3, 3), 7.0).view(), target.view()),
-            f64::INFINITY
-        );
-        assert_eq!(
-            psnr(Array3::from_elem((3, 3, 3), -7.0).view(), target.view()),
-            0.0
-        ); // mse 1
+        assert_eq!(psnr(Array3::from_elem((3, 3, 3), 7.0).view(), target.view()), f64::INFINITY);
+        assert_eq!(psnr(Array3::from_elem((3, 3, 3), -7.0).view(), target.view()), 0.0); // mse 1
         assert!(psnr(Array3::from_elem((3, 3, 3), f32::NAN).view(), target.view()).is_nan());
     }
 
@@ -253,10 +209,7 @@ mod tests {
 
     #[test]
     fn ssim_of_constant_pictures_has_a_closed_form() {
-        let (a, b) = (
-            Array3::from_elem((12, 12, 3), 0.25_f32),
-            Array3::from_elem((12, 12, 3), 0.75_f32),
-        );
+        let (a, b) = (Array3::from_elem((12, 12, 3), 0.25_f32), Array3::from_elem((12, 12, 3), 0.75_f32));
         // No variance: (2 · 0.25 · 0.75 + 1e-4) / (0.25² + 0.75² + 1e-4).
         assert!((ssim(a.view(), b.view()).unwrap() - 0.3751 / 0.6251).abs() < 1e-9);
         assert!((ssim(a.view(), a.view()).unwrap() - 1.0).abs() < 1e-12);
@@ -267,33 +220,14 @@ mod tests {
         let (a, b) = (picture(10, 30, 0.0), picture(10, 30, 1.0));
         assert_eq!(ssim(a.view(), b.view()), None);
         assert!((ssim_same(a.view(), b.view()) - brute_force(&a, &b, 5)).abs() < 1e-10);
-        assert!(
-            (ssim_same(
-                a.slice(ndarray::s![..1, ..1, ..]),
-                a.slice(ndarray::s![..1, ..1, ..])
-            ) - 1.0)
-                .abs()
-                < 1e-12
-        );
+        assert!((ssim_same(a.slice(ndarray::s![..1, ..1, ..]), a.slice(ndarray::s![..1, ..1, ..])) - 1.0).abs() < 1e-12);
     }
 
     #[test]
     fn metrics_have_the_same_bits_for_any_number_of_threads() {
         let (a, b) = (picture(40, 50, 0.0), picture(40, 50, 0.3));
-        let measure = || {
-            (
-                psnr(a.view(), b.view()),
-                ssim(a.view(), b.view()),
-                ssim_same(a.view(), b.view()),
-            )
-        };
-        let with = |threads| {
-            rayon::ThreadPoolBuilder::new()
-                .num_threads(threads)
-                .build()
-                .unwrap()
-                .install(measure)
-        };
+        let measure = || (psnr(a.view(), b.view()), ssim(a.view(), b.view()), ssim_same(a.view(), b.view()));
+        let with = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(measure);
         assert_eq!(with(1), with(3));
     }
 }

@@ -62,8 +62,9 @@ impl<'a> RaySource<'a> {
     /// Rays number `from..from + n` of the endless sequence of epochs: a function of (seed, number) alone.
     pub fn batch<T: Real>(&self, from: u64, n: usize) -> RayBatch<T> {
         let total = self.len();
-        let epochs: Vec<Permutation> =
-            (from / total..=(from + n as u64 - 1) / total).map(|epoch| Permutation::new(total, self.seed, Purpose::RayOrder, epoch)).collect();
+        let epochs: Vec<Permutation> = (from / total..=(from + n as u64 - 1) / total)
+            .map(|epoch| Permutation::new(total, self.seed, Purpose::RayOrder, epoch))
+            .collect();
         let parts = parallel::map_chunks(n, 1024, |range| {
             range
                 .map(|i| {

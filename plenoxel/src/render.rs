@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Engine {
-    /// The graph of small ops: [`composite`] on any field, differentiable any number of times.
+    /// The graph of small ops: [`composite()`] on any field, differentiable any number of times.
     #[default]
     Graph,
 }

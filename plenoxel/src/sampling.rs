@@ -227,7 +227,8 @@ mod tests {
 
     #[test]
     fn step_lengths_add_up_to_the_chord_with_and_without_jitter() {
-        let rays = [ray([-4.0, 0.1, 0.2], [1.0, 0.03, -0.02]), ray([0.0, 0.0, 0.0], [0.3, 0.4, 0.5]), ray([-4.0, 3.0, 0.0], [1.0, 0.0, 0.0])];
+        let rays =
+            [ray([-4.0, 0.1, 0.2], [1.0, 0.03, -0.02]), ray([0.0, 0.0, 0.0], [0.3, 0.4, 0.5]), ray([-4.0, 3.0, 0.0], [1.0, 0.0, 0.0])];
         let aabb = Aabb::cube(1.5);
         for jitter in [Jitter::None, Jitter::PerRay { seed: 7, step: 3 }] {
             for step in [0.013, 0.5, 10.0] {
@@ -261,7 +262,8 @@ mod tests {
         let half: Vec<bool> = (0..8 * 8 * 8).map(|i| i >= 4 * 64).collect();
         let all = sample::<f64>(&rays, &aabb, Spacing::Step(0.1), Jitter::None, None);
         let some = sample::<f64>(&rays, &aabb, Spacing::Step(0.1), Jitter::None, Some(&Occupancy::new(aabb, [8; 3], half)));
-        let kept: Vec<f64> = all.t.data().iter().zip(all.positions.data().chunks(3)).filter(|(_, p)| p[0] >= 0.0).map(|(&t, _)| t).collect();
+        let kept: Vec<f64> =
+            all.t.data().iter().zip(all.positions.data().chunks(3)).filter(|(_, p)| p[0] >= 0.0).map(|(&t, _)| t).collect();
         assert_eq!(some.t.data(), kept);
         assert!(kept.len() < all.len());
     }

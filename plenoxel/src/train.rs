@@ -219,16 +219,24 @@ fn optimizer<T: Real>(config: &Config, plan: &PlannedStage) -> Box<dyn Optimizer
         OptimizerConfig::Sgd => Box::new(Sgd::new(rates())),
         OptimizerConfig::Momentum { decay } => Box::new(Momentum::new(rates(), decay)),
         OptimizerConfig::RmsProp { beta, epsilon } => Box::new(RmsProp::new(rates()).beta(beta).epsilon(epsilon)),
-        OptimizerConfig::LazyAdam { beta1, beta2, epsilon } => Box::new(Adam::new(rates(), AdamMode::Lazy).betas(beta1, beta2).epsilon(epsilon)),
+        OptimizerConfig::LazyAdam { beta1, beta2, epsilon } => {
+            Box::new(Adam::new(rates(), AdamMode::Lazy).betas(beta1, beta2).epsilon(epsilon))
+        }
     }
 }
 
 /// The rate over the steps of a stage.
 fn rate(plan: &PlannedStage, start: f64) -> Box<dyn Schedule> {
-    if start == 0.0 || plan.stage.rate_decay == 1.0 { Box::new(start) } else { Box::new(Exponential::new(start, start * plan.stage.rate_decay, plan.steps)) }
+    if start == 0.0 || plan.stage.rate_decay == 1.0 {
+        Box::new(start)
+    } else {
+        Box::new(Exponential::new(start, start * plan.stage.rate_decay, plan.steps))
+    }
 }
 
 fn mean_squared_error<T: Real>(x: &[T], y: &[T]) -> f64 {
-    let parts = parallel::map_chunks(x.len(), parallel::CHUNK, |range| x[range.clone()].iter().zip(&y[range]).map(|(&x, &y)| ((x - y) * (x - y)).as_f64()).sum::<f64>());
+    let parts = parallel::map_chunks(x.len(), parallel::CHUNK, |range| {
+        x[range.clone()].iter().zip(&y[range]).map(|(&x, &y)| ((x - y) * (x - y)).as_f64()).sum::<f64>()
+    });
     parts.into_iter().sum::<f64>() / x.len() as f64
 }

@@ -50,10 +50,7 @@ impl<T: Real> Op<T> for MulOp {
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
         let g = cx.cotangent();
-        vec![
-            cx.wrt(0, || g.mul_sum_to(&cx.input(1), cx.input_shape(0))),
-            cx.wrt(1, || g.mul_sum_to(&cx.input(0), cx.input_shape(1))),
-        ]
+        vec![cx.wrt(0, || g.mul_sum_to(&cx.input(1), cx.input_shape(0))), cx.wrt(1, || g.mul_sum_to(&cx.input(0), cx.input_shape(1)))]
     }
 }
 
@@ -250,7 +247,9 @@ pub(crate) fn binary<T: Real>(name: &str, x: &Tensor<T>, y: &Tensor<T>, op: impl
         parallel::zip(x.data(), y.data(), &mut out, f);
         return Tensor::from_op(out, x.shape(), &[x, y], op);
     }
-    let Some(shape) = broadcast_shape(x.shape(), y.shape()) else { panic!("{name}: shapes {:?} and {:?} do not broadcast", x.shape(), y.shape()) };
+    let Some(shape) = broadcast_shape(x.shape(), y.shape()) else {
+        panic!("{name}: shapes {:?} and {:?} do not broadcast", x.shape(), y.shape())
+    };
     let mut out = Buffer::stale(shape.iter().product());
     if y.len() == 1 {
         let s = y.data()[0];
@@ -326,7 +325,11 @@ fn broadcast_loop<T: Real>(x: &Tensor<T>, y: &Tensor<T>, shape: &[usize], out: &
             }
             let part = &mut chunk[done * cols..(done + run) * cols];
             let (x, y) = (Rows { data: &x.data()[xo..], row: xr, col: xc }, Rows { data: &y.data()[yo..], row: yr, col: yc });
-            if cols == 3 { rows_loop::<T, 3, _>(x, y, cols, part, f) } else { rows_loop::<T, 0, _>(x, y, cols, part, f) }
+            if cols == 3 {
+                rows_loop::<T, 3, _>(x, y, cols, part, f)
+            } else {
+                rows_loop::<T, 0, _>(x, y, cols, part, f)
+            }
             done += run;
         }
     });

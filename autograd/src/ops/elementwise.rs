@@ -8,7 +8,7 @@ use crate::tensor::Tensor;
 
 /// Function, rule and what the rule reads, in one place.
 macro_rules! elementwise {
-    ($($(#[$doc:meta])* $name:ident, $op:ident, $keep:expr, $f:expr, $rule:expr;)*) => {$(
+    ($($(#[$doc:meta])* $(@$kind:ident)? $name:ident, $op:ident, $keep:expr, $f:expr, $rule:expr;)*) => {$(
         #[derive(Debug)]
         struct $op;
         impl<T: Real> Op<T> for $op {
@@ -25,18 +25,34 @@ macro_rules! elementwise {
         impl<T: Real> Tensor<T> {
             $(#[$doc])*
             pub fn $name(&self) -> Self {
-                unary(self, $op, $f)
+                apply!($($kind)? self, $op, $f)
             }
         }
     )*};
 }
 
+/// Computes with a function; with the version for this machine, [`parallel::fused`], if it contains an exponential.
+macro_rules! apply {
+    (exponential $x:expr, $op:ident, $f:expr) => {
+        if parallel::fused() {
+            const FUSED: bool = true;
+            unary($x, $op, $f)
+        } else {
+            const FUSED: bool = false;
+            unary($x, $op, $f)
+        }
+    };
+    ($x:expr, $op:ident, $f:expr) => {
+        unary($x, $op, $f)
+    };
+}
+
 elementwise! {
     /// y = eˣ.   ∂L/∂x = ∂L/∂y · y
-    exp, Exp, Keep::OUTPUT, T::exp_, |cx: &Vjp<'_, T>| cx.cotangent() * cx.output();
+    @exponential exp, Exp, Keep::OUTPUT, T::exp_::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * cx.output();
 
     /// y = 1 − e⁻ˣ, exact for small x: the opacity of an optical depth.   ∂L/∂x = ∂L/∂y · (1 − y)
-    one_minus_exp_neg, OneMinusExpNeg, Keep::OUTPUT, T::one_minus_exp_neg, |cx: &Vjp<'_, T>| cx.cotangent() * (1.0 - cx.output());
+    @exponential one_minus_exp_neg, OneMinusExpNeg, Keep::OUTPUT, T::one_minus_exp_neg::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * (1.0 - cx.output());
 
     /// y = ln x, for x > 0.   ∂L/∂x = ∂L/∂y / x
     ln, Ln, Keep::INPUTS, |x: T| x.ln(), |cx: &Vjp<'_, T>| cx.cotangent() / cx.input(0);
@@ -51,10 +67,10 @@ elementwise! {
     abs, Abs, Keep::INPUTS, |x: T| x.abs(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sign();
 
     /// y = 1 / (1 + e⁻ˣ).   ∂L/∂x = ∂L/∂y · y (1 − y)
-    sigmoid, Sigmoid, Keep::OUTPUT,
+    @exponential sigmoid, Sigmoid, Keep::OUTPUT,
     |x: T| {
         // Computed from e^-|x|, which cannot overflow.
-        let e = (-x.abs()).exp_();
+        let e = (-x.abs()).exp_::<FUSED>();
         let small = e / (T::one() + e);
         if x >= T::zero() { T::one() - small } else { small }
     },
@@ -64,7 +80,7 @@ elementwise! {
     };
 
     /// y = ln(1 + eˣ), computed as max(x, 0) + ln(1 + e^−|x|).   ∂L/∂x = ∂L/∂y · sigmoid x
-    softplus, Softplus, Keep::INPUTS, |x: T| x.max(T::zero()) + (-x.abs()).exp_().ln_1p(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sigmoid();
+    @exponential softplus, Softplus, Keep::INPUTS, |x: T| x.max(T::zero()) + (-x.abs()).exp_::<FUSED>().ln_1p(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sigmoid();
 
     /// y = max(x, 0); the gradient passes where x >= 0.
     relu, Relu, Keep::INPUTS, |x: T| if x >= T::zero() { x } else { T::zero() }, |cx: &Vjp<'_, T>| {
@@ -125,12 +141,28 @@ impl<T: Real> Tensor<T> {
     /// y = min(max(x, low), high); the gradient passes where low <= x <= high.
     pub fn clamp(&self, low: f64, high: f64) -> Self {
         let (a, b) = (T::lit(low), T::lit(high));
-        unary(self, Clamp { low, high }, move |x: T| if x < a { a } else if x > b { b } else { x })
+        unary(self, Clamp { low, high }, move |x: T| {
+            if x < a {
+                a
+            } else if x > b {
+                b
+            } else {
+                x
+            }
+        })
     }
 
     /// −1, 0 or 1: a constant, whatever `self` is.
     pub fn sign(&self) -> Self {
-        self.constant_map(|x| if x > T::zero() { T::one() } else if x < T::zero() { -T::one() } else { T::zero() })
+        self.constant_map(|x| {
+            if x > T::zero() {
+                T::one()
+            } else if x < T::zero() {
+                -T::one()
+            } else {
+                T::zero()
+            }
+        })
     }
 
     /// f(x), elementwise, as a constant that no gradient flows through: masks, roundings, signs.

@@ -184,11 +184,13 @@ mod tests {
 
     #[test]
     fn products_of_every_shape_and_transposition_equal_the_triple_loop() {
-        let numbers = |n: usize, seed: usize| -> Vec<f64> { (0..n).map(|i| ((i * 7919 + seed * 104_729) % 1000) as f64 / 500.0 - 1.0).collect() };
+        let numbers =
+            |n: usize, seed: usize| -> Vec<f64> { (0..n).map(|i| ((i * 7919 + seed * 104_729) % 1000) as f64 / 500.0 - 1.0).collect() };
         for (m, k, n) in [(1, 1, 1), (3, 5, 2), (130, 7, 33), (2, 9000, 3), (5, 0, 4), (257, 64, 1)] {
             for (ta, tb) in [(false, false), (true, false), (false, true), (true, true)] {
                 let (x, y) = (numbers(m * k, 1), numbers(k * n, 2));
-                let at = |v: &[f64], r: usize, c: usize, rows: usize, cols: usize, t: bool| if t { v[c * rows + r] } else { v[r * cols + c] };
+                let at =
+                    |v: &[f64], r: usize, c: usize, rows: usize, cols: usize, t: bool| if t { v[c * rows + r] } else { v[r * cols + c] };
                 let a = Tensor::from_vec(x.clone(), &if ta { [k, m] } else { [m, k] });
                 let b = Tensor::from_vec(y.clone(), &if tb { [n, k] } else { [k, n] });
                 let got = product(&a, &b, ta, tb);

@@ -2,7 +2,7 @@
 
 use crate::index::{self, Indices};
 use crate::op::{Cotangent, Keep, Op, Vjp};
-use crate::parallel;
+use crate::parallel::{self, dispatched};
 use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
@@ -76,7 +76,13 @@ impl<T: Real> Tensor<T> {
     /// Panics if there is not one row number for each row, or one is too large.
     #[track_caller]
     pub fn scatter_rows(&self, rows: &Indices, table_rows: usize) -> Self {
-        assert_eq!(rows.len(), self.first_len("scatter_rows"), "scatter_rows: {} row numbers for a tensor of shape {:?}", rows.len(), self.shape());
+        assert_eq!(
+            rows.len(),
+            self.first_len("scatter_rows"),
+            "scatter_rows: {} row numbers for a tensor of shape {:?}",
+            rows.len(),
+            self.shape()
+        );
         let mut shape = self.shape().to_vec();
         shape[0] = table_rows;
         let mut out = Buffer::zeros(shape.iter().product());
@@ -106,14 +112,22 @@ pub fn add_rows<T: Real>(table: &mut [T], width: usize, rows: &[u32], values: &[
 
 #[track_caller]
 fn check_rows(op: &str, rows: &[u32], table: usize) {
-    let largest = parallel::map_chunks(rows.len(), 16 * parallel::CHUNK, |range| rows[range].iter().copied().max()).into_iter().flatten().max();
-    assert!(largest.is_none_or(|r| (r as usize) < table), "{op}: row {} of a table of {table} rows", largest.unwrap_or(0));
+    let largest = parallel::map_chunks(rows.len(), parallel::CHUNK, |range| largest(&rows[range])).into_iter().max().unwrap_or(0);
+    assert!(rows.is_empty() || (largest as usize) < table, "{op}: row {largest} of a table of {table} rows");
 }
 
+dispatched! {
+fn largest(rows: &[u32]) -> u32 {
+    rows.iter().copied().fold(0, u32::max)
+}
+}
+
+dispatched! {
 fn copy_rows<T: Real, const W: usize>(table: &[T], rows: &[u32], out: &mut [T]) {
     let (table, _) = table.as_chunks::<W>();
     let (out, _) = out.as_chunks_mut::<W>();
     for (target, &row) in out.iter_mut().zip(rows) {
         *target = table[row as usize];
     }
+}
 }

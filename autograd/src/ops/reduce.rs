@@ -104,7 +104,8 @@ impl<T: Real> Tensor<T> {
         let missing = from.len().checked_sub(shape.len());
         let fits = missing.is_some_and(|m| shape.iter().zip(&from[m..]).all(|(&to, &from)| to == from || to == 1));
         assert!(fits, "sum_to: shape {from:?} cannot be summed to {shape:?}");
-        let kept: Vec<bool> = (0..from.len()).map(|i| i >= from.len() - shape.len() && shape[i + shape.len() - from.len()] == from[i]).collect();
+        let kept: Vec<bool> =
+            (0..from.len()).map(|i| i >= from.len() - shape.len() && shape[i + shape.len() - from.len()] == from[i]).collect();
         // Runs of dimensions that are kept or summed together become one.
         let mut dims: Vec<(usize, bool)> = Vec::new();
         for (&n, &kept) in from.iter().zip(&kept) {

@@ -69,27 +69,32 @@ impl<T: Real> Tensor<T> {
         shape[0] = n;
         let mut out = Buffer::stale(n * width);
         let x = self.data();
-        for_each_segments(offsets, &mut out, |_| width, |first, chunk| {
-            for (r, sum) in chunk.chunks_exact_mut(width.max(1)).enumerate() {
-                let rows = &x[offsets[first + r] as usize * width..offsets[first + r + 1] as usize * width];
-                match width {
-                    1 => sum[0] = rows.iter().copied().sum(),
-                    3 => {
-                        let mut s = [T::zero(); 3];
-                        for row in rows.as_chunks::<3>().0 {
-                            (0..3).for_each(|c| s[c] += row[c]);
+        for_each_segments(
+            offsets,
+            &mut out,
+            |_| width,
+            |first, chunk| {
+                for (r, sum) in chunk.chunks_exact_mut(width.max(1)).enumerate() {
+                    let rows = &x[offsets[first + r] as usize * width..offsets[first + r + 1] as usize * width];
+                    match width {
+                        1 => sum[0] = rows.iter().copied().sum(),
+                        3 => {
+                            let mut s = [T::zero(); 3];
+                            for row in rows.as_chunks::<3>().0 {
+                                (0..3).for_each(|c| s[c] += row[c]);
+                            }
+                            sum.copy_from_slice(&s);
                         }
-                        sum.copy_from_slice(&s);
-                    }
-                    _ => {
-                        sum.fill(T::zero());
-                        for row in rows.chunks_exact(width) {
-                            sum.iter_mut().zip(row).for_each(|(s, &v)| *s += v);
+                        _ => {
+                            sum.fill(T::zero());
+                            for row in rows.chunks_exact(width) {
+                                sum.iter_mut().zip(row).for_each(|(s, &v)| *s += v);
+                            }
                         }
                     }
                 }
-            }
-        });
+            },
+        );
         Tensor::from_op(out, &shape, &[self], SegmentSum { offsets: offsets.clone() })
     }
 
@@ -104,19 +109,24 @@ impl<T: Real> Tensor<T> {
         shape[0] = m;
         let mut out = Buffer::stale(m * width);
         let x = self.data();
-        for_each_segments(offsets, &mut out, |r| (offsets[r + 1] - offsets[r]) as usize * width, |first, mut chunk| {
-            let mut r = first;
-            while !chunk.is_empty() {
-                let (rows, rest) = chunk.split_at_mut((offsets[r + 1] - offsets[r]) as usize * width);
-                let row = &x[r * width..][..width];
-                match row {
-                    [v] => rows.fill(*v),
-                    _ => rows.chunks_exact_mut(width).for_each(|target| target.copy_from_slice(row)),
+        for_each_segments(
+            offsets,
+            &mut out,
+            |r| (offsets[r + 1] - offsets[r]) as usize * width,
+            |first, mut chunk| {
+                let mut r = first;
+                while !chunk.is_empty() {
+                    let (rows, rest) = chunk.split_at_mut((offsets[r + 1] - offsets[r]) as usize * width);
+                    let row = &x[r * width..][..width];
+                    match row {
+                        [v] => rows.fill(*v),
+                        _ => rows.chunks_exact_mut(width).for_each(|target| target.copy_from_slice(row)),
+                    }
+                    chunk = rest;
+                    r += 1;
                 }
-                chunk = rest;
-                r += 1;
-            }
-        });
+            },
+        );
         Tensor::from_op(out, &shape, &[self], SegmentRepeat { offsets: offsets.clone() })
     }
 
@@ -132,34 +142,39 @@ fn scan<T: Real>(x: &Tensor<T>, offsets: &Indices, reverse: bool) -> Tensor<T> {
     let width: usize = x.shape()[1..].iter().product();
     let mut out = Buffer::stale(x.len());
     let data = x.data();
-    for_each_segments(offsets, &mut out, |r| (offsets[r + 1] - offsets[r]) as usize * width, |first, mut chunk| {
-        let mut sums = vec![T::zero(); width];
-        let mut r = first;
-        while !chunk.is_empty() {
-            let (out, rest) = chunk.split_at_mut((offsets[r + 1] - offsets[r]) as usize * width);
-            let x = &data[offsets[r] as usize * width..][..out.len()];
-            if width == 1 {
-                let mut sum = T::zero();
-                let mut step = |(o, &v): (&mut T, &T)| {
-                    *o = sum;
-                    sum += v;
-                };
-                if reverse { out.iter_mut().zip(x).rev().for_each(&mut step) } else { out.iter_mut().zip(x).for_each(&mut step) }
-            } else {
-                sums.fill(T::zero());
-                let count = out.len() / width.max(1);
-                for k in 0..count {
-                    let i = if reverse { count - 1 - k } else { k };
-                    for ((o, &v), sum) in out[i * width..][..width].iter_mut().zip(&x[i * width..][..width]).zip(&mut sums) {
-                        *o = *sum;
-                        *sum += v;
+    for_each_segments(
+        offsets,
+        &mut out,
+        |r| (offsets[r + 1] - offsets[r]) as usize * width,
+        |first, mut chunk| {
+            let mut sums = vec![T::zero(); width];
+            let mut r = first;
+            while !chunk.is_empty() {
+                let (out, rest) = chunk.split_at_mut((offsets[r + 1] - offsets[r]) as usize * width);
+                let x = &data[offsets[r] as usize * width..][..out.len()];
+                if width == 1 {
+                    let mut sum = T::zero();
+                    let mut step = |(o, &v): (&mut T, &T)| {
+                        *o = sum;
+                        sum += v;
+                    };
+                    if reverse { out.iter_mut().zip(x).rev().for_each(&mut step) } else { out.iter_mut().zip(x).for_each(&mut step) }
+                } else {
+                    sums.fill(T::zero());
+                    let count = out.len() / width.max(1);
+                    for k in 0..count {
+                        let i = if reverse { count - 1 - k } else { k };
+                        for ((o, &v), sum) in out[i * width..][..width].iter_mut().zip(&x[i * width..][..width]).zip(&mut sums) {
+                            *o = *sum;
+                            *sum += v;
+                        }
                     }
                 }
+                chunk = rest;
+                r += 1;
             }
-            chunk = rest;
-            r += 1;
-        }
-    });
+        },
+    );
     Tensor::from_op(out, x.shape(), &[x], SegmentScan { offsets: offsets.clone(), reverse })
 }
 
@@ -172,7 +187,12 @@ fn segments(op: &str, offsets: &Indices, rows: usize) -> usize {
 }
 
 /// Calls `f(first_segment, its_part_of_out)` for runs of 256 segments, in parallel; `length(r)` is what segment r owns of `out`.
-fn for_each_segments<T: Real>(offsets: &Indices, out: &mut [T], length: impl Fn(usize) -> usize, f: impl Fn(usize, &mut [T]) + Sync + Send) {
+fn for_each_segments<T: Real>(
+    offsets: &Indices,
+    out: &mut [T],
+    length: impl Fn(usize) -> usize,
+    f: impl Fn(usize, &mut [T]) + Sync + Send,
+) {
     const RUN: usize = 256;
     let n = offsets.len() - 1;
     let mut rest = out;

@@ -127,7 +127,13 @@ impl<T: Real> Tensor<T> {
     /// The same values in another shape of as many elements; nothing is copied.
     #[track_caller]
     pub fn reshape(&self, shape: &[usize]) -> Self {
-        assert_eq!(shape.iter().product::<usize>(), self.len(), "reshape: {:?} has {} elements, {shape:?} another number", self.shape(), self.len());
+        assert_eq!(
+            shape.iter().product::<usize>(),
+            self.len(),
+            "reshape: {:?} has {} elements, {shape:?} another number",
+            self.shape(),
+            self.len()
+        );
         if shape == self.shape() {
             return self.clone();
         }
@@ -148,7 +154,12 @@ impl<T: Real> Tensor<T> {
     /// Values repeated to a larger shape by NumPy's rule.
     #[track_caller]
     pub fn broadcast_to(&self, shape: &[usize]) -> Self {
-        assert_eq!(broadcast_shape(self.shape(), shape).as_deref(), Some(shape), "broadcast_to: {:?} does not broadcast to {shape:?}", self.shape());
+        assert_eq!(
+            broadcast_shape(self.shape(), shape).as_deref(),
+            Some(shape),
+            "broadcast_to: {:?} does not broadcast to {shape:?}",
+            self.shape()
+        );
         let mut out = Buffer::stale(shape.iter().product());
         if self.len() == 1 {
             parallel::fill(&mut out, self.data()[0]);

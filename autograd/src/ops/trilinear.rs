@@ -102,7 +102,8 @@ impl<T: Real> Kernel<T> for Trilinear {
                     let p = first + p;
                     let g = &g.data()[p * width..][..width];
                     let (rows, _) = corners(cells[p], self.nodes);
-                    let dots = rows.map(|row| g.iter().zip(&table.data()[row as usize * width..][..width]).map(|(&g, &v)| g * v).sum::<T>());
+                    let dots =
+                        rows.map(|row| g.iter().zip(&table.data()[row as usize * width..][..width]).map(|(&g, &v)| g * v).sum::<T>());
                     d.copy_from_slice(&slope_of(dots, cells[p], self.nodes));
                 }
             });

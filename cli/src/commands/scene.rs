@@ -1,6 +1,7 @@
 //! `plenoxel scene`: the built-in scene as files.
 
 use super::train::size;
+use crate::memory::Estimate;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
@@ -74,6 +75,9 @@ pub fn run(args: &SceneArgs, console: &Console<'_>) -> Result<()> {
         let found = format!("{}, which is not empty,", args.dir.display());
         return Err(Error::config("DIR", found, "a new folder; or --force"));
     }
+    let estimate = Estimate::of_images(&dataset);
+    console.note(&estimate.describe());
+    estimate.check()?;
     // The lists of an earlier scene would outlive it where this one has no views.
     for split in Split::ALL {
         let path = args.dir.join(format!("transforms_{split}.json"));

@@ -105,7 +105,7 @@ fn learn(
     let plan = trainer.plan().to_vec();
     let total = trainer.total_steps();
     let mut metrics = MetricsFile::create(&folder.metrics(), total)?;
-    let mut progress = console.training(&plan);
+    let mut progress = console.training(&plan, config.prune_from_stage);
     let (mut losses, mut stages) = (Vec::new(), Vec::new());
     let title = format!("Training loss of {}", folder.path().display());
     loop {

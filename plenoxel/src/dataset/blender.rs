@@ -25,60 +25,33 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     let train = read_transforms(root, Split::Train)?;
     if train.is_empty() {
         let path = root.join("transforms_train.json");
-        return Err(Error::input(
-            path,
-            "frames is empty",
-            "at least one training view is needed",
-        ));
+        return Err(Error::input(path, "frames is empty", "at least one training view is needed"));
     }
     let has_val = file_name(root, Split::Val).exists();
-    let val = if has_val {
-        read_transforms(root, Split::Val)?
-    } else {
-        Vec::new()
-    };
-    let test = if file_name(root, Split::Test).exists() {
-        read_transforms(root, Split::Test)?
-    } else {
-        Vec::new()
-    };
+    let val = if has_val { read_transforms(root, Split::Val)? } else { Vec::new() };
+    let test = if file_name(root, Split::Test).exists() { read_transforms(root, Split::Test)? } else { Vec::new() };
     let mut splits = [train, val, test];
     let size = common_size(splits.iter().flatten())?;
     image::check_downscale(options.downscale, size)?;
 
     if let (Some(every), false) = (options.validation_every, has_val) {
-        let (held, kept) = std::mem::take(&mut splits[0])
-            .into_iter()
-            .enumerate()
-            .partition::<Vec<_>, _>(|(k, _)| (k + 1).is_multiple_of(every));
+        let (held, kept) =
+            std::mem::take(&mut splits[0]).into_iter().enumerate().partition::<Vec<_>, _>(|(k, _)| (k + 1).is_multiple_of(every));
         splits[0] = kept.into_iter().map(|(_, listed)| listed).collect();
         splits[1] = held.into_iter().map(|(_, listed)| listed).collect();
     }
     let frame = |listed: Listed| {
-        let intrinsics =
-            Intrinsics::from_fov_x(size.0, size.1, listed.fov_x).downscaled(options.downscale);
-        Frame {
-            name: listed.name,
-            camera: Camera {
-                intrinsics,
-                camera_to_world: listed.camera_to_world,
-            },
-            path: listed.image,
-        }
+        let intrinsics = Intrinsics::from_fov_x(size.0, size.1, listed.fov_x).downscaled(options.downscale);
+        Frame { name: listed.name, camera: Camera { intrinsics, camera_to_world: listed.camera_to_world }, path: listed.image }
     };
     let frames = splits.map(|listed| listed.into_iter().map(frame).collect());
-    let name = root.canonicalize().ok().and_then(|path| {
-        path.file_name()
-            .map(|name| name.to_string_lossy().into_owned())
-    });
+    let name = root.canonicalize().ok().and_then(|path| path.file_name().map(|name| name.to_string_lossy().into_owned()));
     Ok(Dataset {
         name: name.unwrap_or_else(|| "scene".into()),
         format: "NeRF-synthetic (transforms_train.json)",
         size: (size.0 / options.downscale, size.1 / options.downscale),
         frames,
-        source: Source::Files {
-            downscale: options.downscale,
-        },
+        source: Source::Files { downscale: options.downscale },
     })
 }
 
@@ -96,117 +69,64 @@ fn file_name(root: &Path, split: Split) -> PathBuf {
 
 fn read_transforms(root: &Path, split: Split) -> Result<Vec<Listed>> {
     let path = file_name(root, split);
-    let bytes =
-        std::fs::read(&path).map_err(|source| Error::io(&path, source, "reading the cameras"))?;
+    let bytes = std::fs::read(&path).map_err(|source| Error::io(&path, source, "reading the cameras"))?;
     let json: Value = serde_json::from_slice(&bytes).map_err(|error| {
         let place = format!("line {}, column {}", error.line(), error.column());
         let (found, remedy) = if error.is_eof() {
-            (
-                format!("the JSON ends early, at {place}"),
-                "the file is cut short: copy or download it again",
-            )
+            (format!("the JSON ends early, at {place}"), "the file is cut short: copy or download it again")
         } else {
-            (
-                format!("this is not valid JSON: {error}"),
-                "correct it there; numbers must be finite",
-            )
+            (format!("this is not valid JSON: {error}"), "correct it there; numbers must be finite")
         };
         Error::input(&path, found, remedy)
     })?;
     let bad = |found: String, remedy: &str| Error::input(&path, found, remedy);
     let fov_x = match json.get("camera_angle_x") {
         None => {
-            return Err(bad(
-                "there is no key \"camera_angle_x\"".into(),
-                "give the horizontal field of view in radians",
-            ));
+            return Err(bad("there is no key \"camera_angle_x\"".into(), "give the horizontal field of view in radians"));
         }
-        Some(value) => value
-            .as_f64()
-            .filter(|angle| *angle > 0.0 && *angle < std::f64::consts::PI),
+        Some(value) => value.as_f64().filter(|angle| *angle > 0.0 && *angle < std::f64::consts::PI),
     };
     let Some(fov_x) = fov_x else {
-        return Err(bad(
-            format!("camera_angle_x is {}", json["camera_angle_x"]),
-            "it is a number of radians between 0 and pi",
-        ));
+        return Err(bad(format!("camera_angle_x is {}", json["camera_angle_x"]), "it is a number of radians between 0 and pi"));
     };
     let Some(frames) = json.get("frames") else {
-        return Err(bad(
-            "there is no key \"frames\"".into(),
-            "list the views, each with file_path and transform_matrix",
-        ));
+        return Err(bad("there is no key \"frames\"".into(), "list the views, each with file_path and transform_matrix"));
     };
     let Some(frames) = frames.as_array() else {
-        return Err(bad(
-            "frames is not a list".into(),
-            "list the views, each with file_path and transform_matrix",
-        ));
+        return Err(bad("frames is not a list".into(), "list the views, each with file_path and transform_matrix"));
     };
     let mut listed = Vec::with_capacity(frames.len());
     for (k, frame) in frames.iter().enumerate() {
         let text = match frame.get("file_path") {
             None => {
-                return Err(bad(
-                    format!("frame {k} has no key \"file_path\""),
-                    "name the image, without extension",
-                ));
+                return Err(bad(format!("frame {k} has no key \"file_path\""), "name the image, without extension"));
             }
             Some(value) => value.as_str().filter(|text| !text.is_empty()),
         };
         let Some(text) = text else {
-            return Err(bad(
-                format!("file_path of frame {k} is {}", frame["file_path"]),
-                "name the image, without extension",
-            ));
+            return Err(bad(format!("file_path of frame {k} is {}", frame["file_path"]), "name the image, without extension"));
         };
         let image = find_image(root, split, text).map_err(|tried| {
-            let tried: Vec<String> = tried
-                .iter()
-                .map(|path| path.display().to_string())
-                .collect();
-            bad(
-                format!("the image \"{text}\" of frame {k} does not exist"),
-                &format!("looked for {}", tried.join(" and ")),
-            )
+            let tried: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
+            bad(format!("the image \"{text}\" of frame {k} does not exist"), &format!("looked for {}", tried.join(" and ")))
         })?;
-        let name = image
-            .file_stem()
-            .map(|stem| stem.to_string_lossy().into_owned())
-            .unwrap_or_default();
+        let name = image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
         let Some(matrix) = frame.get("transform_matrix") else {
-            return Err(bad(
-                format!("frame {k} has no key \"transform_matrix\""),
-                "give the 4 x 4 camera-to-world matrix",
-            ));
+            return Err(bad(format!("frame {k} has no key \"transform_matrix\""), "give the 4 x 4 camera-to-world matrix"));
         };
-        let camera_to_world = pose(matrix).map_err(|(found, remedy)| {
-            bad(format!("transform_matrix of frame {k} {found}"), remedy)
-        })?;
-        listed.push(Listed {
-            name,
-            image,
-            fov_x,
-            camera_to_world,
-        });
+        let camera_to_world = pose(matrix).map_err(|(found, remedy)| bad(format!("transform_matrix of frame {k} {found}"), remedy))?;
+        listed.push(Listed { name, image, fov_x, camera_to_world });
     }
     Ok(listed)
 }
 
 /// The image a `file_path` means: relative to the scene as written, or by its last part in the split's folder; `.png` is
 /// appended unless it is there. Otherwise the places that were tried.
-fn find_image(
-    root: &Path,
-    split: Split,
-    file_path: &str,
-) -> std::result::Result<PathBuf, Vec<PathBuf>> {
+fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result<PathBuf, Vec<PathBuf>> {
     let file_path = file_path.replace('\\', "/");
     let base = file_path.rsplit('/').next().unwrap_or(&file_path);
     let folder = root.join(split.to_string());
-    let mut tried = vec![
-        root.join(file_path.trim_start_matches("./")),
-        folder.join(base),
-    ];
+    let mut tried = vec![root.join(file_path.trim_start_matches("./")), folder.join(base)];
     if !file_path.to_ascii_lowercase().ends_with(".png") {
         for path in &mut tried {
             path.as_mut_os_string().push(".png");
@@ -215,11 +135,7 @@ fn find_image(
     tried.dedup();
     // An image with another extension is found too, so that the message can say that it is not a PNG.
     let as_written = root.join(file_path.trim_start_matches("./"));
-    let found = tried
-        .iter()
-        .chain([&as_written])
-        .find(|path| path.is_file())
-        .cloned();
+    let found = tried.iter().chain([&as_written]).find(|path| path.is_file()).cloned();
     found.ok_or(tried)
 }
 
@@ -227,58 +143,33 @@ fn find_image(
 fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'static str)> {
     const SHAPE: &str = "it is a list of 4 rows of 4 numbers";
     let mut m = [[0.0; 4]; 4];
-    let rows = matrix
-        .as_array()
-        .ok_or_else(|| ("is not a list of rows".to_owned(), SHAPE))?;
+    let rows = matrix.as_array().ok_or_else(|| ("is not a list of rows".to_owned(), SHAPE))?;
     if rows.len() != 4 {
         return Err((format!("has {} rows", rows.len()), SHAPE));
     }
     for (i, row) in rows.iter().enumerate() {
-        let row = row
-            .as_array()
-            .ok_or_else(|| (format!("has a row {i} that is not a list"), SHAPE))?;
+        let row = row.as_array().ok_or_else(|| (format!("has a row {i} that is not a list"), SHAPE))?;
         if row.len() != 4 {
             return Err((format!("has {} numbers in row {i}", row.len()), SHAPE));
         }
         for (j, value) in row.iter().enumerate() {
             let number = value.as_f64().filter(|number| number.is_finite());
-            m[i][j] = number.ok_or_else(|| {
-                (
-                    format!("has {value} in row {i}, column {j}"),
-                    "every entry is a finite number",
-                )
-            })?;
+            m[i][j] = number.ok_or_else(|| (format!("has {value} in row {i}, column {j}"), "every entry is a finite number"))?;
         }
     }
-    if m[3]
-        .iter()
-        .zip([0.0, 0.0, 0.0, 1.0])
-        .any(|(a, b)| (a - b).abs() > 1e-6)
-    {
-        return Err((
-            format!("has the last row {:?}", m[3]),
-            "the last row of a rigid motion is 0 0 0 1",
-        ));
+    if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6) {
+        return Err((format!("has the last row {:?}", m[3]), "the last row of a rigid motion is 0 0 0 1"));
     }
     let matrix = DMat4::from_cols_array_2d(&m).transpose();
     let rotation = DMat3::from_mat4(matrix);
     let error = rotation.transpose() * rotation - DMat3::IDENTITY;
-    let worst = error
-        .to_cols_array()
-        .into_iter()
-        .fold(0.0, |worst: f64, value| worst.max(value.abs()));
+    let worst = error.to_cols_array().into_iter().fold(0.0, |worst: f64, value| worst.max(value.abs()));
     // A huge entry overflows to infinity on the diagonal of RᵀR, so no NaN can hide the others.
     if worst > ORTHONORMAL_WITHIN {
-        return Err((
-            format!("is not a rotation: RᵀR differs from 1 by {worst:.1e}"),
-            "remove scale and shear",
-        ));
+        return Err((format!("is not a rotation: RᵀR differs from 1 by {worst:.1e}"), "remove scale and shear"));
     }
     if rotation.determinant() < 0.0 {
-        return Err((
-            "is a reflection: its determinant is -1".into(),
-            "use OpenGL axes: x right, y up, z backwards",
-        ));
+        return Err(("is a reflection: its determinant is -1".into(), "use OpenGL axes: x right, y up, z backwards"));
     }
     Ok(DAffine3::from_mat4(matrix))
 }
@@ -291,19 +182,9 @@ fn common_size<'a>(listed: impl Iterator<Item = &'a Listed>) -> Result<(usize, u
         match first {
             None => first = Some((path, size)),
             Some((other, expected)) if expected != size => {
-                let found = format!(
-                    "the image has {} x {} pixels, but {} has {} x {}",
-                    size.0,
-                    size.1,
-                    other.display(),
-                    expected.0,
-                    expected.1
-                );
-                return Err(Error::input(
-                    path,
-                    found,
-                    "all images of a scene must have one size",
-                ));
+                let found =
+                    format!("the image has {} x {} pixels, but {} has {} x {}", size.0, size.1, other.display(), expected.0, expected.1);
+                return Err(Error::input(path, found, "all images of a scene must have one size"));
             }
             Some(_) => {}
         }
@@ -320,82 +201,20 @@ mod tests {
 
     #[test]
     fn a_pose_survives_being_written_and_read() {
-        let camera = Camera::look_at(
-            DVec3::new(1.0, -3.0, 2.0),
-            DVec3::ZERO,
-            DVec3::Z,
-            Intrinsics::from_fov_x(4, 4, 0.7),
-        );
-        assert_eq!(
-            pose(&json!(rows(&camera.camera_to_world))).unwrap(),
-            camera.camera_to_world
-        );
+        let camera = Camera::look_at(DVec3::new(1.0, -3.0, 2.0), DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(4, 4, 0.7));
+        assert_eq!(pose(&json!(rows(&camera.camera_to_world))).unwrap(), camera.camera_to_world);
     }
 
     #[test]
     fn matrices_that_are_not_rigid_motions_are_refused_with_the_reason() {
         let refused = |matrix: Value| pose(&matrix).unwrap_err().0;
-        assert_eq!(
-            refused(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])),
-            "has 3 rows"
-        );
-        assert_eq!(
-            refused(json!([[1, 0, 0, 0], [0, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1]])),
-            "has 3 numbers in row 1"
-        );
-        assert_eq!(
-            refused(json!([
-                [1, 0, 0, 0],
-                [0, 1, 0, null],
-                [0, 0, 1, 0],
-                [0, 0, 0, 1]
-            ])),
-            "has null in row 1, column 3"
-        );
-        assert!(
-            refused(json!([
-                [1, 0, 0, 0],
-                [0, 1, 0, 0],
-                [0, 0, 1, 0],
-                [0, 0, 0.5, 1]
-            ]))
-            .starts_with("has the last row")
-        );
-        assert!(
-            refused(json!([
-                [2, 0, 0, 0],
-                [0, 2, 0, 0],
-                [0, 0, 2, 0],
-                [0, 0, 0, 1]
-            ]))
-            .contains("RᵀR differs from 1 by 3.0e0")
-        );
-        assert!(
-            refused(json!([
-                [1e300, 0, 0, 0],
-                [0, 1, 0, 0],
-                [0, 0, 1, 0],
-                [0, 0, 0, 1]
-            ]))
-            .contains("not a rotation")
-        );
-        assert!(
-            refused(json!([
-                [1, 0, 0, 0],
-                [0, -1, 0, 0],
-                [0, 0, 1, 0],
-                [0, 0, 0, 1]
-            ]))
-            .contains("reflection")
-        );
-        assert!(
-            pose(&json!([
-                [1, 0, 1e-5, 0],
-                [0, 1, 0, 0],
-                [0, 0, 1, 0],
-                [0, 0, 0, 1]
-            ]))
-            .is_ok()
-        );
+        assert_eq!(refused(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])), "has 3 rows");
+        assert_eq!(refused(json!([[1, 0, 0, 0], [0, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1]])), "has 3 numbers in row 1");
+        assert_eq!(refused(json!([[1, 0, 0, 0], [0, 1, 0, null], [0, 0, 1, 0], [0, 0, 0, 1]])), "has null in row 1, column 3");
+        assert!(refused(json!([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.5, 1]])).starts_with("has the last row"));
+        assert!(refused(json!([[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])).contains("RᵀR differs from 1 by 3.0e0"));
+        assert!(refused(json!([[1e300, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])).contains("not a rotation"));
+        assert!(refused(json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])).contains("reflection"));
+        assert!(pose(&json!([[1, 0, 1e-5, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])).is_ok());
     }
 }

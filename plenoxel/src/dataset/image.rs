@@ -6,9 +6,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
-use ::image::{
-    DynamicImage, ExtendedColorType, ImageEncoder, ImageError, ImageFormat, ImageReader, Limits,
-};
+use ::image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageError, ImageFormat, ImageReader, Limits};
 use ndarray::{Array2, Array3, ArrayView3};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -30,31 +28,21 @@ const END: [u8; 12] = *b"\0\0\0\0IEND\xae\x42\x60\x82";
 pub fn size(path: &Path) -> Result<(usize, usize)> {
     let mut file = open(path)?;
     let mut head = [0_u8; 24];
-    let length = read_up_to(&mut file, &mut head)
-        .map_err(|source| Error::io(path, source, "reading the image's header"))?;
+    let length = read_up_to(&mut file, &mut head).map_err(|source| Error::io(path, source, "reading the image's header"))?;
     if head[..length.min(8)] != SIGNATURE[..length.min(8)] || length == 0 {
         return Err(not_png(path, &head[..length]));
     }
     if length < head.len() || &head[12..16] != b"IHDR" {
         return Err(cut_short(path));
     }
-    let number =
-        |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+    let number = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
     let (width, height) = (number(16), number(20));
     if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
         let found = format!("the header says {width} x {height} pixels");
-        return Err(Error::input(
-            path,
-            found,
-            format!("images of 1 to {MAX_SIDE} pixels a side are accepted"),
-        ));
+        return Err(Error::input(path, found, format!("images of 1 to {MAX_SIDE} pixels a side are accepted")));
     }
     let mut tail = [0_u8; END.len()];
-    let whole = file
-        .seek(SeekFrom::End(-(END.len() as i64)))
-        .and_then(|_| file.read_exact(&mut tail))
-        .is_ok()
-        && tail == END;
+    let whole = file.seek(SeekFrom::End(-(END.len() as i64))).and_then(|_| file.read_exact(&mut tail)).is_ok() && tail == END;
     if !whole {
         read(path)?;
     }
@@ -73,25 +61,14 @@ pub fn read(path: &Path) -> Result<RgbaImage> {
     // The largest picture within the limits: 16-bit RGBA.
     limits.max_alloc = Some(8 * u64::from(MAX_SIDE) * u64::from(MAX_SIDE));
     reader.limits(limits);
-    reader
-        .decode()
-        .map(DynamicImage::into_rgba8)
-        .map_err(|error| match error {
-            ImageError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => {
-                cut_short(path)
-            }
-            ImageError::IoError(source) => Error::io(path, source, "decoding the image"),
-            ImageError::Limits(_) => Error::input(
-                path,
-                "the header claims an enormous image",
-                format!("images of 1 to {MAX_SIDE} pixels a side are accepted"),
-            ),
-            other => Error::input(
-                path,
-                format!("the image cannot be decoded ({other})"),
-                "write it again as PNG",
-            ),
-        })
+    reader.decode().map(DynamicImage::into_rgba8).map_err(|error| match error {
+        ImageError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => cut_short(path),
+        ImageError::IoError(source) => Error::io(path, source, "decoding the image"),
+        ImageError::Limits(_) => {
+            Error::input(path, "the header claims an enormous image", format!("images of 1 to {MAX_SIDE} pixels a side are accepted"))
+        }
+        other => Error::input(path, format!("the image cannot be decoded ({other})"), "write it again as PNG"),
+    })
 }
 
 /// Checks that pictures of `width` x `height` can be reduced `k` times: k must divide both, since blocks of different sizes
@@ -103,15 +80,8 @@ pub fn check_downscale(k: usize, (width, height): (usize, usize)) -> Result<()> 
     if k > 0 && divides(k) {
         return Ok(());
     }
-    let divisors: Vec<String> = (1..=width.min(height))
-        .filter(|&k| divides(k))
-        .map(|k| k.to_string())
-        .collect();
-    let found = if k == 0 {
-        "0".to_owned()
-    } else {
-        format!("{k}, which does not divide the {width} x {height} images,")
-    };
+    let divisors: Vec<String> = (1..=width.min(height)).filter(|&k| divides(k)).map(|k| k.to_string()).collect();
+    let found = if k == 0 { "0".to_owned() } else { format!("{k}, which does not divide the {width} x {height} images,") };
     Err(Error::config("downscale", found, divisors.join(", ")))
 }
 
@@ -125,10 +95,7 @@ pub fn downscale(image: &RgbaImage, k: usize) -> RgbaImage {
         return image.clone();
     }
     let (width, height) = (image.width() as usize, image.height() as usize);
-    assert!(
-        k > 0 && width.is_multiple_of(k) && height.is_multiple_of(k),
-        "downscale {k} does not divide {width} x {height}"
-    );
+    assert!(k > 0 && width.is_multiple_of(k) && height.is_multiple_of(k), "downscale {k} does not divide {width} x {height}");
     let pixels = image.as_raw();
     RgbaImage::from_fn((width / k) as u32, (height / k) as u32, |i, j| {
         let mut sum = [0_u64; 4];
@@ -142,18 +109,9 @@ pub fn downscale(image: &RgbaImage, k: usize) -> RgbaImage {
                 sum[3] += alpha;
             }
         }
-        let rounded = |numerator: u64, denominator: u64| {
-            (numerator + denominator / 2)
-                .checked_div(denominator)
-                .unwrap_or(0) as u8
-        };
+        let rounded = |numerator: u64, denominator: u64| (numerator + denominator / 2).checked_div(denominator).unwrap_or(0) as u8;
         let alpha = sum[3];
-        ::image::Rgba([
-            rounded(sum[0], alpha),
-            rounded(sum[1], alpha),
-            rounded(sum[2], alpha),
-            rounded(alpha, (k * k) as u64),
-        ])
+        ::image::Rgba([rounded(sum[0], alpha), rounded(sum[1], alpha), rounded(sum[2], alpha), rounded(alpha, (k * k) as u64)])
     })
 }
 
@@ -163,21 +121,14 @@ pub fn color(image: &RgbaImage, x: usize, y: usize, background: [f32; 3]) -> [f3
     let [r, g, b, a] = image.get_pixel(x as u32, y as u32).0;
     let alpha = f32::from(a) / 255.0;
     let over = |value: u8, back: f32| f32::from(value) / 255.0 * alpha + back * (1.0 - alpha);
-    [
-        over(r, background[0]),
-        over(g, background[1]),
-        over(b, background[2]),
-    ]
+    [over(r, background[0]), over(g, background[1]), over(b, background[2])]
 }
 
 /// The whole picture over `background`: [height, width, 3] in [0, 1].
 pub fn composite(image: &RgbaImage, background: [f32; 3]) -> Array3<f32> {
     let (width, height) = (image.width() as usize, image.height() as usize);
     let mut out = Array3::zeros((height, width, 3));
-    for ((y, x), mut pixel) in ndarray::indices((height, width))
-        .into_iter()
-        .zip(out.lanes_mut(ndarray::Axis(2)))
-    {
+    for ((y, x), mut pixel) in ndarray::indices((height, width)).into_iter().zip(out.lanes_mut(ndarray::Axis(2))) {
         for (to, value) in pixel.iter_mut().zip(color(image, x, y, background)) {
             *to = value;
         }
@@ -191,79 +142,39 @@ pub fn composite(image: &RgbaImage, background: [f32; 3]) -> Array3<f32> {
 /// Panics unless there are three channels. Errors: an empty picture, or the disk's refusal.
 pub fn write_rgb(path: &Path, rgb: ArrayView3<'_, f32>) -> Result<()> {
     let (height, width, channels) = rgb.dim();
-    assert_eq!(
-        channels,
-        3,
-        "write_rgb: expected [height, width, 3], got {:?}",
-        rgb.shape()
-    );
-    let bytes: Vec<u8> = rgb
-        .iter()
-        .map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8)
-        .collect();
+    assert_eq!(channels, 3, "write_rgb: expected [height, width, 3], got {:?}", rgb.shape());
+    let bytes: Vec<u8> = rgb.iter().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
     encode(path, &bytes, (width, height), ExtendedColorType::Rgb8)
 }
 
 /// Writes an RGBA picture with straight alpha as PNG. The file appears whole or not at all.
 pub fn write_rgba(path: &Path, image: &RgbaImage) -> Result<()> {
-    encode(
-        path,
-        image.as_raw(),
-        (image.width() as usize, image.height() as usize),
-        ExtendedColorType::Rgba8,
-    )
+    encode(path, image.as_raw(), (image.width() as usize, image.height() as usize), ExtendedColorType::Rgba8)
 }
 
 /// Writes 16-bit gray values [height, width] as PNG. The file appears whole or not at all.
 pub fn write_gray16(path: &Path, values: &Array2<u16>) -> Result<()> {
     // The encoder takes samples in the machine's byte order.
-    let bytes: Vec<u8> = values
-        .iter()
-        .flat_map(|value| value.to_ne_bytes())
-        .collect();
-    encode(
-        path,
-        &bytes,
-        (values.ncols(), values.nrows()),
-        ExtendedColorType::L16,
-    )
+    let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_ne_bytes()).collect();
+    encode(path, &bytes, (values.ncols(), values.nrows()), ExtendedColorType::L16)
 }
 
-fn encode(
-    path: &Path,
-    bytes: &[u8],
-    (width, height): (usize, usize),
-    color: ExtendedColorType,
-) -> Result<()> {
+fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<()> {
     let mut png = Vec::new();
-    ::image::codecs::png::PngEncoder::new(&mut png)
-        .write_image(bytes, width as u32, height as u32, color)
-        .map_err(|error| {
-            Error::input(
-                path,
-                format!("a {width} x {height} image cannot be encoded ({error})"),
-                "choose a usual image size",
-            )
-        })?;
+    ::image::codecs::png::PngEncoder::new(&mut png).write_image(bytes, width as u32, height as u32, color).map_err(|error| {
+        Error::input(path, format!("a {width} x {height} image cannot be encoded ({error})"), "choose a usual image size")
+    })?;
     files::write_atomically(path, &png)
 }
 
 fn open(path: &Path) -> Result<File> {
     let file = File::open(path).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound => Error::input(
-            path,
-            "there is no such image",
-            "put the file there or correct the path",
-        ),
+        std::io::ErrorKind::NotFound => Error::input(path, "there is no such image", "put the file there or correct the path"),
         _ => Error::io(path, source, "opening the image"),
     })?;
     // On Unix a folder can be opened like a file and only refuses to be read.
     if file.metadata().is_ok_and(|data| data.is_dir()) {
-        return Err(Error::input(
-            path,
-            "this is a folder",
-            "a PNG image is expected here",
-        ));
+        return Err(Error::input(path, "this is a folder", "a PNG image is expected here"));
     }
     Ok(file)
 }
@@ -288,11 +199,7 @@ fn not_png(path: &Path, head: &[u8]) -> Error {
 }
 
 fn cut_short(path: &Path) -> Error {
-    Error::input(
-        path,
-        "the PNG ends early: it is cut short",
-        "copy or download the file again",
-    )
+    Error::input(path, "the PNG ends early: it is cut short", "copy or download the file again")
 }
 
 #[cfg(test)]
@@ -307,15 +214,9 @@ mod tests {
     /// Encodes with the `image` crate, writes, reads back with `read`, removes the file.
     fn round_trip(name: &str, image: impl Into<DynamicImage>) -> RgbaImage {
         let path = temporary(name);
-        image
-            .into()
-            .save_with_format(&path, ImageFormat::Png)
-            .unwrap();
+        image.into().save_with_format(&path, ImageFormat::Png).unwrap();
         let read = read(&path).unwrap();
-        assert_eq!(
-            size(&path).unwrap(),
-            (read.width() as usize, read.height() as usize)
-        );
+        assert_eq!(size(&path).unwrap(), (read.width() as usize, read.height() as usize));
         std::fs::remove_file(path).unwrap();
         read
     }
@@ -329,10 +230,7 @@ mod tests {
         let rgb = round_trip("rgb", ImageBuffer::from_pixel(1, 1, Rgb([1_u8, 2, 3])));
         assert_eq!(rgb.get_pixel(0, 0).0, [1, 2, 3, 255]);
         // 16 bit to 8 bit is value / 257, rounded: 257 * 100 + 128 is just below half way between 100 and 101.
-        let deep = round_trip(
-            "deep",
-            ImageBuffer::from_pixel(1, 1, Rgba([257_u16 * 100 + 128, 257 * 100 + 129, 0, 65535])),
-        );
+        let deep = round_trip("deep", ImageBuffer::from_pixel(1, 1, Rgba([257_u16 * 100 + 128, 257 * 100 + 129, 0, 65535])));
         assert_eq!(deep.get_pixel(0, 0).0, [100, 101, 0, 255]);
     }
 
@@ -351,10 +249,7 @@ mod tests {
         for ((y, x, c), value) in small.indexed_iter() {
             let block = large.slice(ndarray::s![y * k..(y + 1) * k, x * k..(x + 1) * k, c]);
             // Color and alpha are each rounded by at most half a level, and each moves the composite by at most that.
-            assert!(
-                (value - block.mean().unwrap()).abs() < 1.0 / 255.0 + 1e-6,
-                "pixel ({x}, {y}) channel {c}"
-            );
+            assert!((value - block.mean().unwrap()).abs() < 1.0 / 255.0 + 1e-6, "pixel ({x}, {y}) channel {c}");
         }
     }
 
@@ -363,24 +258,14 @@ mod tests {
         let mut image = RgbaImage::from_pixel(2, 2, Rgba([0, 0, 0, 0]));
         image.put_pixel(0, 0, Rgba([200, 100, 50, 255]));
         assert_eq!(downscale(&image, 2).get_pixel(0, 0).0, [200, 100, 50, 64]); // 255 / 4 = 63.75
-        assert_eq!(
-            downscale(&RgbaImage::from_pixel(2, 2, Rgba([9, 9, 9, 0])), 2)
-                .get_pixel(0, 0)
-                .0,
-            [0; 4]
-        );
+        assert_eq!(downscale(&RgbaImage::from_pixel(2, 2, Rgba([9, 9, 9, 0])), 2).get_pixel(0, 0).0, [0; 4]);
     }
 
     #[test]
     fn a_reduction_that_does_not_divide_lists_those_that_do() {
         let error = check_downscale(3, (8, 12)).unwrap_err();
         assert_eq!(error.exit_code(), 2);
-        assert!(
-            error
-                .to_string()
-                .contains("does not divide the 8 x 12 images"),
-            "{error}"
-        );
+        assert!(error.to_string().contains("does not divide the 8 x 12 images"), "{error}");
         assert!(error.to_string().ends_with("accepted: 1, 2, 4"), "{error}");
         assert!(check_downscale(0, (8, 12)).is_err() && check_downscale(4, (8, 12)).is_ok());
     }
@@ -392,10 +277,7 @@ mod tests {
         write_rgb(&path, rgb.view()).unwrap();
         let image = read(&path).unwrap();
         // 0.5 * 255 = 127.5 rounds to 128; 0.0019 * 255 = 0.48 and 0.0021 * 255 = 0.54 fall on either side of a half.
-        assert_eq!(
-            (image.get_pixel(0, 0).0, image.get_pixel(1, 0).0),
-            ([0, 128, 255, 255], [0, 0, 1, 255])
-        );
+        assert_eq!((image.get_pixel(0, 0).0, image.get_pixel(1, 0).0), ([0, 128, 255, 255], [0, 0, 1, 255]));
         std::fs::remove_file(path).unwrap();
     }
 
@@ -403,15 +285,8 @@ mod tests {
     fn sixteen_bit_gray_is_written_in_the_right_byte_order() {
         let path = temporary("gray16");
         write_gray16(&path, &ndarray::arr2(&[[0, 256, 65535], [1, 2, 3]])).unwrap();
-        let image =
-            ImageReader::with_format(BufReader::new(File::open(&path).unwrap()), ImageFormat::Png)
-                .decode()
-                .unwrap()
-                .into_luma16();
-        assert_eq!(
-            (image.dimensions(), image.as_raw().as_slice()),
-            ((3, 2), &[0, 256, 65535, 1, 2, 3][..])
-        );
+        let image = ImageReader::with_format(BufReader::new(File::open(&path).unwrap()), ImageFormat::Png).decode().unwrap().into_luma16();
+        assert_eq!((image.dimensions(), image.as_raw().as_slice()), ((3, 2), &[0, 256, 65535, 1, 2, 3][..]));
         std::fs::remove_file(path).unwrap();
     }
 
@@ -425,21 +300,14 @@ mod tests {
         std::fs::write(&path, bytes).unwrap();
         let error = size(&path).unwrap_err();
         assert!(error.to_string().contains("60000 x 60000"), "{error}");
-        assert_eq!(
-            (error.exit_code(), read(&path).unwrap_err().exit_code()),
-            (3, 3)
-        );
+        assert_eq!((error.exit_code(), read(&path).unwrap_err().exit_code()), (3, 3));
         std::fs::remove_file(path).unwrap();
     }
 
     #[test]
     fn a_png_cut_anywhere_is_noticed_without_being_asked_to_decode() {
         let path = temporary("cut");
-        write_rgba(
-            &path,
-            &RgbaImage::from_fn(16, 16, |x, y| Rgba([x as u8, y as u8, 5, 255])),
-        )
-        .unwrap();
+        write_rgba(&path, &RgbaImage::from_fn(16, 16, |x, y| Rgba([x as u8, y as u8, 5, 255]))).unwrap();
         let bytes = std::fs::read(&path).unwrap();
         for length in [1, 8, 20, 30, 45, bytes.len() - 20, bytes.len() - 13] {
             std::fs::write(&path, &bytes[..length]).unwrap();

@@ -46,14 +46,7 @@ pub struct ProceduralOptions {
 impl Default for ProceduralOptions {
     /// 200 x 200 pixels of 3 x 3 rays; 100 training, 10 validation and 25 test views.
     fn default() -> Self {
-        ProceduralOptions {
-            width: 200,
-            height: 200,
-            train: 100,
-            val: 10,
-            test: 25,
-            supersample: 3,
-        }
+        ProceduralOptions { width: 200, height: 200, train: 100, val: 10, test: 25, supersample: 3 }
     }
 }
 
@@ -80,11 +73,7 @@ pub(super) fn dataset(options: ProceduralOptions) -> Result<Dataset> {
         };
         let frame = |k: usize| {
             let eye = CAMERA_DISTANCE * direction(k, count);
-            Frame {
-                name: format!("r_{k}"),
-                camera: Camera::look_at(eye, DVec3::ZERO, DVec3::Z, intrinsics),
-                path: PathBuf::new(),
-            }
+            Frame { name: format!("r_{k}"), camera: Camera::look_at(eye, DVec3::ZERO, DVec3::Z, intrinsics), path: PathBuf::new() }
         };
         (0..count).map(frame).collect()
     });
@@ -93,10 +82,7 @@ pub(super) fn dataset(options: ProceduralOptions) -> Result<Dataset> {
         format: "built-in still life",
         size: (options.width, options.height),
         frames,
-        source: Source::Procedural {
-            scene: Arc::new(Scene::still_life()),
-            supersample: options.supersample,
-        },
+        source: Source::Procedural { scene: Arc::new(Scene::still_life()), supersample: options.supersample },
     })
 }
 
@@ -104,10 +90,7 @@ pub(super) fn dataset(options: ProceduralOptions) -> Result<Dataset> {
 /// lattice): nearly even, from just above the horizon to nearly overhead. `turn` radians are added to every azimuth.
 fn hemisphere(k: usize, n: usize, turn: f64) -> DVec3 {
     const GOLDEN_ANGLE: f64 = 2.399963229728653; // pi (3 - sqrt 5)
-    toward(
-        0.02 + 0.97 * (k as f64 + 0.5) / n as f64,
-        GOLDEN_ANGLE * k as f64 + turn,
-    )
+    toward(0.02 + 0.97 * (k as f64 + 0.5) / n as f64, GOLDEN_ANGLE * k as f64 + turn)
 }
 
 /// Direction `k` of `n` on the test path: twice around while the height swings slowly between low and high.
@@ -127,14 +110,7 @@ mod tests {
     use super::*;
 
     fn small() -> ProceduralOptions {
-        ProceduralOptions {
-            width: 24,
-            height: 16,
-            train: 3,
-            val: 1,
-            test: 2,
-            supersample: 2,
-        }
+        ProceduralOptions { width: 24, height: 16, train: 3, val: 1, test: 2, supersample: 2 }
     }
 
     #[test]
@@ -143,14 +119,8 @@ mod tests {
         let mut eyes: Vec<DVec3> = Vec::new();
         for split in Split::ALL {
             for camera in dataset.cameras(split) {
-                assert!(
-                    (camera.position().length() - CAMERA_DISTANCE).abs() < 1e-12
-                        && camera.position().z > 0.0
-                );
-                assert!(
-                    eyes.iter()
-                        .all(|eye| eye.distance(camera.position()) > 0.01)
-                );
+                assert!((camera.position().length() - CAMERA_DISTANCE).abs() < 1e-12 && camera.position().z > 0.0);
+                assert!(eyes.iter().all(|eye| eye.distance(camera.position()) > 0.01));
                 eyes.push(camera.position());
             }
         }
@@ -165,10 +135,7 @@ mod tests {
             assert_eq!(total, 3);
             highest.fetch_max(done, std::sync::atomic::Ordering::Relaxed);
         });
-        let (views, again) = (
-            views.unwrap(),
-            dataset.load(Split::Train, &|_, _| ()).unwrap(),
-        );
+        let (views, again) = (views.unwrap(), dataset.load(Split::Train, &|_, _| ()).unwrap());
         assert_eq!(highest.into_inner(), 3);
         for (a, b) in views.iter().zip(&again) {
             assert!(a.image == b.image && a.depth == b.depth && a.name == b.name);
@@ -179,59 +146,21 @@ mod tests {
     #[test]
     fn impossible_options_are_named() {
         for (options, key) in [
-            (
-                ProceduralOptions {
-                    width: 0,
-                    ..small()
-                },
-                "width",
-            ),
-            (
-                ProceduralOptions {
-                    height: 20_000,
-                    ..small()
-                },
-                "height",
-            ),
-            (
-                ProceduralOptions {
-                    train: 0,
-                    ..small()
-                },
-                "train",
-            ),
-            (
-                ProceduralOptions {
-                    supersample: 17,
-                    ..small()
-                },
-                "supersample",
-            ),
+            (ProceduralOptions { width: 0, ..small() }, "width"),
+            (ProceduralOptions { height: 20_000, ..small() }, "height"),
+            (ProceduralOptions { train: 0, ..small() }, "train"),
+            (ProceduralOptions { supersample: 17, ..small() }, "supersample"),
         ] {
             let error = Dataset::procedural(options).unwrap_err();
-            assert!(
-                error.exit_code() == 2 && error.to_string().starts_with(key),
-                "{error}"
-            );
+            assert!(error.exit_code() == 2 && error.to_string().starts_with(key), "{error}");
         }
     }
 
     #[test]
     fn one_view_of_each_picture_covers_a_third_to_a_half_of_the_frame() {
-        let dataset = Dataset::procedural(ProceduralOptions {
-            width: 50,
-            height: 50,
-            ..ProceduralOptions::default()
-        })
-        .unwrap();
+        let dataset = Dataset::procedural(ProceduralOptions { width: 50, height: 50, ..ProceduralOptions::default() }).unwrap();
         let views = dataset.load(Split::Train, &|_, _| ()).unwrap();
-        let covered = |view: &super::super::View| {
-            view.image
-                .pixels()
-                .map(|pixel| f64::from(pixel.0[3]) / 255.0)
-                .sum::<f64>()
-                / 2500.0
-        };
+        let covered = |view: &super::super::View| view.image.pixels().map(|pixel| f64::from(pixel.0[3]) / 255.0).sum::<f64>() / 2500.0;
         let mean = views.iter().map(covered).sum::<f64>() / views.len() as f64;
         assert!((0.33..0.5).contains(&mean), "mean coverage {mean}");
     }

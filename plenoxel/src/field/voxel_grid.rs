@@ -211,17 +211,22 @@ impl<T: Real> VoxelGrid<T> {
 
     /// True if every stored number is finite.
     pub fn is_finite(&self) -> bool {
-        [&self.density, &self.color].iter().all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
+        [&self.density, &self.color]
+            .iter()
+            .all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
     }
 }
 
 fn project_param<T: Real>(param: &mut Param<T>, gradients: &Gradients<T>, clamp: impl Fn(T) -> T + Sync) {
     match gradients.of(param) {
         None => {}
-        Some(Grad::Dense(_)) => param.update(|values| parallel::for_each_chunk(values, parallel::CHUNK, |_, chunk| chunk.iter_mut().for_each(|v| *v = clamp(*v)))),
+        Some(Grad::Dense(_)) => param
+            .update(|values| parallel::for_each_chunk(values, parallel::CHUNK, |_, chunk| chunk.iter_mut().for_each(|v| *v = clamp(*v)))),
         Some(Grad::Rows(rows)) => {
             let width = rows.width();
-            param.update(|values| parallel::for_each_table_row(values, width, rows.rows(), |_, row| row.iter_mut().for_each(|v| *v = clamp(*v))));
+            param.update(|values| {
+                parallel::for_each_table_row(values, width, rows.rows(), |_, row| row.iter_mut().for_each(|v| *v = clamp(*v)))
+            });
         }
     }
 }

@@ -52,7 +52,11 @@ fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, cells: Cells, stream: u64) 
 /// Panics if the table does not have one row for each node. A grid without cells (a side of one node) has variation 0.
 #[track_caller]
 pub fn total_variation<T: Real>(table: &Tensor<T>, nodes: [usize; 3]) -> Tensor<T> {
-    assert!(table.ndim() == 2 && table.shape()[0] == nodes.iter().product::<usize>(), "total_variation: {nodes:?} nodes, table {:?}", table.shape());
+    assert!(
+        table.ndim() == 2 && table.shape()[0] == nodes.iter().product::<usize>(),
+        "total_variation: {nodes:?} nodes, table {:?}",
+        table.shape()
+    );
     let kernel = TotalVariation { nodes };
     let value = kernel.value(table);
     Tensor::from_kernel(vec![value].into(), &[], &[table], kernel)

@@ -18,7 +18,7 @@ pub struct Picture {
 }
 
 /// Rays rendered at a time: bounds the memory.
-const CHUNK: usize = 8192;
+const CHUNK: usize = 4096;
 
 /// Renders what a camera sees.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {

@@ -206,13 +206,23 @@ impl Config {
     pub fn validate(&self) -> Result<()> {
         let positive = |key: &str, value: f64| check(value > 0.0 && value.is_finite(), key, value, "a number above 0");
         check((1..=64).contains(&self.downscale), "downscale", self.downscale, "1 to 64")?;
-        check(self.background.iter().all(|c| (0.0..=1.0).contains(c)), "background", format!("{:?}", self.background), "three numbers in [0, 1]")?;
+        check(
+            self.background.iter().all(|c| (0.0..=1.0).contains(c)),
+            "background",
+            format!("{:?}", self.background),
+            "three numbers in [0, 1]",
+        )?;
         positive("half_width", self.half_width)?;
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check(self.sh_offset.is_finite(), "sh_offset", self.sh_offset, "a finite number")?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
         check(self.prune_below >= 0.0, "prune_below", self.prune_below, "a number of at least 0")?;
-        check(self.initial.density.is_finite() && self.initial.density >= 0.0, "initial.density", self.initial.density, "a number of at least 0")?;
+        check(
+            self.initial.density.is_finite() && self.initial.density >= 0.0,
+            "initial.density",
+            self.initial.density,
+            "a number of at least 0",
+        )?;
         check(self.initial.color.is_finite(), "initial.color", self.initial.color, "a finite number")?;
         match self.optimizer {
             OptimizerConfig::Sgd => {}
@@ -229,7 +239,12 @@ impl Config {
         }
         check(!self.losses.is_empty(), "losses", "no loss", "at least one, as in `mse = 1.0`")?;
         for (name, weight) in &self.losses {
-            check(loss::NAMES.contains(&name.as_str()), &format!("losses.{name}"), "an unknown loss", &format!("one of {}", loss::NAMES.join(", ")))?;
+            check(
+                loss::NAMES.contains(&name.as_str()),
+                &format!("losses.{name}"),
+                "an unknown loss",
+                &format!("one of {}", loss::NAMES.join(", ")),
+            )?;
             let fits = match *weight {
                 Weight::Constant(w) => w.is_finite() && w >= 0.0,
                 Weight::Exponential { from, to, steps } => from > 0.0 && from.is_finite() && to > 0.0 && to.is_finite() && steps > 0,
@@ -245,7 +260,12 @@ impl Config {
                 (None, Some(steps)) => steps > 0,
                 _ => false,
             };
-            check(length, &key("epochs"), format!("epochs {:?}, steps {:?}", stage.epochs, stage.steps), "exactly one of `epochs` and `steps`, above 0")?;
+            check(
+                length,
+                &key("epochs"),
+                format!("epochs {:?}, steps {:?}", stage.epochs, stage.steps),
+                "exactly one of `epochs` and `steps`, above 0",
+            )?;
             sampling(&key("sampling"), stage.sampling)?;
             for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate)] {
                 check(rate.is_finite() && rate >= 0.0, &key(name), rate, "a number of at least 0")?;

@@ -13,28 +13,16 @@ use std::path::Path;
 
 /// Writes `dataset` to the folder `root`; see [`Dataset::write_blender`].
 pub fn write(dataset: &Dataset, root: &Path, overwrite: bool) -> Result<()> {
-    let occupied =
-        root.exists() && !std::fs::read_dir(root).is_ok_and(|mut entries| entries.next().is_none());
+    let occupied = root.exists() && !std::fs::read_dir(root).is_ok_and(|mut entries| entries.next().is_none());
     if occupied && !overwrite {
-        return Err(Error::input(
-            root,
-            "this is not an empty folder",
-            "choose a new folder or allow overwriting",
-        ));
+        return Err(Error::input(root, "this is not an empty folder", "choose a new folder or allow overwriting"));
     }
     for split in Split::ALL {
         let cameras = dataset.cameras(split);
-        if let Some(odd) = cameras.iter().position(|camera| {
-            !expressible(&camera.intrinsics) || camera.intrinsics != cameras[0].intrinsics
-        }) {
-            let found = format!(
-                "{split} view {odd} has intrinsics the NeRF-synthetic format cannot express"
-            );
-            return Err(Error::input(
-                root,
-                found,
-                "only one camera with square pixels and a centred principal point can be written",
-            ));
+        if let Some(odd) = cameras.iter().position(|camera| !expressible(&camera.intrinsics) || camera.intrinsics != cameras[0].intrinsics)
+        {
+            let found = format!("{split} view {odd} has intrinsics the NeRF-synthetic format cannot express");
+            return Err(Error::input(root, found, "only one camera with square pixels and a centred principal point can be written"));
         }
         files::create_dir(&root.join(split.to_string()))?;
         let views = dataset.load(split, &|_, _| ())?;
@@ -43,10 +31,7 @@ pub fn write(dataset: &Dataset, root: &Path, overwrite: bool) -> Result<()> {
             .map(|view| {
                 let folder = root.join(split.to_string());
                 if let (Split::Test, Some(depth)) = (split, &view.depth) {
-                    image::write_gray16(
-                        &folder.join(format!("{}_depth_0000.png", view.name)),
-                        &millimetres(depth),
-                    )?;
+                    image::write_gray16(&folder.join(format!("{}_depth_0000.png", view.name)), &millimetres(depth))?;
                 }
                 image::write_rgba(&folder.join(format!("{}.png", view.name)), &view.image)
             })
@@ -73,21 +58,10 @@ pub(super) fn rows(pose: &DAffine3) -> [[f64; 4]; 4] {
     let row = |axis: DVec3, offset: f64| [axis.x, axis.y, axis.z, offset];
     let r = pose.matrix3.transpose();
     let t = pose.translation;
-    [
-        row(r.x_axis, t.x),
-        row(r.y_axis, t.y),
-        row(r.z_axis, t.z),
-        [0.0, 0.0, 0.0, 1.0],
-    ]
+    [row(r.x_axis, t.x), row(r.y_axis, t.y), row(r.z_axis, t.z), [0.0, 0.0, 0.0, 1.0]]
 }
 
 /// Distances in thousandths of a world unit, 0 where nothing was hit.
 fn millimetres(depth: &Array2<f32>) -> Array2<u16> {
-    depth.mapv(|t| {
-        if t.is_finite() {
-            (t * 1000.0).round() as u16
-        } else {
-            0
-        }
-    })
+    depth.mapv(|t| if t.is_finite() { (t * 1000.0).round() as u16 } else { 0 })
 }

@@ -23,13 +23,7 @@ impl Bounds {
     /// The bounds of up to [`MOST`] objects.
     pub fn new(objects: &[Object]) -> Self {
         let (none, nothing) = ([0.0; MOST], [f32::NEG_INFINITY; MOST]);
-        let mut bounds = Bounds {
-            x: none,
-            y: none,
-            z: none,
-            radius: nothing,
-            shade: none,
-        };
+        let mut bounds = Bounds { x: none, y: none, z: none, radius: nothing, shade: none };
         for (k, object) in objects.iter().enumerate() {
             let Ball { center, radius } = object.solid.bound();
             [bounds.x[k], bounds.y[k], bounds.z[k]] = center.as_vec3().to_array();
@@ -42,8 +36,7 @@ impl Bounds {
     /// The objects whose balls the ray comes near: within `spread` times the distance, as a cone of rays does.
     #[inline]
     pub fn near(&self, origin: DVec3, direction: DVec3, spread: f32) -> u32 {
-        let ([ox, oy, oz], [dx, dy, dz]) =
-            (origin.as_vec3().to_array(), direction.as_vec3().to_array());
+        let ([ox, oy, oz], [dx, dy, dz]) = (origin.as_vec3().to_array(), direction.as_vec3().to_array());
         let mut hit = [0_u32; MOST];
         for (k, hit) in hit.iter_mut().enumerate() {
             let (x, y, z) = (self.x[k] - ox, self.y[k] - oy, self.z[k] - oz);
@@ -51,15 +44,9 @@ impl Bounds {
             // The cross product, not the difference of two squares, which single precision could not afford.
             let (u, v, w) = (y * dz - z * dy, z * dx - x * dz, x * dy - y * dx);
             let reach = self.radius[k] + spread * (along.abs() + self.radius[k]);
-            *hit = u32::from(
-                (along > -self.radius[k])
-                    & (u * u + v * v + w * w <= reach * reach)
-                    & (reach > 0.0),
-            );
+            *hit = u32::from((along > -self.radius[k]) & (u * u + v * v + w * w <= reach * reach) & (reach > 0.0));
         }
-        hit.iter()
-            .enumerate()
-            .fold(0, |bits, (k, hit)| bits | hit << k)
+        hit.iter().enumerate().fold(0, |bits, (k, hit)| bits | hit << k)
     }
 
     /// The share of the sky that the objects but `own`, taken as balls, leave open to the point `p` with normal `n`: each
@@ -71,8 +58,7 @@ impl Bounds {
         for (k, open) in open.iter_mut().enumerate() {
             let (x, y, z) = (self.x[k] - px, self.y[k] - py, self.z[k] - pz);
             let squared = x * x + y * y + z * z;
-            let blocked =
-                (x * nx + y * ny + z * nz).max(0.0) * self.shade[k] / (squared * squared.sqrt());
+            let blocked = (x * nx + y * ny + z * nz).max(0.0) * self.shade[k] / (squared * squared.sqrt());
             *open = 1.0 - blocked.min(0.85);
         }
         open[own] = 1.0;

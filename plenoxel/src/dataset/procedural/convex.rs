@@ -18,31 +18,13 @@ pub enum Convex {
     /// A sphere with its inside.
     Sphere { center: DVec3, radius: f64 },
     /// A box with the given orthonormal `axes`.
-    Block {
-        center: DVec3,
-        half: DVec3,
-        axes: [DVec3; 3],
-    },
+    Block { center: DVec3, half: DVec3, axes: [DVec3; 3] },
     /// A cylinder with flat ends, `half` long to either side of its middle along the unit `axis`.
-    Cylinder {
-        center: DVec3,
-        axis: DVec3,
-        half: f64,
-        radius: f64,
-    },
+    Cylinder { center: DVec3, axis: DVec3, half: f64, radius: f64 },
     /// The same with round ends beyond the flat ones.
-    Capsule {
-        center: DVec3,
-        axis: DVec3,
-        half: f64,
-        radius: f64,
-    },
+    Capsule { center: DVec3, axis: DVec3, half: f64, radius: f64 },
     /// An upright cone from the disc of `radius` about `base` to the tip `height` above it.
-    Cone {
-        base: DVec3,
-        radius: f64,
-        height: f64,
-    },
+    Cone { base: DVec3, radius: f64, height: f64 },
     /// Everything below a horizontal plane.
     Below { z: f64 },
 }
@@ -58,17 +40,11 @@ pub struct Span {
 
 impl Span {
     /// The whole line.
-    pub const ALL: Span = Span {
-        enter: f64::NEG_INFINITY,
-        exit: f64::INFINITY,
-    };
+    pub const ALL: Span = Span { enter: f64::NEG_INFINITY, exit: f64::INFINITY };
 
     #[inline]
     pub fn overlap(self, other: Span) -> Option<Span> {
-        let both = Span {
-            enter: self.enter.max(other.enter),
-            exit: self.exit.min(other.exit),
-        };
+        let both = Span { enter: self.enter.max(other.enter), exit: self.exit.min(other.exit) };
         (both.enter < both.exit).then_some(both)
     }
 
@@ -78,10 +54,7 @@ impl Span {
         let (Some(a), Some(b)) = (a, b) else {
             return a.or(b);
         };
-        Some(Span {
-            enter: a.enter.min(b.enter),
-            exit: a.exit.max(b.exit),
-        })
+        Some(Span { enter: a.enter.min(b.enter), exit: a.exit.max(b.exit) })
     }
 
     /// Where a coordinate that starts at `o` and changes by `d` per unit of the ray is between -half and half.
@@ -91,10 +64,7 @@ impl Span {
             return (o.abs() <= half).then_some(Span::ALL);
         }
         let (a, b) = ((-half - o) / d, (half - o) / d);
-        Some(Span {
-            enter: a.min(b),
-            exit: a.max(b),
-        })
+        Some(Span { enter: a.min(b), exit: a.max(b) })
     }
 
     /// Between the roots of a t² + 2 b t + c, for a > 0.
@@ -105,10 +75,7 @@ impl Span {
             return None;
         }
         let root = root.sqrt();
-        Some(Span {
-            enter: (-b - root) / a,
-            exit: (-b + root) / a,
-        })
+        Some(Span { enter: (-b - root) / a, exit: (-b + root) / a })
     }
 
     /// The ray's interval in a ball about the origin of `o`.
@@ -134,35 +101,17 @@ impl Convex {
     /// A box turned by `yaw` radians about the vertical.
     pub fn block(center: DVec3, half: DVec3, yaw: f64) -> Self {
         let (sin, cos) = yaw.sin_cos();
-        Convex::Block {
-            center,
-            half,
-            axes: [
-                DVec3::new(cos, sin, 0.0),
-                DVec3::new(-sin, cos, 0.0),
-                DVec3::Z,
-            ],
-        }
+        Convex::Block { center, half, axes: [DVec3::new(cos, sin, 0.0), DVec3::new(-sin, cos, 0.0), DVec3::Z] }
     }
 
     /// A cylinder with flat ends at `a` and `b`.
     pub fn cylinder(a: DVec3, b: DVec3, radius: f64) -> Self {
-        Convex::Cylinder {
-            center: a.midpoint(b),
-            axis: (b - a).normalize(),
-            half: 0.5 * a.distance(b),
-            radius,
-        }
+        Convex::Cylinder { center: a.midpoint(b), axis: (b - a).normalize(), half: 0.5 * a.distance(b), radius }
     }
 
     /// All points within `radius` of the segment from `a` to `b`.
     pub fn capsule(a: DVec3, b: DVec3, radius: f64) -> Self {
-        Convex::Capsule {
-            center: a.midpoint(b),
-            axis: (b - a).normalize(),
-            half: 0.5 * a.distance(b),
-            radius,
-        }
+        Convex::Capsule { center: a.midpoint(b), axis: (b - a).normalize(), half: 0.5 * a.distance(b), radius }
     }
 
     /// The interval in which the ray is inside.
@@ -177,49 +126,25 @@ impl Convex {
                 }
                 Some(span)
             }
-            Convex::Cylinder {
-                center,
-                axis,
-                half,
-                radius,
-            } => {
+            Convex::Cylinder { center, axis, half, radius } => {
                 let o = origin - center;
                 Span::slab(axis.dot(o), axis.dot(d), half)?.overlap(Span::tube(o, d, axis, radius)?)
             }
-            Convex::Capsule {
-                center,
-                axis,
-                half,
-                radius,
-            } => {
+            Convex::Capsule { center, axis, half, radius } => {
                 let o = origin - center;
                 // A ray that misses the infinite tube misses everything in it.
                 let tube = Span::tube(o, d, axis, radius)?;
-                let sides =
-                    Span::slab(axis.dot(o), axis.dot(d), half).and_then(|slab| slab.overlap(tube));
-                let caps = Span::hull(
-                    Span::ball(o - axis * half, d, radius),
-                    Span::ball(o + axis * half, d, radius),
-                );
+                let sides = Span::slab(axis.dot(o), axis.dot(d), half).and_then(|slab| slab.overlap(tube));
+                let caps = Span::hull(Span::ball(o - axis * half, d, radius), Span::ball(o + axis * half, d, radius));
                 Span::hull(caps, sides)
             }
-            Convex::Cone {
-                base,
-                radius,
-                height,
-            } => cone_span(origin - base - DVec3::Z * height, d, radius, height),
+            Convex::Cone { base, radius, height } => cone_span(origin - base - DVec3::Z * height, d, radius, height),
             Convex::Below { z } => {
                 let t = (z - origin.z) / d.z;
                 match d.z {
                     0.0 => (origin.z <= z).then_some(Span::ALL),
-                    rise if rise > 0.0 => Some(Span {
-                        exit: t,
-                        ..Span::ALL
-                    }),
-                    _ => Some(Span {
-                        enter: t,
-                        ..Span::ALL
-                    }),
+                    rise if rise > 0.0 => Some(Span { exit: t, ..Span::ALL }),
+                    _ => Some(Span { enter: t, ..Span::ALL }),
                 }
             }
         }
@@ -232,40 +157,20 @@ impl Convex {
             Convex::Block { center, half, axes } => {
                 let along = axes.map(|axis| axis.dot(p - center));
                 let beyond = |k: usize| along[k].abs() - half[k];
-                let face =
-                    (1..3).fold(0, |face, k| if beyond(k) > beyond(face) { k } else { face });
+                let face = (1..3).fold(0, |face, k| if beyond(k) > beyond(face) { k } else { face });
                 axes[face] * along[face].signum()
             }
-            Convex::Cylinder {
-                center,
-                axis,
-                half,
-                radius,
-            } => {
+            Convex::Cylinder { center, axis, half, radius } => {
                 let along = axis.dot(p - center);
                 let out = p - center - axis * along;
-                if along.abs() - half > out.length() - radius {
-                    axis * along.signum()
-                } else {
-                    out.normalize()
-                }
+                if along.abs() - half > out.length() - radius { axis * along.signum() } else { out.normalize() }
             }
-            Convex::Capsule {
-                center, axis, half, ..
-            } => (p - center - axis * axis.dot(p - center).clamp(-half, half)).normalize(),
-            Convex::Cone {
-                base,
-                radius,
-                height,
-            } => {
+            Convex::Capsule { center, axis, half, .. } => (p - center - axis * axis.dot(p - center).clamp(-half, half)).normalize(),
+            Convex::Cone { base, radius, height } => {
                 let o = p - base;
                 let across = o.truncate().length();
                 let side = (across * height + (o.z - height) * radius) / radius.hypot(height);
-                if -o.z > side {
-                    DVec3::NEG_Z
-                } else {
-                    DVec3::new(o.x * height, o.y * height, across * radius).normalize_or(DVec3::Z)
-                }
+                if -o.z > side { DVec3::NEG_Z } else { DVec3::new(o.x * height, o.y * height, across * radius).normalize_or(DVec3::Z) }
             }
             Convex::Below { .. } => DVec3::Z,
         }
@@ -278,33 +183,17 @@ impl Convex {
             Convex::Sphere { center, radius } => p.distance(center) - radius,
             Convex::Block { center, half, axes } => {
                 let q = axes.map(|axis| axis.dot(p - center));
-                (0..3)
-                    .map(|k| q[k].abs() - half[k])
-                    .fold(f64::NEG_INFINITY, f64::max)
+                (0..3).map(|k| q[k].abs() - half[k]).fold(f64::NEG_INFINITY, f64::max)
             }
-            Convex::Cylinder {
-                center,
-                axis,
-                half,
-                radius,
-            } => {
+            Convex::Cylinder { center, axis, half, radius } => {
                 let along = axis.dot(p - center);
                 ((p - center - axis * along).length() - radius).max(along.abs() - half)
             }
-            Convex::Capsule {
-                center,
-                axis,
-                half,
-                radius,
-            } => {
+            Convex::Capsule { center, axis, half, radius } => {
                 let along = axis.dot(p - center).clamp(-half, half);
                 p.distance(center + axis * along) - radius
             }
-            Convex::Cone {
-                base,
-                radius,
-                height,
-            } => {
+            Convex::Cone { base, radius, height } => {
                 let o = p - base;
                 let slope = radius.hypot(height);
                 ((o.truncate().length() * height + (o.z - height) * radius) / slope).max(-o.z)
@@ -317,39 +206,13 @@ impl Convex {
     pub fn bound(&self) -> Option<Ball> {
         Some(match *self {
             Convex::Sphere { center, radius } => Ball { center, radius },
-            Convex::Block { center, half, .. } => Ball {
-                center,
-                radius: half.length(),
-            },
-            Convex::Cylinder {
-                center,
-                half,
-                radius,
-                ..
-            } => Ball {
-                center,
-                radius: radius.hypot(half),
-            },
-            Convex::Capsule {
-                center,
-                half,
-                radius,
-                ..
-            } => Ball {
-                center,
-                radius: radius + half,
-            },
+            Convex::Block { center, half, .. } => Ball { center, radius: half.length() },
+            Convex::Cylinder { center, half, radius, .. } => Ball { center, radius: radius.hypot(half) },
+            Convex::Capsule { center, half, radius, .. } => Ball { center, radius: radius + half },
             // The ball through the tip and the rim, or the rim's own for a flat cone.
-            Convex::Cone {
-                base,
-                radius,
-                height,
-            } => {
+            Convex::Cone { base, radius, height } => {
                 let up = (0.5 * (height * height - radius * radius) / height).max(0.0);
-                Ball {
-                    center: base + DVec3::Z * up,
-                    radius: (height - up).max(radius.hypot(up)),
-                }
+                Ball { center: base + DVec3::Z * up, radius: (height - up).max(radius.hypot(up)) }
             }
             Convex::Below { .. } => return None,
         })
@@ -367,22 +230,8 @@ fn cone_span(o: DVec3, d: DVec3, radius: f64, height: f64) -> Option<Span> {
     if a.abs() < 1e-12 {
         // Parallel to a line of the cone: one crossing, and the ray is inside on the side where 2 b t + c < 0.
         let t = -0.5 * c / b;
-        let side = if b > 0.0 {
-            Span {
-                exit: t,
-                ..Span::ALL
-            }
-        } else {
-            Span {
-                enter: t,
-                ..Span::ALL
-            }
-        };
-        return if t.is_finite() {
-            side.overlap(slab)
-        } else {
-            None
-        };
+        let side = if b > 0.0 { Span { exit: t, ..Span::ALL } } else { Span { enter: t, ..Span::ALL } };
+        return if t.is_finite() { side.overlap(slab) } else { None };
     }
     if a > 0.0 {
         // Across the cone: inside between the crossings, both on one nappe; the slab removes the upper one.
@@ -390,16 +239,6 @@ fn cone_span(o: DVec3, d: DVec3, radius: f64, height: f64) -> Option<Span> {
     }
     // Steeper than the cone: outside between the crossings, one on each nappe; the lower nappe is the one against z.
     let outside = Span::between_roots(-a, -b, -c)?;
-    let side = if d.z > 0.0 {
-        Span {
-            exit: outside.enter,
-            ..Span::ALL
-        }
-    } else {
-        Span {
-            enter: outside.exit,
-            ..Span::ALL
-        }
-    };
+    let side = if d.z > 0.0 { Span { exit: outside.enter, ..Span::ALL } } else { Span { enter: outside.exit, ..Span::ALL } };
     side.overlap(slab)
 }

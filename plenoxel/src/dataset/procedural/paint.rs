@@ -21,23 +21,11 @@ pub enum Pattern {
     Plain,
     /// Cells of `side` along axes turned about the vertical through `center`, of which `across` is the first; an infinite side
     /// makes stripes.
-    Checker {
-        center: DVec3,
-        across: DVec3,
-        side: DVec3,
-    },
+    Checker { center: DVec3, across: DVec3, side: DVec3 },
     /// Stripes that go `turns` times around the vertical through `center` and `rise` times per unit of height.
-    Spiral {
-        center: DVec3,
-        turns: f64,
-        rise: f64,
-    },
+    Spiral { center: DVec3, turns: f64, rise: f64 },
     /// Meridians and parallels of a globe.
-    Globe {
-        center: DVec3,
-        meridians: f64,
-        belts: f64,
-    },
+    Globe { center: DVec3, meridians: f64, belts: f64 },
 }
 
 impl Pattern {
@@ -46,31 +34,14 @@ impl Pattern {
         let azimuth = |o: DVec3| o.y.atan2(o.x) / TAU;
         let cell = match *self {
             Pattern::Plain => 0.0,
-            Pattern::Checker {
-                center,
-                across,
-                side,
-            } => {
+            Pattern::Checker { center, across, side } => {
                 let o = p - center;
-                let cells =
-                    (dvec3(across.dot(o), across.x * o.y - across.y * o.x, o.z) / side).floor();
+                let cells = (dvec3(across.dot(o), across.x * o.y - across.y * o.x, o.z) / side).floor();
                 cells.x + cells.y + cells.z
             }
-            Pattern::Spiral {
-                center,
-                turns: 0.0,
-                rise,
-            } => (rise * (p.z - center.z)).floor(),
-            Pattern::Spiral {
-                center,
-                turns,
-                rise,
-            } => (turns * azimuth(p - center) + rise * (p.z - center.z)).floor(),
-            Pattern::Globe {
-                center,
-                meridians,
-                belts,
-            } => {
+            Pattern::Spiral { center, turns: 0.0, rise } => (rise * (p.z - center.z)).floor(),
+            Pattern::Spiral { center, turns, rise } => (turns * azimuth(p - center) + rise * (p.z - center.z)).floor(),
+            Pattern::Globe { center, meridians, belts } => {
                 let o = p - center;
                 let polar = (o.z / o.length()).clamp(-1.0, 1.0).acos() / PI;
                 (meridians * azimuth(o)).floor() + (belts * polar).floor()
@@ -82,11 +53,7 @@ impl Pattern {
 
 /// The sky seen in a mirror that reflects into a direction of the given height (cosine to the vertical).
 pub fn sky_color(height: f64) -> DVec3 {
-    let (ground, horizon, zenith) = (
-        dvec3(0.10, 0.06, 0.04),
-        dvec3(0.95, 0.85, 0.72),
-        dvec3(0.22, 0.45, 0.95),
-    );
+    let (ground, horizon, zenith) = (dvec3(0.10, 0.06, 0.04), dvec3(0.95, 0.85, 0.72), dvec3(0.22, 0.45, 0.95));
     if height < 0.15 {
         let s = ((height + 0.55) / 0.7).clamp(0.0, 1.0);
         ground.lerp(horizon, s * s * (3.0 - 2.0 * s))

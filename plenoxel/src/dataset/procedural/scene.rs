@@ -38,25 +38,14 @@ impl Scene {
     /// The built-in still life.
     pub fn still_life() -> Self {
         let objects = objects();
-        let casters = objects
-            .iter()
-            .enumerate()
-            .filter(|(_, object)| object.casts)
-            .fold(0, |bits, (k, _)| bits | 1 << k);
-        Scene {
-            bounds: Bounds::new(&objects),
-            casters,
-            objects,
-        }
+        let casters = objects.iter().enumerate().filter(|(_, object)| object.casts).fold(0, |bits, (k, _)| bits | 1 << k);
+        Scene { bounds: Bounds::new(&objects), casters, objects }
     }
 
     /// Signed distance from `point` to the nearest surface, negative inside solid matter. The sign is exact; outside, the value
     /// never exceeds the true distance.
     pub fn distance(&self, point: DVec3) -> f64 {
-        self.objects
-            .iter()
-            .map(|object| object.solid.distance(point))
-            .fold(f64::INFINITY, f64::min)
+        self.objects.iter().map(|object| object.solid.distance(point)).fold(f64::INFINITY, f64::min)
     }
 
     /// True inside solid matter.
@@ -66,15 +55,13 @@ impl Scene {
 
     /// Distance along the unit ray to the first surface, infinite where there is none.
     pub fn depth(&self, ray: &Ray) -> f64 {
-        self.first(ray.origin, ray.direction, u32::MAX)
-            .map_or(f64::INFINITY, |surface| surface.hit.t)
+        self.first(ray.origin, ray.direction, u32::MAX).map_or(f64::INFINITY, |surface| surface.hit.t)
     }
 
     /// Color in [0, 1] (as stored in an image) where the ray first meets a surface, or `None` where it meets none. It depends on
     /// the direction for glossy surfaces.
     pub fn color(&self, ray: &Ray) -> Option<[f64; 3]> {
-        self.first(ray.origin, ray.direction, u32::MAX)
-            .map(|surface| self.shade(&surface, ray.origin, ray.direction).to_array())
+        self.first(ray.origin, ray.direction, u32::MAX).map(|surface| self.shade(&surface, ray.origin, ray.direction).to_array())
     }
 
     /// The picture `camera` takes, with `supersample` x `supersample` rays per pixel, and the exact depth along the ray of each
@@ -85,10 +72,7 @@ impl Scene {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let mut pixels = vec![0_u8; 4 * width * height];
         let mut depth = vec![f32::INFINITY; width * height];
-        let rows = pixels
-            .par_chunks_mut(4 * width)
-            .zip(depth.par_chunks_mut(width))
-            .enumerate();
+        let rows = pixels.par_chunks_mut(4 * width).zip(depth.par_chunks_mut(width)).enumerate();
         rows.for_each(|(j, (pixels, depth))| {
             for i in 0..width {
                 let candidates = self.candidates(camera, i, j);
@@ -99,38 +83,19 @@ impl Scene {
                 if let Some(surface) = self.first(center.origin, center.direction, candidates) {
                     depth[i] = surface.hit.t as f32;
                 }
-                pixels[4 * i..4 * i + 4].copy_from_slice(&self.pixel(
-                    camera,
-                    i,
-                    j,
-                    supersample,
-                    candidates,
-                ));
+                pixels[4 * i..4 * i + 4].copy_from_slice(&self.pixel(camera, i, j, supersample, candidates));
             }
         });
         // Both buffers have the sizes the constructors ask for, so neither refuses.
         let depth = Array2::from_shape_vec((height, width), depth).unwrap_or_default();
-        (
-            RgbaImage::from_raw(width as u32, height as u32, pixels).unwrap_or_default(),
-            depth,
-        )
+        (RgbaImage::from_raw(width as u32, height as u32, pixels).unwrap_or_default(), depth)
     }
 
-    fn pixel(
-        &self,
-        camera: &Camera,
-        i: usize,
-        j: usize,
-        supersample: usize,
-        candidates: u32,
-    ) -> [u8; 4] {
+    fn pixel(&self, camera: &Camera, i: usize, j: usize, supersample: usize, candidates: u32) -> [u8; 4] {
         let (mut sum, mut hits) = (DVec3::ZERO, 0_usize);
         for k in 0..supersample * supersample {
             let place = |cell: usize| (cell as f64 + 0.5) / supersample as f64;
-            let ray = camera.ray(
-                i as f64 + place(k % supersample),
-                j as f64 + place(k / supersample),
-            );
+            let ray = camera.ray(i as f64 + place(k % supersample), j as f64 + place(k / supersample));
             if let Some(surface) = self.first(ray.origin, ray.direction, candidates) {
                 sum += self.shade(&surface, ray.origin, ray.direction);
                 hits += 1;
@@ -139,10 +104,7 @@ impl Scene {
         if hits == 0 {
             return [0; 4];
         }
-        let [r, g, b] = (sum / hits as f64 * 255.0)
-            .round()
-            .to_array()
-            .map(|value| value as u8);
+        let [r, g, b] = (sum / hits as f64 * 255.0).round().to_array().map(|value| value as u8);
         let alpha = (hits as f64 / (supersample * supersample) as f64 * 255.0).round() as u8;
         [r, g, b, alpha]
     }
@@ -173,14 +135,9 @@ impl Scene {
     /// True if anything lies between `point`, on an object facing the light, and the key light.
     fn shadowed(&self, point: DVec3, light: DVec3, own: usize) -> bool {
         // A convex solid cannot shade its own lit side.
-        let others = if self.objects[own].solid.convex() {
-            !(1 << own)
-        } else {
-            u32::MAX
-        };
+        let others = if self.objects[own].solid.convex() { !(1 << own) } else { u32::MAX };
         let near = self.casters & others & self.bounds.near(point, light, 0.0);
-        members(near, &self.objects)
-            .any(|(_, object)| object.solid.first_hit(point, light).is_some())
+        members(near, &self.objects).any(|(_, object)| object.solid.first_hit(point, light).is_some())
     }
 
     /// Lambert under a key light with shadows, a fill light and a sky darkened by neighbours; on glossy paint, broad
@@ -190,41 +147,22 @@ impl Scene {
         let fill = dvec3(-0.75, 0.35, 0.56).normalize();
         let (object, n) = (&self.objects[surface.object], surface.hit.normal);
         let p = origin + surface.hit.t * direction;
-        let paint = if surface.hit.carved {
-            &object.lining
-        } else {
-            &object.skin
-        };
+        let paint = if surface.hit.carved { &object.lining } else { &object.skin };
         let albedo = paint.colors[usize::from(paint.pattern.second(p))];
 
         let toward = n.dot(key);
-        let lit = if toward > 0.0 && !self.shadowed(p + OFFSET * n, key, surface.object) {
-            1.0
-        } else {
-            0.0
-        };
-        let sky = self.bounds.open_sky(p, n, surface.object)
-            * if surface.hit.carved {
-                object.openness
-            } else {
-                1.0
-            };
-        let ambient =
-            sky * (dvec3(0.26, 0.20, 0.16).lerp(dvec3(0.38, 0.42, 0.50), 0.5 + 0.5 * n.z));
-        let diffuse = lit * toward.max(0.0) * dvec3(1.02, 0.95, 0.82)
-            + n.dot(fill).max(0.0) * sky * dvec3(0.14, 0.17, 0.24);
+        let lit = if toward > 0.0 && !self.shadowed(p + OFFSET * n, key, surface.object) { 1.0 } else { 0.0 };
+        let sky = self.bounds.open_sky(p, n, surface.object) * if surface.hit.carved { object.openness } else { 1.0 };
+        let ambient = sky * (dvec3(0.26, 0.20, 0.16).lerp(dvec3(0.38, 0.42, 0.50), 0.5 + 0.5 * n.z));
+        let diffuse = lit * toward.max(0.0) * dvec3(1.02, 0.95, 0.82) + n.dot(fill).max(0.0) * sky * dvec3(0.14, 0.17, 0.24);
         let mut color = albedo * (ambient + diffuse);
         if paint.gloss > 0.0 {
             let facing = (-n.dot(direction)).max(0.0);
-            let highlight = |light: DVec3, power: i32| {
-                (light - direction).normalize().dot(n).max(0.0).powi(power)
-            };
+            let highlight = |light: DVec3, power: i32| (light - direction).normalize().dot(n).max(0.0).powi(power);
             let fresnel = 0.10 + 0.55 * (1.0 - facing).powi(3);
             let mirrored = sky_color((direction - 2.0 * n.dot(direction) * n).z);
-            let shine = lit * highlight(key, 16) * dvec3(0.85, 0.80, 0.72)
-                + highlight(fill, 12) * dvec3(0.10, 0.13, 0.20);
-            color = color * (1.0 - paint.gloss * fresnel)
-                + paint.gloss * (fresnel * sky * mirrored + shine);
+            let shine = lit * highlight(key, 16) * dvec3(0.85, 0.80, 0.72) + highlight(fill, 12) * dvec3(0.10, 0.13, 0.20);
+            color = color * (1.0 - paint.gloss * fresnel) + paint.gloss * (fresnel * sky * mirrored + shine);
         }
         // A square root stands for the display's gamma: a picture stores values as the eye wants them.
         color.clamp(DVec3::ZERO, DVec3::ONE).map(f64::sqrt)
@@ -248,12 +186,7 @@ mod tests {
     use crate::camera::Intrinsics;
 
     fn camera(eye: DVec3) -> Camera {
-        Camera::look_at(
-            eye.normalize() * 4.03,
-            DVec3::ZERO,
-            DVec3::Z,
-            Intrinsics::from_fov_x(48, 48, 0.6911),
-        )
+        Camera::look_at(eye.normalize() * 4.03, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(48, 48, 0.6911))
     }
 
     #[test]
@@ -271,10 +204,7 @@ mod tests {
     #[test]
     fn hollows_are_empty_although_no_silhouette_shows_it() {
         let scene = Scene::still_life();
-        assert!(
-            !scene.occupied(dvec3(-0.47, -0.40, TABLE + 0.2))
-                && scene.occupied(dvec3(-0.47, -0.40, TABLE + 0.01))
-        );
+        assert!(!scene.occupied(dvec3(-0.47, -0.40, TABLE + 0.2)) && scene.occupied(dvec3(-0.47, -0.40, TABLE + 0.01)));
         let block = dvec3(0.46, 0.50, TABLE + 0.31);
         assert!(!scene.occupied(block + DVec3::Z * 0.2) && scene.occupied(block));
     }
@@ -290,18 +220,9 @@ mod tests {
             if t.is_finite() {
                 seen += 1;
                 // f32 keeps a distance of 4 to 2.4e-7.
-                assert!(
-                    scene
-                        .distance(ray.origin + f64::from(t) * ray.direction)
-                        .abs()
-                        < 1e-6
-                );
+                assert!(scene.distance(ray.origin + f64::from(t) * ray.direction).abs() < 1e-6);
                 for k in 1..40 {
-                    assert!(
-                        !scene.occupied(
-                            ray.origin + f64::from(t) * f64::from(k) / 40.0 * ray.direction
-                        )
-                    );
+                    assert!(!scene.occupied(ray.origin + f64::from(t) * f64::from(k) / 40.0 * ray.direction));
                 }
             } else if image.get_pixel(i as u32, j as u32).0[3] == 0 {
                 assert!(scene.depth(&ray).is_infinite());
@@ -318,10 +239,7 @@ mod tests {
             let candidates = scene.candidates(&camera, i, j);
             for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.4, 0.7)] {
                 let ray = camera.ray(i as f64 + dx, j as f64 + dy);
-                let (some, all) = (
-                    scene.first(ray.origin, ray.direction, candidates),
-                    scene.first(ray.origin, ray.direction, u32::MAX),
-                );
+                let (some, all) = (scene.first(ray.origin, ray.direction, candidates), scene.first(ray.origin, ray.direction, u32::MAX));
                 assert_eq!(some.map(|found| found.hit.t), all.map(|found| found.hit.t));
             }
         }
@@ -331,13 +249,7 @@ mod tests {
     fn only_glossy_paint_depends_on_the_direction_of_view() {
         let scene = Scene::still_life();
         let seen = |target: DVec3, from: DVec3| {
-            scene
-                .color(&Ray {
-                    origin: target + 2.0 * from.normalize(),
-                    direction: -from.normalize(),
-                    stretch: 1.0,
-                })
-                .unwrap()
+            scene.color(&Ray { origin: target + 2.0 * from.normalize(), direction: -from.normalize(), stretch: 1.0 }).unwrap()
         };
         let difference = |target: DVec3, a: DVec3, b: DVec3| {
             let (a, b) = (seen(target, a), seen(target, b));

@@ -20,17 +20,9 @@ pub struct Hit {
 #[derive(Debug, Clone)]
 pub enum Solid {
     /// What all of `body` share, without what any of `holes` covers.
-    Carved {
-        body: Vec<Convex>,
-        holes: Vec<Convex>,
-    },
+    Carved { body: Vec<Convex>, holes: Vec<Convex> },
     /// A ring of tube radius `tube` about the circle of `radius` around the unit `axis`.
-    Torus {
-        center: DVec3,
-        axis: DVec3,
-        radius: f64,
-        tube: f64,
-    },
+    Torus { center: DVec3, axis: DVec3, radius: f64, tube: f64 },
 }
 
 impl Solid {
@@ -53,12 +45,8 @@ impl Solid {
                 let mut t = inside.enter;
                 // Jump over each hole that covers the present point, until none does.
                 let covering = |t: f64| {
-                    let spans = holes
-                        .iter()
-                        .filter_map(|hole| Some((hole, hole.span(origin, direction)?)));
-                    spans
-                        .into_iter()
-                        .find(|(_, span)| span.enter <= t && t < span.exit)
+                    let spans = holes.iter().filter_map(|hole| Some((hole, hole.span(origin, direction)?)));
+                    spans.into_iter().find(|(_, span)| span.enter <= t && t < span.exit)
                 };
                 while let Some((hole, span)) = covering(t.max(0.0)) {
                     (t, surface) = (span.exit, (Some(hole), true));
@@ -68,18 +56,9 @@ impl Solid {
                 }
                 let (piece, carved) = (surface.0?, surface.1);
                 let outward = piece.normal(origin + t * direction);
-                Some(Hit {
-                    t,
-                    normal: if carved { -outward } else { outward },
-                    carved,
-                })
+                Some(Hit { t, normal: if carved { -outward } else { outward }, carved })
             }
-            Solid::Torus {
-                center,
-                axis,
-                radius,
-                tube,
-            } => torus_hit(origin - center, direction, *axis, *radius, *tube),
+            Solid::Torus { center, axis, radius, tube } => torus_hit(origin - center, direction, *axis, *radius, *tube),
         }
     }
 
@@ -87,20 +66,10 @@ impl Solid {
     pub fn distance(&self, p: DVec3) -> f64 {
         match self {
             Solid::Carved { body, holes } => {
-                let outside = body
-                    .iter()
-                    .map(|piece| piece.distance(p))
-                    .fold(f64::NEG_INFINITY, f64::max);
-                holes
-                    .iter()
-                    .fold(outside, |distance, hole| distance.max(-hole.distance(p)))
+                let outside = body.iter().map(|piece| piece.distance(p)).fold(f64::NEG_INFINITY, f64::max);
+                holes.iter().fold(outside, |distance, hole| distance.max(-hole.distance(p)))
             }
-            Solid::Torus {
-                center,
-                axis,
-                radius,
-                tube,
-            } => torus_distance(p - center, *axis, *radius, *tube).0,
+            Solid::Torus { center, axis, radius, tube } => torus_distance(p - center, *axis, *radius, *tube).0,
         }
     }
 
@@ -113,23 +82,10 @@ impl Solid {
     pub fn bound(&self) -> Ball {
         match self {
             Solid::Carved { body, .. } => {
-                let all = Ball {
-                    center: DVec3::ZERO,
-                    radius: f64::INFINITY,
-                };
-                body.iter()
-                    .filter_map(Convex::bound)
-                    .fold(all, |a, b| if b.radius < a.radius { b } else { a })
+                let all = Ball { center: DVec3::ZERO, radius: f64::INFINITY };
+                body.iter().filter_map(Convex::bound).fold(all, |a, b| if b.radius < a.radius { b } else { a })
             }
-            Solid::Torus {
-                center,
-                radius,
-                tube,
-                ..
-            } => Ball {
-                center: *center,
-                radius: radius + tube,
-            },
+            Solid::Torus { center, radius, tube, .. } => Ball { center: *center, radius: radius + tube },
         }
     }
 }
@@ -166,11 +122,7 @@ fn torus_hit(o: DVec3, d: DVec3, axis: DVec3, radius: f64, tube: f64) -> Option<
                 t -= distance / closing;
                 t -= torus_distance(o + t * d, axis, radius, tube).0 / closing;
                 let normal = torus_distance(o + t * d, axis, radius, tube).1;
-                return (t > 0.0).then_some(Hit {
-                    t,
-                    normal,
-                    carved: false,
-                });
+                return (t > 0.0).then_some(Hit { t, normal, carved: false });
             }
             // Leaving, or gliding past: a step that keeps the ray moving.
             t += 1e-5;
@@ -189,56 +141,23 @@ mod tests {
 
     fn solids() -> Vec<Solid> {
         let at = DVec3::new(0.1, -0.2, 0.3);
-        let convex = |piece: Convex| Solid::Carved {
-            body: vec![piece],
-            holes: vec![],
-        };
-        let hole = Convex::Sphere {
-            center: at + DVec3::X * 0.5,
-            radius: 0.35,
-        };
+        let convex = |piece: Convex| Solid::Carved { body: vec![piece], holes: vec![] };
+        let hole = Convex::Sphere { center: at + DVec3::X * 0.5, radius: 0.35 };
         vec![
-            convex(Convex::Sphere {
-                center: at,
-                radius: 0.6,
-            }),
+            convex(Convex::Sphere { center: at, radius: 0.6 }),
             convex(Convex::block(at, DVec3::new(0.5, 0.3, 0.4), 0.4)),
             convex(Convex::cylinder(at, DVec3::new(-0.3, 0.4, 0.9), 0.25)),
             convex(Convex::capsule(at, DVec3::new(-0.5, 0.4, 0.9), 0.15)),
-            convex(Convex::Cone {
-                base: at - DVec3::Z * 0.5,
-                radius: 0.5,
-                height: 1.1,
-            }),
+            convex(Convex::Cone { base: at - DVec3::Z * 0.5, radius: 0.5, height: 1.1 }),
             Solid::Carved {
-                body: vec![
-                    Convex::Sphere {
-                        center: at,
-                        radius: 0.7,
-                    },
-                    Convex::Below { z: 0.4 },
-                ],
-                holes: vec![Convex::Sphere {
-                    center: at,
-                    radius: 0.6,
-                }],
+                body: vec![Convex::Sphere { center: at, radius: 0.7 }, Convex::Below { z: 0.4 }],
+                holes: vec![Convex::Sphere { center: at, radius: 0.6 }],
             },
             Solid::Carved {
                 body: vec![Convex::block(at, DVec3::splat(0.5), 0.2)],
-                holes: vec![
-                    hole,
-                    Convex::Sphere {
-                        center: at,
-                        radius: 0.3,
-                    },
-                ],
+                holes: vec![hole, Convex::Sphere { center: at, radius: 0.3 }],
             },
-            Solid::Torus {
-                center: at,
-                axis: DVec3::new(0.3, 0.4, 1.0).normalize(),
-                radius: 0.5,
-                tube: 0.1,
-            },
+            Solid::Torus { center: at, axis: DVec3::new(0.3, 0.4, 1.0).normalize(), radius: 0.5, tube: 0.1 },
         ]
     }
 
@@ -274,32 +193,17 @@ mod tests {
                         Some(hit) => {
                             hits += 1;
                             let place = origin + hit.t * direction;
+                            assert!((hit.t - t).abs() < 1e-6 || nearest < 1e-6, "solid {which}, ray {k}: {} against {t}", hit.t);
+                            assert!(solid.distance(place).abs() < 1e-8, "solid {which}: not on the surface");
+                            assert!((hit.normal.length() - 1.0).abs() < 1e-6 && hit.normal.dot(direction) < 1e-6);
                             assert!(
-                                (hit.t - t).abs() < 1e-6 || nearest < 1e-6,
-                                "solid {which}, ray {k}: {} against {t}",
-                                hit.t
-                            );
-                            assert!(
-                                solid.distance(place).abs() < 1e-8,
-                                "solid {which}: not on the surface"
-                            );
-                            assert!(
-                                (hit.normal.length() - 1.0).abs() < 1e-6
-                                    && hit.normal.dot(direction) < 1e-6
-                            );
-                            assert!(
-                                solid.distance(place + 1e-5 * hit.normal) > 0.0
-                                    && solid.distance(place - 1e-5 * hit.normal) < 0.0
+                                solid.distance(place + 1e-5 * hit.normal) > 0.0 && solid.distance(place - 1e-5 * hit.normal) < 0.0
                                     || nearest < 1e-6
                                     || edge(solid, place)
                             );
                         }
                         None => assert!(
-                            t > 6.0
-                                || nearest > -1e-7
-                                    && nearest.abs() < 1e-4
-                                    && t > 0.0
-                                    && grazing(solid, origin, direction),
+                            t > 6.0 || nearest > -1e-7 && nearest.abs() < 1e-4 && t > 0.0 && grazing(solid, origin, direction),
                             "solid {which}, ray {k}: missed at {t}"
                         ),
                     }
@@ -317,10 +221,8 @@ mod tests {
     /// True close to an edge, where a step along the normal may cross another face.
     fn edge(solid: &Solid, p: DVec3) -> bool {
         let h = 1e-4;
-        let gradient = DVec3::from_array(
-            [DVec3::X, DVec3::Y, DVec3::Z]
-                .map(|e| (solid.distance(p + h * e) - solid.distance(p - h * e)) / (2.0 * h)),
-        );
+        let gradient =
+            DVec3::from_array([DVec3::X, DVec3::Y, DVec3::Z].map(|e| (solid.distance(p + h * e) - solid.distance(p - h * e)) / (2.0 * h)));
         (gradient.length() - 1.0).abs() > 1e-3
     }
 
@@ -337,9 +239,7 @@ mod tests {
     #[test]
     fn a_ray_that_starts_on_a_wall_and_leaves_meets_nothing() {
         let bowl = &solids()[5];
-        let hit = bowl
-            .first_hit(DVec3::new(0.1, -0.2, 3.0), DVec3::NEG_Z)
-            .unwrap();
+        let hit = bowl.first_hit(DVec3::new(0.1, -0.2, 3.0), DVec3::NEG_Z).unwrap();
         assert!(hit.carved && (hit.t - 3.3).abs() < 1e-12); // the hole's lowest point: 0.3 - 0.6 = -0.3
         let wall = DVec3::new(0.1, -0.2, 3.0 - hit.t) + 1e-6 * hit.normal;
         assert!(bowl.first_hit(wall, DVec3::Z).is_none());
