@@ -3,13 +3,13 @@
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Error;
-use plenoxel::field::voxel_grid::{Interpolation, VoxelGrid};
+use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::loss::Objective;
 use plenoxel::metrics::psnr;
+use plenoxel::render::RenderOptions;
 use plenoxel::render::picture::picture;
-use plenoxel::render::{Engine, RenderOptions};
 use plenoxel::sampling::Jitter;
-use plenoxel::train::config::{ColorKind, Config, Initial, OptimizerConfig, Sampling, Stage, Weight};
+use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Sampling, Stage, Weight};
 use plenoxel::train::{Report, Trainer};
 use std::collections::BTreeMap;
 
@@ -35,28 +35,7 @@ fn stage(resolution: usize, steps: u64) -> Stage {
 }
 
 fn config() -> Config {
-    Config {
-        seed: 42,
-        downscale: 1,
-        validation_every: 0,
-        background: [1.0; 3],
-        half_width: 1.5,
-        interpolation: Interpolation::Trilinear,
-        color: ColorKind::Rgb,
-        sh_degree: 0,
-        sh_offset: 0.5,
-        engine: Engine::Graph,
-        rays_per_step: 512,
-        jitter: true,
-        project: false,
-        prune_from_stage: None,
-        prune_below: 0.0,
-        initial: Initial { density: 0.1, color: 0.5, random: false },
-        optimizer: OptimizerConfig::LazyAdam { beta1: 0.9, beta2: 0.99, epsilon: 1e-12 },
-        losses: BTreeMap::from([("mse".to_owned(), Weight::Constant(1.0))]),
-        stages: vec![stage(8, 60), stage(16, 120)],
-        evaluation: Sampling::Step { step: 0.5 },
-    }
+    Config { color: ColorKind::Rgb, rays_per_step: 512, stages: vec![stage(8, 60), stage(16, 120)], ..Config::default() }
 }
 
 fn run(config: Config, views: &[View]) -> (VoxelGrid<f32>, Vec<Report>) {

@@ -5,7 +5,7 @@
 //! A kernel in a differentiable pass is replaced by its reference: the new nodes have the largest ids and are popped next.
 
 use crate::gradients::{Grad, Gradients, RowSparse};
-use crate::graph::{self, Node, Rule, no_grad};
+use crate::graph::{self, Node, Rule};
 use crate::index::{self, Indices};
 use crate::op::{Cotangent, GradSink, KernelCall, Vjp};
 use crate::parallel;
@@ -63,25 +63,24 @@ pub fn value_and_grad<T: Real>(f: impl FnOnce() -> Tensor<T>) -> (T, Gradients<T
     (value, to_leaves(root, seed))
 }
 
-/// First derivatives of ⟨seed, root⟩ to every leaf. Owning the root, it frees what it has passed.
+/// First derivatives of ⟨seed, root⟩ to every leaf. Owning the root, it frees what it has passed. Rules see constants here, so nothing is
+/// recorded.
 pub(crate) fn to_leaves<T: Real>(root: Option<Arc<Node<T>>>, seed: Tensor<T>) -> Gradients<T> {
-    no_grad(|| {
-        let mut pass = Pass { tracked: false, needed: None, pending: HashMap::new(), heap: BinaryHeap::new() };
-        let mut by_leaf = HashMap::new();
-        if let Some(root) = root {
-            pass.push(root, Pending::Dense(seed));
+    let mut pass = Pass { tracked: false, needed: None, pending: HashMap::new(), heap: BinaryHeap::new() };
+    let mut by_leaf = HashMap::new();
+    if let Some(root) = root {
+        pass.push(root, Pending::Dense(seed));
+    }
+    while let Some((node, pending)) = pass.pop() {
+        if matches!(node.rule, Rule::Leaf) {
+            by_leaf.insert(node.id, pending.finish(&node.shape));
+        } else {
+            // A row gradient that arrives at an op is made dense: look up first and apply activations after.
+            let cotangent = pending.dense(&node.shape);
+            pass.spread(node, cotangent);
         }
-        while let Some((node, pending)) = pass.pop() {
-            if matches!(node.rule, Rule::Leaf) {
-                by_leaf.insert(node.id, pending.finish(&node.shape));
-            } else {
-                // A row gradient that arrives at an op is made dense: look up first and apply activations after.
-                let cotangent = pending.dense(&node.shape);
-                pass.spread(node, cotangent);
-            }
-        }
-        Gradients { by_leaf }
-    })
+    }
+    Gradients { by_leaf }
 }
 
 struct Pass<T: Real> {

@@ -30,7 +30,7 @@ impl<T: Real> RowSparse<T> {
     pub fn new(shape: &[usize], rows: Buffer<u32>, values: Buffer<T>) -> Self {
         let width: usize = shape[1..].iter().product();
         assert_eq!(rows.len() * width, values.len(), "RowSparse: {} rows of {width} values got {} values", rows.len(), values.len());
-        debug_assert!(rows.is_sorted_by(|a, b| a < b), "RowSparse: rows must be sorted and unique");
+        assert!(rows.is_sorted_by(|a, b| a < b), "RowSparse: rows must be sorted and unique");
         assert!(rows.last().is_none_or(|&last| (last as usize) < shape[0]), "RowSparse: a row lies beyond the table of {} rows", shape[0]);
         RowSparse { shape: IxDyn(shape), rows, values }
     }

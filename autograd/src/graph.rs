@@ -71,6 +71,9 @@ pub(crate) fn recording() -> bool {
 }
 
 /// Runs `f` without recording a graph, on this thread. Evaluation does not need it: ops on constants record nothing anyway.
+///
+/// While `f` waits for a parallel op, rayon may run another task on this thread. Do not build graphs in tasks of rayon's that run beside a
+/// `no_grad`.
 pub fn no_grad<R>(f: impl FnOnce() -> R) -> R {
     struct Restore(bool);
     impl Drop for Restore {

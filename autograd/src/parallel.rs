@@ -124,7 +124,7 @@ pub fn copy<E: Copy + Send + Sync>(source: &[E], out: &mut [E]) {
 
 /// `out[i] = f(x[i])`
 pub fn map<T: Real>(x: &[T], out: &mut [T], f: impl Fn(T) -> T + Sync) {
-    for_each_chunk(out, CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
+    for_each_chunk(out, 4 * CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
 }
 
 /// `out[i] = f(x[i], y[i])`

@@ -20,8 +20,6 @@ pub const PRESETS: [(&str, &str, &str); 3] = [
     ("paper", "\"Plenoxels and extension to point clouds\", bugs repaired", include_str!("../presets/paper.toml")),
 ];
 
-const DEFAULTS: &str = include_str!("../presets/defaults.toml");
-
 /// A configuration in the making.
 #[derive(Debug)]
 pub struct Layers {
@@ -34,7 +32,8 @@ impl Layers {
     /// The defaults alone.
     pub fn defaults() -> Result<Self> {
         let mut layers = Layers { table: Table::new(), places: Vec::new() };
-        layers.text(DEFAULTS, &|_| "the defaults".to_owned())?;
+        let text = toml::to_string(&Config::default()).map_err(|e| Error::config("the defaults", e, "a defect of the program"))?;
+        layers.text(&text, &|_| "the defaults".to_owned())?;
         Ok(layers)
     }
 

@@ -46,7 +46,7 @@ impl Estimate {
                 OptimizerConfig::Momentum { .. } | OptimizerConfig::RmsProp { .. } => 1,
                 OptimizerConfig::LazyAdam { .. } => 2,
             };
-        let rays = config.rays_per_step as u64;
+        let rays = config.rays_per_update() as u64;
         let step = config.stages.iter().map(|stage| {
             let shape = config.grid_shape(stage.resolution);
             let samples = rays * mean_samples(stage.sampling, &shape);
@@ -166,7 +166,7 @@ fn mean_samples(sampling: Sampling, shape: &GridShape) -> u64 {
     let side = 2.0 * shape.half_width;
     let samples = match sampling {
         Sampling::Step { step } => side / (step * shape.voxel_side()),
-        Sampling::Points { samples, far } => side / (far / samples as f64),
+        Sampling::Points { samples, far } => (side / (far / samples as f64)).min(samples as f64),
     };
     samples.ceil() as u64 + 1
 }

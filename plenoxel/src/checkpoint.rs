@@ -18,7 +18,9 @@ pub const FORMAT: &str = "plenoxel 1";
 /// Where a voxel's value sits and what it means, in words.
 pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; \
     sigma = max(0, density) after interpolation, per world length; \
-    harmonics as in svox2: R, G, B blocks; 1, -y, z, -x, xy, -yz, 2zz-xx-yy, -xz, xx-yy; max(0, offset + sum)";
+    harmonics in the order and signs of svox2, blocks of R, G, B: \
+    1, -y, z, -x, xy, -yz, 2zz-xx-yy, -xz, xx-yy, -y(3xx-yy), xyz, -y(4zz-xx-yy), z(2zz-3xx-3yy), -x(4zz-xx-yy), z(xx-yy), -x(xx-3yy), \
+    orthonormal over the sphere; color = max(0, offset + sum)";
 /// Key of the metadata.
 const KEY: &str = "plenoxel";
 
@@ -54,6 +56,9 @@ pub struct Header {
 }
 
 impl Header {
+    /// The frame of the dataset itself.
+    const IDENTITY: [[f64; 4]; 4] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+
     /// The header of a grid.
     pub fn new<T: Real>(grid: &VoxelGrid<T>, scene: &str, background: [f32; 3], seed: u64, step: u64) -> Self {
         let shape = grid.shape();
@@ -61,8 +66,6 @@ impl Header {
             Color::Rgb => (None, 0.0),
             Color::Sh { degree, offset } => (Some(degree), offset),
         };
-        let mut identity = [[0.0; 4]; 4];
-        (0..4).for_each(|i| identity[i][i] = 1.0);
         Header {
             format: FORMAT.to_owned(),
             convention: CONVENTION.to_owned(),
@@ -72,7 +75,7 @@ impl Header {
             sh_degree,
             sh_offset,
             background,
-            scene_transform: identity,
+            scene_transform: Self::IDENTITY,
             scene: scene.to_owned(),
             seed,
             step,
@@ -128,7 +131,14 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     }
     let header: Header = serde_json::from_str(text).map_err(unreadable)?;
     let degree_known = header.sh_degree.is_none_or(|d| d <= crate::field::sh::MAX_DEGREE);
-    if !((1..=4096).contains(&header.resolution) && degree_known && header.half_width > 0.0 && header.half_width.is_finite()) {
+    if header.scene_transform != Header::IDENTITY {
+        return Err(Error::input(
+            path,
+            "a grid that is not in the frame of its dataset",
+            "this version reads grids whose scene_transform is the identity",
+        ));
+    }
+    if !((1..=1024).contains(&header.resolution) && degree_known && header.half_width > 0.0 && header.half_width.is_finite()) {
         return Err(Error::input(path, "a header with impossible values", retrain));
     }
     let shape = header.shape();
@@ -147,5 +157,8 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     };
     let channels = shape.color.channels();
     let grid = VoxelGrid::from_tables(shape, table("density", 1, &[n, n, n])?, table("color", channels, &[n, n, n, channels])?);
+    if !grid.is_finite() {
+        return Err(Error::input(path, "numbers that are not finite", retrain));
+    }
     Ok((grid, header))
 }

@@ -32,3 +32,8 @@ pub mod rays;
 pub mod render;
 pub mod sampling;
 pub mod train;
+
+/// The code of the repository's front page is compiled and run with the tests.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct FrontPage;

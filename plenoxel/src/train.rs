@@ -59,13 +59,22 @@ pub struct Trainer<'a, T: Real> {
     objective: Objective<T>,
     grid: VoxelGrid<T>,
     optimizer: Box<dyn Optimizer<T>>,
-    occupancy: Option<Occupancy>,
+    empty: Option<EmptySpace>,
     step: u64,
+}
+
+/// What pruning leaves.
+struct EmptySpace {
+    /// Voxels that may hold matter; all others stay at density 0.
+    kept: Occupancy,
+    /// Voxels in which a sample can read a kept one.
+    looked_at: Occupancy,
 }
 
 impl<'a, T: Real> Trainer<'a, T> {
     /// A run from its beginning, with the losses that the config names.
     pub fn new(config: Config, views: &'a [View]) -> Result<Self> {
+        config.validate()?;
         let objective = objective(&config)?;
         Self::with_objective(config, views, objective)
     }
@@ -82,7 +91,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             .stages
             .iter()
             .map(|&stage| {
-                let steps = stage.step_count(rays.len(), config.rays_per_step);
+                let steps = stage.step_count(rays.len(), config.rays_per_update());
                 first += steps;
                 PlannedStage { stage, first: first - steps, steps }
             })
@@ -94,7 +103,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        Ok(Trainer { config, plan, rays, objective, grid, optimizer, occupancy: None, step: 0 })
+        Ok(Trainer { config, plan, rays, objective, grid, optimizer, empty: None, step: 0 })
     }
 
     /// The grid as it is now.
@@ -136,13 +145,14 @@ impl<'a, T: Real> Trainer<'a, T> {
         if self.step == plan.first {
             self.begin(index);
         }
-        let batch = self.rays.batch::<T>(self.step * self.config.rays_per_step as u64, self.config.rays_per_step);
+        let rays = self.config.rays_per_update();
+        let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
         let options = RenderOptions {
             aabb: self.grid.aabb(),
             spacing: plan.stage.sampling.spacing(self.grid.shape().voxel_side()),
             jitter: if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None },
             background: self.config.background,
-            occupancy: self.occupancy.as_ref(),
+            occupancy: self.empty.as_ref().map(|empty| &empty.looked_at),
         };
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
@@ -152,7 +162,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             let step = Step { number: self.step, seed: self.config.seed, batch: &batch, rendered: &rendered, grid: &self.grid };
             let (total, values) = self.objective.evaluate(&step);
             losses = values.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
-            total
+            if self.config.updates_per_step == 1 { total } else { total / self.config.updates_per_step as f64 }
         });
         let loss = loss.as_f64();
         if !loss.is_finite() {
@@ -163,6 +173,9 @@ impl<'a, T: Real> Trainer<'a, T> {
         self.optimizer.step(&mut self.grid, &gradients, in_stage);
         if self.config.project {
             self.grid.project(&gradients);
+        }
+        if let Some(empty) = &self.empty {
+            self.grid.clear_touched_outside(&gradients, &empty.kept);
         }
         let ends_stage = in_stage + 1 == plan.steps;
         if ends_stage && !self.grid.is_finite() {
@@ -187,16 +200,19 @@ impl<'a, T: Real> Trainer<'a, T> {
     /// What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
     fn begin(&mut self, index: usize) {
         let plan = &self.plan[index];
-        if plan.stage.resolution != self.grid.shape().resolution {
-            self.grid = self.grid.resample(plan.stage.resolution);
-            release_free_buffers();
-        }
+        // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, plan);
-        self.occupancy = None;
+        self.empty = None;
+        if plan.stage.resolution != self.grid.shape().resolution {
+            release_free_buffers();
+            self.grid = self.grid.resample(plan.stage.resolution);
+        }
         if self.config.prune_from_stage.is_some_and(|first| index >= first) {
-            let occupancy = self.grid.occupancy(self.config.prune_below);
-            self.grid.clear_outside(&occupancy);
-            self.occupancy = Some(occupancy);
+            let kept = self.grid.occupancy(self.config.prune_below);
+            self.grid.clear_outside(&kept);
+            // A sample beside a kept voxel reads it, so training looks there as evaluation will.
+            let looked_at = self.grid.reached_from(&kept);
+            self.empty = Some(EmptySpace { kept, looked_at });
         }
     }
 
@@ -207,6 +223,9 @@ impl<'a, T: Real> Trainer<'a, T> {
 
 /// The losses that a config names.
 pub fn objective<T: Real>(config: &Config) -> Result<Objective<T>> {
+    if config.losses.is_empty() {
+        return Err(Error::config("losses", "no loss", "at least one, as in `mse = 1.0`"));
+    }
     config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| match *weight {
         Weight::Constant(weight) => objective.with_named(name, weight),
         Weight::Exponential { from, to, steps } => objective.with_named(name, Exponential::new(from, to, steps)),

@@ -119,13 +119,13 @@ impl<T: Real> Tensor<T> {
     /// max(x, y), elementwise with broadcasting. Where they are equal the gradient goes to x.
     #[track_caller]
     pub fn maximum(&self, other: &Self) -> Self {
-        binary("maximum", self, other, Extremum { largest: true }, |x, y| if x >= y { x } else { y })
+        binary("maximum", self, other, Extremum { largest: true }, |x, y| if x >= y || x.is_nan() { x } else { y })
     }
 
     /// min(x, y), elementwise with broadcasting. Where they are equal the gradient goes to x.
     #[track_caller]
     pub fn minimum(&self, other: &Self) -> Self {
-        binary("minimum", self, other, Extremum { largest: false }, |x, y| if x <= y { x } else { y })
+        binary("minimum", self, other, Extremum { largest: false }, |x, y| if x <= y || x.is_nan() { x } else { y })
     }
 
     /// (self · other) summed down to `shape`: what the cotangent of a broadcast product is.

@@ -82,8 +82,8 @@ elementwise! {
     /// y = ln(1 + eˣ), computed as max(x, 0) + ln(1 + e^−|x|).   ∂L/∂x = ∂L/∂y · sigmoid x
     @exponential softplus, Softplus, Keep::INPUTS, |x: T| x.max(T::zero()) + (-x.abs()).exp_::<FUSED>().ln_1p(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sigmoid();
 
-    /// y = max(x, 0); the gradient passes where x >= 0.
-    relu, Relu, Keep::INPUTS, |x: T| if x >= T::zero() { x } else { T::zero() }, |cx: &Vjp<'_, T>| {
+    /// y = max(x, 0), NaN staying NaN; the gradient passes where x >= 0.
+    relu, Relu, Keep::INPUTS, |x: T| if x < T::zero() { T::zero() } else { x }, |cx: &Vjp<'_, T>| {
         let x = cx.input(0).detach();
         cx.cotangent() * x.greater_equal(&Tensor::scalar(T::zero()))
     };

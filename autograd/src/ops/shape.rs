@@ -6,7 +6,7 @@ use crate::parallel;
 use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
-use ndarray::{ArrayViewD, Axis, Dimension, IxDyn, Slice};
+use ndarray::{Dimension, IxDyn};
 
 /// The same values in another shape.   ∂L/∂x = ∂L/∂y in the old shape
 #[derive(Debug)]
@@ -280,13 +280,6 @@ impl<T: Real> Tensor<T> {
         }
         let parts: Vec<Tensor<T>> = parts.iter().map(|p| p.unsqueeze(axis)).collect();
         Self::concat(&parts.iter().collect::<Vec<_>>(), axis)
-    }
-
-    /// Part of the value along the first axis as an array view; for reading results.
-    pub fn rows_view(&self, range: std::ops::Range<usize>) -> ArrayViewD<'_, T> {
-        let mut view = self.value();
-        view.slice_axis_inplace(Axis(0), Slice::from(range));
-        view
     }
 }
 

@@ -181,8 +181,20 @@ impl<T: Real> VoxelGrid<T> {
     /// The voxels in which a sample can have positive density: those whose own value, or with trilinear look-up a neighbour's, is above
     /// `threshold`. With threshold 0, leaving out the samples elsewhere changes no rendered value.
     pub fn occupancy(&self, threshold: f64) -> Occupancy {
-        let (n, threshold) = (self.shape.resolution, T::lit(threshold));
-        let density = self.density.tensor().data();
+        let (density, threshold) = (self.density.tensor().data(), T::lit(threshold));
+        self.reached(|row| density[row] > threshold)
+    }
+
+    /// The voxels in which a sample can read one of `kept`: the same with nearest look-up, their neighbours too with trilinear.
+    ///
+    /// Panics if it has other cells than this grid has voxels.
+    pub fn reached_from(&self, kept: &Occupancy) -> Occupancy {
+        assert_eq!(kept.cells(), self.nodes(), "reached_from: occupancy of another grid");
+        self.reached(|row| kept.mask()[row])
+    }
+
+    fn reached(&self, full: impl Fn(usize) -> bool + Sync) -> Occupancy {
+        let n = self.shape.resolution;
         let mut mask = vec![false; n * n * n];
         let reach = usize::from(self.shape.interpolation == Interpolation::Trilinear);
         parallel::for_each_chunk(&mut mask, n * n, |start, slab| {
@@ -190,7 +202,7 @@ impl<T: Real> VoxelGrid<T> {
             let i = start / (n * n);
             for (cell, m) in slab.iter_mut().enumerate() {
                 let (j, k) = (cell / n, cell % n);
-                *m = around(i).any(|a| around(j).any(|b| density[(a * n + b) * n..][around(k)].iter().any(|&d| d > threshold)));
+                *m = around(i).any(|a| around(j).any(|b| around(k).any(|c| full((a * n + b) * n + c))));
             }
         });
         Occupancy::new(self.aabb(), self.nodes(), mask)
@@ -207,6 +219,24 @@ impl<T: Real> VoxelGrid<T> {
                 chunk.iter_mut().zip(&mask[start..]).filter(|(_, m)| !**m).for_each(|(d, _)| *d = T::zero());
             });
         });
+    }
+
+    /// The same for the rows that `gradients` touched: what an optimizer moved out there goes back to 0.
+    pub fn clear_touched_outside(&mut self, gradients: &Gradients<T>, occupancy: &Occupancy) {
+        match gradients.of(&self.density) {
+            None => {}
+            Some(Grad::Dense(_)) => self.clear_outside(occupancy),
+            Some(Grad::Rows(rows)) => {
+                let (rows, mask) = (rows.rows(), occupancy.mask());
+                self.density.update(|density| {
+                    parallel::for_each_table_row(density, 1, rows, |k, row| {
+                        if !mask[rows[k] as usize] {
+                            row[0] = T::zero();
+                        }
+                    });
+                });
+            }
+        }
     }
 
     /// True if every stored number is finite.

@@ -102,7 +102,7 @@ impl TotalVariation {
         self.nodes.iter().map(|n| n - 1).product::<usize>() * width
     }
 
-    /// Calls `f` with the four lines of each (x, y) of slab x that has forward neighbours: itself, its x neighbour, its y neighbour.
+    /// The line of nodes at (i, j), that of its x neighbour and that of its y neighbour.
     fn lines<'a, T>(&self, table: &'a [T], width: usize, i: usize, j: usize) -> [&'a [T]; 3] {
         let line = self.line(width);
         let at = |i: usize, j: usize| &table[(i * self.nodes[1] + j) * line..][..line];

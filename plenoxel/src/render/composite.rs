@@ -40,9 +40,9 @@ pub fn composite<T: Real>(samples: Samples<T>, radiance: Radiance<T>, background
     let tau = &radiance.sigma * &samples.delta;
     let transmittance = (-tau.segment_exclusive_sum(offsets)).exp();
     let weights = transmittance * tau.one_minus_exp_neg();
-    let depth_in_all = tau.segment_sum(offsets);
-    let opacity = depth_in_all.one_minus_exp_neg();
-    let log_transmittance = -depth_in_all;
+    let optical_depth = tau.segment_sum(offsets);
+    let opacity = optical_depth.one_minus_exp_neg();
+    let log_transmittance = -optical_depth;
     let rgb = (weights.unsqueeze(1) * &radiance.rgb).segment_sum(offsets) + log_transmittance.exp().unsqueeze(1) * background;
     Rendered { rgb, opacity, log_transmittance, samples: PerSample { weights, radiance, samples } }
 }

@@ -37,12 +37,15 @@ pub struct Config {
     pub engine: Engine,
     /// Rays in a step.
     pub rays_per_step: usize,
+    /// The rays of a step are taken in this many parts, each with an update of its own by the part's share of the step's gradient: the
+    /// same length of step for each ray, without many rays pushing one voxel too far at once.
+    pub updates_per_step: usize,
     /// Shift the samples of each training ray by a random fraction of a step.
     pub jitter: bool,
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
     pub project: bool,
-    /// From this stage on (counted from 0), voxels whose density is at most `prune_below` at the stage's start, with all their
-    /// neighbours, are never looked at again.
+    /// From this stage on (counted from 0), voxels that at the stage's start have, with all their neighbours, a density of at most
+    /// `prune_below` are emptied, stay empty during the stage, and are not looked at.
     pub prune_from_stage: Option<usize>,
     /// Density, 1 / world length, at which a voxel counts as empty when pruning.
     pub prune_below: f64,
@@ -135,7 +138,7 @@ pub struct Stage {
     /// Length in epochs over all training pixels; exactly one of `epochs` and `steps` is given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub epochs: Option<f64>,
-    /// Length in steps.
+    /// Length in updates.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub steps: Option<u64>,
     /// Where samples lie.
@@ -172,6 +175,14 @@ pub enum Sampling {
 }
 
 impl Sampling {
+    /// The most samples that a ray can take through a grid.
+    fn most(self, resolution: usize) -> f64 {
+        match self {
+            Sampling::Step { step } => 3f64.sqrt() * resolution as f64 / step + 2.0,
+            Sampling::Points { samples, .. } => samples as f64,
+        }
+    }
+
     /// The spacing for voxels of a side.
     pub fn spacing(self, voxel_side: f64) -> Spacing {
         match self {
@@ -182,17 +193,67 @@ impl Sampling {
 }
 
 impl Stage {
-    /// Steps of this stage when an epoch has `rays` rays.
-    pub fn step_count(&self, rays: u64, rays_per_step: usize) -> u64 {
+    /// Updates of this stage when an epoch has `rays` rays and an update takes `rays_per_update` of them.
+    pub fn step_count(&self, rays: u64, rays_per_update: usize) -> u64 {
         match (self.steps, self.epochs) {
             (Some(steps), _) => steps,
-            (None, Some(epochs)) => ((epochs * rays as f64 / rays_per_step as f64).round() as u64).max(1),
+            (None, Some(epochs)) => ((epochs * rays as f64 / rays_per_update as f64).round() as u64).max(1),
             (None, None) => 0,
         }
     }
 }
 
+/// A recipe for small scenes of about unit size, photographed from all sides over white: what presets and files change.
+impl Default for Config {
+    fn default() -> Self {
+        let stage = |resolution, steps, density_rate, rate_decay| Stage {
+            resolution,
+            epochs: None,
+            steps: Some(steps),
+            // svox2: half a voxel.
+            sampling: Sampling::Step { step: 0.5 },
+            density_rate,
+            color_rate: 0.03,
+            rate_decay,
+        };
+        Config {
+            seed: 42,
+            downscale: 1,
+            validation_every: 20,
+            background: [1.0; 3],
+            // World units: svox2 and nerfstudio on NeRF-synthetic scenes.
+            half_width: 1.5,
+            interpolation: Interpolation::Trilinear,
+            color: ColorKind::Sh,
+            // svox2: degree 2, and zero coefficients are gray.
+            sh_degree: 2,
+            sh_offset: 0.5,
+            engine: Engine::Graph,
+            rays_per_step: 4096,
+            updates_per_step: 1,
+            jitter: true,
+            project: false,
+            prune_from_stage: None,
+            prune_below: 0.2,
+            // svox2's start: thin gray fog.
+            initial: Initial { density: 0.1, color: 0.0, random: false },
+            // Gradients of a mean over 4096 rays are small: the usual 1e-8 would damp them.
+            optimizer: OptimizerConfig::LazyAdam { beta1: 0.9, beta2: 0.99, epsilon: 1e-12 },
+            losses: BTreeMap::from([("mse".to_owned(), Weight::Constant(1.0))]),
+            // Ours, chosen on validation views of the built-in scene: densities move by about one unit a step, so that a voxel is opaque or
+            // empty within a few dozen steps, colors by 0.03; the last stage settles.
+            stages: vec![stage(16, 200, 1.0, 1.0), stage(32, 200, 1.0, 1.0), stage(64, 300, 1.5, 1.0), stage(128, 600, 2.0, 0.2)],
+            evaluation: Sampling::Step { step: 0.5 },
+        }
+    }
+}
+
 impl Config {
+    /// Rays of one update.
+    pub fn rays_per_update(&self) -> usize {
+        self.rays_per_step / self.updates_per_step
+    }
+
     /// The grid of a stage.
     pub fn grid_shape(&self, resolution: usize) -> GridShape {
         let color = match self.color {
@@ -216,6 +277,8 @@ impl Config {
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check(self.sh_offset.is_finite(), "sh_offset", self.sh_offset, "a finite number")?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
+        let divides = self.updates_per_step > 0 && self.rays_per_step.is_multiple_of(self.updates_per_step);
+        check(divides, "updates_per_step", self.updates_per_step, "a divisor of rays_per_step")?;
         check(self.prune_below >= 0.0, "prune_below", self.prune_below, "a number of at least 0")?;
         check(
             self.initial.density.is_finite() && self.initial.density >= 0.0,
@@ -237,7 +300,6 @@ impl Config {
                 positive("optimizer.epsilon", epsilon)?;
             }
         }
-        check(!self.losses.is_empty(), "losses", "no loss", "at least one, as in `mse = 1.0`")?;
         for (name, weight) in &self.losses {
             check(
                 loss::NAMES.contains(&name.as_str()),
@@ -256,21 +318,25 @@ impl Config {
             let key = |name: &str| format!("stages[{i}].{name}");
             check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels a side")?;
             let length = match (stage.epochs, stage.steps) {
-                (Some(epochs), None) => epochs > 0.0 && epochs.is_finite(),
-                (None, Some(steps)) => steps > 0,
+                (Some(epochs), None) => epochs > 0.0 && epochs <= 1e6,
+                (None, Some(steps)) => (1..=1_000_000_000).contains(&steps),
                 _ => false,
             };
-            check(
-                length,
-                &key("epochs"),
-                format!("epochs {:?}, steps {:?}", stage.epochs, stage.steps),
-                "exactly one of `epochs` and `steps`, above 0",
-            )?;
+            let found = format!("epochs {:?}, steps {:?}", stage.epochs, stage.steps);
+            check(length, &key("epochs"), found, "exactly one of `epochs`, above 0 to 1e6, and `steps`, 1 to 1e9")?;
             sampling(&key("sampling"), stage.sampling)?;
             for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate)] {
-                check(rate.is_finite() && rate >= 0.0, &key(name), rate, "a number of at least 0")?;
+                check(rate == 0.0 || (1e-30..=1e30).contains(&rate), &key(name), rate, "0, or 1e-30 to 1e30")?;
             }
-            positive(&key("rate_decay"), stage.rate_decay)?;
+            check((1e-6..=1e6).contains(&stage.rate_decay), &key("rate_decay"), stage.rate_decay, "1e-6 to 1e6")?;
+            // Samples of a batch are counted in 32 bits.
+            let samples = stage.sampling.most(stage.resolution) * self.rays_per_step as f64;
+            check(
+                samples < f64::from(u32::MAX),
+                &key("sampling"),
+                format!("up to {samples:.0} samples in a step"),
+                "below 4294967295: longer steps or fewer rays",
+            )?;
         }
         sampling("evaluation", self.evaluation)
     }
@@ -281,7 +347,7 @@ fn sampling(key: &str, sampling: Sampling) -> Result<()> {
         Sampling::Step { step } => check((0.01..=100.0).contains(&step), &format!("{key}.step"), step, "0.01 to 100 voxel sides"),
         Sampling::Points { samples, far } => {
             check((2..=100_000).contains(&samples), &format!("{key}.samples"), samples, "2 to 100000")?;
-            check(far > 0.0 && far.is_finite(), &format!("{key}.far"), far, "a number above 0")
+            check((1e-6..=1e6).contains(&far), &format!("{key}.far"), far, "1e-6 to 1e6")
         }
     }
 }
