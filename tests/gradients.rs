@@ -5,7 +5,7 @@
 
 mod support;
 
-use autograd::{Gradcheck, Tensor, grad};
+use autograd::{Gradcheck, Tensor, check_kernel, grad};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation};
 use plenoxel::field::{Field, sh};
 use plenoxel::geometry::Aabb;
@@ -105,6 +105,18 @@ fn total_variation_over_all_cells_is_the_sampled_one_over_a_run_of_all() {
         approx::assert_relative_eq!(a.item(), b.item(), epsilon = 1e-12);
         let (ga, gb) = (a.backward().array(&x), b.backward().array(&x));
         assert!(ga.iter().zip(&gb).all(|(a, b)| (a - b).abs() < 1e-12));
+    }
+}
+
+#[test]
+fn the_kernel_of_total_variation_agrees_with_its_reference_in_both_precisions() {
+    for width in [1, 3, 4, 27] {
+        for nodes in [[5, 4, 6], [2, 2, 2]] {
+            let table = numbers(&[nodes.iter().product(), width], -1.0, 1.0, 33);
+            check_kernel::<f64>(|x| loss::total_variation(&x[0], nodes), [table.clone()], 1e-12).unwrap_or_else(|e| panic!("{e}"));
+            check_kernel::<f32>(|x| loss::total_variation(&x[0], nodes), [table.mapv(|x| x as f32)], 1e-5)
+                .unwrap_or_else(|e| panic!("{e}"));
+        }
     }
 }
 

@@ -74,8 +74,10 @@ fn a_small_scene_is_learned() {
 #[test]
 fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
     let train = views(Split::Train);
-    let mut short = config();
-    short.stages = vec![stage(8, 8), stage(12, 8)];
+    // Large enough that batches, tables and losses are cut into many chunks.
+    let mut short = Config { rays_per_step: 4096, color: ColorKind::Sh, sh_degree: 1, prune_from_stage: Some(1), ..config() };
+    short.initial.random = true;
+    short.stages = vec![stage(24, 3), stage(40, 3)];
     short.losses.insert("tv_density_sampled".to_owned(), Weight::Constant(1e-3));
     short.losses.insert("tv_color".to_owned(), Weight::Exponential { from: 1e-3, to: 1e-4, steps: 16 });
     let bits = |threads: usize, seed: u64| {
@@ -90,6 +92,23 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
         assert!(bits(threads, 42) == one, "{threads} threads differ from one");
     }
     assert!(bits(2, 43) != one, "another seed is another run");
+}
+
+#[test]
+fn a_pruned_run_is_trained_on_all_that_evaluation_sees() {
+    let train = views(Split::Train);
+    let config = Config { prune_from_stage: Some(1), prune_below: 0.2, ..config() };
+    let mut trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
+    while trainer.step().expect("finite numbers").is_some() {}
+    let looked_at = trainer.occupancy().expect("space was pruned");
+    assert!(looked_at.fraction() < 0.9, "{} of the voxels are looked at", looked_at.fraction());
+    let grid = trainer.grid();
+    let spacing = config.evaluation.spacing(grid.shape().voxel_side());
+    let everywhere = RenderOptions { aabb: grid.aabb(), spacing, jitter: Jitter::None, background: [1.0; 3], occupancy: None };
+    let there = RenderOptions { occupancy: Some(looked_at), ..everywhere.clone() };
+    for view in views(Split::Test) {
+        assert_eq!(picture(grid, &view.camera, &everywhere).rgb, picture(grid, &view.camera, &there).rgb);
+    }
 }
 
 #[test]
@@ -129,7 +148,10 @@ fn a_loss_that_is_not_finite_stops_the_run_with_its_step() {
 fn a_config_with_an_impossible_value_names_its_key() {
     let train = views(Split::Train);
     type Break = fn(&mut Config);
-    let broken: [(&str, Break); 7] = [
+    let broken: [(&str, Break); 10] = [
+        ("stages[0].rate_decay", |c| c.stages[0].rate_decay = 1e-100),
+        ("stages[0].density_rate", |c| c.stages[0].density_rate = 1e-300),
+        ("stages[0].epochs", |c| (c.stages[0].steps, c.stages[0].epochs) = (None, Some(1e30))),
         ("half_width", |c| c.half_width = 0.0),
         ("sh_degree", |c| c.sh_degree = 4),
         ("rays_per_step", |c| c.rays_per_step = 0),

@@ -46,7 +46,7 @@ impl Estimate {
                 OptimizerConfig::Momentum { .. } | OptimizerConfig::RmsProp { .. } => 1,
                 OptimizerConfig::LazyAdam { .. } => 2,
             };
-        let rays = config.rays_per_update() as u64;
+        let rays = config.rays_per_step as u64;
         let step = config.stages.iter().map(|stage| {
             let shape = config.grid_shape(stage.resolution);
             let samples = rays * mean_samples(stage.sampling, &shape);

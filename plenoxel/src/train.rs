@@ -91,7 +91,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             .stages
             .iter()
             .map(|&stage| {
-                let steps = stage.step_count(rays.len(), config.rays_per_update());
+                let steps = stage.step_count(rays.len(), config.rays_per_step);
                 first += steps;
                 PlannedStage { stage, first: first - steps, steps }
             })
@@ -114,6 +114,11 @@ impl<'a, T: Real> Trainer<'a, T> {
     /// The trained grid.
     pub fn into_grid(self) -> VoxelGrid<T> {
         self.grid
+    }
+
+    /// The voxels that training looks at in this stage; `None` if none are left out.
+    pub fn occupancy(&self) -> Option<&Occupancy> {
+        self.empty.as_ref().map(|empty| &empty.looked_at)
     }
 
     /// The config.
@@ -145,14 +150,14 @@ impl<'a, T: Real> Trainer<'a, T> {
         if self.step == plan.first {
             self.begin(index);
         }
-        let rays = self.config.rays_per_update();
+        let rays = self.config.rays_per_step;
         let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
         let options = RenderOptions {
             aabb: self.grid.aabb(),
             spacing: plan.stage.sampling.spacing(self.grid.shape().voxel_side()),
             jitter: if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None },
             background: self.config.background,
-            occupancy: self.empty.as_ref().map(|empty| &empty.looked_at),
+            occupancy: self.occupancy(),
         };
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
@@ -162,7 +167,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             let step = Step { number: self.step, seed: self.config.seed, batch: &batch, rendered: &rendered, grid: &self.grid };
             let (total, values) = self.objective.evaluate(&step);
             losses = values.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
-            if self.config.updates_per_step == 1 { total } else { total / self.config.updates_per_step as f64 }
+            total
         });
         let loss = loss.as_f64();
         if !loss.is_finite() {

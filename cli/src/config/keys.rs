@@ -20,7 +20,6 @@ const TABLES: &[(&str, &[&str])] = &[
             "sh_offset",
             "engine",
             "rays_per_step",
-            "updates_per_step",
             "jitter",
             "project",
             "prune_from_stage",

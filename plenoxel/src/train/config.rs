@@ -37,9 +37,6 @@ pub struct Config {
     pub engine: Engine,
     /// Rays in a step.
     pub rays_per_step: usize,
-    /// The rays of a step are taken in this many parts, each with an update of its own by the part's share of the step's gradient: the
-    /// same length of step for each ray, without many rays pushing one voxel too far at once.
-    pub updates_per_step: usize,
     /// Shift the samples of each training ray by a random fraction of a step.
     pub jitter: bool,
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
@@ -138,7 +135,7 @@ pub struct Stage {
     /// Length in epochs over all training pixels; exactly one of `epochs` and `steps` is given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub epochs: Option<f64>,
-    /// Length in updates.
+    /// Length in steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub steps: Option<u64>,
     /// Where samples lie.
@@ -193,11 +190,11 @@ impl Sampling {
 }
 
 impl Stage {
-    /// Updates of this stage when an epoch has `rays` rays and an update takes `rays_per_update` of them.
-    pub fn step_count(&self, rays: u64, rays_per_update: usize) -> u64 {
+    /// Steps of this stage when an epoch has `rays` rays.
+    pub fn step_count(&self, rays: u64, rays_per_step: usize) -> u64 {
         match (self.steps, self.epochs) {
             (Some(steps), _) => steps,
-            (None, Some(epochs)) => ((epochs * rays as f64 / rays_per_update as f64).round() as u64).max(1),
+            (None, Some(epochs)) => ((epochs * rays as f64 / rays_per_step as f64).round() as u64).max(1),
             (None, None) => 0,
         }
     }
@@ -230,7 +227,6 @@ impl Default for Config {
             sh_offset: 0.5,
             engine: Engine::Graph,
             rays_per_step: 4096,
-            updates_per_step: 1,
             jitter: true,
             project: false,
             prune_from_stage: None,
@@ -249,11 +245,6 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Rays of one update.
-    pub fn rays_per_update(&self) -> usize {
-        self.rays_per_step / self.updates_per_step
-    }
-
     /// The grid of a stage.
     pub fn grid_shape(&self, resolution: usize) -> GridShape {
         let color = match self.color {
@@ -277,8 +268,6 @@ impl Config {
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check(self.sh_offset.is_finite(), "sh_offset", self.sh_offset, "a finite number")?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
-        let divides = self.updates_per_step > 0 && self.rays_per_step.is_multiple_of(self.updates_per_step);
-        check(divides, "updates_per_step", self.updates_per_step, "a divisor of rays_per_step")?;
         check(self.prune_below >= 0.0, "prune_below", self.prune_below, "a number of at least 0")?;
         check(
             self.initial.density.is_finite() && self.initial.density >= 0.0,
