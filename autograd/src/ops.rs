@@ -1,4 +1,4 @@
-//! Every op, by file. Each is a function on [`crate::Tensor`], a rule beside it, and a row of the table in `tests/gradcheck.rs`.
+//! Every op, by file. Each is a function on [`crate::Tensor`], a rule beside it, and a row of the table in `tests/gradcheck/rows.rs`.
 //!
 //! | file | ops | gradient of the inputs |
 //! | --- | --- | --- |

@@ -6,8 +6,8 @@
 use crate::real::Real;
 use rayon::prelude::*;
 
-/// Compiles a function for several instruction sets and picks the best at run time. All of them round alike: see [`Real`].
-/// Builds with debug assertions, in which the tests run, have the portable version only, which gives the same bits: every crate that uses
+/// Compiles a function for several instruction sets and picks the best at run time. Their results differ at most in the last place of an exponential: see [`fused`].
+/// Builds with debug assertions, in which the tests run, have the portable version only: every crate that uses
 /// a generic loop compiles it anew, and four versions of each would take minutes.
 macro_rules! dispatched {
     ($(#[$meta:meta])* $visibility:vis fn $($rest:tt)*) => {

@@ -107,7 +107,7 @@ fn learn(
     let mut metrics = MetricsFile::create(&folder.metrics(), total)?;
     let mut progress = console.training(&plan, config.prune_from_stage);
     let (mut losses, mut stages) = (Vec::new(), Vec::new());
-    let title = format!("Training loss of {}", folder.path().display());
+    let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
     loop {
         let report = match clock.time(|| trainer.step()) {
             Ok(Some(report)) => report,
