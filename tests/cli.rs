@@ -344,7 +344,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
 fn numbers_that_are_not_finite_end_the_run_and_leave_the_metrics_but_no_checkpoint() {
     let folder = Folder::new("nan");
     let run = folder.path("run");
-    let diverging = ["--set", "optimizer={kind=\"sgd\"}", "--set", "stages[1].color_rate=1e38"];
+    let diverging = ["--set", "optimizer={kind=\"sgd\"}", "--set", "stages[1].color_rate=1e30"];
     train(&run, &diverging).refused(4, &["step ", "rates"]);
     let metrics = fs::read_to_string(format!("{run}/metrics.jsonl")).unwrap();
     assert!(metrics.lines().count() > 5, "the first stage is there");

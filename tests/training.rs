@@ -141,7 +141,7 @@ fn a_loss_that_is_not_finite_stops_the_run_with_its_step() {
     let mut trainer = Trainer::<f32>::with_objective(config(), &train, objective).expect("a valid config");
     let error = (0..10).find_map(|_| trainer.step().err()).expect("it stops");
     assert!(matches!(error, Error::Numeric { .. }) && error.exit_code() == 4);
-    assert!(error.to_string().contains("step 3") && error.to_string().contains("bad inf"), "{error}");
+    assert!(error.to_string().contains("step 3") && error.to_string().contains("inf"), "{error}");
 }
 
 #[test]

@@ -272,7 +272,7 @@ mod tests {
         let mut config = preset("paper").resolve().unwrap();
         config.background = [1.0 / 3.0, 0.1, 2.0 / 3.0];
         config.half_width = 4.0 / 3.0;
-        config.stages[0].density_rate = 1e-300;
+        config.stages[0].density_rate = 1e-29 / 3.0;
         write(&path, &config, "").unwrap();
         assert_eq!(read(&path).unwrap(), config);
         std::fs::remove_file(path).unwrap();
