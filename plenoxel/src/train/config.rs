@@ -236,7 +236,7 @@ impl Default for Config {
             // Gradients of a mean over 4096 rays are small: the usual 1e-8 would damp them.
             optimizer: OptimizerConfig::LazyAdam { beta1: 0.9, beta2: 0.99, epsilon: 1e-12 },
             losses: BTreeMap::from([("mse".to_owned(), Weight::Constant(1.0))]),
-            // Ours, chosen on validation views of the built-in scene: densities move by about one unit a step, so that a voxel is opaque or
+            // Ours, a first guess and not tuned: densities move by about one unit a step, so that a voxel is opaque or
             // empty within a few dozen steps, colors by 0.03; the last stage settles.
             stages: vec![stage(16, 200, 1.0, 1.0), stage(32, 200, 1.0, 1.0), stage(64, 300, 1.5, 1.0), stage(128, 600, 2.0, 0.2)],
             evaluation: Sampling::Step { step: 0.5 },
