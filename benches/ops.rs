@@ -44,6 +44,10 @@ fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str) {
 }
 
 fn main() {
+    support::on_the_pool(run);
+}
+
+fn run() {
     let args = arguments();
     let picks: Indices = numbers(PICKS, 7).iter().map(|x| ((x * ROWS as f32) as u32).min(ROWS as u32 - 1)).collect::<Vec<_>>().into();
     for width in [4, 28] {

@@ -7,14 +7,22 @@ use autograd::{Tensor, no_grad};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::field::{Field, Radiance};
 use plenoxel::geometry::Aabb;
-use plenoxel::render::{RenderOptions, Rendered, render};
+use plenoxel::render::{Engine, RenderOptions, Rendered, render};
 use plenoxel::sampling::{Jitter, Samples, Spacing};
 use support::{ray, rays};
 
 const CUBE: f64 = 1.0;
 
 fn options(spacing: Spacing, jitter: Jitter) -> RenderOptions<'static> {
-    RenderOptions { aabb: Aabb::cube(CUBE), spacing, jitter, background: [0.2, 0.4, 0.6], occupancy: None }
+    RenderOptions {
+        aabb: Aabb::cube(CUBE),
+        spacing,
+        jitter,
+        background: [0.2, 0.4, 0.6],
+        occupancy: None,
+        engine: Engine::default(),
+        stop_below: 0.0,
+    }
 }
 
 /// Density σ and color c in the whole box.
@@ -142,8 +150,9 @@ fn distortion_in_linear_time_equals_the_double_sum() {
         1.0,
         5,
     );
-    let rendered = render(&grid, &rays(), &options(Spacing::Step(0.2), Jitter::None));
-    let s = &rendered.samples;
+    let options = RenderOptions { engine: Engine::Graph, ..options(Spacing::Step(0.2), Jitter::None) };
+    let rendered = render(&grid, &rays(), &options);
+    let s = rendered.samples().expect("the graph keeps them");
     let (w, t, d) = (s.weights.data(), s.samples.t.data(), s.samples.delta.data());
     for r in 0..rays().len() {
         let own = s.samples.offsets[r] as usize..s.samples.offsets[r + 1] as usize;
@@ -164,9 +173,23 @@ fn leaving_out_empty_voxels_changes_no_pixel() {
     let occupancy = grid.occupancy(0.0);
     let plain = options(Spacing::Step(0.07), Jitter::None);
     let skipping = RenderOptions { occupancy: Some(&occupancy), ..plain.clone() };
-    let (a, b) = (render(&grid, &rays(), &plain), render(&grid, &rays(), &skipping));
-    assert!(b.samples.samples.len() < a.samples.samples.len());
-    for (a, b) in a.rgb.data().iter().zip(b.rgb.data()) {
-        assert_relative_eq!(a, b, epsilon = 1e-14);
+    // And a grid that does not have its empty voxels at all, against one where they are 0.
+    let zeros = Tensor::from_vec(grid.density.tensor().data().iter().map(|d| d.max(0.0)).collect(), grid.density.shape());
+    let zeros = VoxelGrid::from_tables(shape, zeros, random.color.tensor().detach());
+    let sparse = zeros.pruned(&zeros.voxels_where(|row| zeros.density.tensor().data()[row] > 0.0));
+    assert!(sparse.lattice().present() < 12 * 12 * 12 / 5);
+    for engine in [Engine::Graph, Engine::Fused] {
+        let [plain, skipping] = [&plain, &skipping].map(|options| RenderOptions { engine, ..options.clone() });
+        let (whole, part) = (render(&grid, &rays(), &plain), render(&grid, &rays(), &skipping));
+        assert!(part.sample_count < whole.sample_count);
+        for (a, b) in whole.rgb.data().iter().zip(part.rgb.data()) {
+            assert_relative_eq!(a, b, epsilon = 1e-14);
+        }
+        // Its colors are gone too, its densities were nothing.
+        let (whole, part) = (render(&zeros, &rays(), &plain), render(&sparse, &rays(), &plain));
+        assert!(part.sample_count < whole.sample_count);
+        for (a, b) in whole.opacity.data().iter().zip(part.opacity.data()) {
+            assert_relative_eq!(a, b, epsilon = 1e-14);
+        }
     }
 }

@@ -18,7 +18,7 @@ fn sampled(n: usize, f: impl Fn([f64; 3]) -> f64) -> VoxelGrid<f64> {
     let values: Vec<f64> = centers(n).into_iter().map(f).collect();
     let color =
         Tensor::stack(&[0.1, 0.2, 0.3].map(|s| Tensor::from_vec(values.iter().map(|v| s * v).collect(), &[n * n * n])).each_ref(), 1);
-    VoxelGrid::from_tables(shape, Tensor::from_vec(values, &[n * n * n, 1]), color)
+    VoxelGrid::from_row_major(shape, &Tensor::from_vec(values, &[n * n * n, 1]), &color)
 }
 
 #[test]
@@ -29,10 +29,11 @@ fn resampling_a_trilinear_function_is_exact_between_the_old_centres() {
     for n in [3, 5, 8, 10] {
         let new = old.resample(n);
         // The hull of the old centres is ±0.8; beyond it the field repeats its border.
-        for (at, &got) in centers(n).into_iter().zip(new.density.tensor().data()) {
+        let [density, color] = new.to_row_major();
+        for (at, &got) in centers(n).into_iter().zip(density.data()) {
             assert_relative_eq!(got, f(at.map(|x| x.clamp(-0.8, 0.8))), epsilon = 1e-12);
         }
-        for (row, &d) in new.color.tensor().data().chunks(3).zip(new.density.tensor().data()) {
+        for (row, &d) in color.data().chunks(3).zip(density.data()) {
             assert_relative_eq!(row[2], 0.3 * d, epsilon = 1e-12);
         }
     }
@@ -51,8 +52,8 @@ fn upsampling_keeps_the_field_at_the_old_centres_when_the_ratio_is_odd() {
     for i in 0..4 {
         for j in 0..4 {
             for k in 0..4 {
-                let (was, is) = ((i * 4 + j) * 4 + k, ((3 * i + 1) * 12 + 3 * j + 1) * 12 + 3 * k + 1);
-                assert_relative_eq!(new.density.tensor().data()[is], old.density.tensor().data()[was], epsilon = 1e-12);
+                let at = |grid: &VoxelGrid<f64>, voxel| grid.density.tensor().data()[grid.lattice().row(voxel).expect("present") as usize];
+                assert_relative_eq!(at(&new, [3 * i + 1, 3 * j + 1, 3 * k + 1]), at(&old, [i, j, k]), epsilon = 1e-12);
             }
         }
     }
@@ -73,18 +74,25 @@ fn nearest_look_up_reads_the_voxel_a_point_lies_in() {
 }
 
 #[test]
-fn clearing_outside_an_occupancy_keeps_what_is_visible() {
-    let mut grid = sampled(8, |[x, y, z]| if x * x + y * y + z * z < 0.3 { 3.0 } else { 0.01 });
-    let before: Vec<f64> = grid.density.tensor().data().to_vec();
-    let occupancy = grid.occupancy(0.1);
-    grid.clear_outside(&occupancy);
-    let after = grid.density.tensor().data();
-    for (b, a) in before.iter().zip(after) {
-        if *b > 0.1 {
-            assert_eq!(a, b);
-        }
+fn pruning_keeps_what_is_visible_and_a_pruned_grid_resamples_to_the_same_field() {
+    let grid = sampled(8, |[x, y, z]| if x * x + y * y + z * z < 0.3 { 3.0 } else { 0.01 });
+    let kept = grid.occupancy(0.1);
+    let pruned = grid.pruned(&kept);
+    let [before, after] = [&grid, &pruned].map(|g| g.to_row_major()[0].data().to_vec());
+    for (b, a) in before.iter().zip(&after) {
+        assert!(a == b || *a == 0.0 && *b <= 0.1);
     }
-    assert!(after.iter().filter(|&&d| d == 0.0).count() > 100);
+    assert!(pruned.lattice().present() < 400 && pruned.lattice().rows() >= pruned.lattice().present());
     // A voxel beside a full one stays as it was: trilinear look-up reads it.
     assert!(after.contains(&0.01));
+    // Where everything read is present, the finer grids are the same.
+    let [whole, sparse] = [&grid, &pruned].map(|g| g.resample(16));
+    assert!(sparse.lattice().present() < 16 * 16 * 16 && !sparse.lattice().is_full());
+    let (whole, sparse) = (whole.to_row_major()[0].data().to_vec(), sparse.to_row_major()[0].data().to_vec());
+    let mut equal = 0;
+    for (w, s) in whole.iter().zip(&sparse) {
+        assert!(s <= w);
+        equal += usize::from(s == w && *w > 0.02);
+    }
+    assert!(equal > 500, "{equal}");
 }

@@ -5,12 +5,12 @@
 
 mod support;
 
-use autograd::{Gradcheck, Tensor, check_kernel, grad};
+use autograd::{Gradcheck, Lattice, Tensor, check_kernel, grad};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation};
 use plenoxel::field::{Field, sh};
 use plenoxel::geometry::Aabb;
 use plenoxel::loss::{self, Step};
-use plenoxel::render::{RenderOptions, Rendered, render};
+use plenoxel::render::{Engine, RenderOptions, Rendered, render};
 use plenoxel::sampling::{Jitter, Spacing};
 use support::{batch, grid_of, numbers, rays, shape};
 
@@ -21,6 +21,8 @@ fn options() -> RenderOptions<'static> {
         jitter: Jitter::PerRay { seed: 1, step: 2 },
         background: [1.0, 0.9, 0.8],
         occupancy: None,
+        engine: Engine::default(),
+        stop_below: 0.0,
     }
 }
 
@@ -57,13 +59,14 @@ fn every_column_of_a_whole_render_agrees_with_finite_differences() {
         ("sparsity", Rendered::sparsity),
         ("distortion", Rendered::distortion),
     ];
-    println!("| render | column | orders | worst relative error |\n| --- | --- | --- | --- |");
+    println!("| render | engine | column | orders | worst relative error |\n| --- | --- | --- | --- | --- |");
     for (name, shape) in shapes() {
-        for (column, get) in columns {
-            let f = |x: &[Tensor<f64>]| get(&render(&grid_of(shape, &x[0], &x[1]), &rays(), &options()));
+        for ((column, get), engine) in columns.into_iter().flat_map(|c| [(c, Engine::Graph), (c, Engine::Fused)]) {
+            let options = RenderOptions { engine, ..options() };
+            let f = |x: &[Tensor<f64>]| get(&render(&grid_of(shape, &x[0], &x[1]), &rays(), &options));
             let report =
                 Gradcheck::new(f, tables(&shape)).named(format!("{name}, {column}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
-            println!("| {name} | {column} | 1, 2 | {:.1e} |", report.worst_relative_error);
+            println!("| {name} | {engine:?} | {column} | 1, 2 | {:.1e} |", report.worst_relative_error);
         }
     }
 }
@@ -90,18 +93,22 @@ fn every_loss_agrees_with_finite_differences() {
     }
 }
 
+/// Whole bricks, some cut by the border, one without cells, and one with holes.
+fn lattices() -> Vec<Lattice> {
+    let mut all: Vec<Lattice> = [[8, 4, 4], [5, 4, 6], [2, 5, 3], [1, 4, 4]].map(Lattice::bricks).into();
+    all.push(Lattice::bricks_where([9, 6, 7], |[i, j, k]| (i * 7 + j * 5 + k * 3) % 11 > 1));
+    all
+}
+
 #[test]
 fn total_variation_over_all_cells_is_the_sampled_one_over_a_run_of_all() {
-    for nodes in [[4, 4, 4], [2, 5, 3], [1, 4, 4]] {
-        let table = numbers(&[nodes.iter().product(), 2], -1.0, 1.0, 31);
-        let cells: usize = nodes.iter().map(|n| n - 1).product();
-        let whole = |x: &[Tensor<f64>]| loss::total_variation(&x[0], nodes);
+    for lattice in lattices() {
+        let rows = lattice.rows();
+        let table = numbers(&[rows, 2], -1.0, 1.0, 31);
+        let whole = |x: &[Tensor<f64>]| loss::total_variation(&x[0], &lattice);
         Gradcheck::new(whole, vec![table.clone()]).named("total variation").order(2).run().unwrap_or_else(|e| panic!("{e}"));
-        if cells == 0 {
-            continue;
-        }
         let x = Tensor::variable(table);
-        let (a, b) = (loss::total_variation(&x, nodes), loss::sampled_total_variation(&x, nodes, cells - 1, cells));
+        let (a, b) = (loss::total_variation(&x, &lattice), loss::sampled_total_variation(&x, &lattice, rows - 1, rows));
         approx::assert_relative_eq!(a.item(), b.item(), epsilon = 1e-12);
         let (ga, gb) = (a.backward().array(&x), b.backward().array(&x));
         assert!(ga.iter().zip(&gb).all(|(a, b)| (a - b).abs() < 1e-12));
@@ -111,10 +118,10 @@ fn total_variation_over_all_cells_is_the_sampled_one_over_a_run_of_all() {
 #[test]
 fn the_kernel_of_total_variation_agrees_with_its_reference_in_both_precisions() {
     for width in [1, 3, 4, 27] {
-        for nodes in [[5, 4, 6], [2, 2, 2]] {
-            let table = numbers(&[nodes.iter().product(), width], -1.0, 1.0, 33);
-            check_kernel::<f64>(|x| loss::total_variation(&x[0], nodes), [table.clone()], 1e-12).unwrap_or_else(|e| panic!("{e}"));
-            check_kernel::<f32>(|x| loss::total_variation(&x[0], nodes), [table.mapv(|x| x as f32)], 1e-5)
+        for lattice in lattices() {
+            let table = numbers(&[lattice.rows(), width], -1.0, 1.0, 33);
+            check_kernel::<f64>(|x| loss::total_variation(&x[0], &lattice), [table.clone()], 1e-12).unwrap_or_else(|e| panic!("{e}"));
+            check_kernel::<f32>(|x| loss::total_variation(&x[0], &lattice), [table.mapv(|x| x as f32)], 1e-5)
                 .unwrap_or_else(|e| panic!("{e}"));
         }
     }

@@ -3,12 +3,13 @@
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Error;
+use plenoxel::field::Field;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::loss::Objective;
 use plenoxel::metrics::psnr;
-use plenoxel::render::RenderOptions;
 use plenoxel::render::picture::picture;
-use plenoxel::sampling::Jitter;
+use plenoxel::render::{Engine, RenderOptions};
+use plenoxel::sampling::{Jitter, Occupancy};
 use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Sampling, Stage, Weight};
 use plenoxel::train::{Report, Trainer};
 use std::collections::BTreeMap;
@@ -55,6 +56,8 @@ fn test_psnr(grid: &VoxelGrid<f32>) -> f64 {
         jitter: Jitter::None,
         background: [1.0; 3],
         occupancy: None,
+        engine: Engine::default(),
+        stop_below: 0.0,
     };
     let views = views(Split::Test);
     let sum: f64 = views.iter().map(|v| psnr(picture(grid, &v.camera, &options).rgb.view(), v.composite([1.0; 3]).view())).sum();
@@ -100,12 +103,21 @@ fn a_pruned_run_is_trained_on_all_that_evaluation_sees() {
     let config = Config { prune_from_stage: Some(1), prune_below: 0.2, ..config() };
     let mut trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
     while trainer.step().expect("finite numbers").is_some() {}
-    let looked_at = trainer.occupancy().expect("space was pruned");
-    assert!(looked_at.fraction() < 0.9, "{} of the voxels are looked at", looked_at.fraction());
     let grid = trainer.grid();
+    let looked_at = grid.reach().expect("space was pruned");
+    assert!(looked_at.fraction() < 0.9, "{} of the voxels are looked at", looked_at.fraction());
     let spacing = config.evaluation.spacing(grid.shape().voxel_side());
-    let everywhere = RenderOptions { aabb: grid.aabb(), spacing, jitter: Jitter::None, background: [1.0; 3], occupancy: None };
-    let there = RenderOptions { occupancy: Some(looked_at), ..everywhere.clone() };
+    let everywhere = Occupancy::new(grid.aabb(), grid.lattice().nodes(), &vec![true; grid.shape().voxels()]);
+    let there = RenderOptions {
+        aabb: grid.aabb(),
+        spacing,
+        jitter: Jitter::None,
+        background: [1.0; 3],
+        occupancy: None,
+        engine: Engine::default(),
+        stop_below: 0.0,
+    };
+    let everywhere = RenderOptions { occupancy: Some(&everywhere), ..there.clone() };
     for view in views(Split::Test) {
         assert_eq!(picture(grid, &view.camera, &everywhere).rgb, picture(grid, &view.camera, &there).rgb);
     }

@@ -188,6 +188,19 @@ impl<T: Real> RowPart<T> {
         }
     }
 
+    /// The sum with a dense gradient, in its buffer if nobody else holds it.
+    fn added_to(self, mut dense: Tensor<T>) -> Tensor<T> {
+        let width = dense.shape()[1..].iter().product();
+        let table = Arc::<Buffer<T>>::make_mut(&mut dense.data);
+        match self {
+            RowPart::Merged(rows) => rows.add_to(table),
+            RowPart::Touches { rows, values } => {
+                index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values.data())
+            }
+        }
+        dense
+    }
+
     fn dense(self, shape: &IxDyn) -> Tensor<T> {
         match self {
             RowPart::Merged(rows) => rows.to_dense(),
@@ -202,6 +215,9 @@ impl<T: Real> Pending<T> {
             (Pending::Rows(mut a), Pending::Rows(b)) => {
                 a.extend(b);
                 Pending::Rows(a)
+            }
+            (Pending::Dense(dense), Pending::Rows(parts)) | (Pending::Rows(parts), Pending::Dense(dense)) if !tracked => {
+                Pending::Dense(parts.into_iter().fold(dense, |sum, part| part.added_to(sum)))
             }
             (a, b) => {
                 let (a, b) = (a.dense(shape), b.dense(shape));
@@ -248,7 +264,7 @@ pub(crate) fn add_grads<T: Real>(a: Grad<T>, b: Grad<T>) -> Grad<T> {
         (Grad::Rows(a), Grad::Rows(b)) => Grad::Rows(index::add_row_sparse(a, b)),
         (Grad::Dense(a), Grad::Dense(b)) => Grad::Dense(add_in_place(a, b)),
         (Grad::Dense(dense), Grad::Rows(rows)) | (Grad::Rows(rows), Grad::Dense(dense)) => {
-            Grad::Dense(add_in_place(dense, rows.to_dense()))
+            Grad::Dense(RowPart::Merged(rows).added_to(dense))
         }
     }
 }

@@ -1,11 +1,14 @@
 //! Gradients as optimizers take them: dense, or the rows that were touched.
 
+use crate::parallel::{self, split_lengths};
 use crate::param::Param;
 use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
 use ndarray::{ArrayD, ArrayView2, ArrayViewD, Dimension, IxDyn};
 use std::collections::HashMap;
+use std::fmt::Debug;
+use std::sync::{Arc, OnceLock};
 
 /// The gradient of one leaf.
 #[derive(Debug, Clone)]
@@ -17,11 +20,32 @@ pub enum Grad<T: Real> {
 }
 
 /// Rows of a table `[R, …]`: sorted, unique, with one row of values each.
+///
+/// It may stand for sums that nobody has computed yet ([`RowSums`]). An optimizer then computes them bucket by bucket while it updates the
+/// table; whoever asks for rows or values gets them all. The numbers are the same.
 #[derive(Debug, Clone)]
 pub struct RowSparse<T: Real> {
     shape: IxDyn,
+    sums: Option<Arc<dyn RowSums<T>>>,
+    merged: OnceLock<Merged<T>>,
+}
+
+#[derive(Debug, Clone)]
+struct Merged<T: Real> {
     rows: Buffer<u32>,
     values: Buffer<T>,
+}
+
+/// A row gradient that is not added up: what each bucket of rows gets can be computed by itself, in an order that only the data decide.
+pub trait RowSums<T: Real>: Debug + Send + Sync {
+    /// A bucket is this power of two of consecutive rows; at least 6.
+    fn bucket_shift(&self) -> u32;
+
+    /// True if no row of the bucket gets anything.
+    fn is_empty(&self, bucket: usize) -> bool;
+
+    /// Adds to `sums`, one row of values for each row of the bucket, and sets the bit of each row that something was added to.
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]);
 }
 
 impl<T: Real> RowSparse<T> {
@@ -32,7 +56,13 @@ impl<T: Real> RowSparse<T> {
         assert_eq!(rows.len() * width, values.len(), "RowSparse: {} rows of {width} values got {} values", rows.len(), values.len());
         assert!(rows.is_sorted_by(|a, b| a < b), "RowSparse: rows must be sorted and unique");
         assert!(rows.last().is_none_or(|&last| (last as usize) < shape[0]), "RowSparse: a row lies beyond the table of {} rows", shape[0]);
-        RowSparse { shape: IxDyn(shape), rows, values }
+        RowSparse { shape: IxDyn(shape), sums: None, merged: OnceLock::from(Merged { rows, values }) }
+    }
+
+    /// Sums for later.
+    pub fn deferred(shape: &[usize], sums: Arc<dyn RowSums<T>>) -> Self {
+        assert!(sums.bucket_shift() >= 6, "RowSparse: a bucket has at least 64 rows");
+        RowSparse { shape: IxDyn(shape), sums: Some(sums), merged: OnceLock::new() }
     }
 
     /// Shape of the whole table.
@@ -47,27 +77,132 @@ impl<T: Real> RowSparse<T> {
 
     /// The touched rows, ascending.
     pub fn rows(&self) -> &[u32] {
-        &self.rows
+        &self.merged().rows
     }
 
     /// `[rows, width]`
     pub fn values(&self) -> ArrayView2<'_, T> {
-        ArrayView2::from_shape((self.rows.len(), self.width()), &self.values[..]).expect("one row of values for each row")
+        ArrayView2::from_shape((self.rows().len(), self.width()), self.data()).expect("one row of values for each row")
     }
 
     /// The values, row after row.
     pub fn data(&self) -> &[T] {
-        &self.values
+        &self.merged().values
     }
 
     /// The same gradient with its zeros.
     pub fn to_dense(&self) -> Tensor<T> {
-        let width = self.width();
         let mut out = Buffer::zeros(self.shape.size());
-        for (k, &row) in self.rows.iter().enumerate() {
-            out[row as usize * width..][..width].copy_from_slice(&self.values[k * width..][..width]);
-        }
+        self.add_to(&mut out);
         Tensor::from_buffer(out, self.shape())
+    }
+
+    /// Adds the rows to a whole table.
+    pub(crate) fn add_to(&self, table: &mut [T]) {
+        let width = self.width();
+        match self.unmerged() {
+            None => parallel::for_each_table_row(table, width, self.rows(), |k, row| {
+                row.iter_mut().zip(&self.data()[k * width..]).for_each(|(t, &v)| *t += v);
+            }),
+            Some(sums) => {
+                let bucket_rows = 1usize << sums.bucket_shift();
+                parallel::for_each_chunk(table, bucket_rows * width, |start, bucket| {
+                    sums.add(start / (bucket_rows * width), bucket, &mut vec![0; bucket_rows / 64]);
+                });
+            }
+        }
+    }
+
+    /// The sums, if nobody has computed them.
+    pub(crate) fn unmerged(&self) -> Option<&dyn RowSums<T>> {
+        if self.merged.get().is_some() { None } else { self.sums.as_deref() }
+    }
+
+    fn merged(&self) -> &Merged<T> {
+        self.merged.get_or_init(|| {
+            let sums = self.sums.as_deref().expect("sums or their result");
+            let (width, rows) = (self.width(), self.shape()[0]);
+            let bucket_rows = 1usize << sums.bucket_shift();
+            let groups = RowGroups::new(rows, bucket_rows);
+            let parts = parallel::map_indices(groups.count, |group| {
+                let (mut found, mut values) = (Vec::new(), Vec::new());
+                groups.for_each_bucket(group, width, sums, |bucket, sums, touched| {
+                    take_bits(touched, |local| {
+                        let row = &mut sums[local * width..][..width];
+                        found.push((bucket * bucket_rows + local) as u32);
+                        values.extend_from_slice(row);
+                        row.fill(T::zero());
+                    });
+                });
+                (found, values)
+            });
+            let total: usize = parts.iter().map(|(rows, _)| rows.len()).sum();
+            let (mut rows, mut values) = (Buffer::stale(total), Buffer::stale(total * width));
+            let lengths = || parts.iter().map(|(rows, _)| rows.len());
+            let targets: Vec<_> =
+                split_lengths(&mut rows, lengths()).into_iter().zip(split_lengths(&mut values, lengths().map(|n| n * width))).collect();
+            parallel::for_each_item(targets, |i, (rows, values)| {
+                rows.copy_from_slice(&parts[i].0);
+                values.copy_from_slice(&parts[i].1);
+            });
+            Merged { rows, values }
+        })
+    }
+}
+
+/// Buckets in groups of neighbours, of a number that does not depend on the threads: a group is what one task works on.
+pub(crate) struct RowGroups {
+    pub(crate) count: usize,
+    buckets: usize,
+    bucket_rows: usize,
+    table_rows: usize,
+    buckets_per_group: usize,
+}
+
+impl RowGroups {
+    pub(crate) fn new(table_rows: usize, bucket_rows: usize) -> Self {
+        let buckets = table_rows.div_ceil(bucket_rows);
+        let buckets_per_group = buckets.div_ceil(64).max(1);
+        RowGroups { count: buckets.div_ceil(buckets_per_group), buckets, bucket_rows, table_rows, buckets_per_group }
+    }
+
+    /// Rows of one group; the last group may have fewer.
+    pub(crate) fn rows_per_group(&self) -> usize {
+        self.buckets_per_group * self.bucket_rows
+    }
+
+    /// Calls `f(bucket, sums, touched)` for the buckets of a group that get anything. `f` finds sums of zero wherever nothing was added, and
+    /// must leave zeros everywhere and no bit set.
+    pub(crate) fn for_each_bucket<T: Real>(
+        &self,
+        group: usize,
+        width: usize,
+        rows: &dyn RowSums<T>,
+        mut f: impl FnMut(usize, &mut [T], &mut [u64]),
+    ) {
+        let first = group * self.buckets_per_group;
+        let mut scratch: Option<(Buffer<T>, Vec<u64>)> = None;
+        for bucket in first..(first + self.buckets_per_group).min(self.buckets) {
+            if rows.is_empty(bucket) {
+                continue;
+            }
+            let (sums, touched) =
+                scratch.get_or_insert_with(|| (Buffer::zeros(self.bucket_rows * width), vec![0u64; self.bucket_rows.div_ceil(64)]));
+            let here = self.bucket_rows.min(self.table_rows - bucket * self.bucket_rows);
+            rows.add(bucket, &mut sums[..here * width], touched);
+            f(bucket, &mut sums[..here * width], touched);
+        }
+    }
+}
+
+/// Calls `f` for each bit that is set, and clears it.
+fn take_bits(words: &mut [u64], mut f: impl FnMut(usize)) {
+    for (w, word) in words.iter_mut().enumerate() {
+        let mut left = std::mem::take(word);
+        while left != 0 {
+            f(w * 64 + left.trailing_zeros() as usize);
+            left &= left - 1;
+        }
     }
 }
 
@@ -135,6 +270,90 @@ impl<T: Real> Gradients<T> {
                 Some(mine) => crate::backward::add_grads(mine, grad),
             };
             self.by_leaf.insert(id, sum);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optim::{Adam, AdamMode, Momentum, Optimizer, RmsProp, Sgd};
+    use crate::param::Bounds;
+
+    /// Row (37 i) mod 1000 gets i and −i, for i below 300.
+    #[derive(Debug)]
+    struct Some300;
+
+    fn row(i: usize) -> usize {
+        37 * i % 1000
+    }
+
+    impl RowSums<f64> for Some300 {
+        fn bucket_shift(&self) -> u32 {
+            7
+        }
+        fn is_empty(&self, bucket: usize) -> bool {
+            bucket == 3
+        }
+        fn add(&self, bucket: usize, sums: &mut [f64], touched: &mut [u64]) {
+            for i in (0..300).filter(|&i| row(i) >> 7 == bucket && bucket != 3) {
+                let local = row(i) & 127;
+                sums[2 * local] += i as f64;
+                sums[2 * local + 1] -= i as f64;
+                touched[local / 64] |= 1 << (local % 64);
+            }
+        }
+    }
+
+    fn deferred() -> RowSparse<f64> {
+        RowSparse::deferred(&[1000, 2], Arc::new(Some300))
+    }
+
+    #[test]
+    fn sums_for_later_are_those_rows_in_order() {
+        let rows = deferred();
+        assert!(rows.unmerged().is_some());
+        let dense = rows.to_dense();
+        assert!(rows.unmerged().is_some(), "the table alone does not need the rows");
+        assert!(rows.rows().is_sorted_by(|a, b| a < b) && !rows.rows().iter().any(|row| row >> 7 == 3));
+        assert!(rows.unmerged().is_none());
+        let mut want = vec![0.0; 2000];
+        for i in (0..300).filter(|&i| row(i) >> 7 != 3) {
+            want[2 * row(i)] += i as f64;
+            want[2 * row(i) + 1] -= i as f64;
+        }
+        assert_eq!(dense.data(), want);
+        assert_eq!(rows.to_dense().data(), want);
+    }
+
+    #[test]
+    fn every_optimizer_does_the_same_with_sums_for_later_and_with_their_rows() {
+        type Make = fn() -> Box<dyn Optimizer<f64>>;
+        let optimizers: [Make; 5] = [
+            || Box::new(Sgd::new(0.01)),
+            || Box::new(Momentum::new(0.01, 0.9)),
+            || Box::new(RmsProp::new(0.1)),
+            || Box::new(Adam::new(0.1, AdamMode::Lazy)),
+            || Box::new(Adam::new(0.1, AdamMode::Dense)),
+        ];
+        for make in optimizers {
+            let run = |merge: bool| {
+                let mut param = Param::from_tensor("table", Tensor::full(&[1000, 2], 0.5));
+                param.set_bounds(Bounds { low: 0.45, high: 0.55 });
+                let mut optimizer = make();
+                for step in 0..3 {
+                    let rows = deferred();
+                    if merge {
+                        rows.rows();
+                    }
+                    let by_leaf = HashMap::from([(param.tensor().id().expect("a leaf"), Grad::Rows(rows))]);
+                    optimizer.step(&mut param, &Gradients { by_leaf }, step);
+                }
+                param.tensor().data().to_vec()
+            };
+            let (later, now) = (run(false), run(true));
+            assert!(later == now);
+            assert!(later.iter().all(|v| (0.45..=0.55).contains(v)) && later.contains(&0.45) && later.contains(&0.55));
         }
     }
 }

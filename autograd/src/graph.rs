@@ -66,7 +66,8 @@ thread_local! {
     static RECORDING: Cell<bool> = const { Cell::new(true) };
 }
 
-pub(crate) fn recording() -> bool {
+/// True unless this thread is inside [`no_grad`].
+pub fn recording() -> bool {
     RECORDING.get()
 }
 

@@ -92,7 +92,7 @@ pub enum Cotangent<T: Real> {
         /// `[rows.len(), …]`, trailing dimensions those of the input.
         values: Tensor<T>,
     },
-    /// The same with rows sorted and unique, from a kernel.
+    /// The same with rows sorted and unique, or to be so when somebody asks: from a kernel.
     Merged(RowSparse<T>),
 }
 
@@ -191,7 +191,7 @@ impl<T: Real> GradSink<T> {
         self.slots[i] = Some(Cotangent::Dense(Tensor::from_buffer(values, self.shapes[i].slice())));
     }
 
-    /// The cotangent of input `i` as sorted, unique rows.
+    /// The cotangent of input `i` as sorted, unique rows, added up now or later.
     pub fn rows(&mut self, i: usize, rows: RowSparse<T>) {
         use ndarray::Dimension;
         debug_assert_eq!(rows.shape(), self.shapes[i].slice());

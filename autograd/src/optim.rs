@@ -6,6 +6,8 @@
 //!
 //! What an optimizer remembers belongs to the identity of a parameter: after [`Param::replace`] it starts afresh, and what was
 //! remembered of an identity that the module no longer has is dropped. So an optimizer serves one module.
+//! A parameter with [`Bounds`] is brought back to them in the elements that were updated (projected descent): from a start within the
+//! bounds that equals clamping all of it.
 //! Every update is elementwise and in place, with the same bits for any number of threads.
 
 mod adam;
@@ -20,7 +22,7 @@ pub use sgd::{Momentum, Sgd};
 
 use crate::gradients::{Grad, Gradients};
 use crate::parallel;
-use crate::param::{Module, Param};
+use crate::param::{Bounds, Module, Param};
 use crate::pool::Buffer;
 use crate::real::Real;
 use std::collections::HashMap;
@@ -113,11 +115,25 @@ impl<T: Real, const N: usize> Memory<T, N> {
     }
 }
 
-/// Replaces the elements that have a gradient, and what is remembered of them, by `rule([θ, state…], g)`; untouched rows stay.
-fn update<T: Real, const N: usize>(tables: [&mut [T]; N], grad: &Grad<T>, rule: impl Fn([T; N], T) -> [T; N] + Sync) {
+/// Replaces the elements that have a gradient, and what is remembered of them, by `rule([θ, state…], g)`, θ then brought back to its bounds;
+/// untouched rows stay.
+fn update<T: Real, const N: usize>(tables: [&mut [T]; N], grad: &Grad<T>, bounds: Bounds<T>, rule: impl Fn([T; N], T) -> [T; N] + Sync) {
+    let rule = bounded(bounds, rule);
     match grad {
         Grad::Dense(g) => parallel::update(tables, g.data(), rule),
-        Grad::Rows(g) => parallel::update_rows(tables, g.width(), g.rows(), g.data(), rule),
+        Grad::Rows(g) => match g.unmerged() {
+            Some(sums) => parallel::update_deferred(tables, g.width(), sums, rule),
+            None => parallel::update_rows(tables, g.width(), g.rows(), g.data(), rule),
+        },
+    }
+}
+
+/// A rule and the projection after it.
+fn bounded<T: Real, const N: usize>(bounds: Bounds<T>, rule: impl Fn([T; N], T) -> [T; N] + Sync) -> impl Fn([T; N], T) -> [T; N] + Sync {
+    move |x, g| {
+        let mut new = rule(x, g);
+        new[0] = bounds.nearest(new[0]);
+        new
     }
 }
 

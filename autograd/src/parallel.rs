@@ -3,12 +3,14 @@
 //! Chunk bounds depend on sizes and never on the number of threads, and partial sums are combined in chunk order, so every result has
 //! the same bits for any thread count.
 
+use crate::gradients::{RowGroups, RowSums};
 use crate::real::Real;
 use rayon::prelude::*;
 
 /// Compiles a function for several instruction sets and picks the best at run time. Their results differ at most in the last place of an exponential: see [`fused`].
 /// Builds with debug assertions, in which the tests run, have the portable version only: every crate that uses
 /// a generic loop compiles it anew, and four versions of each would take minutes.
+#[macro_export]
 macro_rules! dispatched {
     ($(#[$meta:meta])* $visibility:vis fn $($rest:tt)*) => {
         $(#[$meta])*
@@ -20,7 +22,7 @@ macro_rules! dispatched {
         $visibility fn $($rest)*
     };
 }
-pub(crate) use dispatched;
+pub(crate) use dispatched; // The macro is exported: a crate that uses it needs `multiversion`.
 
 /// True if the loops below run in a version that multiplies and adds in one instruction.
 pub fn fused() -> bool {
@@ -74,6 +76,11 @@ pub fn for_each_item<I: Send>(items: Vec<I>, f: impl Fn(usize, I) + Sync + Send)
     items.into_par_iter().enumerate().for_each(|(i, item)| f(i, item));
 }
 
+/// Calls `f(i, item)` for every item, in parallel, and collects in order.
+pub fn map_items<I: Send, R: Send>(items: Vec<I>, f: impl Fn(usize, I) -> R + Sync + Send) -> Vec<R> {
+    items.into_par_iter().enumerate().map(|(i, item)| f(i, item)).collect()
+}
+
 /// Calls `f(start..end)` for consecutive chunks of `0..n` and collects the results in chunk order.
 pub fn map_chunks<R: Send>(n: usize, size: usize, f: impl Fn(std::ops::Range<usize>) -> R + Sync + Send) -> Vec<R> {
     let chunks = n.div_ceil(size);
@@ -124,7 +131,7 @@ pub fn copy<E: Copy + Send + Sync>(source: &[E], out: &mut [E]) {
 
 /// `out[i] = f(x[i])`
 pub fn map<T: Real>(x: &[T], out: &mut [T], f: impl Fn(T) -> T + Sync) {
-    for_each_chunk(out, 4 * CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
+    for_each_chunk(out, 2 * CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
 }
 
 /// `out[i] = f(x[i], y[i])`
@@ -156,6 +163,38 @@ pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], g: &[T], f: impl Fn([T;
 /// The same for some rows of tables of `width` columns. `rows` ascend without repetition and `g` has one row for each; other rows stay.
 pub fn update_rows<T: Real, const N: usize>(x: [&mut [T]; N], width: usize, rows: &[u32], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
     update_part::<T, N, false, _>(x, TableRows { first: 0, width, rows, g }, &f);
+}
+
+/// The same for the rows of a gradient that is not added up: each bucket's sums are computed and used while they are in the cache.
+pub(crate) fn update_deferred<T: Real, const N: usize>(
+    x: [&mut [T]; N],
+    width: usize,
+    rows: &dyn RowSums<T>,
+    f: impl Fn([T; N], T) -> [T; N] + Sync,
+) {
+    let bucket_rows = 1usize << rows.bucket_shift();
+    let groups = RowGroups::new(x[0].len() / width.max(1), bucket_rows);
+    let mut parts: Vec<[&mut [T]; N]> = Vec::with_capacity(groups.count);
+    let mut rest = x;
+    for _ in 0..groups.count {
+        let at = (groups.rows_per_group() * width).min(rest[0].len());
+        let (part, tail) = split(rest, at);
+        parts.push(part);
+        rest = tail;
+    }
+    for_each_item(parts, |group, mut x| {
+        let first = group * groups.rows_per_group();
+        groups.for_each_bucket(group, width, rows, |bucket, sums, touched| {
+            let start = (bucket * bucket_rows - first) * width;
+            let x = x.each_mut().map(|x| &mut x[start..][..sums.len()]);
+            match width {
+                1 => update_touched::<T, N, 1, _>(x, width, sums, touched, &f),
+                3 => update_touched::<T, N, 3, _>(x, width, sums, touched, &f),
+                27 => update_touched::<T, N, 27, _>(x, width, sums, touched, &f),
+                _ => update_touched::<T, N, 0, _>(x, width, sums, touched, &f),
+            }
+        });
+    });
 }
 
 /// The same for all rows, `g` being zero in those that `rows` does not list.
@@ -219,7 +258,7 @@ fn split<T, const N: usize>(x: [&mut [T]; N], at: usize) -> ([&mut [T]; N], [&mu
 
 /// `Σ f(x[i])`: 64 running sums inside a chunk, chunk sums added in order.
 pub fn sum<T: Real>(x: &[T], f: impl Fn(T) -> T + Sync + Send) -> T {
-    map_chunks(x.len(), CHUNK, |range| sum_loop(&x[range], &f)).into_iter().sum()
+    map_chunks(x.len(), 4 * CHUNK, |range| sum_loop(&x[range], &f)).into_iter().sum()
 }
 
 dispatched! {
@@ -306,6 +345,39 @@ fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl 
             x[k][i] = new[k];
         }
     }
+}
+
+dispatched! {
+/// Updates the rows whose bits are set, neighbours together, and clears their sums and bits; `sums` has a row for each row of the tables.
+/// `W` is the width, or 0 for one only known at run time.
+pub(crate) fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(
+    mut x: [&mut [T]; N],
+    width: usize,
+    sums: &mut [T],
+    touched: &mut [u64],
+    f: &F,
+) {
+    let width = if W == 0 { width } else { W };
+    for (w, word) in touched.iter_mut().enumerate() {
+        let mut left = std::mem::take(word);
+        while left != 0 {
+            let bit = left.trailing_zeros();
+            let run = (left >> bit).trailing_ones();
+            left &= if bit + run == 64 { 0 } else { !0 << (bit + run) };
+            let start = (w * 64 + bit as usize) * width;
+            if W != 0 && run == 1 {
+                let g = &mut sums[start..][..W];
+                update_slices(x.each_mut().map(|x| &mut x[start..][..W]), W, |i| g[i], f);
+                g.fill(T::zero());
+            } else {
+                let len = run as usize * width;
+                let g = &mut sums[start..][..len];
+                update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
+                g.fill(T::zero());
+            }
+        }
+    }
+}
 }
 
 dispatched! {

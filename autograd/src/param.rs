@@ -12,17 +12,41 @@ use std::sync::Arc;
 pub struct Param<T: Real> {
     name: String,
     tensor: Tensor<T>,
+    bounds: Bounds<T>,
+}
+
+/// The values a parameter may take: an optimizer brings what it changed back to the nearest of them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bounds<T> {
+    /// Smallest value, or −∞.
+    pub low: T,
+    /// Largest value, or +∞.
+    pub high: T,
+}
+
+impl<T: Real> Bounds<T> {
+    /// All values.
+    pub fn none() -> Self {
+        Bounds { low: T::neg_infinity(), high: T::infinity() }
+    }
+
+    /// The allowed value nearest to x; NaN stays NaN.
+    #[inline(always)]
+    pub fn nearest(self, x: T) -> T {
+        let x = if x < self.low { self.low } else { x };
+        if x > self.high { self.high } else { x }
+    }
 }
 
 impl<T: Real> Param<T> {
     /// A parameter; names are what rates, schedules and checkpoints go by.
     pub fn new<D: Dimension>(name: impl Into<String>, value: Array<T, D>) -> Self {
-        Param { name: name.into(), tensor: Tensor::variable(value) }
+        Self::from_tensor(name, Tensor::constant(value))
     }
 
     /// A parameter that takes over a tensor's value.
     pub fn from_tensor(name: impl Into<String>, value: Tensor<T>) -> Self {
-        Param { name: name.into(), tensor: value.into_variable() }
+        Param { name: name.into(), tensor: value.into_variable(), bounds: Bounds::none() }
     }
 
     /// The name.
@@ -38,6 +62,16 @@ impl<T: Real> Param<T> {
     /// The shape.
     pub fn shape(&self) -> &[usize] {
         self.tensor.shape()
+    }
+
+    /// The values it may take; all of them, unless [`Param::set_bounds`] said otherwise.
+    pub fn bounds(&self) -> Bounds<T> {
+        self.bounds
+    }
+
+    /// Says which values optimizers may give it. Values it has now are not changed.
+    pub fn set_bounds(&mut self, bounds: Bounds<T>) {
+        self.bounds = bounds;
     }
 
     /// Changes the values in place. If somebody still holds a graph or a clone with the old values, they keep them: the buffer is then

@@ -24,12 +24,21 @@ pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + 
     /// This value as `f64`, exactly.
     fn as_f64(self) -> f64;
 
+    /// The integer part of a number in [0, 2²³), without a branch; any integer for other numbers.
+    fn index(self) -> u32;
+
+    /// x^(−1/2) of a positive number, to about two units in the last place.
+    fn inverse_sqrt(self) -> Self;
+
     /// eˣ to about one unit in the last place, without a branch; results below 2⁻¹²⁵ are 0.
     /// `FUSED` says that the machine multiplies and adds in one instruction: [`crate::parallel::fused`].
     fn exp_<const FUSED: bool>(self) -> Self;
 
     /// 1 − e⁻ˣ without cancellation for small x: the opacity of an optical depth.
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self;
+
+    /// (1 − e⁻ˣ, e⁻ˣ), both without cancellation: what an optical depth absorbs and what it lets through.
+    fn absorb<const FUSED: bool>(self) -> (Self, Self);
 }
 
 impl Real for f32 {
@@ -41,6 +50,24 @@ impl Real for f32 {
     #[inline(always)]
     fn as_f64(self) -> f64 {
         f64::from(self)
+    }
+
+    #[inline(always)]
+    fn inverse_sqrt(self) -> Self {
+        // A first guess from the exponent, then Newton's y ← y (3 − x y²) / 2 three times: a third of the time of a root and a division.
+        let half = 0.5 * self;
+        let mut y = f32::from_bits(0x5f37_5a86_u32.wrapping_sub(self.to_bits() >> 1));
+        for _ in 0..3 {
+            y *= 1.5 - half * y * y;
+        }
+        y
+    }
+
+    #[inline(always)]
+    fn index(self) -> u32 {
+        // Integers from 2²³ on are one unit in the last place apart, so the low bits of the sum are the integer.
+        const UNIT: f32 = 8_388_608.0;
+        (self.floor() + UNIT).to_bits() & 0x7f_ffff
     }
 
     /// Cody and Waite's reduction x = n ln 2 + r with |r| <= ln 2 / 2, then a degree-6 polynomial (Cephes `expf`) and a scaling by
@@ -69,6 +96,11 @@ impl Real for f32 {
 
     #[inline(always)]
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self {
+        self.absorb::<FUSED>().0
+    }
+
+    #[inline(always)]
+    fn absorb<const FUSED: bool>(self) -> (Self, Self) {
         // Below 1/2 the Taylor polynomial x − x²/2 + … − x⁸/8! is exact to rounding; above, the difference loses at most one bit.
         let x = self;
         let p = multiply_add::<FUSED>(x, -1.0 / 40_320.0, 1.0 / 5_040.0);
@@ -78,8 +110,8 @@ impl Real for f32 {
         let p = multiply_add::<FUSED>(-x, p, 1.0 / 6.0);
         let p = multiply_add::<FUSED>(-x, p, 0.5);
         let small = x * (1.0 - x * p);
-        let large = 1.0 - (-x).exp_::<FUSED>();
-        if x.abs() < 0.5 { small } else { large }
+        let through = (-x).exp_::<FUSED>();
+        (if x.abs() < 0.5 { small } else { 1.0 - through }, through)
     }
 }
 
@@ -101,6 +133,17 @@ impl Real for f64 {
     }
 
     #[inline(always)]
+    fn inverse_sqrt(self) -> Self {
+        1.0 / self.sqrt()
+    }
+
+    #[inline(always)]
+    fn index(self) -> u32 {
+        const UNIT: f64 = 4_503_599_627_370_496.0;
+        (self.floor() + UNIT).to_bits() as u32 & 0x7f_ffff
+    }
+
+    #[inline(always)]
     fn exp_<const FUSED: bool>(self) -> Self {
         self.exp()
     }
@@ -108,6 +151,11 @@ impl Real for f64 {
     #[inline(always)]
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self {
         -(-self).exp_m1()
+    }
+
+    #[inline(always)]
+    fn absorb<const FUSED: bool>(self) -> (Self, Self) {
+        (self.one_minus_exp_neg::<FUSED>(), (-self).exp())
     }
 }
 

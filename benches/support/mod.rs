@@ -3,6 +3,11 @@
 
 use std::time::Instant;
 
+/// Runs a benchmark as the program runs its commands: on a thread of the pool, so that an op does not wake one up to begin with.
+pub fn on_the_pool(f: impl FnOnce() + Send) {
+    rayon::scope(|_| f());
+}
+
 /// Times of `repeats` calls of `f` in milliseconds, ascending, after two calls that are not counted.
 pub fn repeat(repeats: usize, mut f: impl FnMut()) -> Vec<f64> {
     f();

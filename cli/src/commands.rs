@@ -5,6 +5,7 @@ pub mod info;
 pub mod render;
 pub mod scene;
 pub mod train;
+mod trained_run;
 
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Error;

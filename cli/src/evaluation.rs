@@ -7,10 +7,10 @@ use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
 use plenoxel::geometry::Aabb;
 use plenoxel::metrics;
-use plenoxel::render::RenderOptions;
 use plenoxel::render::picture::{Picture, picture};
+use plenoxel::render::{Engine, RenderOptions};
 use plenoxel::sampling::{Jitter, Occupancy};
-use plenoxel::train::config::Sampling;
+use plenoxel::train::config::{Config, Sampling};
 use serde::Serialize;
 
 /// A grid ready to be looked at: no jitter, empty cells left out, which changes no pixel.
@@ -18,13 +18,14 @@ pub struct Viewer<'a> {
     grid: &'a VoxelGrid<f32>,
     sampling: Sampling,
     background: [f32; 3],
+    engine: Engine,
     occupancy: Occupancy,
 }
 
 impl<'a> Viewer<'a> {
-    /// A viewer of a grid over a background.
-    pub fn new(grid: &'a VoxelGrid<f32>, sampling: Sampling, background: [f32; 3]) -> Self {
-        Viewer { grid, sampling, background, occupancy: grid.occupancy(0.0) }
+    /// A viewer of a grid, with the background and the engine of its run.
+    pub fn new(grid: &'a VoxelGrid<f32>, sampling: Sampling, config: &Config) -> Self {
+        Viewer { grid, sampling, background: config.background, engine: config.engine, occupancy: grid.occupancy(0.0) }
     }
 
     /// What a camera sees.
@@ -36,6 +37,8 @@ impl<'a> Viewer<'a> {
             jitter: Jitter::None,
             background: self.background,
             occupancy: Some(&self.occupancy),
+            engine: self.engine,
+            stop_below: 0.0,
         };
         picture(self.grid, camera, &options)
     }

@@ -7,6 +7,7 @@ use crate::progress::bytes;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::{Color, GridShape};
+use plenoxel::render::Engine;
 use plenoxel::train::config::{Config, OptimizerConfig, Sampling};
 
 /// Bytes by what they are for.
@@ -55,10 +56,12 @@ impl Estimate {
                 true => 2 * shape.bytes() as u64,
                 false => 0,
             };
-            samples * training_bytes_per_sample(&shape) + touched_rows(&shape, samples) + gradient
+            // The fused engine adds rows up where the optimizer wants them.
+            let rows = if config.engine == Engine::Graph || whole_grid_losses(config) { touched_rows(&shape, samples) } else { 0 };
+            samples * training_bytes_per_sample(config.engine, &shape) + rows + gradient
         });
         let step = step.max().unwrap_or(0);
-        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(&shape);
+        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * EVALUATION_BYTES_PER_SAMPLE;
         // The file is put together beside the tables, once in pieces and once whole.
         let saving = 2 * tables;
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
@@ -82,7 +85,7 @@ impl Estimate {
             // The file and the tables read from it.
             grid: 2 * shape.bytes() as u64,
             optimizer: 0,
-            step: samples * evaluation_bytes_per_sample(shape),
+            step: samples * EVALUATION_BYTES_PER_SAMPLE,
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
         }
@@ -171,27 +174,24 @@ fn mean_samples(sampling: Sampling, shape: &GridShape) -> u64 {
     samples.ceil() as u64 + 1
 }
 
-/// Bytes that a training step keeps for each sample, on the graph of small ops: numbers as counted on single stages of 96 voxels a side,
+/// Bytes that a training step keeps for each sample. On the graph of small ops: numbers as counted on single stages of 96 voxels a side,
 /// harmonics of degree 0 and 2 and plain colors.
-fn training_bytes_per_sample(shape: &GridShape) -> u64 {
+fn training_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
     // Positions, distances, lengths, densities, optical depths, weights; then coefficients, the basis, their products, and gradients.
     let geometry = 21;
     let color = match shape.color {
         Color::Rgb => 3,
         Color::Sh { .. } => 5 * shape.color.channels() as u64,
     };
-    4 * (geometry + color)
+    match engine {
+        Engine::Graph => 4 * (geometry + color),
+        // Thirteen numbers of a sample and ten of what it adds to the tables, of which it may have two or three; corners for a while.
+        Engine::Fused => 4 * 48,
+    }
 }
 
-/// Bytes for each sample when nothing is kept for a gradient. Buffers that were free for a short time count too: pictures need them
-/// in many sizes, about twice what is in use.
-fn evaluation_bytes_per_sample(shape: &GridShape) -> u64 {
-    let color = match shape.color {
-        Color::Rgb => 3,
-        Color::Sh { .. } => 5 * shape.color.channels() as u64 / 2,
-    };
-    2 * 4 * (15 + color)
-}
+/// Bytes for each sample when nothing is kept for a gradient: the fused engine's numbers and corners.
+const EVALUATION_BYTES_PER_SAMPLE: u64 = 4 * 30;
 
 /// Rows that a step touches, with their gradients.
 fn touched_rows(shape: &GridShape, samples: u64) -> u64 {

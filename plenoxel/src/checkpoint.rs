@@ -1,20 +1,23 @@
 //! A trained grid on disk: a `safetensors` file that says what its numbers mean.
 //!
-//! Tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. The metadata have one entry, `plenoxel`: a JSON object
-//! with the version and every convention a reader must know. (One entry, for several would be written in a random order, and equal grids
-//! are to be equal files.)
+//! Of a grid with all its voxels, tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. Of a sparse one,
+//! `voxels` `[k]`, `u32`, ascending: those that are present, voxel (x, y, z) as the number (x n + y) n + z; and `density` `[k]` and `color`
+//! `[k, channels]` in that order. The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader
+//! must know. (One entry, for several would be written in a random order, and equal grids are to be equal files.)
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::files::write_atomically;
-use autograd::{Real, Tensor};
+use autograd::{Indices, Lattice, Real, Tensor};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Version of the format.
+/// Version of the format of grids with all their voxels.
 pub const FORMAT: &str = "plenoxel 1";
+/// Version of the format of sparse grids.
+pub const SPARSE_FORMAT: &str = "plenoxel 2";
 /// Where a voxel's value sits and what it means, in words.
 pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; \
     sigma = max(0, density) after interpolation, per world length; \
@@ -27,7 +30,7 @@ const KEY: &str = "plenoxel";
 /// Everything about a checkpoint but its tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
-    /// [`FORMAT`].
+    /// [`FORMAT`] or [`SPARSE_FORMAT`].
     pub format: String,
     /// [`CONVENTION`], for a human reader.
     pub convention: String,
@@ -67,7 +70,7 @@ impl Header {
             Color::Sh { degree, offset } => (Some(degree), offset),
         };
         Header {
-            format: FORMAT.to_owned(),
+            format: if grid.lattice().is_full() { FORMAT } else { SPARSE_FORMAT }.to_owned(),
             convention: CONVENTION.to_owned(),
             resolution: shape.resolution,
             half_width: shape.half_width,
@@ -92,17 +95,48 @@ impl Header {
 
 /// Writes a grid, whole or not at all.
 pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Result<()> {
-    let bytes = |table: &Tensor<T>| -> Vec<u8> { table.data().iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect() };
-    let (density, color) = (bytes(grid.density.tensor()), bytes(grid.color.tensor()));
-    let n = header.resolution;
+    let bytes = |table: &[T]| -> Vec<u8> { table.iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect() };
+    let (n, channels) = (header.resolution, grid.shape().color.channels());
     let defect = |e: &dyn std::fmt::Display| {
         Error::input(path, format!("the checkpoint cannot be put together ({e})"), "this is a defect of the program")
     };
-    let view = |shape: Vec<usize>, data| TensorView::new(Dtype::F32, shape, data).map_err(|e| defect(&e));
-    let tensors = [("density", view(vec![n, n, n], &density)?), ("color", view(vec![n, n, n, grid.shape().color.channels()], &color)?)];
+    let view = |dtype, shape: Vec<usize>, data| TensorView::new(dtype, shape, data).map_err(|e| defect(&e));
     let metadata = HashMap::from([(KEY.to_owned(), serde_json::to_string(header).map_err(|e| defect(&e))?)]);
-    let file = safetensors::serialize(tensors, Some(metadata)).map_err(|e| defect(&e))?;
-    write_atomically(path, &file)
+    let file = if grid.lattice().is_full() {
+        let [density, color] = grid.to_row_major().map(|table| bytes(table.data()));
+        let tensors =
+            [("density", view(Dtype::F32, vec![n, n, n], &density)?), ("color", view(Dtype::F32, vec![n, n, n, channels], &color)?)];
+        safetensors::serialize(tensors, Some(metadata))
+    } else {
+        let voxels = present(grid.lattice());
+        let rows: Vec<u32> = voxels.iter().filter_map(|&v| grid.lattice().row(node(v, n))).collect();
+        let listed = |table: &Tensor<T>| bytes(table.detach().gather_rows(&Indices::from(rows.clone())).data());
+        let (density, color) = (listed(grid.density.tensor()), listed(grid.color.tensor()));
+        let numbers: Vec<u8> = voxels.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let k = voxels.len();
+        let tensors = [
+            ("voxels", view(Dtype::U32, vec![k], &numbers)?),
+            ("density", view(Dtype::F32, vec![k], &density)?),
+            ("color", view(Dtype::F32, vec![k, channels], &color)?),
+        ];
+        safetensors::serialize(tensors, Some(metadata))
+    };
+    write_atomically(path, &file.map_err(|e| defect(&e))?)
+}
+
+/// The present voxels by number, ascending.
+fn present(lattice: &Lattice) -> Vec<u32> {
+    let n = lattice.nodes()[0];
+    let mut voxels: Vec<u32> =
+        (0..lattice.rows() as u32).filter_map(|row| lattice.node(row)).map(|[x, y, z]| ((x * n + y) * n + z) as u32).collect();
+    voxels.sort_unstable();
+    voxels
+}
+
+/// The voxel of a number.
+fn node(voxel: u32, n: usize) -> [usize; 3] {
+    let voxel = voxel as usize;
+    [voxel / (n * n), voxel / n % n, voxel % n]
 }
 
 /// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
@@ -122,11 +156,11 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     // The version first: a later one may have other fields.
     let unreadable = |e: serde_json::Error| Error::input(path, format!("the header cannot be read ({e})"), retrain);
     let format = serde_json::from_str::<serde_json::Value>(text).map_err(unreadable)?["format"].as_str().unwrap_or("none").to_owned();
-    if format != FORMAT {
+    if format != FORMAT && format != SPARSE_FORMAT {
         return Err(Error::input(
             path,
             format!("format `{format}`"),
-            format!("this program reads `{FORMAT}`; use the version that wrote the file"),
+            format!("this program reads `{FORMAT}` and `{SPARSE_FORMAT}`; use the version that wrote the file"),
         ));
     }
     let header: Header = serde_json::from_str(text).map_err(unreadable)?;
@@ -143,20 +177,40 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     }
     let shape = header.shape();
     let n = header.resolution;
-    let table = |name: &str, channels: usize, expected: &[usize]| -> Result<Tensor<T>> {
+    let read = |name: &str, dtype: Dtype, expected: &[usize]| -> Result<&[u8]> {
         let view = tensors.tensor(name).map_err(|_| Error::input(path, format!("no tensor `{name}`"), retrain))?;
-        if view.dtype() != Dtype::F32 || view.shape() != expected {
+        if view.dtype() != dtype || view.shape() != expected {
             return Err(Error::input(
                 path,
                 format!("tensor `{name}` is {:?} {:?}", view.dtype(), view.shape()),
-                format!("F32 {expected:?} is expected; {retrain}"),
+                format!("{dtype:?} {expected:?} is expected; {retrain}"),
             ));
         }
-        let values = view.data().as_chunks::<4>().0.iter().map(|&b| T::lit(f64::from(f32::from_le_bytes(b)))).collect();
-        Ok(Tensor::from_vec(values, &[n * n * n, channels]))
+        Ok(view.data())
+    };
+    let words = |data: &[u8]| data.as_chunks::<4>().0.to_vec();
+    let table = |name: &str, channels: usize, expected: &[usize]| -> Result<Tensor<T>> {
+        let values: Vec<T> =
+            words(read(name, Dtype::F32, expected)?).into_iter().map(|b| T::lit(f64::from(f32::from_le_bytes(b)))).collect();
+        let rows = values.len() / channels;
+        Ok(Tensor::from_vec(values, &[rows, channels]))
     };
     let channels = shape.color.channels();
-    let grid = VoxelGrid::from_tables(shape, table("density", 1, &[n, n, n])?, table("color", channels, &[n, n, n, channels])?);
+    let grid = if format == FORMAT {
+        VoxelGrid::from_row_major(shape, &table("density", 1, &[n, n, n])?, &table("color", channels, &[n, n, n, channels])?)
+    } else {
+        let k = tensors.tensor("voxels").map_or(0, |view| view.shape().iter().product());
+        let voxels: Vec<u32> = words(read("voxels", Dtype::U32, &[k])?).into_iter().map(u32::from_le_bytes).collect();
+        if !voxels.is_sorted_by(|a, b| a < b) || voxels.last().is_none_or(|&last| last as usize >= n * n * n) {
+            return Err(Error::input(path, "a list of voxels that is empty, not ascending, or longer than the grid", retrain));
+        }
+        let [density, color] = [table("density", 1, &[k])?, table("color", channels, &[k, channels])?];
+        let lattice = Lattice::bricks_where([n; 3], |[x, y, z]| voxels.binary_search(&(((x * n + y) * n + z) as u32)).is_ok());
+        let rows: Vec<u32> = voxels.iter().filter_map(|&v| lattice.row(node(v, n))).collect();
+        let placed = |listed: Tensor<T>| listed.scatter_rows(&Indices::from(rows.clone()), lattice.rows());
+        let (density, color) = (placed(density), placed(color));
+        VoxelGrid::with_lattice(shape, lattice, density, color)
+    };
     if !grid.is_finite() {
         return Err(Error::input(path, "numbers that are not finite", retrain));
     }

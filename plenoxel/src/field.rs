@@ -3,7 +3,9 @@
 pub mod sh;
 pub mod voxel_grid;
 
-use crate::sampling::Samples;
+use crate::camera::Ray;
+use crate::render::{RenderOptions, Rendered};
+use crate::sampling::{Occupancy, Samples};
 use autograd::{Real, Tensor};
 
 /// Density and color at samples.
@@ -22,4 +24,14 @@ pub trait Field<T: Real>: Send + Sync {
 
     /// Density and color at packed samples.
     fn radiance(&self, samples: &Samples<T>) -> Radiance<T>;
+
+    /// The cells in which a sample can find anything; `None` if that is everywhere.
+    fn reach(&self) -> Option<&Occupancy> {
+        None
+    }
+
+    /// Pixels in one pass, if this field has a kernel that renders it: the same as [`crate::render::composite()`] of its radiance.
+    fn render_fused(&self, _rays: &[Ray], _options: &RenderOptions<'_>) -> Option<Rendered<T>> {
+        None
+    }
 }

@@ -25,6 +25,9 @@ pub mod error;
 pub mod field;
 pub mod files;
 pub mod geometry;
+#[cfg(debug_assertions)]
+#[doc(hidden)]
+pub mod instances;
 pub mod loss;
 pub mod metrics;
 pub mod random;

@@ -18,12 +18,13 @@ mod total_variation;
 pub use opacity::{beta, entropy, opacity_supervision};
 pub use photometric::{charbonnier, huber, mse};
 pub use sparsity::{cauchy_sparsity, distortion};
-pub use total_variation::{Cells, TotalVariation, sampled_total_variation, total_variation, tv_color, tv_density};
+pub use total_variation::{Cells, sampled_total_variation, total_variation, tv_color, tv_density};
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::rays::RayBatch;
 use crate::render::Rendered;
+use crate::render::composite::PerSample;
 use autograd::optim::Schedule;
 use autograd::{Real, Tensor};
 
@@ -47,6 +48,7 @@ struct Term<T: Real> {
     name: String,
     weight: Box<dyn Schedule>,
     loss: LossFn<T>,
+    needs_samples: bool,
 }
 
 /// A sum of named losses with weights that may change over the run.
@@ -73,8 +75,28 @@ impl<T: Real> Objective<T> {
         weight: impl Schedule + 'static,
         loss: impl Fn(&Step<'_, T>) -> Tensor<T> + Send + Sync + 'static,
     ) -> Self {
-        self.terms.push(Term { name: name.into(), weight: Box::new(weight), loss: Box::new(loss) });
+        self.terms.push(Term { name: name.into(), weight: Box::new(weight), loss: Box::new(loss), needs_samples: false });
         self
+    }
+
+    /// Adds a loss that reads [`Rendered::samples`], the numbers of every sample: training then renders with the graph, which has them.
+    pub fn with_samples(
+        mut self,
+        name: impl Into<String>,
+        weight: impl Schedule + 'static,
+        loss: impl Fn(&Step<'_, T>, &PerSample<T>) -> Tensor<T> + Send + Sync + 'static,
+    ) -> Self {
+        let loss = move |step: &Step<'_, T>| {
+            let samples = step.rendered.samples().expect("a loss of samples is rendered with the graph engine");
+            loss(step, samples)
+        };
+        self.terms.push(Term { name: name.into(), weight: Box::new(weight), loss: Box::new(loss), needs_samples: true });
+        self
+    }
+
+    /// True if a loss reads the numbers of every sample.
+    pub fn needs_samples(&self) -> bool {
+        self.terms.iter().any(|term| term.needs_samples)
     }
 
     /// Adds one of this crate's losses by its name.

@@ -3,10 +3,14 @@
 //! A sample stands for an interval of its ray: position at the interval's middle, `delta` its length. Samples of a batch are packed one ray
 //! after another; ray `r` owns `offsets[r]..offsets[r + 1]`, and rays that miss the box own nothing.
 
+mod occupancy;
+
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
 use autograd::{Buffer, Indices, Real, Tensor, parallel};
+use occupancy::Look;
+pub use occupancy::Occupancy;
 use serde::{Deserialize, Serialize};
 
 /// How samples are spaced along a ray.
@@ -41,7 +45,7 @@ pub enum Jitter {
 }
 
 impl Jitter {
-    fn of(self, ray: usize) -> f64 {
+    pub(crate) fn of(self, ray: usize) -> f64 {
         match self {
             Jitter::None => 0.0,
             Jitter::PerRay { seed, step } => uniform(seed, Purpose::Jitter, step, ray as u64),
@@ -78,8 +82,8 @@ impl<T: Real> Samples<T> {
 
 /// The intervals `k -> (middle, length)` of one ray, as far as they lie in the box.
 #[derive(Clone, Copy, Debug)]
-struct March {
-    count: usize,
+pub(crate) struct March {
+    pub(crate) count: usize,
     near: f64,
     far: f64,
     /// Start of the step with k = 1 (`Step`), or the first point (`Points`).
@@ -89,7 +93,7 @@ struct March {
 }
 
 /// The samples of one ray: everything about their positions is here.
-fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> March {
+pub(crate) fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> March {
     let none = March { count: 0, near: 0.0, far: 0.0, start: 0.0, step: 1.0, points: false };
     let Some((near, far)) = aabb.intersect(ray.origin, ray.direction) else { return none };
     match spacing {
@@ -114,7 +118,8 @@ fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> March {
 
 impl March {
     /// Middle and length of interval k.
-    fn interval(&self, k: usize) -> (f64, f64) {
+    #[inline(always)]
+    pub(crate) fn interval(&self, k: usize) -> (f64, f64) {
         if self.points {
             return (self.start + k as f64 * self.step, self.step);
         }
@@ -122,6 +127,27 @@ impl March {
         let begin = if k == 0 { self.near } else { boundary(k) };
         let end = if k + 1 == self.count { self.far } else { boundary(k + 1) };
         (0.5 * (begin + end), end - begin)
+    }
+
+    /// Calls `f(middle, length)` for the intervals whose middle lies in an occupied cell. Runs of empty bricks are passed in one stride;
+    /// the intervals are those of [`March::interval`] all the same.
+    #[inline]
+    pub(crate) fn for_each_occupied(&self, ray: &Ray, cells: &Occupancy, mut f: impl FnMut(f64, f64)) {
+        let mut k = 0;
+        while k < self.count {
+            let (middle, length) = self.interval(k);
+            match cells.look(ray, middle) {
+                Look::Occupied => f(middle, length),
+                Look::Empty => {}
+                Look::EmptyUntil(exit) => {
+                    // The last k whose middle does not lie beyond the exit, but for rounding; it is looked at again.
+                    let half = if self.points { 0.0 } else { 0.5 };
+                    let last = ((exit - self.start) / self.step + half) as usize;
+                    k = k.max(last.saturating_sub(1));
+                }
+            }
+            k += 1;
+        }
     }
 }
 
@@ -133,7 +159,11 @@ pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitt
         let marches: Vec<March> = range.clone().map(|r| march(&rays[r], aabb, spacing, jitter.of(r))).collect();
         let counts = marches.iter().zip(range).map(|(m, r)| match occupancy {
             None => m.count as u32,
-            Some(cells) => (0..m.count).filter(|&k| cells.occupied(&rays[r], m.interval(k).0)).count() as u32,
+            Some(cells) => {
+                let mut count = 0;
+                m.for_each_occupied(&rays[r], cells, |_, _| count += 1);
+                count
+            }
         });
         let counts = counts.collect();
         (marches, counts)
@@ -154,15 +184,15 @@ pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitt
     parallel::for_each_item(parts, |c, ((t, delta), positions)| {
         let mut i = 0;
         for (ray, march) in rays[c * RUN..].iter().zip(&marches[c].0) {
-            for k in 0..march.count {
-                let (middle, length) = march.interval(k);
-                if occupancy.is_some_and(|cells| !cells.occupied(ray, middle)) {
-                    continue;
-                }
+            let mut place = |middle: f64, length: f64| {
                 let p = ray.origin + middle * ray.direction;
                 (t[i], delta[i]) = (T::lit(middle), T::lit(length));
                 positions[3 * i..3 * i + 3].copy_from_slice(&[T::lit(p.x), T::lit(p.y), T::lit(p.z)]);
                 i += 1;
+            };
+            match occupancy {
+                None => (0..march.count).map(|k| march.interval(k)).for_each(|(middle, length)| place(middle, length)),
+                Some(cells) => march.for_each_occupied(ray, cells, place),
             }
         }
     });
@@ -173,45 +203,6 @@ pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitt
         positions: Tensor::from_buffer(positions, &[m, 3]),
         directions: Tensor::from_vec(directions, &[rays.len(), 3]),
         offsets: offsets.into(),
-    }
-}
-
-/// Which cells of a box may hold matter.
-#[derive(Debug, Clone)]
-pub struct Occupancy {
-    aabb: Aabb,
-    cells: [usize; 3],
-    mask: Vec<bool>,
-}
-
-impl Occupancy {
-    /// Cells in the order of grid rows: (i, j, k) is entry (i·ny + j)·nz + k.
-    ///
-    /// Panics if the mask does not have one entry for each cell.
-    pub fn new(aabb: Aabb, cells: [usize; 3], mask: Vec<bool>) -> Self {
-        assert_eq!(mask.len(), cells.iter().product::<usize>(), "occupancy: one entry for each of {cells:?} cells");
-        Occupancy { aabb, cells, mask }
-    }
-
-    /// Cells along each axis.
-    pub fn cells(&self) -> [usize; 3] {
-        self.cells
-    }
-
-    /// One entry for each cell: may it hold matter?
-    pub fn mask(&self) -> &[bool] {
-        &self.mask
-    }
-
-    /// The share of cells that may hold matter.
-    pub fn fraction(&self) -> f64 {
-        self.mask.iter().filter(|&&m| m).count() as f64 / self.mask.len() as f64
-    }
-
-    fn occupied(&self, ray: &Ray, t: f64) -> bool {
-        let u = (ray.origin + t * ray.direction - self.aabb.min) / (self.aabb.max - self.aabb.min);
-        let cell = |a: usize| ((u[a] * self.cells[a] as f64) as usize).min(self.cells[a] - 1);
-        self.mask[(cell(0) * self.cells[1] + cell(1)) * self.cells[2] + cell(2)]
     }
 }
 
@@ -261,7 +252,7 @@ mod tests {
         let aabb = Aabb::cube(1.0);
         let half: Vec<bool> = (0..8 * 8 * 8).map(|i| i >= 4 * 64).collect();
         let all = sample::<f64>(&rays, &aabb, Spacing::Step(0.1), Jitter::None, None);
-        let some = sample::<f64>(&rays, &aabb, Spacing::Step(0.1), Jitter::None, Some(&Occupancy::new(aabb, [8; 3], half)));
+        let some = sample::<f64>(&rays, &aabb, Spacing::Step(0.1), Jitter::None, Some(&Occupancy::new(aabb, [8; 3], &half)));
         let kept: Vec<f64> =
             all.t.data().iter().zip(all.positions.data().chunks(3)).filter(|(_, p)| p[0] >= 0.0).map(|(&t, _)| t).collect();
         assert_eq!(some.t.data(), kept);

@@ -9,8 +9,8 @@ use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::loss::{Objective, Step};
 use crate::rays::RaySource;
-use crate::render::{RenderOptions, render};
-use crate::sampling::{Jitter, Occupancy};
+use crate::render::{Engine, RenderOptions, render};
+use crate::sampling::Jitter;
 use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Rates, RmsProp, Schedule, Sgd};
 use autograd::{Real, parallel, release_free_buffers, value_and_grad};
 use config::{Config, OptimizerConfig, Stage, Weight};
@@ -59,16 +59,7 @@ pub struct Trainer<'a, T: Real> {
     objective: Objective<T>,
     grid: VoxelGrid<T>,
     optimizer: Box<dyn Optimizer<T>>,
-    empty: Option<EmptySpace>,
     step: u64,
-}
-
-/// What pruning leaves.
-struct EmptySpace {
-    /// Voxels that may hold matter; all others stay at density 0.
-    kept: Occupancy,
-    /// Voxels in which a sample can read a kept one.
-    looked_at: Occupancy,
 }
 
 impl<'a, T: Real> Trainer<'a, T> {
@@ -103,7 +94,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        Ok(Trainer { config, plan, rays, objective, grid, optimizer, empty: None, step: 0 })
+        Ok(Trainer { config, plan, rays, objective, grid, optimizer, step: 0 })
     }
 
     /// The grid as it is now.
@@ -114,11 +105,6 @@ impl<'a, T: Real> Trainer<'a, T> {
     /// The trained grid.
     pub fn into_grid(self) -> VoxelGrid<T> {
         self.grid
-    }
-
-    /// The voxels that training looks at in this stage; `None` if none are left out.
-    pub fn occupancy(&self) -> Option<&Occupancy> {
-        self.empty.as_ref().map(|empty| &empty.looked_at)
     }
 
     /// The config.
@@ -148,7 +134,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         let Some(index) = self.plan.iter().position(|p| self.step < p.first + p.steps) else { return Ok(None) };
         let plan = self.plan[index];
         if self.step == plan.first {
-            self.begin(index);
+            self.begin(index)?;
         }
         let rays = self.config.rays_per_step;
         let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
@@ -157,12 +143,14 @@ impl<'a, T: Real> Trainer<'a, T> {
             spacing: plan.stage.sampling.spacing(self.grid.shape().voxel_side()),
             jitter: if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None },
             background: self.config.background,
-            occupancy: self.occupancy(),
+            occupancy: None,
+            engine: self.engine(),
+            stop_below: self.config.stop_below,
         };
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
             let rendered = render(&self.grid, &batch.rays, &options);
-            samples = rendered.samples.samples.len();
+            samples = rendered.sample_count;
             squared_error = mean_squared_error(rendered.rgb.data(), batch.target.data());
             let step = Step { number: self.step, seed: self.config.seed, batch: &batch, rendered: &rendered, grid: &self.grid };
             let (total, values) = self.objective.evaluate(&step);
@@ -176,12 +164,6 @@ impl<'a, T: Real> Trainer<'a, T> {
         }
         let in_stage = self.step - plan.first;
         self.optimizer.step(&mut self.grid, &gradients, in_stage);
-        if self.config.project {
-            self.grid.project(&gradients);
-        }
-        if let Some(empty) = &self.empty {
-            self.grid.clear_touched_outside(&gradients, &empty.kept);
-        }
         let ends_stage = in_stage + 1 == plan.steps;
         if ends_stage && !self.grid.is_finite() {
             return Err(self.numeric("the grid holds numbers that are not finite".to_owned()));
@@ -203,22 +185,30 @@ impl<'a, T: Real> Trainer<'a, T> {
     }
 
     /// What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
-    fn begin(&mut self, index: usize) {
+    fn begin(&mut self, index: usize) -> Result<()> {
         let plan = &self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, plan);
-        self.empty = None;
         if plan.stage.resolution != self.grid.shape().resolution {
             release_free_buffers();
             self.grid = self.grid.resample(plan.stage.resolution);
         }
         if self.config.prune_from_stage.is_some_and(|first| index >= first) {
             let kept = self.grid.occupancy(self.config.prune_below);
-            self.grid.clear_outside(&kept);
-            // A sample beside a kept voxel reads it, so training looks there as evaluation will.
-            let looked_at = self.grid.reached_from(&kept);
-            self.empty = Some(EmptySpace { kept, looked_at });
+            if kept.fraction() == 0.0 {
+                return Err(self.numeric(format!("no voxel has a density above {}, so pruning leaves nothing", self.config.prune_below)));
+            }
+            self.grid = self.grid.pruned(&kept);
         }
+        if self.config.project {
+            self.grid.project();
+        }
+        Ok(())
+    }
+
+    /// The engine that the config asks for, unless a loss needs what only the graph has.
+    pub fn engine(&self) -> Engine {
+        if self.objective.needs_samples() { Engine::Graph } else { self.config.engine }
     }
 
     fn numeric(&self, found: String) -> Error {

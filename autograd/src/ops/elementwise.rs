@@ -51,8 +51,8 @@ elementwise! {
     /// y = eˣ.   ∂L/∂x = ∂L/∂y · y
     @exponential exp, Exp, Keep::OUTPUT, T::exp_::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * cx.output();
 
-    /// y = 1 − e⁻ˣ, exact for small x: the opacity of an optical depth.   ∂L/∂x = ∂L/∂y · (1 − y)
-    @exponential one_minus_exp_neg, OneMinusExpNeg, Keep::OUTPUT, T::one_minus_exp_neg::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * (1.0 - cx.output());
+    /// y = 1 − e⁻ˣ, exact for small x: the opacity of an optical depth.   ∂L/∂x = ∂L/∂y · e⁻ˣ, which 1 − y would lose where y is near 1
+    @exponential one_minus_exp_neg, OneMinusExpNeg, Keep::INPUTS, T::one_minus_exp_neg::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * (-cx.input(0)).exp();
 
     /// y = ln x, for x > 0.   ∂L/∂x = ∂L/∂y / x
     ln, Ln, Keep::INPUTS, |x: T| x.ln(), |cx: &Vjp<'_, T>| cx.cotangent() / cx.input(0);

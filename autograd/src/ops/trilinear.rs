@@ -1,57 +1,110 @@
 //! Values between the nodes of a grid whose rows are stored in a table.
 //!
-//! Node (i, j, k) of a grid of `[nx, ny, nz]` nodes is row (i·ny + j)·nz + k. Positions are in cells, nodes at the integers;
-//! a position outside is clamped to the box of the nodes, where the gradient with respect to it is 0.
+//! A [`Lattice`] says which row belongs to which node: row-major order, for which `[nx, ny, nz]` is enough, or bricks with nodes that may be
+//! missing and then read as zeros. Positions are in cells, nodes at the integers; a position outside is clamped to the box of the nodes,
+//! where the gradient with respect to it is 0.
 
 use crate::index::{self, Indices};
+use crate::lattice::{Lattice, NodeMap, with_map};
 use crate::op::{GradSink, Kernel, KernelCall};
 use crate::parallel::{self, dispatched};
 use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// The eight rows around a position and what each of them weighs; the last index of a corner runs fastest.
+/// The eight rows around a position and what each of them weighs; the last index of a corner runs fastest. A corner that is not present
+/// weighs nothing and stands in a row that another one has, so that it is not touched for its own sake.
 #[inline(always)]
-pub fn corners<T: Real>(position: [T; 3], nodes: [usize; 3]) -> ([u32; 8], [T; 8]) {
-    let mut low = [0usize; 3];
-    let mut high = [0usize; 3];
-    let mut f = [T::zero(); 3];
-    for a in 0..3 {
-        (low[a], high[a], f[a], _) = axis_cell(position[a], nodes[a]);
-    }
-    let one = T::one();
-    let w = [[one - f[0], f[0]], [one - f[1], f[1]], [one - f[2], f[2]]];
-    let at = [[low[0], high[0]], [low[1], high[1]], [low[2], high[2]]];
-    let mut rows = [0u32; 8];
-    let mut weights = [T::zero(); 8];
-    for c in 0..8 {
-        let (i, j, k) = (c >> 2, c >> 1 & 1, c & 1);
-        rows[c] = ((at[0][i] * nodes[1] + at[1][j]) * nodes[2] + at[2][k]) as u32;
-        weights[c] = w[0][i] * w[1][j] * w[2][k];
-    }
+pub fn corners<T: Real>(position: [T; 3], map: impl NodeMap) -> ([u32; 8], [T; 8]) {
+    let (rows, weights, _) = corners_present(position, map);
     (rows, weights)
 }
 
-/// The row of the node nearest to a position, halves rounded up.
+/// The same, and a bit for each corner that is present.
 #[inline(always)]
-pub fn nearest_row<T: Real>(position: [T; 3], nodes: [usize; 3]) -> u32 {
-    let mut row = 0;
+fn corners_present<T: Real, M: NodeMap>(position: [T; 3], map: M) -> ([u32; 8], [T; 8], u32) {
+    let mut shares = [[0; 2]; 3];
+    let mut f = [T::zero(); 3];
     for a in 0..3 {
-        let last = nodes[a] - 1;
-        let i = (position[a] + T::lit(0.5)).floor().max(T::zero()).to_usize().unwrap_or(0).min(last);
-        row = row * nodes[a] + i;
+        let (low, high, fraction, _) = axis_cell(position[a], map.nodes()[a]);
+        (shares[a], f[a]) = ([map.share(a, low), map.share(a, high)], fraction);
     }
-    row as u32
+    join(shares, f, map)
+}
+
+/// Corners from what the lower and the upper node of each axis add to a node's number, and the fractions between them.
+#[inline(always)]
+fn join<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32; 8], [T; 8], u32) {
+    let one = T::one();
+    let w = [[one - f[0], f[0]], [one - f[1], f[1]], [one - f[2], f[2]]];
+    let mut rows = [0u32; 8];
+    let mut weights = [T::zero(); 8];
+    let mut present = 0u32;
+    for c in 0..8 {
+        let (i, j, k) = (c >> 2, c >> 1 & 1, c & 1);
+        weights[c] = w[0][i] * w[1][j] * w[2][k];
+        match map.row_of(shares[0][i] + shares[1][j] + shares[2][k]) {
+            Ok(row) => {
+                rows[c] = row;
+                present |= 1 << c;
+            }
+            Err(row) => {
+                rows[c] = row;
+                weights[c] = T::zero();
+            }
+        }
+    }
+    if M::SPARSE && present != 0xff {
+        let stand_in = if present == 0 { 0 } else { rows[present.trailing_zeros() as usize] };
+        for (c, row) in rows.iter_mut().enumerate() {
+            if present >> c & 1 == 0 {
+                *row = stand_in;
+            }
+        }
+    }
+    (rows, weights, present)
+}
+
+dispatched! {
+/// The corners of many positions, given axis by axis.
+pub fn corners_of_many<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mut [[u32; 8]], weights: &mut [[T; 8]]) {
+    // What is arithmetic is done for some positions together, before the look-ups in the layout.
+    const TOGETHER: usize = 32;
+    let mut shares = [[[0u32; TOGETHER]; 2]; 3];
+    let mut fractions = [[T::zero(); TOGETHER]; 3];
+    for (run, (rows, weights)) in rows.chunks_mut(TOGETHER).zip(weights.chunks_mut(TOGETHER)).enumerate() {
+        let n = rows.len();
+        for a in 0..3 {
+            let at = &at[a][run * TOGETHER..][..n];
+            let [low_shares, high_shares] = &mut shares[a];
+            for (i, &u) in at.iter().enumerate() {
+                let (low, high, fraction, _) = axis_cell(u, map.nodes()[a]);
+                (low_shares[i], high_shares[i], fractions[a][i]) = (map.share(a, low), map.share(a, high), fraction);
+            }
+        }
+        for i in 0..n {
+            let own = [0, 1, 2].map(|a: usize| [shares[a][0][i], shares[a][1][i]]);
+            let (r, w, _) = join(own, [fractions[0][i], fractions[1][i], fractions[2][i]], map);
+            (rows[i], weights[i]) = (r, w);
+        }
+    }
+}
+}
+
+/// The node nearest to a position, halves rounded up.
+#[inline(always)]
+pub fn nearest_node<T: Real>(position: [T; 3], nodes: [usize; 3]) -> [u32; 3] {
+    std::array::from_fn(|a| (position[a] + T::lit(0.5)).max(T::zero()).min(T::lit((nodes[a] - 1) as f64)).index())
 }
 
 /// Lower node, upper node, fraction between them, and whether the position lies inside (so that it has a gradient).
 #[inline(always)]
-fn axis_cell<T: Real>(u: T, n: usize) -> (usize, usize, T, bool) {
+fn axis_cell<T: Real>(u: T, n: usize) -> (u32, u32, T, bool) {
     let last = T::lit((n - 1) as f64);
     let inside = u >= T::zero() && u <= last;
     let u = u.max(T::zero()).min(last);
-    let low = u.to_usize().unwrap_or(0).min(n.saturating_sub(2));
-    (low, (low + 1).min(n - 1), u - T::lit(low as f64), inside)
+    let low = u.index().min(n.saturating_sub(2) as u32);
+    (low, (low + 1).min(n as u32 - 1), u - T::lit(f64::from(low)), inside)
 }
 
 /// yₚ = Σ over the eight corners c of wc(uₚ) · table[rowc(uₚ)]
@@ -59,7 +112,7 @@ fn axis_cell<T: Real>(u: T, n: usize) -> (usize, usize, T, bool) {
 /// ∂L/∂table[row] = Σ w ∂L/∂y, as rows;  ∂L/∂uₚ = Σc (∂L/∂yₚ · table[rowc]) ∂wc/∂u.
 #[derive(Debug)]
 struct Trilinear {
-    nodes: [usize; 3],
+    lattice: Lattice,
 }
 
 impl<T: Real> Kernel<T> for Trilinear {
@@ -69,20 +122,22 @@ impl<T: Real> Kernel<T> for Trilinear {
 
     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
         let [table, positions] = inputs else { unreachable!("trilinear has two inputs") };
-        let m = positions.shape()[0];
+        let (m, nodes) = (positions.shape()[0], self.lattice.nodes());
         // Fractions and their complements per axis, as columns; the cell itself is constant.
         let column = |a: usize| {
-            let last = (self.nodes[a] - 1) as f64;
+            let last = (nodes[a] - 1) as f64;
             let u = positions.narrow(1, a, 1).clamp(0.0, last);
-            let cell = u.constant_map(|u| T::lit(u.to_usize().unwrap_or(0).min(self.nodes[a].saturating_sub(2)) as f64));
+            let cell = u.constant_map(|u| T::lit(u.to_usize().unwrap_or(0).min(nodes[a].saturating_sub(2)) as f64));
             let f = &u - cell;
             [1.0 - &f, f]
         };
         let weights = [column(0), column(1), column(2)];
         let cells = points(positions);
         let corner = |c: usize| {
-            let rows: Vec<u32> = cells.iter().map(|&p| corners(p, self.nodes).0[c]).collect();
-            let w = &weights[0][c >> 2] * &weights[1][c >> 1 & 1] * &weights[2][c & 1];
+            let found: Vec<_> = cells.iter().map(|&p| with_map!(self.lattice, map => corners_present(p, map))).collect();
+            let rows: Vec<u32> = found.iter().map(|(rows, _, _)| rows[c]).collect();
+            let present: Vec<T> = found.iter().map(|(_, _, present)| T::lit(f64::from(present >> c & 1))).collect();
+            let w = &weights[0][c >> 2] * &weights[1][c >> 1 & 1] * &weights[2][c & 1] * Tensor::from_vec(present, &[m, 1]);
             table.gather_rows(&Indices::from(rows)) * w
         };
         (1..8).fold(corner(0), |sum, c| sum + corner(c)).reshape(&[m, table.shape()[1]])
@@ -92,7 +147,9 @@ impl<T: Real> Kernel<T> for Trilinear {
         let (table, positions, g) = (call.input(0), call.input(1), call.cotangent());
         let cells = points(&positions);
         if call.needs(0) {
-            out.rows(0, index::sum_into_rows(table.shape(), cells.len(), |p| corners(cells[p], self.nodes), g.data()));
+            let sums =
+                with_map!(self.lattice, map => index::sum_into_rows(table.shape(), cells.len(), |p| corners(cells[p], map), g.data()));
+            out.rows(0, sums);
         }
         if call.needs(1) {
             let width = table.shape()[1];
@@ -101,10 +158,12 @@ impl<T: Real> Kernel<T> for Trilinear {
                 for (p, d) in chunk.chunks_exact_mut(3).enumerate() {
                     let p = first + p;
                     let g = &g.data()[p * width..][..width];
-                    let (rows, _) = corners(cells[p], self.nodes);
-                    let dots =
-                        rows.map(|row| g.iter().zip(&table.data()[row as usize * width..][..width]).map(|(&g, &v)| g * v).sum::<T>());
-                    d.copy_from_slice(&slope_of(dots, cells[p], self.nodes));
+                    let (rows, _, present) = with_map!(self.lattice, map => corners_present(cells[p], map));
+                    let dots = std::array::from_fn(|c| match present >> c & 1 {
+                        0 => T::zero(),
+                        _ => g.iter().zip(&table.data()[rows[c] as usize * width..][..width]).map(|(&g, &v)| g * v).sum::<T>(),
+                    });
+                    d.copy_from_slice(&slope_of(dots, cells[p], self.lattice.nodes()));
                 }
             });
             out.dense(1, slope);
@@ -138,54 +197,63 @@ fn points<T: Real>(positions: &Tensor<T>) -> &[[T; 3]] {
 }
 
 impl<T: Real> Tensor<T> {
-    /// Trilinear interpolation of this table `[nx·ny·nz, C]` at `positions` `[m, 3]`, in cells with nodes at the integers: `[m, C]`.
+    /// Trilinear interpolation of this table `[rows, C]` at `positions` `[m, 3]`, in cells with nodes at the integers: `[m, C]`. The layout of
+    /// the table is a [`Lattice`], or `[nx, ny, nz]` for row-major order.
     /// Differentiable in the table (the gradient is row-sparse) and in the positions, where the slope jumps between cells.
     ///
-    /// Panics if the table does not have one row for each node or the positions are not `[m, 3]`.
+    /// Panics if the table does not have the rows of the layout or the positions are not `[m, 3]`.
     #[track_caller]
-    pub fn trilinear(&self, positions: &Self, nodes: [usize; 3]) -> Self {
-        self.check_grid("trilinear", positions, nodes);
+    pub fn trilinear(&self, positions: &Self, lattice: impl Into<Lattice>) -> Self {
+        let lattice = lattice.into();
+        self.check_grid("trilinear", positions, &lattice);
         let width = self.shape()[1];
         let cells = points(positions);
         let mut out = Buffer::stale(cells.len() * width);
         let table = self.data();
-        parallel::for_each_rows(&mut out, width, |first, chunk| {
+        with_map!(lattice, map => parallel::for_each_rows(&mut out, width, |first, chunk| {
             let cells = &cells[first..];
             match width {
-                1 => interpolate::<T, 1>(table, cells, nodes, width, chunk),
-                3 => interpolate::<T, 3>(table, cells, nodes, width, chunk),
-                4 => interpolate::<T, 4>(table, cells, nodes, width, chunk),
-                27 => interpolate::<T, 27>(table, cells, nodes, width, chunk),
-                28 => interpolate::<T, 28>(table, cells, nodes, width, chunk),
-                _ => interpolate::<T, 0>(table, cells, nodes, width, chunk),
+                1 => interpolate::<T, 1, _>(table, cells, map, width, chunk),
+                3 => interpolate::<T, 3, _>(table, cells, map, width, chunk),
+                4 => interpolate::<T, 4, _>(table, cells, map, width, chunk),
+                27 => interpolate::<T, 27, _>(table, cells, map, width, chunk),
+                28 => interpolate::<T, 28, _>(table, cells, map, width, chunk),
+                _ => interpolate::<T, 0, _>(table, cells, map, width, chunk),
             }
-        });
-        Tensor::from_kernel(out, &[cells.len(), width], &[self, positions], Trilinear { nodes })
+        }));
+        Tensor::from_kernel(out, &[cells.len(), width], &[self, positions], Trilinear { lattice })
     }
 
-    /// The row of this table `[nx·ny·nz, C]` whose node is nearest to each of `positions` `[m, 3]`: `[m, C]`.
+    /// The row of this table `[rows, C]` whose node is nearest to each of `positions` `[m, 3]`: `[m, C]`; zeros where that node is not present.
     /// The gradient is row-sparse; there is none with respect to the positions.
     ///
     /// Panics as [`Tensor::trilinear`] does.
     #[track_caller]
-    pub fn nearest(&self, positions: &Self, nodes: [usize; 3]) -> Self {
-        self.check_grid("nearest", positions, nodes);
+    pub fn nearest(&self, positions: &Self, lattice: impl Into<Lattice>) -> Self {
+        let lattice = lattice.into();
+        self.check_grid("nearest", positions, &lattice);
         let cells = points(positions);
         let mut rows = Buffer::stale(cells.len());
-        parallel::for_each_chunk(&mut rows, parallel::CHUNK, |first, chunk| {
+        with_map!(lattice, map => parallel::for_each_chunk(&mut rows, parallel::CHUNK, |first, chunk| {
             for (row, &p) in chunk.iter_mut().zip(&cells[first..]) {
-                *row = nearest_row(p, nodes);
+                *row = map.row_of(map.code(nearest_node(p, map.nodes()))).unwrap_or(u32::MAX);
             }
-        });
-        self.gather_rows(&rows.into())
+        }));
+        if lattice.is_full() {
+            return self.gather_rows(&rows.into());
+        }
+        let present: Vec<T> = rows.iter().map(|&row| if row == u32::MAX { T::zero() } else { T::one() }).collect();
+        rows.iter_mut().filter(|row| **row == u32::MAX).for_each(|row| *row = 0);
+        self.gather_rows(&rows.into()) * Tensor::from_vec(present, &[cells.len(), 1])
     }
 
     #[track_caller]
-    fn check_grid(&self, op: &str, positions: &Self, nodes: [usize; 3]) {
-        let rows: usize = nodes.iter().product();
+    fn check_grid(&self, op: &str, positions: &Self, lattice: &Lattice) {
+        let rows = lattice.rows();
         assert!(
             self.ndim() == 2 && self.shape()[0] == rows && rows > 0,
-            "{op}: a grid of {nodes:?} nodes needs a table of [{rows}, C] rows, got {:?}",
+            "{op}: a grid of {:?} nodes needs a table of [{rows}, C] rows, got {:?}",
+            lattice.nodes(),
             self.shape()
         );
         assert!(positions.ndim() == 2 && positions.shape()[1] == 3, "{op}: positions must be [m, 3], got {:?}", positions.shape());
@@ -194,10 +262,10 @@ impl<T: Real> Tensor<T> {
 
 dispatched! {
 /// `W` is the width, or 0 for one only known at run time.
-fn interpolate<T: Real, const W: usize>(table: &[T], cells: &[[T; 3]], nodes: [usize; 3], width: usize, out: &mut [T]) {
+fn interpolate<T: Real, const W: usize, M: NodeMap>(table: &[T], cells: &[[T; 3]], map: M, width: usize, out: &mut [T]) {
     let width = if W == 0 { width } else { W };
     for (y, &cell) in out.chunks_exact_mut(width).zip(cells) {
-        let (rows, weights) = corners(cell, nodes);
+        let (rows, weights) = corners(cell, map);
         if W == 0 {
             y.fill(T::zero());
             for (&row, &w) in rows.iter().zip(&weights) {

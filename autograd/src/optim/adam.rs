@@ -1,6 +1,6 @@
 //! Adam, in the two algorithms that row gradients make of it.
 
-use super::{Memory, Optimizer, Rates, update};
+use super::{Memory, Optimizer, Rates, bounded, update};
 use crate::gradients::{Grad, Gradients};
 use crate::parallel;
 use crate::param::Module;
@@ -66,9 +66,12 @@ impl<T: Real> Optimizer<T> for Adam<T> {
                 let v = b2 * v + r2 * g * g;
                 [theta - rate * m / (v.sqrt() * scale + epsilon), m, v]
             };
+            let bounds = param.bounds();
             param.update(|theta| match (self.mode, grad) {
-                (AdamMode::Dense, Grad::Rows(g)) => parallel::update_all_rows([theta, m, v], g.width(), g.rows(), g.data(), rule),
-                _ => update([theta, m, v], grad, rule),
+                (AdamMode::Dense, Grad::Rows(g)) => {
+                    parallel::update_all_rows([theta, m, v], g.width(), g.rows(), g.data(), bounded(bounds, rule))
+                }
+                _ => update([theta, m, v], grad, bounds, rule),
             });
         });
     }

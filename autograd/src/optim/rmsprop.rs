@@ -45,8 +45,9 @@ impl<T: Real> Optimizer<T> for RmsProp<T> {
         let (beta, rest, epsilon) = (T::lit(self.beta), T::lit(1.0 - self.beta), T::lit(self.epsilon));
         self.memory.visit(module, grads, |param, grad, [v], _| {
             let rate = T::lit(self.rates.at(param.name(), step));
+            let bounds = param.bounds();
             param.update(|theta| {
-                update([theta, v], grad, |[theta, v], g| {
+                update([theta, v], grad, bounds, |[theta, v], g| {
                     let v = if v == T::zero() { g * g } else { beta * v + rest * g * g };
                     [theta - rate * g / (v.sqrt() + epsilon), v]
                 });

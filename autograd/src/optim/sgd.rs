@@ -23,7 +23,8 @@ impl<T: Real> Optimizer<T> for Sgd {
         module.visit_mut(&mut |param| {
             let Some(grad) = grads.of(param) else { return };
             let rate = T::lit(self.rates.at(param.name(), step));
-            param.update(|theta| update([theta], grad, |[theta], g| [theta - rate * g]));
+            let bounds = param.bounds();
+            param.update(|theta| update([theta], grad, bounds, |[theta], g| [theta - rate * g]));
         });
     }
 }
@@ -51,8 +52,9 @@ impl<T: Real> Optimizer<T> for Momentum<T> {
         let mu = T::lit(self.momentum);
         self.memory.visit(module, grads, |param, grad, [m], _| {
             let rate = T::lit(self.rates.at(param.name(), step));
+            let bounds = param.bounds();
             param.update(|theta| {
-                update([theta, m], grad, |[theta, m], g| {
+                update([theta, m], grad, bounds, |[theta, m], g| {
                     let m = mu * m + g;
                     [theta - rate * m, m]
                 });

@@ -1,17 +1,15 @@
 //! `plenoxel evaluate`: figures of a trained run on the views of a split.
 
 use super::train::load;
-use crate::data::DataSource;
-use crate::evaluation::{Scores, ViewScore, Viewer, with_samples};
-use crate::memory::{self, Estimate};
+use super::trained_run::{Opened, TrainedRun};
+use crate::evaluation::{Scores, ViewScore, Viewer};
+use crate::memory;
 use crate::progress::Console;
-use crate::run_folder::RunFolder;
-use clap::{Args, ValueHint};
+use clap::Args;
 use plenoxel::dataset::Split;
 use plenoxel::error::Result;
 use serde::Serialize;
 use serde_json::{Value, json};
-use std::path::PathBuf;
 use std::time::Instant;
 
 const EXAMPLES: &str = "\
@@ -30,25 +28,8 @@ lie inside the image, ssim_same pads with zeros as svox2 does. The last line on 
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct EvaluateArgs {
-    /// Run folder that `plenoxel train` wrote
-    #[arg(value_hint = ValueHint::DirPath)]
-    run: PathBuf,
-
-    /// Where the dataset is now [default: where it was when training]
-    #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
-    data: Option<PathBuf>,
-
-    /// Views to compare with
-    #[arg(long, help_heading = "Scene", default_value_t = Split::Test, value_parser = super::split)]
-    split: Split,
-
-    /// Reduce the images by this factor [default: as in training]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::factor)]
-    downscale: Option<usize>,
-
-    /// Samples on the longest ray through the box (preset paper: on every ray) [default: as the run's `evaluation` setting says]
-    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = clap::value_parser!(u32).range(2..=100_000))]
-    samples: Option<u32>,
+    #[command(flatten)]
+    run: TrainedRun,
 
     /// Print the JSON object alone
     #[arg(long, help_heading = "Output")]
@@ -57,23 +38,13 @@ pub struct EvaluateArgs {
 
 /// Evaluates a run.
 pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
-    let (folder, mut config, record) = RunFolder::open(&args.run)?;
-    config.downscale = args.downscale.unwrap_or(config.downscale);
-    let source = args.data.as_deref().map_or(record.data, DataSource::folder);
     let start = Instant::now();
-    let dataset = source.reopen(&config)?;
-    super::check_split(&dataset, args.split)?;
-    let shape = super::final_shape(&config);
-    let sampling = args.samples.map_or(config.evaluation, |samples| with_samples(config.evaluation, samples, &shape));
-    let estimate = Estimate::of_evaluation(&config, sampling, &shape, &dataset, Some(args.split));
-    console.note(&estimate.describe());
-    estimate.check()?;
-    let (grid, header) = folder.load()?;
-    let views = load(console, &dataset, args.split, &source)?;
+    let Opened { folder, config, preset, source, dataset, sampling, grid, header } = args.run.open(console, true)?;
+    let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
 
     let start = Instant::now();
-    let viewer = Viewer::new(&grid, sampling, config.background);
+    let viewer = Viewer::new(&grid, sampling, &config);
     let count = console.count("evaluating", views.len());
     let scores = viewer.compare(&views, |i, _, _, _| {
         count.at(i + 1, views.len());
@@ -87,14 +58,14 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
             let ssim = view.ssim.map_or("-".to_owned(), |ssim| format!("{ssim:.4}"));
             console.result(&format!("{:24} {:7.2} dB  ssim {ssim}", view.name, view.psnr))?;
         }
-        console.result(&sentence(&scores, args.split, width, height))?;
+        console.result(&sentence(&scores, args.run.split, width, height))?;
     }
     let trained = folder.result().unwrap_or(Value::Null);
     let figures = Figures {
         psnr: scores.psnr(),
         ssim: scores.ssim(),
         ssim_same: scores.ssim_same(),
-        split: args.split.to_string(),
+        split: args.run.split.to_string(),
         views: views.len(),
         width,
         height,
@@ -108,8 +79,8 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         rays: trained["rays"].as_u64(),
         resolution: header.resolution,
         scene: header.scene,
-        preset: record.preset,
-        run: args.run.display().to_string(),
+        preset,
+        run: folder.path().display().to_string(),
         per_view: scores.per_view,
     };
     console.result(&crate::json_line(&figures)?)

@@ -1,15 +1,12 @@
 //! `plenoxel render`: pictures of a trained run from the cameras of its views.
 
-use crate::data::DataSource;
-use crate::evaluation::{Viewer, with_samples};
+use super::trained_run::{Opened, TrainedRun};
+use crate::evaluation::Viewer;
 use crate::images::{self, DepthRange};
-use crate::memory::Estimate;
 use crate::progress::Console;
-use crate::run_folder::RunFolder;
-use clap::{Args, ValueHint};
+use clap::Args;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
-use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -24,61 +21,34 @@ Writes RUN/renders/<split>_<number>_<name>.png with the colors over the run's ba
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct RenderArgs {
-    /// Run folder that `plenoxel train` wrote
-    #[arg(value_hint = ValueHint::DirPath)]
-    run: PathBuf,
-
-    /// Where the dataset is now [default: where it was when training]
-    #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
-    data: Option<PathBuf>,
-
-    /// Views whose cameras are used
-    #[arg(long, help_heading = "Scene", default_value_t = Split::Test, value_parser = super::split)]
-    split: Split,
+    #[command(flatten)]
+    run: TrainedRun,
 
     /// Render this view only, by number from 0 or by name; may be repeated
     #[arg(long, value_name = "N|NAME", help_heading = "Scene")]
     view: Vec<String>,
-
-    /// Reduce the pictures by this factor [default: as in training]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::factor)]
-    downscale: Option<usize>,
-
-    /// Samples on the longest ray, as for evaluate [default: as the run's `evaluation` setting says]
-    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = clap::value_parser!(u32).range(2..=100_000))]
-    samples: Option<u32>,
 }
 
 /// Renders views of a run.
 pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
-    let (folder, mut config, record) = RunFolder::open(&args.run)?;
-    config.downscale = args.downscale.unwrap_or(config.downscale);
-    let source = args.data.as_deref().map_or(record.data, DataSource::folder);
-    let dataset = source.reopen(&config)?;
-    super::check_split(&dataset, args.split)?;
-    let chosen = choose(&dataset, args.split, &args.view)?;
-    let shape = super::final_shape(&config);
-    let sampling = args.samples.map_or(config.evaluation, |samples| with_samples(config.evaluation, samples, &shape));
-    let estimate = Estimate::of_evaluation(&config, sampling, &shape, &dataset, None);
-    console.note(&estimate.describe());
-    estimate.check()?;
-    let (grid, _) = folder.load()?;
-
+    let Opened { folder, config, dataset, sampling, grid, .. } = args.run.open(console, false)?;
+    let split = args.run.split;
+    let chosen = choose(&dataset, split, &args.view)?;
     let renders = folder.create_renders()?;
-    let viewer = Viewer::new(&grid, sampling, config.background);
-    let (cameras, names) = (dataset.cameras(args.split), dataset.view_names(args.split));
+    let viewer = Viewer::new(&grid, sampling, &config);
+    let (cameras, names) = (dataset.cameras(split), dataset.view_names(split));
     let count = console.count("rendering", chosen.len());
     for (done, &number) in chosen.iter().enumerate() {
         let picture = viewer.see(&cameras[number]);
         let range = DepthRange::of(&cameras[number], config.half_width);
-        let file = |kind: &str| folder.render(&format!("{}_{number:03}_{}{kind}.png", args.split, names[number]));
+        let file = |kind: &str| folder.render(&format!("{}_{number:03}_{}{kind}.png", split, names[number]));
         images::write(&file(""), &picture.rgb)?;
         images::write(&file("_depth"), &images::depth_map(&picture, range))?;
         images::write(&file("_opacity"), &images::opacity_map(&picture))?;
         count.at(done + 1, chosen.len());
     }
     drop(count);
-    console.result(&format!("rendered {} {} views to {}", chosen.len(), args.split, renders.display()))
+    console.result(&format!("rendered {} {} views to {}", chosen.len(), split, renders.display()))
 }
 
 /// Numbers of the views that were asked for: all of the split unless some are named.

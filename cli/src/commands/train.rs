@@ -162,7 +162,7 @@ fn evaluate(
     let mut drawing = Stopwatch::default();
     for stage in &mut learned.stages {
         if let Some(grid) = stage.grid.take() {
-            let viewer = Viewer::new(&grid, config.evaluation, config.background);
+            let viewer = Viewer::new(&grid, config.evaluation, config);
             let scores = viewer.compare(test, |_, _, _, _| {
                 advance();
                 Ok(())
@@ -170,7 +170,7 @@ fn evaluate(
             stage.psnr = scores.psnr();
         }
     }
-    let viewer = Viewer::new(&learned.grid, config.evaluation, config.background);
+    let viewer = Viewer::new(&learned.grid, config.evaluation, config);
     let scores = viewer.compare(test, |i, view, target, picture| {
         advance();
         drawing.time(|| pictures.panel(i, view, target, picture))
@@ -185,7 +185,7 @@ fn evaluate(
 /// A grid with the values that `grid` has now: the tables are shared until training changes them.
 fn copy(grid: &VoxelGrid<f32>) -> VoxelGrid<f32> {
     let (density, color) = (grid.density.tensor().detach(), grid.color.tensor().detach());
-    VoxelGrid::from_tables(*grid.shape(), density, color)
+    VoxelGrid::with_lattice(*grid.shape(), grid.lattice().clone(), density, color)
 }
 
 /// Final figures, in the order in which people look for them.

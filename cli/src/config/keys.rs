@@ -19,6 +19,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "sh_degree",
             "sh_offset",
             "engine",
+            "stop_below",
             "rays_per_step",
             "jitter",
             "project",

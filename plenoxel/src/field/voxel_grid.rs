@@ -1,14 +1,18 @@
-//! Density and color in a dense grid of voxels.
+//! Density and color in a grid of voxels, dense or sparse.
 //!
-//! Voxel (i, j, k) of n³ has its centre at (i + ½, j + ½, k + ½) · side − half and is row (i·n + j)·n + k of the tables: z runs fastest.
-//! Nearest look-up takes the voxel a point lies in; trilinear look-up runs between centres, and in the outer half voxel repeats the
-//! border. Outside the box there is nothing. Values are stored raw and activated after interpolation: σ = max(0, density).
+//! Voxel (i, j, k) of n³ has its centre at (i + ½, j + ½, k + ½) · side − half. A [`Lattice`] of bricks says which row of the tables is
+//! its own, if it is present; one that is not has density and color 0 and takes no part in training. Nearest look-up takes the voxel a
+//! point lies in; trilinear look-up runs between centres, and in the outer half voxel repeats the border. Outside the box there is nothing.
+//! Values are stored raw and activated after interpolation: σ = max(0, density).
 
 use super::{Field, Radiance, sh};
+use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
+use crate::render::{RenderOptions, Rendered, fused};
 use crate::sampling::{Occupancy, Samples};
-use autograd::{Buffer, Grad, Gradients, Module, Param, Real, Tensor, no_grad, parallel};
+use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::{Bounds, Buffer, Indices, Lattice, Module, Param, Real, Tensor, no_grad, parallel};
 use serde::{Deserialize, Serialize};
 
 /// How values between voxel centres are found.
@@ -43,6 +47,23 @@ impl Color {
             Color::Sh { degree, .. } => 3 * sh::count(degree),
         }
     }
+
+    /// Density and color of samples from the numbers looked up for them, `[m, 1]` and `[m, channels]`; `directions` are `[n, 3]`, and ray
+    /// r owns the samples `offsets[r]..offsets[r + 1]`.
+    pub fn activate<T: Real>(self, density: &Tensor<T>, color: &Tensor<T>, directions: &Tensor<T>, offsets: &Indices) -> Radiance<T> {
+        let m = density.shape()[0];
+        let sigma = density.reshape(&[m]).relu();
+        let rgb = match self {
+            Color::Rgb => color.clone(),
+            Color::Sh { degree, offset } => {
+                let count = sh::count(degree);
+                let basis = sh::basis(directions, degree).segment_repeat(offsets);
+                let sum = (color.reshape(&[m, 3, count]) * basis.reshape(&[m, 1, count])).sum_axis(2);
+                (sum + offset).relu()
+            }
+        };
+        Radiance { sigma, rgb }
+    }
 }
 
 /// Shape and meaning of a grid.
@@ -69,16 +90,29 @@ impl GridShape {
         2.0 * self.half_width / self.resolution as f64
     }
 
-    /// Bytes of both tables in `f32`.
+    /// The layout with all voxels present.
+    pub fn full(&self) -> Lattice {
+        Lattice::bricks([self.resolution; 3])
+    }
+
+    /// The voxels in which a sample can read one of `voxels`: the same with nearest look-up, their neighbours too with trilinear.
+    pub fn reached_from(&self, voxels: &Occupancy) -> Occupancy {
+        voxels.dilated(usize::from(self.interpolation == Interpolation::Trilinear))
+    }
+
+    /// Bytes of both tables in `f32`, all voxels being present.
     pub fn bytes(&self) -> usize {
         self.voxels() * (1 + self.color.channels()) * size_of::<f32>()
     }
 }
 
-/// A dense grid with its two parameters, `density` `[n³, 1]` and `color` `[n³, channels]`.
+/// A grid with its two parameters, `density` `[rows, 1]` and `color` `[rows, channels]`.
 #[derive(Debug)]
 pub struct VoxelGrid<T: Real> {
     shape: GridShape,
+    lattice: Lattice,
+    /// The voxels in which a sample can read a present one; `None` if that is everywhere.
+    reach: Option<Occupancy>,
     /// Raw density; σ = max(0, ·) after interpolation, 1 / world length.
     pub density: Param<T>,
     /// Colors or their harmonics.
@@ -88,32 +122,65 @@ pub struct VoxelGrid<T: Real> {
 impl<T: Real> VoxelGrid<T> {
     /// A grid with the same density and the same color numbers everywhere.
     pub fn uniform(shape: GridShape, density: f64, color: f64) -> Self {
-        let n = shape.voxels();
-        Self::from_tables(shape, Tensor::full(&[n, 1], density), Tensor::full(&[n, shape.color.channels()], color))
+        let rows = shape.full().rows();
+        Self::from_tables(shape, Tensor::full(&[rows, 1], density), Tensor::full(&[rows, shape.color.channels()], color))
     }
 
     /// A grid of uniform random numbers: density in [0, `density`), colors in [0, `color`). A function of the seed.
     pub fn random(shape: GridShape, density: f64, color: f64, seed: u64) -> Self {
+        let rows = shape.full().rows();
         let table = |step: u64, width: usize, scale: f64| {
-            let mut values = Buffer::stale(shape.voxels() * width);
+            let mut values = Buffer::stale(rows * width);
             parallel::for_each_chunk(&mut values, parallel::CHUNK, |start, chunk| {
                 for (i, v) in chunk.iter_mut().enumerate() {
                     *v = T::lit(scale * uniform(seed, Purpose::Initial, step, (start + i) as u64));
                 }
             });
-            Tensor::from_buffer(values, &[shape.voxels(), width])
+            Tensor::from_buffer(values, &[rows, width])
         };
         Self::from_tables(shape, table(0, 1, density), table(1, shape.color.channels(), color))
     }
 
-    /// A grid from its tables.
+    /// A grid with all voxels from its tables, whose rows are in the order of [`GridShape::full`].
+    ///
+    /// Panics if they are not `[rows, 1]` and `[rows, channels]`.
+    #[track_caller]
+    pub fn from_tables(shape: GridShape, density: Tensor<T>, color: Tensor<T>) -> Self {
+        Self::with_lattice(shape, shape.full(), density, color)
+    }
+
+    /// A grid with the voxels of a lattice.
+    ///
+    /// Panics if the lattice is of another resolution or the tables do not have its rows.
+    #[track_caller]
+    pub fn with_lattice(shape: GridShape, lattice: Lattice, density: Tensor<T>, color: Tensor<T>) -> Self {
+        let rows = lattice.rows();
+        assert_eq!(lattice.nodes(), [shape.resolution; 3], "lattice of a grid of {}³ voxels", shape.resolution);
+        assert_eq!(density.shape(), [rows, 1], "density table of a grid of {}³ voxels", shape.resolution);
+        assert_eq!(color.shape(), [rows, shape.color.channels()], "color table of a grid of {}³ voxels", shape.resolution);
+        let reach = (!lattice.is_full()).then(|| {
+            let present = Occupancy::from_masks(Aabb::cube(shape.half_width), lattice.nodes(), lattice.masks().to_vec());
+            shape.reached_from(&present)
+        });
+        VoxelGrid { shape, lattice, reach, density: Param::from_tensor("density", density), color: Param::from_tensor("color", color) }
+    }
+
+    /// A grid with all voxels from tables in row-major order, voxel (i, j, k) being row (i·n + j)·n + k.
     ///
     /// Panics if they are not `[n³, 1]` and `[n³, channels]`.
     #[track_caller]
-    pub fn from_tables(shape: GridShape, density: Tensor<T>, color: Tensor<T>) -> Self {
+    pub fn from_row_major(shape: GridShape, density: &Tensor<T>, color: &Tensor<T>) -> Self {
         assert_eq!(density.shape(), [shape.voxels(), 1], "density table of a grid of {}³ voxels", shape.resolution);
         assert_eq!(color.shape(), [shape.voxels(), shape.color.channels()], "color table of a grid of {}³ voxels", shape.resolution);
-        VoxelGrid { shape, density: Param::from_tensor("density", density), color: Param::from_tensor("color", color) }
+        let full = shape.full();
+        let row_major = Lattice::from([shape.resolution; 3]);
+        Self::from_tables(shape, moved(density, &row_major, &full), moved(color, &row_major, &full))
+    }
+
+    /// Both tables in row-major order, with zeros for voxels that are not present: `[n³, 1]` and `[n³, channels]`.
+    pub fn to_row_major(&self) -> [Tensor<T>; 2] {
+        let row_major = Lattice::from(self.lattice.nodes());
+        [&self.density, &self.color].map(|table| moved(table.tensor(), &self.lattice, &row_major))
     }
 
     /// Shape and meaning.
@@ -121,9 +188,9 @@ impl<T: Real> VoxelGrid<T> {
         &self.shape
     }
 
-    /// Voxels along each axis, as lookups take them.
-    pub fn nodes(&self) -> [usize; 3] {
-        [self.shape.resolution; 3]
+    /// Which voxels are present, and their rows: what look-ups take.
+    pub fn lattice(&self) -> &Lattice {
+        &self.lattice
     }
 
     /// The box it fills.
@@ -139,104 +206,95 @@ impl<T: Real> VoxelGrid<T> {
 
     fn look_up(&self, table: &Param<T>, voxels: &Tensor<T>) -> Tensor<T> {
         match self.shape.interpolation {
-            Interpolation::Nearest => table.tensor().nearest(voxels, self.nodes()),
-            Interpolation::Trilinear => table.tensor().trilinear(voxels, self.nodes()),
+            Interpolation::Nearest => table.tensor().nearest(voxels, &self.lattice),
+            Interpolation::Trilinear => table.tensor().trilinear(voxels, &self.lattice),
         }
     }
 
-    /// Clamps density to >= 0, and RGB colors to [0, 1], in the rows that `gradients` touched: after a step from a feasible grid this
-    /// equals clamping the whole of it. (The source paper's projection; harmonics are not clamped.)
-    pub fn project(&mut self, gradients: &Gradients<T>) {
-        project_param(&mut self.density, gradients, |v| v.max(T::zero()));
+    /// Makes optimizers keep density >= 0, and RGB colors in [0, 1] (the source paper's projection; harmonics are free).
+    pub fn project(&mut self) {
+        self.density.set_bounds(Bounds { low: T::zero(), high: T::infinity() });
         if self.shape.color == Color::Rgb {
-            project_param(&mut self.color, gradients, |v| v.max(T::zero()).min(T::one()));
+            self.color.set_bounds(Bounds { low: T::zero(), high: T::one() });
         }
     }
 
-    /// The same field at another resolution: the old field read at the new centres, trilinearly whatever the interpolation.
-    /// Parameters get new identities, so an optimizer starts afresh.
+    /// The same field at another resolution: the old field read at the new centres, trilinearly whatever the interpolation. A new voxel
+    /// is present if it reads one that is. Parameters get new identities, so an optimizer starts afresh.
     pub fn resample(&self, resolution: usize) -> Self {
         let shape = GridShape { resolution, ..self.shape };
+        let ratio = self.shape.resolution as f64 / resolution as f64;
+        let center = |k: usize| (k as f64 + 0.5) * ratio - 0.5;
+        let lattice = match &self.reach {
+            None => shape.full(),
+            Some(_) => {
+                let last = self.shape.resolution - 1;
+                let corners = |k: usize| {
+                    let low = center(k).clamp(0.0, last as f64) as usize;
+                    low..(low + 2).min(last + 1)
+                };
+                Lattice::bricks_where([resolution; 3], |[i, j, k]| {
+                    corners(i).any(|a| corners(j).any(|b| corners(k).any(|c| self.lattice.row([a, b, c]).is_some())))
+                })
+            }
+        };
         let table = |old: &Param<T>| {
             let width = old.shape()[1];
             let old = old.tensor().detach();
-            let mut values = Buffer::stale(shape.voxels() * width);
-            let ratio = self.shape.resolution as f64 / resolution as f64;
-            let center = |k: usize| T::lit((k as f64 + 0.5) * ratio - 0.5);
-            // One slab of new voxels at a time bounds the memory for positions.
-            let slab = resolution * resolution;
-            for (i, part) in values.chunks_exact_mut(slab * width).enumerate() {
-                let mut at = Buffer::stale(slab * 3);
-                for (v, p) in at.chunks_exact_mut(3).enumerate() {
-                    p.copy_from_slice(&[center(i), center(v / resolution), center(v % resolution)]);
-                }
-                let read = no_grad(|| old.trilinear(&Tensor::from_buffer(at, &[slab, 3]), self.nodes()));
+            let mut values = Buffer::stale(lattice.rows() * width);
+            // A run of rows at a time bounds the memory for positions.
+            const RUN: usize = 1 << 16;
+            for (run, part) in values.chunks_mut(RUN * width).enumerate() {
+                let rows = part.len() / width;
+                let mut at = Buffer::stale(rows * 3);
+                parallel::for_each_chunk(&mut at, 3 * 4096, |first, chunk| {
+                    for (r, p) in chunk.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                        let row = run * RUN + first / 3 + r;
+                        *p = lattice.node(row as u32).map_or([T::zero(); 3], |node| node.map(|k| T::lit(center(k))));
+                    }
+                });
+                let read = no_grad(|| old.trilinear(&Tensor::from_buffer(at, &[rows, 3]), &self.lattice));
                 parallel::copy(read.data(), part);
             }
-            Tensor::from_buffer(values, &[shape.voxels(), width])
+            Tensor::from_buffer(values, &[lattice.rows(), width])
         };
-        Self::from_tables(shape, table(&self.density), table(&self.color))
+        let (density, color) = (table(&self.density), table(&self.color));
+        Self::with_lattice(shape, lattice, density, color)
     }
 
     /// The voxels in which a sample can have positive density: those whose own value, or with trilinear look-up a neighbour's, is above
     /// `threshold`. With threshold 0, leaving out the samples elsewhere changes no rendered value.
     pub fn occupancy(&self, threshold: f64) -> Occupancy {
         let (density, threshold) = (self.density.tensor().data(), T::lit(threshold));
-        self.reached(|row| density[row] > threshold)
+        self.shape.reached_from(&self.voxels_where(|row| density[row] > threshold))
     }
 
-    /// The voxels in which a sample can read one of `kept`: the same with nearest look-up, their neighbours too with trilinear.
-    ///
-    /// Panics if it has other cells than this grid has voxels.
-    pub fn reached_from(&self, kept: &Occupancy) -> Occupancy {
-        assert_eq!(kept.cells(), self.nodes(), "reached_from: occupancy of another grid");
-        self.reached(|row| kept.mask()[row])
-    }
-
-    fn reached(&self, full: impl Fn(usize) -> bool + Sync) -> Occupancy {
-        let n = self.shape.resolution;
-        let mut mask = vec![false; n * n * n];
-        let reach = usize::from(self.shape.interpolation == Interpolation::Trilinear);
-        parallel::for_each_chunk(&mut mask, n * n, |start, slab| {
-            let around = |c: usize| c.saturating_sub(reach)..(c + reach + 1).min(n);
-            let i = start / (n * n);
-            for (cell, m) in slab.iter_mut().enumerate() {
-                let (j, k) = (cell / n, cell % n);
-                *m = around(i).any(|a| around(j).any(|b| around(k).any(|c| full((a * n + b) * n + c))));
+    /// The present voxels whose rows `full` names.
+    pub fn voxels_where(&self, full: impl Fn(usize) -> bool + Sync) -> Occupancy {
+        let mut masks = self.lattice.masks().to_vec();
+        let count = self.shape.resolution.div_ceil(BRICK);
+        parallel::for_each_chunk(&mut masks, 256, |first, chunk| {
+            for (b, mask) in chunk.iter_mut().enumerate() {
+                let b = first + b;
+                if let Some((brick, present)) = self.lattice.brick([b / (count * count), b / count % count, b % count]) {
+                    *mask = (0..BRICK_ROWS)
+                        .filter(|bit| present >> bit & 1 == 1 && full(brick * BRICK_ROWS + bit))
+                        .fold(0, |m, bit| m | 1 << bit);
+                }
             }
         });
-        Occupancy::new(self.aabb(), self.nodes(), mask)
+        Occupancy::from_masks(self.aabb(), self.lattice.nodes(), masks)
     }
 
-    /// Sets the density of every voxel outside of `occupancy` to 0.
+    /// The same grid without the voxels outside of `kept`. Parameters get new identities.
     ///
-    /// Panics if it has other cells than this grid has voxels.
-    pub fn clear_outside(&mut self, occupancy: &Occupancy) {
-        assert_eq!(occupancy.cells(), self.nodes(), "clear_outside: occupancy of another grid");
-        let mask = occupancy.mask();
-        self.density.update(|density| {
-            parallel::for_each_chunk(density, parallel::CHUNK, |start, chunk| {
-                chunk.iter_mut().zip(&mask[start..]).filter(|(_, m)| !**m).for_each(|(d, _)| *d = T::zero());
-            });
-        });
-    }
-
-    /// The same for the rows that `gradients` touched: what an optimizer moved out there goes back to 0.
-    pub fn clear_touched_outside(&mut self, gradients: &Gradients<T>, occupancy: &Occupancy) {
-        match gradients.of(&self.density) {
-            None => {}
-            Some(Grad::Dense(_)) => self.clear_outside(occupancy),
-            Some(Grad::Rows(rows)) => {
-                let (rows, mask) = (rows.rows(), occupancy.mask());
-                self.density.update(|density| {
-                    parallel::for_each_table_row(density, 1, rows, |k, row| {
-                        if !mask[rows[k] as usize] {
-                            row[0] = T::zero();
-                        }
-                    });
-                });
-            }
-        }
+    /// Panics if `kept` has other cells than this grid has voxels.
+    pub fn pruned(&self, kept: &Occupancy) -> Self {
+        assert_eq!(kept.cells(), self.lattice.nodes(), "pruned: occupancy of another grid");
+        let masks = kept.masks().iter().zip(self.lattice.masks()).map(|(kept, present)| kept & present).collect();
+        let lattice = Lattice::from_masks(self.lattice.nodes(), masks);
+        let [density, color] = [&self.density, &self.color].map(|table| moved(table.tensor(), &self.lattice, &lattice));
+        Self::with_lattice(self.shape, lattice, density, color)
     }
 
     /// True if every stored number is finite.
@@ -247,18 +305,19 @@ impl<T: Real> VoxelGrid<T> {
     }
 }
 
-fn project_param<T: Real>(param: &mut Param<T>, gradients: &Gradients<T>, clamp: impl Fn(T) -> T + Sync) {
-    match gradients.of(param) {
-        None => {}
-        Some(Grad::Dense(_)) => param
-            .update(|values| parallel::for_each_chunk(values, parallel::CHUNK, |_, chunk| chunk.iter_mut().for_each(|v| *v = clamp(*v)))),
-        Some(Grad::Rows(rows)) => {
-            let width = rows.width();
-            param.update(|values| {
-                parallel::for_each_table_row(values, width, rows.rows(), |_, row| row.iter_mut().for_each(|v| *v = clamp(*v)))
-            });
+/// A table in another layout of the same grid, with zeros where the old one has no node.
+fn moved<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) -> Tensor<T> {
+    let width = table.shape()[1];
+    let mut values = Buffer::stale(to.rows() * width);
+    parallel::for_each_rows(&mut values, width, |first, chunk| {
+        for (r, row) in chunk.chunks_exact_mut(width).enumerate() {
+            match to.node((first + r) as u32).and_then(|node| from.row(node)) {
+                Some(old) => row.copy_from_slice(&table.data()[old as usize * width..][..width]),
+                None => row.fill(T::zero()),
+            }
         }
-    }
+    });
+    Tensor::from_buffer(values, &[to.rows(), width])
 }
 
 impl<T: Real> Field<T> for VoxelGrid<T> {
@@ -267,20 +326,17 @@ impl<T: Real> Field<T> for VoxelGrid<T> {
     }
 
     fn radiance(&self, samples: &Samples<T>) -> Radiance<T> {
-        let m = samples.len();
         let voxels = self.world_to_voxels(&samples.positions);
-        let sigma = self.look_up(&self.density, &voxels).reshape(&[m]).relu();
-        let row = self.look_up(&self.color, &voxels);
-        let rgb = match self.shape.color {
-            Color::Rgb => row,
-            Color::Sh { degree, offset } => {
-                let count = sh::count(degree);
-                let basis = sh::basis(&samples.directions, degree).segment_repeat(&samples.offsets);
-                let sum = (row.reshape(&[m, 3, count]) * basis.reshape(&[m, 1, count])).sum_axis(2);
-                (sum + offset).relu()
-            }
-        };
-        Radiance { sigma, rgb }
+        let (density, color) = (self.look_up(&self.density, &voxels), self.look_up(&self.color, &voxels));
+        self.shape.color.activate(&density, &color, &samples.directions, &samples.offsets)
+    }
+
+    fn reach(&self) -> Option<&Occupancy> {
+        self.reach.as_ref()
+    }
+
+    fn render_fused(&self, rays: &[Ray], options: &RenderOptions<'_>) -> Option<Rendered<T>> {
+        Some(fused::render(self, rays, options))
     }
 }
 

@@ -1,11 +1,12 @@
 //! Isotropic total variation of a grid's rows.
 //!
-//! A cell is a node with its forward neighbours along x, y and z: (nx−1)(ny−1)(nz−1) of them, in row order. Per cell and channel
-//! √(dx² + dy² + dz² + ε), averaged over cells and channels. The gradient is the exact one.
+//! A cell is a node with its forward neighbours along x, y and z, all four being present. Per cell and channel √(dx² + dy² + dz² + ε),
+//! averaged over cells and channels. The gradient is the exact one.
 
 use super::Step;
 use crate::random::{Purpose, bits};
-use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Param, Real, Tensor, parallel};
+use autograd::lattice::Neighbours;
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, Tensor, dispatched, parallel};
 
 /// Keeps the root smooth (source paper).
 const EPSILON: f64 = 1e-5;
@@ -15,7 +16,7 @@ const EPSILON: f64 = 1e-5;
 pub enum Cells {
     /// All: a dense gradient.
     Whole,
-    /// A contiguous run of this share of the cells, at a random place each step (svox2): a row-sparse gradient.
+    /// A contiguous run of this share of the table's rows, at a random place each step (svox2): a row-sparse gradient.
     Share(f64),
 }
 
@@ -35,177 +36,228 @@ pub fn tv_color<T: Real>(cells: Cells) -> impl Fn(&Step<'_, T>) -> Tensor<T> + S
 }
 
 fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, cells: Cells, stream: u64) -> Tensor<T> {
-    let nodes = step.grid.nodes();
+    let lattice = step.grid.lattice();
     match cells {
-        Cells::Whole => total_variation(table.tensor(), nodes),
+        Cells::Whole => total_variation(table.tensor(), lattice),
         Cells::Share(share) => {
-            let all: usize = nodes.iter().map(|n| n - 1).product();
-            let first = bits(step.seed, Purpose::Cells, step.number, stream) % all.max(1) as u64;
-            let count = ((share * all as f64).ceil() as usize).clamp(1, all.max(1));
-            sampled_total_variation(table.tensor(), nodes, first as usize, count)
+            let rows = lattice.rows();
+            let first = bits(step.seed, Purpose::Cells, step.number, stream) % rows.max(1) as u64;
+            let count = ((share * rows as f64).ceil() as usize).clamp(1, rows.max(1));
+            sampled_total_variation(table.tensor(), lattice, first as usize, count)
         }
     }
 }
 
-/// Total variation over all cells of a table `[nx·ny·nz, C]`: a scalar, with a dense gradient.
+/// Total variation over all cells of a table `[rows, C]` in bricks: a scalar. A grid without cells has variation 0. The gradient is dense
+/// where there is a kernel, for the widths that grids have: C = 1, 3, 4, 12, 27, 48.
 ///
-/// Panics if the table does not have one row for each node. A grid without cells (a side of one node) has variation 0.
+/// Panics if the layout is row-major or the table does not have its rows.
 #[track_caller]
-pub fn total_variation<T: Real>(table: &Tensor<T>, nodes: [usize; 3]) -> Tensor<T> {
-    assert!(
-        table.ndim() == 2 && table.shape()[0] == nodes.iter().product::<usize>(),
-        "total_variation: {nodes:?} nodes, table {:?}",
-        table.shape()
-    );
-    let kernel = TotalVariation { nodes };
-    let value = kernel.value(table);
+pub fn total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
+    check(table, lattice);
+    match table.shape()[1] {
+        1 => with_kernel::<T, 1, 4>(table, lattice),
+        3 => with_kernel::<T, 3, 12>(table, lattice),
+        4 => with_kernel::<T, 4, 16>(table, lattice),
+        12 => with_kernel::<T, 12, 48>(table, lattice),
+        27 => with_kernel::<T, 27, 108>(table, lattice),
+        48 => with_kernel::<T, 48, 192>(table, lattice),
+        _ => sampled_total_variation(table, lattice, 0, lattice.rows()),
+    }
+}
+
+/// Through the kernel for a width of `W`; `N` is 4 W, the length of a line.
+fn with_kernel<T: Real, const W: usize, const N: usize>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
+    let bricks = lattice.neighbours();
+    let mut roots = Buffer::<T>::stale(table.len());
+    let values = table.data().as_chunks::<N>().0;
+    let runs: Vec<_> = roots.as_chunks_mut::<N>().0.chunks_mut(RUN * LINES).collect();
+    let sums = parallel::map_items(runs, |run, roots| {
+        inverse_roots::<T, W, N>(values, run * RUN, &bricks[run * RUN..][..roots.len() / LINES], roots)
+    });
+    let terms = bricks.iter().map(|b| b.cells.count_ones() as usize).sum::<usize>() * W;
+    let value = sums.into_iter().sum::<T>() / T::lit(terms.max(1) as f64);
+    let kernel = TotalVariation::<T, W, N> { lattice: lattice.clone(), terms, roots };
     Tensor::from_kernel(vec![value].into(), &[], &[table], kernel)
 }
 
-/// Total variation over `count` cells from number `first` on, wrapping round: a scalar, with a row-sparse gradient.
+/// Total variation over those of `count` rows from number `first` on, wrapping round, that have a cell: a scalar, with a row-sparse gradient.
 ///
-/// Panics if the table does not have one row for each node or there are no cells.
+/// Panics if the layout is row-major or the table does not have its rows.
 #[track_caller]
-pub fn sampled_total_variation<T: Real>(table: &Tensor<T>, nodes: [usize; 3], first: usize, count: usize) -> Tensor<T> {
-    let cells = nodes.map(|n| n.saturating_sub(1));
-    let all: usize = cells.iter().product();
-    assert!(all > 0 && count > 0, "sampled_total_variation: no cells among {nodes:?} nodes");
-    let base: Vec<[usize; 3]> = (0..count)
-        .map(|c| {
-            let cell = (first + c) % all;
-            [cell / (cells[1] * cells[2]), cell / cells[2] % cells[1], cell % cells[2]]
-        })
-        .collect();
-    let node = |offset: [usize; 3]| -> Indices {
-        let rows = base.iter().map(|c| (((c[0] + offset[0]) * nodes[1] + c[1] + offset[1]) * nodes[2] + c[2] + offset[2]) as u32);
-        rows.collect::<Vec<_>>().into()
-    };
-    let center = table.gather_rows(&node([0, 0, 0]));
-    let squares = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map(|o| (table.gather_rows(&node(o)) - &center).square());
-    let [x, y, z] = squares;
+pub fn sampled_total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice, first: usize, count: usize) -> Tensor<T> {
+    check(table, lattice);
+    let mut corners: [Vec<u32>; 4] = Default::default();
+    for row in (0..count).map(|c| ((first + c) % lattice.rows()) as u32) {
+        let Some(node) = lattice.node(row) else { continue };
+        let ahead = |a: usize| {
+            let mut next = node;
+            next[a] += 1;
+            if next[a] < lattice.nodes()[a] { lattice.row(next) } else { None }
+        };
+        if let (Some(x), Some(y), Some(z)) = (ahead(0), ahead(1), ahead(2)) {
+            corners.iter_mut().zip([row, x, y, z]).for_each(|(rows, row)| rows.push(row));
+        }
+    }
+    if corners[0].is_empty() {
+        return Tensor::scalar(T::zero());
+    }
+    let [center, x, y, z] = corners.map(|rows| table.gather_rows(&Indices::from(rows)));
+    let [x, y, z] = [x, y, z].map(|ahead| (ahead - &center).square());
     (x + y + z + EPSILON).sqrt().mean()
+}
+
+#[track_caller]
+fn check<T: Real>(table: &Tensor<T>, lattice: &Lattice) {
+    assert!(lattice.brick_map().is_some(), "total_variation: a lattice in bricks is needed");
+    assert!(
+        table.ndim() == 2 && table.shape()[0] == lattice.rows(),
+        "total_variation: a lattice of {} rows, a table {:?}",
+        lattice.rows(),
+        table.shape()
+    );
 }
 
 /// The kernel behind [`total_variation`].
 #[derive(Debug)]
-pub struct TotalVariation {
-    nodes: [usize; 3],
+struct TotalVariation<T: Real, const W: usize, const N: usize> {
+    lattice: Lattice,
+    /// Cells times channels.
+    terms: usize,
+    /// 1 / √(…) of each cell and channel, 0 where there is no cell: a table.
+    roots: Buffer<T>,
 }
 
-impl TotalVariation {
-    /// Numbers in a line along z, of a table of `width` channels.
-    fn line(&self, width: usize) -> usize {
-        self.nodes[2] * width
-    }
-
-    fn terms(&self, width: usize) -> usize {
-        self.nodes.iter().map(|n| n - 1).product::<usize>() * width
-    }
-
-    /// The line of nodes at (i, j), that of its x neighbour and that of its y neighbour.
-    fn lines<'a, T>(&self, table: &'a [T], width: usize, i: usize, j: usize) -> [&'a [T]; 3] {
-        let line = self.line(width);
-        let at = |i: usize, j: usize| &table[(i * self.nodes[1] + j) * line..][..line];
-        [at(i, j), at(i + 1, j), at(i, j + 1)]
-    }
-
-    fn value<T: Real>(&self, table: &Tensor<T>) -> T {
-        let width = table.shape()[1];
-        let terms = self.terms(width);
-        if terms == 0 {
-            return T::zero();
-        }
-        let slabs = parallel::map_indices(self.nodes[0] - 1, |i| {
-            (0..self.nodes[1] - 1).map(|j| sum_of_roots(self.lines(table.data(), width, i, j), width)).sum::<T>()
-        });
-        slabs.into_iter().sum::<T>() / T::lit(terms as f64)
-    }
-}
-
-/// Σ √(dx² + dy² + dz² + ε) along one line.
-fn sum_of_roots<T: Real>([v, x, y]: [&[T]; 3], width: usize) -> T {
-    let n = v.len() - width;
-    let (v, z, x, y, e) = (&v[..n], &v[width..], &x[..n], &y[..n], T::lit(EPSILON));
-    let mut lanes = [T::zero(); 16];
-    let mut add = |k: usize, lane: usize| {
-        let (dx, dy, dz) = (x[k] - v[k], y[k] - v[k], z[k] - v[k]);
-        lanes[lane] += (dx * dx + dy * dy + dz * dz + e).sqrt();
-    };
-    let body = n / 16 * 16;
-    for block in (0..body).step_by(16) {
-        (0..16).for_each(|lane| add(block + lane, lane));
-    }
-    (body..n).for_each(|k| add(k, k - body));
-    lanes.into_iter().sum()
-}
+/// Bricks that one task works on.
+const RUN: usize = 256;
+/// Lines of four nodes along z in a brick; line 4 x + y begins at (x, y, 0).
+const LINES: usize = 16;
 
 /// With q = s / √(…) for each cell and channel, s = cotangent / number of terms: the cell gets −q (dx + dy + dz), each neighbour q d.
 /// Written as a gather, a node's gradient is what its own cell and the three cells behind it give: no two tasks write the same node.
-impl<T: Real> Kernel<T> for TotalVariation {
+impl<T: Real, const W: usize, const N: usize> Kernel<T> for TotalVariation<T, W, N> {
     fn name(&self) -> &'static str {
         "total_variation"
     }
 
     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
-        let cells: usize = self.nodes.iter().map(|n| n - 1).product();
-        if cells == 0 {
-            return Tensor::scalar(T::zero());
-        }
-        sampled_total_variation(&inputs[0], self.nodes, 0, cells)
+        sampled_total_variation(&inputs[0], &self.lattice, 0, self.lattice.rows())
     }
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
         let table = call.input(0);
-        let width = table.shape()[1];
-        let [nx, ny, nz] = self.nodes;
-        let mut gradient = Buffer::<T>::zeros(table.len());
-        let terms = self.terms(width);
-        if terms > 0 {
-            let scale = call.cotangent().item() / T::lit(terms as f64);
-            // q of every cell and channel, in the layout of the table; the last node of a line has no cell and q = 0.
-            let (line, values) = (self.line(width), table.data());
-            let mut q = Buffer::<T>::zeros(table.len());
-            parallel::for_each_chunk(&mut q, ny * line, |start, slab| {
-                let i = start / (ny * line);
-                if i + 1 < nx {
-                    for (j, q) in slab.chunks_exact_mut(line).enumerate().take(ny - 1) {
-                        inverse_roots(self.lines(values, width, i, j), width, scale, q);
-                    }
-                }
-            });
-            parallel::for_each_chunk(&mut gradient, ny * line, |start, slab| {
-                let i = start / (ny * line);
-                for (j, g) in slab.chunks_exact_mut(line).enumerate() {
-                    let at = |i: usize, j: usize| (&values[(i * ny + j) * line..][..line], &q[(i * ny + j) * line..][..line]);
-                    let (v, own) = at(i, j);
-                    if i + 1 < nx && j + 1 < ny {
-                        let (x, y) = (at(i + 1, j).0, at(i, j + 1).0);
-                        for k in 0..line - width {
-                            g[k] = -own[k] * (x[k] + y[k] + v[k + width] - T::lit(3.0) * v[k]);
-                        }
-                        for k in width..line {
-                            g[k] += own[k - width] * (v[k] - v[k - width]);
-                        }
-                    }
-                    for (v_behind, q_behind) in [(i > 0).then(|| at(i - 1, j)), (j > 0).then(|| at(i, j - 1))].into_iter().flatten() {
-                        for k in 0..line {
-                            g[k] += q_behind[k] * (v[k] - v_behind[k]);
-                        }
-                    }
-                }
-            });
-            debug_assert_eq!(nz * width, line);
-        }
+        let scale = call.cotangent().item() / T::lit(self.terms.max(1) as f64);
+        let (values, roots) = (table.data().as_chunks::<N>().0, self.roots.as_chunks::<N>().0);
+        let mut gradient = Buffer::<T>::stale(table.len());
+        parallel::for_each_chunk(gradient.as_chunks_mut::<N>().0, RUN * LINES, |start, lines| {
+            let (first, count) = (start / LINES, lines.len() / LINES);
+            gradients::<T, W, N>(values, roots, first, &self.lattice.neighbours()[first..][..count], scale, lines);
+        });
         out.dense(0, gradient);
     }
 }
 
-/// scale / √(dx² + dy² + dz² + ε) along one line.
-fn inverse_roots<T: Real>([v, x, y]: [&[T]; 3], width: usize, scale: T, q: &mut [T]) {
-    let n = v.len() - width;
-    let (z, v, x, y, q) = (&v[width..], &v[..n], &x[..n], &y[..n], &mut q[..n]);
-    for k in 0..n {
-        let (dx, dy, dz) = (x[k] - v[k], y[k] - v[k], z[k] - v[k]);
-        q[k] = scale / (dx * dx + dy * dy + dz * dz + T::lit(EPSILON)).sqrt();
+/// Numbers of the lines one step away along x and y and of the next along z, or of the last ones. Where a brick is missing it is the line
+/// itself: no cell reads across.
+#[inline(always)]
+fn lines_near(own: usize, bricks: [Option<u32>; 3], line: usize, ahead: bool) -> [usize; 3] {
+    let this = own * LINES + line;
+    let in_brick = |brick: Option<u32>, line: usize| brick.map_or(this, |b| b as usize * LINES + line);
+    let (x, y) = (line / 4, line % 4);
+    if ahead {
+        let next_x = if x < 3 { this + 4 } else { in_brick(bricks[0], y) };
+        let next_y = if y < 3 { this + 1 } else { in_brick(bricks[1], 4 * x) };
+        [next_x, next_y, in_brick(bricks[2], line)]
+    } else {
+        let last_x = if x > 0 { this - 4 } else { in_brick(bricks[0], 12 + y) };
+        let last_y = if y > 0 { this - 1 } else { in_brick(bricks[1], 4 * x + 3) };
+        [last_x, last_y, in_brick(bricks[2], line)]
     }
+}
+
+/// The nodes of a line one step on along z: `line` without its first node, then the first of `next`.
+#[inline(always)]
+fn next_nodes<T: Real, const W: usize, const N: usize>(line: &[T; N], next: &[T; N]) -> [T; N] {
+    let mut out = [T::zero(); N];
+    out[..N - W].copy_from_slice(&line[W..]);
+    out[N - W..].copy_from_slice(&next[..W]);
+    out
+}
+
+/// The nodes of a line one step back along z: the last of `last`, then `line` without its own.
+#[inline(always)]
+fn last_nodes<T: Real, const W: usize, const N: usize>(line: &[T; N], last: &[T; N]) -> [T; N] {
+    let mut out = [T::zero(); N];
+    out[..W].copy_from_slice(&last[N - W..]);
+    out[W..].copy_from_slice(&line[..N - W]);
+    out
+}
+
+dispatched! {
+/// 1 / √(dx² + dy² + dz² + ε) of the cells of the bricks from number `first` on, 0 elsewhere; returns Σ √(…).
+fn inverse_roots<T: Real, const W: usize, const N: usize>(table: &[[T; N]], first: usize, bricks: &[Neighbours], roots: &mut [[T; N]]) -> T {
+    let mut sum = T::zero();
+    for ((b, brick), roots) in bricks.iter().enumerate().zip(roots.as_chunks_mut::<LINES>().0) {
+        let own = first + b;
+        let mut lanes = [T::zero(); N];
+        for line in 0..LINES {
+            let [x, y, z] = lines_near(own, brick.ahead, line, true).map(|l| &table[l]);
+            let v = &table[own * LINES + line];
+            let z = next_nodes::<T, W, N>(v, z);
+            let mut q = [T::zero(); N];
+            let mut square = [T::zero(); N];
+            for l in 0..N {
+                let (dx, dy, dz) = (x[l] - v[l], y[l] - v[l], z[l] - v[l]);
+                square[l] = dx * dx + dy * dy + dz * dz + T::lit(EPSILON);
+                q[l] = square[l].inverse_sqrt();
+            }
+            let cells = brick.cells >> (4 * line) & 0xf;
+            if cells != 0xf {
+                for node in (0..4).filter(|node| cells >> node & 1 == 0) {
+                    q[node * W..(node + 1) * W].fill(T::zero());
+                }
+            }
+            for l in 0..N {
+                lanes[l] += square[l] * q[l];
+            }
+            roots[line] = q;
+        }
+        sum += lanes.into_iter().sum::<T>();
+    }
+    sum
+}
+}
+
+dispatched! {
+/// The gradient of the bricks from number `first` on, from the roots of their cells and of those behind.
+fn gradients<T: Real, const W: usize, const N: usize>(
+    table: &[[T; N]],
+    roots: &[[T; N]],
+    first: usize,
+    bricks: &[Neighbours],
+    scale: T,
+    out: &mut [[T; N]],
+) {
+    let none = [T::zero(); N];
+    for ((b, brick), out) in bricks.iter().enumerate().zip(out.as_chunks_mut::<LINES>().0) {
+        let own = first + b;
+        for (line, out) in out.iter_mut().enumerate() {
+            let this = own * LINES + line;
+            let [x, y, z] = lines_near(own, brick.ahead, line, true).map(|l| &table[l]);
+            let behind = lines_near(own, brick.behind, line, false);
+            let [last_x, last_y, last_z] = behind.map(|l| &table[l]);
+            let [qx, qy, qz] = behind.map(|l| if l == this { &none } else { &roots[l] });
+            let (v, q) = (&table[this], &roots[this]);
+            let (z, last_z) = (next_nodes::<T, W, N>(v, z), last_nodes::<T, W, N>(v, last_z));
+            let qz = last_nodes::<T, W, N>(q, qz);
+            let mut g = [T::zero(); N];
+            for l in 0..N {
+                let cell = q[l] * (T::lit(3.0) * v[l] - x[l] - y[l] - z[l]);
+                let others = qx[l] * (v[l] - last_x[l]) + qy[l] * (v[l] - last_y[l]) + qz[l] * (v[l] - last_z[l]);
+                g[l] = scale * (cell + others);
+            }
+            *out = g;
+        }
+    }
+}
 }

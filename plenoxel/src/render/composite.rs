@@ -4,6 +4,7 @@
 //! T_N = exp(−Σ τⱼ) left for the background b:  C = Σ wᵢ cᵢ + T_N b,  depth = Σ wᵢ tᵢ,  opacity = 1 − T_N = Σ wᵢ.
 
 use crate::field::Radiance;
+use crate::render::fused;
 use crate::sampling::Samples;
 use autograd::{Real, Tensor};
 
@@ -16,8 +17,16 @@ pub struct Rendered<T: Real> {
     pub opacity: Tensor<T>,
     /// `[n]` ln T_N <= 0.
     pub log_transmittance: Tensor<T>,
-    /// The samples behind the pixels.
-    pub samples: PerSample<T>,
+    /// Samples behind all the pixels.
+    pub sample_count: usize,
+    pub(crate) rest: Rest<T>,
+}
+
+/// What the columns that are not asked for are computed from.
+#[derive(Debug, Clone)]
+pub(crate) enum Rest<T: Real> {
+    Graph(Box<PerSample<T>>),
+    Fused(fused::Columns<T>),
 }
 
 /// What is known of each of m samples.
@@ -44,26 +53,56 @@ pub fn composite<T: Real>(samples: Samples<T>, radiance: Radiance<T>, background
     let opacity = optical_depth.one_minus_exp_neg();
     let log_transmittance = -optical_depth;
     let rgb = (weights.unsqueeze(1) * &radiance.rgb).segment_sum(offsets) + log_transmittance.exp().unsqueeze(1) * background;
-    Rendered { rgb, opacity, log_transmittance, samples: PerSample { weights, radiance, samples } }
+    let sample_count = samples.len();
+    Rendered { rgb, opacity, log_transmittance, sample_count, rest: Rest::Graph(Box::new(PerSample { weights, radiance, samples })) }
 }
 
 impl<T: Real> Rendered<T> {
+    /// Density, color and weight of every sample, if the graph rendered this: the fused engine does not keep them.
+    pub fn samples(&self) -> Option<&PerSample<T>> {
+        match &self.rest {
+            Rest::Graph(samples) => Some(samples),
+            Rest::Fused(_) => None,
+        }
+    }
+
     /// `[n]` Σ wᵢ tᵢ, world length. Not divided by opacity, so that it is smooth; pictures divide.
     pub fn depth(&self) -> Tensor<T> {
-        let s = &self.samples;
-        (&s.weights * &s.samples.t).segment_sum(&s.samples.offsets)
+        match &self.rest {
+            Rest::Graph(samples) => samples.depth(),
+            Rest::Fused(columns) => columns.depth(),
+        }
     }
 
     /// `[n]` Σ ln(1 + 2σᵢ²): Cauchy sparsity (PlenOctrees, svox2).
     pub fn sparsity(&self) -> Tensor<T> {
-        let s = &self.samples;
-        (2.0 * s.radiance.sigma.square() + 1.0).ln().segment_sum(&s.samples.offsets)
+        match &self.rest {
+            Rest::Graph(samples) => samples.sparsity(),
+            Rest::Fused(columns) => columns.sparsity(),
+        }
     }
 
-    /// `[n]` Σᵢⱼ wᵢ wⱼ |tᵢ − tⱼ| + ⅓ Σ wᵢ² δᵢ, world length: the distortion of mip-NeRF 360 (eq. 15), in linear time by prefix sums
-    /// Wᵢ = Σ_{j<i} wⱼ, Mᵢ = Σ_{j<i} wⱼ tⱼ as Σ 2 wᵢ (tᵢ Wᵢ − Mᵢ) + wᵢ² δᵢ / 3.
+    /// `[n]` Σᵢⱼ wᵢ wⱼ |tᵢ − tⱼ| + ⅓ Σ wᵢ² δᵢ, world length: the distortion of mip-NeRF 360 (eq. 15).
     pub fn distortion(&self) -> Tensor<T> {
-        let PerSample { weights: w, samples: s, .. } = &self.samples;
+        match &self.rest {
+            Rest::Graph(samples) => samples.distortion(),
+            Rest::Fused(columns) => columns.distortion(),
+        }
+    }
+}
+
+impl<T: Real> PerSample<T> {
+    fn depth(&self) -> Tensor<T> {
+        (&self.weights * &self.samples.t).segment_sum(&self.samples.offsets)
+    }
+
+    fn sparsity(&self) -> Tensor<T> {
+        (2.0 * self.radiance.sigma.square() + 1.0).ln().segment_sum(&self.samples.offsets)
+    }
+
+    /// In linear time by prefix sums Wᵢ = Σ_{j<i} wⱼ, Mᵢ = Σ_{j<i} wⱼ tⱼ as Σ 2 wᵢ (tᵢ Wᵢ − Mᵢ) + wᵢ² δᵢ / 3.
+    fn distortion(&self) -> Tensor<T> {
+        let PerSample { weights: w, samples: s, .. } = self;
         let before = w.segment_exclusive_sum(&s.offsets);
         let moment = (w * &s.t).segment_exclusive_sum(&s.offsets);
         (2.0 * w * (&s.t * before - moment) + w.square() * &s.delta / 3.0).segment_sum(&s.offsets)

@@ -33,8 +33,10 @@ pub struct Config {
     pub sh_degree: usize,
     /// Color of zero coefficients: 0.5 in svox2, 0 in the source paper.
     pub sh_offset: f64,
-    /// What computes the pixels of a training step.
+    /// What computes the pixels.
     pub engine: Engine,
+    /// Training rays end where less than this share of the light comes from behind; 0 for never. (The graph never does.)
+    pub stop_below: f64,
     /// Rays in a step.
     pub rays_per_step: usize,
     /// Shift the samples of each training ray by a random fraction of a step.
@@ -42,7 +44,7 @@ pub struct Config {
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
     pub project: bool,
     /// From this stage on (counted from 0), voxels that at the stage's start have, with all their neighbours, a density of at most
-    /// `prune_below` are emptied, stay empty during the stage, and are not looked at.
+    /// `prune_below` are taken out of the grid: they are empty from then on, and are not looked at.
     pub prune_from_stage: Option<usize>,
     /// Density, 1 / world length, at which a voxel counts as empty when pruning.
     pub prune_below: f64,
@@ -225,7 +227,8 @@ impl Default for Config {
             // svox2: degree 2, and zero coefficients are gray.
             sh_degree: 2,
             sh_offset: 0.5,
-            engine: Engine::Graph,
+            engine: Engine::Fused,
+            stop_below: 0.0,
             rays_per_step: 4096,
             jitter: true,
             project: false,
@@ -268,6 +271,7 @@ impl Config {
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check(self.sh_offset.is_finite(), "sh_offset", self.sh_offset, "a finite number")?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
+        check((0.0..1.0).contains(&self.stop_below), "stop_below", self.stop_below, "a number in [0, 1)")?;
         check(self.prune_below >= 0.0, "prune_below", self.prune_below, "a number of at least 0")?;
         check(
             self.initial.density.is_finite() && self.initial.density >= 0.0,

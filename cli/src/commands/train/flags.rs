@@ -93,8 +93,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = clap::value_parser!(i64).range(0..=3))]
     sh_degree: Option<i64>,
 
-    /// What computes the pixels of a training step
-    #[arg(long, help_heading = "Training", value_parser = ["graph"])]
+    /// What computes the pixels: fused, in one pass, or graph, the slow one to compare it with
+    #[arg(long, help_heading = "Training", value_parser = ["fused", "graph"])]
     engine: Option<String>,
 
     /// Total variation of the whole grid, weighted as in the source paper: sets tv_density and tv_color to W / 2

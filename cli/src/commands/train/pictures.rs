@@ -51,7 +51,7 @@ impl<'a> Pictures<'a> {
         let Some(camera) = &self.camera else {
             return Ok(());
         };
-        let viewer = Viewer::new(grid, self.config.evaluation, self.config.background);
+        let viewer = Viewer::new(grid, self.config.evaluation, self.config);
         let picture = viewer.see(camera).rgb;
         let resolution = grid.shape().resolution;
         let name = format!("stage_{}_{resolution}.png", stage + 1);

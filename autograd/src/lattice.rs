@@ -1,0 +1,419 @@
+//! Which row of a table each node of a three-dimensional grid has.
+//!
+//! Two layouts. *Row-major*: node (i, j, k) of `[nx, ny, nz]` is row (i·ny + j)·nz + k, and all nodes have one. *Bricks*: 4³ nodes are
+//! 64 neighbouring rows, in row-major order inside, and a link table says which 64 rows a brick has, if any. Bricks are numbered along a
+//! Morton curve, so rows that are near in space are near in memory; those that nobody needs take no memory; and inside a brick a bit for
+//! each node says whether it is *present*. A node that is not present reads as a row of zeros and gets no gradient.
+
+use std::sync::{Arc, OnceLock};
+
+/// Nodes along the side of a brick.
+pub const BRICK: usize = 4;
+/// Rows of a brick.
+pub const BRICK_ROWS: usize = BRICK * BRICK * BRICK;
+/// From a node of a brick to the next along x, y and z, in rows or bits of a mask.
+pub const STRIDE: [usize; 3] = [16, 4, 1];
+/// The nodes of a brick with x, y or z being 0.
+pub const LOW: [u64; 3] = [0xffff, 0x000f_000f_000f_000f, 0x1111_1111_1111_1111];
+
+/// The layout of a grid in a table. Cloning copies a pointer.
+#[derive(Clone, Debug)]
+pub struct Lattice {
+    nodes: [usize; 3],
+    bricks: Option<Arc<Bricks>>,
+}
+
+#[derive(Debug)]
+struct Bricks {
+    /// Bricks along each axis; the last ones may stick out of the grid.
+    count: [usize; 3],
+    /// Number of each brick among those that have rows, bricks in row-major order; 0 for one that has none.
+    links: Vec<u32>,
+    /// A bit for each node of a brick that is present, node (i, j, k) of the brick being bit 16 i + 4 j + k.
+    masks: Vec<u64>,
+    /// True if every node of the grid is present.
+    full: bool,
+    /// Place of each brick that has rows, in bricks, in the order of the rows.
+    places: Vec<[u32; 3]>,
+    neighbours: OnceLock<Vec<Neighbours>>,
+}
+
+/// The bricks around one, and which of its nodes have a cell.
+#[derive(Clone, Copy, Debug)]
+pub struct Neighbours {
+    /// The next brick along each axis, if it has rows.
+    pub ahead: [Option<u32>; 3],
+    /// The one before.
+    pub behind: [Option<u32>; 3],
+    /// A bit for each node that is present with all three nodes ahead of it.
+    pub cells: u64,
+}
+
+impl From<[usize; 3]> for Lattice {
+    fn from(nodes: [usize; 3]) -> Self {
+        Lattice { nodes, bricks: None }
+    }
+}
+
+impl From<&Lattice> for Lattice {
+    fn from(lattice: &Lattice) -> Self {
+        lattice.clone()
+    }
+}
+
+impl Lattice {
+    /// Bricks with all nodes present.
+    pub fn bricks(nodes: [usize; 3]) -> Self {
+        Self::bricks_where(nodes, |_| true)
+    }
+
+    /// Bricks with the nodes that `present` names.
+    pub fn bricks_where(nodes: [usize; 3], present: impl Fn([usize; 3]) -> bool + Sync) -> Self {
+        let count = nodes.map(|n| n.div_ceil(BRICK));
+        let masks = crate::parallel::map_indices(count.iter().product(), |b| {
+            let place = [b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]];
+            (0..BRICK_ROWS).fold(0u64, |mask, local| {
+                let node = node_at(place, local);
+                mask | u64::from((0..3).all(|a| node[a] < nodes[a]) && present(node)) << local
+            })
+        });
+        Self::from_masks(nodes, masks)
+    }
+
+    /// Bricks from one mask of present nodes for each, bricks in row-major order.
+    ///
+    /// Panics if there is not one mask for each brick, or a node outside of the grid is present.
+    pub fn from_masks(nodes: [usize; 3], masks: Vec<u64>) -> Self {
+        let count = nodes.map(|n| n.div_ceil(BRICK));
+        assert_eq!(masks.len(), count.iter().product::<usize>(), "a lattice of {nodes:?} nodes has {count:?} bricks");
+        let mut places: Vec<[u32; 3]> = Vec::new();
+        for (b, &mask) in masks.iter().enumerate() {
+            if mask != 0 {
+                let place = [b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]];
+                let mut left = mask;
+                while left != 0 {
+                    let node = node_at(place, left.trailing_zeros() as usize);
+                    assert!((0..3).all(|a| node[a] < nodes[a]), "node {node:?} lies outside of a lattice of {nodes:?} nodes");
+                    left &= left - 1;
+                }
+                places.push(place.map(|c| c as u32));
+            }
+        }
+        places.sort_unstable_by_key(|&place| morton(place));
+        let mut links = vec![0; masks.len()];
+        for (brick, place) in places.iter().enumerate() {
+            links[number(place.map(|c| c as usize), count)] = brick as u32;
+        }
+        let full = masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>() == nodes.iter().product();
+        Lattice { nodes, bricks: Some(Arc::new(Bricks { count, links, masks, full, places, neighbours: OnceLock::new() })) }
+    }
+
+    /// Nodes along each axis.
+    pub fn nodes(&self) -> [usize; 3] {
+        self.nodes
+    }
+
+    /// Rows of a table in this layout. Rows of a brick whose nodes are not present are in it, and nobody reads them.
+    pub fn rows(&self) -> usize {
+        match &self.bricks {
+            None => self.nodes.iter().product(),
+            Some(bricks) => bricks.places.len() * BRICK_ROWS,
+        }
+    }
+
+    /// Nodes that are present.
+    pub fn present(&self) -> usize {
+        match &self.bricks {
+            None => self.nodes.iter().product(),
+            Some(bricks) => bricks.masks.iter().map(|mask| mask.count_ones() as usize).sum(),
+        }
+    }
+
+    /// True if every node is present.
+    pub fn is_full(&self) -> bool {
+        self.bricks.as_ref().is_none_or(|bricks| bricks.full)
+    }
+
+    /// The row of a node, or `None` if it is not present.
+    ///
+    /// Panics if the node lies outside of the grid.
+    #[inline]
+    pub fn row(&self, node: [usize; 3]) -> Option<u32> {
+        assert!((0..3).all(|a| node[a] < self.nodes[a]), "node {node:?} of a lattice of {:?} nodes", self.nodes);
+        with_map!(self, map => map.row(node).ok())
+    }
+
+    /// The node of a row, or `None` if the row belongs to none that is present.
+    pub fn node(&self, row: u32) -> Option<[usize; 3]> {
+        match &self.bricks {
+            None => {
+                let (row, [nx, ny, nz]) = (row as usize, self.nodes);
+                (row < nx * ny * nz).then(|| [row / (ny * nz), row / nz % ny, row % nz])
+            }
+            Some(bricks) => {
+                let place = bricks.places.get(row as usize / BRICK_ROWS)?.map(|c| c as usize);
+                let local = row as usize % BRICK_ROWS;
+                (bricks.masks[number(place, bricks.count)] >> local & 1 == 1).then(|| node_at(place, local))
+            }
+        }
+    }
+
+    /// Places of the bricks that have rows, in bricks, in the order of the rows; none for a row-major layout.
+    pub fn places(&self) -> &[[u32; 3]] {
+        self.bricks.as_ref().map_or(&[], |bricks| &bricks.places)
+    }
+
+    /// Number and mask of the brick at a place; `None` if it has no rows, lies beyond the grid, or the layout is row-major.
+    pub fn brick(&self, place: [usize; 3]) -> Option<(usize, u64)> {
+        let bricks = self.bricks.as_ref()?;
+        if (0..3).any(|a| place[a] >= bricks.count[a]) {
+            return None;
+        }
+        let b = number(place, bricks.count);
+        (bricks.masks[b] != 0).then(|| (bricks.links[b] as usize, bricks.masks[b]))
+    }
+
+    /// The neighbours of each brick that has rows, in the order of the rows: found once.
+    ///
+    /// Panics if the layout is row-major.
+    pub fn neighbours(&self) -> &[Neighbours] {
+        let bricks = self.bricks.as_ref().expect("a layout in bricks");
+        bricks
+            .neighbours
+            .get_or_init(|| crate::parallel::map_indices(bricks.places.len(), |b| self.neighbours_of(bricks.places[b].map(|c| c as usize))))
+    }
+
+    fn neighbours_of(&self, place: [usize; 3]) -> Neighbours {
+        let mask = self.brick(place).map_or(0, |(_, mask)| mask);
+        let neighbour = |a: usize, step: isize| {
+            let mut there = place;
+            there[a] = there[a].checked_add_signed(step)?;
+            self.brick(there)
+        };
+        let mut cells = mask;
+        for a in 0..3 {
+            let next = neighbour(a, 1).map_or(0, |(_, mask)| mask);
+            // The node ahead is in this brick, or the first of the next one.
+            cells &= (mask & !LOW[a]) >> STRIDE[a] | (next & LOW[a]) << (3 * STRIDE[a]);
+        }
+        let numbers = |step: isize| [0, 1, 2].map(|a| neighbour(a, step).map(|(brick, _)| brick as u32));
+        Neighbours { ahead: numbers(1), behind: numbers(-1), cells }
+    }
+
+    /// One mask of present nodes for each brick, in row-major order; empty for a row-major layout. Node (i, j, k) of a brick is bit
+    /// 16 i + 4 j + k.
+    pub fn masks(&self) -> &[u64] {
+        self.bricks.as_ref().map_or(&[], |bricks| &bricks.masks)
+    }
+
+    /// The layout as kernels see it, or `None` if it is row-major.
+    pub fn brick_map(&self) -> Option<BrickMap<'_>> {
+        self.bricks.as_ref().map(|b| BrickMap { nodes: self.nodes, count: b.count, links: &b.links, masks: &b.masks })
+    }
+
+    /// The same if every node is present, which needs no masks.
+    pub fn full_brick_map(&self) -> Option<FullBrickMap<'_>> {
+        self.brick_map().filter(|_| self.is_full()).map(FullBrickMap)
+    }
+}
+
+/// Number of a brick in row-major order.
+#[inline(always)]
+fn number(place: [usize; 3], count: [usize; 3]) -> usize {
+    (place[0] * count[1] + place[1]) * count[2] + place[2]
+}
+
+/// Node number `local` of the brick at a place.
+fn node_at(place: [usize; 3], local: usize) -> [usize; 3] {
+    [place[0] * BRICK + local / 16, place[1] * BRICK + local / 4 % 4, place[2] * BRICK + local % 4]
+}
+
+/// Bits of the three coordinates, interleaved, x above y above z.
+fn morton(place: [u32; 3]) -> u64 {
+    let spread = |c: u32| {
+        let mut c = u64::from(c) & 0x1f_ffff;
+        for (shift, mask) in [
+            (32, 0x001f_0000_0000_ffff),
+            (16, 0x001f_0000_ff00_00ff),
+            (8, 0x100f_00f0_0f00_f00f),
+            (4, 0x10c3_0c30_c30c_30c3),
+            (2, 0x1249_2492_4924_9249),
+        ] {
+            c = (c | c << shift) & mask;
+        }
+        c
+    };
+    spread(place[0]) << 2 | spread(place[1]) << 1 | spread(place[2])
+}
+
+/// How kernels see a layout: copied into their loops.
+pub trait NodeMap: Copy + Sync {
+    /// Nodes along each axis.
+    fn nodes(self) -> [usize; 3];
+    /// What a coordinate adds to the number of a node.
+    fn share(self, axis: usize, coordinate: u32) -> u32;
+    /// The number of a node inside the grid: arithmetic alone, so that a loop over many nodes vectorises.
+    #[inline(always)]
+    fn code(self, node: [u32; 3]) -> u32 {
+        self.share(0, node[0]) + self.share(1, node[1]) + self.share(2, node[2])
+    }
+    /// The row of the node with a number; the error is some row of the table for a node that is not present.
+    fn row_of(self, code: u32) -> Result<u32, u32>;
+    /// The row of a node inside the grid.
+    #[inline(always)]
+    fn row(self, node: [usize; 3]) -> Result<u32, u32> {
+        self.row_of(self.code(node.map(|c| c as u32)))
+    }
+    /// True if nodes may be missing.
+    const SPARSE: bool;
+}
+
+/// All nodes, row-major.
+#[derive(Clone, Copy, Debug)]
+pub struct RowMajor {
+    /// Nodes along each axis.
+    pub nodes: [usize; 3],
+}
+
+impl NodeMap for RowMajor {
+    const SPARSE: bool = false;
+    #[inline(always)]
+    fn nodes(self) -> [usize; 3] {
+        self.nodes
+    }
+    #[inline(always)]
+    fn share(self, axis: usize, coordinate: u32) -> u32 {
+        coordinate * [self.nodes[1] * self.nodes[2], self.nodes[2], 1][axis] as u32
+    }
+    #[inline(always)]
+    fn row_of(self, code: u32) -> Result<u32, u32> {
+        Ok(code)
+    }
+}
+
+/// Bricks behind a link table.
+#[derive(Clone, Copy, Debug)]
+pub struct BrickMap<'a> {
+    nodes: [usize; 3],
+    count: [usize; 3],
+    links: &'a [u32],
+    masks: &'a [u64],
+}
+
+impl NodeMap for BrickMap<'_> {
+    const SPARSE: bool = true;
+    #[inline(always)]
+    fn nodes(self) -> [usize; 3] {
+        self.nodes
+    }
+    /// Of the number of the brick times 64, and of the node in it.
+    #[inline(always)]
+    fn share(self, axis: usize, coordinate: u32) -> u32 {
+        let bricks = [self.count[1] * self.count[2], self.count[2], 1][axis] as u32;
+        coordinate / 4 * bricks * 64 + coordinate % 4 * STRIDE[axis] as u32
+    }
+    #[inline(always)]
+    fn row_of(self, code: u32) -> Result<u32, u32> {
+        let (brick, local) = (code as usize / BRICK_ROWS, code % 64);
+        let row = self.links[brick] * 64 + local;
+        if self.masks[brick] >> local & 1 == 1 { Ok(row) } else { Err(row) }
+    }
+}
+
+/// Bricks behind a link table with no node missing.
+#[derive(Clone, Copy, Debug)]
+pub struct FullBrickMap<'a>(BrickMap<'a>);
+
+impl NodeMap for FullBrickMap<'_> {
+    const SPARSE: bool = false;
+    #[inline(always)]
+    fn nodes(self) -> [usize; 3] {
+        self.0.nodes
+    }
+    #[inline(always)]
+    fn share(self, axis: usize, coordinate: u32) -> u32 {
+        self.0.share(axis, coordinate)
+    }
+    #[inline(always)]
+    fn row_of(self, code: u32) -> Result<u32, u32> {
+        Ok(self.0.links[code as usize / BRICK_ROWS] * 64 + code % 64)
+    }
+}
+
+/// Runs an expression with the lattice as a [`NodeMap`], compiled for each layout.
+macro_rules! with_map {
+    ($lattice:expr, $map:ident => $body:expr) => {
+        match $lattice.brick_map() {
+            None => {
+                let $map = $crate::lattice::RowMajor { nodes: $lattice.nodes() };
+                $body
+            }
+            Some($map) => $body,
+        }
+    };
+}
+pub(crate) use with_map;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn holed(nodes: [usize; 3]) -> Lattice {
+        Lattice::bricks_where(nodes, |[i, j, k]| (i * 7 + j * 5 + k * 3) % 11 > 2 && (i / 4 + j / 4 + k / 4) % 2 == 0)
+    }
+
+    #[test]
+    fn every_present_node_has_a_row_of_its_own_that_knows_it() {
+        for nodes in [[4, 4, 4], [9, 6, 7], [1, 1, 1], [16, 3, 20]] {
+            for lattice in [Lattice::from(nodes), Lattice::bricks(nodes), holed(nodes)] {
+                let mut rows = Vec::new();
+                for i in 0..nodes[0] {
+                    for j in 0..nodes[1] {
+                        for k in 0..nodes[2] {
+                            if let Some(row) = lattice.row([i, j, k]) {
+                                assert_eq!(lattice.node(row), Some([i, j, k]));
+                                rows.push(row);
+                            }
+                        }
+                    }
+                }
+                rows.sort_unstable();
+                rows.dedup();
+                assert_eq!(rows.len(), lattice.present());
+                assert!(rows.last().is_none_or(|&last| (last as usize) < lattice.rows()));
+                assert_eq!(lattice.is_full(), lattice.present() == nodes.iter().product());
+                assert_eq!((0..lattice.rows() as u32).filter(|&row| lattice.node(row).is_some()).count(), lattice.present());
+            }
+        }
+    }
+
+    #[test]
+    fn rows_of_a_cube_of_bricks_are_neighbours_along_the_morton_curve() {
+        let lattice = Lattice::bricks([32; 3]);
+        // The first 64 bricks are the cube of 16³ nodes at the origin.
+        let cube = |row: u32| lattice.node(row).is_some_and(|node| node.iter().all(|&c| c < 16));
+        assert!((0..16 * 16 * 16).all(cube) && !(16 * 16 * 16..32 * 32 * 32).any(cube));
+    }
+
+    #[test]
+    fn a_cell_is_a_present_node_with_three_present_nodes_ahead() {
+        let lattice = holed([9, 10, 7]);
+        for (brick, neighbours) in lattice.neighbours().iter().enumerate() {
+            for local in 0..BRICK_ROWS {
+                let want = lattice.node((brick * BRICK_ROWS + local) as u32).is_some_and(|node| {
+                    (0..3).all(|a| {
+                        let mut ahead = node;
+                        ahead[a] += 1;
+                        ahead[a] < lattice.nodes()[a] && lattice.row(ahead).is_some()
+                    })
+                });
+                assert_eq!(neighbours.cells >> local & 1 == 1, want);
+            }
+            for a in 0..3 {
+                if let Some(ahead) = neighbours.ahead[a] {
+                    assert_eq!(lattice.neighbours()[ahead as usize].behind[a], Some(brick as u32));
+                }
+            }
+        }
+    }
+}

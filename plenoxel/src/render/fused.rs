@@ -1,0 +1,197 @@
+//! The pixels of [`composite()`](super::composite()) in one pass over a voxel grid, and its adjoint by hand.
+//!
+//! *Forward.* Rays are taken in blocks of fixed size. For each block: where the samples lie, what density is there, what weight that gives
+//! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept.
+//!
+//! *Adjoint.* Each block computes dL/dσ and dL/dc of its samples, ray by ray from the back, and sorts them by the rows of the tables they
+//! were read from. Nothing is added up yet: the optimizer asks for one range of rows after the other ([`RowSums`](autograd::RowSums)), and
+//! the blocks give what they have in the order of the rays. So a step never writes a gradient table, no two threads write to the
+//! same place, and the sums have the same bits for any number of threads.
+
+mod adjoint;
+mod forward;
+mod lookup;
+
+use super::{RenderOptions, Rendered, composite, composite::Rest};
+use crate::camera::Ray;
+use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::field::{Field, sh};
+use crate::sampling::Samples;
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Real, RowSparse, Tensor, no_grad, parallel};
+use forward::Block;
+use std::sync::Arc;
+
+/// Rays that one task renders, and whose gradients it sorts: some ten thousand samples.
+const BLOCK: usize = 256;
+
+/// Columns of the kernel's output.
+const COLUMNS: usize = 7;
+
+/// Where the columns are: rgb in 0..3.
+mod column {
+    pub const DEPTH: usize = 3;
+    pub const OPACITY: usize = 4;
+    pub const LOG_TRANSMITTANCE: usize = 5;
+    pub const DISTORTION: usize = 6;
+}
+
+/// What all blocks of a batch share.
+#[derive(Debug)]
+struct Batch<T: Real> {
+    shape: GridShape,
+    lattice: Lattice,
+    background: [T; 3],
+    /// `[n, 3]`
+    directions: Tensor<T>,
+    /// `[n, (degree + 1)²]`: the harmonics of each ray's direction; `[n, 0]` for RGB.
+    basis: Tensor<T>,
+}
+
+/// A rendered batch, and what its adjoint needs.
+#[derive(Debug)]
+struct State<T: Real> {
+    batch: Batch<T>,
+    blocks: Vec<Block<T>>,
+}
+
+/// The columns that [`Rendered`] computes when asked.
+#[derive(Debug, Clone)]
+pub(crate) struct Columns<T: Real> {
+    /// `[n, COLUMNS]`
+    pixels: Tensor<T>,
+    state: Arc<State<T>>,
+    /// Density and color.
+    tables: [Tensor<T>; 2],
+}
+
+impl<T: Real> Columns<T> {
+    pub(crate) fn depth(&self) -> Tensor<T> {
+        self.pixels.index_axis(1, column::DEPTH)
+    }
+
+    pub(crate) fn distortion(&self) -> Tensor<T> {
+        self.pixels.index_axis(1, column::DISTORTION)
+    }
+
+    pub(crate) fn sparsity(&self) -> Tensor<T> {
+        let n = self.pixels.shape()[0];
+        let values = self.state.blocks.iter().flat_map(Block::sparsity).collect::<Vec<T>>();
+        let [density, color] = &self.tables;
+        Tensor::from_kernel(values.into(), &[n], &[density, color], Fused { state: self.state.clone(), output: Output::Sparsity })
+    }
+}
+
+/// Renders a batch of rays through a grid.
+pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    let n = rays.len();
+    let directions = Tensor::from_vec(rays.iter().flat_map(|r| r.direction.to_array()).map(T::lit).collect(), &[n, 3]);
+    let basis = match grid.shape().color {
+        Color::Rgb => Tensor::zeros(&[n, 0]),
+        Color::Sh { degree, .. } => no_grad(|| sh::basis(&directions, degree)),
+    };
+    let background = options.background.map(|c| T::lit(f64::from(c)));
+    let batch = Batch { shape: *grid.shape(), lattice: grid.lattice().clone(), background, directions, basis };
+    let tables = [grid.density.tensor(), grid.color.tensor()];
+    let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording();
+    let mut pixels = Buffer::stale(n * COLUMNS);
+    let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
+    let scene = forward::Scene {
+        batch: &batch,
+        rays,
+        options,
+        cells: options.occupancy.or(Field::<T>::reach(grid)),
+        tables: tables.map(Tensor::data),
+    };
+    let blocks = parallel::map_items(parts, |b, pixels| scene.render(b * BLOCK, pixels, keep));
+    let sample_count = blocks.iter().map(Block::len).sum();
+    let state = Arc::new(State { batch, blocks });
+    let pixels = Tensor::from_kernel(pixels, &[n, COLUMNS], &tables, Fused { state: state.clone(), output: Output::Pixels });
+    Rendered {
+        rgb: pixels.narrow(1, 0, 3),
+        opacity: pixels.index_axis(1, column::OPACITY),
+        log_transmittance: pixels.index_axis(1, column::LOG_TRANSMITTANCE),
+        sample_count,
+        rest: Rest::Fused(Columns { pixels, state, tables: tables.map(Clone::clone) }),
+    }
+}
+
+/// Which columns a kernel computed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Output {
+    /// `[n, COLUMNS]`
+    Pixels,
+    /// `[n]`
+    Sparsity,
+}
+
+/// A function of the density and the color table.
+#[derive(Debug)]
+struct Fused<T: Real> {
+    state: Arc<State<T>>,
+    output: Output,
+}
+
+impl<T: Real> Kernel<T> for Fused<T> {
+    fn name(&self) -> &'static str {
+        "render_fused"
+    }
+
+    fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
+        let rendered = self.state.composite(&inputs[0], &inputs[1]);
+        match self.output {
+            Output::Sparsity => rendered.sparsity(),
+            Output::Pixels => {
+                let column = |x: Tensor<T>| x.unsqueeze(1);
+                let columns = [
+                    rendered.rgb.clone(),
+                    column(rendered.depth()),
+                    column(rendered.opacity.clone()),
+                    column(rendered.log_transmittance.clone()),
+                    column(rendered.distortion()),
+                ];
+                Tensor::concat(&columns.iter().collect::<Vec<_>>(), 1)
+            }
+        }
+    }
+
+    fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
+        let sums = Arc::new(adjoint::Sums::new(&self.state.batch, &self.state.blocks, call.cotangent(), self.output));
+        if call.needs(0) {
+            out.rows(0, RowSparse::deferred(call.input(0).shape(), Arc::new(adjoint::DensitySums(sums.clone()))));
+        }
+        if call.needs(1) {
+            out.rows(1, RowSparse::deferred(call.input(1).shape(), Arc::new(adjoint::ColorSums(sums))));
+        }
+    }
+}
+
+impl<T: Real> State<T> {
+    /// The same pixels as a graph of small ops.
+    fn composite(&self, density: &Tensor<T>, color: &Tensor<T>) -> Rendered<T> {
+        let batch = &self.batch;
+        let mut offsets = vec![0u32];
+        for block in &self.blocks {
+            let base = offsets[offsets.len() - 1];
+            offsets.extend(block.offsets[1..].iter().map(|o| base + o));
+        }
+        let offsets = Indices::from(offsets);
+        let m: usize = self.blocks.iter().map(Block::len).sum();
+        let joined = |get: fn(&Block<T>) -> &[T]| Tensor::from_vec(self.blocks.iter().flat_map(get).copied().collect(), &[m]);
+        let [x, y, z] = [joined(|b| &b.at[0]), joined(|b| &b.at[1]), joined(|b| &b.at[2])];
+        let voxels = Tensor::stack(&[&x, &y, &z], 1);
+        let look_up = |table: &Tensor<T>| match batch.shape.interpolation {
+            Interpolation::Nearest => table.nearest(&voxels, &batch.lattice),
+            Interpolation::Trilinear => table.trilinear(&voxels, &batch.lattice),
+        };
+        let radiance = batch.shape.color.activate(&look_up(density), &look_up(color), &batch.directions, &offsets);
+        let samples = Samples {
+            t: joined(|b| &b.t),
+            delta: joined(|b| &b.delta),
+            // The world is not needed any more.
+            positions: voxels,
+            directions: batch.directions.clone(),
+            offsets,
+        };
+        composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))
+    }
+}

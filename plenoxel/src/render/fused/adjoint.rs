@@ -1,0 +1,383 @@
+//! From cotangents of pixels to gradients of rows.
+//!
+//! With Gᵢ = ∂L/∂wᵢ and G_b = ∂L/∂T_N, and for any loss on the columns,
+//!
+//! ∂L/∂σᵢ = δᵢ (Gᵢ Tᵢ₊₁ − Σ_{j>i} wⱼ Gⱼ − T_N G_b − ∂L/∂ln T_N) + ∂L/∂sparsity · 4σᵢ / (1 + 2σᵢ²),   ∂L/∂cᵢ = wᵢ ∂L/∂rgb.
+//!
+//! Gᵢ = cᵢ · ∂L/∂rgb + tᵢ ∂L/∂depth + ∂L/∂distortion · (2 Σⱼ wⱼ |tᵢ − tⱼ| + ⅔ wᵢ δᵢ),   G_b = background · ∂L/∂rgb − ∂L/∂opacity.
+
+use super::forward::Block;
+use super::{Batch, COLUMNS, Output, column};
+use crate::field::voxel_grid::{Color, Interpolation};
+use autograd::lattice::NodeMap;
+use autograd::ops::trilinear::corners;
+use autograd::{Buffer, Lattice, Real, RowSums, Tensor, dispatched, parallel};
+use std::sync::Arc;
+
+/// A bucket is this power of two of rows: 64 bricks, a cube of 16³ voxels where all of them are present.
+const BUCKET_SHIFT: u32 = 12;
+
+/// What every sample of a batch adds to the tables, sorted by bucket within each block.
+#[derive(Debug)]
+pub(super) struct Sums<T: Real> {
+    lattice: Lattice,
+    color: Color,
+    /// `[n, (degree + 1)²]`
+    basis: Tensor<T>,
+    blocks: Vec<Records<T>>,
+}
+
+/// The records of one block: a sample has one in every bucket that it reads.
+#[derive(Debug)]
+struct Records<T: Real> {
+    /// Where the records of each bucket begin; one more at the end.
+    starts: Vec<u32>,
+    at: At<T>,
+    /// ∂L/∂density
+    density: Buffer<T>,
+    /// ∂L/∂rgb of the sample, before the harmonics: three numbers a record.
+    color: Buffer<T>,
+    /// Number of the ray; empty for RGB.
+    ray: Buffer<u32>,
+}
+
+#[derive(Debug)]
+enum At<T: Real> {
+    Rows(Buffer<u32>),
+    Voxels([Buffer<T>; 3]),
+}
+
+impl<T: Real> Sums<T> {
+    /// From the cotangent of what a kernel computed.
+    pub fn new(batch: &Batch<T>, blocks: &[Block<T>], cotangent: &Tensor<T>, output: Output) -> Self {
+        let buckets = batch.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
+        let blocks = parallel::map_indices(blocks.len(), |b| {
+            let block = &blocks[b];
+            let gradients = Gradients::new(batch, block, cotangent, output);
+            let lattice = &batch.lattice;
+            match (lattice.full_brick_map(), lattice.brick_map()) {
+                (Some(map), _) => gradients.sorted(batch, block, map, buckets),
+                (None, Some(map)) => gradients.sorted(batch, block, map, buckets),
+                (None, None) => unreachable!("the tables of a voxel grid are in bricks"),
+            }
+        });
+        Sums { lattice: batch.lattice.clone(), color: batch.shape.color, basis: batch.basis.clone(), blocks }
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.blocks.iter().all(|records| records.starts[bucket] == records.starts[bucket + 1])
+    }
+
+    /// Calls `f(records, range)` for the records of a bucket, block after block.
+    fn for_each(&self, bucket: usize, mut f: impl FnMut(&Records<T>, std::ops::Range<usize>)) {
+        for records in &self.blocks {
+            let range = records.starts[bucket] as usize..records.starts[bucket + 1] as usize;
+            if !range.is_empty() {
+                f(records, range);
+            }
+        }
+    }
+}
+
+/// ∂L/∂σ and ∂L/∂c of each sample of a block.
+struct Gradients<T: Real> {
+    sigma: Buffer<T>,
+    /// `[rays, 3]`: what ∂L/∂cᵢ is wᵢ times.
+    rgb: Vec<[T; 3]>,
+}
+
+impl<T: Real> Gradients<T> {
+    fn new(batch: &Batch<T>, block: &Block<T>, cotangent: &Tensor<T>, output: Output) -> Self {
+        let mut sigma = Buffer::stale(block.len());
+        let rays = block.offsets.len() - 1;
+        if output == Output::Sparsity {
+            for (own, &g) in block.rays().zip(&cotangent.data()[block.first..]) {
+                for i in own {
+                    let s = block.density[i].max(T::zero());
+                    sigma[i] = g * T::lit(4.0) * s / (T::one() + T::lit(2.0) * s * s);
+                }
+            }
+            return Gradients { sigma, rgb: vec![[T::zero(); 3]; rays] };
+        }
+        let pixels = &cotangent.data().as_chunks::<COLUMNS>().0[block.first..];
+        for (own, g) in block.rays().zip(pixels) {
+            sigma_of_ray(batch, block, own, g, &mut sigma);
+        }
+        Gradients { sigma, rgb: pixels[..rays].iter().map(|g| [g[0], g[1], g[2]]).collect() }
+    }
+
+    /// Sorts what the samples whose density is not negative have by the buckets they read.
+    fn sorted(&self, batch: &Batch<T>, block: &Block<T>, map: impl NodeMap, buckets: usize) -> Records<T> {
+        match batch.shape.interpolation {
+            Interpolation::Nearest => {
+                let one = |i: usize| [(block.rows[i] >> BUCKET_SHIFT) as u16];
+                let mut rows = Buffer::stale(block.len());
+                let records = self.records(batch, block, buckets, block.len(), one, |place, i| rows[place] = block.rows[i]);
+                Records { at: At::Rows(rows), ..records }
+            }
+            Interpolation::Trilinear => {
+                let mut touched = vec![[NONE; 8]; block.len()];
+                let most = block.len() + touch_buckets(block.at.each_ref().map(|a| &a[..]), map, &mut touched);
+                let mut at = [Buffer::stale(most), Buffer::stale(most), Buffer::stale(most)];
+                let records = self.records(
+                    batch,
+                    block,
+                    buckets,
+                    most,
+                    |i| touched[i],
+                    |place, i| {
+                        at.iter_mut().zip(&block.at).for_each(|(to, from)| to[place] = from[i]);
+                    },
+                );
+                Records { at: At::Voxels(at), ..records }
+            }
+        }
+    }
+
+    /// Counts the records of each bucket, and then puts every record in its place, in the order of the samples. `buckets_of(i)` are those
+    /// that sample i reads, the first [`NONE`] ending them; `put(place, i)` puts where the sample lies.
+    #[inline(always)]
+    fn records<const K: usize>(
+        &self,
+        batch: &Batch<T>,
+        block: &Block<T>,
+        buckets: usize,
+        most: usize,
+        buckets_of: impl Fn(usize) -> [u16; K],
+        mut put: impl FnMut(usize, usize),
+    ) -> Records<T> {
+        let mut starts = vec![0u32; buckets + 1];
+        for i in (0..block.len()).filter(|&i| block.density[i] >= T::zero()) {
+            for bucket in buckets_of(i).into_iter().take_while(|&b| b != NONE) {
+                starts[bucket as usize + 1] += 1;
+            }
+        }
+        for b in 0..buckets {
+            starts[b + 1] += starts[b];
+        }
+        let mut next = starts.clone();
+        let clamped = batch.shape.color != Color::Rgb;
+        let (mut density, mut color) = (Buffer::stale(most), Buffer::stale(3 * most));
+        let mut ray = Buffer::stale(if clamped { most } else { 0 });
+        let to = color.as_chunks_mut::<3>().0;
+        let colors = block.color.as_chunks::<3>().0;
+        for (r, own) in block.rays().enumerate() {
+            let g = self.rgb[r];
+            for i in own.filter(|&i| block.density[i] >= T::zero()) {
+                let w = block.weight[i];
+                let mut c = g.map(|g| w * g);
+                if clamped {
+                    (0..3).filter(|&a| colors[i][a] < T::zero()).for_each(|a| c[a] = T::zero());
+                }
+                for bucket in buckets_of(i).into_iter().take_while(|&b| b != NONE) {
+                    let place = next[bucket as usize] as usize;
+                    next[bucket as usize] += 1;
+                    density[place] = self.sigma[i];
+                    to[place] = c;
+                    if clamped {
+                        ray[place] = (block.first + r) as u32;
+                    }
+                    put(place, i);
+                }
+            }
+        }
+        Records { starts, at: At::Rows(Buffer::stale(0)), density, color, ray }
+    }
+}
+
+/// No bucket: fewer than that many buckets fit a table whose rows have numbers of 32 bits, up to 2²⁸ rows.
+const NONE: u16 = u16::MAX;
+
+dispatched! {
+/// The different buckets that the corners of each position lie in, [`NONE`] after the last. Returns how many more there are than positions.
+fn touch_buckets<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, touched: &mut [[u16; 8]]) -> usize {
+    let n = touched.len();
+    let [x, y, z] = at.map(|a| &a[..n]);
+    let mut more = 0;
+    for i in 0..n {
+        let (rows, _) = corners([x[i], y[i], z[i]], map);
+        let all = rows.map(|row| (row >> BUCKET_SHIFT) as u16);
+        touched[i][0] = all[0];
+        if all != [all[0]; 8] {
+            let mut found = 1;
+            for b in all {
+                if !touched[i][..found].contains(&b) {
+                    touched[i][found] = b;
+                    found += 1;
+                }
+            }
+            more += found - 1;
+        }
+    }
+    more
+}
+}
+
+/// ∂L/∂σ along one ray, from the back.
+#[inline(always)]
+fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: std::ops::Range<usize>, g: &[T; COLUMNS], sigma: &mut [T]) {
+    let Some(last) = own.clone().next_back() else { return };
+    let (g_depth, g_distortion) = (g[column::DEPTH], g[column::DISTORTION]);
+    let g_background = (0..3).map(|c| batch.background[c] * g[c]).sum::<T>() - g[column::OPACITY];
+    let mut behind = block.after[last] * g_background + g[column::LOG_TRANSMITTANCE];
+    let (rgb, _) = block.color.as_chunks::<3>();
+    let clamped = batch.shape.color != Color::Rgb;
+    // Sums over all samples, and over those behind, of w and of w t.
+    let (mut all, mut all_t) = (T::zero(), T::zero());
+    if g_distortion != T::zero() {
+        for i in own.clone() {
+            all += block.weight[i];
+            all_t += block.weight[i] * block.t[i];
+        }
+    }
+    let (mut back, mut back_t) = (T::zero(), T::zero());
+    for i in own.rev() {
+        let (w, t, delta) = (block.weight[i], block.t[i], block.delta[i]);
+        let c = if clamped { rgb[i].map(|c| c.max(T::zero())) } else { rgb[i] };
+        let mut own = c[0] * g[0] + c[1] * g[1] + c[2] * g[2] + t * g_depth;
+        if g_distortion != T::zero() {
+            let (front, front_t) = (all - back - w, all_t - back_t - w * t);
+            let spread = t * front - front_t + back_t - t * back;
+            own += g_distortion * (T::lit(2.0) * spread + T::lit(2.0 / 3.0) * w * delta);
+            back += w;
+            back_t += w * t;
+        }
+        sigma[i] = delta * (own * block.after[i] - behind);
+        behind += w * own;
+    }
+}
+
+/// Rows of the density table.
+#[derive(Debug)]
+pub(super) struct DensitySums<T: Real>(pub Arc<Sums<T>>);
+
+/// Rows of the color table.
+#[derive(Debug)]
+pub(super) struct ColorSums<T: Real>(pub Arc<Sums<T>>);
+
+impl<T: Real> RowSums<T> for DensitySums<T> {
+    fn bucket_shift(&self) -> u32 {
+        BUCKET_SHIFT
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.0.is_empty(bucket)
+    }
+
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        self.0.for_each(bucket, |records, range| match &records.at {
+            At::Rows(rows) => add_rows::<T, 1>(&rows[range.clone()], &records.density[range], sums, touched),
+            At::Voxels(at) => {
+                let at = at.each_ref().map(|a| &a[range.clone()]);
+                let values = &records.density[range];
+                match (self.0.lattice.full_brick_map(), self.0.lattice.brick_map()) {
+                    (Some(map), _) => add_corners::<T, 1, _>(bucket, at, map, |i| [values[i]], sums, touched),
+                    (None, Some(map)) => add_corners::<T, 1, _>(bucket, at, map, |i| [values[i]], sums, touched),
+                    (None, None) => {}
+                }
+            }
+        });
+    }
+}
+
+impl<T: Real> RowSums<T> for ColorSums<T> {
+    fn bucket_shift(&self) -> u32 {
+        BUCKET_SHIFT
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.0.is_empty(bucket)
+    }
+
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        match self.0.color {
+            Color::Rgb => self.add_of_width::<3>(bucket, sums, touched),
+            Color::Sh { degree: 0, .. } => self.add_of_width::<3>(bucket, sums, touched),
+            Color::Sh { degree: 1, .. } => self.add_of_width::<12>(bucket, sums, touched),
+            Color::Sh { degree: 2, .. } => self.add_of_width::<27>(bucket, sums, touched),
+            Color::Sh { .. } => self.add_of_width::<48>(bucket, sums, touched),
+        }
+    }
+}
+
+impl<T: Real> ColorSums<T> {
+    fn add_of_width<const W: usize>(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        let Sums { lattice, color, basis, .. } = &*self.0;
+        let count = W / 3;
+        let harmonic = *color != Color::Rgb;
+        self.0.for_each(bucket, |records, range| {
+            let colors = &records.color.as_chunks::<3>().0[range.clone()];
+            let value = |i: usize| -> [T; W] {
+                let c = colors[i];
+                if !harmonic {
+                    return std::array::from_fn(|k| c[k % 3]);
+                }
+                let y = &basis.data()[records.ray[range.start + i] as usize * count..][..count];
+                let mut v = [T::zero(); W];
+                for a in 0..3 {
+                    for k in 0..count {
+                        v[a * count + k] = c[a] * y[k];
+                    }
+                }
+                v
+            };
+            match &records.at {
+                At::Rows(rows) if !harmonic => add_rows::<T, W>(&rows[range.clone()], colors.as_flattened(), sums, touched),
+                At::Rows(rows) => {
+                    let values: Vec<T> = (0..range.len()).flat_map(value).collect();
+                    add_rows::<T, W>(&rows[range.clone()], &values, sums, touched);
+                }
+                At::Voxels(at) => {
+                    let at = at.each_ref().map(|a| &a[range.clone()]);
+                    match (lattice.full_brick_map(), lattice.brick_map()) {
+                        (Some(map), _) => add_corners::<T, W, _>(bucket, at, map, value, sums, touched),
+                        (None, Some(map)) => add_corners::<T, W, _>(bucket, at, map, value, sums, touched),
+                        (None, None) => {}
+                    }
+                }
+            }
+        });
+    }
+}
+
+dispatched! {
+/// Adds values to rows of one bucket.
+fn add_rows<T: Real, const W: usize>(rows: &[u32], values: &[T], sums: &mut [T], touched: &mut [u64]) {
+    let sums = sums.as_chunks_mut::<W>().0;
+    for (&row, value) in rows.iter().zip(values.as_chunks::<W>().0) {
+        let local = row as usize & ((1 << BUCKET_SHIFT) - 1);
+        touched[local / 64] |= 1 << (local % 64);
+        for (s, &v) in sums[local].iter_mut().zip(value) {
+            *s += v;
+        }
+    }
+}
+}
+
+dispatched! {
+/// Adds weighted values to those of the eight rows around each position that lie in the bucket.
+fn add_corners<T: Real, const W: usize, M: NodeMap>(
+    bucket: usize,
+    at: [&[T]; 3],
+    map: M,
+    value: impl Fn(usize) -> [T; W],
+    sums: &mut [T],
+    touched: &mut [u64],
+) {
+    let sums = sums.as_chunks_mut::<W>().0;
+    let [x, y, z] = at;
+    for (i, ((&x, &y), &z)) in x.iter().zip(y).zip(z).enumerate() {
+        let (rows, weights) = corners([x, y, z], map);
+        let value = value(i);
+        for c in 0..8 {
+            if rows[c] as usize >> BUCKET_SHIFT == bucket {
+                let local = rows[c] as usize & ((1 << BUCKET_SHIFT) - 1);
+                touched[local / 64] |= 1 << (local % 64);
+                for (s, &v) in sums[local].iter_mut().zip(&value) {
+                    *s += weights[c] * v;
+                }
+            }
+        }
+    }
+}
+}

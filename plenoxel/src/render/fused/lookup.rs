@@ -1,0 +1,172 @@
+//! Rows and weights of many positions at once.
+
+use autograd::lattice::NodeMap;
+use autograd::ops::trilinear::{corners_of_many, nearest_node};
+use autograd::{Buffer, Real, dispatched};
+
+/// The eight rows around each of some samples, and their weights.
+pub(super) struct Corners<T: Real> {
+    rows: Buffer<u32>,
+    weights: Buffer<T>,
+}
+
+dispatched! {
+/// The row of the voxel that each position lies in; `u32::MAX` if it is not present.
+pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mut [u32]) {
+    let [x, y, z] = at.map(|a| &a[..rows.len()]);
+    for (i, row) in rows.iter_mut().enumerate() {
+        *row = map.code(nearest_node([x[i], y[i], z[i]], map.nodes()));
+    }
+    for row in rows {
+        *row = map.row_of(*row).unwrap_or(u32::MAX);
+    }
+}
+}
+
+impl<T: Real> Corners<T> {
+    /// Those of `at`, and what a table of one column is there.
+    pub fn new(at: [&[T]; 3], map: impl NodeMap, table: &[T], values: &mut [T]) -> Self {
+        let n = values.len();
+        let mut corners = Corners { rows: Buffer::stale(8 * n), weights: Buffer::stale(8 * n) };
+        let (rows, weights) = (corners.rows.as_chunks_mut().0, corners.weights.as_chunks_mut().0);
+        corners_of_many(at.map(|a| &a[..n]), map, rows, weights);
+        interpolate(table, rows, weights, values);
+        corners
+    }
+
+    /// Rows and weights of a sample.
+    #[inline(always)]
+    pub fn of(&self, i: usize) -> ([u32; 8], [T; 8]) {
+        (self.rows.as_chunks().0[i], self.weights.as_chunks().0[i])
+    }
+}
+
+dispatched! {
+fn interpolate<T: Real>(table: &[T], rows: &[[u32; 8]], weights: &[[T; 8]], values: &mut [T]) {
+    for ((value, rows), weights) in values.iter_mut().zip(rows).zip(weights) {
+        let mut sum = T::zero();
+        for c in 0..8 {
+            sum += weights[c] * table[rows[c] as usize];
+        }
+        *value = sum;
+    }
+}
+}
+
+dispatched! {
+/// What the interval of each sample absorbs, 1 − exp(−σ δ), and what it lets through; σ = max(0, density).
+pub(super) fn absorptions<T: Real, const FUSED: bool>(density: &[T], delta: &[T], alpha: &mut [T], through: &mut [T]) {
+    for (((a, e), &s), &d) in alpha.iter_mut().zip(through).zip(density).zip(delta) {
+        (*a, *e) = (s.max(T::zero()) * d).absorb::<FUSED>();
+    }
+}
+}
+
+dispatched! {
+/// Σⱼ wⱼ rowⱼ of a table of three columns for the samples that are seen, zeros for the others.
+pub(super) fn plain<T: Real, const K: usize>(
+    table: &[T],
+    look: impl Fn(usize) -> ([u32; K], [T; K]),
+    seen: impl Fn(usize) -> bool,
+    out: &mut [[T; 3]],
+) {
+    let table = table.as_chunks::<3>().0;
+    for (i, out) in out.iter_mut().enumerate() {
+        let mut sum = [T::zero(); 3];
+        if seen(i) {
+            let (rows, weights) = look(i);
+            for k in 0..K {
+                let row = table[rows[k] as usize];
+                (0..3).for_each(|c| sum[c] += weights[k] * row[c]);
+            }
+        }
+        *out = sum;
+    }
+}
+}
+
+/// What harmonics need to become colors.
+#[derive(Clone, Copy)]
+pub(super) struct Directions<'a, T> {
+    /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
+    pub offsets: &'a [u32],
+    /// `count` numbers for each ray of the block.
+    pub basis: &'a [T],
+    pub count: usize,
+    /// The color of zero coefficients.
+    pub offset: T,
+}
+
+/// offset + Σₖ Yₖ Σⱼ wⱼ rowⱼₖ in red, green and blue, for the samples that are seen, zeros for the others.
+pub(super) fn harmonics<T: Real, const K: usize>(
+    table: &[T],
+    directions: Directions<'_, T>,
+    look: impl Fn(usize) -> ([u32; K], [T; K]),
+    seen: impl Fn(usize) -> bool,
+    out: &mut [[T; 3]],
+) {
+    match directions.count {
+        1 => contract::<T, K, 3>(table, directions, look, seen, out),
+        4 => contract::<T, K, 12>(table, directions, look, seen, out),
+        9 => contract::<T, K, 27>(table, directions, look, seen, out),
+        _ => contract::<T, K, 48>(table, directions, look, seen, out),
+    }
+}
+
+dispatched! {
+/// `W` is the width of the table.
+fn contract<T: Real, const K: usize, const W: usize>(
+    table: &[T],
+    directions: Directions<'_, T>,
+    look: impl Fn(usize) -> ([u32; K], [T; K]),
+    seen: impl Fn(usize) -> bool,
+    out: &mut [[T; 3]],
+) {
+    // Coefficients of some samples in memory, and then their colors: the two need different vectors.
+    const TOGETHER: usize = 16;
+    let mut sums = [[T::zero(); W]; TOGETHER];
+    let table = table.as_chunks::<W>().0;
+    let count = W / 3;
+    for (own, basis) in directions.offsets.windows(2).zip(directions.basis.chunks_exact(count)) {
+        for (run, out) in out[own[0] as usize..own[1] as usize].chunks_mut(TOGETHER).enumerate() {
+            let first = own[0] as usize + run * TOGETHER;
+            for (i, sum) in sums[..out.len()].iter_mut().enumerate() {
+                if seen(first + i) {
+                    let (rows, weights) = look(first + i);
+                    let rows = rows.map(|row| &table[row as usize]);
+                    if W >= 16 {
+                        weigh::<T, K, W, 16>(rows, weights, sum);
+                    } else {
+                        weigh::<T, K, W, 3>(rows, weights, sum);
+                    }
+                }
+            }
+            for (i, (out, sum)) in out.iter_mut().zip(&sums).enumerate() {
+                for (c, out) in out.iter_mut().enumerate() {
+                    let mut color = directions.offset;
+                    for k in 0..count {
+                        color += sum[c * count + k] * basis[k];
+                    }
+                    *out = if seen(first + i) { color } else { T::zero() };
+                }
+            }
+        }
+    }
+}
+}
+
+/// Σ weightₖ rowₖ, `L` columns at a time; the last ones overlap those before, so that all are whole vectors.
+#[inline(always)]
+fn weigh<T: Real, const K: usize, const W: usize, const L: usize>(rows: [&[T; W]; K], weights: [T; K], sum: &mut [T; W]) {
+    for part in 0..W.div_ceil(L) {
+        let start = (part * L).min(W - L);
+        let mut lanes = [T::zero(); L];
+        for k in 0..K {
+            let row: &[T; L] = rows[k][start..].first_chunk().expect("the part lies in the row");
+            for l in 0..L {
+                lanes[l] += weights[k] * row[l];
+            }
+        }
+        sum[start..start + L].copy_from_slice(&lanes);
+    }
+}

@@ -1,0 +1,250 @@
+//! Which cells of a box may hold matter, and how far it is to the next ones.
+
+use crate::camera::Ray;
+use crate::geometry::Aabb;
+use autograd::lattice::{BRICK, LOW, STRIDE};
+use autograd::parallel;
+use glam::DVec3;
+
+/// Which cells of a box may hold matter. Cells come in bricks of 4³, a bit for each; an empty brick knows how many bricks around it are
+/// empty too.
+#[derive(Debug, Clone)]
+pub struct Occupancy {
+    aabb: Aabb,
+    cells: [usize; 3],
+    /// Bricks along each axis.
+    count: [usize; 3],
+    /// One for each brick, in row-major order; cell (i, j, k) of a brick is bit 16 i + 4 j + k.
+    masks: Vec<u64>,
+    /// For an empty brick, the Chebyshev distance in bricks to the next one that is not, at most [`FAR`]; 0 for that one.
+    distance: Vec<u8>,
+}
+
+/// The largest distance that is told apart.
+const FAR: u8 = 8;
+
+/// What a ray finds at a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Look {
+    Occupied,
+    Empty,
+    /// No occupied cell before this distance along the ray.
+    EmptyUntil(f64),
+}
+
+impl Occupancy {
+    /// Cells in row-major order: (i, j, k) is entry (i·ny + j)·nz + k.
+    ///
+    /// Panics if the mask does not have one entry for each cell.
+    pub fn new(aabb: Aabb, cells: [usize; 3], mask: &[bool]) -> Self {
+        assert_eq!(mask.len(), cells.iter().product::<usize>(), "occupancy: one entry for each of {cells:?} cells");
+        let count = cells.map(|n| n.div_ceil(BRICK));
+        let mut masks = vec![0u64; count.iter().product()];
+        for (c, _) in mask.iter().enumerate().filter(|(_, full)| **full) {
+            let cell = [c / (cells[1] * cells[2]), c / cells[2] % cells[1], c % cells[2]];
+            let (brick, bit) = split(cell, count);
+            masks[brick] |= 1 << bit;
+        }
+        Self::from_masks(aabb, cells, masks)
+    }
+
+    /// Cells from one mask for each brick, as in [`autograd::Lattice::masks`].
+    ///
+    /// Panics if there is not one mask for each brick.
+    pub fn from_masks(aabb: Aabb, cells: [usize; 3], masks: Vec<u64>) -> Self {
+        let count = cells.map(|n| n.div_ceil(BRICK));
+        assert_eq!(masks.len(), count.iter().product::<usize>(), "occupancy: one mask for each of {count:?} bricks");
+        let distance = distances(&masks, count);
+        Occupancy { aabb, cells, count, masks, distance }
+    }
+
+    /// Cells along each axis.
+    pub fn cells(&self) -> [usize; 3] {
+        self.cells
+    }
+
+    /// The box the cells fill.
+    pub fn aabb(&self) -> Aabb {
+        self.aabb
+    }
+
+    /// One mask for each brick, in row-major order.
+    pub fn masks(&self) -> &[u64] {
+        &self.masks
+    }
+
+    /// May a cell hold matter?
+    ///
+    /// Panics if the cell lies outside of the box.
+    pub fn contains(&self, cell: [usize; 3]) -> bool {
+        assert!((0..3).all(|a| cell[a] < self.cells[a]), "cell {cell:?} of {:?}", self.cells);
+        let (brick, bit) = split(cell, self.count);
+        self.masks[brick] >> bit & 1 == 1
+    }
+
+    /// The share of cells that may hold matter.
+    pub fn fraction(&self) -> f64 {
+        self.masks.iter().map(|m| f64::from(m.count_ones())).sum::<f64>() / self.cells.iter().product::<usize>() as f64
+    }
+
+    /// The cells within `radius` cells of these, along axes and diagonals.
+    pub fn dilated(&self, radius: usize) -> Self {
+        let mut masks = self.masks.clone();
+        for _ in 0..radius {
+            for axis in 0..3 {
+                masks = dilate(&masks, self.count, axis);
+            }
+        }
+        for (b, mask) in masks.iter_mut().enumerate() {
+            *mask &= inside(place(b, self.count), self.cells);
+        }
+        Self::from_masks(self.aabb, self.cells, masks)
+    }
+
+    /// What lies at a distance along a ray.
+    #[inline]
+    pub(crate) fn look(&self, ray: &Ray, t: f64) -> Look {
+        let size = self.aabb.max - self.aabb.min;
+        let u = (ray.origin + t * ray.direction - self.aabb.min) / size;
+        let cell: [usize; 3] = std::array::from_fn(|a| ((u[a] * self.cells[a] as f64) as usize).min(self.cells[a] - 1));
+        let (brick, bit) = split(cell, self.count);
+        if self.masks[brick] >> bit & 1 == 1 {
+            return Look::Occupied;
+        }
+        let free = self.distance[brick];
+        if free == 0 {
+            return Look::Empty;
+        }
+        // All bricks nearer than `free` are empty: to where the ray leaves the cube of them.
+        let side = size * DVec3::from_array(self.cells.map(|n| BRICK as f64 / n as f64));
+        let exit = (0..3).fold(f64::INFINITY, |exit, a| {
+            let (here, reach) = ((cell[a] / BRICK) as f64, f64::from(free));
+            let d = ray.direction[a];
+            let plane = self.aabb.min[a] + side[a] * if d > 0.0 { here + reach } else { here + 1.0 - reach };
+            if d == 0.0 { exit } else { exit.min((plane - ray.origin[a]) / d) }
+        });
+        Look::EmptyUntil(exit)
+    }
+}
+
+/// Number of a cell's brick, and of the cell in it.
+#[inline(always)]
+fn split(cell: [usize; 3], count: [usize; 3]) -> (usize, usize) {
+    let brick = (cell[0] / BRICK * count[1] + cell[1] / BRICK) * count[2] + cell[2] / BRICK;
+    (brick, (cell[0] % BRICK) * 16 + (cell[1] % BRICK) * 4 + cell[2] % BRICK)
+}
+
+/// Place of a brick.
+fn place(brick: usize, count: [usize; 3]) -> [usize; 3] {
+    [brick / (count[1] * count[2]), brick / count[2] % count[1], brick % count[2]]
+}
+
+/// The cells of a brick that lie in a box of `cells`.
+pub(crate) fn inside(place: [usize; 3], cells: [usize; 3]) -> u64 {
+    (0..64).filter(|bit| (0..3).all(|a| place[a] * BRICK + (bit >> (4 - 2 * a) & 3) < cells[a])).fold(0, |mask, bit| mask | 1 << bit)
+}
+
+/// Every cell and its two neighbours along an axis.
+fn dilate(masks: &[u64], count: [usize; 3], axis: usize) -> Vec<u64> {
+    let step = STRIDE[axis];
+    let (low, high) = (LOW[axis], LOW[axis] << (3 * step));
+    let stride = [count[1] * count[2], count[2], 1][axis];
+    let mut out = vec![0; masks.len()];
+    parallel::for_each_chunk(&mut out, parallel::CHUNK, |first, chunk| {
+        for (i, out) in chunk.iter_mut().enumerate() {
+            let b = first + i;
+            let at = place(b, count)[axis];
+            let m = masks[b];
+            let before = if at > 0 { masks[b - stride] } else { 0 };
+            let after = if at + 1 < count[axis] { masks[b + stride] } else { 0 };
+            *out = m | (m & !high) << step | (m & !low) >> step | (before & high) >> (3 * step) | (after & low) << (3 * step);
+        }
+    });
+    out
+}
+
+/// Chebyshev distance of each brick to the nearest that is not empty.
+fn distances(masks: &[u64], count: [usize; 3]) -> Vec<u8> {
+    let mut distance: Vec<u8> = masks.iter().map(|&m| if m == 0 { FAR } else { 0 }).collect();
+    // min over the cube around a brick of max |coordinate difference|: one step of growth at a time, an axis after the other.
+    for level in 1..FAR {
+        let mut near: Vec<bool> = distance.iter().map(|&d| d < level).collect();
+        for axis in 0..3 {
+            let stride = [count[1] * count[2], count[2], 1][axis];
+            let old = near.clone();
+            parallel::for_each_chunk(&mut near, parallel::CHUNK, |first, chunk| {
+                for (i, near) in chunk.iter_mut().enumerate() {
+                    let b = first + i;
+                    let at = place(b, count)[axis];
+                    *near |= at > 0 && old[b - stride] || at + 1 < count[axis] && old[b + stride];
+                }
+            });
+        }
+        let mut changed = false;
+        for (d, near) in distance.iter_mut().zip(near) {
+            if near && *d > level {
+                *d = level;
+                changed = true;
+            }
+        }
+        if !changed {
+            break;
+        }
+    }
+    distance
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::{Purpose, uniform};
+
+    fn scattered(cells: [usize; 3], share: f64) -> Occupancy {
+        let n: usize = cells.iter().product();
+        let mask: Vec<bool> = (0..n as u64).map(|c| uniform(3, Purpose::Initial, 0, c) < share).collect();
+        Occupancy::new(Aabb::cube(1.0), cells, &mask)
+    }
+
+    #[test]
+    fn dilation_adds_the_cells_around_and_stays_in_the_box() {
+        let cells = [9, 6, 11];
+        let some = scattered(cells, 0.01);
+        let grown = some.dilated(2);
+        for i in 0..cells[0] {
+            for j in 0..cells[1] {
+                for k in 0..cells[2] {
+                    let around = |c: usize, n: usize| c.saturating_sub(2)..(c + 3).min(n);
+                    let want =
+                        around(i, cells[0]).any(|a| around(j, cells[1]).any(|b| around(k, cells[2]).any(|c| some.contains([a, b, c]))));
+                    assert_eq!(grown.contains([i, j, k]), want, "cell {i} {j} {k}");
+                }
+            }
+        }
+        assert!(grown.fraction() > some.fraction() && grown.fraction() < 1.0);
+    }
+
+    #[test]
+    fn an_empty_stretch_holds_no_occupied_cell() {
+        let some = scattered([70, 64, 66], 0.00002);
+        let origin = DVec3::new(-2.0, 0.13, -0.41);
+        for target in [[0.9, 0.3, 0.2], [0.5, -0.9, 0.9], [0.9, 0.13, -0.41]] {
+            let direction = (DVec3::from(target) - origin).normalize();
+            let ray = Ray { origin, direction, stretch: 1.0 };
+            let (near, far) = some.aabb.intersect(origin, direction).expect("it hits");
+            let mut strides = 0;
+            let mut t = near + 1e-9;
+            while t < far {
+                if let Look::EmptyUntil(exit) = some.look(&ray, t) {
+                    assert!(exit > t);
+                    for k in 0..100 {
+                        let between = t + (exit.min(far) - t) * (f64::from(k) + 0.5) / 100.0;
+                        assert_ne!(some.look(&ray, between), Look::Occupied);
+                    }
+                    strides += 1;
+                }
+                t += 0.01;
+            }
+            assert!(strides > 0);
+        }
+    }
+}

@@ -1,0 +1,240 @@
+//! The fused engine against the graph: values and gradients of every column, on chosen rays and on a thousand random scenes.
+//!
+//! The graph itself is held to finite differences in `gradients.rs` and to closed forms in `analytic_scenes.rs`. To see that this suite can
+//! fail, change any one term of `sigma_of_ray` in `render/fused/adjoint.rs`: most of it does.
+
+mod support;
+
+use autograd::{Lattice, Real, Tensor};
+use plenoxel::camera::Ray;
+use plenoxel::field::sh;
+use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use plenoxel::geometry::Aabb;
+use plenoxel::random::{Purpose, bits, uniform};
+use plenoxel::render::{Engine, RenderOptions, Rendered, render};
+use plenoxel::sampling::{Jitter, Spacing};
+use support::ray;
+
+const COLUMNS: [(&str, usize); 6] =
+    [("rgb", 3), ("depth", 1), ("opacity", 1), ("log transmittance", 1), ("sparsity", 1), ("distortion", 1)];
+
+fn column<T: Real>(rendered: &Rendered<T>, name: &str) -> Tensor<T> {
+    match name {
+        "rgb" => rendered.rgb.clone(),
+        "depth" => rendered.depth(),
+        "opacity" => rendered.opacity.clone(),
+        "log transmittance" => rendered.log_transmittance.clone(),
+        "sparsity" => rendered.sparsity(),
+        "distortion" => rendered.distortion(),
+        _ => unreachable!(),
+    }
+}
+
+/// ‖a − b‖ / ‖b‖, where ‖b‖ counts as 10⁻² at least: in thick matter of one color a gradient is what is left of terms of size 1.
+fn distance<T: Real>(a: &[T], b: &[T]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    let norm = |x: &mut dyn Iterator<Item = f64>| x.map(|v| v * v).sum::<f64>().sqrt();
+    let size = norm(&mut b.iter().map(|v| v.as_f64()));
+    let off = norm(&mut a.iter().zip(b).map(|(a, b)| a.as_f64() - b.as_f64()));
+    assert!(off.is_finite() && size.is_finite());
+    off / size.max(1e-2)
+}
+
+/// The worst distance between the engines over all columns and their gradients by both tables, with the name of where it is.
+fn worst<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> (f64, String) {
+    let mut worst = (0.0, String::new());
+    for (name, width) in COLUMNS {
+        let [fused, graph] = [Engine::Fused, Engine::Graph].map(|engine| {
+            let rendered = render(grid, rays, &RenderOptions { engine, ..options.clone() });
+            let value = column(&rendered, name);
+            // A cotangent of its own for every number.
+            let cotangent: Vec<T> = (0..rays.len() * width).map(|i| T::lit(uniform(5, Purpose::Initial, 9, i as u64) - 0.3)).collect();
+            let loss = (&value * Tensor::from_vec(cotangent, value.shape())).sum();
+            let gradients = loss.backward();
+            let by = [&grid.density, &grid.color].map(|p| gradients.array(p.tensor()).into_iter().collect::<Vec<T>>());
+            (value.data().to_vec(), by, rendered.sample_count)
+        });
+        assert_eq!(fused.2, graph.2, "{name}: numbers of samples");
+        for (what, d) in [
+            ("value", distance(&fused.0, &graph.0)),
+            ("by density", distance(&fused.1[0], &graph.1[0])),
+            ("by color", distance(&fused.1[1], &graph.1[1])),
+        ] {
+            if d >= worst.0 {
+                worst = (d, format!("{name}, {what}"));
+            }
+        }
+    }
+    worst
+}
+
+/// A scene in which everything is drawn: resolution, look-up, colors, which voxels are there, spacing, jitter, rays.
+struct Scene<T: Real> {
+    grid: VoxelGrid<T>,
+    rays: Vec<Ray>,
+    spacing: Spacing,
+    jitter: Jitter,
+    background: [f32; 3],
+}
+
+impl<T: Real> Scene<T> {
+    fn random(seed: u64) -> Self {
+        let draw = |k: u64| uniform(seed, Purpose::Initial, 1, k);
+        let pick = |k: u64, n: u64| bits(seed, Purpose::Initial, 2, k) % n;
+        let resolution = 1 + pick(0, 11) as usize;
+        let interpolation = [Interpolation::Nearest, Interpolation::Trilinear][pick(1, 2) as usize];
+        let color = match pick(2, 5) {
+            0 => Color::Rgb,
+            d => Color::Sh { degree: d as usize - 1, offset: [0.0, 0.5][pick(3, 2) as usize] },
+        };
+        let shape = GridShape { resolution, half_width: 0.7 + draw(4), interpolation, color };
+        let present = [1.0, 0.7, 0.15][pick(5, 3) as usize];
+        let lattice = Lattice::bricks_where([resolution; 3], |[i, j, k]| {
+            (i, j, k) == (0, 0, 0) || uniform(seed, Purpose::Initial, 3, ((i * 64 + j) * 64 + k) as u64) < present
+        });
+        let table = |width: usize, stream: u64, low: f64, high: f64| {
+            let n = lattice.rows() * width;
+            let values = (0..n as u64).map(|i| T::lit(low + (high - low) * uniform(seed, Purpose::Initial, stream, i))).collect();
+            Tensor::from_vec(values, &[lattice.rows(), width])
+        };
+        // A third of the densities is below zero, and some matter is thick.
+        let thick = [3.0, 60.0][pick(6, 2) as usize];
+        let (density, colors) = (table(1, 4, -0.5 * thick, thick), table(color.channels(), 5, -0.4, 0.9));
+        let grid = VoxelGrid::with_lattice(shape, lattice.clone(), density, colors);
+        let coordinate = |k: u64| 4.0 * draw(100 + k) - 2.0;
+        let rays = (0..7)
+            .map(|r| {
+                let from = [0, 1, 2].map(|a| 2.0 * coordinate(6 * r + a));
+                ray(from, [3, 4, 5].map(|a| 0.4 * coordinate(6 * r + a)))
+            })
+            .collect();
+        let spacing = match pick(7, 2) {
+            0 => Spacing::Step(shape.voxel_side() * (0.2 + 1.5 * draw(8))),
+            _ => Spacing::Points { samples: 5 + pick(9, 60) as usize, far: 8.0 },
+        };
+        let jitter = [Jitter::None, Jitter::PerRay { seed, step: 3 }][pick(10, 2) as usize];
+        Scene { grid, rays, spacing, jitter, background: [draw(11) as f32, draw(12) as f32, 1.0] }
+    }
+
+    fn options(&self) -> RenderOptions<'static> {
+        RenderOptions {
+            aabb: self.grid.aabb(),
+            spacing: self.spacing,
+            jitter: self.jitter,
+            background: self.background,
+            occupancy: None,
+            engine: Engine::Fused,
+            stop_below: 0.0,
+        }
+    }
+}
+
+#[test]
+fn a_thousand_random_scenes_agree_in_f64() {
+    let (mut largest, mut place) = (0.0, String::new());
+    for seed in 0..1000 {
+        let scene = Scene::<f64>::random(seed);
+        let (d, name) = worst(&scene.grid, &scene.rays, &scene.options());
+        assert!(d < 1e-10, "seed {seed}, {:?}: {name} is off by {d:e}", scene.grid.shape());
+        if d > largest {
+            (largest, place) = (d, format!("seed {seed}, {name}"));
+        }
+    }
+    println!("1000 random scenes in f64, 6 columns, values and gradients by both tables: worst relative error {largest:.1e} ({place})");
+}
+
+#[test]
+fn random_scenes_agree_in_f32() {
+    let mut largest = 0.0;
+    for seed in 2000..2200 {
+        let scene = Scene::<f32>::random(seed);
+        let (d, name) = worst(&scene.grid, &scene.rays, &scene.options());
+        assert!(d < 2e-4, "seed {seed}, {:?}: {name} is off by {d:e}", scene.grid.shape());
+        largest = f64::max(largest, d);
+    }
+    println!("200 random scenes in f32: worst relative error {largest:.1e}");
+}
+
+#[test]
+fn rays_of_every_kind_agree() {
+    let rays = vec![
+        ray([-3.0, 0.1, 0.2], [3.0, 0.1, 0.2]),
+        ray([0.3, -3.0, 0.0], [0.3, 3.0, 0.0]),
+        ray([0.1, 0.2, 0.3], [1.0, 0.9, -0.8]),
+        ray([-3.0, 2.0, 0.0], [3.0, 2.5, 0.0]),
+        ray([-3.0, 1.0, -1.0], [3.0, 1.0, -1.0]),
+        ray([-3.0, -3.0, -3.0], [3.0, 3.0, 3.0]),
+        ray([0.0, 0.0, 1.0], [0.5, 0.5, 3.0]),
+    ];
+    let options = |spacing| RenderOptions {
+        aabb: Aabb::cube(1.0),
+        spacing,
+        jitter: Jitter::None,
+        background: [0.3, 0.6, 0.9],
+        occupancy: None,
+        engine: Engine::Fused,
+        stop_below: 0.0,
+    };
+    for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+        for color in [Color::Rgb, Color::Sh { degree: 2, offset: 0.5 }] {
+            let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color };
+            let rows = shape.full().rows();
+            let opaque = |row: usize| if row == 21 { 1e4 } else { 0.0 };
+            let cases: [(&str, VoxelGrid<f64>); 4] = [
+                ("random", VoxelGrid::random(shape, 2.0, 1.0, 7)),
+                ("empty", VoxelGrid::uniform(shape, 0.0, 0.5)),
+                ("opaque everywhere", VoxelGrid::uniform(shape, 1e4, 0.5)),
+                (
+                    "one opaque voxel",
+                    VoxelGrid::from_tables(
+                        shape,
+                        Tensor::from_vec((0..rows).map(opaque).collect(), &[rows, 1]),
+                        Tensor::full(&[rows, color.channels()], 0.2),
+                    ),
+                ),
+            ];
+            for (name, grid) in cases {
+                for spacing in [Spacing::Step(0.07), Spacing::Step(5.0), Spacing::Points { samples: 60, far: 8.0 }] {
+                    let (d, what) = worst(&grid, &rays, &options(spacing));
+                    assert!(d < 1e-10, "{name}, {interpolation:?}, {color:?}, {spacing:?}: {what} is off by {d:e}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn second_derivatives_go_through_the_graph() {
+    let shape = support::shape(Interpolation::Trilinear, Color::Sh { degree: 1, offset: 0.5 });
+    let tables = vec![support::numbers(&[64, 1], 0.2, 2.0, 21), support::numbers(&[64, 3 * sh::count(1)], -0.06, 0.06, 22)];
+    let f = |x: &[Tensor<f64>]| {
+        let options = RenderOptions {
+            aabb: Aabb::cube(1.0),
+            spacing: Spacing::Step(0.23),
+            jitter: Jitter::None,
+            background: [1.0, 0.9, 0.8],
+            occupancy: None,
+            engine: Engine::Fused,
+            stop_below: 0.0,
+        };
+        let rendered = render(&support::grid_of(shape, &x[0], &x[1]), &support::rays(), &options);
+        rendered.rgb.square().sum() + rendered.depth().square().sum() + rendered.distortion().sum()
+    };
+    autograd::Gradcheck::new(f, tables).named("fused").order(2).run().unwrap_or_else(|e| panic!("{e}"));
+}
+
+#[test]
+fn stopping_early_is_off_by_no_more_than_it_says() {
+    for seed in 0..40 {
+        let scene = Scene::<f64>::random(seed);
+        let exact = render(&scene.grid, &scene.rays, &scene.options());
+        for stop_below in [1e-1, 1e-2, 1e-4] {
+            let stopped = render(&scene.grid, &scene.rays, &RenderOptions { stop_below, ..scene.options() });
+            // Colors here are the rendered ones of any direction: bounded by the largest sum of coefficients.
+            let brightest = 12.0;
+            for (a, b) in stopped.rgb.data().iter().zip(exact.rgb.data()) {
+                assert!((a - b).abs() <= stop_below * brightest, "seed {seed}, {stop_below}: {a} and {b}");
+            }
+        }
+    }
+}
