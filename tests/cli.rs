@@ -123,7 +123,12 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
     let metrics: Vec<Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(metrics.len(), 10 + 1);
     assert!(metrics[4]["ends_stage"] == true && metrics[4]["resolution"] == 8 && metrics[4]["rays"] == 5 * 256);
-    assert!(metrics[0]["losses"]["mse"] == metrics[0]["loss"] && metrics[9]["psnr"].is_f64());
+    // The preset's weights.
+    let sum: f64 = [("mse", 1.0), ("tv_density_sampled", 1e-4), ("tv_color_sampled", 1e-2)]
+        .map(|(name, weight)| weight * metrics[0]["losses"][name].as_f64().unwrap())
+        .iter()
+        .sum();
+    assert!((sum - metrics[0]["loss"].as_f64().unwrap()).abs() < 1e-6 && metrics[9]["psnr"].is_f64());
     assert_eq!(metrics[10]["final"], result);
     let pictures = ["stage_1_8.png", "stage_2_12.png", "stages.png", "test_000_r_0.png", "test_001_r_1.png", "test_002_r_2.png"];
     assert_eq!(names(&format!("{run}/images")), pictures);
