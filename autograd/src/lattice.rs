@@ -158,11 +158,6 @@ impl Lattice {
         }
     }
 
-    /// Places of the bricks that have rows, in bricks, in the order of the rows; none for a row-major layout.
-    pub fn places(&self) -> &[[u32; 3]] {
-        self.bricks.as_ref().map_or(&[], |bricks| &bricks.places)
-    }
-
     /// Number and mask of the brick at a place; `None` if it has no rows, lies beyond the grid, or the layout is row-major.
     pub fn brick(&self, place: [usize; 3]) -> Option<(usize, u64)> {
         let bricks = self.bricks.as_ref()?;

@@ -14,7 +14,7 @@
 //! 5. **Gradcheck.** [`gradcheck`](gradcheck()) (`gradcheck.rs`) holds a rule to finite differences, [`check_kernel`] a kernel to its
 //!    reference; `tests/gradcheck` has a row for each op.
 //!
-//! Then [`Param`] and [`Module`] (`param.rs`), the leaves that training changes, and [`optim`], which changes them.
+//! Then [`Lattice`] (`lattice.rs`), where the nodes of a grid lie in a table; [`Param`] and [`Module`] (`param.rs`), the leaves that training changes, and [`optim`], which changes them.
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 

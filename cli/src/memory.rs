@@ -61,7 +61,7 @@ impl Estimate {
             samples * training_bytes_per_sample(config.engine, &shape) + rows + gradient
         });
         let step = step.max().unwrap_or(0);
-        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * EVALUATION_BYTES_PER_SAMPLE;
+        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // The file is put together beside the tables, once in pieces and once whole.
         let saving = 2 * tables;
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
@@ -85,7 +85,7 @@ impl Estimate {
             // The file and the tables read from it.
             grid: 2 * shape.bytes() as u64,
             optimizer: 0,
-            step: samples * EVALUATION_BYTES_PER_SAMPLE,
+            step: samples * evaluation_bytes_per_sample(config.engine, shape),
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
         }
@@ -190,8 +190,18 @@ fn training_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
     }
 }
 
-/// Bytes for each sample when nothing is kept for a gradient: the fused engine's numbers and corners.
-const EVALUATION_BYTES_PER_SAMPLE: u64 = 4 * 30;
+/// Bytes for each sample when nothing is kept for a gradient: the fused engine's numbers and corners. On the graph, buffers that were free
+/// for a short time count too: pictures need them in many sizes, about twice what is in use.
+fn evaluation_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
+    let color = match shape.color {
+        Color::Rgb => 3,
+        Color::Sh { .. } => 5 * shape.color.channels() as u64 / 2,
+    };
+    match engine {
+        Engine::Graph => 2 * 4 * (15 + color),
+        Engine::Fused => 4 * 30,
+    }
+}
 
 /// Rows that a step touches, with their gradients.
 fn touched_rows(shape: &GridShape, samples: u64) -> u64 {

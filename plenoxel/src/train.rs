@@ -196,7 +196,11 @@ impl<'a, T: Real> Trainer<'a, T> {
         if self.config.prune_from_stage.is_some_and(|first| index >= first) {
             let kept = self.grid.occupancy(self.config.prune_below);
             if kept.fraction() == 0.0 {
-                return Err(self.numeric(format!("no voxel has a density above {}, so pruning leaves nothing", self.config.prune_below)));
+                return Err(Error::Numeric {
+                    place: format!("step {}", self.step),
+                    found: "pruning would leave nothing".to_owned(),
+                    remedy: format!("set prune_below lower than {}, or prune_from_stage later", self.config.prune_below),
+                });
             }
             self.grid = self.grid.pruned(&kept);
         }

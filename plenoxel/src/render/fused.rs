@@ -8,6 +8,17 @@
 //! the blocks give what they have in the order of the rays. So a step never writes a gradient table, no two threads write to the
 //! same place, and the sums have the same bits for any number of threads.
 
+/// Runs an expression with the layout of a grid's tables as a `NodeMap`: one compiled for grids with all voxels, one for sparse grids.
+macro_rules! with_bricks {
+    ($lattice:expr, $map:ident => $body:expr) => {
+        match ($lattice.full_brick_map(), $lattice.brick_map()) {
+            (Some($map), _) => $body,
+            (None, Some($map)) => $body,
+            (None, None) => unreachable!("the tables of a voxel grid are in bricks"),
+        }
+    };
+}
+
 mod adjoint;
 mod forward;
 mod lookup;

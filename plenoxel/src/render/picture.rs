@@ -19,49 +19,23 @@ pub struct Picture {
 
 /// Rays rendered at a time: bounds the memory.
 const CHUNK: usize = 4096;
-/// Side of the squares in which pixels are taken, so that rays which read the same voxels come one after another.
-const TILE: usize = 16;
 
 /// Renders what a camera sees.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {
     let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
-    let (mut rgb, mut depth, mut opacity) = (Array3::zeros((h, w, 3)), Array2::zeros((h, w)), Array2::zeros((h, w)));
-    let pixels = tiled(w, h);
-    for pixels in pixels.chunks(CHUNK) {
-        let rays: Vec<_> = pixels.iter().map(|&[x, y]| camera.ray(x as f64 + 0.5, y as f64 + 0.5)).collect();
+    let (mut rgb, mut depth, mut opacity) = (Vec::with_capacity(3 * w * h), Vec::with_capacity(w * h), Vec::with_capacity(w * h));
+    let as_f32 = |x: &T| x.as_f64() as f32;
+    for start in (0..w * h).step_by(CHUNK) {
+        let rays: Vec<_> = (start..(start + CHUNK).min(w * h)).map(|p| camera.ray((p % w) as f64 + 0.5, (p / w) as f64 + 0.5)).collect();
         let rendered = no_grad(|| render(field, &rays, options));
-        let (c, d, o) = (rendered.rgb.data().as_chunks::<3>().0, rendered.depth(), rendered.opacity.data());
-        for (i, &[x, y]) in pixels.iter().enumerate() {
-            (0..3).for_each(|a| rgb[[y, x, a]] = c[i][a].as_f64() as f32);
-            depth[[y, x]] = d.data()[i].as_f64() as f32;
-            opacity[[y, x]] = o[i].as_f64() as f32;
-        }
+        rgb.extend(rendered.rgb.data().iter().map(as_f32));
+        depth.extend(rendered.depth().data().iter().map(as_f32));
+        opacity.extend(rendered.opacity.data().iter().map(as_f32));
     }
-    Picture { rgb, depth, opacity }
-}
-
-/// Every pixel (x, y) once, square after square.
-fn tiled(width: usize, height: usize) -> Vec<[usize; 2]> {
-    let mut pixels = Vec::with_capacity(width * height);
-    for top in (0..height).step_by(TILE) {
-        for left in (0..width).step_by(TILE) {
-            for y in top..(top + TILE).min(height) {
-                pixels.extend((left..(left + TILE).min(width)).map(|x| [x, y]));
-            }
-        }
-    }
-    pixels
-}
-
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn squares_cover_every_pixel_once() {
-        for (w, h) in [(1, 1), (16, 16), (33, 17), (5, 40)] {
-            let mut pixels = super::tiled(w, h);
-            pixels.sort_unstable();
-            let all: Vec<[usize; 2]> = (0..w).flat_map(|x| (0..h).map(move |y| [x, y])).collect();
-            assert_eq!(pixels, all);
-        }
+    let fits = "one number for each pixel";
+    Picture {
+        rgb: Array3::from_shape_vec((h, w, 3), rgb).expect(fits),
+        depth: Array2::from_shape_vec((h, w), depth).expect(fits),
+        opacity: Array2::from_shape_vec((h, w), opacity).expect(fits),
     }
 }

@@ -63,11 +63,6 @@ impl Occupancy {
         self.cells
     }
 
-    /// The box the cells fill.
-    pub fn aabb(&self) -> Aabb {
-        self.aabb
-    }
-
     /// One mask for each brick, in row-major order.
     pub fn masks(&self) -> &[u64] {
         &self.masks

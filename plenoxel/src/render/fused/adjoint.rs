@@ -54,12 +54,7 @@ impl<T: Real> Sums<T> {
         let blocks = parallel::map_indices(blocks.len(), |b| {
             let block = &blocks[b];
             let gradients = Gradients::new(batch, block, cotangent, output);
-            let lattice = &batch.lattice;
-            match (lattice.full_brick_map(), lattice.brick_map()) {
-                (Some(map), _) => gradients.sorted(batch, block, map, buckets),
-                (None, Some(map)) => gradients.sorted(batch, block, map, buckets),
-                (None, None) => unreachable!("the tables of a voxel grid are in bricks"),
-            }
+            with_bricks!(batch.lattice, map => gradients.sorted(batch, block, map, buckets))
         });
         Sums { lattice: batch.lattice.clone(), color: batch.shape.color, basis: batch.basis.clone(), blocks }
     }
@@ -110,7 +105,7 @@ impl<T: Real> Gradients<T> {
     fn sorted(&self, batch: &Batch<T>, block: &Block<T>, map: impl NodeMap, buckets: usize) -> Records<T> {
         match batch.shape.interpolation {
             Interpolation::Nearest => {
-                let one = |i: usize| [(block.rows[i] >> BUCKET_SHIFT) as u16];
+                let one = |i: usize| [block.rows[i] >> BUCKET_SHIFT];
                 let mut rows = Buffer::stale(block.len());
                 let records = self.records(batch, block, buckets, block.len(), one, |place, i| rows[place] = block.rows[i]);
                 Records { at: At::Rows(rows), ..records }
@@ -143,7 +138,7 @@ impl<T: Real> Gradients<T> {
         block: &Block<T>,
         buckets: usize,
         most: usize,
-        buckets_of: impl Fn(usize) -> [u16; K],
+        buckets_of: impl Fn(usize) -> [u32; K],
         mut put: impl FnMut(usize, usize),
     ) -> Records<T> {
         let mut starts = vec![0u32; buckets + 1];
@@ -185,18 +180,18 @@ impl<T: Real> Gradients<T> {
     }
 }
 
-/// No bucket: fewer than that many buckets fit a table whose rows have numbers of 32 bits, up to 2²⁸ rows.
-const NONE: u16 = u16::MAX;
+/// No bucket: that of the row `u32::MAX`, which no table reaches.
+const NONE: u32 = u32::MAX >> BUCKET_SHIFT;
 
 dispatched! {
 /// The different buckets that the corners of each position lie in, [`NONE`] after the last. Returns how many more there are than positions.
-fn touch_buckets<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, touched: &mut [[u16; 8]]) -> usize {
+fn touch_buckets<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, touched: &mut [[u32; 8]]) -> usize {
     let n = touched.len();
     let [x, y, z] = at.map(|a| &a[..n]);
     let mut more = 0;
     for i in 0..n {
         let (rows, _) = corners([x[i], y[i], z[i]], map);
-        let all = rows.map(|row| (row >> BUCKET_SHIFT) as u16);
+        let all = rows.map(|row| row >> BUCKET_SHIFT);
         touched[i][0] = all[0];
         if all != [all[0]; 8] {
             let mut found = 1;
@@ -270,11 +265,7 @@ impl<T: Real> RowSums<T> for DensitySums<T> {
             At::Voxels(at) => {
                 let at = at.each_ref().map(|a| &a[range.clone()]);
                 let values = &records.density[range];
-                match (self.0.lattice.full_brick_map(), self.0.lattice.brick_map()) {
-                    (Some(map), _) => add_corners::<T, 1, _>(bucket, at, map, |i| [values[i]], sums, touched),
-                    (None, Some(map)) => add_corners::<T, 1, _>(bucket, at, map, |i| [values[i]], sums, touched),
-                    (None, None) => {}
-                }
+                with_bricks!(self.0.lattice, map => add_corners::<T, 1, _>(bucket, at, map, |i| [values[i]], sums, touched));
             }
         });
     }
@@ -329,11 +320,7 @@ impl<T: Real> ColorSums<T> {
                 }
                 At::Voxels(at) => {
                     let at = at.each_ref().map(|a| &a[range.clone()]);
-                    match (lattice.full_brick_map(), lattice.brick_map()) {
-                        (Some(map), _) => add_corners::<T, W, _>(bucket, at, map, value, sums, touched),
-                        (None, Some(map)) => add_corners::<T, W, _>(bucket, at, map, value, sums, touched),
-                        (None, None) => {}
-                    }
+                    with_bricks!(lattice, map => add_corners::<T, W, _>(bucket, at, map, value, sums, touched));
                 }
             }
         });

@@ -67,12 +67,7 @@ pub(super) struct Scene<'a, T: Real> {
 impl<T: Real> Scene<'_, T> {
     /// Renders the rays from number `first` on, one for each [`COLUMNS`] of `pixels`.
     pub fn render(&self, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
-        let lattice = &self.batch.lattice;
-        match (lattice.full_brick_map(), lattice.brick_map()) {
-            (Some(map), _) => self.render_with(map, first, pixels, keep),
-            (None, Some(map)) => self.render_with(map, first, pixels, keep),
-            (None, None) => unreachable!("the tables of a voxel grid are in bricks"),
-        }
+        with_bricks!(self.batch.lattice, map => self.render_with(map, first, pixels, keep))
     }
 
     fn render_with(&self, map: impl NodeMap, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
