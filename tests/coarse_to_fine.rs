@@ -40,20 +40,17 @@ fn resampling_a_trilinear_function_is_exact_between_the_old_centres() {
 }
 
 #[test]
-fn upsampling_keeps_the_field_at_the_old_centres_when_the_ratio_is_odd() {
+fn upsampling_keeps_a_nearest_field_everywhere_and_a_trilinear_one_at_the_old_centres() {
     // Three new voxels in each old one: the middle one has the old one's centre.
-    let old = VoxelGrid::<f64>::random(
-        GridShape { resolution: 4, half_width: 1.3, interpolation: Interpolation::Nearest, color: Color::Rgb },
-        1.0,
-        1.0,
-        3,
-    );
-    let new = old.resample(12);
-    for i in 0..4 {
-        for j in 0..4 {
-            for k in 0..4 {
-                let at = |grid: &VoxelGrid<f64>, voxel| grid.density.tensor().data()[grid.lattice().row(voxel).expect("present") as usize];
-                assert_relative_eq!(at(&new, [3 * i + 1, 3 * j + 1, 3 * k + 1]), at(&old, [i, j, k]), epsilon = 1e-12);
+    for (interpolation, offsets) in [(Interpolation::Nearest, 0..3), (Interpolation::Trilinear, 1..2)] {
+        let old = VoxelGrid::<f64>::random(GridShape { resolution: 4, half_width: 1.3, interpolation, color: Color::Rgb }, 1.0, 1.0, 3);
+        let new = old.resample(12);
+        let at = |grid: &VoxelGrid<f64>, voxel| grid.density.tensor().data()[grid.lattice().row(voxel).expect("present") as usize];
+        for voxel in 0..4 * 4 * 4 {
+            let [i, j, k] = [voxel / 16, voxel / 4 % 4, voxel % 4];
+            for o in offsets.clone() {
+                let new_voxel = [3 * i + o, 3 * j + offsets.start, 3 * k + offsets.end - 1];
+                assert_relative_eq!(at(&new, new_voxel), at(&old, [i, j, k]), epsilon = 1e-12);
             }
         }
     }

@@ -1,5 +1,7 @@
 //! Rows of a table by number, and back: each other's adjoint.
 
+mod streamed;
+
 use crate::index::{self, Indices};
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::parallel::{self, dispatched};
@@ -53,21 +55,18 @@ impl<T: Real> Tensor<T> {
         shape[0] = rows.len();
         let mut out = Buffer::stale(rows.len() * width);
         let table = self.data();
-        parallel::for_each_rows(&mut out, width, |first, chunk| {
-            let rows = &rows[first..];
-            match width {
-                1 => copy_rows::<T, 1>(table, rows, chunk),
-                3 => copy_rows::<T, 3>(table, rows, chunk),
-                4 => copy_rows::<T, 4>(table, rows, chunk),
-                27 => copy_rows::<T, 27>(table, rows, chunk),
-                28 => copy_rows::<T, 28>(table, rows, chunk),
-                _ => {
-                    for (target, &row) in chunk.chunks_exact_mut(width.max(1)).zip(rows) {
-                        target.copy_from_slice(&table[row as usize * width..][..width]);
-                    }
+        match width {
+            1 => gather_into::<T, 1>(table, rows, &mut out),
+            3 => gather_into::<T, 3>(table, rows, &mut out),
+            4 => gather_into::<T, 4>(table, rows, &mut out),
+            27 => gather_into::<T, 27>(table, rows, &mut out),
+            28 => gather_into::<T, 28>(table, rows, &mut out),
+            _ => parallel::for_each_rows(&mut out, width, |first, chunk| {
+                for (target, &row) in chunk.chunks_exact_mut(width.max(1)).zip(&rows[first..]) {
+                    target.copy_from_slice(&table[row as usize * width..][..width]);
                 }
-            }
-        });
+            }),
+        }
         Tensor::from_op(out, &shape, &[self], GatherRows { rows: rows.clone() })
     }
 
@@ -120,6 +119,18 @@ dispatched! {
 fn largest(rows: &[u32]) -> u32 {
     rows.iter().copied().fold(0, u32::max)
 }
+}
+
+fn gather_into<T: Real, const W: usize>(table: &[T], rows: &[u32], out: &mut [T]) {
+    let past_cache = streamed::worthwhile::<T, W>(out);
+    parallel::for_each_rows(out, W, |first, chunk| {
+        let rows = &rows[first..];
+        if past_cache {
+            streamed::copy_rows::<T, W>(table.as_chunks().0, rows, chunk.as_chunks_mut().0);
+        } else {
+            copy_rows::<T, W>(table, rows, chunk);
+        }
+    });
 }
 
 dispatched! {

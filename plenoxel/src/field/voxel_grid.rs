@@ -219,8 +219,9 @@ impl<T: Real> VoxelGrid<T> {
         }
     }
 
-    /// The same field at another resolution: the old field read at the new centres, trilinearly whatever the interpolation. A new voxel
-    /// is present if it reads one that is. Parameters get new identities, so an optimizer starts afresh.
+    /// The same field at another resolution: the old field read at the new centres, with the look-up that renders it. So a nearest grid
+    /// of twice the resolution shows exactly what the old one showed, and a trilinear one differs within the cells of the old one only.
+    /// A new voxel is present if it reads one that is. Parameters get new identities, so an optimizer starts afresh.
     pub fn resample(&self, resolution: usize) -> Self {
         let shape = GridShape { resolution, ..self.shape };
         let ratio = self.shape.resolution as f64 / resolution as f64;
@@ -230,8 +231,11 @@ impl<T: Real> VoxelGrid<T> {
             Some(_) => {
                 let last = self.shape.resolution - 1;
                 let corners = |k: usize| {
-                    let low = center(k).clamp(0.0, last as f64) as usize;
-                    low..(low + 2).min(last + 1)
+                    let at = center(k).clamp(0.0, last as f64);
+                    match self.shape.interpolation {
+                        Interpolation::Nearest => at.round() as usize..at.round() as usize + 1,
+                        Interpolation::Trilinear => at as usize..(at as usize + 2).min(last + 1),
+                    }
                 };
                 Lattice::bricks_where([resolution; 3], |[i, j, k]| {
                     corners(i).any(|a| corners(j).any(|b| corners(k).any(|c| self.lattice.row([a, b, c]).is_some())))
@@ -240,7 +244,6 @@ impl<T: Real> VoxelGrid<T> {
         };
         let table = |old: &Param<T>| {
             let width = old.shape()[1];
-            let old = old.tensor().detach();
             let mut values = Buffer::stale(lattice.rows() * width);
             // A run of rows at a time bounds the memory for positions.
             const RUN: usize = 1 << 16;
@@ -253,7 +256,7 @@ impl<T: Real> VoxelGrid<T> {
                         *p = lattice.node(row as u32).map_or([T::zero(); 3], |node| node.map(|k| T::lit(center(k))));
                     }
                 });
-                let read = no_grad(|| old.trilinear(&Tensor::from_buffer(at, &[rows, 3]), &self.lattice));
+                let read = no_grad(|| self.look_up(old, &Tensor::from_buffer(at, &[rows, 3])));
                 parallel::copy(read.data(), part);
             }
             Tensor::from_buffer(values, &[lattice.rows(), width])
