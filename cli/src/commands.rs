@@ -33,8 +33,13 @@ fn split(text: &str) -> Result<Split, String> {
     text.parse().map_err(|_| "train, val or test".to_owned())
 }
 
-/// A reduction of images as the command line takes it.
-fn factor(text: &str) -> Result<usize, String> {
-    let factor = text.parse().ok().filter(|k| (1..=64).contains(k));
-    factor.ok_or_else(|| "a whole number from 1 to 64".to_owned())
+/// A whole number within bounds, as the command line takes it.
+pub fn whole<N: TryFrom<u64>>(least: u64, most: u64) -> impl Fn(&str) -> Result<N, String> + Clone {
+    move |text| {
+        let number = text.parse().ok().filter(|n| (least..=most).contains(n));
+        number.and_then(|n| N::try_from(n).ok()).ok_or_else(|| format!("a whole number from {least} to {most}"))
+    }
 }
+
+/// By how much images may be reduced.
+const MOST_REDUCTION: u64 = 64;

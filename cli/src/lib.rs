@@ -57,7 +57,7 @@ enum Command {
 #[derive(Debug, Args)]
 struct Machine {
     /// Threads to compute with; results do not depend on it [default: all cores]
-    #[arg(long, global = true, value_name = "N", help_heading = "Machine", value_parser = threads)]
+    #[arg(long, global = true, value_name = "N", help_heading = "Machine", value_parser = commands::whole::<usize>(1, machine::MOST_THREADS as u64))]
     threads: Option<usize>,
 
     /// Print errors and results only
@@ -118,10 +118,4 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
 fn json_line(value: &impl serde::Serialize) -> Result<String, Error> {
     let defect = |e: serde_json::Error| Error::input("result", e.to_string(), "this is a defect of the program");
     serde_json::to_string(value).map_err(defect)
-}
-
-fn threads(text: &str) -> Result<usize, String> {
-    let most = machine::MOST_THREADS;
-    let threads = text.parse().ok().filter(|n| (1..=most).contains(n));
-    threads.ok_or_else(|| format!("a whole number from 1 to {most}"))
 }

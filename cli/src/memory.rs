@@ -21,6 +21,8 @@ pub struct Estimate {
     pub optimizer: u64,
     /// Samples, intermediate values and gradients of one step, or what evaluating or saving takes if that is more.
     pub step: u64,
+    /// It is of a grid with all voxels, and pruning will take some out.
+    pruned: bool,
     /// The setting that counts most, and what would help.
     key: String,
     advice: &'static str,
@@ -74,7 +76,7 @@ impl Estimate {
             (grid + optimizer + saving, voxels),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
-        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), key, advice }
+        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: config.prune_from_stage.is_some(), key, advice }
     }
 
     /// Rendering a trained grid, and comparing it with the views of a split where `compare` is set.
@@ -86,6 +88,7 @@ impl Estimate {
             grid: 2 * shape.bytes() as u64,
             optimizer: 0,
             step: samples * evaluation_bytes_per_sample(config.engine, shape),
+            pruned: config.prune_from_stage.is_some(),
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
         }
@@ -94,7 +97,7 @@ impl Estimate {
     /// The images of the largest split alone.
     pub fn of_images(dataset: &Dataset) -> Self {
         let images = images(dataset, 1, &Split::ALL);
-        Estimate { images, grid: 0, optimizer: 0, step: 0, key: "DIR".to_owned(), advice: "fewer or smaller views" }
+        Estimate { images, grid: 0, optimizer: 0, step: 0, pruned: false, key: "DIR".to_owned(), advice: "fewer or smaller views" }
     }
 
     /// All of it.
@@ -109,7 +112,8 @@ impl Estimate {
             n => format!(", {name} {}", bytes(n)),
         };
         format!(
-            "memory: about {} (images {}{}{}{})",
+            "memory: {} {} (images {}{}{}{})",
+            if self.pruned { "up to" } else { "about" },
             bytes(self.total()),
             bytes(self.images),
             part("grid", self.grid),

@@ -42,7 +42,7 @@ pub enum Error {
         remedy: String,
     },
     /// The operating system refused to read or write.
-    #[error("{}: {source} while {doing}", path.display())]
+    #[error("{}: {source} while {doing}; {}", path.display(), remedy(source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -80,6 +80,19 @@ impl Error {
     }
 }
 
+/// What helps against a refusal of the operating system.
+fn remedy(refusal: &std::io::Error) -> &'static str {
+    use std::io::ErrorKind::*;
+    match refusal.kind() {
+        NotFound => "check that the path is spelled rightly",
+        PermissionDenied | ReadOnlyFilesystem => "choose a place that may be written, or change its permissions",
+        AlreadyExists | NotADirectory | IsADirectory => "choose another path: a file is where a folder should be, or the other way round",
+        StorageFull | QuotaExceeded | FileTooLarge => "make room on the disk, or choose another one",
+        InvalidFilename => "choose a shorter or plainer name",
+        _ => "check the disk, or choose another path",
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -91,7 +104,7 @@ mod tests {
         let config = Error::config("downscale", 3, "1, 2, 4");
         assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: 3 cannot be used; accepted: 1, 2, 4"));
         let io = Error::io("out", std::io::Error::other("disk full"), "writing");
-        assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing"));
+        assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing; check the disk, or choose another path"));
         let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
         assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }

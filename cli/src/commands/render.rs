@@ -48,7 +48,8 @@ pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
         count.at(done + 1, chosen.len());
     }
     drop(count);
-    console.result(&format!("rendered {} {} views to {}", chosen.len(), split, renders.display()))
+    let views = if chosen.len() == 1 { "view" } else { "views" };
+    console.result(&format!("rendered {} {split} {views} to {}", chosen.len(), renders.display()))
 }
 
 /// Numbers of the views that were asked for: all of the split unless some are named.

@@ -1,6 +1,7 @@
 //! `plenoxel scene`: the built-in scene as files.
 
 use super::train::size;
+use super::whole;
 use crate::memory::Estimate;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
@@ -18,6 +19,9 @@ Examples:
 Writes transforms_{train,val,test}.json and RGBA images with straight alpha, in the NeRF-synthetic format, and exact depth
 beside the test views: 16 bits, thousandths of a world unit, 0 where there is nothing.";
 
+/// The most pixels on a side, and the most views.
+const MOST: u64 = 100_000;
+
 /// Write the built-in scene to a folder in the NeRF-synthetic format
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
@@ -31,23 +35,23 @@ pub struct SceneArgs {
     size: Option<(usize, usize)>,
 
     /// Image width in pixels
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().width)]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().width, value_parser = whole::<usize>(1, MOST))]
     width: usize,
 
     /// Image height in pixels
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().height)]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().height, value_parser = whole::<usize>(1, MOST))]
     height: usize,
 
     /// Training views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().train)]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().train, value_parser = whole::<usize>(0, MOST))]
     train: usize,
 
     /// Validation views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().val)]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().val, value_parser = whole::<usize>(0, MOST))]
     val: usize,
 
     /// Test views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test)]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test, value_parser = whole::<usize>(0, MOST))]
     test: usize,
 
     /// Write into a folder that is not empty

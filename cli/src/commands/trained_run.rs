@@ -29,11 +29,11 @@ pub struct TrainedRun {
     pub split: Split,
 
     /// Reduce the images by this factor [default: as in training]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::factor)]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::whole::<usize>(1, super::MOST_REDUCTION))]
     pub downscale: Option<usize>,
 
     /// Samples on the longest ray through the box (preset paper: on every ray) [default: as the run's `evaluation` setting says]
-    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = clap::value_parser!(u32).range(2..=100_000))]
+    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = super::whole::<u32>(2, 100_000))]
     pub samples: Option<u32>,
 }
 

@@ -1,5 +1,6 @@
 //! The flags of `train`, and the configuration they amount to.
 
+use crate::commands::{MOST_REDUCTION, whole};
 use crate::config::{ConfigFile, Layers, PRESETS};
 use crate::data::DataSource;
 use clap::builder::PossibleValuesParser;
@@ -58,11 +59,11 @@ pub struct TrainArgs {
     set: Vec<String>,
 
     /// Seed of everything random [default: 42]
-    #[arg(long, help_heading = "Settings", value_parser = clap::value_parser!(i64).range(0..))]
+    #[arg(long, help_heading = "Settings", value_parser = whole::<i64>(0, i64::MAX as u64))]
     seed: Option<i64>,
 
     /// Reduce the images by this factor, which must divide their width and height
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = clap::value_parser!(i64).range(1..=64))]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION))]
     downscale: Option<i64>,
 
     /// Color behind the scene: white, black, or three numbers r,g,b in [0, 1] [default: white]
@@ -90,7 +91,7 @@ pub struct TrainArgs {
     color: Option<String>,
 
     /// Degree of the spherical harmonics, 0 to 3; implies --color sh
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = clap::value_parser!(i64).range(0..=3))]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
     sh_degree: Option<i64>,
 
     /// What computes the pixels: fused, in one pass, or graph, the slow one to compare it with
