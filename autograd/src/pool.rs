@@ -29,14 +29,19 @@ impl<E> Pool<E> {
     }
 }
 
-/// Element types with a pool of their own.
-pub trait Pooled: Copy + Default + Send + Sync + Debug + 'static {
+mod sealed {
+    pub trait Sealed {}
+}
+
+/// Element types with a pool of their own: four kinds of plain numbers.
+pub trait Pooled: Copy + Default + Send + Sync + Debug + sealed::Sealed + 'static {
     #[doc(hidden)]
     fn pool() -> &'static Mutex<Pool<Self>>;
 }
 
 macro_rules! pooled {
     ($($t:ty),*) => {$(
+        impl sealed::Sealed for $t {}
         impl Pooled for $t {
             fn pool() -> &'static Mutex<Pool<Self>> {
                 static POOL: Mutex<Pool<$t>> = Mutex::new(Pool::new());

@@ -2,8 +2,8 @@
 //!
 //! Precision is a type parameter and never a feature flag, so a gradient check in `f64` exercises the very code that trains in `f32`.
 //! The functions below that `num_traits::Float` already has are repeated here because a loop over them must vectorise:
-//! they are branch-free polynomials for `f32` and the standard library's for `f64`. Only they use fused multiply-add, where the machine has it:
-//! bits are equal for any number of threads, and between instruction sets up to the last place of an exponential.
+//! they are branch-free polynomials for `f32` and the standard library's for `f64`. They, and a loop that asks for it, use fused multiply-add
+//! where the machine has it: bits are equal for any number of threads, and between instruction sets up to that rounding.
 
 use crate::pool::Pooled;
 use ndarray::NdFloat;
@@ -36,6 +36,12 @@ pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + 
 
     /// 1 − e⁻ˣ without cancellation for small x: the opacity of an optical depth.
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self;
+
+    /// self · b + c, rounded once if `FUSED`.
+    #[inline(always)]
+    fn multiply_add<const FUSED: bool>(self, b: Self, c: Self) -> Self {
+        if FUSED { self.mul_add(b, c) } else { self * b + c }
+    }
 
     /// (1 − e⁻ˣ, e⁻ˣ), both without cancellation: what an optical depth absorbs and what it lets through.
     fn absorb<const FUSED: bool>(self) -> (Self, Self);
@@ -77,15 +83,15 @@ impl Real for f32 {
         let x = self.clamp(-88.0, 89.0);
         // Adding and subtracting 1.5·2²³ rounds to the nearest integer in any instruction set.
         const ROUND: f32 = 12_582_912.0;
-        let rounded = multiply_add::<FUSED>(x, std::f32::consts::LOG2_E, ROUND);
+        let rounded = x.multiply_add::<FUSED>(std::f32::consts::LOG2_E, ROUND);
         let n = rounded - ROUND;
-        let r = multiply_add::<FUSED>(n, 2.121_944_4e-4, multiply_add::<FUSED>(n, -0.693_359_4, x));
-        let p = multiply_add::<FUSED>(r, 1.987_569_2e-4, 1.398_2e-3);
-        let p = multiply_add::<FUSED>(p, r, 8.333_452e-3);
-        let p = multiply_add::<FUSED>(p, r, 4.166_579_6e-2);
-        let p = multiply_add::<FUSED>(p, r, 1.666_666_5e-1);
-        let p = multiply_add::<FUSED>(p, r, 5.000_000_3e-1);
-        let y = multiply_add::<FUSED>(p, r * r, r + 1.0);
+        let r = n.multiply_add::<FUSED>(2.121_944_4e-4, n.multiply_add::<FUSED>(-0.693_359_4, x));
+        let p = r.multiply_add::<FUSED>(1.987_569_2e-4, 1.398_2e-3);
+        let p = p.multiply_add::<FUSED>(r, 8.333_452e-3);
+        let p = p.multiply_add::<FUSED>(r, 4.166_579_6e-2);
+        let p = p.multiply_add::<FUSED>(r, 1.666_666_5e-1);
+        let p = p.multiply_add::<FUSED>(r, 5.000_000_3e-1);
+        let y = p.multiply_add::<FUSED>(r * r, r + 1.0);
         // The integer stands in the low bits of `rounded`; a conversion `as i32` would check its range and not vectorise. NaN gives some
         // scale or other, and y is NaN. Where n = −127 it is held at 0, as
         // that of −126 is.
@@ -103,22 +109,16 @@ impl Real for f32 {
     fn absorb<const FUSED: bool>(self) -> (Self, Self) {
         // Below 1/2 the Taylor polynomial x − x²/2 + … − x⁸/8! is exact to rounding; above, the difference loses at most one bit.
         let x = self;
-        let p = multiply_add::<FUSED>(x, -1.0 / 40_320.0, 1.0 / 5_040.0);
-        let p = multiply_add::<FUSED>(-x, p, 1.0 / 720.0);
-        let p = multiply_add::<FUSED>(-x, p, 1.0 / 120.0);
-        let p = multiply_add::<FUSED>(-x, p, 1.0 / 24.0);
-        let p = multiply_add::<FUSED>(-x, p, 1.0 / 6.0);
-        let p = multiply_add::<FUSED>(-x, p, 0.5);
+        let p = x.multiply_add::<FUSED>(-1.0 / 40_320.0, 1.0 / 5_040.0);
+        let p = (-x).multiply_add::<FUSED>(p, 1.0 / 720.0);
+        let p = (-x).multiply_add::<FUSED>(p, 1.0 / 120.0);
+        let p = (-x).multiply_add::<FUSED>(p, 1.0 / 24.0);
+        let p = (-x).multiply_add::<FUSED>(p, 1.0 / 6.0);
+        let p = (-x).multiply_add::<FUSED>(p, 0.5);
         let small = x * (1.0 - x * p);
         let through = (-x).exp_::<FUSED>();
         (if x.abs() < 0.5 { small } else { 1.0 - through }, through)
     }
-}
-
-/// a b + c, rounded once if `FUSED`.
-#[inline(always)]
-fn multiply_add<const FUSED: bool>(a: f32, b: f32, c: f32) -> f32 {
-    if FUSED { a.mul_add(b, c) } else { a * b + c }
 }
 
 impl Real for f64 {

@@ -1,10 +1,8 @@
 //! Rows of a table by number, and back: each other's adjoint.
 
-mod streamed;
-
 use crate::index::{self, Indices};
 use crate::op::{Cotangent, Keep, Op, Vjp};
-use crate::parallel::{self, dispatched};
+use crate::parallel::{self, dispatched, streamed};
 use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
@@ -122,7 +120,7 @@ fn largest(rows: &[u32]) -> u32 {
 }
 
 fn gather_into<T: Real, const W: usize>(table: &[T], rows: &[u32], out: &mut [T]) {
-    let past_cache = streamed::worthwhile::<T, W>(out);
+    let past_cache = streamed::worthwhile(out);
     parallel::for_each_rows(out, W, |first, chunk| {
         let rows = &rows[first..];
         if past_cache {

@@ -65,27 +65,54 @@ fn join<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32;
     (rows, weights, present)
 }
 
+/// Positions whose corners are found together: a vector of each number.
+pub const TOGETHER: usize = 16;
+
 dispatched! {
-/// The corners of many positions, given axis by axis.
-pub fn corners_of_many<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mut [[u32; 8]], weights: &mut [[T; 8]]) {
-    // What is arithmetic is done for some positions together, before the look-ups in the layout.
-    const TOGETHER: usize = 32;
+/// The corners of many positions, given axis by axis: the eight rows and weights of [`TOGETHER`] of them after the other. In the last
+/// group, what lies beyond the last position is corners of no meaning.
+pub fn corners_of_many<T: Real, M: NodeMap>(
+    at: [&[T]; 3],
+    map: M,
+    rows: &mut [[[u32; TOGETHER]; 8]],
+    weights: &mut [[[T; TOGETHER]; 8]],
+) {
+    // What is arithmetic is done in vectors, before the look-ups in the layout.
     let mut shares = [[[0u32; TOGETHER]; 2]; 3];
-    let mut fractions = [[T::zero(); TOGETHER]; 3];
-    for (run, (rows, weights)) in rows.chunks_mut(TOGETHER).zip(weights.chunks_mut(TOGETHER)).enumerate() {
-        let n = rows.len();
+    let mut fractions = [[[T::zero(); TOGETHER]; 2]; 3];
+    for (group, (rows, weights)) in rows.iter_mut().zip(weights).enumerate() {
         for a in 0..3 {
-            let at = &at[a][run * TOGETHER..][..n];
-            let [low_shares, high_shares] = &mut shares[a];
-            for (i, &u) in at.iter().enumerate() {
-                let (low, high, fraction, _) = axis_cell(u, map.nodes()[a]);
-                (low_shares[i], high_shares[i], fractions[a][i]) = (map.share(a, low), map.share(a, high), fraction);
+            let mut u = [T::zero(); TOGETHER];
+            let own = &at[a][group * TOGETHER..];
+            match own.first_chunk() {
+                Some(whole) => u = *whole,
+                None => u[..own.len()].copy_from_slice(own),
+            }
+            for i in 0..TOGETHER {
+                let (low, high, fraction, _) = axis_cell(u[i], map.nodes()[a]);
+                (shares[a][0][i], shares[a][1][i]) = (map.share(a, low), map.share(a, high));
+                (fractions[a][0][i], fractions[a][1][i]) = (T::one() - fraction, fraction);
             }
         }
-        for i in 0..n {
-            let own = [0, 1, 2].map(|a: usize| [shares[a][0][i], shares[a][1][i]]);
-            let (r, w, _) = join(own, [fractions[0][i], fractions[1][i], fractions[2][i]], map);
-            (rows[i], weights[i]) = (r, w);
+        for c in 0..8 {
+            let [x, y, z] = [c >> 2, c >> 1 & 1, c & 1];
+            for i in 0..TOGETHER {
+                weights[c][i] = fractions[0][x][i] * fractions[1][y][i] * fractions[2][z][i];
+                rows[c][i] = shares[0][x][i] + shares[1][y][i] + shares[2][z][i];
+            }
+        }
+        if M::SPARSE {
+            for i in 0..TOGETHER {
+                let own = [0, 1, 2].map(|a: usize| [shares[a][0][i], shares[a][1][i]]);
+                let (r, w, _) = join(own, [0, 1, 2].map(|a: usize| fractions[a][1][i]), map);
+                for c in 0..8 {
+                    (rows[c][i], weights[c][i]) = (r[c], w[c]);
+                }
+            }
+        } else {
+            for row in rows.as_flattened_mut() {
+                *row = map.row_of(*row).unwrap_or_default();
+            }
         }
     }
 }

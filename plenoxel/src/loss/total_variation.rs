@@ -5,7 +5,7 @@
 
 use super::Step;
 use crate::random::{Purpose, bits};
-use autograd::lattice::Neighbours;
+use autograd::lattice::{BRICK, Neighbours};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, Tensor, dispatched, parallel};
 
 /// Keeps the root smooth (source paper).
@@ -56,28 +56,26 @@ fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, cells: Cells, stream: u64) 
 pub fn total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
     check(table, lattice);
     match table.shape()[1] {
-        1 => with_kernel::<T, 1, 4>(table, lattice),
-        3 => with_kernel::<T, 3, 12>(table, lattice),
-        4 => with_kernel::<T, 4, 16>(table, lattice),
-        12 => with_kernel::<T, 12, 48>(table, lattice),
-        27 => with_kernel::<T, 27, 108>(table, lattice),
-        48 => with_kernel::<T, 48, 192>(table, lattice),
+        1 => with_kernel::<T, 1, 4, 16>(table, lattice),
+        3 => with_kernel::<T, 3, 12, 48>(table, lattice),
+        4 => with_kernel::<T, 4, 16, 64>(table, lattice),
+        12 => with_kernel::<T, 12, 48, 192>(table, lattice),
+        27 => with_kernel::<T, 27, 108, 432>(table, lattice),
+        48 => with_kernel::<T, 48, 192, 768>(table, lattice),
         _ => sampled_total_variation(table, lattice, 0, lattice.rows()),
     }
 }
 
-/// Through the kernel for a width of `W`; `N` is 4 W, the length of a line.
-fn with_kernel<T: Real, const W: usize, const N: usize>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
+/// Through the kernel for a width of `W`; `N` is 4 W, the length of a line, and `S` 16 W, that of a slab.
+fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
     let bricks = lattice.neighbours();
     let mut roots = Buffer::<T>::stale(table.len());
-    let values = table.data().as_chunks::<N>().0;
-    let runs: Vec<_> = roots.as_chunks_mut::<N>().0.chunks_mut(RUN * LINES).collect();
-    let sums = parallel::map_items(runs, |run, roots| {
-        inverse_roots::<T, W, N>(values, run * RUN, &bricks[run * RUN..][..roots.len() / LINES], roots)
-    });
+    let values = table.data().as_chunks::<S>().0;
+    let runs: Vec<_> = roots.as_chunks_mut::<S>().0.chunks_mut(RUN * BRICK).collect();
+    let sums = parallel::map_items(runs, |run, roots| inverse_roots::<T, W, N, S>(values, bricks, run * RUN, roots));
     let terms = bricks.iter().map(|b| b.cells.count_ones() as usize).sum::<usize>() * W;
     let value = sums.into_iter().sum::<T>() / T::lit(terms.max(1) as f64);
-    let kernel = TotalVariation::<T, W, N> { lattice: lattice.clone(), terms, roots };
+    let kernel = TotalVariation::<T, W, N, S> { lattice: lattice.clone(), terms, roots };
     Tensor::from_kernel(vec![value].into(), &[], &[table], kernel)
 }
 
@@ -120,7 +118,7 @@ fn check<T: Real>(table: &Tensor<T>, lattice: &Lattice) {
 
 /// The kernel behind [`total_variation`].
 #[derive(Debug)]
-struct TotalVariation<T: Real, const W: usize, const N: usize> {
+struct TotalVariation<T: Real, const W: usize, const N: usize, const S: usize> {
     lattice: Lattice,
     /// Cells times channels.
     terms: usize,
@@ -130,12 +128,13 @@ struct TotalVariation<T: Real, const W: usize, const N: usize> {
 
 /// Bricks that one task works on.
 const RUN: usize = 256;
-/// Lines of four nodes along z in a brick; line 4 x + y begins at (x, y, 0).
-const LINES: usize = 16;
 
 /// With q = s / √(…) for each cell and channel, s = cotangent / number of terms: the cell gets −q (dx + dy + dz), each neighbour q d.
 /// Written as a gather, a node's gradient is what its own cell and the three cells behind it give: no two tasks write the same node.
-impl<T: Real, const W: usize, const N: usize> Kernel<T> for TotalVariation<T, W, N> {
+///
+/// A brick is four *slabs* of equal x; a slab is four *lines* of equal y; a line is four nodes along z. The loops are over slabs: one step
+/// along x is another slab, one along y shifts the lines and one along z the nodes of each line.
+impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for TotalVariation<T, W, N, S> {
     fn name(&self) -> &'static str {
         "total_variation"
     }
@@ -147,116 +146,138 @@ impl<T: Real, const W: usize, const N: usize> Kernel<T> for TotalVariation<T, W,
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
         let table = call.input(0);
         let scale = call.cotangent().item() / T::lit(self.terms.max(1) as f64);
-        let (values, roots) = (table.data().as_chunks::<N>().0, self.roots.as_chunks::<N>().0);
+        let (values, roots) = (table.data().as_chunks::<S>().0, self.roots.as_chunks::<S>().0);
         let mut gradient = Buffer::<T>::stale(table.len());
-        parallel::for_each_chunk(gradient.as_chunks_mut::<N>().0, RUN * LINES, |start, lines| {
-            let (first, count) = (start / LINES, lines.len() / LINES);
-            gradients::<T, W, N>(values, roots, first, &self.lattice.neighbours()[first..][..count], scale, lines);
+        parallel::for_each_chunk(gradient.as_chunks_mut::<S>().0, RUN * BRICK, |start, slabs| {
+            gradients::<T, W, N, S>(values, roots, self.lattice.neighbours(), start / BRICK, scale, slabs);
         });
         out.dense(0, gradient);
     }
 }
 
-/// Numbers of the lines one step away along x and y and of the next along z, or of the last ones. Where a brick is missing it is the line
-/// itself: no cell reads across.
+/// Slab number x of a brick, if there is one.
 #[inline(always)]
-fn lines_near(own: usize, bricks: [Option<u32>; 3], line: usize, ahead: bool) -> [usize; 3] {
-    let this = own * LINES + line;
-    let in_brick = |brick: Option<u32>, line: usize| brick.map_or(this, |b| b as usize * LINES + line);
-    let (x, y) = (line / 4, line % 4);
-    if ahead {
-        let next_x = if x < 3 { this + 4 } else { in_brick(bricks[0], y) };
-        let next_y = if y < 3 { this + 1 } else { in_brick(bricks[1], 4 * x) };
-        [next_x, next_y, in_brick(bricks[2], line)]
-    } else {
-        let last_x = if x > 0 { this - 4 } else { in_brick(bricks[0], 12 + y) };
-        let last_y = if y > 0 { this - 1 } else { in_brick(bricks[1], 4 * x + 3) };
-        [last_x, last_y, in_brick(bricks[2], line)]
+fn slab<T, const S: usize>(table: &[[T; S]], brick: Option<u32>, x: usize) -> Option<&[T; S]> {
+    brick.map(|b| &table[b as usize * BRICK + x])
+}
+
+/// The nodes one step ahead along x, y and z of those of a slab. Where a brick is missing it is some node of the slab: no cell reads across.
+#[inline(always)]
+fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
+    table: &[[T; S]],
+    own: usize,
+    x: usize,
+    bricks: [Option<u32>; 3],
+) -> (&[T; S], [T; S], [T; S]) {
+    let here = &table[own * BRICK + x];
+    let next_x = if x + 1 < BRICK { &table[own * BRICK + x + 1] } else { slab(table, bricks[0], 0).unwrap_or(here) };
+    let (beyond_y, beyond_z) = (slab(table, bricks[1], x).unwrap_or(here), slab(table, bricks[2], x).unwrap_or(here));
+    let (mut next_y, mut next_z) = (*here, *here);
+    next_y[..S - N].copy_from_slice(&here[N..]);
+    next_y[S - N..].copy_from_slice(&beyond_y[..N]);
+    for y in 0..BRICK {
+        let line = y * N..(y + 1) * N;
+        next_z[line.start..line.end - W].copy_from_slice(&here[line.start + W..line.end]);
+        next_z[line.end - W..line.end].copy_from_slice(&beyond_z[line.start..line.start + W]);
     }
-}
-
-/// The nodes of a line one step on along z: `line` without its first node, then the first of `next`.
-#[inline(always)]
-fn next_nodes<T: Real, const W: usize, const N: usize>(line: &[T; N], next: &[T; N]) -> [T; N] {
-    let mut out = [T::zero(); N];
-    out[..N - W].copy_from_slice(&line[W..]);
-    out[N - W..].copy_from_slice(&next[..W]);
-    out
-}
-
-/// The nodes of a line one step back along z: the last of `last`, then `line` without its own.
-#[inline(always)]
-fn last_nodes<T: Real, const W: usize, const N: usize>(line: &[T; N], last: &[T; N]) -> [T; N] {
-    let mut out = [T::zero(); N];
-    out[..W].copy_from_slice(&last[N - W..]);
-    out[W..].copy_from_slice(&line[..N - W]);
-    out
+    (next_x, next_y, next_z)
 }
 
 dispatched! {
 /// 1 / √(dx² + dy² + dz² + ε) of the cells of the bricks from number `first` on, 0 elsewhere; returns Σ √(…).
-fn inverse_roots<T: Real, const W: usize, const N: usize>(table: &[[T; N]], first: usize, bricks: &[Neighbours], roots: &mut [[T; N]]) -> T {
+fn inverse_roots<T: Real, const W: usize, const N: usize, const S: usize>(
+    table: &[[T; S]],
+    bricks: &[Neighbours],
+    first: usize,
+    roots: &mut [[T; S]],
+) -> T {
     let mut sum = T::zero();
-    for ((b, brick), roots) in bricks.iter().enumerate().zip(roots.as_chunks_mut::<LINES>().0) {
-        let own = first + b;
-        let mut lanes = [T::zero(); N];
-        for line in 0..LINES {
-            let [x, y, z] = lines_near(own, brick.ahead, line, true).map(|l| &table[l]);
-            let v = &table[own * LINES + line];
-            let z = next_nodes::<T, W, N>(v, z);
-            let mut q = [T::zero(); N];
-            let mut square = [T::zero(); N];
-            for l in 0..N {
-                let (dx, dy, dz) = (x[l] - v[l], y[l] - v[l], z[l] - v[l]);
+    for (own, roots) in (first..).zip(roots.as_chunks_mut::<BRICK>().0) {
+        let mut lanes = [T::zero(); S];
+        for x in 0..BRICK {
+            let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, own, x, bricks[own].ahead);
+            let (v, q) = (&table[own * BRICK + x], &mut roots[x]);
+            let mut square = [T::zero(); S];
+            for l in 0..S {
+                let (dx, dy, dz) = (next_x[l] - v[l], next_y[l] - v[l], next_z[l] - v[l]);
                 square[l] = dx * dx + dy * dy + dz * dz + T::lit(EPSILON);
                 q[l] = square[l].inverse_sqrt();
             }
-            let cells = brick.cells >> (4 * line) & 0xf;
-            if cells != 0xf {
-                for node in (0..4).filter(|node| cells >> node & 1 == 0) {
+            let cells = bricks[own].cells >> (16 * x) & 0xffff;
+            if cells != 0xffff {
+                for node in (0..16).filter(|node| cells >> node & 1 == 0) {
                     q[node * W..(node + 1) * W].fill(T::zero());
                 }
             }
-            for l in 0..N {
+            for l in 0..S {
                 lanes[l] += square[l] * q[l];
             }
-            roots[line] = q;
         }
-        sum += lanes.into_iter().sum::<T>();
+        sum += folded(lanes);
     }
     sum
 }
 }
 
+/// Σ lanes, by halves: one addition after the other would take as long as all the rest.
+#[inline(always)]
+fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
+    let mut width = S;
+    while width.is_multiple_of(2) {
+        width /= 2;
+        for l in 0..width {
+            lanes[l] += lanes[width + l];
+        }
+    }
+    lanes[..width].iter().copied().sum()
+}
+
 dispatched! {
 /// The gradient of the bricks from number `first` on, from the roots of their cells and of those behind.
-fn gradients<T: Real, const W: usize, const N: usize>(
-    table: &[[T; N]],
-    roots: &[[T; N]],
-    first: usize,
+fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
+    table: &[[T; S]],
+    roots: &[[T; S]],
     bricks: &[Neighbours],
+    first: usize,
     scale: T,
-    out: &mut [[T; N]],
+    out: &mut [[T; S]],
 ) {
-    let none = [T::zero(); N];
-    for ((b, brick), out) in bricks.iter().enumerate().zip(out.as_chunks_mut::<LINES>().0) {
-        let own = first + b;
-        for (line, out) in out.iter_mut().enumerate() {
-            let this = own * LINES + line;
-            let [x, y, z] = lines_near(own, brick.ahead, line, true).map(|l| &table[l]);
-            let behind = lines_near(own, brick.behind, line, false);
-            let [last_x, last_y, last_z] = behind.map(|l| &table[l]);
-            let [qx, qy, qz] = behind.map(|l| if l == this { &none } else { &roots[l] });
-            let (v, q) = (&table[this], &roots[this]);
-            let (z, last_z) = (next_nodes::<T, W, N>(v, z), last_nodes::<T, W, N>(v, last_z));
-            let qz = last_nodes::<T, W, N>(q, qz);
-            let mut g = [T::zero(); N];
-            for l in 0..N {
-                let cell = q[l] * (T::lit(3.0) * v[l] - x[l] - y[l] - z[l]);
-                let others = qx[l] * (v[l] - last_x[l]) + qy[l] * (v[l] - last_y[l]) + qz[l] * (v[l] - last_z[l]);
-                g[l] = scale * (cell + others);
+    for (own, out) in (first..).zip(out.as_chunks_mut::<BRICK>().0) {
+        let behind = |axis: usize, x: usize| {
+            let brick = bricks[own].behind[axis];
+            slab(table, brick, x).zip(slab(roots, brick, x))
+        };
+        // What cells give to the node ahead: q d. That of a cell in the brick is also taken from its own node.
+        let mut from_x = [T::zero(); S];
+        if let Some((last, q)) = behind(0, BRICK - 1) {
+            let v = &table[own * BRICK];
+            (0..S).for_each(|l| from_x[l] = q[l] * (v[l] - last[l]));
+        }
+        for (x, g) in out.iter_mut().enumerate() {
+            let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, own, x, bricks[own].ahead);
+            let (v, q) = (&table[own * BRICK + x], &roots[own * BRICK + x]);
+            let (mut to_x, mut to_y, mut to_z) = ([T::zero(); S], [T::zero(); S], [T::zero(); S]);
+            for l in 0..S {
+                (to_x[l], to_y[l], to_z[l]) = (q[l] * (next_x[l] - v[l]), q[l] * (next_y[l] - v[l]), q[l] * (next_z[l] - v[l]));
             }
-            *out = g;
+            let (mut from_y, mut from_z) = ([T::zero(); S], [T::zero(); S]);
+            from_y[N..].copy_from_slice(&to_y[..S - N]);
+            if let Some((last, q)) = behind(1, x) {
+                (0..N).for_each(|l| from_y[l] = q[S - N + l] * (v[l] - last[S - N + l]));
+            }
+            for start in (0..S).step_by(N) {
+                from_z[start + W..start + N].copy_from_slice(&to_z[start..start + N - W]);
+            }
+            if let Some((last, q)) = behind(2, x) {
+                for start in (0..S).step_by(N) {
+                    let end = start + N - W;
+                    (0..W).for_each(|l| from_z[start + l] = q[end + l] * (v[start + l] - last[end + l]));
+                }
+            }
+            for l in 0..S {
+                g[l] = scale * ((from_x[l] - to_x[l]) + (from_y[l] - to_y[l]) + (from_z[l] - to_z[l]));
+            }
+            from_x = to_x;
         }
     }
 }

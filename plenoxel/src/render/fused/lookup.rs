@@ -1,8 +1,8 @@
 //! Rows and weights of many positions at once.
 
 use autograd::lattice::NodeMap;
-use autograd::ops::trilinear::{corners_of_many, nearest_node};
-use autograd::{Buffer, Real, dispatched};
+use autograd::ops::trilinear::{TOGETHER, corners_of_many, nearest_node};
+use autograd::{Buffer, Real, dispatched, parallel};
 
 /// The eight rows around each of some samples, and their weights.
 pub(super) struct Corners<T: Real> {
@@ -26,10 +26,10 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 impl<T: Real> Corners<T> {
     /// Those of `at`, and what a table of one column is there.
     pub fn new(at: [&[T]; 3], map: impl NodeMap, table: &[T], values: &mut [T]) -> Self {
-        let n = values.len();
-        let mut corners = Corners { rows: Buffer::stale(8 * n), weights: Buffer::stale(8 * n) };
-        let (rows, weights) = (corners.rows.as_chunks_mut().0, corners.weights.as_chunks_mut().0);
-        corners_of_many(at.map(|a| &a[..n]), map, rows, weights);
+        let size = 8 * values.len().next_multiple_of(TOGETHER);
+        let mut corners = Corners { rows: Buffer::stale(size), weights: Buffer::stale(size) };
+        let (rows, weights) = (corners.rows.as_chunks_mut().0.as_chunks_mut().0, corners.weights.as_chunks_mut().0.as_chunks_mut().0);
+        corners_of_many(at, map, rows, weights);
         interpolate(table, rows, weights, values);
         corners
     }
@@ -37,18 +37,22 @@ impl<T: Real> Corners<T> {
     /// Rows and weights of a sample.
     #[inline(always)]
     pub fn of(&self, i: usize) -> ([u32; 8], [T; 8]) {
-        (self.rows.as_chunks().0[i], self.weights.as_chunks().0[i])
+        let at = i / TOGETHER * 8 * TOGETHER + i % TOGETHER;
+        let (rows, weights) = (&self.rows[at..at + 7 * TOGETHER + 1], &self.weights[at..at + 7 * TOGETHER + 1]);
+        (std::array::from_fn(|c| rows[c * TOGETHER]), std::array::from_fn(|c| weights[c * TOGETHER]))
     }
 }
 
 dispatched! {
-fn interpolate<T: Real>(table: &[T], rows: &[[u32; 8]], weights: &[[T; 8]], values: &mut [T]) {
-    for ((value, rows), weights) in values.iter_mut().zip(rows).zip(weights) {
-        let mut sum = T::zero();
-        for c in 0..8 {
-            sum += weights[c] * table[rows[c] as usize];
+fn interpolate<T: Real>(table: &[T], rows: &[[[u32; TOGETHER]; 8]], weights: &[[[T; TOGETHER]; 8]], values: &mut [T]) {
+    for ((values, rows), weights) in values.chunks_mut(TOGETHER).zip(rows).zip(weights) {
+        let mut sum = [T::zero(); TOGETHER];
+        for (rows, weights) in rows.iter().zip(weights) {
+            for i in 0..TOGETHER {
+                sum[i] += weights[i] * table[rows[i] as usize];
+            }
         }
-        *value = sum;
+        values.copy_from_slice(&sum[..values.len()]);
     }
 }
 }
@@ -105,17 +109,30 @@ pub(super) fn harmonics<T: Real, const K: usize>(
     seen: impl Fn(usize) -> bool,
     out: &mut [[T; 3]],
 ) {
+    match parallel::fused() {
+        true => of_degree::<T, K, true>(table, directions, look, seen, out),
+        false => of_degree::<T, K, false>(table, directions, look, seen, out),
+    }
+}
+
+fn of_degree<T: Real, const K: usize, const FUSED: bool>(
+    table: &[T],
+    directions: Directions<'_, T>,
+    look: impl Fn(usize) -> ([u32; K], [T; K]),
+    seen: impl Fn(usize) -> bool,
+    out: &mut [[T; 3]],
+) {
     match directions.count {
-        1 => contract::<T, K, 3>(table, directions, look, seen, out),
-        4 => contract::<T, K, 12>(table, directions, look, seen, out),
-        9 => contract::<T, K, 27>(table, directions, look, seen, out),
-        _ => contract::<T, K, 48>(table, directions, look, seen, out),
+        1 => contract::<T, K, 3, FUSED>(table, directions, look, seen, out),
+        4 => contract::<T, K, 12, FUSED>(table, directions, look, seen, out),
+        9 => contract::<T, K, 27, FUSED>(table, directions, look, seen, out),
+        _ => contract::<T, K, 48, FUSED>(table, directions, look, seen, out),
     }
 }
 
 dispatched! {
 /// `W` is the width of the table.
-fn contract<T: Real, const K: usize, const W: usize>(
+fn contract<T: Real, const K: usize, const W: usize, const FUSED: bool>(
     table: &[T],
     directions: Directions<'_, T>,
     look: impl Fn(usize) -> ([u32; K], [T; K]),
@@ -135,9 +152,9 @@ fn contract<T: Real, const K: usize, const W: usize>(
                     let (rows, weights) = look(first + i);
                     let rows = rows.map(|row| &table[row as usize]);
                     if W >= 16 {
-                        weigh::<T, K, W, 16>(rows, weights, sum);
+                        weigh::<T, K, W, 16, FUSED>(rows, weights, sum);
                     } else {
-                        weigh::<T, K, W, 3>(rows, weights, sum);
+                        weigh::<T, K, W, 3, FUSED>(rows, weights, sum);
                     }
                 }
             }
@@ -145,7 +162,7 @@ fn contract<T: Real, const K: usize, const W: usize>(
                 for (c, out) in out.iter_mut().enumerate() {
                     let mut color = directions.offset;
                     for k in 0..count {
-                        color += sum[c * count + k] * basis[k];
+                        color = sum[c * count + k].multiply_add::<FUSED>(basis[k], color);
                     }
                     *out = if seen(first + i) { color } else { T::zero() };
                 }
@@ -157,14 +174,18 @@ fn contract<T: Real, const K: usize, const W: usize>(
 
 /// Σ weightₖ rowₖ, `L` columns at a time; the last ones overlap those before, so that all are whole vectors.
 #[inline(always)]
-fn weigh<T: Real, const K: usize, const W: usize, const L: usize>(rows: [&[T; W]; K], weights: [T; K], sum: &mut [T; W]) {
+fn weigh<T: Real, const K: usize, const W: usize, const L: usize, const FUSED: bool>(
+    rows: [&[T; W]; K],
+    weights: [T; K],
+    sum: &mut [T; W],
+) {
     for part in 0..W.div_ceil(L) {
         let start = (part * L).min(W - L);
         let mut lanes = [T::zero(); L];
         for k in 0..K {
             let row: &[T; L] = rows[k][start..].first_chunk().expect("the part lies in the row");
             for l in 0..L {
-                lanes[l] += weights[k] * row[l];
+                lanes[l] = weights[k].multiply_add::<FUSED>(row[l], lanes[l]);
             }
         }
         sum[start..start + L].copy_from_slice(&lanes);

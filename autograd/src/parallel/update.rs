@@ -1,0 +1,246 @@
+//! How optimizers change tables: dense, by rows, or by rows whose gradients are added up on the way.
+
+use super::{CHUNK, dispatched, for_each_item, rows_per_chunk};
+use crate::gradients::{RowGroups, RowSums};
+use crate::real::Real;
+
+/// `(x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i])`: how an optimizer changes values and what it remembers of them.
+pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
+    fn halves<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], g: &[T], f: &F) {
+        if g.len() <= CHUNK {
+            return update_loop(x, g, f);
+        }
+        let middle = (g.len() / 2).next_multiple_of(CHUNK);
+        let (low, high) = split(x, middle);
+        rayon::join(|| halves(low, &g[..middle], f), || halves(high, &g[middle..], f));
+    }
+    halves(x, g, &f);
+}
+
+/// The same for some rows of tables of `width` columns. `rows` ascend without repetition and `g` has one row for each; other rows stay.
+pub fn update_rows<T: Real, const N: usize>(x: [&mut [T]; N], width: usize, rows: &[u32], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
+    update_part::<T, N, false, _>(x, TableRows { first: 0, width, rows, g }, &f);
+}
+
+/// The same for the rows of a gradient that is not added up: each bucket's sums are computed and used while they are in the cache.
+pub(crate) fn update_deferred<T: Real, const N: usize>(
+    x: [&mut [T]; N],
+    width: usize,
+    rows: &dyn RowSums<T>,
+    f: impl Fn([T; N], T) -> [T; N] + Sync,
+) {
+    let bucket_rows = 1usize << rows.bucket_shift();
+    let groups = RowGroups::new(x[0].len() / width.max(1), bucket_rows);
+    let mut parts: Vec<[&mut [T]; N]> = Vec::with_capacity(groups.count);
+    let mut rest = x;
+    for _ in 0..groups.count {
+        let at = (groups.rows_per_group() * width).min(rest[0].len());
+        let (part, tail) = split(rest, at);
+        parts.push(part);
+        rest = tail;
+    }
+    for_each_item(parts, |group, mut x| {
+        let first = group * groups.rows_per_group();
+        groups.for_each_bucket(group, width, rows, |bucket, sums, touched| {
+            let start = (bucket * bucket_rows - first) * width;
+            let x = x.each_mut().map(|x| &mut x[start..][..sums.len()]);
+            match width {
+                1 => update_touched::<T, N, 1, _>(x, width, sums, touched, &f),
+                3 => update_touched::<T, N, 3, _>(x, width, sums, touched, &f),
+                27 => update_touched::<T, N, 27, _>(x, width, sums, touched, &f),
+                _ => update_touched::<T, N, 0, _>(x, width, sums, touched, &f),
+            }
+        });
+    });
+}
+
+/// The same for all rows, `g` being zero in those that `rows` does not list.
+pub fn update_all_rows<T: Real, const N: usize>(
+    x: [&mut [T]; N],
+    width: usize,
+    rows: &[u32],
+    g: &[T],
+    f: impl Fn([T; N], T) -> [T; N] + Sync,
+) {
+    update_part::<T, N, true, _>(x, TableRows { first: 0, width, rows, g }, &f);
+}
+
+/// A part of a table that begins at row `first`, and which of its rows have a gradient.
+#[derive(Clone, Copy)]
+struct TableRows<'a, T> {
+    first: usize,
+    width: usize,
+    rows: &'a [u32],
+    g: &'a [T],
+}
+
+/// Halves the work until it is a chunk. A half of the ascending rows lies in a part of the table of its own, so nothing is shared.
+/// `ALL` visits the rows without a gradient too.
+fn update_part<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N] + Sync>(
+    x: [&mut [T]; N],
+    part: TableRows<'_, T>,
+    f: &F,
+) {
+    let TableRows { first, width, rows, g } = part;
+    let count = if ALL { x[0].len() / width.max(1) } else { rows.len() };
+    if count <= rows_per_chunk(width) {
+        return match width {
+            1 if !ALL => update_short_rows::<T, N, 1, F>(x, part, f),
+            3 if !ALL => update_short_rows::<T, N, 3, F>(x, part, f),
+            4 if !ALL => update_short_rows::<T, N, 4, F>(x, part, f),
+            _ => update_runs::<T, N, ALL, F>(x, part, f),
+        };
+    }
+    let cut = if ALL { first + count / 2 } else { rows[count / 2] as usize };
+    let middle = rows.partition_point(|&row| (row as usize) < cut);
+    let (low, high) = split(x, (cut - first) * width);
+    let ((low_rows, high_rows), (low_g, high_g)) = (rows.split_at(middle), g.split_at(middle * width));
+    rayon::join(
+        || update_part::<T, N, ALL, F>(low, TableRows { rows: low_rows, g: low_g, ..part }, f),
+        || update_part::<T, N, ALL, F>(high, TableRows { first: cut, rows: high_rows, g: high_g, ..part }, f),
+    );
+}
+
+fn split<T, const N: usize>(x: [&mut [T]; N], at: usize) -> ([&mut [T]; N], [&mut [T]; N]) {
+    let mut high = [const { None }; N];
+    let mut k = 0;
+    let low = x.map(|slice| {
+        let (a, b) = slice.split_at_mut(at);
+        high[k] = Some(b);
+        k += 1;
+        a
+    });
+    (low, high.map(Option::unwrap_or_default))
+}
+
+dispatched! {
+fn update_loop<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]; N], g: &[T], f: &F) {
+    update_slices(x, g.len(), |i| g[i], f);
+}
+}
+
+dispatched! {
+/// Rows too short for a loop of their own are gathered, updated together and put back.
+fn update_short_rows<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
+    const TOGETHER: usize = 16;
+    let mut x = x.map(|x| x.as_chunks_mut::<W>().0);
+    let mut block = [[[T::zero(); W]; TOGETHER]; N];
+    for (rows, g) in part.rows.chunks(TOGETHER).zip(part.g.chunks(TOGETHER * W)) {
+        for (block, x) in block.iter_mut().zip(&x) {
+            block.iter_mut().zip(rows).for_each(|(to, &row)| *to = x[row as usize - part.first]);
+        }
+        let slices = block.each_mut().map(|b| b.as_flattened_mut());
+        // A constant length is worth a copy of the loop.
+        if g.len() == TOGETHER * W { update_slices(slices, TOGETHER * W, |i| g[i], f) } else { update_slices(slices, g.len(), |i| g[i], f) }
+        for (block, x) in block.iter().zip(&mut x) {
+            block.iter().zip(rows).for_each(|(&from, &row)| x[row as usize - part.first] = from);
+        }
+    }
+}
+}
+
+dispatched! {
+/// Neighbouring rows are updated as one run; `ALL` fills the gaps with zero gradients.
+fn update_runs<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N]>(mut x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
+    let TableRows { first, width, rows, g } = part;
+    let mut done = 0;
+    let mut k = 0;
+    while k < rows.len() {
+        let run = (1..).take_while(|&n| rows.get(k + n).is_some_and(|&row| (row - rows[k]) as usize == n)).count() + 1;
+        let (start, len) = ((rows[k] as usize - first) * width, run * width);
+        if ALL {
+            update_slices(x.each_mut().map(|x| &mut x[done..start]), start - done, |_| T::zero(), f);
+            done = start + len;
+        }
+        let g = &g[k * width..][..len];
+        update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
+        k += run;
+    }
+    if ALL {
+        let len = x[0].len() - done;
+        update_slices(x.each_mut().map(|x| &mut x[done..]), len, |_| T::zero(), f);
+    }
+}
+}
+
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // N arrays are walked at once.
+fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl Fn(usize) -> T, f: &impl Fn([T; N], T) -> [T; N]) {
+    let x = x.map(|x| &mut x[..len]);
+    for i in 0..len {
+        let new = f(std::array::from_fn(|k| x[k][i]), g(i));
+        for k in 0..N {
+            x[k][i] = new[k];
+        }
+    }
+}
+
+dispatched! {
+/// Updates the rows whose bits are set, neighbours together, and clears their sums and bits; `sums` has a row for each row of the tables.
+/// `W` is the width, or 0 for one only known at run time.
+fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(
+    mut x: [&mut [T]; N],
+    width: usize,
+    sums: &mut [T],
+    touched: &mut [u64],
+    f: &F,
+) {
+    let width = if W == 0 { width } else { W };
+    for (w, word) in touched.iter_mut().enumerate() {
+        let mut left = std::mem::take(word);
+        while left != 0 {
+            let bit = left.trailing_zeros();
+            let run = (left >> bit).trailing_ones();
+            left &= if bit + run == 64 { 0 } else { !0 << (bit + run) };
+            let start = (w * 64 + bit as usize) * width;
+            if W != 0 && run == 1 {
+                let g = &mut sums[start..][..W];
+                update_slices(x.each_mut().map(|x| &mut x[start..][..W]), W, |i| g[i], f);
+                g.fill(T::zero());
+            } else {
+                let len = run as usize * width;
+                let g = &mut sums[start..][..len];
+                update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
+                g.fill(T::zero());
+            }
+        }
+    }
+}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn updates_of_rows_equal_a_plain_loop_for_every_width_and_leave_the_other_rows_alone() {
+        let rule = |[x, v]: [f64; 2], g: f64| [x - g, 0.5 * v + g];
+        for width in [1usize, 2, 3, 4, 28] {
+            // Rows alone, rows in runs, and enough of both for several chunks.
+            let table = 100_000 / width.min(4);
+            let rows: Vec<u32> = (0..table as u32).filter(|r| r % 7 != 0 && (r % 64 < 20 || r % 3 == 0)).collect();
+            let g: Vec<f64> = (0..rows.len() * width).map(|i| (i % 1000) as f64 + 1.0).collect();
+            let start: Vec<f64> = (0..table * width).map(|i| i as f64).collect();
+
+            let (mut x, mut v) = (start.clone(), start.clone());
+            let mut dense = vec![0.0; table * width];
+            for (k, &row) in rows.iter().enumerate() {
+                for c in 0..width {
+                    let at = row as usize * width + c;
+                    dense[at] = g[k * width + c];
+                    [x[at], v[at]] = rule([x[at], v[at]], dense[at]);
+                }
+            }
+            let (mut got_x, mut got_v) = (start.clone(), start.clone());
+            update_rows([&mut got_x, &mut got_v], width, &rows, &g, rule);
+            assert!(got_x == x && got_v == v, "rows of width {width}");
+
+            let (mut x, mut v) = (start.clone(), start.clone());
+            update([&mut x, &mut v], &dense, rule);
+            let (mut got_x, mut got_v) = (start.clone(), start.clone());
+            update_all_rows([&mut got_x, &mut got_v], width, &rows, &g, rule);
+            assert!(got_x == x && got_v == v, "all rows of width {width}");
+            assert!(v.iter().zip(&start).zip(&dense).all(|((v, s), g)| *v == 0.5 * s + g));
+        }
+    }
+}
