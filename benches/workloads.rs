@@ -3,7 +3,8 @@
 //!
 //!     cargo bench --bench workloads -- --data nerf_synthetic/lego W1
 //!
-//! `graph:W1` and so on are the same through the graph of small ops. Without `--data` the rays are of the built-in scene. Peak memory is the process's, so give one workload at a time to compare it.
+//! `graph:W1` and so on are the same through the graph of small ops; `scaling:W1` and `scaling:W2` double one size after the other. Without
+//! `--data` the rays are of the built-in scene. Peak memory is the process's, so give one workload at a time to compare it.
 
 mod support;
 
@@ -22,23 +23,44 @@ use std::hint::black_box;
 use std::path::Path;
 use support::{Arguments, arguments, median, peak_memory_mb, repeat};
 
-const RAYS: usize = 5000;
 const HALF_WIDTH: f64 = 1.4;
-const SPACING: Spacing = Spacing::Points { samples: 200, far: 10.0 / 1.2 };
 
-fn options(jitter: Jitter, engine: Engine) -> RenderOptions<'static> {
-    let aabb = Aabb::cube(HALF_WIDTH);
-    RenderOptions { aabb, spacing: SPACING, jitter, background: [1.0; 3], occupancy: None, engine, stop_below: 0.0 }
+/// A step of training.
+#[derive(Clone, Copy)]
+struct Work {
+    rays: usize,
+    /// Points on a ray, about a third of which lie in the cube.
+    points: usize,
+    resolution: usize,
+    /// Share of the voxels that are present: those with the smallest x.
+    occupied: f64,
+    interpolation: Interpolation,
+    color: Color,
+    rate: f64,
+}
+
+const W1: Work =
+    Work { rays: 5000, points: 200, resolution: 128, occupied: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, rate: 500.0 };
+const W2: Work = Work { interpolation: Interpolation::Trilinear, color: Color::Sh { degree: 2, offset: 0.0 }, rate: 1.0, ..W1 };
+
+fn options(points: usize, jitter: Jitter, engine: Engine) -> RenderOptions<'static> {
+    let (aabb, spacing) = (Aabb::cube(HALF_WIDTH), Spacing::Points { samples: points, far: 10.0 / 1.2 });
+    RenderOptions { aabb, spacing, jitter, background: [1.0; 3], occupancy: None, engine, stop_below: 0.0 }
 }
 
 /// Both engines, with what a row of theirs is called.
 const ENGINES: [(Engine, &str); 2] = [(Engine::Fused, ""), (Engine::Graph, "graph:")];
 
-fn grid(interpolation: Interpolation, color: Color) -> VoxelGrid<f32> {
-    VoxelGrid::random(GridShape { resolution: 128, half_width: HALF_WIDTH, interpolation, color }, 1.0, 1.0, 0)
+fn grid(work: &Work) -> VoxelGrid<f32> {
+    let Work { resolution, interpolation, color, .. } = *work;
+    let grid = VoxelGrid::random(GridShape { resolution, half_width: HALF_WIDTH, interpolation, color }, 1.0, 1.0, 0);
+    if work.occupied == 1.0 {
+        return grid;
+    }
+    let present = (work.occupied * resolution as f64) as usize;
+    let kept = grid.voxels_where(|row| grid.lattice().node(row as u32).is_some_and(|[x, ..]| x < present));
+    grid.pruned(&kept)
 }
-
-const HARMONICS: Color = Color::Sh { degree: 2, offset: 0.0 };
 
 fn open(args: &Arguments, downscale: usize) -> Dataset {
     match &args.data {
@@ -48,24 +70,37 @@ fn open(args: &Arguments, downscale: usize) -> Dataset {
 }
 
 /// W1 and W2: a step of training.
-fn step(args: &Arguments, name: &str, engine: Engine, mut grid: VoxelGrid<f32>, rate: f64) {
+fn step(args: &Arguments, name: &str, engine: Engine, work: &Work) {
     let views = open(args, 8).load(Split::Train, &|_, _| {}).expect("the images load");
     let source = RaySource::new(&views, [1.0; 3], 42);
-    let mut optimizer = Sgd::new(Rates::new(rate));
+    let mut grid = grid(work);
+    let mut optimizer = Sgd::new(Rates::new(work.rate));
     grid.project();
     let (mut number, mut samples) = (0, 0);
     let times = repeat(args.repeats, || {
-        let batch = source.batch::<f32>(number * RAYS as u64, RAYS);
+        let batch = source.batch::<f32>(number * work.rays as u64, work.rays);
         let (loss, gradients) = value_and_grad(|| {
-            let rendered = render(&grid, &batch.rays, &options(Jitter::PerRay { seed: 42, step: number }, engine));
+            let options = options(work.points, Jitter::PerRay { seed: 42, step: number }, engine);
+            let rendered = render(&grid, &batch.rays, &options);
             samples = rendered.sample_count;
-            (&rendered.rgb - &batch.target).square().sum() / RAYS as f64
+            (&rendered.rgb - &batch.target).square().sum() / work.rays as f64
         });
         assert!(loss.is_finite());
         optimizer.step(&mut grid as &mut dyn Module<f32>, &gradients, number);
         number += 1;
     });
-    print(name, &times, Some(RAYS), samples);
+    print(name, &times, Some(work.rays), samples);
+}
+
+/// Each size of a workload from an eighth of it to the whole, rays and points from a quarter to twice.
+fn scaling(args: &Arguments, name: &str, work: &Work) {
+    let row = |what: &str, size: usize, work: Work| step(args, &format!("{name}:{what}={size}"), Engine::Fused, &work);
+    for k in 0..4 {
+        row("rays", 1250 << k, Work { rays: 1250 << k, ..*work });
+        row("points", 50 << k, Work { points: 50 << k, ..*work });
+        row("side", 16 << k, Work { resolution: 16 << k, ..*work });
+        row("eighths_occupied", 1 << k, Work { occupied: f64::from(1 << k) / 8.0, ..*work });
+    }
 }
 
 fn print(name: &str, times: &[f64], rays: Option<usize>, samples: usize) {
@@ -86,13 +121,18 @@ fn run() {
     for (engine, prefix) in ENGINES {
         let row = |name: &str| Some(format!("{prefix}{name}")).filter(|name| args.wants(name));
         if let Some(name) = row("W1") {
-            step(&args, &name, engine, grid(Interpolation::Nearest, Color::Rgb), 500.0);
+            step(&args, &name, engine, &W1);
         }
         if let Some(name) = row("W2") {
-            step(&args, &name, engine, grid(Interpolation::Trilinear, HARMONICS), 1.0);
+            step(&args, &name, engine, &W2);
         }
         if let Some(name) = row("W4") {
             image(&args, &name, engine);
+        }
+    }
+    for (name, work) in [("scaling:W1", W1), ("scaling:W2", W2)] {
+        if args.wants(name) {
+            scaling(&args, name, &work);
         }
     }
     if args.wants("W3") {
@@ -110,9 +150,9 @@ fn image(args: &Arguments, name: &str, engine: Engine) {
     if args.data.is_none() {
         camera.intrinsics = plenoxel::camera::Intrinsics::from_fov_x(800, 800, camera.intrinsics.fov_x());
     }
-    let grid = grid(Interpolation::Trilinear, HARMONICS);
+    let grid = grid(&W2);
     let pixels = camera.intrinsics.width * camera.intrinsics.height;
-    let options = options(Jitter::None, engine);
+    let options = options(W2.points, Jitter::None, engine);
     let times = repeat(args.repeats.min(3), || drop(black_box(picture(&grid, &camera, &options))));
     print(name, &times, Some(pixels), 0);
 }

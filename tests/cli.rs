@@ -136,7 +136,7 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
     let size = |name: &str| image::size(Path::new(&format!("{run}/images/{name}"))).unwrap();
     assert_eq!((size("stages.png"), size("test_000_r_0.png")), ((3 * 24 + 2 * 2, 24), (4 * 24 + 3 * 2, 24)));
     assert!(fs::read_to_string(format!("{run}/loss.svg")).unwrap().contains("12³"));
-    assert!(trained.err.contains("memory: up to ") && trained.err.contains("stage 2/2 (12³)  step 10/10"), "{}", trained.err);
+    assert!(trained.err.contains("memory: about ") && trained.err.contains("stage 2/2 (12³)  step 10/10"), "{}", trained.err);
 
     // The same views, the same figures.
     let evaluated = plenoxel(&["evaluate", &run]).json();

@@ -5,7 +5,10 @@ mod support;
 use approx::assert_relative_eq;
 use autograd::{Tensor, no_grad};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
-use support::numbers;
+use plenoxel::render::fused::largest_weights;
+use plenoxel::render::{Engine, RenderOptions, render};
+use plenoxel::sampling::{Jitter, Spacing};
+use support::{numbers, rays};
 
 /// Voxel centres of a grid of n³ in the cube ±1.
 fn centers(n: usize) -> Vec<[f64; 3]> {
@@ -57,6 +60,22 @@ fn upsampling_keeps_a_nearest_field_everywhere_and_a_trilinear_one_at_the_old_ce
 }
 
 #[test]
+fn a_sparse_nearest_grid_of_twice_the_resolution_has_eight_voxels_for_each() {
+    let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb };
+    let old = VoxelGrid::<f32>::random(shape, 1.0, 1.0, 4);
+    let old = old.pruned(&old.occupancy(0.6));
+    let new = old.resample(16);
+    assert!(old.lattice().present() < 300);
+    assert_eq!(new.lattice().present(), 8 * old.lattice().present());
+    for row in 0..new.lattice().rows() as u32 {
+        if let Some(voxel) = new.lattice().node(row) {
+            let from = old.lattice().row(voxel.map(|c| c / 2)).expect("present") as usize;
+            assert_eq!(new.density.tensor().data()[row as usize], old.density.tensor().data()[from]);
+        }
+    }
+}
+
+#[test]
 fn nearest_look_up_reads_the_voxel_a_point_lies_in() {
     let shape = GridShape { resolution: 4, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Rgb };
     let grid = VoxelGrid::from_tables(shape, Tensor::constant(numbers(&[64, 1], 0.0, 1.0, 1)), Tensor::zeros(&[64, 3]));
@@ -92,4 +111,43 @@ fn pruning_keeps_what_is_visible_and_a_pruned_grid_resamples_to_the_same_field()
         equal += usize::from(s == w && *w > 0.02);
     }
     assert!(equal > 500, "{equal}");
+}
+
+#[test]
+fn the_largest_weight_of_a_voxel_is_that_of_the_samples_that_read_it() {
+    for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+        let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color: Color::Rgb };
+        let grid = VoxelGrid::<f64>::random(shape, 3.0, 1.0, 5);
+        let options = RenderOptions {
+            aabb: grid.aabb(),
+            spacing: Spacing::Step(0.13),
+            jitter: Jitter::None,
+            background: [1.0; 3],
+            occupancy: None,
+            engine: Engine::Graph,
+            stop_below: 0.0,
+        };
+        let mut want = vec![0.0; grid.lattice().rows()];
+        let rendered = no_grad(|| render(&grid, &rays(), &options));
+        let samples = rendered.samples().expect("the graph knows every sample");
+        let voxels = grid.world_to_voxels(&samples.samples.positions);
+        for (u, &w) in voxels.data().chunks(3).zip(samples.weights.data()) {
+            let at = [0, 1, 2].map(|a: usize| u[a].clamp(0.0, 5.0));
+            for corner in 0..8 {
+                let voxel = [0, 1, 2].map(|a: usize| match interpolation {
+                    Interpolation::Nearest => (at[a] + 0.5).floor(),
+                    Interpolation::Trilinear if corner >> a & 1 == 1 => at[a].ceil(),
+                    Interpolation::Trilinear => at[a].floor(),
+                });
+                let row = grid.lattice().row(voxel.map(|v| v as usize)).expect("present") as usize;
+                want[row] = f64::max(want[row], w);
+            }
+        }
+        let (first, rest) = (rays()[..2].to_vec(), rays()[2..].to_vec());
+        let got = largest_weights(&grid, [first, rest], &options);
+        assert!(want.iter().any(|&w| w > 0.2) && want.contains(&0.0));
+        for (got, want) in got.iter().zip(&want) {
+            assert_relative_eq!(f64::from(*got), *want, epsilon = 1e-7);
+        }
+    }
 }

@@ -93,10 +93,11 @@ fn every_loss_agrees_with_finite_differences() {
     }
 }
 
-/// Whole bricks, some cut by the border, one without cells, and one with holes.
+/// Whole bricks, some cut by the border, one without cells, one with holes, and one with bricks missing inside.
 fn lattices() -> Vec<Lattice> {
     let mut all: Vec<Lattice> = [[8, 4, 4], [5, 4, 6], [2, 5, 3], [1, 4, 4]].map(Lattice::bricks).into();
     all.push(Lattice::bricks_where([9, 6, 7], |[i, j, k]| (i * 7 + j * 5 + k * 3) % 11 > 1));
+    all.push(Lattice::bricks_where([12, 9, 10], |[i, j, k]| (i * 7 + j * 5 + k * 3) % 11 > 1 && (i / 4 * 2 + j / 4 + k / 4) % 3 > 0));
     all
 }
 
@@ -117,7 +118,7 @@ fn total_variation_over_all_cells_is_the_sampled_one_over_a_run_of_all() {
 
 #[test]
 fn the_kernel_of_total_variation_agrees_with_its_reference_in_both_precisions() {
-    for width in [1, 3, 4, 27] {
+    for width in [1, 3, 4, 12, 27, 48] {
         for lattice in lattices() {
             let table = numbers(&[lattice.rows(), width], -1.0, 1.0, 33);
             check_kernel::<f64>(|x| loss::total_variation(&x[0], &lattice), [table.clone()], 1e-12).unwrap_or_else(|e| panic!("{e}"));

@@ -78,7 +78,8 @@ fn a_small_scene_is_learned() {
 fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
     let train = views(Split::Train);
     // Large enough that batches, tables and losses are cut into many chunks.
-    let mut short = Config { rays_per_step: 4096, color: ColorKind::Sh, sh_degree: 1, prune_from_stage: Some(1), ..config() };
+    let mut short =
+        Config { rays_per_step: 4096, color: ColorKind::Sh, sh_degree: 1, prune_from_stage: Some(1), prune_unseen_below: 1e-3, ..config() };
     short.initial.random = true;
     short.stages = vec![stage(24, 3), stage(40, 3)];
     short.losses.insert("tv_density_sampled".to_owned(), Weight::Constant(1e-3));
@@ -95,6 +96,24 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
         assert!(bits(threads, 42) == one, "{threads} threads differ from one");
     }
     assert!(bits(2, 43) != one, "another seed is another run");
+}
+
+#[test]
+fn voxels_that_no_training_ray_sees_much_of_go_without_harm() {
+    let train = views(Split::Train);
+    let stages = vec![stage(16, 40), stage(32, 140)];
+    let config = Config { prune_from_stage: Some(1), prune_below: 0.0, stages, ..config() };
+    let pruned = |least: f64| run(Config { prune_unseen_below: least, ..config.clone() }, &train).0;
+    let (full, seen) = (pruned(0.0), pruned(0.05));
+    let (before, after) = (full.lattice().present(), seen.lattice().present());
+    // The scene fills what the density leaves, and most of that is surface.
+    assert!(after < before - 100, "{after} of {before} voxels are seen");
+    assert!(test_psnr(&seen) > test_psnr(&full) - 0.1, "{} dB after {}", test_psnr(&seen), test_psnr(&full));
+    let none = Trainer::<f32>::new(Config { prune_unseen_below: 1.0, ..config.clone() }, &train).and_then(|mut trainer| {
+        while trainer.step()?.is_some() {}
+        Ok(())
+    });
+    assert!(none.is_err_and(|e| e.exit_code() == 4 && e.to_string().contains("prune_unseen_below")));
 }
 
 #[test]

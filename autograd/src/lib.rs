@@ -3,7 +3,7 @@
 //! # The tour, in the order to read the files
 //!
 //! 1. **Value.** [`Tensor`] (`tensor.rs`): a shared buffer, a shape and, if it depends on a variable, a node. [`Real`] (`real.rs`) are the two
-//!    scalar types; [`Buffer`] (`pool.rs`) recycles large arrays; [`parallel`] is the only file that knows of threads.
+//!    scalar types; [`Buffer`] (`pool.rs`) recycles large arrays; [`parallel`] is the only module that knows of threads.
 //! 2. **Graph.** `graph.rs`: a node points at the nodes of its inputs and keeps what its rule reads ([`Keep`]). Nothing else holds a graph
 //!    together, so it lives as long as its last tensor. Ids grow with creation.
 //! 3. **Rule.** `op.rs`: an [`Op`] says in tensor ops how a cotangent goes back; a [`Kernel`] says it in a loop over arrays and names its

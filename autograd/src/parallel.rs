@@ -1,4 +1,4 @@
-//! The only place that knows rayon: fixed chunks, in-order reductions, loops compiled for several instruction sets.
+//! The only module that knows rayon: fixed chunks, in-order reductions, loops compiled for several instruction sets.
 //!
 //! Chunk bounds depend on sizes and never on the number of threads, and partial sums are combined in chunk order, so every result has
 //! the same bits for any thread count.
@@ -11,8 +11,8 @@ use crate::real::Real;
 use rayon::prelude::*;
 pub(crate) use update::{update, update_all_rows, update_deferred, update_rows};
 
-/// Compiles a function for several instruction sets and picks the best at run time. Their results differ where a loop multiplies and adds in one rounding on machines that can: see [`fused`].
-/// Builds with debug assertions, in which the tests run, have the portable version only: every crate that uses
+/// Compiles a function for several instruction sets and picks the best at run time. Their results differ where a loop multiplies and adds in
+/// one rounding on machines that can: see [`fused`]. Builds with debug assertions, in which the tests run, have the portable version only: every crate that uses
 /// a generic loop compiles it anew, and four versions of each would take minutes.
 #[macro_export]
 macro_rules! dispatched {

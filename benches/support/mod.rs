@@ -43,7 +43,7 @@ pub struct Arguments {
 }
 
 pub fn arguments() -> Arguments {
-    let mut parsed = Arguments { names: Vec::new(), repeats: 11, data: None };
+    let mut parsed = Arguments { names: Vec::new(), repeats: 31, data: None };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
         match word.as_str() {

@@ -21,7 +21,7 @@ pub struct Estimate {
     pub optimizer: u64,
     /// Samples, intermediate values and gradients of one step, or what evaluating or saving takes if that is more.
     pub step: u64,
-    /// It is of a grid with all voxels, and pruning will take some out.
+    /// An upper bound: it is of a grid with all voxels, and pruning takes some out.
     pruned: bool,
     /// The setting that counts most, and what would help.
     key: String,
@@ -76,7 +76,7 @@ impl Estimate {
             (grid + optimizer + saving, voxels),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
-        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: config.prune_from_stage.is_some(), key, advice }
+        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: prunes(config), key, advice }
     }
 
     /// Rendering a trained grid, and comparing it with the views of a split where `compare` is set.
@@ -88,7 +88,7 @@ impl Estimate {
             grid: 2 * shape.bytes() as u64,
             optimizer: 0,
             step: samples * evaluation_bytes_per_sample(config.engine, shape),
-            pruned: config.prune_from_stage.is_some(),
+            pruned: prunes(config),
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
         }
@@ -105,6 +105,10 @@ impl Estimate {
         BASE + self.images + self.grid + self.optimizer + self.step
     }
 
+    fn how_much(&self) -> &'static str {
+        if self.pruned { "up to" } else { "about" }
+    }
+
     /// One line for people.
     pub fn describe(&self) -> String {
         let part = |name: &str, n: u64| match n {
@@ -113,7 +117,7 @@ impl Estimate {
         };
         format!(
             "memory: {} {} (images {}{}{}{})",
-            if self.pruned { "up to" } else { "about" },
+            self.how_much(),
             bytes(self.total()),
             bytes(self.images),
             part("grid", self.grid),
@@ -127,12 +131,18 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match available() {
             Some(available) if self.total() > available => {
-                let found = format!("what would need about {} of memory, where {} are free,", bytes(self.total()), bytes(available));
+                let found =
+                    format!("what would need {} {} of memory, where {} are free,", self.how_much(), bytes(self.total()), bytes(available));
                 Err(Error::config(&self.key, found, self.advice))
             }
             _ => Ok(()),
         }
     }
+}
+
+/// True if a stage begins by taking voxels out.
+fn prunes(config: &Config) -> bool {
+    config.prune_from_stage.is_some_and(|first| first < config.stages.len())
 }
 
 /// Bytes of memory that can be taken now: what Linux counts as available, within the limit of the control group; elsewhere unknown.

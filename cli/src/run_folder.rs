@@ -111,6 +111,7 @@ impl RunFolder {
         let record = path.join(RECORD);
         let text = std::fs::read_to_string(&record).map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => Error::input(path, format!("there is no {RECORD} in this folder"), remedy),
+            std::io::ErrorKind::InvalidData => Error::input(&record, "this is not text", "train again, or use an undamaged copy"),
             _ => Error::io(&record, e, "reading the run"),
         })?;
         let record = serde_json::from_str(&text).map_err(|e| {

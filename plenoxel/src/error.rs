@@ -85,7 +85,9 @@ fn remedy(refusal: &std::io::Error) -> &'static str {
     use std::io::ErrorKind::*;
     match refusal.kind() {
         NotFound => "check that the path is spelled rightly",
-        PermissionDenied | ReadOnlyFilesystem => "choose a place that may be written, or change its permissions",
+        PermissionDenied => "change its permissions, or choose another path",
+        ReadOnlyFilesystem => "choose a place that may be written",
+        InvalidData | UnexpectedEof => "the file is damaged: use an undamaged copy",
         AlreadyExists | NotADirectory | IsADirectory => "choose another path: a file is where a folder should be, or the other way round",
         StorageFull | QuotaExceeded | FileTooLarge => "make room on the disk, or choose another one",
         InvalidFilename => "choose a shorter or plainer name",
@@ -105,6 +107,18 @@ mod tests {
         assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: 3 cannot be used; accepted: 1, 2, 4"));
         let io = Error::io("out", std::io::Error::other("disk full"), "writing");
         assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing; check the disk, or choose another path"));
+        for (kind, remedy) in [
+            (std::io::ErrorKind::NotFound, "spelled rightly"),
+            (std::io::ErrorKind::PermissionDenied, "permissions"),
+            (std::io::ErrorKind::ReadOnlyFilesystem, "may be written"),
+            (std::io::ErrorKind::InvalidData, "undamaged"),
+            (std::io::ErrorKind::NotADirectory, "the other way round"),
+            (std::io::ErrorKind::StorageFull, "make room"),
+            (std::io::ErrorKind::InvalidFilename, "shorter"),
+        ] {
+            let text = Error::io("out", kind.into(), "writing").to_string();
+            assert!(text.contains(remedy), "{text}");
+        }
         let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
         assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }

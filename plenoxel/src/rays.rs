@@ -85,12 +85,26 @@ impl<'a> RaySource<'a> {
         batch
     }
 
+    /// All rays of the set, view after view and row after row, `size` at a time.
+    pub fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
+        let ray = |index: u64| {
+            let (view, x, y) = self.place(index);
+            view.camera.ray(x as f64 + 0.5, y as f64 + 0.5)
+        };
+        (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
+    }
+
     /// Ray, color over the background, and alpha of one pixel of the set.
     fn pixel(&self, index: u64) -> (Ray, [f32; 3], f32) {
+        let (view, x, y) = self.place(index);
+        (view.camera.ray(x as f64 + 0.5, y as f64 + 0.5), view.color(x, y, self.background), view.alpha(x, y))
+    }
+
+    /// View, column and row of one pixel of the set.
+    fn place(&self, index: u64) -> (&View, usize, usize) {
         let v = self.first.partition_point(|&f| f <= index) - 1;
         let view = &self.views[v];
         let (pixel, width) = ((index - self.first[v]) as usize, view.image.width() as usize);
-        let (x, y) = (pixel % width, pixel / width);
-        (view.camera.ray(x as f64 + 0.5, y as f64 + 0.5), view.color(x, y, self.background), view.alpha(x, y))
+        (view, pixel % width, pixel / width)
     }
 }

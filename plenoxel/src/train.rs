@@ -9,11 +9,15 @@ use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::loss::{Objective, Step};
 use crate::rays::RaySource;
+use crate::render::fused::largest_weights;
 use crate::render::{Engine, RenderOptions, render};
-use crate::sampling::Jitter;
+use crate::sampling::{Jitter, Occupancy};
 use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Rates, RmsProp, Schedule, Sgd};
 use autograd::{Real, parallel, release_free_buffers, value_and_grad};
 use config::{Config, OptimizerConfig, Stage, Weight};
+
+/// Rays that are rendered at a time to find out what is seen: bounds the memory.
+const RAYS_PER_BATCH: u64 = 1 << 15;
 
 /// What one step did.
 #[derive(Clone, Debug, PartialEq)]
@@ -138,15 +142,8 @@ impl<'a, T: Real> Trainer<'a, T> {
         }
         let rays = self.config.rays_per_step;
         let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
-        let options = RenderOptions {
-            aabb: self.grid.aabb(),
-            spacing: plan.stage.sampling.spacing(self.grid.shape().voxel_side()),
-            jitter: if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None },
-            background: self.config.background,
-            occupancy: None,
-            engine: self.engine(),
-            stop_below: self.config.stop_below,
-        };
+        let jitter = if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None };
+        let options = self.options(&plan.stage, jitter);
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
             let rendered = render(&self.grid, &batch.rays, &options);
@@ -194,12 +191,15 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.grid = self.grid.resample(plan.stage.resolution);
         }
         if self.config.prune_from_stage.is_some_and(|first| index >= first) {
-            let kept = self.grid.occupancy(self.config.prune_below);
+            let kept = self.worth_keeping(&self.plan[index].stage);
             if kept.fraction() == 0.0 {
+                let Config { prune_below, prune_unseen_below, .. } = self.config;
                 return Err(Error::Numeric {
                     place: format!("step {}", self.step),
                     found: "pruning would leave nothing".to_owned(),
-                    remedy: format!("set prune_below lower than {}, or prune_from_stage later", self.config.prune_below),
+                    remedy: format!(
+                        "set prune_below lower than {prune_below}, prune_unseen_below lower than {prune_unseen_below}, or prune_from_stage later"
+                    ),
                 });
             }
             self.grid = self.grid.pruned(&kept);
@@ -208,6 +208,33 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.grid.project();
         }
         Ok(())
+    }
+
+    /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees.
+    fn worth_keeping(&self, stage: &Stage) -> Occupancy {
+        let full = self.grid.occupancy(self.config.prune_below);
+        let least = self.config.prune_unseen_below;
+        if least == 0.0 {
+            return full;
+        }
+        // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
+        const MARGIN: usize = 2;
+        let options = self.options(stage, Jitter::None);
+        let weights = largest_weights(&self.grid, self.rays.in_order(RAYS_PER_BATCH), &options);
+        full.intersection(&self.grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN))
+    }
+
+    /// How a stage renders.
+    fn options(&self, stage: &Stage, jitter: Jitter) -> RenderOptions<'static> {
+        RenderOptions {
+            aabb: self.grid.aabb(),
+            spacing: stage.sampling.spacing(self.grid.shape().voxel_side()),
+            jitter,
+            background: self.config.background,
+            occupancy: None,
+            engine: self.engine(),
+            stop_below: self.config.stop_below,
+        }
     }
 
     /// The engine that the config asks for, unless a loss needs what only the graph has.

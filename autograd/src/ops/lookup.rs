@@ -120,7 +120,7 @@ fn largest(rows: &[u32]) -> u32 {
 }
 
 fn gather_into<T: Real, const W: usize>(table: &[T], rows: &[u32], out: &mut [T]) {
-    let past_cache = streamed::worthwhile(out);
+    let past_cache = (W * size_of::<T>()).is_multiple_of(streamed::UNIT) && streamed::worthwhile(out);
     parallel::for_each_rows(out, W, |first, chunk| {
         let rows = &rows[first..];
         if past_cache {

@@ -69,8 +69,8 @@ fn join<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32;
 pub const TOGETHER: usize = 16;
 
 dispatched! {
-/// The corners of many positions, given axis by axis: the eight rows and weights of [`TOGETHER`] of them after the other. In the last
-/// group, what lies beyond the last position is corners of no meaning.
+/// The corners of many positions, given axis by axis: `rows[g][c][i]` is the row of corner c of position [`TOGETHER`] g + i, `weights` likewise;
+/// beyond the last position they have no meaning. Panics if a group begins beyond it.
 pub fn corners_of_many<T: Real, M: NodeMap>(
     at: [&[T]; 3],
     map: M,
@@ -94,13 +94,6 @@ pub fn corners_of_many<T: Real, M: NodeMap>(
                 (fractions[a][0][i], fractions[a][1][i]) = (T::one() - fraction, fraction);
             }
         }
-        for c in 0..8 {
-            let [x, y, z] = [c >> 2, c >> 1 & 1, c & 1];
-            for i in 0..TOGETHER {
-                weights[c][i] = fractions[0][x][i] * fractions[1][y][i] * fractions[2][z][i];
-                rows[c][i] = shares[0][x][i] + shares[1][y][i] + shares[2][z][i];
-            }
-        }
         if M::SPARSE {
             for i in 0..TOGETHER {
                 let own = [0, 1, 2].map(|a: usize| [shares[a][0][i], shares[a][1][i]]);
@@ -110,6 +103,13 @@ pub fn corners_of_many<T: Real, M: NodeMap>(
                 }
             }
         } else {
+            for c in 0..8 {
+                let [x, y, z] = [c >> 2, c >> 1 & 1, c & 1];
+                for i in 0..TOGETHER {
+                    weights[c][i] = fractions[0][x][i] * fractions[1][y][i] * fractions[2][z][i];
+                    rows[c][i] = shares[0][x][i] + shares[1][y][i] + shares[2][z][i];
+                }
+            }
             for row in rows.as_flattened_mut() {
                 *row = map.row_of(*row).unwrap_or_default();
             }

@@ -5,6 +5,7 @@ use super::whole;
 use crate::memory::Estimate;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
+use plenoxel::dataset::image;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
@@ -19,8 +20,10 @@ Examples:
 Writes transforms_{train,val,test}.json and RGBA images with straight alpha, in the NeRF-synthetic format, and exact depth
 beside the test views: 16 bits, thousandths of a world unit, 0 where there is nothing.";
 
-/// The most pixels on a side, and the most views.
-const MOST: u64 = 100_000;
+/// The most pixels on a side.
+const MOST_PIXELS: u64 = image::MAX_SIDE as u64;
+/// The most views of a split.
+const MOST_VIEWS: u64 = 100_000;
 
 /// Write the built-in scene to a folder in the NeRF-synthetic format
 #[derive(Debug, Args)]
@@ -35,23 +38,23 @@ pub struct SceneArgs {
     size: Option<(usize, usize)>,
 
     /// Image width in pixels
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().width, value_parser = whole::<usize>(1, MOST))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().width, value_parser = whole::<usize>(1, MOST_PIXELS))]
     width: usize,
 
     /// Image height in pixels
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().height, value_parser = whole::<usize>(1, MOST))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().height, value_parser = whole::<usize>(1, MOST_PIXELS))]
     height: usize,
 
     /// Training views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().train, value_parser = whole::<usize>(0, MOST))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().train, value_parser = whole::<usize>(1, MOST_VIEWS))]
     train: usize,
 
     /// Validation views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().val, value_parser = whole::<usize>(0, MOST))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().val, value_parser = whole::<usize>(0, MOST_VIEWS))]
     val: usize,
 
     /// Test views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test, value_parser = whole::<usize>(0, MOST))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test, value_parser = whole::<usize>(0, MOST_VIEWS))]
     test: usize,
 
     /// Write into a folder that is not empty

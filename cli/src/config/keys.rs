@@ -25,6 +25,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "project",
             "prune_from_stage",
             "prune_below",
+            "prune_unseen_below",
             "initial",
             "optimizer",
             "losses",

@@ -12,6 +12,7 @@ use crate::random::{Purpose, uniform};
 use crate::render::{RenderOptions, Rendered, fused};
 use crate::sampling::{Occupancy, Samples};
 use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::ops::trilinear::nearest_node;
 use autograd::{Bounds, Buffer, Indices, Lattice, Module, Param, Real, Tensor, no_grad, parallel};
 use serde::{Deserialize, Serialize};
 
@@ -220,7 +221,8 @@ impl<T: Real> VoxelGrid<T> {
     }
 
     /// The same field at another resolution: the old field read at the new centres, with the look-up that renders it. So a nearest grid
-    /// of twice the resolution shows exactly what the old one showed, and a trilinear one differs within the cells of the old one only.
+    /// of twice the resolution shows exactly what the old one showed; a trilinear one does inside the old cells, and is smoother within a
+    /// quarter of an old voxel of the planes through old centres.
     /// A new voxel is present if it reads one that is. Parameters get new identities, so an optimizer starts afresh.
     pub fn resample(&self, resolution: usize) -> Self {
         let shape = GridShape { resolution, ..self.shape };
@@ -230,11 +232,14 @@ impl<T: Real> VoxelGrid<T> {
             None => shape.full(),
             Some(_) => {
                 let last = self.shape.resolution - 1;
-                let corners = |k: usize| {
-                    let at = center(k).clamp(0.0, last as f64);
-                    match self.shape.interpolation {
-                        Interpolation::Nearest => at.round() as usize..at.round() as usize + 1,
-                        Interpolation::Trilinear => at as usize..(at as usize + 2).min(last + 1),
+                let corners = |k: usize| match self.shape.interpolation {
+                    Interpolation::Nearest => {
+                        let [nearest, ..] = nearest_node([T::lit(center(k)); 3], [last + 1; 3]);
+                        nearest as usize..nearest as usize + 1
+                    }
+                    Interpolation::Trilinear => {
+                        let low = center(k).clamp(0.0, last as f64) as usize;
+                        low..(low + 2).min(last + 1)
                     }
                 };
                 Lattice::bricks_where([resolution; 3], |[i, j, k]| {

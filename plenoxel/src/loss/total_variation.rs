@@ -68,6 +68,7 @@ pub fn total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<
 
 /// Through the kernel for a width of `W`; `N` is 4 W, the length of a line, and `S` 16 W, that of a slab.
 fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
+    const { assert!(N == 4 * W && S == 4 * N) };
     let bricks = lattice.neighbours();
     let mut roots = Buffer::<T>::stale(table.len());
     let values = table.data().as_chunks::<S>().0;

@@ -31,6 +31,7 @@ use crate::sampling::Samples;
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Real, RowSparse, Tensor, no_grad, parallel};
 use forward::Block;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// Rays that one task renders, and whose gradients it sorts: some ten thousand samples.
 const BLOCK: usize = 256;
@@ -92,27 +93,33 @@ impl<T: Real> Columns<T> {
     }
 }
 
+impl<T: Real> Batch<T> {
+    fn new(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Self {
+        let n = rays.len();
+        let directions = Tensor::from_vec(rays.iter().flat_map(|r| r.direction.to_array()).map(T::lit).collect(), &[n, 3]);
+        let basis = match grid.shape().color {
+            Color::Rgb => Tensor::zeros(&[n, 0]),
+            Color::Sh { degree, .. } => no_grad(|| sh::basis(&directions, degree)),
+        };
+        let background = options.background.map(|c| T::lit(f64::from(c)));
+        Batch { shape: *grid.shape(), lattice: grid.lattice().clone(), background, directions, basis }
+    }
+
+    fn scene<'a>(&'a self, grid: &'a VoxelGrid<T>, rays: &'a [Ray], options: &'a RenderOptions<'a>) -> forward::Scene<'a, T> {
+        let tables = [&grid.density, &grid.color].map(|table| table.tensor().data());
+        forward::Scene { batch: self, rays, options, cells: options.occupancy.or(Field::<T>::reach(grid)), tables }
+    }
+}
+
 /// Renders a batch of rays through a grid.
 pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let n = rays.len();
-    let directions = Tensor::from_vec(rays.iter().flat_map(|r| r.direction.to_array()).map(T::lit).collect(), &[n, 3]);
-    let basis = match grid.shape().color {
-        Color::Rgb => Tensor::zeros(&[n, 0]),
-        Color::Sh { degree, .. } => no_grad(|| sh::basis(&directions, degree)),
-    };
-    let background = options.background.map(|c| T::lit(f64::from(c)));
-    let batch = Batch { shape: *grid.shape(), lattice: grid.lattice().clone(), background, directions, basis };
+    let batch = Batch::new(grid, rays, options);
     let tables = [grid.density.tensor(), grid.color.tensor()];
     let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording();
     let mut pixels = Buffer::stale(n * COLUMNS);
     let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
-    let scene = forward::Scene {
-        batch: &batch,
-        rays,
-        options,
-        cells: options.occupancy.or(Field::<T>::reach(grid)),
-        tables: tables.map(Tensor::data),
-    };
+    let scene = batch.scene(grid, rays, options);
     let blocks = parallel::map_items(parts, |b, pixels| scene.render(b * BLOCK, pixels, keep));
     let sample_count = blocks.iter().map(Block::len).sum();
     let state = Arc::new(State { batch, blocks });
@@ -124,6 +131,36 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
         sample_count,
         rest: Rest::Fused(Columns { pixels, state, tables: tables.map(Clone::clone) }),
     }
+}
+
+/// For each row of the tables the largest weight wᵢ = Tᵢ (1 − exp(−σᵢδᵢ)) of the samples that read it, on any of the rays: how much of a
+/// pixel its voxel is ever part of, 0 where no ray comes. Rays come in batches to bound the memory; svox2 prunes by it (`grid_weight_render`).
+pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Vec<f32> {
+    // Numbers that are not negative are in the order of their bits, and a maximum does not depend on the order of its terms.
+    let largest: Vec<AtomicU32> = (0..grid.lattice().rows()).map(|_| AtomicU32::new(0)).collect();
+    for rays in batches {
+        let batch = Batch::new(grid, &rays, options);
+        let scene = batch.scene(grid, &rays, options);
+        parallel::map_chunks(rays.len(), BLOCK, |range| {
+            let (block, corners) = scene.weights(range.start, range.len());
+            let raise = |row: u32, bits: u32| {
+                if let Some(largest) = largest.get(row as usize).filter(|largest| largest.load(Relaxed) < bits) {
+                    largest.fetch_max(bits, Relaxed);
+                }
+            };
+            for (i, weight) in block.weight.iter().enumerate() {
+                let bits = (weight.as_f64() as f32).to_bits();
+                match &corners {
+                    None => raise(block.rows[i], bits),
+                    Some(corners) => {
+                        let (rows, shares) = corners.of(i);
+                        rows.into_iter().zip(shares).filter(|(_, share)| *share > T::zero()).for_each(|(row, _)| raise(row, bits));
+                    }
+                }
+            }
+        });
+    }
+    largest.into_iter().map(|bits| f32::from_bits(bits.into_inner())).collect()
 }
 
 /// Which columns a kernel computed.

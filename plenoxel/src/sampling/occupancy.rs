@@ -96,6 +96,15 @@ impl Occupancy {
         Self::from_masks(self.aabb, self.cells, masks)
     }
 
+    /// The cells that are in both.
+    ///
+    /// Panics if the other has other cells.
+    pub fn intersection(&self, other: &Self) -> Self {
+        assert_eq!(self.cells, other.cells, "occupancy: the intersection of different grids");
+        let masks = self.masks.iter().zip(&other.masks).map(|(a, b)| a & b).collect();
+        Self::from_masks(self.aabb, self.cells, masks)
+    }
+
     /// What lies at a distance along a ray.
     #[inline]
     pub(crate) fn look(&self, ray: &Ray, t: f64) -> Look {

@@ -48,6 +48,9 @@ pub struct Config {
     pub prune_from_stage: Option<usize>,
     /// Density, 1 / world length, at which a voxel counts as empty when pruning.
     pub prune_below: f64,
+    /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
+    /// share of a pixel. 0 for none; svox2: 0.256 / voxels a side.
+    pub prune_unseen_below: f64,
     /// Values before the first step.
     pub initial: Initial,
     /// How gradients change the grid.
@@ -234,6 +237,7 @@ impl Default for Config {
             project: false,
             prune_from_stage: None,
             prune_below: 0.2,
+            prune_unseen_below: 0.0,
             // svox2's start: thin gray fog.
             initial: Initial { density: 0.1, color: 0.0, random: false },
             // Gradients of a mean over 4096 rays are small: the usual 1e-8 would damp them.
@@ -273,6 +277,7 @@ impl Config {
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
         check((0.0..1.0).contains(&self.stop_below), "stop_below", self.stop_below, "a number in [0, 1)")?;
         check(self.prune_below >= 0.0, "prune_below", self.prune_below, "a number of at least 0")?;
+        check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;
         check(
             self.initial.density.is_finite() && self.initial.density >= 0.0,
             "initial.density",

@@ -67,11 +67,23 @@ pub(super) struct Scene<'a, T: Real> {
 impl<T: Real> Scene<'_, T> {
     /// Renders the rays from number `first` on, one for each [`COLUMNS`] of `pixels`.
     pub fn render(&self, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
-        with_bricks!(self.batch.lattice, map => self.render_with(map, first, pixels, keep))
+        let (mut block, found) = self.weights(first, pixels.len() / COLUMNS);
+        block.color = Buffer::stale(3 * block.len());
+        self.colors(&mut block, found.as_ref());
+        self.sum(&block, pixels);
+        if !keep {
+            return Block { first, offsets: block.offsets, density: block.density, ..Block::empty() };
+        }
+        block
     }
 
-    fn render_with(&self, map: impl NodeMap, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
-        let mut block = self.place(first, pixels.len() / COLUMNS);
+    /// The samples of `count` rays from number `first` on, all but their colors; with trilinear look-up also the rows that they read.
+    pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
+        with_bricks!(self.batch.lattice, map => self.weights_with(map, first, count))
+    }
+
+    fn weights_with(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
+        let mut block = self.place(first, count);
         let m = block.len();
         let (mut alpha, mut raw) = (Buffer::stale(m), Buffer::stale(m));
         let mut found = None;
@@ -109,13 +121,7 @@ impl<T: Real> Scene<'_, T> {
                 *through = left;
             }
         }
-        block.color = Buffer::stale(3 * m);
-        self.colors(&mut block, found.as_ref());
-        self.sum(&block, pixels);
-        if !keep {
-            return Block { first, offsets: block.offsets, density: block.density, ..Block::empty() };
-        }
-        block
+        (block, found)
     }
 
     /// Where the samples lie: lengths and positions.

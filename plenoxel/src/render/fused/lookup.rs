@@ -140,13 +140,13 @@ fn contract<T: Real, const K: usize, const W: usize, const FUSED: bool>(
     out: &mut [[T; 3]],
 ) {
     // Coefficients of some samples in memory, and then their colors: the two need different vectors.
-    const TOGETHER: usize = 16;
-    let mut sums = [[T::zero(); W]; TOGETHER];
+    const SAMPLES: usize = 16;
+    let mut sums = [[T::zero(); W]; SAMPLES];
     let table = table.as_chunks::<W>().0;
     let count = W / 3;
     for (own, basis) in directions.offsets.windows(2).zip(directions.basis.chunks_exact(count)) {
-        for (run, out) in out[own[0] as usize..own[1] as usize].chunks_mut(TOGETHER).enumerate() {
-            let first = own[0] as usize + run * TOGETHER;
+        for (run, out) in out[own[0] as usize..own[1] as usize].chunks_mut(SAMPLES).enumerate() {
+            let first = own[0] as usize + run * SAMPLES;
             for (i, sum) in sums[..out.len()].iter_mut().enumerate() {
                 if seen(first + i) {
                     let (rows, weights) = look(first + i);
