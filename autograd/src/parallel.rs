@@ -42,6 +42,11 @@ pub fn fused() -> bool {
     available && !cfg!(debug_assertions)
 }
 
+/// Threads that work at once. A result must not depend on it.
+pub fn threads() -> usize {
+    rayon::current_num_threads()
+}
+
 /// Elements handed to a thread at a time: large enough to hide the hand-over, small enough to stay in a core's cache.
 pub const CHUNK: usize = 16 * 1024;
 

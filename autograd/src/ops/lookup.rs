@@ -104,7 +104,13 @@ impl<T: Real> Tensor<T> {
 pub fn add_rows<T: Real>(table: &mut [T], width: usize, rows: &[u32], values: &[T]) {
     check_rows("add_rows", rows, table.len() / width.max(1));
     assert_eq!(values.len(), rows.len() * width, "add_rows: {} values for {} rows of {width}", values.len(), rows.len());
-    index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values);
+    match width {
+        _ if parallel::threads() > 8 => index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values),
+        1 => index::add_short_rows::<T, 1>(table, rows, values),
+        3 => index::add_short_rows::<T, 3>(table, rows, values),
+        4 => index::add_short_rows::<T, 4>(table, rows, values),
+        _ => index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values),
+    }
 }
 
 #[track_caller]
