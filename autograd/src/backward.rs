@@ -8,6 +8,7 @@ use crate::gradients::{Grad, Gradients, RowSparse};
 use crate::graph::{self, Node, Rule};
 use crate::index::{self, Indices};
 use crate::op::{Cotangent, GradSink, KernelCall, Vjp};
+use crate::ops::lookup::add_rows;
 use crate::parallel;
 use crate::pool::Buffer;
 use crate::real::Real;
@@ -194,9 +195,7 @@ impl<T: Real> RowPart<T> {
         let table = Arc::<Buffer<T>>::make_mut(&mut dense.data);
         match self {
             RowPart::Merged(rows) => rows.add_to(table),
-            RowPart::Touches { rows, values } => {
-                index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values.data())
-            }
+            RowPart::Touches { rows, values } => add_rows(table, width, &rows, values.data()),
         }
         dense
     }

@@ -4,6 +4,8 @@
 //! sorts its own touches by bucket (counting sort, chunks of a size that does not depend on the threads); a bucket then belongs to one
 //! task, which takes the touches chunk after chunk, that is in the order of the items. No atomics, nothing shared for writing, and the same
 //! bits for any number of threads.
+//!
+//! Where rows are short and threads few, looking through all row numbers for one's own is less work than sorting them: [`add_short_rows`].
 
 use crate::gradients::RowSparse;
 use crate::parallel::{self, dispatched, split_lengths};

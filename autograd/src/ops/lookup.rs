@@ -104,11 +104,12 @@ impl<T: Real> Tensor<T> {
 pub fn add_rows<T: Real>(table: &mut [T], width: usize, rows: &[u32], values: &[T]) {
     check_rows("add_rows", rows, table.len() / width.max(1));
     assert_eq!(values.len(), rows.len() * width, "add_rows: {} values for {} rows of {width}", values.len(), rows.len());
+    // More threads would spend more on looking through the rows than they save.
+    let few = parallel::threads() <= 8;
     match width {
-        _ if parallel::threads() > 8 => index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values),
-        1 => index::add_short_rows::<T, 1>(table, rows, values),
-        3 => index::add_short_rows::<T, 3>(table, rows, values),
-        4 => index::add_short_rows::<T, 4>(table, rows, values),
+        1 if few => index::add_short_rows::<T, 1>(table, rows, values),
+        3 if few => index::add_short_rows::<T, 3>(table, rows, values),
+        4 if few => index::add_short_rows::<T, 4>(table, rows, values),
         _ => index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values),
     }
 }
