@@ -176,8 +176,8 @@ fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl 
 }
 
 dispatched! {
-/// Updates the rows whose bits are set, neighbours together, and clears their sums and bits; `sums` has a row for each row of the tables.
-/// `W` is the width, or 0 for one only known at run time.
+/// Updates the rows whose bits are set and clears their sums and bits; `sums` has a row for each row of the tables. `W` is the width, or 0
+/// for one only known at run time. Neighbours are updated together, but short rows one by one: to look for runs costs more than it saves.
 fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(
     mut x: [&mut [T]; N],
     width: usize,
@@ -188,6 +188,13 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
     let width = if W == 0 { width } else { W };
     for (w, word) in touched.iter_mut().enumerate() {
         let mut left = std::mem::take(word);
+        while (1..=4).contains(&W) && left != 0 {
+            let start = (w * 64 + left.trailing_zeros() as usize) * W;
+            left &= left - 1;
+            let g = &mut sums[start..][..W];
+            update_slices(x.each_mut().map(|x| &mut x[start..][..W]), W, |i| g[i], f);
+            g.fill(T::zero());
+        }
         while left != 0 {
             let bit = left.trailing_zeros();
             let run = (left >> bit).trailing_ones();
