@@ -130,6 +130,32 @@ impl<T: Real> Scene<T> {
 }
 
 #[test]
+fn a_batch_too_large_to_be_kept_is_marched_again_chunk_by_chunk() {
+    // Three chunks, the last one not full.
+    let n = 70_000;
+    let rays: Vec<Ray> = (0..n)
+        .map(|r| {
+            let coordinate = |k: u64| 2.0 * uniform(3, Purpose::Initial, r, k) - 1.0;
+            ray([coordinate(0), coordinate(1), 2.0], [coordinate(2), coordinate(3), -1.0])
+        })
+        .collect();
+    for (interpolation, color) in [(Interpolation::Nearest, Color::Rgb), (Interpolation::Trilinear, Color::Sh { degree: 1, offset: 0.5 })] {
+        let grid = VoxelGrid::<f64>::random(GridShape { resolution: 5, half_width: 1.0, interpolation, color }, 2.0, 1.0, 7);
+        let options = RenderOptions {
+            aabb: grid.aabb(),
+            spacing: Spacing::Step(0.9),
+            jitter: Jitter::PerRay { seed: 1, step: 2 },
+            background: [0.2, 0.5, 0.9],
+            occupancy: None,
+            engine: Engine::Fused,
+            stop_below: 0.0,
+        };
+        let (d, what) = worst(&grid, &rays, &options);
+        assert!(d < 1e-10, "{interpolation:?}, {color:?}: {what} is off by {d:e}");
+    }
+}
+
+#[test]
 fn a_thousand_random_scenes_agree_in_f64() {
     let (mut largest, mut place) = (0.0, String::new());
     for seed in 0..1000 {

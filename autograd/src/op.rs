@@ -191,10 +191,13 @@ impl<T: Real> GradSink<T> {
         self.slots[i] = Some(Cotangent::Dense(Tensor::from_buffer(values, self.shapes[i].slice())));
     }
 
-    /// The cotangent of input `i` as sorted, unique rows, added up now or later.
+    /// The cotangent of input `i` as sorted, unique rows, added up now or later. Rows that are given in several calls are added to those before.
     pub fn rows(&mut self, i: usize, rows: RowSparse<T>) {
         use ndarray::Dimension;
         debug_assert_eq!(rows.shape(), self.shapes[i].slice());
-        self.slots[i] = Some(Cotangent::Merged(rows));
+        self.slots[i] = Some(Cotangent::Merged(match self.slots[i].take() {
+            Some(Cotangent::Merged(before)) => crate::index::add_row_sparse(before, rows),
+            _ => rows,
+        }));
     }
 }

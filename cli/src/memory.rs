@@ -8,6 +8,7 @@ use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::{Color, GridShape};
 use plenoxel::render::Engine;
+use plenoxel::render::fused::CHUNK;
 use plenoxel::train::config::{Config, OptimizerConfig, Sampling};
 
 /// Bytes by what they are for.
@@ -53,14 +54,21 @@ impl Estimate {
         let step = config.stages.iter().map(|stage| {
             let shape = config.grid_shape(stage.resolution);
             let samples = rays * mean_samples(stage.sampling, &shape);
+            // What the fused engine keeps is bounded; it then adds rows up chunk by chunk: those so far, those of a chunk, and their sum.
+            let chunked = config.engine == Engine::Fused && rays > CHUNK as u64;
+            let kept = if chunked { samples / rays * CHUNK as u64 } else { samples };
             let gradient = match whole_grid_losses(config) {
                 // Dense gradients, and the roots that a total variation keeps for them.
                 true => 2 * shape.bytes() as u64,
                 false => 0,
             };
-            // The fused engine adds rows up where the optimizer wants them.
-            let rows = if config.engine == Engine::Graph || whole_grid_losses(config) { touched_rows(&shape, samples) } else { 0 };
-            samples * training_bytes_per_sample(config.engine, &shape) + rows + gradient
+            // Else it adds rows up where the optimizer wants them.
+            let rows = match config.engine == Engine::Graph || whole_grid_losses(config) {
+                _ if chunked => 3 * touched_rows(&shape, samples),
+                true => touched_rows(&shape, samples),
+                false => 0,
+            };
+            kept * training_bytes_per_sample(config.engine, &shape) + rows + gradient
         });
         let step = step.max().unwrap_or(0);
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);

@@ -1,7 +1,8 @@
 //! The pixels of [`composite()`](super::composite()) in one pass over a voxel grid, and its adjoint by hand.
 //!
 //! *Forward.* Rays are taken in blocks of fixed size. For each block: where the samples lie, what density is there, what weight that gives
-//! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept.
+//! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept; of a batch of
+//! more than [`CHUNK`] rays nothing is: its adjoint marches again, a chunk after the other, and so needs no more memory than a chunk does.
 //!
 //! *Adjoint.* Each block computes dL/dσ and dL/dc of its samples, ray by ray from the back, and sorts them by the rows of the tables they
 //! were read from. Nothing is added up yet: the optimizer asks for one range of rows after the other ([`RowSums`](autograd::RowSums)), and
@@ -27,14 +28,17 @@ use super::{RenderOptions, Rendered, composite, composite::Rest};
 use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::field::{Field, sh};
-use crate::sampling::Samples;
+use crate::sampling::{Occupancy, Samples};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Real, RowSparse, Tensor, no_grad, parallel};
-use forward::Block;
+use forward::{Block, Scene};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// Rays that one task renders, and whose gradients it sorts: some ten thousand samples.
 const BLOCK: usize = 256;
+
+/// Rays whose samples are kept, or marched again, at a time: what bounds the memory of a step. A usual batch is an eighth of it.
+pub const CHUNK: usize = 128 * BLOCK;
 
 /// Columns of the kernel's output.
 const COLUMNS: usize = 7;
@@ -63,7 +67,18 @@ struct Batch<T: Real> {
 #[derive(Debug)]
 struct State<T: Real> {
     batch: Batch<T>,
-    blocks: Vec<Block<T>>,
+    kept: Kept<T>,
+}
+
+#[derive(Debug)]
+enum Kept<T: Real> {
+    Samples(Vec<Block<T>>),
+    /// What it takes to find the samples again.
+    Rays {
+        rays: Vec<Ray>,
+        options: RenderOptions<'static>,
+        cells: Option<Occupancy>,
+    },
 }
 
 /// The columns that [`Rendered`] computes when asked.
@@ -87,8 +102,9 @@ impl<T: Real> Columns<T> {
 
     pub(crate) fn sparsity(&self) -> Tensor<T> {
         let n = self.pixels.shape()[0];
-        let values = self.state.blocks.iter().flat_map(Block::sparsity).collect::<Vec<T>>();
         let [density, color] = &self.tables;
+        let mut values = Vec::with_capacity(n);
+        self.state.for_each_chunk([density, color], |blocks| values.extend(blocks.iter().flat_map(Block::sparsity)));
         Tensor::from_kernel(values.into(), &[n], &[density, color], Fused { state: self.state.clone(), output: Output::Sparsity })
     }
 }
@@ -105,9 +121,17 @@ impl<T: Real> Batch<T> {
         Batch { shape: *grid.shape(), lattice: grid.lattice().clone(), background, directions, basis }
     }
 
-    fn scene<'a>(&'a self, grid: &'a VoxelGrid<T>, rays: &'a [Ray], options: &'a RenderOptions<'a>) -> forward::Scene<'a, T> {
+    fn scene<'a>(&'a self, grid: &'a VoxelGrid<T>, rays: &'a [Ray], options: &'a RenderOptions<'a>) -> Scene<'a, T> {
         let tables = [&grid.density, &grid.color].map(|table| table.tensor().data());
-        forward::Scene { batch: self, rays, options, cells: options.occupancy.or(Field::<T>::reach(grid)), tables }
+        Scene { batch: self, rays, options, cells: options.occupancy.or(Field::<T>::reach(grid)), tables }
+    }
+}
+
+impl<T: Real> Scene<'_, T> {
+    /// The blocks of the rays from number `first` on, one ray for each [`COLUMNS`] of `pixels`.
+    fn render_all(&self, first: usize, pixels: &mut [T], keep: bool) -> Vec<Block<T>> {
+        let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
+        parallel::map_items(parts, |b, pixels| self.render(first + b * BLOCK, pixels, keep))
     }
 }
 
@@ -116,13 +140,18 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
     let n = rays.len();
     let batch = Batch::new(grid, rays, options);
     let tables = [grid.density.tensor(), grid.color.tensor()];
-    let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording();
+    let tracked = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording();
     let mut pixels = Buffer::stale(n * COLUMNS);
-    let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
     let scene = batch.scene(grid, rays, options);
-    let blocks = parallel::map_items(parts, |b, pixels| scene.render(b * BLOCK, pixels, keep));
+    let blocks = scene.render_all(0, &mut pixels, tracked && n <= CHUNK);
     let sample_count = blocks.iter().map(Block::len).sum();
-    let state = Arc::new(State { batch, blocks });
+    let kept = if n <= CHUNK {
+        Kept::Samples(blocks)
+    } else {
+        let options = RenderOptions { occupancy: None, ..options.clone() };
+        Kept::Rays { rays: rays.to_vec(), options, cells: scene.cells.cloned() }
+    };
+    let state = Arc::new(State { batch, kept });
     let pixels = Tensor::from_kernel(pixels, &[n, COLUMNS], &tables, Fused { state: state.clone(), output: Output::Pixels });
     Rendered {
         rgb: pixels.narrow(1, 0, 3),
@@ -203,43 +232,57 @@ impl<T: Real> Kernel<T> for Fused<T> {
     }
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
-        let sums = Arc::new(adjoint::Sums::new(&self.state.batch, &self.state.blocks, call.cotangent(), self.output));
-        if call.needs(0) {
-            out.rows(0, RowSparse::deferred(call.input(0).shape(), Arc::new(adjoint::DensitySums(sums.clone()))));
-        }
-        if call.needs(1) {
-            out.rows(1, RowSparse::deferred(call.input(1).shape(), Arc::new(adjoint::ColorSums(sums))));
-        }
+        self.state.for_each_chunk([&call.input(0), &call.input(1)], |blocks| {
+            let sums = Arc::new(adjoint::Sums::new(&self.state.batch, blocks, call.cotangent(), self.output));
+            if call.needs(0) {
+                out.rows(0, RowSparse::deferred(call.input(0).shape(), Arc::new(adjoint::DensitySums(sums.clone()))));
+            }
+            if call.needs(1) {
+                out.rows(1, RowSparse::deferred(call.input(1).shape(), Arc::new(adjoint::ColorSums(sums))));
+            }
+        });
     }
 }
 
 impl<T: Real> State<T> {
+    /// Calls `f` with the samples of one chunk of rays after the other, in the order of the rays.
+    fn for_each_chunk(&self, tables: [&Tensor<T>; 2], mut f: impl FnMut(&[Block<T>])) {
+        match &self.kept {
+            Kept::Samples(blocks) => f(blocks),
+            Kept::Rays { rays, options, cells } => {
+                let scene = Scene { batch: &self.batch, rays, options, cells: cells.as_ref(), tables: tables.map(|table| table.data()) };
+                for first in (0..rays.len()).step_by(CHUNK) {
+                    let mut pixels = Buffer::stale(CHUNK.min(rays.len() - first) * COLUMNS);
+                    f(&scene.render_all(first, &mut pixels, true));
+                }
+            }
+        }
+    }
+
     /// The same pixels as a graph of small ops.
     fn composite(&self, density: &Tensor<T>, color: &Tensor<T>) -> Rendered<T> {
         let batch = &self.batch;
         let mut offsets = vec![0u32];
-        for block in &self.blocks {
-            let base = offsets[offsets.len() - 1];
-            offsets.extend(block.offsets[1..].iter().map(|o| base + o));
-        }
+        let mut columns: [Vec<T>; 5] = Default::default();
+        self.for_each_chunk([density, color], |blocks| {
+            for block in blocks {
+                let base = offsets[offsets.len() - 1];
+                offsets.extend(block.offsets[1..].iter().map(|o| base + o));
+                let [x, y, z] = &block.at;
+                columns.iter_mut().zip([x, y, z, &block.t, &block.delta]).for_each(|(to, from)| to.extend_from_slice(from));
+            }
+        });
         let offsets = Indices::from(offsets);
-        let m: usize = self.blocks.iter().map(Block::len).sum();
-        let joined = |get: fn(&Block<T>) -> &[T]| Tensor::from_vec(self.blocks.iter().flat_map(get).copied().collect(), &[m]);
-        let [x, y, z] = [joined(|b| &b.at[0]), joined(|b| &b.at[1]), joined(|b| &b.at[2])];
+        let m = columns[0].len();
+        let [x, y, z, t, delta] = columns.map(|values| Tensor::from_vec(values, &[m]));
         let voxels = Tensor::stack(&[&x, &y, &z], 1);
         let look_up = |table: &Tensor<T>| match batch.shape.interpolation {
             Interpolation::Nearest => table.nearest(&voxels, &batch.lattice),
             Interpolation::Trilinear => table.trilinear(&voxels, &batch.lattice),
         };
         let radiance = batch.shape.color.activate(&look_up(density), &look_up(color), &batch.directions, &offsets);
-        let samples = Samples {
-            t: joined(|b| &b.t),
-            delta: joined(|b| &b.delta),
-            // The world is not needed any more.
-            positions: voxels,
-            directions: batch.directions.clone(),
-            offsets,
-        };
+        // The world is not needed any more.
+        let samples = Samples { t, delta, positions: voxels, directions: batch.directions.clone(), offsets };
         composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))
     }
 }
