@@ -12,9 +12,9 @@ use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
 
 /// Below this the system allocator is as good.
-const SMALLEST: usize = 64 * 1024;
+const SMALLEST: usize = 4 * 1024;
 /// A free buffer is given back after this many requests went by without it: a few training steps.
-const LIFETIME: u64 = 300;
+const LIFETIME: u64 = 3000;
 
 /// Buffers of one element type that are free at the moment.
 #[derive(Debug)]

@@ -4,6 +4,7 @@ use crate::camera::Ray;
 use crate::dataset::View;
 use crate::random::{Permutation, Purpose};
 use autograd::{Buffer, Real, Tensor, parallel};
+use glam::DVec3;
 
 /// Rays with what the photographs show along them.
 #[derive(Debug, Clone)]
@@ -65,24 +66,18 @@ impl<'a> RaySource<'a> {
         let epochs: Vec<Permutation> = (from / total..=(from + n as u64 - 1) / total)
             .map(|epoch| Permutation::new(total, self.seed, Purpose::RayOrder, epoch))
             .collect();
-        let parts = parallel::map_chunks(n, 1024, |range| {
-            range
-                .map(|i| {
-                    let number = from + i as u64;
-                    self.pixel(epochs[(number / total - from / total) as usize].at(number % total))
-                })
-                .collect::<Vec<_>>()
+        let nowhere = Ray { origin: DVec3::ZERO, direction: DVec3::ZERO, stretch: 0.0 };
+        let (mut rays, mut target, mut alpha) = (vec![nowhere; n], Buffer::stale(3 * n), Buffer::stale(n));
+        const RUN: usize = 512;
+        let runs = rays.chunks_mut(RUN).zip(target.chunks_mut(3 * RUN)).zip(alpha.chunks_mut(RUN)).collect();
+        parallel::for_each_item(runs, |run, ((rays, target), alpha)| {
+            for (i, (ray, target)) in rays.iter_mut().zip(target.as_chunks_mut::<3>().0).enumerate() {
+                let number = from + (run * RUN + i) as u64;
+                let (found, color, a) = self.pixel(epochs[(number / total - from / total) as usize].at(number % total));
+                (*ray, *target, alpha[i]) = (found, color.map(|c| T::lit(f64::from(c))), T::lit(f64::from(a)));
+            }
         });
-        let mut batch = RayBatch { rays: Vec::with_capacity(n), target: Tensor::zeros(&[0]), alpha: Tensor::zeros(&[0]) };
-        let (mut target, mut alpha) = (Buffer::stale(3 * n), Buffer::stale(n));
-        for (i, (ray, color, a)) in parts.into_iter().flatten().enumerate() {
-            batch.rays.push(ray);
-            (0..3).for_each(|c| target[3 * i + c] = T::lit(f64::from(color[c])));
-            alpha[i] = T::lit(f64::from(a));
-        }
-        batch.target = Tensor::from_buffer(target, &[n, 3]);
-        batch.alpha = Tensor::from_buffer(alpha, &[n]);
-        batch
+        RayBatch { rays, target: Tensor::from_buffer(target, &[n, 3]), alpha: Tensor::from_buffer(alpha, &[n]) }
     }
 
     /// All rays of the set, view after view and row after row, `size` at a time.

@@ -111,8 +111,9 @@ impl<T: Real> Gradients<T> {
                 Records { at: At::Rows(rows), ..records }
             }
             Interpolation::Trilinear => {
-                let mut touched = vec![[NONE; 8]; block.len()];
-                let most = block.len() + touch_buckets(block.at.each_ref().map(|a| &a[..]), map, &mut touched);
+                let mut touched = Buffer::stale(8 * block.len());
+                let touched = touched.as_chunks_mut().0;
+                let most = block.len() + touch_buckets(block.at.each_ref().map(|a| &a[..]), map, touched);
                 let mut at = [Buffer::stale(most), Buffer::stale(most), Buffer::stale(most)];
                 let records = self.records(
                     batch,
@@ -192,6 +193,7 @@ fn touch_buckets<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, touched: &mut [[u32
     for i in 0..n {
         let (rows, _) = corners([x[i], y[i], z[i]], map);
         let all = rows.map(|row| row >> BUCKET_SHIFT);
+        touched[i] = [NONE; 8];
         touched[i][0] = all[0];
         if all != [all[0]; 8] {
             let mut found = 1;
