@@ -23,6 +23,7 @@ macro_rules! with_bricks {
 mod adjoint;
 mod forward;
 mod lookup;
+mod sorted;
 
 use super::{RenderOptions, Rendered, composite, composite::Rest};
 use crate::camera::Ray;
@@ -39,6 +40,9 @@ const BLOCK: usize = 256;
 
 /// Rays whose samples are kept, or marched again, at a time: what bounds the memory of a step. A usual batch is an eighth of it.
 pub const CHUNK: usize = 128 * BLOCK;
+
+/// A bucket is this power of two of rows: 64 bricks, a cube of 16³ voxels where all of them are present.
+const BUCKET_SHIFT: u32 = 12;
 
 /// Columns of the kernel's output.
 const COLUMNS: usize = 7;
@@ -130,6 +134,9 @@ impl<T: Real> Batch<T> {
 impl<T: Real> Scene<'_, T> {
     /// The blocks of the rays from number `first` on, one ray for each [`COLUMNS`] of `pixels`.
     fn render_all(&self, first: usize, pixels: &mut [T], keep: bool) -> Vec<Block<T>> {
+        if keep && self.worth_sorting() {
+            return self.render_sorted(first, pixels, BLOCK);
+        }
         let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
         parallel::map_items(parts, |b, pixels| self.render(first + b * BLOCK, pixels, keep))
     }

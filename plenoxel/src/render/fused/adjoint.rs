@@ -7,15 +7,12 @@
 //! Gᵢ = cᵢ · ∂L/∂rgb + tᵢ ∂L/∂depth + ∂L/∂distortion · (2 Σⱼ wⱼ |tᵢ − tⱼ| + ⅔ wᵢ δᵢ),   G_b = background · ∂L/∂rgb − ∂L/∂opacity.
 
 use super::forward::Block;
-use super::{Batch, COLUMNS, Output, column};
+use super::{BUCKET_SHIFT, Batch, COLUMNS, Output, column};
 use crate::field::voxel_grid::{Color, Interpolation};
 use autograd::lattice::NodeMap;
 use autograd::ops::trilinear::corners;
 use autograd::{Buffer, Lattice, Real, RowSums, Tensor, dispatched, parallel};
 use std::sync::Arc;
-
-/// A bucket is this power of two of rows: 64 bricks, a cube of 16³ voxels where all of them are present.
-const BUCKET_SHIFT: u32 = 12;
 
 /// What every sample of a batch adds to the tables, sorted by bucket within each block.
 #[derive(Debug)]

@@ -42,6 +42,13 @@ impl<T: Real> Block<T> {
         self.offsets.windows(2).map(|o| o[0] as usize..o[1] as usize)
     }
 
+    /// True for a sample that could be seen if it were dense.
+    #[inline(always)]
+    pub fn seen(&self) -> impl Fn(usize) -> bool {
+        let (density, after, weight) = (&self.density[..], &self.after[..], &self.weight[..]);
+        |i| density[i] >= T::zero() && (after[i] > T::zero() || weight[i] > T::zero())
+    }
+
     /// Σ ln(1 + 2σᵢ²) of each ray.
     pub fn sparsity(&self) -> impl Iterator<Item = T> + '_ {
         self.rays().map(|own| {
@@ -155,7 +162,7 @@ impl<T: Real> Scene<'_, T> {
     fn colors(&self, block: &mut Block<T>, found: Option<&Corners<T>>) {
         let mut color = std::mem::replace(&mut block.color, Buffer::stale(0));
         let out = color.as_chunks_mut::<3>().0;
-        let seen = |i: usize| block.density[i] >= T::zero() && (block.after[i] > T::zero() || block.weight[i] > T::zero());
+        let seen = block.seen();
         let nearest = |i: usize| ([block.rows[i]], [T::one()]);
         let shape = &self.batch.shape;
         match (shape.color, found) {
@@ -163,15 +170,10 @@ impl<T: Real> Scene<'_, T> {
             (Color::Rgb, Some(corners)) => lookup::plain(self.tables[1], |i| corners.of(i), seen, out),
             (Color::Sh { offset, .. }, _) => {
                 let count = shape.color.channels() / 3;
-                let directions = Directions {
-                    offsets: &block.offsets,
-                    basis: &self.batch.basis.data()[block.first * count..],
-                    count,
-                    offset: T::lit(offset),
-                };
+                let directions = Directions { basis: &self.batch.basis.data()[block.first * count..], count, offset: T::lit(offset) };
                 match found {
-                    None => lookup::harmonics(self.tables[1], directions, nearest, seen, out),
-                    Some(corners) => lookup::harmonics(self.tables[1], directions, |i| corners.of(i), seen, out),
+                    None => lookup::harmonics(self.tables[1], &block.offsets, directions, nearest, seen, out),
+                    Some(corners) => lookup::harmonics(self.tables[1], &block.offsets, directions, |i| corners.of(i), seen, out),
                 }
             }
         }
@@ -179,7 +181,7 @@ impl<T: Real> Scene<'_, T> {
     }
 
     /// Pixels from weights and colors.
-    fn sum(&self, block: &Block<T>, pixels: &mut [T]) {
+    pub fn sum(&self, block: &Block<T>, pixels: &mut [T]) {
         let background = self.batch.background;
         let (rgb, _) = block.color.as_chunks::<3>();
         let clamped = self.batch.shape.color != Color::Rgb;

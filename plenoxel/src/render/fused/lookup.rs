@@ -34,6 +34,12 @@ impl<T: Real> Corners<T> {
         corners
     }
 
+    /// The row of a sample's corner with the lowest coordinates.
+    #[inline(always)]
+    pub fn lowest(&self, i: usize) -> u32 {
+        self.rows[i / TOGETHER * 8 * TOGETHER + i % TOGETHER]
+    }
+
     /// Rows and weights of a sample.
     #[inline(always)]
     pub fn of(&self, i: usize) -> ([u32; 8], [T; 8]) {
@@ -92,84 +98,144 @@ pub(super) fn plain<T: Real, const K: usize>(
 /// What harmonics need to become colors.
 #[derive(Clone, Copy)]
 pub(super) struct Directions<'a, T> {
-    /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
-    pub offsets: &'a [u32],
-    /// `count` numbers for each ray of the block.
+    /// `count` numbers for each ray.
     pub basis: &'a [T],
     pub count: usize,
     /// The color of zero coefficients.
     pub offset: T,
 }
 
-/// offset + Σₖ Yₖ Σⱼ wⱼ rowⱼₖ in red, green and blue, for the samples that are seen, zeros for the others.
-pub(super) fn harmonics<T: Real, const K: usize>(
-    table: &[T],
-    directions: Directions<'_, T>,
-    look: impl Fn(usize) -> ([u32; K], [T; K]),
-    seen: impl Fn(usize) -> bool,
-    out: &mut [[T; 3]],
-) {
-    match parallel::fused() {
-        true => of_degree::<T, K, true>(table, directions, look, seen, out),
-        false => of_degree::<T, K, false>(table, directions, look, seen, out),
-    }
+/// Runs an expression with the width of the table and the number of harmonics, and with whether to multiply and add in one rounding.
+macro_rules! with_degree {
+    ($count:expr, $w:ident, $n:ident, $fused:ident => $body:expr) => {{
+        macro_rules! run {
+            ($width:literal, $harmonics:literal) => {{
+                const $w: usize = $width;
+                const $n: usize = $harmonics;
+                if parallel::fused() {
+                    const $fused: bool = true;
+                    $body
+                } else {
+                    const $fused: bool = false;
+                    $body
+                }
+            }};
+        }
+        match $count {
+            1 => run!(3, 1),
+            4 => run!(12, 4),
+            9 => run!(27, 9),
+            _ => run!(48, 16),
+        }
+    }};
 }
 
-fn of_degree<T: Real, const K: usize, const FUSED: bool>(
+/// offset + Σₖ Yₖ Σⱼ wⱼ rowⱼₖ in red, green and blue, for the samples that are seen, zeros for the others. Ray r of `directions` owns the
+/// samples `offsets[r]..offsets[r + 1]`.
+pub(super) fn harmonics<T: Real, const K: usize>(
     table: &[T],
+    offsets: &[u32],
     directions: Directions<'_, T>,
     look: impl Fn(usize) -> ([u32; K], [T; K]),
     seen: impl Fn(usize) -> bool,
     out: &mut [[T; 3]],
 ) {
-    match directions.count {
-        1 => contract::<T, K, 3, FUSED>(table, directions, look, seen, out),
-        4 => contract::<T, K, 12, FUSED>(table, directions, look, seen, out),
-        9 => contract::<T, K, 27, FUSED>(table, directions, look, seen, out),
-        _ => contract::<T, K, 48, FUSED>(table, directions, look, seen, out),
-    }
+    with_degree!(directions.count, W, N, FUSED => of_rays::<T, K, W, N, FUSED>(table, offsets, directions, look, seen, out));
+}
+
+/// The same for a list of samples with trilinear look-up, `rays` being theirs; `out` has one color for each.
+pub(super) fn harmonics_of<T: Real>(
+    table: &[T],
+    at: [&[T]; 3],
+    map: impl NodeMap,
+    samples: &[u32],
+    rays: &[u32],
+    directions: Directions<'_, T>,
+    out: &mut [[T; 3]],
+) {
+    with_degree!(directions.count, W, N, FUSED => of_samples::<T, _, W, N, FUSED>(table, at, map, samples, rays, directions, out));
 }
 
 dispatched! {
-/// `W` is the width of the table.
-fn contract<T: Real, const K: usize, const W: usize, const FUSED: bool>(
+/// `W` is the width of the table, `N` the number of harmonics.
+fn of_rays<T: Real, const K: usize, const W: usize, const N: usize, const FUSED: bool>(
     table: &[T],
+    offsets: &[u32],
     directions: Directions<'_, T>,
     look: impl Fn(usize) -> ([u32; K], [T; K]),
     seen: impl Fn(usize) -> bool,
     out: &mut [[T; 3]],
 ) {
     // Coefficients of some samples in memory, and then their colors: the two need different vectors.
-    const SAMPLES: usize = 16;
-    let mut sums = [[T::zero(); W]; SAMPLES];
+    let mut sums = [[T::zero(); W]; TOGETHER];
     let table = table.as_chunks::<W>().0;
-    let count = W / 3;
-    for (own, basis) in directions.offsets.windows(2).zip(directions.basis.chunks_exact(count)) {
-        for (run, out) in out[own[0] as usize..own[1] as usize].chunks_mut(SAMPLES).enumerate() {
-            let first = own[0] as usize + run * SAMPLES;
+    for (own, basis) in offsets.windows(2).zip(directions.basis.as_chunks::<N>().0) {
+        for (run, out) in out[own[0] as usize..own[1] as usize].chunks_mut(TOGETHER).enumerate() {
+            let first = own[0] as usize + run * TOGETHER;
             for (i, sum) in sums[..out.len()].iter_mut().enumerate() {
                 if seen(first + i) {
                     let (rows, weights) = look(first + i);
-                    let rows = rows.map(|row| &table[row as usize]);
-                    if W >= 16 {
-                        weigh::<T, K, W, 16, FUSED>(rows, weights, sum);
-                    } else {
-                        weigh::<T, K, W, 3, FUSED>(rows, weights, sum);
-                    }
+                    weigh_all::<T, K, W, FUSED>(rows.map(|row| &table[row as usize]), weights, sum);
                 }
             }
             for (i, (out, sum)) in out.iter_mut().zip(&sums).enumerate() {
-                for (c, out) in out.iter_mut().enumerate() {
-                    let mut color = directions.offset;
-                    for k in 0..count {
-                        color = sum[c * count + k].multiply_add::<FUSED>(basis[k], color);
-                    }
-                    *out = if seen(first + i) { color } else { T::zero() };
-                }
+                *out = if seen(first + i) { color::<T, W, N, FUSED>(sum, basis, directions.offset) } else { [T::zero(); 3] };
             }
         }
     }
 }
+}
+
+dispatched! {
+fn of_samples<T: Real, M: NodeMap, const W: usize, const N: usize, const FUSED: bool>(
+    table: &[T],
+    at: [&[T]; 3],
+    map: M,
+    samples: &[u32],
+    rays: &[u32],
+    directions: Directions<'_, T>,
+    out: &mut [[T; 3]],
+) {
+    let mut sums = [[T::zero(); W]; TOGETHER];
+    let mut places = [[T::zero(); TOGETHER]; 3];
+    let (mut rows, mut weights) = ([[[0; TOGETHER]; 8]], [[[T::zero(); TOGETHER]; 8]]);
+    let (table, basis) = (table.as_chunks::<W>().0, directions.basis.as_chunks::<N>().0);
+    for ((samples, rays), out) in samples.chunks(TOGETHER).zip(rays.chunks(TOGETHER)).zip(out.chunks_mut(TOGETHER)) {
+        for (places, at) in places.iter_mut().zip(at) {
+            places.iter_mut().zip(samples).for_each(|(place, &sample)| *place = at[sample as usize]);
+        }
+        corners_of_many(places.each_ref().map(|p| &p[..]), map, &mut rows, &mut weights);
+        for (i, sum) in sums[..samples.len()].iter_mut().enumerate() {
+            let own = std::array::from_fn::<_, 8, _>(|c| &table[rows[0][c][i] as usize]);
+            weigh_all::<T, 8, W, FUSED>(own, std::array::from_fn(|c| weights[0][c][i]), sum);
+        }
+        for ((out, sum), &ray) in out.iter_mut().zip(&sums).zip(rays) {
+            *out = color::<T, W, N, FUSED>(sum, &basis[ray as usize], directions.offset);
+        }
+    }
+}
+}
+
+/// offset + Σₖ basisₖ coefficientₖ in red, green and blue.
+#[inline(always)]
+fn color<T: Real, const W: usize, const N: usize, const FUSED: bool>(coefficients: &[T; W], basis: &[T; N], offset: T) -> [T; 3] {
+    std::array::from_fn(|c| {
+        let mut color = offset;
+        for k in 0..N {
+            color = coefficients[c * N + k].multiply_add::<FUSED>(basis[k], color);
+        }
+        color
+    })
+}
+
+/// Σ weightₖ rowₖ, in whole vectors where a row has one.
+#[inline(always)]
+fn weigh_all<T: Real, const K: usize, const W: usize, const FUSED: bool>(rows: [&[T; W]; K], weights: [T; K], sum: &mut [T; W]) {
+    if W >= 16 {
+        weigh::<T, K, W, 16, FUSED>(rows, weights, sum);
+    } else {
+        weigh::<T, K, W, 3, FUSED>(rows, weights, sum);
+    }
 }
 
 /// Σ weightₖ rowₖ, `L` columns at a time; the last ones overlap those before, so that all are whole vectors.

@@ -1,0 +1,112 @@
+//! The colors of a batch, read in the order of the table's rows.
+//!
+//! The rays of a training batch have nothing to do with each other: taken ray by ray, nearly every sample waits for its rows to come from
+//! memory. Sorted by the buckets that they lie in, samples of other rays find the rows of a bucket in the cache.
+
+use super::forward::{Block, Scene};
+use super::lookup::{self, Corners, Directions};
+use super::{BUCKET_SHIFT, COLUMNS};
+use crate::field::voxel_grid::{Color, Interpolation};
+use autograd::{Buffer, Real, parallel};
+use std::ops::Range;
+
+/// Tasks, each with a range of buckets: some for every thread, so that a dense corner of the scene holds up no one.
+const TASKS: usize = 64;
+
+/// The samples of a block that need a color, by the bucket of their lowest corner.
+struct Order {
+    /// Where each bucket begins; one more at the end.
+    starts: Vec<u32>,
+    samples: Buffer<u32>,
+    /// Number of the ray of each of them.
+    rays: Buffer<u32>,
+}
+
+impl Order {
+    fn new<T: Real>(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
+        let seen = block.seen();
+        let bucket = |i: usize| (corners.lowest(i) >> BUCKET_SHIFT) as usize;
+        let mut starts = vec![0u32; buckets + 1];
+        (0..block.len()).filter(|&i| seen(i)).for_each(|i| starts[bucket(i) + 1] += 1);
+        for b in 0..buckets {
+            starts[b + 1] += starts[b];
+        }
+        let mut next = starts.clone();
+        let count = starts[buckets] as usize;
+        let (mut samples, mut rays) = (Buffer::stale(count), Buffer::stale(count));
+        for (r, own) in block.rays().enumerate() {
+            for i in own.filter(|&i| seen(i)) {
+                let next = &mut next[bucket(i)];
+                (samples[*next as usize], rays[*next as usize]) = (i as u32, (block.first + r) as u32);
+                *next += 1;
+            }
+        }
+        Order { starts, samples, rays }
+    }
+
+    fn range(&self, buckets: Range<usize>) -> Range<usize> {
+        self.starts[buckets.start] as usize..self.starts[buckets.end] as usize
+    }
+}
+
+impl<T: Real> Scene<'_, T> {
+    /// True if the colors of a training batch are worth sorting: rows of several cache lines, eight for each sample.
+    pub fn worth_sorting(&self) -> bool {
+        self.batch.shape.interpolation == Interpolation::Trilinear && matches!(self.batch.shape.color, Color::Sh { degree: 1.., .. })
+    }
+
+    /// Renders all rays, one for each [`COLUMNS`] of `pixels`, `block` at a time, and keeps their samples.
+    pub fn render_sorted(&self, first: usize, pixels: &mut [T], block: usize) -> Vec<Block<T>> {
+        let buckets = self.batch.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
+        let count = pixels.len() / COLUMNS;
+        let (blocks, orders): (Vec<_>, Vec<_>) = parallel::map_chunks(count, block, |range| {
+            let (block, corners) = self.weights(first + range.start, range.len());
+            let corners = corners.expect("trilinear look-up has corners");
+            let order = Order::new(&block, &corners, buckets);
+            (block, order)
+        })
+        .into_iter()
+        .unzip();
+        let colors = self.colors_in_order(&blocks, &orders, buckets);
+        let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(block * COLUMNS)).collect();
+        parallel::map_items(parts, |_, (((mut block, order), sorted), pixels)| {
+            block.color = Buffer::zeros(3 * block.len());
+            let color = block.color.as_chunks_mut::<3>().0;
+            order.samples.iter().zip(sorted.as_chunks::<3>().0).for_each(|(&i, &sorted)| color[i as usize] = sorted);
+            self.sum(&block, pixels);
+            block
+        })
+    }
+
+    /// The colors of the samples of each order.
+    fn colors_in_order(&self, blocks: &[Block<T>], orders: &[Order], buckets: usize) -> Vec<Buffer<T>> {
+        let Color::Sh { offset, .. } = self.batch.shape.color else { unreachable!("worth sorting") };
+        let directions = Directions { basis: self.batch.basis.data(), count: self.batch.shape.color.channels() / 3, offset: T::lit(offset) };
+        let per_task = buckets.div_ceil(TASKS).max(1);
+        let of_task = |task: usize| task * per_task..((task + 1) * per_task).min(buckets);
+        let mut colors: Vec<Buffer<T>> = orders.iter().map(|order| Buffer::stale(3 * order.samples.len())).collect();
+        let mut tasks: Vec<Vec<&mut [T]>> = (0..buckets.div_ceil(per_task)).map(|_| Vec::with_capacity(blocks.len())).collect();
+        for (order, colors) in orders.iter().zip(&mut colors) {
+            let lengths = (0..tasks.len()).map(|task| 3 * order.range(of_task(task)).len());
+            tasks.iter_mut().zip(parallel::split_lengths(colors, lengths)).for_each(|(task, part)| task.push(part));
+        }
+        parallel::for_each_item(tasks, |task, mut parts| {
+            for bucket in of_task(task) {
+                for ((block, order), part) in blocks.iter().zip(orders).zip(&mut parts) {
+                    let range = order.range(bucket..bucket + 1);
+                    if range.is_empty() {
+                        continue;
+                    }
+                    let (out, rest) = std::mem::take(part).split_at_mut(3 * range.len());
+                    *part = rest;
+                    let at = block.at.each_ref().map(|a| &a[..]);
+                    let (samples, rays) = (&order.samples[range.clone()], &order.rays[range]);
+                    with_bricks!(self.batch.lattice, map => {
+                        lookup::harmonics_of(self.tables[1], at, map, samples, rays, directions, out.as_chunks_mut().0);
+                    });
+                }
+            }
+        });
+        colors
+    }
+}
