@@ -5,7 +5,7 @@
 
 mod support;
 
-use autograd::{Lattice, Real, Tensor};
+use autograd::{Lattice, Real, Tensor, no_grad};
 use plenoxel::camera::Ray;
 use plenoxel::field::sh;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -126,6 +126,38 @@ impl<T: Real> Scene<T> {
             engine: Engine::Fused,
             stop_below: 0.0,
         }
+    }
+}
+
+#[test]
+fn a_picture_shows_what_a_training_batch_shows() {
+    // Training reads the colors of harmonics in the order of the table, pictures ray by ray.
+    for degree in 0..=sh::MAX_DEGREE {
+        let shape = GridShape {
+            resolution: 40,
+            half_width: 1.0,
+            interpolation: Interpolation::Trilinear,
+            color: Color::Sh { degree, offset: 0.5 },
+        };
+        let grid = VoxelGrid::<f32>::random(shape, 2.0, 0.3, 7);
+        let rays: Vec<Ray> = (0..600)
+            .map(|r| {
+                let coordinate = |k: u64| 2.0 * uniform(4, Purpose::Initial, r, k) - 1.0;
+                ray([3.0 * coordinate(0), 3.0 * coordinate(1), 3.0], [coordinate(2), coordinate(3), coordinate(4)])
+            })
+            .collect();
+        let options = RenderOptions {
+            aabb: grid.aabb(),
+            spacing: Spacing::Step(0.03),
+            jitter: Jitter::None,
+            background: [1.0; 3],
+            occupancy: None,
+            engine: Engine::Fused,
+            stop_below: 0.0,
+        };
+        let (training, picture) = (render(&grid, &rays, &options), no_grad(|| render(&grid, &rays, &options)));
+        assert!(training.rgb.is_tracked() && !picture.rgb.is_tracked());
+        assert_eq!(training.rgb.data(), picture.rgb.data(), "degree {degree}");
     }
 }
 

@@ -77,12 +77,15 @@ struct State<T: Real> {
 #[derive(Debug)]
 enum Kept<T: Real> {
     Samples(Vec<Block<T>>),
-    /// What it takes to find the samples again.
-    Rays {
-        rays: Vec<Ray>,
-        options: RenderOptions<'static>,
-        cells: Option<Occupancy>,
-    },
+    Rays(Box<Rays>),
+}
+
+/// What it takes to find the samples again.
+#[derive(Debug)]
+struct Rays {
+    rays: Vec<Ray>,
+    options: RenderOptions<'static>,
+    cells: Option<Occupancy>,
 }
 
 /// The columns that [`Rendered`] computes when asked.
@@ -156,7 +159,7 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
         Kept::Samples(blocks)
     } else {
         let options = RenderOptions { occupancy: None, ..options.clone() };
-        Kept::Rays { rays: rays.to_vec(), options, cells: scene.cells.cloned() }
+        Kept::Rays(Box::new(Rays { rays: rays.to_vec(), options, cells: scene.cells.cloned() }))
     };
     let state = Arc::new(State { batch, kept });
     let pixels = Tensor::from_kernel(pixels, &[n, COLUMNS], &tables, Fused { state: state.clone(), output: Output::Pixels });
@@ -256,7 +259,8 @@ impl<T: Real> State<T> {
     fn for_each_chunk(&self, tables: [&Tensor<T>; 2], mut f: impl FnMut(&[Block<T>])) {
         match &self.kept {
             Kept::Samples(blocks) => f(blocks),
-            Kept::Rays { rays, options, cells } => {
+            Kept::Rays(again) => {
+                let Rays { rays, options, cells } = &**again;
                 let scene = Scene { batch: &self.batch, rays, options, cells: cells.as_ref(), tables: tables.map(|table| table.data()) };
                 for first in (0..rays.len()).step_by(CHUNK) {
                     let mut pixels = Buffer::stale(CHUNK.min(rays.len() - first) * COLUMNS);
