@@ -84,18 +84,22 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
     short.stages = vec![stage(24, 3), stage(40, 3)];
     short.losses.insert("tv_density_sampled".to_owned(), Weight::Constant(1e-3));
     short.losses.insert("tv_color".to_owned(), Weight::Exponential { from: 1e-3, to: 1e-4, steps: 16 });
-    let bits = |threads: usize, seed: u64| {
-        let config = Config { seed, ..short.clone() };
+    // And many small steps: a difference would grow.
+    let long = Config { stages: vec![stage(8, 60), stage(16, 140)], ..config() };
+    let bits = |config: &Config, threads: usize, seed: u64| {
+        let config = Config { seed, ..config.clone() };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         let (grid, reports) = pool.install(|| run(config, &train));
         let tables = [&grid.density, &grid.color].map(|p| p.tensor().data().iter().map(|x| x.to_bits()).collect::<Vec<_>>());
         (tables, reports)
     };
-    let one = bits(1, 42);
-    for threads in [2, 3, 8] {
-        assert!(bits(threads, 42) == one, "{threads} threads differ from one");
+    for config in [&short, &long] {
+        let one = bits(config, 1, 42);
+        for threads in [2, 3, 8] {
+            assert!(bits(config, threads, 42) == one, "{threads} threads differ from one");
+        }
+        assert!(bits(config, 2, 43) != one, "another seed is another run");
     }
-    assert!(bits(2, 43) != one, "another seed is another run");
 }
 
 #[test]

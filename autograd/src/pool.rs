@@ -14,7 +14,7 @@ use std::sync::Mutex;
 /// Below this the system allocator is as good.
 const SMALLEST: usize = 4 * 1024;
 /// A free buffer is given back after this many requests went by without it: a few training steps.
-const LIFETIME: u64 = 3000;
+const LIFETIME: u64 = 1000;
 
 /// Buffers of one element type that are free at the moment.
 #[derive(Debug)]

@@ -13,6 +13,9 @@ use std::ops::Range;
 /// Tasks, each with a range of buckets: some for every thread, so that a dense corner of the scene holds up no one.
 const TASKS: usize = 64;
 
+/// Bytes of a color table from which sorting pays: a smaller one stays in the caches as it is. Builds that the tests run in sort sooner.
+const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
+
 /// The samples of a block that need a color, by the bucket of their lowest corner.
 struct Order {
     /// Where each bucket begins; one more at the end.
@@ -50,9 +53,10 @@ impl Order {
 }
 
 impl<T: Real> Scene<'_, T> {
-    /// True if the colors of a training batch are worth sorting: rows of several cache lines, eight for each sample.
+    /// True if the colors of a training batch are worth sorting: eight rows of harmonics for each sample, from a table beyond the caches.
     pub fn worth_sorting(&self) -> bool {
-        self.batch.shape.interpolation == Interpolation::Trilinear && matches!(self.batch.shape.color, Color::Sh { degree: 1.., .. })
+        let harmonics = matches!(self.batch.shape.color, Color::Sh { .. });
+        harmonics && self.batch.shape.interpolation == Interpolation::Trilinear && size_of_val(self.tables[1]) >= LARGE
     }
 
     /// Renders all rays, one for each [`COLUMNS`] of `pixels`, `block` at a time, and keeps their samples.
