@@ -1,4 +1,4 @@
-//! Once its first steps are over, training takes its arrays from the pool, not from the system.
+//! Once its first steps are over, training takes its arrays from the pool and next to nothing from the system.
 
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
@@ -8,8 +8,8 @@ use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Sampling, Stag
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// Bytes from which an allocation counts as large. Below are nodes of the graph, lists of chunks, what rayon needs.
-const LARGE: usize = 64 * 1024;
+/// Bytes from which an allocation counts as large. Below are nodes of the graph, lists of chunks and of marches, what rayon needs.
+const LARGE: usize = 16 * 1024;
 
 static LARGE_ONES: AtomicUsize = AtomicUsize::new(0);
 static ALL: AtomicUsize = AtomicUsize::new(0);
@@ -33,7 +33,7 @@ unsafe impl GlobalAlloc for Counting {
 static ALLOCATOR: Counting = Counting;
 
 #[test]
-fn a_step_in_the_steady_state_takes_no_array_from_the_system() {
+fn a_step_in_the_steady_state_takes_hardly_any_memory_from_the_system() {
     const STEPS: usize = 20;
     let scene = Dataset::procedural(ProceduralOptions { width: 32, height: 32, train: 20, val: 0, test: 3, supersample: 2 })
         .expect("the built-in scene");
@@ -57,10 +57,10 @@ fn a_step_in_the_steady_state_takes_no_array_from_the_system() {
         steps();
         let [all, large] = [&ALL, &LARGE_ONES].map(|n| n.load(Relaxed));
         let (all, large) = ((all - before[0]) as f64 / STEPS as f64, (large - before[1]) as f64 / STEPS as f64);
-        // One is the list of the batch's rays; now and then a batch has more samples than any before. It was 5 and 21 while the lists of
-        // rays and of touched buckets were made anew.
+        // One is the list of the batch's rays; now and then a batch has more samples than any before. With a pool for larger ones only, from
+        // 64 KiB on, and lists made anew it was 144 and 118.
         println!("{interpolation:?}: {all} allocations a step, {large} of at least {LARGE} bytes");
-        assert!(large <= 2.0, "{interpolation:?}: {large} large allocations a step");
+        assert!(large <= 3.0, "{interpolation:?}: {large} large allocations a step");
         assert!(all < 1500.0, "{interpolation:?}: {all} allocations a step");
     }
 }

@@ -93,9 +93,11 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
         let tables = [&grid.density, &grid.color].map(|p| p.tensor().data().iter().map(|x| x.to_bits()).collect::<Vec<_>>());
         (tables, reports)
     };
-    for config in [&short, &long] {
+    // And steps of more rays than are kept at a time.
+    let large = Config { rays_per_step: 40_000, color: ColorKind::Sh, sh_degree: 1, stages: vec![stage(24, 2)], ..config() };
+    for (config, threads) in [(&short, &[2, 3, 8][..]), (&long, &[2, 3, 8]), (&large, &[3])] {
         let one = bits(config, 1, 42);
-        for threads in [2, 3, 8] {
+        for &threads in threads {
             assert!(bits(config, threads, 42) == one, "{threads} threads differ from one");
         }
         assert!(bits(config, 2, 43) != one, "another seed is another run");

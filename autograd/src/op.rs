@@ -184,20 +184,25 @@ pub struct GradSink<T: Real> {
 }
 
 impl<T: Real> GradSink<T> {
-    /// The cotangent of input `i`, in row-major order of its shape.
+    /// The cotangent of input `i`, in row-major order of its shape: given once.
     #[track_caller]
     pub fn dense(&mut self, i: usize, values: Buffer<T>) {
         use ndarray::Dimension;
+        assert!(self.slots[i].is_none(), "a dense cotangent for input {i}, which has one already");
         self.slots[i] = Some(Cotangent::Dense(Tensor::from_buffer(values, self.shapes[i].slice())));
     }
 
     /// The cotangent of input `i` as sorted, unique rows, added up now or later. Rows that are given in several calls are added to those before.
+    ///
+    /// Panics if the input has a dense cotangent already.
+    #[track_caller]
     pub fn rows(&mut self, i: usize, rows: RowSparse<T>) {
         use ndarray::Dimension;
         debug_assert_eq!(rows.shape(), self.shapes[i].slice());
         self.slots[i] = Some(Cotangent::Merged(match self.slots[i].take() {
             Some(Cotangent::Merged(before)) => crate::index::add_row_sparse(before, rows),
-            _ => rows,
+            None => rows,
+            Some(_) => panic!("rows for input {i}, which has a dense cotangent already"),
         }));
     }
 }

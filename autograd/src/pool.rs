@@ -1,4 +1,4 @@
-//! Large buffers, kept and handed out again.
+//! Buffers of some kilobytes and more, kept and handed out again.
 //!
 //! A training step allocates the same few dozen arrays every time. Taking them fresh from the system costs a page fault for every 4 KiB,
 //! which is more than most ops compute; so a dropped [`Buffer`] goes to a pool and the next one of about its size comes from there.
@@ -13,7 +13,7 @@ use std::sync::Mutex;
 
 /// Below this the system allocator is as good.
 const SMALLEST: usize = 4 * 1024;
-/// A free buffer is given back after this many requests went by without it: a few training steps.
+/// A free buffer is given back after this many requests went by without it: some training steps of usual size.
 const LIFETIME: u64 = 1000;
 
 /// Buffers of one element type that are free at the moment.
@@ -141,7 +141,7 @@ pub fn release_free_buffers() {
     clear::<u64>();
 }
 
-/// The smallest free buffer that holds `len` elements and wastes at most a quarter.
+/// The smallest free buffer that holds `len` elements and wastes at most a quarter and 4 KiB.
 fn take<E: Pooled>(len: usize) -> Option<Vec<E>> {
     if len * size_of::<E>() < SMALLEST {
         return None;
@@ -154,7 +154,7 @@ fn take<E: Pooled>(len: usize) -> Option<Vec<E>> {
         .free
         .iter()
         .enumerate()
-        .filter(|(_, (_, v))| v.capacity() >= len && v.capacity() - len <= len / 4 + 1024)
+        .filter(|(_, (_, v))| v.capacity() >= len && v.capacity() - len <= len / 4 + SMALLEST / size_of::<E>())
         .min_by_key(|(_, (_, v))| v.capacity())
         .map(|(i, _)| i);
     let found = best.map(|i| pool.free.swap_remove(i).1);

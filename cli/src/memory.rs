@@ -68,7 +68,9 @@ impl Estimate {
                 true => touched_rows(&shape, samples),
                 false => 0,
             };
-            kept * training_bytes_per_sample(config.engine, &shape) + rows + gradient
+            // Origins, directions, targets and pixels, some of them twice.
+            let batch = rays * 200;
+            kept * training_bytes_per_sample(config.engine, &shape) + batch + rows + gradient
         });
         let step = step.max().unwrap_or(0);
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);

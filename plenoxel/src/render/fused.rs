@@ -1,13 +1,15 @@
 //! The pixels of [`composite()`](super::composite()) in one pass over a voxel grid, and its adjoint by hand.
 //!
 //! *Forward.* Rays are taken in blocks of fixed size. For each block: where the samples lie, what density is there, what weight that gives
-//! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept; of a batch of
-//! more than [`CHUNK`] rays nothing is: its adjoint marches again, a chunk after the other, and so needs no more memory than a chunk does.
+//! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept.
 //!
 //! *Adjoint.* Each block computes dL/dσ and dL/dc of its samples, ray by ray from the back, and sorts them by the rows of the tables they
 //! were read from. Nothing is added up yet: the optimizer asks for one range of rows after the other ([`RowSums`](autograd::RowSums)), and
 //! the blocks give what they have in the order of the rays. So a step never writes a gradient table, no two threads write to the
 //! same place, and the sums have the same bits for any number of threads.
+//!
+//! *Memory.* Of a batch of more than [`CHUNK`] rays nothing is kept: its adjoint marches again, one chunk after the other, and adds up the rows
+//! that a chunk touched before it goes on to the next. So a step takes what a chunk takes, and the touched rows.
 
 /// Runs an expression with the layout of a grid's tables as a `NodeMap`: one compiled for grids with all voxels, one for sparse grids.
 macro_rules! with_bricks {
@@ -30,7 +32,7 @@ use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::field::{Field, sh};
 use crate::sampling::{Occupancy, Samples};
-use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Real, RowSparse, Tensor, no_grad, parallel};
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
 use forward::{Block, Scene};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -138,7 +140,7 @@ impl<T: Real> Scene<'_, T> {
     /// The blocks of the rays from number `first` on, one ray for each [`COLUMNS`] of `pixels`.
     fn render_all(&self, first: usize, pixels: &mut [T], keep: bool) -> Vec<Block<T>> {
         if keep && self.worth_sorting() {
-            return self.render_sorted(first, pixels, BLOCK);
+            return self.render_sorted(first, pixels);
         }
         let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
         parallel::map_items(parts, |b, pixels| self.render(first + b * BLOCK, pixels, keep))
@@ -150,12 +152,16 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
     let n = rays.len();
     let batch = Batch::new(grid, rays, options);
     let tables = [grid.density.tensor(), grid.color.tensor()];
-    let tracked = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording();
+    let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording() && n <= CHUNK;
     let mut pixels = Buffer::stale(n * COLUMNS);
     let scene = batch.scene(grid, rays, options);
-    let blocks = scene.render_all(0, &mut pixels, tracked && n <= CHUNK);
-    let sample_count = blocks.iter().map(Block::len).sum();
-    let kept = if n <= CHUNK {
+    let mut sample_count = 0;
+    let mut blocks = Vec::new();
+    for (chunk, pixels) in pixels.chunks_mut(CHUNK * COLUMNS).enumerate() {
+        blocks = scene.render_all(chunk * CHUNK, pixels, keep);
+        sample_count += blocks.iter().map(Block::len).sum::<usize>();
+    }
+    let kept = if keep {
         Kept::Samples(blocks)
     } else {
         let options = RenderOptions { occupancy: None, ..options.clone() };
@@ -242,13 +248,18 @@ impl<T: Real> Kernel<T> for Fused<T> {
     }
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
+        let later = matches!(self.state.kept, Kept::Samples(_));
         self.state.for_each_chunk([&call.input(0), &call.input(1)], |blocks| {
             let sums = Arc::new(adjoint::Sums::new(&self.state.batch, blocks, call.cotangent(), self.output));
+            let rows = |input: usize, sums: Arc<dyn RowSums<T>>| {
+                let rows = RowSparse::deferred(call.input(input).shape(), sums);
+                if later { rows } else { rows.added_up() }
+            };
             if call.needs(0) {
-                out.rows(0, RowSparse::deferred(call.input(0).shape(), Arc::new(adjoint::DensitySums(sums.clone()))));
+                out.rows(0, rows(0, Arc::new(adjoint::DensitySums(sums.clone()))));
             }
             if call.needs(1) {
-                out.rows(1, RowSparse::deferred(call.input(1).shape(), Arc::new(adjoint::ColorSums(sums))));
+                out.rows(1, rows(1, Arc::new(adjoint::ColorSums(sums))));
             }
         });
     }

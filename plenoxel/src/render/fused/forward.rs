@@ -79,7 +79,7 @@ impl<T: Real> Scene<'_, T> {
         self.colors(&mut block, found.as_ref());
         self.sum(&block, pixels);
         if !keep {
-            return Block { first, offsets: block.offsets, density: block.density, ..Block::empty() };
+            return Block { first, offsets: block.offsets, ..Block::empty() };
         }
         block
     }

@@ -34,7 +34,7 @@ impl<T: Real> Corners<T> {
         corners
     }
 
-    /// The row of a sample's corner with the lowest coordinates.
+    /// The row of a sample's corner with the lowest coordinates, or a row of its neighbourhood if that voxel is not present.
     #[inline(always)]
     pub fn lowest(&self, i: usize) -> u32 {
         self.rows[i / TOGETHER * 8 * TOGETHER + i % TOGETHER]

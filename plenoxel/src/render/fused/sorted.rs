@@ -5,7 +5,7 @@
 
 use super::forward::{Block, Scene};
 use super::lookup::{self, Corners, Directions};
-use super::{BUCKET_SHIFT, COLUMNS};
+use super::{BLOCK, BUCKET_SHIFT, COLUMNS};
 use crate::field::voxel_grid::{Color, Interpolation};
 use autograd::{Buffer, Real, parallel};
 use std::ops::Range;
@@ -59,11 +59,11 @@ impl<T: Real> Scene<'_, T> {
         harmonics && self.batch.shape.interpolation == Interpolation::Trilinear && size_of_val(self.tables[1]) >= LARGE
     }
 
-    /// Renders all rays, one for each [`COLUMNS`] of `pixels`, `block` at a time, and keeps their samples.
-    pub fn render_sorted(&self, first: usize, pixels: &mut [T], block: usize) -> Vec<Block<T>> {
+    /// The blocks of the rays from number `first` on, one ray for each [`COLUMNS`] of `pixels`, with all that the adjoint needs.
+    pub fn render_sorted(&self, first: usize, pixels: &mut [T]) -> Vec<Block<T>> {
         let buckets = self.batch.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
         let count = pixels.len() / COLUMNS;
-        let (blocks, orders): (Vec<_>, Vec<_>) = parallel::map_chunks(count, block, |range| {
+        let (blocks, orders): (Vec<_>, Vec<_>) = parallel::map_chunks(count, BLOCK, |range| {
             let (block, corners) = self.weights(first + range.start, range.len());
             let corners = corners.expect("trilinear look-up has corners");
             let order = Order::new(&block, &corners, buckets);
@@ -72,7 +72,7 @@ impl<T: Real> Scene<'_, T> {
         .into_iter()
         .unzip();
         let colors = self.colors_in_order(&blocks, &orders, buckets);
-        let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(block * COLUMNS)).collect();
+        let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(BLOCK * COLUMNS)).collect();
         parallel::map_items(parts, |_, (((mut block, order), sorted), pixels)| {
             block.color = Buffer::zeros(3 * block.len());
             let color = block.color.as_chunks_mut::<3>().0;
