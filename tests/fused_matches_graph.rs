@@ -68,6 +68,21 @@ fn worst<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>
     worst
 }
 
+/// How a box is rendered.
+fn options(aabb: Aabb, spacing: Spacing, jitter: Jitter, background: [f32; 3]) -> RenderOptions<'static> {
+    RenderOptions { aabb, spacing, jitter, background, occupancy: None, engine: Engine::Fused, stop_below: 0.0 }
+}
+
+/// Rays from one side, into general directions.
+fn rays_from_above(seed: u64, n: u64) -> Vec<Ray> {
+    (0..n)
+        .map(|r| {
+            let coordinate = |k: u64| 2.0 * uniform(seed, Purpose::Initial, r, k) - 1.0;
+            ray([3.0 * coordinate(0), 3.0 * coordinate(1), 3.0], [coordinate(2), coordinate(3), coordinate(4)])
+        })
+        .collect()
+}
+
 /// A scene in which everything is drawn: resolution, look-up, colors, which voxels are there, spacing, jitter, rays.
 struct Scene<T: Real> {
     grid: VoxelGrid<T>,
@@ -117,15 +132,7 @@ impl<T: Real> Scene<T> {
     }
 
     fn options(&self) -> RenderOptions<'static> {
-        RenderOptions {
-            aabb: self.grid.aabb(),
-            spacing: self.spacing,
-            jitter: self.jitter,
-            background: self.background,
-            occupancy: None,
-            engine: Engine::Fused,
-            stop_below: 0.0,
-        }
+        options(self.grid.aabb(), self.spacing, self.jitter, self.background)
     }
 }
 
@@ -139,21 +146,8 @@ fn rows_read_in_their_own_order_agree() {
     let full = VoxelGrid::<f64>::random(shape, 3.0, 0.3, 7);
     // A third of the voxels is missing, in every brick.
     let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
-    let rays: Vec<Ray> = (0..300)
-        .map(|r| {
-            let coordinate = |k: u64| 2.0 * uniform(5, Purpose::Initial, r, k) - 1.0;
-            ray([3.0 * coordinate(0), 3.0 * coordinate(1), 3.0], [coordinate(2), coordinate(3), coordinate(4)])
-        })
-        .collect();
-    let options = RenderOptions {
-        aabb: grid.aabb(),
-        spacing: Spacing::Step(0.04),
-        jitter: Jitter::PerRay { seed: 1, step: 2 },
-        background: [1.0, 0.9, 0.2],
-        occupancy: None,
-        engine: Engine::Fused,
-        stop_below: 0.0,
-    };
+    let rays = rays_from_above(5, 300);
+    let options = options(grid.aabb(), Spacing::Step(0.04), Jitter::PerRay { seed: 1, step: 2 }, [1.0, 0.9, 0.2]);
     let (d, what) = worst(&grid, &rays, &options);
     assert!(d < 1e-10, "{what} is off by {d:e}");
 }
@@ -164,22 +158,9 @@ fn a_picture_shows_what_a_training_batch_shows() {
     for (degree, resolution) in BEYOND_THE_CACHES.into_iter().enumerate() {
         let color = Color::Sh { degree, offset: 0.5 };
         let shape = GridShape { resolution, half_width: 1.0, interpolation: Interpolation::Trilinear, color };
-        let grid = VoxelGrid::<f32>::random(shape, 2.0, 0.3, 7);
-        let rays: Vec<Ray> = (0..600)
-            .map(|r| {
-                let coordinate = |k: u64| 2.0 * uniform(4, Purpose::Initial, r, k) - 1.0;
-                ray([3.0 * coordinate(0), 3.0 * coordinate(1), 3.0], [coordinate(2), coordinate(3), coordinate(4)])
-            })
-            .collect();
-        let options = RenderOptions {
-            aabb: grid.aabb(),
-            spacing: Spacing::Step(0.03),
-            jitter: Jitter::None,
-            background: [1.0; 3],
-            occupancy: None,
-            engine: Engine::Fused,
-            stop_below: 0.0,
-        };
+        let grid = VoxelGrid::<f64>::random(shape, 2.0, 0.3, 7);
+        let rays = rays_from_above(4, 600);
+        let options = options(grid.aabb(), Spacing::Step(0.03), Jitter::None, [1.0; 3]);
         let (training, picture) = (render(&grid, &rays, &options), no_grad(|| render(&grid, &rays, &options)));
         assert!(training.rgb.is_tracked() && !picture.rgb.is_tracked());
         assert_eq!(training.rgb.data(), picture.rgb.data(), "degree {degree}");
@@ -190,24 +171,11 @@ fn a_picture_shows_what_a_training_batch_shows() {
 fn a_batch_too_large_to_be_kept_is_marched_again_chunk_by_chunk() {
     // Three chunks, the last one not full.
     let n = 70_000;
-    let rays: Vec<Ray> = (0..n)
-        .map(|r| {
-            let coordinate = |k: u64| 2.0 * uniform(3, Purpose::Initial, r, k) - 1.0;
-            ray([coordinate(0), coordinate(1), 2.0], [coordinate(2), coordinate(3), -1.0])
-        })
-        .collect();
+    let rays = rays_from_above(3, n);
     for (interpolation, color) in [(Interpolation::Nearest, Color::Rgb), (Interpolation::Trilinear, Color::Sh { degree: 1, offset: 0.5 })] {
         let full = VoxelGrid::<f64>::random(GridShape { resolution: 9, half_width: 1.0, interpolation, color }, 2.0, 1.0, 7);
         let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
-        let options = RenderOptions {
-            aabb: grid.aabb(),
-            spacing: Spacing::Step(0.9),
-            jitter: Jitter::PerRay { seed: 1, step: 2 },
-            background: [0.2, 0.5, 0.9],
-            occupancy: None,
-            engine: Engine::Fused,
-            stop_below: 0.0,
-        };
+        let options = options(grid.aabb(), Spacing::Step(0.9), Jitter::PerRay { seed: 1, step: 2 }, [0.2, 0.5, 0.9]);
         let (d, what) = worst(&grid, &rays, &options);
         assert!(d < 1e-10, "{interpolation:?}, {color:?}: {what} is off by {d:e}");
     }
@@ -250,15 +218,7 @@ fn rays_of_every_kind_agree() {
         ray([-3.0, -3.0, -3.0], [3.0, 3.0, 3.0]),
         ray([0.0, 0.0, 1.0], [0.5, 0.5, 3.0]),
     ];
-    let options = |spacing| RenderOptions {
-        aabb: Aabb::cube(1.0),
-        spacing,
-        jitter: Jitter::None,
-        background: [0.3, 0.6, 0.9],
-        occupancy: None,
-        engine: Engine::Fused,
-        stop_below: 0.0,
-    };
+    let with = |spacing| options(Aabb::cube(1.0), spacing, Jitter::None, [0.3, 0.6, 0.9]);
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
         for color in [Color::Rgb, Color::Sh { degree: 2, offset: 0.5 }] {
             let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color };
@@ -279,7 +239,7 @@ fn rays_of_every_kind_agree() {
             ];
             for (name, grid) in cases {
                 for spacing in [Spacing::Step(0.07), Spacing::Step(5.0), Spacing::Points { samples: 60, far: 8.0 }] {
-                    let (d, what) = worst(&grid, &rays, &options(spacing));
+                    let (d, what) = worst(&grid, &rays, &with(spacing));
                     assert!(d < 1e-10, "{name}, {interpolation:?}, {color:?}, {spacing:?}: {what} is off by {d:e}");
                 }
             }
@@ -292,15 +252,7 @@ fn second_derivatives_go_through_the_graph() {
     let shape = support::shape(Interpolation::Trilinear, Color::Sh { degree: 1, offset: 0.5 });
     let tables = vec![support::numbers(&[64, 1], 0.2, 2.0, 21), support::numbers(&[64, 3 * sh::count(1)], -0.06, 0.06, 22)];
     let f = |x: &[Tensor<f64>]| {
-        let options = RenderOptions {
-            aabb: Aabb::cube(1.0),
-            spacing: Spacing::Step(0.23),
-            jitter: Jitter::None,
-            background: [1.0, 0.9, 0.8],
-            occupancy: None,
-            engine: Engine::Fused,
-            stop_below: 0.0,
-        };
+        let options = options(Aabb::cube(1.0), Spacing::Step(0.23), Jitter::None, [1.0, 0.9, 0.8]);
         let rendered = render(&support::grid_of(shape, &x[0], &x[1]), &support::rays(), &options);
         rendered.rgb.square().sum() + rendered.depth().square().sum() + rendered.distortion().sum()
     };
