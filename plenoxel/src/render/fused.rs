@@ -4,7 +4,7 @@
 //! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept.
 //!
 //! *Adjoint.* Each block computes dL/dσ and dL/dc of its samples, ray by ray from the back, and sorts them by the rows of the tables they
-//! were read from. Nothing is added up yet: the optimizer asks for one range of rows after the other ([`RowSums`](autograd::RowSums)), and
+//! were read from. Nothing is added up yet: the optimizer asks for one range of rows after the other ([`RowSums`]), and
 //! the blocks give what they have in the order of the rays. So a step never writes a gradient table, no two threads write to the
 //! same place, and the sums have the same bits for any number of threads.
 //!
