@@ -184,7 +184,9 @@ pub struct GradSink<T: Real> {
 }
 
 impl<T: Real> GradSink<T> {
-    /// The cotangent of input `i`, in row-major order of its shape: given once.
+    /// The cotangent of input `i`, in row-major order of its shape.
+    ///
+    /// Panics if the input has a cotangent already.
     #[track_caller]
     pub fn dense(&mut self, i: usize, values: Buffer<T>) {
         use ndarray::Dimension;

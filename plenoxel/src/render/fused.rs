@@ -76,6 +76,7 @@ struct State<T: Real> {
     kept: Kept<T>,
 }
 
+/// The samples themselves, or, where they are too many or no gradient is recorded, the rays.
 #[derive(Debug)]
 enum Kept<T: Real> {
     Samples(Vec<Block<T>>),

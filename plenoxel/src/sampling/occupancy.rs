@@ -5,9 +5,10 @@ use crate::geometry::Aabb;
 use autograd::lattice::{BRICK, LOW, STRIDE};
 use autograd::parallel;
 use glam::DVec3;
+use std::sync::Arc;
 
 /// Which cells of a box may hold matter. Cells come in bricks of 4³, a bit for each; an empty brick knows how many bricks around it are
-/// empty too.
+/// empty too. Cloning copies pointers.
 #[derive(Debug, Clone)]
 pub struct Occupancy {
     aabb: Aabb,
@@ -15,9 +16,9 @@ pub struct Occupancy {
     /// Bricks along each axis.
     count: [usize; 3],
     /// One for each brick, in row-major order; cell (i, j, k) of a brick is bit 16 i + 4 j + k.
-    masks: Vec<u64>,
+    masks: Arc<[u64]>,
     /// For an empty brick, the Chebyshev distance in bricks to the next one that is not, at most [`FAR`]; 0 for that one.
-    distance: Vec<u8>,
+    distance: Arc<[u8]>,
 }
 
 /// The largest distance that is told apart.
@@ -54,8 +55,8 @@ impl Occupancy {
     pub fn from_masks(aabb: Aabb, cells: [usize; 3], masks: Vec<u64>) -> Self {
         let count = cells.map(|n| n.div_ceil(BRICK));
         assert_eq!(masks.len(), count.iter().product::<usize>(), "occupancy: one mask for each of {count:?} bricks");
-        let distance = distances(&masks, count);
-        Occupancy { aabb, cells, count, masks, distance }
+        let distance = distances(&masks, count).into();
+        Occupancy { aabb, cells, count, masks: masks.into(), distance }
     }
 
     /// Cells along each axis.
@@ -84,7 +85,7 @@ impl Occupancy {
 
     /// The cells within `radius` cells of these, along axes and diagonals.
     pub fn dilated(&self, radius: usize) -> Self {
-        let mut masks = self.masks.clone();
+        let mut masks = self.masks.to_vec();
         for _ in 0..radius {
             for axis in 0..3 {
                 masks = dilate(&masks, self.count, axis);
@@ -101,7 +102,7 @@ impl Occupancy {
     /// Panics if the other has other cells.
     pub fn intersection(&self, other: &Self) -> Self {
         assert_eq!(self.cells, other.cells, "occupancy: the intersection of different grids");
-        let masks = self.masks.iter().zip(&other.masks).map(|(a, b)| a & b).collect();
+        let masks = self.masks.iter().zip(&*other.masks).map(|(a, b)| a & b).collect();
         Self::from_masks(self.aabb, self.cells, masks)
     }
 

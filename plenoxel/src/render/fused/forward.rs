@@ -164,20 +164,22 @@ impl<T: Real> Scene<'_, T> {
         let out = color.as_chunks_mut::<3>().0;
         let seen = block.seen();
         let nearest = |i: usize| ([block.rows[i]], [T::one()]);
-        let shape = &self.batch.shape;
-        match (shape.color, found) {
-            (Color::Rgb, None) => lookup::plain(self.tables[1], nearest, seen, out),
-            (Color::Rgb, Some(corners)) => lookup::plain(self.tables[1], |i| corners.of(i), seen, out),
-            (Color::Sh { offset, .. }, _) => {
-                let count = shape.color.channels() / 3;
-                let directions = Directions { basis: &self.batch.basis.data()[block.first * count..], count, offset: T::lit(offset) };
-                match found {
-                    None => lookup::harmonics(self.tables[1], &block.offsets, directions, nearest, seen, out),
-                    Some(corners) => lookup::harmonics(self.tables[1], &block.offsets, directions, |i| corners.of(i), seen, out),
-                }
+        match (self.directions(block.first), found) {
+            (None, None) => lookup::plain(self.tables[1], nearest, seen, out),
+            (None, Some(corners)) => lookup::plain(self.tables[1], |i| corners.of(i), seen, out),
+            (Some(directions), None) => lookup::harmonics(self.tables[1], &block.offsets, directions, nearest, seen, out),
+            (Some(directions), Some(corners)) => {
+                lookup::harmonics(self.tables[1], &block.offsets, directions, |i| corners.of(i), seen, out);
             }
         }
         block.color = color;
+    }
+
+    /// What harmonics need of the rays from number `first` on; `None` for plain colors.
+    pub fn directions(&self, first: usize) -> Option<Directions<'_, T>> {
+        let Color::Sh { offset, .. } = self.batch.shape.color else { return None };
+        let count = self.batch.shape.color.channels() / 3;
+        Some(Directions { basis: &self.batch.basis.data()[first * count..], count, offset: T::lit(offset) })
     }
 
     /// Pixels from weights and colors.

@@ -4,7 +4,7 @@
 //! memory. Sorted by the buckets that they lie in, samples of other rays find the rows of a bucket in the cache.
 
 use super::forward::{Block, Scene};
-use super::lookup::{self, Corners, Directions};
+use super::lookup::{self, Corners};
 use super::{BLOCK, BUCKET_SHIFT, COLUMNS};
 use crate::field::voxel_grid::{Color, Interpolation};
 use autograd::{Buffer, Real, parallel};
@@ -84,9 +84,7 @@ impl<T: Real> Scene<'_, T> {
 
     /// The colors of the samples of each order.
     fn colors_in_order(&self, blocks: &[Block<T>], orders: &[Order], buckets: usize) -> Vec<Buffer<T>> {
-        let Color::Sh { offset, .. } = self.batch.shape.color else { unreachable!("worth sorting") };
-        let directions =
-            Directions { basis: self.batch.basis.data(), count: self.batch.shape.color.channels() / 3, offset: T::lit(offset) };
+        let directions = self.directions(0).expect("only harmonics are worth sorting");
         let per_task = buckets.div_ceil(TASKS).max(1);
         let of_task = |task: usize| task * per_task..((task + 1) * per_task).min(buckets);
         let mut colors: Vec<Buffer<T>> = orders.iter().map(|order| Buffer::stale(3 * order.samples.len())).collect();
