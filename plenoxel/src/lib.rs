@@ -19,6 +19,7 @@
 #![warn(missing_docs)]
 
 pub mod camera;
+pub mod carve;
 pub mod checkpoint;
 pub mod dataset;
 pub mod error;

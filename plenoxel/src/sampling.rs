@@ -4,6 +4,7 @@
 //! after another; ray `r` owns `offsets[r]..offsets[r + 1]`, and rays that miss the box own nothing.
 
 mod occupancy;
+pub mod walk;
 
 use crate::camera::Ray;
 use crate::geometry::Aabb;
@@ -11,6 +12,7 @@ use crate::random::{Purpose, uniform};
 use autograd::{Buffer, Indices, Real, Tensor, parallel};
 use occupancy::Look;
 pub use occupancy::Occupancy;
+pub(crate) use occupancy::inside;
 use serde::{Deserialize, Serialize};
 
 /// How samples are spaced along a ray.

@@ -88,8 +88,8 @@ pub fn check_downscale(k: usize, (width, height): (usize, usize)) -> Result<()> 
 /// The picture reduced `k` times: each pixel averages a block of k x k.
 ///
 /// What is averaged is alpha and the color *times* alpha; straight alpha is stored again, everything rounded to nearest. So
-/// compositing the result over any background equals averaging the composited block, up to the rounding to 8 bits. The color
-/// of a pixel with alpha 0 is 0. Panics unless k divides width and height ([`check_downscale`]).
+/// compositing the result over any background equals averaging the composited block, up to the rounding to 8 bits. Alpha is 0 only
+/// where the whole block has alpha 0, so that a silhouette loses nothing; the color there is 0. Panics unless k divides width and height ([`check_downscale`]).
 pub fn downscale(image: &RgbaImage, k: usize) -> RgbaImage {
     if k == 1 {
         return image.clone();
@@ -111,7 +111,8 @@ pub fn downscale(image: &RgbaImage, k: usize) -> RgbaImage {
         }
         let rounded = |numerator: u64, denominator: u64| (numerator + denominator / 2).checked_div(denominator).unwrap_or(0) as u8;
         let alpha = sum[3];
-        ::image::Rgba([rounded(sum[0], alpha), rounded(sum[1], alpha), rounded(sum[2], alpha), rounded(alpha, (k * k) as u64)])
+        let mean = rounded(alpha, (k * k) as u64).max(u8::from(alpha > 0));
+        ::image::Rgba([rounded(sum[0], alpha), rounded(sum[1], alpha), rounded(sum[2], alpha), mean])
     })
 }
 
@@ -259,6 +260,9 @@ mod tests {
         image.put_pixel(0, 0, Rgba([200, 100, 50, 255]));
         assert_eq!(downscale(&image, 2).get_pixel(0, 0).0, [200, 100, 50, 64]); // 255 / 4 = 63.75
         assert_eq!(downscale(&RgbaImage::from_pixel(2, 2, Rgba([9, 9, 9, 0])), 2).get_pixel(0, 0).0, [0; 4]);
+        // A trace of object keeps its pixel: 1 / 4 of a level would round to none.
+        image.put_pixel(0, 0, Rgba([200, 100, 50, 1]));
+        assert_eq!(downscale(&image, 2).get_pixel(0, 0).0, [200, 100, 50, 1]);
     }
 
     #[test]

@@ -135,8 +135,14 @@ impl Occupancy {
 /// Number of a cell's brick, and of the cell in it.
 #[inline(always)]
 fn split(cell: [usize; 3], count: [usize; 3]) -> (usize, usize) {
-    let brick = (cell[0] / BRICK * count[1] + cell[1] / BRICK) * count[2] + cell[2] / BRICK;
+    let brick = place_number(cell.map(|c| c / BRICK), count);
     (brick, (cell[0] % BRICK) * 16 + (cell[1] % BRICK) * 4 + cell[2] % BRICK)
+}
+
+/// Number of the brick at a place.
+#[inline(always)]
+pub(super) fn place_number(place: [usize; 3], count: [usize; 3]) -> usize {
+    (place[0] * count[1] + place[1]) * count[2] + place[2]
 }
 
 /// Place of a brick.

@@ -1,0 +1,223 @@
+//! Colors of an opaque grid from the photographs that show it, without gradients.
+//!
+//! Each voxel v has harmonics xᵥ and is seen from d as S(d)·xᵥ. The problem of the source paper's second extension is one small weighted
+//! least squares for each voxel by itself,
+//!
+//! ```text
+//! min Σ wᵣᵥ |pᵣ − S(dᵣ)·xᵥ|² + λ Σ wᵣᵥ Σ_{k≥1} |xᵥₖ|²        over the rays r that see v with share wᵣᵥ,
+//! ```
+//!
+//! which [`fit_exactly`] solves by its normal equations: Aᵥ xᵥ = bᵥ with Aᵥ = Σ w S Sᵀ + λ (Σ w) diag(0, 1, …, 1), bᵥ = Σ w S p. With degree 0
+//! the answer is the weighted mean of the paper's first extension. But a pixel is shared by several voxels, Cᵣ = Σᵥ wᵣᵥ S(dᵣ)·xᵥ + rest, and
+//! the error that a viewer sees is that of Cᵣ. So sweeps follow: xᵥ ← xᵥ + Aᵥ⁻¹ (Σ w S (pᵣ − Cᵣ) − ridge). Since the shares of a ray add up to
+//! at most 1, the sum of the voxels' own problems is a convex bound on the sum over rays that touches it at x (Jensen), so every sweep lowers
+//! Σᵣ |pᵣ − Cᵣ|² and its ridge, as far as colors stay unclamped: no rate is to be chosen.
+//!
+//! [`fit_by_descent`] is the paper's own way, stochastic gradient descent, with its lost updates repaired.
+
+use super::light::{Hit, Lit, Opaque, Pixel, object_pixels};
+use super::smooth::smoothed;
+use crate::dataset::View;
+use crate::field::sh;
+use crate::random::{Permutation, Purpose};
+use autograd::{Lattice, parallel};
+
+/// What a fit looks at.
+pub struct Seen<'a> {
+    /// The voxels.
+    pub opaque: &'a Opaque<'a>,
+    /// Which of them have rows.
+    pub lattice: &'a Lattice,
+    /// The photographs.
+    pub views: &'a [View],
+    /// Color behind the scene.
+    pub background: [f32; 3],
+    /// Degree of the harmonics.
+    pub degree: usize,
+    /// Color of zero coefficients.
+    pub offset: f32,
+}
+
+/// Harmonics of every row, all of red, then green, then blue; and how much of the pixels each row is, all in all.
+pub struct Fitted {
+    /// `[rows, 3 (degree + 1)²]`
+    pub table: Vec<f32>,
+    /// `[rows]`, Σ w.
+    pub weight: Vec<f32>,
+}
+
+impl Seen<'_> {
+    fn count(&self) -> usize {
+        sh::count(self.degree)
+    }
+
+    /// What the photograph shows more than Σ w max(0, offset + S·x) + rest · background.
+    fn error(&self, lit: &Lit<'_>, table: &[f32]) -> [f32; 3] {
+        let count = self.count();
+        let mut error = [0, 1, 2].map(|c| lit.color[c] - lit.rest * self.background[c]);
+        for &Hit { row, weight, .. } in lit.hits {
+            let row = &table[row as usize * 3 * count..][..3 * count];
+            for (error, x) in error.iter_mut().zip(row.chunks_exact(count)) {
+                *error -= weight * (self.offset + dot(x, lit.basis)).max(0.0);
+            }
+        }
+        error
+    }
+
+    /// Adds Σ w S value to a table like that of the harmonics, for the object pixels of all views.
+    fn gather(&self, value: impl Fn(Lit<'_>) -> [f32; 3] + Sync) -> Vec<f32> {
+        let (count, width) = (self.count(), 3 * self.count());
+        let mut table = vec![0.0; self.lattice.rows() * width];
+        for pixels in object_pixels(self.views) {
+            let light = self.opaque.light(self.views, &pixels, self.background, self.degree, &value);
+            light.for_each_part([(&mut table, width)], |hits, [table]| {
+                for seen in hits.iter() {
+                    add_products(&mut table[seen.row * width..][..width], count, seen.weight, seen.value, seen.basis);
+                }
+            });
+        }
+        table
+    }
+}
+
+/// The solution of every voxel's own problem, then `sweeps` over all of them together.
+pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, swept: &dyn Fn(usize)) -> Fitted {
+    let count = seen.count();
+    let (triangle, width) = (count * (count + 1) / 2, 3 * count);
+    let rows = seen.lattice.rows();
+    // One pass for both sides: the triangle of A, then b.
+    let mut sides = vec![0.0_f32; rows * (triangle + width)];
+    for pixels in object_pixels(seen.views) {
+        let light = seen.opaque.light(seen.views, &pixels, seen.background, seen.degree, |lit| lit.color.map(|c| c - seen.offset));
+        light.for_each_part([(&mut sides, triangle + width)], |hits, [sides]| {
+            for seen in hits.iter() {
+                let (a, b) = sides[seen.row * (triangle + width)..][..triangle + width].split_at_mut(triangle);
+                let mut at = 0;
+                for i in 0..count {
+                    for (a, s) in a[at..=at + i].iter_mut().zip(seen.basis) {
+                        *a += seen.weight * seen.basis[i] * s;
+                    }
+                    at += i + 1;
+                }
+                add_products(b, count, seen.weight, seen.value, seen.basis);
+            }
+        });
+    }
+    let weight: Vec<f32> = sides.chunks_exact(triangle + width).map(|row| row[0] / (sh::Y0 * sh::Y0) as f32).collect();
+    // The right sides are the last numbers of each row of a table.
+    let solve = |table: &mut [f32], right: &[f32], of: usize| {
+        parallel::for_each_rows(table, width, |first, chunk| {
+            for (r, x) in chunk.chunks_exact_mut(width).enumerate() {
+                let row = first + r;
+                if weight[row] > 0.0 {
+                    let a = &sides[row * (triangle + width)..][..triangle];
+                    improve(x, a, &right[(row + 1) * of - width..][..width], ridge * weight[row]);
+                }
+            }
+        });
+    };
+    let mut table = vec![0.0; rows * width];
+    solve(&mut table, &sides, triangle + width);
+    for sweep in 0..sweeps {
+        let error = seen.gather(|lit| seen.error(&lit, &table));
+        solve(&mut table, &error, width);
+        swept(sweep + 1);
+    }
+    Fitted { table, weight }
+}
+
+/// x ← x + A⁻¹ (g − ridge x), channel by channel, without a ridge on the mean.
+fn improve(x: &mut [f32], a: &[f32], g: &[f32], ridge: f32) {
+    const MOST: usize = sh::count(sh::MAX_DEGREE);
+    let count = x.len() / 3;
+    // A little for the mean too: directions that are all the same leave A singular but for rounding.
+    let least = 1e-6 * f64::from(a[0]);
+    let mut l = [[0.0_f64; MOST]; MOST];
+    let mut at = 0;
+    for i in 0..count {
+        for j in 0..=i {
+            let mut sum = f64::from(a[at]) - (0..j).map(|k| l[i][k] * l[j][k]).sum::<f64>();
+            at += 1;
+            if i == j {
+                sum += least + if i > 0 { f64::from(ridge) } else { 0.0 };
+                l[i][i] = sum.max(least).sqrt();
+            } else {
+                l[i][j] = sum / l[j][j];
+            }
+        }
+    }
+    for (x, g) in x.chunks_exact_mut(count).zip(g.chunks_exact(count)) {
+        let mut y = [0.0_f64; MOST];
+        for i in 0..count {
+            let pull = if i > 0 { ridge * x[i] } else { 0.0 };
+            y[i] = (f64::from(g[i] - pull) - (0..i).map(|k| l[i][k] * y[k]).sum::<f64>()) / l[i][i];
+        }
+        for i in (0..count).rev() {
+            y[i] = (y[i] - (i + 1..count).map(|k| l[k][i] * y[k]).sum::<f64>()) / l[i][i];
+            x[i] += y[i] as f32;
+        }
+    }
+}
+
+/// The source paper's descent: rays of object pixels in random order, 5000 to a step, at the rates 0.9, 0.9, 0.1, 0.1 of four epochs, colors
+/// smoothed after the first. Its program keeps one ray's update of all those that meet in a voxel; here a voxel moves by their mean,
+///
+/// ```text
+/// xᵥ ← xᵥ + 2 rate Σ w S (pᵣ − Cᵣ) / Σ w,
+/// ```
+///
+/// the composite has its background, and rays are not jittered.
+pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, stepped: &dyn Fn(usize)) -> Fitted {
+    const RATES: [f32; 4] = [0.9, 0.9, 0.1, 0.1];
+    const RAYS: usize = 5000;
+    let (count, width) = (seen.count(), 3 * seen.count());
+    let mean = fit_exactly(&Seen { degree: 0, ..*seen }, 0.0, 0, &|_| {});
+    let mut table = vec![0.0; seen.lattice.rows() * width];
+    for (row, mean) in table.chunks_exact_mut(width).zip(mean.table.chunks_exact(3)) {
+        row.iter_mut().step_by(count).zip(mean).for_each(|(x, mean)| *x = *mean);
+    }
+    let pixels: Vec<Pixel> = object_pixels(seen.views).flatten().collect();
+    // Of each voxel Σ w S (p − C), then Σ w; zero between steps.
+    let mut sums = vec![0.0; seen.lattice.rows() * (width + 1)];
+    for (epoch, rate) in RATES.into_iter().enumerate() {
+        let order = Permutation::new(pixels.len() as u64, seed, Purpose::RayOrder, epoch as u64);
+        for start in (0..pixels.len()).step_by(RAYS) {
+            let batch: Vec<Pixel> = (start..(start + RAYS).min(pixels.len())).map(|i| pixels[order.at(i as u64) as usize]).collect();
+            let light = seen.opaque.light(seen.views, &batch, seen.background, seen.degree, |lit| seen.error(&lit, &table));
+            light.for_each_part([(&mut table, width), (&mut sums, width + 1)], |hits, [table, sums]| {
+                for seen in hits.iter() {
+                    let sums = &mut sums[seen.row * (width + 1)..][..width + 1];
+                    add_products(&mut sums[..width], count, seen.weight, seen.value, seen.basis);
+                    sums[width] += seen.weight;
+                }
+                for seen in hits.iter() {
+                    let sums = &mut sums[seen.row * (width + 1)..][..width + 1];
+                    if sums[width] > 0.0 {
+                        let scale = 2.0 * rate / sums[width];
+                        table[seen.row * width..][..width].iter_mut().zip(&*sums).for_each(|(x, sum)| *x += scale * sum);
+                        sums.fill(0.0);
+                    }
+                }
+            });
+        }
+        if epoch == 0 {
+            table = smoothed(seen.lattice, &table, width);
+        }
+        stepped(epoch + 1);
+    }
+    Fitted { table, weight: mean.weight }
+}
+
+/// row += w S valueᶜ for the three channels.
+#[inline(always)]
+fn add_products(row: &mut [f32], count: usize, w: f32, value: [f32; 3], basis: &[f32]) {
+    for (row, value) in row.chunks_exact_mut(count).zip(value) {
+        for (x, s) in row.iter_mut().zip(basis) {
+            *x += w * value * s;
+        }
+    }
+}
+
+fn dot(x: &[f32], y: &[f32]) -> f32 {
+    x.iter().zip(y).map(|(x, y)| x * y).sum()
+}

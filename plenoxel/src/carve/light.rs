@@ -1,0 +1,249 @@
+//! What the voxels of an opaque grid give to the pixels of photographs: wᵥ = T (1 − exp(−σ lᵥ)), l being the exact chord of the ray in the
+//! voxel and T what reaches it. Fits read it ray by ray, and add to voxels in an order that depends on the pixels alone.
+
+use crate::camera::Ray;
+use crate::dataset::View;
+use crate::field::sh;
+use crate::geometry::Aabb;
+use crate::sampling::walk::Walk;
+use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::{Buffer, Lattice, Tensor, no_grad, parallel};
+use std::ops::ControlFlow;
+
+/// A ray ends where less than this reaches further: a quarter of a level of an 8-bit image.
+const REST: f32 = 1e-3;
+/// Rays that a thread takes at a time.
+const CHUNK: usize = 1024;
+/// Parts of the tables that are added to side by side.
+const PARTS: usize = 64;
+/// Pixels whose light is in memory at a time.
+const BATCH: usize = 1 << 16;
+
+/// What a voxel gives to a pixel.
+#[derive(Clone, Copy, Debug)]
+pub struct Hit {
+    /// Row of the voxel.
+    pub row: u32,
+    /// The pixel's place in the batch.
+    pub ray: u32,
+    /// Its share of the pixel.
+    pub weight: f32,
+}
+
+/// A pixel of a view.
+#[derive(Clone, Copy, Debug)]
+pub struct Pixel {
+    /// Number of the view.
+    pub view: u32,
+    /// Number of the pixel in it, row after row.
+    pub index: u32,
+}
+
+/// A grid of one density, as light sees it.
+#[derive(Debug)]
+pub struct Opaque<'a> {
+    lattice: &'a Lattice,
+    walk: Walk,
+    /// First row of each brick, bricks in row-major order.
+    first_rows: Vec<u32>,
+    density: f64,
+}
+
+/// A pixel with the light that falls into it.
+pub struct Lit<'a> {
+    /// Its color over the background.
+    pub color: [f32; 3],
+    /// Harmonics at the ray's direction.
+    pub basis: &'a [f32],
+    /// From the camera on.
+    pub hits: &'a [Hit],
+    /// What reaches the background.
+    pub rest: f32,
+}
+
+/// The light of some pixels, with what each pixel has to say to the voxels that it sees.
+pub struct Light {
+    chunks: Vec<Chunk>,
+    /// Three numbers for each pixel.
+    values: Vec<[f32; 3]>,
+    /// Harmonics of each pixel.
+    basis: Tensor<f32>,
+    count: usize,
+    /// Rows of a part.
+    part: usize,
+}
+
+/// The hits of a part of the voxels.
+#[derive(Clone, Copy)]
+pub struct PartHits<'a> {
+    light: &'a Light,
+    part: usize,
+}
+
+/// A voxel of a part, seen by a pixel.
+pub struct SeenBy<'a> {
+    /// Row of the voxel, counted from the first of the part.
+    pub row: usize,
+    /// Its share of the pixel.
+    pub weight: f32,
+    /// What the pixel has to say.
+    pub value: [f32; 3],
+    /// Harmonics at the ray's direction.
+    pub basis: &'a [f32],
+}
+
+impl<'a> PartHits<'a> {
+    /// In the order of the pixels.
+    pub fn iter(self) -> impl Iterator<Item = SeenBy<'a>> {
+        let PartHits { light, part } = self;
+        let hits = light.chunks.iter().flat_map(move |chunk| &chunk.hits[chunk.bounds[part]..chunk.bounds[part + 1]]);
+        hits.map(move |hit| {
+            let ray = hit.ray as usize;
+            SeenBy {
+                row: hit.row as usize - part * light.part,
+                weight: hit.weight,
+                value: light.values[ray],
+                basis: &light.basis.data()[ray * light.count..][..light.count],
+            }
+        })
+    }
+}
+
+/// Hits of consecutive pixels, those of a part of the tables one after another.
+struct Chunk {
+    hits: Vec<Hit>,
+    bounds: [usize; PARTS + 1],
+}
+
+impl<'a> Opaque<'a> {
+    /// All voxels of a lattice with the same density, 1 / world length.
+    pub fn new(lattice: &'a Lattice, aabb: Aabb, density: f64) -> Self {
+        let count = lattice.nodes().map(|n| n.div_ceil(BRICK));
+        let first_rows = parallel::map_indices(lattice.masks().len(), |b| {
+            let brick = lattice.brick([b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]]);
+            brick.map_or(0, |(brick, _)| (brick * BRICK_ROWS) as u32)
+        });
+        Opaque { lattice, walk: Walk::new(aabb, lattice.nodes()), first_rows, density }
+    }
+
+    /// Appends the voxels that give to pixel number `number`; what reaches the background.
+    fn hits(&self, ray: &Ray, number: u32, out: &mut Vec<Hit>) -> f32 {
+        let masks = self.lattice.masks();
+        let mut light = 1.0_f32;
+        let empty = |brick: usize| masks[brick] == 0;
+        self.walk.along(ray, empty, |crossing| {
+            if masks[crossing.brick] >> crossing.bit & 1 == 1 {
+                let passes = (-self.density * (crossing.leave - crossing.enter)).exp() as f32;
+                out.push(Hit { row: self.first_rows[crossing.brick] + crossing.bit as u32, ray: number, weight: light * (1.0 - passes) });
+                light *= passes;
+            }
+            if light < REST { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        });
+        if light < REST { 0.0 } else { light }
+    }
+
+    /// The light of some pixels. `value` says what each has to say to the voxels that it sees; `degree` is of the harmonics.
+    pub fn light(
+        &self,
+        views: &[View],
+        pixels: &[Pixel],
+        background: [f32; 3],
+        degree: usize,
+        value: impl Fn(Lit<'_>) -> [f32; 3] + Sync,
+    ) -> Light {
+        let rays =
+            parallel::map_chunks(pixels.len(), CHUNK, |range| pixels[range].iter().map(|pixel| pixel.ray(views)).collect::<Vec<_>>());
+        let count = sh::count(degree);
+        let basis = basis(&rays, pixels.len(), degree);
+        let part = self.lattice.rows().div_ceil(PARTS).max(1);
+        let chunks = parallel::map_indices(rays.len(), |c| {
+            let (mut hits, mut values) = (Vec::with_capacity(16 * CHUNK), Vec::with_capacity(CHUNK));
+            for (i, ray) in rays[c].iter().enumerate() {
+                let (number, first) = (c * CHUNK + i, hits.len());
+                let rest = self.hits(ray, number as u32, &mut hits);
+                let color = pixels[number].color(views, background);
+                values.push(value(Lit { color, basis: &basis.data()[number * count..][..count], hits: &hits[first..], rest }));
+            }
+            (Chunk::new(&hits, part), values)
+        });
+        let (chunks, values): (Vec<_>, Vec<_>) = chunks.into_iter().unzip();
+        Light { chunks, values: values.concat(), basis, count, part }
+    }
+}
+
+impl Chunk {
+    /// Hits by the part of the tables that they belong to, in their order within each.
+    fn new(hits: &[Hit], part: usize) -> Self {
+        let part_of = |hit: &Hit| hit.row as usize / part;
+        let mut bounds = [0; PARTS + 1];
+        hits.iter().for_each(|hit| bounds[part_of(hit) + 1] += 1);
+        (0..PARTS).for_each(|p| bounds[p + 1] += bounds[p]);
+        let mut next = bounds;
+        let mut sorted = vec![Hit { row: 0, ray: 0, weight: 0.0 }; hits.len()];
+        for hit in hits {
+            let to = &mut next[part_of(hit)];
+            sorted[*to] = *hit;
+            *to += 1;
+        }
+        Chunk { hits: sorted, bounds }
+    }
+}
+
+impl Light {
+    /// Calls `f` with the hits of a part of the voxels, and the rows of some tables that belong to it, for all parts side by side. Tables come
+    /// with their width; hits of a voxel come in the order of the pixels.
+    pub fn for_each_part<const N: usize>(&self, tables: [(&mut Vec<f32>, usize); N], f: impl Fn(PartHits<'_>, [&mut [f32]; N]) + Sync) {
+        let widths = tables.each_ref().map(|(_, width)| *width);
+        let mut rows = tables.map(|(table, width)| table.chunks_mut(self.part * width));
+        let parts: Vec<[&mut [f32]; N]> = std::iter::from_fn(|| {
+            let next = rows.each_mut().map(|rows| rows.next().unwrap_or_default());
+            (!next[0].is_empty()).then_some(next)
+        })
+        .collect();
+        debug_assert!(parts.iter().all(|part| (0..N).all(|t| part[t].len() * widths[0] == part[0].len() * widths[t])));
+        parallel::for_each_item(parts, |part, rows| f(PartHits { light: self, part }, rows));
+    }
+
+    /// True if a pixel sees any voxel.
+    pub fn hits_anything(&self) -> bool {
+        self.chunks.iter().any(|chunk| !chunk.hits.is_empty())
+    }
+}
+
+impl Pixel {
+    fn place(self, views: &[View]) -> (&View, usize, usize) {
+        let view = &views[self.view as usize];
+        (view, (self.index % view.image.width()) as usize, (self.index / view.image.width()) as usize)
+    }
+
+    fn ray(self, views: &[View]) -> Ray {
+        let (view, x, y) = self.place(views);
+        view.camera.ray(x as f64 + 0.5, y as f64 + 0.5)
+    }
+
+    fn color(self, views: &[View], background: [f32; 3]) -> [f32; 3] {
+        let (view, x, y) = self.place(views);
+        view.color(x, y, background)
+    }
+}
+
+/// Harmonics at the directions of some rays, `[rays, (degree + 1)²]`.
+fn basis(rays: &[Vec<Ray>], n: usize, degree: usize) -> Tensor<f32> {
+    let mut directions = Buffer::stale(3 * n);
+    for (ray, out) in rays.iter().flatten().zip(directions.as_chunks_mut::<3>().0) {
+        *out = ray.direction.as_vec3().to_array();
+    }
+    no_grad(|| sh::basis(&Tensor::from_buffer(directions, &[n, 3]), degree))
+}
+
+/// The pixels that show the object, whatever its color: view after view, row after row, a batch at a time.
+pub fn object_pixels(views: &[View]) -> impl Iterator<Item = Vec<Pixel>> + '_ {
+    let mut pixels = views.iter().enumerate().flat_map(|(v, view)| {
+        let alphas = view.image.as_raw().iter().skip(3).step_by(4);
+        alphas.enumerate().filter(|(_, alpha)| **alpha > 0).map(move |(i, _)| Pixel { view: v as u32, index: i as u32 })
+    });
+    std::iter::from_fn(move || {
+        let batch: Vec<Pixel> = pixels.by_ref().take(BATCH).collect();
+        (!batch.is_empty()).then_some(batch)
+    })
+}

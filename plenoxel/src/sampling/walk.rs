@@ -1,0 +1,288 @@
+//! The voxels a ray passes through, each once, in order, with the exact chord (Amanatides and Woo 1987), over bricks of 4³ voxels of which
+//! the empty ones are crossed in one step.
+
+use super::occupancy::place_number;
+use crate::camera::Ray;
+use crate::geometry::Aabb;
+use autograd::lattice::{BRICK, STRIDE};
+use std::ops::ControlFlow;
+
+/// A voxel on a ray.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Crossing {
+    /// Which one.
+    pub voxel: [usize; 3],
+    /// Number of its brick, bricks in row-major order.
+    pub brick: usize,
+    /// Its bit in the brick's mask.
+    pub bit: usize,
+    /// Distance along the ray at which it is entered.
+    pub enter: f64,
+    /// Distance along the ray at which it is left, above `enter`.
+    pub leave: f64,
+}
+
+/// The voxels of a box as rays cross them.
+#[derive(Clone, Copy, Debug)]
+pub struct Walk {
+    aabb: Aabb,
+    voxels: [usize; 3],
+    bricks: [usize; 3],
+}
+
+/// The planes between voxels along one axis, numbered from 0 to `voxels`, as a ray meets them.
+#[derive(Clone, Copy)]
+struct Planes {
+    voxels: usize,
+    /// Where the ray starts, in voxels.
+    start: f64,
+    /// Distance along the ray from plane to plane: negative if it meets them in falling order, infinite if it meets none.
+    spacing: f64,
+}
+
+impl Planes {
+    /// Distance along the ray at which it meets a plane. The one definition: bricks and voxels agree to the bit.
+    #[inline(always)]
+    fn at(&self, plane: usize) -> f64 {
+        (plane as f64 - self.start) * self.spacing
+    }
+
+    fn forward(&self) -> bool {
+        self.spacing > 0.0
+    }
+
+    /// Distances at which the ray enters and leaves the slab between the planes `low` and `high`.
+    #[inline(always)]
+    fn slab(&self, low: usize, high: usize) -> (f64, f64) {
+        if self.spacing.is_infinite() {
+            return match self.start >= low as f64 && self.start <= high as f64 {
+                true => (f64::NEG_INFINITY, f64::INFINITY),
+                false => (f64::INFINITY, f64::NEG_INFINITY),
+            };
+        }
+        if self.forward() { (self.at(low), self.at(high)) } else { (self.at(high), self.at(low)) }
+    }
+
+    /// Distance at which the ray leaves cells `low..high`.
+    #[inline(always)]
+    fn leaves(&self, low: usize, high: usize) -> f64 {
+        match self.spacing.is_infinite() {
+            true => f64::INFINITY,
+            false => self.at(if self.forward() { high } else { low }),
+        }
+    }
+
+    /// The cell among `low..high` that the ray is in just after the distance t.
+    #[inline(always)]
+    fn cell(&self, t: f64, low: usize, high: usize) -> usize {
+        if self.spacing.is_infinite() {
+            return (self.start as usize).clamp(low, high - 1);
+        }
+        let mut k = ((self.start + t / self.spacing) as usize).clamp(low, high - 1);
+        // The division rounds; the planes decide.
+        if self.forward() {
+            while k + 1 < high && self.at(k + 1) <= t {
+                k += 1;
+            }
+            while k > low && self.at(k) > t {
+                k -= 1;
+            }
+        } else {
+            while k > low && self.at(k) <= t {
+                k -= 1;
+            }
+            while k + 1 < high && self.at(k + 1) > t {
+                k += 1;
+            }
+        }
+        k
+    }
+
+    fn new(voxels: usize, origin: f64, direction: f64, low: f64, high: f64) -> Self {
+        let side = (high - low) / voxels as f64;
+        Planes { voxels, start: (origin - low) / side, spacing: if direction == 0.0 { f64::INFINITY } else { side / direction } }
+    }
+
+    /// The voxels of a brick.
+    #[inline(always)]
+    fn of_brick(&self, brick: usize) -> (usize, usize) {
+        (brick * BRICK, (brick * BRICK + BRICK).min(self.voxels))
+    }
+}
+
+impl Walk {
+    /// The voxels of a box.
+    pub fn new(aabb: Aabb, voxels: [usize; 3]) -> Self {
+        Walk { aabb, voxels, bricks: voxels.map(|n| n.div_ceil(BRICK)) }
+    }
+
+    /// Calls `visit` for the voxels on a ray, from its origin on, until it breaks. Voxels of bricks for which `brick_is_empty` (asked when
+    /// the ray comes to the brick, by its number in row-major order) are left out; those that the ray only touches are no voxels on it.
+    #[inline]
+    pub fn along(&self, ray: &Ray, brick_is_empty: impl Fn(usize) -> bool, mut visit: impl FnMut(Crossing) -> ControlFlow<()>) {
+        let planes: [Planes; 3] =
+            [0, 1, 2].map(|a| Planes::new(self.voxels[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]));
+        let (mut t, mut end) = (0.0_f64, f64::INFINITY);
+        for axis in &planes {
+            let (enter, leave) = axis.slab(0, axis.voxels);
+            (t, end) = (t.max(enter), end.min(leave));
+        }
+        // A ray without direction has no end.
+        if t >= end || end.is_infinite() {
+            return;
+        }
+        let mut place = planes.map(|axis| axis.cell(t, 0, axis.voxels) / BRICK);
+        loop {
+            let bounds: [(usize, usize); 3] = [0, 1, 2].map(|a| planes[a].of_brick(place[a]));
+            let exits = [0, 1, 2].map(|a| planes[a].leaves(bounds[a].0, bounds[a].1));
+            let axis = smallest(exits);
+            let brick = place_number(place, self.bricks);
+            let leave = exits[axis].min(end);
+            if leave > t && !brick_is_empty(brick) {
+                if cross(&planes, bounds, brick, t, leave, &mut visit).is_break() {
+                    return;
+                }
+            }
+            let forward = planes[axis].forward();
+            if exits[axis] >= end || if forward { place[axis] + 1 == self.bricks[axis] } else { place[axis] == 0 } {
+                return;
+            }
+            place[axis] = if forward { place[axis] + 1 } else { place[axis] - 1 };
+            t = t.max(exits[axis]);
+        }
+    }
+}
+
+/// The voxels of one brick, between two distances.
+#[inline(always)]
+fn cross(
+    planes: &[Planes; 3],
+    bounds: [(usize, usize); 3],
+    brick: usize,
+    mut t: f64,
+    end: f64,
+    visit: &mut impl FnMut(Crossing) -> ControlFlow<()>,
+) -> ControlFlow<()> {
+    let mut voxel: [usize; 3] = [0, 1, 2].map(|a| planes[a].cell(t, bounds[a].0, bounds[a].1));
+    let mut exits = [0, 1, 2].map(|a| planes[a].leaves(voxel[a], voxel[a] + 1));
+    loop {
+        let axis = smallest(exits);
+        let leave = exits[axis].min(end);
+        if leave > t {
+            let bit = (0..3).map(|a| (voxel[a] - bounds[a].0) * STRIDE[a]).sum();
+            visit(Crossing { voxel, brick, bit, enter: t, leave })?;
+        }
+        let (low, high) = bounds[axis];
+        let forward = planes[axis].forward();
+        if exits[axis] >= end || if forward { voxel[axis] + 1 == high } else { voxel[axis] == low } {
+            return ControlFlow::Continue(());
+        }
+        voxel[axis] = if forward { voxel[axis] + 1 } else { voxel[axis] - 1 };
+        t = t.max(exits[axis]);
+        exits[axis] = planes[axis].leaves(voxel[axis], voxel[axis] + 1);
+    }
+}
+
+/// The axis with the smallest number.
+#[inline(always)]
+fn smallest(x: [f64; 3]) -> usize {
+    if x[0] <= x[1] {
+        if x[0] <= x[2] { 0 } else { 2 }
+    } else if x[1] <= x[2] {
+        1
+    } else {
+        2
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::{Purpose, uniform};
+    use glam::{DVec3, dvec3};
+
+    fn crossings(walk: &Walk, origin: DVec3, direction: DVec3) -> Vec<Crossing> {
+        let mut found = Vec::new();
+        walk.along(
+            &Ray { origin, direction, stretch: 1.0 },
+            |_| false,
+            |crossing| {
+                found.push(crossing);
+                ControlFlow::Continue(())
+            },
+        );
+        found
+    }
+
+    /// Two points on a sphere around the box, by number.
+    fn random_ray(seed: u64) -> (DVec3, DVec3) {
+        let number = |k: u64| 2.0 * uniform(seed, Purpose::Initial, 9, k) - 1.0;
+        let from = 4.0 * dvec3(number(0), number(1), number(2)).normalize();
+        let to = 1.2 * dvec3(number(3), number(4), number(5));
+        (from, (to - from).normalize())
+    }
+
+    #[test]
+    fn the_voxels_of_random_rays_are_those_of_their_middles_and_their_chords_add_up() {
+        let aabb = Aabb { min: dvec3(-1.0, -0.8, -1.3), max: dvec3(1.1, 0.9, 1.2) };
+        let voxels = [13, 8, 21];
+        let walk = Walk::new(aabb, voxels);
+        for seed in 0..2000 {
+            let (origin, direction) = random_ray(seed);
+            let found = crossings(&walk, origin, direction);
+            let chord: f64 = found.iter().map(|c| c.leave - c.enter).sum();
+            let expected = aabb.intersect(origin, direction).map_or(0.0, |(enter, leave)| leave - enter);
+            assert!((chord - expected).abs() < 1e-12, "ray {seed}: {chord} against {expected}");
+            assert!(found.windows(2).all(|pair| pair[0].leave == pair[1].enter), "ray {seed} has gaps");
+            for c in found.iter().filter(|c| c.leave - c.enter > 1e-9) {
+                let middle = origin + 0.5 * (c.enter + c.leave) * direction;
+                let u = (middle - aabb.min) / (aabb.max - aabb.min);
+                let voxel: [usize; 3] = std::array::from_fn(|a| (u[a] * voxels[a] as f64) as usize);
+                assert_eq!(c.voxel, voxel, "ray {seed}");
+            }
+        }
+    }
+
+    #[test]
+    fn rays_along_axes_and_faces_go_straight() {
+        let walk = Walk::new(Aabb::cube(1.0), [8; 3]);
+        let straight = crossings(&walk, dvec3(-3.0, 0.3, -0.9), DVec3::X);
+        assert_eq!(straight.iter().map(|c| c.voxel).collect::<Vec<_>>(), (0..8).map(|i| [i, 5, 0]).collect::<Vec<_>>());
+        let back = crossings(&walk, dvec3(0.3, 0.3, 5.0), -DVec3::Z);
+        assert_eq!(back.iter().map(|c| c.voxel).collect::<Vec<_>>(), (0..8).rev().map(|k| [5, 5, k]).collect::<Vec<_>>());
+        // Between two voxels: one of them, not both; from within, the rest of the way; beside the box and away from it, none.
+        assert_eq!(crossings(&walk, dvec3(-3.0, 0.25, 0.1), DVec3::X).len(), 8);
+        assert_eq!(crossings(&walk, dvec3(0.1, 0.1, 0.1), DVec3::Y).len(), 4);
+        assert!(crossings(&walk, dvec3(-3.0, 1.1, 0.0), DVec3::X).is_empty());
+        assert!(crossings(&walk, dvec3(-3.0, 0.0, 0.0), -DVec3::X).is_empty());
+        assert!(crossings(&walk, DVec3::ZERO, DVec3::ZERO).is_empty());
+    }
+
+    #[test]
+    fn empty_bricks_are_left_out_and_breaking_ends_the_walk() {
+        let walk = Walk::new(Aabb::cube(1.0), [16; 3]);
+        let (origin, direction) = random_ray(7);
+        let all = crossings(&walk, origin, direction);
+        let ray = Ray { origin, direction, stretch: 1.0 };
+        let mut odd = Vec::new();
+        walk.along(
+            &ray,
+            |brick| brick % 2 == 0,
+            |c| {
+                odd.push(c);
+                ControlFlow::Continue(())
+            },
+        );
+        assert!(!odd.is_empty() && odd.iter().copied().eq(all.iter().copied().filter(|c| c.brick % 2 == 1)));
+        let mut first = None;
+        walk.along(
+            &ray,
+            |_| false,
+            |c| {
+                assert!(first.replace(c).is_none());
+                ControlFlow::Break(())
+            },
+        );
+        assert_eq!(first, all.first().copied());
+    }
+}
