@@ -1,7 +1,10 @@
 //! One file for each command: its arguments, and what it does.
 
+pub mod carve;
 pub mod evaluate;
 pub mod info;
+mod new_run;
+mod pictures;
 pub mod render;
 pub mod scene;
 pub mod train;
@@ -9,13 +12,6 @@ mod trained_run;
 
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Error;
-use plenoxel::field::voxel_grid::GridShape;
-use plenoxel::train::config::Config;
-
-/// The grid that a configuration ends with.
-fn final_shape(config: &Config) -> GridShape {
-    config.grid_shape(config.stages.last().map_or(0, |stage| stage.resolution))
-}
 
 /// Refuses a split without views.
 fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
@@ -38,6 +34,22 @@ pub fn whole<N: TryFrom<u64>>(least: u64, most: u64) -> impl Fn(&str) -> Result<
     move |text| {
         let number = text.parse().ok().filter(|n| (least..=most).contains(n));
         number.and_then(|n| N::try_from(n).ok()).ok_or_else(|| format!("a whole number from {least} to {most}"))
+    }
+}
+
+/// A color as the command line takes it: a name, or three numbers.
+fn background(text: &str) -> Result<[f64; 3], String> {
+    match text {
+        "white" => return Ok([1.0; 3]),
+        "black" => return Ok([0.0; 3]),
+        _ => {}
+    }
+    let accepted = "white, black, or three numbers in [0, 1] such as 0.2,0.5,1";
+    let numbers: Vec<f64> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
+    let color: [f64; 3] = numbers.try_into().map_err(|_| accepted)?;
+    match text.matches(',').count() == 2 && color.iter().all(|c| (0.0..=1.0).contains(c)) {
+        true => Ok(color),
+        false => Err(accepted.to_owned()),
     }
 }
 

@@ -20,6 +20,9 @@ pub const PRESETS: [(&str, &str, &str); 3] = [
     ("paper", "\"Plenoxels and extension to point clouds\", bugs repaired", include_str!("../presets/paper.toml")),
 ];
 
+/// What `carve` starts from: no preset of training.
+pub const CARVE: (&str, &str, &str) = ("carve", "an opaque grid from silhouettes", include_str!("../presets/carve.toml"));
+
 /// A configuration in the making.
 #[derive(Debug)]
 pub struct Layers {
@@ -39,7 +42,7 @@ impl Layers {
 
     /// Lays a preset over what is there.
     pub fn preset(&mut self, name: &str) -> Result<()> {
-        let preset = PRESETS.iter().find(|(known, ..)| *known == name);
+        let preset = PRESETS.iter().chain([&CARVE]).find(|(known, ..)| *known == name);
         let Some((name, _, text)) = preset else {
             let names: Vec<&str> = PRESETS.iter().map(|(name, ..)| *name).collect();
             return Err(Error::config("--preset", name, names.join(", ")));
@@ -159,6 +162,28 @@ impl ConfigFile {
         let found = self.lines.iter().find(|(known, _)| known == path);
         found.map(|(_, line)| *line)
     }
+}
+
+/// The settings of a command, defaults < preset < file < flags, and the preset they started from: the one asked for, or `default` unless the
+/// file is complete.
+pub fn layered<'a>(
+    preset: Option<&'a str>,
+    default: &'a str,
+    file: Option<&Path>,
+    flags: impl FnOnce(&mut Layers) -> Result<()>,
+) -> Result<(Config, Option<&'a str>)> {
+    let file = file.map(ConfigFile::read).transpose()?;
+    let complete = file.as_ref().is_some_and(ConfigFile::is_complete);
+    let preset = preset.or((!complete).then_some(default));
+    let mut layers = Layers::defaults()?;
+    if let Some(preset) = preset {
+        layers.preset(preset)?;
+    }
+    if let Some(file) = &file {
+        layers.file(file)?;
+    }
+    flags(&mut layers)?;
+    Ok((layers.resolve()?, preset))
 }
 
 /// Writes a configuration so that reading it gives the same one.

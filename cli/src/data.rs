@@ -39,6 +39,11 @@ impl DataSource {
         DataSource::Folder { path: absolute.unwrap_or_else(|_| path.to_owned()) }
     }
 
+    /// The folder, or without one the built-in scene as it is by default.
+    pub fn of(folder: Option<&Path>) -> Self {
+        folder.map_or_else(|| DataSource::built_in(&ProceduralOptions::default()), DataSource::folder)
+    }
+
     /// The built-in scene.
     pub fn built_in(options: &ProceduralOptions) -> Self {
         DataSource::BuiltIn { width: options.width, height: options.height, train: options.train, val: options.val, test: options.test }

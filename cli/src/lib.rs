@@ -17,7 +17,7 @@ mod progress;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{evaluate, info, render, scene, train};
+use commands::{carve, evaluate, info, render, scene, train};
 use plenoxel::error::Error;
 use progress::Console;
 use std::ffi::OsString;
@@ -30,6 +30,7 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel train                             learn the built-in scene; needs no files
   plenoxel train data/lego --preset paper    learn a NeRF-synthetic scene as the source paper does
+  plenoxel carve data/lego                   an opaque colored grid from silhouettes, in seconds
   plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
   plenoxel render runs/lego-1 --view 0       a picture of it
 
@@ -48,6 +49,7 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Train(Box<train::TrainArgs>),
+    Carve(Box<carve::CarveArgs>),
     Render(render::RenderArgs),
     Evaluate(evaluate::EvaluateArgs),
     Info(info::InfoArgs),
@@ -84,6 +86,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     let console = Console::new(streams, cli.machine.quiet);
     let done = machine::with_threads(cli.machine.threads, || match &cli.command {
         Command::Train(args) => train::run(args, &console),
+        Command::Carve(args) => carve::run(args, &console),
         Command::Render(args) => render::run(args, &console),
         Command::Evaluate(args) => evaluate::run(args, &console),
         Command::Info(args) => info::run(args, &console),

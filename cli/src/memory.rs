@@ -31,6 +31,8 @@ pub struct Estimate {
 
 /// Program, threads, buffers on their way: measured on small runs.
 const BASE: u64 = 60_000_000;
+/// What a batch of pixels gives to voxels while these are colored, with the lists that it is sorted into.
+const CARVING_BATCH: u64 = 100_000_000;
 /// Rays that are rendered at a time when evaluating.
 const EVALUATION_RAYS: u64 = 4096;
 
@@ -89,18 +91,47 @@ impl Estimate {
         Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: prunes(config), key, advice }
     }
 
-    /// Rendering a trained grid, and comparing it with the views of a split where `compare` is set.
-    pub fn of_evaluation(config: &Config, sampling: Sampling, shape: &GridShape, dataset: &Dataset, compare: Option<Split>) -> Self {
+    /// Rendering a trained grid of so many voxels, and comparing it with the views of a split where `compare` is set.
+    pub fn of_evaluation(
+        config: &Config,
+        sampling: Sampling,
+        shape: &GridShape,
+        voxels: usize,
+        dataset: &Dataset,
+        compare: Option<Split>,
+    ) -> Self {
         let samples = EVALUATION_RAYS * mean_samples(sampling, shape);
         Estimate {
             images: compare.map_or(0, |split| images(dataset, config.downscale, &[split])),
             // The file and the tables read from it.
-            grid: 2 * shape.bytes() as u64,
+            grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
             step: samples * evaluation_bytes_per_sample(config.engine, shape),
-            pruned: prunes(config),
+            pruned: false,
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
+        }
+    }
+
+    /// Carving: the images and the masks of the box; and, once it is known how many rows the tables of what is left have, their fit.
+    pub fn of_carving(config: &Config, dataset: &Dataset, rows: usize) -> Self {
+        let shape = config.grid_shape(config.carve.resolution);
+        let coefficients = shape.color.channels() as u64 / 3;
+        // A bit for each voxel, in a few copies, and one byte for each brick.
+        let masks = shape.voxels() as u64;
+        let (width, height) = dataset.size();
+        // Summed-area tables of some views, or the light of a batch of pixels.
+        let step = (32 * (width * height) as u64).max(CARVING_BATCH);
+        // The two sides of the normal equations, the answer, its error, and how much a voxel weighs.
+        let fit = 4 * rows as u64 * (coefficients * (coefficients + 1) / 2 + 9 * coefficients + 2);
+        Estimate {
+            images: images(dataset, config.downscale, &[Split::Train, Split::Test]),
+            grid: masks + fit,
+            optimizer: 0,
+            step,
+            pruned: false,
+            key: "--resolution".to_owned(),
+            advice: "fewer voxels a side, or a lower --sh-degree",
         }
     }
 

@@ -130,12 +130,23 @@ impl RunFolder {
     ///
     /// Errors: there is none, because the run did not end well; or it is damaged.
     pub fn load(&self) -> Result<(VoxelGrid<f32>, Header)> {
+        checkpoint::load(&self.existing_checkpoint()?)
+    }
+
+    /// Reads what the trained grid says of itself, and the number of its voxels.
+    ///
+    /// Errors as for [`RunFolder::load`].
+    pub fn header(&self) -> Result<(Header, usize)> {
+        checkpoint::header(&self.existing_checkpoint()?)
+    }
+
+    fn existing_checkpoint(&self) -> Result<PathBuf> {
         let path = self.checkpoint();
         if !path.exists() {
             let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
             return Err(Error::input(&self.path, found, "train again"));
         }
-        checkpoint::load(&path)
+        Ok(path)
     }
 
     /// Writes the final figures.

@@ -9,9 +9,11 @@ use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::files::write_atomically;
 use autograd::{Indices, Lattice, Real, Tensor};
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 /// Version of the format of grids with all their voxels.
@@ -139,13 +141,26 @@ fn node(voxel: u32, n: usize) -> [usize; 3] {
     [voxel / (n * n), voxel / n % n, voxel % n]
 }
 
-/// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
-pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
-    let file = std::fs::read(path).map_err(|e| Error::io(path, e, "reading the checkpoint"))?;
-    let retrain = "train again, or use an undamaged copy";
-    let damaged = |e: safetensors::SafeTensorError| Error::input(path, format!("not a whole safetensors file ({e})"), retrain);
-    let tensors = SafeTensors::deserialize(&file).map_err(damaged)?;
-    let (_, metadata) = SafeTensors::read_metadata(&file).map_err(damaged)?;
+/// What helps against a damaged file.
+const RETRAIN: &str = "train again, or use an undamaged copy";
+
+/// Reads what a checkpoint says of itself, without its tables: the header, and the number of voxels that are present.
+pub fn header(path: &Path) -> Result<(Header, usize)> {
+    /// The longest header that the format allows.
+    const LONGEST: u64 = 100_000_000;
+    let refused = |e| Error::io(path, e, "reading the checkpoint");
+    let mut file = File::open(path).map_err(refused)?;
+    let (mut length, mut text) = (Vec::new(), Vec::new());
+    file.by_ref().take(8).read_to_end(&mut length).map_err(refused)?;
+    let length = length.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
+    file.take(length.min(LONGEST)).read_to_end(&mut text).map_err(refused)?;
+    let metadata: Metadata = serde_json::from_slice(&text).map_err(|e| damaged(path, &e))?;
+    let shape = metadata.info("voxels").or_else(|| metadata.info("density")).map_or(&[][..], |info| &info.shape);
+    Ok((header_of(path, &metadata)?, shape.iter().product()))
+}
+
+/// The header among the metadata of a file.
+fn header_of(path: &Path, metadata: &Metadata) -> Result<Header> {
     let Some(text) = metadata.metadata().as_ref().and_then(|m| m.get(KEY)) else {
         return Err(Error::input(
             path,
@@ -154,7 +169,7 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
         ));
     };
     // The version first: a later one may have other fields.
-    let unreadable = |e: serde_json::Error| Error::input(path, format!("the header cannot be read ({e})"), retrain);
+    let unreadable = |e: serde_json::Error| Error::input(path, format!("the header cannot be read ({e})"), RETRAIN);
     let format = serde_json::from_str::<serde_json::Value>(text).map_err(unreadable)?["format"].as_str().unwrap_or("none").to_owned();
     if format != FORMAT && format != SPARSE_FORMAT {
         return Err(Error::input(
@@ -173,17 +188,30 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
         ));
     }
     if !((1..=1024).contains(&header.resolution) && degree_known && header.half_width > 0.0 && header.half_width.is_finite()) {
-        return Err(Error::input(path, "a header with impossible values", retrain));
+        return Err(Error::input(path, "a header with impossible values", RETRAIN));
     }
+    Ok(header)
+}
+
+fn damaged(path: &Path, e: &dyn std::fmt::Display) -> Error {
+    Error::input(path, format!("not a whole safetensors file ({e})"), RETRAIN)
+}
+
+/// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
+pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
+    let file = std::fs::read(path).map_err(|e| Error::io(path, e, "reading the checkpoint"))?;
+    let tensors = SafeTensors::deserialize(&file).map_err(|e| damaged(path, &e))?;
+    let (_, metadata) = SafeTensors::read_metadata(&file).map_err(|e| damaged(path, &e))?;
+    let header = header_of(path, &metadata)?;
     let shape = header.shape();
     let n = header.resolution;
     let read = |name: &str, dtype: Dtype, expected: &[usize]| -> Result<&[u8]> {
-        let view = tensors.tensor(name).map_err(|_| Error::input(path, format!("no tensor `{name}`"), retrain))?;
+        let view = tensors.tensor(name).map_err(|_| Error::input(path, format!("no tensor `{name}`"), RETRAIN))?;
         if view.dtype() != dtype || view.shape() != expected {
             return Err(Error::input(
                 path,
                 format!("tensor `{name}` is {:?} {:?}", view.dtype(), view.shape()),
-                format!("{dtype:?} {expected:?} is expected; {retrain}"),
+                format!("{dtype:?} {expected:?} is expected; {RETRAIN}"),
             ));
         }
         Ok(view.data())
@@ -196,13 +224,13 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
         Ok(Tensor::from_vec(values, &[rows, channels]))
     };
     let channels = shape.color.channels();
-    let grid = if format == FORMAT {
+    let grid = if header.format == FORMAT {
         VoxelGrid::from_row_major(shape, &table("density", 1, &[n, n, n])?, &table("color", channels, &[n, n, n, channels])?)
     } else {
         let k = tensors.tensor("voxels").map_or(0, |view| view.shape().iter().product());
         let voxels: Vec<u32> = words(read("voxels", Dtype::U32, &[k])?).into_iter().map(u32::from_le_bytes).collect();
         if !voxels.is_sorted_by(|a, b| a < b) || voxels.last().is_none_or(|&last| last as usize >= n * n * n) {
-            return Err(Error::input(path, "a list of voxels that is empty, not ascending, or longer than the grid", retrain));
+            return Err(Error::input(path, "a list of voxels that is empty, not ascending, or longer than the grid", RETRAIN));
         }
         let [density, color] = [table("density", 1, &[k])?, table("color", channels, &[k, channels])?];
         let lattice = Lattice::bricks_where([n; 3], |[x, y, z]| voxels.binary_search(&(((x * n + y) * n + z) as u32)).is_ok());
@@ -212,7 +240,7 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
         VoxelGrid::with_lattice(shape, lattice, density, color)
     };
     if !grid.is_finite() {
-        return Err(Error::input(path, "numbers that are not finite", retrain));
+        return Err(Error::input(path, "numbers that are not finite", RETRAIN));
     }
     Ok((grid, header))
 }

@@ -81,6 +81,9 @@ impl<'a, T: Real> Trainer<'a, T> {
         if rays.is_empty() {
             return Err(Error::config("train views", "none", "at least one image to learn from"));
         }
+        if config.stages.is_empty() {
+            return Err(Error::config("stages", "no stage", "at least one"));
+        }
         let mut first = 0;
         let plan: Vec<PlannedStage> = config
             .stages

@@ -1,6 +1,6 @@
 //! `plenoxel evaluate`: figures of a trained run on the views of a split.
 
-use super::train::load;
+use super::new_run::load;
 use super::trained_run::{Opened, TrainedRun};
 use crate::evaluation::{Scores, ViewScore, Viewer};
 use crate::memory;

@@ -1,27 +1,25 @@
 //! `plenoxel train`: from photographs to a run folder.
 
 mod flags;
-mod pictures;
 
+use super::new_run::{Stopwatch, announce, load, record};
+use super::pictures::Pictures;
 use crate::curves::loss_svg;
-use crate::data::DataSource;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
-use crate::machine;
 use crate::memory::{self, Estimate};
 use crate::metrics_file::MetricsFile;
 use crate::progress::{Console, clock};
-use crate::run_folder::{RunFolder, RunRecord};
+use crate::run_folder::RunFolder;
 pub use flags::{TrainArgs, size};
-use pictures::Pictures;
 use plenoxel::checkpoint::Header;
-use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::dataset::{Split, View};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::train::Trainer;
 use plenoxel::train::config::Config;
 use serde::Serialize;
 use serde_json::json;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Learns a scene and leaves a run folder.
 pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
@@ -241,57 +239,6 @@ struct Clocks {
     load: Stopwatch,
     train: Stopwatch,
     evaluate: Stopwatch,
-}
-
-#[derive(Debug, Default)]
-struct Stopwatch(Duration);
-
-impl Stopwatch {
-    fn time<R>(&mut self, f: impl FnOnce() -> R) -> R {
-        let start = Instant::now();
-        let result = f();
-        self.0 += start.elapsed();
-        result
-    }
-
-    fn seconds(&self) -> f64 {
-        self.0.as_secs_f64()
-    }
-}
-
-/// Reads or renders a split.
-pub fn load(console: &Console<'_>, dataset: &Dataset, split: Split, source: &DataSource) -> Result<Vec<View>> {
-    let what = match source {
-        DataSource::Folder { .. } => format!("reading {split} images"),
-        DataSource::BuiltIn { .. } => format!("rendering {split} images of the built-in scene"),
-    };
-    let count = console.count(&what, dataset.count(split));
-    dataset.load(split, &|done, total| count.at(done, total))
-}
-
-fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
-    let (width, height) = dataset.size();
-    let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
-    console.note(&format!(
-        "scene: {}, {}, {train} train, {val} val, {test} test views of {width} x {height}, background {:?}, half width {}",
-        dataset.name(),
-        dataset.format(),
-        config.background,
-        config.half_width,
-    ));
-    console.note(&format!("machine: {}, {} threads", machine::instruction_set(), machine::threads()));
-}
-
-fn record(dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> RunRecord {
-    RunRecord {
-        program: crate::PROGRAM.to_owned(),
-        instruction_set: machine::instruction_set().to_owned(),
-        threads: machine::threads(),
-        scene: dataset.name().to_owned(),
-        format: dataset.format().to_owned(),
-        preset: preset.map(str::to_owned),
-        data: source.clone(),
-    }
 }
 
 fn conclude(console: &Console<'_>, folder: &RunFolder, summary: &Summary, scores: &Scores, pictures: &Pictures<'_>) -> Result<()> {

@@ -57,9 +57,10 @@ impl TrainedRun {
         let source = self.data.as_deref().map_or(record.data, DataSource::folder);
         let dataset = source.reopen(&config)?;
         super::check_split(&dataset, self.split)?;
-        let shape = super::final_shape(&config);
+        let (header, voxels) = folder.header()?;
+        let shape = header.shape();
         let sampling = self.samples.map_or(config.evaluation, |samples| with_samples(config.evaluation, samples, &shape));
-        let estimate = Estimate::of_evaluation(&config, sampling, &shape, &dataset, compare.then_some(self.split));
+        let estimate = Estimate::of_evaluation(&config, sampling, &shape, voxels, &dataset, compare.then_some(self.split));
         console.note(&estimate.describe());
         estimate.check()?;
         let (grid, header) = folder.load()?;

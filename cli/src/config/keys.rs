@@ -26,11 +26,13 @@ const TABLES: &[(&str, &[&str])] = &[
             "prune_from_stage",
             "prune_below",
             "prune_unseen_below",
+            "hull",
             "initial",
             "optimizer",
             "losses",
             "stages",
             "evaluation",
+            "carve",
         ],
     ),
     ("initial", &["density", "color", "random"]),
@@ -40,6 +42,7 @@ const TABLES: &[(&str, &[&str])] = &[
     ("stages[]", &["resolution", "epochs", "steps", "sampling", "density_rate", "color_rate", "rate_decay"]),
     ("stages[].sampling", &["step", "samples", "far"]),
     ("evaluation", &["step", "samples", "far"]),
+    ("carve", &["resolution", "rule", "margin", "depth", "fit", "ridge", "sweeps"]),
 ];
 
 /// Checks every key of a table and of the tables in it. `place(path)` says where a path was written.

@@ -38,13 +38,17 @@ pub struct Seen<'a> {
     pub offset: f32,
 }
 
-/// Harmonics of every row, all of red, then green, then blue; and how much of the pixels each row is, all in all.
+/// What a fit finds.
 pub struct Fitted {
-    /// `[rows, 3 (degree + 1)²]`
+    /// Harmonics of every row, all of red, then green, then blue: `[rows, 3 (degree + 1)²]`. Those of voxels that no pixel shows are 0.
     pub table: Vec<f32>,
-    /// `[rows]`, Σ w.
-    pub weight: Vec<f32>,
+    /// The share of object pixels that show no voxel.
+    pub missed: f64,
 }
+
+/// Passes of [`fit_by_descent`] over the pixels.
+pub const EPOCHS: usize = RATES.len();
+const RATES: [f32; 4] = [0.9, 0.9, 0.1, 0.1];
 
 impl Seen<'_> {
     fn count(&self) -> usize {
@@ -80,15 +84,18 @@ impl Seen<'_> {
     }
 }
 
-/// The solution of every voxel's own problem, then `sweeps` over all of them together.
-pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, swept: &dyn Fn(usize)) -> Fitted {
+/// The solution of every voxel's own problem, then `sweeps` over all of them together. `passed(passes)` is called after each.
+pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, passed: &dyn Fn(usize)) -> Fitted {
     let count = seen.count();
     let (triangle, width) = (count * (count + 1) / 2, 3 * count);
     let rows = seen.lattice.rows();
     // One pass for both sides: the triangle of A, then b.
     let mut sides = vec![0.0_f32; rows * (triangle + width)];
+    let (mut pixels_all, mut pixels_missed) = (0, 0);
     for pixels in object_pixels(seen.views) {
         let light = seen.opaque.light(seen.views, &pixels, seen.background, seen.degree, |lit| lit.color.map(|c| c - seen.offset));
+        pixels_all += pixels.len();
+        pixels_missed += light.missed();
         light.for_each_part([(&mut sides, triangle + width)], |hits, [sides]| {
             for seen in hits.iter() {
                 let (a, b) = sides[seen.row * (triangle + width)..][..triangle + width].split_at_mut(triangle);
@@ -118,12 +125,13 @@ pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, swept: &dyn Fn(us
     };
     let mut table = vec![0.0; rows * width];
     solve(&mut table, &sides, triangle + width);
+    passed(1);
     for sweep in 0..sweeps {
         let error = seen.gather(|lit| seen.error(&lit, &table));
         solve(&mut table, &error, width);
-        swept(sweep + 1);
+        passed(sweep + 2);
     }
-    Fitted { table, weight }
+    Fitted { table, missed: pixels_missed as f64 / pixels_all as f64 }
 }
 
 /// x ← x + A⁻¹ (g − ridge x), channel by channel, without a ridge on the mean.
@@ -167,11 +175,11 @@ fn improve(x: &mut [f32], a: &[f32], g: &[f32], ridge: f32) {
 /// ```
 ///
 /// the composite has its background, and rays are not jittered.
-pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, stepped: &dyn Fn(usize)) -> Fitted {
-    const RATES: [f32; 4] = [0.9, 0.9, 0.1, 0.1];
+pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, passed: &dyn Fn(usize)) -> Fitted {
     const RAYS: usize = 5000;
     let (count, width) = (seen.count(), 3 * seen.count());
     let mean = fit_exactly(&Seen { degree: 0, ..*seen }, 0.0, 0, &|_| {});
+    passed(1);
     let mut table = vec![0.0; seen.lattice.rows() * width];
     for (row, mean) in table.chunks_exact_mut(width).zip(mean.table.chunks_exact(3)) {
         row.iter_mut().step_by(count).zip(mean).for_each(|(x, mean)| *x = *mean);
@@ -203,9 +211,9 @@ pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, stepped: &dyn Fn(usize)) -> Fi
         if epoch == 0 {
             table = smoothed(seen.lattice, &table, width);
         }
-        stepped(epoch + 1);
+        passed(epoch + 2);
     }
-    Fitted { table, weight: mean.weight }
+    Fitted { table, missed: mean.missed }
 }
 
 /// row += w S valueᶜ for the three channels.

@@ -71,6 +71,7 @@ pub struct Light {
     count: usize,
     /// Rows of a part.
     part: usize,
+    missed: usize,
 }
 
 /// The hits of a part of the voxels.
@@ -126,20 +127,19 @@ impl<'a> Opaque<'a> {
         Opaque { lattice, walk: Walk::new(aabb, lattice.nodes()), first_rows, density }
     }
 
-    /// Appends the voxels that give to pixel number `number`; what reaches the background.
-    fn hits(&self, ray: &Ray, number: u32, out: &mut Vec<Hit>) -> f32 {
+    /// Appends the voxels on a ray, from the camera on, each with the optical depth behind it as its weight, until that is opaque.
+    fn depths(&self, ray: &Ray, number: u32, out: &mut Vec<Hit>) {
         let masks = self.lattice.masks();
-        let mut light = 1.0_f32;
+        let opaque = -REST.ln();
+        let (mut depth, density) = (0.0_f32, self.density);
         let empty = |brick: usize| masks[brick] == 0;
         self.walk.along(ray, empty, |crossing| {
             if masks[crossing.brick] >> crossing.bit & 1 == 1 {
-                let passes = (-self.density * (crossing.leave - crossing.enter)).exp() as f32;
-                out.push(Hit { row: self.first_rows[crossing.brick] + crossing.bit as u32, ray: number, weight: light * (1.0 - passes) });
-                light *= passes;
+                depth += (density * (crossing.leave - crossing.enter)) as f32;
+                out.push(Hit { row: self.first_rows[crossing.brick] + crossing.bit as u32, ray: number, weight: depth });
             }
-            if light < REST { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            if depth > opaque { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
-        if light < REST { 0.0 } else { light }
     }
 
     /// The light of some pixels. `value` says what each has to say to the voxels that it sees; `degree` is of the harmonics.
@@ -157,18 +157,46 @@ impl<'a> Opaque<'a> {
         let basis = basis(&rays, pixels.len(), degree);
         let part = self.lattice.rows().div_ceil(PARTS).max(1);
         let chunks = parallel::map_indices(rays.len(), |c| {
-            let (mut hits, mut values) = (Vec::with_capacity(16 * CHUNK), Vec::with_capacity(CHUNK));
+            let (mut hits, mut ends) = (Vec::with_capacity(16 * CHUNK), Vec::with_capacity(CHUNK));
             for (i, ray) in rays[c].iter().enumerate() {
-                let (number, first) = (c * CHUNK + i, hits.len());
-                let rest = self.hits(ray, number as u32, &mut hits);
-                let color = pixels[number].color(views, background);
-                values.push(value(Lit { color, basis: &basis.data()[number * count..][..count], hits: &hits[first..], rest }));
+                self.depths(ray, (c * CHUNK + i) as u32, &mut hits);
+                ends.push(hits.len());
             }
-            (Chunk::new(&hits, part), values)
+            let rests = to_weights(&mut hits, &ends);
+            let mut first = 0;
+            let lit = ends.iter().zip(rests).enumerate().map(|(i, (&end, rest))| {
+                let number = c * CHUNK + i;
+                let hits = &hits[std::mem::replace(&mut first, end)..end];
+                let color = pixels[number].color(views, background);
+                value(Lit { color, basis: &basis.data()[number * count..][..count], hits, rest })
+            });
+            let values = lit.collect::<Vec<_>>();
+            let missed = (0..ends.len()).filter(|&i| ends[i] == if i == 0 { 0 } else { ends[i - 1] }).count();
+            (Chunk::new(&hits, part), values, missed)
         });
-        let (chunks, values): (Vec<_>, Vec<_>) = chunks.into_iter().unzip();
-        Light { chunks, values: values.concat(), basis, count, part }
+        let missed = chunks.iter().map(|(.., missed)| missed).sum();
+        let (chunks, values): (Vec<_>, Vec<_>) = chunks.into_iter().map(|(chunk, values, _)| (chunk, values)).unzip();
+        Light { chunks, values: values.concat(), basis, count, part, missed }
     }
+}
+
+/// Turns optical depths behind voxels into their weights, e^(-depth before) - e^(-depth behind), and returns what is left of the light at the
+/// end of each ray: nothing where it is opaque. The hits of ray r end at `ends[r]`.
+fn to_weights(hits: &mut [Hit], ends: &[usize]) -> Vec<f32> {
+    let depths: Vec<f32> = hits.iter().map(|hit| -hit.weight).collect();
+    let n = depths.len();
+    let light = no_grad(|| Tensor::from_vec(depths, &[n]).exp());
+    let light = light.data();
+    let mut first = 0;
+    let rests = ends.iter().map(|&end| {
+        let mut before = 1.0;
+        for i in std::mem::replace(&mut first, end)..end {
+            hits[i].weight = before - light[i];
+            before = light[i];
+        }
+        if before < REST { 0.0 } else { before }
+    });
+    rests.collect()
 }
 
 impl Chunk {
@@ -204,9 +232,9 @@ impl Light {
         parallel::for_each_item(parts, |part, rows| f(PartHits { light: self, part }, rows));
     }
 
-    /// True if a pixel sees any voxel.
-    pub fn hits_anything(&self) -> bool {
-        self.chunks.iter().any(|chunk| !chunk.hits.is_empty())
+    /// The number of pixels that see no voxel.
+    pub fn missed(&self) -> usize {
+        self.missed
     }
 }
 

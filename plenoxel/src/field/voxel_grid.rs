@@ -101,9 +101,14 @@ impl GridShape {
         voxels.dilated(usize::from(self.interpolation == Interpolation::Trilinear))
     }
 
+    /// Bytes of a voxel in both tables, in `f32`.
+    pub fn voxel_bytes(&self) -> usize {
+        (1 + self.color.channels()) * size_of::<f32>()
+    }
+
     /// Bytes of both tables in `f32`, all voxels being present.
     pub fn bytes(&self) -> usize {
-        self.voxels() * (1 + self.color.channels()) * size_of::<f32>()
+        self.voxels() * self.voxel_bytes()
     }
 }
 

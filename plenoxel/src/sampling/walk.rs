@@ -34,79 +34,82 @@ pub struct Walk {
 #[derive(Clone, Copy)]
 struct Planes {
     voxels: usize,
-    /// Where the ray starts, in voxels.
+    /// Where the ray starts, in voxels, and how many it passes in a unit of distance.
     start: f64,
-    /// Distance along the ray from plane to plane: negative if it meets them in falling order, infinite if it meets none.
+    pace: f64,
+    /// Distance along the ray from plane to plane: negative if it meets them in falling order.
     spacing: f64,
+    /// It never meets one.
+    still: bool,
+    /// 1 if it meets them in rising order, 0 if not: what leads from a cell to the plane by which it is left.
+    forward: usize,
 }
 
 impl Planes {
+    fn new(voxels: usize, origin: f64, direction: f64, low: f64, high: f64) -> Self {
+        let side = (high - low) / voxels as f64;
+        Planes {
+            voxels,
+            start: (origin - low) / side,
+            pace: direction / side,
+            spacing: side / direction,
+            still: direction == 0.0,
+            forward: usize::from(direction > 0.0),
+        }
+    }
+
     /// Distance along the ray at which it meets a plane. The one definition: bricks and voxels agree to the bit.
     #[inline(always)]
     fn at(&self, plane: usize) -> f64 {
-        (plane as f64 - self.start) * self.spacing
+        if self.still { f64::INFINITY } else { (plane as f64 - self.start) * self.spacing }
     }
 
-    fn forward(&self) -> bool {
-        self.spacing > 0.0
-    }
-
-    /// Distances at which the ray enters and leaves the slab between the planes `low` and `high`.
-    #[inline(always)]
-    fn slab(&self, low: usize, high: usize) -> (f64, f64) {
-        if self.spacing.is_infinite() {
-            return match self.start >= low as f64 && self.start <= high as f64 {
-                true => (f64::NEG_INFINITY, f64::INFINITY),
-                false => (f64::INFINITY, f64::NEG_INFINITY),
-            };
+    /// Distances at which the ray enters and leaves all voxels.
+    fn chord(&self) -> (f64, f64) {
+        if self.still {
+            let inside = self.start >= 0.0 && self.start <= self.voxels as f64;
+            return if inside { (f64::NEG_INFINITY, f64::INFINITY) } else { (f64::INFINITY, f64::NEG_INFINITY) };
         }
-        if self.forward() { (self.at(low), self.at(high)) } else { (self.at(high), self.at(low)) }
-    }
-
-    /// Distance at which the ray leaves cells `low..high`.
-    #[inline(always)]
-    fn leaves(&self, low: usize, high: usize) -> f64 {
-        match self.spacing.is_infinite() {
-            true => f64::INFINITY,
-            false => self.at(if self.forward() { high } else { low }),
-        }
+        let (low, high) = (self.at(0), self.at(self.voxels));
+        (low.min(high), low.max(high))
     }
 
     /// The cell among `low..high` that the ray is in just after the distance t.
     #[inline(always)]
     fn cell(&self, t: f64, low: usize, high: usize) -> usize {
-        if self.spacing.is_infinite() {
-            return (self.start as usize).clamp(low, high - 1);
-        }
-        let mut k = ((self.start + t / self.spacing) as usize).clamp(low, high - 1);
-        // The division rounds; the planes decide.
-        if self.forward() {
-            while k + 1 < high && self.at(k + 1) <= t {
-                k += 1;
+        let mut k = ((self.start + t * self.pace) as usize).clamp(low, high - 1);
+        // The product rounds; the planes decide.
+        if !self.still {
+            while self.at(k + self.forward) <= t {
+                match self.next(k, low, high) {
+                    Some(next) => k = next,
+                    None => break,
+                }
             }
-            while k > low && self.at(k) > t {
-                k -= 1;
-            }
-        } else {
-            while k > low && self.at(k) <= t {
-                k -= 1;
-            }
-            while k + 1 < high && self.at(k + 1) > t {
-                k += 1;
+            while self.at(k + 1 - self.forward) > t && k + 1 - self.forward > low && k + 1 - self.forward < high {
+                k = k + 1 - 2 * self.forward;
             }
         }
         k
     }
 
-    fn new(voxels: usize, origin: f64, direction: f64, low: f64, high: f64) -> Self {
-        let side = (high - low) / voxels as f64;
-        Planes { voxels, start: (origin - low) / side, spacing: if direction == 0.0 { f64::INFINITY } else { side / direction } }
+    /// The cell after cell k, if there is one among `low..high`.
+    #[inline(always)]
+    fn next(&self, k: usize, low: usize, high: usize) -> Option<usize> {
+        if self.forward == 1 { Some(k + 1).filter(|k| *k < high) } else { k.checked_sub(1).filter(|k| *k >= low) }
     }
 
     /// The voxels of a brick.
     #[inline(always)]
     fn of_brick(&self, brick: usize) -> (usize, usize) {
         (brick * BRICK, (brick * BRICK + BRICK).min(self.voxels))
+    }
+
+    /// Distance at which the ray leaves a brick.
+    #[inline(always)]
+    fn leaves_brick(&self, brick: usize) -> f64 {
+        let (low, high) = self.of_brick(brick);
+        self.at(if self.forward == 1 { high } else { low })
     }
 }
 
@@ -120,35 +123,34 @@ impl Walk {
     /// the ray comes to the brick, by its number in row-major order) are left out; those that the ray only touches are no voxels on it.
     #[inline]
     pub fn along(&self, ray: &Ray, brick_is_empty: impl Fn(usize) -> bool, mut visit: impl FnMut(Crossing) -> ControlFlow<()>) {
-        let planes: [Planes; 3] =
-            [0, 1, 2].map(|a| Planes::new(self.voxels[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]));
+        let axis = |a: usize| Planes::new(self.voxels[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]);
+        let planes = [axis(0), axis(1), axis(2)];
         let (mut t, mut end) = (0.0_f64, f64::INFINITY);
         for axis in &planes {
-            let (enter, leave) = axis.slab(0, axis.voxels);
+            let (enter, leave) = axis.chord();
             (t, end) = (t.max(enter), end.min(leave));
         }
         // A ray without direction has no end.
         if t >= end || end.is_infinite() {
             return;
         }
-        let mut place = planes.map(|axis| axis.cell(t, 0, axis.voxels) / BRICK);
+        let (mut place, mut exits) = ([0; 3], [0.0; 3]);
+        for a in 0..3 {
+            place[a] = planes[a].cell(t, 0, self.voxels[a]) / BRICK;
+            exits[a] = planes[a].leaves_brick(place[a]);
+        }
         loop {
-            let bounds: [(usize, usize); 3] = [0, 1, 2].map(|a| planes[a].of_brick(place[a]));
-            let exits = [0, 1, 2].map(|a| planes[a].leaves(bounds[a].0, bounds[a].1));
             let axis = smallest(exits);
             let brick = place_number(place, self.bricks);
             let leave = exits[axis].min(end);
-            if leave > t && !brick_is_empty(brick) {
-                if cross(&planes, bounds, brick, t, leave, &mut visit).is_break() {
-                    return;
-                }
-            }
-            let forward = planes[axis].forward();
-            if exits[axis] >= end || if forward { place[axis] + 1 == self.bricks[axis] } else { place[axis] == 0 } {
+            if leave > t && !brick_is_empty(brick) && cross(&planes, place, brick, t, leave, &mut visit).is_break() {
                 return;
             }
-            place[axis] = if forward { place[axis] + 1 } else { place[axis] - 1 };
+            let next = planes[axis].next(place[axis], 0, self.bricks[axis]);
+            let Some(next) = next.filter(|_| exits[axis] < end) else { return };
             t = t.max(exits[axis]);
+            place[axis] = next;
+            exits[axis] = planes[axis].leaves_brick(next);
         }
     }
 }
@@ -157,29 +159,31 @@ impl Walk {
 #[inline(always)]
 fn cross(
     planes: &[Planes; 3],
-    bounds: [(usize, usize); 3],
+    place: [usize; 3],
     brick: usize,
     mut t: f64,
     end: f64,
     visit: &mut impl FnMut(Crossing) -> ControlFlow<()>,
 ) -> ControlFlow<()> {
-    let mut voxel: [usize; 3] = [0, 1, 2].map(|a| planes[a].cell(t, bounds[a].0, bounds[a].1));
-    let mut exits = [0, 1, 2].map(|a| planes[a].leaves(voxel[a], voxel[a] + 1));
+    let (mut voxel, mut exits, mut bounds) = ([0; 3], [0.0; 3], [(0, 0); 3]);
+    for a in 0..3 {
+        bounds[a] = planes[a].of_brick(place[a]);
+        voxel[a] = planes[a].cell(t, bounds[a].0, bounds[a].1);
+        exits[a] = planes[a].at(voxel[a] + planes[a].forward);
+    }
     loop {
         let axis = smallest(exits);
         let leave = exits[axis].min(end);
         if leave > t {
-            let bit = (0..3).map(|a| (voxel[a] - bounds[a].0) * STRIDE[a]).sum();
+            let bit = (voxel[0] - bounds[0].0) * STRIDE[0] + (voxel[1] - bounds[1].0) * STRIDE[1] + (voxel[2] - bounds[2].0) * STRIDE[2];
             visit(Crossing { voxel, brick, bit, enter: t, leave })?;
         }
         let (low, high) = bounds[axis];
-        let forward = planes[axis].forward();
-        if exits[axis] >= end || if forward { voxel[axis] + 1 == high } else { voxel[axis] == low } {
-            return ControlFlow::Continue(());
-        }
-        voxel[axis] = if forward { voxel[axis] + 1 } else { voxel[axis] - 1 };
+        let next = planes[axis].next(voxel[axis], low, high);
+        let Some(next) = next.filter(|_| exits[axis] < end) else { return ControlFlow::Continue(()) };
         t = t.max(exits[axis]);
-        exits[axis] = planes[axis].leaves(voxel[axis], voxel[axis] + 1);
+        voxel[axis] = next;
+        exits[axis] = planes[axis].at(next + planes[axis].forward);
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! The same struct is the file `config.toml` of a run, a preset, and what flags change.
 
+use crate::carve::CarveConfig;
 use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation};
@@ -51,6 +52,9 @@ pub struct Config {
     /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
     /// share of a pixel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
+    /// What silhouettes may decide where images have alpha.
+    #[serde(default)]
+    pub hull: Hull,
     /// Values before the first step.
     pub initial: Initial,
     /// How gradients change the grid.
@@ -61,6 +65,20 @@ pub struct Config {
     pub stages: Vec<Stage>,
     /// Where samples lie when images are rendered for pictures and figures.
     pub evaluation: Sampling,
+    /// How to carve, where a run does.
+    #[serde(default)]
+    pub carve: CarveConfig,
+}
+
+/// What silhouettes may decide in training.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Hull {
+    /// Where images have alpha: the size of the cube, and which voxels exist.
+    Auto,
+    /// Nothing: alpha is for compositing over the background only.
+    #[default]
+    Off,
 }
 
 /// Meaning of a voxel's color.
@@ -238,6 +256,7 @@ impl Default for Config {
             prune_from_stage: None,
             prune_below: 0.2,
             prune_unseen_below: 0.0,
+            hull: Hull::Off,
             // svox2's start: thin gray fog.
             initial: Initial { density: 0.1, color: 0.0, random: false },
             // Gradients of a mean over 4096 rays are small: the usual 1e-8 would damp them.
@@ -247,6 +266,7 @@ impl Default for Config {
             // empty within a few dozen steps, colors by 0.03; the last stage settles.
             stages: vec![stage(16, 200, 1.0, 1.0), stage(32, 200, 1.0, 1.0), stage(64, 300, 1.5, 1.0), stage(128, 600, 2.0, 0.2)],
             evaluation: Sampling::Step { step: 0.5 },
+            carve: CarveConfig::default(),
         }
     }
 }
@@ -311,7 +331,6 @@ impl Config {
             };
             check(fits, &format!("losses.{name}"), format!("{weight:?}"), "a number of at least 0, or { from, to, steps } above 0")?;
         }
-        check(!self.stages.is_empty(), "stages", "no stage", "at least one")?;
         for (i, stage) in self.stages.iter().enumerate() {
             let key = |name: &str| format!("stages[{i}].{name}");
             check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels a side")?;
@@ -336,7 +355,13 @@ impl Config {
                 "below 4294967295: longer steps or fewer rays",
             )?;
         }
-        sampling("evaluation", self.evaluation)
+        sampling("evaluation", self.evaluation)?;
+        let CarveConfig { resolution, margin, depth, ridge, sweeps, .. } = self.carve;
+        check((2..=1024).contains(&resolution), "carve.resolution", resolution, "2 to 1024 voxels a side")?;
+        check((0.0..=1e3).contains(&margin), "carve.margin", margin, "0 to 1000 pixels")?;
+        check((1e-3..=1e3).contains(&depth), "carve.depth", depth, "0.001 to 1000")?;
+        check((0.0..=1e6).contains(&ridge), "carve.ridge", ridge, "0 to 1e6")?;
+        check(sweeps <= 1000, "carve.sweeps", sweeps, "0 to 1000")
     }
 }
 

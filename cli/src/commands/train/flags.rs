@@ -1,7 +1,7 @@
 //! The flags of `train`, and the configuration they amount to.
 
-use crate::commands::{MOST_REDUCTION, whole};
-use crate::config::{ConfigFile, Layers, PRESETS};
+use crate::commands::{MOST_REDUCTION, background, whole};
+use crate::config::{self, Layers, PRESETS};
 use crate::data::DataSource;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
@@ -125,22 +125,8 @@ impl TrainArgs {
 
     /// The configuration, and the preset it started from.
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
-        let file = self.config.as_deref().map(ConfigFile::read).transpose()?;
-        let complete = file.as_ref().is_some_and(ConfigFile::is_complete);
         let default = if self.data.is_some() { "standard" } else { "demo" };
-        let preset = match &self.preset {
-            Some(preset) => Some(preset.as_str()),
-            None => (!complete).then_some(default),
-        };
-        let mut layers = Layers::defaults()?;
-        if let Some(preset) = preset {
-            layers.preset(preset)?;
-        }
-        if let Some(file) = &file {
-            layers.file(file)?;
-        }
-        self.flags(&mut layers)?;
-        Ok((layers.resolve()?, preset))
+        config::layered(self.preset.as_deref(), default, self.config.as_deref(), |layers| self.flags(layers))
     }
 
     fn flags(&self, layers: &mut Layers) -> Result<()> {
@@ -169,21 +155,6 @@ impl TrainArgs {
             }
         }
         self.set.iter().try_for_each(|assignment| layers.assign(assignment))
-    }
-}
-
-fn background(text: &str) -> std::result::Result<[f64; 3], String> {
-    match text {
-        "white" => return Ok([1.0; 3]),
-        "black" => return Ok([0.0; 3]),
-        _ => {}
-    }
-    let accepted = "white, black, or three numbers in [0, 1] such as 0.2,0.5,1";
-    let numbers: Vec<f64> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
-    let color: [f64; 3] = numbers.try_into().map_err(|_| accepted)?;
-    match text.matches(',').count() == 2 && color.iter().all(|c| (0.0..=1.0).contains(c)) {
-        true => Ok(color),
-        false => Err(accepted.to_owned()),
     }
 }
 

@@ -1,0 +1,232 @@
+//! `plenoxel carve`: from silhouettes to an opaque colored grid, without training.
+
+use super::new_run::{Stopwatch, announce, load, record};
+use super::pictures::Pictures;
+use super::{MOST_REDUCTION, whole};
+use crate::config::{self, CARVE, Layers};
+use crate::data::DataSource;
+use crate::evaluation::{ViewScore, Viewer};
+use crate::memory::{self, Estimate};
+use crate::progress::Console;
+use crate::run_folder::RunFolder;
+use clap::{Args, ValueHint};
+use plenoxel::carve::{self, Carving, Fit, Rule};
+use plenoxel::checkpoint::Header;
+use plenoxel::dataset::Split;
+use plenoxel::error::Result;
+use plenoxel::train::config::Config;
+use serde::Serialize;
+use std::path::PathBuf;
+use toml::Value;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel carve data/lego                                 the visual hull with mean colors, 256 voxels a side
+  plenoxel carve data/lego --sh-degree 2 --resolution 128  with harmonics of the direction of view
+  plenoxel carve data/lego --carve rays --downscale 4      the source paper's rule, at 200 x 200
+  plenoxel train data/lego --init-from runs/lego-1         training goes on from what was carved
+
+The result is a run like a trained one: evaluate, render, export and info take it. Settings are layered as for train; --set
+reaches those below carve. The last line on stdout is one JSON object.";
+
+/// Carve an opaque colored grid from the silhouettes of images with alpha, in seconds and without training
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct CarveArgs {
+    /// Folder of a dataset in the NeRF-synthetic format; without it, the built-in scene
+    #[arg(value_hint = ValueHint::DirPath)]
+    data: Option<PathBuf>,
+
+    /// Folder to write [default: runs/<scene>-<n>, the first free n]
+    #[arg(long, short, help_heading = "Output", value_hint = ValueHint::DirPath)]
+    out: Option<PathBuf>,
+
+    /// Overwrite the run in the folder
+    #[arg(long, help_heading = "Output")]
+    force: bool,
+
+    /// Write no pictures
+    #[arg(long, help_heading = "Output")]
+    no_images: bool,
+
+    /// TOML file of settings; a complete one, such as the config.toml of a run, replaces all others
+    #[arg(long, value_name = "FILE", help_heading = "Settings", value_hint = ValueHint::FilePath)]
+    config: Option<PathBuf>,
+
+    /// Set any key of the configuration; may be repeated
+    #[arg(long, value_name = "KEY=VALUE", help_heading = "Settings")]
+    set: Vec<String>,
+
+    /// Reduce the images by this factor, which must divide their width and height
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION))]
+    downscale: Option<i64>,
+
+    /// Color behind the scene: white, black, or three numbers r,g,b in [0, 1] [default: white]
+    #[arg(long, help_heading = "Scene", value_parser = super::background)]
+    background: Option<[f64; 3]>,
+
+    /// Half the side of the cube in which the scene lies, in the dataset's units [default: 1.5]
+    #[arg(long, value_name = "LENGTH", help_heading = "Scene", allow_negative_numbers = true)]
+    half_width: Option<f64>,
+
+    /// Voxels along each axis [default: 256]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(2, 1024))]
+    resolution: Option<i64>,
+
+    /// Harmonics of the direction of view up to this degree, 0 to 3, instead of one color a voxel
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
+    sh_degree: Option<i64>,
+
+    /// What makes a voxel go: footprint, a view that shows all of it on background, or rays, the ray of a background pixel through it (the
+    /// source paper's) [default: footprint]
+    #[arg(long, value_name = "RULE", help_heading = "Carving", value_parser = ["footprint", "rays"])]
+    carve: Option<String>,
+
+    /// How colors are found: exact, by least squares, or sgd, the source paper's descent [default: exact]
+    #[arg(long, help_heading = "Carving", value_parser = ["exact", "sgd"])]
+    fit: Option<String>,
+}
+
+impl CarveArgs {
+    fn config(&self) -> Result<Config> {
+        let (config, _) = config::layered(None, CARVE.0, self.config.as_deref(), |layers| self.flags(layers))?;
+        Ok(config)
+    }
+
+    fn flags(&self, layers: &mut Layers) -> Result<()> {
+        let integer = |value: Option<i64>| value.map(Value::Integer);
+        let text = |value: &Option<String>| value.clone().map(Value::String);
+        for (flag, path, value) in [
+            ("--downscale", "downscale", integer(self.downscale)),
+            ("--background", "background", self.background.map(|c| Value::Array(c.map(Value::Float).to_vec()))),
+            ("--half-width", "half_width", self.half_width.map(Value::Float)),
+            ("--sh-degree", "color", self.sh_degree.map(|_| Value::String("sh".to_owned()))),
+            ("--sh-degree", "sh_degree", integer(self.sh_degree)),
+            ("--resolution", "carve.resolution", integer(self.resolution)),
+            ("--carve", "carve.rule", text(&self.carve)),
+            ("--fit", "carve.fit", text(&self.fit)),
+        ] {
+            if let Some(value) = value {
+                layers.set(path, Some(value), flag)?;
+            }
+        }
+        self.set.iter().try_for_each(|assignment| layers.assign(assignment))
+    }
+}
+
+/// Carves a scene and leaves a run folder.
+pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
+    let source = DataSource::of(args.data.as_deref());
+    let config = args.config()?;
+    let mut load_clock = Stopwatch::default();
+    let dataset = load_clock.time(|| source.open(&config))?;
+    announce(console, &dataset, &config);
+    let estimate = Estimate::of_carving(&config, &dataset, 0);
+    console.note(&estimate.describe());
+    estimate.check()?;
+    let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
+    let views = load_clock.time(|| load(console, &dataset, Split::Train, &source))?;
+
+    let mut hull_clock = Stopwatch::default();
+    let carving = hull_clock.time(|| Carving::new(&views, &config))?;
+    let (n, left) = (config.carve.resolution, carving.voxels());
+    let share = 100.0 * left as f64 / (n as f64).powi(3);
+    console.note(&format!("carved {n}³ voxels in {:.2} s: {left} are left, {share:.1} %", hull_clock.seconds()));
+    let estimate = Estimate::of_carving(&config, &dataset, carving.rows());
+    console.note(&estimate.describe());
+    estimate.check()?;
+
+    // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
+    folder.prepare()?;
+    folder.describe(&config, &record(&dataset, Some(CARVE.0), &source))?;
+    console.note(&format!("run: {}", folder.path().display()));
+    let pictures = Pictures::new(&folder, &config, &dataset, !args.no_images)?;
+    let mut color_clock = Stopwatch::default();
+    let passes = match config.carve.fit {
+        Fit::Exact => config.carve.sweeps + 1,
+        Fit::Sgd => carve::color::EPOCHS + 1,
+    };
+    let count = console.count("coloring, pass", passes);
+    let colored = color_clock.time(|| carving.color(&|done| count.at(done, passes)));
+    drop(count);
+    if colored.missed > 0.0 {
+        console.note(&format!(
+            "{:.2} % of the object pixels show no voxel: parts thinner than a pixel, or beyond the box (--half-width)",
+            100.0 * colored.missed
+        ));
+    }
+    let header = Header::new(&colored.grid, dataset.name(), config.background, config.seed, 0);
+    folder.save(&colored.grid, &header)?;
+    drop(carving);
+    drop(views);
+
+    let test = load_clock.time(|| load(console, &dataset, Split::Test, &source))?;
+    let viewer = Viewer::new(&colored.grid, config.evaluation, &config);
+    let count = console.count("evaluating", test.len());
+    let mut evaluate_clock = Stopwatch::default();
+    let scores = evaluate_clock.time(|| {
+        viewer.compare(&test, |i, view, target, picture| {
+            count.at(i + 1, test.len());
+            pictures.panel(i, view, target, picture)
+        })
+    })?;
+    drop(count);
+    let (width, height) = dataset.size();
+    let summary = Summary {
+        psnr: scores.psnr(),
+        ssim: scores.ssim(),
+        ssim_same: scores.ssim_same(),
+        views: test.len(),
+        width,
+        height,
+        background: config.background,
+        seconds: hull_clock.seconds() + color_clock.seconds(),
+        seconds_hull: hull_clock.seconds(),
+        seconds_color: color_clock.seconds(),
+        seconds_load: load_clock.seconds(),
+        seconds_evaluate: evaluate_clock.seconds(),
+        peak_memory_bytes: memory::peak(),
+        resolution: n,
+        voxels: left,
+        rule: config.carve.rule,
+        fit: config.carve.fit,
+        missed_object_pixels: colored.missed,
+        scene: dataset.name().to_owned(),
+        run: folder.path().display().to_string(),
+        per_view: scores.per_view.clone(),
+    };
+    folder.write_result(&summary)?;
+    if let Some(note) = pictures.note() {
+        console.note(&note);
+    }
+    console.note(&format!("hull {:.2} s, colors {:.2} s", summary.seconds_hull, summary.seconds_color));
+    console.result(&super::evaluate::sentence(&scores, Split::Test, width, height))?;
+    console.result(&format!("run folder: {}", folder.path().display()))?;
+    console.result(&crate::json_line(&summary)?)
+}
+
+/// Final figures. `seconds` are of carving and coloring, without reading images.
+#[derive(Debug, Serialize)]
+struct Summary {
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    ssim_same: Option<f64>,
+    views: usize,
+    width: usize,
+    height: usize,
+    background: [f32; 3],
+    seconds: f64,
+    seconds_hull: f64,
+    seconds_color: f64,
+    seconds_load: f64,
+    seconds_evaluate: f64,
+    peak_memory_bytes: Option<u64>,
+    resolution: usize,
+    voxels: usize,
+    rule: Rule,
+    fit: Fit,
+    missed_object_pixels: f64,
+    scene: String,
+    run: String,
+    per_view: Vec<ViewScore>,
+}
