@@ -8,7 +8,6 @@
 
 pub mod color;
 pub mod light;
-mod smooth;
 pub mod visual_hull;
 
 use crate::dataset::View;

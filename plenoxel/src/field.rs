@@ -1,5 +1,6 @@
 //! What fills space: a density and the radiance it emits towards a viewer.
 
+pub(crate) mod neighbours;
 pub mod sh;
 pub mod voxel_grid;
 

@@ -3,6 +3,7 @@
 //! The trainer draws, computes and reports; it never prints and never reads a clock.
 
 pub mod config;
+mod start;
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
@@ -15,6 +16,7 @@ use crate::sampling::{Jitter, Occupancy};
 use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Rates, RmsProp, Schedule, Sgd};
 use autograd::{Real, parallel, release_free_buffers, value_and_grad};
 use config::{Config, OptimizerConfig, Stage, Weight};
+use start::Silhouettes;
 
 /// Rays that are rendered at a time to find out what is seen: bounds the memory.
 const RAYS_PER_BATCH: u64 = 1 << 15;
@@ -60,6 +62,7 @@ pub struct Trainer<'a, T: Real> {
     config: Config,
     plan: Vec<PlannedStage>,
     rays: RaySource<'a>,
+    silhouettes: Option<Silhouettes<'a>>,
     objective: Objective<T>,
     grid: VoxelGrid<T>,
     optimizer: Box<dyn Optimizer<T>>,
@@ -84,24 +87,33 @@ impl<'a, T: Real> Trainer<'a, T> {
         if config.stages.is_empty() {
             return Err(Error::config("stages", "no stage", "at least one"));
         }
-        let mut first = 0;
-        let plan: Vec<PlannedStage> = config
-            .stages
-            .iter()
-            .map(|&stage| {
-                let steps = stage.step_count(rays.len(), config.rays_per_step);
-                first += steps;
-                PlannedStage { stage, first: first - steps, steps }
-            })
-            .collect();
-        let shape = config.grid_shape(plan[0].stage.resolution);
+        let plan = plan(&config, &config.stages, rays.len());
+        let mut shape = config.grid_shape(plan[0].stage.resolution);
+        let silhouettes = Silhouettes::new(&config, views);
+        if let Some(silhouettes) = &silhouettes {
+            shape.half_width = silhouettes.half_width(shape.half_width);
+        }
         let initial = config.initial;
         let grid = match initial.random {
             true => VoxelGrid::random(shape, initial.density, initial.color, config.seed),
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        Ok(Trainer { config, plan, rays, objective, grid, optimizer, step: 0 })
+        Ok(Trainer { config, plan, rays, silhouettes, objective, grid, optimizer, step: 0 })
+    }
+
+    /// The same run starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
+    /// the first stage, and stages coarser than it are left out, except the last.
+    ///
+    /// Panics if steps have been taken.
+    pub fn starting_from(mut self, grid: &VoxelGrid<T>) -> Self {
+        assert_eq!(self.step, 0, "a run starts once");
+        let stages = &self.config.stages;
+        let coarser = stages.iter().take_while(|stage| stage.resolution < grid.shape().resolution).count();
+        self.plan = plan(&self.config, &stages[coarser.min(stages.len() - 1)..], self.rays.len());
+        self.grid = start::adapted(grid, &self.config.grid_shape(self.plan[0].stage.resolution));
+        self.optimizer = optimizer(&self.config, &self.plan[0]);
+        self
     }
 
     /// The grid as it is now.
@@ -193,7 +205,13 @@ impl<'a, T: Real> Trainer<'a, T> {
             release_free_buffers();
             self.grid = self.grid.resample(plan.stage.resolution);
         }
-        if self.config.prune_from_stage.is_some_and(|first| index >= first) {
+        if let Some(silhouettes) = &self.silhouettes {
+            let inside = silhouettes.voxels(self.grid.shape());
+            if inside.fraction() > 0.0 {
+                self.grid = self.grid.pruned(&inside);
+            }
+        }
+        if self.prunes_from().is_some_and(|first| index >= first) {
             let kept = self.worth_keeping(&self.plan[index].stage);
             if kept.fraction() == 0.0 {
                 let Config { prune_below, prune_unseen_below, .. } = self.config;
@@ -211,6 +229,11 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.grid.project();
         }
         Ok(())
+    }
+
+    /// The first stage of the plan that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
+    pub fn prunes_from(&self) -> Option<usize> {
+        self.config.prune_from_stage.map(|first| first.saturating_sub(self.config.stages.len() - self.plan.len()))
     }
 
     /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees.
@@ -248,6 +271,17 @@ impl<'a, T: Real> Trainer<'a, T> {
     fn numeric(&self, found: String) -> Error {
         Error::Numeric { place: format!("step {}", self.step), found, remedy: "lower the learning rates of this stage".to_owned() }
     }
+}
+
+/// Stages one after another.
+fn plan(config: &Config, stages: &[Stage], rays: u64) -> Vec<PlannedStage> {
+    let mut first = 0;
+    let planned = stages.iter().map(|&stage| {
+        let steps = stage.step_count(rays, config.rays_per_step);
+        first += steps;
+        PlannedStage { stage, first: first - steps, steps }
+    });
+    planned.collect()
 }
 
 /// The losses that a config names.

@@ -19,6 +19,7 @@ use plenoxel::train::Trainer;
 use plenoxel::train::config::Config;
 use serde::Serialize;
 use serde_json::json;
+use std::path::Path;
 use std::time::Instant;
 
 /// Learns a scene and leaves a run folder.
@@ -28,6 +29,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     let mut clocks = Clocks::default();
     let dataset = clocks.load.time(|| source.open(&config))?;
     announce(console, &dataset, &config);
+    let initial = config.init_from.as_deref().map(start_from).transpose()?;
     let estimate = Estimate::of_training(&config, &dataset);
     console.note(&estimate.describe());
     estimate.check()?;
@@ -39,7 +41,12 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     folder.describe(&config, &record(&dataset, preset, &source))?;
     console.note(&format!("run: {}", folder.path().display()));
     let mut pictures = Pictures::new(&folder, &config, &dataset, !args.no_images)?;
-    let mut learned = learn(&config, &views, &folder, args.keeps_stages(), console, &mut clocks, &mut pictures)?;
+    let trainer = clocks.train.time(|| {
+        let trainer = Trainer::new(config.clone(), &views)?;
+        Ok(initial.iter().fold(trainer, Trainer::starting_from))
+    })?;
+    drop(initial);
+    let mut learned = learn(trainer, &folder, args.keeps_stages(), console, &mut clocks, &mut pictures)?;
     let header = Header::new(&learned.grid, dataset.name(), config.background, config.seed, learned.steps);
     folder.save(&learned.grid, &header)?;
     let mean_image = evaluation::mean_image(&views, config.background);
@@ -78,6 +85,12 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     conclude(console, &folder, &summary, &scores, &pictures)
 }
 
+/// The grid of an earlier run.
+fn start_from(run: &Path) -> Result<VoxelGrid<f32>> {
+    let (folder, ..) = RunFolder::open(run)?;
+    Ok(folder.load()?.0)
+}
+
 /// A trained grid and how it came about.
 struct Learned {
     grid: VoxelGrid<f32>,
@@ -90,8 +103,7 @@ struct Learned {
 
 /// The training itself; only it is on the clock for training.
 fn learn(
-    config: &Config,
-    views: &[View],
+    mut trainer: Trainer<'_, f32>,
     folder: &RunFolder,
     keep_stages: bool,
     console: &Console<'_>,
@@ -99,11 +111,10 @@ fn learn(
     pictures: &mut Pictures<'_>,
 ) -> Result<Learned> {
     let clock = &mut clocks.train;
-    let mut trainer = clock.time(|| Trainer::<f32>::new(config.clone(), views))?;
     let plan = trainer.plan().to_vec();
     let total = trainer.total_steps();
     let mut metrics = MetricsFile::create(&folder.metrics(), total)?;
-    let mut progress = console.training(&plan, config.prune_from_stage);
+    let mut progress = console.training(&plan, trainer.prunes_from());
     let (mut losses, mut stages) = (Vec::new(), Vec::new());
     let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
     loop {

@@ -26,6 +26,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "prune_from_stage",
             "prune_below",
             "prune_unseen_below",
+            "init_from",
             "hull",
             "initial",
             "optimizer",

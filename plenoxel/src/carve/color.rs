@@ -16,8 +16,8 @@
 //! [`fit_by_descent`] is the paper's own way, stochastic gradient descent, with its lost updates repaired.
 
 use super::light::{Hit, Lit, Opaque, Pixel, object_pixels};
-use super::smooth::smoothed;
 use crate::dataset::View;
+use crate::field::neighbours::smoothed;
 use crate::field::sh;
 use crate::random::{Permutation, Purpose};
 use autograd::{Lattice, parallel};

@@ -5,6 +5,8 @@
 //! point lies in; trilinear look-up runs between centres, and in the outer half voxel repeats the border. Outside the box there is nothing.
 //! Values are stored raw and activated after interpolation: σ = max(0, density).
 
+mod reshape;
+
 use super::{Field, Radiance, sh};
 use crate::camera::Ray;
 use crate::geometry::Aabb;
@@ -12,8 +14,8 @@ use crate::random::{Purpose, uniform};
 use crate::render::{RenderOptions, Rendered, fused};
 use crate::sampling::{Occupancy, Samples};
 use autograd::lattice::{BRICK, BRICK_ROWS};
-use autograd::ops::trilinear::nearest_node;
-use autograd::{Bounds, Buffer, Indices, Lattice, Module, Param, Real, Tensor, no_grad, parallel};
+use autograd::{Bounds, Buffer, Indices, Lattice, Module, Param, Real, Tensor, parallel};
+use reshape::moved;
 use serde::{Deserialize, Serialize};
 
 /// How values between voxel centres are found.
@@ -225,56 +227,6 @@ impl<T: Real> VoxelGrid<T> {
         }
     }
 
-    /// The same field at another resolution: the old field read at the new centres, with the look-up that renders it. So a nearest grid
-    /// of twice the resolution shows exactly what the old one showed; a trilinear one does inside the old cells, and is smoother within a
-    /// quarter of an old voxel of the planes through old centres.
-    /// A new voxel is present if it reads one that is. Parameters get new identities, so an optimizer starts afresh.
-    pub fn resample(&self, resolution: usize) -> Self {
-        let shape = GridShape { resolution, ..self.shape };
-        let ratio = self.shape.resolution as f64 / resolution as f64;
-        let center = |k: usize| (k as f64 + 0.5) * ratio - 0.5;
-        let lattice = match &self.reach {
-            None => shape.full(),
-            Some(_) => {
-                let last = self.shape.resolution - 1;
-                let corners = |k: usize| match self.shape.interpolation {
-                    Interpolation::Nearest => {
-                        let [nearest, ..] = nearest_node([T::lit(center(k)); 3], [last + 1; 3]);
-                        nearest as usize..nearest as usize + 1
-                    }
-                    Interpolation::Trilinear => {
-                        let low = center(k).clamp(0.0, last as f64) as usize;
-                        low..(low + 2).min(last + 1)
-                    }
-                };
-                Lattice::bricks_where([resolution; 3], |[i, j, k]| {
-                    corners(i).any(|a| corners(j).any(|b| corners(k).any(|c| self.lattice.row([a, b, c]).is_some())))
-                })
-            }
-        };
-        let table = |old: &Param<T>| {
-            let width = old.shape()[1];
-            let mut values = Buffer::stale(lattice.rows() * width);
-            // A run of rows at a time bounds the memory for positions.
-            const RUN: usize = 1 << 16;
-            for (run, part) in values.chunks_mut(RUN * width).enumerate() {
-                let rows = part.len() / width;
-                let mut at = Buffer::stale(rows * 3);
-                parallel::for_each_chunk(&mut at, 3 * 4096, |first, chunk| {
-                    for (r, p) in chunk.as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                        let row = run * RUN + first / 3 + r;
-                        *p = lattice.node(row as u32).map_or([T::zero(); 3], |node| node.map(|k| T::lit(center(k))));
-                    }
-                });
-                let read = no_grad(|| self.look_up(old, &Tensor::from_buffer(at, &[rows, 3])));
-                parallel::copy(read.data(), part);
-            }
-            Tensor::from_buffer(values, &[lattice.rows(), width])
-        };
-        let (density, color) = (table(&self.density), table(&self.color));
-        Self::with_lattice(shape, lattice, density, color)
-    }
-
     /// The voxels in which a sample can have positive density: those whose own value, or with trilinear look-up a neighbour's, is above
     /// `threshold`. With threshold 0, leaving out the samples elsewhere changes no rendered value.
     pub fn occupancy(&self, threshold: f64) -> Occupancy {
@@ -299,38 +251,12 @@ impl<T: Real> VoxelGrid<T> {
         Occupancy::from_masks(self.aabb(), self.lattice.nodes(), masks)
     }
 
-    /// The same grid without the voxels outside of `kept`. Parameters get new identities.
-    ///
-    /// Panics if `kept` has other cells than this grid has voxels.
-    pub fn pruned(&self, kept: &Occupancy) -> Self {
-        assert_eq!(kept.cells(), self.lattice.nodes(), "pruned: occupancy of another grid");
-        let masks = kept.masks().iter().zip(self.lattice.masks()).map(|(kept, present)| kept & present).collect();
-        let lattice = Lattice::from_masks(self.lattice.nodes(), masks);
-        let [density, color] = [&self.density, &self.color].map(|table| moved(table.tensor(), &self.lattice, &lattice));
-        Self::with_lattice(self.shape, lattice, density, color)
-    }
-
     /// True if every stored number is finite.
     pub fn is_finite(&self) -> bool {
         [&self.density, &self.color]
             .iter()
             .all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
     }
-}
-
-/// A table in another layout of the same grid, with zeros where the old one has no node.
-fn moved<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) -> Tensor<T> {
-    let width = table.shape()[1];
-    let mut values = Buffer::stale(to.rows() * width);
-    parallel::for_each_rows(&mut values, width, |first, chunk| {
-        for (r, row) in chunk.chunks_exact_mut(width).enumerate() {
-            match to.node((first + r) as u32).and_then(|node| from.row(node)) {
-                Some(old) => row.copy_from_slice(&table.data()[old as usize * width..][..width]),
-                None => row.fill(T::zero()),
-            }
-        }
-    });
-    Tensor::from_buffer(values, &[to.rows(), width])
 }
 
 impl<T: Real> Field<T> for VoxelGrid<T> {

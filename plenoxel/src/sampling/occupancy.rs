@@ -2,7 +2,7 @@
 
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use autograd::lattice::{BRICK, LOW, STRIDE};
+use autograd::lattice::{BRICK, BRICK_ROWS, LOW, STRIDE};
 use autograd::parallel;
 use glam::DVec3;
 use std::sync::Arc;
@@ -81,6 +81,23 @@ impl Occupancy {
     /// The share of cells that may hold matter.
     pub fn fraction(&self) -> f64 {
         self.masks.iter().map(|m| f64::from(m.count_ones())).sum::<f64>() / self.cells.iter().product::<usize>() as f64
+    }
+
+    /// The smallest box around the cells that may hold matter; `None` if none may.
+    pub fn bounds(&self) -> Option<Aabb> {
+        let (mut low, mut high) = (self.cells, [0; 3]);
+        for (b, mask) in self.masks.iter().enumerate() {
+            let place = place(b, self.count);
+            for bit in (0..BRICK_ROWS).filter(|bit| mask >> bit & 1 == 1) {
+                for a in 0..3 {
+                    let k = place[a] * BRICK + (bit / STRIDE[a]) % BRICK;
+                    (low[a], high[a]) = (low[a].min(k), high[a].max(k + 1));
+                }
+            }
+        }
+        let side = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells.map(|n| n as f64));
+        let corner = |k: [usize; 3]| self.aabb.min + side * DVec3::from_array(k.map(|k| k as f64));
+        (low[0] < high[0]).then(|| Aabb { min: corner(low), max: corner(high) })
     }
 
     /// The cells within `radius` cells of these, along axes and diagonals.

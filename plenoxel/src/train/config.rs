@@ -11,6 +11,7 @@ use crate::render::Engine;
 use crate::sampling::Spacing;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 /// A run, completely: the same config and the same data give the same bits.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,6 +53,9 @@ pub struct Config {
     /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
     /// share of a pixel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
+    /// Folder of the run whose grid training starts from.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub init_from: Option<PathBuf>,
     /// What silhouettes may decide where images have alpha.
     #[serde(default)]
     pub hull: Hull,
@@ -256,6 +260,7 @@ impl Default for Config {
             prune_from_stage: None,
             prune_below: 0.2,
             prune_unseen_below: 0.0,
+            init_from: None,
             hull: Hull::Off,
             // svox2's start: thin gray fog.
             initial: Initial { density: 0.1, color: 0.0, random: false },

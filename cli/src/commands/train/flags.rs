@@ -94,6 +94,15 @@ pub struct TrainArgs {
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
     sh_degree: Option<i64>,
 
+    /// Start from the grid of this run, trained or carved, in its box; stages coarser than it are left out
+    #[arg(long, value_name = "RUN", help_heading = "Training", value_hint = ValueHint::DirPath)]
+    init_from: Option<PathBuf>,
+
+    /// Where images have alpha, let silhouettes decide the size of the box and which voxels exist (auto), or use alpha for compositing
+    /// only (off)
+    #[arg(long, help_heading = "Training", value_parser = ["auto", "off"])]
+    hull: Option<String>,
+
     /// What computes the pixels: fused, in one pass, or graph, the slow one to compare it with
     #[arg(long, help_heading = "Training", value_parser = ["fused", "graph"])]
     engine: Option<String>,
@@ -136,6 +145,9 @@ impl TrainArgs {
             (None, Some(_)) => Some(Value::String("sh".to_owned())),
             (color, _) => text(color),
         };
+        // Absolute, so that the settings repeat the run from anywhere.
+        let init_from = self.init_from.as_deref().map(|path| path.canonicalize().unwrap_or_else(|_| path.to_owned()));
+        let init_from = init_from.map(|path| Value::String(path.to_string_lossy().into_owned()));
         let background = self.background.map(|c| Value::Array(c.map(Value::Float).to_vec()));
         let tv = self.tv.map(|weight| Value::Float(0.5 * weight));
         for (flag, path, value) in [
@@ -147,6 +159,8 @@ impl TrainArgs {
             ("--color", "color", color),
             ("--sh-degree", "sh_degree", integer(self.sh_degree)),
             ("--engine", "engine", text(&self.engine)),
+            ("--init-from", "init_from", init_from),
+            ("--hull", "hull", text(&self.hull)),
             ("--tv", "losses.tv_density", tv.clone()),
             ("--tv", "losses.tv_color", tv),
         ] {

@@ -1,0 +1,51 @@
+//! What training may know before its first step: silhouettes, and a grid that was there before.
+
+use super::config::{Config, Hull};
+use crate::carve::{has_alpha, visual_hull};
+use crate::dataset::View;
+use crate::field::voxel_grid::{GridShape, Interpolation, VoxelGrid};
+use crate::geometry::Aabb;
+use crate::sampling::Occupancy;
+use autograd::Real;
+
+/// Voxels along each axis of the hull that the cube is fitted to.
+const COARSE: usize = 64;
+
+/// Silhouettes of the training views, where the config lets them decide and the images have alpha.
+#[derive(Debug)]
+pub struct Silhouettes<'a> {
+    views: &'a [View],
+    margin: f64,
+}
+
+impl<'a> Silhouettes<'a> {
+    /// `None` if they have no say.
+    pub fn new(config: &Config, views: &'a [View]) -> Option<Self> {
+        (config.hull == Hull::Auto && has_alpha(views)).then_some(Silhouettes { views, margin: config.carve.margin })
+    }
+
+    /// The half width of the smallest cube around the origin that holds all that the silhouettes leave of the cube of `half_width`, or
+    /// that one itself if they leave nothing.
+    pub fn half_width(&self, half_width: f64) -> f64 {
+        let hull = visual_hull::by_footprint(self.views, Aabb::cube(half_width), [COARSE; 3], self.margin);
+        hull.bounds().map_or(half_width, |bounds| bounds.max.max(-bounds.min).max_element())
+    }
+
+    /// The voxels that a sample inside of the silhouettes can read.
+    pub fn voxels(&self, shape: &GridShape) -> Occupancy {
+        let aabb = Aabb::cube(shape.half_width);
+        shape.reached_from(&visual_hull::by_footprint(self.views, aabb, [shape.resolution; 3], self.margin))
+    }
+}
+
+/// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
+/// trilinear look-up will read them. The box stays that of the grid.
+pub fn adapted<T: Real>(grid: &VoxelGrid<T>, shape: &GridShape) -> VoxelGrid<T> {
+    let grid = grid.with_color(shape.color);
+    let grid = if grid.shape().resolution == shape.resolution { grid } else { grid.resample(shape.resolution) };
+    let grid = match shape.interpolation {
+        Interpolation::Nearest => grid,
+        Interpolation::Trilinear => grid.grown(),
+    };
+    grid.with_interpolation(shape.interpolation)
+}
