@@ -1,6 +1,9 @@
 //! One file for each command: its arguments, and what it does.
 
+mod cloud_filters;
 pub mod evaluate;
+pub mod export;
+pub mod filter;
 pub mod info;
 pub mod render;
 pub mod scene;
@@ -39,6 +42,21 @@ pub fn whole<N: TryFrom<u64>>(least: u64, most: u64) -> impl Fn(&str) -> Result<
         let number = text.parse().ok().filter(|n| (least..=most).contains(n));
         number.and_then(|n| N::try_from(n).ok()).ok_or_else(|| format!("a whole number from {least} to {most}"))
     }
+}
+
+/// A number of at least `least`, as the command line takes it.
+fn number(least: f64) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| match text.parse::<f64>() {
+        Ok(number) if number.is_finite() && number >= least => Ok(number),
+        _ if least.is_finite() => Err(format!("a number of at least {least}")),
+        _ => Err("a number".to_owned()),
+    }
+}
+
+/// Numbers with commas between them, as the command line takes them.
+fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|n| n.trim().parse().ok().filter(|n: &f64| n.is_finite())).collect();
+    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| format!("{N} numbers with commas between them"))
 }
 
 /// By how much images may be reduced.

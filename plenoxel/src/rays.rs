@@ -83,23 +83,40 @@ impl<'a> RaySource<'a> {
     /// All rays of the set, view after view and row after row, `size` at a time.
     pub fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
         let ray = |index: u64| {
-            let (view, x, y) = self.place(index);
-            view.camera.ray(x as f64 + 0.5, y as f64 + 0.5)
+            let (v, x, y) = self.place(index);
+            self.views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5)
         };
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
 
+    /// The rays of [`RaySource::in_order`] whose pixels show something in front of the background: those with an alpha above 0, or, in a view
+    /// that is opaque everywhere, with another color than the background's.
+    pub fn of_objects(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
+        let opaque: Vec<bool> = self.views.iter().map(|view| view.image.pixels().all(|p| p.0[3] == 255)).collect();
+        let color = self.background.map(|c| (c * 255.0).round() as u8);
+        (0..self.len().div_ceil(size)).map(move |batch| {
+            let indices = batch * size..((batch + 1) * size).min(self.len());
+            let shown = indices.filter_map(|index| {
+                let (v, x, y) = self.place(index);
+                let [r, g, b, a] = self.views[v].image.get_pixel(x as u32, y as u32).0;
+                let object = if opaque[v] { [r, g, b] != color } else { a > 0 };
+                object.then(|| self.views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5))
+            });
+            shown.collect()
+        })
+    }
+
     /// Ray, color over the background, and alpha of one pixel of the set.
     fn pixel(&self, index: u64) -> (Ray, [f32; 3], f32) {
-        let (view, x, y) = self.place(index);
+        let (v, x, y) = self.place(index);
+        let view = &self.views[v];
         (view.camera.ray(x as f64 + 0.5, y as f64 + 0.5), view.color(x, y, self.background), view.alpha(x, y))
     }
 
-    /// View, column and row of one pixel of the set.
-    fn place(&self, index: u64) -> (&View, usize, usize) {
+    /// Number of the view, column and row of one pixel of the set.
+    fn place(&self, index: u64) -> (usize, usize, usize) {
         let v = self.first.partition_point(|&f| f <= index) - 1;
-        let view = &self.views[v];
-        let (pixel, width) = ((index - self.first[v]) as usize, view.image.width() as usize);
-        (view, pixel % width, pixel / width)
+        let (pixel, width) = ((index - self.first[v]) as usize, self.views[v].image.width() as usize);
+        (v, pixel % width, pixel / width)
     }
 }
