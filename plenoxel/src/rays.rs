@@ -89,20 +89,21 @@ impl<'a> RaySource<'a> {
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
 
-    /// The rays of [`RaySource::in_order`] whose pixels show something in front of the background: those with an alpha above 0, or, in a view
-    /// that is opaque everywhere, with another color than the background's.
-    pub fn of_objects(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
+    /// The rays of [`RaySource::in_order`], each with the alpha of its pixel. A view that is opaque everywhere has no alpha to tell objects by:
+    /// there it is 0 where the color is the background's, else 1.
+    pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
         let opaque: Vec<bool> = self.views.iter().map(|view| view.image.pixels().all(|p| p.0[3] == 255)).collect();
-        let color = self.background.map(|c| (c * 255.0).round() as u8);
-        (0..self.len().div_ceil(size)).map(move |batch| {
-            let indices = batch * size..((batch + 1) * size).min(self.len());
-            let shown = indices.filter_map(|index| {
-                let (v, x, y) = self.place(index);
-                let [r, g, b, a] = self.views[v].image.get_pixel(x as u32, y as u32).0;
-                let object = if opaque[v] { [r, g, b] != color } else { a > 0 };
-                object.then(|| self.views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5))
-            });
-            shown.collect()
+        let background = self.background.map(|c| (c * 255.0).round() as u8);
+        let alpha = move |index: u64| {
+            let (v, x, y) = self.place(index);
+            match self.views[v].image.get_pixel(x as u32, y as u32).0 {
+                [r, g, b, _] if opaque[v] => f32::from(u8::from([r, g, b] != background)),
+                [.., alpha] => f32::from(alpha) / 255.0,
+            }
+        };
+        self.in_order(size).zip(0..).map(move |(rays, batch)| {
+            let alphas = (batch * size..).take(rays.len()).map(&alpha).collect();
+            (rays, alphas)
         })
     }
 

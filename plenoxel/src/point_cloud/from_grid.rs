@@ -22,8 +22,8 @@ pub enum Coordinates {
 /// Where the one color of a voxel comes from that has one for each direction. Plain colors are taken as they are.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ColorFrom<'a> {
-    /// The mean of what cameras see of it, each ray counting by the weight it gives to the voxel. Nobody ever looked from other directions,
-    /// and harmonics are arbitrary there.
+    /// The mean of what cameras see of it in photographs of objects, each ray counting by the weight it gives to the voxel. Nobody ever looked
+    /// from other directions, and harmonics are arbitrary there.
     Seen(&'a Seen),
     /// The mean over all directions, seen or not: the constant harmonic.
     Mean,
@@ -40,26 +40,40 @@ pub struct VoxelOptions<'a> {
     pub color: ColorFrom<'a>,
     /// The least opacity of a point; voxels without density are left out at any rate.
     pub min_alpha: f64,
-    /// What rays see of the grid, and the least weight on one of them that a point needs; `None` takes voxels that nobody sees too.
-    pub visible: Option<(&'a Seen, f64)>,
+    /// What cameras must see of a voxel; `None` takes all.
+    pub visible: Option<Visible<'a>>,
+}
+
+/// What cameras must see of a voxel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Visible<'a> {
+    /// What they see.
+    pub seen: &'a Seen,
+    /// The least [`Seen::weight`].
+    pub min_weight: f64,
+    /// The least [`Seen::object`]: clouds in the background's color, that hang where they hide nothing, are near 0.
+    pub min_object: f64,
 }
 
 /// The voxels of a grid as points, in row-major order of voxels, x slowest. Fields: `opacity` (α) and `density` (σ, 1 / world length), and
-/// `weight`, the largest on any ray, where that is known. Coordinates are rounded to `f32`, as files have them.
+/// `weight` and `object` of [`Seen`], where that is known. Coordinates are rounded to `f32`, as files have them.
 ///
 /// Panics if what was seen is of a grid with another layout.
 #[track_caller]
 pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> PointCloud {
     let (shape, lattice) = (grid.shape(), grid.lattice());
     let seen = match (options.visible, options.color) {
-        (Some((seen, _)), _) | (None, ColorFrom::Seen(seen)) => Some(seen),
+        (Some(Visible { seen, .. }), _) | (None, ColorFrom::Seen(seen)) => Some(seen),
         _ => None,
     };
     assert!(seen.is_none_or(|seen| seen.weight.len() == lattice.rows()), "points: what was seen is of another grid");
     let (n, side) = (shape.resolution, shape.voxel_side());
     let sigma = |row: u32| grid.density.tensor().data()[row as usize].as_f64().max(0.0);
     let alpha = |row: u32| -(-sigma(row) * side).exp_m1();
-    let visible = |row: u32| options.visible.is_none_or(|(seen, least)| f64::from(seen.weight[row as usize]) >= least);
+    let visible = |row: u32| {
+        let at_least = |values: &[f32], least: f64| f64::from(values[row as usize]) >= least;
+        options.visible.is_none_or(|v| at_least(&v.seen.weight, v.min_weight) && at_least(&v.seen.object, v.min_object))
+    };
     let planes = parallel::map_indices(n, |x| {
         let voxels = (0..n).flat_map(|y| (0..n).map(move |z| [x, y, z]));
         let found = voxels.filter_map(|voxel| lattice.row(voxel).map(|row| (voxel, row)));
@@ -84,7 +98,10 @@ pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> Point
         values: chosen.iter().map(|&(_, row)| value(row) as f32).collect(),
     };
     let mut fields = vec![field("opacity", &alpha), field("density", &sigma)];
-    fields.extend(seen.map(|seen| field("weight", &|row| f64::from(seen.weight[row as usize]))));
+    if let Some(seen) = seen {
+        fields.push(field("weight", &|row| f64::from(seen.weight[row as usize])));
+        fields.push(field("object", &|row| f64::from(seen.object[row as usize])));
+    }
     let rows: Vec<u32> = chosen.iter().map(|&(_, row)| row).collect();
     PointCloud {
         positions: chosen.iter().map(position).collect(),

@@ -13,7 +13,7 @@ use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::export;
 use plenoxel::field::voxel_grid::{Color, VoxelGrid};
-use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, VoxelOptions};
+use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, VoxelOptions};
 use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
 use plenoxel::render::fused::{Seen, seen};
@@ -25,7 +25,7 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel export ply runs/lego                                what the training cameras see, into runs/lego/cloud.ply
   plenoxel export ply runs/lego --sor-sigma 2                  and without stragglers
-  plenoxel export ply runs/lego --min-alpha 0 --min-weight 0   every voxel that has density
+  plenoxel export ply runs/lego --min-alpha 0 --min-weight 0 --min-object 0
   plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
 
 The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at
@@ -56,10 +56,14 @@ pub struct PlyArgs {
     #[arg(long, value_name = "A", help_heading = "Voxels", default_value_t = MIN_ALPHA, value_parser = share)]
     min_alpha: f64,
 
-    /// Keep voxels that are at least this share of some pixel of a training view, among the pixels that show more than background; 0 keeps
-    /// unseen ones too
+    /// Keep voxels that make at least this share of some pixel of a training view; 0 keeps those that nobody sees
     #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = MIN_WEIGHT, value_parser = share)]
     min_weight: f64,
+
+    /// Keep voxels of whose pixels in the training views at least this share shows an object: floating clouds in the background's color have
+    /// 0. Alpha tells objects from the background, or the color in images without alpha
+    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = MIN_OBJECT, value_parser = share)]
+    min_object: f64,
 
     /// Where the dataset is now [default: where it was when training]
     #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
@@ -74,8 +78,9 @@ pub struct PlyArgs {
 }
 
 /// Chosen by looking at clouds of lego, of both presets.
-const MIN_ALPHA: f64 = 0.1;
-const MIN_WEIGHT: f64 = 0.1;
+const MIN_ALPHA: f64 = 0.2;
+const MIN_WEIGHT: f64 = 0.05;
+const MIN_OBJECT: f64 = 0.7;
 
 /// Rays that are looked along at a time.
 const RAYS_PER_BATCH: u64 = 1 << 15;
@@ -114,7 +119,8 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
     config.downscale = args.downscale.unwrap_or(config.downscale);
     let (grid, header) = folder.load()?;
     let harmonics = grid.shape().color != Color::Rgb;
-    let looks = args.min_weight > 0.0 || (harmonics && args.color == ColorChoice::Seen);
+    let chooses = args.min_weight > 0.0 || args.min_object > 0.0;
+    let looks = chooses || (harmonics && args.color == ColorChoice::Seen);
     let seen = if looks { Some(look(args, &config, record, &grid, console)?) } else { None };
 
     let coordinates = match args.coords {
@@ -126,7 +132,8 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         (ColorChoice::Direction(direction), _) => ColorFrom::Direction(direction),
         (ColorChoice::Mean | ColorChoice::Seen, _) => ColorFrom::Mean,
     };
-    let visible = seen.as_ref().filter(|_| args.min_weight > 0.0).map(|seen| (seen, args.min_weight));
+    let (min_weight, min_object) = (args.min_weight, args.min_object);
+    let visible = seen.as_ref().filter(|_| chooses).map(|seen| Visible { seen, min_weight, min_object });
     let cloud = from_grid::points(&grid, &VoxelOptions { coordinates, color, min_alpha: args.min_alpha, visible });
 
     let side = grid.shape().voxel_side();
@@ -151,7 +158,7 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         format!("{} voxels a side, scene {}, {} steps", n, header.scene, header.step),
         format!("coordinates: {frame}"),
         format!("voxel_side {}", lengths.voxel.unwrap_or(1.0)),
-        "opacity = 1 - exp(-density * side of a voxel in the world); weight: the largest share of a training pixel".to_owned(),
+        "opacity = 1 - exp(-density * side of a voxel in the world); weight, object: what training views show of it".to_owned(),
         report.clone(),
     ];
     export::ply::write(&path, &cloud.chosen(&left), &comments)?;
@@ -161,7 +168,7 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
 /// What the training cameras see of a grid.
 fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32>, console: &Console<'_>) -> Result<Seen> {
     let source = args.data.as_deref().map_or(record.data, DataSource::folder);
-    let without = "or go on without its cameras: --min-weight 0 --color mean";
+    let without = "or go on without its cameras: --min-weight 0 --min-object 0 --color mean";
     let dataset = source.reopen(config).map_err(|e| match e {
         Error::Input { path, found, remedy } => Error::input(path, found, format!("{remedy}, {without}")),
         other => other,
@@ -184,7 +191,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     };
     let total = rays.len().div_ceil(RAYS_PER_BATCH) as usize;
     let count = console.count("looking along training rays", total);
-    let batches = rays.of_objects(RAYS_PER_BATCH).enumerate().map(|(done, batch)| {
+    let batches = rays.in_order_with_alpha(RAYS_PER_BATCH).enumerate().map(|(done, batch)| {
         count.at(done, total);
         batch
     });

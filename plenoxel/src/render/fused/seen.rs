@@ -7,13 +7,15 @@ use crate::render::RenderOptions;
 use autograd::{Real, parallel};
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
-/// What rays see of each row of a grid's tables.
+/// What photographs show of each row of a grid's tables. Each sample on a ray counts by its weight w, times the share that the row has in it;
+/// a is the alpha of the ray's pixel, how much of an object it shows. Numbers are 0 where no ray comes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Seen {
-    /// [`largest_weights`]
+    /// The largest w a: how much of a pixel's object the row is ever part of.
     pub weight: Vec<f32>,
-    /// Σ w c(d) / Σ w over the samples that read the row, w being a sample's weight times the row's share of it and c(d) the color of the
-    /// row alone into the ray's direction; black where no ray comes.
+    /// Σ w a / Σ w: 1 for what stands in front of objects, 0 for what stands only where photographs show the background.
+    pub object: Vec<f32>,
+    /// Σ w a c(d) / Σ w a, c(d) being the color of the row alone into the ray's direction.
     pub color: Vec<[f32; 3]>,
 }
 
@@ -21,42 +23,58 @@ pub struct Seen {
 /// pixel its voxel is ever part of, 0 where no ray comes. Rays come in batches to bound the memory; svox2 prunes by it (`grid_weight_render`).
 pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Vec<f32> {
     let largest = Largest::new(grid.lattice().rows());
-    for_each_read(grid, batches, options, |row, weight, _, _| largest.raise(row, weight));
+    for rays in batches {
+        for_each_read(grid, &rays, options, 0.0, |row, _, weight, _, _| largest.raise(row, weight));
+    }
     largest.into_weights()
 }
 
-/// The largest weights, and the mean colors. Colors are added up as whole multiples of 2⁻²⁴, whose sum does not depend on the order, so that
-/// the result has the same bits for any number of threads.
-pub fn seen<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Seen {
+/// What rays with the alphas of their pixels see. Samples with a weight below 1 / 1024, a quarter of a step of 8 bits, are not counted. Sums
+/// are of whole multiples of 2⁻²⁴ and so do not depend on their order: the result has the same bits for any number of threads.
+pub fn seen<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = (Vec<Ray>, Vec<f32>)>, options: &RenderOptions<'_>) -> Seen {
+    const LEAST: f64 = 1.0 / 1024.0;
     const ONE: f64 = (1u64 << 24) as f64;
     /// A color is at most 1 on a screen. This only keeps sums over 2³¹ samples within 64 bits.
     const BRIGHTEST: f64 = 256.0;
     let rows = grid.lattice().rows();
     let largest = Largest::new(rows);
-    let sums: Vec<[AtomicU64; 4]> = (0..rows).map(|_| Default::default()).collect();
+    // Of w, of w a, and of w a c.
+    let sums: Vec<[AtomicU64; 5]> = (0..rows).map(|_| Default::default()).collect();
     let (table, channels) = (grid.color.tensor().data(), grid.shape().color.channels());
-    for_each_read(grid, batches, options, |row, weight, share, basis| {
-        largest.raise(row, weight);
-        let amount = (weight.as_f64() * share.as_f64() * ONE).round();
-        let Some(sums) = sums.get(row as usize).filter(|_| amount > 0.0) else { return };
-        let numbers = &table[row as usize * channels..][..channels];
-        let color = |c: usize| match grid.shape().color {
-            Color::Rgb => numbers[c].as_f64(),
-            Color::Sh { offset, .. } => {
-                let numbers = &numbers[c * basis.len()..][..basis.len()];
-                offset + numbers.iter().zip(basis).map(|(&number, &y)| number * y).sum::<T>().as_f64()
+    for (rays, alphas) in batches {
+        for_each_read(grid, &rays, options, LEAST, |row, ray, weight, share, basis| {
+            let Some(sums) = sums.get(row as usize) else { return };
+            let add = |sum: usize, amount: f64| {
+                sums[sum].fetch_add((amount * ONE + 0.5) as u64, Relaxed);
+            };
+            let amount = (weight * share).as_f64();
+            add(0, amount);
+            let alpha = f64::from(alphas[ray]);
+            if alpha == 0.0 {
+                return;
             }
-        };
-        for (c, sum) in sums[..3].iter().enumerate() {
-            sum.fetch_add((color(c).clamp(0.0, BRIGHTEST) * amount).round() as u64, Relaxed);
-        }
-        sums[3].fetch_add(amount as u64, Relaxed);
-    });
-    let mean = |sums: [AtomicU64; 4]| {
-        let [r, g, b, weight] = sums.map(|sum| sum.into_inner() as f64);
-        [r, g, b].map(|c| (c / weight.max(1.0)) as f32)
+            largest.raise(row, weight * T::lit(alpha));
+            add(1, amount * alpha);
+            let numbers = &table[row as usize * channels..][..channels];
+            if let Color::Sh { offset, .. } = grid.shape().color {
+                for c in 0..3 {
+                    let numbers = numbers[c * basis.len()..].iter().zip(basis);
+                    let color = offset + numbers.map(|(&number, &y)| number * y).sum::<T>().as_f64();
+                    add(2 + c, amount * alpha * color.clamp(0.0, BRIGHTEST));
+                }
+            }
+        });
+    }
+    let sums: Vec<[f64; 5]> = sums.into_iter().map(|sums| sums.map(|sum| sum.into_inner() as f64)).collect();
+    let color = |row: usize| match grid.shape().color {
+        Color::Rgb => [0, 1, 2].map(|c| if sums[row][1] > 0.0 { table[row * channels + c].as_f64() as f32 } else { 0.0 }),
+        Color::Sh { .. } => [2, 3, 4].map(|c| (sums[row][c] / sums[row][1].max(1.0)) as f32),
     };
-    Seen { weight: largest.into_weights(), color: sums.into_iter().map(mean).collect() }
+    Seen {
+        weight: largest.into_weights(),
+        object: sums.iter().map(|sums| (sums[1] / sums[0].max(1.0)) as f32).collect(),
+        color: (0..rows).map(color).collect(),
+    }
 }
 
 /// The largest weight of each row so far. Numbers that are not negative are in the order of their bits, and a maximum does not depend on the
@@ -81,34 +99,34 @@ impl Largest {
     }
 }
 
-/// Calls `f(row, weight, share, basis)` for every row that a sample reads: the sample's weight, the row's share of the sample, and the
-/// harmonics of the ray's direction.
+/// Calls `f(row, ray, weight, share, basis)` for every row that a sample with a weight above `least` reads: the number of its ray, its weight,
+/// the row's share of it, and the harmonics of the ray's direction.
 fn for_each_read<T: Real>(
     grid: &VoxelGrid<T>,
-    batches: impl IntoIterator<Item = Vec<Ray>>,
+    rays: &[Ray],
     options: &RenderOptions<'_>,
-    f: impl Fn(u32, T, T, &[T]) + Sync,
+    least: f64,
+    f: impl Fn(u32, usize, T, T, &[T]) + Sync,
 ) {
-    for rays in batches {
-        let batch = Batch::new(grid, &rays, options);
-        let scene = batch.scene(grid, &rays, options);
-        let count = batch.basis.shape()[1];
-        parallel::map_chunks(rays.len(), BLOCK, |range| {
-            let (block, corners) = scene.weights(range.start, range.len());
-            for (ray, own) in range.zip(block.rays()) {
-                let basis = &batch.basis.data()[ray * count..][..count];
-                for i in own {
-                    let weight = block.weight[i];
-                    match &corners {
-                        None => f(block.rows[i], weight, T::one(), basis),
-                        Some(corners) => {
-                            let (rows, shares) = corners.of(i);
-                            let reads = rows.into_iter().zip(shares).filter(|(_, share)| *share > T::zero());
-                            reads.for_each(|(row, share)| f(row, weight, share, basis));
-                        }
+    let least = T::lit(least);
+    let batch = Batch::new(grid, rays, options);
+    let scene = batch.scene(grid, rays, options);
+    let count = batch.basis.shape()[1];
+    parallel::map_chunks(rays.len(), BLOCK, |range| {
+        let (block, corners) = scene.weights(range.start, range.len());
+        for (ray, own) in range.zip(block.rays()) {
+            let basis = &batch.basis.data()[ray * count..][..count];
+            for i in own.filter(|&i| block.weight[i] > least) {
+                let weight = block.weight[i];
+                match &corners {
+                    None => f(block.rows[i], ray, weight, T::one(), basis),
+                    Some(corners) => {
+                        let (rows, shares) = corners.of(i);
+                        let reads = rows.into_iter().zip(shares).filter(|(_, share)| *share > T::zero());
+                        reads.for_each(|(row, share)| f(row, ray, weight, share, basis));
                     }
                 }
             }
-        });
-    }
+        }
+    });
 }
