@@ -1,5 +1,5 @@
 //! The filters with which people clean point clouds, as CloudCompare defines them (CCCoreLib, `CloudSamplingTools.cpp`): the same settings
-//! keep the same points.
+//! keep the same points, but for noise that nobody can decide: see [`NoiseError`].
 //!
 //! Each filter looks at the points that the one before has left, in this order: box, value, noise, statistical outliers.
 //! CloudCompare stores coordinates in 32 bits, shifted where they are large, and so do the filters; the cloud itself keeps its own.
@@ -37,7 +37,8 @@ pub struct Range {
 }
 
 /// Noise filter. The neighbors of a point are the others within `radius`. If there are at least three, the point stays if its distance to
-/// the plane nearest to them is at most `error`; if those three lie on a line, it goes.
+/// the plane nearest to them is at most `error`. If there are three that make no plane, A, B and C with |AB × AC|² below 2⁻²³, it goes: the
+/// bound is CloudCompare's and depends on the unit of length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Noise {
     /// Distance within which points are neighbors, in the units of the coordinates.

@@ -19,11 +19,11 @@ pub enum Coordinates {
     Grid,
 }
 
-/// Where the one color of a voxel comes from that has one for each direction. Plain colors are taken as they are.
+/// Where the one color of a voxel comes from. A plain color is the same into every direction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ColorFrom<'a> {
-    /// The mean of what cameras see of it in photographs of objects, each ray counting by the weight it gives to the voxel. Nobody ever looked
-    /// from other directions, and harmonics are arbitrary there.
+    /// The mean color of the samples that read it, on rays whose pixels show objects, each counting by its weight. Nobody ever looked from
+    /// other directions, and harmonics are arbitrary there; and what a voxel holds alone is not what is seen of it between its neighbors.
     Seen(&'a Seen),
     /// The mean over all directions, seen or not: the constant harmonic.
     Mean,
@@ -114,7 +114,7 @@ pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> Point
     }
 }
 
-/// −∇α / |∇α|, or 0 where α does not change: central differences, smoothed by 1, 2, 1 across (Sobel's operator in space). Of opacity and
+/// −∇α / |∇α|, or 0 where α does not change but for rounding: central differences, smoothed by 1, 2, 1 across (Sobel's operator in space). Of opacity and
 /// not of density itself: the direction is the same, and a density of 10⁴ beside one of 10³, both opaque, does not turn it.
 fn normal(at: IVec3, alpha: impl Fn(IVec3) -> f64) -> [f32; 3] {
     let mut gradient = DVec3::ZERO;
@@ -128,7 +128,8 @@ fn normal(at: IVec3, alpha: impl Fn(IVec3) -> f64) -> [f32; 3] {
             }
         }
     }
-    (-gradient).normalize_or_zero().as_vec3().to_array()
+    let changes = gradient.length() > 1e-6;
+    if changes { (-gradient.normalize()).as_vec3().to_array() } else { [0.0; 3] }
 }
 
 /// Colors of some rows, 8-bit sRGB.
@@ -138,8 +139,8 @@ fn colors<T: Real>(grid: &VoxelGrid<T>, rows: &[u32], from: ColorFrom<'_>) -> Ve
     let coefficients = |row: u32| &table[row as usize * channels..][..channels];
     let eight_bits = |c: f64| (c.clamp(0.0, 1.0) * 255.0).round() as u8;
     let color: Box<dyn Fn(u32) -> [f64; 3] + Sync> = match (grid.shape().color, from) {
+        (_, ColorFrom::Seen(seen)) => Box::new(|row| seen.color[row as usize].map(f64::from)),
         (Color::Rgb, _) => Box::new(|row| [0, 1, 2].map(|c| coefficients(row)[c].as_f64())),
-        (Color::Sh { .. }, ColorFrom::Seen(seen)) => Box::new(|row| seen.color[row as usize].map(f64::from)),
         (Color::Sh { degree, offset }, from) => {
             let basis: Vec<f64> = match from {
                 ColorFrom::Direction(direction) => {

@@ -31,8 +31,8 @@ impl Moments {
     }
 
     /// The plane that minimises the sum of squared distances: through the mean, its normal being the eigenvector of the covariance with the
-    /// smallest eigenvalue. `None` if there are fewer than three points, or if there are three on a line: CloudCompare has no plane
-    /// through those, and some plane through more of them.
+    /// smallest eigenvalue. `None` if there are fewer than three points, or three, A, B and C, with |AB × AC|² below ε = 2⁻²³: on a line, or
+    /// nearly so. The bound is CloudCompare's and depends on the unit of length; through four points on a line it has some plane.
     pub fn plane(&self) -> Option<Plane> {
         if self.count < 3 {
             return None;
@@ -50,8 +50,8 @@ impl Moments {
         let mut ascending = [0, 1, 2];
         ascending.sort_by(|&a, &b| values[a].total_cmp(&values[b]));
         let [smallest, middle, largest] = ascending;
-        // Of three points two eigenvalues are 0 up to rounding exactly if they lie on a line.
-        if self.count == 3 && values[middle] <= 1e-12 * values[largest] {
+        // Of three points, |AB × AC|² = 27 λ₁ λ₂, the two eigenvalues of the covariance that are not 0.
+        if self.count == 3 && 27.0 * values[middle] * values[largest] < f64::from(f32::EPSILON) {
             return None;
         }
         Some(Plane { center, normal: vectors.col(smallest).normalize(), deviation: values[smallest].max(0.0).sqrt() })

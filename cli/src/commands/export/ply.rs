@@ -12,7 +12,7 @@ use glam::DVec3;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::export;
-use plenoxel::field::voxel_grid::{Color, VoxelGrid};
+use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, VoxelOptions};
 use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
@@ -29,7 +29,7 @@ Examples:
   plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
 
 The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at
-the density. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
+the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbors. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
 
 /// Write the voxels of a run as a colored point cloud
 #[derive(Debug, Args)]
@@ -47,8 +47,7 @@ pub struct PlyArgs {
     #[arg(long, help_heading = "Output", default_value = "world")]
     coords: Coords,
 
-    /// The one color of a voxel with harmonics: what training cameras see of it, the mean over all directions, or what a ray in the
-    /// direction X,Y,Z shows
+    /// The one color of a voxel: what training cameras see of it, the mean over all directions, or what a ray in the direction X,Y,Z shows
     #[arg(long, value_name = "seen|mean|X,Y,Z", help_heading = "Output", default_value = "seen", value_parser = color, allow_hyphen_values = true)]
     color: ColorChoice,
 
@@ -78,7 +77,7 @@ pub struct PlyArgs {
 }
 
 /// Chosen by looking at clouds of lego, of both presets.
-const MIN_ALPHA: f64 = 0.2;
+const MIN_ALPHA: f64 = 0.1;
 const MIN_WEIGHT: f64 = 0.05;
 const MIN_OBJECT: f64 = 0.7;
 
@@ -118,9 +117,8 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
     let (folder, mut config, record) = RunFolder::open(&args.run)?;
     config.downscale = args.downscale.unwrap_or(config.downscale);
     let (grid, header) = folder.load()?;
-    let harmonics = grid.shape().color != Color::Rgb;
     let chooses = args.min_weight > 0.0 || args.min_object > 0.0;
-    let looks = chooses || (harmonics && args.color == ColorChoice::Seen);
+    let looks = chooses || args.color == ColorChoice::Seen;
     let seen = if looks { Some(look(args, &config, record, &grid, console)?) } else { None };
 
     let coordinates = match args.coords {

@@ -56,7 +56,7 @@ fn foreign(encoding: Encoding) -> Vec<u8> {
         }
         file.extend(bytes);
     };
-    [(2.0, Number::U8), (0.5, Number::F32), (1.5, Number::F32), (-7.0, Number::I32)].map(|(v, n)| put(v, n));
+    [(2.0, Number::U8), (0.5, Number::F32), (1.5, Number::F32), (-7.0, Number::I32)].into_iter().for_each(|(v, n)| put(v, n));
     for i in 0..3u8 {
         let f = f64::from(i);
         put(4_500_000.125 + f, Number::F64);
@@ -64,12 +64,12 @@ fn foreign(encoding: Encoding) -> Vec<u8> {
         (0..i).for_each(|j| put(f64::from(j) - 1.0, Number::I32));
         put(f / 3.0, Number::F64);
         put(-f, Number::F64);
-        [f, 128.0, 255.0].map(|c| put(c, Number::U8));
+        [f, 128.0, 255.0].into_iter().for_each(|c| put(c, Number::U8));
         put(if i == 1 { f64::NAN } else { 0.25 * f }, Number::F32);
         put(-300.0 + f, Number::I16);
     }
-    [3.0].map(|v| put(v, Number::U8));
-    [0.0, 1.0, 2.0].map(|v| put(v, Number::I32));
+    put(3.0, Number::U8);
+    [0.0, 1.0, 2.0].into_iter().for_each(|v| put(v, Number::I32));
     file
 }
 

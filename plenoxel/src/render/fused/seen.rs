@@ -15,7 +15,7 @@ pub struct Seen {
     pub weight: Vec<f32>,
     /// Σ w a / Σ w: 1 for what stands in front of objects, 0 for what stands only where photographs show the background.
     pub object: Vec<f32>,
-    /// Σ w a c(d) / Σ w a, c(d) being the color of the row alone into the ray's direction.
+    /// Σ w a c / Σ w a, c being the color that the sample shows to the ray.
     pub color: Vec<[f32; 3]>,
 }
 
@@ -24,7 +24,7 @@ pub struct Seen {
 pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Vec<f32> {
     let largest = Largest::new(grid.lattice().rows());
     for rays in batches {
-        for_each_read(grid, &rays, options, 0.0, |row, _, weight, _, _| largest.raise(row, weight));
+        for_each_sample(grid, &rays, options, 0.0, |sample| sample.reads().for_each(|(row, _)| largest.raise(row, sample.weight)));
     }
     largest.into_weights()
 }
@@ -41,39 +41,30 @@ pub fn seen<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = (Vec
     // Of w, of w a, and of w a c.
     let sums: Vec<[AtomicU64; 5]> = (0..rows).map(|_| Default::default()).collect();
     let (table, channels) = (grid.color.tensor().data(), grid.shape().color.channels());
+    let add = |sum: &AtomicU64, amount: f64| sum.fetch_add((amount * ONE + 0.5) as u64, Relaxed);
     for (rays, alphas) in batches {
-        for_each_read(grid, &rays, options, LEAST, |row, ray, weight, share, basis| {
-            let Some(sums) = sums.get(row as usize) else { return };
-            let add = |sum: usize, amount: f64| {
-                sums[sum].fetch_add((amount * ONE + 0.5) as u64, Relaxed);
-            };
-            let amount = (weight * share).as_f64();
-            add(0, amount);
-            let alpha = f64::from(alphas[ray]);
-            if alpha == 0.0 {
-                return;
-            }
-            largest.raise(row, weight * T::lit(alpha));
-            add(1, amount * alpha);
-            let numbers = &table[row as usize * channels..][..channels];
-            if let Color::Sh { offset, .. } = grid.shape().color {
-                for c in 0..3 {
-                    let numbers = numbers[c * basis.len()..].iter().zip(basis);
-                    let color = offset + numbers.map(|(&number, &y)| number * y).sum::<T>().as_f64();
-                    add(2 + c, amount * alpha * color.clamp(0.0, BRIGHTEST));
+        for_each_sample(grid, &rays, options, LEAST, |sample| {
+            let alpha = f64::from(alphas[sample.ray]);
+            let color = if alpha > 0.0 { sample.color(grid.shape().color, table, channels) } else { [0.0; 3] };
+            for (row, share) in sample.reads() {
+                let Some(sums) = sums.get(row as usize) else { continue };
+                let amount = (sample.weight * share).as_f64();
+                add(&sums[0], amount);
+                if alpha > 0.0 {
+                    largest.raise(row, sample.weight * T::lit(alpha));
+                    add(&sums[1], amount * alpha);
+                    for (c, sum) in color.iter().zip(&sums[2..]) {
+                        add(sum, amount * alpha * c.clamp(0.0, BRIGHTEST));
+                    }
                 }
             }
         });
     }
     let sums: Vec<[f64; 5]> = sums.into_iter().map(|sums| sums.map(|sum| sum.into_inner() as f64)).collect();
-    let color = |row: usize| match grid.shape().color {
-        Color::Rgb => [0, 1, 2].map(|c| if sums[row][1] > 0.0 { table[row * channels + c].as_f64() as f32 } else { 0.0 }),
-        Color::Sh { .. } => [2, 3, 4].map(|c| (sums[row][c] / sums[row][1].max(1.0)) as f32),
-    };
     Seen {
         weight: largest.into_weights(),
         object: sums.iter().map(|sums| (sums[1] / sums[0].max(1.0)) as f32).collect(),
-        color: (0..rows).map(color).collect(),
+        color: sums.iter().map(|sums| [2, 3, 4].map(|c| (sums[c] / sums[1].max(1.0)) as f32)).collect(),
     }
 }
 
@@ -99,15 +90,43 @@ impl Largest {
     }
 }
 
-/// Calls `f(row, ray, weight, share, basis)` for every row that a sample with a weight above `least` reads: the number of its ray, its weight,
-/// the row's share of it, and the harmonics of the ray's direction.
-fn for_each_read<T: Real>(
-    grid: &VoxelGrid<T>,
-    rays: &[Ray],
-    options: &RenderOptions<'_>,
-    least: f64,
-    f: impl Fn(u32, usize, T, T, &[T]) + Sync,
-) {
+/// A sample on a ray, and what it reads of the tables.
+struct Sample<'a, T> {
+    /// Number of its ray.
+    ray: usize,
+    weight: T,
+    /// Harmonics of the ray's direction; empty for plain colors.
+    basis: &'a [T],
+    rows: &'a [u32],
+    shares: &'a [T],
+}
+
+impl<T: Real> Sample<'_, T> {
+    /// Rows with their shares, those that have one.
+    fn reads(&self) -> impl Iterator<Item = (u32, T)> + '_ {
+        self.rows.iter().copied().zip(self.shares.iter().copied()).filter(|(_, share)| *share > T::zero())
+    }
+
+    /// What it shows to its ray.
+    fn color(&self, meaning: Color, table: &[T], channels: usize) -> [f64; 3] {
+        let mut sum = [T::zero(); 3];
+        for (row, share) in self.reads() {
+            let Some(numbers) = table.get(row as usize * channels..(row as usize + 1) * channels) else { continue };
+            for (sum, numbers) in sum.iter_mut().zip(numbers.chunks_exact(channels / 3)) {
+                let own: T = match meaning {
+                    Color::Rgb => numbers[0],
+                    Color::Sh { .. } => numbers.iter().zip(self.basis).map(|(&number, &y)| number * y).sum(),
+                };
+                *sum += share * own;
+            }
+        }
+        let offset = if let Color::Sh { offset, .. } = meaning { offset } else { 0.0 };
+        sum.map(|c| c.as_f64() + offset)
+    }
+}
+
+/// Calls `f` for every sample with a weight above `least`.
+fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>, least: f64, f: impl Fn(Sample<'_, T>) + Sync) {
     let least = T::lit(least);
     let batch = Batch::new(grid, rays, options);
     let scene = batch.scene(grid, rays, options);
@@ -119,11 +138,10 @@ fn for_each_read<T: Real>(
             for i in own.filter(|&i| block.weight[i] > least) {
                 let weight = block.weight[i];
                 match &corners {
-                    None => f(block.rows[i], ray, weight, T::one(), basis),
+                    None => f(Sample { ray, weight, basis, rows: &block.rows[i..=i], shares: &[T::one()] }),
                     Some(corners) => {
                         let (rows, shares) = corners.of(i);
-                        let reads = rows.into_iter().zip(shares).filter(|(_, share)| *share > T::zero());
-                        reads.for_each(|(row, share)| f(row, ray, weight, share, basis));
+                        f(Sample { ray, weight, basis, rows: &rows, shares: &shares });
                     }
                 }
             }
