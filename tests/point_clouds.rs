@@ -83,7 +83,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     assert!(file.header().remarks.contains(&"comment voxel_side 0.1875".to_owned()), "{:?}", file.header().remarks);
     let read = file.cloud().unwrap();
     assert!(read.len() > 50 && read.len() < 16 * 16 * 16 && read.positions.iter().all(|p| p.abs().max_element() < 1.5));
-    assert!(read.field("opacity").unwrap().iter().all(|a| (0.1..=1.0).contains(a)));
+    assert!(read.field("opacity").unwrap().iter().all(|a| (0.05..=1.0).contains(a)));
 
     // All voxels with density, then fewer and fewer.
     let all = folder.path("all.ply");

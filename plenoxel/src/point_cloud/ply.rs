@@ -26,6 +26,8 @@ pub struct PlyFile {
     header: Header,
     /// Number of the element with the points.
     points: usize,
+    /// Numbers of its properties x, y and z.
+    axes: [usize; 3],
     rows: Rows,
 }
 
@@ -64,7 +66,7 @@ impl PlyFile {
             let found = format!("the header says {} points", header.elements[points].count);
             return Err(Error::input(path, found, "at most 4294967295 are read"));
         }
-        let mut file = PlyFile { path: path.to_owned(), bytes, header, points, rows: Rows::Fixed { start: 0, stride: 0 } };
+        let mut file = PlyFile { path: path.to_owned(), bytes, header, points, axes: [0; 3], rows: Rows::At(Vec::new()) };
         let mut cursor = Cursor { bytes: &file.bytes, at: file.header.length, encoding: file.header.encoding };
         let mut rows = None;
         for (number, element) in file.header.elements.iter().enumerate() {
@@ -72,12 +74,13 @@ impl PlyFile {
             rows = rows.or(found.filter(|_| number == points));
         }
         file.rows = rows.unwrap_or(Rows::At(Vec::new()));
-        for axis in ["x", "y", "z"] {
-            if file.property(&[axis]).is_none() {
+        for (number, axis) in ["x", "y", "z"].into_iter().enumerate() {
+            let Some(property) = file.property(&[axis]) else {
                 let names: Vec<&str> = file.element().properties.iter().map(|p| &p.name[..]).collect();
                 let found = format!("the points have no property `{axis}`, but [{}]", names.join(", "));
                 return Err(Error::input(path, found, "properties x, y and z are expected"));
-            }
+            };
+            file.axes[number] = property;
         }
         Ok(file)
     }
@@ -106,26 +109,26 @@ impl PlyFile {
     ///
     /// Errors: something in a text is no number, as in [`PlyFile::values`].
     pub fn positions(&self) -> Result<Vec<DVec3>> {
-        let [x, y, z] = [self.of("x")?, self.of("y")?, self.of("z")?];
+        let [x, y, z] = self.axes;
+        let [x, y, z] = [self.column(x)?, self.column(y)?, self.column(z)?];
         Ok(x.into_iter().zip(y).zip(z).map(|((x, y), z)| DVec3::new(x, y, z)).collect())
     }
 
     /// Names of the scalar fields: every property of the points that is one number and no coordinate, normal or color, without the
     /// `scalar_` in front of it.
     pub fn field_names(&self) -> Vec<&str> {
-        self.fields().map(|p| field_name(&p.name)).collect()
+        self.fields().map(|(_, p)| field_name(&p.name)).collect()
     }
 
     /// The values of a scalar field, by its name with or without `scalar_`.
     ///
     /// Errors: there is none with this name; something in a text is no number.
     pub fn values(&self, name: &str) -> Result<Vec<f32>> {
-        let property = self.fields().find(|p| p.name == name || field_name(&p.name) == name);
-        let Some(property) = property else {
+        let Some((property, _)) = self.fields().find(|(_, p)| p.name == name || field_name(&p.name) == name) else {
             let found = format!("no scalar field `{name}`");
             return Err(Error::input(&self.path, found, format!("its scalar fields are [{}]", self.field_names().join(", "))));
         };
-        Ok(self.of(&property.name)?.into_iter().map(|v| v as f32).collect())
+        self.in_single(property)
     }
 
     /// Coordinates, colors, normals and scalar fields. Colors are `red`, `green` and `blue`, also with `diffuse_` in front of them, or `r`,
@@ -145,7 +148,8 @@ impl PlyFile {
         };
         let colors = three(COLORS)?.map(|colors| colors.into_iter().map(|c| c.map(|c| (c * scale).round() as u8)).collect());
         let normals = three(NORMALS)?.map(|normals| normals.into_iter().map(|n| n.map(|n| n as f32)).collect());
-        let field = |p: &Property| Ok(ScalarField { name: field_name(&p.name).to_owned(), values: self.values(&p.name)? });
+        let field =
+            |(number, p): (usize, &Property)| Ok(ScalarField { name: field_name(&p.name).to_owned(), values: self.in_single(number)? });
         Ok(PointCloud { positions: self.positions()?, colors, normals, fields: self.fields().map(field).collect::<Result<_>>()? })
     }
 
@@ -198,16 +202,15 @@ impl PlyFile {
         self.element().properties.iter().position(fits)
     }
 
-    fn fields(&self) -> impl Iterator<Item = &Property> {
+    /// The scalar fields, with the numbers of their properties.
+    fn fields(&self) -> impl Iterator<Item = (usize, &Property)> {
         let known = |name: &str| COLORS.iter().chain(&NORMALS).any(|names| names.contains(&name)) || ["x", "y", "z"].contains(&name);
-        self.element().properties.iter().filter(move |p| matches!(p.kind, Kind::Scalar(_)) && !known(&p.name.to_lowercase()))
+        let scalar = move |p: &Property| matches!(p.kind, Kind::Scalar(_)) && !known(&p.name.to_lowercase());
+        self.element().properties.iter().enumerate().filter(move |(_, p)| scalar(p))
     }
 
-    /// The numbers of the first property with a name.
-    fn of(&self, name: &str) -> Result<Vec<f64>> {
-        let small = name.to_lowercase();
-        let exact = self.element().properties.iter().position(|p| p.name == name);
-        self.column(exact.or_else(|| self.property(&[&small])).unwrap_or(0))
+    fn in_single(&self, property: usize) -> Result<Vec<f32>> {
+        Ok(self.column(property)?.into_iter().map(|v| v as f32).collect())
     }
 
     /// The numbers of a property, row after row.

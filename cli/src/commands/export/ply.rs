@@ -77,7 +77,7 @@ pub struct PlyArgs {
 }
 
 /// Chosen by looking at clouds of lego, of both presets.
-const MIN_ALPHA: f64 = 0.1;
+const MIN_ALPHA: f64 = 0.05;
 const MIN_WEIGHT: f64 = 0.05;
 const MIN_OBJECT: f64 = 0.7;
 
@@ -172,7 +172,9 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
         other => other,
     })?;
     check_split(&dataset, Split::Train)?;
-    let estimate = Estimate::of_evaluation(config, config.evaluation, grid.shape(), &dataset, Some(Split::Train));
+    let mut estimate = Estimate::of_evaluation(config, config.evaluation, grid.shape(), &dataset, Some(Split::Train));
+    // What is added up for each row.
+    estimate.grid += (grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>())) as u64;
     console.note(&estimate.describe());
     estimate.check()?;
     let views = load(console, &dataset, Split::Train, &source)?;
