@@ -49,7 +49,8 @@ pub struct Noise {
     pub remove_isolated: bool,
 }
 
-/// How far from the plane of its neighbors a point may be. Distances that are equal but for the rounding of the coordinates count as equal:
+/// How far from the plane of its neighbors a point may be. Distances count as equal that differ by less than the rounding of the coordinates,
+/// 8 · 2⁻²³ of the largest:
 /// on a lattice that decides about whole edges, and CloudCompare lets chance decide.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum NoiseError {
