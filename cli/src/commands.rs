@@ -1,7 +1,10 @@
 //! One file for each command: its arguments, and what it does.
 
 pub mod carve;
+mod cloud_filters;
 pub mod evaluate;
+pub mod export;
+pub mod filter;
 pub mod info;
 mod new_run;
 mod pictures;
@@ -44,13 +47,23 @@ fn background(text: &str) -> Result<[f64; 3], String> {
         "black" => return Ok([0.0; 3]),
         _ => {}
     }
-    let accepted = "white, black, or three numbers in [0, 1] such as 0.2,0.5,1";
-    let numbers: Vec<f64> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
-    let color: [f64; 3] = numbers.try_into().map_err(|_| accepted)?;
-    match text.matches(',').count() == 2 && color.iter().all(|c| (0.0..=1.0).contains(c)) {
-        true => Ok(color),
-        false => Err(accepted.to_owned()),
+    let color = numbers(text).ok().filter(|color: &[f64; 3]| color.iter().all(|c| (0.0..=1.0).contains(c)));
+    color.ok_or_else(|| "white, black, or three numbers in [0, 1] such as 0.2,0.5,1".to_owned())
+}
+
+/// A number of at least `least`, as the command line takes it.
+fn number(least: f64) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| match text.parse::<f64>() {
+        Ok(number) if number.is_finite() && number >= least => Ok(number),
+        _ if least.is_finite() => Err(format!("a number of at least {least}")),
+        _ => Err("a number".to_owned()),
     }
+}
+
+/// Numbers with commas between them, as the command line takes them.
+fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|n| n.trim().parse().ok().filter(|n: &f64| n.is_finite())).collect();
+    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| format!("{N} numbers with commas between them"))
 }
 
 /// By how much images may be reduced.

@@ -17,7 +17,7 @@ mod progress;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{carve, evaluate, info, render, scene, train};
+use commands::{carve, evaluate, export, filter, info, render, scene, train};
 use plenoxel::error::Error;
 use progress::Console;
 use std::ffi::OsString;
@@ -33,6 +33,7 @@ Examples:
   plenoxel carve data/lego                   an opaque colored grid from silhouettes, in seconds
   plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
   plenoxel render runs/lego-1 --view 0       a picture of it
+  plenoxel export ply runs/lego-1            its voxels as a colored point cloud
 
 Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing.";
 
@@ -52,6 +53,8 @@ enum Command {
     Carve(Box<carve::CarveArgs>),
     Render(render::RenderArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Export(export::ExportArgs),
+    Filter(filter::FilterArgs),
     Info(info::InfoArgs),
     Scene(scene::SceneArgs),
 }
@@ -89,6 +92,8 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
         Command::Carve(args) => carve::run(args, &console),
         Command::Render(args) => render::run(args, &console),
         Command::Evaluate(args) => evaluate::run(args, &console),
+        Command::Export(args) => export::run(args, &console),
+        Command::Filter(args) => filter::run(args, &console),
         Command::Info(args) => info::run(args, &console),
         Command::Scene(args) => scene::run(args, &console),
     });

@@ -44,6 +44,7 @@ const RESULT: &str = "result.json";
 const README: &str = "README.md";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
+const CLOUD: &str = "cloud.ply";
 
 impl RunFolder {
     /// The folder that a new run will have: the one asked for, or `runs/<scene>-<n>` with the first free n. Nothing is written yet.
@@ -69,7 +70,7 @@ impl RunFolder {
     /// the new one's; files of other kinds stay.
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
-        for name in [CHECKPOINT, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
+        for name in [CHECKPOINT, RESULT, METRICS, LOSS, CONFIG, RECORD, README, CLOUD] {
             let path = self.path.join(name);
             if path.exists() {
                 std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
@@ -180,6 +181,11 @@ impl RunFolder {
         self.path.join(CHECKPOINT)
     }
 
+    /// Its voxels as points.
+    pub fn cloud(&self) -> PathBuf {
+        self.path.join(CLOUD)
+    }
+
     /// A picture of the run.
     pub fn image(&self, name: &str) -> PathBuf {
         self.path.join(IMAGES).join(name)
@@ -225,6 +231,7 @@ const EXPLANATION: &str = "\
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
   pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.
 - `renders/`: what `plenoxel render` wrote.
+- `cloud.ply`: what `plenoxel export ply` wrote.
 ";
 
 /// `root/<scene>-<n>` with the first n from 1 on that nothing has.

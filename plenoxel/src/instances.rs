@@ -8,7 +8,9 @@ use crate::dataset::View;
 use crate::error::Result;
 use crate::field::Field;
 use crate::field::voxel_grid::VoxelGrid;
+use crate::point_cloud::from_grid::{ColorFrom, Coordinates, VoxelOptions, points};
 use crate::rays::RaySource;
+use crate::render::fused::seen;
 use crate::render::picture::picture;
 use crate::render::{RenderOptions, render};
 use crate::train::{Trainer, config::Config};
@@ -39,6 +41,8 @@ fn all<T: Real>(config: Config, views: &[View], options: &RenderOptions<'_>, pat
     let _ = (gradients.array(grid.density.tensor()), grid.density.tensor().to_array());
     Sgd::new(Rates::new(0.1)).step(&mut grid, &gradients, 0);
     let _ = picture(&grid, &views[0].camera, options);
+    let seen = seen(&grid, RaySource::new(views, options.background, 0).in_order_with_alpha(1), options);
+    let _ = points(&grid, &VoxelOptions { coordinates: Coordinates::World, color: ColorFrom::Seen(&seen), min_alpha: 0.0, visible: None });
     checkpoint::save(path, &grid, &Header::new(&grid, "", options.background, 0, 0))?;
     let _ = checkpoint::load::<T>(path)?;
     Trainer::<T>::new(config, views)?.step()?;

@@ -14,6 +14,7 @@
 //! | [`train`] | batch → render → loss → gradients → optimizer, coarse to fine |
 //! | [`checkpoint`] | a trained grid on disk |
 //! | [`metrics`] | PSNR and SSIM |
+//! | [`point_cloud`], [`export`] | a trained grid as colored points; filters; files for other programs |
 //! | [`random`], [`files`], [`error`] | numbers by purpose, files whole or not at all, what can go wrong |
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
@@ -23,6 +24,7 @@ pub mod carve;
 pub mod checkpoint;
 pub mod dataset;
 pub mod error;
+pub mod export;
 pub mod field;
 pub mod files;
 pub mod geometry;
@@ -31,6 +33,7 @@ pub mod geometry;
 pub mod instances;
 pub mod loss;
 pub mod metrics;
+pub mod point_cloud;
 pub mod random;
 pub mod rays;
 pub mod render;

@@ -88,23 +88,41 @@ impl<'a> RaySource<'a> {
     /// All rays of the set, view after view and row after row, `size` at a time.
     pub fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
         let ray = |index: u64| {
-            let (view, x, y) = self.place(index);
-            view.camera.ray(x as f64 + 0.5, y as f64 + 0.5)
+            let (v, x, y) = self.place(index);
+            self.views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5)
         };
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
 
+    /// The rays of [`RaySource::in_order`], each with the alpha of its pixel. A view that is opaque everywhere has no alpha to tell objects by:
+    /// there it is 0 where the color is the background's, else 1.
+    pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
+        let opaque: Vec<bool> = self.views.iter().map(|view| view.image.pixels().all(|p| p.0[3] == 255)).collect();
+        let background = self.background.map(|c| (c * 255.0).round() as u8);
+        let alpha = move |index: u64| {
+            let (v, x, y) = self.place(index);
+            match self.views[v].image.get_pixel(x as u32, y as u32).0 {
+                [r, g, b, _] if opaque[v] => f32::from(u8::from([r, g, b] != background)),
+                [.., alpha] => f32::from(alpha) / 255.0,
+            }
+        };
+        self.in_order(size).zip(0..).map(move |(rays, batch)| {
+            let alphas = (batch * size..).take(rays.len()).map(&alpha).collect();
+            (rays, alphas)
+        })
+    }
+
     /// Ray, color over the background, and alpha of one pixel of the set.
     fn pixel(&self, index: u64) -> (Ray, [f32; 3], f32) {
-        let (view, x, y) = self.place(index);
+        let (v, x, y) = self.place(index);
+        let view = &self.views[v];
         (view.camera.ray(x as f64 + 0.5, y as f64 + 0.5), view.color(x, y, self.background), view.alpha(x, y))
     }
 
-    /// View, column and row of one pixel of the set.
-    fn place(&self, index: u64) -> (&View, usize, usize) {
+    /// Number of the view, column and row of one pixel of the set.
+    fn place(&self, index: u64) -> (usize, usize, usize) {
         let v = self.first.partition_point(|&f| f <= index) - 1;
-        let view = &self.views[v];
-        let (pixel, width) = ((index - self.first[v]) as usize, view.image.width() as usize);
-        (view, pixel % width, pixel / width)
+        let (pixel, width) = ((index - self.first[v]) as usize, self.views[v].image.width() as usize);
+        (v, pixel % width, pixel / width)
     }
 }

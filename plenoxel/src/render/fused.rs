@@ -25,6 +25,7 @@ macro_rules! with_bricks {
 mod adjoint;
 mod forward;
 mod lookup;
+mod seen;
 mod sorted;
 
 use super::{RenderOptions, Rendered, composite, composite::Rest};
@@ -34,8 +35,8 @@ use crate::field::{Field, sh};
 use crate::sampling::{Occupancy, Samples};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
 use forward::{Block, Scene};
+pub use seen::{Seen, largest_weights, seen};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 /// Rays that one task renders, and whose gradients it sorts: some ten thousand samples.
 const BLOCK: usize = 256;
@@ -177,36 +178,6 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
         sample_count,
         rest: Rest::Fused(Columns { pixels, state, tables: tables.map(Clone::clone) }),
     }
-}
-
-/// For each row of the tables the largest weight wᵢ = Tᵢ (1 − exp(−σᵢδᵢ)) of the samples that read it, on any of the rays: how much of a
-/// pixel its voxel is ever part of, 0 where no ray comes. Rays come in batches to bound the memory; svox2 prunes by it (`grid_weight_render`).
-pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Vec<f32> {
-    // Numbers that are not negative are in the order of their bits, and a maximum does not depend on the order of its terms.
-    let largest: Vec<AtomicU32> = (0..grid.lattice().rows()).map(|_| AtomicU32::new(0)).collect();
-    for rays in batches {
-        let batch = Batch::new(grid, &rays, options);
-        let scene = batch.scene(grid, &rays, options);
-        parallel::map_chunks(rays.len(), BLOCK, |range| {
-            let (block, corners) = scene.weights(range.start, range.len());
-            let raise = |row: u32, bits: u32| {
-                if let Some(largest) = largest.get(row as usize).filter(|largest| largest.load(Relaxed) < bits) {
-                    largest.fetch_max(bits, Relaxed);
-                }
-            };
-            for (i, weight) in block.weight.iter().enumerate() {
-                let bits = (weight.as_f64() as f32).to_bits();
-                match &corners {
-                    None => raise(block.rows[i], bits),
-                    Some(corners) => {
-                        let (rows, shares) = corners.of(i);
-                        rows.into_iter().zip(shares).filter(|(_, share)| *share > T::zero()).for_each(|(row, _)| raise(row, bits));
-                    }
-                }
-            }
-        });
-    }
-    largest.into_iter().map(|bits| f32::from_bits(bits.into_inner())).collect()
 }
 
 /// Which columns a kernel computed.

@@ -43,18 +43,22 @@ struct Planes {
     still: bool,
     /// 1 if it meets them in rising order, 0 if not: what leads from a cell to the plane by which it is left.
     forward: usize,
+    /// What leads from a cell to the next one, by wrapping addition.
+    step: usize,
 }
 
 impl Planes {
     fn new(voxels: usize, origin: f64, direction: f64, low: f64, high: f64) -> Self {
         let side = (high - low) / voxels as f64;
+        let forward = usize::from(direction > 0.0);
         Planes {
             voxels,
             start: (origin - low) / side,
             pace: direction / side,
             spacing: side / direction,
             still: direction == 0.0,
-            forward: usize::from(direction > 0.0),
+            forward,
+            step: (2 * forward).wrapping_sub(1),
         }
     }
 
@@ -79,37 +83,22 @@ impl Planes {
     fn cell(&self, t: f64, low: usize, high: usize) -> usize {
         let mut k = ((self.start + t * self.pace) as usize).clamp(low, high - 1);
         // The product rounds; the planes decide.
+        let inside = |k: usize| k >= low && k < high;
         if !self.still {
-            while self.at(k + self.forward) <= t {
-                match self.next(k, low, high) {
-                    Some(next) => k = next,
-                    None => break,
-                }
+            while self.at(k + self.forward) <= t && inside(k.wrapping_add(self.step)) {
+                k = k.wrapping_add(self.step);
             }
-            while self.at(k + 1 - self.forward) > t && k + 1 - self.forward > low && k + 1 - self.forward < high {
-                k = k + 1 - 2 * self.forward;
+            while self.at(k + 1 - self.forward) > t && inside(k.wrapping_sub(self.step)) {
+                k = k.wrapping_sub(self.step);
             }
         }
         k
     }
 
-    /// The cell after cell k, if there is one among `low..high`.
-    #[inline(always)]
-    fn next(&self, k: usize, low: usize, high: usize) -> Option<usize> {
-        if self.forward == 1 { Some(k + 1).filter(|k| *k < high) } else { k.checked_sub(1).filter(|k| *k >= low) }
-    }
-
-    /// The voxels of a brick.
-    #[inline(always)]
-    fn of_brick(&self, brick: usize) -> (usize, usize) {
-        (brick * BRICK, (brick * BRICK + BRICK).min(self.voxels))
-    }
-
     /// Distance at which the ray leaves a brick.
     #[inline(always)]
     fn leaves_brick(&self, brick: usize) -> f64 {
-        let (low, high) = self.of_brick(brick);
-        self.at(if self.forward == 1 { high } else { low })
+        self.at(((brick + self.forward) * BRICK).min(self.voxels))
     }
 }
 
@@ -142,20 +131,21 @@ impl Walk {
         loop {
             let axis = smallest(exits);
             let brick = place_number(place, self.bricks);
-            let leave = exits[axis].min(end);
+            let leave = exits[axis];
             if leave > t && !brick_is_empty(brick) && cross(&planes, place, brick, t, leave, &mut visit).is_break() {
                 return;
             }
-            let next = planes[axis].next(place[axis], 0, self.bricks[axis]);
-            let Some(next) = next.filter(|_| exits[axis] < end) else { return };
-            t = t.max(exits[axis]);
-            place[axis] = next;
-            exits[axis] = planes[axis].leaves_brick(next);
+            place[axis] = place[axis].wrapping_add(planes[axis].step);
+            if place[axis] >= self.bricks[axis] {
+                return;
+            }
+            t = t.max(leave);
+            exits[axis] = planes[axis].leaves_brick(place[axis]);
         }
     }
 }
 
-/// The voxels of one brick, between two distances.
+/// The voxels of one brick, between two distances, of which the second is where a plane around the brick is met.
 #[inline(always)]
 fn cross(
     planes: &[Planes; 3],
@@ -165,25 +155,25 @@ fn cross(
     end: f64,
     visit: &mut impl FnMut(Crossing) -> ControlFlow<()>,
 ) -> ControlFlow<()> {
-    let (mut voxel, mut exits, mut bounds) = ([0; 3], [0.0; 3], [(0, 0); 3]);
+    let (mut voxel, mut exits) = ([0; 3], [0.0; 3]);
     for a in 0..3 {
-        bounds[a] = planes[a].of_brick(place[a]);
-        voxel[a] = planes[a].cell(t, bounds[a].0, bounds[a].1);
+        let low = place[a] * BRICK;
+        voxel[a] = planes[a].cell(t, low, (low + BRICK).min(planes[a].voxels));
         exits[a] = planes[a].at(voxel[a] + planes[a].forward);
     }
     loop {
         let axis = smallest(exits);
         let leave = exits[axis].min(end);
         if leave > t {
-            let bit = (voxel[0] - bounds[0].0) * STRIDE[0] + (voxel[1] - bounds[1].0) * STRIDE[1] + (voxel[2] - bounds[2].0) * STRIDE[2];
+            let bit = voxel[0] % BRICK * STRIDE[0] + voxel[1] % BRICK * STRIDE[1] + voxel[2] % BRICK * STRIDE[2];
             visit(Crossing { voxel, brick, bit, enter: t, leave })?;
         }
-        let (low, high) = bounds[axis];
-        let next = planes[axis].next(voxel[axis], low, high);
-        let Some(next) = next.filter(|_| exits[axis] < end) else { return ControlFlow::Continue(()) };
-        t = t.max(exits[axis]);
-        voxel[axis] = next;
-        exits[axis] = planes[axis].at(next + planes[axis].forward);
+        if exits[axis] >= end {
+            return ControlFlow::Continue(());
+        }
+        t = t.max(leave);
+        voxel[axis] = voxel[axis].wrapping_add(planes[axis].step);
+        exits[axis] = planes[axis].at(voxel[axis] + planes[axis].forward);
     }
 }
 

@@ -1,0 +1,200 @@
+//! `plenoxel export ply`: the voxels of a run as a colored point cloud.
+
+use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
+use crate::commands::new_run::load;
+use crate::commands::{MOST_REDUCTION, check_split, numbers, whole};
+use crate::data::DataSource;
+use crate::memory::Estimate;
+use crate::progress::Console;
+use crate::run_folder::{RunFolder, RunRecord};
+use clap::{Args, ValueEnum, ValueHint};
+use glam::DVec3;
+use plenoxel::dataset::Split;
+use plenoxel::error::{Error, Result};
+use plenoxel::export;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, VoxelOptions};
+use plenoxel::rays::RaySource;
+use plenoxel::render::RenderOptions;
+use plenoxel::render::fused::{Seen, seen};
+use plenoxel::sampling::Jitter;
+use plenoxel::train::config::Config;
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel export ply runs/lego                                what the training cameras see, into runs/lego/cloud.ply
+  plenoxel export ply runs/lego --sor-sigma 2                  and without stragglers
+  plenoxel export ply runs/lego --min-alpha 0 --min-weight 0 --min-object 0
+  plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
+
+The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at
+the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbors. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
+
+/// Write the voxels of a run as a colored point cloud
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct PlyArgs {
+    /// Run folder that `plenoxel train` wrote
+    #[arg(value_hint = ValueHint::DirPath)]
+    run: PathBuf,
+
+    /// File to write [default: RUN/cloud.ply]
+    #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
+    out: Option<PathBuf>,
+
+    /// Frame of the points: the dataset's own, or indices of voxels from 0
+    #[arg(long, help_heading = "Output", default_value = "world")]
+    coords: Coords,
+
+    /// The one color of a voxel: what training cameras see of it, the mean over all directions, or what a ray in the direction X,Y,Z shows
+    #[arg(long, value_name = "seen|mean|X,Y,Z", help_heading = "Output", default_value = "seen", value_parser = color, allow_hyphen_values = true)]
+    color: ColorChoice,
+
+    /// Keep voxels that take at least this share of a ray that crosses them, 1 - exp(-density * side)
+    #[arg(long, value_name = "A", help_heading = "Voxels", default_value_t = MIN_ALPHA, value_parser = share)]
+    min_alpha: f64,
+
+    /// Keep voxels that make at least this share of some pixel of a training view; 0 keeps those that nobody sees
+    #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = MIN_WEIGHT, value_parser = share)]
+    min_weight: f64,
+
+    /// Keep voxels of whose pixels in the training views at least this share shows an object: floating clouds in the background's color have
+    /// 0. Alpha tells objects from the background, or the color in images without alpha
+    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = MIN_OBJECT, value_parser = share)]
+    min_object: f64,
+
+    /// Where the dataset is now [default: where it was when training]
+    #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
+    data: Option<PathBuf>,
+
+    /// Reduce the training images by this factor [default: as in training]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<usize>(1, MOST_REDUCTION))]
+    downscale: Option<usize>,
+
+    #[command(flatten)]
+    filters: CloudFilters,
+}
+
+/// Chosen by looking at clouds of lego, of both presets.
+const MIN_ALPHA: f64 = 0.05;
+const MIN_WEIGHT: f64 = 0.05;
+const MIN_OBJECT: f64 = 0.7;
+
+/// Rays that are looked along at a time.
+const RAYS_PER_BATCH: u64 = 1 << 15;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Coords {
+    World,
+    Grid,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum ColorChoice {
+    Seen,
+    Mean,
+    Direction(DVec3),
+}
+
+fn color(text: &str) -> std::result::Result<ColorChoice, String> {
+    match text {
+        "seen" => Ok(ColorChoice::Seen),
+        "mean" => Ok(ColorChoice::Mean),
+        _ => {
+            let direction = numbers::<3>(text).ok().and_then(|d| DVec3::from_array(d).try_normalize());
+            direction.map(ColorChoice::Direction).ok_or_else(|| "seen, mean, or a direction x,y,z".to_owned())
+        }
+    }
+}
+
+fn share(text: &str) -> std::result::Result<f64, String> {
+    text.parse().ok().filter(|s| (0.0..=1.0).contains(s)).ok_or_else(|| "a number from 0 to 1".to_owned())
+}
+
+/// Exports the voxels of a run.
+pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
+    let (folder, mut config, record) = RunFolder::open(&args.run)?;
+    config.downscale = args.downscale.unwrap_or(config.downscale);
+    let (grid, header) = folder.load()?;
+    let chooses = args.min_weight > 0.0 || args.min_object > 0.0;
+    let looks = chooses || args.color == ColorChoice::Seen;
+    let seen = if looks { Some(look(args, &config, record, &grid, console)?) } else { None };
+
+    let coordinates = match args.coords {
+        Coords::World => Coordinates::World,
+        Coords::Grid => Coordinates::Grid,
+    };
+    let color = match (args.color, &seen) {
+        (ColorChoice::Seen, Some(seen)) => ColorFrom::Seen(seen),
+        (ColorChoice::Direction(direction), _) => ColorFrom::Direction(direction),
+        (ColorChoice::Mean | ColorChoice::Seen, _) => ColorFrom::Mean,
+    };
+    let (min_weight, min_object) = (args.min_weight, args.min_object);
+    let visible = seen.as_ref().filter(|_| chooses).map(|seen| Visible { seen, min_weight, min_object });
+    let cloud = from_grid::points(&grid, &VoxelOptions { coordinates, color, min_alpha: args.min_alpha, visible });
+
+    let side = grid.shape().voxel_side();
+    let lengths = match coordinates {
+        Coordinates::World => UnitLengths { voxel: Some(side), world: 1.0 },
+        Coordinates::Grid => UnitLengths { voxel: Some(1.0), world: 1.0 / side },
+    };
+    let names: Vec<&str> = cloud.fields.iter().map(|field| &field.name[..]).collect();
+    let field = args.filters.value_field(&names)?;
+    let values = field.as_deref().and_then(|name| cloud.field(name));
+    let (left, report) = args.filters.filters(lengths)?.apply(&cloud.positions, values)?;
+    let report = describe(cloud.len(), &report);
+    check_not_empty(left.len(), &report)?;
+
+    let path = args.out.clone().unwrap_or_else(|| folder.cloud());
+    let (n, half) = (grid.shape().resolution, grid.shape().half_width);
+    let frame = match coordinates {
+        Coordinates::World => "the dataset's own".to_owned(),
+        Coordinates::Grid => format!("indices of voxels; world = (index + 0.5) * {side} - {half}"),
+    };
+    let comments = [
+        format!("{} voxels a side, scene {}, {} steps", n, header.scene, header.step),
+        format!("coordinates: {frame}"),
+        format!("voxel_side {}", lengths.voxel.unwrap_or(1.0)),
+        "opacity = 1 - exp(-density * side of a voxel in the world); weight, object: what training views show of it".to_owned(),
+        report.clone(),
+    ];
+    export::ply::write(&path, &cloud.chosen(&left), &comments)?;
+    console.result(&format!("wrote {} points to {} ({report})", left.len(), path.display()))
+}
+
+/// What the training cameras see of a grid.
+fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32>, console: &Console<'_>) -> Result<Seen> {
+    let source = args.data.as_deref().map_or(record.data, DataSource::folder);
+    let without = "or go on without its cameras: --min-weight 0 --min-object 0 --color mean";
+    let dataset = source.reopen(config).map_err(|e| match e {
+        Error::Input { path, found, remedy } => Error::input(path, found, format!("{remedy}, {without}")),
+        other => other,
+    })?;
+    check_split(&dataset, Split::Train)?;
+    let mut estimate =
+        Estimate::of_evaluation(config, config.evaluation, grid.shape(), grid.lattice().present(), &dataset, Some(Split::Train));
+    // What is added up for each row.
+    estimate.grid += (grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>())) as u64;
+    console.note(&estimate.describe());
+    estimate.check()?;
+    let views = load(console, &dataset, Split::Train, &source)?;
+    let rays = RaySource::new(&views, config.background, config.seed);
+    let occupancy = grid.occupancy(0.0);
+    let options = RenderOptions {
+        aabb: grid.aabb(),
+        spacing: config.evaluation.spacing(grid.shape().voxel_side()),
+        jitter: Jitter::None,
+        background: config.background,
+        occupancy: Some(&occupancy),
+        engine: config.engine,
+        stop_below: 0.0,
+    };
+    let total = rays.len().div_ceil(RAYS_PER_BATCH) as usize;
+    let count = console.count("looking along training rays", total);
+    let batches = rays.in_order_with_alpha(RAYS_PER_BATCH).enumerate().map(|(done, batch)| {
+        count.at(done, total);
+        batch
+    });
+    Ok(seen(grid, batches, &options))
+}

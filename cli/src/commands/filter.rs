@@ -1,0 +1,68 @@
+//! `plenoxel filter`: CloudCompare's filters for the point clouds of others.
+
+use super::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
+use crate::progress::Console;
+use clap::{Args, ValueHint};
+use plenoxel::error::{Error, Result};
+use plenoxel::files;
+use plenoxel::point_cloud::filter::Filters;
+use plenoxel::point_cloud::ply::{Kind, PlyFile};
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel filter scan.ply --out clean.ply --sor-neighbours 6 --sor-sigma 1
+  plenoxel filter scan.ply --out clean.ply --noise-radius 0.05 --remove-isolated
+  plenoxel filter runs/lego/cloud.ply --out clean.ply --min-value 0.5 --value-field opacity
+
+Filters are CloudCompare's, with the same settings keeping the same points, and are applied in this order: bbox, value,
+noise, SOR. The new file has the encoding of the old one, and of each point that stays all properties to the last digit;
+faces and other elements are left out, for they name points by number.";
+
+/// Clean a point cloud with CloudCompare's filters
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct FilterArgs {
+    /// PLY file to read: text or binary, from whatever program
+    #[arg(value_hint = ValueHint::FilePath)]
+    cloud: PathBuf,
+
+    /// PLY file to write
+    #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
+    out: PathBuf,
+
+    #[command(flatten)]
+    filters: CloudFilters,
+}
+
+/// Filters a cloud.
+pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
+    let file = PlyFile::open(&args.cloud)?;
+    let side = file.header().remarks.iter().find_map(|line| line.strip_prefix("comment voxel_side ")?.trim().parse().ok());
+    let side = side.filter(|side: &f64| side.is_finite() && *side > 0.0);
+    let filters = args.filters.filters(UnitLengths { voxel: side, world: 1.0 })?;
+    if filters == Filters::default() {
+        return Err(Error::config(
+            "filters",
+            "none",
+            "at least one of --bbox, --min-value, --max-value, --noise-radius, --sor-neighbours, --sor-sigma",
+        ));
+    }
+    let lists = file.element().properties.iter().filter(|p| matches!(p.kind, Kind::List(..))).count();
+    console.note(&format!("{}: {} points, fields [{}], {lists} lists", args.cloud.display(), file.len(), file.field_names().join(", ")));
+    if filters.noise.is_some() {
+        let unit =
+            side.map_or("the units of the file".to_owned(), |side| format!("the units of the file, in which a voxel's side is {side}"));
+        console.note(&format!("noise radius: {} in {unit}", filters.noise.map_or(0.0, |noise| noise.radius)));
+    }
+    for element in file.others().filter(|element| element.count > 0) {
+        console.note(&format!("left out: {} rows of `{}`, which may name points by number", element.count, element.name));
+    }
+    let field = args.filters.value_field(&file.field_names())?;
+    let values = field.as_deref().map(|name| file.values(name)).transpose()?;
+    let (left, report) = filters.apply(&file.positions()?, values.as_deref())?;
+    let report = describe(file.len(), &report);
+    check_not_empty(left.len(), &report)?;
+    files::write_atomically(&args.out, &file.chosen(&left, &format!("filtered by {}: {report}", crate::PROGRAM)))?;
+    console.result(&format!("wrote {} points to {} ({report})", left.len(), args.out.display()))
+}

@@ -1,0 +1,119 @@
+//! The plane nearest to some points.
+
+use glam::{DMat3, DVec3};
+
+/// Count, sum and sum of squares of some points: what a plane through them needs.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Moments {
+    pub count: u32,
+    sum: DVec3,
+    /// xx, yy, zz and xy, yz, zx.
+    squares: [DVec3; 2],
+}
+
+/// A plane and how well it fits.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Plane {
+    pub center: DVec3,
+    /// Unit.
+    pub normal: DVec3,
+    /// Standard deviation of the points' distances to the plane, which are 0 in the mean: the root of the smallest eigenvalue.
+    pub deviation: f64,
+}
+
+impl Moments {
+    /// Takes a point in. The nearer the points are to the origin, the smaller the error.
+    pub fn add(&mut self, p: DVec3) {
+        self.count += 1;
+        self.sum += p;
+        self.squares[0] += p * p;
+        self.squares[1] += p * DVec3::new(p.y, p.z, p.x);
+    }
+
+    /// The plane that minimises the sum of squared distances: through the mean, its normal being the eigenvector of the covariance with the
+    /// smallest eigenvalue. `None` if there are fewer than three points, or three, A, B and C, with |AB × AC|² below ε = 2⁻²³: on a line, or
+    /// nearly so. The bound is CloudCompare's and depends on the unit of length; through four points on a line it has some plane.
+    pub fn plane(&self) -> Option<Plane> {
+        if self.count < 3 {
+            return None;
+        }
+        let n = f64::from(self.count);
+        let center = self.sum / n;
+        let squares = self.squares[0] / n - center * center;
+        let products = self.squares[1] / n - center * DVec3::new(center.y, center.z, center.x);
+        let covariance = DMat3::from_cols(
+            DVec3::new(squares.x, products.x, products.z),
+            DVec3::new(products.x, squares.y, products.y),
+            DVec3::new(products.z, products.y, squares.z),
+        );
+        let (values, vectors) = eigen(covariance);
+        let mut ascending = [0, 1, 2];
+        ascending.sort_by(|&a, &b| values[a].total_cmp(&values[b]));
+        let [smallest, middle, largest] = ascending;
+        // Of three points, |AB × AC|² = 27 λ₁ λ₂, the two eigenvalues of the covariance that are not 0.
+        if self.count == 3 && 27.0 * values[middle] * values[largest] < f64::from(f32::EPSILON) {
+            return None;
+        }
+        Some(Plane { center, normal: vectors.col(smallest).normalize(), deviation: values[smallest].max(0.0).sqrt() })
+    }
+}
+
+/// Eigenvalues and eigenvectors, in columns, of a symmetric matrix: Jacobi's rotations (Golub and Van Loan, 8.5), each of which makes one
+/// number off the diagonal 0. Every sweep squares what is left there, so that a few are enough for `f64`.
+fn eigen(mut a: DMat3) -> (DVec3, DMat3) {
+    const SWEEPS: usize = 12;
+    let mut vectors = DMat3::IDENTITY;
+    for _ in 0..SWEEPS {
+        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
+            let off = a.col(q)[p];
+            if off == 0.0 {
+                continue;
+            }
+            let theta = (a.col(q)[q] - a.col(p)[p]) / (2.0 * off);
+            let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
+            let c = 1.0 / (t * t + 1.0).sqrt();
+            let s = t * c;
+            let mut rotation = DMat3::IDENTITY;
+            rotation.col_mut(p)[p] = c;
+            rotation.col_mut(q)[q] = c;
+            rotation.col_mut(q)[p] = s;
+            rotation.col_mut(p)[q] = -s;
+            a = rotation.transpose() * a * rotation;
+            vectors *= rotation;
+        }
+    }
+    (DVec3::new(a.x_axis.x, a.y_axis.y, a.z_axis.z), vectors)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::{Purpose, uniform};
+
+    #[test]
+    fn eigenvectors_of_a_symmetric_matrix_are_orthonormal_and_put_it_together_again() {
+        for seed in 0..200 {
+            let number = |i| 2.0 * uniform(seed, Purpose::Initial, 0, i) - 1.0;
+            // Every fourth is singular.
+            let half = DMat3::from_cols(
+                DVec3::new(number(0), number(1), number(2)),
+                DVec3::new(number(3), number(4), number(5)),
+                if seed % 4 == 0 { DVec3::ZERO } else { DVec3::new(number(6), number(7), number(8)) },
+            );
+            let a = half * half.transpose();
+            let (values, vectors) = eigen(a);
+            let again = vectors * DMat3::from_diagonal(values) * vectors.transpose();
+            assert!(again.abs_diff_eq(a, 1e-14) && (vectors.transpose() * vectors).abs_diff_eq(DMat3::IDENTITY, 1e-14), "seed {seed}");
+        }
+    }
+
+    #[test]
+    fn three_points_on_a_line_have_no_plane_and_four_have_one_through_the_line() {
+        let mut moments = Moments::default();
+        (0..3).for_each(|k| moments.add(DVec3::new(0.1, 0.2, 0.7) * f64::from(k) + DVec3::X));
+        assert!(moments.plane().is_none());
+        moments.add(DVec3::new(0.3, 0.6, 2.1) + DVec3::X);
+        let plane = moments.plane().expect("a plane");
+        assert!(plane.normal.dot(DVec3::new(0.1, 0.2, 0.7)).abs() < 1e-9 && plane.deviation < 1e-7);
+    }
+}

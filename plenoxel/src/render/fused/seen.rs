@@ -1,0 +1,150 @@
+//! What rays see of each voxel: the largest weight, and the color.
+
+use super::{BLOCK, Batch};
+use crate::camera::Ray;
+use crate::field::voxel_grid::{Color, VoxelGrid};
+use crate::render::RenderOptions;
+use autograd::{Real, parallel};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
+
+/// What photographs show of each row of a grid's tables. Each sample on a ray counts by its weight w, times the share that the row has in it;
+/// a is the alpha of the ray's pixel, how much of an object it shows. Numbers are 0 where no ray comes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Seen {
+    /// The largest w a: how much of a pixel's object the row is ever part of.
+    pub weight: Vec<f32>,
+    /// Σ w a / Σ w: 1 for what stands in front of objects, 0 for what stands only where photographs show the background.
+    pub object: Vec<f32>,
+    /// Σ w a c / Σ w a, c being the color that the sample shows to the ray.
+    pub color: Vec<[f32; 3]>,
+}
+
+/// For each row of the tables the largest weight wᵢ = Tᵢ (1 − exp(−σᵢδᵢ)) of the samples that read it, on any of the rays: how much of a
+/// pixel its voxel is ever part of, 0 where no ray comes. Rays come in batches to bound the memory; svox2 prunes by it (`grid_weight_render`).
+pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Vec<f32> {
+    let largest = Largest::new(grid.lattice().rows());
+    for rays in batches {
+        for_each_sample(grid, &rays, options, 0.0, |sample| sample.reads().for_each(|(row, _)| largest.raise(row, sample.weight)));
+    }
+    largest.into_weights()
+}
+
+/// What rays with the alphas of their pixels see. Samples with a weight below 1 / 1024, a quarter of a step of 8 bits, are not counted. Sums
+/// are of whole multiples of 2⁻²⁴ and so do not depend on their order: the result has the same bits for any number of threads.
+pub fn seen<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = (Vec<Ray>, Vec<f32>)>, options: &RenderOptions<'_>) -> Seen {
+    const LEAST: f64 = 1.0 / 1024.0;
+    const ONE: f64 = (1u64 << 24) as f64;
+    /// A color is at most 1 on a screen. This only keeps sums over 2³¹ samples within 64 bits.
+    const BRIGHTEST: f64 = 256.0;
+    let rows = grid.lattice().rows();
+    let largest = Largest::new(rows);
+    // Of w, of w a, and of w a c.
+    let sums: Vec<[AtomicU64; 5]> = (0..rows).map(|_| Default::default()).collect();
+    let (table, channels) = (grid.color.tensor().data(), grid.shape().color.channels());
+    let add = |sum: &AtomicU64, amount: f64| sum.fetch_add((amount * ONE + 0.5) as u64, Relaxed);
+    for (rays, alphas) in batches {
+        for_each_sample(grid, &rays, options, LEAST, |sample| {
+            let alpha = f64::from(alphas[sample.ray]);
+            let color = if alpha > 0.0 { sample.color(grid.shape().color, table, channels) } else { [0.0; 3] };
+            for (row, share) in sample.reads() {
+                let Some(sums) = sums.get(row as usize) else { continue };
+                let amount = (sample.weight * share).as_f64();
+                add(&sums[0], amount);
+                if alpha > 0.0 {
+                    largest.raise(row, sample.weight * T::lit(alpha));
+                    add(&sums[1], amount * alpha);
+                    for (c, sum) in color.iter().zip(&sums[2..]) {
+                        add(sum, amount * alpha * c.clamp(0.0, BRIGHTEST));
+                    }
+                }
+            }
+        });
+    }
+    let sums: Vec<[f64; 5]> = sums.into_iter().map(|sums| sums.map(|sum| sum.into_inner() as f64)).collect();
+    Seen {
+        weight: largest.into_weights(),
+        object: sums.iter().map(|sums| (sums[1] / sums[0].max(1.0)) as f32).collect(),
+        color: sums.iter().map(|sums| [2, 3, 4].map(|c| (sums[c] / sums[1].max(1.0)) as f32)).collect(),
+    }
+}
+
+/// The largest weight of each row so far. Numbers that are not negative are in the order of their bits, and a maximum does not depend on the
+/// order of its terms.
+struct Largest(Vec<AtomicU32>);
+
+impl Largest {
+    fn new(rows: usize) -> Self {
+        Largest((0..rows).map(|_| AtomicU32::new(0)).collect())
+    }
+
+    #[inline(always)]
+    fn raise<T: Real>(&self, row: u32, weight: T) {
+        let bits = (weight.as_f64() as f32).to_bits();
+        if let Some(largest) = self.0.get(row as usize).filter(|largest| largest.load(Relaxed) < bits) {
+            largest.fetch_max(bits, Relaxed);
+        }
+    }
+
+    fn into_weights(self) -> Vec<f32> {
+        self.0.into_iter().map(|bits| f32::from_bits(bits.into_inner())).collect()
+    }
+}
+
+/// A sample on a ray, and what it reads of the tables.
+struct Sample<'a, T> {
+    /// Number of its ray.
+    ray: usize,
+    weight: T,
+    /// Harmonics of the ray's direction; empty for plain colors.
+    basis: &'a [T],
+    rows: &'a [u32],
+    shares: &'a [T],
+}
+
+impl<T: Real> Sample<'_, T> {
+    /// Rows with their shares, those that have one.
+    fn reads(&self) -> impl Iterator<Item = (u32, T)> + '_ {
+        self.rows.iter().copied().zip(self.shares.iter().copied()).filter(|(_, share)| *share > T::zero())
+    }
+
+    /// What it shows to its ray.
+    fn color(&self, meaning: Color, table: &[T], channels: usize) -> [f64; 3] {
+        let mut sum = [T::zero(); 3];
+        for (row, share) in self.reads() {
+            let Some(numbers) = table.get(row as usize * channels..(row as usize + 1) * channels) else { continue };
+            for (sum, numbers) in sum.iter_mut().zip(numbers.chunks_exact(channels / 3)) {
+                let own: T = match meaning {
+                    Color::Rgb => numbers[0],
+                    Color::Sh { .. } => numbers.iter().zip(self.basis).map(|(&number, &y)| number * y).sum(),
+                };
+                *sum += share * own;
+            }
+        }
+        let offset = if let Color::Sh { offset, .. } = meaning { offset } else { 0.0 };
+        sum.map(|c| c.as_f64() + offset)
+    }
+}
+
+/// Calls `f` for every sample with a weight above `least`.
+fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>, least: f64, f: impl Fn(Sample<'_, T>) + Sync) {
+    let least = T::lit(least);
+    let batch = Batch::new(grid, rays, options);
+    let scene = batch.scene(grid, rays, options);
+    let count = batch.basis.shape()[1];
+    parallel::map_chunks(rays.len(), BLOCK, |range| {
+        let (block, corners) = scene.weights(range.start, range.len());
+        for (ray, own) in range.zip(block.rays()) {
+            let basis = &batch.basis.data()[ray * count..][..count];
+            for i in own.filter(|&i| block.weight[i] > least) {
+                let weight = block.weight[i];
+                match &corners {
+                    None => f(Sample { ray, weight, basis, rows: &block.rows[i..=i], shares: &[T::one()] }),
+                    Some(corners) => {
+                        let (rows, shares) = corners.of(i);
+                        f(Sample { ray, weight, basis, rows: &rows, shares: &shares });
+                    }
+                }
+            }
+        }
+    });
+}
