@@ -7,7 +7,6 @@ pub mod export;
 pub mod filter;
 pub mod info;
 mod new_run;
-mod pictures;
 pub mod render;
 pub mod scene;
 pub mod train;

@@ -230,6 +230,7 @@ const EXPLANATION: &str = "\
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
   pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.
+- `images/carved.png`: what was carved, seen by some test cameras.
 - `renders/`: what `plenoxel render` wrote.
 - `cloud.ply`: what `plenoxel export ply` wrote.
 ";

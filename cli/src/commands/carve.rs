@@ -1,18 +1,18 @@
 //! `plenoxel carve`: from silhouettes to an opaque colored grid, without training.
 
 use super::new_run::{Stopwatch, announce, load, record};
-use super::pictures::Pictures;
 use super::{MOST_REDUCTION, whole};
 use crate::config::{self, CARVE, Layers};
 use crate::data::DataSource;
-use crate::evaluation::{ViewScore, Viewer};
+use crate::evaluation::Viewer;
+use crate::images;
 use crate::memory::{self, Estimate};
 use crate::progress::Console;
 use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
-use plenoxel::carve::{self, Carving, Fit, Rule};
+use plenoxel::carve::{self, Carving, Colored, Fit, Rule};
 use plenoxel::checkpoint::Header;
-use plenoxel::dataset::Split;
+use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::train::config::Config;
 use serde::Serialize;
@@ -140,7 +140,6 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     folder.prepare()?;
     folder.describe(&config, &record(&dataset, Some(CARVE.0), &source))?;
     console.note(&format!("run: {}", folder.path().display()));
-    let pictures = Pictures::new(&folder, &config, &dataset, !args.no_images)?;
     let mut color_clock = Stopwatch::default();
     let passes = match config.carve.fit {
         Fit::Exact => config.carve.sweeps + 1,
@@ -160,31 +159,14 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     drop(carving);
     drop(views);
 
-    let test = load_clock.time(|| load(console, &dataset, Split::Test, &source))?;
-    let viewer = Viewer::new(&colored.grid, config.evaluation, &config);
-    let count = console.count("evaluating", test.len());
-    let mut evaluate_clock = Stopwatch::default();
-    let scores = evaluate_clock.time(|| {
-        viewer.compare(&test, |i, view, target, picture| {
-            count.at(i + 1, test.len());
-            pictures.panel(i, view, target, picture)
-        })
-    })?;
-    drop(count);
-    let (width, height) = dataset.size();
+    if !args.no_images {
+        console.note(&format!("pictures of {} views in images/carved.png", draw(&folder, &config, &dataset, &colored)?));
+    }
     let summary = Summary {
-        psnr: scores.psnr(),
-        ssim: scores.ssim(),
-        ssim_same: scores.ssim_same(),
-        views: test.len(),
-        width,
-        height,
-        background: config.background,
         seconds: hull_clock.seconds() + color_clock.seconds(),
         seconds_hull: hull_clock.seconds(),
         seconds_color: color_clock.seconds(),
         seconds_load: load_clock.seconds(),
-        seconds_evaluate: evaluate_clock.seconds(),
         peak_memory_bytes: memory::peak(),
         resolution: n,
         voxels: left,
@@ -193,33 +175,36 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
         missed_object_pixels: colored.missed,
         scene: dataset.name().to_owned(),
         run: folder.path().display().to_string(),
-        per_view: scores.per_view.clone(),
     };
     folder.write_result(&summary)?;
-    if let Some(note) = pictures.note() {
-        console.note(&note);
-    }
-    console.note(&format!("hull {:.2} s, colors {:.2} s", summary.seconds_hull, summary.seconds_color));
-    console.result(&super::evaluate::sentence(&scores, Split::Test, width, height))?;
+    let Summary { seconds, seconds_hull, seconds_color, .. } = summary;
+    console.result(&format!(
+        "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; `plenoxel evaluate` compares it"
+    ))?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.result(&crate::json_line(&summary)?)
+}
+
+/// Writes what some cameras see of the grid, side by side, and says how many.
+fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, colored: &Colored) -> Result<usize> {
+    const MOST: usize = 4;
+    let split = if dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
+    let cameras = dataset.cameras(split);
+    let viewer = Viewer::new(&colored.grid, config.evaluation, config);
+    let chosen = images::evenly_spaced(cameras.len(), MOST);
+    let pictures: Vec<_> = chosen.into_iter().map(|number| viewer.see(&cameras[number]).rgb).collect();
+    folder.create_images()?;
+    images::write(&folder.image("carved.png"), &images::strip(&pictures.iter().collect::<Vec<_>>()))?;
+    Ok(pictures.len())
 }
 
 /// Final figures. `seconds` are of carving and coloring, without reading images.
 #[derive(Debug, Serialize)]
 struct Summary {
-    psnr: Option<f64>,
-    ssim: Option<f64>,
-    ssim_same: Option<f64>,
-    views: usize,
-    width: usize,
-    height: usize,
-    background: [f32; 3],
     seconds: f64,
     seconds_hull: f64,
     seconds_color: f64,
     seconds_load: f64,
-    seconds_evaluate: f64,
     peak_memory_bytes: Option<u64>,
     resolution: usize,
     voxels: usize,
@@ -228,5 +213,4 @@ struct Summary {
     missed_object_pixels: f64,
     scene: String,
     run: String,
-    per_view: Vec<ViewScore>,
 }

@@ -1,9 +1,9 @@
 //! `plenoxel train`: from photographs to a run folder.
 
 mod flags;
+mod pictures;
 
 use super::new_run::{Stopwatch, announce, load, record};
-use super::pictures::Pictures;
 use crate::curves::loss_svg;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
 use crate::memory::{self, Estimate};
@@ -11,6 +11,7 @@ use crate::metrics_file::MetricsFile;
 use crate::progress::{Console, clock};
 use crate::run_folder::RunFolder;
 pub use flags::{TrainArgs, size};
+use pictures::Pictures;
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Split, View};
 use plenoxel::error::Result;

@@ -1,4 +1,4 @@
-//! The pictures that a new run leaves: one view at the end of each stage, and panels of test views.
+//! The pictures of a run: one view at the end of each stage, and panels of test views.
 
 use crate::evaluation::Viewer;
 use crate::images::{self, DepthRange, Rgb};
