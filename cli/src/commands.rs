@@ -1,6 +1,7 @@
 //! One file for each command: its arguments, and what it does.
 
 pub mod evaluate;
+pub mod export;
 pub mod info;
 pub mod render;
 pub mod scene;

@@ -17,7 +17,7 @@ mod progress;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{evaluate, info, render, scene, train};
+use commands::{evaluate, export, info, render, scene, train};
 use plenoxel::error::Error;
 use progress::Console;
 use std::ffi::OsString;
@@ -32,6 +32,7 @@ Examples:
   plenoxel train data/lego --preset paper    learn a NeRF-synthetic scene as the source paper does
   plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
   plenoxel render runs/lego-1 --view 0       a picture of it
+  plenoxel export mesh runs/lego-1           its surface, for other programs
 
 Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing.";
 
@@ -50,6 +51,7 @@ enum Command {
     Train(Box<train::TrainArgs>),
     Render(render::RenderArgs),
     Evaluate(evaluate::EvaluateArgs),
+    Export(export::ExportArgs),
     Info(info::InfoArgs),
     Scene(scene::SceneArgs),
 }
@@ -86,6 +88,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
         Command::Train(args) => train::run(args, &console),
         Command::Render(args) => render::run(args, &console),
         Command::Evaluate(args) => evaluate::run(args, &console),
+        Command::Export(args) => export::run(args, &console),
         Command::Info(args) => info::run(args, &console),
         Command::Scene(args) => scene::run(args, &console),
     });

@@ -104,6 +104,20 @@ impl Estimate {
         }
     }
 
+    /// Reading a trained grid. What is made of it is smaller, for it is of its surface.
+    pub fn of_export(config: &Config, shape: &GridShape) -> Self {
+        Estimate {
+            images: 0,
+            // The file and the tables read from it.
+            grid: 2 * shape.bytes() as u64,
+            optimizer: 0,
+            step: 0,
+            pruned: prunes(config),
+            key: "RUN".to_owned(),
+            advice: "a machine with more",
+        }
+    }
+
     /// The images of the largest split alone.
     pub fn of_images(dataset: &Dataset) -> Self {
         let images = images(dataset, 1, &Split::ALL);

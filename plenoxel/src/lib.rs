@@ -13,6 +13,7 @@
 //! | [`loss`] | losses and their weighted sum |
 //! | [`train`] | batch → render → loss → gradients → optimizer, coarse to fine |
 //! | [`checkpoint`] | a trained grid on disk |
+//! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
 //! | [`metrics`] | PSNR and SSIM |
 //! | [`random`], [`files`], [`error`] | numbers by purpose, files whole or not at all, what can go wrong |
 #![deny(unsafe_code)]
@@ -22,6 +23,7 @@ pub mod camera;
 pub mod checkpoint;
 pub mod dataset;
 pub mod error;
+pub mod export;
 pub mod field;
 pub mod files;
 pub mod geometry;
