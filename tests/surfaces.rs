@@ -34,9 +34,13 @@ fn sparse(resolution: usize, voxels: &[([usize; 3], [u8; 3])]) -> VoxelGrid<f64>
     VoxelGrid::with_lattice(shape, lattice, Tensor::from_vec(density, &[rows, 1]), Tensor::from_vec(color, &[rows, 3]))
 }
 
-/// What a program that knows the format sees: voxels of the scene with their colors.
-fn read(model: &Vox) -> (DotVoxData, BTreeMap<[i32; 3], [u8; 3]>) {
-    let file = dot_vox::load_bytes(&model.to_bytes().unwrap()).unwrap();
+/// What a program that knows the format reads.
+fn parse(model: &Vox) -> DotVoxData {
+    dot_vox::load_bytes(&model.to_bytes().unwrap()).unwrap()
+}
+
+/// The voxels of a scene with their colors.
+fn scene(file: &DotVoxData) -> BTreeMap<[i32; 3], [u8; 3]> {
     let mut seen = BTreeMap::new();
     let SceneNode::Transform { child: 1, .. } = &file.scenes[0] else { panic!("{:?}", file.scenes[0]) };
     let SceneNode::Group { children, .. } = &file.scenes[1] else { panic!("{:?}", file.scenes[1]) };
@@ -54,7 +58,7 @@ fn read(model: &Vox) -> (DotVoxData, BTreeMap<[i32; 3], [u8; 3]>) {
             assert_eq!(seen.insert(at, [color.r, color.g, color.b]), None, "{at:?} twice");
         }
     }
-    (file, seen)
+    seen
 }
 
 /// An L that stands: no rotation but the identity, and no reflection, maps it to itself.
@@ -71,7 +75,7 @@ const L: [([usize; 3], [u8; 3]); 6] = [
 fn a_vox_file_has_the_voxels_of_the_grid_where_they_were_and_as_they_were() {
     // The earlier export lost the voxels of its first color, had every other one shifted by one, and laid the model on its side.
     let model = vox(&sparse(6, &L), &VoxOptions::default()).unwrap();
-    let (file, seen) = read(&model);
+    let file = parse(&model);
     assert_eq!((file.version, file.models.len(), file.palette.len()), (150, 1, 256));
     let voxels = file.models[0].voxels.iter().map(|v| ([v.x, v.y, v.z].map(usize::from), &file.palette[usize::from(v.i)]));
     let mut voxels: Vec<_> = voxels.map(|(place, color)| (place, [color.r, color.g, color.b])).collect();
@@ -79,9 +83,7 @@ fn a_vox_file_has_the_voxels_of_the_grid_where_they_were_and_as_they_were() {
     let mut want = L.to_vec();
     want.sort_unstable();
     assert_eq!(voxels, want);
-    // In the scene the box of 6³ is centred in x and y and stands on the ground.
-    let want: BTreeMap<_, _> = L.into_iter().map(|([x, y, z], color)| ([x as i32 - 3, y as i32 - 3, z as i32], color)).collect();
-    assert_eq!(seen, want);
+    assert!(file.scenes.is_empty(), "a single model stands where MagicaVoxel puts it");
 }
 
 #[test]
@@ -89,12 +91,12 @@ fn a_grid_of_300_voxels_a_side_becomes_tiles_that_meet() {
     let colors = |i: usize| [i as u8 * 7, 255 - i as u8, 40];
     let places = [[0, 0, 0], [255, 255, 255], [256, 255, 255], [255, 256, 255], [255, 255, 256], [299, 299, 299], [12, 280, 3]];
     let voxels: Vec<_> = places.into_iter().enumerate().map(|(i, place)| (place, colors(i))).collect();
-    let (file, seen) = read(&vox(&sparse(300, &voxels), &VoxOptions::default()).unwrap());
+    let file = parse(&vox(&sparse(300, &voxels), &VoxOptions::default()).unwrap());
     // Of the eight tiles those with two coordinates beyond 256 are empty, and are not there.
     assert_eq!(file.models.len(), 5);
     assert!(file.models.iter().all(|tile| [tile.size.x, tile.size.y, tile.size.z].iter().all(|side| *side == 256 || *side == 44)));
     let want = voxels.into_iter().map(|([x, y, z], color)| ([x as i32 - 150, y as i32 - 150, z as i32], color)).collect();
-    assert_eq!(seen, want);
+    assert_eq!(scene(&file), want);
 }
 
 #[test]
@@ -111,14 +113,16 @@ fn indices_are_1_to_255_and_the_palette_is_of_the_voxels_that_are_written() {
     let model = vox(&grid, &VoxOptions::default()).unwrap();
     assert_eq!((model.palette.len(), model.voxels.len()), (255, 600 + 512 - 216));
     assert!(model.voxels.iter().all(|&(_, index)| index > 0));
-    let (_, seen) = read(&model);
+    let file = parse(&model);
+    let colors = |v: &dot_vox::Voxel| file.palette[usize::from(v.i)];
+    let seen: BTreeMap<_, _> = file.models[0].voxels.iter().map(|v| ([v.x, v.y, v.z].map(usize::from), colors(v))).collect();
     for (place, color) in &voxels[..600] {
-        let shown = seen[&[place[0] as i32 - 16, place[1] as i32 - 16, place[2] as i32]];
+        let shown = [seen[place].r, seen[place].g, seen[place].b];
         let error: i32 = color.iter().zip(shown).map(|(a, b)| (i32::from(*a) - i32::from(b)).pow(2)).sum();
         // 254 cells of a square of 255 x 255 have sides of 16: a corner is 8 √2 from the middle.
         assert!(error < 16 * 16, "{color:?} shown as {shown:?}");
     }
-    assert!(seen.values().all(|color| color[2] < 100), "the white inside is not in the palette");
+    assert!(seen.values().all(|color| color.b < 100), "the white inside is not in the palette");
     let solid = vox(&grid, &VoxOptions { solid: true, ..VoxOptions::default() }).unwrap();
     assert_eq!(solid.voxels.len(), 600 + 512);
 }
@@ -160,8 +164,9 @@ fn a_ball_has_a_closed_outward_surface_of_its_volume_area_normals_and_colors() {
         // A chord of one voxel, 0.075, sags by 0.075² / (8 · 0.9) = 0.0008.
         assert!((out.length() - radius).abs() < 0.0008, "vertex at {}", out.length());
         assert!(out.normalize().dot(DVec3::from(normal.map(f64::from))) > 0.999);
-        for (c, axis) in rgb.iter().zip(out.to_array()).filter(|(_, axis)| axis.abs() > 0.075) {
-            assert_eq!(*c, if axis > 0.0 { 255 } else { 51 });
+        for (c, axis) in rgb.iter().zip(out.to_array()).filter(|(_, axis)| axis.abs() > 0.15) {
+            // Two voxels from where colors change, for a ray goes a voxel deep.
+            assert!(c.abs_diff(if axis > 0.0 { 255 } else { 51 }) <= 1);
         }
     }
 }
@@ -172,7 +177,8 @@ fn vertices_lie_where_the_density_has_the_level_in_world_coordinates() {
     let half_space = grid(10, |p| 10.0 + 20.0 * p.x, |_| [0.5; 3]);
     let surface = mesh(&half_space, &MeshOptions { level: Some(16.0), direction: None }).unwrap();
     assert_closed(&surface);
-    assert!((surface.volume() - 1.2 * 3.0 * 3.0).abs() / 10.8 < 0.03, "all but beveled edges: {}", surface.volume());
+    // Of 1.2 · 3 · 3, the four edges along x and the eight across are beveled by half a voxel: 28.8 · 0.15² / 2, less where they meet.
+    assert!((10.8 - 0.324 - 0.01..10.8 - 0.25).contains(&surface.volume()), "{}", surface.volume());
     for ([x, y, z], normal) in surface.positions.iter().zip(&surface.normals) {
         let on_a_side = [y, z].iter().any(|c| (c.abs() - 1.5).abs() < 1e-6);
         assert!((x - 0.3).abs() < 1e-6 || (x - 1.5).abs() < 1e-6 || on_a_side, "({x}, {y}, {z})");

@@ -10,6 +10,7 @@
 
 mod cases;
 
+use super::SURFACE_ALPHA;
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use autograd::{Real, parallel};
@@ -40,7 +41,7 @@ impl Mesh {
 /// Which surface, and its colors.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct MeshOptions {
-    /// The density on the surface, 1 / world length; `None` is where a voxel absorbs half of the light, ln 2 / side.
+    /// The density on the surface, 1 / world length; `None` is where a voxel absorbs [`SURFACE_ALPHA`].
     pub level: Option<f64>,
     /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each vertex against its normal.
     pub direction: Option<DVec3>,
@@ -49,15 +50,14 @@ pub struct MeshOptions {
 /// The surface on which the density of a grid has a level.
 ///
 /// Densities are read on the lines between neighbouring centres, linearly. That is what a trilinear grid renders; of a nearest grid it rounds the
-/// corners off. Normals are −∇σ, central differences over neighbouring voxels, interpolated. A vertex has the color of the voxel on its dense
-/// side: the other one was never seen clearly, or is not there.
+/// corners off. Normals are −∇σ, central differences over neighbouring voxels, interpolated. A vertex has the color that a camera sees there.
 ///
 /// The result does not depend on the number of threads.
 ///
 /// Errors: the level is not positive, or no voxel is denser.
 pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh> {
     let shape = grid.shape();
-    let level = options.level.unwrap_or_else(|| shape.density_of_alpha(0.5));
+    let level = options.level.unwrap_or_else(|| shape.density_of_alpha(SURFACE_ALPHA));
     let largest = parallel::map_chunks(grid.density.tensor().data().len(), parallel::CHUNK, |range| {
         range.filter_map(|row| grid.lattice().node(row as u32).map(|_| grid.density.tensor().data()[row].as_f64())).fold(0.0, f64::max)
     });
@@ -72,10 +72,11 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
     let Surface { crossings, triangles } = surface(grid, level);
     let vertices = parallel::map_indices(crossings.len(), |v| crossings[v].vertex(grid, level));
     let rows: Vec<u32> = vertices.iter().map(|vertex| vertex.row).collect();
-    let colors = super::bytes_of(grid, &rows, |v| vertices[v].normal, options.direction);
+    let [points, normals] = [|v: &Vertex| v.position, |v: &Vertex| v.normal].map(|part| vertices.iter().map(part).collect::<Vec<_>>());
+    let colors = super::seen(grid, &points, &normals, &rows, options.direction);
     Ok(Mesh {
-        positions: vertices.iter().map(|vertex| vertex.position.as_vec3().to_array()).collect(),
-        normals: vertices.iter().map(|vertex| vertex.normal.as_vec3().to_array()).collect(),
+        positions: points.iter().map(|point| point.as_vec3().to_array()).collect(),
+        normals: normals.iter().map(|normal| normal.as_vec3().to_array()).collect(),
         colors,
         triangles,
     })
@@ -108,11 +109,13 @@ impl Crossing {
             end
         });
         let [a, b] = ends.map(|end| grid.density_at(end));
-        let t = ((level - a) / (b - a)).clamp(NEAREST, 1.0 - NEAREST);
+        let n = grid.shape().resolution as isize;
+        let t = match ends.as_flattened().iter().all(|k| (0..n).contains(k)) {
+            true => ((level - a) / (b - a)).clamp(NEAREST, 1.0 - NEAREST),
+            // The border voxel fills its outer half: matter ends at the face of the box.
+            false => 0.5,
+        };
         let [from, to] = ends.map(|end| grid.shape().center(end));
-        // The border voxel fills its outer half: the surface around it is the face of the box.
-        let half = DVec3::splat(grid.shape().half_width);
-        let position = from.lerp(to, t).clamp(-half, half);
         let [dense, thin] = if a > b { [0, 1] } else { [1, 0] };
         let slope = grid.outward(ends[0]).lerp(grid.outward(ends[1]), t);
         // A speck of matter may have no slope: it is seen along the edge.
@@ -120,7 +123,7 @@ impl Crossing {
         let normal = slope.try_normalize().unwrap_or_else(|| along.normalize());
         // The dense end is above a positive level, so it is present.
         let row = grid.lattice().row(ends[dense].map(|k| k as usize)).unwrap_or_default();
-        Vertex { position, normal, row }
+        Vertex { position: from.lerp(to, t), normal, row }
     }
 }
 

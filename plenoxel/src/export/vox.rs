@@ -1,12 +1,14 @@
 //! Voxels for MagicaVoxel: the .vox format, version 150, with the scene graph of its extension.
 //!
 //! The format's x, y and z are those of the dataset, right-handed and z up, so voxel (i, j, k) of the grid is voxel (i, j, k) of the file. A model
-//! has at most 256 voxels a side: larger grids become tiles of 256³ with the grid's coordinates modulo 256, put together by the scene graph.
-//! There, the grid's box is centred in x and y and stands on the ground.
+//! has at most 256 voxels a side: larger grids become tiles of 256³ with the grid's coordinates modulo 256, put together by the scene graph so
+//! that the box is centred in x and y and stands on the ground. That is where MagicaVoxel puts a single model by itself, so a smaller grid
+//! needs no scene graph, which some readers do not know.
 //!
 //! A voxel has the index of its color, 1 to 255, as 0 would be empty; entry i − 1 of the 256 in the file belongs to index i. Source: the
 //! specification `MagicaVoxel-file-format-vox.txt` of github.com/ephtracy/voxel-model, and the extension beside it.
 
+use super::SURFACE_ALPHA;
 use crate::error::{Error, Result};
 use crate::export::palette::quantize;
 use crate::field::voxel_grid::VoxelGrid;
@@ -38,7 +40,7 @@ pub struct VoxOptions {
 
 impl Default for VoxOptions {
     fn default() -> Self {
-        VoxOptions { min_alpha: 0.1, solid: false, direction: None }
+        VoxOptions { min_alpha: SURFACE_ALPHA, solid: false, direction: None }
     }
 }
 
@@ -58,7 +60,10 @@ pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     }
     // All of them are present: an absent voxel has no density.
     let rows: Vec<u32> = places.iter().map(|voxel| grid.lattice().row(voxel.map(usize::from)).unwrap_or_default()).collect();
-    let colors = super::bytes_of(grid, &rows, |v| grid.outward(places[v].map(|k| k as isize)), direction);
+    let signed = |place: &[u16; 3]| place.map(|k| k as isize);
+    let points: Vec<DVec3> = places.iter().map(|place| grid.shape().center(signed(place))).collect();
+    let outward: Vec<DVec3> = places.iter().map(|place| grid.outward(signed(place))).collect();
+    let colors = super::seen(grid, &points, &outward, &rows, direction);
     let (palette, entries) = quantize(&colors, 255);
     let voxels = places.into_iter().zip(entries).map(|(place, entry)| (place, entry + 1)).collect();
     Ok(Vox { resolution: grid.shape().resolution, palette, voxels })
@@ -99,7 +104,9 @@ impl Vox {
             let count = integers([tile.voxels.len() as i32]);
             chunk(&mut chunks, b"XYZI", &[count.as_slice(), tile.voxels.as_flattened()].concat());
         }
-        self.scene_graph(&tiles, &mut chunks);
+        if self.resolution > SIDE {
+            self.scene_graph(&tiles, &mut chunks);
+        }
         let mut entries: Vec<u8> = self.palette.iter().flat_map(|&[r, g, b]| [r, g, b, 255]).collect();
         entries.resize(4 * 256, 0);
         chunk(&mut chunks, b"RGBA", &entries);

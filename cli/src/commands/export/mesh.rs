@@ -27,7 +27,7 @@ pub struct MeshArgs {
     #[arg(long, value_name = "FORMAT", help_heading = "Output", value_parser = format)]
     format: Option<MeshFormat>,
 
-    /// Density on the surface, 1 / world length [default: where a voxel absorbs half of the light that crosses it]
+    /// Density on the surface, 1 / world length [default: where a voxel absorbs 30 % of the light that crosses it]
     #[arg(long, value_name = "SIGMA", help_heading = "Surface")]
     level: Option<f64>,
 }
