@@ -1,7 +1,7 @@
 //! The surface of a grid's matter as triangles with normals and colors.
 //!
 //! Marching cubes (Lorensen and Cline 1987) on the cells between voxel centres: wherever the density crosses the level between two neighbouring
-//! centres lies a vertex, and each cell joins its vertices to polygons. Which ones is not a printed table but derived, in [`cases`], from one
+//! centres lies a vertex, and each cell joins its vertices to polygons. Which ones is not a printed table but derived, in `mesh/cases.rs`, from one
 //! rule for the faces of cells; two cells see their common face alike, so the surface is closed and each edge has exactly two triangles.
 //! Surface nets were rejected for that reason: where matter touches along an edge, four of their triangles meet.
 //!
