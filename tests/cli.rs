@@ -365,6 +365,30 @@ fn numbers_that_are_not_finite_end_the_run_and_leave_the_metrics_but_no_checkpoi
 }
 
 #[test]
+fn a_run_is_exported_to_its_folder_or_to_a_file() {
+    let folder = Folder::new("export");
+    let run = folder.path("run");
+    assert_eq!(train(&run, &["--no-images"]).code, 0);
+    // Ten steps make fog: a low level finds some of it.
+    for (what, file, start) in [("vox", "grid.vox", b"VOX ".as_slice()), ("mesh", "mesh.ply", b"ply\n")] {
+        let fog = if what == "vox" { ["--min-alpha", "0"] } else { ["--level", "1e-3"] };
+        let answer = plenoxel(&["export", what, &run, fog[0], fog[1]]);
+        assert!(answer.code == 0 && answer.out.contains(file), "{} {}", answer.out, answer.err);
+        assert!(fs::read(Path::new(&run).join("exports").join(file)).unwrap().starts_with(start));
+    }
+    let out = folder.path("fog.GLB");
+    assert_eq!(plenoxel(&["export", "mesh", &run, "--level", "1e-3", "--direction", "0,0,-1", "--out", &out]).code, 0);
+    assert!(fs::read(&out).unwrap().starts_with(b"glTF"));
+    let export = |args: &[&str]| plenoxel(&[&["export"], args].concat());
+    export(&["mesh", &run, "--out", &out, "--format", "obj"]).refused(2, &["--out", "fog.GLB", ".obj"]);
+    export(&["mesh", &run, "--level", "1e9"]).refused(2, &["--level", "above 0 and below"]);
+    export(&["mesh", &run, "--direction", "0,0,0"]).refused(2, &["--direction", "three numbers"]);
+    export(&["vox", &run, "--min-alpha", "1"]).refused(2, &["--min-alpha", "below 1"]);
+    export(&["vox", &folder.path("none")]).refused(3, &["none", "there is no such run"]);
+    export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "spelled rightly"]);
+}
+
+#[test]
 fn a_damaged_run_is_refused() {
     let folder = Folder::new("damaged");
     let run = folder.path("run");
@@ -410,7 +434,7 @@ fn a_reader_that_went_away_is_no_failure_and_a_full_disk_is() {
 fn help_mentions_every_command_and_flag() {
     let help = plenoxel(&["--help"]);
     assert!(help.code == 0 && help.err.is_empty());
-    for part in ["train", "render", "evaluate", "info", "scene", "Exit codes"] {
+    for part in ["train", "render", "evaluate", "export", "info", "scene", "Exit codes"] {
         assert!(help.out.contains(part), "{part}");
     }
     let version = plenoxel(&["--version"]);
@@ -422,9 +446,12 @@ fn help_mentions_every_command_and_flag() {
         ("render", "--split --view --downscale --data Examples:"),
         ("evaluate", "--split --downscale --samples --json --data Examples:"),
         ("info", "Examples:"),
+        ("export", "vox mesh"),
+        ("export vox", "--out --direction --min-alpha --solid Examples:"),
+        ("export mesh", "--out --direction --format --level Examples:"),
         ("scene", "--width --height --train --val --test --force Examples:"),
     ] {
-        let help = plenoxel(&[command, "--help"]);
+        let help = plenoxel(&[command.split(' ').collect(), vec!["--help"]].concat());
         assert_eq!(help.code, 0);
         assert!(flags.split_whitespace().all(|flag| help.out.contains(flag)), "{command}: {}", help.out);
     }

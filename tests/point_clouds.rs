@@ -75,7 +75,7 @@ fn points(path: &str) -> usize {
 fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     let folder = Folder::new("export");
     let (data, run) = trained(&folder);
-    let cloud = format!("{run}/cloud.ply");
+    let cloud = format!("{run}/exports/cloud.ply");
     let said = plenoxel(&["export", "ply", &run]).done();
     assert!(said.contains("wrote") && said.contains(&cloud), "{said}");
     let file = PlyFile::open(Path::new(&cloud)).unwrap();

@@ -34,6 +34,7 @@ Examples:
   plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
   plenoxel render runs/lego-1 --view 0       a picture of it
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
+  plenoxel export mesh runs/lego-1           its surface, for other programs
 
 Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing.";
 

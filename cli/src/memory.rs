@@ -135,6 +135,20 @@ impl Estimate {
         }
     }
 
+    /// Reading a trained grid of so many voxels. What is made of it is smaller, for it is of its surface.
+    pub fn of_export(shape: &GridShape, voxels: usize) -> Self {
+        Estimate {
+            images: 0,
+            // The file and the tables read from it.
+            grid: 2 * (voxels * shape.voxel_bytes()) as u64,
+            optimizer: 0,
+            step: 0,
+            pruned: false,
+            key: "RUN".to_owned(),
+            advice: "a machine with more",
+        }
+    }
+
     /// The images of the largest split alone.
     pub fn of_images(dataset: &Dataset) -> Self {
         let images = images(dataset, 1, &Split::ALL);

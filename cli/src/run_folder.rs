@@ -44,7 +44,7 @@ const RESULT: &str = "result.json";
 const README: &str = "README.md";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
-const CLOUD: &str = "cloud.ply";
+const EXPORTS: &str = "exports";
 
 impl RunFolder {
     /// The folder that a new run will have: the one asked for, or `runs/<scene>-<n>` with the first free n. Nothing is written yet.
@@ -70,18 +70,18 @@ impl RunFolder {
     /// the new one's; files of other kinds stay.
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
-        for name in [CHECKPOINT, RESULT, METRICS, LOSS, CONFIG, RECORD, README, CLOUD] {
+        for name in [CHECKPOINT, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
             let path = self.path.join(name);
             if path.exists() {
                 std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
             }
         }
-        for folder in [IMAGES, RENDERS].map(|name| self.path.join(name)) {
-            let Ok(entries) = std::fs::read_dir(&folder) else {
+        for (folder, endings) in [(IMAGES, ["png"].as_slice()), (RENDERS, &["png"]), (EXPORTS, &["vox", "ply", "obj", "glb"])] {
+            let Ok(entries) = std::fs::read_dir(self.path.join(folder)) else {
                 continue;
             };
-            let pictures = entries.flatten().map(|entry| entry.path());
-            for path in pictures.filter(|path| path.extension().is_some_and(|e| e == "png")) {
+            let ours = |path: &PathBuf| path.extension().is_some_and(|ending| endings.iter().any(|e| ending == *e));
+            for path in entries.flatten().map(|entry| entry.path()).filter(ours) {
                 std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
             }
         }
@@ -181,11 +181,6 @@ impl RunFolder {
         self.path.join(CHECKPOINT)
     }
 
-    /// Its voxels as points.
-    pub fn cloud(&self) -> PathBuf {
-        self.path.join(CLOUD)
-    }
-
     /// A picture of the run.
     pub fn image(&self, name: &str) -> PathBuf {
         self.path.join(IMAGES).join(name)
@@ -206,6 +201,13 @@ impl RunFolder {
         let path = self.path.join(RENDERS);
         files::create_dir(&path)?;
         Ok(path)
+    }
+
+    /// Makes the folder for what other programs read, and names a file in it.
+    pub fn create_export(&self, name: &str) -> Result<PathBuf> {
+        let path = self.path.join(EXPORTS);
+        files::create_dir(&path)?;
+        Ok(path.join(name))
     }
 
     fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
@@ -232,7 +234,7 @@ const EXPLANATION: &str = "\
   pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.
 - `images/carved.png`: what was carved, seen by some test cameras.
 - `renders/`: what `plenoxel render` wrote.
-- `cloud.ply`: what `plenoxel export ply` wrote.
+- `exports/`: what `plenoxel export` wrote, for other programs.
 ";
 
 /// `root/<scene>-<n>` with the first n from 1 on that nothing has.
@@ -271,14 +273,16 @@ mod tests {
     fn an_occupied_folder_is_refused_unless_forced_and_other_files_survive() {
         let path = std::env::temp_dir().join(format!("plenoxel-occupied-{}", std::process::id()));
         std::fs::create_dir_all(path.join(IMAGES)).unwrap();
-        for name in [CHECKPOINT, "notes.txt", "images/old.png"] {
+        std::fs::create_dir_all(path.join(EXPORTS)).unwrap();
+        for name in [CHECKPOINT, "notes.txt", "images/old.png", "exports/mesh.glb", "exports/notes.txt"] {
             std::fs::write(path.join(name), "x").unwrap();
         }
         let refused = RunFolder::choose(Some(&path), "x", false).unwrap_err();
         assert!(refused.exit_code() == 2 && refused.to_string().contains("--force"));
         RunFolder::choose(Some(&path), "x", true).unwrap().prepare().unwrap();
         assert!(!path.join(CHECKPOINT).exists() && !path.join("images/old.png").exists());
-        assert!(path.join("notes.txt").exists());
+        assert!(!path.join("exports/mesh.glb").exists());
+        assert!(path.join("notes.txt").exists() && path.join("exports/notes.txt").exists());
         std::fs::remove_dir_all(path).unwrap();
     }
 }

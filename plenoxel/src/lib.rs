@@ -13,6 +13,7 @@
 //! | [`loss`] | losses and their weighted sum |
 //! | [`train`] | batch → render → loss → gradients → optimizer, coarse to fine |
 //! | [`checkpoint`] | a trained grid on disk |
+//! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
 //! | [`metrics`] | PSNR and SSIM |
 //! | [`point_cloud`], [`export`] | a trained grid as colored points; filters; files for other programs |
 //! | [`random`], [`files`], [`error`] | numbers by purpose, files whole or not at all, what can go wrong |

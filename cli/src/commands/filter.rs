@@ -13,7 +13,7 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel filter scan.ply --out clean.ply --sor-neighbours 6 --sor-sigma 1
   plenoxel filter scan.ply --out clean.ply --noise-radius 0.05 --remove-isolated
-  plenoxel filter runs/lego/cloud.ply --out clean.ply --min-value 0.5 --value-field opacity
+  plenoxel filter runs/lego/exports/cloud.ply --out clean.ply --min-value 0.5 --value-field opacity
 
 Filters are CloudCompare's, with the same settings keeping the same points, and are applied in this order: bbox, value,
 noise, SOR. The new file has the encoding of the old one, and of each point that stays all properties to the last digit;

@@ -5,6 +5,7 @@
 //! point lies in; trilinear look-up runs between centres, and in the outer half voxel repeats the border. Outside the box there is nothing.
 //! Values are stored raw and activated after interpolation: σ = max(0, density).
 
+mod appearance;
 mod reshape;
 
 use super::{Field, Radiance, sh};
@@ -15,6 +16,7 @@ use crate::render::{RenderOptions, Rendered, fused};
 use crate::sampling::{Occupancy, Samples};
 use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::{Bounds, Buffer, Indices, Lattice, Module, Param, Real, Tensor, parallel};
+use glam::DVec3;
 use reshape::moved;
 use serde::{Deserialize, Serialize};
 
@@ -56,16 +58,21 @@ impl Color {
     pub fn activate<T: Real>(self, density: &Tensor<T>, color: &Tensor<T>, directions: &Tensor<T>, offsets: &Indices) -> Radiance<T> {
         let m = density.shape()[0];
         let sigma = density.reshape(&[m]).relu();
-        let rgb = match self {
+        let rgb = self.shade(color, |degree| sh::basis(directions, degree).segment_repeat(offsets));
+        Radiance { sigma, rgb }
+    }
+
+    /// Colors `[m, 3]` of color numbers `[m, channels]`; `basis` gives the harmonics of a degree at the direction of each, `[m, count]`.
+    fn shade<T: Real>(self, color: &Tensor<T>, basis: impl FnOnce(usize) -> Tensor<T>) -> Tensor<T> {
+        let m = color.shape()[0];
+        match self {
             Color::Rgb => color.clone(),
             Color::Sh { degree, offset } => {
                 let count = sh::count(degree);
-                let basis = sh::basis(directions, degree).segment_repeat(offsets);
-                let sum = (color.reshape(&[m, 3, count]) * basis.reshape(&[m, 1, count])).sum_axis(2);
+                let sum = (color.reshape(&[m, 3, count]) * basis(degree).reshape(&[m, 1, count])).sum_axis(2);
                 (sum + offset).relu()
             }
-        };
-        Radiance { sigma, rgb }
+        }
     }
 }
 
@@ -91,6 +98,16 @@ impl GridShape {
     /// Side of a voxel, world length.
     pub fn voxel_side(&self) -> f64 {
         2.0 * self.half_width / self.resolution as f64
+    }
+
+    /// The density at which a voxel absorbs the share `alpha` of the light that crosses it along an axis: −ln(1 − α) / side, 1 / world length.
+    pub fn density_of_alpha(&self, alpha: f64) -> f64 {
+        -(-alpha).ln_1p() / self.voxel_side()
+    }
+
+    /// World position of a voxel's centre. One outside of the grid has its place too.
+    pub fn center(&self, voxel: [isize; 3]) -> DVec3 {
+        DVec3::from(voxel.map(|k| (k as f64 + 0.5) * self.voxel_side() - self.half_width))
     }
 
     /// The layout with all voxels present.

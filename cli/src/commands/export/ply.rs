@@ -23,7 +23,7 @@ use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel export ply runs/lego                                what the training cameras see, into runs/lego/cloud.ply
+  plenoxel export ply runs/lego                                what the training cameras see, into runs/lego/exports/cloud.ply
   plenoxel export ply runs/lego --sor-sigma 2                  and without stragglers
   plenoxel export ply runs/lego --min-alpha 0 --min-weight 0 --min-object 0
   plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
@@ -39,7 +39,7 @@ pub struct PlyArgs {
     #[arg(value_hint = ValueHint::DirPath)]
     run: PathBuf,
 
-    /// File to write [default: RUN/cloud.ply]
+    /// File to write [default: RUN/exports/cloud.ply]
     #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
 
@@ -146,7 +146,7 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
     let report = describe(cloud.len(), &report);
     check_not_empty(left.len(), &report)?;
 
-    let path = args.out.clone().unwrap_or_else(|| folder.cloud());
+    let path = args.out.clone().map_or_else(|| folder.create_export("cloud.ply"), Ok)?;
     let (n, half) = (grid.shape().resolution, grid.shape().half_width);
     let frame = match coordinates {
         Coordinates::World => "the dataset's own".to_owned(),

@@ -1,0 +1,55 @@
+//! `plenoxel export mesh`: the surface of a trained run.
+
+use super::{Exported, as_flag, ending};
+use crate::progress::Console;
+use clap::Args;
+use plenoxel::error::Result;
+use plenoxel::export::mesh::{MeshOptions, mesh};
+use plenoxel::export::mesh_file::MeshFormat;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel export mesh runs/lego
+  plenoxel export mesh runs/lego --format glb
+  plenoxel export mesh runs/lego --level 20 --out lego.obj
+
+Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the dataset's coordinates, z up. GLB files turn
+it, for glTF has y up. A higher level takes fog away, and thin parts with it.";
+
+/// Write the surface of a run as a colored mesh
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct MeshArgs {
+    #[command(flatten)]
+    exported: Exported,
+
+    /// ply, obj or glb [default: as --out ends, else ply]
+    #[arg(long, value_name = "FORMAT", help_heading = "Output", value_parser = format)]
+    format: Option<MeshFormat>,
+
+    /// Density on the surface, 1 / world length [default: where a voxel absorbs 30 % of the light that crosses it]
+    #[arg(long, value_name = "SIGMA", help_heading = "Surface")]
+    level: Option<f64>,
+}
+
+/// Writes the surface of a run.
+pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
+    let named = args.exported.out.as_deref().and_then(ending).and_then(|ending| ending.parse().ok());
+    let format = args.format.or(named).unwrap_or(MeshFormat::Ply);
+    let (folder, grid) = args.exported.open(console, &format.to_string())?;
+    let options = MeshOptions { level: args.level, direction: args.exported.direction };
+    let surface = mesh(&grid, &options).map_err(as_flag)?;
+    let bytes = format.encode(&surface, crate::PROGRAM).map_err(as_flag)?;
+    let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes)?;
+    let (vertices, triangles) = (surface.positions.len(), surface.triangles.len());
+    console.result(&format!(
+        "wrote {vertices} vertices and {triangles} triangles around {:.4} of volume to {}",
+        surface.volume(),
+        file.display()
+    ))
+}
+
+/// A format as the command line takes it.
+fn format(text: &str) -> std::result::Result<MeshFormat, String> {
+    text.parse().map_err(|_| "ply, obj or glb".to_owned())
+}

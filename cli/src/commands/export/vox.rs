@@ -1,0 +1,40 @@
+//! `plenoxel export vox`: a trained run for MagicaVoxel.
+
+use super::{Exported, as_flag};
+use crate::progress::Console;
+use clap::Args;
+use plenoxel::error::Result;
+use plenoxel::export::vox::{VoxOptions, vox};
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel export vox runs/lego
+  plenoxel export vox runs/lego --min-alpha 0.5 --out lego.vox
+
+Writes RUN/exports/grid.vox. Voxel (i, j, k) of the grid is voxel (i, j, k) of the file, z up; grids of more than 256 voxels
+a side become tiles of 256 in one scene. The palette has up to 255 colors, chosen for the voxels that are written.";
+
+/// Write the voxels of a run as a MagicaVoxel .vox file
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct VoxArgs {
+    #[command(flatten)]
+    exported: Exported,
+
+    /// Take voxels that absorb more than this share of the light that crosses them
+    #[arg(long, value_name = "A", help_heading = "Voxels", default_value_t = VoxOptions::default().min_alpha)]
+    min_alpha: f64,
+
+    /// Take voxels too that others hide on all six sides
+    #[arg(long, help_heading = "Voxels")]
+    solid: bool,
+}
+
+/// Writes the voxels of a run.
+pub fn run(args: &VoxArgs, console: &Console<'_>) -> Result<()> {
+    let (folder, grid) = args.exported.open(console, "vox")?;
+    let options = VoxOptions { min_alpha: args.min_alpha, solid: args.solid, direction: args.exported.direction };
+    let model = vox(&grid, &options).map_err(as_flag)?;
+    let file = args.exported.write(&folder, "grid.vox", &model.to_bytes().map_err(as_flag)?)?;
+    console.result(&format!("wrote {} voxels in {} colors to {}", model.voxels.len(), model.palette.len(), file.display()))
+}

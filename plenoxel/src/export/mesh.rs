@@ -1,0 +1,236 @@
+//! The surface of a grid's matter as triangles with normals and colors.
+//!
+//! Marching cubes (Lorensen and Cline 1987) on the cells between voxel centres: wherever the density crosses the level between two neighbouring
+//! centres lies a vertex, and each cell joins its vertices to polygons. Which ones is not a printed table but derived, in `mesh/cases.rs`, from one
+//! rule for the faces of cells; two cells see their common face alike, so the surface is closed and each edge has exactly two triangles.
+//! Surface nets were rejected for that reason: where matter touches along an edge, four of their triangles meet.
+//!
+//! Outside of the box there is nothing, so a surface that reaches it is closed on its faces. Planes of centres are taken two at a time:
+//! memory is that of the grid, the mesh, and a few arrays of resolution².
+
+mod cases;
+
+use super::SURFACE_ALPHA;
+use crate::error::{Error, Result};
+use crate::field::voxel_grid::VoxelGrid;
+use autograd::{Real, parallel};
+use cases::{CORNERS, EDGES};
+use glam::DVec3;
+
+/// A surface in the dataset's world coordinates.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Mesh {
+    /// World position of each vertex.
+    pub positions: Vec<[f32; 3]>,
+    /// Unit normal of each vertex, out of the matter.
+    pub normals: Vec<[f32; 3]>,
+    /// sRGB color of each vertex.
+    pub colors: Vec<[u8; 3]>,
+    /// Vertices of each triangle, counterclockwise seen from outside.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+impl Mesh {
+    /// The volume enclosed, world length³, by the divergence theorem: Σ a · (b × c) / 6.
+    pub fn volume(&self) -> f64 {
+        let corner = |v: u32| DVec3::from(self.positions[v as usize].map(f64::from));
+        self.triangles.iter().map(|t| t.map(corner)).map(|[a, b, c]| a.dot(b.cross(c)) / 6.0).sum()
+    }
+}
+
+/// Which surface, and its colors.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct MeshOptions {
+    /// The density on the surface, 1 / world length; `None` is where a voxel absorbs [`SURFACE_ALPHA`].
+    pub level: Option<f64>,
+    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each vertex against its normal.
+    pub direction: Option<DVec3>,
+}
+
+/// The surface on which the density of a grid has a level.
+///
+/// Densities are read on the lines between neighbouring centres, linearly. That is what a trilinear grid renders; of a nearest grid it rounds the
+/// corners off. Normals are −∇σ, central differences over neighbouring voxels, interpolated. A vertex has the color that a camera sees there.
+///
+/// The result does not depend on the number of threads.
+///
+/// Errors: the level is not positive, or no voxel is denser.
+pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh> {
+    let shape = grid.shape();
+    let level = options.level.unwrap_or_else(|| shape.density_of_alpha(SURFACE_ALPHA));
+    let largest = parallel::map_chunks(grid.density.tensor().data().len(), parallel::CHUNK, |range| {
+        range.filter_map(|row| grid.lattice().node(row as u32).map(|_| grid.density.tensor().data()[row].as_f64())).fold(0.0, f64::max)
+    });
+    let largest = largest.into_iter().fold(0.0, f64::max);
+    if !(level > 0.0 && level < largest) {
+        let accepted = match largest > 0.0 {
+            true => format!("above 0 and below {largest:.4}, the largest density of this grid"),
+            false => "none, for this grid is empty: train it longer".to_owned(),
+        };
+        return Err(Error::config("level", format!("{level:.4}"), accepted));
+    }
+    let Surface { crossings, triangles } = surface(grid, level);
+    let vertices = parallel::map_indices(crossings.len(), |v| crossings[v].vertex(grid, level));
+    let rows: Vec<u32> = vertices.iter().map(|vertex| vertex.row).collect();
+    let [points, normals] = [|v: &Vertex| v.position, |v: &Vertex| v.normal].map(|part| vertices.iter().map(part).collect::<Vec<_>>());
+    let colors = super::seen(grid, &points, &normals, &rows, options.direction);
+    Ok(Mesh {
+        positions: points.iter().map(|point| point.as_vec3().to_array()).collect(),
+        normals: normals.iter().map(|normal| normal.as_vec3().to_array()).collect(),
+        colors,
+        triangles,
+    })
+}
+
+/// Two neighbouring centres with the level between them: `low`, and the next one along `axis`. Coordinates run from −1, outside of the box.
+#[derive(Debug, Clone, Copy)]
+struct Crossing {
+    low: [i16; 3],
+    axis: u8,
+}
+
+/// What is known of a vertex.
+struct Vertex {
+    position: DVec3,
+    normal: DVec3,
+    /// Row of the voxel on the dense side.
+    row: u32,
+}
+
+/// How near a vertex may come to a centre, as a share of the voxel's side: nearer ones of several edges would be one point in `f32`, and
+/// programs that join equal points would find degenerate triangles.
+const NEAREST: f64 = 0.01;
+
+impl Crossing {
+    fn vertex<T: Real>(self, grid: &VoxelGrid<T>, level: f64) -> Vertex {
+        let ends = [0, 1].map(|step| {
+            let mut end = self.low.map(isize::from);
+            end[usize::from(self.axis)] += step;
+            end
+        });
+        let [a, b] = ends.map(|end| grid.density_at(end));
+        let n = grid.shape().resolution as isize;
+        let t = match ends.as_flattened().iter().all(|k| (0..n).contains(k)) {
+            true => ((level - a) / (b - a)).clamp(NEAREST, 1.0 - NEAREST),
+            // The border voxel fills its outer half: matter ends at the face of the box.
+            false => 0.5,
+        };
+        let [from, to] = ends.map(|end| grid.shape().center(end));
+        let [dense, thin] = if a > b { [0, 1] } else { [1, 0] };
+        let slope = grid.outward(ends[0]).lerp(grid.outward(ends[1]), t);
+        // A speck of matter may have no slope: it is seen along the edge.
+        let along = grid.shape().center(ends[thin]) - grid.shape().center(ends[dense]);
+        let normal = slope.try_normalize().unwrap_or_else(|| along.normalize());
+        // The dense end is above a positive level, so it is present.
+        let row = grid.lattice().row(ends[dense].map(|k| k as usize)).unwrap_or_default();
+        Vertex { position: from.lerp(to, t), normal, row }
+    }
+}
+
+/// Vertices as the edges they lie on, and the triangles between them.
+#[derive(Default)]
+struct Surface {
+    crossings: Vec<Crossing>,
+    triangles: Vec<[u32; 3]>,
+}
+
+/// A plane of centres of equal x with a margin of one, row-major in y and z.
+struct Plane {
+    /// Which centres are denser than the level.
+    dense: Vec<bool>,
+    /// For each row of centres, whether one of them is.
+    rows: Vec<bool>,
+    /// The vertices on the edges that begin at each centre along x, y and z; anything where there is none.
+    vertices: [Vec<u32>; 3],
+}
+
+impl Plane {
+    fn new(side: usize) -> Self {
+        let vertices = [0, 1, 2].map(|_| vec![0; side * side]);
+        Plane { dense: vec![false; side * side], rows: vec![false; side], vertices }
+    }
+
+    /// Fills it with the centres of an x from −1 to n.
+    fn read<T: Real>(&mut self, grid: &VoxelGrid<T>, level: f64, x: isize) {
+        let side = self.rows.len();
+        parallel::for_each_chunk(&mut self.dense, side, |start, row| {
+            let y = (start / side) as isize - 1;
+            for (z, dense) in (-1..).zip(row) {
+                *dense = grid.density_at([x, y, z]) > level;
+            }
+        });
+        for (row, any) in self.dense.chunks_exact(side).zip(&mut self.rows) {
+            *any = row.contains(&true);
+        }
+    }
+}
+
+/// All vertices and triangles, x slowest.
+fn surface<T: Real>(grid: &VoxelGrid<T>, level: f64) -> Surface {
+    let n = grid.shape().resolution as isize;
+    let side = n as usize + 2;
+    let cases = cases::triangles();
+    let mut found = Surface::default();
+    let (mut low, mut high) = (Plane::new(side), Plane::new(side));
+    // The plane at −1 is empty.
+    for x in -1..n {
+        high.read(grid, level, x + 1);
+        found.add_vertices(&mut low, &mut high, x);
+        found.add_triangles(&cases, &low, &high);
+        std::mem::swap(&mut low, &mut high);
+    }
+    found
+}
+
+impl Surface {
+    /// The vertices on edges from the plane at `x` to the next one, and on those inside of the latter.
+    fn add_vertices(&mut self, low: &mut Plane, high: &mut Plane, x: isize) {
+        let side = low.rows.len();
+        for y in 0..side {
+            let beyond = y + 1 < side && high.rows[y + 1];
+            if !(low.rows[y] || high.rows[y] || beyond) {
+                continue;
+            }
+            for z in 0..side {
+                let at = y * side + z;
+                let here = high.dense[at];
+                let mut place = |vertices: &mut [u32], x: isize, axis: u8| {
+                    vertices[at] = self.crossings.len() as u32;
+                    self.crossings.push(Crossing { low: [x as i16, y as i16 - 1, z as i16 - 1], axis });
+                };
+                if low.dense[at] != here {
+                    place(&mut low.vertices[0], x, 0);
+                }
+                if y + 1 < side && high.dense[at + side] != here {
+                    place(&mut high.vertices[1], x + 1, 1);
+                }
+                if z + 1 < side && high.dense[at + 1] != here {
+                    place(&mut high.vertices[2], x + 1, 2);
+                }
+            }
+        }
+    }
+
+    /// The triangles in the cells between two planes.
+    fn add_triangles(&mut self, cases: &[Vec<[u8; 3]>], low: &Plane, high: &Plane) {
+        let side = low.rows.len();
+        let planes = [low, high];
+        for y in 0..side - 1 {
+            if !planes.iter().any(|plane| plane.rows[y] || plane.rows[y + 1]) {
+                continue;
+            }
+            for z in 0..side - 1 {
+                let place = |[_, dy, dz]: [usize; 3]| (y + dy) * side + z + dz;
+                let case = CORNERS
+                    .iter()
+                    .enumerate()
+                    .fold(0, |case, (bit, &corner)| case | usize::from(planes[corner[0]].dense[place(corner)]) << bit);
+                let vertex = |edge: u8| {
+                    let (corner, axis) = EDGES[usize::from(edge)];
+                    planes[corner[0]].vertices[axis][place(corner)]
+                };
+                self.triangles.extend(cases[case].iter().map(|triangle| triangle.map(vertex)));
+            }
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! A mesh as the bytes of a file: PLY, OBJ or binary glTF.
+
+use super::mesh::Mesh;
+use crate::error::{Error, Result};
+use serde_json::{Value, json};
+use std::fmt::{self, Display, Write};
+use std::str::FromStr;
+
+/// The formats there are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MeshFormat {
+    /// Stanford PLY, binary little endian, z up; colors as bytes `red`, `green`, `blue`.
+    Ply,
+    /// Wavefront OBJ, text, z up; colors after the positions, `v x y z r g b`, in [0, 1].
+    Obj,
+    /// Binary glTF 2.0. Positions are the dataset's, and the node that holds them is turned so that the dataset's z is glTF's y, which is up. The
+    /// material is unlit, for the colors have the light in them already, and colors are linear, as glTF demands.
+    Glb,
+}
+
+impl MeshFormat {
+    /// All of them.
+    pub const ALL: [Self; 3] = [MeshFormat::Ply, MeshFormat::Obj, MeshFormat::Glb];
+
+    /// The bytes of a file of this format. `comment` says where the mesh is from, on one line.
+    ///
+    /// Errors: the mesh is larger than the format allows.
+    pub fn encode(self, mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
+        match self {
+            MeshFormat::Ply => Ok(ply(mesh, comment)),
+            MeshFormat::Obj => Ok(obj(mesh, comment)),
+            MeshFormat::Glb => glb(mesh, comment),
+        }
+    }
+}
+
+impl Display for MeshFormat {
+    /// Its name, which is the ending of its files.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            MeshFormat::Ply => "ply",
+            MeshFormat::Obj => "obj",
+            MeshFormat::Glb => "glb",
+        })
+    }
+}
+
+impl FromStr for MeshFormat {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        let known = Self::ALL.into_iter().find(|format| format.to_string().eq_ignore_ascii_case(text));
+        known.ok_or_else(|| Error::config("format", format!("\"{text}\""), "ply, obj, glb"))
+    }
+}
+
+fn ply(mesh: &Mesh, comment: &str) -> Vec<u8> {
+    let header = format!(
+        "ply\nformat binary_little_endian 1.0\ncomment {comment}\n\
+        element vertex {}\nproperty float x\nproperty float y\nproperty float z\nproperty float nx\nproperty float ny\nproperty float nz\n\
+        property uchar red\nproperty uchar green\nproperty uchar blue\n\
+        element face {}\nproperty list uchar int vertex_indices\nend_header\n",
+        mesh.positions.len(),
+        mesh.triangles.len()
+    );
+    let mut file = Vec::with_capacity(header.len() + mesh.positions.len() * 27 + mesh.triangles.len() * 13);
+    file.extend_from_slice(header.as_bytes());
+    for ((position, normal), color) in mesh.positions.iter().zip(&mesh.normals).zip(&mesh.colors) {
+        file.extend(position.iter().chain(normal).flat_map(|x| x.to_le_bytes()));
+        file.extend_from_slice(color);
+    }
+    for triangle in &mesh.triangles {
+        file.push(3);
+        file.extend(triangle.iter().flat_map(|v| v.to_le_bytes()));
+    }
+    file
+}
+
+fn obj(mesh: &Mesh, comment: &str) -> Vec<u8> {
+    let mut file = format!("# {comment}\n");
+    let mut line = |text: fmt::Arguments<'_>| {
+        // Writing to a string cannot fail.
+        let _ = file.write_fmt(text);
+    };
+    for ([x, y, z], color) in mesh.positions.iter().zip(&mesh.colors) {
+        let [r, g, b] = color.map(|c| f64::from(c) / 255.0);
+        line(format_args!("v {x} {y} {z} {r:.4} {g:.4} {b:.4}\n"));
+    }
+    for [x, y, z] in &mesh.normals {
+        line(format_args!("vn {x:.4} {y:.4} {z:.4}\n"));
+    }
+    for triangle in &mesh.triangles {
+        let [a, b, c] = triangle.map(|v| u64::from(v) + 1);
+        line(format_args!("f {a}//{a} {b}//{b} {c}//{c}\n"));
+    }
+    file.into_bytes()
+}
+
+/// Numbers of the glTF specification: types of components, targets of buffer views.
+mod gltf {
+    pub const UNSIGNED_SHORT: u32 = 5123;
+    pub const UNSIGNED_INT: u32 = 5125;
+    pub const FLOAT: u32 = 5126;
+    pub const VERTICES: u32 = 34962;
+    pub const INDICES: u32 = 34963;
+}
+
+fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
+    let floats = |rows: &[[f32; 3]]| -> Vec<u8> { rows.as_flattened().iter().flat_map(|x| x.to_le_bytes()).collect() };
+    // Shorts, for bytes would band in the dark; with an alpha, for rows must begin at multiples of four bytes.
+    let colors = mesh.colors.iter().flat_map(|rgb| rgb.map(linear).into_iter().chain([u16::MAX]).flat_map(u16::to_le_bytes)).collect();
+    let count = mesh.positions.len();
+    let bound = |pick: fn(f32, f32) -> f32| {
+        let corner = mesh.positions.iter().copied().reduce(|a, b| [0, 1, 2].map(|axis| pick(a[axis], b[axis])));
+        corner.unwrap_or_default()
+    };
+    let parts: [(Vec<u8>, u32, Value); 4] = [
+        (
+            floats(&mesh.positions),
+            gltf::VERTICES,
+            json!({ "componentType": gltf::FLOAT, "type": "VEC3", "count": count, "min": bound(f32::min), "max": bound(f32::max) }),
+        ),
+        (floats(&mesh.normals), gltf::VERTICES, json!({ "componentType": gltf::FLOAT, "type": "VEC3", "count": count })),
+        (colors, gltf::VERTICES, json!({ "componentType": gltf::UNSIGNED_SHORT, "normalized": true, "type": "VEC4", "count": count })),
+        (
+            mesh.triangles.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect(),
+            gltf::INDICES,
+            json!({ "componentType": gltf::UNSIGNED_INT, "type": "SCALAR", "count": 3 * mesh.triangles.len() }),
+        ),
+    ];
+    let (mut binary, mut views, mut accessors) = (Vec::new(), Vec::new(), Vec::new());
+    for (number, (bytes, target, mut accessor)) in parts.into_iter().enumerate() {
+        views.push(json!({ "buffer": 0, "byteOffset": binary.len(), "byteLength": bytes.len(), "target": target }));
+        accessor["bufferView"] = json!(number);
+        accessors.push(accessor);
+        binary.extend(bytes);
+    }
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    let document = json!({
+        "asset": { "version": "2.0", "generator": comment },
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{ "nodes": [0] }],
+        // A quarter turn about x: (x, y, z) to (x, z, −y).
+        "nodes": [{ "mesh": 0, "rotation": [-half, 0.0, 0.0, half] }],
+        "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0, "NORMAL": 1, "COLOR_0": 2 }, "indices": 3, "material": 0 }] }],
+        "materials": [{
+            "pbrMetallicRoughness": { "baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0 },
+            "extensions": { "KHR_materials_unlit": {} }
+        }],
+        "buffers": [{ "byteLength": binary.len() }],
+        "bufferViews": views,
+        "accessors": accessors,
+    });
+    let mut text = document.to_string().into_bytes();
+    text.resize(text.len().next_multiple_of(4), b' ');
+    // All parts have whole words, so the binary needs no padding.
+    let total = 12 + 8 + text.len() + 8 + binary.len();
+    let Ok(length) = u32::try_from(total) else {
+        return Err(Error::config("format", format!("glb, for a mesh of {total} bytes,"), "ply or obj: glTF ends at 4 GiB"));
+    };
+    let word = |n: usize| (n as u32).to_le_bytes();
+    let header = [b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes()].concat();
+    Ok([header.as_slice(), &word(text.len()), b"JSON", &text, &word(binary.len()), b"BIN\0", &binary].concat())
+}
+
+/// An sRGB byte as 16 bits of linear light (IEC 61966-2-1).
+fn linear(byte: u8) -> u16 {
+    let c = f64::from(byte) / 255.0;
+    let linear = if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) };
+    (linear * 65535.0).round() as u16
+}

@@ -1,0 +1,179 @@
+//! Voxels for MagicaVoxel: the .vox format, version 150, with the scene graph of its extension.
+//!
+//! The format's x, y and z are those of the dataset, right-handed and z up, so voxel (i, j, k) of the grid is voxel (i, j, k) of the file. A model
+//! has at most 256 voxels a side: larger grids become tiles of 256³ with the grid's coordinates modulo 256, put together by the scene graph so
+//! that the box is centred in x and y and stands on the ground. That is where MagicaVoxel puts a single model by itself, so a smaller grid
+//! needs no scene graph, which some readers do not know.
+//!
+//! A voxel has the index of its color, 1 to 255, as 0 would be empty; entry i − 1 of the 256 in the file belongs to index i. Source: the
+//! specification `MagicaVoxel-file-format-vox.txt` of github.com/ephtracy/voxel-model, and the extension beside it.
+
+use super::SURFACE_ALPHA;
+use crate::error::{Error, Result};
+use crate::export::palette::quantize;
+use crate::field::voxel_grid::VoxelGrid;
+use crate::sampling::Occupancy;
+use autograd::{Real, parallel};
+use glam::DVec3;
+
+/// The voxels of a .vox file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Vox {
+    /// Voxels along each axis of the grid.
+    pub resolution: usize,
+    /// sRGB colors, at most 255.
+    pub palette: Vec<[u8; 3]>,
+    /// Voxel (i, j, k) of the grid, and the index of its color: 1 is the first of the palette.
+    pub voxels: Vec<([u16; 3], u8)>,
+}
+
+/// Which voxels, and their colors.
+#[derive(Debug, Clone, Copy)]
+pub struct VoxOptions {
+    /// Voxels are taken that absorb more than this share of the light that crosses them: 1 − exp(−σ side).
+    pub min_alpha: f64,
+    /// Take those too that others hide on all six sides.
+    pub solid: bool,
+    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each voxel against [`VoxelGrid::outward`].
+    pub direction: Option<DVec3>,
+}
+
+impl Default for VoxOptions {
+    fn default() -> Self {
+        VoxOptions { min_alpha: SURFACE_ALPHA, solid: false, direction: None }
+    }
+}
+
+/// The voxels of a grid with a palette made from their colors alone.
+///
+/// Errors: `min_alpha` is not in [0, 1), or no voxel absorbs more.
+pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
+    let VoxOptions { min_alpha, solid, direction } = *options;
+    if !(0.0..1.0).contains(&min_alpha) {
+        return Err(Error::config("min_alpha", min_alpha, "0 or more, and below 1"));
+    }
+    let dense = grid.voxels_above(min_alpha);
+    let places = places(&dense, solid);
+    if places.is_empty() {
+        let found = format!("{min_alpha}, which no voxel of this grid exceeds,");
+        return Err(Error::config("min_alpha", found, "a smaller share of the light; if 0 is refused, train longer"));
+    }
+    // All of them are present: an absent voxel has no density.
+    let rows: Vec<u32> = places.iter().map(|voxel| grid.lattice().row(voxel.map(usize::from)).unwrap_or_default()).collect();
+    let signed = |place: &[u16; 3]| place.map(|k| k as isize);
+    let points: Vec<DVec3> = places.iter().map(|place| grid.shape().center(signed(place))).collect();
+    let outward: Vec<DVec3> = places.iter().map(|place| grid.outward(signed(place))).collect();
+    let colors = super::seen(grid, &points, &outward, &rows, direction);
+    let (palette, entries) = quantize(&colors, 255);
+    let voxels = places.into_iter().zip(entries).map(|(place, entry)| (place, entry + 1)).collect();
+    Ok(Vox { resolution: grid.shape().resolution, palette, voxels })
+}
+
+/// The voxels of an occupancy, x slowest; without those that have all six neighbours, unless `solid`.
+fn places(dense: &Occupancy, solid: bool) -> Vec<[u16; 3]> {
+    let n = dense.cells()[0];
+    let hidden = |[i, j, k]: [usize; 3]| {
+        [i, j, k].iter().all(|c| (1..n - 1).contains(c))
+            && [[i - 1, j, k], [i + 1, j, k], [i, j - 1, k], [i, j + 1, k], [i, j, k - 1], [i, j, k + 1]].iter().all(|&c| dense.contains(c))
+    };
+    let planes = parallel::map_indices(n, |i| {
+        let voxels = (0..n * n).map(|v| [i, v / n, v % n]).filter(|&voxel| dense.contains(voxel) && (solid || !hidden(voxel)));
+        voxels.map(|voxel| voxel.map(|c| c as u16)).collect::<Vec<_>>()
+    });
+    planes.concat()
+}
+
+/// The most voxels along a side of a model: coordinates are bytes.
+const SIDE: usize = 256;
+
+impl Vox {
+    /// The file's bytes.
+    ///
+    /// Errors: more voxels than the format can count.
+    pub fn to_bytes(&self) -> Result<Vec<u8>> {
+        // Chunks say their length in 31 bits, and a voxel has four bytes.
+        const MOST: usize = (1 << 29) - (1 << 20);
+        if self.voxels.len() > MOST {
+            let found = format!("a selection of {} voxels", self.voxels.len());
+            return Err(Error::config("min_alpha", found, format!("at most {MOST} voxels: a larger share, or hidden voxels left out")));
+        }
+        let tiles = self.tiles();
+        let mut chunks = Vec::new();
+        for tile in &tiles {
+            chunk(&mut chunks, b"SIZE", &integers(tile.size.map(|side| side as i32)));
+            let count = integers([tile.voxels.len() as i32]);
+            chunk(&mut chunks, b"XYZI", &[count.as_slice(), tile.voxels.as_flattened()].concat());
+        }
+        if self.resolution > SIDE {
+            self.scene_graph(&tiles, &mut chunks);
+        }
+        let mut entries: Vec<u8> = self.palette.iter().flat_map(|&[r, g, b]| [r, g, b, 255]).collect();
+        entries.resize(4 * 256, 0);
+        chunk(&mut chunks, b"RGBA", &entries);
+        Ok([b"VOX ".as_slice(), &integers([150]), b"MAIN", &integers([0, chunks.len() as i32]), &chunks].concat())
+    }
+
+    /// The parts of at most 256 voxels a side that are not empty, x slowest.
+    fn tiles(&self) -> Vec<Tile> {
+        let count = self.resolution.div_ceil(SIDE);
+        let mut tiles: Vec<Tile> = (0..count * count * count)
+            .map(|t| {
+                let origin = [t / (count * count), t / count % count, t % count].map(|c| c * SIDE);
+                Tile { origin, size: origin.map(|start| (self.resolution - start).min(SIDE)), voxels: Vec::new() }
+            })
+            .collect();
+        for &(place, index) in &self.voxels {
+            let [a, b, c] = place.map(|k| usize::from(k) / SIDE);
+            let [x, y, z] = place.map(|k| (usize::from(k) % SIDE) as u8);
+            tiles[(a * count + b) * count + c].voxels.push([x, y, z, index]);
+        }
+        tiles.retain(|tile| !tile.voxels.is_empty());
+        tiles
+    }
+
+    /// Node 0 is the root's place, node 1 the group of all tiles; tile m has its place in node 2 m + 2 and its shape in node 2 m + 3.
+    fn scene_graph(&self, tiles: &[Tile], chunks: &mut Vec<u8>) {
+        const NO_ATTRIBUTES: i32 = 0;
+        const RESERVED: i32 = -1;
+        const LAYER: i32 = 0;
+        const FRAMES: i32 = 1;
+        const MODELS: i32 = 1;
+        let count = tiles.len() as i32;
+        chunk(chunks, b"nTRN", &integers([0, NO_ATTRIBUTES, 1, RESERVED, RESERVED, FRAMES, NO_ATTRIBUTES]));
+        let children: Vec<u8> = (0..count).flat_map(|m| (2 * m + 2).to_le_bytes()).collect();
+        chunk(chunks, b"nGRP", &[integers([1, NO_ATTRIBUTES, count]), children].concat());
+        for (m, tile) in (0..).zip(tiles) {
+            let [place, shape] = [2 * m + 2, 2 * m + 3];
+            // A model's place is that of its voxel number size / 2, rounded down.
+            let half = self.resolution / 2;
+            let [x, y, z] = [0, 1, 2].map(|a| (tile.origin[a] + tile.size[a] / 2) as i32 - [half, half, 0][a] as i32);
+            let translation = [integers([1]), string("_t"), string(&format!("{x} {y} {z}"))].concat();
+            chunk(chunks, b"nTRN", &[integers([place, NO_ATTRIBUTES, shape, RESERVED, LAYER, FRAMES]), translation].concat());
+            chunk(chunks, b"nSHP", &integers([shape, NO_ATTRIBUTES, MODELS, m, NO_ATTRIBUTES]));
+        }
+    }
+}
+
+/// A part of the grid.
+struct Tile {
+    /// Its first voxel.
+    origin: [usize; 3],
+    size: [usize; 3],
+    /// Voxel of the tile, and index of the color.
+    voxels: Vec<[u8; 4]>,
+}
+
+/// A chunk without children: its name, the lengths of its content and its children, and the content.
+fn chunk(chunks: &mut Vec<u8>, name: &[u8; 4], content: &[u8]) {
+    chunks.extend_from_slice(name);
+    chunks.extend(integers([content.len() as i32, 0]));
+    chunks.extend_from_slice(content);
+}
+
+fn integers<const N: usize>(numbers: [i32; N]) -> Vec<u8> {
+    numbers.into_iter().flat_map(i32::to_le_bytes).collect()
+}
+
+fn string(text: &str) -> Vec<u8> {
+    [integers([text.len() as i32]).as_slice(), text.as_bytes()].concat()
+}

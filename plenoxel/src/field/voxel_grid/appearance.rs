@@ -1,0 +1,114 @@
+//! What a voxel is by itself, without rays: how much matter, which way it faces, its color from there. What exports are made of.
+
+use super::VoxelGrid;
+use crate::sampling::Occupancy;
+use autograd::{Indices, Real, Tensor, no_grad};
+use glam::DVec3;
+
+/// Rows whose colors are computed at a time, which bounds the memory for their harmonics.
+const RUN: usize = 1 << 16;
+
+impl<T: Real> VoxelGrid<T> {
+    /// The voxels that absorb more than the share `alpha` of the light that crosses them along an axis: 1 − exp(−σ side) > α.
+    pub fn voxels_above(&self, alpha: f64) -> Occupancy {
+        let (density, threshold) = (self.density.tensor().data(), self.shape.density_of_alpha(alpha));
+        self.voxels_where(|row| density[row].as_f64() > threshold)
+    }
+
+    /// Raw density of a voxel, 1 / world length: 0 for one that is not present or lies outside of the grid.
+    pub fn density_at(&self, voxel: [isize; 3]) -> f64 {
+        let inside = voxel.iter().all(|k| (0..self.shape.resolution as isize).contains(k));
+        let row = inside.then(|| self.lattice.row(voxel.map(|k| k as usize))).flatten();
+        row.map_or(0.0, |row| self.density.tensor().data()[row as usize].as_f64())
+    }
+
+    /// Where matter gets thinner fastest around a voxel: −∇σ by central differences over its neighbours, 1 / world length², not normalised. It
+    /// points out of a surface. Zero where the neighbours say nothing, as inside of solid matter.
+    pub fn outward(&self, voxel: [isize; 3]) -> DVec3 {
+        let sigma = |axis: usize, step: isize| {
+            let mut there = voxel;
+            there[axis] += step;
+            self.density_at(there).max(0.0)
+        };
+        DVec3::from([0, 1, 2].map(|axis| sigma(axis, -1) - sigma(axis, 1))) / (2.0 * self.shape.voxel_side())
+    }
+
+    /// Colors of rows of the tables, each seen along its unit direction from the viewer into the scene: what [`super::Color::activate`] gives for a
+    /// sample at the centre of the voxel. A direction of zero gives the mean over all directions (before the maximum with 0), for no harmonic but
+    /// the first has a mean. sRGB as the photographs have it, not clamped.
+    ///
+    /// Panics if there is not one direction for each row, or a row is not in the tables.
+    pub fn colors_of(&self, rows: &[u32], directions: &[DVec3]) -> Vec<[f64; 3]> {
+        assert_eq!(rows.len(), directions.len(), "colors_of: one direction for each row");
+        let runs = rows.chunks(RUN).zip(directions.chunks(RUN));
+        let colors = runs.flat_map(|(rows, directions)| {
+            let m = rows.len();
+            let directions = directions.iter().flat_map(|d| d.to_array().map(T::lit)).collect();
+            let directions = Tensor::from_vec(directions, &[m, 3]);
+            let numbers = self.color.tensor().detach().gather_rows(&Indices::from(rows.to_vec()));
+            let rgb = no_grad(|| self.shape.color.shade(&numbers, |degree| crate::field::sh::basis(&directions, degree)));
+            let rgb: Vec<[f64; 3]> = rgb.data().as_chunks::<3>().0.iter().map(|c| c.map(T::as_f64)).collect();
+            rgb
+        });
+        colors.collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Color, GridShape, Interpolation};
+    use super::*;
+    use crate::field::Field;
+    use crate::sampling::Samples;
+
+    fn shape(color: Color) -> GridShape {
+        GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color }
+    }
+
+    #[test]
+    fn a_row_has_the_color_that_a_ray_finds_at_its_voxel() {
+        for color in [Color::Rgb, Color::Sh { degree: 2, offset: 0.5 }] {
+            let grid = VoxelGrid::<f64>::random(shape(color), 1.0, 1.0, 3);
+            let (voxel, direction) = ([2, 0, 3], DVec3::new(0.48, -0.6, 0.64));
+            let samples = Samples {
+                t: Tensor::zeros(&[1]),
+                delta: Tensor::full(&[1], 1.0),
+                positions: Tensor::from_vec(grid.shape().center(voxel).to_array().to_vec(), &[1, 3]),
+                directions: Tensor::from_vec(direction.to_array().to_vec(), &[1, 3]),
+                offsets: Indices::from(vec![0, 1]),
+            };
+            let row = grid.lattice().row(voxel.map(|k| k as usize)).unwrap();
+            assert_eq!(grid.colors_of(&[row], &[direction])[0].as_slice(), grid.radiance(&samples).rgb.data());
+        }
+    }
+
+    #[test]
+    fn a_direction_of_zero_gives_the_mean_of_all_directions() {
+        let grid = VoxelGrid::<f64>::random(shape(Color::Sh { degree: 3, offset: 2.0 }), 1.0, 0.1, 5);
+        let mean = grid.colors_of(&[7], &[DVec3::ZERO])[0];
+        // The 26 directions of a cube's corners, edges and faces with weights 27, 32 and 40 of 840 integrate polynomials of degree 7 exactly.
+        let mut sum = DVec3::ZERO;
+        for (x, y, z) in
+            (0..27).map(|c| (f64::from(c / 9 - 1), f64::from(c / 3 % 3 - 1), f64::from(c % 3 - 1))).filter(|d| *d != (0.0, 0.0, 0.0))
+        {
+            let d = DVec3::new(x, y, z);
+            let weight = [40.0, 32.0, 27.0][d.length_squared() as usize - 1] / 840.0;
+            sum += weight * DVec3::from(grid.colors_of(&[7], &[d.normalize()])[0]);
+        }
+        assert!((sum - DVec3::from(mean)).length() < 1e-12, "{sum} against {mean:?}");
+    }
+
+    #[test]
+    fn outward_points_out_of_matter_and_alpha_is_what_a_voxel_absorbs() {
+        let shape = shape(Color::Rgb);
+        let density = Tensor::from_vec((0..64).map(|v| if v / 16 < 2 { 3.0 } else { 0.0 }).collect(), &[64, 1]);
+        let grid = VoxelGrid::<f64>::from_row_major(shape, &density, &Tensor::zeros(&[64, 3]));
+        // 3 before, 0 after, two voxels of side 0.5 apart.
+        assert_eq!(grid.outward([1, 2, 2]), DVec3::X * 3.0);
+        assert_eq!(grid.outward([0, 2, 2]), DVec3::X * -3.0, "there is nothing outside of the box");
+        let alpha = 1.0 - (-3.0f64 * 0.5).exp();
+        assert!((shape.density_of_alpha(alpha) - 3.0).abs() < 1e-12);
+        assert_eq!(grid.voxels_above(alpha - 1e-9).fraction(), 0.5);
+        assert_eq!(grid.voxels_above(alpha + 1e-9).fraction(), 0.0);
+    }
+}
