@@ -184,7 +184,7 @@ fn error_of(views: &[View], config: &Config) -> f64 {
                 }
                 ControlFlow::Continue(())
             };
-            walk.along(&ray, |_| false, visit);
+            walk.along(&ray, |_| 0, visit);
             for (c, target) in color.iter().zip(view.color(x as usize, y as usize, config.background)) {
                 sum += (c + light - f64::from(target)).powi(2);
             }

@@ -5,6 +5,7 @@ use crate::camera::Ray;
 use crate::dataset::View;
 use crate::field::sh;
 use crate::geometry::Aabb;
+use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
 use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::{Buffer, Lattice, Tensor, no_grad, parallel};
@@ -44,6 +45,7 @@ pub struct Pixel {
 pub struct Opaque<'a> {
     lattice: &'a Lattice,
     walk: Walk,
+    occupancy: Occupancy,
     /// First row of each brick, bricks in row-major order.
     first_rows: Vec<u32>,
     density: f64,
@@ -124,22 +126,26 @@ impl<'a> Opaque<'a> {
             let brick = lattice.brick([b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]]);
             brick.map_or(0, |(brick, _)| (brick * BRICK_ROWS) as u32)
         });
-        Opaque { lattice, walk: Walk::new(aabb, lattice.nodes()), first_rows, density }
+        let occupancy = Occupancy::from_masks(aabb, lattice.nodes(), lattice.masks().to_vec());
+        Opaque { lattice, walk: Walk::new(aabb, lattice.nodes()), occupancy, first_rows, density }
     }
 
     /// Appends the voxels on a ray, from the camera on, each with the optical depth behind it as its weight, until that is opaque.
     fn depths(&self, ray: &Ray, number: u32, out: &mut Vec<Hit>) {
-        let masks = self.lattice.masks();
+        let masks = self.occupancy.masks();
         let opaque = -REST.ln();
         let (mut depth, density) = (0.0_f32, self.density);
-        let empty = |brick: usize| masks[brick] == 0;
-        self.walk.along(ray, empty, |crossing| {
-            if masks[crossing.brick] >> crossing.bit & 1 == 1 {
-                depth += (density * (crossing.leave - crossing.enter)) as f32;
-                out.push(Hit { row: self.first_rows[crossing.brick] + crossing.bit as u32, ray: number, weight: depth });
-            }
-            if depth > opaque { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-        });
+        self.walk.along(
+            ray,
+            |brick| self.occupancy.free(brick),
+            |crossing| {
+                if masks[crossing.brick] >> crossing.bit & 1 == 1 {
+                    depth += (density * (crossing.leave - crossing.enter)) as f32;
+                    out.push(Hit { row: self.first_rows[crossing.brick] + crossing.bit as u32, ray: number, weight: depth });
+                }
+                if depth > opaque { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            },
+        );
     }
 
     /// The light of some pixels. `value` says what each has to say to the voxels that it sees; `degree` is of the harmonics.

@@ -48,18 +48,25 @@ pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3]) -> Occupancy {
     let walk = Walk::new(aabb, voxels);
     // Voxels only ever go, so the order in which they do is all the same.
     let masks: Vec<AtomicU64> = full(voxels).into_iter().map(AtomicU64::new).collect();
-    for view in views {
-        let (width, height) = view.image.dimensions();
-        parallel::map_indices(height as usize, |y| {
-            for x in (0..width as usize).filter(|&x| is_background(view, x, y)) {
+    let (mut done, mut group) = (0, 1);
+    while done < views.len() {
+        // What is empty now stays so: the next views, as many again, cross it in large steps.
+        let snapshot = || masks.iter().map(|mask| mask.load(Relaxed)).collect();
+        let empty = Occupancy::from_masks(aabb, voxels, snapshot());
+        let free = |brick: usize| if masks[brick].load(Relaxed) == 0 { empty.free(brick).max(1) } else { 0 };
+        let next = &views[done..(done + group).min(views.len())];
+        let rows: Vec<(&View, usize)> = next.iter().flat_map(|view| (0..view.image.height() as usize).map(move |y| (view, y))).collect();
+        parallel::map_items(rows, |_, (view, y)| {
+            for x in (0..view.image.width() as usize).filter(|&x| is_background(view, x, y)) {
                 let ray = view.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
-                let empty = |brick: usize| masks[brick].load(Relaxed) == 0;
-                walk.along(&ray, empty, |crossing| {
+                walk.along(&ray, free, |crossing| {
                     masks[crossing.brick].fetch_and(!(1 << crossing.bit), Relaxed);
                     ControlFlow::Continue(())
                 });
             }
         });
+        done += next.len();
+        group = done;
     }
     Occupancy::from_masks(aabb, voxels, masks.into_iter().map(AtomicU64::into_inner).collect())
 }

@@ -4,10 +4,9 @@
 //! α = 1 − exp(−σ · side) with σ = max(0, density); its normal points to where opacity falls; its color is one of [`ColorFrom`].
 
 use super::{PointCloud, ScalarField};
-use crate::field::sh;
-use crate::field::voxel_grid::{Color, VoxelGrid};
+use crate::field::voxel_grid::VoxelGrid;
 use crate::render::fused::Seen;
-use autograd::{Real, Tensor, no_grad, parallel};
+use autograd::{Real, parallel};
 use glam::{DVec3, IVec3};
 
 /// Frame of the points.
@@ -134,29 +133,14 @@ fn normal(at: IVec3, alpha: impl Fn(IVec3) -> f64) -> [f32; 3] {
 
 /// Colors of some rows, 8-bit sRGB.
 fn colors<T: Real>(grid: &VoxelGrid<T>, rows: &[u32], from: ColorFrom<'_>) -> Vec<[u8; 3]> {
-    let table = grid.color.tensor().data();
-    let channels = grid.shape().color.channels();
-    let coefficients = |row: u32| &table[row as usize * channels..][..channels];
-    let eight_bits = |c: f64| (c.clamp(0.0, 1.0) * 255.0).round() as u8;
-    let color: Box<dyn Fn(u32) -> [f64; 3] + Sync> = match (grid.shape().color, from) {
-        (_, ColorFrom::Seen(seen)) => Box::new(|row| seen.color[row as usize].map(f64::from)),
-        (Color::Rgb, _) => Box::new(|row| [0, 1, 2].map(|c| coefficients(row)[c].as_f64())),
-        (Color::Sh { degree, offset }, from) => {
-            let basis: Vec<f64> = match from {
-                ColorFrom::Direction(direction) => {
-                    let direction = Tensor::<f64>::from_vec(direction.to_array().to_vec(), &[1, 3]);
-                    no_grad(|| sh::basis(&direction, degree)).data().to_vec()
-                }
-                _ => vec![sh::Y0],
-            };
-            Box::new(move |row| {
-                let channel = |c: &[T]| c.iter().zip(&basis).map(|(c, y)| c.as_f64() * y).sum::<f64>() + offset;
-                let per_channel = sh::count(degree);
-                [0, 1, 2].map(|c| channel(&coefficients(row)[c * per_channel..][..per_channel]))
-            })
-        }
+    let along = |direction: DVec3| grid.colors_of(rows, &vec![direction; rows.len()]);
+    let colors = match from {
+        ColorFrom::Seen(seen) => rows.iter().map(|&row| seen.color[row as usize].map(f64::from)).collect(),
+        ColorFrom::Direction(direction) => along(direction),
+        // A direction of zero stands for all of them.
+        ColorFrom::Mean => along(DVec3::ZERO),
     };
-    parallel::map_indices(rows.len(), |i| color(rows[i]).map(eight_bits))
+    colors.into_iter().map(|color: [f64; 3]| color.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8)).collect()
 }
 
 #[cfg(test)]

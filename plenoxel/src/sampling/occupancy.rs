@@ -69,6 +69,13 @@ impl Occupancy {
         &self.masks
     }
 
+    /// How many layers of bricks are empty at a brick: 0 if it is not, k if all within k − 1 of it along axes and diagonals are. At most 8 are
+    /// told apart.
+    #[inline]
+    pub fn free(&self, brick: usize) -> u8 {
+        self.distance[brick]
+    }
+
     /// May a cell hold matter?
     ///
     /// Panics if the cell lies outside of the box.

@@ -95,10 +95,11 @@ impl Planes {
         k
     }
 
-    /// Distance at which the ray leaves a brick.
+    /// Distance at which the ray leaves a brick and those within `layers` − 1 of it.
     #[inline(always)]
-    fn leaves_brick(&self, brick: usize) -> f64 {
-        self.at(((brick + self.forward) * BRICK).min(self.voxels))
+    fn leaves_bricks(&self, brick: usize, layers: usize) -> f64 {
+        let plane = if self.forward == 1 { brick + layers } else { (brick + 1).saturating_sub(layers) };
+        self.at((plane * BRICK).min(self.voxels))
     }
 }
 
@@ -108,10 +109,11 @@ impl Walk {
         Walk { aabb, voxels, bricks: voxels.map(|n| n.div_ceil(BRICK)) }
     }
 
-    /// Calls `visit` for the voxels on a ray, from its origin on, until it breaks. Voxels of bricks for which `brick_is_empty` (asked when
-    /// the ray comes to the brick, by its number in row-major order) are left out; those that the ray only touches are no voxels on it.
+    /// Calls `visit` for the voxels on a ray, from its origin on, until it breaks; those that the ray only touches are no voxels on it.
+    /// `free(brick)`, asked when the ray comes to a brick, by its number in row-major order, says how many layers of bricks are empty: 0 if the
+    /// brick is not, 1 if it is, k if all around it within k − 1 are too ([`super::Occupancy::free`]). Voxels of empty bricks are left out.
     #[inline]
-    pub fn along(&self, ray: &Ray, brick_is_empty: impl Fn(usize) -> bool, mut visit: impl FnMut(Crossing) -> ControlFlow<()>) {
+    pub fn along(&self, ray: &Ray, free: impl Fn(usize) -> u8, mut visit: impl FnMut(Crossing) -> ControlFlow<()>) {
         let axis = |a: usize| Planes::new(self.voxels[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]);
         let planes = [axis(0), axis(1), axis(2)];
         let (mut t, mut end) = (0.0_f64, f64::INFINITY);
@@ -126,13 +128,31 @@ impl Walk {
         let (mut place, mut exits) = ([0; 3], [0.0; 3]);
         for a in 0..3 {
             place[a] = planes[a].cell(t, 0, self.voxels[a]) / BRICK;
-            exits[a] = planes[a].leaves_brick(place[a]);
+            exits[a] = planes[a].leaves_bricks(place[a], 1);
         }
         loop {
             let axis = smallest(exits);
             let brick = place_number(place, self.bricks);
+            let layers = usize::from(free(brick));
+            if layers > 1 {
+                // To where the ray leaves the cube of empty bricks.
+                let beyond = [0, 1, 2].map(|a| planes[a].leaves_bricks(place[a], layers));
+                let axis = smallest(beyond);
+                t = t.max(beyond[axis]);
+                for a in 0..3 {
+                    place[a] = match a == axis {
+                        true => place[a].wrapping_add(planes[a].step.wrapping_mul(layers)),
+                        false => planes[a].cell(t, 0, self.voxels[a]) / BRICK,
+                    };
+                    if place[a] >= self.bricks[a] {
+                        return;
+                    }
+                    exits[a] = planes[a].leaves_bricks(place[a], 1);
+                }
+                continue;
+            }
             let leave = exits[axis];
-            if leave > t && !brick_is_empty(brick) && cross(&planes, place, brick, t, leave, &mut visit).is_break() {
+            if layers == 0 && leave > t && cross(&planes, place, brick, t, leave, &mut visit).is_break() {
                 return;
             }
             place[axis] = place[axis].wrapping_add(planes[axis].step);
@@ -140,7 +160,7 @@ impl Walk {
                 return;
             }
             t = t.max(leave);
-            exits[axis] = planes[axis].leaves_brick(place[axis]);
+            exits[axis] = planes[axis].leaves_bricks(place[axis], 1);
         }
     }
 }
@@ -193,13 +213,14 @@ fn smallest(x: [f64; 3]) -> usize {
 mod tests {
     use super::*;
     use crate::random::{Purpose, uniform};
+    use crate::sampling::Occupancy;
     use glam::{DVec3, dvec3};
 
     fn crossings(walk: &Walk, origin: DVec3, direction: DVec3) -> Vec<Crossing> {
         let mut found = Vec::new();
         walk.along(
             &Ray { origin, direction, stretch: 1.0 },
-            |_| false,
+            |_| 0,
             |crossing| {
                 found.push(crossing);
                 ControlFlow::Continue(())
@@ -261,17 +282,33 @@ mod tests {
         let mut odd = Vec::new();
         walk.along(
             &ray,
-            |brick| brick % 2 == 0,
+            |brick| u8::from(brick % 2 == 0),
             |c| {
                 odd.push(c);
                 ControlFlow::Continue(())
             },
         );
         assert!(!odd.is_empty() && odd.iter().copied().eq(all.iter().copied().filter(|c| c.brick % 2 == 1)));
+        // Jumping over several layers of empty bricks changes nothing.
+        let occupancy = Occupancy::new(Aabb::cube(1.0), [37; 3], &(0..37 * 37 * 37).map(|v| v % 2999 == 7).collect::<Vec<_>>());
+        let walk_large = Walk::new(Aabb::cube(1.0), [37; 3]);
+        for seed in 0..500 {
+            let (origin, direction) = random_ray(seed);
+            let ray = Ray { origin, direction, stretch: 1.0 };
+            let along = |free: &dyn Fn(usize) -> u8| {
+                let mut found = Vec::new();
+                walk_large.along(&ray, free, |c| {
+                    found.push(c);
+                    ControlFlow::Continue(())
+                });
+                found
+            };
+            assert_eq!(along(&|brick| occupancy.free(brick)), along(&|brick| occupancy.free(brick).min(1)), "ray {seed}");
+        }
         let mut first = None;
         walk.along(
             &ray,
-            |_| false,
+            |_| 0,
             |c| {
                 assert!(first.replace(c).is_none());
                 ControlFlow::Break(())

@@ -1,9 +1,11 @@
 use super::*;
 use crate::camera::Ray;
+use crate::field::voxel_grid::Color;
 use crate::field::voxel_grid::{GridShape, Interpolation};
 use crate::render::fused::{largest_weights, seen};
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
+use autograd::Tensor;
 
 const SHAPE: GridShape =
     GridShape { resolution: 8, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Sh { degree: 1, offset: 0.5 } };
