@@ -1,65 +1,15 @@
 //! The command line, called like any function: what a user types, what comes back, what lies in the folder afterwards.
 
+#[path = "support/command.rs"]
+mod command;
+
+use command::{Answer, Folder, plenoxel};
 use plenoxel::dataset::image;
 use plenoxel_cli::Streams;
 use serde_json::Value;
 use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-
-/// What a command line came to.
-struct Answer {
-    code: u8,
-    out: String,
-    err: String,
-}
-
-impl Answer {
-    /// The last line on stdout, which is JSON.
-    fn json(&self) -> Value {
-        assert_eq!(self.code, 0, "{}", self.err);
-        serde_json::from_str(self.out.lines().last().unwrap()).unwrap()
-    }
-
-    /// Checks the exit code and that stderr says all of `parts`.
-    #[track_caller]
-    fn refused(&self, code: u8, parts: &[&str]) {
-        assert_eq!(self.code, code, "{}", self.err);
-        assert!(parts.iter().all(|part| self.err.contains(part)), "{parts:?} in {}", self.err);
-        assert_eq!(self.err.matches("error: ").count(), 1, "one message: {}", self.err);
-    }
-}
-
-fn plenoxel(args: &[&str]) -> Answer {
-    let (mut out, mut err) = (Vec::new(), Vec::new());
-    let line = ["plenoxel"].iter().chain(args);
-    let code = plenoxel_cli::run(line, Streams { out: &mut out, err: &mut err, terminal: false });
-    Answer { code, out: String::from_utf8(out).unwrap(), err: String::from_utf8(err).unwrap() }
-}
-
-/// A folder of a test's own, removed when the test has passed.
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(name: &str) -> Self {
-        let path = std::env::temp_dir().join(format!("plenoxel-cli-{}-{name}", std::process::id()));
-        let _ = fs::remove_dir_all(&path);
-        fs::create_dir_all(&path).unwrap();
-        Folder(path)
-    }
-
-    fn path(&self, name: &str) -> String {
-        self.0.join(name).display().to_string()
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        if !std::thread::panicking() {
-            let _ = fs::remove_dir_all(&self.0);
-        }
-    }
-}
 
 /// Two short stages on a coarse grid.
 const SHORT: &str = "stages=[\
@@ -455,4 +405,52 @@ fn help_mentions_every_command_and_flag() {
         assert_eq!(help.code, 0);
         assert!(flags.split_whitespace().all(|flag| help.out.contains(flag)), "{command}: {}", help.out);
     }
+}
+
+#[test]
+fn what_is_carved_is_a_run_that_other_commands_take_and_training_starts_from() {
+    let folder = Folder::new("carve");
+    let (data, carved, trained) = (folder.path("scene"), folder.path("carved"), folder.path("trained"));
+    plenoxel(&["scene", &data, "--size", "40", "--train", "10", "--val", "0", "--test", "2"]).done();
+    let result = plenoxel(&["carve", &data, "--out", &carved, "--resolution", "24", "--sh-degree", "1", "--quiet"]).json();
+    assert_eq!((result["resolution"].as_u64(), result["rule"].as_str()), (Some(24), Some("footprint")));
+    let voxels = result["voxels"].as_u64().unwrap();
+    assert!((100..5000).contains(&voxels), "{voxels}");
+    for file in ["checkpoint.safetensors", "config.toml", "images/carved.png", "result.json", "run.json", "README.md"] {
+        assert!(Path::new(&format!("{carved}/{file}")).exists(), "{file}");
+    }
+    let psnr = plenoxel(&["evaluate", &carved, "--quiet"]).json()["psnr"].as_f64().unwrap();
+    assert!(psnr > 12.0, "{psnr}");
+    let told = plenoxel(&["info", &carved]).done();
+    assert!(told.contains("nearest") && told.contains("degree 1"), "{told}");
+    // The same settings again give the same bits.
+    let again = folder.path("again");
+    plenoxel(&["carve", &data, "--out", &again, "--config", &format!("{carved}/config.toml"), "--quiet"]).done();
+    let [a, b] = [&carved, &again].map(|run| fs::read(format!("{run}/checkpoint.safetensors")).unwrap());
+    assert!(a == b);
+    let stages = "stages=[{resolution=24, steps=2, sampling={step=0.5}, density_rate=0.1, color_rate=0.01}]";
+    let start = ["train", &data, "--out", &trained, "--init-from", &carved, "--set", stages, "--set", "rays_per_step=256", "--quiet"];
+    let warm = plenoxel(&start).json()["psnr"].as_f64().unwrap();
+    assert!(warm > psnr - 2.0, "{warm} against {psnr}");
+    assert!(fs::read_to_string(format!("{trained}/config.toml")).unwrap().contains("init_from = "));
+}
+
+#[test]
+fn carving_refuses_what_it_cannot_carve_and_writes_nothing() {
+    let folder = Folder::new("carve-refused");
+    let (data, out) = (folder.path("scene"), folder.path("out"));
+    plenoxel(&["scene", &data, "--size", "24", "--train", "3", "--val", "0", "--test", "1"]).done();
+    plenoxel(&["carve", &data, "--out", &out, "--resolution", "1"]).refused(2, &["--resolution", "from 2 to 1024"]);
+    plenoxel(&["carve", &data, "--out", &out, "--set", "carve.rezolution=8"]).refused(2, &["`rezolution`", "`resolution`"]);
+    plenoxel(&["carve", &data, "--out", &out, "--set", "carve.depth=-1"]).refused(2, &["carve.depth", "0.001 to 1000"]);
+    plenoxel(&["carve", &data, "--out", &out, "--half-width", "1e9", "--resolution", "8"]).refused(2, &["half_width", "a box around the object"]);
+    plenoxel(&["train", &data, "--out", &out, "--init-from", &folder.path("none")]).refused(3, &["there is no such run"]);
+    for view in 0..3 {
+        let path = PathBuf::from(format!("{data}/train/r_{view}.png"));
+        let mut picture = image::read(&path).unwrap();
+        picture.pixels_mut().for_each(|p| p.0[3] = 255);
+        image::write_rgba(&path, &picture).unwrap();
+    }
+    plenoxel(&["carve", &data, "--out", &out, "--resolution", "8"]).refused(2, &["no transparent pixel", "alpha channel"]);
+    assert!(!Path::new(&out).exists());
 }

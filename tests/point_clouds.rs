@@ -1,62 +1,12 @@
 //! Point clouds on the command line: a run as points, and the clouds of others cleaned.
 
+#[path = "support/command.rs"]
+mod command;
+
+use command::{Folder, plenoxel};
 use plenoxel::point_cloud::ply::PlyFile;
-use plenoxel_cli::Streams;
 use std::fs;
-use std::path::{Path, PathBuf};
-
-struct Answer {
-    code: u8,
-    out: String,
-    err: String,
-}
-
-impl Answer {
-    /// Checks that it went well, and returns what stdout says.
-    #[track_caller]
-    fn done(self) -> String {
-        assert_eq!(self.code, 0, "{}", self.err);
-        self.out
-    }
-
-    /// Checks the exit code and that stderr says all of `parts`.
-    #[track_caller]
-    fn refused(&self, code: u8, parts: &[&str]) {
-        assert_eq!(self.code, code, "{}", self.err);
-        assert!(parts.iter().all(|part| self.err.contains(part)), "{parts:?} in {}", self.err);
-    }
-}
-
-fn plenoxel(args: &[&str]) -> Answer {
-    let (mut out, mut err) = (Vec::new(), Vec::new());
-    let line = ["plenoxel"].iter().chain(args);
-    let code = plenoxel_cli::run(line, Streams { out: &mut out, err: &mut err, terminal: false });
-    Answer { code, out: String::from_utf8(out).unwrap(), err: String::from_utf8(err).unwrap() }
-}
-
-/// A folder of a test's own, removed when the test has passed.
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(name: &str) -> Self {
-        let path = std::env::temp_dir().join(format!("plenoxel-points-{}-{name}", std::process::id()));
-        let _ = fs::remove_dir_all(&path);
-        fs::create_dir_all(&path).unwrap();
-        Folder(path)
-    }
-
-    fn path(&self, name: &str) -> String {
-        self.0.join(name).display().to_string()
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        if !std::thread::panicking() {
-            let _ = fs::remove_dir_all(&self.0);
-        }
-    }
-}
+use std::path::Path;
 
 /// The built-in scene as files, and a short run on it.
 fn trained(folder: &Folder) -> (String, String) {

@@ -1,0 +1,68 @@
+//! A command line, called like any function, and a folder for it.
+#![allow(dead_code)]
+
+use plenoxel_cli::Streams;
+use serde_json::Value;
+use std::fs;
+use std::path::PathBuf;
+
+/// What a command line came to.
+pub struct Answer {
+    pub code: u8,
+    pub out: String,
+    pub err: String,
+}
+
+impl Answer {
+    /// The last line on stdout, which is JSON.
+    pub fn json(&self) -> Value {
+        assert_eq!(self.code, 0, "{}", self.err);
+        serde_json::from_str(self.out.lines().last().unwrap()).unwrap()
+    }
+
+    /// Checks that it went well, and returns what stdout says.
+    #[track_caller]
+    pub fn done(self) -> String {
+        assert_eq!(self.code, 0, "{}", self.err);
+        self.out
+    }
+
+    /// Checks the exit code and that stderr says all of `parts`.
+    #[track_caller]
+    pub fn refused(&self, code: u8, parts: &[&str]) {
+        assert_eq!(self.code, code, "{}", self.err);
+        assert!(parts.iter().all(|part| self.err.contains(part)), "{parts:?} in {}", self.err);
+        assert_eq!(self.err.matches("error: ").count(), 1, "one message: {}", self.err);
+    }
+}
+
+pub fn plenoxel(args: &[&str]) -> Answer {
+    let (mut out, mut err) = (Vec::new(), Vec::new());
+    let line = ["plenoxel"].iter().chain(args);
+    let code = plenoxel_cli::run(line, Streams { out: &mut out, err: &mut err, terminal: false });
+    Answer { code, out: String::from_utf8(out).unwrap(), err: String::from_utf8(err).unwrap() }
+}
+
+/// A folder of a test's own, removed when the test has passed.
+pub struct Folder(pub PathBuf);
+
+impl Folder {
+    pub fn new(name: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("plenoxel-cli-{}-{name}", std::process::id()));
+        let _ = fs::remove_dir_all(&path);
+        fs::create_dir_all(&path).unwrap();
+        Folder(path)
+    }
+
+    pub fn path(&self, name: &str) -> String {
+        self.0.join(name).display().to_string()
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        if !std::thread::panicking() {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+}
