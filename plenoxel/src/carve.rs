@@ -8,6 +8,7 @@
 
 pub mod color;
 pub mod light;
+pub mod photo_hull;
 mod smooth;
 pub mod visual_hull;
 
