@@ -1,6 +1,7 @@
 //! Carving: from photographs to an opaque colored grid, without gradients.
 //!
-//! 1. [`visual_hull`]: what the silhouettes of all views leave of the box;
+//! 1. [`mod@visual_hull`]: what the silhouettes of all views leave of the box;
+//!    [`mod@photo_hull`]: what the colors leave of that, or of the whole box;
 //! 2. [`light`]: which voxels a pixel shows, and how much of it each is;
 //! 3. [`color`]: the colors, or their harmonics, that explain the pixels best.
 //!

@@ -6,7 +6,9 @@
 //!
 //! 1. look: the exact walk of each object pixel's ray finds the first voxel left (item buffers, as in generalized voxel coloring: Culbertson,
 //!    Malzbender and Slabaugh 1999). Only the rays of voxels that went in the round before are walked again.
-//! 2. test: voxels that new pixels see are tested with all of their pixels in all views ([`Votes`]).
+//! 2. test: voxels that new pixels see are tested with all of their pixels in all views: those are inconsistent whose colors have a standard
+//!    deviation above [`PhotoConfig::noise`]. A view votes by the range of the colors of its pixels, as much as there are of them
+//!    (`votes.rs`).
 //! 3. carve: voxels go that are inconsistent, and so are at least half of the visible ones among their 26 neighbours: surfaces that are
 //!    really elsewhere are wrong in patches, while the surface itself is wrong in single voxels and lines, where a texture or a silhouette
 //!    crosses them. One wrong removal would show the voxel behind it at a place where it is inconsistent too, and so on.
@@ -15,10 +17,10 @@
 //! nothing: the pixels of a voxel that is left only become more, and what contradicts a voxel before others of its round are gone does so
 //! afterwards. With a test that more pixels can only make stricter, any order has the same fixed point, the photo hull: the union of all
 //! shapes in the box that are consistent, hence a superset of the true one if that is. Here the spread is a mean over pixels and patches
-//! have to agree, so the order of rounds is part of the definition; at its end no visible voxel is inconsistent together with its patch.
+//! have to agree, so the rounds are part of the definition; at their end no visible voxel is inconsistent together with its patch.
 //!
 //! Pixels without alpha show no voxel: these are carved first, as by [`by_footprint`], where visibility plays no part. Shiny surfaces have
-//! no one color; where they reflect more than `noise` they are carved. Plain walls of hollows give nothing to tell them from a lid by.
+//! no one color: where their shine varies by more than `noise` they are carved into. Plain walls of hollows give nothing to tell them from a lid by.
 
 mod visible;
 mod votes;
@@ -47,7 +49,8 @@ pub struct PhotoConfig {
 }
 
 impl Default for PhotoConfig {
-    /// The 15 % of the range of colors at which the built-in scene keeps its shiny ball; Kutulakos and Seitz use as much.
+    /// 15 % of the range of colors: the least at which the built-in scene, of 64³ voxels, loses none that matter fills. At 0.10 its shiny ball
+    /// has holes; at 0.18 nearly nothing goes.
     fn default() -> Self {
         PhotoConfig { noise: 0.15 }
     }
@@ -57,12 +60,7 @@ impl Default for PhotoConfig {
 /// `progress(round, carved, left)` is called after each round, from 1, with the number of voxels carved in it and left.
 ///
 /// Errors: a configuration error for a noise that is not above 0.
-pub fn photo_hull(
-    views: &[View],
-    start: &Occupancy,
-    config: &PhotoConfig,
-    progress: &dyn Fn(usize, usize, usize),
-) -> Result<Occupancy> {
+pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progress: &dyn Fn(usize, usize, usize)) -> Result<Occupancy> {
     if config.noise.is_nan() || config.noise <= 0.0 {
         return Err(Error::config("noise", config.noise, "a number above 0"));
     }
@@ -88,7 +86,8 @@ pub fn photo_hull(
             surface.visible[brick] |= fresh[brick];
             surface.inconsistent[brick] = surface.inconsistent[brick] & !fresh[brick] | inconsistent;
         }
-        let carved = parallel::map_indices(masks.len(), |brick| members(surface.inconsistent[brick], |bit| surface.patch_agrees(brick, bit)));
+        let carved =
+            parallel::map_indices(masks.len(), |brick| members(surface.inconsistent[brick], |bit| surface.patch_agrees(brick, bit)));
         surface.remove(&carved);
         masks.iter_mut().zip(&carved).for_each(|(mask, carved)| *mask &= !carved);
         let ones = |masks: &[u64]| masks.iter().map(|mask| mask.count_ones() as usize).sum();

@@ -6,8 +6,8 @@ use glam::{DVec3, dvec3};
 
 /// Half the side of the cube that all tests look at, in a box of half width 1.
 const HALF: f64 = 0.75;
-/// Half the side and the depth of the pit in its top.
-const PIT: [f64; 2] = [0.375, 0.75];
+/// Half the side and the depth of the pit in its top. Its walls, like the cube's, lie between voxels of a box of 24³: none is half full.
+const PIT: [f64; 2] = [1.0 / 3.0, 0.75];
 
 /// The point of the cube that a ray meets first; with or without a pit.
 fn meets(ray: &Ray, pit: bool) -> Option<DVec3> {

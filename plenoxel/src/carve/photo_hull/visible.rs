@@ -3,7 +3,7 @@
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
-use autograd::lattice::BRICK_ROWS;
+use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::parallel;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -31,7 +31,7 @@ impl<'a> FirstVoxels<'a> {
     ///
     /// Panics if there are more voxels than numbers: some 1600³.
     pub fn new(views: &'a [View], aabb: Aabb, voxels: [usize; 3]) -> Self {
-        let bricks: usize = voxels.map(|n| n.div_ceil(autograd::lattice::BRICK)).iter().product();
+        let bricks: usize = voxels.map(|n| n.div_ceil(BRICK)).iter().product();
         assert!(bricks * BRICK_ROWS < UNKNOWN as usize, "photo hull: {voxels:?} voxels are more than 32 bits can number");
         let of_alpha = |&alpha: &u8| if alpha == 0 { NOTHING } else { UNKNOWN };
         let numbers = views.iter().map(|view| view.image.as_raw().iter().skip(3).step_by(4).map(of_alpha).collect()).collect();
