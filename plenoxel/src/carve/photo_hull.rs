@@ -20,7 +20,8 @@
 //! have to agree, so the rounds are part of the definition; at their end no visible voxel is inconsistent together with its patch.
 //!
 //! Pixels without alpha show no voxel: these are carved first, as by [`by_footprint`], where visibility plays no part. Shiny surfaces have
-//! no one color: where their shine varies by more than `noise` they are carved into. Plain walls of hollows give nothing to tell them from a lid by.
+//! no one color: where their shine varies by more than `noise` they are carved into. Plain walls of hollows give nothing to tell them from a
+//! lid by.
 
 mod visible;
 mod votes;
@@ -49,8 +50,8 @@ pub struct PhotoConfig {
 }
 
 impl Default for PhotoConfig {
-    /// 15 % of the range of colors: the least at which the built-in scene, of 64³ voxels, loses none that matter fills. At 0.10 its shiny ball
-    /// has holes; at 0.18 nearly nothing goes.
+    /// 15 % of the range of colors. On the built-in scene (100 views of 200 x 200, 128³ voxels) half of what fills the bowl goes and 0.12 % of
+    /// the voxels that are at least half full, nearly all of its shiny ball; at 0.12 it is two thirds, and 1 %.
     fn default() -> Self {
         PhotoConfig { noise: 0.15 }
     }
