@@ -443,7 +443,8 @@ fn carving_refuses_what_it_cannot_carve_and_writes_nothing() {
     plenoxel(&["carve", &data, "--out", &out, "--resolution", "1"]).refused(2, &["--resolution", "from 2 to 1024"]);
     plenoxel(&["carve", &data, "--out", &out, "--set", "carve.rezolution=8"]).refused(2, &["`rezolution`", "`resolution`"]);
     plenoxel(&["carve", &data, "--out", &out, "--set", "carve.depth=-1"]).refused(2, &["carve.depth", "0.001 to 1000"]);
-    plenoxel(&["carve", &data, "--out", &out, "--half-width", "1e9", "--resolution", "8"]).refused(2, &["half_width", "a box around the object"]);
+    plenoxel(&["carve", &data, "--out", &out, "--half-width", "1e9", "--resolution", "8"])
+        .refused(2, &["half_width", "a box around the object"]);
     plenoxel(&["train", &data, "--out", &out, "--init-from", &folder.path("none")]).refused(3, &["there is no such run"]);
     for view in 0..3 {
         let path = PathBuf::from(format!("{data}/train/r_{view}.png"));

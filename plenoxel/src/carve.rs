@@ -1,13 +1,16 @@
 //! Carving: from photographs to an opaque colored grid, without gradients.
 //!
-//! 1. [`visual_hull`]: what the silhouettes of all views leave of the box;
-//! 2. [`light`]: which voxels a pixel shows, and how much of it each is;
-//! 3. [`color`]: the colors, or their harmonics, that explain the pixels best.
+//! 1. [`mod@visual_hull`]: what the silhouettes of all views leave of the box;
+//!    [`mod@photo_hull`]: what the colors leave of that, or of the whole box;
+//! 2. [`photo_hull`], if asked for: what the colors of all views leave of that;
+//! 3. [`light`]: which voxels a pixel shows, and how much of it each is;
+//! 4. [`color`]: the colors, or their harmonics, that explain the pixels best.
 //!
 //! [`Carving`] does one after the other. What comes out is a grid like any other: it renders, and training can start from it.
 
 pub mod color;
 pub mod light;
+pub mod photo_hull;
 pub mod visual_hull;
 
 use crate::dataset::View;
@@ -19,6 +22,7 @@ use crate::train::config::Config;
 use autograd::{Buffer, Lattice, Tensor};
 use color::{Fitted, Seen};
 use light::Opaque;
+use photo_hull::PhotoConfig;
 use serde::{Deserialize, Serialize};
 
 /// How to carve.
@@ -33,6 +37,9 @@ pub struct CarveConfig {
     pub margin: f64,
     /// Optical depth of a voxel along its side, σ · side: how opaque what is left is.
     pub depth: f64,
+    /// Carve on, away from what the photographs contradict.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub photo: Option<PhotoConfig>,
     /// How colors are found.
     pub fit: Fit,
     /// Pull on the harmonics above the mean, as a share of what a voxel weighs in the pixels.
@@ -70,6 +77,7 @@ impl Default for CarveConfig {
             margin: 0.5,
             // The source paper's 40 per unit length at 128 voxels to 2.8. On held-out training views of lego, 0.5 and 1.5 are 0.4 and 0.2 dB worse.
             depth: 0.875,
+            photo: None,
             fit: Fit::Exact,
             // On the same views, of degree 2: 0.01 and 0.03 are 0.1 and 0.4 dB worse, three sweeps as good as one, ten worse.
             ridge: 0.003,
@@ -105,28 +113,34 @@ fn alphas(views: &[View]) -> impl Iterator<Item = u8> {
 }
 
 impl<'a> Carving<'a> {
-    /// Carves the box of a configuration.
+    /// Carves the box of a configuration: to the visual hull where images have alpha, and on to the photo hull if the config asks for it.
+    /// `progress(round, carved, left)` is called after each round of the latter.
     ///
-    /// Errors: no view has a transparent pixel, or one that is not; nothing is left of the box, or nothing goes.
-    pub fn new(views: &'a [View], config: &'a Config) -> Result<Self> {
-        if !has_alpha(views) {
+    /// Errors: no view has a transparent pixel (and only silhouettes are asked for), or one that is not; nothing is left of the box, or
+    /// nothing goes.
+    pub fn new(views: &'a [View], config: &'a Config, progress: &dyn Fn(usize, usize, usize)) -> Result<Self> {
+        if !has_alpha(views) && config.carve.photo.is_none() {
             let found = "the images, which have no transparent pixel,";
-            return Err(Error::config("DATA", found, "images with an alpha channel that is 0 on the background"));
+            let accepted = "images with an alpha channel that is 0 on the background; or --photo-consistency, which needs none";
+            return Err(Error::config("DATA", found, accepted));
         }
         if alphas(views).all(|alpha| alpha == 0) {
             return Err(Error::config("DATA", "the images, which are transparent all over,", "images that show an object"));
         }
-        let CarveConfig { resolution, rule, margin, .. } = config.carve;
+        let CarveConfig { resolution, rule, margin, photo, .. } = config.carve;
         let (aabb, voxels) = (Aabb::cube(config.half_width), [resolution; 3]);
-        let hull = match rule {
+        let mut hull = match rule {
             Rule::Footprint => visual_hull::by_footprint(views, aabb, voxels, margin),
             Rule::Rays => visual_hull::by_rays(views, aabb, voxels),
         };
+        if let Some(photo) = &photo {
+            hull = photo_hull::photo_hull(views, &hull, photo, progress)?;
+        }
         let half_width =
             |found: &str| Err(Error::config("half_width", format!("{}, {found},", config.half_width), "a box around the object"));
         match hull.fraction() {
-            0.0 => half_width("of which the silhouettes leave nothing"),
-            1.0 => half_width("of which no image shows a voxel on background"),
+            0.0 => half_width("of which the images leave nothing"),
+            1.0 => half_width("of which no image shows a voxel that is not there"),
             _ => Ok(Carving { views, config, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }
     }

@@ -10,6 +10,7 @@ use crate::memory::{self, Estimate};
 use crate::progress::Console;
 use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
+use plenoxel::carve::photo_hull::PhotoConfig;
 use plenoxel::carve::{self, Carving, Colored, Fit, Rule};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split};
@@ -24,6 +25,7 @@ Examples:
   plenoxel carve data/lego                                 the visual hull with mean colors, 256 voxels a side
   plenoxel carve data/lego --sh-degree 2 --resolution 128  with harmonics of the direction of view
   plenoxel carve data/lego --carve rays --downscale 4      the source paper's rule, at 200 x 200
+  plenoxel carve data/lego --photo-consistency             hollows too, where colors contradict
   plenoxel train data/lego --init-from runs/lego-1         training goes on from what was carved
 
 The result is a run like a trained one: evaluate, render, export and info take it. Settings are layered as for train; --set
@@ -82,6 +84,11 @@ pub struct CarveArgs {
     #[arg(long, value_name = "RULE", help_heading = "Carving", value_parser = ["footprint", "rays"])]
     carve: Option<String>,
 
+    /// Carve on, away voxels of which the photographs show colors that differ by more than this standard deviation, of sRGB values in [0, 1]
+    /// [default without a number: 0.15]. Needs no alpha
+    #[arg(long, value_name = "NOISE", help_heading = "Carving", value_parser = super::number(0.0), num_args = 0..=1)]
+    photo_consistency: Option<Option<f64>>,
+
     /// How colors are found: exact, by least squares, or sgd, the source paper's descent [default: exact]
     #[arg(long, help_heading = "Carving", value_parser = ["exact", "sgd"])]
     fit: Option<String>,
@@ -96,6 +103,7 @@ impl CarveArgs {
     fn flags(&self, layers: &mut Layers) -> Result<()> {
         let integer = |value: Option<i64>| value.map(Value::Integer);
         let text = |value: &Option<String>| value.clone().map(Value::String);
+        let noise = self.photo_consistency.map(|noise| noise.unwrap_or(PhotoConfig::default().noise));
         for (flag, path, value) in [
             ("--downscale", "downscale", integer(self.downscale)),
             ("--background", "background", self.background.map(|c| Value::Array(c.map(Value::Float).to_vec()))),
@@ -104,6 +112,7 @@ impl CarveArgs {
             ("--sh-degree", "sh_degree", integer(self.sh_degree)),
             ("--resolution", "carve.resolution", integer(self.resolution)),
             ("--carve", "carve.rule", text(&self.carve)),
+            ("--photo-consistency", "carve.photo.noise", noise.map(Value::Float)),
             ("--fit", "carve.fit", text(&self.fit)),
         ] {
             if let Some(value) = value {
@@ -128,7 +137,8 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let views = load_clock.time(|| load(console, &dataset, Split::Train, &source))?;
 
     let mut hull_clock = Stopwatch::default();
-    let carving = hull_clock.time(|| Carving::new(&views, &config))?;
+    let round = |round, carved, left| console.note(&format!("photo hull, round {round}: {carved} voxels carved, {left} left"));
+    let carving = hull_clock.time(|| Carving::new(&views, &config, &round))?;
     let (n, left) = (config.carve.resolution, carving.voxels());
     let share = 100.0 * left as f64 / (n as f64).powi(3);
     console.note(&format!("carved {n}³ voxels in {:.2} s: {left} are left, {share:.1} %", hull_clock.seconds()));

@@ -43,7 +43,8 @@ const TABLES: &[(&str, &[&str])] = &[
     ("stages[]", &["resolution", "epochs", "steps", "sampling", "density_rate", "color_rate", "rate_decay"]),
     ("stages[].sampling", &["step", "samples", "far"]),
     ("evaluation", &["step", "samples", "far"]),
-    ("carve", &["resolution", "rule", "margin", "depth", "fit", "ridge", "sweeps"]),
+    ("carve", &["resolution", "rule", "margin", "depth", "photo", "fit", "ridge", "sweeps"]),
+    ("carve.photo", &["noise"]),
 ];
 
 /// Checks every key of a table and of the tables in it. `place(path)` says where a path was written.

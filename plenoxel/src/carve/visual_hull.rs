@@ -200,7 +200,7 @@ impl Silhouette {
 }
 
 /// x·depth, y·depth and depth of a point as a camera sees it, x and y in pixels: linear in the point.
-fn homogeneous(camera: &Camera, point: DVec3) -> DVec3 {
+pub(super) fn homogeneous(camera: &Camera, point: DVec3) -> DVec3 {
     let k = &camera.intrinsics;
     let local = camera.camera_to_world.inverse().transform_point3(point);
     let depth = -local.z;

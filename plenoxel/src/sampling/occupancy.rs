@@ -59,6 +59,11 @@ impl Occupancy {
         Occupancy { aabb, cells, count, masks: masks.into(), distance }
     }
 
+    /// The box.
+    pub fn aabb(&self) -> Aabb {
+        self.aabb
+    }
+
     /// Cells along each axis.
     pub fn cells(&self) -> [usize; 3] {
         self.cells
@@ -158,7 +163,7 @@ impl Occupancy {
 
 /// Number of a cell's brick, and of the cell in it.
 #[inline(always)]
-fn split(cell: [usize; 3], count: [usize; 3]) -> (usize, usize) {
+pub(crate) fn split(cell: [usize; 3], count: [usize; 3]) -> (usize, usize) {
     let brick = place_number(cell.map(|c| c / BRICK), count);
     (brick, (cell[0] % BRICK) * 16 + (cell[1] % BRICK) * 4 + cell[2] % BRICK)
 }

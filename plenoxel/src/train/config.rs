@@ -361,7 +361,9 @@ impl Config {
             )?;
         }
         sampling("evaluation", self.evaluation)?;
-        let CarveConfig { resolution, margin, depth, ridge, sweeps, .. } = self.carve;
+        let CarveConfig { resolution, margin, depth, photo, ridge, sweeps, .. } = self.carve;
+        let noise = photo.map_or(1.0, |photo| photo.noise);
+        check((1e-6..=1.0).contains(&noise), "carve.photo.noise", noise, "1e-6 to 1")?;
         check((2..=1024).contains(&resolution), "carve.resolution", resolution, "2 to 1024 voxels a side")?;
         check((0.0..=1e3).contains(&margin), "carve.margin", margin, "0 to 1000 pixels")?;
         check((1e-3..=1e3).contains(&depth), "carve.depth", depth, "0.001 to 1000")?;

@@ -1,0 +1,79 @@
+//! Which voxel each pixel sees: item buffers (Weghorst, Hooper and Greenberg 1984).
+
+use crate::dataset::View;
+use crate::geometry::Aabb;
+use crate::sampling::walk::Walk;
+use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::parallel;
+use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+/// The ray meets no voxel, or its pixel is background.
+const NOTHING: u32 = u32::MAX;
+/// The ray has not been walked yet.
+const UNKNOWN: u32 = u32::MAX - 1;
+
+/// The number of a voxel in an item buffer.
+pub fn number(brick: usize, bit: usize) -> u32 {
+    (brick * BRICK_ROWS + bit) as u32
+}
+
+/// The first voxel on the ray of the center of each pixel, four bytes each.
+pub struct FirstVoxels<'a> {
+    views: &'a [View],
+    walk: Walk,
+    /// `[views][height · width]`
+    numbers: Vec<Vec<u32>>,
+}
+
+impl<'a> FirstVoxels<'a> {
+    /// Nothing is known of any ray yet.
+    ///
+    /// Panics if there are more voxels than numbers: some 1600³.
+    pub fn new(views: &'a [View], aabb: Aabb, voxels: [usize; 3]) -> Self {
+        let bricks: usize = voxels.map(|n| n.div_ceil(BRICK)).iter().product();
+        assert!(bricks * BRICK_ROWS < UNKNOWN as usize, "photo hull: {voxels:?} voxels are more than 32 bits can number");
+        let of_alpha = |&alpha: &u8| if alpha == 0 { NOTHING } else { UNKNOWN };
+        let numbers = views.iter().map(|view| view.image.as_raw().iter().skip(3).step_by(4).map(of_alpha).collect()).collect();
+        FirstVoxels { views, walk: Walk::new(aabb, voxels), numbers }
+    }
+
+    /// Walks the rays whose voxel is not among those of the masks any more. The voxels that pixels see which did not see them before, as
+    /// masks.
+    pub fn update(&mut self, masks: &[u64]) -> Vec<u64> {
+        let fresh: Vec<AtomicU64> = masks.iter().map(|_| AtomicU64::new(0)).collect();
+        let rows = self.numbers.iter_mut().zip(self.views).flat_map(|(numbers, view)| {
+            let rows = numbers.chunks_mut(view.image.width() as usize).enumerate();
+            rows.map(move |(y, row)| (view, y, row))
+        });
+        let is_left = |number: u32| masks[number as usize / BRICK_ROWS] >> (number as usize % BRICK_ROWS) & 1 == 1;
+        let walk = &self.walk;
+        parallel::for_each_item(rows.collect(), |_, (view, y, row)| {
+            for (x, first) in row.iter_mut().enumerate() {
+                if *first == NOTHING || *first != UNKNOWN && is_left(*first) {
+                    continue;
+                }
+                *first = NOTHING;
+                let ray = view.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
+                walk.along(
+                    &ray,
+                    |brick| u8::from(masks[brick] == 0),
+                    |crossing| {
+                        if masks[crossing.brick] >> crossing.bit & 1 == 0 {
+                            return ControlFlow::Continue(());
+                        }
+                        *first = number(crossing.brick, crossing.bit);
+                        fresh[crossing.brick].fetch_or(1 << crossing.bit, Relaxed);
+                        ControlFlow::Break(())
+                    },
+                );
+            }
+        });
+        fresh.into_iter().map(AtomicU64::into_inner).collect()
+    }
+
+    /// Numbers of the first voxels of a view's pixels, row after row; a number that no voxel has where there is none.
+    pub fn of_view(&self, view: usize) -> &[u32] {
+        &self.numbers[view]
+    }
+}

@@ -1,0 +1,122 @@
+//! What the views have to say about a voxel, and how far they disagree.
+
+use crate::carve::visual_hull::homogeneous;
+use crate::dataset::View;
+use crate::dataset::image::RgbaImage;
+use crate::geometry::Aabb;
+use glam::DVec3;
+
+/// Projections onto the ranges by which the common color is found.
+const ITERATIONS: usize = 12;
+
+/// How voxels project into a view.
+pub struct Projection {
+    /// Width and height in pixels.
+    size: [usize; 2],
+    /// x·depth, y·depth and depth of the corner of voxel (0, 0, 0), and what a voxel adds to them along each axis.
+    origin: DVec3,
+    steps: [DVec3; 3],
+}
+
+/// The colors of a voxel in a view.
+#[derive(Clone, Copy, Debug)]
+pub struct Vote {
+    /// Least and largest value of each channel among the pixels that see the voxel, in [0, 1].
+    range: [[f32; 2]; 3],
+    /// How many they are.
+    pixels: u32,
+}
+
+/// The colors of a voxel in the views that see it.
+#[derive(Default)]
+pub struct Votes(Vec<Vote>);
+
+impl Projection {
+    /// Of the voxels of a box into a view.
+    pub fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
+        let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
+        let origin = homogeneous(&view.camera, aabb.min);
+        let steps = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| homogeneous(&view.camera, aabb.min + axis * side) - origin);
+        Projection { size: [view.image.width() as usize, view.image.height() as usize], origin, steps }
+    }
+
+    /// What the pixels say of which a voxel, given by place and by number, is the first; `None` if there are none.
+    pub fn vote(&self, image: &RgbaImage, first: &[u32], voxel: [usize; 3], number: u32) -> Option<Vote> {
+        let [columns, rows] = self.pixels(voxel)?;
+        let mut vote = Vote { range: [[1.0, 0.0]; 3], pixels: 0 };
+        for y in rows.0..rows.1 {
+            let start = y * self.size[0];
+            let seen = &first[start + columns.0..start + columns.1];
+            for (x, _) in seen.iter().enumerate().filter(|(_, first)| **first == number) {
+                let pixel = &image.as_raw()[4 * (start + columns.0 + x)..][..3];
+                for (range, &value) in vote.range.iter_mut().zip(pixel) {
+                    let value = f32::from(value) / 255.0;
+                    *range = [range[0].min(value), range[1].max(value)];
+                }
+                vote.pixels += 1;
+            }
+        }
+        (vote.pixels > 0).then_some(vote)
+    }
+
+    /// The columns and rows of pixels around a voxel's projection, each from the first to one behind the last; `None` if they are beside the
+    /// image, or part of the voxel is not before the camera.
+    fn pixels(&self, voxel: [usize; 3]) -> Option<[(usize, usize); 2]> {
+        let base = (0..3).fold(self.origin, |p, a| p + voxel[a] as f64 * self.steps[a]);
+        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+        for corner in 0..8 {
+            let p = (0..3).filter(|a| corner >> a & 1 == 1).fold(base, |p, a| p + self.steps[a]);
+            if p.z <= 0.0 {
+                return None;
+            }
+            for (a, at) in [p.x / p.z, p.y / p.z].into_iter().enumerate() {
+                (low[a], high[a]) = (low[a].min(at), high[a].max(at));
+            }
+        }
+        let along = |a: usize| {
+            let end = self.size[a] as f64;
+            (low[a].floor().clamp(0.0, end) as usize, (high[a].floor() + 1.0).clamp(0.0, end) as usize)
+        };
+        let [columns, rows] = [along(0), along(1)];
+        (columns.0 < columns.1 && rows.0 < rows.1).then_some([columns, rows])
+    }
+}
+
+impl Votes {
+    /// Forgets all of them.
+    pub fn clear(&mut self) {
+        self.0.clear();
+    }
+
+    /// Adds a view's, if there is one.
+    pub fn extend(&mut self, vote: Option<Vote>) {
+        self.0.extend(vote);
+    }
+
+    /// The standard deviation of the colors around the one that explains them best, in [0, 1]; 0 for less than two views. With K views, nₖ
+    /// pixels and the box Rₖ of colors of each,
+    ///
+    /// ```text
+    /// s² = K / (K − 1) · min_c Σₖ nₖ |c − nearest point of Rₖ to c|² / (3 Σₖ nₖ):
+    /// ```
+    ///
+    /// a view that sees several colors on a voxel says that any of those between is right, so a texture that is finer than voxels contradicts
+    /// nothing; and one that sees little of it, past others, says little. c ← mean of the nearest points lowers the sum in every iteration.
+    pub fn spread(&self) -> f64 {
+        let (votes, views) = (&self.0, self.0.len());
+        if views < 2 {
+            return 0.0;
+        }
+        let total: f32 = votes.iter().map(|vote| vote.pixels as f32).sum();
+        let mean = |of: &dyn Fn(&Vote) -> f32| votes.iter().map(|vote| vote.pixels as f32 * of(vote)).sum::<f32>() / total;
+        let square: f32 = (0..3)
+            .map(|channel| {
+                let nearest = |vote: &Vote, c: f32| c.clamp(vote.range[channel][0], vote.range[channel][1]);
+                let middle = mean(&|vote| 0.5 * (vote.range[channel][0] + vote.range[channel][1]));
+                let c = (0..ITERATIONS).fold(middle, |c, _| mean(&|vote| nearest(vote, c)));
+                mean(&|vote| (c - nearest(vote, c)).powi(2))
+            })
+            .sum();
+        f64::from(square / 3.0 * views as f32 / (views - 1) as f32).sqrt()
+    }
+}
