@@ -12,6 +12,7 @@
 //! | [`render`] | from samples to pixels; [`render::composite`](mod@render::composite) is the specification |
 //! | [`loss`] | losses and their weighted sum |
 //! | [`train`] | batch → render → loss → gradients → optimizer, coarse to fine |
+//! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |
 //! | [`checkpoint`] | a trained grid on disk |
 //! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
 //! | [`metrics`] | PSNR and SSIM |
