@@ -16,6 +16,8 @@ pub struct Projection {
     /// x·depth, y·depth and depth of the corner of voxel (0, 0, 0), and what a voxel adds to them along each axis.
     origin: DVec3,
     steps: [DVec3; 3],
+    /// Side of a voxel in pixels, times depth.
+    scale: f64,
 }
 
 /// The colors of a voxel in a view.
@@ -37,32 +39,43 @@ impl Projection {
         let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
         let origin = homogeneous(&view.camera, aabb.min);
         let steps = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| homogeneous(&view.camera, aabb.min + axis * side) - origin);
-        Projection { size: [view.image.width() as usize, view.image.height() as usize], origin, steps }
+        Projection {
+            size: [view.image.width() as usize, view.image.height() as usize],
+            origin,
+            steps,
+            scale: view.camera.intrinsics.fx * side.max_element(),
+        }
     }
 
     /// What the pixels say of which a voxel, given by place and by number, is the first; `None` if there are none.
+    ///
+    /// A pixel that is wider than a voxel shows its surroundings too. So where a voxel is w < 1 pixels wide, the range reaches 1 − w of the
+    /// way to the pixels around, but not beyond the middle between them. Without this, the smeared edge of a texture is as wide as a patch
+    /// of such voxels and contradicts all of it.
     pub fn vote(&self, image: &RgbaImage, first: &[u32], voxel: [usize; 3], number: u32) -> Option<Vote> {
         let [columns, rows] = self.pixels(voxel)?;
+        let base = self.corner(voxel);
+        let reach = (1.0 - self.scale / base.z).clamp(0.0, 0.5) as f32;
         let mut vote = Vote { range: [[1.0, 0.0]; 3], pixels: 0 };
         for y in rows.0..rows.1 {
             let start = y * self.size[0];
             let seen = &first[start + columns.0..start + columns.1];
             for (x, _) in seen.iter().enumerate().filter(|(_, first)| **first == number) {
-                let pixel = &image.as_raw()[4 * (start + columns.0 + x)..][..3];
-                for (range, &value) in vote.range.iter_mut().zip(pixel) {
-                    let value = f32::from(value) / 255.0;
-                    *range = [range[0].min(value), range[1].max(value)];
-                }
-                vote.pixels += 1;
+                vote.add(image, columns.0 + x, y, reach);
             }
         }
         (vote.pixels > 0).then_some(vote)
     }
 
+    /// Its first corner, as `origin` is that of voxel (0, 0, 0).
+    fn corner(&self, voxel: [usize; 3]) -> DVec3 {
+        (0..3).fold(self.origin, |p, a| p + voxel[a] as f64 * self.steps[a])
+    }
+
     /// The columns and rows of pixels around a voxel's projection, each from the first to one behind the last; `None` if they are beside the
     /// image, or part of the voxel is not before the camera.
     fn pixels(&self, voxel: [usize; 3]) -> Option<[(usize, usize); 2]> {
-        let base = (0..3).fold(self.origin, |p, a| p + voxel[a] as f64 * self.steps[a]);
+        let base = self.corner(voxel);
         let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
         for corner in 0..8 {
             let p = (0..3).filter(|a| corner >> a & 1 == 1).fold(base, |p, a| p + self.steps[a]);
@@ -79,6 +92,28 @@ impl Projection {
         };
         let [columns, rows] = [along(0), along(1)];
         (columns.0 < columns.1 && rows.0 < rows.1).then_some([columns, rows])
+    }
+}
+
+impl Vote {
+    /// Adds a pixel's color, and those `reach` of the way to the object pixels around it.
+    fn add(&mut self, image: &RgbaImage, x: usize, y: usize, reach: f32) {
+        let color = |x: usize, y: usize| {
+            let [r, g, b, alpha] = image.get_pixel(x as u32, y as u32).0;
+            (alpha > 0).then(|| [r, g, b].map(|value| f32::from(value) / 255.0))
+        };
+        let Some(middle) = color(x, y) else { return };
+        self.pixels += 1;
+        let around = if reach > 0.0 { 1 } else { 0 };
+        for j in y.saturating_sub(around)..(y + around + 1).min(image.height() as usize) {
+            for i in x.saturating_sub(around)..(x + around + 1).min(image.width() as usize) {
+                let Some(other) = color(i, j) else { continue };
+                for (c, range) in self.range.iter_mut().enumerate() {
+                    let value = middle[c] + reach * (other[c] - middle[c]);
+                    *range = [range[0].min(value), range[1].max(value)];
+                }
+            }
+        }
     }
 }
 
