@@ -11,12 +11,14 @@ use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::{Buffer, Lattice, Tensor, no_grad, parallel};
 use std::ops::ControlFlow;
 
-/// A ray ends where less than this reaches further: a quarter of a level of an 8-bit image.
-const REST: f32 = 1e-3;
+/// A ray ends where less than this reaches further: half a level of an 8-bit image.
+const REST: f32 = 1.0 / 512.0;
 /// Rays that a thread takes at a time.
 const CHUNK: usize = 1024;
 /// Parts of the tables that are added to side by side.
 const PARTS: usize = 64;
+/// Views that are searched for object pixels at a time.
+const VIEWS: usize = 8;
 /// Pixels whose light is in memory at a time.
 const BATCH: usize = 1 << 16;
 
@@ -272,12 +274,13 @@ fn basis(rays: &[Vec<Ray>], n: usize, degree: usize) -> Tensor<f32> {
 
 /// The pixels that show the object, whatever its color: view after view, row after row, a batch at a time.
 pub fn object_pixels(views: &[View]) -> impl Iterator<Item = Vec<Pixel>> + '_ {
-    let mut pixels = views.iter().enumerate().flat_map(|(v, view)| {
-        let alphas = view.image.as_raw().iter().skip(3).step_by(4);
-        alphas.enumerate().filter(|(_, alpha)| **alpha > 0).map(move |(i, _)| Pixel { view: v as u32, index: i as u32 })
-    });
-    std::iter::from_fn(move || {
-        let batch: Vec<Pixel> = pixels.by_ref().take(BATCH).collect();
-        (!batch.is_empty()).then_some(batch)
+    views.chunks(VIEWS).enumerate().flat_map(|(group, views)| {
+        let lists = parallel::map_indices(views.len(), |v| {
+            let alphas = views[v].image.as_raw().as_chunks::<4>().0;
+            let view = (group * VIEWS + v) as u32;
+            let shows = |(i, pixel): (usize, &[u8; 4])| (pixel[3] > 0).then_some(Pixel { view, index: i as u32 });
+            alphas.iter().enumerate().filter_map(shows).collect::<Vec<_>>()
+        });
+        lists.concat().chunks(BATCH).map(<[Pixel]>::to_vec).collect::<Vec<_>>()
     })
 }

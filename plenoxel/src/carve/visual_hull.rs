@@ -60,7 +60,9 @@ pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3]) -> Occupancy {
             for x in (0..view.image.width() as usize).filter(|&x| is_background(view, x, y)) {
                 let ray = view.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
                 walk.along(&ray, free, |crossing| {
-                    masks[crossing.brick].fetch_and(!(1 << crossing.bit), Relaxed);
+                    if masks[crossing.brick].load(Relaxed) >> crossing.bit & 1 == 1 {
+                        masks[crossing.brick].fetch_and(!(1 << crossing.bit), Relaxed);
+                    }
                     ControlFlow::Continue(())
                 });
             }

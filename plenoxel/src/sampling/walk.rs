@@ -157,7 +157,8 @@ impl Walk {
             let layers = usize::from(free(brick));
             if layers > 1 {
                 // To where the ray leaves the cube of empty bricks.
-                let beyond = Front { place: front.place, exits: [0, 1, 2].map(|a| planes[a].leaves_bricks(front.place[a], layers)) };
+                let leaves = |a: usize| planes[a].leaves_bricks(front.place[a], layers);
+                let beyond = Front { place: front.place, exits: [leaves(0), leaves(1), leaves(2)] };
                 t = larger(t, beyond.leave());
                 for (a, axis) in planes.iter().enumerate() {
                     front.place[a] = match beyond.exits[a] <= t {
