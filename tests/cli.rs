@@ -444,7 +444,9 @@ fn carving_refuses_what_it_cannot_carve_and_writes_nothing() {
     plenoxel(&["carve", &data, "--out", &out, "--set", "carve.rezolution=8"]).refused(2, &["`rezolution`", "`resolution`"]);
     plenoxel(&["carve", &data, "--out", &out, "--set", "carve.depth=-1"]).refused(2, &["carve.depth", "0.001 to 1000"]);
     plenoxel(&["carve", &data, "--out", &out, "--half-width", "1e9", "--resolution", "8"])
-        .refused(2, &["half_width", "a box around the object"]);
+        .refused(2, &["half_width", "a box around the object alone, below"]);
+    plenoxel(&["carve", &data, "--out", &out, "--photo-consistency=1e-9"]).refused(2, &["carve.photo.noise", "1e-6 to 1"]);
+    plenoxel(&["train", &data, "--out", &out, "--set", "stages=[]"]).refused(2, &["stages", "at least one"]);
     plenoxel(&["train", &data, "--out", &out, "--init-from", &folder.path("none")]).refused(3, &["there is no such run"]);
     for view in 0..3 {
         let path = PathBuf::from(format!("{data}/train/r_{view}.png"));
@@ -452,6 +454,7 @@ fn carving_refuses_what_it_cannot_carve_and_writes_nothing() {
         picture.pixels_mut().for_each(|p| p.0[3] = 255);
         image::write_rgba(&path, &picture).unwrap();
     }
-    plenoxel(&["carve", &data, "--out", &out, "--resolution", "8"]).refused(2, &["no transparent pixel", "alpha channel"]);
+    plenoxel(&["carve", &data, "--out", &out, "--resolution", "8"])
+        .refused(3, &["no transparent pixel", "alpha channel", "--photo-consistency"]);
     assert!(!Path::new(&out).exists());
 }

@@ -54,8 +54,9 @@ fn background(text: &str) -> Result<[f64; 3], String> {
 fn number(least: f64) -> impl Fn(&str) -> Result<f64, String> + Clone {
     move |text| match text.parse::<f64>() {
         Ok(number) if number.is_finite() && number >= least => Ok(number),
-        _ if least.is_finite() => Err(format!("a number of at least {least}")),
-        _ => Err("a number".to_owned()),
+        _ if least == f64::NEG_INFINITY => Err("a number".to_owned()),
+        _ if least == f64::MIN_POSITIVE => Err("a number above 0".to_owned()),
+        _ => Err(format!("a number of at least {least}")),
     }
 }
 

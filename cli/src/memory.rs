@@ -4,6 +4,7 @@
 //! The last depends on how many samples the rays take: about as many as cross the box from face to face, fewer after pruning.
 
 use crate::progress::bytes;
+use plenoxel::carve::Fit;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::{Color, GridShape};
@@ -31,14 +32,14 @@ pub struct Estimate {
 
 /// Program, threads, buffers on their way: measured on small runs.
 const BASE: u64 = 60_000_000;
-/// What a batch of pixels gives to voxels while these are colored, with the lists that it is sorted into.
-const CARVING_BATCH: u64 = 100_000_000;
+/// Pixels whose voxels are in memory at a time when carving, 12 bytes each and in up to three copies.
+const CARVING_PIXELS: u64 = 1 << 16;
 /// Rays that are rendered at a time when evaluating.
 const EVALUATION_RAYS: u64 = 4096;
 
 impl Estimate {
-    /// A training run with everything around it.
-    pub fn of_training(config: &Config, dataset: &Dataset) -> Self {
+    /// A training run with everything around it; `initial` bytes are of the grid that it starts from.
+    pub fn of_training(config: &Config, dataset: &Dataset, initial: u64) -> Self {
         let finest = config.stages.iter().enumerate();
         let (index, resolution) =
             finest.map(|(i, stage)| (i, stage.resolution)).max_by_key(|(_, resolution)| *resolution).unwrap_or((0, 0));
@@ -79,7 +80,7 @@ impl Estimate {
         // The file is put together beside the tables, once in pieces and once whole.
         let saving = 2 * tables;
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
-        let grid = tables + earlier;
+        let grid = tables + earlier + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, or a lower sh_degree");
         let parts = [
             (images, ("downscale".to_owned(), "a larger factor, so that the images fit")),
@@ -121,29 +122,31 @@ impl Estimate {
         let masks = shape.voxels() as u64;
         let (width, height) = dataset.size();
         // Summed-area tables of some views, or the light of a batch of pixels.
-        let step = (32 * (width * height) as u64).max(CARVING_BATCH);
+        let step = (32 * (width * height) as u64).max(CARVING_PIXELS * 36 * hits_of_pixel(config));
+        // Which voxel each pixel sees; the list that descent draws pixels from.
+        let pixels = (width * height * dataset.count(Split::Train)) as u64;
+        let items = if config.carve.photo.is_some() { 4 * pixels } else { 0 } + if config.carve.fit == Fit::Sgd { 8 * pixels } else { 0 };
         // The two sides of the normal equations, the answer, its error, and how much a voxel weighs.
         let fit = 4 * rows as u64 * (coefficients * (coefficients + 1) / 2 + 9 * coefficients + 2);
-        Estimate {
-            images: images(dataset, config.downscale, &[Split::Train, Split::Test]),
-            grid: masks + fit,
-            optimizer: 0,
-            step,
-            pruned: false,
-            key: "--resolution".to_owned(),
-            advice: "fewer voxels a side, or a lower --sh-degree",
-        }
+        let images = images(dataset, config.downscale, &[Split::Train]) + items;
+        let grid = masks + fit;
+        let (key, advice) = match images > grid {
+            true => ("--downscale", "a larger factor, so that the images fit"),
+            false => ("--resolution", "fewer voxels a side, or a lower --sh-degree"),
+        };
+        Estimate { images, grid, optimizer: 0, step, pruned: false, key: key.to_owned(), advice }
     }
 
-    /// Reading a trained grid of so many voxels. What is made of it is smaller, for it is of its surface.
+    /// Reading a trained grid of so many voxels, and making something of them: at most all of them.
     pub fn of_export(shape: &GridShape, voxels: usize) -> Self {
         Estimate {
             images: 0,
             // The file and the tables read from it.
             grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
-            step: 0,
-            pruned: false,
+            // Places, rows, normals and colors.
+            step: 100 * voxels as u64,
+            pruned: true,
             key: "RUN".to_owned(),
             advice: "a machine with more",
         }
@@ -231,6 +234,13 @@ fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
     // A file and its decoded pixels.
     let decoding = threads * 8 * pixels * (downscale * downscale) as u64;
     views.unwrap_or(0) as u64 * pixels * per_pixel + decoding
+}
+
+/// Voxels that a pixel may see in a carved grid: until it is opaque, or the box ends.
+fn hits_of_pixel(config: &Config) -> u64 {
+    // Two voxels for each optical depth of one, since rays are oblique; e^-6.3 is what `carve::light` cuts off.
+    let opaque = 2.0 * 6.3 / config.carve.depth + 2.0;
+    opaque.min(3f64.sqrt() * config.carve.resolution as f64) as u64
 }
 
 /// Samples a ray takes in the box, at the mean over rays that fill the frame: about the side of the box.

@@ -100,7 +100,7 @@ impl RunFolder {
     ///
     /// Errors: it is not the folder of a run.
     pub fn open(path: &Path) -> Result<(Self, Config, RunRecord)> {
-        let remedy = "give the folder that `plenoxel train` wrote";
+        let remedy = "give the folder that `plenoxel train` or `plenoxel carve` wrote";
         if !path.exists() {
             return Err(Error::input(path, "there is no such run", remedy));
         }
@@ -222,13 +222,15 @@ impl RunFolder {
 const EXPLANATION: &str = "\
 # A run of plenoxel
 
-- `config.toml`: every setting, resolved; `plenoxel train DATA --config config.toml` repeats the run.
+Of these files, those that apply: a carved run has no training to tell of.
+
+- `config.toml`: every setting, resolved; `plenoxel train DATA --config config.toml` repeats the run (`carve` one that was carved).
 - `run.json`: the data, the program, the machine.
 - `metrics.jsonl`: one line every few steps and at every stage end, then one with the final figures. `loss`, `losses` and `psnr` are of
   training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training.
 - `loss.svg`: the loss over the steps.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
-- `result.json`: the final figures. `seconds` are of training alone: making grids, steps, pruning, upsampling.
+- `result.json`: the final figures. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring.
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
   pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.

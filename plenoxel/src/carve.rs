@@ -1,8 +1,7 @@
 //! Carving: from photographs to an opaque colored grid, without gradients.
 //!
 //! 1. [`mod@visual_hull`]: what the silhouettes of all views leave of the box;
-//!    [`mod@photo_hull`]: what the colors leave of that, or of the whole box;
-//! 2. [`photo_hull`], if asked for: what the colors of all views leave of that;
+//! 2. [`mod@photo_hull`], if asked for: what the colors of all views leave of that;
 //! 3. [`light`]: which voxels a pixel shows, and how much of it each is;
 //! 4. [`color`]: the colors, or their harmonics, that explain the pixels best.
 //!
@@ -16,7 +15,7 @@ pub mod visual_hull;
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::field::sh;
-use crate::field::voxel_grid::{Color, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::train::config::Config;
 use autograd::{Buffer, Lattice, Tensor};
@@ -119,27 +118,36 @@ impl<'a> Carving<'a> {
     /// Errors: no view has a transparent pixel (and only silhouettes are asked for), or one that is not; nothing is left of the box, or
     /// nothing goes.
     pub fn new(views: &'a [View], config: &'a Config, progress: &dyn Fn(usize, usize, usize)) -> Result<Self> {
+        let images = |found: &str, remedy: &str| Err(Error::input("the training images", found, remedy));
         if !has_alpha(views) && config.carve.photo.is_none() {
-            let found = "the images, which have no transparent pixel,";
-            let accepted = "images with an alpha channel that is 0 on the background; or --photo-consistency, which needs none";
-            return Err(Error::config("DATA", found, accepted));
+            let remedy = "silhouettes need an alpha channel that is 0 on the background; --photo-consistency carves without";
+            return images("they have no transparent pixel", remedy);
         }
         if alphas(views).all(|alpha| alpha == 0) {
-            return Err(Error::config("DATA", "the images, which are transparent all over,", "images that show an object"));
+            return images("they are transparent all over", "give images that show an object");
         }
         let CarveConfig { resolution, rule, margin, photo, .. } = config.carve;
         let (aabb, voxels) = (Aabb::cube(config.half_width), [resolution; 3]);
+        // No image shows the voxel that its camera stands in, so it would stay and hide everything.
+        if let Some(view) = views.iter().find(|view| aabb.contains(view.camera.position())) {
+            let nearest = views.iter().map(|view| view.camera.position().abs().max_element()).fold(f64::INFINITY, f64::min);
+            let found = format!("{}, a box in which the camera of {} stands,", config.half_width, view.name);
+            return Err(Error::config("half_width", found, format!("a box around the object alone, below {nearest:.3}")));
+        }
         let mut hull = match rule {
             Rule::Footprint => visual_hull::by_footprint(views, aabb, voxels, margin),
             Rule::Rays => visual_hull::by_rays(views, aabb, voxels),
         };
+        let half_width =
+            |found: &str| Err(Error::config("half_width", format!("{}, {found},", config.half_width), "a box around the object"));
+        if hull.fraction() == 0.0 {
+            return half_width("of which the silhouettes leave nothing");
+        }
         if let Some(photo) = &photo {
             hull = photo_hull::photo_hull(views, &hull, photo, progress)?;
         }
-        let half_width =
-            |found: &str| Err(Error::config("half_width", format!("{}, {found},", config.half_width), "a box around the object"));
         match hull.fraction() {
-            0.0 => half_width("of which the images leave nothing"),
+            0.0 => Err(Error::config("carve.photo.noise", photo.map_or(0.0, |photo| photo.noise), "more, for nothing is left")),
             1.0 => half_width("of which no image shows a voxel that is not there"),
             _ => Ok(Carving { views, config, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }
@@ -158,7 +166,8 @@ impl<'a> Carving<'a> {
     /// Finds the colors. `progress(passes)` is called after each pass over the pixels.
     pub fn color(&self, progress: &dyn Fn(usize)) -> Colored {
         let (config, lattice, rows) = (self.config, &self.lattice, self.lattice.rows());
-        let shape = config.grid_shape(config.carve.resolution);
+        // Colors are found for what one sees in the voxel that a point lies in, whatever training would do.
+        let shape = GridShape { interpolation: Interpolation::Nearest, ..config.grid_shape(config.carve.resolution) };
         let density = config.carve.depth / shape.voxel_side();
         let opaque = Opaque::new(lattice, Aabb::cube(shape.half_width), density);
         let (degree, offset) = match shape.color {

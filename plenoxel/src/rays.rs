@@ -50,11 +50,6 @@ impl<'a> RaySource<'a> {
         RaySource { views, background, seed, first }
     }
 
-    /// The views.
-    pub fn views(&self) -> &'a [View] {
-        self.views
-    }
-
     /// Rays in one epoch.
     pub fn len(&self) -> u64 {
         self.first[self.views.len()]

@@ -84,9 +84,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         if rays.is_empty() {
             return Err(Error::config("train views", "none", "at least one image to learn from"));
         }
-        if config.stages.is_empty() {
-            return Err(Error::config("stages", "no stage", "at least one"));
-        }
+        config.check_stages()?;
         let plan = plan(&config, &config.stages, rays.len());
         let mut shape = config.grid_shape(plan[0].stage.resolution);
         let silhouettes = Silhouettes::new(&config, views);
@@ -207,9 +205,15 @@ impl<'a, T: Real> Trainer<'a, T> {
         }
         if let Some(silhouettes) = &self.silhouettes {
             let inside = silhouettes.voxels(self.grid.shape());
-            if inside.fraction() > 0.0 {
-                self.grid = self.grid.pruned(&inside);
+            let pruned = self.grid.pruned(&inside);
+            if pruned.lattice().present() == 0 {
+                return Err(Error::config(
+                    "hull",
+                    "\"auto\", with silhouettes that hold nothing of the grid,",
+                    "\"off\"; or another half_width, or another run to start from",
+                ));
             }
+            self.grid = pruned;
         }
         if self.prunes_from().is_some_and(|first| index >= first) {
             let kept = self.worth_keeping(&self.plan[index].stage);

@@ -31,7 +31,7 @@ Examples:
 The result is a run like a trained one: evaluate, render, export and info take it. Settings are layered as for train; --set
 reaches those below carve. The last line on stdout is one JSON object.";
 
-/// Carve an opaque colored grid from the silhouettes of images with alpha, in seconds and without training
+/// Carve an opaque colored grid, without training, from the silhouettes of images with alpha or from colors that contradict
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct CarveArgs {
@@ -86,7 +86,7 @@ pub struct CarveArgs {
 
     /// Carve on, away voxels of which the photographs show colors that differ by more than this standard deviation, of sRGB values in [0, 1]
     /// [default without a number: 0.15]. Needs no alpha
-    #[arg(long, value_name = "NOISE", help_heading = "Carving", value_parser = super::number(0.0), num_args = 0..=1)]
+    #[arg(long, value_name = "NOISE", help_heading = "Carving", value_parser = super::number(0.0), num_args = 0..=1, require_equals = true)]
     photo_consistency: Option<Option<f64>>,
 
     /// How colors are found: exact, by least squares, or sgd, the source paper's descent [default: exact]
@@ -95,9 +95,8 @@ pub struct CarveArgs {
 }
 
 impl CarveArgs {
-    fn config(&self) -> Result<Config> {
-        let (config, _) = config::layered(None, CARVE.0, self.config.as_deref(), |layers| self.flags(layers))?;
-        Ok(config)
+    fn config(&self) -> Result<(Config, Option<&str>)> {
+        config::layered(None, CARVE.0, self.config.as_deref(), |layers| self.flags(layers))
     }
 
     fn flags(&self, layers: &mut Layers) -> Result<()> {
@@ -126,7 +125,7 @@ impl CarveArgs {
 /// Carves a scene and leaves a run folder.
 pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let source = DataSource::of(args.data.as_deref());
-    let config = args.config()?;
+    let (config, preset) = args.config()?;
     let mut load_clock = Stopwatch::default();
     let dataset = load_clock.time(|| source.open(&config))?;
     announce(console, &dataset, &config);
@@ -148,7 +147,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
 
     // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
     folder.prepare()?;
-    folder.describe(&config, &record(&dataset, Some(CARVE.0), &source))?;
+    folder.describe(&config, &record(&dataset, preset, &source))?;
     console.note(&format!("run: {}", folder.path().display()));
     let mut color_clock = Stopwatch::default();
     let passes = match config.carve.fit {
@@ -158,7 +157,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let count = console.count("coloring, pass", passes);
     let colored = color_clock.time(|| carving.color(&|done| count.at(done, passes)));
     drop(count);
-    if colored.missed > 0.0 {
+    if colored.missed > 0.0 && carve::has_alpha(&views) {
         console.note(&format!(
             "{:.2} % of the object pixels show no voxel: parts thinner than a pixel, or beyond the box (--half-width)",
             100.0 * colored.missed

@@ -41,12 +41,12 @@ pub fn run(args: &ExportArgs, console: &Console<'_>) -> Result<()> {
 /// Which run, where to, and from where colors are seen.
 #[derive(Debug, Args)]
 struct Exported {
-    /// Run folder that `plenoxel train` wrote
+    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
     #[arg(value_hint = ValueHint::DirPath)]
     run: PathBuf,
 
     /// File to write, replacing what is there [default: in RUN/exports]
-    #[arg(long, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
+    #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
 
     /// Take colors that depend on the direction as seen along this one, from the viewer into the scene [default: against the surface's normal]

@@ -40,7 +40,7 @@ pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
     let count = console.count("rendering", chosen.len());
     for (done, &number) in chosen.iter().enumerate() {
         let picture = viewer.see(&cameras[number]);
-        let range = DepthRange::of(&cameras[number], config.half_width);
+        let range = DepthRange::of(&cameras[number], grid.shape().half_width);
         let file = |kind: &str| folder.render(&format!("{}_{number:03}_{}{kind}.png", split, names[number]));
         images::write(&file(""), &picture.rgb)?;
         images::write(&file("_depth"), &images::depth_map(&picture, range))?;

@@ -14,26 +14,34 @@ pub use flags::{TrainArgs, size};
 use pictures::Pictures;
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Split, View};
-use plenoxel::error::Result;
+use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::train::Trainer;
 use plenoxel::train::config::Config;
 use serde::Serialize;
 use serde_json::json;
-use std::path::Path;
 use std::time::Instant;
 
 /// Learns a scene and leaves a run folder.
 pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     let source = args.source();
     let (config, preset) = args.config()?;
+    config.check_stages()?;
+    if let (Some(from), Some(to)) = (&config.init_from, &args.out)
+        && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
+    {
+        return Err(Error::config("--init-from", format!("{}, which is --out too,", from.display()), "another folder to write"));
+    }
     let mut clocks = Clocks::default();
     let dataset = clocks.load.time(|| source.open(&config))?;
     announce(console, &dataset, &config);
-    let initial = config.init_from.as_deref().map(start_from).transpose()?;
-    let estimate = Estimate::of_training(&config, &dataset);
+    let initial = config.init_from.as_deref().map(RunFolder::open).transpose()?.map(|(folder, ..)| folder);
+    let known = initial.as_ref().map(RunFolder::header).transpose()?;
+    let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
+    let estimate = Estimate::of_training(&config, &dataset, bytes as u64);
     console.note(&estimate.describe());
     estimate.check()?;
+    let initial = initial.map(|folder| folder.load()).transpose()?.map(|(grid, _)| grid);
     let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
 
@@ -47,6 +55,11 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
         Ok(initial.iter().fold(trainer, Trainer::starting_from))
     })?;
     drop(initial);
+    let half_width = trainer.grid().shape().half_width;
+    if half_width != config.half_width {
+        let chosen = if config.init_from.is_some() { "of the grid it starts from" } else { "around the silhouettes" };
+        console.note(&format!("box: half width {half_width:.4}, {chosen}"));
+    }
     let mut learned = learn(trainer, &folder, args.keeps_stages(), console, &mut clocks, &mut pictures)?;
     let header = Header::new(&learned.grid, dataset.name(), config.background, config.seed, learned.steps);
     folder.save(&learned.grid, &header)?;
@@ -84,12 +97,6 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     folder.write_result(&summary)?;
     learned.metrics.append(&Final { result: &summary })?;
     conclude(console, &folder, &summary, &scores, &pictures)
-}
-
-/// The grid of an earlier run.
-fn start_from(run: &Path) -> Result<VoxelGrid<f32>> {
-    let (folder, ..) = RunFolder::open(run)?;
-    Ok(folder.load()?.0)
 }
 
 /// A trained grid and how it came about.
@@ -181,9 +188,10 @@ fn evaluate(
         }
     }
     let viewer = Viewer::new(&learned.grid, config.evaluation, config);
+    let half_width = learned.grid.shape().half_width;
     let scores = viewer.compare(test, |i, view, target, picture| {
         advance();
-        drawing.time(|| pictures.panel(i, view, target, picture))
+        drawing.time(|| pictures.panel(i, view, target, picture, half_width))
     })?;
     clocks.evaluate.0 += start.elapsed() - drawing.0;
     if let Some(last) = learned.stages.last_mut() {

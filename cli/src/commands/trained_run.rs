@@ -16,7 +16,7 @@ use std::path::PathBuf;
 /// Which run, and how to look at it.
 #[derive(Debug, Args)]
 pub struct TrainedRun {
-    /// Run folder that `plenoxel train` wrote
+    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
     #[arg(value_hint = ValueHint::DirPath)]
     pub run: PathBuf,
 

@@ -19,14 +19,13 @@
 //! shapes in the box that are consistent, hence a superset of the true one if that is. Here the spread is a mean over pixels and patches
 //! have to agree, so the rounds are part of the definition; at their end no visible voxel is inconsistent together with its patch.
 //!
-//! Pixels without alpha show no voxel: these are carved first, as by [`by_footprint`], where visibility plays no part. Shiny surfaces have
+//! Pixels without alpha show no voxel and do not vote: what they contradict, the visual hull has left out already. Shiny surfaces have
 //! no one color: where their shine varies by more than `noise` they are carved into. Plain walls of hollows give nothing to tell them from a
 //! lid by.
 
 mod visible;
 mod votes;
 
-use super::visual_hull::by_footprint;
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::sampling::{Occupancy, split};
@@ -35,9 +34,6 @@ use autograd::parallel;
 use serde::{Deserialize, Serialize};
 use visible::FirstVoxels;
 use votes::{Projection, Votes};
-
-/// Pixels around a voxel's projection that must be background too for the voxel to go: see [`by_footprint`].
-const MARGIN: f64 = 0.5;
 
 /// What makes a voxel photo-consistent.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -66,7 +62,7 @@ pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progr
         return Err(Error::config("noise", config.noise, "a number above 0"));
     }
     let (aabb, voxels) = (start.aabb(), start.cells());
-    let mut masks = start.intersection(&by_footprint(views, aabb, voxels, MARGIN)).masks().to_vec();
+    let mut masks = start.masks().to_vec();
     let projections: Vec<Projection> = views.iter().map(|view| Projection::of(view, aabb, voxels)).collect();
     let mut first = FirstVoxels::new(views, aabb, voxels);
     let mut surface = Surface { voxels, visible: vec![0; masks.len()], inconsistent: vec![0; masks.len()] };

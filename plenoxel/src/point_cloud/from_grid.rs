@@ -135,7 +135,11 @@ fn normal(at: IVec3, alpha: impl Fn(IVec3) -> f64) -> [f32; 3] {
 fn colors<T: Real>(grid: &VoxelGrid<T>, rows: &[u32], from: ColorFrom<'_>) -> Vec<[u8; 3]> {
     let along = |direction: DVec3| grid.colors_of(rows, &vec![direction; rows.len()]);
     let colors = match from {
-        ColorFrom::Seen(seen) => rows.iter().map(|&row| seen.color[row as usize].map(f64::from)).collect(),
+        // What nobody sees has its mean color.
+        ColorFrom::Seen(seen) => {
+            let color = |(&row, mean)| if seen.weight[row as usize] > 0.0 { seen.color[row as usize].map(f64::from) } else { mean };
+            rows.iter().zip(along(DVec3::ZERO)).map(color).collect()
+        }
         ColorFrom::Direction(direction) => along(direction),
         // A direction of zero stands for all of them.
         ColorFrom::Mean => along(DVec3::ZERO),

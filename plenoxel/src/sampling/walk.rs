@@ -39,24 +39,30 @@ struct Planes {
     pace: f64,
     /// Distance along the ray from plane to plane: negative if it meets them in falling order.
     spacing: f64,
-    /// It never meets one.
-    still: bool,
+    /// The plane at distance 0, a fraction: where the ray starts, or, if it never meets a plane, one before all of them, which are then at
+    /// distances beyond any box.
+    origin: f64,
     /// 1 if it meets them in rising order, 0 if not: what leads from a cell to the plane by which it is left.
     forward: usize,
     /// What leads from a cell to the next one, by wrapping addition.
     step: usize,
 }
 
+/// A distance that no ray gets to.
+const NEVER: f64 = 1e300;
+
 impl Planes {
     fn new(voxels: usize, origin: f64, direction: f64, low: f64, high: f64) -> Self {
         let side = (high - low) / voxels as f64;
         let forward = usize::from(direction > 0.0);
+        let start = (origin - low) / side;
+        let still = direction == 0.0;
         Planes {
             voxels,
-            start: (origin - low) / side,
+            start,
             pace: direction / side,
-            spacing: side / direction,
-            still: direction == 0.0,
+            spacing: if still { NEVER } else { side / direction },
+            origin: if still { -1.0 } else { start },
             forward,
             step: (2 * forward).wrapping_sub(1),
         }
@@ -65,12 +71,12 @@ impl Planes {
     /// Distance along the ray at which it meets a plane.
     #[inline(always)]
     fn at(&self, plane: usize) -> f64 {
-        if self.still { f64::INFINITY } else { (plane as f64 - self.start) * self.spacing }
+        (plane as f64 - self.origin) * self.spacing
     }
 
     /// Distances at which the ray enters and leaves all voxels.
     fn chord(&self) -> (f64, f64) {
-        if self.still {
+        if self.pace == 0.0 {
             let inside = self.start >= 0.0 && self.start <= self.voxels as f64;
             return if inside { (f64::NEG_INFINITY, f64::INFINITY) } else { (f64::INFINITY, f64::NEG_INFINITY) };
         }

@@ -286,6 +286,11 @@ impl Config {
         GridShape { resolution, half_width: self.half_width, interpolation: self.interpolation, color }
     }
 
+    /// Checks that there is something to train.
+    pub fn check_stages(&self) -> Result<()> {
+        check(!self.stages.is_empty(), "stages", "no stage", "at least one")
+    }
+
     /// Checks every value; an error names the key as the file spells it.
     pub fn validate(&self) -> Result<()> {
         let positive = |key: &str, value: f64| check(value > 0.0 && value.is_finite(), key, value, "a number above 0");

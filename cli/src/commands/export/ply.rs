@@ -35,7 +35,7 @@ the density. It is meant for solid clouds, with the zeros of the line above it: 
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct PlyArgs {
-    /// Run folder that `plenoxel train` wrote
+    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
     #[arg(value_hint = ValueHint::DirPath)]
     run: PathBuf,
 
@@ -116,15 +116,26 @@ fn share(text: &str) -> std::result::Result<f64, String> {
 pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
     let (folder, mut config, record) = RunFolder::open(&args.run)?;
     config.downscale = args.downscale.unwrap_or(config.downscale);
+    let (header, voxels) = folder.header()?;
+    let estimate = Estimate::of_export(&header.shape(), voxels);
+    console.note(&estimate.describe());
+    estimate.check()?;
+    // Filters before the minutes that looking may take.
+    let side = header.shape().voxel_side();
+    let coordinates = match args.coords {
+        Coords::World => Coordinates::World,
+        Coords::Grid => Coordinates::Grid,
+    };
+    let lengths = match coordinates {
+        Coordinates::World => UnitLengths { voxel: Some(side), world: 1.0 },
+        Coordinates::Grid => UnitLengths { voxel: Some(1.0), world: 1.0 / side },
+    };
+    let filters = args.filters.filters(lengths)?;
     let (grid, header) = folder.load()?;
     let chooses = args.min_weight > 0.0 || args.min_object > 0.0;
     let looks = chooses || args.color == ColorChoice::Seen;
     let seen = if looks { Some(look(args, &config, record, &grid, console)?) } else { None };
 
-    let coordinates = match args.coords {
-        Coords::World => Coordinates::World,
-        Coords::Grid => Coordinates::Grid,
-    };
     let color = match (args.color, &seen) {
         (ColorChoice::Seen, Some(seen)) => ColorFrom::Seen(seen),
         (ColorChoice::Direction(direction), _) => ColorFrom::Direction(direction),
@@ -134,15 +145,10 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
     let visible = seen.as_ref().filter(|_| chooses).map(|seen| Visible { seen, min_weight, min_object });
     let cloud = from_grid::points(&grid, &VoxelOptions { coordinates, color, min_alpha: args.min_alpha, visible });
 
-    let side = grid.shape().voxel_side();
-    let lengths = match coordinates {
-        Coordinates::World => UnitLengths { voxel: Some(side), world: 1.0 },
-        Coordinates::Grid => UnitLengths { voxel: Some(1.0), world: 1.0 / side },
-    };
     let names: Vec<&str> = cloud.fields.iter().map(|field| &field.name[..]).collect();
     let field = args.filters.value_field(&names)?;
     let values = field.as_deref().and_then(|name| cloud.field(name));
-    let (left, report) = args.filters.filters(lengths)?.apply(&cloud.positions, values)?;
+    let (left, report) = filters.apply(&cloud.positions, values)?;
     let report = describe(cloud.len(), &report);
     check_not_empty(left.len(), &report)?;
 

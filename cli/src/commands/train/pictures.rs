@@ -60,12 +60,12 @@ impl<'a> Pictures<'a> {
         Ok(())
     }
 
-    /// A test view was rendered with the final grid.
-    pub fn panel(&self, number: usize, view: &View, target: &Rgb, picture: &Picture) -> Result<()> {
+    /// A test view was rendered with the final grid, which fills a cube of a half width.
+    pub fn panel(&self, number: usize, view: &View, target: &Rgb, picture: &Picture, half_width: f64) -> Result<()> {
         if !self.panels.contains(&number) {
             return Ok(());
         }
-        let range = DepthRange::of(&view.camera, self.config.half_width);
+        let range = DepthRange::of(&view.camera, half_width);
         let name = format!("test_{number:03}_{}.png", view.name);
         images::write(&self.folder.image(&name), &images::panel(target, picture, range))
     }

@@ -1,5 +1,6 @@
 use super::*;
 use crate::camera::{Camera, Intrinsics, Ray};
+use crate::carve::visual_hull::by_footprint;
 use crate::dataset::image::RgbaImage;
 use crate::geometry::Aabb;
 use glam::{DVec3, dvec3};
@@ -77,7 +78,7 @@ fn matter(p: DVec3) -> bool {
 #[test]
 fn the_photo_hull_opens_a_pit_that_the_visual_hull_fills() {
     let views = views(40, true, false);
-    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], MARGIN);
+    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], 0.5);
     assert_eq!(count(&visual, pit).0, count(&visual, pit).1);
     let photo = hull(&views, &visual, 0.12);
     let (left, all) = count(&photo, pit);
@@ -100,7 +101,7 @@ fn without_alpha_the_surroundings_do_not_agree_on_anything_in_the_box() {
 #[test]
 fn a_consistent_convex_body_loses_nothing() {
     let views = views(30, false, false);
-    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], MARGIN);
+    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], 0.5);
     let photo = hull(&views, &visual, 0.15);
     let (left, all) = count(&photo, |p| p.abs().max_element() < HALF);
     assert_eq!(left, all);
