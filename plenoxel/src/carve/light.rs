@@ -8,7 +8,7 @@ use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
 use autograd::lattice::{BRICK, BRICK_ROWS};
-use autograd::{Buffer, Lattice, Tensor, no_grad, parallel};
+use autograd::{Lattice, Tensor, no_grad, parallel};
 use std::ops::ControlFlow;
 
 /// A ray ends where less than this reaches further: half a level of an 8-bit image.
@@ -27,7 +27,7 @@ const BATCH: usize = 1 << 16;
 pub struct Hit {
     /// Row of the voxel.
     pub row: u32,
-    /// The pixel's place in the batch.
+    /// The pixel's place in its chunk.
     pub ray: u32,
     /// Its share of the pixel.
     pub weight: f32,
@@ -68,14 +68,10 @@ pub struct Lit<'a> {
 /// The light of some pixels, with what each pixel has to say to the voxels that it sees.
 pub struct Light {
     chunks: Vec<Chunk>,
-    /// Three numbers for each pixel.
-    values: Vec<[f32; 3]>,
-    /// Harmonics of each pixel.
-    basis: Tensor<f32>,
+    /// Harmonics of a pixel.
     count: usize,
     /// Rows of a part.
     part: usize,
-    missed: usize,
 }
 
 /// The hits of a part of the voxels.
@@ -101,23 +97,29 @@ impl<'a> PartHits<'a> {
     /// In the order of the pixels.
     pub fn iter(self) -> impl Iterator<Item = SeenBy<'a>> {
         let PartHits { light, part } = self;
-        let hits = light.chunks.iter().flat_map(move |chunk| &chunk.hits[chunk.bounds[part]..chunk.bounds[part + 1]]);
-        hits.map(move |hit| {
-            let ray = hit.ray as usize;
-            SeenBy {
-                row: hit.row as usize - part * light.part,
-                weight: hit.weight,
-                value: light.values[ray],
-                basis: &light.basis.data()[ray * light.count..][..light.count],
-            }
+        light.chunks.iter().flat_map(move |chunk| {
+            chunk.hits[chunk.bounds[part]..chunk.bounds[part + 1]].iter().map(move |hit| {
+                let ray = hit.ray as usize;
+                SeenBy {
+                    row: hit.row as usize - part * light.part,
+                    weight: hit.weight,
+                    value: chunk.values[ray],
+                    basis: &chunk.basis.data()[ray * light.count..][..light.count],
+                }
+            })
         })
     }
 }
 
-/// Hits of consecutive pixels, those of a part of the tables one after another.
+/// Consecutive pixels, and their hits: those of a part of the tables one after another.
 struct Chunk {
     hits: Vec<Hit>,
     bounds: [usize; PARTS + 1],
+    values: Vec<[f32; 3]>,
+    /// `[pixels, (degree + 1)²]`
+    basis: Tensor<f32>,
+    /// Pixels that see no voxel.
+    missed: usize,
 }
 
 impl<'a> Opaque<'a> {
@@ -159,32 +161,30 @@ impl<'a> Opaque<'a> {
         degree: usize,
         value: impl Fn(Lit<'_>) -> [f32; 3] + Sync,
     ) -> Light {
-        let rays =
-            parallel::map_chunks(pixels.len(), CHUNK, |range| pixels[range].iter().map(|pixel| pixel.ray(views)).collect::<Vec<_>>());
         let count = sh::count(degree);
-        let basis = basis(&rays, pixels.len(), degree);
         let part = self.lattice.rows().div_ceil(PARTS).max(1);
-        let chunks = parallel::map_indices(rays.len(), |c| {
+        let chunks = parallel::map_chunks(pixels.len(), CHUNK, |range| {
+            let pixels = &pixels[range];
+            let rays: Vec<Ray> = pixels.iter().map(|pixel| pixel.ray(views)).collect();
+            let basis = basis(&rays, degree);
             let (mut hits, mut ends) = (Vec::with_capacity(16 * CHUNK), Vec::with_capacity(CHUNK));
-            for (i, ray) in rays[c].iter().enumerate() {
-                self.depths(ray, (c * CHUNK + i) as u32, &mut hits);
+            for (i, ray) in rays.iter().enumerate() {
+                self.depths(ray, i as u32, &mut hits);
                 ends.push(hits.len());
             }
             let rests = to_weights(&mut hits, &ends);
-            let mut first = 0;
+            let (mut first, mut missed) = (0, 0);
             let lit = ends.iter().zip(rests).enumerate().map(|(i, (&end, rest))| {
-                let number = c * CHUNK + i;
                 let hits = &hits[std::mem::replace(&mut first, end)..end];
-                let color = pixels[number].color(views, background);
-                value(Lit { color, basis: &basis.data()[number * count..][..count], hits, rest })
+                missed += usize::from(hits.is_empty());
+                let color = pixels[i].color(views, background);
+                value(Lit { color, basis: &basis.data()[i * count..][..count], hits, rest })
             });
-            let values = lit.collect::<Vec<_>>();
-            let missed = (0..ends.len()).filter(|&i| ends[i] == if i == 0 { 0 } else { ends[i - 1] }).count();
-            (Chunk::new(&hits, part), values, missed)
+            let values = lit.collect();
+            let (hits, bounds) = by_part(&hits, part);
+            Chunk { hits, bounds, values, basis, missed }
         });
-        let missed = chunks.iter().map(|(.., missed)| missed).sum();
-        let (chunks, values): (Vec<_>, Vec<_>) = chunks.into_iter().map(|(chunk, values, _)| (chunk, values)).unzip();
-        Light { chunks, values: values.concat(), basis, count, part, missed }
+        Light { chunks, count, part }
     }
 }
 
@@ -207,22 +207,20 @@ fn to_weights(hits: &mut [Hit], ends: &[usize]) -> Vec<f32> {
     rests.collect()
 }
 
-impl Chunk {
-    /// Hits by the part of the tables that they belong to, in their order within each.
-    fn new(hits: &[Hit], part: usize) -> Self {
-        let part_of = |hit: &Hit| hit.row as usize / part;
-        let mut bounds = [0; PARTS + 1];
-        hits.iter().for_each(|hit| bounds[part_of(hit) + 1] += 1);
-        (0..PARTS).for_each(|p| bounds[p + 1] += bounds[p]);
-        let mut next = bounds;
-        let mut sorted = vec![Hit { row: 0, ray: 0, weight: 0.0 }; hits.len()];
-        for hit in hits {
-            let to = &mut next[part_of(hit)];
-            sorted[*to] = *hit;
-            *to += 1;
-        }
-        Chunk { hits: sorted, bounds }
+/// Hits by the part of the tables that they belong to, in their order within each, and where each part begins.
+fn by_part(hits: &[Hit], part: usize) -> (Vec<Hit>, [usize; PARTS + 1]) {
+    let part_of = |hit: &Hit| hit.row as usize / part;
+    let mut bounds = [0; PARTS + 1];
+    hits.iter().for_each(|hit| bounds[part_of(hit) + 1] += 1);
+    (0..PARTS).for_each(|p| bounds[p + 1] += bounds[p]);
+    let mut next = bounds;
+    let mut sorted = vec![Hit { row: 0, ray: 0, weight: 0.0 }; hits.len()];
+    for hit in hits {
+        let to = &mut next[part_of(hit)];
+        sorted[*to] = *hit;
+        *to += 1;
     }
+    (sorted, bounds)
 }
 
 impl Light {
@@ -242,7 +240,7 @@ impl Light {
 
     /// The number of pixels that see no voxel.
     pub fn missed(&self) -> usize {
-        self.missed
+        self.chunks.iter().map(|chunk| chunk.missed).sum()
     }
 }
 
@@ -264,12 +262,9 @@ impl Pixel {
 }
 
 /// Harmonics at the directions of some rays, `[rays, (degree + 1)²]`.
-fn basis(rays: &[Vec<Ray>], n: usize, degree: usize) -> Tensor<f32> {
-    let mut directions = Buffer::stale(3 * n);
-    for (ray, out) in rays.iter().flatten().zip(directions.as_chunks_mut::<3>().0) {
-        *out = ray.direction.as_vec3().to_array();
-    }
-    no_grad(|| sh::basis(&Tensor::from_buffer(directions, &[n, 3]), degree))
+fn basis(rays: &[Ray], degree: usize) -> Tensor<f32> {
+    let directions = rays.iter().flat_map(|ray| ray.direction.as_vec3().to_array()).collect();
+    no_grad(|| sh::basis(&Tensor::from_vec(directions, &[rays.len(), 3]), degree))
 }
 
 /// The pixels that show the object, whatever its color: view after view, row after row, a batch at a time.
