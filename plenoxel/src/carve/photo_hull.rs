@@ -53,7 +53,7 @@ impl Default for PhotoConfig {
     }
 }
 
-/// The voxels of `start` that are photo-consistent in all views. `start` must hold the scene: a visual hull, or the whole box.
+/// The voxels of `start` that are photo-consistent in all views. `start` must hold the scene: a visual hull, or the whole box where there is no alpha.
 /// `progress(round, carved, left)` is called after each round, from 1, with the number of voxels carved in it and left.
 ///
 /// Errors: a configuration error for a noise that is not above 0.

@@ -85,8 +85,6 @@ fn the_photo_hull_opens_a_pit_that_the_visual_hull_fills() {
     assert!(left * 10 < all, "{left} of {all} voxels of the pit are left");
     let (left, all) = count(&photo, matter);
     assert!(all - left <= all / 500, "{left} of {all} voxels of the cube are left");
-    // From the whole box, silhouettes come to the same.
-    assert_eq!(hull(&views, &box_of(24), 0.12).masks(), photo.masks());
 }
 
 #[test]
