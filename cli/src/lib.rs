@@ -30,7 +30,7 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel train                             learn the built-in scene; needs no files
   plenoxel train data/lego --preset paper    learn a NeRF-synthetic scene as the source paper does
-  plenoxel carve data/lego                   an opaque colored grid from silhouettes, in seconds
+  plenoxel carve data/lego                   an opaque colored grid from silhouettes
   plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
   plenoxel render runs/lego-1 --view 0       a picture of it
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud

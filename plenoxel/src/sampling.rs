@@ -12,7 +12,7 @@ use crate::random::{Purpose, uniform};
 use autograd::{Buffer, Indices, Real, Tensor, parallel};
 use occupancy::Look;
 pub use occupancy::Occupancy;
-pub(crate) use occupancy::{inside, split};
+pub(crate) use occupancy::{inside, place, split};
 use serde::{Deserialize, Serialize};
 
 /// How samples are spaced along a ray.

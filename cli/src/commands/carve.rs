@@ -1,4 +1,4 @@
-//! `plenoxel carve`: from silhouettes to an opaque colored grid, without training.
+//! `plenoxel carve`: from silhouettes and colors to an opaque colored grid, without training.
 
 use super::new_run::{Stopwatch, announce, load, record};
 use super::{MOST_REDUCTION, whole};
@@ -85,7 +85,7 @@ pub struct CarveArgs {
     carve: Option<String>,
 
     /// Carve on, away voxels of which the photographs show colors that differ by more than this standard deviation, of sRGB values in [0, 1]
-    /// [default without a number: 0.15]. Needs no alpha
+    /// (without a number: by the default of carve.photo.noise). Needs no alpha
     #[arg(long, value_name = "NOISE", help_heading = "Carving", value_parser = super::number(0.0), num_args = 0..=1, require_equals = true)]
     photo_consistency: Option<Option<f64>>,
 

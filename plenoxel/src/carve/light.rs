@@ -5,8 +5,8 @@ use crate::camera::Ray;
 use crate::dataset::View;
 use crate::field::sh;
 use crate::geometry::Aabb;
-use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
+use crate::sampling::{Occupancy, place};
 use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::{Lattice, Tensor, no_grad, parallel};
 use std::ops::ControlFlow;
@@ -127,7 +127,7 @@ impl<'a> Opaque<'a> {
     pub fn new(lattice: &'a Lattice, aabb: Aabb, density: f64) -> Self {
         let count = lattice.nodes().map(|n| n.div_ceil(BRICK));
         let first_rows = parallel::map_indices(lattice.masks().len(), |b| {
-            let brick = lattice.brick([b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]]);
+            let brick = lattice.brick(place(b, count));
             brick.map_or(0, |(brick, _)| (brick * BRICK_ROWS) as u32)
         });
         let occupancy = Occupancy::from_masks(aabb, lattice.nodes(), lattice.masks().to_vec());

@@ -28,7 +28,7 @@ mod votes;
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::sampling::{Occupancy, split};
+use crate::sampling::{Occupancy, place, split};
 use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::parallel;
 use serde::{Deserialize, Serialize};
@@ -112,7 +112,7 @@ impl Surface {
 
     fn voxel(&self, brick: usize, bit: usize) -> [usize; 3] {
         let count = self.bricks();
-        let place = [brick / (count[1] * count[2]), brick / count[2] % count[1], brick % count[2]];
+        let place = place(brick, count);
         [0, 1, 2].map(|a| place[a] * BRICK + (bit >> (4 - 2 * a) & 3))
     }
 

@@ -6,7 +6,7 @@ use crate::camera::Camera;
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
-use crate::sampling::{Occupancy, inside};
+use crate::sampling::{Occupancy, inside, place};
 use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::parallel;
 use glam::{DVec3, dvec3};
@@ -25,7 +25,6 @@ const BRICKS: usize = 16;
 /// Bricks of 4³ voxels are tested by the rectangle around their projection, voxels by the projection itself, a convex polygon.
 pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64) -> Occupancy {
     let count = voxels.map(|n| n.div_ceil(BRICK));
-    let place = |b: usize| [b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]];
     let mut masks = full(voxels);
     for views in views.chunks(VIEWS) {
         let silhouettes = parallel::map_indices(views.len(), |v| Silhouette::of(&views[v], aabb, voxels));
@@ -33,7 +32,7 @@ pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64)
             for (b, mask) in masks.iter_mut().enumerate() {
                 for silhouette in &silhouettes {
                     if *mask != 0 {
-                        *mask &= !silhouette.outside(place(first + b), *mask, margin);
+                        *mask &= !silhouette.outside(place(first + b, count), *mask, margin);
                     }
                 }
             }
@@ -81,7 +80,7 @@ pub(super) fn is_background(view: &View, x: usize, y: usize) -> bool {
 /// Masks of all voxels.
 pub(super) fn full(voxels: [usize; 3]) -> Vec<u64> {
     let count = voxels.map(|n| n.div_ceil(BRICK));
-    parallel::map_indices(count.iter().product(), |b| inside([b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]], voxels))
+    parallel::map_indices(count.iter().product(), |b| inside(place(b, count), voxels))
 }
 
 /// Where a view shows the object, and how voxels project into it.

@@ -81,10 +81,9 @@ pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> Point
     let chosen: Vec<([usize; 3], u32)> = planes.into_iter().flatten().collect();
 
     let position = |&([x, y, z], _): &([usize; 3], u32)| {
-        let index = DVec3::new(x as f64, y as f64, z as f64);
         let at = match options.coordinates {
-            Coordinates::Grid => index,
-            Coordinates::World => (index + 0.5) * side - shape.half_width,
+            Coordinates::Grid => DVec3::new(x as f64, y as f64, z as f64),
+            Coordinates::World => shape.center([x, y, z].map(|k| k as isize)),
         };
         at.as_vec3().as_dvec3()
     };

@@ -175,7 +175,7 @@ pub(super) fn place_number(place: [usize; 3], count: [usize; 3]) -> usize {
 }
 
 /// Place of a brick.
-fn place(brick: usize, count: [usize; 3]) -> [usize; 3] {
+pub(crate) fn place(brick: usize, count: [usize; 3]) -> [usize; 3] {
     [brick / (count[1] * count[2]), brick / count[2] % count[1], brick % count[2]]
 }
 

@@ -99,7 +99,7 @@ pub struct TrainArgs {
     init_from: Option<PathBuf>,
 
     /// Where images have alpha, let silhouettes decide the size of the box and which voxels exist (auto), or use alpha for compositing
-    /// only (off)
+    /// only (off) [default: auto; preset paper: off]
     #[arg(long, help_heading = "Training", value_parser = ["auto", "off"])]
     hull: Option<String>,
 

@@ -114,16 +114,14 @@ fn less_noise_carves_more() {
 }
 
 #[test]
-fn threads_do_not_matter_and_neither_does_the_order_of_views() {
-    let mut views = views(16, true, true);
+fn any_number_of_threads_carves_the_same() {
+    let views = views(16, true, true);
     let with = |views: &[View], threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| hull(views, &box_of(16), 0.12).masks().to_vec())
     };
     let one = with(&views, 1);
     assert!(with(&views, 2) == one && with(&views, 3) == one);
-    views.reverse();
-    assert_eq!(with(&views, 2), one);
 }
 
 #[test]
