@@ -2,6 +2,7 @@
 
 use glam::{DVec3, dvec3};
 use plenoxel::camera::{Camera, Intrinsics};
+use plenoxel::carve::photo_hull::{self, PhotoConfig};
 use plenoxel::carve::{CarveConfig, Carving, Fit, Rule, visual_hull};
 use plenoxel::dataset::image::RgbaImage;
 use plenoxel::dataset::procedural::{ProceduralOptions, Scene};
@@ -99,6 +100,75 @@ fn needless_voxels_of_the_rules_against_the_ideal_hull() {
             println!("  {name}: {left} left, {needless} needless, {} carved that hold matter", carved_wrongly(scene, &hull, n));
         }
     }
+}
+
+/// A texture that changes over about ten degrees, far behind the still life.
+fn surroundings(direction: DVec3) -> [f64; 3] {
+    let wave = |axis: DVec3, phase: f64| (18.0 * axis.dot(direction) + phase).sin();
+    let channel = |k: f64| wave(dvec3(0.9, -0.3, 0.5), k) + wave(dvec3(-0.4, 0.8, 0.7), 2.0 * k) + wave(dvec3(0.2, 0.6, -0.9), 3.0 * k);
+    [1.0, 2.5, 4.0].map(|k| 0.5 + 0.5 * channel(k).sin())
+}
+
+/// The same views as photographs without alpha.
+fn over_surroundings(mut views: Vec<View>) -> Vec<View> {
+    for View { camera, image, .. } in &mut views {
+        for (x, y, pixel) in image.enumerate_pixels_mut() {
+            let behind = surroundings(camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5).direction);
+            let alpha = f64::from(pixel.0[3]) / 255.0;
+            for (value, behind) in pixel.0.iter_mut().zip(behind) {
+                *value = (alpha * f64::from(*value) + (1.0 - alpha) * 255.0 * behind).round() as u8;
+            }
+            pixel.0[3] = 255;
+        }
+    }
+    views
+}
+
+/// `cargo test --release --test carving -- --ignored --nocapture`: what the photo hull carves of the hollows that no silhouette shows, and what
+/// of matter. A voxel is full by as many of 64 points as lie in matter.
+#[test]
+#[ignore = "figures"]
+fn hollows_in_the_visual_and_in_the_photo_hull() {
+    let (dataset, views) = still_life();
+    let scene = dataset.scene().unwrap();
+    let opaque = over_surroundings(views.clone());
+    let report = |name: &str, n: usize, start: &Occupancy, noises: &[f64], views: &[View]| {
+        let corners = [0.125, 0.375, 0.625, 0.875];
+        let full: Vec<usize> = voxels(n)
+            .map(|voxel| (0..64).filter(|k| scene.distance(point(voxel, n, [k / 16, k / 4 % 4, k % 4].map(|c| corners[c]))) < 0.0).count())
+            .collect();
+        let of = |[x, y, z]: [usize; 3]| full[(x * n + y) * n + z];
+        let count = |is: &(dyn Fn([usize; 3]) -> bool + Sync)| voxels(n).filter(|&voxel| is(voxel)).count();
+        let tell = |name: &str, hull: &Occupancy| {
+            let empty = count(&|v| hull.contains(v) && of(v) == 0);
+            // The bowl stands where x < 0, the block with the dimples where x > 0.
+            let hollow = |v: [usize; 3], side: f64| {
+                let middle = point(v, n, [0.5; 3]);
+                hull.contains(v) && of(v) == 0 && side * middle.x > 0.0 && scene.in_hollow(middle)
+            };
+            let (bowl, dimples) = (count(&|v| hollow(v, -1.0)), count(&|v| hollow(v, 1.0)));
+            let lost = |least: usize| count(&|v| start.contains(v) && !hull.contains(v) && of(v) >= least);
+            let lost = (lost(32), lost(64));
+            println!(
+                "  {name}: {empty} empty, {bowl} in the bowl, {dimples} in dimples; carved: {} at least half full, {} full",
+                lost.0, lost.1
+            );
+        };
+        println!("{name}, {n}³: {} voxels at least half full", full.iter().filter(|n| **n >= 32).count());
+        tell("before", start);
+        for &noise in noises {
+            let hull = photo_hull::photo_hull(views, start, &PhotoConfig { noise }, &|_, _, _| ()).unwrap();
+            tell(&format!("noise {noise}"), &hull);
+        }
+    };
+    let noise = PhotoConfig::default().noise;
+    for n in [64, 128] {
+        let hull = visual_hull::by_footprint(&views, Aabb::cube(HALF_WIDTH), [n; 3], CarveConfig::default().margin);
+        report("from the visual hull", n, &hull, &[noise, 0.8 * noise], &views);
+    }
+    let n = 64;
+    let all = Occupancy::new(Aabb::cube(HALF_WIDTH), [n; 3], &vec![true; n.pow(3)]);
+    report("no alpha, from the whole box", n, &all, &[noise], &opaque);
 }
 
 /// A few small views of the still life.

@@ -5,6 +5,7 @@
 
 use crate::progress::bytes;
 use plenoxel::carve::Fit;
+use plenoxel::carve::color::KEPT_LIGHT;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::{Color, GridShape};
@@ -129,6 +130,8 @@ impl Estimate {
         // The two sides of the normal equations, the answer, its error, and how much a voxel weighs.
         let fit = 4 * rows as u64 * (coefficients * (coefficients + 1) / 2 + 9 * coefficients + 2);
         let images = images(dataset, config.downscale, &[Split::Train]) + items;
+        let kept = if rows > 0 { (KEPT_LIGHT as u64).min(12 * pixels * hits_of_pixel(config)) } else { 0 };
+        let step = step + kept;
         let grid = masks + fit;
         let (key, advice) = match images > grid {
             true => ("--downscale", "a larger factor, so that the images fit"),

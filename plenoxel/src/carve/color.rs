@@ -15,7 +15,7 @@
 //!
 //! [`fit_by_descent`] is the paper's own way, stochastic gradient descent, with its lost updates repaired.
 
-use super::light::{Hit, Lit, Opaque, Pixel, object_pixels};
+use super::light::{Light, Opaque, Pixel, object_pixels};
 use crate::dataset::View;
 use crate::field::neighbours::smoothed;
 use crate::field::sh;
@@ -46,6 +46,8 @@ pub struct Fitted {
     pub missed: f64,
 }
 
+/// Bytes of light that a fit keeps from one pass to the next.
+pub const KEPT_LIGHT: usize = 1 << 28;
 /// Passes of [`fit_by_descent`] over the pixels.
 pub const EPOCHS: usize = RATES.len();
 const RATES: [f32; 4] = [0.9, 0.9, 0.1, 0.1];
@@ -55,32 +57,43 @@ impl Seen<'_> {
         sh::count(self.degree)
     }
 
-    /// What the photograph shows more than Σ w max(0, offset + S·x) + rest · background.
-    fn error(&self, lit: &Lit<'_>, table: &[f32]) -> [f32; 3] {
-        let count = self.count();
-        let mut error = [0, 1, 2].map(|c| lit.color[c] - lit.rest * self.background[c]);
-        for &Hit { row, weight, .. } in lit.hits {
-            let row = &table[row as usize * 3 * count..][..3 * count];
-            for (error, x) in error.iter_mut().zip(row.chunks_exact(count)) {
-                *error -= weight * (self.offset + dot(x, lit.basis)).max(0.0);
-            }
-        }
-        error
+    fn light(&self, pixels: &[Pixel]) -> Light {
+        self.opaque.light(self.views, pixels, self.background, self.degree)
     }
 
-    /// Adds Σ w S value to a table like that of the harmonics, for the object pixels of all views.
-    fn gather(&self, value: impl Fn(Lit<'_>) -> [f32; 3] + Sync) -> Vec<f32> {
-        let (count, width) = (self.count(), 3 * self.count());
-        let mut table = vec![0.0; self.lattice.rows() * width];
-        for pixels in object_pixels(self.views) {
-            let light = self.opaque.light(self.views, &pixels, self.background, self.degree, &value);
-            light.for_each_part([(&mut table, width)], |hits, [table]| {
-                for seen in hits.iter() {
-                    add_products(&mut table[seen.row * width..][..width], count, seen.weight, seen.value, seen.basis);
-                }
-            });
+    /// Has pixels say what they show more than the voxels do.
+    fn compare(&self, light: &mut Light, table: &[f32]) {
+        let count = self.count();
+        light.say_errors(|row, basis| {
+            let row = &table[row * 3 * count..][..3 * count];
+            [0, 1, 2].map(|c| (self.offset + dot(&row[c * count..][..count], basis)).max(0.0))
+        });
+    }
+}
+
+/// The light of all object pixels, batch by batch, of which the first are kept for the next pass.
+struct Passes<'a> {
+    seen: &'a Seen<'a>,
+    kept: Vec<Light>,
+    /// Bytes that are left for more.
+    room: usize,
+}
+
+impl<'a> Passes<'a> {
+    fn new(seen: &'a Seen<'a>) -> Self {
+        Passes { seen, kept: Vec::new(), room: KEPT_LIGHT }
+    }
+
+    fn pass(&mut self, mut f: impl FnMut(&mut Light)) {
+        self.kept.iter_mut().for_each(&mut f);
+        for pixels in object_pixels(self.seen.views).skip(self.kept.len()) {
+            let mut light = self.seen.light(&pixels);
+            f(&mut light);
+            self.room = self.room.saturating_sub(light.bytes());
+            if self.room > 0 {
+                self.kept.push(light);
+            }
         }
-        table
     }
 }
 
@@ -92,24 +105,24 @@ pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, passed: &dyn Fn(u
     // One pass for both sides: the triangle of A, then b.
     let mut sides = vec![0.0_f32; rows * (triangle + width)];
     let (mut pixels_all, mut pixels_missed) = (0, 0);
-    for pixels in object_pixels(seen.views) {
-        let light = seen.opaque.light(seen.views, &pixels, seen.background, seen.degree, |lit| lit.color.map(|c| c - seen.offset));
-        pixels_all += pixels.len();
+    let mut passes = Passes::new(seen);
+    passes.pass(|light| {
+        pixels_all += light.pixels();
         pixels_missed += light.missed();
         light.for_each_part([(&mut sides, triangle + width)], |hits, [sides]| {
-            for seen in hits.iter() {
-                let (a, b) = sides[seen.row * (triangle + width)..][..triangle + width].split_at_mut(triangle);
+            for hit in hits.iter() {
+                let (a, b) = sides[hit.row * (triangle + width)..][..triangle + width].split_at_mut(triangle);
                 let mut at = 0;
                 for i in 0..count {
-                    for (a, s) in a[at..=at + i].iter_mut().zip(seen.basis) {
-                        *a += seen.weight * seen.basis[i] * s;
+                    for (a, s) in a[at..=at + i].iter_mut().zip(hit.basis) {
+                        *a += hit.weight * hit.basis[i] * s;
                     }
                     at += i + 1;
                 }
-                add_products(b, count, seen.weight, seen.value, seen.basis);
+                add_products(b, count, hit.weight, hit.value.map(|color| color - seen.offset), hit.basis);
             }
         });
-    }
+    });
     let weight: Vec<f32> = sides.chunks_exact(triangle + width).map(|row| row[0] / (sh::Y0 * sh::Y0) as f32).collect();
     // The right sides are the last numbers of each row of a table.
     let solve = |table: &mut [f32], right: &[f32], of: usize| {
@@ -127,7 +140,15 @@ pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, passed: &dyn Fn(u
     solve(&mut table, &sides, triangle + width);
     passed(1);
     for sweep in 0..sweeps {
-        let error = seen.gather(|lit| seen.error(&lit, &table));
+        let mut error = vec![0.0; rows * width];
+        passes.pass(|light| {
+            seen.compare(light, &table);
+            light.for_each_part([(&mut error, width)], |hits, [error]| {
+                for hit in hits.iter() {
+                    add_products(&mut error[hit.row * width..][..width], count, hit.weight, hit.value, hit.basis);
+                }
+            });
+        });
         solve(&mut table, &error, width);
         passed(sweep + 2);
     }
@@ -191,7 +212,8 @@ pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, passed: &dyn Fn(usize)) -> Fit
         let order = Permutation::new(pixels.len() as u64, seed, Purpose::RayOrder, epoch as u64);
         for start in (0..pixels.len()).step_by(RAYS) {
             let batch: Vec<Pixel> = (start..(start + RAYS).min(pixels.len())).map(|i| pixels[order.at(i as u64) as usize]).collect();
-            let light = seen.opaque.light(seen.views, &batch, seen.background, seen.degree, |lit| seen.error(&lit, &table));
+            let mut light = seen.light(&batch);
+            seen.compare(&mut light, &table);
             light.for_each_part([(&mut table, width), (&mut sums, width + 1)], |hits, [table, sums]| {
                 for seen in hits.iter() {
                     let sums = &mut sums[seen.row * (width + 1)..][..width + 1];

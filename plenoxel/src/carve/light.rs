@@ -53,19 +53,7 @@ pub struct Opaque<'a> {
     density: f64,
 }
 
-/// A pixel with the light that falls into it.
-pub struct Lit<'a> {
-    /// Its color over the background.
-    pub color: [f32; 3],
-    /// Harmonics at the ray's direction.
-    pub basis: &'a [f32],
-    /// From the camera on.
-    pub hits: &'a [Hit],
-    /// What reaches the background.
-    pub rest: f32,
-}
-
-/// The light of some pixels, with what each pixel has to say to the voxels that it sees.
+/// The light of some pixels, with what each pixel has to say to the voxels that it sees: at first its color over the background.
 pub struct Light {
     chunks: Vec<Chunk>,
     /// Harmonics of a pixel.
@@ -115,6 +103,8 @@ impl<'a> PartHits<'a> {
 struct Chunk {
     hits: Vec<Hit>,
     bounds: [usize; PARTS + 1],
+    /// What each pixel shows without the background behind the voxels.
+    objects: Vec<[f32; 3]>,
     values: Vec<[f32; 3]>,
     /// `[pixels, (degree + 1)²]`
     basis: Tensor<f32>,
@@ -131,7 +121,8 @@ impl<'a> Opaque<'a> {
             brick.map_or(0, |(brick, _)| (brick * BRICK_ROWS) as u32)
         });
         let occupancy = Occupancy::from_masks(aabb, lattice.nodes(), lattice.masks().to_vec());
-        Opaque { lattice, walk: Walk::new(aabb, lattice.nodes()), occupancy, first_rows, density }
+        let extent = occupancy.extent().unwrap_or_default();
+        Opaque { lattice, walk: Walk::new(aabb, lattice.nodes()).within(extent), occupancy, first_rows, density }
     }
 
     /// Appends the voxels on a ray, from the camera on, each with the optical depth behind it as its weight, until that is opaque.
@@ -152,39 +143,28 @@ impl<'a> Opaque<'a> {
         );
     }
 
-    /// The light of some pixels. `value` says what each has to say to the voxels that it sees; `degree` is of the harmonics.
-    pub fn light(
-        &self,
-        views: &[View],
-        pixels: &[Pixel],
-        background: [f32; 3],
-        degree: usize,
-        value: impl Fn(Lit<'_>) -> [f32; 3] + Sync,
-    ) -> Light {
-        let count = sh::count(degree);
+    /// The light of some pixels; `degree` is of the harmonics.
+    pub fn light(&self, views: &[View], pixels: &[Pixel], background: [f32; 3], degree: usize) -> Light {
         let part = self.lattice.rows().div_ceil(PARTS).max(1);
         let chunks = parallel::map_chunks(pixels.len(), CHUNK, |range| {
             let pixels = &pixels[range];
             let rays: Vec<Ray> = pixels.iter().map(|pixel| pixel.ray(views)).collect();
-            let basis = basis(&rays, degree);
             let (mut hits, mut ends) = (Vec::with_capacity(16 * CHUNK), Vec::with_capacity(CHUNK));
+            let mut missed = 0;
             for (i, ray) in rays.iter().enumerate() {
+                let first = hits.len();
                 self.depths(ray, i as u32, &mut hits);
+                missed += usize::from(hits.len() == first);
                 ends.push(hits.len());
             }
             let rests = to_weights(&mut hits, &ends);
-            let (mut first, mut missed) = (0, 0);
-            let lit = ends.iter().zip(rests).enumerate().map(|(i, (&end, rest))| {
-                let hits = &hits[std::mem::replace(&mut first, end)..end];
-                missed += usize::from(hits.is_empty());
-                let color = pixels[i].color(views, background);
-                value(Lit { color, basis: &basis.data()[i * count..][..count], hits, rest })
-            });
-            let values = lit.collect();
+            let values: Vec<[f32; 3]> = pixels.iter().map(|pixel| pixel.color(views, background)).collect();
+            let behind = |(value, rest): (&[f32; 3], f32)| [0, 1, 2].map(|c| value[c] - rest * background[c]);
+            let objects = values.iter().zip(rests).map(behind).collect();
             let (hits, bounds) = by_part(&hits, part);
-            Chunk { hits, bounds, values, basis, missed }
+            Chunk { hits, bounds, objects, values, basis: basis(&rays, degree), missed }
         });
-        Light { chunks, count, part }
+        Light { chunks, count: sh::count(degree), part }
     }
 }
 
@@ -224,6 +204,21 @@ fn by_part(hits: &[Hit], part: usize) -> (Vec<Hit>, [usize; PARTS + 1]) {
 }
 
 impl Light {
+    /// Has each pixel say what it shows more than Σ w color + rest · background. `color(row, basis)` is of a voxel in the ray's direction.
+    pub fn say_errors(&mut self, color: impl Fn(usize, &[f32]) -> [f32; 3] + Sync) {
+        let count = self.count;
+        parallel::for_each_chunk(&mut self.chunks, 1, |_, chunks| {
+            for Chunk { hits, objects, values, basis, .. } in chunks {
+                values.copy_from_slice(objects);
+                for hit in &*hits {
+                    let ray = hit.ray as usize;
+                    let color = color(hit.row as usize, &basis.data()[ray * count..][..count]);
+                    values[ray].iter_mut().zip(color).for_each(|(value, color)| *value -= hit.weight * color);
+                }
+            }
+        });
+    }
+
     /// Calls `f` with the hits of a part of the voxels, and the rows of some tables that belong to it, for all parts side by side. Tables come
     /// with their width; hits of a voxel come in the order of the pixels.
     pub fn for_each_part<const N: usize>(&self, tables: [(&mut Vec<f32>, usize); N], f: impl Fn(PartHits<'_>, [&mut [f32]; N]) + Sync) {
@@ -236,6 +231,17 @@ impl Light {
         .collect();
         debug_assert!(parts.iter().all(|part| (0..N).all(|t| part[t].len() * widths[0] == part[0].len() * widths[t])));
         parallel::for_each_item(parts, |part, rows| f(PartHits { light: self, part }, rows));
+    }
+
+    /// The number of pixels.
+    pub fn pixels(&self) -> usize {
+        self.chunks.iter().map(|chunk| chunk.values.len()).sum()
+    }
+
+    /// Bytes that it takes.
+    pub fn bytes(&self) -> usize {
+        let of_chunk = |chunk: &Chunk| size_of_val(&*chunk.hits) + (24 + 4 * self.count) * chunk.values.len();
+        self.chunks.iter().map(of_chunk).sum()
     }
 
     /// The number of pixels that see no voxel.

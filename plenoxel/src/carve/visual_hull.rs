@@ -44,14 +44,15 @@ pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64)
 /// The voxels that the ray of no background pixel passes through: the source paper's rule, with every voxel on the ray instead of those
 /// around 900 points. Rays are of pixel centres, so it carves into what thin parts leave between them.
 pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3]) -> Occupancy {
-    let walk = Walk::new(aabb, voxels);
     // Voxels only ever go, so the order in which they do is all the same.
     let masks: Vec<AtomicU64> = full(voxels).into_iter().map(AtomicU64::new).collect();
     let (mut done, mut group) = (0, 1);
     while done < views.len() {
-        // What is empty now stays so: the next views, as many again, cross it in large steps.
+        // What is empty now stays so: the next views, as many again, leave it out or cross it in large steps.
         let snapshot = || masks.iter().map(|mask| mask.load(Relaxed)).collect();
         let empty = Occupancy::from_masks(aabb, voxels, snapshot());
+        let Some(extent) = empty.extent() else { break };
+        let walk = Walk::new(aabb, voxels).within(extent);
         let free = |brick: usize| if masks[brick].load(Relaxed) == 0 { empty.free(brick).max(1) } else { 0 };
         let next = &views[done..(done + group).min(views.len())];
         let rows: Vec<(&View, usize)> = next.iter().flat_map(|view| (0..view.image.height() as usize).map(move |y| (view, y))).collect();

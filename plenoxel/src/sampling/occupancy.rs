@@ -97,8 +97,15 @@ impl Occupancy {
 
     /// The smallest box around the cells that may hold matter; `None` if none may.
     pub fn bounds(&self) -> Option<Aabb> {
+        let side = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells.map(|n| n as f64));
+        let corner = |k: [usize; 3]| self.aabb.min + side * DVec3::from_array(k.map(|k| k as f64));
+        self.extent().map(|[low, high]| Aabb { min: corner(low), max: corner(high) })
+    }
+
+    /// The same in cells: the lowest along each axis, and one above the highest.
+    pub fn extent(&self) -> Option<[[usize; 3]; 2]> {
         let (mut low, mut high) = (self.cells, [0; 3]);
-        for (b, mask) in self.masks.iter().enumerate() {
+        for (b, mask) in self.masks.iter().enumerate().filter(|(_, mask)| **mask != 0) {
             let place = place(b, self.count);
             for bit in (0..BRICK_ROWS).filter(|bit| mask >> bit & 1 == 1) {
                 for a in 0..3 {
@@ -107,9 +114,7 @@ impl Occupancy {
                 }
             }
         }
-        let side = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells.map(|n| n as f64));
-        let corner = |k: [usize; 3]| self.aabb.min + side * DVec3::from_array(k.map(|k| k as f64));
-        (low[0] < high[0]).then(|| Aabb { min: corner(low), max: corner(high) })
+        (low[0] < high[0]).then_some([low, high])
     }
 
     /// The cells within `radius` cells of these, along axes and diagonals.

@@ -28,6 +28,8 @@ pub struct Walk {
     aabb: Aabb,
     voxels: [usize; 3],
     bricks: [usize; 3],
+    /// Planes before and behind which nothing is visited.
+    extent: [[usize; 3]; 2],
 }
 
 /// The planes between voxels along one axis, numbered from 0 to `voxels`, as a ray meets them.
@@ -74,13 +76,13 @@ impl Planes {
         (plane as f64 - self.origin) * self.spacing
     }
 
-    /// Distances at which the ray enters and leaves all voxels.
-    fn chord(&self) -> (f64, f64) {
+    /// Distances at which the ray enters and leaves what is between two planes.
+    fn chord(&self, low: usize, high: usize) -> (f64, f64) {
         if self.pace == 0.0 {
-            let inside = self.start >= 0.0 && self.start <= self.voxels as f64;
+            let inside = self.start >= low as f64 && self.start <= high as f64;
             return if inside { (f64::NEG_INFINITY, f64::INFINITY) } else { (f64::INFINITY, f64::NEG_INFINITY) };
         }
-        let (low, high) = (self.at(0), self.at(self.voxels));
+        let (low, high) = (self.at(low), self.at(high));
         (low.min(high), low.max(high))
     }
 
@@ -129,21 +131,27 @@ impl Front {
 impl Walk {
     /// The voxels of a box.
     pub fn new(aabb: Aabb, voxels: [usize; 3]) -> Self {
-        Walk { aabb, voxels, bricks: voxels.map(|n| n.div_ceil(BRICK)) }
+        Walk { aabb, voxels, bricks: voxels.map(|n| n.div_ceil(BRICK)), extent: [[0; 3], voxels] }
+    }
+
+    /// Only those from one corner on and before another ([`super::Occupancy::extent`]).
+    pub fn within(self, extent: [[usize; 3]; 2]) -> Self {
+        Walk { extent, ..self }
     }
 
     /// Calls `visit` for the voxels on a ray, from its origin on, until it breaks; those that the ray only touches are no voxels on it.
     /// `free(brick)`, asked when the ray comes to a brick, by its number in row-major order, says how many layers of bricks are empty: 0 if the
     /// brick is not, 1 if it is, k if all around it within k − 1 are too ([`super::Occupancy::free`]). Voxels of empty bricks are left out.
     ///
-    /// Chords add up to that of the box within rounding.
+    /// Chords add up to that of the extent within rounding.
     #[inline]
     pub fn along(&self, ray: &Ray, free: impl Fn(usize) -> u8, mut visit: impl FnMut(Crossing) -> ControlFlow<()>) {
         let axis = |a: usize| Planes::new(self.voxels[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]);
         let planes = [axis(0), axis(1), axis(2)];
         let (mut t, mut end) = (0.0_f64, f64::INFINITY);
-        for axis in &planes {
-            let (enter, leave) = axis.chord();
+        let [low, high] = self.extent;
+        for (a, axis) in planes.iter().enumerate() {
+            let (enter, leave) = axis.chord(low[a], high[a]);
             (t, end) = (t.max(enter), end.min(leave));
         }
         // A ray without direction has no end.
@@ -313,23 +321,28 @@ mod tests {
         // Jumping over several layers of empty bricks changes nothing.
         let occupancy = Occupancy::new(Aabb::cube(1.0), [37; 3], &(0..37 * 37 * 37).map(|v| v % 2999 == 7).collect::<Vec<_>>());
         let walk_large = Walk::new(Aabb::cube(1.0), [37; 3]);
+        let near = walk_large.within(occupancy.extent().unwrap());
         for seed in 0..500 {
             let (origin, direction) = random_ray(seed);
             let ray = Ray { origin, direction, stretch: 1.0 };
-            let along = |free: &dyn Fn(usize) -> u8| {
+            let along = |walk: &Walk, free: &dyn Fn(usize) -> u8| {
                 let mut found = Vec::new();
-                walk_large.along(&ray, free, |c| {
+                walk.along(&ray, free, |c| {
                     found.push(c);
                     ControlFlow::Continue(())
                 });
                 found
             };
-            let (jumps, steps) = (along(&|brick| occupancy.free(brick)), along(&|brick| occupancy.free(brick).min(1)));
+            let (jumps, steps) =
+                (along(&walk_large, &|brick| occupancy.free(brick)), along(&walk_large, &|brick| occupancy.free(brick).min(1)));
             let chord = |found: &[Crossing]| -> f64 { found.iter().map(|c| c.leave - c.enter).sum() };
             assert!((chord(&jumps) - chord(&steps)).abs() < 1e-9, "ray {seed}");
             let solid =
                 |found: &[Crossing]| -> Vec<[usize; 3]> { found.iter().filter(|c| c.leave - c.enter > 1e-9).map(|c| c.voxel).collect() };
             assert_eq!(solid(&jumps), solid(&steps), "ray {seed}");
+            // Nor does leaving out what is before and behind all matter, to matter.
+            let matter = |found: &[Crossing]| solid(found).into_iter().filter(|&voxel| occupancy.contains(voxel)).collect::<Vec<_>>();
+            assert_eq!(matter(&along(&near, &|brick| occupancy.free(brick))), matter(&jumps), "ray {seed}");
         }
         let mut first = None;
         walk.along(

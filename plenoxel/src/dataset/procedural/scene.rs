@@ -53,6 +53,11 @@ impl Scene {
         self.distance(point) < 0.0
     }
 
+    /// True in what was cut out of a solid and is empty: in the bowl, and in the dimples of the block.
+    pub fn in_hollow(&self, point: DVec3) -> bool {
+        !self.occupied(point) && self.objects.iter().any(|object| object.solid.in_hollow(point))
+    }
+
     /// Distance along the unit ray to the first surface, infinite where there is none.
     pub fn depth(&self, ray: &Ray) -> f64 {
         self.first(ray.origin, ray.direction, u32::MAX).map_or(f64::INFINITY, |surface| surface.hit.t)

@@ -73,6 +73,17 @@ impl Solid {
         }
     }
 
+    /// True in a hole, within the body that it was cut out of.
+    pub fn in_hollow(&self, p: DVec3) -> bool {
+        match self {
+            Solid::Carved { body, holes } => {
+                let within = |piece: &Convex| piece.distance(p) < 0.0;
+                body.iter().all(within) && holes.iter().any(within)
+            }
+            Solid::Torus { .. } => false,
+        }
+    }
+
     /// True if no ray can leave the solid and meet it again.
     pub fn convex(&self) -> bool {
         matches!(self, Solid::Carved { holes, .. } if holes.is_empty())
