@@ -113,7 +113,7 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
         assert!(described.out.contains(part), "{part}: {}", described.out);
     }
     let checkpoint = plenoxel(&["info", &format!("{run}/checkpoint.safetensors")]);
-    assert!(checkpoint.out.contains("10 steps on procedural, seed 42"), "{}", checkpoint.out);
+    assert!(checkpoint.out.contains("10 steps, procedural, seed 42"), "{}", checkpoint.out);
 }
 
 #[test]
@@ -194,9 +194,9 @@ fn a_run_is_overwritten_only_when_forced_and_leaves_nothing_of_the_old_one() {
     assert!(plenoxel(&["info", &data]).out.contains("1 train, 0 val, 0 test"));
     fs::write(folder.path("file"), "x").unwrap();
     plenoxel(&["scene", &folder.path("file")]).refused(2, &["which is a file"]);
-    train(&folder.path("file"), &["--force"]).refused(2, &["which is a file"]);
+    train(&folder.path("file"), &["--force"]).refused(2, &["is a file"]);
     // A folder cannot be made below a file.
-    train(&folder.path("file/run"), &["--quiet"]).refused(5, &["file/run", "creating the folder"]);
+    train(&folder.path("file/run"), &["--quiet"]).refused(2, &["file/run", "is a file"]);
 }
 
 #[test]

@@ -189,7 +189,9 @@ pub fn layered<'a>(
 /// Writes a configuration so that reading it gives the same one.
 pub fn write(path: &Path, config: &Config, origin: &str) -> Result<()> {
     let text = toml::to_string(config).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?;
-    let heading = format!("# {origin}\n# Complete: it needs no preset. `plenoxel train DATA --config THIS_FILE` repeats the run.\n\n");
+    let heading = format!(
+        "# {origin}\n# Complete: it needs no preset. `plenoxel train DATA --config THIS_FILE` (`carve`, if there are no stages) repeats the run.\n\n"
+    );
     files::write_atomically(path, (heading + &text).as_bytes())
 }
 

@@ -206,14 +206,27 @@ fn prunes(config: &Config) -> bool {
     config.prune_from_stage.is_some_and(|first| first < config.stages.len())
 }
 
-/// Bytes of memory that can be taken now: what Linux counts as available, within the limit of the control group; elsewhere unknown.
+/// Bytes of memory that can be taken now: what Linux counts as available, within the limits of the control group and of the
+/// process; elsewhere unknown.
 pub fn available() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let free = kilobytes(&text, "MemAvailable:")?;
     let number = |path: &str| -> Option<u64> { std::fs::read_to_string(path).ok()?.trim().parse().ok() };
     let limit = number("/sys/fs/cgroup/memory.max");
     let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0);
-    Some(limit.map_or(free, |limit| free.min(limit.saturating_sub(used))))
+    let free = limit.map_or(free, |limit| free.min(limit.saturating_sub(used)));
+    let limits = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
+    Some(address_space(&limits).map_or(free, |limit| free.min(limit.saturating_sub(taken()))))
+}
+
+/// Bytes of addresses this process may have (`ulimit -v`), by the kernel's table of limits.
+fn address_space(limits: &str) -> Option<u64> {
+    limits.lines().find_map(|line| line.strip_prefix("Max address space"))?.split_whitespace().next()?.parse().ok()
+}
+
+/// Bytes of addresses that it has.
+fn taken() -> u64 {
+    std::fs::read_to_string("/proc/self/status").ok().and_then(|text| kilobytes(&text, "VmSize:")).unwrap_or(0)
 }
 
 /// The most memory this process ever had at once, in bytes; `None` where the system does not say.
@@ -305,5 +318,8 @@ mod tests {
         let text = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t 1 kB\n";
         assert_eq!(kilobytes(text, "VmHWM:"), Some(2048 * 1024));
         assert_eq!(kilobytes(text, "VmSwap:"), None);
+        let limits = "Limit                     Soft Limit           Hard Limit           Units\nMax address space         6144000000           unlimited            bytes\n";
+        assert_eq!(address_space(limits), Some(6_144_000_000));
+        assert_eq!(address_space("Max address space         unlimited            unlimited            bytes\n"), None);
     }
 }

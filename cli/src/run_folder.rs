@@ -49,19 +49,23 @@ const EXPORTS: &str = "exports";
 impl RunFolder {
     /// The folder that a new run will have: the one asked for, or `runs/<scene>-<n>` with the first free n. Nothing is written yet.
     ///
-    /// Errors: it has something in it and may not be overwritten, or it is a file.
+    /// Errors: it has something in it that is not a run, or a run that may not be overwritten; or it is a file.
     pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
         let Some(path) = out else {
             return Ok(RunFolder { path: first_free(Path::new("runs"), scene) });
         };
-        if path.exists() && !path.is_dir() {
-            let found = format!("{}, which is a file,", path.display());
+        if let Some(file) = path.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir()) {
+            let found = format!("{}, where {} is a file,", path.display(), file.display());
             return Err(Error::config("--out", found, "a folder"));
         }
         let occupied = std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some());
         if occupied && !overwrite {
             let found = format!("{}, which is not empty,", path.display());
             return Err(Error::config("--out", found, "a new folder; or --force, which overwrites the run in it"));
+        }
+        if occupied && !path.join(RECORD).exists() {
+            let found = format!("{}, which holds something that is not a run,", path.display());
+            return Err(Error::config("--out", found, "a new folder, or that of a run, which --force overwrites"));
         }
         Ok(RunFolder { path: path.to_owned() })
     }

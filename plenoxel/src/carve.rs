@@ -111,6 +111,15 @@ fn alphas(views: &[View]) -> impl Iterator<Item = u8> {
     views.iter().flat_map(|view| view.image.as_raw().iter().skip(3).step_by(4).copied())
 }
 
+/// About how many voxels silhouettes will leave, told by a coarse hull in no time; `None` if there are no silhouettes.
+pub fn voxels_expected(views: &[View], config: &Config) -> Option<f64> {
+    const COARSE: usize = 64;
+    let hull = has_alpha(views).then(|| {
+        visual_hull::by_footprint(views, Aabb::cube(config.half_width), [COARSE.min(config.carve.resolution); 3], config.carve.margin)
+    });
+    hull.map(|hull| hull.fraction() * (config.carve.resolution as f64).powi(3))
+}
+
 impl<'a> Carving<'a> {
     /// Carves the box of a configuration: to the visual hull where images have alpha, and on to the photo hull if the config asks for it.
     /// `progress(round, carved, left)` is called after each round of the latter.
@@ -148,7 +157,10 @@ impl<'a> Carving<'a> {
         }
         match hull.fraction() {
             0.0 => Err(Error::config("carve.photo.noise", photo.map_or(0.0, |photo| photo.noise), "more, for nothing is left")),
-            1.0 => half_width("of which no image shows a voxel that is not there"),
+            1.0 => {
+                let found = format!("{resolution}, of which no image shows one voxel whole on background,");
+                Err(Error::config("carve.resolution", found, "more voxels along an axis, or a larger half_width"))
+            }
             _ => Ok(Carving { views, config, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }
     }

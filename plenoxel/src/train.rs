@@ -114,6 +114,11 @@ impl<'a, T: Real> Trainer<'a, T> {
         self
     }
 
+    /// The same from a carved grid, whose voxels are as opaque as each other: they are made thin, so that gradients reach what is behind them.
+    pub fn starting_from_carved(self, grid: &VoxelGrid<T>) -> Self {
+        self.starting_from(&start::thinned(grid))
+    }
+
     /// The grid as it is now.
     pub fn grid(&self) -> &VoxelGrid<T> {
         &self.grid

@@ -85,7 +85,7 @@ pub struct CarveArgs {
     carve: Option<String>,
 
     /// Carve on, away voxels of which the photographs show colors that differ by more than this standard deviation, of sRGB values in [0, 1]
-    /// (without a number: by the default of carve.photo.noise). Needs no alpha
+    /// (0.15 if no number is given). Needs no alpha, but surroundings that show through: against one plain color everywhere nothing contradicts
     #[arg(long, value_name = "NOISE", help_heading = "Carving", value_parser = super::number(0.0), num_args = 0..=1, require_equals = true)]
     photo_consistency: Option<Option<f64>>,
 
@@ -122,6 +122,9 @@ impl CarveArgs {
     }
 }
 
+/// Voxels along an axis from which the hull takes so long that one would rather know before whether its colors fit in memory.
+const LARGE: usize = 256;
+
 /// Carves a scene and leaves a run folder.
 pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let source = DataSource::of(args.data.as_deref());
@@ -136,11 +139,21 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let views = load_clock.time(|| load(console, &dataset, Split::Train, &source))?;
 
     let mut hull_clock = Stopwatch::default();
+    // A coarse hull is too large. If not even half of what it says would fit, that is said before the work is done.
+    if config.carve.resolution > LARGE {
+        let expected = hull_clock.time(|| carve::voxels_expected(&views, &config)).unwrap_or(0.0);
+        Estimate::of_carving(&config, &dataset, (0.5 * expected) as usize).check()?;
+    }
     let round = |round, carved, left| console.note(&format!("photo hull, round {round}: {carved} voxels carved, {left} left"));
     let carving = hull_clock.time(|| Carving::new(&views, &config, &round))?;
     let (n, left) = (config.carve.resolution, carving.voxels());
     let share = 100.0 * left as f64 / (n as f64).powi(3);
     console.note(&format!("carved {n}³ voxels in {:.2} s: {left} are left, {share:.1} %", hull_clock.seconds()));
+    if share > 50.0 {
+        console.note(
+            "most of the box is left: the photographs contradict little of it; more views, alpha, or a smaller --half-width would help",
+        );
+    }
     let estimate = Estimate::of_carving(&config, &dataset, carving.rows());
     console.note(&estimate.describe());
     estimate.check()?;
@@ -188,7 +201,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     folder.write_result(&summary)?;
     let Summary { seconds, seconds_hull, seconds_color, .. } = summary;
     console.result(&format!(
-        "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; `plenoxel evaluate` compares it"
+        "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; `plenoxel evaluate` compares it with test views"
     ))?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.result(&crate::json_line(&summary)?)

@@ -152,5 +152,9 @@ pub fn check_not_empty(left: usize, report: &str) -> Result<()> {
     if left > 0 {
         return Ok(());
     }
-    Err(Error::config("filters", format!("what leaves no point ({report})"), "lower thresholds"))
+    Err(Error::config(
+        "filters",
+        format!("what leaves no point ({report})"),
+        "settings that keep some: a wider box, a lower minimum, a larger radius or sigma",
+    ))
 }

@@ -89,7 +89,8 @@ fn of_run(path: &Path) -> Result<Lines> {
     };
     lines.push(("data", data));
     let stages = config.stages.iter().map(|stage| format!("{}³", stage.resolution));
-    lines.push(("stages", stages.collect::<Vec<_>>().join(", ")));
+    let stages = if config.stages.is_empty() { "none: it was carved".to_owned() } else { stages.collect::<Vec<_>>().join(", ") };
+    lines.push(("stages", stages));
     if folder.checkpoint().exists() {
         let (grid, header) = folder.load()?;
         lines.extend(of_grid(&grid, &header));
@@ -106,6 +107,10 @@ fn of_run(path: &Path) -> Result<Lines> {
     Ok(lines)
 }
 
+fn steps(count: u64) -> String {
+    if count == 0 { "not: carved".to_owned() } else { format!("{count} steps") }
+}
+
 fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
     let shape = grid.shape();
     let n = shape.resolution;
@@ -114,17 +119,19 @@ fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
         Some(degree) => format!("spherical harmonics of degree {degree}, offset {}", header.sh_offset),
     };
     let density = grid.density.tensor().data();
-    let matter = density.iter().filter(|d| **d > 0.0).count() as f64 / density.len() as f64;
+    let (present, all) = (grid.lattice().present() as f64, shape.voxels() as f64);
+    let matter = grid.voxels_where(|row| density[row] > 0.0).fraction();
     let largest = density.iter().copied().fold(0.0, f32::max);
     vec![
         ("grid", format!("{n}³ voxels of side {:.5} in [-{w}, {w}]³", shape.voxel_side(), w = shape.half_width)),
         ("convention", checkpoint::CONVENTION.to_owned()),
         ("interpolation", format!("{:?}", shape.interpolation).to_lowercase()),
         ("color", color),
-        ("density", format!("{:.1} % of voxels above 0, at most {largest:.1} per unit length", 100.0 * matter)),
+        ("stored", format!("{present} voxels, {:.1} % of the box", 100.0 * present / all)),
+        ("density", format!("above 0 in {:.1} % of the box, at most {largest:.1} per unit length", 100.0 * matter)),
         ("background", format!("{:?}", header.background)),
-        ("memory", bytes(shape.bytes() as u64)),
-        ("trained", format!("{} steps on {}, seed {}, by {}", header.step, header.scene, header.seed, header.writer)),
+        ("memory", bytes((grid.lattice().rows() * shape.voxel_bytes()) as u64)),
+        ("trained", format!("{}, {}, seed {}, by {}", steps(header.step), header.scene, header.seed, header.writer)),
     ]
 }
 

@@ -35,8 +35,14 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     let mut clocks = Clocks::default();
     let dataset = clocks.load.time(|| source.open(&config))?;
     announce(console, &dataset, &config);
-    let initial = config.init_from.as_deref().map(RunFolder::open).transpose()?.map(|(folder, ..)| folder);
+    let from = config.init_from.as_deref().map(RunFolder::open).transpose()?;
+    // A run without stages was carved.
+    let carved = from.as_ref().is_some_and(|(_, config, _)| config.stages.is_empty());
+    let initial = from.map(|(folder, ..)| folder);
     let known = initial.as_ref().map(RunFolder::header).transpose()?;
+    if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != dataset.name()) {
+        console.note(&format!("the grid it starts from is of another scene: {}, not {}", header.scene, dataset.name()));
+    }
     let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
     let estimate = Estimate::of_training(&config, &dataset, bytes as u64);
     console.note(&estimate.describe());
@@ -52,7 +58,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     let mut pictures = Pictures::new(&folder, &config, &dataset, !args.no_images)?;
     let trainer = clocks.train.time(|| {
         let trainer = Trainer::new(config.clone(), &views)?;
-        Ok(initial.iter().fold(trainer, Trainer::starting_from))
+        Ok(initial.iter().fold(trainer, if carved { Trainer::starting_from_carved } else { Trainer::starting_from }))
     })?;
     drop(initial);
     let half_width = trainer.grid().shape().half_width;
