@@ -260,6 +260,26 @@ fn second_derivatives_go_through_the_graph() {
 }
 
 #[test]
+fn gradients_of_rays_that_stop_are_those_of_what_they_render() {
+    for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+        let shape = support::shape(interpolation, Color::Sh { degree: 1, offset: 0.5 });
+        let tables = vec![support::numbers(&[64, 1], 2.0, 6.0, 21), support::numbers(&[64, 3 * sh::count(1)], -0.06, 0.06, 22)];
+        let with = |stop_below: f64| {
+            move |x: &[Tensor<f64>]| {
+                let options = options(Aabb::cube(1.0), Spacing::Step(0.23), Jitter::None, [1.0, 0.9, 0.8]);
+                let options = RenderOptions { stop_below, ..options };
+                let rendered = render(&support::grid_of(shape, &x[0], &x[1]), &support::rays(), &options);
+                rendered.rgb.square().sum() + rendered.depth().square().sum() + rendered.distortion().sum()
+            }
+        };
+        let constants: Vec<Tensor<f64>> = tables.iter().cloned().map(Tensor::from).collect();
+        let value = |stop_below: f64| with(stop_below)(&constants).item();
+        assert!((value(0.3) - value(0.0)).abs() > 1e-3, "nothing is hidden");
+        autograd::Gradcheck::new(with(0.3), tables.clone()).named("stopped").run().unwrap_or_else(|e| panic!("{e}"));
+    }
+}
+
+#[test]
 fn stopping_early_is_off_by_no_more_than_it_says() {
     for seed in 0..40 {
         let scene = Scene::<f64>::random(seed);

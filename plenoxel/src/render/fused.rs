@@ -260,10 +260,14 @@ impl<T: Real> State<T> {
         let mut columns: [Vec<T>; 5] = Default::default();
         self.for_each_chunk([density, color], |blocks| {
             for block in blocks {
-                let base = offsets[offsets.len() - 1];
-                offsets.extend(block.offsets[1..].iter().map(|o| base + o));
                 let [x, y, z] = &block.at;
-                columns.iter_mut().zip([x, y, z, &block.t, &block.delta]).for_each(|(to, from)| to.extend_from_slice(from));
+                for own in block.rays() {
+                    // What has no density takes no part: empty space, and all that lies behind where a ray has stopped.
+                    for i in own.filter(|&i| block.density[i] >= T::zero()) {
+                        columns.iter_mut().zip([x, y, z, &block.t, &block.delta]).for_each(|(to, from)| to.push(from[i]));
+                    }
+                    offsets.push(columns[0].len() as u32);
+                }
             }
         });
         let offsets = Indices::from(offsets);

@@ -16,7 +16,7 @@ pub(super) struct Block<T: Real> {
     pub first: usize,
     /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
-    /// As looked up: σ is this where it is not negative.
+    /// As looked up: σ is this where it is not negative. It is −1 where the ray has stopped before.
     pub density: Buffer<T>,
     /// Voxel coordinates; like all that follow, empty if no gradient will be asked for.
     pub at: [Buffer<T>; 3],
@@ -120,11 +120,14 @@ impl<T: Real> Scene<'_, T> {
         for own in block.offsets.windows(2) {
             let own = own[0] as usize..own[1] as usize;
             let mut left = T::one();
-            for (w, through) in block.weight[own.clone()].iter_mut().zip(&mut block.after[own]) {
-                // Nothing behind the stop is seen; what would be counts as background.
-                let (absorbed, passed) = if left < stop { (T::zero(), T::one()) } else { (*w, *through) };
-                *w = left * absorbed;
-                left *= passed;
+            let samples = block.weight[own.clone()].iter_mut().zip(&mut block.after[own.clone()]).zip(&mut block.density[own]);
+            for ((w, through), density) in samples {
+                // Behind the stop there is nothing; what would be seen counts as background.
+                if left < stop {
+                    (*w, *through, *density) = (T::zero(), T::one(), -T::one());
+                }
+                *w *= left;
+                left *= *through;
                 *through = left;
             }
         }
