@@ -3,8 +3,12 @@
 use crate::camera::Ray;
 use crate::dataset::View;
 use crate::random::{Permutation, Purpose};
+use crate::sampling::Occupancy;
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
+use tiles::Tile;
+
+mod tiles;
 
 /// Rays with what the photographs show along them.
 #[derive(Debug, Clone)]
@@ -29,30 +33,41 @@ impl<T: Real> RayBatch<T> {
     }
 }
 
-/// Every pixel of some views, in an order that is shuffled anew each epoch.
+/// The pixels of some views, all of them or those that can see something, in an order that is shuffled anew each epoch.
 #[derive(Debug)]
 pub struct RaySource<'a> {
     views: &'a [View],
     background: [f32; 3],
     seed: u64,
-    /// `first[v]` is the number of pixels before view v.
+    tiles: Vec<Tile>,
+    /// `first[t]` is the number of pixels before tile t.
     first: Vec<u64>,
 }
 
 impl<'a> RaySource<'a> {
     /// The pixels of `views` over a background.
     pub fn new(views: &'a [View], background: [f32; 3], seed: u64) -> Self {
+        let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
+        Self::of_tiles(views, background, seed, tiles)
+    }
+
+    fn of_tiles(views: &'a [View], background: [f32; 3], seed: u64, tiles: Vec<Tile>) -> Self {
         let mut first = vec![0];
-        for view in views {
-            let (w, h) = view.image.dimensions();
-            first.push(first[first.len() - 1] + u64::from(w) * u64::from(h));
+        for tile in &tiles {
+            first.push(first[first.len() - 1] + tile.pixels() as u64);
         }
-        RaySource { views, background, seed, first }
+        RaySource { views, background, seed, tiles, first }
+    }
+
+    /// The pixels of the same views around the projections of what may hold matter. The others show the background whatever is learned, so
+    /// they say nothing, except of the mean of the errors.
+    pub fn aimed_at(&self, matter: &Occupancy) -> Self {
+        Self::of_tiles(self.views, self.background, self.seed, tiles::showing(self.views, matter))
     }
 
     /// Rays in one epoch.
     pub fn len(&self) -> u64 {
-        self.first[self.views.len()]
+        self.first[self.tiles.len()]
     }
 
     /// True if there are no pixels.
@@ -116,8 +131,9 @@ impl<'a> RaySource<'a> {
 
     /// Number of the view, column and row of one pixel of the set.
     fn place(&self, index: u64) -> (usize, usize, usize) {
-        let v = self.first.partition_point(|&f| f <= index) - 1;
-        let (pixel, width) = ((index - self.first[v]) as usize, self.views[v].image.width() as usize);
-        (v, pixel % width, pixel / width)
+        let t = self.first.partition_point(|&f| f <= index) - 1;
+        let Tile { view, x, y, width, .. } = self.tiles[t];
+        let pixel = (index - self.first[t]) as u32;
+        (view as usize, (x + pixel % width) as usize, (y + pixel / width) as usize)
     }
 }

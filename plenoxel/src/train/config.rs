@@ -41,6 +41,10 @@ pub struct Config {
     pub stop_below: f64,
     /// Rays in a step.
     pub rays_per_step: usize,
+    /// Draw no rays that see nothing but empty space: only those of pixels around the projections of what is left of the grid. Where a stage
+    /// begins without empty space, all are drawn. Needs no alpha.
+    #[serde(default)]
+    pub aim: bool,
     /// Shift the samples of each training ray by a random fraction of a step.
     pub jitter: bool,
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
@@ -255,6 +259,7 @@ impl Default for Config {
             engine: Engine::Fused,
             stop_below: 0.0,
             rays_per_step: 4096,
+            aim: false,
             jitter: true,
             project: false,
             prune_from_stage: None,
