@@ -2,6 +2,7 @@
 
 use crate::camera::Ray;
 use crate::dataset::View;
+use crate::geometry::Aabb;
 use crate::random::{Permutation, Purpose};
 use crate::sampling::Occupancy;
 use autograd::{Buffer, Real, Tensor, parallel};
@@ -95,8 +96,34 @@ impl<'a> RaySource<'a> {
         RayBatch { rays, target: Tensor::from_buffer(target, &[n, 3]), alpha: Tensor::from_buffer(alpha, &[n]) }
     }
 
+    /// Rays of the set through every `stride`-th column and row of the views, tile after tile, `size` at a time.
+    pub fn lattice_of_rays(&self, stride: u32, size: usize) -> impl Iterator<Item = Vec<Ray>> + '_ {
+        let along = move |from: u32, count: u32| (from.next_multiple_of(stride)..from + count).step_by(stride as usize);
+        let of_tile = move |tile: &Tile| {
+            let &Tile { view, x, y, width, height } = tile;
+            along(y, height).flat_map(move |y| along(x, width).map(move |x| (view as usize, x, y)))
+        };
+        let mut pixels = self.tiles.iter().flat_map(of_tile);
+        std::iter::from_fn(move || {
+            let ray = |(v, x, y): (usize, u32, u32)| self.views[v].camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let rays: Vec<Ray> = pixels.by_ref().take(size).map(ray).collect();
+            (!rays.is_empty()).then_some(rays)
+        })
+    }
+
+    /// How many pixels apart rays may be so that two at least pass through a voxel of this side, wherever it is in a box: the projection of the
+    /// farthest, halved.
+    pub fn stride(&self, side: f64, aabb: Aabb) -> u32 {
+        let reach = 0.5 * (aabb.max - aabb.min).length();
+        let pixels = self.views.iter().map(|view| {
+            let k = &view.camera.intrinsics;
+            k.fx.min(k.fy) * side / (view.camera.position().distance(0.5 * (aabb.min + aabb.max)) + reach)
+        });
+        (0.5 * pixels.fold(f64::INFINITY, f64::min)).clamp(1.0, 64.0) as u32
+    }
+
     /// All rays of the set, view after view and row after row, `size` at a time.
-    pub fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
+    fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
         let ray = |index: u64| {
             let (v, x, y) = self.place(index);
             self.views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5)

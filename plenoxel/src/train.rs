@@ -20,7 +20,7 @@ use config::{Config, OptimizerConfig, Stage, Weight};
 use start::Silhouettes;
 
 /// Rays that are rendered at a time to find out what is seen: bounds the memory.
-const RAYS_PER_BATCH: u64 = 1 << 15;
+const RAYS_PER_BATCH: usize = 1 << 15;
 
 /// What one step did.
 #[derive(Clone, Debug, PartialEq)]
@@ -263,7 +263,8 @@ impl<'a, T: Real> Trainer<'a, T> {
         // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
         const MARGIN: usize = 2;
         let options = self.options(stage, Jitter::None);
-        let weights = largest_weights(&self.grid, self.rays.in_order(RAYS_PER_BATCH), &options);
+        let stride = self.rays.stride(self.grid.shape().voxel_side(), self.grid.aabb());
+        let weights = largest_weights(&self.grid, self.rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
         full.intersection(&self.grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN))
     }
 

@@ -55,7 +55,7 @@ pub struct Config {
     /// Density, 1 / world length, at which a voxel counts as empty when pruning.
     pub prune_below: f64,
     /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
-    /// share of a pixel. 0 for none; svox2: 0.256 / voxels a side.
+    /// share of a pixel. Rays are as many as pass through every voxel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
     /// Folder of the run whose grid training starts from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
