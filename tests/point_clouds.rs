@@ -75,18 +75,22 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     for (flag, value, part) in [
         ("--color", "blue", "seen, mean, or a direction"),
         ("--color", "0,0,0", "direction"),
-        ("--min-alpha", "1.5", "from 0 to 1"),
+        ("--min-alpha", "1.5", "from 0 on, and below 1"),
+        ("--min-weight", "1.5", "from 0 to 1"),
         ("--coords", "camera", "world"),
         ("--noise-radius", "0", "--noise-radius"),
         ("--noise-radius", "nan", "--noise-radius"),
         ("--sor-neighbours", "1", "from 2 to 1000"),
         ("--noise-error", "0.1", "--noise-radius"),
         ("--bbox", "1,2,3", "6 numbers"),
+        ("--bbox", "1,0,0,-1,1,1", "no minimum above"),
         ("--value-field", "density", "--min-value"),
     ] {
         plenoxel(&["export", "ply", &run, "--data", &moved, flag, value]).refused(2, &[flag, part]);
     }
-    plenoxel(&["export", "ply", &run, "--data", &moved, "--bbox", "1,0,0,-1,1,1"]).refused(2, &["--bbox", "no minimum above"]);
+    // Before the views are looked for.
+    let unknown = ["export", "ply", &run, "--min-value", "1", "--value-field", "depth"];
+    plenoxel(&unknown).refused(2, &["--value-field", "depth", "opacity, density, weight, object"]);
     let help = plenoxel(&["export"]);
     assert!(help.code == 2 && ["ply", "vox", "mesh"].iter().all(|format| help.err.contains(format)), "{}", help.err);
 }

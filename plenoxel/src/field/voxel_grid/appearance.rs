@@ -9,10 +9,11 @@ use glam::DVec3;
 const RUN: usize = 1 << 16;
 
 impl<T: Real> VoxelGrid<T> {
-    /// The voxels that absorb more than the share `alpha` of the light that crosses them along an axis: 1 − exp(−σ side) > α.
-    pub fn voxels_above(&self, alpha: f64) -> Occupancy {
-        let (density, threshold) = (self.density.tensor().data(), self.shape.density_of_alpha(alpha));
-        self.voxels_where(|row| density[row].as_f64() > threshold)
+    /// The voxels that absorb at least the share `min_alpha` of the light that crosses them ([`super::GridShape::alpha_of_density`]), and
+    /// have density.
+    pub fn voxels_absorbing(&self, min_alpha: f64) -> Occupancy {
+        let density = self.density.tensor().data();
+        self.voxels_where(|row| density[row] > T::zero() && self.shape.alpha_of_density(density[row].as_f64()) >= min_alpha)
     }
 
     /// Raw density of a voxel, 1 / world length: 0 for one that is not present or lies outside of the grid.
@@ -107,8 +108,10 @@ mod tests {
         assert_eq!(grid.outward([1, 2, 2]), DVec3::X * 3.0);
         assert_eq!(grid.outward([0, 2, 2]), DVec3::X * -3.0, "there is nothing outside of the box");
         let alpha = 1.0 - (-3.0f64 * 0.5).exp();
+        assert!((shape.alpha_of_density(3.0) - alpha).abs() < 1e-12 && shape.alpha_of_density(-3.0) == 0.0);
         assert!((shape.density_of_alpha(alpha) - 3.0).abs() < 1e-12);
-        assert_eq!(grid.voxels_above(alpha - 1e-9).fraction(), 0.5);
-        assert_eq!(grid.voxels_above(alpha + 1e-9).fraction(), 0.0);
+        for (min_alpha, fraction) in [(0.0, 0.5), (shape.alpha_of_density(3.0), 0.5), (alpha + 1e-9, 0.0)] {
+            assert_eq!(grid.voxels_absorbing(min_alpha).fraction(), fraction, "{min_alpha}");
+        }
     }
 }
