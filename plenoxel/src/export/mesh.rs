@@ -50,7 +50,7 @@ pub struct MeshOptions {
 /// The surface on which the density of a grid has a level.
 ///
 /// Densities are read on the lines between neighbouring centres, linearly. That is what a trilinear grid renders; of a nearest grid it rounds the
-/// corners off. Normals are −∇σ, central differences over neighbouring voxels, interpolated. A vertex has the color that a camera sees there.
+/// corners off. Normals are [`VoxelGrid::outward`], interpolated. A vertex has the color that a camera sees there.
 ///
 /// The result does not depend on the number of threads.
 ///

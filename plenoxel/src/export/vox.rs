@@ -34,7 +34,8 @@ pub struct VoxOptions {
     pub min_alpha: f64,
     /// Take those too that others hide on all six sides.
     pub solid: bool,
-    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each voxel against [`VoxelGrid::outward`].
+    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each voxel against [`VoxelGrid::outward`], through open
+    /// faces.
     pub direction: Option<DVec3>,
 }
 
@@ -62,11 +63,24 @@ pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     let rows: Vec<u32> = places.iter().map(|voxel| grid.lattice().row(voxel.map(usize::from)).unwrap_or_default()).collect();
     let signed = |place: &[u16; 3]| place.map(|k| k as isize);
     let points: Vec<DVec3> = places.iter().map(|place| grid.shape().center(signed(place))).collect();
-    let outward: Vec<DVec3> = places.iter().map(|place| grid.outward(signed(place))).collect();
+    let outward: Vec<DVec3> = places.iter().map(|place| open(grid.outward(signed(place)), signed(place), &dense)).collect();
     let colors = near_colors(grid, &points, &directions(&outward, direction), &rows);
     let (palette, entries) = quantize(&colors, 255);
     let voxels = places.into_iter().zip(entries).map(|(place, entry)| (place, entry + 1)).collect();
     Ok(Vox { resolution: grid.shape().resolution, palette, voxels })
+}
+
+/// The part of an outward vector that points through open faces of a voxel: where a neighbour is taken too, nothing of it is seen.
+fn open(outward: DVec3, voxel: [isize; 3], dense: &Occupancy) -> DVec3 {
+    let taken = |voxel: [isize; 3]| {
+        let inside = (0..3).all(|a| (0..dense.cells()[a] as isize).contains(&voxel[a]));
+        inside && dense.contains(voxel.map(|k| k as usize))
+    };
+    DVec3::from([0, 1, 2].map(|axis| {
+        let mut beyond = voxel;
+        beyond[axis] += if outward[axis] > 0.0 { 1 } else { -1 };
+        if taken(beyond) { 0.0 } else { outward[axis] }
+    }))
 }
 
 /// The voxels of an occupancy, x slowest; without those that have all six neighbours, unless `solid`.

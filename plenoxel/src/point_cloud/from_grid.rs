@@ -1,14 +1,14 @@
 //! The voxels of a grid as points.
 //!
 //! A point is the centre of a voxel. Its opacity is what a ray loses that crosses the voxel from face to face
-//! ([`crate::field::voxel_grid::GridShape::alpha_of_density`]); its normal points to where opacity falls; its color is one of [`ColorFrom`].
+//! ([`crate::field::voxel_grid::GridShape::alpha_of_density`]); its normal is [`VoxelGrid::outward`]; its color is one of [`ColorFrom`].
 
 use super::{PointCloud, ScalarField};
 use crate::export::{in_bytes, near_colors};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::render::fused::Seen;
 use autograd::{Real, parallel};
-use glam::{DVec3, IVec3};
+use glam::DVec3;
 
 /// Frame of the points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -95,10 +95,6 @@ pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> Point
         Coordinates::Grid => chosen.iter().map(|(voxel, _)| DVec3::from(voxel.map(|k| k as f64))).collect(),
         Coordinates::World => centers.iter().map(|center| center.as_vec3().as_dvec3()).collect(),
     };
-    let alpha_at = |at: IVec3| {
-        let inside = at.cmpge(IVec3::ZERO).all() && at.cmplt(IVec3::splat(n as i32)).all();
-        inside.then(|| lattice.row(at.to_array().map(|c| c as usize))).flatten().map_or(0.0, alpha)
-    };
     let of_seen = |values: fn(&Seen) -> &[f32], row: u32| seen.map_or(0.0, |seen| f64::from(values(seen)[row as usize]));
     let values: [&dyn Fn(u32) -> f64; FIELDS.len()] =
         [&alpha, &sigma, &|row| of_seen(|seen| &seen.weight, row), &|row| of_seen(|seen| &seen.object, row)];
@@ -111,30 +107,17 @@ pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> Point
     PointCloud {
         positions,
         colors: Some(colors(grid, &centers, &rows, options.color)),
-        normals: Some(parallel::map_indices(chosen.len(), |i| {
-            let [x, y, z] = chosen[i].0;
-            normal(IVec3::new(x as i32, y as i32, z as i32), alpha_at)
-        })),
+        normals: Some(parallel::map_indices(chosen.len(), |i| normal(grid, chosen[i].0))),
         fields,
     }
 }
 
-/// −∇α / |∇α|, or 0 where α does not change but for rounding: central differences, smoothed by 1, 2, 1 across (Sobel's operator in space). Of opacity and
-/// not of density itself: the direction is the same, and a density of 10⁴ beside one of 10³, both opaque, does not turn it.
-fn normal(at: IVec3, alpha: impl Fn(IVec3) -> f64) -> [f32; 3] {
-    let mut gradient = DVec3::ZERO;
-    for dx in -1i32..=1 {
-        for dy in -1i32..=1 {
-            for dz in -1i32..=1 {
-                let offset = IVec3::new(dx, dy, dz);
-                let smooth = (IVec3::splat(2) - offset.abs()).as_dvec3();
-                let across = DVec3::new(smooth.y * smooth.z, smooth.z * smooth.x, smooth.x * smooth.y);
-                gradient += offset.as_dvec3() * across * alpha(at + offset);
-            }
-        }
-    }
-    let changes = gradient.length() > 1e-6;
-    if changes { (-gradient.normalize()).as_vec3().to_array() } else { [0.0; 3] }
+/// The unit normal of a voxel, 0 where it faces nowhere.
+fn normal<T: Real>(grid: &VoxelGrid<T>, voxel: [usize; 3]) -> [f32; 3] {
+    /// Change of α from one voxel to the next that is no surface any more, as inside of opaque matter.
+    const FLAT: f64 = 1e-7;
+    let outward = grid.outward(voxel.map(|k| k as isize));
+    if outward.length() > FLAT { outward.normalize().as_vec3().to_array() } else { [0.0; 3] }
 }
 
 /// Colors of some voxels by their centres and rows, 8-bit sRGB.
