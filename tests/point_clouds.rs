@@ -120,15 +120,15 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
         assert!(!Path::new(&out).exists());
     };
     refused(&[], 2, &["filters", "at least one of"]);
-    refused(&["--min-value", "0.5"], 2, &["several scalar fields", "height, time"]);
+    refused(&["--max-value", "0.5"], 2, &["error: --max-value", "several scalar fields", "height, time"]);
     refused(&["--min-value", "0.5", "--value-field", "depth"], 2, &["--value-field", "depth", "height, time"]);
     refused(&["--noise-radius", "2", "--units", "voxel"], 2, &["--units", "voxel_side", "world"]);
-    refused(&["--sor-neighbours", "11"], 2, &["sor-neighbours", "fewer than the 11 points"]);
+    refused(&["--sor-neighbours", "11"], 2, &["error: --sor-neighbours: 11 cannot", "fewer than the 11 points"]);
     plenoxel(&["filter", &cloud, "-o", &clean, "--min-value", "0.5", "--value-field", "scalar_time", "--max-value", "6"]).done();
     assert_eq!(points(&clean), 6);
     let noise = plenoxel(&["filter", &cloud, "-o", &clean, "--noise-radius", "2.5", "--remove-isolated"]);
     assert!(noise.err.contains("the units of the file"), "{}", noise.err);
-    // Of the neighbors in a row three lie on a line, and four have a plane through it.
+    // Of the neighbours in a row three lie on a line, and four have a plane through it.
     assert_eq!((noise.code, points(&clean)), (0, 6));
 
     fs::write(&cloud, &text.as_bytes()[..text.len() - 12]).unwrap();

@@ -8,7 +8,7 @@ use plenoxel::geometry::Aabb;
 use plenoxel::point_cloud::filter::{Filters, Kept, Noise, NoiseError, Outliers, Range};
 
 /// CloudCompare's own defaults.
-const NEIGHBORS: usize = 6;
+const NEIGHBOURS: usize = 6;
 const SIGMA: f64 = 1.0;
 
 /// What to remove from a cloud, in this order: box, value, noise, outliers.
@@ -31,7 +31,7 @@ pub struct CloudFilters {
     #[arg(long, value_name = "NAME", requires = "values")]
     value_field: Option<String>,
 
-    /// Noise filter: remove points off the plane of their neighbors within this distance. Between voxels distances are 1, 1.41, 1.73,
+    /// Noise filter: remove points off the plane of their neighbours within this distance. Between voxels distances are 1, 1.41, 1.73,
     /// 2 ... sides: choose one between those
     #[arg(long, value_name = "R", value_parser = number(f64::MIN_POSITIVE))]
     noise_radius: Option<f64>,
@@ -40,11 +40,11 @@ pub struct CloudFilters {
     #[arg(long, value_name = "D", value_parser = number(0.0), requires = "noise_radius", conflicts_with = "noise_relative")]
     noise_error: Option<f64>,
 
-    /// Noise filter: the distance from the plane that is allowed, in standard deviations of the neighbors' distances [default: 1]
+    /// Noise filter: the distance from the plane that is allowed, in standard deviations of the neighbours' distances [default: 1]
     #[arg(long, value_name = "N", value_parser = number(0.0), requires = "noise_radius")]
     noise_relative: Option<f64>,
 
-    /// Noise filter: remove points with fewer than three neighbors too
+    /// Noise filter: remove points with fewer than three neighbours too
     #[arg(long, requires = "noise_radius")]
     remove_isolated: bool,
 
@@ -105,7 +105,7 @@ impl CloudFilters {
             remove_isolated: self.remove_isolated,
         });
         let outliers = (self.sor_neighbours.is_some() || self.sor_sigma.is_some())
-            .then(|| Outliers { neighbors: self.sor_neighbours.unwrap_or(NEIGHBORS), sigma: self.sor_sigma.unwrap_or(SIGMA) });
+            .then(|| Outliers { neighbours: self.sor_neighbours.unwrap_or(NEIGHBOURS), sigma: self.sor_sigma.unwrap_or(SIGMA) });
         Ok(Filters { within: self.bbox, value, noise, outliers })
     }
 
@@ -118,13 +118,15 @@ impl CloudFilters {
         }
         let known = |name: &str| names.iter().find(|n| **n == name.trim_start_matches("scalar_")).map(|n| (*n).to_owned());
         let list = names.join(", ");
+        let flag = if self.min_value.is_some() { "--min-value" } else { "--max-value" };
         match (&self.value_field, names) {
-            (_, []) => Err(Error::config("--min-value", "a cloud without scalar fields", "a cloud with one")),
+            (_, []) => Err(Error::config(flag, "a cloud without scalar fields", "a cloud with one")),
             (Some(name), _) => known(name).map(Some).ok_or_else(|| Error::config("--value-field", format!("`{name}`"), list)),
             (None, [only]) => Ok(Some((*only).to_owned())),
-            (None, _) => known("density").or_else(|| known("sigma")).map(Some).ok_or_else(|| {
-                Error::config("--min-value", "a cloud with several scalar fields", format!("--value-field with one of {list}"))
-            }),
+            (None, _) => known("density")
+                .or_else(|| known("sigma"))
+                .map(Some)
+                .ok_or_else(|| Error::config(flag, "a cloud with several scalar fields", format!("--value-field with one of {list}"))),
         }
     }
 

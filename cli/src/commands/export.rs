@@ -91,14 +91,6 @@ fn ending(path: &Path) -> Option<String> {
     path.extension().map(|ending| ending.to_string_lossy().to_ascii_lowercase())
 }
 
-/// A setting of the library under the name that its flag has.
-fn as_flag(error: Error) -> Error {
-    match error {
-        Error::Config { key, found, accepted } => Error::config(format!("--{}", key.replace('_', "-")), found, accepted),
-        other => other,
-    }
-}
-
 /// What `--min-alpha` means, whatever is exported.
 const MIN_ALPHA: &str =
     "Keep voxels that absorb at least this share of the light that crosses them, 1 - exp(-density * side); none without density";

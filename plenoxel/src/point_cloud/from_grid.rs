@@ -23,7 +23,7 @@ pub enum Coordinates {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ColorFrom<'a> {
     /// The mean color of the samples that read it, on rays whose pixels show objects, each counting by its weight. Nobody ever looked from
-    /// other directions, and harmonics are arbitrary there; and what a voxel holds alone is not what is seen of it between its neighbors.
+    /// other directions, and harmonics are arbitrary there; and what a voxel holds alone is not what is seen of it between its neighbours.
     Seen(&'a Seen),
     /// The mean over all directions, seen or not: the constant harmonic.
     Mean,

@@ -1,4 +1,4 @@
-//! Nearest neighbors and neighbors within a radius, in the arithmetic of CloudCompare: coordinates are `f32`, their differences are
+//! Nearest neighbours and neighbours within a radius, in the arithmetic of CloudCompare: coordinates are `f32`, their differences are
 //! rounded to `f32`, and squares are added in `f64`.
 //!
 //! A balanced kd-tree, split at the middle point of the longest side: points on a lattice, of which many share a coordinate, points that
@@ -15,7 +15,7 @@ type Point = [f32; 3];
 /// Points in the order of the tree.
 #[derive(Debug)]
 pub(super) struct Tree {
-    /// In an order in which neighbors are near each other.
+    /// In an order in which neighbours are near each other.
     pub points: Vec<Point>,
     /// Their numbers in the cloud.
     pub numbers: Vec<u32>,

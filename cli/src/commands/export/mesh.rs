@@ -1,7 +1,7 @@
 //! `plenoxel export mesh`: the surface of a trained run.
 
-use super::{Exported, Opened, SurfaceColors, as_flag, ending};
-use crate::commands::number;
+use super::{Exported, Opened, SurfaceColors, ending};
+use crate::commands::{as_flag, number};
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::error::Result;

@@ -3,7 +3,7 @@
 use super::{ColorChoice, Exported, MIN_ALPHA, Opened, color, min_alpha};
 use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
 use crate::commands::new_run::load;
-use crate::commands::{MOST_REDUCTION, check_split, whole};
+use crate::commands::{MOST_REDUCTION, as_flag, check_split, whole};
 use crate::data::DataSource;
 use crate::memory::Estimate;
 use crate::progress::Console;
@@ -29,7 +29,7 @@ Examples:
   plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
 
 The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at
-the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbors. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
+the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbours. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
 
 /// Write the voxels of a run as a colored point cloud
 #[derive(Debug, Args)]
@@ -121,7 +121,7 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
     let cloud = from_grid::points(&grid, &VoxelOptions { coordinates, color, min_alpha: args.min_alpha, visible });
 
     let values = field.as_deref().and_then(|name| cloud.field(name));
-    let (left, report) = filters.apply(&cloud.positions, values)?;
+    let (left, report) = filters.apply(&cloud.positions, values).map_err(as_flag)?;
     let report = describe(cloud.len(), &report);
     check_not_empty(left.len(), &report)?;
 

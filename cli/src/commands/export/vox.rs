@@ -1,6 +1,7 @@
 //! `plenoxel export vox`: a trained run for MagicaVoxel.
 
-use super::{Exported, MIN_ALPHA, Opened, SurfaceColors, as_flag, min_alpha};
+use super::{Exported, MIN_ALPHA, Opened, SurfaceColors, min_alpha};
+use crate::commands::as_flag;
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::error::Result;
