@@ -4,7 +4,7 @@
 //! Each filter looks at the points that the one before has left, in this order: box, value, noise, statistical outliers.
 //! CloudCompare stores coordinates in 32 bits, shifted where they are large, and so do the filters; the cloud itself keeps its own.
 
-use super::plane::Moments;
+use super::sums::Sums;
 use super::tree::Tree;
 use crate::error::{Error, Result};
 use crate::geometry::Aabb;
@@ -137,14 +137,11 @@ impl Noise {
         let rounding = 8.0 * f64::from(f32::EPSILON * largest);
         // The radius is a 32-bit number too.
         let squared_radius = f64::from(self.radius as f32).powi(2);
-        of_each(&tree, |point, number| {
-            let mut moments = Moments::default();
-            let from = |other: [f32; 3]| DVec3::from_array([0, 1, 2].map(|a| f64::from(other[a]) - f64::from(point[a])));
-            tree.within(point, squared_radius, |other, other_number| {
-                if other_number != number {
-                    moments.add(from(other));
-                }
-            });
+        let sums = Sums::new(&tree);
+        of_each(&tree, |point| {
+            let mut moments = sums.within(point, squared_radius);
+            // About itself, the point adds nothing but its number.
+            moments.count -= 1;
             if moments.count < 3 {
                 return !self.remove_isolated;
             }
@@ -168,7 +165,7 @@ impl Outliers {
             return Err(Error::config("sor_neighbours", k, accepted));
         }
         let tree = Tree::new(points);
-        let distances = of_each(&tree, |point, _| {
+        let distances = of_each(&tree, |point| {
             let mut nearest = vec![0.0; k];
             tree.nearest(point, &mut nearest);
             // The first is the point itself, or one that coincides with it.
@@ -182,12 +179,10 @@ impl Outliers {
     }
 }
 
-/// `f(point, number)` of every point, by number. Points are taken in the order of the tree, in which neighbours share caches.
-fn of_each<R: Copy + Default + Send + Sync>(tree: &Tree, f: impl Fn([f32; 3], u32) -> R + Sync + Send) -> Vec<R> {
+/// `f(point)` of every point, by number. Points are taken in the order of the tree, in which neighbours share caches.
+fn of_each<R: Copy + Default + Send + Sync>(tree: &Tree, f: impl Fn([f32; 3]) -> R + Sync + Send) -> Vec<R> {
     let n = tree.points.len();
-    let found = parallel::map_chunks(n, RUN, |range| -> Vec<R> {
-        tree.points[range.clone()].iter().zip(&tree.numbers[range]).map(|(&point, &number)| f(point, number)).collect()
-    });
+    let found = parallel::map_chunks(n, RUN, |range| -> Vec<R> { tree.points[range].iter().map(|&point| f(point)).collect() });
     let mut by_number = vec![R::default(); n];
     tree.numbers.iter().zip(found.into_iter().flatten()).for_each(|(&number, r)| by_number[number as usize] = r);
     by_number

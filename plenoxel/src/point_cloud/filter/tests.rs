@@ -109,7 +109,8 @@ fn outliers_are_those_of_the_definition() {
 fn noise_is_that_of_the_definition() {
     let points = scattered(700, 3);
     for error in [NoiseError::Absolute(0.01), NoiseError::Relative(1.0), NoiseError::Relative(0.4)] {
-        for radius in [0.05, 0.12, 0.5] {
+        // Few neighbours, many, nearly all, all: the cloud is 14 across.
+        for radius in [0.05, 0.12, 0.5, 5.0, 20.0] {
             let beyond = noise_by_definition(&points, radius, error);
             // On the limit but for rounding: the filter keeps these, and allows for 8 ε of the largest coordinate, which is 8.
             let undecided = |b: f64| b > -1e-7 && b < 1e-5;
@@ -125,6 +126,15 @@ fn noise_is_that_of_the_definition() {
             }
         }
     }
+}
+
+#[test]
+fn a_radius_that_holds_the_whole_cloud_is_not_asked_of_each_pair() {
+    // 10¹⁰ pairs, which would take minutes.
+    let points = scattered(100_000, 12);
+    let noise = |radius| Noise { radius, error: NoiseError::Relative(1.0), remove_isolated: true };
+    let [all, more] = [20.0, 1e9].map(|radius| kept(&points, &Filters { noise: Some(noise(radius)), ..Filters::default() }));
+    assert!(all == more && all.len() > 50_000, "{} are left", all.len());
 }
 
 #[test]
