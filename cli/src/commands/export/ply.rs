@@ -56,7 +56,7 @@ pub struct PlyArgs {
     min_weight: f64,
 
     /// Keep voxels of whose pixels in the training views at least this share shows an object: floating clouds in the background's color have
-    /// 0. Alpha tells objects from the background, or the color in images without alpha
+    /// 0. Alpha tells objects from the background, or the color where no image is transparent anywhere
     #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = LEAST_OBJECT, value_parser = share)]
     min_object: f64,
 
