@@ -1,7 +1,7 @@
 //! Training rays, made on the fly: a ray is a view, a pixel and a camera, so a scene costs no more memory than its 8-bit images.
 
 use crate::camera::Ray;
-use crate::dataset::View;
+use crate::dataset::{View, has_alpha};
 use crate::geometry::Aabb;
 use crate::random::{Permutation, Purpose};
 use crate::sampling::Occupancy;
@@ -131,16 +131,17 @@ impl<'a> RaySource<'a> {
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
 
-    /// The rays of [`RaySource::in_order`], each with the alpha of its pixel. A view that is opaque everywhere has no alpha to tell objects by:
-    /// there it is 0 where the color is the background's, else 1.
+    /// The rays of [`RaySource::in_order`], each with the alpha of its pixel. Where no view has a transparent pixel ([`has_alpha`]), alpha does
+    /// not tell objects: it is 0 where the color is the background's then, else 1.
     pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
-        let opaque: Vec<bool> = self.views.iter().map(|view| view.image.pixels().all(|p| p.0[3] == 255)).collect();
-        let background = self.background.map(|c| (c * 255.0).round() as u8);
+        let has_alpha = has_alpha(self.views);
+        let in_bytes = |color: [f32; 3]| color.map(|c| (c * 255.0).round() as u8);
         let alpha = move |index: u64| {
             let (v, x, y) = self.place(index);
-            match self.views[v].image.get_pixel(x as u32, y as u32).0 {
-                [r, g, b, _] if opaque[v] => f32::from(u8::from([r, g, b] != background)),
-                [.., alpha] => f32::from(alpha) / 255.0,
+            let view = &self.views[v];
+            match has_alpha {
+                true => view.alpha(x, y),
+                false => f32::from(u8::from(in_bytes(view.color(x, y, self.background)) != in_bytes(self.background))),
             }
         };
         self.in_order(size).zip(0..).map(move |(rays, batch)| {
@@ -162,5 +163,32 @@ impl<'a> RaySource<'a> {
         let Tile { view, x, y, width, .. } = self.tiles[t];
         let pixel = (index - self.first[t]) as u32;
         (view as usize, (x + pixel % width) as usize, (y + pixel / width) as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Camera, Intrinsics};
+    use crate::dataset::image::RgbaImage;
+
+    /// A view of some pixels in a row.
+    fn view(pixels: &[[u8; 4]]) -> View {
+        let intrinsics = Intrinsics::from_fov_x(pixels.len(), 1, 0.7);
+        let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, intrinsics);
+        let image = RgbaImage::from_fn(pixels.len() as u32, 1, |x, _| pixels[x as usize].into());
+        View { name: String::new(), camera, image, depth: None }
+    }
+
+    #[test]
+    fn a_view_full_of_object_is_judged_by_alpha_if_another_one_has_some() {
+        let alphas = |views: &[View]| -> Vec<f32> {
+            RaySource::new(views, [1.0; 3], 0).in_order_with_alpha(3).flat_map(|(_, alphas)| alphas).collect()
+        };
+        let (white, red) = ([255, 255, 255, 255], [255, 0, 0, 255]);
+        // White parts of an object that fills its picture are object.
+        let [full, other] = [view(&[white, red]), view(&[white, [0; 4], [9, 9, 9, 51]])];
+        assert_eq!(alphas(&[full.clone(), other]), [1.0, 1.0, 1.0, 0.0, 0.2]);
+        assert_eq!(alphas(&[full.clone(), full]), [0.0, 1.0, 0.0, 1.0]);
     }
 }
