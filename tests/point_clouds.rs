@@ -137,5 +137,5 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     refused(&["--sor-sigma", "1"], 3, &["scan.ply", "row 0", "0,5"]);
     fs::write(&cloud, "solid cube").unwrap();
     refused(&["--sor-sigma", "1"], 3, &["scan.ply", "no PLY file", "solid cube"]);
-    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(5, &["missing.ply", "spelled rightly"]);
+    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(3, &["missing.ply", "no such file"]);
 }
