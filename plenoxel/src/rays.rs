@@ -131,8 +131,8 @@ impl<'a> RaySource<'a> {
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
 
-    /// All rays of the set, view after view and row after row, `size` at a time, each with the alpha of its pixel. Where no view has a transparent pixel ([`has_alpha`]), alpha does
-    /// not tell objects: it is 0 where the color is the background's then, else 1.
+    /// All rays of the set, view after view and row after row, `size` at a time, each with the alpha of its pixel. Where no
+    /// view has a transparent pixel ([`has_alpha`]), alpha does not tell objects: it is 0 where the color is the background's then, else 1.
     pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
         let has_alpha = has_alpha(self.views);
         let in_bytes = |color: [f32; 3]| color.map(|c| (c * 255.0).round() as u8);
