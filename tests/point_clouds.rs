@@ -71,7 +71,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "no such run"]);
     plenoxel(&["export", "ply", &run, "--data", &moved, "-o", &folder.path("no/where.ply")]).refused(5, &["no/where.ply"]);
     let none = ["export", "ply", &run, "--data", &moved, "--min-value", "1e9"];
-    plenoxel(&none).refused(2, &["leaves no point", "value 0", "lower thresholds"]);
+    plenoxel(&none).refused(2, &["leaves no point", "value 0", "a lower minimum"]);
     for (flag, value, part) in [
         ("--color", "blue", "seen, mean, or a direction"),
         ("--color", "0,0,0", "direction"),
