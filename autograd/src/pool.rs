@@ -54,29 +54,34 @@ pooled!(f32, f64, u32, u64);
 
 /// An owned array that returns to the pool when dropped.
 #[derive(Debug, Default)]
-pub struct Buffer<E: Pooled>(Vec<E>);
+pub struct Buffer<E: Pooled> {
+    /// All that has been written once, so that a buffer cut short need not be filled again.
+    all: Vec<E>,
+    len: usize,
+}
 
 impl<E: Pooled> Buffer<E> {
     /// `len` elements of unspecified (but initialised) contents: for a caller who writes all of them.
     pub fn stale(len: usize) -> Self {
-        match take::<E>(len) {
-            Some(mut v) => {
-                v.resize(len, E::default());
-                Buffer(v)
-            }
-            None => Buffer(fresh(len)),
-        }
+        let all = take(len).map_or_else(
+            || fresh(len),
+            |mut found| {
+                found.resize(found.len().max(len), E::default());
+                found
+            },
+        );
+        Buffer { all, len }
     }
 
     /// `len` zeros.
     pub fn zeros(len: usize) -> Self {
-        match take::<E>(len) {
-            Some(mut v) => {
-                v.resize(len, E::default());
-                crate::parallel::fill(&mut v, E::default());
-                Buffer(v)
+        match take(len) {
+            Some(mut all) => {
+                all.resize(all.len().max(len), E::default());
+                crate::parallel::fill(&mut all[..len], E::default());
+                Buffer { all, len }
             }
-            None => Buffer(fresh(len)),
+            None => Buffer { all: fresh(len), len },
         }
     }
 
@@ -89,13 +94,22 @@ impl<E: Pooled> Buffer<E> {
 
     /// Keeps the first `len` elements.
     pub fn truncate(&mut self, len: usize) {
-        self.0.truncate(len);
+        self.len = self.len.min(len);
+    }
+
+    /// At least `len` elements: those that are there, and then stale ones.
+    pub fn grow(&mut self, len: usize) {
+        if len > self.len {
+            let mut grown = Self::stale(len);
+            grown[..self.len].copy_from_slice(self);
+            *self = grown;
+        }
     }
 }
 
 impl<E: Pooled> From<Vec<E>> for Buffer<E> {
-    fn from(v: Vec<E>) -> Self {
-        Buffer(v)
+    fn from(all: Vec<E>) -> Self {
+        Buffer { len: all.len(), all }
     }
 }
 
@@ -108,19 +122,19 @@ impl<E: Pooled> Clone for Buffer<E> {
 impl<E: Pooled> Deref for Buffer<E> {
     type Target = [E];
     fn deref(&self) -> &[E] {
-        &self.0
+        &self.all[..self.len]
     }
 }
 
 impl<E: Pooled> DerefMut for Buffer<E> {
     fn deref_mut(&mut self) -> &mut [E] {
-        &mut self.0
+        &mut self.all[..self.len]
     }
 }
 
 impl<E: Pooled> Drop for Buffer<E> {
     fn drop(&mut self) {
-        let v = std::mem::take(&mut self.0);
+        let v = std::mem::take(&mut self.all);
         if v.capacity() * size_of::<E>() >= SMALLEST {
             let mut pool = E::pool().lock().unwrap_or_else(|e| e.into_inner());
             let now = pool.clock;

@@ -13,6 +13,9 @@ use plenoxel::sampling::{Jitter, Occupancy};
 use plenoxel::train::config::{Config, Sampling};
 use serde::Serialize;
 
+/// Pictures end a ray where less light than this comes from behind: no number of 8 bits changes by more than a fortieth of a step.
+const STOP_BELOW: f64 = 1e-4;
+
 /// A grid ready to be looked at: no jitter, empty cells left out, which changes no pixel.
 pub struct Viewer<'a> {
     grid: &'a VoxelGrid<f32>,
@@ -38,7 +41,7 @@ impl<'a> Viewer<'a> {
             background: self.background,
             occupancy: Some(&self.occupancy),
             engine: self.engine,
-            stop_below: 0.0,
+            stop_below: STOP_BELOW,
         };
         picture(self.grid, camera, &options)
     }

@@ -38,9 +38,9 @@ pub struct RenderOptions<'a> {
     pub occupancy: Option<&'a Occupancy>,
     /// What does it.
     pub engine: Engine,
-    /// The fused engine stops where less than this share of the light comes from behind; 0 for never. Behind, it looks up densities and
-    /// nothing more: all columns and all gradients are of the samples before. A color is then off by at most this times the largest
-    /// difference between colors.
+    /// The fused engine ends a ray where less than this share of the light comes from behind; 0 for never. What lies behind is not looked up:
+    /// all columns and all gradients are of the samples before. A color is then off by at most this times the largest difference between
+    /// colors.
     pub stop_below: f64,
 }
 

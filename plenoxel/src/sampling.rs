@@ -9,8 +9,8 @@ pub mod walk;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
-use autograd::{Buffer, Indices, Real, Tensor, parallel};
-use occupancy::Look;
+use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
+use occupancy::{Along, Look};
 pub use occupancy::Occupancy;
 pub(crate) use occupancy::{inside, place, split};
 use serde::{Deserialize, Serialize};
@@ -123,34 +123,112 @@ impl March {
     #[inline(always)]
     pub(crate) fn interval(&self, k: usize) -> (f64, f64) {
         if self.points {
-            return (self.start + k as f64 * self.step, self.step);
+            return self.inner_interval(k);
         }
-        let boundary = |k: usize| self.start + (k as f64 - 1.0) * self.step;
-        let begin = if k == 0 { self.near } else { boundary(k) };
-        let end = if k + 1 == self.count { self.far } else { boundary(k + 1) };
+        let begin = if k == 0 { self.near } else { self.boundary(k) };
+        let end = if k + 1 == self.count { self.far } else { self.boundary(k + 1) };
         (0.5 * (begin + end), end - begin)
     }
 
-    /// Calls `f(middle, length)` for the intervals whose middle lies in an occupied cell. Runs of empty bricks are passed in one stride;
-    /// the intervals are those of [`March::interval`] all the same.
-    #[inline]
-    pub(crate) fn for_each_occupied(&self, ray: &Ray, cells: &Occupancy, mut f: impl FnMut(f64, f64)) {
-        let mut k = 0;
-        while k < self.count {
-            let (middle, length) = self.interval(k);
-            match cells.look(ray, middle) {
-                Look::Occupied => f(middle, length),
-                Look::Empty => {}
-                Look::EmptyUntil(exit) => {
-                    // The last k whose middle does not lie beyond the exit, but for rounding; it is looked at again.
-                    let half = if self.points { 0.0 } else { 0.5 };
-                    let last = ((exit - self.start) / self.step + half) as usize;
-                    k = k.max(last.saturating_sub(1));
-                }
+    /// The same if it is neither the first nor the last.
+    #[inline(always)]
+    fn inner_interval(&self, k: usize) -> (f64, f64) {
+        if self.points {
+            return (self.start + f64::from(k as u32) * self.step, self.step);
+        }
+        let (begin, end) = (self.boundary(k), self.boundary(k + 1));
+        (0.5 * (begin + end), end - begin)
+    }
+
+    /// Where interval k begins if it is not the first.
+    #[inline(always)]
+    fn boundary(&self, k: usize) -> f64 {
+        self.start + (f64::from(k as u32) - 1.0) * self.step
+    }
+
+    /// The intervals from number `first` on.
+    #[inline(always)]
+    fn intervals<const N: usize>(&self, first: usize) -> [(f64, f64); N] {
+        let mut found: [(f64, f64); N] = std::array::from_fn(|i| self.inner_interval(first + i));
+        for k in [0, self.count - 1] {
+            if let Some(end) = k.checked_sub(first).filter(|end| *end < N) {
+                found[end] = self.interval(k);
             }
-            k += 1;
+        }
+        found
+    }
+
+    /// The intervals whose middle lies in an occupied cell.
+    #[inline]
+    pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
+        Occupied { march: *self, along: cells.along(ray), next: 0, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
+    }
+}
+
+/// Intervals that are looked at together.
+const LOOKS: usize = 16;
+
+/// `(middle, length)` of those intervals of a march that lie in occupied cells. Runs of empty bricks are passed in one stride; the intervals are
+/// those of [`March::interval`] all the same.
+#[derive(Clone, Debug)]
+pub(crate) struct Occupied<'a> {
+    march: March,
+    along: Along<'a>,
+    /// The next interval to be looked at.
+    next: usize,
+    /// What was found the last time: `count` intervals, of which some are taken.
+    found: [(f64, f64); LOOKS],
+    taken: usize,
+    count: usize,
+}
+
+impl Iterator for Occupied<'_> {
+    type Item = (f64, f64);
+
+    #[inline]
+    fn next(&mut self) -> Option<(f64, f64)> {
+        while self.taken == self.count {
+            if self.next >= self.march.count {
+                return None;
+            }
+            self.look();
+        }
+        self.taken += 1;
+        Some(self.found[self.taken - 1])
+    }
+}
+
+impl Occupied<'_> {
+    /// Finds the next intervals, if there are any in the next bricks.
+    fn look(&mut self) {
+        let march = &self.march;
+        (self.taken, self.count) = (0, 0);
+        if let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
+            // The last k whose middle does not lie beyond the exit, but for rounding; it is looked at again.
+            let half = if march.points { 0.0 } else { 0.5 };
+            let last = ((exit - march.start) / march.step + half) as usize;
+            self.next = (self.next + 1).max(last);
+        } else {
+            self.count = occupied_of(march, &self.along, self.next, &mut self.found);
+            self.next += LOOKS;
         }
     }
+}
+
+dispatched! {
+/// Those of the [`LOOKS`] intervals from number `first` on that are occupied. Returns how many.
+fn occupied_of(march: &March, along: &Along<'_>, first: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
+    let all: [(f64, f64); LOOKS] = march.intervals(first);
+    let occupied = along.occupied(&all.map(|(middle, _)| middle));
+    let mut count = 0;
+    for i in 0..LOOKS.min(march.count - first) {
+        if occupied[i] {
+            found[count] = all[i];
+            count += 1;
+        }
+    }
+    count
+}
 }
 
 /// Packed samples of a batch of rays through a box. With `occupancy`, samples in empty cells are left out; the others stay where they
@@ -161,11 +239,7 @@ pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitt
         let marches: Vec<March> = range.clone().map(|r| march(&rays[r], aabb, spacing, jitter.of(r))).collect();
         let counts = marches.iter().zip(range).map(|(m, r)| match occupancy {
             None => m.count as u32,
-            Some(cells) => {
-                let mut count = 0;
-                m.for_each_occupied(&rays[r], cells, |_, _| count += 1);
-                count
-            }
+            Some(cells) => m.occupied(&rays[r], cells).count() as u32,
         });
         let counts = counts.collect();
         (marches, counts)
@@ -194,7 +268,7 @@ pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitt
             };
             match occupancy {
                 None => (0..march.count).map(|k| march.interval(k)).for_each(|(middle, length)| place(middle, length)),
-                Some(cells) => march.for_each_occupied(ray, cells, place),
+                Some(cells) => march.occupied(ray, cells).for_each(|(middle, length)| place(middle, length)),
             }
         }
     });

@@ -25,6 +25,7 @@ macro_rules! with_bricks {
 mod adjoint;
 mod forward;
 mod lookup;
+mod places;
 mod seen;
 mod sorted;
 

@@ -140,29 +140,68 @@ impl Occupancy {
         Self::from_masks(self.aabb, self.cells, masks)
     }
 
-    /// What lies at a distance along a ray.
+    /// What can be looked up along a ray.
     #[inline]
-    pub(crate) fn look(&self, ray: &Ray, t: f64) -> Look {
-        let size = self.aabb.max - self.aabb.min;
-        let u = (ray.origin + t * ray.direction - self.aabb.min) / size;
-        let cell: [usize; 3] = std::array::from_fn(|a| ((u[a] * self.cells[a] as f64) as usize).min(self.cells[a] - 1));
-        let (brick, bit) = split(cell, self.count);
-        if self.masks[brick] >> bit & 1 == 1 {
+    pub(crate) fn along(&self, ray: &Ray) -> Along<'_> {
+        let per_length = DVec3::from_array(self.cells.map(|n| n as f64)) / (self.aabb.max - self.aabb.min);
+        let slope = ray.direction * per_length;
+        Along { cells: self, start: (ray.origin - self.aabb.min) * per_length, slope, per_cell: slope.recip() }
+    }
+}
+
+/// A ray through a box, its position in cells being `start + t slope`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Along<'a> {
+    cells: &'a Occupancy,
+    start: DVec3,
+    slope: DVec3,
+    /// One over the slope.
+    per_cell: DVec3,
+}
+
+impl Along<'_> {
+    /// What lies at a distance along the ray.
+    #[inline]
+    pub(crate) fn look(&self, t: f64) -> Look {
+        let Occupancy { cells, count, masks, distance, .. } = self.cells;
+        let cell: [usize; 3] = std::array::from_fn(|a| self.cell(a, t, cells[a]) as usize);
+        let (brick, bit) = split(cell, *count);
+        if masks[brick] >> bit & 1 == 1 {
             return Look::Occupied;
         }
-        let free = self.distance[brick];
+        let free = distance[brick];
         if free == 0 {
             return Look::Empty;
         }
         // All bricks nearer than `free` are empty: to where the ray leaves the cube of them.
-        let side = size * DVec3::from_array(self.cells.map(|n| BRICK as f64 / n as f64));
         let exit = (0..3).fold(f64::INFINITY, |exit, a| {
             let (here, reach) = ((cell[a] / BRICK) as f64, f64::from(free));
-            let d = ray.direction[a];
-            let plane = self.aabb.min[a] + side[a] * if d > 0.0 { here + reach } else { here + 1.0 - reach };
-            if d == 0.0 { exit } else { exit.min((plane - ray.origin[a]) / d) }
+            let d = self.slope[a];
+            let plane = BRICK as f64 * if d > 0.0 { here + reach } else { here + 1.0 - reach };
+            if d == 0.0 { exit } else { exit.min((plane - self.start[a]) * self.per_cell[a]) }
         });
         Look::EmptyUntil(exit)
+    }
+
+    /// The cell that a distance lies in, along one axis.
+    #[inline(always)]
+    fn cell(&self, axis: usize, t: f64, cells: usize) -> i32 {
+        (self.start[axis] + t * self.slope[axis]).max(0.0).min((cells - 1) as f64) as i32
+    }
+
+    /// Which of some distances lie in occupied cells.
+    #[inline(always)]
+    pub(crate) fn occupied<const N: usize>(&self, t: &[f64; N]) -> [bool; N] {
+        let Occupancy { cells, count, masks, .. } = self.cells;
+        let (mut bricks, mut bits) = ([0i32; N], [0i32; N]);
+        for a in 0..3 {
+            for i in 0..N {
+                let cell = self.cell(a, t[i], cells[a]);
+                bricks[i] = bricks[i] * count[a] as i32 + cell / BRICK as i32;
+                bits[i] = bits[i] * BRICK as i32 + cell % BRICK as i32;
+            }
+        }
+        std::array::from_fn(|i| masks[bricks[i] as usize] >> bits[i] & 1 == 1)
     }
 }
 
@@ -276,14 +315,15 @@ mod tests {
             let direction = (DVec3::from(target) - origin).normalize();
             let ray = Ray { origin, direction, stretch: 1.0 };
             let (near, far) = some.aabb.intersect(origin, direction).expect("it hits");
+            let along = some.along(&ray);
             let mut strides = 0;
             let mut t = near + 1e-9;
             while t < far {
-                if let Look::EmptyUntil(exit) = some.look(&ray, t) {
+                if let Look::EmptyUntil(exit) = along.look(t) {
                     assert!(exit > t);
                     for k in 0..100 {
                         let between = t + (exit.min(far) - t) * (f64::from(k) + 0.5) / 100.0;
-                        assert_ne!(some.look(&ray, between), Look::Occupied);
+                        assert_ne!(along.look(between), Look::Occupied);
                     }
                     strides += 1;
                 }

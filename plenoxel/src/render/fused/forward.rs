@@ -1,13 +1,14 @@
 //! From rays to pixels, a block of rays at a time.
 
 use super::lookup::{self, Corners, Directions};
-use super::{Batch, COLUMNS, column};
+use super::places::{Places, RUN};
+use super::{BLOCK, Batch, COLUMNS, column};
 use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
-use crate::sampling::{March, Occupancy, march};
+use crate::sampling::{Occupancy, march};
 use autograd::lattice::NodeMap;
-use autograd::{Buffer, Real, dispatched, parallel};
+use autograd::{Buffer, Real, parallel};
 
 /// The samples of some rays, as far as the adjoint needs them. Arrays have one entry for each sample unless said otherwise.
 #[derive(Debug)]
@@ -16,7 +17,7 @@ pub(super) struct Block<T: Real> {
     pub first: usize,
     /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
-    /// As looked up: σ is this where it is not negative. It is −1 where the ray has stopped before.
+    /// As looked up: σ is this where it is not negative.
     pub density: Buffer<T>,
     /// Voxel coordinates; like all that follow, empty if no gradient will be asked for.
     pub at: [Buffer<T>; 3],
@@ -90,75 +91,60 @@ impl<T: Real> Scene<'_, T> {
     }
 
     fn weights_with(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
-        let mut block = self.place(first, count);
-        let m = block.len();
-        let (mut alpha, mut raw) = (Buffer::stale(m), Buffer::stale(m));
-        let mut found = None;
-        let at = block.at.each_ref().map(|a| &a[..]);
-        match self.batch.shape.interpolation {
-            Interpolation::Nearest => {
-                block.rows = Buffer::stale(m);
-                lookup::nearest_rows(at, map, &mut block.rows);
-                // What is not present is nothing, and no gradient makes it something.
-                for (raw, &row) in raw.iter_mut().zip(&block.rows[..]) {
-                    *raw = self.tables[0].get(row as usize).copied().unwrap_or(-T::one());
-                }
-            }
-            Interpolation::Trilinear => {
-                found = Some(Corners::new(at, map, self.tables[0], &mut raw));
-            }
-        }
-        block.density = raw;
-        block.after = Buffer::stale(m);
-        if parallel::fused() {
-            lookup::absorptions::<T, true>(&block.density, &block.delta, &mut alpha, &mut block.after);
-        } else {
-            lookup::absorptions::<T, false>(&block.density, &block.delta, &mut alpha, &mut block.after);
-        }
-        block.weight = alpha;
-        let stop = T::lit(self.options.stop_below);
-        for own in block.offsets.windows(2) {
-            let own = own[0] as usize..own[1] as usize;
-            let mut left = T::one();
-            let samples = block.weight[own.clone()].iter_mut().zip(&mut block.after[own.clone()]).zip(&mut block.density[own]);
-            for ((w, through), density) in samples {
-                // Behind the stop there is nothing; what would be seen counts as background.
-                if left < stop {
-                    (*w, *through, *density) = (T::zero(), T::one(), -T::one());
-                }
-                *w *= left;
-                left *= *through;
-                *through = left;
-            }
-        }
-        (block, found)
-    }
-
-    /// Where the samples lie: lengths and positions.
-    fn place(&self, first: usize, count: usize) -> Block<T> {
-        let RenderOptions { aabb, spacing, jitter, .. } = self.options;
-        let rays = &self.rays[first..first + count];
-        let marches: Vec<March> = rays.iter().enumerate().map(|(r, ray)| march(ray, aabb, *spacing, jitter.of(first + r))).collect();
-        let bound = marches.iter().map(|m| m.count).sum();
+        let RenderOptions { aabb, spacing, jitter, stop_below, .. } = self.options;
+        let stop = T::lit(*stop_below);
+        let trilinear = self.batch.shape.interpolation == Interpolation::Trilinear;
         let mut block = Block { first, ..Block::empty() };
-        [block.t, block.delta] = [Buffer::stale(bound), Buffer::stale(bound)];
-        block.at = [Buffer::stale(bound), Buffer::stale(bound), Buffer::stale(bound)];
-        let scale = 1.0 / self.batch.shape.voxel_side();
-        let to_voxels = [T::lit(scale), T::lit(self.batch.shape.half_width * scale - 0.5)];
+        let mut found = trilinear.then(Corners::none);
         let mut end = 0;
-        for (ray, march) in rays.iter().zip(&marches) {
-            let [x, y, z] = block.at.each_mut().map(|a| &mut a[end..]);
-            let out = [x, y, z, &mut block.t[end..], &mut block.delta[end..]];
-            end += match self.cells {
-                None => place_all(march, ray, to_voxels, out),
-                Some(cells) => place_occupied(march, ray, cells, to_voxels, out),
-            };
+        for (r, ray) in self.rays[first..first + count].iter().enumerate() {
+            let march = march(ray, aabb, *spacing, jitter.of(first + r));
+            let mut places = Places::new(march, ray, self.cells, &self.batch.shape);
+            let mut left = T::one();
+            // What lies behind the stop is never looked up: of a run in which it comes, the rest is dropped.
+            while left >= stop {
+                block.make_room(end + RUN, trilinear);
+                let own = places.next_run(block.places(end));
+                if own == 0 {
+                    break;
+                }
+                let run = end..end + own;
+                let at = block.at.each_ref().map(|at| &at[run.clone()]);
+                let density = &mut block.density[run.clone()];
+                match &mut found {
+                    Some(corners) => corners.push(at, map, self.tables[0], density),
+                    None => {
+                        let rows = &mut block.rows[run.clone()];
+                        lookup::nearest_rows(at, map, rows);
+                        // What is not present is nothing, and no gradient makes it something.
+                        for (density, &row) in density.iter_mut().zip(&*rows) {
+                            *density = self.tables[0].get(row as usize).copied().unwrap_or(-T::one());
+                        }
+                    }
+                }
+                let (delta, weight, after) = (&block.delta[run.clone()], &mut block.weight[run.clone()], &mut block.after[run]);
+                if parallel::fused() {
+                    lookup::absorptions::<T, true>(density, delta, weight, after);
+                } else {
+                    lookup::absorptions::<T, false>(density, delta, weight, after);
+                }
+                for (w, through) in weight.iter_mut().zip(after) {
+                    if left < stop {
+                        break;
+                    }
+                    *w *= left;
+                    left *= *through;
+                    *through = left;
+                    end += 1;
+                }
+            }
+            if let Some(corners) = &mut found {
+                corners.truncate(end);
+            }
             block.offsets.push(end as u32);
         }
-        block.at.iter_mut().for_each(|a| a.truncate(end));
-        block.t.truncate(end);
-        block.delta.truncate(end);
-        block
+        block.truncate(end);
+        (block, found)
     }
 
     /// The color of every sample that could be seen if it were dense; zeros for the others.
@@ -229,38 +215,32 @@ impl<T: Real> Block<T> {
             color: none(),
         }
     }
-}
 
-dispatched! {
-/// Every interval of a march: voxel coordinates, middle, length. Returns how many.
-fn place_all<T: Real>(march: &March, ray: &Ray, to_voxels: [T; 2], out: [&mut [T]; 5]) -> usize {
-    let n = march.count;
-    let [x, y, z, t, delta] = out.map(|o| &mut o[..n]);
-    let (o, d) = (ray.origin, ray.direction);
-    for k in 0..n {
-        let (middle, length) = march.interval(k);
-        x[k] = T::lit(o.x + middle * d.x) * to_voxels[0] + to_voxels[1];
-        y[k] = T::lit(o.y + middle * d.y) * to_voxels[0] + to_voxels[1];
-        z[k] = T::lit(o.z + middle * d.z) * to_voxels[0] + to_voxels[1];
-        t[k] = T::lit(middle);
-        delta[k] = T::lit(length);
+    /// What is there for each sample but its row and color.
+    fn columns(&mut self) -> [&mut Buffer<T>; 8] {
+        let [x, y, z] = &mut self.at;
+        [x, y, z, &mut self.t, &mut self.delta, &mut self.density, &mut self.weight, &mut self.after]
     }
-    n
-}
-}
 
-/// The intervals whose middles lie in occupied cells.
-fn place_occupied<T: Real>(march: &March, ray: &Ray, cells: &Occupancy, to_voxels: [T; 2], out: [&mut [T]; 5]) -> usize {
-    let [x, y, z, t, delta] = out;
-    let mut n = 0;
-    march.for_each_occupied(ray, cells, |middle, length| {
-        let p = ray.origin + middle * ray.direction;
-        x[n] = T::lit(p.x) * to_voxels[0] + to_voxels[1];
-        y[n] = T::lit(p.y) * to_voxels[0] + to_voxels[1];
-        z[n] = T::lit(p.z) * to_voxels[0] + to_voxels[1];
-        t[n] = T::lit(middle);
-        delta[n] = T::lit(length);
-        n += 1;
-    });
-    n
+    /// Makes room for `count` samples and more, so that it is seldom asked for.
+    fn make_room(&mut self, count: usize, trilinear: bool) {
+        if count > self.t.len() {
+            let size = (2 * self.t.len()).max(32 * BLOCK);
+            self.columns().into_iter().for_each(|column| column.grow(size));
+            if !trilinear {
+                self.rows.grow(size);
+            }
+        }
+    }
+
+    /// Positions, middle and length of the samples from number `end` on.
+    fn places(&mut self, end: usize) -> [&mut [T; RUN]; 5] {
+        let [x, y, z, t, delta, ..] = self.columns();
+        [x, y, z, t, delta].map(|column| column[end..].first_chunk_mut().expect("there is room for a run"))
+    }
+
+    fn truncate(&mut self, count: usize) {
+        self.columns().into_iter().for_each(|column| column.truncate(count));
+        self.rows.truncate(count);
+    }
 }

@@ -6,8 +6,13 @@ use autograd::{Buffer, Real, dispatched, parallel};
 
 /// The eight rows around each of some samples, and their weights.
 pub(super) struct Corners<T: Real> {
+    /// In groups of [`TOGETHER`] samples, corner by corner.
     rows: Buffer<u32>,
     weights: Buffer<T>,
+    /// Numbers of a whole group that are in use.
+    end: usize,
+    /// Where the first corner of each sample is; the next ones follow [`TOGETHER`] apart.
+    places: Vec<u32>,
 }
 
 dispatched! {
@@ -24,26 +29,44 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 }
 
 impl<T: Real> Corners<T> {
-    /// Those of `at`, and what a table of one column is there.
-    pub fn new(at: [&[T]; 3], map: impl NodeMap, table: &[T], values: &mut [T]) -> Self {
-        let size = 8 * values.len().next_multiple_of(TOGETHER);
-        let mut corners = Corners { rows: Buffer::stale(size), weights: Buffer::stale(size) };
-        let (rows, weights) = (corners.rows.as_chunks_mut().0.as_chunks_mut().0, corners.weights.as_chunks_mut().0.as_chunks_mut().0);
+    /// Of no samples.
+    pub fn none() -> Self {
+        Corners { rows: Buffer::stale(0), weights: Buffer::stale(0), end: 0, places: Vec::new() }
+    }
+
+    /// Adds those of at most [`TOGETHER`] positions, and gives what a table of one column is there.
+    pub fn push(&mut self, at: [&[T]; 3], map: impl NodeMap, table: &[T], values: &mut [T]) {
+        const GROUP: usize = 8 * TOGETHER;
+        assert!(values.len() <= TOGETHER, "corners are found {TOGETHER} at a time");
+        let first = self.end;
+        self.end += GROUP;
+        if self.end > self.rows.len() {
+            let size = (2 * self.rows.len()).max(1024 * GROUP);
+            self.rows.grow(size);
+            self.weights.grow(size);
+        }
+        let rows = self.rows[first..self.end].as_chunks_mut().0.as_chunks_mut().0;
+        let weights = self.weights[first..self.end].as_chunks_mut().0.as_chunks_mut().0;
         corners_of_many(at, map, rows, weights);
         interpolate(table, rows, weights, values);
-        corners
+        self.places.extend((first..).take(values.len()).map(|place| place as u32));
+    }
+
+    /// Keeps the first `count` samples.
+    pub fn truncate(&mut self, count: usize) {
+        self.places.truncate(count);
     }
 
     /// The row of a sample's corner with the lowest coordinates, or a row of its neighbourhood if that voxel is not present.
     #[inline(always)]
     pub fn lowest(&self, i: usize) -> u32 {
-        self.rows[i / TOGETHER * 8 * TOGETHER + i % TOGETHER]
+        self.rows[self.places[i] as usize]
     }
 
     /// Rows and weights of a sample.
     #[inline(always)]
     pub fn of(&self, i: usize) -> ([u32; 8], [T; 8]) {
-        let at = i / TOGETHER * 8 * TOGETHER + i % TOGETHER;
+        let at = self.places[i] as usize;
         let (rows, weights) = (&self.rows[at..at + 7 * TOGETHER + 1], &self.weights[at..at + 7 * TOGETHER + 1]);
         (std::array::from_fn(|c| rows[c * TOGETHER]), std::array::from_fn(|c| weights[c * TOGETHER]))
     }

@@ -127,6 +127,8 @@ impl<T: Real> Sample<'_, T> {
 
 /// Calls `f` for every sample with a weight above `least`.
 fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>, least: f64, f: impl Fn(Sample<'_, T>) + Sync) {
+    // Where less light is left, no sample weighs as much.
+    let options = &RenderOptions { stop_below: options.stop_below.max(least), ..options.clone() };
     let least = T::lit(least);
     let batch = Batch::new(grid, rays, options);
     let scene = batch.scene(grid, rays, options);

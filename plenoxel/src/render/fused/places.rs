@@ -1,0 +1,72 @@
+//! Where the samples of a ray lie, a run of them at a time: a ray that ends early asks for no more.
+
+use crate::camera::Ray;
+use crate::field::voxel_grid::GridShape;
+use crate::sampling::{March, Occupancy, Occupied};
+use autograd::ops::trilinear::TOGETHER;
+use autograd::{Real, dispatched};
+
+/// Samples that are looked up together.
+pub(super) const RUN: usize = TOGETHER;
+
+/// The samples of one ray that are still to come.
+pub(super) struct Places<'a, T> {
+    ray: &'a Ray,
+    /// Voxel coordinates are the world's times the first number, plus the second.
+    to_voxels: [T; 2],
+    rest: Rest<'a>,
+}
+
+enum Rest<'a> {
+    /// Every interval of a march from this number on.
+    All(March, usize),
+    Occupied(Occupied<'a>),
+}
+
+impl<'a, T: Real> Places<'a, T> {
+    pub fn new(march: March, ray: &'a Ray, cells: Option<&'a Occupancy>, shape: &GridShape) -> Self {
+        let scale = 1.0 / shape.voxel_side();
+        let rest = match cells {
+            None => Rest::All(march, 0),
+            Some(cells) => Rest::Occupied(march.occupied(ray, cells)),
+        };
+        Places { ray, to_voxels: [T::lit(scale), T::lit(shape.half_width * scale - 0.5)], rest }
+    }
+
+    /// Voxel coordinates, middles and lengths of the next samples, as many as there are and [`RUN`] at most. Returns how many; 0 at the end.
+    pub fn next_run(&mut self, out: [&mut [T; RUN]; 5]) -> usize {
+        let mut intervals = [(0.0, 0.0); RUN];
+        let mut count = 0;
+        match &mut self.rest {
+            Rest::All(march, next) => {
+                count = RUN.min(march.count - *next);
+                for (i, interval) in intervals.iter_mut().enumerate() {
+                    *interval = march.interval(*next + i);
+                }
+                *next += count;
+            }
+            Rest::Occupied(rest) => {
+                for (to, interval) in intervals.iter_mut().zip(rest) {
+                    *to = interval;
+                    count += 1;
+                }
+            }
+        }
+        place(self.ray, &intervals, self.to_voxels, out);
+        count
+    }
+}
+
+dispatched! {
+fn place<T: Real>(ray: &Ray, intervals: &[(f64, f64); RUN], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
+    let [x, y, z, t, delta] = out;
+    let (o, d) = (ray.origin, ray.direction);
+    for (i, &(middle, length)) in intervals.iter().enumerate() {
+        x[i] = T::lit(o.x + middle * d.x) * to_voxels[0] + to_voxels[1];
+        y[i] = T::lit(o.y + middle * d.y) * to_voxels[0] + to_voxels[1];
+        z[i] = T::lit(o.z + middle * d.z) * to_voxels[0] + to_voxels[1];
+        t[i] = T::lit(middle);
+        delta[i] = T::lit(length);
+    }
+}
+}
