@@ -94,6 +94,22 @@ pub struct Carving<'a> {
     lattice: Lattice,
 }
 
+/// How far carving has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Progress {
+    /// Views whose silhouettes have carved.
+    Views(usize),
+    /// A round of the photo hull is over.
+    Round {
+        /// Its number, from 1.
+        round: usize,
+        /// Voxels that went in it.
+        carved: usize,
+        /// Voxels that are left.
+        left: usize,
+    },
+}
+
 /// A carved grid with its colors.
 #[derive(Debug)]
 pub struct Colored {
@@ -107,18 +123,23 @@ pub struct Colored {
 pub fn voxels_expected(views: &[View], config: &Config) -> Option<f64> {
     const COARSE: usize = 64;
     let hull = has_alpha(views).then(|| {
-        visual_hull::by_footprint(views, Aabb::cube(config.half_width), [COARSE.min(config.carve.resolution); 3], config.carve.margin)
+        visual_hull::by_footprint(
+            views,
+            Aabb::cube(config.half_width),
+            [COARSE.min(config.carve.resolution); 3],
+            config.carve.margin,
+            &|_| (),
+        )
     });
     hull.map(|hull| hull.fraction() * (config.carve.resolution as f64).powi(3))
 }
 
 impl<'a> Carving<'a> {
     /// Carves the box of a configuration: to the visual hull where images have alpha, and on to the photo hull if the config asks for it.
-    /// `progress(round, carved, left)` is called after each round of the latter.
     ///
     /// Errors: no view has a transparent pixel (and only silhouettes are asked for), or one that is not; nothing is left of the box, or
     /// nothing goes.
-    pub fn new(views: &'a [View], config: &'a Config, progress: &dyn Fn(usize, usize, usize)) -> Result<Self> {
+    pub fn new(views: &'a [View], config: &'a Config, progress: &dyn Fn(Progress)) -> Result<Self> {
         let images = |found: &str, remedy: &str| Err(Error::input("the training images", found, remedy));
         if !has_alpha(views) && config.carve.photo.is_none() {
             let remedy = "silhouettes need an alpha channel that is 0 on the background; --photo-consistency carves without";
@@ -136,8 +157,8 @@ impl<'a> Carving<'a> {
             return Err(Error::config("half_width", found, format!("a box around the object alone, below {nearest:.3}")));
         }
         let mut hull = match rule {
-            Rule::Footprint => visual_hull::by_footprint(views, aabb, voxels, margin),
-            Rule::Rays => visual_hull::by_rays(views, aabb, voxels),
+            Rule::Footprint => visual_hull::by_footprint(views, aabb, voxels, margin, &|views| progress(Progress::Views(views))),
+            Rule::Rays => visual_hull::by_rays(views, aabb, voxels, &|views| progress(Progress::Views(views))),
         };
         let half_width =
             |found: &str| Err(Error::config("half_width", format!("{}, {found},", config.half_width), "a box around the object"));
@@ -145,7 +166,7 @@ impl<'a> Carving<'a> {
             return half_width("of which the silhouettes leave nothing");
         }
         if let Some(photo) = &photo {
-            hull = photo_hull::photo_hull(views, &hull, photo, progress)?;
+            hull = photo_hull::photo_hull(views, &hull, photo, &|round, carved, left| progress(Progress::Round { round, carved, left }))?;
         }
         match hull.fraction() {
             0.0 => Err(Error::config("carve.photo.noise", photo.map_or(0.0, |photo| photo.noise), "more, for nothing is left")),

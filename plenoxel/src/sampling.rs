@@ -10,8 +10,8 @@ use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
-use occupancy::{Along, Look};
 pub use occupancy::Occupancy;
+use occupancy::{Along, Look};
 pub(crate) use occupancy::{inside, place, split};
 use serde::{Deserialize, Serialize};
 

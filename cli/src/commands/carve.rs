@@ -11,7 +11,7 @@ use crate::progress::Console;
 use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::carve::photo_hull::PhotoConfig;
-use plenoxel::carve::{self, Carving, Colored, Fit, Rule};
+use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
@@ -144,8 +144,13 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
         let expected = hull_clock.time(|| carve::voxels_expected(&views, &config)).unwrap_or(0.0);
         Estimate::of_carving(&config, &dataset, (0.5 * expected) as usize).check()?;
     }
-    let round = |round, carved, left| console.note(&format!("photo hull, round {round}: {carved} voxels carved, {left} left"));
-    let carving = hull_clock.time(|| Carving::new(&views, &config, &round))?;
+    let count = console.count("carving, view", views.len());
+    let progress = |progress| match progress {
+        Progress::Views(done) => count.at(done, views.len()),
+        Progress::Round { round, carved, left } => console.note(&format!("photo hull, round {round}: {carved} voxels carved, {left} left")),
+    };
+    let carving = hull_clock.time(|| Carving::new(&views, &config, &progress))?;
+    drop(count);
     let (n, left) = (config.carve.resolution, carving.voxels());
     let share = 100.0 * left as f64 / (n as f64).powi(3);
     console.note(&format!("carved {n}³ voxels in {:.2} s: {left} are left, {share:.1} %", hull_clock.seconds()));

@@ -22,10 +22,11 @@ const BRICKS: usize = 16;
 /// decide.
 ///
 /// Bricks of 4³ voxels are tested by the rectangle around their projection, voxels by the projection itself, a convex polygon.
-pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64) -> Occupancy {
+/// `progress(views)` is called as views are done.
+pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64, progress: &dyn Fn(usize)) -> Occupancy {
     let count = voxels.map(|n| n.div_ceil(BRICK));
     let mut masks = full(voxels);
-    for views in views.chunks(VIEWS) {
+    for (chunk, views) in views.chunks(VIEWS).enumerate() {
         let silhouettes = parallel::map_indices(views.len(), |v| Silhouette::of(&views[v], aabb, voxels));
         parallel::for_each_chunk(&mut masks, BRICKS, |first, masks| {
             for (b, mask) in masks.iter_mut().enumerate() {
@@ -36,13 +37,15 @@ pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64)
                 }
             }
         });
+        progress(chunk * VIEWS + views.len());
     }
     Occupancy::from_masks(aabb, voxels, masks)
 }
 
 /// The voxels that the ray of no background pixel passes through: the source paper's rule, with every voxel on the ray instead of those
 /// around 900 points. Rays are of pixel centres, so it carves into what thin parts leave between them.
-pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3]) -> Occupancy {
+/// `progress(views)` is called as views are done.
+pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3], progress: &dyn Fn(usize)) -> Occupancy {
     // Voxels only ever go, so the order in which they do is all the same.
     let masks: Vec<AtomicU64> = full(voxels).into_iter().map(AtomicU64::new).collect();
     let (mut done, mut group) = (0, 1);
@@ -67,6 +70,7 @@ pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3]) -> Occupancy {
             }
         });
         done += next.len();
+        progress(done);
         group = done;
     }
     Occupancy::from_masks(aabb, voxels, masks.into_iter().map(AtomicU64::into_inner).collect())

@@ -27,14 +27,14 @@ impl<'a> Silhouettes<'a> {
     /// The half width of the smallest cube around the origin that holds all that the silhouettes leave of the cube of `half_width`, or
     /// that one itself if they leave nothing.
     pub fn half_width(&self, half_width: f64) -> f64 {
-        let hull = visual_hull::by_footprint(self.views, Aabb::cube(half_width), [COARSE; 3], self.margin);
+        let hull = visual_hull::by_footprint(self.views, Aabb::cube(half_width), [COARSE; 3], self.margin, &|_| ());
         hull.bounds().map_or(half_width, |bounds| bounds.max.max(-bounds.min).max_element())
     }
 
     /// The voxels that a sample inside of the silhouettes can read.
     pub fn voxels(&self, shape: &GridShape) -> Occupancy {
         let aabb = Aabb::cube(shape.half_width);
-        shape.reached_from(&visual_hull::by_footprint(self.views, aabb, [shape.resolution; 3], self.margin))
+        shape.reached_from(&visual_hull::by_footprint(self.views, aabb, [shape.resolution; 3], self.margin, &|_| ()))
     }
 }
 
