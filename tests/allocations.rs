@@ -43,6 +43,7 @@ fn a_step_in_the_steady_state_takes_hardly_any_memory_from_the_system() {
         epochs: None,
         steps: Some(1000),
         sampling: Sampling::Step { step: 0.5 },
+        image_reduction: 1,
         density_rate: 1.0,
         color_rate: 0.05,
         rate_decay: 1.0,

@@ -29,6 +29,7 @@ fn stage(resolution: usize, steps: u64) -> Stage {
         epochs: None,
         steps: Some(steps),
         sampling: Sampling::Step { step: 0.7 },
+        image_reduction: 1,
         density_rate: 1.0,
         color_rate: 0.05,
         rate_decay: 0.3,
@@ -103,6 +104,24 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
         }
         assert!(bits(config, 2, 43) != one, "another seed is another run");
     }
+}
+
+#[test]
+fn a_stage_of_reduced_images_learns_from_what_reduced_views_show() {
+    let train = views(Split::Train);
+    let first = |image_reduction, views: &[View]| {
+        let stages = vec![Stage { image_reduction, ..stage(8, 6) }, stage(16, 4)];
+        let mut trainer = Trainer::<f32>::new(Config { stages, ..config() }, views).expect("a valid config");
+        let losses: Vec<f64> = std::iter::from_fn(|| trainer.step().expect("finite numbers")).map(|report| report.loss).collect();
+        losses
+    };
+    let reduced: Vec<View> = train.iter().map(|view| view.reduced(4)).collect();
+    assert_eq!(reduced[0].image.dimensions(), (8, 8));
+    // 32 is not divided by 6, and not by 5.
+    assert_eq!(train[0].reduced(6).image, reduced[0].image);
+    assert_eq!(first(4, &train)[..6], first(1, &reduced)[..6]);
+    assert_eq!(first(6, &train), first(4, &train));
+    assert_ne!(first(4, &train)[0], first(1, &train)[0]);
 }
 
 #[test]

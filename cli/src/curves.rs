@@ -225,6 +225,7 @@ mod tests {
             epochs: None,
             steps: Some(50),
             sampling: Sampling::Step { step: 0.5 },
+            image_reduction: 1,
             density_rate: 1.0,
             color_rate: 1.0,
             rate_decay: 1.0,

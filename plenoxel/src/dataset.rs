@@ -79,6 +79,16 @@ impl View {
         f32::from(self.image.get_pixel(x as u32, y as u32).0[3]) / 255.0
     }
 
+    /// The same with an image reduced by `k` in both directions, with a box filter, or by the largest number below that divides its sides.
+    /// There is no depth of it.
+    pub fn reduced(&self, k: usize) -> Self {
+        let (width, height) = self.image.dimensions();
+        let divides = |k: &usize| width.is_multiple_of(*k as u32) && height.is_multiple_of(*k as u32);
+        let k = (1..=k).rev().find(divides).unwrap_or(1);
+        let camera = Camera { intrinsics: self.camera.intrinsics.downscaled(k), ..self.camera.clone() };
+        View { name: self.name.clone(), camera, image: image::downscale(&self.image, k), depth: None }
+    }
+
     /// The whole picture over `background`, [height, width, 3] in [0, 1].
     pub fn composite(&self, background: [f32; 3]) -> Array3<f32> {
         image::composite(&self.image, background)

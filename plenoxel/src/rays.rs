@@ -7,6 +7,7 @@ use crate::random::{Permutation, Purpose};
 use crate::sampling::Occupancy;
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
+use std::borrow::Cow;
 use tiles::Tile;
 
 mod tiles;
@@ -37,7 +38,7 @@ impl<T: Real> RayBatch<T> {
 /// The pixels of some views, all of them or those that can see something, in an order that is shuffled anew each epoch.
 #[derive(Debug)]
 pub struct RaySource<'a> {
-    views: &'a [View],
+    views: Cow<'a, [View]>,
     background: [f32; 3],
     seed: u64,
     tiles: Vec<Tile>,
@@ -47,12 +48,15 @@ pub struct RaySource<'a> {
 
 impl<'a> RaySource<'a> {
     /// The pixels of `views` over a background.
-    pub fn new(views: &'a [View], background: [f32; 3], seed: u64) -> Self {
+    ///
+    /// Views that are owned stay in memory as long as the source.
+    pub fn new(views: impl Into<Cow<'a, [View]>>, background: [f32; 3], seed: u64) -> Self {
+        let views = views.into();
         let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
         Self::of_tiles(views, background, seed, tiles)
     }
 
-    fn of_tiles(views: &'a [View], background: [f32; 3], seed: u64, tiles: Vec<Tile>) -> Self {
+    fn of_tiles(views: Cow<'a, [View]>, background: [f32; 3], seed: u64, tiles: Vec<Tile>) -> Self {
         let mut first = vec![0];
         for tile in &tiles {
             first.push(first[first.len() - 1] + tile.pixels() as u64);
@@ -62,8 +66,15 @@ impl<'a> RaySource<'a> {
 
     /// The pixels of the same views around the projections of what may hold matter. The others show the background whatever is learned, so
     /// they say nothing, except of the mean of the errors.
-    pub fn aimed_at(&self, matter: &Occupancy) -> Self {
-        Self::of_tiles(self.views, self.background, self.seed, tiles::showing(self.views, matter))
+    pub fn aimed_at(self, matter: &Occupancy) -> Self {
+        let tiles = tiles::showing(&self.views, matter);
+        Self::of_tiles(self.views, self.background, self.seed, tiles)
+    }
+
+    /// The share of the pixels of the views that are in the set.
+    pub fn share(&self) -> f64 {
+        let all: u64 = self.views.iter().map(|view| u64::from(view.image.width()) * u64::from(view.image.height())).sum();
+        self.len() as f64 / all as f64
     }
 
     /// Rays in one epoch.
@@ -134,7 +145,7 @@ impl<'a> RaySource<'a> {
     /// All rays of the set, view after view and row after row, `size` at a time, each with the alpha of its pixel. Where no
     /// view has a transparent pixel ([`has_alpha`]), alpha does not tell objects: it is 0 where the color is the background's then, else 1.
     pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
-        let has_alpha = has_alpha(self.views);
+        let has_alpha = has_alpha(&self.views);
         let in_bytes = |color: [f32; 3]| color.map(|c| (c * 255.0).round() as u8);
         let alpha = move |index: u64| {
             let (v, x, y) = self.place(index);

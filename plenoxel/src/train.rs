@@ -18,6 +18,7 @@ use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Rates, R
 use autograd::{Real, parallel, release_free_buffers, value_and_grad};
 use config::{Config, OptimizerConfig, Stage, Weight};
 use start::Silhouettes;
+use std::borrow::Cow;
 
 /// Rays that are rendered at a time to find out what is seen: bounds the memory.
 const RAYS_PER_BATCH: usize = 1 << 15;
@@ -62,9 +63,10 @@ pub struct PlannedStage {
 pub struct Trainer<'a, T: Real> {
     config: Config,
     plan: Vec<PlannedStage>,
+    views: &'a [View],
     rays: RaySource<'a>,
-    /// The share of all pixels that they are; the others have no error.
-    share: f64,
+    /// By how much the images are reduced whose pixels the rays are.
+    reduction: usize,
     silhouettes: Option<Silhouettes<'a>>,
     objective: Objective<T>,
     grid: VoxelGrid<T>,
@@ -100,7 +102,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        Ok(Trainer { config, plan, rays, share: 1.0, silhouettes, objective, grid, optimizer, step: 0 })
+        Ok(Trainer { config, plan, views, rays, reduction: 1, silhouettes, objective, grid, optimizer, step: 0 })
     }
 
     /// The same run starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
@@ -169,7 +171,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         let (loss, gradients) = value_and_grad(|| {
             let rendered = render(&self.grid, &batch.rays, &options);
             samples = rendered.sample_count;
-            squared_error = self.share * mean_squared_error(rendered.rgb.data(), batch.target.data());
+            squared_error = self.rays.share() * mean_squared_error(rendered.rgb.data(), batch.target.data());
             let step = Step { number: self.step, seed: self.config.seed, batch: &batch, rendered: &rendered, grid: &self.grid };
             let (total, values) = self.objective.evaluate(&step);
             losses = values.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
@@ -204,12 +206,16 @@ impl<'a, T: Real> Trainer<'a, T> {
 
     /// What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
     fn begin(&mut self, index: usize) -> Result<()> {
-        let plan = &self.plan[index];
+        let plan = self.plan[index];
         // The old state goes before the finer grid comes.
-        self.optimizer = optimizer(&self.config, plan);
+        self.optimizer = optimizer(&self.config, &plan);
         if plan.stage.resolution != self.grid.shape().resolution {
             release_free_buffers();
             self.grid = self.grid.resample(plan.stage.resolution);
+        }
+        if plan.stage.image_reduction != self.reduction {
+            self.reduction = plan.stage.image_reduction;
+            self.rays = self.all_rays();
         }
         if let Some(silhouettes) = &self.silhouettes {
             let inside = silhouettes.voxels(self.grid.shape());
@@ -238,14 +244,21 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.grid = self.grid.pruned(&kept);
         }
         if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
-            let all = self.rays.len() as f64 / self.share;
-            self.rays = self.rays.aimed_at(reach);
-            self.share = self.rays.len() as f64 / all;
+            self.rays = self.all_rays().aimed_at(reach);
         }
         if self.config.project {
             self.grid.project();
         }
         Ok(())
+    }
+
+    /// The rays of all pixels of the images as reduced now.
+    fn all_rays(&self) -> RaySource<'a> {
+        let views: Cow<'a, [View]> = match self.reduction {
+            1 => self.views.into(),
+            k => parallel::map_indices(self.views.len(), |v| self.views[v].reduced(k)).into(),
+        };
+        RaySource::new(views, self.config.background, self.config.seed)
     }
 
     /// The first stage of the plan that begins by pruning, if one does: the config counts those too that a start from a grid has left out.

@@ -41,7 +41,7 @@ const TABLES: &[(&str, &[&str])] = &[
     ("optimizer", &["kind", "decay", "beta", "beta1", "beta2", "epsilon"]),
     ("losses", &loss::NAMES),
     ("losses.*", &["from", "to", "steps"]),
-    ("stages[]", &["resolution", "epochs", "steps", "sampling", "density_rate", "color_rate", "rate_decay"]),
+    ("stages[]", &["resolution", "epochs", "steps", "sampling", "image_reduction", "density_rate", "color_rate", "rate_decay"]),
     ("stages[].sampling", &["step", "samples", "far"]),
     ("evaluation", &["step", "samples", "far"]),
     ("carve", &["resolution", "rule", "margin", "depth", "photo", "fit", "ridge", "sweeps"]),

@@ -171,6 +171,10 @@ pub struct Stage {
     pub steps: Option<u64>,
     /// Where samples lie.
     pub sampling: Sampling,
+    /// Images are reduced by this factor while the stage lasts, or by the largest below it that divides their sides: one ray then says what
+    /// many pixels show, which is all that large voxels can tell. An epoch is of the images as they were.
+    #[serde(default = "whole")]
+    pub image_reduction: usize,
     /// Learning rate of the density, at the stage's start.
     pub density_rate: f64,
     /// Learning rate of the colors, at the stage's start.
@@ -182,6 +186,10 @@ pub struct Stage {
 
 fn one() -> f64 {
     1.0
+}
+
+fn whole() -> usize {
+    1
 }
 
 /// Where samples lie along a ray.
@@ -240,6 +248,7 @@ impl Default for Config {
             steps: Some(steps),
             // svox2: half a voxel.
             sampling: Sampling::Step { step: 0.5 },
+            image_reduction: 1,
             density_rate,
             color_rate: 0.03,
             rate_decay,
@@ -360,6 +369,7 @@ impl Config {
             for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate)] {
                 check(rate == 0.0 || (1e-30..=1e30).contains(&rate), &key(name), rate, "0, or 1e-30 to 1e30")?;
             }
+            check((1..=64).contains(&stage.image_reduction), &key("image_reduction"), stage.image_reduction, "1 to 64")?;
             check((1e-6..=1e6).contains(&stage.rate_decay), &key("rate_decay"), stage.rate_decay, "1e-6 to 1e6")?;
             // Samples of a batch are counted in 32 bits.
             let samples = stage.sampling.most(stage.resolution) * self.rays_per_step as f64;

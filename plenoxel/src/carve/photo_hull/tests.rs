@@ -78,7 +78,7 @@ fn matter(p: DVec3) -> bool {
 #[test]
 fn the_photo_hull_opens_a_pit_that_the_visual_hull_fills() {
     let views = views(40, true, false);
-    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], 0.5);
+    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], 0.5, &|_| ());
     assert_eq!(count(&visual, pit).0, count(&visual, pit).1);
     let photo = hull(&views, &visual, 0.12);
     let (left, all) = count(&photo, pit);
@@ -99,7 +99,7 @@ fn without_alpha_the_surroundings_do_not_agree_on_anything_in_the_box() {
 #[test]
 fn a_consistent_convex_body_loses_nothing() {
     let views = views(30, false, false);
-    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], 0.5);
+    let visual = by_footprint(&views, Aabb::cube(1.0), [24; 3], 0.5, &|_| ());
     let photo = hull(&views, &visual, 0.15);
     let (left, all) = count(&photo, |p| p.abs().max_element() < HALF);
     assert_eq!(left, all);
