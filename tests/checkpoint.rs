@@ -12,7 +12,7 @@ fn folder(name: &str) -> PathBuf {
 
 fn grid() -> (VoxelGrid<f32>, Header) {
     let shape =
-        GridShape { resolution: 5, half_width: 1.4, interpolation: Interpolation::Trilinear, color: Color::Sh { degree: 2, offset: 0.5 } };
+        GridShape { resolution: 5, half_width: 1.4, interpolation: Interpolation::Trilinear, color: Color::Sh { degree: 2, offset: 0.5 }, sh_reduction: 1 };
     let grid = VoxelGrid::random(shape, 3.0, 1.0, 9);
     let header = Header::new(&grid, "still life", [1.0, 1.0, 1.0], 42, 1234);
     (grid, header)

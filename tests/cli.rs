@@ -390,7 +390,7 @@ fn help_mentions_every_command_and_flag() {
     let version = plenoxel(&["--version"]);
     assert!(version.code == 0 && version.out.starts_with("plenoxel 0."), "{}", version.out);
     let flags = "--out --force --no-images --preset --config --set --seed --downscale --background --half-width --interpolation --color \
-        --sh-degree --engine --tv --threads --quiet --scene-size --scene-views Examples:";
+        --sh-degree --sh-reduction --engine --tv --threads --quiet --scene-size --scene-views Examples:";
     for (command, flags) in [
         ("train", flags),
         ("render", "--split --view --downscale --data Examples:"),

@@ -31,6 +31,7 @@ fn stage(resolution: usize, steps: u64) -> Stage {
         sampling: Sampling::Step { step: 0.7 },
         density_rate: 1.0,
         color_rate: 0.05,
+        harmonics_rate: None,
         rate_decay: 0.3,
     }
 }

@@ -46,7 +46,7 @@ const DEPTH: f64 = 0.2;
 /// A carved grid that lets light through: as thin as training starts from it.
 pub fn thinned<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
     let density = grid.density.tensor().clamp(0.0, DEPTH / grid.shape().voxel_side());
-    VoxelGrid::with_lattice(*grid.shape(), grid.lattice().clone(), density, grid.color.tensor().clone())
+    grid.with_density(density)
 }
 
 /// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
@@ -58,5 +58,6 @@ pub fn adapted<T: Real>(grid: &VoxelGrid<T>, shape: &GridShape) -> VoxelGrid<T> 
         Interpolation::Nearest => grid,
         Interpolation::Trilinear => grid.grown(),
     };
-    grid.with_interpolation(shape.interpolation)
+    // Last, so that harmonics are averaged over what training will see.
+    grid.with_interpolation(shape.interpolation).with_reduction(shape.sh_reduction)
 }

@@ -11,14 +11,14 @@ const RUN: usize = 1 << 16;
 impl<T: Real> VoxelGrid<T> {
     /// The voxels that absorb more than the share `alpha` of the light that crosses them along an axis: 1 − exp(−σ side) > α.
     pub fn voxels_above(&self, alpha: f64) -> Occupancy {
-        let (density, threshold) = (self.density.tensor().data(), self.shape.density_of_alpha(alpha));
+        let (density, threshold) = (self.density.tensor().data(), self.shape().density_of_alpha(alpha));
         self.voxels_where(|row| density[row].as_f64() > threshold)
     }
 
     /// Raw density of a voxel, 1 / world length: 0 for one that is not present or lies outside of the grid.
     pub fn density_at(&self, voxel: [isize; 3]) -> f64 {
-        let inside = voxel.iter().all(|k| (0..self.shape.resolution as isize).contains(k));
-        let row = inside.then(|| self.lattice.row(voxel.map(|k| k as usize))).flatten();
+        let inside = voxel.iter().all(|k| (0..self.shape().resolution as isize).contains(k));
+        let row = inside.then(|| self.lattice().row(voxel.map(|k| k as usize))).flatten();
         row.map_or(0.0, |row| self.density.tensor().data()[row as usize].as_f64())
     }
 
@@ -30,7 +30,7 @@ impl<T: Real> VoxelGrid<T> {
             there[axis] += step;
             self.density_at(there).max(0.0)
         };
-        DVec3::from([0, 1, 2].map(|axis| sigma(axis, -1) - sigma(axis, 1))) / (2.0 * self.shape.voxel_side())
+        DVec3::from([0, 1, 2].map(|axis| sigma(axis, -1) - sigma(axis, 1))) / (2.0 * self.shape().voxel_side())
     }
 
     /// Colors of rows of the tables, each seen along its unit direction from the viewer into the scene: what [`super::Color::activate`] gives for a
@@ -45,12 +45,20 @@ impl<T: Real> VoxelGrid<T> {
             let m = rows.len();
             let directions = directions.iter().flat_map(|d| d.to_array().map(T::lit)).collect();
             let directions = Tensor::from_vec(directions, &[m, 3]);
-            let numbers = self.color.tensor().detach().gather_rows(&Indices::from(rows.to_vec()));
-            let rgb = no_grad(|| self.shape.color.shade(&numbers, |degree| crate::field::sh::basis(&directions, degree)));
+            let numbers = self.numbers_of(rows);
+            let rgb = no_grad(|| self.shape().color.shade(&numbers, |degree| crate::field::sh::basis(&directions, degree)));
             let rgb: Vec<[f64; 3]> = rgb.data().as_chunks::<3>().0.iter().map(|c| c.map(T::as_f64)).collect();
             rgb
         });
         colors.collect()
+    }
+
+    /// All numbers of the colors at the centres of the voxels of rows, `[rows, channels]`, something for rows of no voxel. A constant.
+    pub(super) fn numbers_of(&self, rows: &[u32]) -> Tensor<T> {
+        let color = self.color.tensor().detach().gather_rows(&Indices::from(rows.to_vec()));
+        let Some(harmonics) = &self.harmonics else { return color };
+        let centers = rows.iter().flat_map(|&row| self.lattice().node(row).unwrap_or_default().map(|k| T::lit(k as f64))).collect();
+        no_grad(|| self.layout().whole_colors(color, Some(harmonics.tensor()), &Tensor::from_vec(centers, &[rows.len(), 3])))
     }
 }
 
@@ -62,7 +70,7 @@ mod tests {
     use crate::sampling::Samples;
 
     fn shape(color: Color) -> GridShape {
-        GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color }
+        GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color, sh_reduction: 1 }
     }
 
     #[test]

@@ -8,7 +8,7 @@ use crate::sampling::{Jitter, Spacing};
 use autograd::Tensor;
 
 const SHAPE: GridShape =
-    GridShape { resolution: 8, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Sh { degree: 1, offset: 0.5 } };
+    GridShape { resolution: 8, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Sh { degree: 1, offset: 0.5 }, sh_reduction: 1 };
 
 /// A grid with the densities and coefficients that functions of a voxel name.
 fn grid(shape: GridShape, density: impl Fn([usize; 3]) -> f64, color: impl Fn([usize; 3], usize) -> f64) -> VoxelGrid<f64> {

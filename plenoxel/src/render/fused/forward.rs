@@ -7,7 +7,7 @@ use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
 use crate::sampling::{March, Occupancy, march};
 use autograd::lattice::NodeMap;
-use autograd::{Buffer, Real, dispatched, parallel};
+use autograd::{Buffer, Real, Tensor, dispatched, parallel};
 
 /// The samples of some rays, as far as the adjoint needs them. Arrays have one entry for each sample unless said otherwise.
 #[derive(Debug)]
@@ -67,11 +67,24 @@ pub(super) struct Scene<'a, T: Real> {
     pub rays: &'a [Ray],
     pub options: &'a RenderOptions<'a>,
     pub cells: Option<&'a Occupancy>,
-    /// Density and color.
-    pub tables: [&'a [T]; 2],
+    /// Density, color, and harmonics where they are reduced.
+    pub tables: [&'a [T]; 3],
 }
 
-impl<T: Real> Scene<'_, T> {
+impl<'a, T: Real> Scene<'a, T> {
+    /// Of a grid's tables.
+    pub fn new(
+        batch: &'a Batch<T>,
+        rays: &'a [Ray],
+        options: &'a RenderOptions<'a>,
+        cells: Option<&'a Occupancy>,
+        tables: impl IntoIterator<Item = &'a Tensor<T>>,
+    ) -> Self {
+        let mut scene = Scene { batch, rays, options, cells, tables: [&[]; 3] };
+        scene.tables.iter_mut().zip(tables).for_each(|(table, tensor)| *table = tensor.data());
+        scene
+    }
+
     /// Renders the rays from number `first` on, one for each [`COLUMNS`] of `pixels`.
     pub fn render(&self, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
         let (mut block, found) = self.weights(first, pixels.len() / COLUMNS);
@@ -86,7 +99,7 @@ impl<T: Real> Scene<'_, T> {
 
     /// The samples of `count` rays from number `first` on, all but their colors; with trilinear look-up also the rows that they read.
     pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
-        with_bricks!(self.batch.lattice, map => self.weights_with(map, first, count))
+        with_bricks!(self.batch.layout.lattice, map => self.weights_with(map, first, count))
     }
 
     fn weights_with(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
@@ -95,7 +108,7 @@ impl<T: Real> Scene<'_, T> {
         let (mut alpha, mut raw) = (Buffer::stale(m), Buffer::stale(m));
         let mut found = None;
         let at = block.at.each_ref().map(|a| &a[..]);
-        match self.batch.shape.interpolation {
+        match self.batch.layout.shape.interpolation {
             Interpolation::Nearest => {
                 block.rows = Buffer::stale(m);
                 lookup::nearest_rows(at, map, &mut block.rows);
@@ -143,8 +156,8 @@ impl<T: Real> Scene<'_, T> {
         let mut block = Block { first, ..Block::empty() };
         [block.t, block.delta] = [Buffer::stale(bound), Buffer::stale(bound)];
         block.at = [Buffer::stale(bound), Buffer::stale(bound), Buffer::stale(bound)];
-        let scale = 1.0 / self.batch.shape.voxel_side();
-        let to_voxels = [T::lit(scale), T::lit(self.batch.shape.half_width * scale - 0.5)];
+        let scale = 1.0 / self.batch.layout.shape.voxel_side();
+        let to_voxels = [T::lit(scale), T::lit(self.batch.layout.shape.half_width * scale - 0.5)];
         let mut end = 0;
         for (ray, march) in rays.iter().zip(&marches) {
             let [x, y, z] = block.at.each_mut().map(|a| &mut a[end..]);
@@ -175,21 +188,24 @@ impl<T: Real> Scene<'_, T> {
                 lookup::harmonics(self.tables[1], &block.offsets, directions, |i| corners.of(i), seen, out);
             }
         }
+        if let Some(lattice) = &self.batch.layout.harmonics {
+            self.add_harmonics(lattice, block, out);
+        }
         block.color = color;
     }
 
-    /// What harmonics need of the rays from number `first` on; `None` for plain colors.
+    /// What the harmonics in a row of the color table need of the rays from number `first` on; `None` if it has none.
     pub fn directions(&self, first: usize) -> Option<Directions<'_, T>> {
-        let Color::Sh { offset, .. } = self.batch.shape.color else { return None };
-        let count = self.batch.shape.color.channels() / 3;
-        Some(Directions { basis: &self.batch.basis.data()[first * count..], count, offset: T::lit(offset) })
+        let Color::Sh { offset, .. } = self.batch.layout.shape.color else { return None };
+        let count = self.batch.harmonics();
+        (count > 0).then(|| Directions { basis: &self.batch.basis.data()[first * count..], count, offset: T::lit(offset) })
     }
 
     /// Pixels from weights and colors.
     pub fn sum(&self, block: &Block<T>, pixels: &mut [T]) {
         let background = self.batch.background;
         let (rgb, _) = block.color.as_chunks::<3>();
-        let clamped = self.batch.shape.color != Color::Rgb;
+        let clamped = self.batch.layout.shape.color != Color::Rgb;
         let shown = |c: T| if clamped { c.max(T::zero()) } else { c };
         for (own, pixel) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0) {
             let (mut color, mut depth, mut opacity, mut optical_depth, mut distortion, mut moment) =

@@ -26,11 +26,18 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 impl<T: Real> Corners<T> {
     /// Those of `at`, and what a table of one column is there.
     pub fn new(at: [&[T]; 3], map: impl NodeMap, table: &[T], values: &mut [T]) -> Self {
-        let size = 8 * values.len().next_multiple_of(TOGETHER);
+        let corners = Self::find(at, map, values.len());
+        let (rows, weights) = (corners.rows.as_chunks().0.as_chunks().0, corners.weights.as_chunks().0.as_chunks().0);
+        interpolate(table, rows, weights, values);
+        corners
+    }
+
+    /// Those of `count` positions.
+    pub fn find(at: [&[T]; 3], map: impl NodeMap, count: usize) -> Self {
+        let size = 8 * count.next_multiple_of(TOGETHER);
         let mut corners = Corners { rows: Buffer::stale(size), weights: Buffer::stale(size) };
         let (rows, weights) = (corners.rows.as_chunks_mut().0.as_chunks_mut().0, corners.weights.as_chunks_mut().0.as_chunks_mut().0);
         corners_of_many(at, map, rows, weights);
-        interpolate(table, rows, weights, values);
         corners
     }
 
