@@ -141,7 +141,8 @@ const BEYOND_THE_CACHES: [usize; 4] = [144, 92, 72, 60];
 #[test]
 fn rows_read_in_their_own_order_agree() {
     let color = Color::Sh { degree: 2, offset: 0.5 };
-    let shape = GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+    let shape =
+        GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
     let full = VoxelGrid::<f64>::random(shape, 3.0, 0.3, 7);
     // A third of the voxels is missing, in every brick.
     let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
@@ -172,7 +173,8 @@ fn a_batch_too_large_to_be_kept_is_marched_again_chunk_by_chunk() {
     let n = 70_000;
     let rays = rays_from_above(3, n);
     for (interpolation, color) in [(Interpolation::Nearest, Color::Rgb), (Interpolation::Trilinear, Color::Sh { degree: 1, offset: 0.5 })] {
-        let full = VoxelGrid::<f64>::random(GridShape { resolution: 9, half_width: 1.0, interpolation, color, sh_reduction: 1 }, 2.0, 1.0, 7);
+        let full =
+            VoxelGrid::<f64>::random(GridShape { resolution: 9, half_width: 1.0, interpolation, color, sh_reduction: 1 }, 2.0, 1.0, 7);
         let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
         let options = options(grid.aabb(), Spacing::Step(0.9), Jitter::PerRay { seed: 1, step: 2 }, [0.2, 0.5, 0.9]);
         let (d, what) = worst(&grid, &rays, &options);

@@ -82,7 +82,10 @@ fn every_loss_agrees_with_finite_differences() {
     for (render_name, shape) in [
         ("Nearest RGB", shape(Interpolation::Nearest, Color::Rgb)),
         ("Trilinear SH 2", shape(Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 })),
-        ("Trilinear SH 2 for every 2", GridShape { sh_reduction: 2, ..shape(Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 }) }),
+        (
+            "Trilinear SH 2 for every 2",
+            GridShape { sh_reduction: 2, ..shape(Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 }) },
+        ),
     ] {
         for name in loss::NAMES {
             // A closure over what a step needs, with sampled cells at a fixed place.

@@ -191,7 +191,13 @@ fn vertices_lie_where_the_density_has_the_level_in_world_coordinates() {
 
 #[test]
 fn a_surface_through_noise_is_closed_and_the_same_for_any_number_of_threads() {
-    let shape = |interpolation| GridShape { resolution: 14, half_width: 1.0, interpolation, color: Color::Sh { degree: 1, offset: 0.5 }, sh_reduction: 1 };
+    let shape = |interpolation| GridShape {
+        resolution: 14,
+        half_width: 1.0,
+        interpolation,
+        color: Color::Sh { degree: 1, offset: 0.5 },
+        sh_reduction: 1,
+    };
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
         let noise = VoxelGrid::<f32>::random(shape(interpolation), 1.0, 1.0, 11);
         let options = MeshOptions { level: Some(0.6), direction: None };
@@ -208,8 +214,13 @@ fn a_surface_through_noise_is_closed_and_the_same_for_any_number_of_threads() {
 #[test]
 fn harmonics_are_seen_against_the_normal_or_along_one_direction() {
     // Red grows along the direction of sight, from the coefficient of −x: c = 0.5 + 0.4886 · 0.5 · x.
-    let shape =
-        GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Sh { degree: 1, offset: 0.5 }, sh_reduction: 1 };
+    let shape = GridShape {
+        resolution: 8,
+        half_width: 1.0,
+        interpolation: Interpolation::Nearest,
+        color: Color::Sh { degree: 1, offset: 0.5 },
+        sh_reduction: 1,
+    };
     let n = shape.voxels();
     let inside = |v: usize| [v / 64, v / 8 % 8, v % 8].iter().all(|k| (2..6).contains(k));
     let density = Tensor::from_vec((0..n).map(|v| if inside(v) { 100.0 } else { 0.0 }).collect(), &[n, 1]);

@@ -197,8 +197,7 @@ impl<T: Real> VoxelGrid<T> {
 
     /// True if every stored number is finite.
     pub fn is_finite(&self) -> bool {
-        self.params()
-            .all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
+        self.params().all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
     }
 }
 

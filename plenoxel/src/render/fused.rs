@@ -116,7 +116,12 @@ impl<T: Real> Columns<T> {
         let n = self.pixels.shape()[0];
         let mut values = Vec::with_capacity(n);
         self.state.for_each_chunk(&self.tables, |blocks| values.extend(blocks.iter().flat_map(Block::sparsity)));
-        Tensor::from_kernel(values.into(), &[n], &self.tables.iter().collect::<Vec<_>>(), Fused { state: self.state.clone(), output: Output::Sparsity })
+        Tensor::from_kernel(
+            values.into(),
+            &[n],
+            &self.tables.iter().collect::<Vec<_>>(),
+            Fused { state: self.state.clone(), output: Output::Sparsity },
+        )
     }
 }
 

@@ -34,7 +34,7 @@ pub struct Config {
     /// Degree of the harmonics, 0 to 3, where `color = "sh"`.
     pub sh_degree: usize,
     /// Harmonics of degree 1 and more are stored for every so many voxels along each axis, the mean color for each; 1 for all coefficients in
-    /// every voxel. Where there are no such harmonics it means nothing.
+    /// every voxel. Where there are no such harmonics it means nothing, and carving finds all coefficients for each voxel.
     #[serde(default = "one")]
     pub sh_reduction: usize,
     /// Color of zero coefficients: 0.5 in svox2, 0 in the source paper.
@@ -364,7 +364,8 @@ impl Config {
             check(length, &key("epochs"), found, "exactly one of `epochs`, above 0 to 1e6, and `steps`, 1 to 1e9")?;
             sampling(&key("sampling"), stage.sampling)?;
             let harmonics_rate = stage.harmonics_rate.unwrap_or(stage.color_rate);
-            for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate), ("harmonics_rate", harmonics_rate)] {
+            for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate), ("harmonics_rate", harmonics_rate)]
+            {
                 check(rate == 0.0 || (1e-30..=1e30).contains(&rate), &key(name), rate, "0, or 1e-30 to 1e30")?;
             }
             check((1e-6..=1e6).contains(&stage.rate_decay), &key("rate_decay"), stage.rate_decay, "1e-6 to 1e6")?;

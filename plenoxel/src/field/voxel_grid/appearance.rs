@@ -69,14 +69,20 @@ mod tests {
     use crate::field::Field;
     use crate::sampling::Samples;
 
+    /// Harmonics are for every second voxel where there are any.
+    fn reduced(color: Color) -> GridShape {
+        GridShape { sh_reduction: 2, ..shape(color) }.normalised()
+    }
+
     fn shape(color: Color) -> GridShape {
         GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color, sh_reduction: 1 }
     }
 
     #[test]
     fn a_row_has_the_color_that_a_ray_finds_at_its_voxel() {
-        for color in [Color::Rgb, Color::Sh { degree: 2, offset: 0.5 }] {
-            let grid = VoxelGrid::<f64>::random(shape(color), 1.0, 1.0, 3);
+        let harmonics = Color::Sh { degree: 2, offset: 0.5 };
+        for shape in [shape(Color::Rgb), shape(harmonics), reduced(harmonics)] {
+            let grid = VoxelGrid::<f64>::random(shape, 1.0, 1.0, 3);
             let (voxel, direction) = ([2, 0, 3], DVec3::new(0.48, -0.6, 0.64));
             let samples = Samples {
                 t: Tensor::zeros(&[1]),

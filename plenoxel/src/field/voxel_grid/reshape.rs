@@ -58,10 +58,8 @@ impl<T: Real> VoxelGrid<T> {
             }
             Tensor::from_buffer(values, &[to.rows(), width])
         };
-        let mut tables = vec![
-            read(self.density.tensor(), self.lattice(), &layout.lattice),
-            read(self.color.tensor(), self.lattice(), &layout.lattice),
-        ];
+        let mut tables =
+            vec![read(self.density.tensor(), self.lattice(), &layout.lattice), read(self.color.tensor(), self.lattice(), &layout.lattice)];
         // The centres of the harmonics' voxels are scaled by the same ratio. Some lie beyond the old ones.
         if let (Some(table), Some(from), Some(to)) = (&self.harmonics, self.harmonics_lattice(), &layout.harmonics) {
             let wider = dilated(from);

@@ -65,7 +65,7 @@ fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lat
 }
 
 /// What gives rows and weights of a sample; rows may repeat, with no weight.
-type Reads<T> = Box<dyn Fn(usize) -> ([u32; 8], [T; 8])>;
+pub(super) type Reads<T> = Box<dyn Fn(usize) -> ([u32; 8], [T; 8])>;
 
 /// The rows of harmonics that samples of a block read, where harmonics are reduced.
 pub(super) fn reads<T: Real>(batch: &Batch<T>, block: &Block<T>) -> Option<Reads<T>> {
@@ -116,7 +116,8 @@ fn add_to_means<T: Real, const K: usize, const N: usize>(
     seen: impl Fn(usize) -> bool,
     out: &mut [[T; 3]],
 ) {
-    let mut colors = [[T::zero(); 4]; K];
+    let table = table.as_chunks::<N>().0;
+    let mut colors: [Rgb0<T>; K] = [[T::zero(); 4]; K];
     for (own, basis) in offsets.windows(2).zip(basis.chunks_exact(N + 1)) {
         let mut weighed = None;
         for i in (own[0] as usize..own[1] as usize).filter(|&i| seen(i)) {
@@ -124,9 +125,12 @@ fn add_to_means<T: Real, const K: usize, const N: usize>(
             if weighed != Some(rows) {
                 weighed = Some(rows);
                 for (color, row) in colors.iter_mut().zip(rows) {
-                    let row = table.as_chunks::<N>().0.get(3 * row as usize..3 * row as usize + 3);
-                    for (c, color) in color[..3].iter_mut().enumerate() {
-                        *color = row.map_or(T::zero(), |row| (0..N).map(|k| row[c][k] * basis[k + 1]).sum());
+                    *color = [T::zero(); 4];
+                    let Some(row) = table.get(3 * row as usize..3 * row as usize + 3) else { continue };
+                    for c in 0..3 {
+                        for k in 0..N {
+                            color[c] += row[c][k] * basis[k + 1];
+                        }
                     }
                 }
             }
@@ -217,11 +221,6 @@ impl<T: Real, const K: usize> Runs<T, K> {
         }
         Runs { runs, starts, numbers }
     }
-
-    /// The runs that have a row in a bucket, in the order of the rays.
-    fn of(&self, bucket: usize) -> impl Iterator<Item = &Run<T, K>> {
-        self.numbers[self.starts[bucket] as usize..self.starts[bucket + 1] as usize].iter().map(|&number| &self.runs[number as usize])
-    }
 }
 
 impl<T: Real, const K: usize> HarmonicsSums<T, K> {
@@ -246,33 +245,36 @@ impl<T: Real, const K: usize> RowSums<T> for HarmonicsSums<T, K> {
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        let runs = self.blocks.iter().flat_map(|runs| runs.of(bucket));
-        match self.basis.shape()[1] {
-            4 => add_runs::<T, K, 3>(bucket, runs, self.basis.data(), sums, touched),
-            9 => add_runs::<T, K, 8>(bucket, runs, self.basis.data(), sums, touched),
-            _ => add_runs::<T, K, 15>(bucket, runs, self.basis.data(), sums, touched),
-        }
+        let basis = self.basis.data();
+        self.blocks.iter().for_each(|runs| match self.basis.shape()[1] {
+            4 => add_runs::<T, K, 3>(bucket, runs, basis, sums, touched),
+            9 => add_runs::<T, K, 8>(bucket, runs, basis, sums, touched),
+            _ => add_runs::<T, K, 15>(bucket, runs, basis, sums, touched),
+        });
     }
 }
 
 dispatched! {
-/// Adds to the rows of runs that lie in the bucket; `basis` has `N` + 1 numbers for each ray, a row 3 `N`.
-fn add_runs<'a, T: Real, const K: usize, const N: usize>(
+/// Adds what runs have, in the order of the rays, to their rows in the bucket; `basis` has `N` + 1 numbers for each ray, a row 3 `N`.
+fn add_runs<T: Real, const K: usize, const N: usize>(
     bucket: usize,
-    runs: impl Iterator<Item = &'a Run<T, K>>,
+    runs: &Runs<T, K>,
     basis: &[T],
     sums: &mut [T],
     touched: &mut [u64],
 ) {
     let sums = sums.as_chunks_mut::<N>().0;
-    for run in runs {
+    for &number in &runs.numbers[runs.starts[bucket] as usize..runs.starts[bucket + 1] as usize] {
+        let run = &runs.runs[number as usize];
         let y: &[T; N] = basis[run.ray as usize * (N + 1) + 1..].first_chunk().expect("the harmonics of each ray");
         for (row, own) in run.rows.iter().zip(&run.sums) {
             if *row as usize >> BUCKET_SHIFT == bucket {
                 let local = *row as usize & ((1 << BUCKET_SHIFT) - 1);
                 touched[local / 64] |= 1 << (local % 64);
                 for c in 0..3 {
-                    (0..N).for_each(|k| sums[3 * local + c][k] += own[c] * y[k]);
+                    for k in 0..N {
+                        sums[3 * local + c][k] += own[c] * y[k];
+                    }
                 }
             }
         }

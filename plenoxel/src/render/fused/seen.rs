@@ -96,8 +96,8 @@ struct Sample<'a, T> {
     weight: T,
     /// Of density and color.
     own: Reads<'a, T>,
-    /// Of harmonics that are reduced.
-    harmonics: Option<Reads<'a, T>>,
+    /// Of harmonics that are reduced: its number among the block's samples, what finds their rows, and the harmonics of the ray's direction.
+    harmonics: Option<(usize, &'a reduced::Reads<T>, &'a [T])>,
 }
 
 /// Rows of a table with their shares.
@@ -136,8 +136,10 @@ impl<T: Real> Sample<'_, T> {
     /// What it shows to its ray.
     fn color(&self, grid: &VoxelGrid<T>) -> [f64; 3] {
         let mut sum = self.own.color(grid.color.tensor());
-        if let (Some(reads), Some(table)) = (&self.harmonics, &grid.harmonics) {
-            sum.iter_mut().zip(reads.color(table.tensor())).for_each(|(sum, c)| *sum += c);
+        if let (Some((i, reads, basis)), Some(table)) = (self.harmonics, &grid.harmonics) {
+            let (rows, shares) = reads(i);
+            let changing = Reads { rows: &rows, shares: &shares, basis }.color(table.tensor());
+            sum.iter_mut().zip(changing).for_each(|(sum, c)| *sum += c);
         }
         let offset = if let Color::Sh { offset, .. } = grid.shape().color { offset } else { 0.0 };
         sum.map(|c| c.as_f64() + offset)
@@ -159,8 +161,7 @@ fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderO
             let (basis, beyond) = batch.basis.data()[ray * count..][..count].split_at(here);
             for i in own.filter(|&i| block.weight[i] > least) {
                 let weight = block.weight[i];
-                let read = reduced.as_ref().map(|reads| reads(i));
-                let harmonics = read.as_ref().map(|(rows, shares)| Reads { rows, shares, basis: beyond });
+                let harmonics = reduced.as_ref().map(|reads| (i, reads, beyond));
                 match &corners {
                     None => f(Sample { ray, weight, own: Reads { rows: &block.rows[i..=i], shares: &[T::one()], basis }, harmonics }),
                     Some(corners) => {
