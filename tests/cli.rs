@@ -327,14 +327,24 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
         assert!(fs::read(Path::new(&run).join("exports").join(file)).unwrap().starts_with(start));
     }
     let out = folder.path("fog.GLB");
-    assert_eq!(plenoxel(&["export", "mesh", &run, "--level", "1e-3", "--direction", "0,0,-1", "--out", &out]).code, 0);
+    assert_eq!(plenoxel(&["export", "mesh", &run, "--level", "1e-3", "--color", "0,0,-1", "--out", &out]).code, 0);
     assert!(fs::read(&out).unwrap().starts_with(b"glTF"));
     let export = |args: &[&str]| plenoxel(&[&["export"], args].concat());
     export(&["mesh", &run, "--out", &out, "--format", "obj"]).refused(2, &["--out", "fog.GLB", ".obj"]);
     export(&["mesh", &run, "--level", "1e9"]).refused(2, &["--level", "above 0 and below"]);
-    export(&["mesh", &run, "--direction", "0,0,0"]).refused(2, &["--direction", "three numbers"]);
-    export(&["vox", &run, "--min-alpha", "1"]).refused(2, &["--min-alpha", "below 1"]);
-    export(&["vox", &folder.path("none")]).refused(3, &["none", "there is no such run"]);
+    // What flags alone can tell is told before a run is looked for.
+    let none = folder.path("none");
+    for what in ["vox", "mesh"] {
+        for color in ["0,0,0", "seen", "1,2"] {
+            export(&[what, &none, "--color", color]).refused(2, &["--color", "facing, or a direction of three numbers"]);
+        }
+    }
+    export(&["mesh", &none, "--level", "0"]).refused(2, &["--level", "above 0"]);
+    for (what, alpha) in [("vox", "1"), ("vox", "2"), ("ply", "1"), ("ply", "nan")] {
+        export(&[what, &none, "--min-alpha", alpha]).refused(2, &["--min-alpha", "from 0 on, and below 1"]);
+    }
+    export(&["ply", &none, "--out", "cloud.obj"]).refused(2, &["--out", "cloud.obj", ".ply"]);
+    export(&["vox", &none]).refused(3, &["none", "there is no such run"]);
     export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "spelled rightly"]);
 }
 
@@ -396,9 +406,10 @@ fn help_mentions_every_command_and_flag() {
         ("render", "--split --view --downscale --data Examples:"),
         ("evaluate", "--split --downscale --samples --json --data Examples:"),
         ("info", "Examples:"),
-        ("export", "vox mesh"),
-        ("export vox", "--out --direction --min-alpha --solid Examples:"),
-        ("export mesh", "--out --direction --format --level Examples:"),
+        ("export", "ply vox mesh"),
+        ("export ply", "--out --color --min-alpha --min-weight --min-object --coords --bbox --sor-sigma Examples:"),
+        ("export vox", "--out --color --min-alpha --solid Examples:"),
+        ("export mesh", "--out --color --format --level Examples:"),
         ("scene", "--width --height --train --val --test --force Examples:"),
     ] {
         let help = plenoxel(&[command.split(' ').collect(), vec!["--help"]].concat());

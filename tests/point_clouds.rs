@@ -71,22 +71,26 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "no such run"]);
     plenoxel(&["export", "ply", &run, "--data", &moved, "-o", &folder.path("no/where.ply")]).refused(5, &["no/where.ply"]);
     let none = ["export", "ply", &run, "--data", &moved, "--min-value", "1e9"];
-    plenoxel(&none).refused(2, &["leaves no point", "value 0", "lower thresholds"]);
+    plenoxel(&none).refused(2, &["leaves no point", "value 0", "a lower minimum"]);
     for (flag, value, part) in [
         ("--color", "blue", "seen, mean, or a direction"),
         ("--color", "0,0,0", "direction"),
-        ("--min-alpha", "1.5", "from 0 to 1"),
+        ("--min-alpha", "1.5", "from 0 on, and below 1"),
+        ("--min-weight", "1.5", "from 0 to 1"),
         ("--coords", "camera", "world"),
         ("--noise-radius", "0", "--noise-radius"),
         ("--noise-radius", "nan", "--noise-radius"),
         ("--sor-neighbours", "1", "from 2 to 1000"),
         ("--noise-error", "0.1", "--noise-radius"),
         ("--bbox", "1,2,3", "6 numbers"),
+        ("--bbox", "1,0,0,-1,1,1", "no minimum above"),
         ("--value-field", "density", "--min-value"),
     ] {
         plenoxel(&["export", "ply", &run, "--data", &moved, flag, value]).refused(2, &[flag, part]);
     }
-    plenoxel(&["export", "ply", &run, "--data", &moved, "--bbox", "1,0,0,-1,1,1"]).refused(2, &["--bbox", "no minimum above"]);
+    // Before the views are looked for.
+    let unknown = ["export", "ply", &run, "--min-value", "1", "--value-field", "depth"];
+    plenoxel(&unknown).refused(2, &["--value-field", "depth", "opacity, density, weight, object"]);
     let help = plenoxel(&["export"]);
     assert!(help.code == 2 && ["ply", "vox", "mesh"].iter().all(|format| help.err.contains(format)), "{}", help.err);
 }
@@ -116,15 +120,15 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
         assert!(!Path::new(&out).exists());
     };
     refused(&[], 2, &["filters", "at least one of"]);
-    refused(&["--min-value", "0.5"], 2, &["several scalar fields", "height, time"]);
+    refused(&["--max-value", "0.5"], 2, &["error: --max-value", "several scalar fields", "height, time"]);
     refused(&["--min-value", "0.5", "--value-field", "depth"], 2, &["--value-field", "depth", "height, time"]);
     refused(&["--noise-radius", "2", "--units", "voxel"], 2, &["--units", "voxel_side", "world"]);
-    refused(&["--sor-neighbours", "11"], 2, &["sor-neighbours", "fewer than the 11 points"]);
+    refused(&["--sor-neighbours", "11"], 2, &["error: --sor-neighbours: 11 cannot", "fewer than the 11 points"]);
     plenoxel(&["filter", &cloud, "-o", &clean, "--min-value", "0.5", "--value-field", "scalar_time", "--max-value", "6"]).done();
     assert_eq!(points(&clean), 6);
     let noise = plenoxel(&["filter", &cloud, "-o", &clean, "--noise-radius", "2.5", "--remove-isolated"]);
     assert!(noise.err.contains("the units of the file"), "{}", noise.err);
-    // Of the neighbors in a row three lie on a line, and four have a plane through it.
+    // Of the neighbours in a row three lie on a line, and four have a plane through it.
     assert_eq!((noise.code, points(&clean)), (0, 6));
 
     fs::write(&cloud, &text.as_bytes()[..text.len() - 12]).unwrap();
@@ -133,5 +137,5 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     refused(&["--sor-sigma", "1"], 3, &["scan.ply", "row 0", "0,5"]);
     fs::write(&cloud, "solid cube").unwrap();
     refused(&["--sor-sigma", "1"], 3, &["scan.ply", "no PLY file", "solid cube"]);
-    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(5, &["missing.ply", "spelled rightly"]);
+    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(3, &["missing.ply", "no such file"]);
 }

@@ -81,6 +81,7 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
     // Large enough that batches, tables and losses are cut into many chunks.
     let mut short =
         Config { rays_per_step: 4096, color: ColorKind::Sh, sh_degree: 1, prune_from_stage: Some(1), prune_unseen_below: 1e-3, ..config() };
+    (short.aim, short.stop_below) = (true, 1e-3);
     short.initial.random = true;
     short.stages = vec![stage(24, 3), stage(40, 3)];
     short.losses.insert("tv_density_sampled".to_owned(), Weight::Constant(1e-3));

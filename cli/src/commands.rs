@@ -26,6 +26,14 @@ fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
     Err(Error::config("--split", found, others.join(", ")))
 }
 
+/// A setting of the library under the name that its flag has.
+fn as_flag(error: Error) -> Error {
+    match error {
+        Error::Config { key, found, accepted } => Error::config(format!("--{}", key.replace('_', "-")), found, accepted),
+        other => other,
+    }
+}
+
 /// A split as the command line takes it.
 fn split(text: &str) -> Result<Split, String> {
     text.parse().map_err(|_| "train, val or test".to_owned())

@@ -285,6 +285,10 @@ mod tests {
         }
         let refused = RunFolder::choose(Some(&path), "x", false).unwrap_err();
         assert!(refused.exit_code() == 2 && refused.to_string().contains("--force"));
+        // What is not a run is not overwritten, come what may.
+        let refused = RunFolder::choose(Some(&path), "x", true).unwrap_err();
+        assert!(refused.exit_code() == 2 && refused.to_string().contains("not a run"), "{refused}");
+        std::fs::write(path.join(RECORD), "{}").unwrap();
         RunFolder::choose(Some(&path), "x", true).unwrap().prepare().unwrap();
         assert!(!path.join(CHECKPOINT).exists() && !path.join("images/old.png").exists());
         assert!(!path.join("exports/mesh.glb").exists());

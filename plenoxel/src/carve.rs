@@ -10,9 +10,10 @@
 pub mod color;
 pub mod light;
 pub mod photo_hull;
+mod projection;
 pub mod visual_hull;
 
-use crate::dataset::View;
+use crate::dataset::{View, has_alpha};
 use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -102,15 +103,6 @@ pub struct Colored {
     pub missed: f64,
 }
 
-/// True if some pixel is transparent.
-pub fn has_alpha(views: &[View]) -> bool {
-    alphas(views).any(|alpha| alpha == 0)
-}
-
-fn alphas(views: &[View]) -> impl Iterator<Item = u8> {
-    views.iter().flat_map(|view| view.image.as_raw().iter().skip(3).step_by(4).copied())
-}
-
 /// About how many voxels silhouettes will leave, told by a coarse hull in no time; `None` if there are no silhouettes.
 pub fn voxels_expected(views: &[View], config: &Config) -> Option<f64> {
     const COARSE: usize = 64;
@@ -132,7 +124,7 @@ impl<'a> Carving<'a> {
             let remedy = "silhouettes need an alpha channel that is 0 on the background; --photo-consistency carves without";
             return images("they have no transparent pixel", remedy);
         }
-        if alphas(views).all(|alpha| alpha == 0) {
+        if views.iter().all(|view| view.image.pixels().all(|pixel| pixel.0[3] == 0)) {
             return images("they are transparent all over", "give images that show an object");
         }
         let CarveConfig { resolution, rule, margin, photo, .. } = config.carve;

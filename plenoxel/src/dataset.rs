@@ -85,6 +85,11 @@ impl View {
     }
 }
 
+/// True if some pixel of some view is transparent: then alpha says in all of them what is object and what is background.
+pub fn has_alpha(views: &[View]) -> bool {
+    views.iter().any(|view| view.image.pixels().any(|pixel| pixel.0[3] == 0))
+}
+
 /// How to open a folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OpenOptions {

@@ -25,14 +25,19 @@ const CLEARANCE: f64 = 1.0;
 /// Rays rendered at a time, which bounds the memory.
 const RAYS: usize = 4096;
 
-/// The 8-bit colors that a camera sees close by at `points`, looking along `direction`, or where that is `None` against the `outward` vectors, of any
-/// length: what a ray renders from a voxel before the point, divided by its opacity. A surface in a radiance field is several voxels thick, and
-/// the colors of single ones mean little: only their sum was fitted.
+/// The directions, from the viewer into the scene, in which colors are seen: `along`, or where that is `None` each against its `outward`
+/// vector, of any length; zero where that is zero.
+fn directions(outward: &[DVec3], along: Option<DVec3>) -> Vec<DVec3> {
+    outward.iter().map(|out| along.unwrap_or(-out.normalize_or_zero())).collect()
+}
+
+/// The 8-bit colors that a camera sees close by at `points`, looking along their unit `directions`: what a ray renders from a voxel before
+/// the point, divided by its opacity. A surface in a radiance field is several voxels thick, and the colors of single ones mean little: only
+/// their sum was fitted.
 ///
-/// A point without an outward vector has the mean color of its voxel, of which `rows` has the row in the tables.
-fn seen<T: Real>(grid: &VoxelGrid<T>, points: &[DVec3], outward: &[DVec3], rows: &[u32], direction: Option<DVec3>) -> Vec<[u8; 3]> {
+/// A point with a direction of zero has the mean color of its voxel, of which `rows` has the row in the tables.
+pub(crate) fn near_colors<T: Real>(grid: &VoxelGrid<T>, points: &[DVec3], directions: &[DVec3], rows: &[u32]) -> Vec<[u8; 3]> {
     let side = grid.shape().voxel_side();
-    let directions: Vec<DVec3> = outward.iter().map(|out| direction.unwrap_or(-out.normalize_or_zero())).collect();
     let options = RenderOptions {
         aabb: grid.aabb(),
         spacing: Spacing::Step(side / 2.0),
@@ -42,9 +47,9 @@ fn seen<T: Real>(grid: &VoxelGrid<T>, points: &[DVec3], outward: &[DVec3], rows:
         engine: Engine::Fused,
         stop_below: 1e-3,
     };
-    let mut colors = grid.colors_of(rows, &directions);
-    for start in (0..points.len()).step_by(RAYS) {
-        let facing: Vec<usize> = (start..(start + RAYS).min(points.len())).filter(|&i| directions[i] != DVec3::ZERO).collect();
+    let mut colors = grid.colors_of(rows, directions);
+    let facing: Vec<usize> = (0..points.len()).filter(|&i| directions[i] != DVec3::ZERO).collect();
+    for facing in facing.chunks(RAYS) {
         let ray = |&i: &usize| Ray { origin: points[i] - CLEARANCE * side * directions[i], direction: directions[i], stretch: 1.0 };
         let rays: Vec<Ray> = facing.iter().map(ray).collect();
         let rendered = no_grad(|| render(grid, &rays, &options));
@@ -54,6 +59,10 @@ fn seen<T: Real>(grid: &VoxelGrid<T>, points: &[DVec3], outward: &[DVec3], rows:
             }
         }
     }
-    let byte = |c: f64| (c.clamp(0.0, 1.0) * 255.0).round() as u8;
-    colors.into_iter().map(|rgb| rgb.map(byte)).collect()
+    colors.into_iter().map(in_bytes).collect()
+}
+
+/// An sRGB color in 8 bits, from 0 to 255.
+pub(crate) fn in_bytes(rgb: [f64; 3]) -> [u8; 3] {
+    rgb.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8)
 }

@@ -7,6 +7,7 @@ pub mod filter;
 pub mod from_grid;
 mod plane;
 pub mod ply;
+mod sums;
 mod tree;
 
 use glam::DVec3;

@@ -1,10 +1,15 @@
 //! Training rays, made on the fly: a ray is a view, a pixel and a camera, so a scene costs no more memory than its 8-bit images.
 
 use crate::camera::Ray;
-use crate::dataset::View;
+use crate::dataset::{View, has_alpha};
+use crate::geometry::Aabb;
 use crate::random::{Permutation, Purpose};
+use crate::sampling::Occupancy;
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
+use tiles::Tile;
+
+mod tiles;
 
 /// Rays with what the photographs show along them.
 #[derive(Debug, Clone)]
@@ -29,30 +34,41 @@ impl<T: Real> RayBatch<T> {
     }
 }
 
-/// Every pixel of some views, in an order that is shuffled anew each epoch.
+/// The pixels of some views, all of them or those that can see something, in an order that is shuffled anew each epoch.
 #[derive(Debug)]
 pub struct RaySource<'a> {
     views: &'a [View],
     background: [f32; 3],
     seed: u64,
-    /// `first[v]` is the number of pixels before view v.
+    tiles: Vec<Tile>,
+    /// `first[t]` is the number of pixels before tile t.
     first: Vec<u64>,
 }
 
 impl<'a> RaySource<'a> {
     /// The pixels of `views` over a background.
     pub fn new(views: &'a [View], background: [f32; 3], seed: u64) -> Self {
+        let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
+        Self::of_tiles(views, background, seed, tiles)
+    }
+
+    fn of_tiles(views: &'a [View], background: [f32; 3], seed: u64, tiles: Vec<Tile>) -> Self {
         let mut first = vec![0];
-        for view in views {
-            let (w, h) = view.image.dimensions();
-            first.push(first[first.len() - 1] + u64::from(w) * u64::from(h));
+        for tile in &tiles {
+            first.push(first[first.len() - 1] + tile.pixels() as u64);
         }
-        RaySource { views, background, seed, first }
+        RaySource { views, background, seed, tiles, first }
+    }
+
+    /// The pixels of the same views around the projections of what may hold matter. The others show the background whatever is learned, so
+    /// they say nothing, except of the mean of the errors.
+    pub fn aimed_at(&self, matter: &Occupancy) -> Self {
+        Self::of_tiles(self.views, self.background, self.seed, tiles::showing(self.views, matter))
     }
 
     /// Rays in one epoch.
     pub fn len(&self) -> u64 {
-        self.first[self.views.len()]
+        self.first[self.tiles.len()]
     }
 
     /// True if there are no pixels.
@@ -80,8 +96,34 @@ impl<'a> RaySource<'a> {
         RayBatch { rays, target: Tensor::from_buffer(target, &[n, 3]), alpha: Tensor::from_buffer(alpha, &[n]) }
     }
 
+    /// Rays of the set through every `stride`-th column and row of the views, tile after tile, `size` at a time.
+    pub fn lattice_of_rays(&self, stride: u32, size: usize) -> impl Iterator<Item = Vec<Ray>> + '_ {
+        let along = move |from: u32, count: u32| (from.next_multiple_of(stride)..from + count).step_by(stride as usize);
+        let of_tile = move |tile: &Tile| {
+            let &Tile { view, x, y, width, height } = tile;
+            along(y, height).flat_map(move |y| along(x, width).map(move |x| (view as usize, x, y)))
+        };
+        let mut pixels = self.tiles.iter().flat_map(of_tile);
+        std::iter::from_fn(move || {
+            let ray = |(v, x, y): (usize, u32, u32)| self.views[v].camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let rays: Vec<Ray> = pixels.by_ref().take(size).map(ray).collect();
+            (!rays.is_empty()).then_some(rays)
+        })
+    }
+
+    /// How many pixels apart rays may be so that two at least pass through a voxel of this side, wherever it is in a box: the projection of the
+    /// farthest, halved.
+    pub fn stride(&self, side: f64, aabb: Aabb) -> u32 {
+        let reach = 0.5 * (aabb.max - aabb.min).length();
+        let pixels = self.views.iter().map(|view| {
+            let k = &view.camera.intrinsics;
+            k.fx.min(k.fy) * side / (view.camera.position().distance(0.5 * (aabb.min + aabb.max)) + reach)
+        });
+        (0.5 * pixels.fold(f64::INFINITY, f64::min)).clamp(1.0, 64.0) as u32
+    }
+
     /// All rays of the set, view after view and row after row, `size` at a time.
-    pub fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
+    fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
         let ray = |index: u64| {
             let (v, x, y) = self.place(index);
             self.views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5)
@@ -89,16 +131,17 @@ impl<'a> RaySource<'a> {
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
 
-    /// The rays of [`RaySource::in_order`], each with the alpha of its pixel. A view that is opaque everywhere has no alpha to tell objects by:
-    /// there it is 0 where the color is the background's, else 1.
+    /// All rays of the set, view after view and row after row, `size` at a time, each with the alpha of its pixel. Where no
+    /// view has a transparent pixel ([`has_alpha`]), alpha does not tell objects: it is 0 where the color is the background's then, else 1.
     pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
-        let opaque: Vec<bool> = self.views.iter().map(|view| view.image.pixels().all(|p| p.0[3] == 255)).collect();
-        let background = self.background.map(|c| (c * 255.0).round() as u8);
+        let has_alpha = has_alpha(self.views);
+        let in_bytes = |color: [f32; 3]| color.map(|c| (c * 255.0).round() as u8);
         let alpha = move |index: u64| {
             let (v, x, y) = self.place(index);
-            match self.views[v].image.get_pixel(x as u32, y as u32).0 {
-                [r, g, b, _] if opaque[v] => f32::from(u8::from([r, g, b] != background)),
-                [.., alpha] => f32::from(alpha) / 255.0,
+            let view = &self.views[v];
+            match has_alpha {
+                true => view.alpha(x, y),
+                false => f32::from(u8::from(in_bytes(view.color(x, y, self.background)) != in_bytes(self.background))),
             }
         };
         self.in_order(size).zip(0..).map(move |(rays, batch)| {
@@ -116,8 +159,36 @@ impl<'a> RaySource<'a> {
 
     /// Number of the view, column and row of one pixel of the set.
     fn place(&self, index: u64) -> (usize, usize, usize) {
-        let v = self.first.partition_point(|&f| f <= index) - 1;
-        let (pixel, width) = ((index - self.first[v]) as usize, self.views[v].image.width() as usize);
-        (v, pixel % width, pixel / width)
+        let t = self.first.partition_point(|&f| f <= index) - 1;
+        let Tile { view, x, y, width, .. } = self.tiles[t];
+        let pixel = (index - self.first[t]) as u32;
+        (view as usize, (x + pixel % width) as usize, (y + pixel / width) as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Camera, Intrinsics};
+    use crate::dataset::image::RgbaImage;
+
+    /// A view of some pixels in a row.
+    fn view(pixels: &[[u8; 4]]) -> View {
+        let intrinsics = Intrinsics::from_fov_x(pixels.len(), 1, 0.7);
+        let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, intrinsics);
+        let image = RgbaImage::from_fn(pixels.len() as u32, 1, |x, _| pixels[x as usize].into());
+        View { name: String::new(), camera, image, depth: None }
+    }
+
+    #[test]
+    fn a_view_full_of_object_is_judged_by_alpha_if_another_one_has_some() {
+        let alphas = |views: &[View]| -> Vec<f32> {
+            RaySource::new(views, [1.0; 3], 0).in_order_with_alpha(3).flat_map(|(_, alphas)| alphas).collect()
+        };
+        let (white, red) = ([255, 255, 255, 255], [255, 0, 0, 255]);
+        // White parts of an object that fills its picture are object.
+        let [full, other] = [view(&[white, red]), view(&[white, [0; 4], [9, 9, 9, 51]])];
+        assert_eq!(alphas(&[full.clone(), other]), [1.0, 1.0, 1.0, 0.0, 0.2]);
+        assert_eq!(alphas(&[full.clone(), full]), [0.0, 1.0, 0.0, 1.0]);
     }
 }

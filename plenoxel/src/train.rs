@@ -7,6 +7,7 @@ mod start;
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
+use crate::field::Field;
 use crate::field::voxel_grid::VoxelGrid;
 use crate::loss::{Objective, Step};
 use crate::rays::RaySource;
@@ -19,7 +20,7 @@ use config::{Config, OptimizerConfig, Stage, Weight};
 use start::Silhouettes;
 
 /// Rays that are rendered at a time to find out what is seen: bounds the memory.
-const RAYS_PER_BATCH: u64 = 1 << 15;
+const RAYS_PER_BATCH: usize = 1 << 15;
 
 /// What one step did.
 #[derive(Clone, Debug, PartialEq)]
@@ -34,7 +35,7 @@ pub struct Report {
     pub loss: f64,
     /// Each loss by itself, unweighted.
     pub losses: Vec<(String, f64)>,
-    /// −10 log₁₀ of the batch's mean squared error: of training rays, before the update.
+    /// −10 log₁₀ of the batch's mean squared error: of training rays, before the update; with `aim`, as if rays that see nothing were in it.
     pub psnr: f64,
     /// Rays in the batch.
     pub rays: usize,
@@ -62,6 +63,8 @@ pub struct Trainer<'a, T: Real> {
     config: Config,
     plan: Vec<PlannedStage>,
     rays: RaySource<'a>,
+    /// The share of all pixels that they are; the others have no error.
+    share: f64,
     silhouettes: Option<Silhouettes<'a>>,
     objective: Objective<T>,
     grid: VoxelGrid<T>,
@@ -97,7 +100,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        Ok(Trainer { config, plan, rays, silhouettes, objective, grid, optimizer, step: 0 })
+        Ok(Trainer { config, plan, rays, share: 1.0, silhouettes, objective, grid, optimizer, step: 0 })
     }
 
     /// The same run starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
@@ -166,7 +169,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         let (loss, gradients) = value_and_grad(|| {
             let rendered = render(&self.grid, &batch.rays, &options);
             samples = rendered.sample_count;
-            squared_error = mean_squared_error(rendered.rgb.data(), batch.target.data());
+            squared_error = self.share * mean_squared_error(rendered.rgb.data(), batch.target.data());
             let step = Step { number: self.step, seed: self.config.seed, batch: &batch, rendered: &rendered, grid: &self.grid };
             let (total, values) = self.objective.evaluate(&step);
             losses = values.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
@@ -234,6 +237,11 @@ impl<'a, T: Real> Trainer<'a, T> {
             }
             self.grid = self.grid.pruned(&kept);
         }
+        if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
+            let all = self.rays.len() as f64 / self.share;
+            self.rays = self.rays.aimed_at(reach);
+            self.share = self.rays.len() as f64 / all;
+        }
         if self.config.project {
             self.grid.project();
         }
@@ -255,7 +263,8 @@ impl<'a, T: Real> Trainer<'a, T> {
         // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
         const MARGIN: usize = 2;
         let options = self.options(stage, Jitter::None);
-        let weights = largest_weights(&self.grid, self.rays.in_order(RAYS_PER_BATCH), &options);
+        let stride = self.rays.stride(self.grid.shape().voxel_side(), self.grid.aabb());
+        let weights = largest_weights(&self.grid, self.rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
         full.intersection(&self.grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN))
     }
 

@@ -13,7 +13,7 @@ use clap::{Args, ValueHint};
 use plenoxel::carve::photo_hull::PhotoConfig;
 use plenoxel::carve::{self, Carving, Colored, Fit, Rule};
 use plenoxel::checkpoint::Header;
-use plenoxel::dataset::{Dataset, Split};
+use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
 use plenoxel::train::config::Config;
 use serde::Serialize;
@@ -170,7 +170,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let count = console.count("coloring, pass", passes);
     let colored = color_clock.time(|| carving.color(&|done| count.at(done, passes)));
     drop(count);
-    if colored.missed > 0.0 && carve::has_alpha(&views) {
+    if colored.missed > 0.0 && has_alpha(&views) {
         console.note(&format!(
             "{:.2} % of the object pixels show no voxel: parts thinner than a pixel, or beyond the box (--half-width)",
             100.0 * colored.missed

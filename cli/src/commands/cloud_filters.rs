@@ -1,23 +1,23 @@
 //! The flags of CloudCompare's filters, which `export ply` and `filter` share.
 
 use super::{number, numbers, whole};
-use clap::{Args, ValueEnum};
+use clap::{ArgGroup, Args, ValueEnum};
 use glam::DVec3;
 use plenoxel::error::{Error, Result};
 use plenoxel::geometry::Aabb;
 use plenoxel::point_cloud::filter::{Filters, Kept, Noise, NoiseError, Outliers, Range};
 
 /// CloudCompare's own defaults.
-const NEIGHBORS: usize = 6;
+const NEIGHBOURS: usize = 6;
 const SIGMA: f64 = 1.0;
 
 /// What to remove from a cloud, in this order: box, value, noise, outliers.
 #[derive(Debug, Args)]
-#[command(next_help_heading = "Filters")]
+#[command(next_help_heading = "Filters", group = ArgGroup::new("values").args(["min_value", "max_value"]).multiple(true))]
 pub struct CloudFilters {
     /// Keep points in the box XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX, in the coordinates of the file written
-    #[arg(long, value_name = "BOX", value_parser = numbers::<6>, allow_hyphen_values = true)]
-    bbox: Option<[f64; 6]>,
+    #[arg(long, value_name = "BOX", value_parser = bounds, allow_hyphen_values = true)]
+    bbox: Option<Aabb>,
 
     /// Keep points whose value is at least this
     #[arg(long, value_name = "V", value_parser = number(f64::NEG_INFINITY), allow_hyphen_values = true)]
@@ -28,10 +28,10 @@ pub struct CloudFilters {
     max_value: Option<f64>,
 
     /// Scalar field that --min-value and --max-value look at [default: density or sigma, or the only one]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", requires = "values")]
     value_field: Option<String>,
 
-    /// Noise filter: remove points off the plane of their neighbors within this distance. Between voxels distances are 1, 1.41, 1.73,
+    /// Noise filter: remove points off the plane of their neighbours within this distance. Between voxels distances are 1, 1.41, 1.73,
     /// 2 ... sides: choose one between those
     #[arg(long, value_name = "R", value_parser = number(f64::MIN_POSITIVE))]
     noise_radius: Option<f64>,
@@ -40,11 +40,11 @@ pub struct CloudFilters {
     #[arg(long, value_name = "D", value_parser = number(0.0), requires = "noise_radius", conflicts_with = "noise_relative")]
     noise_error: Option<f64>,
 
-    /// Noise filter: the distance from the plane that is allowed, in standard deviations of the neighbors' distances [default: 1]
+    /// Noise filter: the distance from the plane that is allowed, in standard deviations of the neighbours' distances [default: 1]
     #[arg(long, value_name = "N", value_parser = number(0.0), requires = "noise_radius")]
     noise_relative: Option<f64>,
 
-    /// Noise filter: remove points with fewer than three neighbors too
+    /// Noise filter: remove points with fewer than three neighbours too
     #[arg(long, requires = "noise_radius")]
     remove_isolated: bool,
 
@@ -83,7 +83,7 @@ pub struct UnitLengths {
 impl CloudFilters {
     /// The filters for a cloud.
     ///
-    /// Errors: lengths in voxels, where nobody knows how large they are; a box without inside.
+    /// Errors: lengths in voxels, where nobody knows how large they are.
     pub fn filters(&self, lengths: UnitLengths) -> Result<Filters> {
         let unit = match (self.units, lengths.voxel) {
             (Some(Units::World), _) | (None, None) => lengths.world,
@@ -93,11 +93,6 @@ impl CloudFilters {
                 return Err(Error::config("--units", found, "world"));
             }
         };
-        let within = self.bbox.map(|[a, b, c, d, e, f]| Aabb { min: DVec3::new(a, b, c), max: DVec3::new(d, e, f) });
-        if within.is_some_and(|within| within.min.cmpgt(within.max).any()) {
-            let found = format!("{:?}", self.bbox.unwrap_or_default());
-            return Err(Error::config("--bbox", found, "XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX with no minimum above its maximum"));
-        }
         let value = self
             .looks_at_values()
             .then(|| Range { low: self.min_value.unwrap_or(f64::NEG_INFINITY), high: self.max_value.unwrap_or(f64::INFINITY) });
@@ -110,8 +105,8 @@ impl CloudFilters {
             remove_isolated: self.remove_isolated,
         });
         let outliers = (self.sor_neighbours.is_some() || self.sor_sigma.is_some())
-            .then(|| Outliers { neighbors: self.sor_neighbours.unwrap_or(NEIGHBORS), sigma: self.sor_sigma.unwrap_or(SIGMA) });
-        Ok(Filters { within, value, noise, outliers })
+            .then(|| Outliers { neighbours: self.sor_neighbours.unwrap_or(NEIGHBOURS), sigma: self.sor_sigma.unwrap_or(SIGMA) });
+        Ok(Filters { within: self.bbox, value, noise, outliers })
     }
 
     /// The scalar field to look at, out of those that a cloud has; `None` if no filter looks at values.
@@ -119,26 +114,33 @@ impl CloudFilters {
     /// Errors: the cloud has none, or several, or not the one that was asked for.
     pub fn value_field(&self, names: &[&str]) -> Result<Option<String>> {
         if !self.looks_at_values() {
-            return match &self.value_field {
-                Some(name) => Err(Error::config("--value-field", format!("{name} alone"), "together with --min-value or --max-value")),
-                None => Ok(None),
-            };
+            return Ok(None);
         }
         let known = |name: &str| names.iter().find(|n| **n == name.trim_start_matches("scalar_")).map(|n| (*n).to_owned());
         let list = names.join(", ");
+        let flag = if self.min_value.is_some() { "--min-value" } else { "--max-value" };
         match (&self.value_field, names) {
-            (_, []) => Err(Error::config("--min-value", "a cloud without scalar fields", "a cloud with one")),
+            (_, []) => Err(Error::config(flag, "a cloud without scalar fields", "a cloud with one")),
             (Some(name), _) => known(name).map(Some).ok_or_else(|| Error::config("--value-field", format!("`{name}`"), list)),
             (None, [only]) => Ok(Some((*only).to_owned())),
-            (None, _) => known("density").or_else(|| known("sigma")).map(Some).ok_or_else(|| {
-                Error::config("--min-value", "a cloud with several scalar fields", format!("--value-field with one of {list}"))
-            }),
+            (None, _) => known("density")
+                .or_else(|| known("sigma"))
+                .map(Some)
+                .ok_or_else(|| Error::config(flag, "a cloud with several scalar fields", format!("--value-field with one of {list}"))),
         }
     }
 
     fn looks_at_values(&self) -> bool {
         self.min_value.is_some() || self.max_value.is_some()
     }
+}
+
+/// A box as the command line takes it.
+fn bounds(text: &str) -> std::result::Result<Aabb, String> {
+    let [a, b, c, d, e, f] = numbers::<6>(text)?;
+    let (min, max) = (DVec3::new(a, b, c), DVec3::new(d, e, f));
+    let accepted = "XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX with no minimum above its maximum";
+    if min.cmple(max).all() { Ok(Aabb { min, max }) } else { Err(accepted.to_owned()) }
 }
 
 /// What filters did, in words: "5000 points, value 4000, sor 3900".

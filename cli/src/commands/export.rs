@@ -4,14 +4,17 @@ mod mesh;
 mod ply;
 mod vox;
 
+use super::numbers;
 use crate::memory::Estimate;
 use crate::progress::Console;
-use crate::run_folder::RunFolder;
+use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, Subcommand, ValueHint};
 use glam::DVec3;
+use plenoxel::checkpoint::Header;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
+use plenoxel::train::config::Config;
 use std::path::{Path, PathBuf};
 
 /// Write a trained run as files of other programs
@@ -38,7 +41,7 @@ pub fn run(args: &ExportArgs, console: &Console<'_>) -> Result<()> {
     }
 }
 
-/// Which run, where to, and from where colors are seen.
+/// Which run, and where to.
 #[derive(Debug, Args)]
 struct Exported {
     /// Run folder that `plenoxel train` or `plenoxel carve` wrote
@@ -48,26 +51,31 @@ struct Exported {
     /// File to write, replacing what is there [default: in RUN/exports]
     #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
+}
 
-    /// Take colors that depend on the direction as seen along this one, from the viewer into the scene [default: against the surface's normal]
-    #[arg(long, value_name = "X,Y,Z", help_heading = "Colors", value_parser = direction, allow_hyphen_values = true)]
-    direction: Option<DVec3>,
+/// A run as it was found.
+struct Opened {
+    folder: RunFolder,
+    config: Config,
+    record: RunRecord,
+    header: Header,
+    grid: VoxelGrid<f32>,
 }
 
 impl Exported {
-    /// The trained grid, once memory is known to suffice, and the name of the file to be fit for its format.
-    fn open(&self, console: &Console<'_>, format: &str) -> Result<(RunFolder, VoxelGrid<f32>)> {
+    /// The run with its grid, once memory is known to suffice, and the name of the file to be fit for its format.
+    fn open(&self, console: &Console<'_>, format: &str) -> Result<Opened> {
         if let Some(out) = self.out.as_deref().filter(|out| ending(out).as_deref() != Some(format)) {
             let found = format!("{}, for a file of the format {format},", out.display());
             return Err(Error::config("--out", found, format!("a name that ends in .{format}")));
         }
-        let (folder, ..) = RunFolder::open(&self.run)?;
+        let (folder, config, record) = RunFolder::open(&self.run)?;
         let (header, voxels) = folder.header()?;
         let estimate = Estimate::of_export(&header.shape(), voxels);
         console.note(&estimate.describe());
         estimate.check()?;
-        let (grid, _) = folder.load()?;
-        Ok((folder, grid))
+        let (grid, header) = folder.load()?;
+        Ok(Opened { folder, config, record, header, grid })
     }
 
     /// Writes the file that was asked for, or else one of a name in the run's folder, and says which.
@@ -83,16 +91,55 @@ fn ending(path: &Path) -> Option<String> {
     path.extension().map(|ending| ending.to_string_lossy().to_ascii_lowercase())
 }
 
-/// A setting of the library under the name that its flag has.
-fn as_flag(error: Error) -> Error {
-    match error {
-        Error::Config { key, found, accepted } => Error::config(format!("--{}", key.replace('_', "-")), found, accepted),
-        other => other,
+/// What `--min-alpha` means, whatever is exported.
+const MIN_ALPHA: &str =
+    "Keep voxels that absorb at least this share of the light that crosses them, 1 - exp(-density * side); none without density";
+
+/// A least share of the light as the command line takes it: no voxel absorbs all of it.
+fn min_alpha(text: &str) -> std::result::Result<f64, String> {
+    text.parse().ok().filter(|share| (0.0..1.0).contains(share)).ok_or_else(|| "a number from 0 on, and below 1".to_owned())
+}
+
+/// The one color of a place, where it depends on the direction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum ColorChoice {
+    /// What training cameras see of it.
+    Seen,
+    /// The mean over all directions.
+    Mean,
+    /// As seen straight on, against the normal of the surface.
+    Facing,
+    /// As seen along a unit direction, from the viewer into the scene.
+    Along(DVec3),
+}
+
+/// A choice as the command line takes it: one of some words, or a direction.
+fn color(words: &'static [(&'static str, ColorChoice)]) -> impl Fn(&str) -> std::result::Result<ColorChoice, String> + Clone {
+    move |text| {
+        if let Some((_, choice)) = words.iter().find(|(word, _)| *word == text) {
+            return Ok(*choice);
+        }
+        let direction = numbers::<3>(text).ok().and_then(|d| DVec3::from(d).try_normalize());
+        let words = || words.iter().map(|(word, _)| format!("{word}, ")).collect::<String>();
+        direction
+            .map(ColorChoice::Along)
+            .ok_or_else(|| format!("{}or a direction of three numbers such as 0,0,-1, not all of them 0", words()))
     }
 }
 
-/// A direction as the command line takes it, of unit length.
-fn direction(text: &str) -> std::result::Result<DVec3, String> {
-    let direction = super::numbers(text).ok().and_then(|d: [f64; 3]| DVec3::from(d).try_normalize());
-    direction.ok_or_else(|| "three numbers such as 0,0,-1, not all of them 0".to_owned())
+/// From where the colors of a surface are seen.
+#[derive(Debug, Args)]
+struct SurfaceColors {
+    /// The one color of a place, where it depends on the direction: as seen straight on, against the surface's normal, or what a ray in
+    /// the direction X,Y,Z, from the viewer into the scene, shows there
+    #[arg(long, value_name = "facing|X,Y,Z", help_heading = "Colors", default_value = "facing", allow_hyphen_values = true,
+          value_parser = color(&[("facing", ColorChoice::Facing)]))]
+    color: ColorChoice,
+}
+
+impl SurfaceColors {
+    /// The direction, if it is one for all.
+    fn direction(&self) -> Option<DVec3> {
+        if let ColorChoice::Along(direction) = self.color { Some(direction) } else { None }
+    }
 }

@@ -1,5 +1,6 @@
 //! `plenoxel filter`: CloudCompare's filters for the point clouds of others.
 
+use super::as_flag;
 use super::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
 use crate::progress::Console;
 use clap::{Args, ValueHint};
@@ -37,6 +38,9 @@ pub struct FilterArgs {
 
 /// Filters a cloud.
 pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
+    if !args.cloud.exists() {
+        return Err(Error::input(&args.cloud, "there is no such file", "give a point cloud in PLY"));
+    }
     let file = PlyFile::open(&args.cloud)?;
     let side = file.header().remarks.iter().find_map(|line| line.strip_prefix("comment voxel_side ")?.trim().parse().ok());
     let side = side.filter(|side: &f64| side.is_finite() && *side > 0.0);
@@ -60,7 +64,7 @@ pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
     }
     let field = args.filters.value_field(&file.field_names())?;
     let values = field.as_deref().map(|name| file.values(name)).transpose()?;
-    let (left, report) = filters.apply(&file.positions()?, values.as_deref())?;
+    let (left, report) = filters.apply(&file.positions()?, values.as_deref()).map_err(as_flag)?;
     let report = describe(file.len(), &report);
     check_not_empty(left.len(), &report)?;
     files::write_atomically(&args.out, &file.chosen(&left, &format!("filtered by {}: {report}", crate::PROGRAM)))?;

@@ -22,6 +22,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "engine",
             "stop_below",
             "rays_per_step",
+            "aim",
             "jitter",
             "project",
             "prune_from_stage",

@@ -33,7 +33,7 @@ use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::parallel;
 use serde::{Deserialize, Serialize};
 use visible::FirstVoxels;
-use votes::{Projection, Votes};
+use votes::{Votes, Witness};
 
 /// What makes a voxel photo-consistent.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -63,7 +63,7 @@ pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progr
     }
     let (aabb, voxels) = (start.aabb(), start.cells());
     let mut masks = start.masks().to_vec();
-    let projections: Vec<Projection> = views.iter().map(|view| Projection::of(view, aabb, voxels)).collect();
+    let witnesses: Vec<Witness> = views.iter().map(|view| Witness::of(view, aabb, voxels)).collect();
     let mut first = FirstVoxels::new(views, aabb, voxels);
     let mut surface = Surface { voxels, visible: vec![0; masks.len()], inconsistent: vec![0; masks.len()] };
     for round in 1.. {
@@ -74,7 +74,7 @@ pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progr
                 votes.clear();
                 for (v, view) in views.iter().enumerate() {
                     let voxel = surface.voxel(brick, bit);
-                    votes.extend(projections[v].vote(&view.image, first.of_view(v), voxel, visible::number(brick, bit)));
+                    votes.extend(witnesses[v].vote(&view.image, first.of_view(v), voxel, visible::number(brick, bit)));
                 }
                 votes.spread() > config.noise
             })

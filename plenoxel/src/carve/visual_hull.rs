@@ -2,14 +2,13 @@
 //!
 //! Background is what has alpha 0, and a reduced picture has alpha 0 only where its whole block has ([`crate::dataset::image::downscale`]).
 
-use crate::camera::Camera;
+use super::projection::{Pixels, Projection, Rectangle, size};
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
 use crate::sampling::{Occupancy, inside, place};
 use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::parallel;
-use glam::{DVec3, dvec3};
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -86,22 +85,18 @@ pub(super) fn full(voxels: [usize; 3]) -> Vec<u64> {
 
 /// Where a view shows the object, and how voxels project into it.
 struct Silhouette {
-    width: usize,
-    height: usize,
-    /// Object pixels above and left of each corner of the pixels: a summed-area table (Crow 1984), `width + 1` to a row.
+    projection: Projection,
+    /// Object pixels above and left of each corner of the pixels: a summed-area table (Crow 1984), width + 1 to a row.
     sums: Vec<u32>,
-    /// x·depth, y·depth and depth of the corner of voxel (0, 0, 0), and what a voxel adds to them along each axis.
-    origin: DVec3,
-    steps: [DVec3; 3],
     voxels: [usize; 3],
 }
 
-/// The corners of a box by number: bit 0 for x, 1 for y, 2 for z; and pairs of those that an edge joins.
+/// Pairs of corners ([`Projection::corners`]) that an edge joins.
 const EDGES: [(usize, usize); 12] = [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)];
 
 impl Silhouette {
     fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
-        let (width, height) = (view.image.width() as usize, view.image.height() as usize);
+        let [width, height] = size(view);
         let mut sums = vec![0; (width + 1) * (height + 1)];
         for y in 0..height {
             let mut row = 0;
@@ -110,45 +105,28 @@ impl Silhouette {
                 sums[(y + 1) * (width + 1) + x + 1] = sums[y * (width + 1) + x + 1] + row;
             }
         }
-        let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
-        let origin = homogeneous(&view.camera, aabb.min);
-        let steps = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| homogeneous(&view.camera, aabb.min + axis * side) - origin);
-        Silhouette { width, height, sums, origin, steps, voxels }
+        Silhouette { projection: Projection::of(view, aabb, voxels), sums, voxels }
     }
 
     /// Those voxels of a brick, as a mask, whose projection lies on background.
     fn outside(&self, place: [usize; 3], mask: u64, margin: f64) -> u64 {
         let low = place.map(|c| c * BRICK);
         let high = [0, 1, 2].map(|a| (low[a] + BRICK).min(self.voxels[a]));
-        if let Some(corners) = self.corners(low, high) {
+        if let Some(corners) = self.projection.corners(low, high) {
             let bounds = Rectangle::around(&corners, margin);
             match self.object_pixels(bounds) {
                 Some(0) if self.holds(bounds) => return mask,
                 // Not seen, or object all over: nothing in it lies on background.
                 None => return 0,
-                Some(n) if n == bounds.clipped(self.width, self.height).area() => return 0,
+                Some(n) if n == self.projection.touched(bounds).area() => return 0,
                 Some(_) => {}
             }
         }
         let on_background = |bit: usize| {
             let low = [0, 1, 2].map(|a| low[a] + (bit >> (4 - 2 * a) & 3));
-            self.corners(low, low.map(|k| k + 1)).is_some_and(|corners| self.is_on_background(&corners, margin))
+            self.projection.corners(low, low.map(|k| k + 1)).is_some_and(|corners| self.is_on_background(&corners, margin))
         };
         (0..BRICK_ROWS).filter(|bit| mask >> bit & 1 == 1 && on_background(*bit)).fold(0, |out, bit| out | 1 << bit)
-    }
-
-    /// The projections of the corners of a box of voxels, if all of them are before the camera.
-    fn corners(&self, low: [usize; 3], high: [usize; 3]) -> Option<[[f64; 2]; 8]> {
-        let mut corners = [[0.0; 2]; 8];
-        for (c, corner) in corners.iter_mut().enumerate() {
-            let at = |a: usize| (if c >> a & 1 == 1 { high[a] } else { low[a] }) as f64;
-            let p = self.origin + at(0) * self.steps[0] + at(1) * self.steps[1] + at(2) * self.steps[2];
-            if p.z <= 0.0 {
-                return None;
-            }
-            *corner = [p.x / p.z, p.y / p.z];
-        }
-        Some(corners)
     }
 
     /// True if the convex polygon around some points, and a margin around it, are inside of the image and on background.
@@ -162,7 +140,7 @@ impl Silhouette {
             None => return false,
             Some(_) => {}
         }
-        let (first, last) = (bounds.low[1].floor() as usize, (bounds.high[1].floor() as usize).min(self.height - 1));
+        let (first, last) = (bounds.low[1].floor() as usize, (bounds.high[1].floor() as usize).min(self.projection.size[1] - 1));
         (first..=last).all(|row| {
             // The part of the polygon that is in this row of pixels lies between ends of the parts of its edges that are.
             let (top, bottom) = (row as f64 - margin, row as f64 + 1.0 + margin);
@@ -187,60 +165,17 @@ impl Silhouette {
 
     /// True if a rectangle is inside of the image.
     fn holds(&self, rectangle: Rectangle) -> bool {
-        rectangle.low.iter().all(|&low| low >= 0.0) && rectangle.high[0] <= self.width as f64 && rectangle.high[1] <= self.height as f64
+        (0..2).all(|a| rectangle.low[a] >= 0.0 && rectangle.high[a] <= self.projection.size[a] as f64)
     }
 
     /// The number of object pixels that a rectangle touches; `None` if it is beside the image.
     fn object_pixels(&self, rectangle: Rectangle) -> Option<usize> {
-        let Pixels { x, y } = rectangle.clipped(self.width, self.height);
-        if x.0 >= x.1 || y.0 >= y.1 {
+        let pixels = self.projection.touched(rectangle);
+        if pixels.area() == 0 {
             return None;
         }
-        let sum = |x: usize, y: usize| self.sums[y * (self.width + 1) + x];
+        let Pixels { x, y } = pixels;
+        let sum = |x: usize, y: usize| self.sums[y * (self.projection.size[0] + 1) + x];
         Some((sum(x.1, y.1) + sum(x.0, y.0) - sum(x.0, y.1) - sum(x.1, y.0)) as usize)
-    }
-}
-
-/// x·depth, y·depth and depth of a point as a camera sees it, x and y in pixels: linear in the point.
-pub(super) fn homogeneous(camera: &Camera, point: DVec3) -> DVec3 {
-    let k = &camera.intrinsics;
-    let local = camera.camera_to_world.inverse().transform_point3(point);
-    let depth = -local.z;
-    dvec3(k.fx * local.x + k.cx * depth, -k.fy * local.y + k.cy * depth, depth)
-}
-
-/// A rectangle of an image, in pixel coordinates.
-#[derive(Clone, Copy, Debug)]
-struct Rectangle {
-    low: [f64; 2],
-    high: [f64; 2],
-}
-
-/// Columns and rows of pixels, each from the first to one behind the last.
-#[derive(Clone, Copy, Debug)]
-struct Pixels {
-    x: (usize, usize),
-    y: (usize, usize),
-}
-
-impl Pixels {
-    fn area(self) -> usize {
-        (self.x.1 - self.x.0) * (self.y.1 - self.y.0)
-    }
-}
-
-impl Rectangle {
-    fn around(points: &[[f64; 2]; 8], margin: f64) -> Self {
-        let along = |a: usize, f: fn(f64, f64) -> f64| points.iter().map(|p| p[a]).reduce(f).unwrap_or(f64::NAN);
-        Rectangle { low: [0, 1].map(|a| along(a, f64::min) - margin), high: [0, 1].map(|a| along(a, f64::max) + margin) }
-    }
-
-    /// The pixels that it touches.
-    fn clipped(self, width: usize, height: usize) -> Pixels {
-        let along = |a: usize, n: usize| {
-            let low = self.low[a].floor().clamp(0.0, n as f64) as usize;
-            (low, ((self.high[a].floor() + 1.0).clamp(0.0, n as f64) as usize).max(low))
-        };
-        Pixels { x: along(0, width), y: along(1, height) }
     }
 }

@@ -10,7 +10,7 @@
 
 mod cases;
 
-use super::SURFACE_ALPHA;
+use super::{SURFACE_ALPHA, directions, near_colors};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use autograd::{Real, parallel};
@@ -50,7 +50,7 @@ pub struct MeshOptions {
 /// The surface on which the density of a grid has a level.
 ///
 /// Densities are read on the lines between neighbouring centres, linearly. That is what a trilinear grid renders; of a nearest grid it rounds the
-/// corners off. Normals are −∇σ, central differences over neighbouring voxels, interpolated. A vertex has the color that a camera sees there.
+/// corners off. Normals are [`VoxelGrid::outward`], interpolated. A vertex has the color that a camera sees there.
 ///
 /// The result does not depend on the number of threads.
 ///
@@ -73,7 +73,7 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
     let vertices = parallel::map_indices(crossings.len(), |v| crossings[v].vertex(grid, level));
     let rows: Vec<u32> = vertices.iter().map(|vertex| vertex.row).collect();
     let [points, normals] = [|v: &Vertex| v.position, |v: &Vertex| v.normal].map(|part| vertices.iter().map(part).collect::<Vec<_>>());
-    let colors = super::seen(grid, &points, &normals, &rows, options.direction);
+    let colors = near_colors(grid, &points, &directions(&normals, options.direction), &rows);
     Ok(Mesh {
         positions: points.iter().map(|point| point.as_vec3().to_array()).collect(),
         normals: normals.iter().map(|normal| normal.as_vec3().to_array()).collect(),

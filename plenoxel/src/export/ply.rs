@@ -4,20 +4,10 @@
 //! which CloudCompare takes as such; and `quality`, the first field once more, which MeshLab takes (CloudCompare without a window leaves
 //! it out). No property is a list: CloudCompare does not read those of points.
 
-use crate::error::Result;
-use crate::files::write_atomically;
 use crate::point_cloud::PointCloud;
 use crate::point_cloud::ply::{Element, Encoding, Kind, Number, Property, SCALAR_PREFIX, header_lines};
-use std::path::Path;
 
-/// Writes a cloud, whole or not at all. Comments stand in the header, a line each.
-///
-/// Errors: it cannot be written.
-pub fn write(path: &Path, cloud: &PointCloud, comments: &[String]) -> Result<()> {
-    write_atomically(path, &encode(cloud, comments))
-}
-
-/// The bytes of the file. Coordinates are `float`, or `double` if some are not a `float`; spaces in names become `_`.
+/// The bytes of the file, with comments in its header, a line each. Coordinates are `float`, or `double` if some are not a `float`; spaces in names become `_`.
 pub fn encode(cloud: &PointCloud, comments: &[String]) -> Vec<u8> {
     let exact = |p: &glam::DVec3| p.as_vec3().as_dvec3() == *p || !p.is_finite();
     let coordinate = if cloud.positions.iter().all(exact) { Number::F32 } else { Number::F64 };

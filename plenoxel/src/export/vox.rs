@@ -8,7 +8,7 @@
 //! A voxel has the index of its color, 1 to 255, as 0 would be empty; entry i − 1 of the 256 in the file belongs to index i. Source: the
 //! specification `MagicaVoxel-file-format-vox.txt` of github.com/ephtracy/voxel-model, and the extension beside it.
 
-use super::SURFACE_ALPHA;
+use super::{SURFACE_ALPHA, directions, near_colors};
 use crate::error::{Error, Result};
 use crate::export::palette::quantize;
 use crate::field::voxel_grid::VoxelGrid;
@@ -30,11 +30,12 @@ pub struct Vox {
 /// Which voxels, and their colors.
 #[derive(Debug, Clone, Copy)]
 pub struct VoxOptions {
-    /// Voxels are taken that absorb more than this share of the light that crosses them: 1 − exp(−σ side).
+    /// Voxels are taken that absorb at least this share of the light that crosses them ([`VoxelGrid::voxels_absorbing`]).
     pub min_alpha: f64,
     /// Take those too that others hide on all six sides.
     pub solid: bool,
-    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each voxel against [`VoxelGrid::outward`].
+    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each voxel against [`VoxelGrid::outward`], through open
+    /// faces.
     pub direction: Option<DVec3>,
 }
 
@@ -46,27 +47,40 @@ impl Default for VoxOptions {
 
 /// The voxels of a grid with a palette made from their colors alone.
 ///
-/// Errors: `min_alpha` is not in [0, 1), or no voxel absorbs more.
+/// Errors: `min_alpha` is not in [0, 1), or no voxel absorbs as much.
 pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     let VoxOptions { min_alpha, solid, direction } = *options;
     if !(0.0..1.0).contains(&min_alpha) {
         return Err(Error::config("min_alpha", min_alpha, "0 or more, and below 1"));
     }
-    let dense = grid.voxels_above(min_alpha);
+    let dense = grid.voxels_absorbing(min_alpha);
     let places = places(&dense, solid);
     if places.is_empty() {
-        let found = format!("{min_alpha}, which no voxel of this grid exceeds,");
+        let found = format!("{min_alpha}, which no voxel of this grid reaches,");
         return Err(Error::config("min_alpha", found, "a smaller share of the light; if 0 is refused, train longer"));
     }
     // All of them are present: an absent voxel has no density.
     let rows: Vec<u32> = places.iter().map(|voxel| grid.lattice().row(voxel.map(usize::from)).unwrap_or_default()).collect();
     let signed = |place: &[u16; 3]| place.map(|k| k as isize);
     let points: Vec<DVec3> = places.iter().map(|place| grid.shape().center(signed(place))).collect();
-    let outward: Vec<DVec3> = places.iter().map(|place| grid.outward(signed(place))).collect();
-    let colors = super::seen(grid, &points, &outward, &rows, direction);
+    let outward: Vec<DVec3> = places.iter().map(|place| open(grid.outward(signed(place)), signed(place), &dense)).collect();
+    let colors = near_colors(grid, &points, &directions(&outward, direction), &rows);
     let (palette, entries) = quantize(&colors, 255);
     let voxels = places.into_iter().zip(entries).map(|(place, entry)| (place, entry + 1)).collect();
     Ok(Vox { resolution: grid.shape().resolution, palette, voxels })
+}
+
+/// The part of an outward vector that points through open faces of a voxel: where a neighbour is taken too, nothing of it is seen.
+fn open(outward: DVec3, voxel: [isize; 3], dense: &Occupancy) -> DVec3 {
+    let taken = |voxel: [isize; 3]| {
+        let inside = (0..3).all(|a| (0..dense.cells()[a] as isize).contains(&voxel[a]));
+        inside && dense.contains(voxel.map(|k| k as usize))
+    };
+    DVec3::from([0, 1, 2].map(|axis| {
+        let mut beyond = voxel;
+        beyond[axis] += if outward[axis] > 0.0 { 1 } else { -1 };
+        if taken(beyond) { 0.0 } else { outward[axis] }
+    }))
 }
 
 /// The voxels of an occupancy, x slowest; without those that have all six neighbours, unless `solid`.

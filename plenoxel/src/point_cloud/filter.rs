@@ -4,7 +4,7 @@
 //! Each filter looks at the points that the one before has left, in this order: box, value, noise, statistical outliers.
 //! CloudCompare stores coordinates in 32 bits, shifted where they are large, and so do the filters; the cloud itself keeps its own.
 
-use super::plane::Moments;
+use super::sums::Sums;
 use super::tree::Tree;
 use crate::error::{Error, Result};
 use crate::geometry::Aabb;
@@ -21,7 +21,7 @@ pub struct Filters {
     pub within: Option<Aabb>,
     /// Points whose value is not in the range.
     pub value: Option<Range>,
-    /// Points off the surface that their neighbors make.
+    /// Points off the surface that their neighbours make.
     pub noise: Option<Noise>,
     /// Points far from others.
     pub outliers: Option<Outliers>,
@@ -36,36 +36,36 @@ pub struct Range {
     pub high: f64,
 }
 
-/// Noise filter. The neighbors of a point are the others within `radius`. If there are at least three, the point stays if its distance to
+/// Noise filter. The neighbours of a point are the others within `radius`. If there are at least three, the point stays if its distance to
 /// the plane nearest to them is at most `error`. If there are three that make no plane, A, B and C with |AB × AC|² below 2⁻²³, it goes: the
 /// bound is CloudCompare's and depends on the unit of length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Noise {
-    /// Distance within which points are neighbors, in the units of the coordinates.
+    /// Distance within which points are neighbours, in the units of the coordinates.
     pub radius: f64,
     /// How far from the plane a point may be.
     pub error: NoiseError,
-    /// Removes points with fewer than three neighbors; else they stay.
+    /// Removes points with fewer than three neighbours; else they stay.
     pub remove_isolated: bool,
 }
 
-/// How far from the plane of its neighbors a point may be. Distances count as equal that differ by less than the rounding of the coordinates,
+/// How far from the plane of its neighbours a point may be. Distances count as equal that differ by less than the rounding of the coordinates,
 /// 8 · 2⁻²³ of the largest:
 /// on a lattice that decides about whole edges, and CloudCompare lets chance decide.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum NoiseError {
     /// In the units of the coordinates.
     Absolute(f64),
-    /// In standard deviations of the neighbors' own distances to the plane; CloudCompare's default is 1.
+    /// In standard deviations of the neighbours' own distances to the plane; CloudCompare's default is 1.
     Relative(f64),
 }
 
-/// Statistical outlier removal (SOR): d is the mean distance of a point to its nearest `neighbors` − 1 others (the point itself counts as
+/// Statistical outlier removal (SOR): d is the mean distance of a point to its nearest `neighbours` − 1 others (the point itself counts as
 /// one, as in PCL); it stays if d ≤ mean of d + `sigma` · standard deviation of d, both over all points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outliers {
     /// Nearest points, the point itself among them.
-    pub neighbors: usize,
+    pub neighbours: usize,
     /// Standard deviations above the mean.
     pub sigma: f64,
 }
@@ -85,7 +85,7 @@ impl Filters {
     /// Numbers of the points that stay, ascending, and what each filter did. `values` are those that [`Filters::value`] looks at, one for
     /// each point. Points whose coordinates are no numbers go first of all.
     ///
-    /// Errors: a value filter without values; as many neighbors asked for as there are points.
+    /// Errors: a value filter without values; as many neighbours asked for as there are points.
     pub fn apply(&self, positions: &[DVec3], values: Option<&[f32]>) -> Result<(Vec<u32>, Vec<Kept>)> {
         let mut left: Vec<u32> = (0..positions.len() as u32).collect();
         let mut report = Vec::new();
@@ -104,7 +104,7 @@ impl Filters {
             filter("bbox", &mut left, &|left| Ok(left.iter().map(|i| within.contains(position(i))).collect()))?;
         }
         if let Some(range) = self.value {
-            let values = values.ok_or_else(|| Error::config("min-value", "a cloud without values", "a cloud with a scalar field"))?;
+            let values = values.ok_or_else(|| Error::config("min_value", "a cloud without values", "a cloud with a scalar field"))?;
             let (low, high) = (range.low as f32, range.high as f32);
             filter("value", &mut left, &|left| Ok(left.iter().map(|&i| (low..=high).contains(&values[i as usize])).collect()))?;
         }
@@ -137,14 +137,11 @@ impl Noise {
         let rounding = 8.0 * f64::from(f32::EPSILON * largest);
         // The radius is a 32-bit number too.
         let squared_radius = f64::from(self.radius as f32).powi(2);
-        of_each(&tree, |point, number| {
-            let mut moments = Moments::default();
-            let from = |other: [f32; 3]| DVec3::from_array([0, 1, 2].map(|a| f64::from(other[a]) - f64::from(point[a])));
-            tree.within(point, squared_radius, |other, other_number| {
-                if other_number != number {
-                    moments.add(from(other));
-                }
-            });
+        let sums = Sums::new(&tree);
+        of_each(&tree, |point| {
+            let mut moments = sums.within(point, squared_radius);
+            // About itself, the point adds nothing but its number.
+            moments.count -= 1;
             if moments.count < 3 {
                 return !self.remove_isolated;
             }
@@ -162,13 +159,13 @@ impl Noise {
 impl Outliers {
     /// Which points stay. The means are rounded to 32 bits, and so are their squares, before they are added up in 64, as in CloudCompare.
     fn keep(&self, points: &[[f32; 3]]) -> Result<Vec<bool>> {
-        let k = self.neighbors;
+        let k = self.neighbours;
         if k < 2 || k >= points.len() {
             let accepted = format!("2 or more, and fewer than the {} points that are left", points.len());
-            return Err(Error::config("sor-neighbours", k, accepted));
+            return Err(Error::config("sor_neighbours", k, accepted));
         }
         let tree = Tree::new(points);
-        let distances = of_each(&tree, |point, _| {
+        let distances = of_each(&tree, |point| {
             let mut nearest = vec![0.0; k];
             tree.nearest(point, &mut nearest);
             // The first is the point itself, or one that coincides with it.
@@ -182,12 +179,10 @@ impl Outliers {
     }
 }
 
-/// `f(point, number)` of every point, by number. Points are taken in the order of the tree, in which neighbors share caches.
-fn of_each<R: Copy + Default + Send + Sync>(tree: &Tree, f: impl Fn([f32; 3], u32) -> R + Sync + Send) -> Vec<R> {
+/// `f(point)` of every point, by number. Points are taken in the order of the tree, in which neighbours share caches.
+fn of_each<R: Copy + Default + Send + Sync>(tree: &Tree, f: impl Fn([f32; 3]) -> R + Sync + Send) -> Vec<R> {
     let n = tree.points.len();
-    let found = parallel::map_chunks(n, RUN, |range| -> Vec<R> {
-        tree.points[range.clone()].iter().zip(&tree.numbers[range]).map(|(&point, &number)| f(point, number)).collect()
-    });
+    let found = parallel::map_chunks(n, RUN, |range| -> Vec<R> { tree.points[range].iter().map(|&point| f(point)).collect() });
     let mut by_number = vec![R::default(); n];
     tree.numbers.iter().zip(found.into_iter().flatten()).for_each(|(&number, r)| by_number[number as usize] = r);
     by_number

@@ -30,6 +30,16 @@ impl Moments {
         self.squares[1] += p * DVec3::new(p.y, p.z, p.x);
     }
 
+    /// Takes points in that were added up about another origin, which lies at `offset`.
+    pub fn add_all(&mut self, others: &Moments, offset: DVec3) {
+        let turned = |p: DVec3| DVec3::new(p.y, p.z, p.x);
+        let (n, sum) = (f64::from(others.count), others.sum);
+        self.count += others.count;
+        self.sum += sum + n * offset;
+        self.squares[0] += others.squares[0] + 2.0 * offset * sum + n * offset * offset;
+        self.squares[1] += others.squares[1] + offset * turned(sum) + turned(offset) * sum + n * offset * turned(offset);
+    }
+
     /// The plane that minimises the sum of squared distances: through the mean, its normal being the eigenvector of the covariance with the
     /// smallest eigenvalue. `None` if there are fewer than three points, or three, A, B and C, with |AB × AC|² below ε = 2⁻²³: on a line, or
     /// nearly so. The bound is CloudCompare's and depends on the unit of length; through four points on a line it has some plane.
@@ -105,6 +115,21 @@ mod tests {
             let again = vectors * DMat3::from_diagonal(values) * vectors.transpose();
             assert!(again.abs_diff_eq(a, 1e-14) && (vectors.transpose() * vectors).abs_diff_eq(DMat3::IDENTITY, 1e-14), "seed {seed}");
         }
+    }
+
+    #[test]
+    fn points_that_were_added_up_elsewhere_have_the_plane_that_they_have_one_by_one() {
+        let number = |i| 2.0 * uniform(5, Purpose::Initial, 1, i) - 1.0;
+        let points: Vec<DVec3> = (0..30).map(|i| DVec3::new(number(3 * i), number(3 * i + 1), 0.1 * number(3 * i + 2))).collect();
+        let (mut single, mut part, mut joined) = (Moments::default(), Moments::default(), Moments::default());
+        let offset = DVec3::new(0.3, -2.0, 1.1);
+        points.iter().for_each(|p| single.add(*p));
+        points[..20].iter().for_each(|p| part.add(*p - offset));
+        points[20..].iter().for_each(|p| joined.add(*p));
+        joined.add_all(&part, offset);
+        let [a, b] = [single, joined].map(|moments| moments.plane().expect("a plane"));
+        assert!(joined.count == 30 && a.center.abs_diff_eq(b.center, 1e-14) && (a.deviation - b.deviation).abs() < 1e-13);
+        assert!(a.normal.dot(b.normal).abs() > 1.0 - 1e-13);
     }
 
     #[test]

@@ -1,21 +1,24 @@
-//! Nearest neighbors and neighbors within a radius, in the arithmetic of CloudCompare: coordinates are `f32`, their differences are
-//! rounded to `f32`, and squares are added in `f64`.
+//! Nearest neighbours, in the arithmetic of CloudCompare: coordinates are `f32`, their differences are rounded to `f32`, and squares are
+//! added in `f64`.
 //!
 //! A balanced kd-tree, split at the middle point of the longest side: points on a lattice, of which many share a coordinate, points that
 //! coincide, and a cloud with one point far away cost no more than others. (Cells of one size would put such a cloud into one of them.)
 //! Nothing depends on the number of threads.
 
-/// Points of a leaf.
-const LEAF: usize = 12;
+use std::ops::Range;
+
+/// Points of a leaf, at most.
+pub(super) const LEAF: usize = 12;
 /// Smaller parts are not worth a task of their own.
 const TASK: usize = 1 << 14;
 
-type Point = [f32; 3];
+/// A point in 32 bits.
+pub(super) type Point = [f32; 3];
 
 /// Points in the order of the tree.
 #[derive(Debug)]
 pub(super) struct Tree {
-    /// In an order in which neighbors are near each other.
+    /// In an order in which neighbours are near each other.
     pub points: Vec<Point>,
     /// Their numbers in the cloud.
     pub numbers: Vec<u32>,
@@ -47,27 +50,17 @@ impl Tree {
         });
     }
 
-    /// Calls `f(point, number)` for every point at a squared distance of at most `squared_radius` from `query`.
-    pub fn within(&self, query: Point, squared_radius: f64, mut f: impl FnMut(Point, u32)) {
-        // The search leaves out what is as far as its bound or farther.
-        self.search(0..self.points.len(), query, &mut [squared_radius.next_up()], &mut |_, i| {
-            if squared_distance(self.points[i], query) <= squared_radius {
-                f(self.points[i], self.numbers[i]);
-            }
-        });
-    }
-
     /// Visits the points of a part that may be nearer than the last of `bounds`, which a visit may lower; nearer halves first.
-    fn search(&self, part: std::ops::Range<usize>, query: Point, bounds: &mut [f64], visit: &mut impl FnMut(&mut [f64], usize)) {
+    fn search(&self, part: Range<usize>, query: Point, bounds: &mut [f64], visit: &mut impl FnMut(&mut [f64], usize)) {
         if part.len() <= LEAF {
             part.for_each(|i| visit(bounds, i));
             return;
         }
-        let middle = part.start + part.len() / 2;
+        let (low, high) = halves(part);
+        let middle = low.end;
         let axis = usize::from(self.axes[middle]);
         // Rounding is monotonic: no point beyond the plane has a smaller difference than this.
         let ahead = f64::from(query[axis] - self.points[middle][axis]);
-        let (low, high) = (part.start..middle, middle + 1..part.end);
         let (near, far) = if ahead < 0.0 { (low, high) } else { (high, low) };
         self.search(near, query, bounds, visit);
         if ahead * ahead < bounds[bounds.len() - 1] {
@@ -77,8 +70,14 @@ impl Tree {
     }
 }
 
+/// The halves of a part of a tree; the point between them, at the end of the first, belongs to neither.
+pub(super) fn halves(part: Range<usize>) -> (Range<usize>, Range<usize>) {
+    let middle = part.start + part.len() / 2;
+    (part.start..middle, middle + 1..part.end)
+}
+
 /// CloudCompare's (CCCoreLib, `DgmOctree.cpp`).
-fn squared_distance(a: Point, b: Point) -> f64 {
+pub(super) fn squared_distance(a: Point, b: Point) -> f64 {
     (0..3).map(|axis| f64::from(a[axis] - b[axis])).map(|d| d * d).sum()
 }
 

@@ -208,13 +208,16 @@ fn cross(
     visit: &mut impl FnMut(Crossing) -> ControlFlow<()>,
 ) -> ControlFlow<()> {
     let low = [place[0] * BRICK, place[1] * BRICK, place[2] * BRICK];
+    // A brick at the border may have fewer voxels.
+    let mut size = [BRICK; 3];
     let mut front = Front { place: [0; 3], exits: [0.0; 3] };
     for (a, axis) in planes.iter().enumerate() {
-        let voxel = axis.cell(t, low[a], (low[a] + BRICK).min(axis.voxels));
+        size[a] = BRICK.min(axis.voxels - low[a]);
+        let voxel = axis.cell(t, low[a], low[a] + size[a]);
         front.place[a] = voxel - low[a];
         front.exits[a] = axis.at(voxel + axis.forward);
     }
-    while t < end && front.place[0] < BRICK && front.place[1] < BRICK && front.place[2] < BRICK {
+    while t < end && front.place[0] < size[0] && front.place[1] < size[1] && front.place[2] < size[2] {
         let leave = smaller(front.leave(), end);
         let [x, y, z] = front.place;
         if leave > t {
@@ -274,6 +277,7 @@ mod tests {
         for seed in 0..2000 {
             let (origin, direction) = random_ray(seed);
             let found = crossings(&walk, origin, direction);
+            assert!(found.iter().all(|c| (0..3).all(|a| c.voxel[a] < voxels[a])), "ray {seed} leaves the box");
             let chord: f64 = found.iter().map(|c| c.leave - c.enter).sum();
             let expected = aabb.intersect(origin, direction).map_or(0.0, |(enter, leave)| leave - enter);
             assert!((chord - expected).abs() < 1e-12, "ray {seed}: {chord} against {expected}");

@@ -45,6 +45,10 @@ pub struct Config {
     pub stop_below: f64,
     /// Rays in a step.
     pub rays_per_step: usize,
+    /// Draw no rays that see nothing but empty space: only those of pixels around the projections of what is left of the grid. Where a stage
+    /// begins without empty space, all are drawn. Needs no alpha.
+    #[serde(default)]
+    pub aim: bool,
     /// Shift the samples of each training ray by a random fraction of a step.
     pub jitter: bool,
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
@@ -55,7 +59,7 @@ pub struct Config {
     /// Density, 1 / world length, at which a voxel counts as empty when pruning.
     pub prune_below: f64,
     /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
-    /// share of a pixel. 0 for none; svox2: 0.256 / voxels a side.
+    /// share of a pixel. Rays are as many as pass through every voxel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
     /// Folder of the run whose grid training starts from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -264,6 +268,7 @@ impl Default for Config {
             engine: Engine::Fused,
             stop_below: 0.0,
             rays_per_step: 4096,
+            aim: false,
             jitter: true,
             project: false,
             prune_from_stage: None,

@@ -1,8 +1,8 @@
 //! What training may know before its first step: silhouettes, and a grid that was there before.
 
 use super::config::{Config, Hull};
-use crate::carve::{has_alpha, visual_hull};
-use crate::dataset::View;
+use crate::carve::visual_hull;
+use crate::dataset::{View, has_alpha};
 use crate::field::voxel_grid::{GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;

@@ -1,6 +1,7 @@
 //! `plenoxel export mesh`: the surface of a trained run.
 
-use super::{Exported, as_flag, ending};
+use super::{Exported, Opened, SurfaceColors, ending};
+use crate::commands::{as_flag, number};
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::error::Result;
@@ -23,12 +24,15 @@ pub struct MeshArgs {
     #[command(flatten)]
     exported: Exported,
 
+    #[command(flatten)]
+    colors: SurfaceColors,
+
     /// ply, obj or glb [default: as --out ends, else ply]
     #[arg(long, value_name = "FORMAT", help_heading = "Output", value_parser = format)]
     format: Option<MeshFormat>,
 
     /// Density on the surface, 1 / world length [default: where a voxel absorbs 30 % of the light that crosses it]
-    #[arg(long, value_name = "SIGMA", help_heading = "Surface")]
+    #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE))]
     level: Option<f64>,
 }
 
@@ -36,8 +40,8 @@ pub struct MeshArgs {
 pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
     let named = args.exported.out.as_deref().and_then(ending).and_then(|ending| ending.parse().ok());
     let format = args.format.or(named).unwrap_or(MeshFormat::Ply);
-    let (folder, grid) = args.exported.open(console, &format.to_string())?;
-    let options = MeshOptions { level: args.level, direction: args.exported.direction };
+    let Opened { folder, grid, .. } = args.exported.open(console, &format.to_string())?;
+    let options = MeshOptions { level: args.level, direction: args.colors.direction() };
     let surface = mesh(&grid, &options).map_err(as_flag)?;
     let bytes = format.encode(&surface, crate::PROGRAM).map_err(as_flag)?;
     let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes)?;

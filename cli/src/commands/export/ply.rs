@@ -1,17 +1,17 @@
 //! `plenoxel export ply`: the voxels of a run as a colored point cloud.
 
+use super::{ColorChoice, Exported, MIN_ALPHA, Opened, color, min_alpha};
 use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
 use crate::commands::new_run::load;
-use crate::commands::{MOST_REDUCTION, check_split, numbers, whole};
+use crate::commands::{MOST_REDUCTION, as_flag, check_split, whole};
 use crate::data::DataSource;
 use crate::memory::Estimate;
 use crate::progress::Console;
-use crate::run_folder::{RunFolder, RunRecord};
+use crate::run_folder::RunRecord;
 use clap::{Args, ValueEnum, ValueHint};
-use glam::DVec3;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
-use plenoxel::export;
+use plenoxel::export::ply::encode;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, VoxelOptions};
 use plenoxel::rays::RaySource;
@@ -29,39 +29,35 @@ Examples:
   plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
 
 The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at
-the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbors. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
+the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbours. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
 
 /// Write the voxels of a run as a colored point cloud
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct PlyArgs {
-    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
-    #[arg(value_hint = ValueHint::DirPath)]
-    run: PathBuf,
-
-    /// File to write [default: RUN/exports/cloud.ply]
-    #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
-    out: Option<PathBuf>,
+    #[command(flatten)]
+    exported: Exported,
 
     /// Frame of the points: the dataset's own, or indices of voxels from 0
     #[arg(long, help_heading = "Output", default_value = "world")]
     coords: Coords,
 
-    /// The one color of a voxel: what training cameras see of it, the mean over all directions, or what a ray in the direction X,Y,Z shows
-    #[arg(long, value_name = "seen|mean|X,Y,Z", help_heading = "Output", default_value = "seen", value_parser = color, allow_hyphen_values = true)]
+    /// The one color of a voxel, where it depends on the direction: what training cameras see of it, the mean over all directions, or what a ray
+    /// in the direction X,Y,Z, from the viewer into the scene, shows there
+    #[arg(long, value_name = "seen|mean|X,Y,Z", help_heading = "Colors", default_value = "seen", allow_hyphen_values = true,
+          value_parser = color(&[("seen", ColorChoice::Seen), ("mean", ColorChoice::Mean)]))]
     color: ColorChoice,
 
-    /// Keep voxels that take at least this share of a ray that crosses them, 1 - exp(-density * side)
-    #[arg(long, value_name = "A", help_heading = "Voxels", default_value_t = MIN_ALPHA, value_parser = share)]
+    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = LEAST_ALPHA, value_parser = min_alpha)]
     min_alpha: f64,
 
     /// Keep voxels that make at least this share of some pixel of a training view; 0 keeps those that nobody sees
-    #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = MIN_WEIGHT, value_parser = share)]
+    #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = LEAST_WEIGHT, value_parser = share)]
     min_weight: f64,
 
     /// Keep voxels of whose pixels in the training views at least this share shows an object: floating clouds in the background's color have
-    /// 0. Alpha tells objects from the background, or the color in images without alpha
-    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = MIN_OBJECT, value_parser = share)]
+    /// 0. Alpha tells objects from the background, or the color where no image is transparent anywhere
+    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = LEAST_OBJECT, value_parser = share)]
     min_object: f64,
 
     /// Where the dataset is now [default: where it was when training]
@@ -76,10 +72,11 @@ pub struct PlyArgs {
     filters: CloudFilters,
 }
 
-/// Chosen by looking at clouds of lego, of both presets.
-const MIN_ALPHA: f64 = 0.05;
-const MIN_WEIGHT: f64 = 0.05;
-const MIN_OBJECT: f64 = 0.7;
+/// Chosen by looking at clouds of lego, of both presets. Less alpha than in exports that choose by nothing else: here the training views choose
+/// too, and where a run ends early, as with the preset `paper`, no voxel absorbs 0.3.
+const LEAST_ALPHA: f64 = 0.05;
+const LEAST_WEIGHT: f64 = 0.05;
+const LEAST_OBJECT: f64 = 0.7;
 
 /// Rays that are looked along at a time.
 const RAYS_PER_BATCH: u64 = 1 << 15;
@@ -90,37 +87,14 @@ enum Coords {
     Grid,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum ColorChoice {
-    Seen,
-    Mean,
-    Direction(DVec3),
-}
-
-fn color(text: &str) -> std::result::Result<ColorChoice, String> {
-    match text {
-        "seen" => Ok(ColorChoice::Seen),
-        "mean" => Ok(ColorChoice::Mean),
-        _ => {
-            let direction = numbers::<3>(text).ok().and_then(|d| DVec3::from_array(d).try_normalize());
-            direction.map(ColorChoice::Direction).ok_or_else(|| "seen, mean, or a direction x,y,z".to_owned())
-        }
-    }
-}
-
 fn share(text: &str) -> std::result::Result<f64, String> {
     text.parse().ok().filter(|s| (0.0..=1.0).contains(s)).ok_or_else(|| "a number from 0 to 1".to_owned())
 }
 
 /// Exports the voxels of a run.
 pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
-    let (folder, mut config, record) = RunFolder::open(&args.run)?;
+    let Opened { folder, mut config, record, header, grid } = args.exported.open(console, "ply")?;
     config.downscale = args.downscale.unwrap_or(config.downscale);
-    let (header, voxels) = folder.header()?;
-    let estimate = Estimate::of_export(&header.shape(), voxels);
-    console.note(&estimate.describe());
-    estimate.check()?;
-    // Filters before the minutes that looking may take.
     let side = header.shape().voxel_side();
     let coordinates = match args.coords {
         Coords::World => Coordinates::World,
@@ -130,29 +104,27 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         Coordinates::World => UnitLengths { voxel: Some(side), world: 1.0 },
         Coordinates::Grid => UnitLengths { voxel: Some(1.0), world: 1.0 / side },
     };
+    // Filters before the minutes that looking may take.
     let filters = args.filters.filters(lengths)?;
-    let (grid, header) = folder.load()?;
     let chooses = args.min_weight > 0.0 || args.min_object > 0.0;
     let looks = chooses || args.color == ColorChoice::Seen;
+    let field = args.filters.value_field(from_grid::field_names(looks))?;
     let seen = if looks { Some(look(args, &config, record, &grid, console)?) } else { None };
 
     let color = match (args.color, &seen) {
         (ColorChoice::Seen, Some(seen)) => ColorFrom::Seen(seen),
-        (ColorChoice::Direction(direction), _) => ColorFrom::Direction(direction),
-        (ColorChoice::Mean | ColorChoice::Seen, _) => ColorFrom::Mean,
+        (ColorChoice::Along(direction), _) => ColorFrom::Direction(direction),
+        _ => ColorFrom::Mean,
     };
     let (min_weight, min_object) = (args.min_weight, args.min_object);
     let visible = seen.as_ref().filter(|_| chooses).map(|seen| Visible { seen, min_weight, min_object });
     let cloud = from_grid::points(&grid, &VoxelOptions { coordinates, color, min_alpha: args.min_alpha, visible });
 
-    let names: Vec<&str> = cloud.fields.iter().map(|field| &field.name[..]).collect();
-    let field = args.filters.value_field(&names)?;
     let values = field.as_deref().and_then(|name| cloud.field(name));
-    let (left, report) = filters.apply(&cloud.positions, values)?;
+    let (left, report) = filters.apply(&cloud.positions, values).map_err(as_flag)?;
     let report = describe(cloud.len(), &report);
     check_not_empty(left.len(), &report)?;
 
-    let path = args.out.clone().map_or_else(|| folder.create_export("cloud.ply"), Ok)?;
     let (n, half) = (grid.shape().resolution, grid.shape().half_width);
     let frame = match coordinates {
         Coordinates::World => "the dataset's own".to_owned(),
@@ -165,8 +137,8 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         "opacity = 1 - exp(-density * side of a voxel in the world); weight, object: what training views show of it".to_owned(),
         report.clone(),
     ];
-    export::ply::write(&path, &cloud.chosen(&left), &comments)?;
-    console.result(&format!("wrote {} points to {} ({report})", left.len(), path.display()))
+    let file = args.exported.write(&folder, "cloud.ply", &encode(&cloud.chosen(&left), &comments))?;
+    console.result(&format!("wrote {} points to {} ({report})", left.len(), file.display()))
 }
 
 /// What the training cameras see of a grid.

@@ -1,6 +1,7 @@
 //! `plenoxel export vox`: a trained run for MagicaVoxel.
 
-use super::{Exported, as_flag};
+use super::{Exported, MIN_ALPHA, Opened, SurfaceColors, min_alpha};
+use crate::commands::as_flag;
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::error::Result;
@@ -21,19 +22,21 @@ pub struct VoxArgs {
     #[command(flatten)]
     exported: Exported,
 
-    /// Take voxels that absorb more than this share of the light that crosses them
-    #[arg(long, value_name = "A", help_heading = "Voxels", default_value_t = VoxOptions::default().min_alpha)]
+    #[command(flatten)]
+    colors: SurfaceColors,
+
+    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = VoxOptions::default().min_alpha, value_parser = min_alpha)]
     min_alpha: f64,
 
-    /// Take voxels too that others hide on all six sides
+    /// Keep voxels too that others hide on all six sides
     #[arg(long, help_heading = "Voxels")]
     solid: bool,
 }
 
 /// Writes the voxels of a run.
 pub fn run(args: &VoxArgs, console: &Console<'_>) -> Result<()> {
-    let (folder, grid) = args.exported.open(console, "vox")?;
-    let options = VoxOptions { min_alpha: args.min_alpha, solid: args.solid, direction: args.exported.direction };
+    let Opened { folder, grid, .. } = args.exported.open(console, "vox")?;
+    let options = VoxOptions { min_alpha: args.min_alpha, solid: args.solid, direction: args.colors.direction() };
     let model = vox(&grid, &options).map_err(as_flag)?;
     let file = args.exported.write(&folder, "grid.vox", &model.to_bytes().map_err(as_flag)?)?;
     console.result(&format!("wrote {} voxels in {} colors to {}", model.voxels.len(), model.palette.len(), file.display()))

@@ -1,6 +1,6 @@
 //! What the views have to say about a voxel, and how far they disagree.
 
-use crate::carve::visual_hull::homogeneous;
+use crate::carve::projection::{Pixels, Projection, Rectangle};
 use crate::dataset::View;
 use crate::dataset::image::RgbaImage;
 use crate::geometry::Aabb;
@@ -9,13 +9,9 @@ use glam::DVec3;
 /// Projections onto the ranges by which the common color is found.
 const ITERATIONS: usize = 12;
 
-/// How voxels project into a view.
-pub struct Projection {
-    /// Width and height in pixels.
-    size: [usize; 2],
-    /// x·depth, y·depth and depth of the corner of voxel (0, 0, 0), and what a voxel adds to them along each axis.
-    origin: DVec3,
-    steps: [DVec3; 3],
+/// A view that says what it shows of voxels.
+pub struct Witness {
+    projection: Projection,
     /// Side of a voxel in pixels, times depth.
     scale: f64,
 }
@@ -33,18 +29,11 @@ pub struct Vote {
 #[derive(Default)]
 pub struct Votes(Vec<Vote>);
 
-impl Projection {
-    /// Of the voxels of a box into a view.
+impl Witness {
+    /// Of the voxels of a box.
     pub fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
         let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
-        let origin = homogeneous(&view.camera, aabb.min);
-        let steps = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| homogeneous(&view.camera, aabb.min + axis * side) - origin);
-        Projection {
-            size: [view.image.width() as usize, view.image.height() as usize],
-            origin,
-            steps,
-            scale: view.camera.intrinsics.fx * side.max_element(),
-        }
+        Witness { projection: Projection::of(view, aabb, voxels), scale: view.camera.intrinsics.fx * side.max_element() }
     }
 
     /// What the pixels say of which a voxel, given by place and by number, is the first; `None` if there are none.
@@ -53,45 +42,18 @@ impl Projection {
     /// way to the pixels around, but not beyond the middle between them. Without this, the smeared edge of a texture is as wide as a patch
     /// of such voxels and contradicts all of it.
     pub fn vote(&self, image: &RgbaImage, first: &[u32], voxel: [usize; 3], number: u32) -> Option<Vote> {
-        let [columns, rows] = self.pixels(voxel)?;
-        let base = self.corner(voxel);
-        let reach = (1.0 - self.scale / base.z).clamp(0.0, 0.5) as f32;
+        let corners = self.projection.corners(voxel, voxel.map(|k| k + 1))?;
+        let Pixels { x: columns, y: rows } = self.projection.touched(Rectangle::around(&corners, 0.0));
+        let reach = (1.0 - self.scale / self.projection.corner(voxel).z).clamp(0.0, 0.5) as f32;
         let mut vote = Vote { range: [[1.0, 0.0]; 3], pixels: 0 };
         for y in rows.0..rows.1 {
-            let start = y * self.size[0];
+            let start = y * self.projection.size[0];
             let seen = &first[start + columns.0..start + columns.1];
             for (x, _) in seen.iter().enumerate().filter(|(_, first)| **first == number) {
                 vote.add(image, columns.0 + x, y, reach);
             }
         }
         (vote.pixels > 0).then_some(vote)
-    }
-
-    /// Its first corner, as `origin` is that of voxel (0, 0, 0).
-    fn corner(&self, voxel: [usize; 3]) -> DVec3 {
-        (0..3).fold(self.origin, |p, a| p + voxel[a] as f64 * self.steps[a])
-    }
-
-    /// The columns and rows of pixels around a voxel's projection, each from the first to one behind the last; `None` if they are beside the
-    /// image, or part of the voxel is not before the camera.
-    fn pixels(&self, voxel: [usize; 3]) -> Option<[(usize, usize); 2]> {
-        let base = self.corner(voxel);
-        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-        for corner in 0..8 {
-            let p = (0..3).filter(|a| corner >> a & 1 == 1).fold(base, |p, a| p + self.steps[a]);
-            if p.z <= 0.0 {
-                return None;
-            }
-            for (a, at) in [p.x / p.z, p.y / p.z].into_iter().enumerate() {
-                (low[a], high[a]) = (low[a].min(at), high[a].max(at));
-            }
-        }
-        let along = |a: usize| {
-            let end = self.size[a] as f64;
-            (low[a].floor().clamp(0.0, end) as usize, (high[a].floor() + 1.0).clamp(0.0, end) as usize)
-        };
-        let [columns, rows] = [along(0), along(1)];
-        (columns.0 < columns.1 && rows.0 < rows.1).then_some([columns, rows])
     }
 }
 

@@ -131,7 +131,13 @@ impl GridShape {
         2.0 * self.half_width / self.resolution as f64
     }
 
-    /// The density at which a voxel absorbs the share `alpha` of the light that crosses it along an axis: −ln(1 − α) / side, 1 / world length.
+    /// The share α of the light that a voxel of a raw density σ, 1 / world length, absorbs when it crosses it along an axis:
+    /// 1 − exp(−max(0, σ) side), in [0, 1].
+    pub fn alpha_of_density(&self, density: f64) -> f64 {
+        -(-density.max(0.0) * self.voxel_side()).exp_m1()
+    }
+
+    /// The density at which a voxel absorbs the share `alpha` of the light: −ln(1 − α) / side, 1 / world length.
     pub fn density_of_alpha(&self, alpha: f64) -> f64 {
         -(-alpha).ln_1p() / self.voxel_side()
     }

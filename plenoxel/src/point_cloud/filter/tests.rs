@@ -65,7 +65,7 @@ fn smallest_eigen(a: glam::DMat3) -> (f64, DVec3) {
 }
 
 /// The definition, with all points and the deviations measured one by one: how far beyond the limit each point is; infinite for isolated
-/// ones, and 1 for those whose three neighbors make no plane.
+/// ones, and 1 for those whose three neighbours make no plane.
 fn noise_by_definition(points: &[DVec3], radius: f64, error: NoiseError) -> Vec<f64> {
     let one = |i: usize| {
         let near = |q: &DVec3| f64::from((q.as_vec3() - points[i].as_vec3()).length()) <= radius;
@@ -97,9 +97,9 @@ fn noise_by_definition(points: &[DVec3], radius: f64, error: NoiseError) -> Vec<
 #[test]
 fn outliers_are_those_of_the_definition() {
     for (points, name) in [(scattered(700, 1), "scattered"), (lattice(2), "lattice")] {
-        for (neighbors, sigma) in [(2, 0.5), (6, 1.0), (6, 0.2), (12, 2.0), (40, -0.3)] {
-            let got = kept(&points, &Filters { outliers: Some(Outliers { neighbors, sigma }), ..Filters::default() });
-            assert_eq!(got, outliers_by_definition(&points, neighbors, sigma), "{name}, {neighbors} neighbors, {sigma} sigma");
+        for (neighbours, sigma) in [(2, 0.5), (6, 1.0), (6, 0.2), (12, 2.0), (40, -0.3)] {
+            let got = kept(&points, &Filters { outliers: Some(Outliers { neighbours, sigma }), ..Filters::default() });
+            assert_eq!(got, outliers_by_definition(&points, neighbours, sigma), "{name}, {neighbours} neighbours, {sigma} sigma");
             assert!(got.len() < points.len() || name == "lattice", "the setting removes something");
         }
     }
@@ -109,7 +109,8 @@ fn outliers_are_those_of_the_definition() {
 fn noise_is_that_of_the_definition() {
     let points = scattered(700, 3);
     for error in [NoiseError::Absolute(0.01), NoiseError::Relative(1.0), NoiseError::Relative(0.4)] {
-        for radius in [0.05, 0.12, 0.5] {
+        // Few neighbours, many, nearly all, all: the cloud is 14 across.
+        for radius in [0.05, 0.12, 0.5, 5.0, 20.0] {
             let beyond = noise_by_definition(&points, radius, error);
             // On the limit but for rounding: the filter keeps these, and allows for 8 ε of the largest coordinate, which is 8.
             let undecided = |b: f64| b > -1e-7 && b < 1e-5;
@@ -128,10 +129,19 @@ fn noise_is_that_of_the_definition() {
 }
 
 #[test]
+fn a_radius_that_holds_the_whole_cloud_is_not_asked_of_each_pair() {
+    // 10¹⁰ pairs, which would take minutes.
+    let points = scattered(100_000, 12);
+    let noise = |radius| Noise { radius, error: NoiseError::Relative(1.0), remove_isolated: true };
+    let [all, more] = [20.0, 1e9].map(|radius| kept(&points, &Filters { noise: Some(noise(radius)), ..Filters::default() }));
+    assert!(all == more && all.len() > 50_000, "{} are left", all.len());
+}
+
+#[test]
 fn of_a_solid_cube_of_voxels_the_noise_filter_takes_the_corners() {
-    // With a radius of 1.28 sides the neighbors are those across a face. Inside, on faces and on edges the point is as near to their plane
-    // as they are: on an edge, with neighbors ±x, +y, +z, their plane has the normal (0, 1, 1) / √2 and the distances ±1 / (2 √2) from the
-    // mean, and so has the point: equal but for rounding. At a corner the three neighbors lie in a plane, 1 / √3 away.
+    // With a radius of 1.28 sides the neighbours are those across a face. Inside, on faces and on edges the point is as near to their plane
+    // as they are: on an edge, with neighbours ±x, +y, +z, their plane has the normal (0, 1, 1) / √2 and the distances ±1 / (2 √2) from the
+    // mean, and so has the point: equal but for rounding. At a corner the three neighbours lie in a plane, 1 / √3 away.
     for (side, origin) in [(1.0, 0.0), (0.0234375, -1.47), (0.1, 3.3)] {
         let voxels = (0..64).map(|v| DVec3::new(f64::from(v / 16), f64::from(v / 4 % 4), f64::from(v % 4)));
         let points: Vec<DVec3> = voxels.map(|p| rounded((p + 0.5) * side + origin)).collect();
@@ -153,7 +163,7 @@ fn filters_are_applied_one_after_the_other_and_say_what_they_did() {
         within: Some(Aabb { min: DVec3::splat(-0.5), max: DVec3::new(1.0, 0.9, 2.0) }),
         value: Some(Range { low: 0.25, high: f64::INFINITY }),
         noise: Some(Noise { radius: 0.2, error: NoiseError::Relative(1.5), remove_isolated: true }),
-        outliers: Some(Outliers { neighbors: 6, sigma: 1.0 }),
+        outliers: Some(Outliers { neighbours: 6, sigma: 1.0 }),
     };
     let (got, report) = filters.apply(&points, Some(&values)).unwrap();
     assert_eq!(report.iter().map(|kept| kept.filter).collect::<Vec<_>>(), ["finite", "bbox", "value", "noise", "sor"]);
@@ -176,7 +186,7 @@ fn points_far_from_the_origin_are_filtered_like_those_near_it() {
     // Whole multiples of 2⁻¹⁰: exact in 32 bits near the origin, and in 64 anywhere.
     let near: Vec<DVec3> = scattered(500, 8).iter().map(|p| (p * 1024.0).round() / 1024.0).collect();
     let far: Vec<DVec3> = near.iter().map(|p| p + DVec3::new(431_000.0, 5_412_000.0, 300.0)).collect();
-    let outliers = Filters { outliers: Some(Outliers { neighbors: 6, sigma: 1.0 }), ..Filters::default() };
+    let outliers = Filters { outliers: Some(Outliers { neighbours: 6, sigma: 1.0 }), ..Filters::default() };
     assert_eq!(kept(&far, &outliers), kept(&near, &outliers));
 }
 
@@ -187,7 +197,7 @@ fn threads_do_not_change_what_is_kept_and_points_that_coincide_do_no_harm() {
     points.push(DVec3::splat(1e6));
     let filters = Filters {
         noise: Some(Noise { radius: 0.004, error: NoiseError::Relative(1.0), remove_isolated: false }),
-        outliers: Some(Outliers { neighbors: 6, sigma: 1.0 }),
+        outliers: Some(Outliers { neighbours: 6, sigma: 1.0 }),
         ..Filters::default()
     };
     let with = |threads: usize| {
@@ -202,9 +212,9 @@ fn threads_do_not_change_what_is_kept_and_points_that_coincide_do_no_harm() {
 #[test]
 fn settings_that_fit_no_point_are_refused() {
     let points = scattered(5, 10);
-    let outliers = |neighbors| Filters { outliers: Some(Outliers { neighbors, sigma: 1.0 }), ..Filters::default() };
-    for neighbors in [0, 1, 5, 6] {
-        let error = outliers(neighbors).apply(&points, None).unwrap_err();
+    let outliers = |neighbours| Filters { outliers: Some(Outliers { neighbours, sigma: 1.0 }), ..Filters::default() };
+    for neighbours in [0, 1, 5, 6] {
+        let error = outliers(neighbours).apply(&points, None).unwrap_err();
         assert!(error.exit_code() == 2 && error.to_string().contains("fewer than the 5 points"), "{error}");
     }
     assert!(outliers(4).apply(&points, None).is_ok());

@@ -81,6 +81,22 @@ fn points_are_the_centers_of_dense_voxels_with_opacity_and_density() {
 }
 
 #[test]
+fn a_color_along_a_direction_is_what_a_ray_shows_and_not_what_a_voxel_holds_alone() {
+    // A thin black voxel before an opaque white one: ½ ± Y₀ · 1.7725.
+    let density = |v: [usize; 3]| match v {
+        [1, 2, 3] => 0.1,
+        [1, 2, 4] => 1000.0,
+        _ => 0.0,
+    };
+    let grid = grid(SHAPE, density, |[.., z], c| if c % 4 > 0 { 0.0 } else { (z as f64 - 3.5) * 2.0 * 1.772_453_85 });
+    let color = |color| points(&grid, &VoxelOptions { color, ..options() }).colors.unwrap()[0];
+    assert_eq!(color(ColorFrom::Mean), [0; 3]);
+    // The black one lets e^(-0.1 · 0.5) = 0.951 through; from the other side the white one hides it.
+    assert_eq!(color(ColorFrom::Direction(DVec3::Z)), [243; 3]);
+    assert_eq!(color(ColorFrom::Direction(-DVec3::Z)), [255; 3]);
+}
+
+#[test]
 fn normals_point_out_of_matter() {
     let solid = |inside: &dyn Fn(DVec3) -> bool| {
         grid(SHAPE, |v| 50.0 * f64::from(u8::from(inside(DVec3::from_array(v.map(|c| c as f64))))), |_, _| 0.0)

@@ -1,0 +1,99 @@
+//! How voxels project into a picture: what the visual hull and the photo hull look up.
+
+use crate::camera::Camera;
+use crate::dataset::View;
+use crate::geometry::Aabb;
+use glam::{DVec3, dvec3};
+
+/// How the voxels of a box project into a view.
+pub struct Projection {
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+    /// x·depth, y·depth and depth of the corner of voxel (0, 0, 0), and what a voxel adds to them along each axis.
+    origin: DVec3,
+    steps: [DVec3; 3],
+}
+
+impl Projection {
+    /// Of the voxels of a box into a view.
+    pub fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
+        let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
+        let origin = homogeneous(&view.camera, aabb.min);
+        let steps = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| homogeneous(&view.camera, aabb.min + axis * side) - origin);
+        Projection { size: size(view), origin, steps }
+    }
+
+    /// x·depth, y·depth and depth of a voxel's first corner, x and y in pixels.
+    pub fn corner(&self, voxel: [usize; 3]) -> DVec3 {
+        let [x, y, z] = voxel.map(|k| k as f64);
+        self.origin + x * self.steps[0] + y * self.steps[1] + z * self.steps[2]
+    }
+
+    /// The projections of the corners of a box of voxels, from `low` to one behind the last, if all of them are before the camera. Bit a of a
+    /// corner's number says whether it is the higher one along axis a.
+    pub fn corners(&self, low: [usize; 3], high: [usize; 3]) -> Option<[[f64; 2]; 8]> {
+        let mut corners = [[0.0; 2]; 8];
+        for (c, corner) in corners.iter_mut().enumerate() {
+            let p = self.corner([0, 1, 2].map(|a| if c >> a & 1 == 1 { high[a] } else { low[a] }));
+            if p.z <= 0.0 {
+                return None;
+            }
+            *corner = [p.x / p.z, p.y / p.z];
+        }
+        Some(corners)
+    }
+
+    /// The pixels of the view that a rectangle touches; none if it is beside the image.
+    pub fn touched(&self, rectangle: Rectangle) -> Pixels {
+        let along = |a: usize| {
+            let end = self.size[a] as f64;
+            let low = rectangle.low[a].floor().clamp(0.0, end) as usize;
+            (low, ((rectangle.high[a].floor() + 1.0).clamp(0.0, end) as usize).max(low))
+        };
+        Pixels { x: along(0), y: along(1) }
+    }
+}
+
+/// Width and height of a view's image, in pixels.
+pub fn size(view: &View) -> [usize; 2] {
+    [view.image.width() as usize, view.image.height() as usize]
+}
+
+/// x·depth, y·depth and depth of a point as a camera sees it, x and y in pixels: linear in the point.
+fn homogeneous(camera: &Camera, point: DVec3) -> DVec3 {
+    let k = &camera.intrinsics;
+    let local = camera.camera_to_world.inverse().transform_point3(point);
+    let depth = -local.z;
+    dvec3(k.fx * local.x + k.cx * depth, -k.fy * local.y + k.cy * depth, depth)
+}
+
+/// A rectangle of an image, in pixel coordinates.
+#[derive(Clone, Copy, Debug)]
+pub struct Rectangle {
+    /// Left and top.
+    pub low: [f64; 2],
+    /// Right and bottom.
+    pub high: [f64; 2],
+}
+
+/// Columns and rows of pixels, each from the first to one behind the last.
+#[derive(Clone, Copy, Debug)]
+pub struct Pixels {
+    pub x: (usize, usize),
+    pub y: (usize, usize),
+}
+
+impl Pixels {
+    /// Their number.
+    pub fn area(self) -> usize {
+        (self.x.1 - self.x.0) * (self.y.1 - self.y.0)
+    }
+}
+
+impl Rectangle {
+    /// The smallest one around some points, and a margin.
+    pub fn around(points: &[[f64; 2]; 8], margin: f64) -> Self {
+        let along = |a: usize, f: fn(f64, f64) -> f64| points.iter().map(|p| p[a]).reduce(f).unwrap_or(f64::NAN);
+        Rectangle { low: [0, 1].map(|a| along(a, f64::min) - margin), high: [0, 1].map(|a| along(a, f64::max) + margin) }
+    }
+}

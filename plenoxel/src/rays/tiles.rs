@@ -1,0 +1,132 @@
+//! Which parts of the views can show something.
+
+use crate::dataset::View;
+use crate::sampling::{Occupancy, place};
+use autograd::lattice::BRICK;
+use autograd::parallel;
+use glam::{DVec3, dvec3};
+
+/// Pixels along a side of a tile.
+const SIDE: u32 = 8;
+
+/// A rectangle of pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Tile {
+    /// Number of the view.
+    pub view: u32,
+    /// Its first column and row.
+    pub x: u32,
+    pub y: u32,
+    pub width: u32,
+    pub height: u32,
+}
+
+impl Tile {
+    /// All of a view.
+    pub fn of_view(number: usize, view: &View) -> Self {
+        let (width, height) = view.image.dimensions();
+        Tile { view: number as u32, x: 0, y: 0, width, height }
+    }
+
+    pub fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+}
+
+/// The tiles that bricks of cells project into, by the rectangle around each; all tiles of a view that has a brick beside or behind its camera.
+pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
+    let (aabb, cells) = (matter.aabb(), matter.cells());
+    let count = cells.map(|n| n.div_ceil(BRICK));
+    let side = (aabb.max - aabb.min) / DVec3::from_array(cells.map(|n| n as f64));
+    let bricks = matter.masks().iter().enumerate().filter(|(_, mask)| **mask != 0);
+    let boxes: Vec<[DVec3; 2]> = bricks
+        .map(|(b, _)| {
+            let low = place(b, count).map(|k| k * BRICK);
+            let corner = |k: [usize; 3]| aabb.min + side * DVec3::from_array(k.map(|k| k as f64));
+            [corner(low), corner([0, 1, 2].map(|a| (low[a] + BRICK).min(cells[a])))]
+        })
+        .collect();
+    let of_views = parallel::map_indices(views.len(), |v| {
+        let all = Tile::of_view(v, &views[v]);
+        let (columns, rows) = (all.width.div_ceil(SIDE), all.height.div_ceil(SIDE));
+        let mut shows = vec![false; (columns * rows) as usize];
+        for corners in &boxes {
+            let Some([low, high]) = rectangle(&views[v], corners) else {
+                shows.fill(true);
+                break;
+            };
+            let range = |a: usize, n: u32| {
+                let clamped = |x: f64| (x / f64::from(SIDE)).floor().clamp(0.0, f64::from(n)) as u32;
+                clamped(low[a])..(clamped(high[a]) + 1).min(n)
+            };
+            for row in range(1, rows) {
+                let own = range(0, columns);
+                shows[(row * columns + own.start) as usize..(row * columns + own.end.max(own.start)) as usize].fill(true);
+            }
+        }
+        let tile = |t: u32| {
+            let (x, y) = (t % columns * SIDE, t / columns * SIDE);
+            Tile { x, y, width: SIDE.min(all.width - x), height: SIDE.min(all.height - y), ..all }
+        };
+        (0..columns * rows).filter(|&t| shows[t as usize]).map(tile).collect::<Vec<_>>()
+    });
+    of_views.concat()
+}
+
+/// The rectangle around the projection of a box into a view, in pixels; `None` if some of it is not before the camera.
+fn rectangle(view: &View, [min, max]: &[DVec3; 2]) -> Option<[[f64; 2]; 2]> {
+    let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    for c in 0..8 {
+        let at = |bit: usize, min: f64, max: f64| if c >> bit & 1 == 1 { max } else { min };
+        let (x, y, _) = view.camera.project(dvec3(at(0, min.x, max.x), at(1, min.y, max.y), at(2, min.z, max.z)))?;
+        for (a, value) in [x, y].into_iter().enumerate() {
+            (low[a], high[a]) = (low[a].min(value), high[a].max(value));
+        }
+    }
+    Some([low, high])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::procedural::ProceduralOptions;
+    use crate::dataset::{Dataset, Split};
+    use crate::geometry::Aabb;
+    use crate::sampling::walk::Walk;
+    use std::ops::ControlFlow;
+
+    #[test]
+    fn every_pixel_whose_ray_meets_matter_is_in_one_tile_and_many_others_in_none() {
+        let options = ProceduralOptions { width: 50, height: 37, train: 6, val: 0, test: 0, supersample: 1 };
+        let views = Dataset::procedural(options).unwrap().load(Split::Train, &|_, _| {}).unwrap();
+        let cells = [30; 3];
+        let ball = |v: usize| {
+            let at = [v / 900, v / 30 % 30, v % 30].map(|k| (k as f64 + 0.5) / 15.0 - 1.0);
+            dvec3(at[0] - 0.3, at[1], at[2]).length() < 0.3
+        };
+        let matter = Occupancy::new(Aabb::cube(1.0), cells, &(0..27000).map(ball).collect::<Vec<_>>());
+        let mut times = vec![vec![0; 50 * 37]; views.len()];
+        for tile in showing(&views, &matter) {
+            for (x, y) in (0..tile.pixels() as u32).map(|p| (tile.x + p % tile.width, tile.y + p / tile.width)) {
+                times[tile.view as usize][(y * 50 + x) as usize] += 1;
+            }
+        }
+        let walk = Walk::new(Aabb::cube(1.0), cells);
+        for (view, times) in views.iter().zip(&times) {
+            for (p, &times) in times.iter().enumerate() {
+                let mut meets = false;
+                let ray = view.camera.ray((p % 50) as f64 + 0.5, (p / 50) as f64 + 0.5);
+                walk.along(
+                    &ray,
+                    |_| 0,
+                    |crossing| {
+                        meets |= matter.contains(crossing.voxel);
+                        ControlFlow::Continue(())
+                    },
+                );
+                assert!(times == 1 || times == 0 && !meets, "{} pixel {p}: {times}, {meets}", view.name);
+            }
+            assert!(times.iter().filter(|n| **n == 0).count() > 600, "{}", view.name);
+        }
+    }
+}
