@@ -52,12 +52,12 @@ pub fn thinned<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
 /// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
 /// trilinear look-up will read them. The box stays that of the grid.
 pub fn adapted<T: Real>(grid: &VoxelGrid<T>, shape: &GridShape) -> VoxelGrid<T> {
-    let grid = grid.with_color(shape.color);
-    let grid = if grid.shape().resolution == shape.resolution { grid } else { grid.resample(shape.resolution) };
-    let grid = match shape.interpolation {
-        Interpolation::Nearest => grid,
-        Interpolation::Trilinear => grid.grown(),
-    };
-    // Last, so that harmonics are averaged over what training will see.
-    grid.with_interpolation(shape.interpolation).with_reduction(shape.sh_reduction)
+    let same = grid.shape().resolution == shape.resolution;
+    let resampled = (!same).then(|| grid.resample(shape.resolution));
+    let grid = resampled.as_ref().unwrap_or(grid);
+    // Before colors change: zeros are then those of voxels that nobody saw.
+    let grown = (shape.interpolation == Interpolation::Trilinear).then(|| grid.grown());
+    let grid = grown.as_ref().unwrap_or(grid);
+    // Harmonics last, so that they are averaged over what training will see.
+    grid.with_color(shape.color).with_interpolation(shape.interpolation).with_reduction(shape.sh_reduction)
 }

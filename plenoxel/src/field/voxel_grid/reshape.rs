@@ -78,7 +78,8 @@ impl<T: Real> VoxelGrid<T> {
     }
 
     /// The same grid with a layer of voxels around those that are present: without density, and of the mean color of the voxels that they
-    /// touch. So trilinear look-up at the border reads colors of the object and not of nothing.
+    /// touch. So trilinear look-up at the border reads colors of the object and not of nothing. Voxels whose color numbers are all 0, as those
+    /// that no pixel shows to carving, have no say where others have.
     pub fn grown(&self) -> Self {
         let lattice = dilated(self.lattice());
         let density = moved(self.density.tensor(), self.lattice(), &lattice);
@@ -130,16 +131,50 @@ pub(super) fn moved<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) ->
     Tensor::from_buffer(values, &[to.rows(), width])
 }
 
-/// A table in another layout of the same grid, with the mean of the rows around where the old one has no node.
+/// A table in another layout of the same grid, with the mean of the rows around where the old one has no node. Rows of zeros, which nobody
+/// gave numbers, have no say where others have.
 pub(super) fn spread<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) -> Tensor<T> {
     let width = table.shape()[1];
     let mut values = Buffer::copy_of(moved(table, from, to).data());
     parallel::for_each_rows(&mut values, width, |first, chunk| {
         for (r, row) in chunk.chunks_exact_mut(width).enumerate() {
             if let Some(node) = to.node((first + r) as u32).filter(|node| from.row(*node).is_none()) {
-                neighbours::average(from, table.data(), node, row);
+                neighbours::average(from, table.data(), node, |row| row.iter().any(|x| *x != T::zero()), row);
             }
         }
     });
     Tensor::from_buffer(values, &[to.rows(), width])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Color;
+    use super::*;
+
+    #[test]
+    fn the_layer_around_has_the_colors_of_what_it_touches_but_not_of_what_nobody_saw() {
+        let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
+        // Side by side two voxels with colors and one that no pixel showed; far from them another such.
+        let present = [[1, 1, 1], [1, 1, 2], [1, 1, 3], [6, 6, 6]];
+        let lattice = Lattice::bricks_where([8; 3], |voxel| present.contains(&voxel));
+        let mut color = vec![0.0; 3 * lattice.rows()];
+        for (voxel, rgb) in [(present[0], [0.2, 0.4, 0.6]), (present[1], [0.8, 0.0, 0.0])] {
+            let row = lattice.row(voxel).unwrap() as usize;
+            color[3 * row..3 * row + 3].copy_from_slice(&rgb);
+        }
+        let rows = lattice.rows();
+        let grid = VoxelGrid::<f64>::with_lattice(shape, lattice, Tensor::full(&[rows, 1], 5.0), Tensor::from_vec(color, &[rows, 3]));
+        let grown = grid.grown();
+        let color_at = |voxel: [usize; 3]| {
+            let row = grown.lattice().row(voxel).unwrap() as usize;
+            [0, 1, 2].map(|c| grown.color.tensor().data()[3 * row + c])
+        };
+        assert_eq!(grown.density_at([2, 1, 1]), 0.0);
+        assert_eq!(color_at([1, 1, 0]), [0.2, 0.4, 0.6]);
+        // It touches the second across an edge, and the third across a face.
+        let near = color_at([2, 1, 3]);
+        assert!((near[0] - 0.8).abs() < 1e-12 && near[1..] == [0.0; 2], "{near:?}");
+        // Nothing better is near; and what was there stays.
+        assert_eq!((color_at([1, 1, 4]), color_at([6, 6, 7]), color_at([1, 1, 3])), ([0.0; 3], [0.0; 3], [0.0; 3]));
+    }
 }
