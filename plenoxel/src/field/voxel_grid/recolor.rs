@@ -36,8 +36,9 @@ impl<T: Real> VoxelGrid<T> {
         }
     }
 
-    /// The same grid with harmonics of degree 1 and more for every so many voxels along each axis; 1 for all in every voxel. A larger voxel has
-    /// the mean of the voxels in it, or of the larger ones around it; a smaller one what is read at its centre.
+    /// The same grid with harmonics of degree 1 and more for every so many voxels along each axis; 1 for all in every voxel. A smaller voxel has
+    /// what is read at its centre; a larger one the mean Σ αᵥ cᵥ / Σ αᵥ of the voxels v in it, αᵥ being the share of light that they absorb
+    /// ([`GridShape::alpha_of_density`]), a plain mean if none absorbs any, or that of the larger ones around it if it holds none.
     pub fn with_reduction(&self, reduction: usize) -> Self {
         let shape = GridShape { sh_reduction: reduction, ..*self.shape() }.normalised();
         if shape == *self.shape() {
@@ -65,22 +66,24 @@ impl<T: Real> VoxelGrid<T> {
     /// The same grid in a reduced shape, of one with all coefficients in every voxel.
     fn reduced(&self, shape: GridShape) -> Self {
         let layout = Layout::new(shape, self.lattice().clone());
-        let (width, all) = (shape.harmonics_width(), self.color.tensor().data());
+        let (width, all, density) = (shape.harmonics_width(), self.color.tensor().data(), self.density.tensor().data());
         let count = width / 3 + 1;
         let holding = holding(&shape, self.lattice());
         let mut means = Buffer::zeros(holding.rows() * width);
         parallel::for_each_rows(&mut means, width, |first, chunk| {
             for (r, mean) in chunk.chunks_exact_mut(width).enumerate() {
                 let Some(place) = holding.node((first + r) as u32) else { continue };
-                let mut voxels = 0.0;
-                for row in held(&shape, place).filter_map(|voxel| self.lattice().row(voxel)) {
-                    voxels += 1.0;
-                    let own = &all[row as usize * 3 * count..][..3 * count];
+                let rows = held(&shape, place).filter_map(|voxel| self.lattice().row(voxel));
+                let rows: Vec<(usize, f64)> =
+                    rows.map(|row| (row as usize, shape.alpha_of_density(density[row as usize].as_f64()))).collect();
+                let total: f64 = rows.iter().map(|(_, alpha)| alpha).sum();
+                for &(row, alpha) in &rows {
+                    let weight = T::lit(if total > 0.0 { alpha / total } else { 1.0 / rows.len() as f64 });
+                    let own = &all[row * 3 * count..][..3 * count];
                     for (mean, own) in mean.chunks_exact_mut(count - 1).zip(own.chunks_exact(count)) {
-                        mean.iter_mut().zip(&own[1..]).for_each(|(mean, &own)| *mean += own);
+                        mean.iter_mut().zip(&own[1..]).for_each(|(mean, &own)| *mean += weight * own);
                     }
                 }
-                mean.iter_mut().for_each(|mean| *mean /= T::lit(voxels));
             }
         });
         let means = Tensor::from_buffer(means, &[holding.rows(), width]);
@@ -101,4 +104,34 @@ fn resized<T: Real>(table: &Tensor<T>, width: usize) -> Buffer<T> {
         }
     });
     values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Interpolation;
+    use super::*;
+
+    #[test]
+    fn a_larger_voxel_has_the_harmonics_of_what_absorbs_light_in_it() {
+        let color = Color::Sh { degree: 1, offset: 0.5 };
+        let shape = GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
+        // In the first of 2³ larger voxels two of eight absorb light, one of them twice the share; in the others none does.
+        let density = |v: usize| match v {
+            0 => shape.density_of_alpha(0.4),
+            1 => shape.density_of_alpha(0.8),
+            16 => -3.0,
+            _ => 0.0,
+        };
+        let density = Tensor::from_vec((0..64).map(density).collect(), &[64, 1]);
+        let number = |v: usize, k: usize| (v * 12 + k) as f64;
+        let numbers = Tensor::from_vec((0..64 * 12).map(|i| number(i / 12, i % 12)).collect(), &[64, 12]);
+        let reduced = VoxelGrid::<f64>::from_row_major(shape, &density, &numbers).with_reduction(2);
+        let (table, lattice) = (reduced.harmonics.as_ref().unwrap(), reduced.harmonics_lattice().unwrap());
+        let read = |place: [usize; 3]| &table.tensor().data()[9 * lattice.row(place).unwrap() as usize..][..9];
+        for (i, k) in [1, 2, 3, 5, 6, 7, 9, 10, 11].into_iter().enumerate() {
+            assert!((read([0, 0, 0])[i] - (number(0, k) + 2.0 * number(1, k)) / 3.0).abs() < 1e-12);
+            // Voxels 42, 43, 46, 47 and those 16 further.
+            assert!((read([1, 1, 1])[i] - number(0, k) - 12.0 * 52.5).abs() < 1e-12);
+        }
+    }
 }
