@@ -3,9 +3,11 @@
 //! Of a grid with all its voxels, tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. Of a sparse one,
 //! `voxels` `[k]`, `u32`, ascending: those that are present, voxel (x, y, z) as the number (x n + y) n + z; and `density` `[k]` and `color`
 //! `[k, channels]` in that order. Where harmonics of degree 1 and more are reduced, a grid is written as a sparse one even if it has all its
-//! voxels, `color` is `[k, 3]`, the means, and the harmonics follow in the same manner: `harmonics_voxels` `[h]`, (x, y, z) of m = ⌈n / reduction⌉
-//! voxels along an axis as the number (x m + y) m + z, and `harmonics` `[h, channels − 3]`. The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader
-//! must know. (One entry, for several would be written in a random order, and equal grids are to be equal files.)
+//! voxels, `color` is `[k, 3]`, the means, and the harmonics follow in the same manner: `harmonics_voxels` `[h]`, (x, y, z) of
+//! m = ⌈n / reduction⌉ voxels along an axis as the number (x m + y) m + z, and `harmonics` `[h, channels − 3]`.
+//!
+//! The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader must know. (One entry, for several
+//! would be written in a random order, and equal grids are to be equal files.)
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -222,7 +224,7 @@ fn header_of(path: &Path, metadata: &Metadata) -> Result<Header> {
             "this version reads grids whose scene_transform is the identity",
         ));
     }
-    let reduced = header.sh_reduction > 0 && header.shape().is_reduced() == (format == REDUCED_FORMAT);
+    let reduced = (1..=1024).contains(&header.sh_reduction) && header.shape().is_reduced() == (format == REDUCED_FORMAT);
     if !((1..=1024).contains(&header.resolution) && degree_known && reduced && header.half_width > 0.0 && header.half_width.is_finite()) {
         return Err(Error::input(path, "a header with impossible values", RETRAIN));
     }
