@@ -46,6 +46,7 @@ fn a_step_in_the_steady_state_takes_hardly_any_memory_from_the_system() {
         image_reduction: 1,
         density_rate: 1.0,
         color_rate: 0.05,
+        harmonics_rate: None,
         rate_decay: 1.0,
     };
     for (interpolation, color) in [(Interpolation::Nearest, ColorKind::Rgb), (Interpolation::Trilinear, ColorKind::Sh)] {

@@ -65,7 +65,7 @@ fn a_slab_of_fog_shows_its_closed_form_for_any_number_of_samples() {
 #[test]
 fn a_voxel_grid_with_one_value_is_a_slab_of_fog() {
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
-        let shape = GridShape { resolution: 5, half_width: CUBE, interpolation, color: Color::Rgb };
+        let shape = GridShape { resolution: 5, half_width: CUBE, interpolation, color: Color::Rgb, sh_reduction: 1 };
         let grid = VoxelGrid::<f64>::uniform(shape, 0.7, 0.25);
         let rendered = render(&grid, &rays(), &options(Spacing::Step(0.1), Jitter::None));
         let fog = render(&Fog { sigma: 0.7, color: [0.25; 3] }, &rays(), &options(Spacing::Step(10.0), Jitter::None));
@@ -122,7 +122,7 @@ fn a_ball_shows_the_chord_through_it() {
 #[test]
 fn an_empty_box_and_a_missed_box_show_the_background() {
     let empty = VoxelGrid::<f64>::uniform(
-        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb },
+        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 },
         0.0,
         0.7,
     );
@@ -145,7 +145,7 @@ fn an_empty_box_and_a_missed_box_show_the_background() {
 #[test]
 fn distortion_in_linear_time_equals_the_double_sum() {
     let grid = VoxelGrid::<f64>::random(
-        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb },
+        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 },
         2.0,
         1.0,
         5,
@@ -164,7 +164,7 @@ fn distortion_in_linear_time_equals_the_double_sum() {
 
 #[test]
 fn leaving_out_empty_voxels_changes_no_pixel() {
-    let shape = GridShape { resolution: 12, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb };
+    let shape = GridShape { resolution: 12, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
     let random = VoxelGrid::<f64>::random(shape, 1.0, 1.0, 8);
     // Nine voxels in ten are empty, some of them negative.
     let density: Vec<f64> = random.density.tensor().data().iter().map(|&d| if d > 0.9 { 5.0 * d } else { d - 0.95 }).collect();

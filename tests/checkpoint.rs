@@ -11,8 +11,13 @@ fn folder(name: &str) -> PathBuf {
 }
 
 fn grid() -> (VoxelGrid<f32>, Header) {
-    let shape =
-        GridShape { resolution: 5, half_width: 1.4, interpolation: Interpolation::Trilinear, color: Color::Sh { degree: 2, offset: 0.5 } };
+    let shape = GridShape {
+        resolution: 5,
+        half_width: 1.4,
+        interpolation: Interpolation::Trilinear,
+        color: Color::Sh { degree: 2, offset: 0.5 },
+        sh_reduction: 1,
+    };
     let grid = VoxelGrid::random(shape, 3.0, 1.0, 9);
     let header = Header::new(&grid, "still life", [1.0, 1.0, 1.0], 42, 1234);
     (grid, header)
@@ -53,6 +58,38 @@ fn a_sparse_grid_comes_back_with_the_same_voxels() {
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, replace(&bytes, br#"\"resolution\":5"#, br#"\"resolution\":3"#)).unwrap();
     assert!(checkpoint::load::<f32>(&path).expect_err("it is damaged").to_string().contains("list of voxels"));
+}
+
+#[test]
+fn reduced_harmonics_come_back_and_whole_ones_leave_no_trace_of_them() {
+    let path = folder("reduced").join("checkpoint.safetensors");
+    let (whole, header) = grid();
+    checkpoint::save(&path, &whole, &header).expect("it is written");
+    let bytes = std::fs::read(&path).unwrap();
+    assert!(!String::from_utf8_lossy(&bytes).contains("reduction"));
+    // All voxels, and a fifth of them.
+    let all = VoxelGrid::<f32>::random(GridShape { sh_reduction: 2, ..*whole.shape() }, 3.0, 1.0, 9);
+    for grid in [all.pruned(&all.voxels_where(|row| row % 5 == 1)), all] {
+        let header = Header::new(&grid, "still life", [1.0; 3], 42, 1234);
+        assert_eq!(header.format, checkpoint::REDUCED_FORMAT);
+        checkpoint::save(&path, &grid, &header).expect("it is written");
+        let (read, read_header) = checkpoint::load::<f32>(&path).expect("it is read");
+        assert_eq!((read.shape(), &read_header), (grid.shape(), &header));
+        assert_eq!(read.lattice().masks(), grid.lattice().masks());
+        let (read_lattice, lattice) = (read.harmonics_lattice().expect("reduced"), grid.harmonics_lattice().expect("reduced"));
+        assert_eq!(read_lattice.masks(), lattice.masks());
+        for (read, written) in read.params().zip(grid.params()) {
+            let width = written.shape()[1];
+            let lattice = if written.name() == "harmonics" { lattice } else { grid.lattice() };
+            for row in (0..lattice.rows()).filter(|&row| lattice.node(row as u32).is_some()) {
+                assert_eq!(read.tensor().data()[row * width..][..width], written.tensor().data()[row * width..][..width]);
+            }
+        }
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, replace(&bytes, br#"\"sh_reduction\":2"#, br#"\"sh_reduction\":3"#)).unwrap();
+        let message = checkpoint::load::<f32>(&path).expect_err("it is damaged").to_string();
+        assert!(message.contains("harmonics of other voxels") || message.contains("list of voxels"), "{message}");
+    }
 }
 
 #[test]

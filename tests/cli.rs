@@ -332,6 +332,7 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
     let export = |args: &[&str]| plenoxel(&[&["export"], args].concat());
     export(&["mesh", &run, "--out", &out, "--format", "obj"]).refused(2, &["--out", "fog.GLB", ".obj"]);
     export(&["mesh", &run, "--level", "1e9"]).refused(2, &["--level", "above 0 and below"]);
+    export(&["mesh", &run, "--level", "1e-3", "--min-part", "999999"]).refused(2, &["--min-part", "999999 faces", "the largest part"]);
     // What flags alone can tell is told before a run is looked for.
     let none = folder.path("none");
     for what in ["vox", "mesh"] {
@@ -400,7 +401,7 @@ fn help_mentions_every_command_and_flag() {
     let version = plenoxel(&["--version"]);
     assert!(version.code == 0 && version.out.starts_with("plenoxel 0."), "{}", version.out);
     let flags = "--out --force --no-images --preset --config --set --seed --downscale --background --half-width --interpolation --color \
-        --sh-degree --engine --tv --threads --quiet --scene-size --scene-views Examples:";
+        --sh-degree --sh-reduction --engine --tv --threads --quiet --scene-size --scene-views Examples:";
     for (command, flags) in [
         ("train", flags),
         ("render", "--split --view --downscale --data Examples:"),
@@ -409,7 +410,7 @@ fn help_mentions_every_command_and_flag() {
         ("export", "ply vox mesh"),
         ("export ply", "--out --color --min-alpha --min-weight --min-object --coords --bbox --sor-sigma Examples:"),
         ("export vox", "--out --color --min-alpha --solid Examples:"),
-        ("export mesh", "--out --color --format --level Examples:"),
+        ("export mesh", "--out --color --format --level --min-part Examples:"),
         ("scene", "--width --height --train --val --test --force Examples:"),
     ] {
         let help = plenoxel(&[command.split(' ').collect(), vec!["--help"]].concat());

@@ -4,6 +4,7 @@ mod support;
 
 use approx::assert_relative_eq;
 use autograd::{Tensor, no_grad};
+use glam::DVec3;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::render::fused::largest_weights;
 use plenoxel::render::{Engine, RenderOptions, render};
@@ -17,7 +18,7 @@ fn centers(n: usize) -> Vec<[f64; 3]> {
 }
 
 fn sampled(n: usize, f: impl Fn([f64; 3]) -> f64) -> VoxelGrid<f64> {
-    let shape = GridShape { resolution: n, half_width: 1.0, interpolation: Interpolation::Trilinear, color: Color::Rgb };
+    let shape = GridShape { resolution: n, half_width: 1.0, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
     let values: Vec<f64> = centers(n).into_iter().map(f).collect();
     let color =
         Tensor::stack(&[0.1, 0.2, 0.3].map(|s| Tensor::from_vec(values.iter().map(|v| s * v).collect(), &[n * n * n])).each_ref(), 1);
@@ -46,7 +47,12 @@ fn resampling_a_trilinear_function_is_exact_between_the_old_centres() {
 fn upsampling_keeps_a_nearest_field_everywhere_and_a_trilinear_one_at_the_old_centres() {
     // Three new voxels in each old one: the middle one has the old one's centre.
     for (interpolation, offsets) in [(Interpolation::Nearest, 0..3), (Interpolation::Trilinear, 1..2)] {
-        let old = VoxelGrid::<f64>::random(GridShape { resolution: 4, half_width: 1.3, interpolation, color: Color::Rgb }, 1.0, 1.0, 3);
+        let old = VoxelGrid::<f64>::random(
+            GridShape { resolution: 4, half_width: 1.3, interpolation, color: Color::Rgb, sh_reduction: 1 },
+            1.0,
+            1.0,
+            3,
+        );
         let new = old.resample(12);
         let at = |grid: &VoxelGrid<f64>, voxel| grid.density.tensor().data()[grid.lattice().row(voxel).expect("present") as usize];
         for voxel in 0..4 * 4 * 4 {
@@ -61,7 +67,7 @@ fn upsampling_keeps_a_nearest_field_everywhere_and_a_trilinear_one_at_the_old_ce
 
 #[test]
 fn a_sparse_nearest_grid_of_twice_the_resolution_has_eight_voxels_for_each() {
-    let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb };
+    let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
     let old = VoxelGrid::<f32>::random(shape, 1.0, 1.0, 4);
     let old = old.pruned(&old.occupancy(0.6));
     let new = old.resample(16);
@@ -77,7 +83,7 @@ fn a_sparse_nearest_grid_of_twice_the_resolution_has_eight_voxels_for_each() {
 
 #[test]
 fn nearest_look_up_reads_the_voxel_a_point_lies_in() {
-    let shape = GridShape { resolution: 4, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Rgb };
+    let shape = GridShape { resolution: 4, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
     let grid = VoxelGrid::from_tables(shape, Tensor::constant(numbers(&[64, 1], 0.0, 1.0, 1)), Tensor::zeros(&[64, 3]));
     // Voxels are 1 wide: (−1.99, 0.5, 1.99) lies in (0, 2, 3); its faces belong to the next voxel.
     for (at, row) in [([-1.99, 0.5, 1.99], 11), ([-2.0, -2.0, -2.0], 0), ([-1.0, 0.0, 1.0], 16 + 8 + 3), ([2.0, 2.0, 2.0], 63)] {
@@ -116,7 +122,7 @@ fn pruning_keeps_what_is_visible_and_a_pruned_grid_resamples_to_the_same_field()
 #[test]
 fn the_largest_weight_of_a_voxel_is_that_of_the_samples_that_read_it() {
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
-        let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color: Color::Rgb };
+        let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color: Color::Rgb, sh_reduction: 1 };
         let grid = VoxelGrid::<f64>::random(shape, 3.0, 1.0, 5);
         let options = RenderOptions {
             aabb: grid.aabb(),
@@ -149,5 +155,100 @@ fn the_largest_weight_of_a_voxel_is_that_of_the_samples_that_read_it() {
         for (got, want) in got.iter().zip(&want) {
             assert_relative_eq!(f64::from(*got), *want, epsilon = 1e-7);
         }
+    }
+}
+
+/// A shape whose harmonics of degree 1 are stored for every fourth voxel.
+fn reduced(resolution: usize, interpolation: Interpolation) -> GridShape {
+    GridShape { resolution, half_width: 1.0, interpolation, color: Color::Sh { degree: 1, offset: 0.5 }, sh_reduction: 4 }
+}
+
+/// Pixels of the rays that tests share.
+fn pixels(grid: &VoxelGrid<f64>) -> Vec<f64> {
+    let options = RenderOptions {
+        aabb: grid.aabb(),
+        spacing: Spacing::Step(0.05),
+        jitter: Jitter::None,
+        background: [1.0; 3],
+        occupancy: None,
+        engine: Engine::Graph,
+        stop_below: 0.0,
+    };
+    no_grad(|| render(grid, &rays(), &options)).rgb.data().to_vec()
+}
+
+#[test]
+fn resampled_harmonics_are_read_where_their_larger_voxels_are() {
+    // An affine function of the place in each coefficient.
+    let f = |at: [f64; 3], k: usize| 0.1 * k as f64 + 0.3 * at[0] - 0.2 * at[1] + 0.4 * at[2];
+    let old = VoxelGrid::<f64>::random(reduced(12, Interpolation::Trilinear), 1.0, 1.0, 3);
+    let lattice = old.harmonics_lattice().expect("they are reduced").clone();
+    // Three of them, 2 / 3 wide.
+    let center = |k: usize, n: f64| (k as f64 + 0.5) * 2.0 / n - 1.0;
+    let values = (0..lattice.rows() as u32).flat_map(|row| {
+        let at = lattice.node(row).map_or([0.0; 3], |node| node.map(|k| center(k, 3.0)));
+        (0..9).map(move |k| f(at, k))
+    });
+    let values = Tensor::from_vec(values.collect(), &[lattice.rows(), 9]);
+    let tables = vec![old.density.tensor().detach(), old.color.tensor().detach(), values];
+    let old = VoxelGrid::with_tables(*old.shape(), old.lattice().clone(), tables);
+    let new = old.resample(24);
+    let (table, lattice) = (new.harmonics.as_ref().expect("still reduced"), new.harmonics_lattice().expect("still reduced"));
+    assert_eq!(lattice.nodes(), [6; 3]);
+    for (row, numbers) in table.tensor().data().chunks(9).enumerate() {
+        let Some(node) = lattice.node(row as u32) else { continue };
+        let at = node.map(|k| center(k, 6.0).clamp(center(0, 3.0), center(2, 3.0)));
+        for (k, &number) in numbers.iter().enumerate() {
+            assert_relative_eq!(number, f(at, k), epsilon = 1e-12);
+        }
+    }
+}
+
+#[test]
+fn voxels_that_go_leave_the_harmonics_that_others_read() {
+    for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+        for resolution in [13, 16] {
+            let full = VoxelGrid::<f64>::random(reduced(resolution, interpolation), 3.0, 0.4, 3);
+            // Matter in a ball away from the middle.
+            let ball = |[x, y, z]: [i32; 3]| x * x + (y - 4).pow(2) + (z - 6).pow(2) < 40;
+            let inside = |row: usize| full.lattice().node(row as u32).is_some_and(|voxel| ball(voxel.map(|k| k as i32)));
+            let density = full.density.tensor().data().iter().enumerate().map(|(row, &d)| if inside(row) { d } else { 0.0 });
+            let full = full.with_density(Tensor::from_vec(density.collect(), &[full.lattice().rows(), 1]));
+            let pruned = full.pruned(&full.occupancy(0.0));
+            let count = |grid: &VoxelGrid<f64>| grid.harmonics_lattice().map_or(0, |lattice| lattice.present());
+            assert!(count(&pruned) < count(&full), "{interpolation:?}");
+            for (a, b) in pixels(&pruned).into_iter().zip(pixels(&full)) {
+                assert_relative_eq!(a, b, epsilon = 1e-12);
+            }
+            assert!(pruned.grown().with_interpolation(Interpolation::Trilinear).resample(2 * resolution).is_finite());
+        }
+    }
+}
+
+#[test]
+fn harmonics_that_are_the_same_everywhere_are_so_at_any_reduction() {
+    for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+        let shape = GridShape { sh_reduction: 1, ..reduced(13, interpolation) };
+        let random = VoxelGrid::<f64>::random(shape, 3.0, 0.4, 3);
+        let numbers = random.color.tensor().data().iter().enumerate();
+        // The mean of a channel, and three numbers of harmonics.
+        let numbers = numbers.map(|(i, &number)| if i % 4 == 0 { number } else { 0.05 * (i % 12) as f64 - 0.2 });
+        let color = Tensor::from_vec(numbers.collect(), random.color.shape());
+        let whole = VoxelGrid::from_tables(shape, random.density.tensor().detach(), color);
+        let whole = whole.pruned(&whole.voxels_where(|row| row % 5 != 0 && row % 64 > 20));
+        // At the centres of voxels: between them, the whole one fades out towards those that are not there.
+        let rows: Vec<u32> = (0..whole.lattice().rows() as u32).filter(|&row| whole.lattice().node(row).is_some()).collect();
+        let colors = |grid: &VoxelGrid<f64>| grid.colors_of(&rows, &vec![DVec3::new(0.48, -0.6, 0.64); rows.len()]);
+        let want = colors(&whole);
+        let by_four = whole.with_reduction(4);
+        assert_eq!(by_four.color.shape()[1], 3);
+        let richer = by_four.with_color(Color::Sh { degree: 2, offset: 0.5 }).with_color(shape.color);
+        for grid in [by_four.with_reduction(1), by_four.with_reduction(3), by_four, richer] {
+            for (a, b) in colors(&grid).into_iter().flatten().zip(want.iter().flatten()) {
+                assert_relative_eq!(a, *b, epsilon = 1e-12);
+            }
+        }
+        // Colors that are the same from everywhere have nothing to reduce.
+        assert_eq!(whole.with_reduction(4).with_color(Color::Rgb).shape(), whole.with_color(Color::Rgb).shape());
     }
 }

@@ -40,7 +40,7 @@ fn distance<T: Real>(a: &[T], b: &[T]) -> f64 {
     off / size.max(1e-2)
 }
 
-/// The worst distance between the engines over all columns and their gradients by both tables, with the name of where it is.
+/// The worst distance between the engines over all columns and their gradients by all tables, with the name of where it is.
 fn worst<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> (f64, String) {
     let mut worst = (0.0, String::new());
     for (name, width) in COLUMNS {
@@ -51,15 +51,13 @@ fn worst<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>
             let cotangent: Vec<T> = (0..rays.len() * width).map(|i| T::lit(uniform(5, Purpose::Initial, 9, i as u64) - 0.3)).collect();
             let loss = (&value * Tensor::from_vec(cotangent, value.shape())).sum();
             let gradients = loss.backward();
-            let by = [&grid.density, &grid.color].map(|p| gradients.array(p.tensor()).into_iter().collect::<Vec<T>>());
+            let by: Vec<(String, Vec<T>)> =
+                grid.params().map(|p| (format!("by {}", p.name()), gradients.array(p.tensor()).into_iter().collect())).collect();
             (value.data().to_vec(), by, rendered.sample_count)
         });
         assert_eq!(fused.2, graph.2, "{name}: numbers of samples");
-        for (what, d) in [
-            ("value", distance(&fused.0, &graph.0)),
-            ("by density", distance(&fused.1[0], &graph.1[0])),
-            ("by color", distance(&fused.1[1], &graph.1[1])),
-        ] {
+        let by = fused.1.iter().zip(&graph.1).map(|((what, fused), (_, graph))| (&what[..], distance(fused, graph)));
+        for (what, d) in [("value", distance(&fused.0, &graph.0))].into_iter().chain(by) {
             if d >= worst.0 {
                 worst = (d, format!("{name}, {what}"));
             }
@@ -83,7 +81,7 @@ fn rays_from_above(seed: u64, n: u64) -> Vec<Ray> {
         .collect()
 }
 
-/// A scene in which everything is drawn: resolution, look-up, colors, which voxels are there, spacing, jitter, rays.
+/// A scene in which everything is drawn: resolution, look-up, colors, how far harmonics are reduced, which voxels are there, spacing, jitter, rays.
 struct Scene<T: Real> {
     grid: VoxelGrid<T>,
     rays: Vec<Ray>,
@@ -102,20 +100,21 @@ impl<T: Real> Scene<T> {
             0 => Color::Rgb,
             d => Color::Sh { degree: d as usize - 1, offset: [0.0, 0.5][pick(3, 2) as usize] },
         };
-        let shape = GridShape { resolution, half_width: 0.7 + draw(4), interpolation, color };
+        let shape = GridShape { resolution, half_width: 0.7 + draw(4), interpolation, color, sh_reduction: 1 + pick(13, 4) as usize };
         let present = [1.0, 0.7, 0.15][pick(5, 3) as usize];
         let lattice = Lattice::bricks_where([resolution; 3], |[i, j, k]| {
             (i, j, k) == (0, 0, 0) || uniform(seed, Purpose::Initial, 3, ((i * 64 + j) * 64 + k) as u64) < present
         });
-        let table = |width: usize, stream: u64, low: f64, high: f64| {
+        let table = |lattice: &Lattice, width: usize, stream: u64, low: f64, high: f64| {
             let n = lattice.rows() * width;
             let values = (0..n as u64).map(|i| T::lit(low + (high - low) * uniform(seed, Purpose::Initial, stream, i))).collect();
             Tensor::from_vec(values, &[lattice.rows(), width])
         };
         // A third of the densities is below zero, and some matter is thick.
         let thick = [3.0, 60.0][pick(6, 2) as usize];
-        let (density, colors) = (table(1, 4, -0.5 * thick, thick), table(color.channels(), 5, -0.4, 0.9));
-        let grid = VoxelGrid::with_lattice(shape, lattice.clone(), density, colors);
+        let mut tables = vec![table(&lattice, 1, 4, -0.5 * thick, thick), table(&lattice, shape.color_width(), 5, -0.4, 0.9)];
+        tables.extend(shape.harmonics_lattice(&lattice).map(|lattice| table(&lattice, shape.harmonics_width(), 6, -0.4, 0.9)));
+        let grid = VoxelGrid::with_tables(shape, lattice, tables);
         let coordinate = |k: u64| 4.0 * draw(100 + k) - 2.0;
         let rays = (0..7)
             .map(|r| {
@@ -142,7 +141,8 @@ const BEYOND_THE_CACHES: [usize; 4] = [144, 92, 72, 60];
 #[test]
 fn rows_read_in_their_own_order_agree() {
     let color = Color::Sh { degree: 2, offset: 0.5 };
-    let shape = GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color };
+    let shape =
+        GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
     let full = VoxelGrid::<f64>::random(shape, 3.0, 0.3, 7);
     // A third of the voxels is missing, in every brick.
     let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
@@ -157,7 +157,7 @@ fn a_picture_shows_what_a_training_batch_shows() {
     // Training reads the colors of harmonics in the order of the table, pictures ray by ray.
     for (degree, resolution) in BEYOND_THE_CACHES.into_iter().enumerate() {
         let color = Color::Sh { degree, offset: 0.5 };
-        let shape = GridShape { resolution, half_width: 1.0, interpolation: Interpolation::Trilinear, color };
+        let shape = GridShape { resolution, half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
         let grid = VoxelGrid::<f64>::random(shape, 2.0, 0.3, 7);
         let rays = rays_from_above(4, 600);
         let options = options(grid.aabb(), Spacing::Step(0.03), Jitter::None, [1.0; 3]);
@@ -172,12 +172,16 @@ fn a_batch_too_large_to_be_kept_is_marched_again_chunk_by_chunk() {
     // Three chunks, the last one not full.
     let n = 70_000;
     let rays = rays_from_above(3, n);
-    for (interpolation, color) in [(Interpolation::Nearest, Color::Rgb), (Interpolation::Trilinear, Color::Sh { degree: 1, offset: 0.5 })] {
-        let full = VoxelGrid::<f64>::random(GridShape { resolution: 9, half_width: 1.0, interpolation, color }, 2.0, 1.0, 7);
+    let harmonics = Color::Sh { degree: 1, offset: 0.5 };
+    for (interpolation, color, sh_reduction) in
+        [(Interpolation::Nearest, Color::Rgb, 1), (Interpolation::Trilinear, harmonics, 1), (Interpolation::Trilinear, harmonics, 4)]
+    {
+        let shape = GridShape { resolution: 9, half_width: 1.0, interpolation, color, sh_reduction };
+        let full = VoxelGrid::<f64>::random(shape, 2.0, 1.0, 7);
         let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
         let options = options(grid.aabb(), Spacing::Step(0.9), Jitter::PerRay { seed: 1, step: 2 }, [0.2, 0.5, 0.9]);
         let (d, what) = worst(&grid, &rays, &options);
-        assert!(d < 1e-10, "{interpolation:?}, {color:?}: {what} is off by {d:e}");
+        assert!(d < 1e-10, "{shape:?}: {what} is off by {d:e}");
     }
 }
 
@@ -192,7 +196,7 @@ fn a_thousand_random_scenes_agree_in_f64() {
             (largest, place) = (d, format!("seed {seed}, {name}"));
         }
     }
-    println!("1000 random scenes in f64, 6 columns, values and gradients by both tables: worst relative error {largest:.1e} ({place})");
+    println!("1000 random scenes in f64, 6 columns, values and gradients by all tables: worst relative error {largest:.1e} ({place})");
 }
 
 #[test]
@@ -221,7 +225,7 @@ fn rays_of_every_kind_agree() {
     let with = |spacing| options(Aabb::cube(1.0), spacing, Jitter::None, [0.3, 0.6, 0.9]);
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
         for color in [Color::Rgb, Color::Sh { degree: 2, offset: 0.5 }] {
-            let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color };
+            let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color, sh_reduction: 1 };
             let rows = shape.full().rows();
             let opaque = |row: usize| if row == 21 { 1e4 } else { 0.0 };
             let cases: [(&str, VoxelGrid<f64>); 4] = [
@@ -253,7 +257,7 @@ fn second_derivatives_go_through_the_graph() {
     let tables = vec![support::numbers(&[64, 1], 0.2, 2.0, 21), support::numbers(&[64, 3 * sh::count(1)], -0.06, 0.06, 22)];
     let f = |x: &[Tensor<f64>]| {
         let options = options(Aabb::cube(1.0), Spacing::Step(0.23), Jitter::None, [1.0, 0.9, 0.8]);
-        let rendered = render(&support::grid_of(shape, &x[0], &x[1]), &support::rays(), &options);
+        let rendered = render(&support::grid_of(shape, x), &support::rays(), &options);
         rendered.rgb.square().sum() + rendered.depth().square().sum() + rendered.distortion().sum()
     };
     autograd::Gradcheck::new(f, tables).named("fused").order(2).run().unwrap_or_else(|e| panic!("{e}"));
@@ -268,7 +272,7 @@ fn gradients_of_rays_that_stop_are_those_of_what_they_render() {
             move |x: &[Tensor<f64>]| {
                 let options = options(Aabb::cube(1.0), Spacing::Step(0.23), Jitter::None, [1.0, 0.9, 0.8]);
                 let options = RenderOptions { stop_below, ..options };
-                let rendered = render(&support::grid_of(shape, &x[0], &x[1]), &support::rays(), &options);
+                let rendered = render(&support::grid_of(shape, x), &support::rays(), &options);
                 rendered.rgb.square().sum() + rendered.depth().square().sum() + rendered.distortion().sum()
             }
         };

@@ -33,18 +33,23 @@ fn shapes() -> Vec<(String, GridShape)> {
         for degree in 0..=sh::MAX_DEGREE {
             shapes.push((format!("{interpolation:?} SH {degree}"), shape(interpolation, Color::Sh { degree, offset: 0.5 })));
         }
+        for (degree, sh_reduction) in [(2, 2), (1, 3)] {
+            let whole = shape(interpolation, Color::Sh { degree, offset: 0.5 });
+            shapes.push((format!("{interpolation:?} SH {degree} for every {sh_reduction}"), GridShape { sh_reduction, ..whole }));
+        }
     }
     shapes
 }
 
-/// Density and color tables off every kink.
+/// Tables off every kink.
 fn tables(shape: &GridShape) -> Vec<ndarray::ArrayD<f64>> {
-    let channels = shape.color.channels();
     let color = match shape.color {
         Color::Rgb => numbers(&[64, 3], 0.1, 0.9, 22),
-        Color::Sh { .. } => numbers(&[64, channels], -0.06, 0.06, 22),
+        Color::Sh { .. } => numbers(&[64, shape.color_width()], -0.06, 0.06, 22),
     };
-    vec![numbers(&[64, 1], 0.2, 2.0, 21), color]
+    let harmonics = shape.harmonics_lattice(&shape.full());
+    let harmonics = harmonics.map(|lattice| numbers(&[lattice.rows(), shape.harmonics_width()], -0.06, 0.06, 23));
+    [numbers(&[64, 1], 0.2, 2.0, 21), color].into_iter().chain(harmonics).collect()
 }
 
 type Column = fn(&Rendered<f64>) -> Tensor<f64>;
@@ -63,7 +68,7 @@ fn every_column_of_a_whole_render_agrees_with_finite_differences() {
     for (name, shape) in shapes() {
         for ((column, get), engine) in columns.into_iter().flat_map(|c| [(c, Engine::Graph), (c, Engine::Fused)]) {
             let options = RenderOptions { engine, ..options() };
-            let f = |x: &[Tensor<f64>]| get(&render(&grid_of(shape, &x[0], &x[1]), &rays(), &options));
+            let f = |x: &[Tensor<f64>]| get(&render(&grid_of(shape, x), &rays(), &options));
             let report =
                 Gradcheck::new(f, tables(&shape)).named(format!("{name}, {column}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));
             println!("| {name} | {engine:?} | {column} | 1, 2 | {:.1e} |", report.worst_relative_error);
@@ -77,12 +82,16 @@ fn every_loss_agrees_with_finite_differences() {
     for (render_name, shape) in [
         ("Nearest RGB", shape(Interpolation::Nearest, Color::Rgb)),
         ("Trilinear SH 2", shape(Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 })),
+        (
+            "Trilinear SH 2 for every 2",
+            GridShape { sh_reduction: 2, ..shape(Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 }) },
+        ),
     ] {
         for name in loss::NAMES {
             // A closure over what a step needs, with sampled cells at a fixed place.
             let objective = loss::Objective::<f64>::new().with_named(name, 1.0).expect("a loss of that name");
             let f = |x: &[Tensor<f64>]| {
-                let (grid, batch) = (grid_of(shape, &x[0], &x[1]), batch());
+                let (grid, batch) = (grid_of(shape, x), batch());
                 let rendered = render(&grid, &batch.rays, &options());
                 objective.evaluate(&Step { number: 3, seed: 4, batch: &batch, rendered: &rendered, grid: &grid }).0
             };
@@ -118,7 +127,7 @@ fn total_variation_over_all_cells_is_the_sampled_one_over_a_run_of_all() {
 
 #[test]
 fn the_kernel_of_total_variation_agrees_with_its_reference_in_both_precisions() {
-    for width in [1, 3, 4, 12, 27, 48] {
+    for width in [1, 3, 4, 9, 12, 24, 27, 45, 48] {
         for lattice in lattices() {
             let table = numbers(&[lattice.rows(), width], -1.0, 1.0, 33);
             check_kernel::<f64>(|x| loss::total_variation(&x[0], &lattice), [table.clone()], 1e-12).unwrap_or_else(|e| panic!("{e}"));
@@ -134,7 +143,7 @@ fn an_eikonal_penalty_is_differentiable_through_the_slope_of_the_density() {
     // Points off the planes through voxel centres, where the slope jumps.
     let points = numbers(&[40, 3], -0.72, 0.72, 41).mapv(|x| if ((x + 1.0) * 2.0 - 0.5).fract().abs() < 0.02 { x + 0.03 } else { x });
     let f = |x: &[Tensor<f64>]| {
-        let grid = grid_of(shape, &x[0], &Tensor::zeros(&[64, 3]));
+        let grid = grid_of(shape, &[x[0].clone(), Tensor::zeros(&[64, 3])]);
         let at = Tensor::variable(points.clone());
         let normal = &grad(&grid.density(&at).sum(), &[&at])[0];
         (normal.square().sum_axis(1).sqrt() - 1.0).square().mean()

@@ -31,18 +31,18 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     let file = PlyFile::open(Path::new(&cloud)).unwrap();
     assert_eq!(file.field_names(), ["opacity", "density", "weight", "object", "quality"]);
     assert!(file.header().remarks.contains(&"comment voxel_side 0.1875".to_owned()), "{:?}", file.header().remarks);
-    let read = file.cloud().unwrap();
-    assert!(read.len() > 50 && read.len() < 16 * 16 * 16 && read.positions.iter().all(|p| p.abs().max_element() < 1.5));
-    assert!(read.field("opacity").unwrap().iter().all(|a| (0.05..=1.0).contains(a)));
+    let places = file.positions().unwrap();
+    assert!(places.len() > 50 && places.len() < 16 * 16 * 16 && places.iter().all(|p| p.abs().max_element() < 1.5));
+    assert!(file.values("opacity").unwrap().iter().all(|a| (0.05..=1.0).contains(a)));
 
     // All voxels with density, then fewer and fewer.
     let all = folder.path("all.ply");
     plenoxel(&["export", "ply", &run, "-o", &all, "--min-alpha", "0", "--min-weight", "0", "--min-object", "0"]).done();
-    assert!(points(&all) > read.len());
+    assert!(points(&all) > file.len());
     let thin = folder.path("thin.ply");
     let recipe = ["--min-value", "2", "--noise-radius", "1.28", "--sor-neighbours", "6", "--sor-sigma", "0.2"];
     let said = plenoxel(&[&["export", "ply", &run, "-o", &thin], &recipe[..]].concat()).done();
-    assert!(["value", "noise", "sor"].iter().all(|step| said.contains(step)) && points(&thin) < read.len(), "{said}");
+    assert!(["value", "noise", "sor"].iter().all(|step| said.contains(step)) && points(&thin) < file.len(), "{said}");
     // The same filters on the file keep the same points: it says how large its voxels are.
     let again = folder.path("again.ply");
     plenoxel(&[&["filter", &cloud, "-o", &again], &recipe[..]].concat()).done();
@@ -66,7 +66,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     assert!(!Path::new(&cloud).exists(), "half an export");
     plenoxel(&["export", "ply", &run, "--min-weight", "0", "--min-object", "0", "--color", "mean"]).done();
     plenoxel(&["export", "ply", &run, "--data", &moved]).done();
-    assert_eq!(points(&cloud), read.len());
+    assert_eq!(points(&cloud), file.len());
 
     plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "no such run"]);
     plenoxel(&["export", "ply", &run, "--data", &moved, "-o", &folder.path("no/where.ply")]).refused(5, &["no/where.ply"]);

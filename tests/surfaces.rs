@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, HashMap};
 
 /// A trilinear grid of RGB colors in the cube ±1.5 whose density and color are functions of a voxel's centre.
 fn grid(resolution: usize, density: impl Fn(DVec3) -> f64, color: impl Fn(DVec3) -> [f64; 3]) -> VoxelGrid<f64> {
-    let shape = GridShape { resolution, half_width: 1.5, interpolation: Interpolation::Trilinear, color: Color::Rgb };
+    let shape = GridShape { resolution, half_width: 1.5, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
     let n = resolution;
     let centers: Vec<DVec3> = (0..n * n * n).map(|v| shape.center([v / (n * n), v / n % n, v % n].map(|k| k as isize))).collect();
     let densities = centers.iter().map(|&p| density(p)).collect();
@@ -22,7 +22,7 @@ fn grid(resolution: usize, density: impl Fn(DVec3) -> f64, color: impl Fn(DVec3)
 
 /// A sparse grid of opaque voxels, each with its own color.
 fn sparse(resolution: usize, voxels: &[([usize; 3], [u8; 3])]) -> VoxelGrid<f64> {
-    let shape = GridShape { resolution, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb };
+    let shape = GridShape { resolution, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
     let lattice = Lattice::bricks_where([resolution; 3], |node| voxels.iter().any(|(voxel, _)| *voxel == node));
     let rows = lattice.rows();
     let (mut density, mut color) = (vec![0.0; rows], vec![0.0; 3 * rows]);
@@ -151,7 +151,7 @@ fn a_ball_has_a_closed_outward_surface_of_its_volume_area_normals_and_colors() {
     // Density 50 on the sphere, falling by 100 per unit length: negative outside, as raw densities may be.
     let color = |p: DVec3| (p - center).to_array().map(|c| if c > 0.0 { 1.0 } else { 0.2 });
     let ball = grid(40, |p| 50.0 + 100.0 * (radius - p.distance(center)), color);
-    let surface = mesh(&ball, &MeshOptions { level: Some(50.0), direction: None }).unwrap();
+    let surface = mesh(&ball, &MeshOptions { level: Some(50.0), ..MeshOptions::default() }).unwrap();
     assert_closed(&surface);
     // V − E + F = 2 with E = 3 F / 2.
     assert_eq!(surface.positions.len() as i64 - surface.triangles.len() as i64 / 2, 2);
@@ -175,7 +175,7 @@ fn a_ball_has_a_closed_outward_surface_of_its_volume_area_normals_and_colors() {
 fn vertices_lie_where_the_density_has_the_level_in_world_coordinates() {
     // Density 10 + 20 x: 16 at x = 0.3. What is denser reaches the face of the box at 1.5.
     let half_space = grid(10, |p| 10.0 + 20.0 * p.x, |_| [0.5; 3]);
-    let surface = mesh(&half_space, &MeshOptions { level: Some(16.0), direction: None }).unwrap();
+    let surface = mesh(&half_space, &MeshOptions { level: Some(16.0), ..MeshOptions::default() }).unwrap();
     assert_closed(&surface);
     // Of 1.2 · 3 · 3, the four edges along x and the eight across are beveled by half a voxel: 28.8 · 0.15² / 2, less where they meet.
     assert!((10.8 - 0.324 - 0.01..10.8 - 0.25).contains(&surface.volume()), "{}", surface.volume());
@@ -191,10 +191,16 @@ fn vertices_lie_where_the_density_has_the_level_in_world_coordinates() {
 
 #[test]
 fn a_surface_through_noise_is_closed_and_the_same_for_any_number_of_threads() {
-    let shape = |interpolation| GridShape { resolution: 14, half_width: 1.0, interpolation, color: Color::Sh { degree: 1, offset: 0.5 } };
+    let shape = |interpolation| GridShape {
+        resolution: 14,
+        half_width: 1.0,
+        interpolation,
+        color: Color::Sh { degree: 1, offset: 0.5 },
+        sh_reduction: 1,
+    };
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
         let noise = VoxelGrid::<f32>::random(shape(interpolation), 1.0, 1.0, 11);
-        let options = MeshOptions { level: Some(0.6), direction: None };
+        let options = MeshOptions { level: Some(0.6), ..MeshOptions::default() };
         let surface = mesh(&noise, &options).unwrap();
         assert_closed(&surface);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
@@ -208,8 +214,13 @@ fn a_surface_through_noise_is_closed_and_the_same_for_any_number_of_threads() {
 #[test]
 fn harmonics_are_seen_against_the_normal_or_along_one_direction() {
     // Red grows along the direction of sight, from the coefficient of −x: c = 0.5 + 0.4886 · 0.5 · x.
-    let shape =
-        GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Sh { degree: 1, offset: 0.5 } };
+    let shape = GridShape {
+        resolution: 8,
+        half_width: 1.0,
+        interpolation: Interpolation::Nearest,
+        color: Color::Sh { degree: 1, offset: 0.5 },
+        sh_reduction: 1,
+    };
     let n = shape.voxels();
     let inside = |v: usize| [v / 64, v / 8 % 8, v % 8].iter().all(|k| (2..6).contains(k));
     let density = Tensor::from_vec((0..n).map(|v| if inside(v) { 100.0 } else { 0.0 }).collect(), &[n, 1]);
@@ -231,10 +242,27 @@ fn harmonics_are_seen_against_the_normal_or_along_one_direction() {
 }
 
 #[test]
+fn small_parts_are_left_out_and_the_others_are_as_they_were() {
+    let ball = |p: DVec3| 50.0 + 100.0 * (0.6 - p.length());
+    // Two voxels by themselves, with eight triangles each, and a ball.
+    let specks = [DVec3::new(1.21875, 1.21875, 0.28125), DVec3::new(-1.21875, 0.28125, 1.21875)];
+    let color = |p: DVec3| p.to_array().map(|c| 0.5 + c / 4.0);
+    let with_specks = grid(16, |p| if specks.iter().any(|speck| p.distance(*speck) < 1e-6) { 60.0 } else { ball(p) }, color);
+    let options = |min_part| MeshOptions { level: Some(50.0), min_part, ..MeshOptions::default() };
+    let [all, least, large] = [0, 8, 9].map(|min_part| mesh(&with_specks, &options(min_part)).unwrap());
+    assert_eq!(all, least);
+    assert_eq!(all.triangles.len(), large.triangles.len() + 2 * 8);
+    assert_closed(&large);
+    assert_eq!(large, mesh(&grid(16, ball, color), &options(0)).unwrap());
+    let error = mesh(&with_specks, &options(1 << 20)).unwrap_err();
+    assert!(error.exit_code() == 2 && error.to_string().contains(&format!("up to {}", large.triangles.len())), "{error}");
+}
+
+#[test]
 fn selections_that_hold_nothing_are_refused_with_what_would_do() {
     let thin = grid(4, |_| 0.1, |_| [0.0; 3]);
     for (level, part) in [(None, "below 0.1"), (Some(-1.0), "above 0"), (Some(f64::NAN), "above 0"), (Some(0.2), "below 0.1")] {
-        let error = mesh(&thin, &MeshOptions { level, direction: None }).unwrap_err();
+        let error = mesh(&thin, &MeshOptions { level, ..MeshOptions::default() }).unwrap_err();
         assert!(error.exit_code() == 2 && error.to_string().contains(part), "{error}");
     }
     for (min_alpha, part) in [(0.5, "smaller"), (1.0, "below 1"), (-0.1, "0 or more"), (f64::NAN, "0 or more")] {
@@ -248,7 +276,7 @@ fn selections_that_hold_nothing_are_refused_with_what_would_do() {
 #[test]
 fn mesh_files_hold_the_mesh() {
     let ball = grid(8, |p| 10.0 - 10.0 * p.length(), |_| [1.0, 0.5, 0.0]);
-    let surface = mesh(&ball, &MeshOptions { level: Some(4.0), direction: None }).unwrap();
+    let surface = mesh(&ball, &MeshOptions { level: Some(4.0), ..MeshOptions::default() }).unwrap();
     let (vertices, triangles) = (surface.positions.len(), surface.triangles.len());
 
     let ply = MeshFormat::Ply.encode(&surface, "test").unwrap();

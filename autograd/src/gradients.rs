@@ -347,7 +347,7 @@ mod tests {
             || Box::new(Adam::new(0.1, AdamMode::Dense)),
         ];
         // The widths that have loops of their own, and one that has not.
-        for (make, width) in optimizers.into_iter().flat_map(|make| [1, 2, 3, 27].map(|width| (make, width))) {
+        for (make, width) in optimizers.into_iter().flat_map(|make| [1, 2, 3, 24, 27].map(|width| (make, width))) {
             let run = |merge: bool| {
                 let mut param = Param::from_tensor("table", Tensor::full(&[1000, width], 0.5));
                 param.set_bounds(Bounds { low: 0.45, high: 0.55 });

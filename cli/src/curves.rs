@@ -228,6 +228,7 @@ mod tests {
             image_reduction: 1,
             density_rate: 1.0,
             color_rate: 1.0,
+            harmonics_rate: None,
             rate_decay: 1.0,
         };
         let planned = |(i, resolution)| PlannedStage { stage: stage(resolution), first: 50 * i as u64, steps: 50 };

@@ -82,7 +82,7 @@ impl Estimate {
         let saving = 2 * tables;
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
         let grid = tables + earlier + 2 * initial;
-        let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, or a lower sh_degree");
+        let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, a lower sh_degree, or a higher sh_reduction");
         let parts = [
             (images, ("downscale".to_owned(), "a larger factor, so that the images fit")),
             (step, ("rays_per_step".to_owned(), "fewer rays in a step")),
@@ -300,8 +300,12 @@ fn evaluation_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
 
 /// Rows that a step touches, with their gradients.
 fn touched_rows(shape: &GridShape, samples: u64) -> u64 {
-    let rows = (shape.voxels() as u64).min(8 * samples);
-    rows * 4 * (2 + shape.color.channels() as u64)
+    let of = |voxels: usize, numbers: usize| (voxels as u64).min(8 * samples) * 4 * numbers as u64;
+    let harmonics = match shape.is_reduced() {
+        true => of(shape.harmonics_resolution().pow(3), 1 + shape.harmonics_width()),
+        false => 0,
+    };
+    of(shape.voxels(), 2 + shape.color_width()) + harmonics
 }
 
 /// True if a loss looks at the whole grid, so that gradients are dense.

@@ -191,8 +191,8 @@ impl<'a> Carving<'a> {
     /// Finds the colors. `progress(passes)` is called after each pass over the pixels.
     pub fn color(&self, progress: &dyn Fn(usize)) -> Colored {
         let (config, lattice, rows) = (self.config, &self.lattice, self.lattice.rows());
-        // Colors are found for what one sees in the voxel that a point lies in, whatever training would do.
-        let shape = GridShape { interpolation: Interpolation::Nearest, ..config.grid_shape(config.carve.resolution) };
+        // Colors are found for what one sees in the voxel that a point lies in, and for each voxel by itself, whatever training would do.
+        let shape = GridShape { interpolation: Interpolation::Nearest, sh_reduction: 1, ..config.grid_shape(config.carve.resolution) };
         let density = config.carve.depth / shape.voxel_side();
         let opaque = Opaque::new(lattice, Aabb::cube(shape.half_width), density);
         let (degree, offset) = match shape.color {

@@ -2,13 +2,18 @@
 //!
 //! Of a grid with all its voxels, tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. Of a sparse one,
 //! `voxels` `[k]`, `u32`, ascending: those that are present, voxel (x, y, z) as the number (x n + y) n + z; and `density` `[k]` and `color`
-//! `[k, channels]` in that order. The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader
-//! must know. (One entry, for several would be written in a random order, and equal grids are to be equal files.)
+//! `[k, channels]` in that order. Where harmonics of degree 1 and more are reduced, a grid is written as a sparse one even if it has all its
+//! voxels, `color` is `[k, 3]`, the means, and the harmonics follow in the same manner: `harmonics_voxels` `[h]`, (x, y, z) of
+//! m = ⌈n / reduction⌉ voxels along an axis as the number (x m + y) m + z, and `harmonics` `[h, channels − 3]`.
+//!
+//! The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader must know. (One entry, for several
+//! would be written in a random order, and equal grids are to be equal files.)
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::files::write_atomically;
-use autograd::{Indices, Lattice, Real, Tensor};
+use autograd::{Indices, Lattice, Param, Real, Tensor};
+use safetensors::SafeTensorError;
 use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -20,21 +25,26 @@ use std::path::Path;
 pub const FORMAT: &str = "plenoxel 1";
 /// Version of the format of sparse grids.
 pub const SPARSE_FORMAT: &str = "plenoxel 2";
+/// Version of the format of grids whose harmonics are reduced.
+pub const REDUCED_FORMAT: &str = "plenoxel 3";
 /// Where a voxel's value sits and what it means, in words.
 pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; \
     sigma = max(0, density) after interpolation, per world length; \
     harmonics in the order and signs of svox2, blocks of R, G, B: \
     1, -y, z, -x, xy, -yz, 2zz-xx-yy, -xz, xx-yy, -y(3xx-yy), xyz, -y(4zz-xx-yy), z(2zz-3xx-3yy), -x(4zz-xx-yy), z(xx-yy), -x(xx-3yy), \
     orthonormal over the sphere; color = max(0, offset + sum)";
+/// What is said beside [`CONVENTION`] where harmonics are reduced.
+const REDUCED_CONVENTION: &str = "; `color` has the means of R, G, B alone; `harmonics` has those of degree 1 and more, in voxels whose sides are \
+    sh_reduction times as long and whose box begins at the same corner and may end beyond it; they are looked up as the other values are";
 /// Key of the metadata.
 const KEY: &str = "plenoxel";
 
 /// Everything about a checkpoint but its tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
-    /// [`FORMAT`] or [`SPARSE_FORMAT`].
+    /// [`FORMAT`], [`SPARSE_FORMAT`] or [`REDUCED_FORMAT`].
     pub format: String,
-    /// [`CONVENTION`], for a human reader.
+    /// [`CONVENTION`] and what else is to be known, for a human reader.
     pub convention: String,
     /// Shape of the grid.
     pub resolution: usize,
@@ -46,6 +56,9 @@ pub struct Header {
     pub sh_degree: Option<usize>,
     /// Color of zero coefficients.
     pub sh_offset: f64,
+    /// Harmonics of degree 1 and more are there for every so many voxels along each axis; not written where it is 1.
+    #[serde(default = "unreduced", skip_serializing_if = "is_unreduced")]
+    pub sh_reduction: usize,
     /// Color behind the scene it was trained with.
     pub background: [f32; 3],
     /// Grid world to dataset world, a row-major 4 × 4 matrix: the identity as long as grids live in the dataset's own frame.
@@ -60,6 +73,14 @@ pub struct Header {
     pub writer: String,
 }
 
+fn unreduced() -> usize {
+    1
+}
+
+fn is_unreduced(reduction: &usize) -> bool {
+    *reduction == 1
+}
+
 impl Header {
     /// The frame of the dataset itself.
     const IDENTITY: [[f64; 4]; 4] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
@@ -71,14 +92,20 @@ impl Header {
             Color::Rgb => (None, 0.0),
             Color::Sh { degree, offset } => (Some(degree), offset),
         };
+        let format = match (shape.is_reduced(), grid.lattice().is_full()) {
+            (true, _) => REDUCED_FORMAT,
+            (false, true) => FORMAT,
+            (false, false) => SPARSE_FORMAT,
+        };
         Header {
-            format: if grid.lattice().is_full() { FORMAT } else { SPARSE_FORMAT }.to_owned(),
-            convention: CONVENTION.to_owned(),
+            format: format.to_owned(),
+            convention: CONVENTION.to_owned() + if shape.is_reduced() { REDUCED_CONVENTION } else { "" },
             resolution: shape.resolution,
             half_width: shape.half_width,
             interpolation: shape.interpolation,
             sh_degree,
             sh_offset,
+            sh_reduction: shape.sh_reduction,
             background,
             scene_transform: Self::IDENTITY,
             scene: scene.to_owned(),
@@ -91,39 +118,44 @@ impl Header {
     /// Shape of the grid it describes.
     pub fn shape(&self) -> GridShape {
         let color = self.sh_degree.map_or(Color::Rgb, |degree| Color::Sh { degree, offset: self.sh_offset });
-        GridShape { resolution: self.resolution, half_width: self.half_width, interpolation: self.interpolation, color }
+        let Header { resolution, half_width, interpolation, sh_reduction, .. } = *self;
+        GridShape { resolution, half_width, interpolation, color, sh_reduction }
     }
 }
 
 /// Writes a grid, whole or not at all.
 pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Result<()> {
     let bytes = |table: &[T]| -> Vec<u8> { table.iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect() };
-    let (n, channels) = (header.resolution, grid.shape().color.channels());
+    let (n, channels) = (header.resolution, grid.shape().color_width());
     let defect = |e: &dyn std::fmt::Display| {
         Error::input(path, format!("the checkpoint cannot be put together ({e})"), "this is a defect of the program")
     };
-    let view = |dtype, shape: Vec<usize>, data| TensorView::new(dtype, shape, data).map_err(|e| defect(&e));
     let metadata = HashMap::from([(KEY.to_owned(), serde_json::to_string(header).map_err(|e| defect(&e))?)]);
-    let file = if grid.lattice().is_full() {
+    let mut arrays: Vec<(&str, Dtype, Vec<usize>, Vec<u8>)> = Vec::new();
+    if header.format == FORMAT {
         let [density, color] = grid.to_row_major().map(|table| bytes(table.data()));
-        let tensors =
-            [("density", view(Dtype::F32, vec![n, n, n], &density)?), ("color", view(Dtype::F32, vec![n, n, n, channels], &color)?)];
-        safetensors::serialize(tensors, Some(metadata))
+        arrays.push(("density", Dtype::F32, vec![n, n, n], density));
+        arrays.push(("color", Dtype::F32, vec![n, n, n, channels], color));
     } else {
-        let voxels = present(grid.lattice());
-        let rows: Vec<u32> = voxels.iter().filter_map(|&v| grid.lattice().row(node(v, n))).collect();
-        let listed = |table: &Tensor<T>| bytes(table.detach().gather_rows(&Indices::from(rows.clone())).data());
-        let (density, color) = (listed(grid.density.tensor()), listed(grid.color.tensor()));
-        let numbers: Vec<u8> = voxels.iter().flat_map(|v| v.to_le_bytes()).collect();
-        let k = voxels.len();
-        let tensors = [
-            ("voxels", view(Dtype::U32, vec![k], &numbers)?),
-            ("density", view(Dtype::F32, vec![k], &density)?),
-            ("color", view(Dtype::F32, vec![k, channels], &color)?),
-        ];
-        safetensors::serialize(tensors, Some(metadata))
-    };
-    write_atomically(path, &file.map_err(|e| defect(&e))?)
+        let mut list = |name: &'static str, lattice: &Lattice, tables: &[(&'static str, &Param<T>)]| {
+            let voxels = present(lattice);
+            let rows = Indices::from(rows_of(&voxels, lattice));
+            arrays.push((name, Dtype::U32, vec![voxels.len()], voxels.iter().flat_map(|v| v.to_le_bytes()).collect()));
+            for (name, table) in tables {
+                let width = table.shape()[1];
+                let shape = if *name == "density" { vec![voxels.len()] } else { vec![voxels.len(), width] };
+                arrays.push((name, Dtype::F32, shape, bytes(table.tensor().detach().gather_rows(&rows).data())));
+            }
+        };
+        list("voxels", grid.lattice(), &[("density", &grid.density), ("color", &grid.color)]);
+        if let (Some(table), Some(lattice)) = (&grid.harmonics, grid.harmonics_lattice()) {
+            list("harmonics_voxels", lattice, &[("harmonics", table)]);
+        }
+    }
+    let views = arrays.iter().map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)));
+    let views = views.collect::<std::result::Result<Vec<_>, SafeTensorError>>().map_err(|e| defect(&e))?;
+    let file = safetensors::serialize(views, Some(metadata)).map_err(|e| defect(&e))?;
+    write_atomically(path, &file)
 }
 
 /// The present voxels by number, ascending.
@@ -133,6 +165,11 @@ fn present(lattice: &Lattice) -> Vec<u32> {
         (0..lattice.rows() as u32).filter_map(|row| lattice.node(row)).map(|[x, y, z]| ((x * n + y) * n + z) as u32).collect();
     voxels.sort_unstable();
     voxels
+}
+
+/// The rows of voxels that are present, in the order of their numbers.
+fn rows_of(voxels: &[u32], lattice: &Lattice) -> Vec<u32> {
+    voxels.iter().filter_map(|&voxel| lattice.row(node(voxel, lattice.nodes()[0]))).collect()
 }
 
 /// The voxel of a number.
@@ -171,11 +208,11 @@ fn header_of(path: &Path, metadata: &Metadata) -> Result<Header> {
     // The version first: a later one may have other fields.
     let unreadable = |e: serde_json::Error| Error::input(path, format!("the header cannot be read ({e})"), RETRAIN);
     let format = serde_json::from_str::<serde_json::Value>(text).map_err(unreadable)?["format"].as_str().unwrap_or("none").to_owned();
-    if format != FORMAT && format != SPARSE_FORMAT {
+    if ![FORMAT, SPARSE_FORMAT, REDUCED_FORMAT].contains(&&format[..]) {
         return Err(Error::input(
             path,
             format!("format `{format}`"),
-            format!("this program reads `{FORMAT}` and `{SPARSE_FORMAT}`; use the version that wrote the file"),
+            format!("this program reads `{FORMAT}`, `{SPARSE_FORMAT}` and `{REDUCED_FORMAT}`; use the version that wrote the file"),
         ));
     }
     let header: Header = serde_json::from_str(text).map_err(unreadable)?;
@@ -187,7 +224,8 @@ fn header_of(path: &Path, metadata: &Metadata) -> Result<Header> {
             "this version reads grids whose scene_transform is the identity",
         ));
     }
-    if !((1..=1024).contains(&header.resolution) && degree_known && header.half_width > 0.0 && header.half_width.is_finite()) {
+    let reduced = (1..=1024).contains(&header.sh_reduction) && header.shape().is_reduced() == (format == REDUCED_FORMAT);
+    if !((1..=1024).contains(&header.resolution) && degree_known && reduced && header.half_width > 0.0 && header.half_width.is_finite()) {
         return Err(Error::input(path, "a header with impossible values", RETRAIN));
     }
     Ok(header)
@@ -223,21 +261,34 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
         let rows = values.len() / channels;
         Ok(Tensor::from_vec(values, &[rows, channels]))
     };
-    let channels = shape.color.channels();
+    let channels = shape.color_width();
     let grid = if header.format == FORMAT {
         VoxelGrid::from_row_major(shape, &table("density", 1, &[n, n, n])?, &table("color", channels, &[n, n, n, channels])?)
     } else {
-        let k = tensors.tensor("voxels").map_or(0, |view| view.shape().iter().product());
-        let voxels: Vec<u32> = words(read("voxels", Dtype::U32, &[k])?).into_iter().map(u32::from_le_bytes).collect();
-        if !voxels.is_sorted_by(|a, b| a < b) || voxels.last().is_none_or(|&last| last as usize >= n * n * n) {
-            return Err(Error::input(path, "a list of voxels that is empty, not ascending, or longer than the grid", RETRAIN));
-        }
-        let [density, color] = [table("density", 1, &[k])?, table("color", channels, &[k, channels])?];
+        let list = |name: &str, n: usize| -> Result<Vec<u32>> {
+            let k = tensors.tensor(name).map_or(0, |view| view.shape().iter().product());
+            let voxels: Vec<u32> = words(read(name, Dtype::U32, &[k])?).into_iter().map(u32::from_le_bytes).collect();
+            if !voxels.is_sorted_by(|a, b| a < b) || voxels.last().is_none_or(|&last| last as usize >= n * n * n) {
+                return Err(Error::input(path, "a list of voxels that is empty, not ascending, or longer than the grid", RETRAIN));
+            }
+            Ok(voxels)
+        };
+        let placed = |listed: Tensor<T>, voxels: &[u32], lattice: &Lattice| {
+            listed.scatter_rows(&Indices::from(rows_of(voxels, lattice)), lattice.rows())
+        };
+        let voxels = list("voxels", n)?;
+        let k = voxels.len();
         let lattice = Lattice::bricks_where([n; 3], |[x, y, z]| voxels.binary_search(&(((x * n + y) * n + z) as u32)).is_ok());
-        let rows: Vec<u32> = voxels.iter().filter_map(|&v| lattice.row(node(v, n))).collect();
-        let placed = |listed: Tensor<T>| listed.scatter_rows(&Indices::from(rows.clone()), lattice.rows());
-        let (density, color) = (placed(density), placed(color));
-        VoxelGrid::with_lattice(shape, lattice, density, color)
+        let fine = [table("density", 1, &[k])?, table("color", channels, &[k, channels])?];
+        let mut tables = fine.map(|table| placed(table, &voxels, &lattice)).to_vec();
+        if let Some(lattice) = shape.harmonics_lattice(&lattice) {
+            let (voxels, width) = (list("harmonics_voxels", shape.harmonics_resolution())?, shape.harmonics_width());
+            if voxels != present(&lattice) {
+                return Err(Error::input(path, "harmonics of other voxels than those around its own", RETRAIN));
+            }
+            tables.push(placed(table("harmonics", width, &[voxels.len(), width])?, &voxels, &lattice));
+        }
+        VoxelGrid::with_tables(shape, lattice, tables)
     };
     if !grid.is_finite() {
         return Err(Error::input(path, "numbers that are not finite", RETRAIN));

@@ -32,7 +32,7 @@ fn all<T: Real>(config: Config, views: &[View], options: &RenderOptions<'_>, pat
     let shape = config.grid_shape(4);
     let mut grid = VoxelGrid::<T>::uniform(shape, 1.0, 0.0).resample(3);
     grid = VoxelGrid::from_row_major(shape, &grid.to_row_major()[0], grid.color.tensor());
-    grid = grid.pruned(&grid.occupancy(0.0));
+    grid = grid.with_reduction(2).pruned(&grid.occupancy(0.0));
     let batch = RaySource::new(views, options.background, 0).batch::<T>(0, 1);
     let rendered = render(&grid, &batch.rays, options);
     let density = grid.density(&batch.target);

@@ -327,7 +327,9 @@ pub fn objective<T: Real>(config: &Config) -> Result<Objective<T>> {
 }
 
 fn optimizer<T: Real>(config: &Config, plan: &PlannedStage) -> Box<dyn Optimizer<T>> {
-    let rates = || Rates::new(0.0).with("density", rate(plan, plan.stage.density_rate)).with("color", rate(plan, plan.stage.color_rate));
+    let Stage { density_rate, color_rate, harmonics_rate, .. } = plan.stage;
+    let by_name = [("density", density_rate), ("color", color_rate), ("harmonics", harmonics_rate.unwrap_or(color_rate))];
+    let rates = || by_name.into_iter().fold(Rates::new(0.0), |rates, (name, start)| rates.with(name, rate(plan, start)));
     match config.optimizer {
         OptimizerConfig::Sgd => Box::new(Sgd::new(rates())),
         OptimizerConfig::Momentum { decay } => Box::new(Momentum::new(rates(), decay)),

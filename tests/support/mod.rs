@@ -28,13 +28,14 @@ pub fn tensor(shape: &[usize], low: f64, high: f64, seed: u64) -> Tensor<f64> {
 
 /// A grid of 4³ voxels in the cube ±1.
 pub fn shape(interpolation: Interpolation, color: Color) -> GridShape {
-    GridShape { resolution: 4, half_width: 1.0, interpolation, color }
+    GridShape { resolution: 4, half_width: 1.0, interpolation, color, sh_reduction: 1 }
 }
 
-/// A grid whose tables are given tensors, tracked or not, so that whole renders can be differentiated by their tables.
-pub fn grid_of<T: Real>(shape: GridShape, density: &Tensor<T>, color: &Tensor<T>) -> VoxelGrid<T> {
-    let mut grid = VoxelGrid::from_tables(shape, density.detach(), color.detach());
-    for (param, table) in [(&mut grid.density, density), (&mut grid.color, color)] {
+/// A grid with all voxels whose tables are given tensors, tracked or not, so that whole renders can be differentiated by their tables.
+pub fn grid_of<T: Real>(shape: GridShape, tables: &[Tensor<T>]) -> VoxelGrid<T> {
+    let mut grid = VoxelGrid::with_tables(shape, shape.full(), tables.iter().map(Tensor::detach).collect());
+    let params = [&mut grid.density, &mut grid.color].into_iter().chain(&mut grid.harmonics);
+    for (param, table) in params.zip(tables) {
         if table.is_tracked() {
             param.bind(table.clone());
         }

@@ -47,6 +47,7 @@ pub(crate) fn update_deferred<T: Real, const N: usize>(
             match width {
                 1 => update_touched::<T, N, 1, _>(x, width, sums, touched, &f),
                 3 => update_touched::<T, N, 3, _>(x, width, sums, touched, &f),
+                24 => update_touched::<T, N, 24, _>(x, width, sums, touched, &f),
                 27 => update_touched::<T, N, 27, _>(x, width, sums, touched, &f),
                 _ => update_touched::<T, N, 0, _>(x, width, sums, touched, &f),
             }

@@ -116,7 +116,14 @@ fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
     let n = shape.resolution;
     let color = match header.sh_degree {
         None => "RGB".to_owned(),
-        Some(degree) => format!("spherical harmonics of degree {degree}, offset {}", header.sh_offset),
+        Some(degree) => {
+            let means = if shape.is_reduced() {
+                format!(", all but the means for every {} voxels along an axis", shape.sh_reduction)
+            } else {
+                String::new()
+            };
+            format!("spherical harmonics of degree {degree}, offset {}{means}", header.sh_offset)
+        }
     };
     let density = grid.density.tensor().data();
     let (present, all) = (grid.lattice().present() as f64, shape.voxels() as f64);
@@ -124,13 +131,13 @@ fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
     let largest = density.iter().copied().fold(0.0, f32::max);
     vec![
         ("grid", format!("{n}³ voxels of side {:.5} in [-{w}, {w}]³", shape.voxel_side(), w = shape.half_width)),
-        ("convention", checkpoint::CONVENTION.to_owned()),
+        ("convention", header.convention.clone()),
         ("interpolation", format!("{:?}", shape.interpolation).to_lowercase()),
         ("color", color),
         ("stored", format!("{present} voxels, {:.1} % of the box", 100.0 * present / all)),
         ("density", format!("above 0 in {:.1} % of the box, at most {largest:.1} per unit length", 100.0 * matter)),
         ("background", format!("{:?}", header.background)),
-        ("memory", bytes((grid.lattice().rows() * shape.voxel_bytes()) as u64)),
+        ("memory", bytes(grid.params().map(|table| size_of_val(table.tensor().data()) as u64).sum())),
         ("trained", format!("{}, {}, seed {}, by {}", steps(header.step), header.scene, header.seed, header.writer)),
     ]
 }

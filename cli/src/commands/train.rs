@@ -208,8 +208,7 @@ fn evaluate(
 
 /// A grid with the values that `grid` has now: the tables are shared until training changes them.
 fn copy(grid: &VoxelGrid<f32>) -> VoxelGrid<f32> {
-    let (density, color) = (grid.density.tensor().detach(), grid.color.tensor().detach());
-    VoxelGrid::with_lattice(*grid.shape(), grid.lattice().clone(), density, color)
+    grid.with_density(grid.density.tensor().detach())
 }
 
 /// Final figures, in the order in which people look for them.

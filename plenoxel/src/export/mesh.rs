@@ -9,6 +9,7 @@
 //! memory is that of the grid, the mesh, and a few arrays of resolution².
 
 mod cases;
+mod parts;
 
 use super::{SURFACE_ALPHA, directions, near_colors};
 use crate::error::{Error, Result};
@@ -45,6 +46,8 @@ pub struct MeshOptions {
     pub level: Option<f64>,
     /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each vertex against its normal.
     pub direction: Option<DVec3>,
+    /// The least triangles of a part that is kept. Parts hang together by common vertices: specks are some, and so are the walls of hollows.
+    pub min_part: usize,
 }
 
 /// The surface on which the density of a grid has a level.
@@ -54,7 +57,7 @@ pub struct MeshOptions {
 ///
 /// The result does not depend on the number of threads.
 ///
-/// Errors: the level is not positive, or no voxel is denser.
+/// Errors: the level is not positive, or no voxel is denser; no part has so many triangles.
 pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh> {
     let shape = grid.shape();
     let level = options.level.unwrap_or_else(|| shape.density_of_alpha(SURFACE_ALPHA));
@@ -69,7 +72,7 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
         };
         return Err(Error::config("level", format!("{level:.4}"), accepted));
     }
-    let Surface { crossings, triangles } = surface(grid, level);
+    let Surface { crossings, triangles } = surface(grid, level).without_parts_below(options.min_part)?;
     let vertices = parallel::map_indices(crossings.len(), |v| crossings[v].vertex(grid, level));
     let rows: Vec<u32> = vertices.iter().map(|vertex| vertex.row).collect();
     let [points, normals] = [|v: &Vertex| v.position, |v: &Vertex| v.normal].map(|part| vertices.iter().map(part).collect::<Vec<_>>());

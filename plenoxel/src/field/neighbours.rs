@@ -8,7 +8,7 @@ pub(crate) fn smoothed<T: Real>(lattice: &Lattice, table: &[T], width: usize) ->
     parallel::for_each_rows(&mut out, width, |first, chunk| {
         for (r, out) in chunk.chunks_exact_mut(width).enumerate() {
             if let Some(voxel) = lattice.node((first + r) as u32) {
-                average(lattice, table, voxel, out);
+                average(lattice, table, voxel, |_| true, out);
             }
         }
     });
@@ -16,8 +16,8 @@ pub(crate) fn smoothed<T: Real>(lattice: &Lattice, table: &[T], width: usize) ->
 }
 
 /// The mean of the rows of a voxel and the 26 around it, as far as they are present, with the source paper's weights: 6 for the voxel itself, 1
-/// for a neighbour across a face, 1/√2 across an edge, 1/√3 across a corner. Zero if none is present.
-pub(crate) fn average<T: Real>(lattice: &Lattice, table: &[T], voxel: [usize; 3], out: &mut [T]) {
+/// for a neighbour across a face, 1/√2 across an edge, 1/√3 across a corner. Only rows that `counts` are taken in; zero if there is none.
+pub(crate) fn average<T: Real>(lattice: &Lattice, table: &[T], voxel: [usize; 3], counts: impl Fn(&[T]) -> bool, out: &mut [T]) {
     let (nodes, width) = (lattice.nodes(), out.len());
     let weights = [6.0, 1.0, 0.5_f64.sqrt(), (1.0_f64 / 3.0).sqrt()].map(T::lit);
     out.fill(T::zero());
@@ -28,10 +28,11 @@ pub(crate) fn average<T: Real>(lattice: &Lattice, table: &[T], voxel: [usize; 3]
         if (0..3).any(|a| around[a] >= nodes[a]) {
             continue;
         }
-        if let Some(row) = lattice.row(around) {
+        let row = lattice.row(around).map(|row| &table[row as usize * width..][..width]);
+        if let Some(row) = row.filter(|row| counts(row)) {
             let weight = weights[step.iter().filter(|s| **s != 1).count()];
             total += weight;
-            out.iter_mut().zip(&table[row as usize * width..][..width]).for_each(|(out, x)| *out += weight * *x);
+            out.iter_mut().zip(row).for_each(|(out, x)| *out += weight * *x);
         }
     }
     if total > T::zero() {

@@ -4,177 +4,75 @@
 //! its own, if it is present; one that is not has density and color 0 and takes no part in training. Nearest look-up takes the voxel a
 //! point lies in; trilinear look-up runs between centres, and in the outer half voxel repeats the border. Outside the box there is nothing.
 //! Values are stored raw and activated after interpolation: σ = max(0, density).
+//!
+//! How a color changes with the direction changes little from voxel to voxel. So harmonics of degree 1 and more may be stored for every f-th
+//! voxel along each axis only ([`GridShape::sh_reduction`]), which leaves 3 numbers of color in a voxel and is harder to overfit:
+//! c(x, d) = max(0, offset + Y₀ c₀(x) + Σ_{k≥1} Yₖ(d) cₖ(x)), where c₀ is read as density is, and cₖ the same way in a grid of ⌈n / f⌉³ voxels
+//! of side f · side with the same lowest corner. Its coordinates are (u + ½) / f − ½ of the voxel coordinates u.
 
 mod appearance;
+pub(crate) mod layout;
+mod recolor;
 mod reshape;
+mod shape;
 
-use super::{Field, Radiance, sh};
+use super::{Field, Radiance};
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
 use crate::render::{RenderOptions, Rendered, fused};
 use crate::sampling::{Occupancy, Samples};
 use autograd::lattice::{BRICK, BRICK_ROWS};
-use autograd::{Bounds, Buffer, Indices, Lattice, Module, Param, Real, Tensor, parallel};
-use glam::DVec3;
+use autograd::{Bounds, Buffer, Lattice, Module, Param, Real, Tensor, parallel};
+use layout::Layout;
 use reshape::moved;
-use serde::{Deserialize, Serialize};
+pub use shape::{Color, GridShape, Interpolation};
 
-/// How values between voxel centres are found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Interpolation {
-    /// The voxel the point lies in.
-    Nearest,
-    /// The eight voxel centres around the point.
-    Trilinear,
-}
-
-/// What a row of the color table means.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Color {
-    /// Red, green and blue, the same from everywhere.
-    Rgb,
-    /// Spherical harmonics, all coefficients of red, then green, then blue: c = max(0, offset + Σ Yₖ(d) cₖ).
-    Sh {
-        /// 0 to 3.
-        degree: usize,
-        /// The color of zero coefficients: 0.5 in svox2, 0 in the source paper.
-        offset: f64,
-    },
-}
-
-impl Color {
-    /// Numbers in a row of the color table.
-    pub fn channels(self) -> usize {
-        match self {
-            Color::Rgb => 3,
-            Color::Sh { degree, .. } => 3 * sh::count(degree),
-        }
-    }
-
-    /// Density and color of samples from the numbers looked up for them, `[m, 1]` and `[m, channels]`; `directions` are `[n, 3]`, and ray
-    /// r owns the samples `offsets[r]..offsets[r + 1]`.
-    pub fn activate<T: Real>(self, density: &Tensor<T>, color: &Tensor<T>, directions: &Tensor<T>, offsets: &Indices) -> Radiance<T> {
-        let m = density.shape()[0];
-        let sigma = density.reshape(&[m]).relu();
-        let rgb = self.shade(color, |degree| sh::basis(directions, degree).segment_repeat(offsets));
-        Radiance { sigma, rgb }
-    }
-
-    /// Colors `[m, 3]` of color numbers `[m, channels]`; `basis` gives the harmonics of a degree at the direction of each, `[m, count]`.
-    fn shade<T: Real>(self, color: &Tensor<T>, basis: impl FnOnce(usize) -> Tensor<T>) -> Tensor<T> {
-        let m = color.shape()[0];
-        match self {
-            Color::Rgb => color.clone(),
-            Color::Sh { degree, offset } => {
-                let count = sh::count(degree);
-                let sum = (color.reshape(&[m, 3, count]) * basis(degree).reshape(&[m, 1, count])).sum_axis(2);
-                (sum + offset).relu()
-            }
-        }
-    }
-}
-
-/// Shape and meaning of a grid.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct GridShape {
-    /// Voxels along each axis.
-    pub resolution: usize,
-    /// Half the side of the cube it fills, world length.
-    pub half_width: f64,
-    /// Look-up between centres.
-    pub interpolation: Interpolation,
-    /// Meaning of the color table.
-    pub color: Color,
-}
-
-impl GridShape {
-    /// The number of voxels.
-    pub fn voxels(&self) -> usize {
-        self.resolution.pow(3)
-    }
-
-    /// Side of a voxel, world length.
-    pub fn voxel_side(&self) -> f64 {
-        2.0 * self.half_width / self.resolution as f64
-    }
-
-    /// The share α of the light that a voxel of a raw density σ, 1 / world length, absorbs when it crosses it along an axis:
-    /// 1 − exp(−max(0, σ) side), in [0, 1].
-    pub fn alpha_of_density(&self, density: f64) -> f64 {
-        -(-density.max(0.0) * self.voxel_side()).exp_m1()
-    }
-
-    /// The density at which a voxel absorbs the share `alpha` of the light: −ln(1 − α) / side, 1 / world length.
-    pub fn density_of_alpha(&self, alpha: f64) -> f64 {
-        -(-alpha).ln_1p() / self.voxel_side()
-    }
-
-    /// World position of a voxel's centre. One outside of the grid has its place too.
-    pub fn center(&self, voxel: [isize; 3]) -> DVec3 {
-        DVec3::from(voxel.map(|k| (k as f64 + 0.5) * self.voxel_side() - self.half_width))
-    }
-
-    /// The layout with all voxels present.
-    pub fn full(&self) -> Lattice {
-        Lattice::bricks([self.resolution; 3])
-    }
-
-    /// The voxels in which a sample can read one of `voxels`: the same with nearest look-up, their neighbours too with trilinear.
-    pub fn reached_from(&self, voxels: &Occupancy) -> Occupancy {
-        voxels.dilated(usize::from(self.interpolation == Interpolation::Trilinear))
-    }
-
-    /// Bytes of a voxel in both tables, in `f32`.
-    pub fn voxel_bytes(&self) -> usize {
-        (1 + self.color.channels()) * size_of::<f32>()
-    }
-
-    /// Bytes of both tables in `f32`, all voxels being present.
-    pub fn bytes(&self) -> usize {
-        self.voxels() * self.voxel_bytes()
-    }
-}
-
-/// A grid with its two parameters, `density` `[rows, 1]` and `color` `[rows, channels]`.
+/// A grid with its parameters: `density` `[rows, 1]`, `color` `[rows, color_width]` and, where harmonics are reduced, `harmonics`
+/// `[rows of larger voxels, harmonics_width]`.
 #[derive(Debug)]
 pub struct VoxelGrid<T: Real> {
-    shape: GridShape,
-    lattice: Lattice,
+    layout: Layout,
     /// The voxels in which a sample can read a present one; `None` if that is everywhere.
     reach: Option<Occupancy>,
     /// Raw density; σ = max(0, ·) after interpolation, 1 / world length.
     pub density: Param<T>,
-    /// Colors or their harmonics.
+    /// Colors or their harmonics; of harmonics that are reduced, the means.
     pub color: Param<T>,
+    /// Harmonics of degree 1 and more, where they are reduced.
+    pub harmonics: Option<Param<T>>,
 }
 
 impl<T: Real> VoxelGrid<T> {
     /// A grid with the same density and the same color numbers everywhere.
     pub fn uniform(shape: GridShape, density: f64, color: f64) -> Self {
-        let rows = shape.full().rows();
-        Self::from_tables(shape, Tensor::full(&[rows, 1], density), Tensor::full(&[rows, shape.color.channels()], color))
+        Self::filled(shape, |table, shape| Tensor::full(&shape, [density, color, color][table]))
     }
 
     /// A grid of uniform random numbers: density in [0, `density`), colors in [0, `color`). A function of the seed.
     pub fn random(shape: GridShape, density: f64, color: f64, seed: u64) -> Self {
-        let rows = shape.full().rows();
-        let table = |step: u64, width: usize, scale: f64| {
+        Self::filled(shape, |table, [rows, width]| {
+            let scale = [density, color, color][table];
             let mut values = Buffer::stale(rows * width);
             parallel::for_each_chunk(&mut values, parallel::CHUNK, |start, chunk| {
                 for (i, v) in chunk.iter_mut().enumerate() {
-                    *v = T::lit(scale * uniform(seed, Purpose::Initial, step, (start + i) as u64));
+                    *v = T::lit(scale * uniform(seed, Purpose::Initial, table as u64, (start + i) as u64));
                 }
             });
             Tensor::from_buffer(values, &[rows, width])
-        };
-        Self::from_tables(shape, table(0, 1, density), table(1, shape.color.channels(), color))
+        })
+    }
+
+    /// A grid with all voxels from what `fill` makes of each table's number and shape.
+    fn filled(shape: GridShape, fill: impl Fn(usize, [usize; 2]) -> Tensor<T>) -> Self {
+        let layout = Layout::new(shape, shape.full());
+        let tables = layout.tables().into_iter().enumerate().map(|(table, shape)| fill(table, shape)).collect();
+        Self::assembled(layout, tables)
     }
 
     /// A grid with all voxels from its tables, whose rows are in the order of [`GridShape::full`].
     ///
-    /// Panics if they are not `[rows, 1]` and `[rows, channels]`.
+    /// Panics if they are not `[rows, 1]` and `[rows, channels]`, or if the shape's harmonics are reduced.
     #[track_caller]
     pub fn from_tables(shape: GridShape, density: Tensor<T>, color: Tensor<T>) -> Self {
         Self::with_lattice(shape, shape.full(), density, color)
@@ -182,23 +80,39 @@ impl<T: Real> VoxelGrid<T> {
 
     /// A grid with the voxels of a lattice.
     ///
-    /// Panics if the lattice is of another resolution or the tables do not have its rows.
+    /// Panics if the lattice is of another resolution, the tables do not have its rows, or the shape's harmonics are reduced.
     #[track_caller]
     pub fn with_lattice(shape: GridShape, lattice: Lattice, density: Tensor<T>, color: Tensor<T>) -> Self {
-        let rows = lattice.rows();
-        assert_eq!(lattice.nodes(), [shape.resolution; 3], "lattice of a grid of {}³ voxels", shape.resolution);
-        assert_eq!(density.shape(), [rows, 1], "density table of a grid of {}³ voxels", shape.resolution);
-        assert_eq!(color.shape(), [rows, shape.color.channels()], "color table of a grid of {}³ voxels", shape.resolution);
+        Self::with_tables(shape, lattice, vec![density, color])
+    }
+
+    /// A grid with the voxels of a lattice and all its tables: density, color and, if the shape's harmonics are reduced, these, whose rows are
+    /// those of [`GridShape::harmonics_lattice`].
+    ///
+    /// Panics if the lattice is of another resolution, or the tables are not as many or not of these shapes.
+    #[track_caller]
+    pub fn with_tables(shape: GridShape, lattice: Lattice, tables: Vec<Tensor<T>>) -> Self {
+        Self::assembled(Layout::new(shape, lattice), tables)
+    }
+
+    #[track_caller]
+    fn assembled(layout: Layout, tables: Vec<Tensor<T>>) -> Self {
+        let found: Vec<&[usize]> = tables.iter().map(Tensor::shape).collect();
+        assert_eq!(found, layout.tables(), "tables of a grid of {}³ voxels, with {:?}", layout.shape.resolution, layout.shape);
+        let lattice = &layout.lattice;
         let reach = (!lattice.is_full()).then(|| {
-            let present = Occupancy::from_masks(Aabb::cube(shape.half_width), lattice.nodes(), lattice.masks().to_vec());
-            shape.reached_from(&present)
+            let present = Occupancy::from_masks(Aabb::cube(layout.shape.half_width), lattice.nodes(), lattice.masks().to_vec());
+            layout.shape.reached_from(&present)
         });
-        VoxelGrid { shape, lattice, reach, density: Param::from_tensor("density", density), color: Param::from_tensor("color", color) }
+        let mut params = ["density", "color", "harmonics"].into_iter().zip(tables).map(|(name, table)| Param::from_tensor(name, table));
+        let (Some(density), Some(color)) = (params.next(), params.next()) else { unreachable!("every layout has two tables") };
+        let harmonics = params.next();
+        VoxelGrid { layout, reach, density, color, harmonics }
     }
 
     /// A grid with all voxels from tables in row-major order, voxel (i, j, k) being row (i·n + j)·n + k.
     ///
-    /// Panics if they are not `[n³, 1]` and `[n³, channels]`.
+    /// Panics if they are not `[n³, 1]` and `[n³, channels]`, or if the shape's harmonics are reduced.
     #[track_caller]
     pub fn from_row_major(shape: GridShape, density: &Tensor<T>, color: &Tensor<T>) -> Self {
         assert_eq!(density.shape(), [shape.voxels(), 1], "density table of a grid of {}³ voxels", shape.resolution);
@@ -208,44 +122,51 @@ impl<T: Real> VoxelGrid<T> {
         Self::from_tables(shape, moved(density, &row_major, &full), moved(color, &row_major, &full))
     }
 
-    /// Both tables in row-major order, with zeros for voxels that are not present: `[n³, 1]` and `[n³, channels]`.
+    /// Density and color in row-major order, with zeros for voxels that are not present: `[n³, 1]` and `[n³, color_width]`.
     pub fn to_row_major(&self) -> [Tensor<T>; 2] {
-        let row_major = Lattice::from(self.lattice.nodes());
-        [&self.density, &self.color].map(|table| moved(table.tensor(), &self.lattice, &row_major))
+        let row_major = Lattice::from(self.lattice().nodes());
+        [&self.density, &self.color].map(|table| moved(table.tensor(), self.lattice(), &row_major))
     }
 
     /// Shape and meaning.
     pub fn shape(&self) -> &GridShape {
-        &self.shape
+        &self.layout.shape
     }
 
     /// Which voxels are present, and their rows: what look-ups take.
     pub fn lattice(&self) -> &Lattice {
-        &self.lattice
+        &self.layout.lattice
+    }
+
+    /// The same for the harmonics, where they are reduced.
+    pub fn harmonics_lattice(&self) -> Option<&Lattice> {
+        self.layout.harmonics.as_ref()
+    }
+
+    pub(crate) fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// The parameters in the order of the tables: density, color, and harmonics where they are reduced.
+    pub fn params(&self) -> impl Iterator<Item = &Param<T>> {
+        [&self.density, &self.color].into_iter().chain(&self.harmonics)
     }
 
     /// The box it fills.
     pub fn aabb(&self) -> Aabb {
-        Aabb::cube(self.shape.half_width)
+        Aabb::cube(self.shape().half_width)
     }
 
     /// World positions to voxel coordinates, in which centres are the integers: (p + half) / side − ½.
     pub fn world_to_voxels(&self, positions: &Tensor<T>) -> Tensor<T> {
-        let scale = 1.0 / self.shape.voxel_side();
-        positions.affine(scale, self.shape.half_width * scale - 0.5)
-    }
-
-    fn look_up(&self, table: &Param<T>, voxels: &Tensor<T>) -> Tensor<T> {
-        match self.shape.interpolation {
-            Interpolation::Nearest => table.tensor().nearest(voxels, &self.lattice),
-            Interpolation::Trilinear => table.tensor().trilinear(voxels, &self.lattice),
-        }
+        let scale = 1.0 / self.shape().voxel_side();
+        positions.affine(scale, self.shape().half_width * scale - 0.5)
     }
 
     /// Makes optimizers keep density >= 0, and RGB colors in [0, 1] (the source paper's projection; harmonics are free).
     pub fn project(&mut self) {
         self.density.set_bounds(Bounds { low: T::zero(), high: T::infinity() });
-        if self.shape.color == Color::Rgb {
+        if self.shape().color == Color::Rgb {
             self.color.set_bounds(Bounds { low: T::zero(), high: T::one() });
         }
     }
@@ -254,43 +175,42 @@ impl<T: Real> VoxelGrid<T> {
     /// `threshold`. With threshold 0, leaving out the samples elsewhere changes no rendered value.
     pub fn occupancy(&self, threshold: f64) -> Occupancy {
         let (density, threshold) = (self.density.tensor().data(), T::lit(threshold));
-        self.shape.reached_from(&self.voxels_where(|row| density[row] > threshold))
+        self.shape().reached_from(&self.voxels_where(|row| density[row] > threshold))
     }
 
     /// The present voxels whose rows `full` names.
     pub fn voxels_where(&self, full: impl Fn(usize) -> bool + Sync) -> Occupancy {
-        let mut masks = self.lattice.masks().to_vec();
-        let count = self.shape.resolution.div_ceil(BRICK);
+        let mut masks = self.lattice().masks().to_vec();
+        let count = self.shape().resolution.div_ceil(BRICK);
         parallel::for_each_chunk(&mut masks, 256, |first, chunk| {
             for (b, mask) in chunk.iter_mut().enumerate() {
                 let b = first + b;
-                if let Some((brick, present)) = self.lattice.brick([b / (count * count), b / count % count, b % count]) {
+                if let Some((brick, present)) = self.lattice().brick([b / (count * count), b / count % count, b % count]) {
                     *mask = (0..BRICK_ROWS)
                         .filter(|bit| present >> bit & 1 == 1 && full(brick * BRICK_ROWS + bit))
                         .fold(0, |m, bit| m | 1 << bit);
                 }
             }
         });
-        Occupancy::from_masks(self.aabb(), self.lattice.nodes(), masks)
+        Occupancy::from_masks(self.aabb(), self.lattice().nodes(), masks)
     }
 
     /// True if every stored number is finite.
     pub fn is_finite(&self) -> bool {
-        [&self.density, &self.color]
-            .iter()
-            .all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
+        self.params().all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
     }
 }
 
 impl<T: Real> Field<T> for VoxelGrid<T> {
     fn density(&self, positions: &Tensor<T>) -> Tensor<T> {
-        self.look_up(&self.density, &self.world_to_voxels(positions)).reshape(&[positions.shape()[0]]).relu()
+        self.layout.look_up(self.density.tensor(), &self.world_to_voxels(positions)).reshape(&[positions.shape()[0]]).relu()
     }
 
     fn radiance(&self, samples: &Samples<T>) -> Radiance<T> {
         let voxels = self.world_to_voxels(&samples.positions);
-        let (density, color) = (self.look_up(&self.density, &voxels), self.look_up(&self.color, &voxels));
-        self.shape.color.activate(&density, &color, &samples.directions, &samples.offsets)
+        let [density, color] = [&self.density, &self.color].map(|table| self.layout.look_up(table.tensor(), &voxels));
+        let color = self.layout.whole_colors(color, self.harmonics.as_ref().map(Param::tensor), &voxels);
+        self.shape().color.activate(&density, &color, &samples.directions, &samples.offsets)
     }
 
     fn reach(&self) -> Option<&Occupancy> {
@@ -304,12 +224,12 @@ impl<T: Real> Field<T> for VoxelGrid<T> {
 
 impl<T: Real> Module<T> for VoxelGrid<T> {
     fn visit(&self, f: &mut dyn FnMut(&Param<T>)) {
-        f(&self.density);
-        f(&self.color);
+        self.params().for_each(f);
     }
 
     fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>)) {
         f(&mut self.density);
         f(&mut self.color);
+        self.harmonics.iter_mut().for_each(f);
     }
 }

@@ -27,16 +27,24 @@ impl Cells {
 
 /// Total variation of the density.
 pub fn tv_density<T: Real>(cells: Cells) -> impl Fn(&Step<'_, T>) -> Tensor<T> + Send + Sync {
-    move |step| tv(step, &step.grid.density, cells, 0)
+    move |step| tv(step, &step.grid.density, step.grid.lattice(), cells, 0)
 }
 
-/// Total variation of the colors or their harmonics.
+/// Total variation of the colors or their harmonics: the mean over all their channels, each in the cells of its own table.
 pub fn tv_color<T: Real>(cells: Cells) -> impl Fn(&Step<'_, T>) -> Tensor<T> + Send + Sync {
-    move |step| tv(step, &step.grid.color, cells, 1)
+    move |step| {
+        let (grid, color) = (step.grid, tv(step, &step.grid.color, step.grid.lattice(), cells, 1));
+        match (&grid.harmonics, grid.harmonics_lattice()) {
+            (Some(table), Some(lattice)) => {
+                let share = grid.shape().harmonics_width() as f64 / grid.shape().color.channels() as f64;
+                (1.0 - share) * color + share * tv(step, table, lattice, cells, 2)
+            }
+            _ => color,
+        }
+    }
 }
 
-fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, cells: Cells, stream: u64) -> Tensor<T> {
-    let lattice = step.grid.lattice();
+fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, lattice: &Lattice, cells: Cells, stream: u64) -> Tensor<T> {
     match cells {
         Cells::Whole => total_variation(table.tensor(), lattice),
         Cells::Share(share) => {
@@ -49,7 +57,7 @@ fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, cells: Cells, stream: u64) 
 }
 
 /// Total variation over all cells of a table `[rows, C]` in bricks: a scalar. A grid without cells has variation 0. The gradient is dense
-/// where there is a kernel, for the widths that grids have: C = 1, 3, 4, 12, 27, 48.
+/// where there is a kernel, for the widths that grids have: C = 1, 3, 4, 9, 12, 24, 27, 45, 48.
 ///
 /// Panics if the layout is row-major or the table does not have its rows.
 #[track_caller]
@@ -59,8 +67,11 @@ pub fn total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<
         1 => with_kernel::<T, 1, 4, 16>(table, lattice),
         3 => with_kernel::<T, 3, 12, 48>(table, lattice),
         4 => with_kernel::<T, 4, 16, 64>(table, lattice),
+        9 => with_kernel::<T, 9, 36, 144>(table, lattice),
         12 => with_kernel::<T, 12, 48, 192>(table, lattice),
+        24 => with_kernel::<T, 24, 96, 384>(table, lattice),
         27 => with_kernel::<T, 27, 108, 432>(table, lattice),
+        45 => with_kernel::<T, 45, 180, 720>(table, lattice),
         48 => with_kernel::<T, 48, 192, 768>(table, lattice),
         _ => sampled_total_variation(table, lattice, 0, lattice.rows()),
     }

@@ -1,8 +1,8 @@
 //! PLY files as others write them: text or binary of either byte order, with any properties in any order.
 //!
 //! A [`PlyFile`] keeps the bytes, so that [`PlyFile::chosen`] can write some of the points with everything the file says of them, whatever
-//! it may be, to the last digit; [`PlyFile::cloud`] is what this crate understands of it. Memory is bounded by the size of the file: a header
-//! that promises more than the file holds is refused before anything is allocated.
+//! it may be, to the last digit. Memory is bounded by the size of the file: a header that promises more than the file holds is refused before
+//! anything is allocated.
 //!
 //! (The crate `ply-rs-bw` was weighed. It refuses names such as `scalar_Coord._Z` and values such as `nan`, which CloudCompare writes.)
 
@@ -10,7 +10,6 @@ mod header;
 
 pub use header::{Element, Encoding, Header, Kind, Number, Property};
 
-use super::{PointCloud, ScalarField};
 use crate::error::{Error, Result};
 use glam::DVec3;
 use std::path::{Path, PathBuf};
@@ -129,28 +128,6 @@ impl PlyFile {
             return Err(Error::input(&self.path, found, format!("its scalar fields are [{}]", self.field_names().join(", "))));
         };
         self.in_single(property)
-    }
-
-    /// Coordinates, colors, normals and scalar fields. Colors are `red`, `green` and `blue`, also with `diffuse_` in front of them, or `r`,
-    /// `g` and `b`: whole numbers up to 255, or up to 65535, or floats from 0 to 1.
-    ///
-    /// Errors: something in a text is no number.
-    pub fn cloud(&self) -> Result<PointCloud> {
-        let three = |names: [&[&str]; 3]| -> Result<Option<Vec<[f64; 3]>>> {
-            let [Some(a), Some(b), Some(c)] = names.map(|names| self.property(names)) else { return Ok(None) };
-            let [a, b, c] = [self.column(a)?, self.column(b)?, self.column(c)?];
-            Ok(Some(a.into_iter().zip(b).zip(c).map(|((a, b), c)| [a, b, c]).collect()))
-        };
-        let scale = match self.property(COLORS[0]).map(|p| self.element().properties[p].kind) {
-            Some(Kind::Scalar(Number::F32 | Number::F64)) => 255.0,
-            Some(Kind::Scalar(Number::I16 | Number::U16 | Number::I32 | Number::U32)) => 1.0 / 257.0,
-            _ => 1.0,
-        };
-        let colors = three(COLORS)?.map(|colors| colors.into_iter().map(|c| c.map(|c| (c * scale).round() as u8)).collect());
-        let normals = three(NORMALS)?.map(|normals| normals.into_iter().map(|n| n.map(|n| n as f32)).collect());
-        let field =
-            |(number, p): (usize, &Property)| Ok(ScalarField { name: field_name(&p.name).to_owned(), values: self.in_single(number)? });
-        Ok(PointCloud { positions: self.positions()?, colors, normals, fields: self.fields().map(field).collect::<Result<_>>()? })
     }
 
     /// Elements besides the points, such as faces: they are not written again, for they name points by number.

@@ -26,15 +26,17 @@ mod adjoint;
 mod forward;
 mod lookup;
 mod places;
+mod reduced;
 mod seen;
 mod sorted;
 
 use super::{RenderOptions, Rendered, composite, composite::Rest};
 use crate::camera::Ray;
-use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::field::voxel_grid::layout::Layout;
+use crate::field::voxel_grid::{Color, VoxelGrid};
 use crate::field::{Field, sh};
 use crate::sampling::{Occupancy, Samples};
-use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Param, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
 use forward::{Block, Scene};
 pub use seen::{Seen, largest_weights, seen};
 use std::sync::Arc;
@@ -62,8 +64,7 @@ mod column {
 /// What all blocks of a batch share.
 #[derive(Debug)]
 struct Batch<T: Real> {
-    shape: GridShape,
-    lattice: Lattice,
+    layout: Layout,
     background: [T; 3],
     /// `[n, 3]`
     directions: Tensor<T>,
@@ -99,8 +100,8 @@ pub(crate) struct Columns<T: Real> {
     /// `[n, COLUMNS]`
     pixels: Tensor<T>,
     state: Arc<State<T>>,
-    /// Density and color.
-    tables: [Tensor<T>; 2],
+    /// Those of the grid.
+    tables: Vec<Tensor<T>>,
 }
 
 impl<T: Real> Columns<T> {
@@ -114,10 +115,14 @@ impl<T: Real> Columns<T> {
 
     pub(crate) fn sparsity(&self) -> Tensor<T> {
         let n = self.pixels.shape()[0];
-        let [density, color] = &self.tables;
         let mut values = Vec::with_capacity(n);
-        self.state.for_each_chunk([density, color], |blocks| values.extend(blocks.iter().flat_map(Block::sparsity)));
-        Tensor::from_kernel(values.into(), &[n], &[density, color], Fused { state: self.state.clone(), output: Output::Sparsity })
+        self.state.for_each_chunk(&self.tables, |blocks| values.extend(blocks.iter().flat_map(Block::sparsity)));
+        Tensor::from_kernel(
+            values.into(),
+            &[n],
+            &self.tables.iter().collect::<Vec<_>>(),
+            Fused { state: self.state.clone(), output: Output::Sparsity },
+        )
     }
 }
 
@@ -130,12 +135,17 @@ impl<T: Real> Batch<T> {
             Color::Sh { degree, .. } => no_grad(|| sh::basis(&directions, degree)),
         };
         let background = options.background.map(|c| T::lit(f64::from(c)));
-        Batch { shape: *grid.shape(), lattice: grid.lattice().clone(), background, directions, basis }
+        Batch { layout: grid.layout().clone(), background, directions, basis }
+    }
+
+    /// Harmonics of a channel in a row of the color table; 0 if its three numbers are colors, or means whose harmonics are reduced.
+    fn harmonics(&self) -> usize {
+        let shape = &self.layout.shape;
+        if shape.color == Color::Rgb || shape.is_reduced() { 0 } else { shape.color_width() / 3 }
     }
 
     fn scene<'a>(&'a self, grid: &'a VoxelGrid<T>, rays: &'a [Ray], options: &'a RenderOptions<'a>) -> Scene<'a, T> {
-        let tables = [&grid.density, &grid.color].map(|table| table.tensor().data());
-        Scene { batch: self, rays, options, cells: options.occupancy.or(Field::<T>::reach(grid)), tables }
+        Scene::new(self, rays, options, options.occupancy.or(Field::<T>::reach(grid)), grid.params().map(Param::tensor))
     }
 }
 
@@ -154,7 +164,7 @@ impl<T: Real> Scene<'_, T> {
 pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let n = rays.len();
     let batch = Batch::new(grid, rays, options);
-    let tables = [grid.density.tensor(), grid.color.tensor()];
+    let tables: Vec<&Tensor<T>> = grid.params().map(Param::tensor).collect();
     let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording() && n <= CHUNK;
     let mut pixels = Buffer::stale(n * COLUMNS);
     let scene = batch.scene(grid, rays, options);
@@ -177,7 +187,7 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
         opacity: pixels.index_axis(1, column::OPACITY),
         log_transmittance: pixels.index_axis(1, column::LOG_TRANSMITTANCE),
         sample_count,
-        rest: Rest::Fused(Columns { pixels, state, tables: tables.map(Clone::clone) }),
+        rest: Rest::Fused(Columns { pixels, state, tables: tables.into_iter().cloned().collect() }),
     }
 }
 
@@ -190,7 +200,7 @@ enum Output {
     Sparsity,
 }
 
-/// A function of the density and the color table.
+/// A function of the tables of a grid.
 #[derive(Debug)]
 struct Fused<T: Real> {
     state: Arc<State<T>>,
@@ -203,7 +213,7 @@ impl<T: Real> Kernel<T> for Fused<T> {
     }
 
     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
-        let rendered = self.state.composite(&inputs[0], &inputs[1]);
+        let rendered = self.state.composite(inputs);
         match self.output {
             Output::Sparsity => rendered.sparsity(),
             Output::Pixels => {
@@ -222,10 +232,12 @@ impl<T: Real> Kernel<T> for Fused<T> {
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
         let later = matches!(self.state.kept, Kept::Samples(_));
-        self.state.for_each_chunk([&call.input(0), &call.input(1)], |blocks| {
-            let sums = Arc::new(adjoint::Sums::new(&self.state.batch, blocks, call.cotangent(), self.output));
+        let batch = &self.state.batch;
+        let tables: Vec<Tensor<T>> = (0..batch.layout.tables().len()).map(|input| call.input(input)).collect();
+        self.state.for_each_chunk(&tables, |blocks| {
+            let sums = Arc::new(adjoint::Sums::new(batch, blocks, call.cotangent(), self.output));
             let rows = |input: usize, sums: Arc<dyn RowSums<T>>| {
-                let rows = RowSparse::deferred(call.input(input).shape(), sums);
+                let rows = RowSparse::deferred(tables[input].shape(), sums);
                 if later { rows } else { rows.added_up() }
             };
             if call.needs(0) {
@@ -234,18 +246,21 @@ impl<T: Real> Kernel<T> for Fused<T> {
             if call.needs(1) {
                 out.rows(1, rows(1, Arc::new(adjoint::ColorSums(sums))));
             }
+            if let Some(lattice) = batch.layout.harmonics.as_ref().filter(|_| call.needs(2) && self.output == Output::Pixels) {
+                out.rows(2, rows(2, reduced::sums(batch, lattice, blocks, call.cotangent())));
+            }
         });
     }
 }
 
 impl<T: Real> State<T> {
     /// Calls `f` with the samples of one chunk of rays after the other, in the order of the rays.
-    fn for_each_chunk(&self, tables: [&Tensor<T>; 2], mut f: impl FnMut(&[Block<T>])) {
+    fn for_each_chunk(&self, tables: &[Tensor<T>], mut f: impl FnMut(&[Block<T>])) {
         match &self.kept {
             Kept::Samples(blocks) => f(blocks),
             Kept::Rays(again) => {
                 let Rays { rays, options, cells } = &**again;
-                let scene = Scene { batch: &self.batch, rays, options, cells: cells.as_ref(), tables: tables.map(|table| table.data()) };
+                let scene = Scene::new(&self.batch, rays, options, cells.as_ref(), tables);
                 for first in (0..rays.len()).step_by(CHUNK) {
                     let mut pixels = Buffer::stale(CHUNK.min(rays.len() - first) * COLUMNS);
                     f(&scene.render_all(first, &mut pixels, true));
@@ -255,11 +270,11 @@ impl<T: Real> State<T> {
     }
 
     /// The same pixels as a graph of small ops.
-    fn composite(&self, density: &Tensor<T>, color: &Tensor<T>) -> Rendered<T> {
+    fn composite(&self, tables: &[Tensor<T>]) -> Rendered<T> {
         let batch = &self.batch;
         let mut offsets = vec![0u32];
         let mut columns: [Vec<T>; 5] = Default::default();
-        self.for_each_chunk([density, color], |blocks| {
+        self.for_each_chunk(tables, |blocks| {
             for block in blocks {
                 let [x, y, z] = &block.at;
                 for own in block.rays() {
@@ -275,11 +290,9 @@ impl<T: Real> State<T> {
         let m = columns[0].len();
         let [x, y, z, t, delta] = columns.map(|values| Tensor::from_vec(values, &[m]));
         let voxels = Tensor::stack(&[&x, &y, &z], 1);
-        let look_up = |table: &Tensor<T>| match batch.shape.interpolation {
-            Interpolation::Nearest => table.nearest(&voxels, &batch.lattice),
-            Interpolation::Trilinear => table.trilinear(&voxels, &batch.lattice),
-        };
-        let radiance = batch.shape.color.activate(&look_up(density), &look_up(color), &batch.directions, &offsets);
+        let [density, color] = [0, 1].map(|table: usize| batch.layout.look_up(&tables[table], &voxels));
+        let color = batch.layout.whole_colors(color, tables.get(2), &voxels);
+        let radiance = batch.layout.shape.color.activate(&density, &color, &batch.directions, &offsets);
         // The world is not needed any more.
         let samples = Samples { t, delta, positions: voxels, directions: batch.directions.clone(), offsets };
         composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))

@@ -33,6 +33,10 @@ pub struct Config {
     pub color: ColorKind,
     /// Degree of the harmonics, 0 to 3, where `color = "sh"`.
     pub sh_degree: usize,
+    /// Harmonics of degree 1 and more are stored for every so many voxels along each axis, the mean color for each; 1 for all coefficients in
+    /// every voxel. Where there are no such harmonics it means nothing, and carving finds all coefficients for each voxel.
+    #[serde(default = "one")]
+    pub sh_reduction: usize,
     /// Color of zero coefficients: 0.5 in svox2, 0 in the source paper.
     pub sh_offset: f64,
     /// What computes the pixels.
@@ -179,13 +183,16 @@ pub struct Stage {
     pub density_rate: f64,
     /// Learning rate of the colors, at the stage's start.
     pub color_rate: f64,
-    /// Both rates fall exponentially to this share of themselves at the stage's end; 1 keeps them.
+    /// Learning rate of harmonics that are reduced, at the stage's start; without it `color_rate`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub harmonics_rate: Option<f64>,
+    /// All rates fall exponentially to this share of themselves at the stage's end; 1 keeps them.
     #[serde(default = "one")]
     pub rate_decay: f64,
 }
 
-fn one() -> f64 {
-    1.0
+fn one<N: From<u8>>() -> N {
+    N::from(1)
 }
 
 fn whole() -> usize {
@@ -251,6 +258,7 @@ impl Default for Config {
             image_reduction: 1,
             density_rate,
             color_rate: 0.03,
+            harmonics_rate: None,
             rate_decay,
         };
         Config {
@@ -264,6 +272,7 @@ impl Default for Config {
             color: ColorKind::Sh,
             // svox2: degree 2, and zero coefficients are gray.
             sh_degree: 2,
+            sh_reduction: 1,
             sh_offset: 0.5,
             engine: Engine::Fused,
             stop_below: 0.0,
@@ -297,7 +306,8 @@ impl Config {
             ColorKind::Rgb => Color::Rgb,
             ColorKind::Sh => Color::Sh { degree: self.sh_degree, offset: self.sh_offset },
         };
-        GridShape { resolution, half_width: self.half_width, interpolation: self.interpolation, color }
+        let Config { half_width, interpolation, sh_reduction, .. } = *self;
+        GridShape { resolution, half_width, interpolation, color, sh_reduction }.normalised()
     }
 
     /// Checks that there is something to train.
@@ -317,6 +327,7 @@ impl Config {
         )?;
         positive("half_width", self.half_width)?;
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
+        check((1..=64).contains(&self.sh_reduction), "sh_reduction", self.sh_reduction, "1 to 64")?;
         check(self.sh_offset.is_finite(), "sh_offset", self.sh_offset, "a finite number")?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
         check((0.0..1.0).contains(&self.stop_below), "stop_below", self.stop_below, "a number in [0, 1)")?;
@@ -366,7 +377,9 @@ impl Config {
             let found = format!("epochs {:?}, steps {:?}", stage.epochs, stage.steps);
             check(length, &key("epochs"), found, "exactly one of `epochs`, above 0 to 1e6, and `steps`, 1 to 1e9")?;
             sampling(&key("sampling"), stage.sampling)?;
-            for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate)] {
+            let harmonics_rate = stage.harmonics_rate.unwrap_or(stage.color_rate);
+            for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate), ("harmonics_rate", harmonics_rate)]
+            {
                 check(rate == 0.0 || (1e-30..=1e30).contains(&rate), &key(name), rate, "0, or 1e-30 to 1e30")?;
             }
             check((1..=64).contains(&stage.image_reduction), &key("image_reduction"), stage.image_reduction, "1 to 64")?;

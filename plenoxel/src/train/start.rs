@@ -46,17 +46,18 @@ const DEPTH: f64 = 0.2;
 /// A carved grid that lets light through: as thin as training starts from it.
 pub fn thinned<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
     let density = grid.density.tensor().clamp(0.0, DEPTH / grid.shape().voxel_side());
-    VoxelGrid::with_lattice(*grid.shape(), grid.lattice().clone(), density, grid.color.tensor().clone())
+    grid.with_density(density)
 }
 
 /// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
 /// trilinear look-up will read them. The box stays that of the grid.
 pub fn adapted<T: Real>(grid: &VoxelGrid<T>, shape: &GridShape) -> VoxelGrid<T> {
-    let grid = grid.with_color(shape.color);
-    let grid = if grid.shape().resolution == shape.resolution { grid } else { grid.resample(shape.resolution) };
-    let grid = match shape.interpolation {
-        Interpolation::Nearest => grid,
-        Interpolation::Trilinear => grid.grown(),
-    };
-    grid.with_interpolation(shape.interpolation)
+    let same = grid.shape().resolution == shape.resolution;
+    let resampled = (!same).then(|| grid.resample(shape.resolution));
+    let grid = resampled.as_ref().unwrap_or(grid);
+    // Before colors change: zeros are then those of voxels that nobody saw.
+    let grown = (shape.interpolation == Interpolation::Trilinear).then(|| grid.grown());
+    let grid = grown.as_ref().unwrap_or(grid);
+    // Harmonics last, so that they are averaged over what training will see.
+    grid.with_color(shape.color).with_interpolation(shape.interpolation).with_reduction(shape.sh_reduction)
 }

@@ -1,7 +1,7 @@
 //! `plenoxel export mesh`: the surface of a trained run.
 
 use super::{Exported, Opened, SurfaceColors, ending};
-use crate::commands::{as_flag, number};
+use crate::commands::{as_flag, number, whole};
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::error::Result;
@@ -12,7 +12,7 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel export mesh runs/lego
   plenoxel export mesh runs/lego --format glb
-  plenoxel export mesh runs/lego --level 20 --out lego.obj
+  plenoxel export mesh runs/lego --level 20 --min-part 100 --out lego.obj
 
 Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the dataset's coordinates, z up. GLB files turn
 it, for glTF has y up. A higher level takes fog away, and thin parts with it.";
@@ -34,6 +34,10 @@ pub struct MeshArgs {
     /// Density on the surface, 1 / world length [default: where a voxel absorbs 30 % of the light that crosses it]
     #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE))]
     level: Option<f64>,
+
+    /// Leave out separate parts of fewer triangles than this: specks of fog, and hollows that nobody sees
+    #[arg(long, value_name = "FACES", help_heading = "Surface", default_value_t = MeshOptions::default().min_part, value_parser = whole::<usize>(0, u64::from(u32::MAX)))]
+    min_part: usize,
 }
 
 /// Writes the surface of a run.
@@ -41,7 +45,7 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
     let named = args.exported.out.as_deref().and_then(ending).and_then(|ending| ending.parse().ok());
     let format = args.format.or(named).unwrap_or(MeshFormat::Ply);
     let Opened { folder, grid, .. } = args.exported.open(console, &format.to_string())?;
-    let options = MeshOptions { level: args.level, direction: args.colors.direction() };
+    let options = MeshOptions { level: args.level, direction: args.colors.direction(), min_part: args.min_part };
     let surface = mesh(&grid, &options).map_err(as_flag)?;
     let bytes = format.encode(&surface, crate::PROGRAM).map_err(as_flag)?;
     let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes)?;

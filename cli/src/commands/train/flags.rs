@@ -94,6 +94,11 @@ pub struct TrainArgs {
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
     sh_degree: Option<i64>,
 
+    /// Store harmonics of degree 1 and more for every N-th voxel along each axis only, which takes less memory and time; 4 is a good start
+    /// [default: 1]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64))]
+    sh_reduction: Option<i64>,
+
     /// Start from the grid of this run, trained or carved, in its box; stages coarser than it are left out
     #[arg(long, value_name = "RUN", help_heading = "Training", value_hint = ValueHint::DirPath)]
     init_from: Option<PathBuf>,
@@ -158,6 +163,7 @@ impl TrainArgs {
             ("--interpolation", "interpolation", text(&self.interpolation)),
             ("--color", "color", color),
             ("--sh-degree", "sh_degree", integer(self.sh_degree)),
+            ("--sh-reduction", "sh_reduction", integer(self.sh_reduction)),
             ("--engine", "engine", text(&self.engine)),
             ("--init-from", "init_from", init_from),
             ("--hull", "hull", text(&self.hull)),

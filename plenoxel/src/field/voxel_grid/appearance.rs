@@ -13,13 +13,13 @@ impl<T: Real> VoxelGrid<T> {
     /// have density.
     pub fn voxels_absorbing(&self, min_alpha: f64) -> Occupancy {
         let density = self.density.tensor().data();
-        self.voxels_where(|row| density[row] > T::zero() && self.shape.alpha_of_density(density[row].as_f64()) >= min_alpha)
+        self.voxels_where(|row| density[row] > T::zero() && self.shape().alpha_of_density(density[row].as_f64()) >= min_alpha)
     }
 
     /// Raw density of a voxel, 1 / world length: 0 for one that is not present or lies outside of the grid.
     pub fn density_at(&self, voxel: [isize; 3]) -> f64 {
-        let inside = voxel.iter().all(|k| (0..self.shape.resolution as isize).contains(k));
-        let row = inside.then(|| self.lattice.row(voxel.map(|k| k as usize))).flatten();
+        let inside = voxel.iter().all(|k| (0..self.shape().resolution as isize).contains(k));
+        let row = inside.then(|| self.lattice().row(voxel.map(|k| k as usize))).flatten();
         row.map_or(0.0, |row| self.density.tensor().data()[row as usize].as_f64())
     }
 
@@ -34,7 +34,7 @@ impl<T: Real> VoxelGrid<T> {
         const SMOOTH: [f64; 3] = [1.0, 2.0, 1.0];
         let alpha: [f64; 27] = std::array::from_fn(|k| {
             let step = STRIDES.map(|stride| (k / stride % 3) as isize - 1);
-            self.shape.alpha_of_density(self.density_at([0, 1, 2].map(|axis| voxel[axis] + step[axis])))
+            self.shape().alpha_of_density(self.density_at([0, 1, 2].map(|axis| voxel[axis] + step[axis])))
         });
         let fall = |axis: usize| -> f64 {
             let [along, a, b] = [0, 1, 2].map(|k| STRIDES[(axis + k) % 3]);
@@ -59,12 +59,20 @@ impl<T: Real> VoxelGrid<T> {
             let m = rows.len();
             let directions = directions.iter().flat_map(|d| d.to_array().map(T::lit)).collect();
             let directions = Tensor::from_vec(directions, &[m, 3]);
-            let numbers = self.color.tensor().detach().gather_rows(&Indices::from(rows.to_vec()));
-            let rgb = no_grad(|| self.shape.color.shade(&numbers, |degree| crate::field::sh::basis(&directions, degree)));
+            let numbers = self.numbers_of(rows);
+            let rgb = no_grad(|| self.shape().color.shade(&numbers, |degree| crate::field::sh::basis(&directions, degree)));
             let rgb: Vec<[f64; 3]> = rgb.data().as_chunks::<3>().0.iter().map(|c| c.map(T::as_f64)).collect();
             rgb
         });
         colors.collect()
+    }
+
+    /// All numbers of the colors at the centres of the voxels of rows, `[rows, channels]`, something for rows of no voxel. A constant.
+    pub(super) fn numbers_of(&self, rows: &[u32]) -> Tensor<T> {
+        let color = self.color.tensor().detach().gather_rows(&Indices::from(rows.to_vec()));
+        let Some(harmonics) = &self.harmonics else { return color };
+        let centers = rows.iter().flat_map(|&row| self.lattice().node(row).unwrap_or_default().map(|k| T::lit(k as f64))).collect();
+        no_grad(|| self.layout().whole_colors(color, Some(harmonics.tensor()), &Tensor::from_vec(centers, &[rows.len(), 3])))
     }
 }
 
@@ -76,14 +84,20 @@ mod tests {
     use crate::random::{Purpose, uniform};
     use crate::sampling::Samples;
 
+    /// Harmonics are for every second voxel where there are any.
+    fn reduced(color: Color) -> GridShape {
+        GridShape { sh_reduction: 2, ..shape(color) }.normalised()
+    }
+
     fn shape(color: Color) -> GridShape {
-        GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color }
+        GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color, sh_reduction: 1 }
     }
 
     #[test]
     fn a_row_has_the_color_that_a_ray_finds_at_its_voxel() {
-        for color in [Color::Rgb, Color::Sh { degree: 2, offset: 0.5 }] {
-            let grid = VoxelGrid::<f64>::random(shape(color), 1.0, 1.0, 3);
+        let harmonics = Color::Sh { degree: 2, offset: 0.5 };
+        for shape in [shape(Color::Rgb), shape(harmonics), reduced(harmonics)] {
+            let grid = VoxelGrid::<f64>::random(shape, 1.0, 1.0, 3);
             let (voxel, direction) = ([2, 0, 3], DVec3::new(0.48, -0.6, 0.64));
             let samples = Samples {
                 t: Tensor::zeros(&[1]),

@@ -1,11 +1,14 @@
-//! The same field in another grid: another resolution, other voxels, another meaning of colors. Parameters get new identities, so an optimizer
+//! The same field in another grid: another resolution, other voxels, another look-up. Parameters get new identities, so an optimizer
 //! starts afresh.
+//!
+//! Harmonics that are reduced come along: where the new grid has them and the old one had none, they are the mean of those around.
 
-use super::{Color, GridShape, Interpolation, VoxelGrid};
-use crate::field::{neighbours, sh};
+use super::layout::{Layout, dilated};
+use super::{GridShape, Interpolation, VoxelGrid};
+use crate::field::neighbours;
 use crate::sampling::Occupancy;
 use autograd::ops::trilinear::nearest_node;
-use autograd::{Buffer, Lattice, Param, Real, Tensor, no_grad, parallel};
+use autograd::{Buffer, Lattice, Real, Tensor, no_grad, parallel};
 
 impl<T: Real> VoxelGrid<T> {
     /// The same field at another resolution: the old field read at the new centres, with the look-up that renders it. So a nearest grid
@@ -13,14 +16,14 @@ impl<T: Real> VoxelGrid<T> {
     /// quarter of an old voxel of the planes through old centres.
     /// A new voxel is present if it reads one that is.
     pub fn resample(&self, resolution: usize) -> Self {
-        let shape = GridShape { resolution, ..self.shape };
-        let ratio = self.shape.resolution as f64 / resolution as f64;
+        let shape = GridShape { resolution, ..*self.shape() };
+        let ratio = self.shape().resolution as f64 / resolution as f64;
         let center = |k: usize| (k as f64 + 0.5) * ratio - 0.5;
         let lattice = match &self.reach {
             None => shape.full(),
             Some(_) => {
-                let last = self.shape.resolution - 1;
-                let corners = |k: usize| match self.shape.interpolation {
+                let last = self.shape().resolution - 1;
+                let corners = |k: usize| match self.shape().interpolation {
                     Interpolation::Nearest => {
                         let [nearest, ..] = nearest_node([T::lit(center(k)); 3], [last + 1; 3]);
                         nearest as usize..nearest as usize + 1
@@ -31,13 +34,14 @@ impl<T: Real> VoxelGrid<T> {
                     }
                 };
                 Lattice::bricks_where([resolution; 3], |[i, j, k]| {
-                    corners(i).any(|a| corners(j).any(|b| corners(k).any(|c| self.lattice.row([a, b, c]).is_some())))
+                    corners(i).any(|a| corners(j).any(|b| corners(k).any(|c| self.lattice().row([a, b, c]).is_some())))
                 })
             }
         };
-        let table = |old: &Param<T>| {
-            let width = old.shape()[1];
-            let mut values = Buffer::stale(lattice.rows() * width);
+        let layout = Layout::new(shape, lattice);
+        let read = |table: &Tensor<T>, from: &Lattice, to: &Lattice| {
+            let width = table.shape()[1];
+            let mut values = Buffer::stale(to.rows() * width);
             // A run of rows at a time bounds the memory for positions.
             const RUN: usize = 1 << 16;
             for (run, part) in values.chunks_mut(RUN * width).enumerate() {
@@ -46,77 +50,69 @@ impl<T: Real> VoxelGrid<T> {
                 parallel::for_each_chunk(&mut at, 3 * 4096, |first, chunk| {
                     for (r, p) in chunk.as_chunks_mut::<3>().0.iter_mut().enumerate() {
                         let row = run * RUN + first / 3 + r;
-                        *p = lattice.node(row as u32).map_or([T::zero(); 3], |node| node.map(|k| T::lit(center(k))));
+                        *p = to.node(row as u32).map_or([T::zero(); 3], |node| node.map(|k| T::lit(center(k))));
                     }
                 });
-                let read = no_grad(|| self.look_up(old, &Tensor::from_buffer(at, &[rows, 3])));
+                let read = no_grad(|| shape.interpolation.look_up(table, &Tensor::from_buffer(at, &[rows, 3]), from));
                 parallel::copy(read.data(), part);
             }
-            Tensor::from_buffer(values, &[lattice.rows(), width])
+            Tensor::from_buffer(values, &[to.rows(), width])
         };
-        let (density, color) = (table(&self.density), table(&self.color));
-        Self::with_lattice(shape, lattice, density, color)
+        let mut tables =
+            vec![read(self.density.tensor(), self.lattice(), &layout.lattice), read(self.color.tensor(), self.lattice(), &layout.lattice)];
+        // The centres of the harmonics' voxels are scaled by the same ratio. Some lie beyond the old ones.
+        if let (Some(table), Some(from), Some(to)) = (&self.harmonics, self.harmonics_lattice(), &layout.harmonics) {
+            let wider = dilated(from);
+            tables.push(read(&spread(table.tensor(), from, &wider), &wider, to));
+        }
+        Self::assembled(layout, tables)
     }
 
     /// The same grid without the voxels outside of `kept`.
     ///
     /// Panics if `kept` has other cells than this grid has voxels.
     pub fn pruned(&self, kept: &Occupancy) -> Self {
-        assert_eq!(kept.cells(), self.lattice.nodes(), "pruned: occupancy of another grid");
-        let masks = kept.masks().iter().zip(self.lattice.masks()).map(|(kept, present)| kept & present).collect();
-        self.in_lattice(Lattice::from_masks(self.lattice.nodes(), masks))
+        assert_eq!(kept.cells(), self.lattice().nodes(), "pruned: occupancy of another grid");
+        let masks = kept.masks().iter().zip(self.lattice().masks()).map(|(kept, present)| kept & present).collect();
+        self.in_lattice(Lattice::from_masks(self.lattice().nodes(), masks))
     }
 
     /// The same grid with a layer of voxels around those that are present: without density, and of the mean color of the voxels that they
-    /// touch. So trilinear look-up at the border reads colors of the object and not of nothing.
+    /// touch. So trilinear look-up at the border reads colors of the object and not of nothing. Voxels whose color numbers are all 0, as those
+    /// that no pixel shows to carving, have no say where others have.
     pub fn grown(&self) -> Self {
-        let present = Occupancy::from_masks(self.aabb(), self.lattice.nodes(), self.lattice.masks().to_vec());
-        let mut grown = self.in_lattice(Lattice::from_masks(self.lattice.nodes(), present.dilated(1).masks().to_vec()));
-        let width = self.shape.color.channels();
-        let mut colors = Buffer::copy_of(grown.color.tensor().data());
-        parallel::for_each_rows(&mut colors, width, |first, chunk| {
-            for (r, color) in chunk.chunks_exact_mut(width).enumerate() {
-                if let Some(voxel) = grown.lattice.node((first + r) as u32).filter(|voxel| self.lattice.row(*voxel).is_none()) {
-                    neighbours::average(&self.lattice, self.color.tensor().data(), voxel, color);
-                }
-            }
-        });
-        let shape = colors.len() / width;
-        grown.color.replace(Tensor::from_buffer(colors, &[shape, width]));
-        grown
-    }
-
-    /// The same grid with colors of another kind. Harmonics that are left out are lost; colors that become harmonics look the same from
-    /// everywhere; harmonics that become colors are seen as the mean over all directions.
-    pub fn with_color(&self, color: Color) -> Self {
-        // Offset, factor of the mean, and numbers of a channel.
-        let kind = |color: Color| match color {
-            Color::Rgb => (0.0, 1.0, 1),
-            Color::Sh { degree, offset } => (offset, sh::Y0, sh::count(degree)),
-        };
-        let ((offset, factor, count), (new_offset, new_factor, new_count)) = (kind(self.shape.color), kind(color));
-        let (old, rows) = (self.color.tensor().data(), self.lattice.rows());
-        let mut table = Buffer::zeros(rows * 3 * new_count);
-        parallel::for_each_rows(&mut table, 3 * new_count, |first, chunk| {
-            for (new, old) in chunk.chunks_exact_mut(new_count).zip(old[3 * count * first..].chunks_exact(count)) {
-                let same = count.min(new_count);
-                new[..same].copy_from_slice(&old[..same]);
-                new[0] = (old[0] * T::lit(factor) + T::lit(offset - new_offset)) / T::lit(new_factor);
-            }
-        });
-        let shape = GridShape { color, ..self.shape };
-        Self::with_lattice(shape, self.lattice.clone(), self.density.tensor().detach(), Tensor::from_buffer(table, &[rows, 3 * new_count]))
+        let lattice = dilated(self.lattice());
+        let density = moved(self.density.tensor(), self.lattice(), &lattice);
+        let color = spread(self.color.tensor(), self.lattice(), &lattice);
+        self.with_voxels(*self.shape(), lattice, density, color)
     }
 
     /// The same numbers, looked up another way.
     pub fn with_interpolation(&self, interpolation: Interpolation) -> Self {
-        let shape = GridShape { interpolation, ..self.shape };
-        Self::with_lattice(shape, self.lattice.clone(), self.density.tensor().detach(), self.color.tensor().detach())
+        let shape = GridShape { interpolation, ..*self.shape() };
+        self.with_voxels(shape, self.lattice().clone(), self.density.tensor().detach(), self.color.tensor().detach())
     }
 
+    /// The same grid with other densities, `[rows, 1]`. The other tables are shared until somebody changes them.
+    pub fn with_density(&self, density: Tensor<T>) -> Self {
+        let tables = [density].into_iter().chain(self.params().skip(1).map(|table| table.tensor().detach())).collect();
+        Self::assembled(self.layout().clone(), tables)
+    }
+
+    /// The same grid with some of its voxels.
     fn in_lattice(&self, lattice: Lattice) -> Self {
-        let [density, color] = [&self.density, &self.color].map(|table| moved(table.tensor(), &self.lattice, &lattice));
-        Self::with_lattice(self.shape, lattice, density, color)
+        let [density, color] = [&self.density, &self.color].map(|table| moved(table.tensor(), self.lattice(), &lattice));
+        self.with_voxels(*self.shape(), lattice, density, color)
+    }
+
+    /// A grid of the same resolution and kind of colors with other voxels, or another look-up, and the harmonics of this one.
+    fn with_voxels(&self, shape: GridShape, lattice: Lattice, density: Tensor<T>, color: Tensor<T>) -> Self {
+        let layout = Layout::new(shape, lattice);
+        let mut tables = vec![density, color];
+        if let (Some(table), Some(from), Some(to)) = (&self.harmonics, self.harmonics_lattice(), &layout.harmonics) {
+            tables.push(spread(table.tensor(), from, to));
+        }
+        Self::assembled(layout, tables)
     }
 }
 
@@ -133,4 +129,52 @@ pub(super) fn moved<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) ->
         }
     });
     Tensor::from_buffer(values, &[to.rows(), width])
+}
+
+/// A table in another layout of the same grid, with the mean of the rows around where the old one has no node. Rows of zeros, which nobody
+/// gave numbers, have no say where others have.
+pub(super) fn spread<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) -> Tensor<T> {
+    let width = table.shape()[1];
+    let mut values = Buffer::copy_of(moved(table, from, to).data());
+    parallel::for_each_rows(&mut values, width, |first, chunk| {
+        for (r, row) in chunk.chunks_exact_mut(width).enumerate() {
+            if let Some(node) = to.node((first + r) as u32).filter(|node| from.row(*node).is_none()) {
+                neighbours::average(from, table.data(), node, |row| row.iter().any(|x| *x != T::zero()), row);
+            }
+        }
+    });
+    Tensor::from_buffer(values, &[to.rows(), width])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Color;
+    use super::*;
+
+    #[test]
+    fn the_layer_around_has_the_colors_of_what_it_touches_but_not_of_what_nobody_saw() {
+        let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
+        // Side by side two voxels with colors and one that no pixel showed; far from them another such.
+        let present = [[1, 1, 1], [1, 1, 2], [1, 1, 3], [6, 6, 6]];
+        let lattice = Lattice::bricks_where([8; 3], |voxel| present.contains(&voxel));
+        let mut color = vec![0.0; 3 * lattice.rows()];
+        for (voxel, rgb) in [(present[0], [0.2, 0.4, 0.6]), (present[1], [0.8, 0.0, 0.0])] {
+            let row = lattice.row(voxel).unwrap() as usize;
+            color[3 * row..3 * row + 3].copy_from_slice(&rgb);
+        }
+        let rows = lattice.rows();
+        let grid = VoxelGrid::<f64>::with_lattice(shape, lattice, Tensor::full(&[rows, 1], 5.0), Tensor::from_vec(color, &[rows, 3]));
+        let grown = grid.grown();
+        let color_at = |voxel: [usize; 3]| {
+            let row = grown.lattice().row(voxel).unwrap() as usize;
+            [0, 1, 2].map(|c| grown.color.tensor().data()[3 * row + c])
+        };
+        assert_eq!(grown.density_at([2, 1, 1]), 0.0);
+        assert_eq!(color_at([1, 1, 0]), [0.2, 0.4, 0.6]);
+        // It touches the second across an edge, and the third across a face.
+        let near = color_at([2, 1, 3]);
+        assert!((near[0] - 0.8).abs() < 1e-12 && near[1..] == [0.0; 2], "{near:?}");
+        // Nothing better is near; and what was there stays.
+        assert_eq!((color_at([1, 1, 4]), color_at([6, 6, 7]), color_at([1, 1, 3])), ([0.0; 3], [0.0; 3], [0.0; 3]));
+    }
 }

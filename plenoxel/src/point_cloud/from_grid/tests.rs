@@ -7,8 +7,13 @@ use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
 use autograd::Tensor;
 
-const SHAPE: GridShape =
-    GridShape { resolution: 8, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Sh { degree: 1, offset: 0.5 } };
+const SHAPE: GridShape = GridShape {
+    resolution: 8,
+    half_width: 2.0,
+    interpolation: Interpolation::Nearest,
+    color: Color::Sh { degree: 1, offset: 0.5 },
+    sh_reduction: 1,
+};
 
 /// A grid with the densities and coefficients that functions of a voxel name.
 fn grid(shape: GridShape, density: impl Fn([usize; 3]) -> f64, color: impl Fn([usize; 3], usize) -> f64) -> VoxelGrid<f64> {
@@ -137,6 +142,24 @@ fn colors_are_those_that_cameras_see_and_voxels_that_nobody_sees_are_left_out() 
         let of = |min_object: f64| Some(Visible { seen: &both, min_weight: 0.0, min_object });
         assert_eq!(points(&slab, &VoxelOptions { visible: of(0.5), ..options() }).len(), 64, "{interpolation:?}");
         assert_eq!(points(&slab, &VoxelOptions { visible: of(0.0), ..options() }).len(), 128);
+    }
+}
+
+#[test]
+fn reduced_harmonics_are_seen_as_whole_ones_are() {
+    for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+        // Means of all kinds, harmonics that are the same everywhere.
+        let whole = grid(
+            SHAPE.with(interpolation),
+            |[x, y, z]| ((x * 7 + y * 3 + z * 5) % 11) as f64 * 0.3,
+            |[x, y, z], c| if c % 4 == 0 { ((x + 2 * y + 3 * z) % 13) as f64 * 0.1 } else { 0.02 * c as f64 - 0.1 },
+        );
+        let [whole, reduced] =
+            [whole.with_reduction(1), whole.with_reduction(4)].map(|grid| seen(&grid, [(rays(1.0), vec![1.0; 64])], &look(&grid)));
+        assert!(whole.weight == reduced.weight && whole.color.iter().any(|c| c[0] > 0.1));
+        for (a, b) in whole.color.iter().flatten().zip(reduced.color.iter().flatten()) {
+            assert!((a - b).abs() < 1e-4, "{a} and {b}");
+        }
     }
 }
 

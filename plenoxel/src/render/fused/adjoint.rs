@@ -8,6 +8,7 @@
 
 use super::forward::Block;
 use super::{BUCKET_SHIFT, Batch, COLUMNS, Output, column};
+use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
 use autograd::lattice::NodeMap;
 use autograd::ops::trilinear::corners;
@@ -18,7 +19,8 @@ use std::sync::Arc;
 #[derive(Debug)]
 pub(super) struct Sums<T: Real> {
     lattice: Lattice,
-    color: Color,
+    /// Harmonics of a channel in a row of the color table, as [`Batch::harmonics`] counts them.
+    count: usize,
     /// `[n, (degree + 1)²]`
     basis: Tensor<T>,
     blocks: Vec<Records<T>>,
@@ -32,9 +34,9 @@ struct Records<T: Real> {
     at: At<T>,
     /// ∂L/∂density
     density: Buffer<T>,
-    /// ∂L/∂rgb of the sample, before the harmonics: three numbers a record.
+    /// ∂L/∂rgb of the sample, before the harmonics of its ray: three numbers a record. Where a row has none, what it adds to the row.
     color: Buffer<T>,
-    /// Number of the ray; empty for RGB.
+    /// Number of the ray; empty where rows have no harmonics.
     ray: Buffer<u32>,
 }
 
@@ -47,13 +49,13 @@ enum At<T: Real> {
 impl<T: Real> Sums<T> {
     /// From the cotangent of what a kernel computed.
     pub fn new(batch: &Batch<T>, blocks: &[Block<T>], cotangent: &Tensor<T>, output: Output) -> Self {
-        let buckets = batch.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
+        let buckets = batch.layout.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
         let blocks = parallel::map_indices(blocks.len(), |b| {
             let block = &blocks[b];
             let gradients = Gradients::new(batch, block, cotangent, output);
-            with_bricks!(batch.lattice, map => gradients.sorted(batch, block, map, buckets))
+            with_bricks!(batch.layout.lattice, map => gradients.sorted(batch, block, map, buckets))
         });
-        Sums { lattice: batch.lattice.clone(), color: batch.shape.color, basis: batch.basis.clone(), blocks }
+        Sums { lattice: batch.layout.lattice.clone(), count: batch.harmonics(), basis: batch.basis.clone(), blocks }
     }
 
     fn is_empty(&self, bucket: usize) -> bool {
@@ -100,7 +102,7 @@ impl<T: Real> Gradients<T> {
 
     /// Sorts what the samples whose density is not negative have by the buckets they read.
     fn sorted(&self, batch: &Batch<T>, block: &Block<T>, map: impl NodeMap, buckets: usize) -> Records<T> {
-        match batch.shape.interpolation {
+        match batch.layout.shape.interpolation {
             Interpolation::Nearest => {
                 let one = |i: usize| [block.rows[i] >> BUCKET_SHIFT];
                 let mut rows = Buffer::stale(block.len());
@@ -149,9 +151,10 @@ impl<T: Real> Gradients<T> {
             starts[b + 1] += starts[b];
         }
         let mut next = starts.clone();
-        let clamped = batch.shape.color != Color::Rgb;
+        let clamped = batch.layout.shape.color != Color::Rgb;
         let (mut density, mut color) = (Buffer::stale(most), Buffer::stale(3 * most));
-        let mut ray = Buffer::stale(if clamped { most } else { 0 });
+        let harmonic = batch.harmonics() > 0;
+        let mut ray = Buffer::stale(if harmonic { most } else { 0 });
         let to = color.as_chunks_mut::<3>().0;
         let colors = block.color.as_chunks::<3>().0;
         for (r, own) in block.rays().enumerate() {
@@ -162,12 +165,15 @@ impl<T: Real> Gradients<T> {
                 if clamped {
                     (0..3).filter(|&a| colors[i][a] < T::zero()).for_each(|a| c[a] = T::zero());
                 }
+                if clamped && !harmonic {
+                    c = c.map(|c| c * T::lit(sh::Y0));
+                }
                 for bucket in buckets_of(i).into_iter().take_while(|&b| b != NONE) {
                     let place = next[bucket as usize] as usize;
                     next[bucket as usize] += 1;
                     density[place] = self.sigma[i];
                     to[place] = c;
-                    if clamped {
+                    if harmonic {
                         ray[place] = (block.first + r) as u32;
                     }
                     put(place, i);
@@ -215,7 +221,7 @@ fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: std::ops::Rang
     let g_background = (0..3).map(|c| batch.background[c] * g[c]).sum::<T>() - g[column::OPACITY];
     let mut behind = block.after[last] * g_background + g[column::LOG_TRANSMITTANCE];
     let (rgb, _) = block.color.as_chunks::<3>();
-    let clamped = batch.shape.color != Color::Rgb;
+    let clamped = batch.layout.shape.color != Color::Rgb;
     // Sums over all samples, and over those behind, of w and of w t.
     let (mut all, mut all_t) = (T::zero(), T::zero());
     if g_distortion != T::zero() {
@@ -280,21 +286,19 @@ impl<T: Real> RowSums<T> for ColorSums<T> {
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        match self.0.color {
-            Color::Rgb => self.add_of_width::<3>(bucket, sums, touched),
-            Color::Sh { degree: 0, .. } => self.add_of_width::<3>(bucket, sums, touched),
-            Color::Sh { degree: 1, .. } => self.add_of_width::<12>(bucket, sums, touched),
-            Color::Sh { degree: 2, .. } => self.add_of_width::<27>(bucket, sums, touched),
-            Color::Sh { .. } => self.add_of_width::<48>(bucket, sums, touched),
+        match self.0.count {
+            0 | 1 => self.add_of_width::<3>(bucket, sums, touched),
+            4 => self.add_of_width::<12>(bucket, sums, touched),
+            9 => self.add_of_width::<27>(bucket, sums, touched),
+            _ => self.add_of_width::<48>(bucket, sums, touched),
         }
     }
 }
 
 impl<T: Real> ColorSums<T> {
     fn add_of_width<const W: usize>(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        let Sums { lattice, color, basis, .. } = &*self.0;
-        let count = W / 3;
-        let harmonic = *color != Color::Rgb;
+        let Sums { lattice, basis, count: harmonics, .. } = &*self.0;
+        let (count, harmonic) = (W / 3, *harmonics > 0);
         self.0.for_each(bucket, |records, range| {
             let colors = &records.color.as_chunks::<3>().0[range.clone()];
             let value = |i: usize| -> [T; W] {

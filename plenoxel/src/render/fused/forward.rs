@@ -8,7 +8,7 @@ use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
 use crate::sampling::{Occupancy, march};
 use autograd::lattice::NodeMap;
-use autograd::{Buffer, Real, parallel};
+use autograd::{Buffer, Real, Tensor, parallel};
 
 /// The samples of some rays, as far as the adjoint needs them. Arrays have one entry for each sample unless said otherwise.
 #[derive(Debug)]
@@ -68,11 +68,24 @@ pub(super) struct Scene<'a, T: Real> {
     pub rays: &'a [Ray],
     pub options: &'a RenderOptions<'a>,
     pub cells: Option<&'a Occupancy>,
-    /// Density and color.
-    pub tables: [&'a [T]; 2],
+    /// Density, color, and harmonics where they are reduced.
+    pub tables: [&'a [T]; 3],
 }
 
-impl<T: Real> Scene<'_, T> {
+impl<'a, T: Real> Scene<'a, T> {
+    /// Of a grid's tables.
+    pub fn new(
+        batch: &'a Batch<T>,
+        rays: &'a [Ray],
+        options: &'a RenderOptions<'a>,
+        cells: Option<&'a Occupancy>,
+        tables: impl IntoIterator<Item = &'a Tensor<T>>,
+    ) -> Self {
+        let mut scene = Scene { batch, rays, options, cells, tables: [&[]; 3] };
+        scene.tables.iter_mut().zip(tables).for_each(|(table, tensor)| *table = tensor.data());
+        scene
+    }
+
     /// Renders the rays from number `first` on, one for each [`COLUMNS`] of `pixels`.
     pub fn render(&self, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
         let (mut block, found) = self.weights(first, pixels.len() / COLUMNS);
@@ -87,19 +100,19 @@ impl<T: Real> Scene<'_, T> {
 
     /// The samples of `count` rays from number `first` on, all but their colors; with trilinear look-up also the rows that they read.
     pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
-        with_bricks!(self.batch.lattice, map => self.weights_with(map, first, count))
+        with_bricks!(self.batch.layout.lattice, map => self.weights_with(map, first, count))
     }
 
     fn weights_with(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let RenderOptions { aabb, spacing, jitter, stop_below, .. } = self.options;
         let stop = T::lit(*stop_below);
-        let trilinear = self.batch.shape.interpolation == Interpolation::Trilinear;
+        let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
         let mut block = Block { first, ..Block::empty() };
         let mut found = trilinear.then(Corners::none);
         let mut end = 0;
         for (r, ray) in self.rays[first..first + count].iter().enumerate() {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut places = Places::new(march, ray, self.cells, &self.batch.shape);
+            let mut places = Places::new(march, ray, self.cells, &self.batch.layout.shape);
             let mut left = T::one();
             // What lies behind the stop is never looked up: of a run in which it comes, the rest is dropped.
             while left >= stop {
@@ -161,21 +174,24 @@ impl<T: Real> Scene<'_, T> {
                 lookup::harmonics(self.tables[1], &block.offsets, directions, |i| corners.of(i), seen, out);
             }
         }
+        if let Some(lattice) = &self.batch.layout.harmonics {
+            self.add_harmonics(lattice, block, out);
+        }
         block.color = color;
     }
 
-    /// What harmonics need of the rays from number `first` on; `None` for plain colors.
+    /// What the harmonics in a row of the color table need of the rays from number `first` on; `None` if it has none.
     pub fn directions(&self, first: usize) -> Option<Directions<'_, T>> {
-        let Color::Sh { offset, .. } = self.batch.shape.color else { return None };
-        let count = self.batch.shape.color.channels() / 3;
-        Some(Directions { basis: &self.batch.basis.data()[first * count..], count, offset: T::lit(offset) })
+        let Color::Sh { offset, .. } = self.batch.layout.shape.color else { return None };
+        let count = self.batch.harmonics();
+        (count > 0).then(|| Directions { basis: &self.batch.basis.data()[first * count..], count, offset: T::lit(offset) })
     }
 
     /// Pixels from weights and colors.
     pub fn sum(&self, block: &Block<T>, pixels: &mut [T]) {
         let background = self.batch.background;
         let (rgb, _) = block.color.as_chunks::<3>();
-        let clamped = self.batch.shape.color != Color::Rgb;
+        let clamped = self.batch.layout.shape.color != Color::Rgb;
         let shown = |c: T| if clamped { c.max(T::zero()) } else { c };
         for (own, pixel) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0) {
             let (mut color, mut depth, mut opacity, mut optical_depth, mut distortion, mut moment) =

@@ -4,6 +4,9 @@ use autograd::lattice::NodeMap;
 use autograd::ops::trilinear::{TOGETHER, corners_of_many, nearest_node};
 use autograd::{Buffer, Real, dispatched, parallel};
 
+/// Numbers of a group of samples whose corners were found together.
+const GROUP: usize = 8 * TOGETHER;
+
 /// The eight rows around each of some samples, and their weights.
 pub(super) struct Corners<T: Real> {
     /// In groups of [`TOGETHER`] samples, corner by corner.
@@ -29,6 +32,16 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 }
 
 impl<T: Real> Corners<T> {
+    /// Those of `count` positions.
+    pub fn find(at: [&[T]; 3], map: impl NodeMap, count: usize) -> Self {
+        let end = count.div_ceil(TOGETHER) * GROUP;
+        let mut corners = Corners { rows: Buffer::stale(end), weights: Buffer::stale(end), end, places: Vec::new() };
+        let (rows, weights) = (corners.rows.as_chunks_mut().0.as_chunks_mut().0, corners.weights.as_chunks_mut().0.as_chunks_mut().0);
+        corners_of_many(at, map, rows, weights);
+        corners.places.extend((0..count).map(|i| (i / TOGETHER * GROUP + i % TOGETHER) as u32));
+        corners
+    }
+
     /// Of no samples.
     pub fn none() -> Self {
         Corners { rows: Buffer::stale(0), weights: Buffer::stale(0), end: 0, places: Vec::new() }
@@ -36,7 +49,6 @@ impl<T: Real> Corners<T> {
 
     /// Adds those of at most [`TOGETHER`] positions, and gives what a table of one column is there.
     pub fn push(&mut self, at: [&[T]; 3], map: impl NodeMap, table: &[T], values: &mut [T]) {
-        const GROUP: usize = 8 * TOGETHER;
         assert!(values.len() <= TOGETHER, "corners are found {TOGETHER} at a time");
         let first = self.end;
         self.end += GROUP;

@@ -1,10 +1,10 @@
 //! What rays see of each voxel: the largest weight, and the color.
 
-use super::{BLOCK, Batch};
+use super::{BLOCK, Batch, reduced};
 use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, VoxelGrid};
 use crate::render::RenderOptions;
-use autograd::{Real, parallel};
+use autograd::{Real, Tensor, parallel};
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 /// What photographs show of each row of a grid's tables. Each sample on a ray counts by its weight w, times the share that the row has in it;
@@ -24,7 +24,7 @@ pub struct Seen {
 pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Vec<f32> {
     let largest = Largest::new(grid.lattice().rows());
     for rays in batches {
-        for_each_sample(grid, &rays, options, 0.0, |sample| sample.reads().for_each(|(row, _)| largest.raise(row, sample.weight)));
+        for_each_sample(grid, &rays, options, 0.0, |sample| sample.own.iter().for_each(|(row, _)| largest.raise(row, sample.weight)));
     }
     largest.into_weights()
 }
@@ -40,13 +40,12 @@ pub fn seen<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = (Vec
     let largest = Largest::new(rows);
     // Of w, of w a, and of w a c.
     let sums: Vec<[AtomicU64; 5]> = (0..rows).map(|_| Default::default()).collect();
-    let (table, channels) = (grid.color.tensor().data(), grid.shape().color.channels());
     let add = |sum: &AtomicU64, amount: f64| sum.fetch_add((amount * ONE + 0.5) as u64, Relaxed);
     for (rays, alphas) in batches {
         for_each_sample(grid, &rays, options, LEAST, |sample| {
             let alpha = f64::from(alphas[sample.ray]);
-            let color = if alpha > 0.0 { sample.color(grid.shape().color, table, channels) } else { [0.0; 3] };
-            for (row, share) in sample.reads() {
+            let color = if alpha > 0.0 { sample.color(grid) } else { [0.0; 3] };
+            for (row, share) in sample.own.iter() {
                 let Some(sums) = sums.get(row as usize) else { continue };
                 let amount = (sample.weight * share).as_f64();
                 add(&sums[0], amount);
@@ -95,32 +94,54 @@ struct Sample<'a, T> {
     /// Number of its ray.
     ray: usize,
     weight: T,
-    /// Harmonics of the ray's direction; empty for plain colors.
-    basis: &'a [T],
-    rows: &'a [u32],
-    shares: &'a [T],
+    /// Of density and color.
+    own: Reads<'a, T>,
+    /// Of harmonics that are reduced: its number among the block's samples, what finds their rows, and the harmonics of the ray's direction.
+    harmonics: Option<(usize, &'a reduced::Reads<T>, &'a [T])>,
 }
 
-impl<T: Real> Sample<'_, T> {
+/// Rows of a table with their shares.
+struct Reads<'a, T> {
+    rows: &'a [u32],
+    shares: &'a [T],
+    /// What the numbers of a channel in a row are multiplied by: harmonics of the ray's direction; empty for plain colors.
+    basis: &'a [T],
+}
+
+impl<T: Real> Reads<'_, T> {
     /// Rows with their shares, those that have one.
-    fn reads(&self) -> impl Iterator<Item = (u32, T)> + '_ {
+    fn iter(&self) -> impl Iterator<Item = (u32, T)> + '_ {
         self.rows.iter().copied().zip(self.shares.iter().copied()).filter(|(_, share)| *share > T::zero())
     }
 
-    /// What it shows to its ray.
-    fn color(&self, meaning: Color, table: &[T], channels: usize) -> [f64; 3] {
+    /// What a table shows of these rows.
+    fn color(&self, table: &Tensor<T>) -> [T; 3] {
+        let (table, channels) = (table.data(), table.shape()[1]);
         let mut sum = [T::zero(); 3];
-        for (row, share) in self.reads() {
+        for (row, share) in self.iter() {
             let Some(numbers) = table.get(row as usize * channels..(row as usize + 1) * channels) else { continue };
             for (sum, numbers) in sum.iter_mut().zip(numbers.chunks_exact(channels / 3)) {
-                let own: T = match meaning {
-                    Color::Rgb => numbers[0],
-                    Color::Sh { .. } => numbers.iter().zip(self.basis).map(|(&number, &y)| number * y).sum(),
+                let own: T = match self.basis {
+                    [] => numbers[0],
+                    basis => numbers.iter().zip(basis).map(|(&number, &y)| number * y).sum(),
                 };
                 *sum += share * own;
             }
         }
-        let offset = if let Color::Sh { offset, .. } = meaning { offset } else { 0.0 };
+        sum
+    }
+}
+
+impl<T: Real> Sample<'_, T> {
+    /// What it shows to its ray.
+    fn color(&self, grid: &VoxelGrid<T>) -> [f64; 3] {
+        let mut sum = self.own.color(grid.color.tensor());
+        if let (Some((i, reads, basis)), Some(table)) = (self.harmonics, &grid.harmonics) {
+            let (rows, shares) = reads(i);
+            let changing = Reads { rows: &rows, shares: &shares, basis }.color(table.tensor());
+            sum.iter_mut().zip(changing).for_each(|(sum, c)| *sum += c);
+        }
+        let offset = if let Color::Sh { offset, .. } = grid.shape().color { offset } else { 0.0 };
         sum.map(|c| c.as_f64() + offset)
     }
 }
@@ -133,17 +154,21 @@ fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderO
     let batch = Batch::new(grid, rays, options);
     let scene = batch.scene(grid, rays, options);
     let count = batch.basis.shape()[1];
+    // Harmonics in a row of the color table; those behind them are reduced.
+    let here = batch.harmonics().max(1).min(count);
     parallel::map_chunks(rays.len(), BLOCK, |range| {
         let (block, corners) = scene.weights(range.start, range.len());
+        let reduced = reduced::reads(&batch, &block);
         for (ray, own) in range.zip(block.rays()) {
-            let basis = &batch.basis.data()[ray * count..][..count];
+            let (basis, beyond) = batch.basis.data()[ray * count..][..count].split_at(here);
             for i in own.filter(|&i| block.weight[i] > least) {
                 let weight = block.weight[i];
+                let harmonics = reduced.as_ref().map(|reads| (i, reads, beyond));
                 match &corners {
-                    None => f(Sample { ray, weight, basis, rows: &block.rows[i..=i], shares: &[T::one()] }),
+                    None => f(Sample { ray, weight, own: Reads { rows: &block.rows[i..=i], shares: &[T::one()], basis }, harmonics }),
                     Some(corners) => {
                         let (rows, shares) = corners.of(i);
-                        f(Sample { ray, weight, basis, rows: &rows, shares: &shares });
+                        f(Sample { ray, weight, own: Reads { rows: &rows, shares: &shares, basis }, harmonics });
                     }
                 }
             }

@@ -6,7 +6,7 @@
 use super::forward::{Block, Scene};
 use super::lookup::{self, Corners};
 use super::{BLOCK, BUCKET_SHIFT, COLUMNS};
-use crate::field::voxel_grid::{Color, Interpolation};
+use crate::field::voxel_grid::Interpolation;
 use autograd::{Buffer, Real, parallel};
 use std::ops::Range;
 
@@ -55,13 +55,13 @@ impl Order {
 impl<T: Real> Scene<'_, T> {
     /// True if the colors of a training batch are worth sorting: eight rows of harmonics for each sample, from a table beyond the caches.
     pub fn worth_sorting(&self) -> bool {
-        let harmonics = matches!(self.batch.shape.color, Color::Sh { .. });
-        harmonics && self.batch.shape.interpolation == Interpolation::Trilinear && size_of_val(self.tables[1]) >= LARGE
+        let shape = &self.batch.layout.shape;
+        self.batch.harmonics() > 0 && shape.interpolation == Interpolation::Trilinear && size_of_val(self.tables[1]) >= LARGE
     }
 
     /// The blocks of the rays from number `first` on, one ray for each [`COLUMNS`] of `pixels`, with all that the adjoint needs.
     pub fn render_sorted(&self, first: usize, pixels: &mut [T]) -> Vec<Block<T>> {
-        let buckets = self.batch.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
+        let buckets = self.batch.layout.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
         let count = pixels.len() / COLUMNS;
         let (blocks, orders): (Vec<_>, Vec<_>) = parallel::map_chunks(count, BLOCK, |range| {
             let (block, corners) = self.weights(first + range.start, range.len());
@@ -104,7 +104,7 @@ impl<T: Real> Scene<'_, T> {
                     *part = rest;
                     let at = block.at.each_ref().map(|a| &a[..]);
                     let (samples, rays) = (&order.samples[range.clone()], &order.rays[range]);
-                    with_bricks!(self.batch.lattice, map => {
+                    with_bricks!(self.batch.layout.lattice, map => {
                         lookup::harmonics_of(self.tables[1], at, map, samples, rays, directions, out.as_chunks_mut().0);
                     });
                 }

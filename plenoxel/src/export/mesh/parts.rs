@@ -1,0 +1,60 @@
+//! Parts of a surface: triangles that hang together by common vertices.
+
+use super::Surface;
+use crate::error::{Error, Result};
+
+impl Surface {
+    /// The same surface without its parts of fewer than `least` triangles.
+    ///
+    /// Errors: nothing is left.
+    pub fn without_parts_below(self, least: usize) -> Result<Self> {
+        let mut parts = Parts::new(self.crossings.len());
+        for &[a, b, c] in &self.triangles {
+            parts.join(a, b);
+            parts.join(b, c);
+        }
+        let mut count = vec![0; self.crossings.len()];
+        self.triangles.iter().for_each(|triangle| count[parts.name(triangle[0]) as usize] += 1);
+        let largest = count.iter().copied().max().unwrap_or(0);
+        if least > largest {
+            let found = format!("{least} faces, more than any part of this surface has,");
+            return Err(Error::config("min_part", found, format!("up to {largest}, the faces of the largest part")));
+        }
+        let mut left = Surface::default();
+        // The new number of each vertex that stays; each has a triangle.
+        let mut numbers = vec![0; self.crossings.len()];
+        for (v, &crossing) in self.crossings.iter().enumerate() {
+            if count[parts.name(v as u32) as usize] >= least {
+                numbers[v] = left.crossings.len() as u32;
+                left.crossings.push(crossing);
+            }
+        }
+        let stays = self.triangles.iter().filter(|triangle| count[parts.name(triangle[0]) as usize] >= least);
+        left.triangles = stays.map(|triangle| triangle.map(|v| numbers[v as usize])).collect();
+        Ok(left)
+    }
+}
+
+/// Disjoint sets of vertices (Tarjan 1975), each named by its smallest vertex: a vertex points at another one of its set, or at itself.
+struct Parts(Vec<u32>);
+
+impl Parts {
+    fn new(vertices: usize) -> Self {
+        Parts((0..vertices as u32).collect())
+    }
+
+    /// The name of the set of a vertex. Ways that were gone are halved.
+    fn name(&mut self, mut v: u32) -> u32 {
+        while self.0[v as usize] != v {
+            let next = self.0[v as usize];
+            self.0[v as usize] = self.0[next as usize];
+            v = next;
+        }
+        v
+    }
+
+    fn join(&mut self, a: u32, b: u32) {
+        let (a, b) = (self.name(a), self.name(b));
+        self.0[a.max(b) as usize] = a.min(b);
+    }
+}

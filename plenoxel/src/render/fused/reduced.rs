@@ -1,0 +1,283 @@
+//! Harmonics that are stored for larger voxels than the means of colors.
+//!
+//! Samples that follow each other on a ray mostly read the same rows of harmonics. So these rows are weighed with the harmonics of the ray's
+//! direction once, which leaves a color for each row, and the samples weigh those: rgb = offset + Y₀ Σⱼ wⱼ meanⱼ + Σᵢ vᵢ (Σₖ Yₖ rowᵢₖ). The
+//! adjoint goes back the same way: what the samples of such a run add to the color of each row is summed first, Σ v ∂L/∂rgb, and then each
+//! row gets it times Yₖ, bucket by bucket like everything else.
+
+use super::forward::{Block, Scene};
+use super::lookup::{Corners, nearest_rows};
+use super::{Batch, COLUMNS};
+use crate::field::sh;
+use crate::field::voxel_grid::{Color, Interpolation};
+use autograd::{Buffer, Lattice, Real, RowSums, Tensor, dispatched, parallel};
+use std::sync::Arc;
+
+/// A bucket is this power of two of rows: 8 bricks. The table is small, and many tasks are to share it.
+const BUCKET_SHIFT: u32 = 9;
+
+/// Red, green and blue, and a zero that makes a vector of them.
+type Rgb0<T> = [T; 4];
+
+/// The rows of harmonics that each sample reads, `K` of them.
+trait Look<T: Real, const K: usize>: Sized {
+    fn find(at: [&[T]; 3], lattice: &Lattice, count: usize) -> Self;
+    /// Rows and weights of a sample.
+    fn of(&self, i: usize) -> ([u32; K], [T; K]);
+}
+
+/// One row for each sample; one beyond the table where there is none.
+struct Nearest(Buffer<u32>);
+
+impl<T: Real> Look<T, 1> for Nearest {
+    fn find(at: [&[T]; 3], lattice: &Lattice, count: usize) -> Self {
+        let mut rows = Buffer::stale(count);
+        with_bricks!(lattice, map => nearest_rows(at, map, &mut rows));
+        Nearest(rows)
+    }
+
+    #[inline(always)]
+    fn of(&self, i: usize) -> ([u32; 1], [T; 1]) {
+        ([self.0[i]], [T::one()])
+    }
+}
+
+impl<T: Real> Look<T, 8> for Corners<T> {
+    fn find(at: [&[T]; 3], lattice: &Lattice, count: usize) -> Self {
+        with_bricks!(lattice, map => Corners::find(at, map, count))
+    }
+
+    #[inline(always)]
+    fn of(&self, i: usize) -> ([u32; 8], [T; 8]) {
+        Corners::of(self, i)
+    }
+}
+
+/// What the samples of a block read.
+fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lattice, block: &Block<T>) -> L {
+    let [scale, shift] = batch.layout.shape.to_harmonics().map(T::lit);
+    let at = block.at.each_ref().map(|at| {
+        let mut to = Buffer::stale(at.len());
+        to.iter_mut().zip(&at[..]).for_each(|(to, &u)| *to = u * scale + shift);
+        to
+    });
+    L::find(at.each_ref().map(|at| &at[..]), lattice, block.len())
+}
+
+/// What gives rows and weights of a sample; rows may repeat, with no weight.
+pub(super) type Reads<T> = Box<dyn Fn(usize) -> ([u32; 8], [T; 8])>;
+
+/// The rows of harmonics that samples of a block read, where harmonics are reduced.
+pub(super) fn reads<T: Real>(batch: &Batch<T>, block: &Block<T>) -> Option<Reads<T>> {
+    let lattice = batch.layout.harmonics.as_ref()?;
+    Some(match batch.layout.shape.interpolation {
+        Interpolation::Nearest => {
+            let found = found::<T, Nearest, 1>(batch, lattice, block);
+            Box::new(move |i| ([found.0[i]; 8], std::array::from_fn(|k| if k == 0 { T::one() } else { T::zero() })))
+        }
+        Interpolation::Trilinear => {
+            let found = found::<T, Corners<T>, 8>(batch, lattice, block);
+            Box::new(move |i| found.of(i))
+        }
+    })
+}
+
+impl<T: Real> Scene<'_, T> {
+    /// Makes colors of the means of the samples that are seen.
+    pub fn add_harmonics(&self, lattice: &Lattice, block: &Block<T>, out: &mut [[T; 3]]) {
+        match self.batch.layout.shape.interpolation {
+            Interpolation::Nearest => self.add_found::<Nearest, 1>(lattice, block, out),
+            Interpolation::Trilinear => self.add_found::<Corners<T>, 8>(lattice, block, out),
+        }
+    }
+
+    fn add_found<L: Look<T, K>, const K: usize>(&self, lattice: &Lattice, block: &Block<T>, out: &mut [[T; 3]]) {
+        let Color::Sh { offset, .. } = self.batch.layout.shape.color else { unreachable!("plain colors have no harmonics") };
+        let count = self.batch.basis.shape()[1];
+        let basis = &self.batch.basis.data()[block.first * count..];
+        let (found, offset) = (found::<T, L, K>(self.batch, lattice, block), T::lit(offset));
+        let look = |i: usize| found.of(i);
+        match count {
+            4 => add_to_means::<T, K, 3>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
+            9 => add_to_means::<T, K, 8>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
+            _ => add_to_means::<T, K, 15>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
+        }
+    }
+}
+
+dispatched! {
+/// `basis` has `N` + 1 numbers for each ray, a row of the table 3 `N`. A row that is not in the table is zeros.
+fn add_to_means<T: Real, const K: usize, const N: usize>(
+    table: &[T],
+    offsets: &[u32],
+    basis: &[T],
+    offset: T,
+    look: impl Fn(usize) -> ([u32; K], [T; K]),
+    seen: impl Fn(usize) -> bool,
+    out: &mut [[T; 3]],
+) {
+    let table = table.as_chunks::<N>().0;
+    let mut colors: [Rgb0<T>; K] = [[T::zero(); 4]; K];
+    for (own, basis) in offsets.windows(2).zip(basis.chunks_exact(N + 1)) {
+        let mut weighed = None;
+        for i in (own[0] as usize..own[1] as usize).filter(|&i| seen(i)) {
+            let (rows, weights) = look(i);
+            if weighed != Some(rows) {
+                weighed = Some(rows);
+                for (color, row) in colors.iter_mut().zip(rows) {
+                    *color = [T::zero(); 4];
+                    let Some(row) = table.get(3 * row as usize..3 * row as usize + 3) else { continue };
+                    for c in 0..3 {
+                        for k in 0..N {
+                            color[c] += row[c][k] * basis[k + 1];
+                        }
+                    }
+                }
+            }
+            let mut sum: Rgb0<T> = [T::zero(); 4];
+            for k in 0..K {
+                (0..4).for_each(|c| sum[c] += weights[k] * colors[k][c]);
+            }
+            (0..3).for_each(|c| out[i][c] = offset + T::lit(sh::Y0) * out[i][c] + sum[c]);
+        }
+    }
+}
+}
+
+/// What the samples of a batch add to the rows of harmonics, from the cotangent of the pixels.
+pub(super) fn sums<T: Real>(batch: &Batch<T>, lattice: &Lattice, blocks: &[Block<T>], cotangent: &Tensor<T>) -> Arc<dyn RowSums<T>> {
+    match batch.layout.shape.interpolation {
+        Interpolation::Nearest => Arc::new(HarmonicsSums::new::<Nearest>(batch, lattice, blocks, cotangent)),
+        Interpolation::Trilinear => Arc::new(HarmonicsSums::new::<Corners<T>>(batch, lattice, blocks, cotangent)),
+    }
+}
+
+/// Rows of the table of harmonics, of which a sample reads `K`.
+#[derive(Debug)]
+struct HarmonicsSums<T: Real, const K: usize> {
+    /// `[n, (degree + 1)²]`
+    basis: Tensor<T>,
+    blocks: Vec<Runs<T, K>>,
+}
+
+/// The runs of samples of one block that read the same rows, and their numbers by the buckets of these rows.
+#[derive(Debug)]
+struct Runs<T: Real, const K: usize> {
+    runs: Vec<Run<T, K>>,
+    /// Where the numbers of each bucket begin; one more at the end.
+    starts: Vec<u32>,
+    numbers: Vec<u32>,
+}
+
+/// Samples of a ray that read the same rows.
+#[derive(Debug)]
+struct Run<T: Real, const K: usize> {
+    ray: u32,
+    rows: [u32; K],
+    /// Σ v ∂L/∂rgb over the samples for each row, v being its weight.
+    sums: [Rgb0<T>; K],
+}
+
+impl<T: Real, const K: usize> Run<T, K> {
+    /// The buckets of its rows, each once.
+    fn buckets(&self, count: usize) -> impl Iterator<Item = usize> {
+        let all = self.rows.map(|row| row as usize >> BUCKET_SHIFT);
+        (0..K).filter(move |&k| all[k] < count && !all[..k].contains(&all[k])).map(move |k| all[k])
+    }
+}
+
+impl<T: Real, const K: usize> Runs<T, K> {
+    fn new(block: &Block<T>, look: impl Fn(usize) -> ([u32; K], [T; K]), pixels: &[[T; COLUMNS]], buckets: usize) -> Self {
+        let colors = block.color.as_chunks::<3>().0;
+        let mut runs: Vec<Run<T, K>> = Vec::new();
+        for ((r, own), g) in block.rays().enumerate().zip(pixels) {
+            let ray = (block.first + r) as u32;
+            for i in own.filter(|&i| block.density[i] >= T::zero()) {
+                let (rows, weights) = look(i);
+                if runs.last().is_none_or(|run| run.ray != ray || run.rows != rows) {
+                    runs.push(Run { ray, rows, sums: [[T::zero(); 4]; K] });
+                }
+                let Some(run) = runs.last_mut() else { unreachable!("a run was just begun") };
+                let mut c = [T::zero(); 4];
+                for a in (0..3).filter(|&a| colors[i][a] >= T::zero()) {
+                    c[a] = block.weight[i] * g[a];
+                }
+                for (sum, weight) in run.sums.iter_mut().zip(weights) {
+                    (0..4).for_each(|a| sum[a] += weight * c[a]);
+                }
+            }
+        }
+        let mut starts = vec![0u32; buckets + 1];
+        runs.iter().flat_map(|run| run.buckets(buckets)).for_each(|bucket| starts[bucket + 1] += 1);
+        for b in 0..buckets {
+            starts[b + 1] += starts[b];
+        }
+        let (mut next, mut numbers) = (starts.clone(), vec![0; starts[buckets] as usize]);
+        for (number, run) in runs.iter().enumerate() {
+            for bucket in run.buckets(buckets) {
+                numbers[next[bucket] as usize] = number as u32;
+                next[bucket] += 1;
+            }
+        }
+        Runs { runs, starts, numbers }
+    }
+}
+
+impl<T: Real, const K: usize> HarmonicsSums<T, K> {
+    fn new<L: Look<T, K>>(batch: &Batch<T>, lattice: &Lattice, blocks: &[Block<T>], cotangent: &Tensor<T>) -> Self {
+        let buckets = lattice.rows().div_ceil(1 << BUCKET_SHIFT);
+        let blocks = parallel::map_indices(blocks.len(), |b| {
+            let block = &blocks[b];
+            let found = found::<T, L, K>(batch, lattice, block);
+            Runs::new(block, |i| found.of(i), &cotangent.data().as_chunks().0[block.first..], buckets)
+        });
+        HarmonicsSums { basis: batch.basis.clone(), blocks }
+    }
+}
+
+impl<T: Real, const K: usize> RowSums<T> for HarmonicsSums<T, K> {
+    fn bucket_shift(&self) -> u32 {
+        BUCKET_SHIFT
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.blocks.iter().all(|runs| runs.starts[bucket] == runs.starts[bucket + 1])
+    }
+
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        let basis = self.basis.data();
+        self.blocks.iter().for_each(|runs| match self.basis.shape()[1] {
+            4 => add_runs::<T, K, 3>(bucket, runs, basis, sums, touched),
+            9 => add_runs::<T, K, 8>(bucket, runs, basis, sums, touched),
+            _ => add_runs::<T, K, 15>(bucket, runs, basis, sums, touched),
+        });
+    }
+}
+
+dispatched! {
+/// Adds what runs have, in the order of the rays, to their rows in the bucket; `basis` has `N` + 1 numbers for each ray, a row 3 `N`.
+fn add_runs<T: Real, const K: usize, const N: usize>(
+    bucket: usize,
+    runs: &Runs<T, K>,
+    basis: &[T],
+    sums: &mut [T],
+    touched: &mut [u64],
+) {
+    let sums = sums.as_chunks_mut::<N>().0;
+    for &number in &runs.numbers[runs.starts[bucket] as usize..runs.starts[bucket + 1] as usize] {
+        let run = &runs.runs[number as usize];
+        let y: &[T; N] = basis[run.ray as usize * (N + 1) + 1..].first_chunk().expect("the harmonics of each ray");
+        for (row, own) in run.rows.iter().zip(&run.sums) {
+            if *row as usize >> BUCKET_SHIFT == bucket {
+                let local = *row as usize & ((1 << BUCKET_SHIFT) - 1);
+                touched[local / 64] |= 1 << (local % 64);
+                for c in 0..3 {
+                    for k in 0..N {
+                        sums[3 * local + c][k] += own[c] * y[k];
+                    }
+                }
+            }
+        }
+    }
+}
+}
