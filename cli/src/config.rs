@@ -14,8 +14,10 @@ use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
 /// The presets by name: what they are for, and their text.
-pub const PRESETS: [(&str, &str, &str); 3] = [
+pub const PRESETS: [(&str, &str, &str); 5] = [
     ("demo", "the built-in scene in minutes", include_str!("../presets/demo.toml")),
+    ("fast", "a minute", include_str!("../presets/fast.toml")),
+    ("quality", "the best in about eleven minutes", include_str!("../presets/quality.toml")),
     ("standard", "a dataset of your own", include_str!("../presets/standard.toml")),
     ("paper", "\"Plenoxels and extension to point clouds\", bugs repaired", include_str!("../presets/paper.toml")),
 ];

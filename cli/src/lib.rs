@@ -66,6 +66,10 @@ struct Machine {
     #[arg(long, global = true, value_name = "N", help_heading = "Machine", value_parser = commands::whole::<usize>(1, machine::MOST_THREADS as u64))]
     threads: Option<usize>,
 
+    /// Refuse what would need more memory than this, such as 8GB or 500MiB [default: what is free]
+    #[arg(long, global = true, value_name = "SIZE", help_heading = "Machine", value_parser = commands::memory_size)]
+    max_memory: Option<u64>,
+
     /// Print errors and results only
     #[arg(long, short, global = true, help_heading = "Machine")]
     quiet: bool,
@@ -88,6 +92,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
         Err(answer) => return answer_to_arguments(&answer, streams),
     };
     let console = Console::new(streams, cli.machine.quiet);
+    memory::limit(cli.machine.max_memory);
     let done = machine::with_threads(cli.machine.threads, || match &cli.command {
         Command::Train(args) => train::run(args, &console),
         Command::Carve(args) => carve::run(args, &console),

@@ -12,6 +12,7 @@ use plenoxel::field::voxel_grid::{Color, GridShape};
 use plenoxel::render::Engine;
 use plenoxel::render::fused::CHUNK;
 use plenoxel::train::config::{Config, OptimizerConfig, Sampling};
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Bytes by what they are for.
 #[derive(Debug, Clone, PartialEq)]
@@ -206,9 +207,24 @@ fn prunes(config: &Config) -> bool {
     config.prune_from_stage.is_some_and(|first| first < config.stages.len())
 }
 
-/// Bytes of memory that can be taken now: what Linux counts as available, within the limits of the control group and of the
-/// process; elsewhere unknown.
+/// Bytes that a command may take in all, if the user set them; 0 if not.
+static LIMIT: AtomicU64 = AtomicU64::new(0);
+
+/// Has the commands that follow take no more than this.
+pub fn limit(bytes: Option<u64>) {
+    LIMIT.store(bytes.unwrap_or(0), Relaxed);
+}
+
+/// Bytes of memory that can be taken now: what is free, and no more than the user allows.
 pub fn available() -> Option<u64> {
+    match LIMIT.load(Relaxed) {
+        0 => free(),
+        limit => Some(free().map_or(limit, |free| free.min(limit))),
+    }
+}
+
+/// What Linux counts as available, within the limits of the control group and of the process; elsewhere unknown.
+fn free() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let free = kilobytes(&text, "MemAvailable:")?;
     let number = |path: &str| -> Option<u64> { std::fs::read_to_string(path).ok()?.trim().parse().ok() };
@@ -316,6 +332,14 @@ fn whole_grid_losses(config: &Config) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sizes_have_units_of_1000_or_of_1024() {
+        use crate::commands::memory_size;
+        let sizes = [("17", 17), ("500MB", 500_000_000), ("1.5g", 1_500_000_000), ("8 GiB", 8 << 30), ("2mib", 2 << 20)];
+        sizes.into_iter().for_each(|(text, bytes)| assert_eq!(memory_size(text), Ok(bytes), "{text}"));
+        ["", "GB", "-1GB", "8 apples", "0", "1.2.3MB", "nan"].into_iter().for_each(|text| assert!(memory_size(text).is_err(), "{text}"));
+    }
 
     #[test]
     fn numbers_are_found_in_the_text_of_the_kernel() {

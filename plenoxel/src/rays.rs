@@ -122,15 +122,17 @@ impl<'a> RaySource<'a> {
         })
     }
 
-    /// How many pixels apart rays may be so that two at least pass through a voxel of this side, wherever it is in a box: the projection of the
-    /// farthest, halved.
+    /// How many pixels apart rays may be so that 8 of them or more pass through a voxel of this side that all views have in sight, wherever
+    /// it is in a box: as the projection of the farthest would have it.
     pub fn stride(&self, side: f64, aabb: Aabb) -> u32 {
+        const RAYS: f64 = 8.0;
         let reach = 0.5 * (aabb.max - aabb.min).length();
         let pixels = self.views.iter().map(|view| {
             let k = &view.camera.intrinsics;
             k.fx.min(k.fy) * side / (view.camera.position().distance(0.5 * (aabb.min + aabb.max)) + reach)
         });
-        (0.5 * pixels.fold(f64::INFINITY, f64::min)).clamp(1.0, 64.0) as u32
+        let apart = (self.views.len() as f64 / RAYS).sqrt();
+        (apart * pixels.fold(f64::INFINITY, f64::min)).clamp(1.0, 64.0) as u32
     }
 
     /// All rays of the set, view after view and row after row, `size` at a time.

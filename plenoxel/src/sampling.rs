@@ -202,8 +202,10 @@ impl Occupied<'_> {
     /// Finds the next intervals, if there are any in the next bricks.
     fn look(&mut self) {
         let march = &self.march;
+        // Where the last look found something there is more to be expected.
+        let lost = self.count == 0;
         (self.taken, self.count) = (0, 0);
-        if let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
+        if lost && let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
             // The last k whose middle does not lie beyond the exit, but for rounding; it is looked at again.
             let half = if march.points { 0.0 } else { 0.5 };
             let last = ((exit - march.start) / march.step + half) as usize;

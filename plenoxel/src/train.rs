@@ -163,6 +163,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         if self.step == plan.first {
             self.begin(index)?;
         }
+        let in_stage = self.step - plan.first;
         let rays = self.config.rays_per_step;
         let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
         let jitter = if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None };
@@ -182,7 +183,6 @@ impl<'a, T: Real> Trainer<'a, T> {
             let parts: Vec<String> = losses.iter().map(|(name, value)| format!("{name} {value}")).collect();
             return Err(self.numeric(format!("the loss is {loss} ({})", parts.join(", "))));
         }
-        let in_stage = self.step - plan.first;
         self.optimizer.step(&mut self.grid, &gradients, in_stage);
         let ends_stage = in_stage + 1 == plan.steps;
         if ends_stage && !self.grid.is_finite() {
@@ -204,22 +204,22 @@ impl<'a, T: Real> Trainer<'a, T> {
         Ok(Some(report))
     }
 
-    /// What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
+    /// What happens between stages: empty space is left out, the field is read at a finer resolution, the optimizer starts afresh.
     fn begin(&mut self, index: usize) -> Result<()> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        if plan.stage.resolution != self.grid.shape().resolution {
+        if self.prunes_from().is_some_and(|first| index >= first) {
+            let before = self.plan[index.saturating_sub(1)].stage;
+            self.prune(&before)?;
+        }
+        let finer = plan.stage.resolution != self.grid.shape().resolution;
+        if finer {
             release_free_buffers();
             self.grid = self.grid.resample(plan.stage.resolution);
         }
-        if plan.stage.image_reduction != self.reduction {
-            self.reduction = plan.stage.image_reduction;
-            self.rays = self.all_rays();
-        }
-        if let Some(silhouettes) = &self.silhouettes {
-            let inside = silhouettes.voxels(self.grid.shape());
-            let pruned = self.grid.pruned(&inside);
+        if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
+            let pruned = self.grid.pruned(&silhouettes.voxels(&self.grid));
             if pruned.lattice().present() == 0 {
                 return Err(Error::config(
                     "hull",
@@ -229,19 +229,9 @@ impl<'a, T: Real> Trainer<'a, T> {
             }
             self.grid = pruned;
         }
-        if self.prunes_from().is_some_and(|first| index >= first) {
-            let kept = self.worth_keeping(&self.plan[index].stage);
-            if kept.fraction() == 0.0 {
-                let Config { prune_below, prune_unseen_below, .. } = self.config;
-                return Err(Error::Numeric {
-                    place: format!("step {}", self.step),
-                    found: "pruning would leave nothing".to_owned(),
-                    remedy: format!(
-                        "set prune_below lower than {prune_below}, prune_unseen_below lower than {prune_unseen_below}, or prune_from_stage later"
-                    ),
-                });
-            }
-            self.grid = self.grid.pruned(&kept);
+        if plan.stage.image_reduction != self.reduction {
+            self.reduction = plan.stage.image_reduction;
+            self.rays = self.all_rays();
         }
         if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
             self.rays = self.all_rays().aimed_at(reach);
@@ -249,6 +239,23 @@ impl<'a, T: Real> Trainer<'a, T> {
         if self.config.project {
             self.grid.project();
         }
+        Ok(())
+    }
+
+    /// Takes empty voxels out of the grid, seen as the last stage saw it.
+    fn prune(&mut self, stage: &Stage) -> Result<()> {
+        let kept = self.worth_keeping(stage);
+        if kept.fraction() == 0.0 {
+            let Config { prune_below, prune_unseen_below, .. } = self.config;
+            return Err(Error::Numeric {
+                place: format!("step {}", self.step),
+                found: "pruning would leave nothing".to_owned(),
+                remedy: format!(
+                    "set prune_below lower than {prune_below}, prune_unseen_below lower than {prune_unseen_below}, or prune_from_stage later"
+                ),
+            });
+        }
+        self.grid = self.grid.pruned(&kept);
         Ok(())
     }
 
@@ -273,9 +280,11 @@ impl<'a, T: Real> Trainer<'a, T> {
         if least == 0.0 {
             return full;
         }
-        // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
-        const MARGIN: usize = 2;
-        let options = self.options(stage, Jitter::None);
+        // What lies behind a surface must stay for the surface to move. svox2 has 2 voxels of the finer grid.
+        const MARGIN: usize = 1;
+        // Where less light is left, no sample weighs as much.
+        let stop_below = self.config.stop_below.max(least);
+        let options = RenderOptions { stop_below, ..self.options(stage, Jitter::None) };
         let stride = self.rays.stride(self.grid.shape().voxel_side(), self.grid.aabb());
         let weights = largest_weights(&self.grid, self.rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
         full.intersection(&self.grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN))

@@ -37,24 +37,33 @@ fn corners_present<T: Real, M: NodeMap>(position: [T; 3], map: M) -> ([u32; 8], 
 fn join<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32; 8], [T; 8], u32) {
     let one = T::one();
     let w = [[one - f[0], f[0]], [one - f[1], f[1]], [one - f[2], f[2]]];
-    let mut rows = [0u32; 8];
-    let mut weights = [T::zero(); 8];
-    let mut present = 0u32;
-    for c in 0..8 {
-        let (i, j, k) = (c >> 2, c >> 1 & 1, c & 1);
-        weights[c] = w[0][i] * w[1][j] * w[2][k];
-        match map.row_of(shares[0][i] + shares[1][j] + shares[2][k]) {
-            Ok(row) => {
-                rows[c] = row;
-                present |= 1 << c;
-            }
-            Err(row) => {
-                rows[c] = row;
-                weights[c] = T::zero();
-            }
-        }
+    let axes = |c: usize| [c >> 2, c >> 1 & 1, c & 1];
+    let codes = std::array::from_fn(|c| (0..3).map(|a| shares[a][axes(c)[a]]).sum());
+    let (rows, present) = rows_of(codes, map);
+    let weights = std::array::from_fn(|c| {
+        let [i, j, k] = axes(c);
+        if present >> c & 1 == 1 { w[0][i] * w[1][j] * w[2][k] } else { T::zero() }
+    });
+    (rows, weights, present)
+}
+
+/// Eight corners, each of them present.
+const ALL: u32 = 0xff;
+
+/// The rows of the eight corners of a cell with these numbers, and a bit for each that is present; the others stand in the row of one that is.
+#[inline(always)]
+fn rows_of<M: NodeMap>(codes: [u32; 8], map: M) -> ([u32; 8], u32) {
+    if let Some(rows) = map.rows_of_cell(codes) {
+        return (rows, ALL);
     }
-    if M::SPARSE && present != 0xff {
+    let mut rows = [0; 8];
+    let mut present = 0;
+    for (c, code) in codes.into_iter().enumerate() {
+        let found = map.row_of(code);
+        present |= u32::from(found.is_ok()) << c;
+        rows[c] = found.unwrap_or_else(|row| row);
+    }
+    if M::SPARSE && present != ALL {
         let stand_in = if present == 0 { 0 } else { rows[present.trailing_zeros() as usize] };
         for (c, row) in rows.iter_mut().enumerate() {
             if present >> c & 1 == 0 {
@@ -62,7 +71,7 @@ fn join<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32;
             }
         }
     }
-    (rows, weights, present)
+    (rows, present)
 }
 
 /// Positions whose corners are found together: a vector of each number.
@@ -94,22 +103,24 @@ pub fn corners_of_many<T: Real, M: NodeMap>(
                 (fractions[a][0][i], fractions[a][1][i]) = (T::one() - fraction, fraction);
             }
         }
+        for c in 0..8 {
+            let [x, y, z] = [c >> 2, c >> 1 & 1, c & 1];
+            for i in 0..TOGETHER {
+                weights[c][i] = fractions[0][x][i] * fractions[1][y][i] * fractions[2][z][i];
+                rows[c][i] = shares[0][x][i] + shares[1][y][i] + shares[2][z][i];
+            }
+        }
         if M::SPARSE {
             for i in 0..TOGETHER {
-                let own = [0, 1, 2].map(|a: usize| [shares[a][0][i], shares[a][1][i]]);
-                let (r, w, _) = join(own, [0, 1, 2].map(|a: usize| fractions[a][1][i]), map);
+                let (found, present) = rows_of(std::array::from_fn(|c| rows[c][i]), map);
                 for c in 0..8 {
-                    (rows[c][i], weights[c][i]) = (r[c], w[c]);
+                    rows[c][i] = found[c];
+                }
+                if present != ALL {
+                    (0..8).filter(|c| present >> c & 1 == 0).for_each(|c| weights[c][i] = T::zero());
                 }
             }
         } else {
-            for c in 0..8 {
-                let [x, y, z] = [c >> 2, c >> 1 & 1, c & 1];
-                for i in 0..TOGETHER {
-                    weights[c][i] = fractions[0][x][i] * fractions[1][y][i] * fractions[2][z][i];
-                    rows[c][i] = shares[0][x][i] + shares[1][y][i] + shares[2][z][i];
-                }
-            }
             for row in rows.as_flattened_mut() {
                 *row = map.row_of(*row).unwrap_or_default();
             }

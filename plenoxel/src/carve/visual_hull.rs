@@ -24,8 +24,14 @@ const BRICKS: usize = 16;
 /// Bricks of 4³ voxels are tested by the rectangle around their projection, voxels by the projection itself, a convex polygon.
 /// `progress(views)` is called as views are done.
 pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64, progress: &dyn Fn(usize)) -> Occupancy {
+    by_footprint_of(views, &Occupancy::from_masks(aabb, voxels, full(voxels)), margin, progress)
+}
+
+/// The same of some of the voxels alone.
+pub fn by_footprint_of(views: &[View], of: &Occupancy, margin: f64, progress: &dyn Fn(usize)) -> Occupancy {
+    let (aabb, voxels) = (of.aabb(), of.cells());
     let count = voxels.map(|n| n.div_ceil(BRICK));
-    let mut masks = full(voxels);
+    let mut masks = of.masks().to_vec();
     for (chunk, views) in views.chunks(VIEWS).enumerate() {
         let silhouettes = parallel::map_indices(views.len(), |v| Silhouette::of(&views[v], aabb, voxels));
         parallel::for_each_chunk(&mut masks, BRICKS, |first, masks| {

@@ -31,10 +31,11 @@ impl<'a> Silhouettes<'a> {
         hull.bounds().map_or(half_width, |bounds| bounds.max.max(-bounds.min).max_element())
     }
 
-    /// The voxels that a sample inside of the silhouettes can read.
-    pub fn voxels(&self, shape: &GridShape) -> Occupancy {
-        let aabb = Aabb::cube(shape.half_width);
-        shape.reached_from(&visual_hull::by_footprint(self.views, aabb, [shape.resolution; 3], self.margin, &|_| ()))
+    /// The voxels of a grid that a sample inside of the silhouettes can read.
+    pub fn voxels<T: Real>(&self, grid: &VoxelGrid<T>) -> Occupancy {
+        let shape = grid.shape();
+        let near = shape.reached_from(&grid.voxels_where(|_| true));
+        shape.reached_from(&visual_hull::by_footprint_of(self.views, &near, self.margin, &|_| ()))
     }
 }
 

@@ -135,24 +135,35 @@ impl<'a, T: Real> Scene<'a, T> {
                         }
                     }
                 }
-                let (delta, weight, after) = (&block.delta[run.clone()], &mut block.weight[run.clone()], &mut block.after[run]);
+                let (delta, weight, after) = (&block.delta[run.clone()], &mut block.weight[run.clone()], &mut block.after[run.clone()]);
                 if parallel::fused() {
                     lookup::absorptions::<T, true>(density, delta, weight, after);
                 } else {
                     lookup::absorptions::<T, false>(density, delta, weight, after);
                 }
-                for (w, through) in weight.iter_mut().zip(after) {
+                for i in run {
                     if left < stop {
                         break;
                     }
-                    *w *= left;
-                    left *= *through;
-                    *through = left;
+                    // A sample of no density takes no part, and no gradient changes it.
+                    if block.density[i] < T::zero() {
+                        continue;
+                    }
+                    block.weight[i] *= left;
+                    left *= block.after[i];
+                    block.after[i] = left;
+                    if i != end {
+                        block.columns().into_iter().for_each(|column| column[end] = column[i]);
+                        match &mut found {
+                            Some(corners) => corners.replace(end, i),
+                            None => block.rows[end] = block.rows[i],
+                        }
+                    }
                     end += 1;
                 }
-            }
-            if let Some(corners) = &mut found {
-                corners.truncate(end);
+                if let Some(corners) = &mut found {
+                    corners.truncate(end);
+                }
             }
             block.offsets.push(end as u32);
         }

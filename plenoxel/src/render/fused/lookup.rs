@@ -64,6 +64,11 @@ impl<T: Real> Corners<T> {
         self.places.extend((first..).take(values.len()).map(|place| place as u32));
     }
 
+    /// Sample number `to` becomes what number `from` is.
+    pub fn replace(&mut self, to: usize, from: usize) {
+        self.places[to] = self.places[from];
+    }
+
     /// Keeps the first `count` samples.
     pub fn truncate(&mut self, count: usize) {
         self.places.truncate(count);

@@ -5,6 +5,7 @@ use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, VoxelGrid};
 use crate::render::RenderOptions;
 use autograd::{Real, Tensor, parallel};
+use std::cell::LazyCell;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 /// What photographs show of each row of a grid's tables. Each sample on a ray counts by its weight w, times the share that the row has in it;
@@ -96,8 +97,10 @@ struct Sample<'a, T> {
     weight: T,
     /// Of density and color.
     own: Reads<'a, T>,
-    /// Of harmonics that are reduced: its number among the block's samples, what finds their rows, and the harmonics of the ray's direction.
-    harmonics: Option<(usize, &'a reduced::Reads<T>, &'a [T])>,
+    /// Rows of harmonics that are reduced with their shares, which are found when they are asked for.
+    reduced: &'a dyn Fn() -> Option<([u32; 8], [T; 8])>,
+    /// The harmonics of the ray's direction that belong to them.
+    beyond: &'a [T],
 }
 
 /// Rows of a table with their shares.
@@ -136,9 +139,8 @@ impl<T: Real> Sample<'_, T> {
     /// What it shows to its ray.
     fn color(&self, grid: &VoxelGrid<T>) -> [f64; 3] {
         let mut sum = self.own.color(grid.color.tensor());
-        if let (Some((i, reads, basis)), Some(table)) = (self.harmonics, &grid.harmonics) {
-            let (rows, shares) = reads(i);
-            let changing = Reads { rows: &rows, shares: &shares, basis }.color(table.tensor());
+        if let (Some((rows, shares)), Some(table)) = ((self.reduced)(), &grid.harmonics) {
+            let changing = Reads { rows: &rows, shares: &shares, basis: self.beyond }.color(table.tensor());
             sum.iter_mut().zip(changing).for_each(|(sum, c)| *sum += c);
         }
         let offset = if let Color::Sh { offset, .. } = grid.shape().color { offset } else { 0.0 };
@@ -158,17 +160,18 @@ fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderO
     let here = batch.harmonics().max(1).min(count);
     parallel::map_chunks(rays.len(), BLOCK, |range| {
         let (block, corners) = scene.weights(range.start, range.len());
-        let reduced = reduced::reads(&batch, &block);
+        let reads = LazyCell::new(|| reduced::reads(&batch, &block));
         for (ray, own) in range.zip(block.rays()) {
             let (basis, beyond) = batch.basis.data()[ray * count..][..count].split_at(here);
             for i in own.filter(|&i| block.weight[i] > least) {
                 let weight = block.weight[i];
-                let harmonics = reduced.as_ref().map(|reads| (i, reads, beyond));
+                let reduced = || reads.as_ref().map(|reads| reads(i));
+                let sample = |own| f(Sample { ray, weight, own, reduced: &reduced, beyond });
                 match &corners {
-                    None => f(Sample { ray, weight, own: Reads { rows: &block.rows[i..=i], shares: &[T::one()], basis }, harmonics }),
+                    None => sample(Reads { rows: &block.rows[i..=i], shares: &[T::one()], basis }),
                     Some(corners) => {
                         let (rows, shares) = corners.of(i);
-                        f(Sample { ray, weight, own: Reads { rows: &rows, shares: &shares, basis }, harmonics });
+                        sample(Reads { rows: &rows, shares: &shares, basis });
                     }
                 }
             }
