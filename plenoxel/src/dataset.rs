@@ -85,7 +85,7 @@ impl View {
         let (width, height) = self.image.dimensions();
         let divides = |k: &usize| width.is_multiple_of(*k as u32) && height.is_multiple_of(*k as u32);
         let k = (1..=k).rev().find(divides).unwrap_or(1);
-        let camera = Camera { intrinsics: self.camera.intrinsics.downscaled(k), ..self.camera.clone() };
+        let camera = Camera { intrinsics: self.camera.intrinsics.downscaled(k), ..self.camera };
         View { name: self.name.clone(), camera, image: image::downscale(&self.image, k), depth: None }
     }
 

@@ -14,39 +14,34 @@ pub(super) struct Places<'a, T> {
     ray: &'a Ray,
     /// Voxel coordinates are the world's times the first number, plus the second.
     to_voxels: [T; 2],
-    rest: Rest<'a>,
-}
-
-enum Rest<'a> {
-    /// Every interval of a march from this number on.
-    All(March, usize),
-    Occupied(Occupied<'a>),
+    /// The march, and how many of its intervals have been given.
+    march: March,
+    next: usize,
+    /// Where cells are known that hold nothing, the intervals in the others instead.
+    occupied: Option<Occupied<'a>>,
 }
 
 impl<'a, T: Real> Places<'a, T> {
     pub fn new(march: March, ray: &'a Ray, cells: Option<&'a Occupancy>, shape: &GridShape) -> Self {
         let scale = 1.0 / shape.voxel_side();
-        let rest = match cells {
-            None => Rest::All(march, 0),
-            Some(cells) => Rest::Occupied(march.occupied(ray, cells)),
-        };
-        Places { ray, to_voxels: [T::lit(scale), T::lit(shape.half_width * scale - 0.5)], rest }
+        let to_voxels = [T::lit(scale), T::lit(shape.half_width * scale - 0.5)];
+        Places { ray, to_voxels, march, next: 0, occupied: cells.map(|cells| march.occupied(ray, cells)) }
     }
 
     /// Voxel coordinates, middles and lengths of the next samples, as many as there are and [`RUN`] at most. Returns how many; 0 at the end.
     pub fn next_run(&mut self, out: [&mut [T; RUN]; 5]) -> usize {
         let mut intervals = [(0.0, 0.0); RUN];
         let mut count = 0;
-        match &mut self.rest {
-            Rest::All(march, next) => {
-                count = RUN.min(march.count - *next);
+        match &mut self.occupied {
+            None => {
+                count = RUN.min(self.march.count - self.next);
                 for (i, interval) in intervals.iter_mut().enumerate() {
-                    *interval = march.interval(*next + i);
+                    *interval = self.march.interval(self.next + i);
                 }
-                *next += count;
+                self.next += count;
             }
-            Rest::Occupied(rest) => {
-                for (to, interval) in intervals.iter_mut().zip(rest) {
+            Some(occupied) => {
+                for (to, interval) in intervals.iter_mut().zip(occupied) {
                     *to = interval;
                     count += 1;
                 }
