@@ -50,16 +50,16 @@ pub fn whole<N: TryFrom<u64>>(least: u64, most: u64) -> impl Fn(&str) -> Result<
 /// An amount of memory as the command line takes it: a number of bytes, or of units of 1000 or 1024.
 pub fn memory_size(text: &str) -> Result<u64, String> {
     let unit = text.trim_start_matches(|c: char| c.is_ascii_digit() || c == '.');
-    let (power, base) = match unit.trim().to_ascii_lowercase().as_str() {
-        "" | "b" => (0, 1.0),
-        "m" | "mb" => (2, 1000.0),
-        "g" | "gb" => (3, 1000.0),
-        "mib" => (2, 1024.0),
-        "gib" => (3, 1024.0),
-        _ => (0, f64::NAN),
+    let bytes_of_unit = match unit.trim().to_ascii_lowercase().as_str() {
+        "" | "b" => 1.0,
+        "m" | "mb" => 1e6,
+        "g" | "gb" => 1e9,
+        "mib" => f64::from(1 << 20),
+        "gib" => f64::from(1 << 30),
+        _ => f64::NAN,
     };
     let number: f64 = text[..text.len() - unit.len()].parse().unwrap_or(f64::NAN);
-    let bytes = number * f64::powi(base, power);
+    let bytes = number * bytes_of_unit;
     if bytes >= 1.0 { Ok(bytes as u64) } else { Err("an amount of memory, such as 8GB, 8GiB or 500MB".to_owned()) }
 }
 
