@@ -209,14 +209,18 @@ impl<'a, T: Real> Trainer<'a, T> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        if self.prunes_from().is_some_and(|first| index >= first) {
+        let prunes = self.prunes_from().is_some_and(|first| index >= first);
+        if prunes {
             let before = self.plan[index.saturating_sub(1)].stage;
-            self.prune(&before)?;
+            self.prune(&self.worth_keeping(&before))?;
         }
         let finer = plan.stage.resolution != self.grid.shape().resolution;
         if finer {
             release_free_buffers();
             self.grid = self.grid.resample(plan.stage.resolution);
+            if prunes {
+                self.prune(&self.grid.occupancy(self.config.prune_below))?;
+            }
         }
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
             let pruned = self.grid.pruned(&silhouettes.voxels(&self.grid));
@@ -242,9 +246,8 @@ impl<'a, T: Real> Trainer<'a, T> {
         Ok(())
     }
 
-    /// Takes empty voxels out of the grid, seen as the last stage saw it.
-    fn prune(&mut self, stage: &Stage) -> Result<()> {
-        let kept = self.worth_keeping(stage);
+    /// Takes all other voxels out of the grid.
+    fn prune(&mut self, kept: &Occupancy) -> Result<()> {
         if kept.fraction() == 0.0 {
             let Config { prune_below, prune_unseen_below, .. } = self.config;
             return Err(Error::Numeric {
@@ -255,7 +258,7 @@ impl<'a, T: Real> Trainer<'a, T> {
                 ),
             });
         }
-        self.grid = self.grid.pruned(&kept);
+        self.grid = self.grid.pruned(kept);
         Ok(())
     }
 
@@ -273,7 +276,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         self.config.prune_from_stage.map(|first| first.saturating_sub(self.config.stages.len() - self.plan.len()))
     }
 
-    /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees.
+    /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees as it did in a stage.
     fn worth_keeping(&self, stage: &Stage) -> Occupancy {
         let full = self.grid.occupancy(self.config.prune_below);
         let least = self.config.prune_unseen_below;

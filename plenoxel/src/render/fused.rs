@@ -172,7 +172,7 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
     let mut blocks = Vec::new();
     for (chunk, pixels) in pixels.chunks_mut(CHUNK * COLUMNS).enumerate() {
         blocks = scene.render_all(chunk * CHUNK, pixels, keep);
-        sample_count += blocks.iter().map(Block::len).sum::<usize>();
+        sample_count += blocks.iter().map(|block| block.looked_at).sum::<usize>();
     }
     let kept = if keep {
         Kept::Samples(blocks)

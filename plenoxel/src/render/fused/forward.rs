@@ -15,6 +15,8 @@ use autograd::{Buffer, Real, Tensor, parallel};
 pub(super) struct Block<T: Real> {
     /// Number of its first ray.
     pub first: usize,
+    /// Samples that were looked at, those without density too, which are not kept.
+    pub looked_at: usize,
     /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
     /// As looked up: σ is this where it is not negative.
@@ -93,7 +95,7 @@ impl<'a, T: Real> Scene<'a, T> {
         self.colors(&mut block, found.as_ref());
         self.sum(&block, pixels);
         if !keep {
-            return Block { first, offsets: block.offsets, ..Block::empty() };
+            return Block { first, looked_at: block.looked_at, offsets: block.offsets, ..Block::empty() };
         }
         block
     }
@@ -145,6 +147,7 @@ impl<'a, T: Real> Scene<'a, T> {
                     if left < stop {
                         break;
                     }
+                    block.looked_at += 1;
                     // A sample of no density takes no part, and no gradient changes it.
                     if block.density[i] < T::zero() {
                         continue;
@@ -231,6 +234,7 @@ impl<T: Real> Block<T> {
         let none = || Buffer::stale(0);
         Block {
             first: 0,
+            looked_at: 0,
             offsets: vec![0],
             density: none(),
             at: [none(), none(), none()],

@@ -15,7 +15,9 @@ pub(super) struct Corners<T: Real> {
     /// Numbers of a whole group that are in use.
     end: usize,
     /// Where the first corner of each sample is; the next ones follow [`TOGETHER`] apart.
-    places: Vec<u32>,
+    places: Buffer<u32>,
+    /// How many samples there are.
+    count: usize,
 }
 
 dispatched! {
@@ -35,16 +37,16 @@ impl<T: Real> Corners<T> {
     /// Those of `count` positions.
     pub fn find(at: [&[T]; 3], map: impl NodeMap, count: usize) -> Self {
         let end = count.div_ceil(TOGETHER) * GROUP;
-        let mut corners = Corners { rows: Buffer::stale(end), weights: Buffer::stale(end), end, places: Vec::new() };
+        let mut corners = Corners { rows: Buffer::stale(end), weights: Buffer::stale(end), end, places: Buffer::stale(count), count };
         let (rows, weights) = (corners.rows.as_chunks_mut().0.as_chunks_mut().0, corners.weights.as_chunks_mut().0.as_chunks_mut().0);
         corners_of_many(at, map, rows, weights);
-        corners.places.extend((0..count).map(|i| (i / TOGETHER * GROUP + i % TOGETHER) as u32));
+        corners.places.iter_mut().enumerate().for_each(|(i, place)| *place = (i / TOGETHER * GROUP + i % TOGETHER) as u32);
         corners
     }
 
     /// Of no samples.
     pub fn none() -> Self {
-        Corners { rows: Buffer::stale(0), weights: Buffer::stale(0), end: 0, places: Vec::new() }
+        Corners { rows: Buffer::stale(0), weights: Buffer::stale(0), end: 0, places: Buffer::stale(0), count: 0 }
     }
 
     /// Adds those of at most [`TOGETHER`] positions, and gives what a table of one column is there.
@@ -61,7 +63,12 @@ impl<T: Real> Corners<T> {
         let weights = self.weights[first..self.end].as_chunks_mut().0.as_chunks_mut().0;
         corners_of_many(at, map, rows, weights);
         interpolate(table, rows, weights, values);
-        self.places.extend((first..).take(values.len()).map(|place| place as u32));
+        let before = self.count;
+        self.count += values.len();
+        if self.count > self.places.len() {
+            self.places.grow((2 * self.places.len()).max(1024 * TOGETHER));
+        }
+        self.places[before..self.count].iter_mut().zip(first..).for_each(|(to, place)| *to = place as u32);
     }
 
     /// Sample number `to` becomes what number `from` is.
@@ -71,7 +78,7 @@ impl<T: Real> Corners<T> {
 
     /// Keeps the first `count` samples.
     pub fn truncate(&mut self, count: usize) {
-        self.places.truncate(count);
+        self.count = count;
     }
 
     /// The row of a sample's corner with the lowest coordinates, or a row of its neighbourhood if that voxel is not present.
