@@ -204,23 +204,15 @@ impl<'a, T: Real> Trainer<'a, T> {
         Ok(Some(report))
     }
 
-    /// What happens between stages: empty space is left out, the field is read at a finer resolution, the optimizer starts afresh.
+    /// What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
     fn begin(&mut self, index: usize) -> Result<()> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        let prunes = self.prunes_from().is_some_and(|first| index >= first);
-        if prunes {
-            let before = self.plan[index.saturating_sub(1)].stage;
-            self.prune(&self.worth_keeping(&before))?;
-        }
         let finer = plan.stage.resolution != self.grid.shape().resolution;
         if finer {
             release_free_buffers();
             self.grid = self.grid.resample(plan.stage.resolution);
-            if prunes {
-                self.prune(&self.grid.occupancy(self.config.prune_below))?;
-            }
         }
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
             let pruned = self.grid.pruned(&silhouettes.voxels(&self.grid));
@@ -236,6 +228,9 @@ impl<'a, T: Real> Trainer<'a, T> {
         if plan.stage.image_reduction != self.reduction {
             self.reduction = plan.stage.image_reduction;
             self.rays = self.all_rays();
+        }
+        if self.prunes_from().is_some_and(|first| index >= first) {
+            self.prune(&self.worth_keeping(&plan.stage))?;
         }
         if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
             self.rays = self.all_rays().aimed_at(reach);
@@ -276,15 +271,15 @@ impl<'a, T: Real> Trainer<'a, T> {
         self.config.prune_from_stage.map(|first| first.saturating_sub(self.config.stages.len() - self.plan.len()))
     }
 
-    /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees as it did in a stage.
+    /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees.
     fn worth_keeping(&self, stage: &Stage) -> Occupancy {
         let full = self.grid.occupancy(self.config.prune_below);
         let least = self.config.prune_unseen_below;
         if least == 0.0 {
             return full;
         }
-        // What lies behind a surface must stay for the surface to move. svox2 has 2 voxels of the finer grid.
-        const MARGIN: usize = 1;
+        // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
+        const MARGIN: usize = 2;
         // Where less light is left, no sample weighs as much.
         let stop_below = self.config.stop_below.max(least);
         let options = RenderOptions { stop_below, ..self.options(stage, Jitter::None) };
