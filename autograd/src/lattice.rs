@@ -5,7 +5,11 @@
 //! Morton curve, so rows that are near in space are near in memory; those that nobody needs take no memory; and inside a brick a bit for
 //! each node says whether it is *present*. A node that is not present reads as a row of zeros and gets no gradient.
 
+use crate::parallel::gathered;
 use std::sync::{Arc, OnceLock};
+
+/// Nodes that are looked up together: a vector of their numbers.
+pub const TOGETHER: usize = 16;
 
 /// Nodes along the side of a brick.
 pub const BRICK: usize = 4;
@@ -27,8 +31,10 @@ pub struct Lattice {
 struct Bricks {
     /// Bricks along each axis; the last ones may stick out of the grid.
     count: [usize; 3],
-    /// Number of each brick among those that have rows, bricks in row-major order; 0 for one that has none.
+    /// Number of each brick among those that have rows, bricks in row-major order; how many these are for one that has none.
     links: Vec<u32>,
+    /// The masks of the bricks that have rows, in their order, and an empty one at the end: a table that stays in the cache.
+    linked_masks: Vec<u64>,
     /// A bit for each node of a brick that is present, node (i, j, k) of the brick being bit 16 i + 4 j + k.
     masks: Vec<u64>,
     /// True if every node of the grid is present.
@@ -100,12 +106,14 @@ impl Lattice {
             }
         }
         places.sort_unstable_by_key(|&place| morton(place));
-        let mut links = vec![0; masks.len()];
+        let mut links = vec![places.len() as u32; masks.len()];
+        let mut linked_masks = vec![0; places.len() + 1];
         for (brick, place) in places.iter().enumerate() {
-            links[number(place.map(|c| c as usize), count)] = brick as u32;
+            let b = number(place.map(|c| c as usize), count);
+            (links[b], linked_masks[brick]) = (brick as u32, masks[b]);
         }
         let full = masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>() == nodes.iter().product();
-        Lattice { nodes, bricks: Some(Arc::new(Bricks { count, links, masks, full, places, neighbours: OnceLock::new() })) }
+        Lattice { nodes, bricks: Some(Arc::new(Bricks { count, links, linked_masks, masks, full, places, neighbours: OnceLock::new() })) }
     }
 
     /// Nodes along each axis.
@@ -140,7 +148,7 @@ impl Lattice {
     #[inline]
     pub fn row(&self, node: [usize; 3]) -> Option<u32> {
         assert!((0..3).all(|a| node[a] < self.nodes[a]), "node {node:?} of a lattice of {:?} nodes", self.nodes);
-        with_map!(self, map => map.row(node).ok())
+        with_map!(self, map => map.row(node))
     }
 
     /// The node of a row, or `None` if the row belongs to none that is present.
@@ -203,7 +211,7 @@ impl Lattice {
 
     /// The layout as kernels see it, or `None` if it is row-major.
     pub fn brick_map(&self) -> Option<BrickMap<'_>> {
-        self.bricks.as_ref().map(|b| BrickMap { nodes: self.nodes, count: b.count, links: &b.links, masks: &b.masks })
+        self.bricks.as_ref().map(|b| BrickMap { nodes: self.nodes, count: b.count, links: &b.links, masks: &b.linked_masks })
     }
 
     /// The same if every node is present, which needs no masks.
@@ -252,16 +260,13 @@ pub trait NodeMap: Copy + Sync {
     fn code(self, node: [u32; 3]) -> u32 {
         self.share(0, node[0]) + self.share(1, node[1]) + self.share(2, node[2])
     }
-    /// The row of the node with a number; the error is some row of the table for a node that is not present.
-    fn row_of(self, code: u32) -> Result<u32, u32>;
-    /// The rows of the eight corners of a cell, the last index running fastest, if that is known at a glance and all of them are present.
-    #[inline(always)]
-    fn rows_of_cell(self, _: [u32; 8]) -> Option<[u32; 8]> {
-        None
-    }
+    /// The row of the node with a number, if it is present.
+    fn row_of(self, code: u32) -> Option<u32>;
+    /// The rows of many nodes, and all bits for each that is present. What stands for the row of one that is not has no meaning.
+    fn rows_of(self, codes: [u32; TOGETHER]) -> ([u32; TOGETHER], [u32; TOGETHER]);
     /// The row of a node inside the grid.
     #[inline(always)]
-    fn row(self, node: [usize; 3]) -> Result<u32, u32> {
+    fn row(self, node: [usize; 3]) -> Option<u32> {
         self.row_of(self.code(node.map(|c| c as u32)))
     }
     /// True if nodes may be missing.
@@ -286,8 +291,12 @@ impl NodeMap for RowMajor {
         coordinate * [self.nodes[1] * self.nodes[2], self.nodes[2], 1][axis] as u32
     }
     #[inline(always)]
-    fn row_of(self, code: u32) -> Result<u32, u32> {
-        Ok(code)
+    fn row_of(self, code: u32) -> Option<u32> {
+        Some(code)
+    }
+    #[inline(always)]
+    fn rows_of(self, codes: [u32; TOGETHER]) -> ([u32; TOGETHER], [u32; TOGETHER]) {
+        (codes, [!0; TOGETHER])
     }
 }
 
@@ -298,6 +307,14 @@ pub struct BrickMap<'a> {
     count: [usize; 3],
     links: &'a [u32],
     masks: &'a [u64],
+}
+
+impl BrickMap<'_> {
+    /// The links of the bricks of many nodes.
+    #[inline(always)]
+    fn linked(self, codes: [u32; TOGETHER]) -> [u32; TOGETHER] {
+        gathered(self.links, codes.map(|code| code / 64))
+    }
 }
 
 impl NodeMap for BrickMap<'_> {
@@ -313,23 +330,21 @@ impl NodeMap for BrickMap<'_> {
         coordinate / 4 * bricks * 64 + coordinate % 4 * STRIDE[axis] as u32
     }
     #[inline(always)]
-    fn row_of(self, code: u32) -> Result<u32, u32> {
-        let (brick, local) = (code as usize / BRICK_ROWS, code % 64);
-        let row = self.links[brick] * 64 + local;
-        if self.masks[brick] >> local & 1 == 1 { Ok(row) } else { Err(row) }
+    fn row_of(self, code: u32) -> Option<u32> {
+        let (link, local) = (self.links[code as usize / BRICK_ROWS], code % 64);
+        (self.masks[link as usize] >> local & 1 == 1).then_some(link * 64 + local)
     }
-    /// If all lie in one brick, as those of 27 cells of 64 do.
     #[inline(always)]
-    fn rows_of_cell(self, codes: [u32; 8]) -> Option<[u32; 8]> {
-        const LINE: u64 = 1 | 1 << STRIDE[2];
-        const SQUARE: u64 = LINE | LINE << STRIDE[1];
-        const CORNERS: u64 = SQUARE | SQUARE << STRIDE[0];
-        let (brick, local) = (codes[0] as usize / BRICK_ROWS, codes[0] % 64);
-        if codes[7] as usize / BRICK_ROWS != brick || !self.masks[brick] >> local & CORNERS != 0 {
-            return None;
+    fn rows_of(self, codes: [u32; TOGETHER]) -> ([u32; TOGETHER], [u32; TOGETHER]) {
+        let links = self.linked(codes);
+        let masks = gathered(self.masks, links);
+        let (mut rows, mut present) = ([0; TOGETHER], [0; TOGETHER]);
+        for i in 0..TOGETHER {
+            let local = codes[i] % 64;
+            rows[i] = links[i] * 64 + local;
+            present[i] = 0u32.wrapping_sub((masks[i] >> local) as u32 & 1);
         }
-        let from = (self.links[brick] * 64).wrapping_sub(brick as u32 * 64);
-        Some(codes.map(|code| code.wrapping_add(from)))
+        (rows, present)
     }
 }
 
@@ -348,8 +363,17 @@ impl NodeMap for FullBrickMap<'_> {
         self.0.share(axis, coordinate)
     }
     #[inline(always)]
-    fn row_of(self, code: u32) -> Result<u32, u32> {
-        Ok(self.0.links[code as usize / BRICK_ROWS] * 64 + code % 64)
+    fn row_of(self, code: u32) -> Option<u32> {
+        Some(self.0.links[code as usize / BRICK_ROWS] * 64 + code % 64)
+    }
+    #[inline(always)]
+    fn rows_of(self, codes: [u32; TOGETHER]) -> ([u32; TOGETHER], [u32; TOGETHER]) {
+        let links = self.0.linked(codes);
+        let mut rows = [0; TOGETHER];
+        for i in 0..TOGETHER {
+            rows[i] = links[i] * 64 + codes[i] % 64;
+        }
+        (rows, [!0; TOGETHER])
     }
 }
 

@@ -3,11 +3,13 @@
 //! Chunk bounds depend on sizes and never on the number of threads, and partial sums are combined in chunk order, so every result has
 //! the same bits for any thread count.
 
+mod gather;
 pub(crate) mod streamed;
 mod update;
 
 use crate::pool::Pooled;
 use crate::real::Real;
+pub use gather::gathered;
 use rayon::prelude::*;
 pub(crate) use update::{update, update_all_rows, update_deferred, update_rows};
 

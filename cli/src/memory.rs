@@ -296,8 +296,8 @@ fn training_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
     };
     match engine {
         Engine::Graph => 4 * (geometry + color),
-        // Thirteen numbers of a sample and ten of what it adds to the tables, of which it may have two or three; corners for a while.
-        Engine::Fused => 4 * 48,
+        // Thirteen numbers of a sample, twenty of what it adds to the tables, of which it has one or two, and sixteen of its corners for a while.
+        Engine::Fused => 4 * 64,
     }
 }
 

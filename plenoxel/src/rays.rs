@@ -44,6 +44,8 @@ pub struct RaySource<'a> {
     tiles: Vec<Tile>,
     /// `first[t]` is the number of pixels before tile t.
     first: Vec<u64>,
+    /// Pixels of all views.
+    pixels: u64,
 }
 
 impl<'a> RaySource<'a> {
@@ -53,28 +55,29 @@ impl<'a> RaySource<'a> {
     pub fn new(views: impl Into<Cow<'a, [View]>>, background: [f32; 3], seed: u64) -> Self {
         let views = views.into();
         let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
-        Self::of_tiles(views, background, seed, tiles)
+        let mut source = RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), pixels: 0 };
+        source.set_tiles(tiles);
+        source.pixels = source.len();
+        source
     }
 
-    fn of_tiles(views: Cow<'a, [View]>, background: [f32; 3], seed: u64, tiles: Vec<Tile>) -> Self {
-        let mut first = vec![0];
+    fn set_tiles(&mut self, tiles: Vec<Tile>) {
+        self.first = vec![0];
         for tile in &tiles {
-            first.push(first[first.len() - 1] + tile.pixels() as u64);
+            self.first.push(self.first[self.first.len() - 1] + tile.pixels() as u64);
         }
-        RaySource { views, background, seed, tiles, first }
+        self.tiles = tiles;
     }
 
-    /// The pixels of the same views around the projections of what may hold matter. The others show the background whatever is learned, so
-    /// they say nothing, except of the mean of the errors.
-    pub fn aimed_at(self, matter: &Occupancy) -> Self {
-        let tiles = tiles::showing(&self.views, matter);
-        Self::of_tiles(self.views, self.background, self.seed, tiles)
+    /// From now on the pixels of the same views around the projections of what may hold matter. The others show the background whatever is
+    /// learned, so they say nothing, except of the mean of the errors.
+    pub fn aim_at(&mut self, matter: &Occupancy) {
+        self.set_tiles(tiles::showing(&self.views, matter));
     }
 
     /// The share of the pixels of the views that are in the set.
     pub fn share(&self) -> f64 {
-        let all: u64 = self.views.iter().map(|view| u64::from(view.image.width()) * u64::from(view.image.height())).sum();
-        self.len() as f64 / all as f64
+        self.len() as f64 / self.pixels as f64
     }
 
     /// Rays in one epoch.

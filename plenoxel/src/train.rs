@@ -229,11 +229,10 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.reduction = plan.stage.image_reduction;
             self.rays = self.all_rays();
         }
+        self.aim();
         if self.prunes_from().is_some_and(|first| index >= first) {
-            self.prune(&self.worth_keeping(&plan.stage))?;
-        }
-        if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
-            self.rays = self.all_rays().aimed_at(reach);
+            self.prune(&plan.stage)?;
+            self.aim();
         }
         if self.config.project {
             self.grid.project();
@@ -241,8 +240,16 @@ impl<'a, T: Real> Trainer<'a, T> {
         Ok(())
     }
 
-    /// Takes all other voxels out of the grid.
-    fn prune(&mut self, kept: &Occupancy) -> Result<()> {
+    /// Leaves the rays out that pass what is left of the grid, if the config says so.
+    fn aim(&mut self) {
+        if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
+            self.rays.aim_at(reach);
+        }
+    }
+
+    /// Takes the voxels out of the grid that are not worth keeping.
+    fn prune(&mut self, stage: &Stage) -> Result<()> {
+        let kept = self.worth_keeping(stage);
         if kept.fraction() == 0.0 {
             let Config { prune_below, prune_unseen_below, .. } = self.config;
             return Err(Error::Numeric {
@@ -253,7 +260,7 @@ impl<'a, T: Real> Trainer<'a, T> {
                 ),
             });
         }
-        self.grid = self.grid.pruned(kept);
+        self.grid = self.grid.pruned(&kept);
         Ok(())
     }
 

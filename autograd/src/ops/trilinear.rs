@@ -5,7 +5,7 @@
 //! where the gradient with respect to it is 0.
 
 use crate::index::{self, Indices};
-use crate::lattice::{Lattice, NodeMap, with_map};
+use crate::lattice::{Lattice, NodeMap, TOGETHER, with_map};
 use crate::op::{GradSink, Kernel, KernelCall};
 use crate::parallel::{self, dispatched};
 use crate::pool::Buffer;
@@ -53,15 +53,12 @@ const ALL: u32 = 0xff;
 /// The rows of the eight corners of a cell with these numbers, and a bit for each that is present; the others stand in the row of one that is.
 #[inline(always)]
 fn rows_of<M: NodeMap>(codes: [u32; 8], map: M) -> ([u32; 8], u32) {
-    if let Some(rows) = map.rows_of_cell(codes) {
-        return (rows, ALL);
-    }
     let mut rows = [0; 8];
     let mut present = 0;
     for (c, code) in codes.into_iter().enumerate() {
         let found = map.row_of(code);
-        present |= u32::from(found.is_ok()) << c;
-        rows[c] = found.unwrap_or_else(|row| row);
+        present |= u32::from(found.is_some()) << c;
+        rows[c] = found.unwrap_or_default();
     }
     if M::SPARSE && present != ALL {
         let stand_in = if present == 0 { 0 } else { rows[present.trailing_zeros() as usize] };
@@ -73,9 +70,6 @@ fn rows_of<M: NodeMap>(codes: [u32; 8], map: M) -> ([u32; 8], u32) {
     }
     (rows, present)
 }
-
-/// Positions whose corners are found together: a vector of each number.
-pub const TOGETHER: usize = 16;
 
 dispatched! {
 /// The corners of many positions, given axis by axis: `rows[g][c][i]` is the row of corner c of position [`TOGETHER`] g + i, `weights` likewise;
@@ -110,19 +104,24 @@ pub fn corners_of_many<T: Real, M: NodeMap>(
                 rows[c][i] = shares[0][x][i] + shares[1][y][i] + shares[2][z][i];
             }
         }
-        if M::SPARSE {
-            for i in 0..TOGETHER {
-                let (found, present) = rows_of(std::array::from_fn(|c| rows[c][i]), map);
-                for c in 0..8 {
-                    rows[c][i] = found[c];
-                }
-                if present != ALL {
-                    (0..8).filter(|c| present >> c & 1 == 0).for_each(|c| weights[c][i] = T::zero());
+        let mut present = [[0; TOGETHER]; 8];
+        for c in 0..8 {
+            (rows[c], present[c]) = map.rows_of(rows[c]);
+        }
+        if M::SPARSE && present != [[!0; TOGETHER]; 8] {
+            let mut stand_in = [0; TOGETHER];
+            for c in (0..8).rev() {
+                for i in 0..TOGETHER {
+                    stand_in[i] = rows[c][i] & present[c][i] | stand_in[i] & !present[c][i];
                 }
             }
-        } else {
-            for row in rows.as_flattened_mut() {
-                *row = map.row_of(*row).unwrap_or_default();
+            for c in 0..8 {
+                for i in 0..TOGETHER {
+                    rows[c][i] = rows[c][i] & present[c][i] | stand_in[i] & !present[c][i];
+                }
+                for i in 0..TOGETHER {
+                    weights[c][i] = if present[c][i] == 0 { T::zero() } else { weights[c][i] };
+                }
             }
         }
     }

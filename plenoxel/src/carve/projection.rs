@@ -3,6 +3,7 @@
 use crate::camera::Camera;
 use crate::dataset::View;
 use crate::geometry::Aabb;
+use autograd::lattice::BRICK;
 use glam::{DVec3, dvec3};
 
 /// How the voxels of a box project into a view.
@@ -24,6 +25,7 @@ impl Projection {
     }
 
     /// x·depth, y·depth and depth of a voxel's first corner, x and y in pixels.
+    #[inline(always)]
     pub fn corner(&self, voxel: [usize; 3]) -> DVec3 {
         let [x, y, z] = voxel.map(|k| k as f64);
         self.origin + x * self.steps[0] + y * self.steps[1] + z * self.steps[2]
@@ -31,6 +33,7 @@ impl Projection {
 
     /// The projections of the corners of a box of voxels, from `low` to one behind the last, if all of them are before the camera. Bit a of a
     /// corner's number says whether it is the higher one along axis a.
+    #[inline(always)]
     pub fn corners(&self, low: [usize; 3], high: [usize; 3]) -> Option<[[f64; 2]; 8]> {
         let mut corners = [[0.0; 2]; 8];
         for (c, corner) in corners.iter_mut().enumerate() {
@@ -43,7 +46,23 @@ impl Projection {
         Some(corners)
     }
 
+    /// The same for each voxel of a brick, whose first is `low`: neighbours share them.
+    #[inline(always)]
+    pub fn corners_in_brick(&self, low: [usize; 3]) -> BrickCorners {
+        let mut corners = [[[[0.0; 2]; BRICK + 1]; BRICK + 1]; BRICK + 1];
+        for (i, plane) in corners.iter_mut().enumerate() {
+            for (j, line) in plane.iter_mut().enumerate() {
+                for (k, corner) in line.iter_mut().enumerate() {
+                    let p = self.corner([low[0] + i, low[1] + j, low[2] + k]);
+                    *corner = if p.z > 0.0 { [p.x / p.z, p.y / p.z] } else { [f64::NAN; 2] };
+                }
+            }
+        }
+        BrickCorners(corners)
+    }
+
     /// The pixels of the view that a rectangle touches; none if it is beside the image.
+    #[inline(always)]
     pub fn touched(&self, rectangle: Rectangle) -> Pixels {
         let along = |a: usize| {
             let end = self.size[a] as f64;
@@ -51,6 +70,19 @@ impl Projection {
             (low, ((rectangle.high[a].floor() + 1.0).clamp(0.0, end) as usize).max(low))
         };
         Pixels { x: along(0), y: along(1) }
+    }
+}
+
+/// The projections of the corners of all voxels of a brick; NaN for those that are not before the camera.
+pub struct BrickCorners([[[[f64; 2]; BRICK + 1]; BRICK + 1]; BRICK + 1]);
+
+impl BrickCorners {
+    /// Those of a voxel, given by its bit, in the order of [`Projection::corners`].
+    #[inline(always)]
+    pub fn of(&self, bit: usize) -> Option<[[f64; 2]; 8]> {
+        let [x, y, z] = [bit >> 4, bit >> 2 & 3, bit & 3];
+        let corners = std::array::from_fn(|c| self.0[x + (c & 1)][y + (c >> 1 & 1)][z + (c >> 2)]);
+        corners.iter().all(|corner: &[f64; 2]| !corner[0].is_nan()).then_some(corners)
     }
 }
 
@@ -85,6 +117,7 @@ pub struct Pixels {
 
 impl Pixels {
     /// Their number.
+    #[inline(always)]
     pub fn area(self) -> usize {
         (self.x.1 - self.x.0) * (self.y.1 - self.y.0)
     }
@@ -92,6 +125,7 @@ impl Pixels {
 
 impl Rectangle {
     /// The smallest one around some points, and a margin.
+    #[inline(always)]
     pub fn around(points: &[[f64; 2]; 8], margin: f64) -> Self {
         let along = |a: usize, f: fn(f64, f64) -> f64| points.iter().map(|p| p[a]).reduce(f).unwrap_or(f64::NAN);
         Rectangle { low: [0, 1].map(|a| along(a, f64::min) - margin), high: [0, 1].map(|a| along(a, f64::max) + margin) }

@@ -8,7 +8,7 @@ use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
 use crate::sampling::{Occupancy, inside, place};
 use autograd::lattice::{BRICK, BRICK_ROWS};
-use autograd::parallel;
+use autograd::{dispatched, parallel};
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -38,7 +38,7 @@ pub fn by_footprint_of(views: &[View], of: &Occupancy, margin: f64, progress: &d
             for (b, mask) in masks.iter_mut().enumerate() {
                 for silhouette in &silhouettes {
                     if *mask != 0 {
-                        *mask &= !silhouette.outside(place(first + b, count), *mask, margin);
+                        *mask &= !outside(silhouette, place(first + b, count), *mask, margin);
                     }
                 }
             }
@@ -104,6 +104,28 @@ struct Silhouette {
 /// Pairs of corners ([`Projection::corners`]) that an edge joins.
 const EDGES: [(usize, usize); 12] = [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)];
 
+dispatched! {
+/// Those voxels of a brick, as a mask, whose projection lies on background.
+fn outside(silhouette: &Silhouette, place: [usize; 3], mask: u64, margin: f64) -> u64 {
+    let Silhouette { projection, voxels, .. } = silhouette;
+    let low = place.map(|c| c * BRICK);
+    let high = [0, 1, 2].map(|a| (low[a] + BRICK).min(voxels[a]));
+    if let Some(corners) = projection.corners(low, high) {
+        let bounds = Rectangle::around(&corners, margin);
+        match silhouette.object_pixels(bounds) {
+            Some(0) if silhouette.holds(bounds) => return mask,
+            // Not seen, or object all over: nothing in it lies on background.
+            None => return 0,
+            Some(n) if n == projection.touched(bounds).area() => return 0,
+            Some(_) => {}
+        }
+    }
+    let corners = projection.corners_in_brick(low);
+    let on_background = |bit: usize| corners.of(bit).is_some_and(|corners| silhouette.is_on_background(&corners, margin));
+    (0..BRICK_ROWS).filter(|bit| mask >> bit & 1 == 1 && on_background(*bit)).fold(0, |out, bit| out | 1 << bit)
+}
+}
+
 impl Silhouette {
     fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
         let [width, height] = size(view);
@@ -118,28 +140,8 @@ impl Silhouette {
         Silhouette { projection: Projection::of(view, aabb, voxels), sums, voxels }
     }
 
-    /// Those voxels of a brick, as a mask, whose projection lies on background.
-    fn outside(&self, place: [usize; 3], mask: u64, margin: f64) -> u64 {
-        let low = place.map(|c| c * BRICK);
-        let high = [0, 1, 2].map(|a| (low[a] + BRICK).min(self.voxels[a]));
-        if let Some(corners) = self.projection.corners(low, high) {
-            let bounds = Rectangle::around(&corners, margin);
-            match self.object_pixels(bounds) {
-                Some(0) if self.holds(bounds) => return mask,
-                // Not seen, or object all over: nothing in it lies on background.
-                None => return 0,
-                Some(n) if n == self.projection.touched(bounds).area() => return 0,
-                Some(_) => {}
-            }
-        }
-        let on_background = |bit: usize| {
-            let low = [0, 1, 2].map(|a| low[a] + (bit >> (4 - 2 * a) & 3));
-            self.projection.corners(low, low.map(|k| k + 1)).is_some_and(|corners| self.is_on_background(&corners, margin))
-        };
-        (0..BRICK_ROWS).filter(|bit| mask >> bit & 1 == 1 && on_background(*bit)).fold(0, |out, bit| out | 1 << bit)
-    }
-
     /// True if the convex polygon around some points, and a margin around it, are inside of the image and on background.
+    #[inline(always)]
     fn is_on_background(&self, corners: &[[f64; 2]; 8], margin: f64) -> bool {
         let bounds = Rectangle::around(corners, margin);
         if !self.holds(bounds) {
@@ -151,7 +153,7 @@ impl Silhouette {
             Some(_) => {}
         }
         let (first, last) = (bounds.low[1].floor() as usize, (bounds.high[1].floor() as usize).min(self.projection.size[1] - 1));
-        (first..=last).all(|row| {
+        for row in first..=last {
             // The part of the polygon that is in this row of pixels lies between ends of the parts of its edges that are.
             let (top, bottom) = (row as f64 - margin, row as f64 + 1.0 + margin);
             let (mut left, mut right) = (f64::INFINITY, f64::NEG_INFINITY);
@@ -169,16 +171,21 @@ impl Silhouette {
                 }
             }
             let strip = Rectangle { low: [left - margin, row as f64], high: [right + margin, row as f64 + 0.5] };
-            left > right || self.object_pixels(strip).is_none_or(|n| n == 0)
-        })
+            if left <= right && self.object_pixels(strip).is_some_and(|n| n > 0) {
+                return false;
+            }
+        }
+        true
     }
 
     /// True if a rectangle is inside of the image.
+    #[inline(always)]
     fn holds(&self, rectangle: Rectangle) -> bool {
         (0..2).all(|a| rectangle.low[a] >= 0.0 && rectangle.high[a] <= self.projection.size[a] as f64)
     }
 
     /// The number of object pixels that a rectangle touches; `None` if it is beside the image.
+    #[inline(always)]
     fn object_pixels(&self, rectangle: Rectangle) -> Option<usize> {
         let pixels = self.projection.touched(rectangle);
         if pixels.area() == 0 {

@@ -166,12 +166,10 @@ impl Along<'_> {
         let Occupancy { cells, count, masks, distance, .. } = self.cells;
         let cell: [usize; 3] = std::array::from_fn(|a| self.cell(a, t, cells[a]) as usize);
         let (brick, bit) = split(cell, *count);
-        if masks[brick] >> bit & 1 == 1 {
-            return Look::Occupied;
-        }
+        // The distances are a table that stays in the cache, and most of what is looked at is far from everything.
         let free = distance[brick];
         if free == 0 {
-            return Look::Empty;
+            return if masks[brick] >> bit & 1 == 1 { Look::Occupied } else { Look::Empty };
         }
         // All bricks nearer than `free` are empty: to where the ray leaves the cube of them.
         let exit = (0..3).fold(f64::INFINITY, |exit, a| {
@@ -185,23 +183,24 @@ impl Along<'_> {
 
     /// The cell that a distance lies in, along one axis.
     #[inline(always)]
-    fn cell(&self, axis: usize, t: f64, cells: usize) -> i32 {
-        (self.start[axis] + t * self.slope[axis]).max(0.0).min((cells - 1) as f64) as i32
+    fn cell(&self, axis: usize, t: f64, cells: usize) -> u32 {
+        (self.start[axis] + t * self.slope[axis]).max(0.0).min((cells - 1) as f64) as u32
     }
 
     /// Which of some distances lie in occupied cells.
     #[inline(always)]
     pub(crate) fn occupied<const N: usize>(&self, t: &[f64; N]) -> [bool; N] {
         let Occupancy { cells, count, masks, .. } = self.cells;
-        let (mut bricks, mut bits) = ([0i32; N], [0i32; N]);
+        let (mut bricks, mut bits) = ([0; N], [0; N]);
         for a in 0..3 {
             for i in 0..N {
                 let cell = self.cell(a, t[i], cells[a]);
-                bricks[i] = bricks[i] * count[a] as i32 + cell / BRICK as i32;
-                bits[i] = bits[i] * BRICK as i32 + cell % BRICK as i32;
+                bricks[i] = bricks[i] * count[a] as u32 + cell / BRICK as u32;
+                bits[i] = bits[i] * BRICK as u32 + cell % BRICK as u32;
             }
         }
-        std::array::from_fn(|i| masks[bricks[i] as usize] >> bits[i] & 1 == 1)
+        let masks = parallel::gathered(masks, bricks);
+        std::array::from_fn(|i| masks[i] >> bits[i] & 1 == 1)
     }
 }
 

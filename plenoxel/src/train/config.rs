@@ -59,7 +59,7 @@ pub struct Config {
     /// Density, 1 / world length, at which a voxel counts as empty when pruning.
     pub prune_below: f64,
     /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
-    /// share of a pixel. Rays are as many as pass through every voxel. 0 for none; svox2: 0.256 / voxels a side.
+    /// share of a pixel. Of the pixels as many are looked along as make eight rays through every voxel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
     /// Folder of the run whose grid training starts from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -177,7 +177,7 @@ pub struct Stage {
     pub sampling: Sampling,
     /// Images are reduced by this factor while the stage lasts, or by the largest below it that divides their sides: one ray then says what
     /// many pixels show, which is all that large voxels can tell. An epoch is of the images as they were.
-    #[serde(default = "whole")]
+    #[serde(default = "one")]
     pub image_reduction: usize,
     /// Learning rate of the density, at the stage's start.
     pub density_rate: f64,
@@ -193,10 +193,6 @@ pub struct Stage {
 
 fn one<N: From<u8>>() -> N {
     N::from(1)
-}
-
-fn whole() -> usize {
-    1
 }
 
 /// Where samples lie along a ray.

@@ -7,18 +7,17 @@
 //! Gᵢ = cᵢ · ∂L/∂rgb + tᵢ ∂L/∂depth + ∂L/∂distortion · (2 Σⱼ wⱼ |tᵢ − tⱼ| + ⅔ wᵢ δᵢ),   G_b = background · ∂L/∂rgb − ∂L/∂opacity.
 
 use super::forward::Block;
+use super::lookup::Corners;
 use super::{BUCKET_SHIFT, Batch, COLUMNS, Output, column};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
-use autograd::lattice::NodeMap;
-use autograd::ops::trilinear::corners;
-use autograd::{Buffer, Lattice, Real, RowSums, Tensor, dispatched, parallel};
+use autograd::{Buffer, Real, RowSums, Tensor, dispatched, parallel};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// What every sample of a batch adds to the tables, sorted by bucket within each block.
 #[derive(Debug)]
 pub(super) struct Sums<T: Real> {
-    lattice: Lattice,
     /// Harmonics of a channel in a row of the color table, as [`Batch::harmonics`] counts them.
     count: usize,
     /// `[n, (degree + 1)²]`
@@ -43,7 +42,7 @@ struct Records<T: Real> {
 #[derive(Debug)]
 enum At<T: Real> {
     Rows(Buffer<u32>),
-    Voxels([Buffer<T>; 3]),
+    Corners(Corners<T>),
 }
 
 impl<T: Real> Sums<T> {
@@ -53,9 +52,9 @@ impl<T: Real> Sums<T> {
         let blocks = parallel::map_indices(blocks.len(), |b| {
             let block = &blocks[b];
             let gradients = Gradients::new(batch, block, cotangent, output);
-            with_bricks!(batch.layout.lattice, map => gradients.sorted(batch, block, map, buckets))
+            gradients.sorted(batch, block, buckets)
         });
-        Sums { lattice: batch.layout.lattice.clone(), count: batch.harmonics(), basis: batch.basis.clone(), blocks }
+        Sums { count: batch.harmonics(), basis: batch.basis.clone(), blocks }
     }
 
     fn is_empty(&self, bucket: usize) -> bool {
@@ -63,7 +62,7 @@ impl<T: Real> Sums<T> {
     }
 
     /// Calls `f(records, range)` for the records of a bucket, block after block.
-    fn for_each(&self, bucket: usize, mut f: impl FnMut(&Records<T>, std::ops::Range<usize>)) {
+    fn for_each(&self, bucket: usize, mut f: impl FnMut(&Records<T>, Range<usize>)) {
         for records in &self.blocks {
             let range = records.starts[bucket] as usize..records.starts[bucket + 1] as usize;
             if !range.is_empty() {
@@ -101,7 +100,7 @@ impl<T: Real> Gradients<T> {
     }
 
     /// Sorts what the samples whose density is not negative have by the buckets they read.
-    fn sorted(&self, batch: &Batch<T>, block: &Block<T>, map: impl NodeMap, buckets: usize) -> Records<T> {
+    fn sorted(&self, batch: &Batch<T>, block: &Block<T>, buckets: usize) -> Records<T> {
         match batch.layout.shape.interpolation {
             Interpolation::Nearest => {
                 let one = |i: usize| [block.rows[i] >> BUCKET_SHIFT];
@@ -110,21 +109,15 @@ impl<T: Real> Gradients<T> {
                 Records { at: At::Rows(rows), ..records }
             }
             Interpolation::Trilinear => {
+                let at = block.at.each_ref().map(|a| &a[..]);
+                let found = with_bricks!(batch.layout.lattice, map => Corners::find(at, map, block.len()));
                 let mut touched = Buffer::stale(8 * block.len());
                 let touched = touched.as_chunks_mut().0;
-                let most = block.len() + touch_buckets(block.at.each_ref().map(|a| &a[..]), map, touched);
-                let mut at = [Buffer::stale(most), Buffer::stale(most), Buffer::stale(most)];
-                let records = self.records(
-                    batch,
-                    block,
-                    buckets,
-                    most,
-                    |i| touched[i],
-                    |place, i| {
-                        at.iter_mut().zip(&block.at).for_each(|(to, from)| to[place] = from[i]);
-                    },
-                );
-                Records { at: At::Voxels(at), ..records }
+                let most = block.len() + touch_buckets(&found, touched);
+                let mut sorted = Corners::none();
+                sorted.make_room(most);
+                let records = self.records(batch, block, buckets, most, |i| touched[i], |place, i| sorted.set(place, found.of(i)));
+                Records { at: At::Corners(sorted), ..records }
             }
         }
     }
@@ -188,21 +181,18 @@ impl<T: Real> Gradients<T> {
 const NONE: u32 = u32::MAX >> BUCKET_SHIFT;
 
 dispatched! {
-/// The different buckets that the corners of each position lie in, [`NONE`] after the last. Returns how many more there are than positions.
-fn touch_buckets<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, touched: &mut [[u32; 8]]) -> usize {
-    let n = touched.len();
-    let [x, y, z] = at.map(|a| &a[..n]);
+/// The different buckets that the corners of each sample lie in, [`NONE`] after the last. Returns how many more there are than samples.
+fn touch_buckets<T: Real>(corners: &Corners<T>, touched: &mut [[u32; 8]]) -> usize {
     let mut more = 0;
-    for i in 0..n {
-        let (rows, _) = corners([x[i], y[i], z[i]], map);
-        let all = rows.map(|row| row >> BUCKET_SHIFT);
-        touched[i] = [NONE; 8];
-        touched[i][0] = all[0];
+    for (i, touched) in touched.iter_mut().enumerate() {
+        let all = corners.of(i).0.map(|row| row >> BUCKET_SHIFT);
+        *touched = [NONE; 8];
+        touched[0] = all[0];
         if all != [all[0]; 8] {
             let mut found = 1;
             for b in all {
-                if !touched[i][..found].contains(&b) {
-                    touched[i][found] = b;
+                if !touched[..found].contains(&b) {
+                    touched[found] = b;
                     found += 1;
                 }
             }
@@ -215,7 +205,7 @@ fn touch_buckets<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, touched: &mut [[u32
 
 /// ∂L/∂σ along one ray, from the back.
 #[inline(always)]
-fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: std::ops::Range<usize>, g: &[T; COLUMNS], sigma: &mut [T]) {
+fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: Range<usize>, g: &[T; COLUMNS], sigma: &mut [T]) {
     let Some(last) = own.clone().next_back() else { return };
     let (g_depth, g_distortion) = (g[column::DEPTH], g[column::DISTORTION]);
     let g_background = (0..3).map(|c| batch.background[c] * g[c]).sum::<T>() - g[column::OPACITY];
@@ -267,11 +257,7 @@ impl<T: Real> RowSums<T> for DensitySums<T> {
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
         self.0.for_each(bucket, |records, range| match &records.at {
             At::Rows(rows) => add_rows::<T, 1>(&rows[range.clone()], &records.density[range], sums, touched),
-            At::Voxels(at) => {
-                let at = at.each_ref().map(|a| &a[range.clone()]);
-                let values = &records.density[range];
-                with_bricks!(self.0.lattice, map => add_corners::<T, 1, _>(bucket, at, map, |i| [values[i]], sums, touched));
-            }
+            At::Corners(corners) => add_corners::<T, 1>(bucket, corners, range, |i| [records.density[i]], sums, touched),
         });
     }
 }
@@ -297,16 +283,16 @@ impl<T: Real> RowSums<T> for ColorSums<T> {
 
 impl<T: Real> ColorSums<T> {
     fn add_of_width<const W: usize>(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        let Sums { lattice, basis, count: harmonics, .. } = &*self.0;
+        let Sums { basis, count: harmonics, .. } = &*self.0;
         let (count, harmonic) = (W / 3, *harmonics > 0);
         self.0.for_each(bucket, |records, range| {
-            let colors = &records.color.as_chunks::<3>().0[range.clone()];
+            let colors = records.color.as_chunks::<3>().0;
             let value = |i: usize| -> [T; W] {
                 let c = colors[i];
                 if !harmonic {
                     return std::array::from_fn(|k| c[k % 3]);
                 }
-                let y = &basis.data()[records.ray[range.start + i] as usize * count..][..count];
+                let y = &basis.data()[records.ray[i] as usize * count..][..count];
                 let mut v = [T::zero(); W];
                 for a in 0..3 {
                     for k in 0..count {
@@ -316,15 +302,12 @@ impl<T: Real> ColorSums<T> {
                 v
             };
             match &records.at {
-                At::Rows(rows) if !harmonic => add_rows::<T, W>(&rows[range.clone()], colors.as_flattened(), sums, touched),
+                At::Rows(rows) if !harmonic => add_rows::<T, W>(&rows[range.clone()], colors[range].as_flattened(), sums, touched),
                 At::Rows(rows) => {
-                    let values: Vec<T> = (0..range.len()).flat_map(value).collect();
-                    add_rows::<T, W>(&rows[range.clone()], &values, sums, touched);
+                    let values: Vec<T> = range.clone().flat_map(value).collect();
+                    add_rows::<T, W>(&rows[range], &values, sums, touched);
                 }
-                At::Voxels(at) => {
-                    let at = at.each_ref().map(|a| &a[range.clone()]);
-                    with_bricks!(lattice, map => add_corners::<T, W, _>(bucket, at, map, value, sums, touched));
-                }
+                At::Corners(corners) => add_corners::<T, W>(bucket, corners, range, value, sums, touched),
             }
         });
     }
@@ -345,19 +328,18 @@ fn add_rows<T: Real, const W: usize>(rows: &[u32], values: &[T], sums: &mut [T],
 }
 
 dispatched! {
-/// Adds weighted values to those of the eight rows around each position that lie in the bucket.
-fn add_corners<T: Real, const W: usize, M: NodeMap>(
+/// Adds weighted values to those of the eight rows around each sample that lie in the bucket.
+fn add_corners<T: Real, const W: usize>(
     bucket: usize,
-    at: [&[T]; 3],
-    map: M,
+    corners: &Corners<T>,
+    range: Range<usize>,
     value: impl Fn(usize) -> [T; W],
     sums: &mut [T],
     touched: &mut [u64],
 ) {
     let sums = sums.as_chunks_mut::<W>().0;
-    let [x, y, z] = at;
-    for (i, ((&x, &y), &z)) in x.iter().zip(y).zip(z).enumerate() {
-        let (rows, weights) = corners([x, y, z], map);
+    for i in range {
+        let (rows, weights) = corners.of(i);
         let value = value(i);
         for c in 0..8 {
             if rows[c] as usize >> BUCKET_SHIFT == bucket {

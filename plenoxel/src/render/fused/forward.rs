@@ -1,6 +1,6 @@
 //! From rays to pixels, a block of rays at a time.
 
-use super::lookup::{self, Corners, Directions};
+use super::lookup::{self, Corners, Directions, Group};
 use super::places::{Places, RUN};
 use super::{BLOCK, Batch, COLUMNS, column};
 use crate::camera::Ray;
@@ -111,6 +111,8 @@ impl<'a, T: Real> Scene<'a, T> {
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
         let mut block = Block { first, ..Block::empty() };
         let mut found = trilinear.then(Corners::none);
+        let mut group = Group::none();
+        let mut kept = [0; RUN];
         let mut end = 0;
         for (r, ray) in self.rays[first..first + count].iter().enumerate() {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
@@ -118,7 +120,10 @@ impl<'a, T: Real> Scene<'a, T> {
             let mut left = T::one();
             // What lies behind the stop is never looked up: of a run in which it comes, the rest is dropped.
             while left >= stop {
-                block.make_room(end + RUN, trilinear);
+                if end + RUN > block.t.len() {
+                    let room = block.make_room(trilinear);
+                    found.iter_mut().for_each(|corners| corners.make_room(room));
+                }
                 let own = places.next_run(block.places(end));
                 if own == 0 {
                     break;
@@ -126,8 +131,11 @@ impl<'a, T: Real> Scene<'a, T> {
                 let run = end..end + own;
                 let at = block.at.each_ref().map(|at| &at[run.clone()]);
                 let density = &mut block.density[run.clone()];
-                match &mut found {
-                    Some(corners) => corners.push(at, map, self.tables[0], density),
+                match found {
+                    Some(_) => {
+                        group.find(at, map);
+                        group.density(self.tables[0], density);
+                    }
                     None => {
                         let rows = &mut block.rows[run.clone()];
                         lookup::nearest_rows(at, map, rows);
@@ -143,6 +151,7 @@ impl<'a, T: Real> Scene<'a, T> {
                 } else {
                     lookup::absorptions::<T, false>(density, delta, weight, after);
                 }
+                let first = end;
                 for i in run {
                     if left < stop {
                         break;
@@ -157,15 +166,14 @@ impl<'a, T: Real> Scene<'a, T> {
                     block.after[i] = left;
                     if i != end {
                         block.columns().into_iter().for_each(|column| column[end] = column[i]);
-                        match &mut found {
-                            Some(corners) => corners.replace(end, i),
-                            None => block.rows[end] = block.rows[i],
-                        }
                     }
+                    kept[end - first] = i - first;
                     end += 1;
                 }
-                if let Some(corners) = &mut found {
-                    corners.truncate(end);
+                let kept = &kept[..end - first];
+                match &mut found {
+                    Some(corners) => corners.put(first, kept.iter().copied(), &group),
+                    None => kept.iter().enumerate().for_each(|(to, from)| block.rows[first + to] = block.rows[first + from]),
                 }
             }
             block.offsets.push(end as u32);
@@ -253,15 +261,14 @@ impl<T: Real> Block<T> {
         [x, y, z, &mut self.t, &mut self.delta, &mut self.density, &mut self.weight, &mut self.after]
     }
 
-    /// Makes room for `count` samples and more, so that it is seldom asked for.
-    fn make_room(&mut self, count: usize, trilinear: bool) {
-        if count > self.t.len() {
-            let size = (2 * self.t.len()).max(32 * BLOCK);
-            self.columns().into_iter().for_each(|column| column.grow(size));
-            if !trilinear {
-                self.rows.grow(size);
-            }
+    /// Makes room for more samples, so many that it is seldom asked for, and says how many there are room for.
+    fn make_room(&mut self, trilinear: bool) -> usize {
+        let size = (2 * self.t.len()).max(32 * BLOCK);
+        self.columns().into_iter().for_each(|column| column.grow(size));
+        if !trilinear {
+            self.rows.grow(size);
         }
+        size
     }
 
     /// Positions, middle and length of the samples from number `end` on.

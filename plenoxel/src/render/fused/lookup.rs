@@ -1,23 +1,21 @@
 //! Rows and weights of many positions at once.
 
-use autograd::lattice::NodeMap;
-use autograd::ops::trilinear::{TOGETHER, corners_of_many, nearest_node};
+use autograd::lattice::{NodeMap, TOGETHER};
+use autograd::ops::trilinear::{corners_of_many, nearest_node};
 use autograd::{Buffer, Real, dispatched, parallel};
 
-/// Numbers of a group of samples whose corners were found together.
-const GROUP: usize = 8 * TOGETHER;
-
 /// The eight rows around each of some samples, and their weights.
+#[derive(Debug)]
 pub(super) struct Corners<T: Real> {
-    /// In groups of [`TOGETHER`] samples, corner by corner.
+    /// Eight numbers a sample.
     rows: Buffer<u32>,
     weights: Buffer<T>,
-    /// Numbers of a whole group that are in use.
-    end: usize,
-    /// Where the first corner of each sample is; the next ones follow [`TOGETHER`] apart.
-    places: Buffer<u32>,
-    /// How many samples there are.
-    count: usize,
+}
+
+/// Those of samples that are looked up together, corner by corner.
+pub(super) struct Group<T> {
+    rows: [[[u32; TOGETHER]; 8]; 1],
+    weights: [[[T; TOGETHER]; 8]; 1],
 }
 
 dispatched! {
@@ -33,80 +31,89 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 }
 }
 
+impl<T: Real> Group<T> {
+    /// Room for some.
+    pub fn none() -> Self {
+        Group { rows: [[[0; TOGETHER]; 8]], weights: [[[T::zero(); TOGETHER]; 8]] }
+    }
+
+    /// Finds those of at most [`TOGETHER`] positions.
+    #[inline(always)]
+    pub fn find(&mut self, at: [&[T]; 3], map: impl NodeMap) {
+        corners_of_many(at, map, &mut self.rows, &mut self.weights);
+    }
+
+    /// What a table of one column is at each position.
+    pub fn density(&self, table: &[T], values: &mut [T]) {
+        interpolate(table, &self.rows[0], &self.weights[0], values);
+    }
+}
+
 impl<T: Real> Corners<T> {
     /// Those of `count` positions.
     pub fn find(at: [&[T]; 3], map: impl NodeMap, count: usize) -> Self {
-        let end = count.div_ceil(TOGETHER) * GROUP;
-        let mut corners = Corners { rows: Buffer::stale(end), weights: Buffer::stale(end), end, places: Buffer::stale(count), count };
-        let (rows, weights) = (corners.rows.as_chunks_mut().0.as_chunks_mut().0, corners.weights.as_chunks_mut().0.as_chunks_mut().0);
-        corners_of_many(at, map, rows, weights);
-        corners.places.iter_mut().enumerate().for_each(|(i, place)| *place = (i / TOGETHER * GROUP + i % TOGETHER) as u32);
+        let (mut corners, mut group) = (Corners::none(), Group::none());
+        corners.make_room(count);
+        for first in (0..count).step_by(TOGETHER) {
+            let own = first..count.min(first + TOGETHER);
+            group.find(at.map(|at| &at[own.clone()]), map);
+            corners.put(first, 0..own.len(), &group);
+        }
         corners
     }
 
     /// Of no samples.
     pub fn none() -> Self {
-        Corners { rows: Buffer::stale(0), weights: Buffer::stale(0), end: 0, places: Buffer::stale(0), count: 0 }
+        Corners { rows: Buffer::stale(0), weights: Buffer::stale(0) }
     }
 
-    /// Adds those of at most [`TOGETHER`] positions, and gives what a table of one column is there.
-    pub fn push(&mut self, at: [&[T]; 3], map: impl NodeMap, table: &[T], values: &mut [T]) {
-        assert!(values.len() <= TOGETHER, "corners are found {TOGETHER} at a time");
-        let first = self.end;
-        self.end += GROUP;
-        if self.end > self.rows.len() {
-            let size = (2 * self.rows.len()).max(1024 * GROUP);
-            self.rows.grow(size);
-            self.weights.grow(size);
-        }
-        let rows = self.rows[first..self.end].as_chunks_mut().0.as_chunks_mut().0;
-        let weights = self.weights[first..self.end].as_chunks_mut().0.as_chunks_mut().0;
-        corners_of_many(at, map, rows, weights);
-        interpolate(table, rows, weights, values);
-        let before = self.count;
-        self.count += values.len();
-        if self.count > self.places.len() {
-            self.places.grow((2 * self.places.len()).max(1024 * TOGETHER));
-        }
-        self.places[before..self.count].iter_mut().zip(first..).for_each(|(to, place)| *to = place as u32);
+    /// Makes room for `count` samples.
+    pub fn make_room(&mut self, count: usize) {
+        self.rows.grow(8 * count);
+        self.weights.grow(8 * count);
     }
 
-    /// Sample number `to` becomes what number `from` is.
-    pub fn replace(&mut self, to: usize, from: usize) {
-        self.places[to] = self.places[from];
+    /// Sets those of samples from number `first` on to some of a group. There must be room.
+    pub fn put(&mut self, first: usize, from: impl Iterator<Item = usize> + Clone, group: &Group<T>) {
+        transpose(&group.rows[0], from.clone(), &mut self.rows.as_chunks_mut().0[first..]);
+        transpose(&group.weights[0], from, &mut self.weights.as_chunks_mut().0[first..]);
     }
 
-    /// Keeps the first `count` samples.
-    pub fn truncate(&mut self, count: usize) {
-        self.count = count;
-    }
-
-    /// The row of a sample's corner with the lowest coordinates, or a row of its neighbourhood if that voxel is not present.
+    /// Sets those of a sample. There must be room.
     #[inline(always)]
-    pub fn lowest(&self, i: usize) -> u32 {
-        self.rows[self.places[i] as usize]
+    pub fn set(&mut self, i: usize, (rows, weights): ([u32; 8], [T; 8])) {
+        self.rows.as_chunks_mut().0[i] = rows;
+        self.weights.as_chunks_mut().0[i] = weights;
     }
 
     /// Rows and weights of a sample.
     #[inline(always)]
     pub fn of(&self, i: usize) -> ([u32; 8], [T; 8]) {
-        let at = self.places[i] as usize;
-        let (rows, weights) = (&self.rows[at..at + 7 * TOGETHER + 1], &self.weights[at..at + 7 * TOGETHER + 1]);
-        (std::array::from_fn(|c| rows[c * TOGETHER]), std::array::from_fn(|c| weights[c * TOGETHER]))
+        (self.rows.as_chunks().0[i], self.weights.as_chunks().0[i])
     }
 }
 
 dispatched! {
-fn interpolate<T: Real>(table: &[T], rows: &[[[u32; TOGETHER]; 8]], weights: &[[[T; TOGETHER]; 8]], values: &mut [T]) {
-    for ((values, rows), weights) in values.chunks_mut(TOGETHER).zip(rows).zip(weights) {
-        let mut sum = [T::zero(); TOGETHER];
-        for (rows, weights) in rows.iter().zip(weights) {
-            for i in 0..TOGETHER {
-                sum[i] += weights[i] * table[rows[i] as usize];
-            }
+/// The corners of some samples of a group, one after the other.
+fn transpose<N: Copy>(group: &[[N; TOGETHER]; 8], from: impl Iterator<Item = usize>, to: &mut [[N; 8]]) {
+    for (to, i) in to.iter_mut().zip(from) {
+        for c in 0..8 {
+            to[c] = group[c][i % TOGETHER];
         }
-        values.copy_from_slice(&sum[..values.len()]);
     }
+}
+}
+
+dispatched! {
+fn interpolate<T: Real>(table: &[T], rows: &[[u32; TOGETHER]; 8], weights: &[[T; TOGETHER]; 8], values: &mut [T]) {
+    let mut sum = [T::zero(); TOGETHER];
+    for (rows, weights) in rows.iter().zip(weights) {
+        let own = parallel::gathered(table, *rows);
+        for i in 0..TOGETHER {
+            sum[i] += weights[i] * own[i];
+        }
+    }
+    values.copy_from_slice(&sum[..values.len()]);
 }
 }
 
@@ -277,7 +284,7 @@ fn color<T: Real, const W: usize, const N: usize, const FUSED: bool>(coefficient
 
 /// Σ weightₖ rowₖ, in whole vectors where a row has one.
 #[inline(always)]
-fn weigh_all<T: Real, const K: usize, const W: usize, const FUSED: bool>(rows: [&[T; W]; K], weights: [T; K], sum: &mut [T; W]) {
+pub(super) fn weigh_all<T: Real, const K: usize, const W: usize, const FUSED: bool>(rows: [&[T; W]; K], weights: [T; K], sum: &mut [T; W]) {
     if W >= 16 {
         weigh::<T, K, W, 16, FUSED>(rows, weights, sum);
     } else {

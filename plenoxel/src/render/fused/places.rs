@@ -3,7 +3,7 @@
 use crate::camera::Ray;
 use crate::field::voxel_grid::GridShape;
 use crate::sampling::{March, Occupancy, Occupied};
-use autograd::ops::trilinear::TOGETHER;
+use autograd::lattice::TOGETHER;
 use autograd::{Real, dispatched};
 
 /// Samples that are looked up together.

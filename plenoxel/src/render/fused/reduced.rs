@@ -1,12 +1,11 @@
 //! Harmonics that are stored for larger voxels than the means of colors.
 //!
-//! Samples that follow each other on a ray mostly read the same rows of harmonics. So these rows are weighed with the harmonics of the ray's
-//! direction once, which leaves a color for each row, and the samples weigh those: rgb = offset + Y₀ Σⱼ wⱼ meanⱼ + Σᵢ vᵢ (Σₖ Yₖ rowᵢₖ). The
-//! adjoint goes back the same way: what the samples of such a run add to the color of each row is summed first, Σ v ∂L/∂rgb, and then each
-//! row gets it times Yₖ, bucket by bucket like everything else.
+//! rgb = offset + Y₀ Σⱼ wⱼ meanⱼ + Σₖ Yₖ Σᵢ vᵢ rowᵢₖ. Samples that follow each other on a ray mostly read the same rows of harmonics: in the
+//! adjoint, what the samples of such a run add to the color of each row is summed first, Σ v ∂L/∂rgb, and then each row gets it times Yₖ,
+//! bucket by bucket like everything else.
 
 use super::forward::{Block, Scene};
-use super::lookup::{Corners, nearest_rows};
+use super::lookup::{Corners, nearest_rows, weigh_all};
 use super::{Batch, COLUMNS};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
@@ -98,16 +97,16 @@ impl<T: Real> Scene<'_, T> {
         let (found, offset) = (found::<T, L, K>(self.batch, lattice, block), T::lit(offset));
         let look = |i: usize| found.of(i);
         match count {
-            4 => add_to_means::<T, K, 3>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
-            9 => add_to_means::<T, K, 8>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
-            _ => add_to_means::<T, K, 15>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
+            4 => add_to_means::<T, K, 9, 3>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
+            9 => add_to_means::<T, K, 24, 8>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
+            _ => add_to_means::<T, K, 45, 15>(self.tables[2], &block.offsets, basis, offset, look, block.seen(), out),
         }
     }
 }
 
 dispatched! {
-/// `basis` has `N` + 1 numbers for each ray, a row of the table 3 `N`. A row that is not in the table is zeros.
-fn add_to_means<T: Real, const K: usize, const N: usize>(
+/// `basis` has `N` + 1 numbers for each ray, a row of the table `W` = 3 `N`. A row that is not in the table is zeros.
+fn add_to_means<T: Real, const K: usize, const W: usize, const N: usize>(
     table: &[T],
     offsets: &[u32],
     basis: &[T],
@@ -116,29 +115,19 @@ fn add_to_means<T: Real, const K: usize, const N: usize>(
     seen: impl Fn(usize) -> bool,
     out: &mut [[T; 3]],
 ) {
-    let table = table.as_chunks::<N>().0;
-    let mut colors: [Rgb0<T>; K] = [[T::zero(); 4]; K];
+    let table = table.as_chunks::<W>().0;
+    let (none, mut sum) = ([T::zero(); W], [T::zero(); W]);
     for (own, basis) in offsets.windows(2).zip(basis.chunks_exact(N + 1)) {
-        let mut weighed = None;
         for i in (own[0] as usize..own[1] as usize).filter(|&i| seen(i)) {
             let (rows, weights) = look(i);
-            if weighed != Some(rows) {
-                weighed = Some(rows);
-                for (color, row) in colors.iter_mut().zip(rows) {
-                    *color = [T::zero(); 4];
-                    let Some(row) = table.get(3 * row as usize..3 * row as usize + 3) else { continue };
-                    for c in 0..3 {
-                        for k in 0..N {
-                            color[c] += row[c][k] * basis[k + 1];
-                        }
-                    }
+            weigh_all::<T, K, W, false>(rows.map(|row| table.get(row as usize).unwrap_or(&none)), weights, &mut sum);
+            for c in 0..3 {
+                let mut color = offset + T::lit(sh::Y0) * out[i][c];
+                for k in 0..N {
+                    color += sum[c * N + k] * basis[k + 1];
                 }
+                out[i][c] = color;
             }
-            let mut sum: Rgb0<T> = [T::zero(); 4];
-            for k in 0..K {
-                (0..4).for_each(|c| sum[c] += weights[k] * colors[k][c]);
-            }
-            (0..3).for_each(|c| out[i][c] = offset + T::lit(sh::Y0) * out[i][c] + sum[c]);
         }
     }
 }

@@ -28,7 +28,7 @@ struct Order {
 impl Order {
     fn new<T: Real>(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
         let seen = block.seen();
-        let bucket = |i: usize| (corners.lowest(i) >> BUCKET_SHIFT) as usize;
+        let bucket = |i: usize| (corners.of(i).0[0] >> BUCKET_SHIFT) as usize;
         let mut starts = vec![0u32; buckets + 1];
         (0..block.len()).filter(|&i| seen(i)).for_each(|i| starts[bucket(i) + 1] += 1);
         for b in 0..buckets {
