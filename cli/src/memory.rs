@@ -270,8 +270,8 @@ fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
 
 /// Voxels that a pixel may see in a carved grid: until it is opaque, or the box ends.
 fn hits_of_pixel(config: &Config) -> u64 {
-    // Two voxels for each optical depth of one, since rays are oblique; e^-6.3 is what `carve::light` cuts off.
-    let opaque = 2.0 * 6.3 / config.carve.depth + 2.0;
+    // Two voxels for each optical depth of one, since rays are oblique; e^-4.9 is what `carve::light` cuts off.
+    let opaque = 2.0 * 4.9 / config.carve.depth + 2.0;
     opaque.min(3f64.sqrt() * config.carve.resolution as f64) as u64
 }
 

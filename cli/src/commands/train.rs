@@ -1,5 +1,6 @@
 //! `plenoxel train`: from photographs to a run folder.
 
+mod budget;
 mod flags;
 mod pictures;
 
@@ -25,7 +26,7 @@ use std::time::Instant;
 /// Learns a scene and leaves a run folder.
 pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     let source = args.source();
-    let (config, preset) = args.config()?;
+    let (mut config, preset) = args.config()?;
     config.check_stages()?;
     if let (Some(from), Some(to)) = (&config.init_from, &args.out)
         && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
@@ -51,6 +52,11 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
 
+    if let Some(seconds) = args.time {
+        config = clocks.train.time(|| budget::on_time(config, &views, seconds))?;
+        let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
+        console.note(&format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", ")));
+    }
     // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
     folder.prepare()?;
     folder.describe(&config, &record(&dataset, preset, &source))?;
@@ -87,6 +93,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
         height,
         background: config.background,
         seconds: clocks.train.seconds(),
+        seconds_planned: args.time,
         seconds_load: clocks.load.seconds(),
         seconds_evaluate: clocks.evaluate.seconds(),
         peak_memory_bytes: memory::peak(),
@@ -224,6 +231,8 @@ struct Summary {
     height: usize,
     background: [f32; 3],
     seconds: f64,
+    /// The time that was asked for.
+    seconds_planned: Option<f64>,
     seconds_load: f64,
     seconds_evaluate: f64,
     peak_memory_bytes: Option<u64>,

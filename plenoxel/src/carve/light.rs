@@ -11,8 +11,8 @@ use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::{Lattice, Tensor, no_grad, parallel};
 use std::ops::ControlFlow;
 
-/// A ray ends where less than this reaches further: half a level of an 8-bit image.
-const REST: f32 = 1.0 / 512.0;
+/// A ray ends in the voxel behind which less than this is left of its light, and that voxel takes what is left: two levels of an 8-bit image.
+const REST: f32 = 1.0 / 128.0;
 /// Rays that a thread takes at a time.
 const CHUNK: usize = 1024;
 /// Parts of the tables that are added to side by side.
@@ -169,7 +169,7 @@ impl<'a> Opaque<'a> {
 }
 
 /// Turns optical depths behind voxels into their weights, e^(-depth before) - e^(-depth behind), and returns what is left of the light at the
-/// end of each ray: nothing where it is opaque. The hits of ray r end at `ends[r]`.
+/// end of each ray: nothing where it is opaque, for the last voxel has taken it. The hits of ray r end at `ends[r]`.
 fn to_weights(hits: &mut [Hit], ends: &[usize]) -> Vec<f32> {
     let depths: Vec<f32> = hits.iter().map(|hit| -hit.weight).collect();
     let n = depths.len();
@@ -179,10 +179,11 @@ fn to_weights(hits: &mut [Hit], ends: &[usize]) -> Vec<f32> {
     let rests = ends.iter().map(|&end| {
         let mut before = 1.0;
         for i in std::mem::replace(&mut first, end)..end {
-            hits[i].weight = before - light[i];
-            before = light[i];
+            let behind = if light[i] < REST { 0.0 } else { light[i] };
+            hits[i].weight = before - behind;
+            before = behind;
         }
-        if before < REST { 0.0 } else { before }
+        before
     });
     rests.collect()
 }
