@@ -39,18 +39,19 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     Ok(Config { stages, ..config })
 }
 
-/// Takes steps until the time is over, three at least.
+/// Takes steps of the first stage until the time is over or the stage is.
 fn measure(config: &Config, views: &[View], seconds: f64) -> Result<Speed> {
     let start = Instant::now();
     let mut trainer = Trainer::<f32>::new(config.clone(), views)?;
     // The first step begins the stage.
     trainer.step()?;
     let begin = start.elapsed().as_secs_f64();
-    let (first, mut count) = (Instant::now(), 0.0);
-    while (count < 3.0 || start.elapsed().as_secs_f64() < seconds) && trainer.step()?.is_some_and(|report| report.stage == 0) {
-        count += 1.0;
+    let (mut count, mut step) = (0, begin);
+    while count + 1 < trainer.plan()[0].steps && (count < 3 || start.elapsed().as_secs_f64() < seconds) {
+        trainer.step()?;
+        count += 1;
+        step = (start.elapsed().as_secs_f64() - begin) / count as f64;
     }
-    let step = if count > 0.0 { first.elapsed().as_secs_f64() / count } else { begin };
     Ok(Speed { step, begin, spent: start.elapsed().as_secs_f64() })
 }
 
