@@ -47,6 +47,8 @@ fn a_step_in_the_steady_state_takes_hardly_any_memory_from_the_system() {
         density_rate: 1.0,
         color_rate: 0.05,
         harmonics_rate: None,
+        density_warm_up: 0,
+        color_decay: None,
         rate_decay: 1.0,
     };
     for (interpolation, color) in [(Interpolation::Nearest, ColorKind::Rgb), (Interpolation::Trilinear, ColorKind::Sh)] {

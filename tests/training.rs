@@ -33,6 +33,8 @@ fn stage(resolution: usize, steps: u64) -> Stage {
         density_rate: 1.0,
         color_rate: 0.05,
         harmonics_rate: None,
+        density_warm_up: 0,
+        color_decay: None,
         rate_decay: 0.3,
     }
 }
@@ -191,6 +193,24 @@ fn a_closure_of_the_user_is_a_loss_like_any_other() {
 }
 
 #[test]
+fn weights_and_rates_follow_their_schedules() {
+    let train = views(Split::Train);
+    let first = Stage { density_warm_up: 4, rate_decay: 0.5, color_decay: Some(0.25), ..stage(8, 8) };
+    let mut config = Config { stages: vec![first], ..config() };
+    config.losses.insert("beta".to_owned(), Weight::Until { weight: 1e-6, until: 3 });
+    let (density_rate, color_rate) = (first.density_rate, first.color_rate);
+    let mut trainer = Trainer::<f32>::new(config, &train).expect("a valid config");
+    for step in 0..8 {
+        let report = trainer.step().expect("finite numbers").expect("a step");
+        assert_eq!(report.losses.iter().any(|(name, _)| name == "beta"), step < 3, "step {step}");
+        let t = f64::from(step) / 8.0;
+        let delay = 0.01 + 0.99 * (std::f64::consts::FRAC_PI_2 * (2.0 * t).min(1.0)).sin();
+        assert!((report.density_rate / (delay * density_rate * 0.5f64.powf(t)) - 1.0).abs() < 1e-9, "step {step}");
+        assert!((report.color_rate / (color_rate * 0.25f64.powf(t)) - 1.0).abs() < 1e-9, "step {step}");
+    }
+}
+
+#[test]
 fn a_loss_that_is_not_finite_stops_the_run_with_its_step() {
     let train = views(Split::Train);
     let objective = Objective::new().with("bad", 1.0, |step| {
@@ -207,7 +227,9 @@ fn a_loss_that_is_not_finite_stops_the_run_with_its_step() {
 fn a_config_with_an_impossible_value_names_its_key() {
     let train = views(Split::Train);
     type Break = fn(&mut Config);
-    let broken: [(&str, Break); 10] = [
+    let broken: [(&str, Break); 12] = [
+        ("losses.beta", |c| c.losses = BTreeMap::from([("beta".to_owned(), Weight::Until { weight: 1.0, until: 0 })])),
+        ("stages[0].color_decay", |c| c.stages[0].color_decay = Some(0.0)),
         ("stages[0].rate_decay", |c| c.stages[0].rate_decay = 1e-100),
         ("stages[0].density_rate", |c| c.stages[0].density_rate = 1e-300),
         ("stages[0].epochs", |c| (c.stages[0].steps, c.stages[0].epochs) = (None, Some(1e30))),

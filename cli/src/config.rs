@@ -14,11 +14,12 @@ use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
 /// The presets by name: what they are for, and their text.
-pub const PRESETS: [(&str, &str, &str); 5] = [
+pub const PRESETS: [(&str, &str, &str); 6] = [
     ("demo", "the built-in scene in minutes", include_str!("../presets/demo.toml")),
     ("fast", "a minute", include_str!("../presets/fast.toml")),
     ("quality", "the best in about eleven minutes", include_str!("../presets/quality.toml")),
     ("standard", "a dataset of your own", include_str!("../presets/standard.toml")),
+    ("plenoxels", "Plenoxels as published: hours", include_str!("../presets/plenoxels.toml")),
     ("paper", "\"Plenoxels and extension to point clouds\", bugs repaired", include_str!("../presets/paper.toml")),
 ];
 
@@ -260,7 +261,7 @@ fn explain(message: &str) -> (String, String) {
     let accepted = if complaint.contains("enum Sampling") {
         "{ step = voxel sides } or { samples = points, far = largest t }".to_owned()
     } else if complaint.contains("enum Weight") {
-        "a number, or { from = …, to = …, steps = … }".to_owned()
+        "a number, { weight = …, until = step } or { from = …, to = …, steps = … }".to_owned()
     } else {
         complaint
     };
@@ -342,7 +343,7 @@ mod tests {
         let message = refusal(&["evaluation={samples=5}"]);
         assert!(message.starts_with("--set evaluation") && message.contains("far ="), "{message}");
         let message = refusal(&["losses.mse=often"]);
-        assert!(message.contains("a number, or { from"), "{message}");
+        assert!(message.contains("a number, { weight = ") && message.contains("{ from = "), "{message}");
         assert!(refusal(&["stages"]).contains("key=value"));
     }
 

@@ -229,6 +229,8 @@ mod tests {
             density_rate: 1.0,
             color_rate: 1.0,
             harmonics_rate: None,
+            density_warm_up: 0,
+            color_decay: None,
             rate_decay: 1.0,
         };
         let planned = |(i, resolution)| PlannedStage { stage: stage(resolution), first: 50 * i as u64, steps: 50 };

@@ -228,7 +228,8 @@ impl Training<'_, '_> {
     fn remaining(&self, report: &Report) -> f64 {
         let now = &self.plan[report.stage];
         let step = match self.step_seconds.count {
-            0.0 => self.seconds,
+            // The first of a stage: as all before it, on the mean.
+            0.0 => self.seconds / (report.step + 1) as f64,
             _ => self.step_seconds.value,
         };
         let samples = |index: usize| {

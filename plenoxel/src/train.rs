@@ -14,7 +14,7 @@ use crate::rays::RaySource;
 use crate::render::fused::largest_weights;
 use crate::render::{Engine, RenderOptions, render};
 use crate::sampling::{Jitter, Occupancy};
-use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Rates, RmsProp, Schedule, Sgd};
+use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Piecewise, Rates, RmsProp, Schedule, Sgd, WarmUp};
 use autograd::{Real, parallel, release_free_buffers, value_and_grad};
 use config::{Config, OptimizerConfig, Stage, Weight};
 use start::Silhouettes;
@@ -197,8 +197,8 @@ impl<'a, T: Real> Trainer<'a, T> {
             psnr: -10.0 * squared_error.log10(),
             rays: batch.len(),
             samples,
-            density_rate: rate(&plan, plan.stage.density_rate).at(in_stage),
-            color_rate: rate(&plan, plan.stage.color_rate).at(in_stage),
+            density_rate: density_rate(&plan).at(in_stage),
+            color_rate: color_rate(&plan, plan.stage.color_rate).at(in_stage),
         };
         self.step += 1;
         Ok(Some(report))
@@ -336,14 +336,18 @@ pub fn objective<T: Real>(config: &Config) -> Result<Objective<T>> {
     }
     config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| match *weight {
         Weight::Constant(weight) => objective.with_named(name, weight),
+        Weight::Until { weight, until } => objective.with_named(name, Piecewise::new(weight).then(until, 0.0)),
         Weight::Exponential { from, to, steps } => objective.with_named(name, Exponential::new(from, to, steps)),
     })
 }
 
 fn optimizer<T: Real>(config: &Config, plan: &PlannedStage) -> Box<dyn Optimizer<T>> {
-    let Stage { density_rate, color_rate, harmonics_rate, .. } = plan.stage;
-    let by_name = [("density", density_rate), ("color", color_rate), ("harmonics", harmonics_rate.unwrap_or(color_rate))];
-    let rates = || by_name.into_iter().fold(Rates::new(0.0), |rates, (name, start)| rates.with(name, rate(plan, start)));
+    let Stage { color_rate: of_color, harmonics_rate, .. } = plan.stage;
+    let of_harmonics = harmonics_rate.unwrap_or(of_color);
+    let rates = || {
+        let rates = Rates::new(0.0).with("density", density_rate(plan)).with("color", color_rate(plan, of_color));
+        rates.with("harmonics", color_rate(plan, of_harmonics))
+    };
     match config.optimizer {
         OptimizerConfig::Sgd => Box::new(Sgd::new(rates())),
         OptimizerConfig::Momentum { decay } => Box::new(Momentum::new(rates(), decay)),
@@ -354,13 +358,21 @@ fn optimizer<T: Real>(config: &Config, plan: &PlannedStage) -> Box<dyn Optimizer
     }
 }
 
-/// The rate over the steps of a stage.
-fn rate(plan: &PlannedStage, start: f64) -> Box<dyn Schedule> {
-    if start == 0.0 || plan.stage.rate_decay == 1.0 {
-        Box::new(start)
-    } else {
-        Box::new(Exponential::new(start, start * plan.stage.rate_decay, plan.steps))
-    }
+/// The density's rate over the steps of a stage.
+fn density_rate(plan: &PlannedStage) -> Box<dyn Schedule> {
+    // svox2's.
+    const FIRST: f64 = 0.01;
+    let whole = rate(plan, plan.stage.density_rate, plan.stage.rate_decay);
+    if plan.stage.density_warm_up == 0 { whole } else { Box::new(WarmUp::new(whole, FIRST, plan.stage.density_warm_up)) }
+}
+
+/// That of colors or harmonics.
+fn color_rate(plan: &PlannedStage, start: f64) -> Box<dyn Schedule> {
+    rate(plan, start, plan.stage.color_decay())
+}
+
+fn rate(plan: &PlannedStage, start: f64, decay: f64) -> Box<dyn Schedule> {
+    if start == 0.0 || decay == 1.0 { Box::new(start) } else { Box::new(Exponential::new(start, start * decay, plan.steps)) }
 }
 
 fn mean_squared_error<T: Real>(x: &[T], y: &[T]) -> f64 {

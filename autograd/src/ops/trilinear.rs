@@ -323,3 +323,27 @@ fn interpolate<T: Real, const W: usize, M: NodeMap>(table: &[T], cells: &[[T; 3]
     }
 }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn corners_of_many_are_those_of_each() {
+        let nodes = [9, 14, 7];
+        let holed = Lattice::bricks_where(nodes, |[i, j, k]| (i * 7 + j * 5 + k * 3) % 11 > 2 && (i / 4 + j / 4 + k / 4) % 2 == 0);
+        // Inside, on nodes, on the border and beyond it; not a whole number of groups.
+        let at: Vec<[f64; 3]> = (0..999).map(|i| std::array::from_fn(|a| f64::from((i * [7, 11, 13][a]) % 160) * 0.125 - 2.0)).collect();
+        let columns: [Vec<f64>; 3] = std::array::from_fn(|a| at.iter().map(|p| p[a]).collect());
+        for lattice in [Lattice::from(nodes), Lattice::bricks(nodes), holed] {
+            let groups = at.len().div_ceil(TOGETHER);
+            let (mut rows, mut weights) = (vec![[[0; TOGETHER]; 8]; groups], vec![[[0.0; TOGETHER]; 8]; groups]);
+            with_map!(lattice, map => corners_of_many(columns.each_ref().map(|c| &c[..]), map, &mut rows, &mut weights));
+            for (i, &p) in at.iter().enumerate() {
+                let (group, lane) = (i / TOGETHER, i % TOGETHER);
+                let found = (rows[group].map(|rows| rows[lane]), weights[group].map(|weights| weights[lane]));
+                assert_eq!(found, with_map!(lattice, map => corners(p, map)), "position {p:?}");
+            }
+        }
+    }
+}

@@ -3,10 +3,19 @@
 use plenoxel::error::{Error, Result};
 use toml::{Table, Value};
 
-/// Keys of which one excludes the others: writing the first takes away the rest. They are the two ways to place samples and the two
-/// ways to give a stage its length.
-const ALTERNATIVES: [(&str, &[&str]); 5] =
-    [("step", &["samples", "far"]), ("samples", &["step"]), ("far", &["step"]), ("epochs", &["steps"]), ("steps", &["epochs"])];
+/// Keys of which one excludes the others: writing the first takes away the rest. They are the two ways to place samples, the two ways to
+/// give a stage its length, and the two ways in which the weight of a loss changes.
+const ALTERNATIVES: [(&str, &[&str]); 9] = [
+    ("step", &["samples", "far"]),
+    ("samples", &["step"]),
+    ("far", &["step"]),
+    ("epochs", &["steps"]),
+    ("steps", &["epochs", "weight", "until"]),
+    ("weight", &["from", "to", "steps"]),
+    ("until", &["from", "to", "steps"]),
+    ("from", &["weight", "until"]),
+    ("to", &["weight", "until"]),
+];
 
 /// Lays `over` upon `base`, key by key: tables are merged, everything else, lists included, is replaced. A table with another
 /// `kind` replaces its predecessor, whose keys would mean nothing to it.

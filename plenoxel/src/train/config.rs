@@ -71,7 +71,7 @@ pub struct Config {
     pub initial: Initial,
     /// How gradients change the grid.
     pub optimizer: OptimizerConfig,
-    /// Weight of each loss: a number, or `{ from, to, steps }` for an exponential change over the run.
+    /// Weight of each loss: a number, `{ weight, until }` for one that ends, or `{ from, to, steps }` for an exponential change over the run.
     pub losses: BTreeMap<String, Weight>,
     /// Coarse to fine.
     pub stages: Vec<Stage>,
@@ -144,12 +144,19 @@ pub enum OptimizerConfig {
     },
 }
 
-/// A weight of a loss.
+/// A weight of a loss over the steps of the run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, deny_unknown_fields)]
 pub enum Weight {
     /// The same all the time.
     Constant(f64),
+    /// The same up to a step, and nothing from then on.
+    Until {
+        /// Before `until`.
+        weight: f64,
+        /// The first step without it.
+        until: u64,
+    },
     /// Log-linear from one to the other over so many steps, then constant.
     Exponential {
         /// At step 0.
@@ -186,13 +193,24 @@ pub struct Stage {
     /// Learning rate of harmonics that are reduced, at the stage's start; without it `color_rate`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub harmonics_rate: Option<f64>,
+    /// Steps over which the density's rate rises from a hundredth of itself, along a quarter of a sine (svox2's delay); 0 for none.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub density_warm_up: u64,
     /// All rates fall exponentially to this share of themselves at the stage's end; 1 keeps them.
     #[serde(default = "one")]
     pub rate_decay: f64,
+    /// The same for the rates of colors and harmonics, if they fall otherwise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub color_decay: Option<f64>,
 }
 
 fn one<N: From<u8>>() -> N {
     N::from(1)
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
+fn is_zero(n: &u64) -> bool {
+    *n == 0
 }
 
 /// Where samples lie along a ray.
@@ -232,6 +250,11 @@ impl Sampling {
 }
 
 impl Stage {
+    /// The share of their first rates that colors and harmonics end with.
+    pub fn color_decay(&self) -> f64 {
+        self.color_decay.unwrap_or(self.rate_decay)
+    }
+
     /// Steps of this stage when an epoch has `rays` rays.
     pub fn step_count(&self, rays: u64, rays_per_step: usize) -> u64 {
         match (self.steps, self.epochs) {
@@ -255,7 +278,9 @@ impl Default for Config {
             density_rate,
             color_rate: 0.03,
             harmonics_rate: None,
+            density_warm_up: 0,
             rate_decay,
+            color_decay: None,
         };
         Config {
             seed: 42,
@@ -358,9 +383,15 @@ impl Config {
             )?;
             let fits = match *weight {
                 Weight::Constant(w) => w.is_finite() && w >= 0.0,
+                Weight::Until { weight, until } => weight.is_finite() && weight >= 0.0 && until > 0,
                 Weight::Exponential { from, to, steps } => from > 0.0 && from.is_finite() && to > 0.0 && to.is_finite() && steps > 0,
             };
-            check(fits, &format!("losses.{name}"), format!("{weight:?}"), "a number of at least 0, or { from, to, steps } above 0")?;
+            check(
+                fits,
+                &format!("losses.{name}"),
+                format!("{weight:?}"),
+                "a number of at least 0, { weight, until } with until above 0, or { from, to, steps } above 0",
+            )?;
         }
         for (i, stage) in self.stages.iter().enumerate() {
             let key = |name: &str| format!("stages[{i}].{name}");
@@ -379,7 +410,9 @@ impl Config {
                 check(rate == 0.0 || (1e-30..=1e30).contains(&rate), &key(name), rate, "0, or 1e-30 to 1e30")?;
             }
             check((1..=64).contains(&stage.image_reduction), &key("image_reduction"), stage.image_reduction, "1 to 64")?;
-            check((1e-6..=1e6).contains(&stage.rate_decay), &key("rate_decay"), stage.rate_decay, "1e-6 to 1e6")?;
+            for (name, decay) in [("rate_decay", stage.rate_decay), ("color_decay", stage.color_decay())] {
+                check((1e-6..=1e6).contains(&decay), &key(name), decay, "1e-6 to 1e6")?;
+            }
             // Samples of a batch are counted in 32 bits.
             let samples = stage.sampling.most(stage.resolution) * self.rays_per_step as f64;
             check(

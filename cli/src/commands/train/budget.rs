@@ -9,7 +9,7 @@ use plenoxel::dataset::View;
 use plenoxel::error::{Error, Result};
 use plenoxel::rays::RaySource;
 use plenoxel::train::Trainer;
-use plenoxel::train::config::{Config, Stage};
+use plenoxel::train::config::{Config, Stage, Weight};
 use std::time::Instant;
 
 /// A step at k times the resolution takes k to this power times as long: 128 to 384 voxels a side.
@@ -17,7 +17,7 @@ const GROWTH: f64 = 0.75;
 /// To begin a stage of 256 voxels a side takes as long as this many rays at 128, and more with the 1.5th power of the resolution: the grid is
 /// resampled, and its voxels are looked at.
 const RAYS_TO_BEGIN: f64 = 500_000.0;
-/// The share of the time that goes into finding out how fast the machine is, at most.
+/// The share of the time that goes into finding out how fast the machine is, but for a few steps that it always takes.
 const CALIBRATION: f64 = 0.03;
 
 /// How fast the machine is, and what is gone by now.
@@ -32,73 +32,100 @@ struct Speed {
 
 /// The same settings with stages of such lengths that training takes `seconds`, this included.
 pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
+    if config.init_from.is_some() {
+        return Err(Error::config("--time", "a run that starts from another", "--time without --init-from, or stages with steps"));
+    }
     let rays = RaySource::new(views, config.background, config.seed).len();
     let steps = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step));
     let speed = measure(&config, views, CALIBRATION * seconds)?;
-    let stages = planned(&config.stages, &steps.collect::<Vec<_>>(), config.rays_per_step, seconds, &speed)?;
-    Ok(Config { stages, ..config })
+    let steps: Vec<u64> = steps.collect();
+    let factor = factor(&config.stages, &steps, config.rays_per_step, seconds, &speed)?;
+    let scaled = |steps: u64| ((steps as f64 * factor).round() as u64).max(1);
+    let stages = config.stages.iter().zip(&steps).map(|(&stage, &steps)| {
+        let density_warm_up = if stage.density_warm_up == 0 { 0 } else { scaled(stage.density_warm_up) };
+        Stage { steps: Some(scaled(steps)), epochs: None, density_warm_up, ..stage }
+    });
+    let stages = stages.collect();
+    let losses = config.losses.into_iter().map(|(name, weight)| {
+        let weight = match weight {
+            Weight::Constant(_) => weight,
+            Weight::Until { weight, until } => Weight::Until { weight, until: scaled(until) },
+            Weight::Exponential { from, to, steps } => Weight::Exponential { from, to, steps: scaled(steps) },
+        };
+        (name, weight)
+    });
+    Ok(Config { stages, losses: losses.collect(), ..config })
 }
 
-/// Takes steps of the first stage until the time is over or the stage is.
+/// Takes steps like those of the first stage until the time is over.
 fn measure(config: &Config, views: &[View], seconds: f64) -> Result<Speed> {
     let start = Instant::now();
-    let mut trainer = Trainer::<f32>::new(config.clone(), views)?;
+    let endless = Stage { steps: Some(1 << 20), epochs: None, ..config.stages[0] };
+    let mut trainer = Trainer::<f32>::new(Config { stages: vec![endless], ..config.clone() }, views)?;
     // The first step begins the stage.
     trainer.step()?;
     let begin = start.elapsed().as_secs_f64();
-    let (mut count, mut step) = (0, begin);
-    while count + 1 < trainer.plan()[0].steps && (count < 3 || start.elapsed().as_secs_f64() < seconds) {
+    let mut count = 0.0;
+    while count < 3.0 || start.elapsed().as_secs_f64() < seconds {
         trainer.step()?;
-        count += 1;
-        step = (start.elapsed().as_secs_f64() - begin) / count as f64;
+        count += 1.0;
     }
-    Ok(Speed { step, begin, spent: start.elapsed().as_secs_f64() })
+    let spent = start.elapsed().as_secs_f64();
+    Ok(Speed { step: (spent - begin) / count, begin, spent })
 }
 
-/// All stages longer or shorter by the same factor.
-fn planned(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed) -> Result<Vec<Stage>> {
-    let growth = |stage: &Stage| stage.resolution as f64 / stages[0].resolution as f64;
+/// By how much all stages have to be longer for the time to be full.
+fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed) -> Result<f64> {
+    // Seconds for a step at a resolution.
+    let step = |resolution: usize| speed.step * (resolution as f64 / stages[0].resolution as f64).powf(GROWTH);
     let begins = stages.windows(2).filter(|pair| pair[1].resolution != pair[0].resolution);
-    let begins = begins.map(|pair| RAYS_TO_BEGIN / rays_per_step as f64 * (pair[1].resolution as f64 / 256.0).powf(1.5) * speed.step);
+    let begins = begins.map(|pair| RAYS_TO_BEGIN / rays_per_step as f64 * step(128) * (pair[1].resolution as f64 / 256.0).powf(1.5));
     let fixed = speed.spent + speed.begin + begins.sum::<f64>();
-    let cost = stages.iter().zip(steps).map(|(stage, &steps)| steps as f64 * growth(stage).powf(GROWTH) * speed.step);
-    let factor = (seconds - fixed) / cost.sum::<f64>();
+    let cost = stages.iter().zip(steps).map(|(stage, &steps)| steps as f64 * step(stage.resolution)).sum::<f64>();
     // Shorter than this a stage does not get to where the next one can begin.
     const LEAST: f64 = 0.1;
-    if factor < LEAST {
-        let least = clock(fixed + (seconds - fixed) * LEAST / factor);
-        let needed = if factor > 0.0 { format!("more than {least}") } else { format!("more than {}", clock(fixed)) };
-        return Err(Error::config("--time", format!("{seconds} seconds"), format!("{needed}, as these stages need here; or fewer voxels")));
+    if seconds < fixed + LEAST * cost {
+        let accepted = format!("{} or more, which these stages need here; or fewer voxels", clock((fixed + LEAST * cost).ceil()));
+        return Err(Error::config("--time", format!("{seconds} seconds"), accepted));
     }
-    let planned = stages.iter().zip(steps).map(|(&stage, &steps)| {
-        let steps = ((steps as f64 * factor).round() as u64).max(1);
-        Stage { steps: Some(steps), epochs: None, ..stage }
-    });
-    Ok(planned.collect())
+    Ok((seconds - fixed) / cost)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use plenoxel::dataset::procedural::ProceduralOptions;
+    use plenoxel::dataset::{Dataset, Split};
 
     #[test]
-    fn stages_keep_their_proportions_and_fill_the_time() {
+    fn stages_fill_the_time() {
         let stage = Config::default().stages[0];
         let stages = [64, 128, 256].map(|resolution| Stage { resolution, ..stage });
-        let steps = [100, 200, 400];
         let speed = Speed { step: 0.01, begin: 0.5, spent: 0.5 };
-        let of = |seconds: f64| planned(&stages, &steps, 10_000, seconds, &speed);
-        let counts = |seconds: f64| of(seconds).unwrap().iter().map(|stage| stage.steps.unwrap()).collect::<Vec<_>>();
-        let (short, long) = (counts(10.0), counts(100.0));
-        for (short, long) in [(&short, &long), (&long, &counts(1000.0))] {
-            assert!(short.iter().zip(long).all(|(short, long)| short < long), "{short:?} {long:?}");
-        }
-        assert!(long[2].abs_diff(2 * long[1]) < 3 && long[1].abs_diff(2 * long[0]) < 3, "{long:?}");
-        // Two begins of a stage, and steps that cost 1, 2^0.75 and 4^0.75.
-        let begins = 50.0 * 0.01 * (0.5f64.powf(1.5) + 1.0);
-        let steps: f64 = long.iter().zip([1.0f64, 2.0, 4.0]).map(|(&n, k)| n as f64 * k.powf(0.75) * 0.01).sum();
-        assert!((1.0 + begins + steps - 100.0).abs() < 0.1, "{long:?}");
+        let of = |seconds: f64| factor(&stages, &[100, 200, 400], 10_000, seconds, &speed);
+        let factors = [10.0, 100.0, 1000.0].map(|seconds| of(seconds).unwrap());
+        assert!(factors.is_sorted_by(|short, long| short < long), "{factors:?}");
+        // Two begins of a stage, at 2^0.75 of a first step each, and steps that cost 1, 2^0.75 and 4^0.75.
+        let begins = 50.0 * 0.01 * 2f64.powf(0.75) * (0.5f64.powf(1.5) + 1.0);
+        let steps = 0.01 * (100.0 + 200.0 * 2f64.powf(0.75) + 400.0 * 4f64.powf(0.75));
+        assert!((1.0 + begins + factors[1] * steps - 100.0).abs() < 1e-9, "{factors:?}");
         let error = of(2.0).unwrap_err().to_string();
-        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("fewer voxels"), "{error}");
+        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:04 or more"), "{error}");
+    }
+
+    #[test]
+    fn all_that_is_counted_in_steps_is_planned() {
+        let scene = ProceduralOptions { width: 8, height: 8, train: 4, val: 1, test: 1, ..ProceduralOptions::default() };
+        let views = Dataset::procedural(scene).unwrap().load(Split::Train, &|_, _| ()).unwrap();
+        let stage = Stage { resolution: 8, steps: Some(1000), density_warm_up: 500, ..Config::default().stages[0] };
+        let losses = [("mse", Weight::Constant(1.0)), ("beta", Weight::Until { weight: 1e-9, until: 250 })];
+        let losses = losses.map(|(name, weight)| (name.to_owned(), weight)).into();
+        let config = Config { stages: vec![stage], losses, rays_per_step: 16, ..Config::default() };
+        let planned = on_time(config.clone(), &views, 1.0).unwrap();
+        let Stage { steps: Some(steps), density_warm_up, .. } = planned.stages[0] else { panic!("steps are planned") };
+        let Weight::Until { until, .. } = planned.losses["beta"] else { panic!("a weight keeps its form") };
+        assert!(steps.abs_diff(2 * density_warm_up) <= 2 && density_warm_up.abs_diff(2 * until) <= 2, "{steps} {density_warm_up} {until}");
+        let from = Config { init_from: Some("run".into()), ..config };
+        assert!(on_time(from, &views, 1.0).unwrap_err().to_string().contains("--init-from"));
     }
 }

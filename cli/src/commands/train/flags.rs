@@ -46,7 +46,7 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     stage_psnr: bool,
 
-    /// Settings to start from [default: demo for the built-in scene, standard for a folder]
+    /// Settings to start from [default: demo for the built-in scene, standard for a folder; another with --time]
     #[arg(long, help_heading = "Settings", value_parser = PossibleValuesParser::new(PRESETS.map(|(name, ..)| name)))]
     preset: Option<String>,
 
@@ -109,7 +109,7 @@ pub struct TrainArgs {
     init_from: Option<PathBuf>,
 
     /// Where images have alpha, let silhouettes decide the size of the box and which voxels exist (auto), or use alpha for compositing
-    /// only (off) [default: auto; preset paper: off]
+    /// only (off) [default: auto; presets paper and plenoxels: off]
     #[arg(long, help_heading = "Training", value_parser = ["auto", "off"])]
     hull: Option<String>,
 
@@ -240,5 +240,15 @@ mod tests {
         assert!(three_counts("6,1").is_err() && three_counts("6,x,3").is_err());
         assert_eq!(weight("1e-4"), Ok(1e-4));
         assert!(weight("-1").is_err() && weight("inf").is_err());
+    }
+
+    #[test]
+    fn durations_have_units() {
+        for (text, seconds) in [("90", 90.0), ("90s", 90.0), ("1.5m", 90.0), ("2min", 120.0), ("1h", 3600.0)] {
+            assert_eq!(duration(text), Ok(seconds), "{text}");
+        }
+        for text in ["", "s", "0", "-5s", "5 m", "1d", "nan", "inf", "1e9s"] {
+            assert!(duration(text).is_err(), "{text}");
+        }
     }
 }

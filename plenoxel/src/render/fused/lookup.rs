@@ -73,13 +73,14 @@ impl<T: Real> Corners<T> {
         self.weights.grow(8 * count);
     }
 
-    /// Sets those of samples from number `first` on to some of a group. There must be room.
-    pub fn put(&mut self, first: usize, from: impl Iterator<Item = usize> + Clone, group: &Group<T>) {
-        transpose(&group.rows[0], from.clone(), &mut self.rows.as_chunks_mut().0[first..]);
-        transpose(&group.weights[0], from, &mut self.weights.as_chunks_mut().0[first..]);
+    /// Sets those of samples from number `first` on to some of a group. Panics if there is no room.
+    pub fn put(&mut self, first: usize, from: impl ExactSizeIterator<Item = usize> + Clone, group: &Group<T>) {
+        let own = first..first + from.len();
+        transpose(&group.rows[0], from.clone(), &mut self.rows.as_chunks_mut().0[own.clone()]);
+        transpose(&group.weights[0], from, &mut self.weights.as_chunks_mut().0[own]);
     }
 
-    /// Sets those of a sample. There must be room.
+    /// Sets those of a sample. Panics if there is no room.
     #[inline(always)]
     pub fn set(&mut self, i: usize, (rows, weights): ([u32; 8], [T; 8])) {
         self.rows.as_chunks_mut().0[i] = rows;
