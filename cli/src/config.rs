@@ -16,8 +16,8 @@ use toml::{Table, Value};
 /// The presets by name: what they are for, and their text.
 pub const PRESETS: [(&str, &str, &str); 6] = [
     ("demo", "the built-in scene in minutes", include_str!("../presets/demo.toml")),
-    ("fast", "a minute", include_str!("../presets/fast.toml")),
-    ("quality", "the best in about eleven minutes", include_str!("../presets/quality.toml")),
+    ("fast", "a minute or two", include_str!("../presets/fast.toml")),
+    ("quality", "the best in eleven to fifteen minutes", include_str!("../presets/quality.toml")),
     ("standard", "a dataset of your own", include_str!("../presets/standard.toml")),
     ("plenoxels", "Plenoxels as published: hours", include_str!("../presets/plenoxels.toml")),
     ("paper", "\"Plenoxels and extension to point clouds\", bugs repaired", include_str!("../presets/paper.toml")),

@@ -297,7 +297,7 @@ fn training_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
     match engine {
         Engine::Graph => 4 * (geometry + color),
         // Thirteen numbers of a sample, twenty of what it adds to the tables, of which it has one or two, and sixteen of its corners for a while.
-        // Of reduced harmonics, forty-one more for each run of samples that read the same rows.
+        // Of reduced harmonics, forty-one more for each run of samples that read the same rows: of (1 + reduction) / 2, say.
         Engine::Fused if shape.is_reduced() => 4 * (64 + 82 / (1 + shape.sh_reduction as u64)),
         Engine::Fused => 4 * 64,
     }

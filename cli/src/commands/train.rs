@@ -53,6 +53,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
 
     if let Some(seconds) = args.time {
+        console.note("finding out how fast this machine is");
         config = clocks.train.time(|| budget::on_time(config, &views, seconds))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
         console.note(&format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", ")));

@@ -194,7 +194,7 @@ pub struct Stage {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub harmonics_rate: Option<f64>,
     /// Steps over which the density's rate rises from a hundredth of itself, along a quarter of a sine (svox2's delay); 0 for none.
-    #[serde(default, skip_serializing_if = "is_zero")]
+    #[serde(default)]
     pub density_warm_up: u64,
     /// All rates fall exponentially to this share of themselves at the stage's end; 1 keeps them.
     #[serde(default = "one")]
@@ -206,11 +206,6 @@ pub struct Stage {
 
 fn one<N: From<u8>>() -> N {
     N::from(1)
-}
-
-#[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
-fn is_zero(n: &u64) -> bool {
-    *n == 0
 }
 
 /// Where samples lie along a ray.

@@ -17,8 +17,8 @@ const GROWTH: f64 = 0.75;
 /// To begin a stage of 256 voxels a side takes as long as this many rays at 128, and more with the 1.5th power of the resolution: the grid is
 /// resampled, and its voxels are looked at.
 const RAYS_TO_BEGIN: f64 = 500_000.0;
-/// The share of the time that goes into finding out how fast the machine is, but for a few steps that it always takes.
-const CALIBRATION: f64 = 0.03;
+/// The share of the time that goes into finding out how fast the machine is, and the seconds that are enough; a few steps it always takes.
+const CALIBRATION: (f64, f64) = (0.03, 20.0);
 
 /// How fast the machine is, and what is gone by now.
 struct Speed {
@@ -37,7 +37,7 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     }
     let rays = RaySource::new(views, config.background, config.seed).len();
     let steps = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step));
-    let speed = measure(&config, views, CALIBRATION * seconds)?;
+    let speed = measure(&config, views, (CALIBRATION.0 * seconds).min(CALIBRATION.1))?;
     let steps: Vec<u64> = steps.collect();
     let factor = factor(&config.stages, &steps, config.rays_per_step, seconds, &speed)?;
     let scaled = |steps: u64| ((steps as f64 * factor).round() as u64).max(1);

@@ -190,7 +190,7 @@ impl TrainArgs {
 }
 
 /// Seconds from `90`, `90s`, `1.5m` or `1h`.
-pub fn duration(text: &str) -> std::result::Result<f64, String> {
+fn duration(text: &str) -> std::result::Result<f64, String> {
     let number = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
     let unit = match &text[number.len()..] {
         "" | "s" => Some(1.0),

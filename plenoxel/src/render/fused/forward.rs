@@ -151,7 +151,7 @@ impl<'a, T: Real> Scene<'a, T> {
                 } else {
                     lookup::absorptions::<T, false>(density, delta, weight, after);
                 }
-                let first = end;
+                let before = end;
                 for i in run {
                     if left < stop {
                         break;
@@ -167,13 +167,13 @@ impl<'a, T: Real> Scene<'a, T> {
                     if i != end {
                         block.columns().into_iter().for_each(|column| column[end] = column[i]);
                     }
-                    kept[end - first] = i - first;
+                    kept[end - before] = i - before;
                     end += 1;
                 }
-                let kept = &kept[..end - first];
+                let kept = &kept[..end - before];
                 match &mut found {
-                    Some(corners) => corners.put(first, kept.iter().copied(), &group),
-                    None => kept.iter().enumerate().for_each(|(to, from)| block.rows[first + to] = block.rows[first + from]),
+                    Some(corners) => corners.put(before, kept.iter().copied(), &group),
+                    None => kept.iter().enumerate().for_each(|(to, from)| block.rows[before + to] = block.rows[before + from]),
                 }
             }
             block.offsets.push(end as u32);

@@ -3,6 +3,7 @@
 use autograd::lattice::{NodeMap, TOGETHER};
 use autograd::ops::trilinear::{corners_of_many, nearest_node};
 use autograd::{Buffer, Real, dispatched, parallel};
+use std::slice::from_mut;
 
 /// The eight rows around each of some samples, and their weights.
 #[derive(Debug)]
@@ -14,8 +15,8 @@ pub(super) struct Corners<T: Real> {
 
 /// Those of samples that are looked up together, corner by corner.
 pub(super) struct Group<T> {
-    rows: [[[u32; TOGETHER]; 8]; 1],
-    weights: [[[T; TOGETHER]; 8]; 1],
+    rows: [[u32; TOGETHER]; 8],
+    weights: [[T; TOGETHER]; 8],
 }
 
 dispatched! {
@@ -34,18 +35,18 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 impl<T: Real> Group<T> {
     /// Room for some.
     pub fn none() -> Self {
-        Group { rows: [[[0; TOGETHER]; 8]], weights: [[[T::zero(); TOGETHER]; 8]] }
+        Group { rows: [[0; TOGETHER]; 8], weights: [[T::zero(); TOGETHER]; 8] }
     }
 
     /// Finds those of at most [`TOGETHER`] positions.
     #[inline(always)]
     pub fn find(&mut self, at: [&[T]; 3], map: impl NodeMap) {
-        corners_of_many(at, map, &mut self.rows, &mut self.weights);
+        corners_of_many(at, map, from_mut(&mut self.rows), from_mut(&mut self.weights));
     }
 
     /// What a table of one column is at each position.
     pub fn density(&self, table: &[T], values: &mut [T]) {
-        interpolate(table, &self.rows[0], &self.weights[0], values);
+        interpolate(table, &self.rows, &self.weights, values);
     }
 }
 
@@ -76,8 +77,8 @@ impl<T: Real> Corners<T> {
     /// Sets those of samples from number `first` on to some of a group. Panics if there is no room.
     pub fn put(&mut self, first: usize, from: impl ExactSizeIterator<Item = usize> + Clone, group: &Group<T>) {
         let own = first..first + from.len();
-        transpose(&group.rows[0], from.clone(), &mut self.rows.as_chunks_mut().0[own.clone()]);
-        transpose(&group.weights[0], from, &mut self.weights.as_chunks_mut().0[own]);
+        transpose(&group.rows, from.clone(), &mut self.rows.as_chunks_mut().0[own.clone()]);
+        transpose(&group.weights, from, &mut self.weights.as_chunks_mut().0[own]);
     }
 
     /// Sets those of a sample. Panics if there is no room.
@@ -253,16 +254,16 @@ fn of_samples<T: Real, M: NodeMap, const W: usize, const N: usize, const FUSED: 
 ) {
     let mut sums = [[T::zero(); W]; TOGETHER];
     let mut places = [[T::zero(); TOGETHER]; 3];
-    let (mut rows, mut weights) = ([[[0; TOGETHER]; 8]], [[[T::zero(); TOGETHER]; 8]]);
+    let mut group = Group::none();
     let (table, basis) = (table.as_chunks::<W>().0, directions.basis.as_chunks::<N>().0);
     for ((samples, rays), out) in samples.chunks(TOGETHER).zip(rays.chunks(TOGETHER)).zip(out.chunks_mut(TOGETHER)) {
         for (places, at) in places.iter_mut().zip(at) {
             places.iter_mut().zip(samples).for_each(|(place, &sample)| *place = at[sample as usize]);
         }
-        corners_of_many(places.each_ref().map(|p| &p[..]), map, &mut rows, &mut weights);
+        group.find(places.each_ref().map(|p| &p[..]), map);
         for (i, sum) in sums[..samples.len()].iter_mut().enumerate() {
-            let own = std::array::from_fn::<_, 8, _>(|c| &table[rows[0][c][i] as usize]);
-            weigh_all::<T, 8, W, FUSED>(own, std::array::from_fn(|c| weights[0][c][i]), sum);
+            let own = group.rows.each_ref().map(|rows| &table[rows[i] as usize]);
+            weigh_all::<T, 8, W, FUSED>(own, group.weights.each_ref().map(|weights| weights[i]), sum);
         }
         for ((out, sum), &ray) in out.iter_mut().zip(&sums).zip(rays) {
             *out = color::<T, W, N, FUSED>(sum, &basis[ray as usize], directions.offset);
