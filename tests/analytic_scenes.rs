@@ -3,7 +3,7 @@
 mod support;
 
 use approx::assert_relative_eq;
-use autograd::{Tensor, no_grad};
+use autograd::{Tensor, no_grad, value_and_grad};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::field::{Field, Radiance};
 use plenoxel::geometry::Aabb;
@@ -170,7 +170,7 @@ fn leaving_out_empty_voxels_changes_no_pixel() {
     let density: Vec<f64> = random.density.tensor().data().iter().map(|&d| if d > 0.9 { 5.0 * d } else { d - 0.95 }).collect();
     let density = Tensor::from_vec(density.into_iter().map(|d| d.max(-0.2)).collect(), &[12 * 12 * 12, 1]);
     let grid = VoxelGrid::from_tables(shape, density, random.color.tensor().detach());
-    let occupancy = grid.occupancy(0.0);
+    let occupancy = grid.matter();
     let plain = options(Spacing::Step(0.07), Jitter::None);
     let skipping = RenderOptions { occupancy: Some(&occupancy), ..plain.clone() };
     // And a grid that does not have its empty voxels at all, against one where they are 0.
@@ -190,6 +190,39 @@ fn leaving_out_empty_voxels_changes_no_pixel() {
         assert!(part.sample_count < whole.sample_count);
         for (a, b) in whole.opacity.data().iter().zip(part.opacity.data()) {
             assert_relative_eq!(a, b, epsilon = 1e-14);
+        }
+    }
+}
+
+#[test]
+fn samples_where_nothing_learns_change_no_gradient() {
+    for interpolation in [Interpolation::Trilinear, Interpolation::Nearest] {
+        let shape = GridShape { resolution: 12, half_width: CUBE, interpolation, color: Color::Rgb, sh_reduction: 1 };
+        let random = VoxelGrid::<f64>::random(shape, 1.0, 1.0, 8);
+        // Four voxels in five are below 0, some are 0.
+        let density: Vec<f64> =
+            random.density.tensor().data().iter().map(|&d| if d < 0.82 { d - 0.9 } else { 9.0 * (d - 0.85).max(0.0) }).collect();
+        assert!(density.contains(&0.0));
+        let grid = VoxelGrid::from_tables(shape, Tensor::from_vec(density, &[12 * 12 * 12, 1]), random.color.tensor().detach());
+        let learning = grid.learning();
+        let all = options(Spacing::Step(0.07), Jitter::None);
+        let some = RenderOptions { occupancy: Some(&learning), ..all.clone() };
+        for engine in [Engine::Graph, Engine::Fused] {
+            let [all, some] = [&all, &some].map(|options| {
+                let options = RenderOptions { engine, ..options.clone() };
+                let mut samples = 0;
+                let (loss, gradients) = value_and_grad(|| {
+                    let rendered = render(&grid, &rays(), &options);
+                    samples = rendered.sample_count;
+                    rendered.rgb.square().sum()
+                });
+                let rows = [&grid.density, &grid.color]
+                    .map(|param| gradients.of(param).expect("it is read").to_array().into_raw_vec_and_offset().0);
+                (loss, rows.concat(), samples)
+            });
+            assert!(some.2 < all.2, "{} of {} samples", some.2, all.2);
+            assert_relative_eq!(some.0, all.0, epsilon = 1e-13);
+            some.1.iter().zip(&all.1).for_each(|(some, all)| assert_relative_eq!(some, all, epsilon = 1e-13));
         }
     }
 }

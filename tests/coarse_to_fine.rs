@@ -44,6 +44,33 @@ fn resampling_a_trilinear_function_is_exact_between_the_old_centres() {
 }
 
 #[test]
+fn a_field_read_in_a_smaller_cube_is_where_it_was() {
+    let f = |[x, y, z]: [f64; 3]| 2.0 + 0.3 * x - 0.2 * y + 0.1 * z + 0.4 * x * y - 0.3 * y * z;
+    let old = sampled(10, f);
+    let new = old.resample_in(8, 0.7);
+    assert_eq!((new.shape().resolution, new.shape().half_width), (8, 0.7));
+    for (at, &got) in centers(8).into_iter().zip(new.to_row_major()[0].data()) {
+        assert_relative_eq!(got, f(at.map(|x| 0.7 * x)), epsilon = 1e-12);
+    }
+    // And reduced harmonics, whose voxels are twice as wide.
+    let shape = GridShape { color: Color::Sh { degree: 1, offset: 0.5 }, ..*old.shape() };
+    let harmonic = VoxelGrid::<f64>::random(shape, 1.0, 1.0, 3).with_reduction(2);
+    // Each new centre is where eight old ones meet: less than half the cube, voxels of the same width.
+    let half = harmonic.resample_in(4, 0.4);
+    let row = |grid: &VoxelGrid<f64>, at| grid.harmonics_lattice().and_then(|l| l.row(at)).expect("present") as usize;
+    let value = |grid: &VoxelGrid<f64>, at| grid.harmonics.as_ref().expect("reduced").tensor().data()[9 * row(grid, at)];
+    let centre = |grid: &VoxelGrid<f64>, k: usize| (k as f64 + 0.5) * 2.0 * grid.shape().voxel_side() - grid.shape().half_width;
+    for (new, old) in [([0, 0, 0], [1.5; 3]), ([1, 1, 0], [2.5, 2.5, 1.5])] {
+        (0..3).for_each(|a| assert_relative_eq!(centre(&half, new[a]), (old[a] + 0.5) * 0.4 - 1.0, epsilon = 1e-12));
+        let around = |k: f64| [k as usize, k as usize + 1];
+        let corners = around(old[0]).into_iter().flat_map(|i| around(old[1]).map(|j| [i, j]));
+        let corners = corners.flat_map(|[i, j]| around(old[2]).map(|k| [i, j, k]));
+        let mean = corners.map(|at| value(&harmonic, at)).sum::<f64>() / 8.0;
+        assert_relative_eq!(value(&half, new), mean, epsilon = 1e-12);
+    }
+}
+
+#[test]
 fn upsampling_keeps_a_nearest_field_everywhere_and_a_trilinear_one_at_the_old_centres() {
     // Three new voxels in each old one: the middle one has the old one's centre.
     for (interpolation, offsets) in [(Interpolation::Nearest, 0..3), (Interpolation::Trilinear, 1..2)] {

@@ -1,5 +1,6 @@
 //! Whole runs, small.
 
+use autograd::Tensor;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Error;
@@ -108,6 +109,29 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
         }
         assert!(bits(config, 2, 43) != one, "another seed is another run");
     }
+}
+
+#[test]
+fn pruning_fits_the_cube_to_what_is_left() {
+    let train = views(Split::Train);
+    let slow = |resolution| Stage { density_rate: 1e-9, color_rate: 1e-9, ..stage(resolution, 1) };
+    let config = Config { prune_from_stage: Some(1), prune_below: 0.2, stages: vec![slow(16), slow(24)], half_width: 2.0, ..config() };
+    // A ball of radius 0.6 around a point: voxels are 0.25 wide.
+    let mut ball = VoxelGrid::<f32>::uniform(config.grid_shape(16), 0.0, 0.5);
+    let centre = |k: usize| (k as f64 + 0.5) * 0.25 - 2.0;
+    let inside = |at: [usize; 3]| (centre(at[0]) - 0.3).powi(2) + centre(at[1]).powi(2) + centre(at[2]).powi(2) < 0.36;
+    let density =
+        (0..ball.lattice().rows() as u32).map(|row| ball.lattice().node(row).map_or(0.0, |at| if inside(at) { 9.0 } else { -1.0 }));
+    let density: Vec<f32> = density.collect();
+    ball = ball.with_density(Tensor::from_vec(density, ball.density.tensor().shape()));
+    let half_width = |fit_box| {
+        let mut trainer = Trainer::new(Config { fit_box, ..config.clone() }, &train).expect("a valid config").starting_from(&ball);
+        while trainer.step().expect("finite numbers").is_some() {}
+        trainer.grid().shape().half_width
+    };
+    assert_eq!(half_width(false), 2.0);
+    // The outermost voxel of the ball is centred at 0.625: with half of itself, and the neighbour whose samples read it, 1.0.
+    assert_eq!(half_width(true), 1.0);
 }
 
 #[test]

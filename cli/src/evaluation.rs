@@ -28,7 +28,7 @@ pub struct Viewer<'a> {
 impl<'a> Viewer<'a> {
     /// A viewer of a grid, with the background and the engine of its run.
     pub fn new(grid: &'a VoxelGrid<f32>, sampling: Sampling, config: &Config) -> Self {
-        Viewer { grid, sampling, background: config.background, engine: config.engine, occupancy: grid.occupancy(0.0) }
+        Viewer { grid, sampling, background: config.background, engine: config.engine, occupancy: grid.matter() }
     }
 
     /// What a camera sees.

@@ -23,6 +23,10 @@ use std::borrow::Cow;
 /// Rays that are rendered at a time to find out what is seen: bounds the memory.
 const RAYS_PER_BATCH: usize = 1 << 15;
 
+/// After so many steps it is looked up anew where the grid can learn. What has a density below 0 all around has no gradient; it comes to
+/// have one when a voxel at its edge, which others have in common with it, rises.
+const STEPS_PER_LOOK: u64 = 64;
+
 /// What one step did.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
@@ -70,6 +74,8 @@ pub struct Trainer<'a, T: Real> {
     silhouettes: Option<Silhouettes<'a>>,
     objective: Objective<T>,
     grid: VoxelGrid<T>,
+    /// Where the grid could learn when last looked at: samples elsewhere are left out.
+    learning: Option<Occupancy>,
     optimizer: Box<dyn Optimizer<T>>,
     step: u64,
 }
@@ -102,7 +108,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        Ok(Trainer { config, plan, views, rays, reduction: 1, silhouettes, objective, grid, optimizer, step: 0 })
+        Ok(Trainer { config, plan, views, rays, reduction: 1, silhouettes, objective, grid, learning: None, optimizer, step: 0 })
     }
 
     /// The same run starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
@@ -164,10 +170,13 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.begin(index)?;
         }
         let in_stage = self.step - plan.first;
+        if in_stage.is_multiple_of(STEPS_PER_LOOK) {
+            self.learning = Some(self.grid.learning());
+        }
         let rays = self.config.rays_per_step;
         let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
         let jitter = if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None };
-        let options = self.options(&plan.stage, jitter);
+        let options = RenderOptions { occupancy: self.learning.as_ref(), ..self.options(&plan.stage, jitter) };
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
             let rendered = render(&self.grid, &batch.rays, &options);
@@ -209,10 +218,12 @@ impl<'a, T: Real> Trainer<'a, T> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        let finer = plan.stage.resolution != self.grid.shape().resolution;
+        let shape = *self.grid.shape();
+        let half_width = self.fitted(index).unwrap_or(shape.half_width);
+        let finer = plan.stage.resolution != shape.resolution || half_width != shape.half_width;
         if finer {
             release_free_buffers();
-            self.grid = self.grid.resample(plan.stage.resolution);
+            self.grid = self.grid.resample_in(plan.stage.resolution, half_width);
         }
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
             let pruned = self.grid.pruned(&silhouettes.voxels(&self.grid));
@@ -238,6 +249,13 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.grid.project();
         }
         Ok(())
+    }
+
+    /// Half the side of the cube that a stage gets by `fit_box`.
+    fn fitted(&self, index: usize) -> Option<f64> {
+        let first = self.config.fit_box && self.silhouettes.is_none() && self.prunes_from() == Some(index);
+        let before = &self.plan[index.checked_sub(1).filter(|_| first)?].stage;
+        self.worth_keeping(before).half_width()
     }
 
     /// Leaves the rays out that pass what is left of the grid, if the config says so.

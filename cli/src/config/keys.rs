@@ -28,6 +28,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "prune_from_stage",
             "prune_below",
             "prune_unseen_below",
+            "fit_box",
             "init_from",
             "hull",
             "initial",

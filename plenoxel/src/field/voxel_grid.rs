@@ -102,7 +102,7 @@ impl<T: Real> VoxelGrid<T> {
         let lattice = &layout.lattice;
         let reach = (!lattice.is_full()).then(|| {
             let present = Occupancy::from_masks(Aabb::cube(layout.shape.half_width), lattice.nodes(), lattice.masks().to_vec());
-            layout.shape.reached_from(&present)
+            layout.shape.cells_reading(present)
         });
         let mut params = ["density", "color", "harmonics"].into_iter().zip(tables).map(|(name, table)| Param::from_tensor(name, table));
         let (Some(density), Some(color)) = (params.next(), params.next()) else { unreachable!("every layout has two tables") };
@@ -171,8 +171,20 @@ impl<T: Real> VoxelGrid<T> {
         }
     }
 
-    /// The voxels in which a sample can have positive density: those whose own value, or with trilinear look-up a neighbour's, is above
-    /// `threshold`. With threshold 0, leaving out the samples elsewhere changes no rendered value.
+    /// The cells in which a sample can have a density above 0: with trilinear look-up those between centres of voxels, with nearest the voxels.
+    /// Leaving out the samples elsewhere changes no rendered value.
+    pub fn matter(&self) -> Occupancy {
+        let density = self.density.tensor().data();
+        self.shape().cells_reading(self.voxels_where(|row| density[row] > T::zero()))
+    }
+
+    /// The cells in which a sample can have a gradient: it has none where its density is below 0.
+    pub fn learning(&self) -> Occupancy {
+        let density = self.density.tensor().data();
+        self.shape().cells_reading(self.voxels_where(|row| density[row] >= T::zero()))
+    }
+
+    /// The voxels in which a sample can have a density above `threshold`: those whose own value, or with trilinear look-up a neighbour's, is.
     pub fn occupancy(&self, threshold: f64) -> Occupancy {
         let (density, threshold) = (self.density.tensor().data(), T::lit(threshold));
         self.shape().reached_from(&self.voxels_where(|row| density[row] > threshold))

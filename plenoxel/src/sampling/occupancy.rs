@@ -102,7 +102,12 @@ impl Occupancy {
         self.extent().map(|[low, high]| Aabb { min: corner(low), max: corner(high) })
     }
 
-    /// The same in cells: the lowest along each axis, and one above the highest.
+    /// Half the side of the smallest cube around the origin that holds all cells that may hold matter; `None` if none may.
+    pub fn half_width(&self) -> Option<f64> {
+        self.bounds().map(|bounds| bounds.max.max(-bounds.min).max_element())
+    }
+
+    /// The bounds in cells: the lowest along each axis, and one above the highest.
     pub fn extent(&self) -> Option<[[usize; 3]; 2]> {
         let (mut low, mut high) = (self.cells, [0; 3]);
         for (b, mask) in self.masks.iter().enumerate().filter(|(_, mask)| **mask != 0) {
@@ -122,13 +127,30 @@ impl Occupancy {
         let mut masks = self.masks.to_vec();
         for _ in 0..radius {
             for axis in 0..3 {
-                masks = dilate(&masks, self.count, axis);
+                masks = dilate(&masks, self.count, axis, true);
             }
         }
         for (b, mask) in masks.iter_mut().enumerate() {
             *mask &= inside(place(b, self.count), self.cells);
         }
         Self::from_masks(self.aabb, self.cells, masks)
+    }
+
+    /// The cells between the centres of these: one more along each axis, in a box larger by half a cell on every side, so that cell (i, j, k)
+    /// has its corners at the centres of the cells (i − 1, j − 1, k − 1) to (i, j, k). Those with one of these cells at a corner.
+    pub fn between_centres(&self) -> Self {
+        let half = 0.5 * (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells.map(|n| n as f64));
+        let aabb = Aabb { min: self.aabb.min - half, max: self.aabb.max + half };
+        let cells = self.cells.map(|n| n + 1);
+        let count = cells.map(|n| n.div_ceil(BRICK));
+        let mut masks = vec![0; count.iter().product()];
+        for (b, mask) in self.masks.iter().enumerate() {
+            masks[place_number(place(b, self.count), count)] = *mask;
+        }
+        for axis in 0..3 {
+            masks = dilate(&masks, count, axis, false);
+        }
+        Self::from_masks(aabb, cells, masks)
     }
 
     /// The cells that are in both.
@@ -227,8 +249,8 @@ pub(crate) fn inside(place: [usize; 3], cells: [usize; 3]) -> u64 {
     (0..64).filter(|bit| (0..3).all(|a| place[a] * BRICK + (bit >> (4 - 2 * a) & 3) < cells[a])).fold(0, |mask, bit| mask | 1 << bit)
 }
 
-/// Every cell and its two neighbours along an axis.
-fn dilate(masks: &[u64], count: [usize; 3], axis: usize) -> Vec<u64> {
+/// Every cell and the next one along an axis, and, if asked for, the one before it.
+fn dilate(masks: &[u64], count: [usize; 3], axis: usize, back: bool) -> Vec<u64> {
     let step = STRIDE[axis];
     let (low, high) = (LOW[axis], LOW[axis] << (3 * step));
     let stride = [count[1] * count[2], count[2], 1][axis];
@@ -239,8 +261,11 @@ fn dilate(masks: &[u64], count: [usize; 3], axis: usize) -> Vec<u64> {
             let at = place(b, count)[axis];
             let m = masks[b];
             let before = if at > 0 { masks[b - stride] } else { 0 };
-            let after = if at + 1 < count[axis] { masks[b + stride] } else { 0 };
-            *out = m | (m & !high) << step | (m & !low) >> step | (before & high) >> (3 * step) | (after & low) << (3 * step);
+            *out = m | (m & !high) << step | (before & high) >> (3 * step);
+            if back {
+                let after = if at + 1 < count[axis] { masks[b + stride] } else { 0 };
+                *out |= (m & !low) >> step | (after & low) << (3 * step);
+            }
         }
     });
     out
@@ -304,6 +329,27 @@ mod tests {
             }
         }
         assert!(grown.fraction() > some.fraction() && grown.fraction() < 1.0);
+    }
+
+    #[test]
+    fn a_cell_between_centres_is_occupied_if_one_of_its_corners_is() {
+        let cells = [8, 5, 11];
+        let some = scattered(cells, 0.02);
+        let between = some.between_centres();
+        assert_eq!(between.cells(), [9, 6, 12]);
+        for i in 0..9 {
+            for j in 0..6 {
+                for k in 0..12 {
+                    let corners = |c: usize, n: usize| c.saturating_sub(1)..(c + 1).min(n);
+                    let want = corners(i, 8).any(|a| corners(j, 5).any(|b| corners(k, 11).any(|c| some.contains([a, b, c]))));
+                    assert_eq!(between.contains([i, j, k]), want, "cell {i} {j} {k}");
+                }
+            }
+        }
+        // The centre of the first cell of the old box is the low corner of cell 1.
+        let side = (between.aabb().max - between.aabb().min) / DVec3::new(9.0, 6.0, 12.0);
+        let centre = some.aabb().min + 0.5 * (some.aabb().max - some.aabb().min) / DVec3::new(8.0, 5.0, 11.0);
+        assert!((between.aabb().min + side - centre).abs().max_element() < 1e-12);
     }
 
     #[test]

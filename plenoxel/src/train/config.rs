@@ -61,6 +61,10 @@ pub struct Config {
     /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
     /// share of a pixel. Of the pixels as many are looked along as make eight rays through every voxel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
+    /// The first pruning makes the cube smaller too: as small as what is left allows, around the origin. Needs no alpha; where silhouettes have
+    /// decided the size (`hull`), it stays.
+    #[serde(default)]
+    pub fit_box: bool,
     /// Folder of the run whose grid training starts from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init_from: Option<PathBuf>,
@@ -299,6 +303,7 @@ impl Default for Config {
             prune_from_stage: None,
             prune_below: 0.2,
             prune_unseen_below: 0.0,
+            fit_box: false,
             init_from: None,
             hull: Hull::Off,
             // svox2's start: thin gray fog.

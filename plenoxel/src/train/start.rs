@@ -28,7 +28,7 @@ impl<'a> Silhouettes<'a> {
     /// that one itself if they leave nothing.
     pub fn half_width(&self, half_width: f64) -> f64 {
         let hull = visual_hull::by_footprint(self.views, Aabb::cube(half_width), [COARSE; 3], self.margin, &|_| ());
-        hull.bounds().map_or(half_width, |bounds| bounds.max.max(-bounds.min).max_element())
+        hull.half_width().unwrap_or(half_width)
     }
 
     /// The voxels of a grid that a sample inside of the silhouettes can read.

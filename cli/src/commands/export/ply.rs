@@ -158,7 +158,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     estimate.check()?;
     let views = load(console, &dataset, Split::Train, &source)?;
     let rays = RaySource::new(&views, config.background, config.seed);
-    let occupancy = grid.occupancy(0.0);
+    let occupancy = grid.matter();
     let options = RenderOptions {
         aabb: grid.aabb(),
         spacing: config.evaluation.spacing(grid.shape().voxel_side()),

@@ -16,9 +16,24 @@ impl<T: Real> VoxelGrid<T> {
     /// quarter of an old voxel of the planes through old centres.
     /// A new voxel is present if it reads one that is.
     pub fn resample(&self, resolution: usize) -> Self {
-        let shape = GridShape { resolution, ..*self.shape() };
-        let ratio = self.shape().resolution as f64 / resolution as f64;
-        let center = |k: usize| (k as f64 + 0.5) * ratio - 0.5;
+        self.resample_in(resolution, self.shape().half_width)
+    }
+
+    /// The same in a smaller cube around the origin: what lies outside of it is lost.
+    ///
+    /// Panics if the cube is not smaller.
+    #[track_caller]
+    pub fn resample_in(&self, resolution: usize, half_width: f64) -> Self {
+        let old = self.shape();
+        assert!(half_width > 0.0 && half_width <= old.half_width, "half width {half_width} of a grid of half width {}", old.half_width);
+        let shape = GridShape { resolution, half_width, ..*old };
+        let ratio = shape.voxel_side() / old.voxel_side();
+        // A new centre in voxels of the old grid that are `sides` of its sides wide.
+        let center_of = |sides: usize| {
+            let beyond = (old.half_width - half_width) / (old.voxel_side() * sides as f64);
+            move |k: usize| (k as f64 + 0.5) * ratio - 0.5 + beyond
+        };
+        let center = center_of(1);
         let lattice = match &self.reach {
             None => shape.full(),
             Some(_) => {
@@ -39,7 +54,8 @@ impl<T: Real> VoxelGrid<T> {
             }
         };
         let layout = Layout::new(shape, lattice);
-        let read = |table: &Tensor<T>, from: &Lattice, to: &Lattice| {
+        let read = |table: &Tensor<T>, from: &Lattice, to: &Lattice, sides: usize| {
+            let center = center_of(sides);
             let width = table.shape()[1];
             let mut values = Buffer::stale(to.rows() * width);
             // A run of rows at a time bounds the memory for positions.
@@ -58,12 +74,12 @@ impl<T: Real> VoxelGrid<T> {
             }
             Tensor::from_buffer(values, &[to.rows(), width])
         };
-        let mut tables =
-            vec![read(self.density.tensor(), self.lattice(), &layout.lattice), read(self.color.tensor(), self.lattice(), &layout.lattice)];
-        // The centres of the harmonics' voxels are scaled by the same ratio. Some lie beyond the old ones.
+        let whole = [&self.density, &self.color].map(|table| read(table.tensor(), self.lattice(), &layout.lattice, 1));
+        let mut tables = Vec::from(whole);
+        // Some centres of the harmonics' voxels lie beyond the old ones.
         if let (Some(table), Some(from), Some(to)) = (&self.harmonics, self.harmonics_lattice(), &layout.harmonics) {
             let wider = dilated(from);
-            tables.push(read(&spread(table.tensor(), from, &wider), &wider, to));
+            tables.push(read(&spread(table.tensor(), from, &wider), &wider, to, old.sh_reduction));
         }
         Self::assembled(layout, tables)
     }

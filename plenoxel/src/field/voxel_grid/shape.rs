@@ -165,6 +165,14 @@ impl GridShape {
         voxels.dilated(usize::from(self.interpolation == Interpolation::Trilinear))
     }
 
+    /// The cells in which a sample reads one of `voxels`: the same with nearest look-up, those between centres with trilinear.
+    pub fn cells_reading(&self, voxels: Occupancy) -> Occupancy {
+        match self.interpolation {
+            Interpolation::Nearest => voxels,
+            Interpolation::Trilinear => voxels.between_centres(),
+        }
+    }
+
     /// Bytes of a voxel in all tables, in `f32`, with its share of the harmonics where they are reduced.
     pub fn voxel_bytes(&self) -> usize {
         let shared = (self.harmonics_width() * size_of::<f32>()).div_ceil(self.sh_reduction.pow(3));
