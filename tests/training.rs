@@ -1,6 +1,5 @@
 //! Whole runs, small.
 
-use autograd::Tensor;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Error;
@@ -11,7 +10,7 @@ use plenoxel::metrics::psnr;
 use plenoxel::render::picture::picture;
 use plenoxel::render::{Engine, RenderOptions};
 use plenoxel::sampling::{Jitter, Occupancy};
-use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Sampling, Stage, Weight};
+use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Sampling, Scout, Stage, Weight};
 use plenoxel::train::{Report, Trainer};
 use std::collections::BTreeMap;
 
@@ -112,26 +111,28 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
 }
 
 #[test]
-fn pruning_fits_the_cube_to_what_is_left() {
+fn a_scout_finds_where_matter_is() {
     let train = views(Split::Train);
-    let slow = |resolution| Stage { density_rate: 1e-9, color_rate: 1e-9, ..stage(resolution, 1) };
-    let config = Config { prune_from_stage: Some(1), prune_below: 0.2, stages: vec![slow(16), slow(24)], half_width: 2.0, ..config() };
-    // A ball of radius 0.6 around a point: voxels are 0.25 wide.
-    let mut ball = VoxelGrid::<f32>::uniform(config.grid_shape(16), 0.0, 0.5);
-    let centre = |k: usize| (k as f64 + 0.5) * 0.25 - 2.0;
-    let inside = |at: [usize; 3]| (centre(at[0]) - 0.3).powi(2) + centre(at[1]).powi(2) + centre(at[2]).powi(2) < 0.36;
-    let density =
-        (0..ball.lattice().rows() as u32).map(|row| ball.lattice().node(row).map_or(0.0, |at| if inside(at) { 9.0 } else { -1.0 }));
-    let density: Vec<f32> = density.collect();
-    ball = ball.with_density(Tensor::from_vec(density, ball.density.tensor().shape()));
-    let half_width = |fit_box| {
-        let mut trainer = Trainer::new(Config { fit_box, ..config.clone() }, &train).expect("a valid config").starting_from(&ball);
-        while trainer.step().expect("finite numbers").is_some() {}
-        trainer.grid().shape().half_width
-    };
-    assert_eq!(half_width(false), 2.0);
-    // The outermost voxel of the ball is centred at 0.625: with half of itself, and the neighbour whose samples read it, 1.0.
-    assert_eq!(half_width(true), 1.0);
+    let scout = Scout { density: 0.1, stage: Stage { density_rate: 2.0, ..stage(16, 80) } };
+    let stages = vec![stage(32, 1), stage(32, 60)];
+    let config = Config { scout: Some(scout), prune_unseen_below: 0.03, stages, rays_per_step: 2048, ..config() };
+    let mut trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
+    assert_eq!(trainer.plan().iter().map(|p| (p.first, p.stage.resolution)).collect::<Vec<_>>(), [(0, 16), (80, 32), (81, 32)]);
+    assert_eq!(trainer.prunes_from(), None);
+    while trainer.step().expect("finite numbers").is_some_and(|report| report.step < 80) {}
+    let (shape, present) = (*trainer.grid().shape(), trainer.grid().lattice().present());
+    assert_eq!(shape.resolution, 32);
+    assert!(shape.half_width <= config.half_width && present > 1000 && present < 32 * 32 * 32 / 2, "{present} in {}", shape.half_width);
+    while trainer.step().expect("finite numbers").is_some() {}
+    let psnr = test_psnr(trainer.grid());
+    assert!(psnr > 16.5, "test PSNR {psnr}");
+    // A run that starts from another needs none, and pruning counts the stages of the config.
+    let pruning = Config { prune_from_stage: Some(1), ..config };
+    let trainer = Trainer::new(pruning, &train).expect("a valid config");
+    assert_eq!(trainer.prunes_from(), Some(2));
+    let grid = VoxelGrid::<f32>::uniform(trainer.config().grid_shape(32), 0.1, 0.0);
+    let trainer = trainer.starting_from(&grid);
+    assert_eq!((trainer.plan().len(), trainer.prunes_from()), (2, Some(1)));
 }
 
 #[test]

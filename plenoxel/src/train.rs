@@ -16,7 +16,7 @@ use crate::render::{Engine, RenderOptions, render};
 use crate::sampling::{Jitter, Occupancy};
 use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Piecewise, Rates, RmsProp, Schedule, Sgd, WarmUp};
 use autograd::{Real, parallel, release_free_buffers, value_and_grad};
-use config::{Config, OptimizerConfig, Stage, Weight};
+use config::{Config, Initial, OptimizerConfig, Stage, Weight};
 use start::Silhouettes;
 use std::borrow::Cow;
 
@@ -72,6 +72,8 @@ pub struct Trainer<'a, T: Real> {
     /// By how much the images are reduced whose pixels the rays are.
     reduction: usize,
     silhouettes: Option<Silhouettes<'a>>,
+    /// True if the first stage of the plan is the scout's.
+    scouts: bool,
     objective: Objective<T>,
     grid: VoxelGrid<T>,
     /// Where the grid could learn when last looked at: samples elsewhere are left out.
@@ -96,19 +98,21 @@ impl<'a, T: Real> Trainer<'a, T> {
             return Err(Error::config("train views", "none", "at least one image to learn from"));
         }
         config.check_stages()?;
-        let plan = plan(&config, &config.stages, rays.len());
-        let mut shape = config.grid_shape(plan[0].stage.resolution);
         let silhouettes = Silhouettes::new(&config, views);
+        let scout = config.scout.filter(|_| silhouettes.is_none());
+        let plan = plan(&config, scout.iter().map(|scout| scout.stage).chain(config.stages.iter().copied()), rays.len());
+        let mut shape = config.grid_shape(plan[0].stage.resolution);
         if let Some(silhouettes) = &silhouettes {
             shape.half_width = silhouettes.half_width(shape.half_width);
         }
-        let initial = config.initial;
+        let initial = Initial { density: scout.map_or(config.initial.density, |scout| scout.density), ..config.initial };
         let grid = match initial.random {
             true => VoxelGrid::random(shape, initial.density, initial.color, config.seed),
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        Ok(Trainer { config, plan, views, rays, reduction: 1, silhouettes, objective, grid, learning: None, optimizer, step: 0 })
+        let scouts = scout.is_some();
+        Ok(Trainer { config, plan, views, rays, reduction: 1, silhouettes, scouts, objective, grid, learning: None, optimizer, step: 0 })
     }
 
     /// The same run starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
@@ -119,7 +123,8 @@ impl<'a, T: Real> Trainer<'a, T> {
         assert_eq!(self.step, 0, "a run starts once");
         let stages = &self.config.stages;
         let coarser = stages.iter().take_while(|stage| stage.resolution < grid.shape().resolution).count();
-        self.plan = plan(&self.config, &stages[coarser.min(stages.len() - 1)..], self.rays.len());
+        self.scouts = false;
+        self.plan = plan(&self.config, stages[coarser.min(stages.len() - 1)..].iter().copied(), self.rays.len());
         self.grid = start::adapted(grid, &self.config.grid_shape(self.plan[0].stage.resolution));
         self.optimizer = optimizer(&self.config, &self.plan[0]);
         self
@@ -218,12 +223,14 @@ impl<'a, T: Real> Trainer<'a, T> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        let shape = *self.grid.shape();
-        let half_width = self.fitted(index).unwrap_or(shape.half_width);
-        let finer = plan.stage.resolution != shape.resolution || half_width != shape.half_width;
-        if finer {
+        let finer = plan.stage.resolution != self.grid.shape().resolution;
+        if self.scouts && index == 1 {
+            let kept = self.worth_keeping(&self.plan[0].stage);
+            self.grid =
+                start::scouted(&self.grid, &kept, plan.stage.resolution, &self.config.initial).ok_or_else(|| self.pruned_to_nothing())?;
+        } else if finer {
             release_free_buffers();
-            self.grid = self.grid.resample_in(plan.stage.resolution, half_width);
+            self.grid = self.grid.resample(plan.stage.resolution);
         }
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
             let pruned = self.grid.pruned(&silhouettes.voxels(&self.grid));
@@ -251,13 +258,6 @@ impl<'a, T: Real> Trainer<'a, T> {
         Ok(())
     }
 
-    /// Half the side of the cube that a stage gets by `fit_box`.
-    fn fitted(&self, index: usize) -> Option<f64> {
-        let first = self.config.fit_box && self.silhouettes.is_none() && self.prunes_from() == Some(index);
-        let before = &self.plan[index.checked_sub(1).filter(|_| first)?].stage;
-        self.worth_keeping(before).half_width()
-    }
-
     /// Leaves the rays out that pass what is left of the grid, if the config says so.
     fn aim(&mut self) {
         if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
@@ -269,17 +269,21 @@ impl<'a, T: Real> Trainer<'a, T> {
     fn prune(&mut self, stage: &Stage) -> Result<()> {
         let kept = self.worth_keeping(stage);
         if kept.fraction() == 0.0 {
-            let Config { prune_below, prune_unseen_below, .. } = self.config;
-            return Err(Error::Numeric {
-                place: format!("step {}", self.step),
-                found: "pruning would leave nothing".to_owned(),
-                remedy: format!(
-                    "set prune_below lower than {prune_below}, prune_unseen_below lower than {prune_unseen_below}, or prune_from_stage later"
-                ),
-            });
+            return Err(self.pruned_to_nothing());
         }
         self.grid = self.grid.pruned(&kept);
         Ok(())
+    }
+
+    fn pruned_to_nothing(&self) -> Error {
+        let Config { prune_below, prune_unseen_below, .. } = self.config;
+        Error::Numeric {
+            place: format!("step {}", self.step),
+            found: "pruning would leave nothing".to_owned(),
+            remedy: format!(
+                "set prune_below lower than {prune_below}, prune_unseen_below lower than {prune_unseen_below}, or prune_from_stage later"
+            ),
+        }
     }
 
     /// The rays of all pixels of the images as reduced now.
@@ -293,7 +297,8 @@ impl<'a, T: Real> Trainer<'a, T> {
 
     /// The first stage of the plan that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
     pub fn prunes_from(&self) -> Option<usize> {
-        self.config.prune_from_stage.map(|first| first.saturating_sub(self.config.stages.len() - self.plan.len()))
+        let scout = usize::from(self.scouts);
+        self.config.prune_from_stage.map(|first| scout + first.saturating_sub(self.config.stages.len() + scout - self.plan.len()))
     }
 
     /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees.
@@ -337,9 +342,9 @@ impl<'a, T: Real> Trainer<'a, T> {
 }
 
 /// Stages one after another.
-fn plan(config: &Config, stages: &[Stage], rays: u64) -> Vec<PlannedStage> {
+fn plan(config: &Config, stages: impl Iterator<Item = Stage>, rays: u64) -> Vec<PlannedStage> {
     let mut first = 0;
-    let planned = stages.iter().map(|&stage| {
+    let planned = stages.map(|stage| {
         let steps = stage.step_count(rays, config.rays_per_step);
         first += steps;
         PlannedStage { stage, first: first - steps, steps }

@@ -4,6 +4,24 @@ use plenoxel::error::{Error, Result};
 use plenoxel::loss;
 use toml::{Table, Value};
 
+/// The keys of a stage.
+const STAGE: &[&str] = &[
+    "resolution",
+    "epochs",
+    "steps",
+    "sampling",
+    "image_reduction",
+    "density_rate",
+    "color_rate",
+    "harmonics_rate",
+    "density_warm_up",
+    "rate_decay",
+    "color_decay",
+];
+
+/// The two ways to place samples.
+const SAMPLING: &[&str] = &["step", "samples", "far"];
+
 /// Every table with its keys. In a path, `[]` stands for any index and `*` for any name.
 const TABLES: &[(&str, &[&str])] = &[
     (
@@ -28,7 +46,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "prune_from_stage",
             "prune_below",
             "prune_unseen_below",
-            "fit_box",
+            "scout",
             "init_from",
             "hull",
             "initial",
@@ -43,24 +61,12 @@ const TABLES: &[(&str, &[&str])] = &[
     ("optimizer", &["kind", "decay", "beta", "beta1", "beta2", "epsilon"]),
     ("losses", &loss::NAMES),
     ("losses.*", &["weight", "until", "from", "to", "steps"]),
-    (
-        "stages[]",
-        &[
-            "resolution",
-            "epochs",
-            "steps",
-            "sampling",
-            "image_reduction",
-            "density_rate",
-            "color_rate",
-            "harmonics_rate",
-            "density_warm_up",
-            "rate_decay",
-            "color_decay",
-        ],
-    ),
-    ("stages[].sampling", &["step", "samples", "far"]),
-    ("evaluation", &["step", "samples", "far"]),
+    ("stages[]", STAGE),
+    ("stages[].sampling", SAMPLING),
+    ("scout", &["density", "stage"]),
+    ("scout.stage", STAGE),
+    ("scout.stage.sampling", SAMPLING),
+    ("evaluation", SAMPLING),
     ("carve", &["resolution", "rule", "margin", "depth", "photo", "fit", "ridge", "sweeps"]),
     ("carve.photo", &["noise"]),
 ];

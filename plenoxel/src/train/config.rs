@@ -61,10 +61,11 @@ pub struct Config {
     /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
     /// share of a pixel. Of the pixels as many are looked along as make eight rays through every voxel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
-    /// The first pruning makes the cube smaller too: as small as what is left allows, around the origin. Needs no alpha; where silhouettes have
-    /// decided the size (`hull`), it stays.
-    #[serde(default)]
-    pub fit_box: bool,
+    /// A short run before the first stage, where no silhouettes and no other run say which voxels exist: those of its grid that are worth
+    /// keeping (`prune_below`, `prune_unseen_below`) do, the cube becomes as small as they allow, and training starts from `initial` in them.
+    /// Needs no alpha.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scout: Option<Scout>,
     /// Folder of the run whose grid training starts from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init_from: Option<PathBuf>,
@@ -208,6 +209,16 @@ pub struct Stage {
     pub color_decay: Option<f64>,
 }
 
+/// How to find out where matter is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scout {
+    /// Density before the first step, 1 / world length: thin enough that light gets through the cube.
+    pub density: f64,
+    /// What is trained.
+    pub stage: Stage,
+}
+
 fn one<N: From<u8>>() -> N {
     N::from(1)
 }
@@ -303,7 +314,7 @@ impl Default for Config {
             prune_from_stage: None,
             prune_below: 0.2,
             prune_unseen_below: 0.0,
-            fit_box: false,
+            scout: None,
             init_from: None,
             hull: Hull::Off,
             // svox2's start: thin gray fog.
@@ -393,8 +404,12 @@ impl Config {
                 "a number of at least 0, { weight, until } with until above 0, or { from, to, steps } above 0",
             )?;
         }
-        for (i, stage) in self.stages.iter().enumerate() {
-            let key = |name: &str| format!("stages[{i}].{name}");
+        if let Some(scout) = &self.scout {
+            positive("scout.density", scout.density)?;
+        }
+        let stages = self.stages.iter().enumerate().map(|(i, stage)| (format!("stages[{i}]"), stage));
+        for (place, stage) in stages.chain(self.scout.iter().map(|scout| ("scout.stage".to_owned(), &scout.stage))) {
+            let key = |name: &str| format!("{place}.{name}");
             check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels a side")?;
             let length = match (stage.epochs, stage.steps) {
                 (Some(epochs), None) => epochs > 0.0 && epochs <= 1e6,

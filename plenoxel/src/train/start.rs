@@ -1,6 +1,6 @@
 //! What training may know before its first step: silhouettes, and a grid that was there before.
 
-use super::config::{Config, Hull};
+use super::config::{Config, Hull, Initial};
 use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
 use crate::field::voxel_grid::{GridShape, Interpolation, VoxelGrid};
@@ -37,6 +37,14 @@ impl<'a> Silhouettes<'a> {
         let near = shape.reached_from(&grid.voxels_where(|_| true));
         shape.reached_from(&visual_hull::by_footprint_of(self.views, &near, self.margin, &|_| ()))
     }
+}
+
+/// A grid with the voxels that read one of those to keep, in the smallest cube that holds these, at another resolution and as training starts;
+/// `None` if none are kept.
+pub fn scouted<T: Real>(grid: &VoxelGrid<T>, kept: &Occupancy, resolution: usize, initial: &Initial) -> Option<VoxelGrid<T>> {
+    let near = grid.pruned(kept).resample_in(resolution, kept.half_width()?);
+    let whole = VoxelGrid::uniform(*near.shape(), initial.density, initial.color);
+    Some(whole.pruned(&near.voxels_where(|_| true)))
 }
 
 /// Optical depth of a carved voxel along its side with which training starts. As opaque as carving leaves it, hardly a gradient gets past the
