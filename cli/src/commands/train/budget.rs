@@ -13,7 +13,7 @@ use plenoxel::train::config::{Config, Stage, Weight};
 use std::time::Instant;
 
 /// A step at k times the resolution takes k to this power times as long: 128 to 384 voxels a side.
-const GROWTH: f64 = 0.9;
+const GROWTH: f64 = 1.2;
 /// To begin a stage of 256 voxels a side takes as long as this many rays at 128, and more with the 1.5th power of the resolution: the grid is
 /// resampled, and its voxels are looked at.
 const RAYS_TO_BEGIN: f64 = 500_000.0;
@@ -111,7 +111,7 @@ mod tests {
         let steps = 0.01 * (100.0 + 200.0 * 2f64.powf(GROWTH) + 400.0 * 4f64.powf(GROWTH));
         assert!((1.0 + begins + factors[1] * steps - 100.0).abs() < 1e-9, "{factors:?}");
         let error = of(2.0).unwrap_err().to_string();
-        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:04 or more"), "{error}");
+        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:05 or more"), "{error}");
     }
 
     #[test]
