@@ -111,7 +111,7 @@ mod tests {
         let steps = 0.01 * (100.0 + 200.0 * 2f64.powf(GROWTH) + 400.0 * 4f64.powf(GROWTH));
         assert!((1.0 + begins + factors[1] * steps - 100.0).abs() < 1e-9, "{factors:?}");
         let error = of(2.0).unwrap_err().to_string();
-        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:05 or more"), "{error}");
+        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:06 or more"), "{error}");
     }
 
     #[test]
