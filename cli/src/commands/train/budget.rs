@@ -12,8 +12,9 @@ use plenoxel::train::Trainer;
 use plenoxel::train::config::{Config, Stage, Weight};
 use std::time::Instant;
 
-/// A step at k times the resolution takes k to this power times as long: 128 to 384 voxels a side.
-const GROWTH: f64 = 1.2;
+/// A step at k times the resolution takes k to this power times as long, 128 to 384 voxels a side: the first where harmonics are few and stay
+/// in the cache, for every fourth voxel or less, the other where there are more.
+const GROWTH: [f64; 2] = [0.8, 1.2];
 /// To begin a stage of 256 voxels a side takes as long as this many rays at 128, and more with the 1.5th power of the resolution: the grid is
 /// resampled, and its voxels are looked at.
 const RAYS_TO_BEGIN: f64 = 500_000.0;
@@ -39,7 +40,8 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     let steps = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step));
     let speed = measure(&config, views, (CALIBRATION.0 * seconds).min(CALIBRATION.1))?;
     let steps: Vec<u64> = steps.collect();
-    let factor = factor(&config.stages, &steps, config.rays_per_step, seconds, &speed)?;
+    let growth = GROWTH[usize::from(config.sh_reduction < 4)];
+    let factor = factor(&config.stages, &steps, config.rays_per_step, seconds, &speed, growth)?;
     let scaled = |steps: u64| ((steps as f64 * factor).round() as u64).max(1);
     let stages = config.stages.iter().zip(&steps).map(|(&stage, &steps)| {
         let density_warm_up = if stage.density_warm_up == 0 { 0 } else { scaled(stage.density_warm_up) };
@@ -76,9 +78,9 @@ fn measure(config: &Config, views: &[View], seconds: f64) -> Result<Speed> {
 }
 
 /// By how much all stages have to be longer for the time to be full.
-fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed) -> Result<f64> {
+fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed, growth: f64) -> Result<f64> {
     // Seconds for a step at a resolution.
-    let step = |resolution: usize| speed.step * (resolution as f64 / stages[0].resolution as f64).powf(GROWTH);
+    let step = |resolution: usize| speed.step * (resolution as f64 / stages[0].resolution as f64).powf(growth);
     let begins = stages.windows(2).filter(|pair| pair[1].resolution != pair[0].resolution);
     let begins = begins.map(|pair| RAYS_TO_BEGIN / rays_per_step as f64 * step(128) * (pair[1].resolution as f64 / 256.0).powf(1.5));
     let fixed = speed.spent + speed.begin + begins.sum::<f64>();
@@ -103,15 +105,15 @@ mod tests {
         let stage = Config::default().stages[0];
         let stages = [64, 128, 256].map(|resolution| Stage { resolution, ..stage });
         let speed = Speed { step: 0.01, begin: 0.5, spent: 0.5 };
-        let of = |seconds: f64| factor(&stages, &[100, 200, 400], 10_000, seconds, &speed);
+        let of = |seconds: f64| factor(&stages, &[100, 200, 400], 10_000, seconds, &speed, 1.0);
         let factors = [10.0, 100.0, 1000.0].map(|seconds| of(seconds).unwrap());
         assert!(factors.is_sorted_by(|short, long| short < long), "{factors:?}");
-        // Two begins of a stage, at 2^GROWTH of a first step each, and steps that cost 1, 2^GROWTH and 4^GROWTH.
-        let begins = 50.0 * 0.01 * 2f64.powf(GROWTH) * (0.5f64.powf(1.5) + 1.0);
-        let steps = 0.01 * (100.0 + 200.0 * 2f64.powf(GROWTH) + 400.0 * 4f64.powf(GROWTH));
+        // Two begins of a stage, at 2 first steps each, and steps that cost 1, 2 and 4.
+        let begins = 50.0 * 0.01 * 2.0 * (0.5f64.powf(1.5) + 1.0);
+        let steps = 0.01 * (100.0 + 200.0 * 2.0 + 400.0 * 4.0);
         assert!((1.0 + begins + factors[1] * steps - 100.0).abs() < 1e-9, "{factors:?}");
         let error = of(2.0).unwrap_err().to_string();
-        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:06 or more"), "{error}");
+        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:05 or more"), "{error}");
     }
 
     #[test]
