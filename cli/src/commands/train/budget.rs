@@ -69,7 +69,7 @@ fn measure(config: &Config, views: &[View], seconds: f64) -> Result<Speed> {
     while trainer.step()?.is_some_and(|report| report.stage < last) {}
     let begin = start.elapsed().as_secs_f64();
     let mut count = 0.0;
-    while count < 3.0 || start.elapsed().as_secs_f64() < seconds {
+    while count < 3.0 || start.elapsed().as_secs_f64() < begin + seconds {
         trainer.step()?;
         count += 1.0;
     }
