@@ -31,6 +31,23 @@ use std::collections::HashMap;
 pub trait Optimizer<T: Real>: Send {
     /// One step. `step` counts from 0 and is what schedules go by.
     fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64);
+
+    /// What it remembers of a parameter, to be kept with its values; `None` if nothing.
+    fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>>;
+
+    /// Goes on with a parameter as one of its kind that remembered this. False, and nothing is done, if it does not remember so many numbers of
+    /// each element.
+    #[must_use]
+    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool;
+}
+
+/// What an optimizer remembers of a parameter.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Remembered<'a, T: Real> {
+    /// Steps in which it had a gradient.
+    pub updates: u64,
+    /// As many numbers in each as the parameter has values: of momentum the velocity, of [`RmsProp`] v, of [`Adam`] m and v.
+    pub arrays: Vec<&'a [T]>,
 }
 
 /// Learning rates: a schedule for each parameter name, and one for the names that are not listed.
@@ -112,6 +129,19 @@ impl<T: Real, const N: usize> Memory<T, N> {
             }
         });
         self.by_id.retain(|_, slot| slot.last_seen == round);
+    }
+
+    fn of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
+        let slot = self.by_id.get(&param.id())?;
+        let arrays = slot.state.as_ref()?.iter().map(|array| &array[..]).collect();
+        Some(Remembered { updates: slot.updates, arrays })
+    }
+
+    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
+        let fits = arrays.iter().all(|array| array.len() == param.tensor().len());
+        let Some(state) = arrays.try_into().ok().filter(|_| fits) else { return false };
+        self.by_id.insert(param.id(), Slot { state: Some(state), updates, last_seen: self.round });
+        true
     }
 }
 
@@ -196,6 +226,33 @@ mod tests {
             used.step(&mut old, &grads_old, 5);
             fresh.step(&mut new, &grads_new, 5);
             assert_eq!(old[0].tensor().data(), new[0].tensor().data(), "{name}");
+        }
+    }
+
+    #[test]
+    fn one_that_recalls_goes_on_as_the_one_that_remembered() {
+        for ((name, mut first), (_, mut second)) in all().into_iter().zip(all()) {
+            let mut whole = params(7);
+            for step in 0..3 {
+                let grads = gradients(&whole);
+                first.step(&mut whole, &grads, step);
+            }
+            let mut copy: Vec<Param<f32>> = whole.iter().map(|p| Param::from_tensor(p.name(), p.tensor().detach())).collect();
+            for (old, new) in whole.iter().zip(&copy) {
+                if let Some(Remembered { updates, arrays }) = first.memory_of(old) {
+                    let arrays: Vec<_> = arrays.into_iter().map(Buffer::copy_of).collect();
+                    let short = arrays.iter().map(|array| Buffer::copy_of(&array[1..])).collect();
+                    assert!(!second.recall(new, updates, short), "{name}");
+                    assert!(!second.recall(new, updates, vec![Buffer::zeros(7); 3]), "{name}");
+                    assert!(second.recall(new, updates, arrays), "{name}");
+                }
+            }
+            for step in 3..6 {
+                let (grads, grads_of_copy) = (gradients(&whole), gradients(&copy));
+                first.step(&mut whole, &grads, step);
+                second.step(&mut copy, &grads_of_copy, step);
+            }
+            assert_eq!(whole[0].tensor().data(), copy[0].tensor().data(), "{name}");
         }
     }
 

@@ -6,19 +6,13 @@
 //! voxels, `color` is `[k, 3]`, the means, and the harmonics follow in the same manner: `harmonics_voxels` `[h]`, (x, y, z) of
 //! m = ⌈n / reduction⌉ voxels along an axis as the number (x m + y) m + z, and `harmonics` `[h, channels − 3]`.
 //!
-//! The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader must know. (One entry, for several
-//! would be written in a random order, and equal grids are to be equal files.)
+//! The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader must know.
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
-use crate::files::write_atomically;
+use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of};
 use autograd::{Indices, Lattice, Param, Real, Tensor};
-use safetensors::SafeTensorError;
-use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::HashMap;
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// Version of the format of grids with all their voxels.
@@ -36,8 +30,6 @@ pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * hal
 /// What is said beside [`CONVENTION`] where harmonics are reduced.
 const REDUCED_CONVENTION: &str = "; `color` has the means of R, G, B alone; `harmonics` has those of degree 1 and more, in voxels whose sides are \
     sh_reduction times as long and whose box begins at the same corner and may end beyond it; they are looked up as the other values are";
-/// Key of the metadata.
-const KEY: &str = "plenoxel";
 
 /// Everything about a checkpoint but its tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -125,37 +117,30 @@ impl Header {
 
 /// Writes a grid, whole or not at all.
 pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Result<()> {
-    let bytes = |table: &[T]| -> Vec<u8> { table.iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect() };
     let (n, channels) = (header.resolution, grid.shape().color_width());
-    let defect = |e: &dyn std::fmt::Display| {
-        Error::input(path, format!("the checkpoint cannot be put together ({e})"), "this is a defect of the program")
-    };
-    let metadata = HashMap::from([(KEY.to_owned(), serde_json::to_string(header).map_err(|e| defect(&e))?)]);
-    let mut arrays: Vec<(&str, Dtype, Vec<usize>, Vec<u8>)> = Vec::new();
+    let mut entries: Vec<Entry<'_>> = Vec::new();
     if header.format == FORMAT {
-        let [density, color] = grid.to_row_major().map(|table| bytes(table.data()));
-        arrays.push(("density", Dtype::F32, vec![n, n, n], density));
-        arrays.push(("color", Dtype::F32, vec![n, n, n, channels], color));
+        let [density, color] = grid.to_row_major();
+        entries.push(Entry::new("density", Dtype::F32, vec![n, n, n], move || bytes_of(density.data(), Dtype::F32)));
+        entries.push(Entry::new("color", Dtype::F32, vec![n, n, n, channels], move || bytes_of(color.data(), Dtype::F32)));
     } else {
         let mut list = |name: &'static str, lattice: &Lattice, tables: &[(&'static str, &Param<T>)]| {
             let voxels = present(lattice);
             let rows = Indices::from(rows_of(&voxels, lattice));
-            arrays.push((name, Dtype::U32, vec![voxels.len()], voxels.iter().flat_map(|v| v.to_le_bytes()).collect()));
             for (name, table) in tables {
                 let width = table.shape()[1];
                 let shape = if *name == "density" { vec![voxels.len()] } else { vec![voxels.len(), width] };
-                arrays.push((name, Dtype::F32, shape, bytes(table.tensor().detach().gather_rows(&rows).data())));
+                let (table, rows) = (table.tensor().detach(), rows.clone());
+                entries.push(Entry::new(*name, Dtype::F32, shape, move || bytes_of(table.gather_rows(&rows).data(), Dtype::F32)));
             }
+            entries.push(Entry::new(name, Dtype::U32, vec![voxels.len()], move || voxels.iter().flat_map(|v| v.to_le_bytes()).collect()));
         };
         list("voxels", grid.lattice(), &[("density", &grid.density), ("color", &grid.color)]);
         if let (Some(table), Some(lattice)) = (&grid.harmonics, grid.harmonics_lattice()) {
             list("harmonics_voxels", lattice, &[("harmonics", table)]);
         }
     }
-    let views = arrays.iter().map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)));
-    let views = views.collect::<std::result::Result<Vec<_>, SafeTensorError>>().map_err(|e| defect(&e))?;
-    let file = safetensors::serialize(views, Some(metadata)).map_err(|e| defect(&e))?;
-    write_atomically(path, &file)
+    tensor_file::write(path, header, &entries)
 }
 
 /// The present voxels by number, ascending.
@@ -178,44 +163,27 @@ fn node(voxel: u32, n: usize) -> [usize; 3] {
     [voxel / (n * n), voxel / n % n, voxel % n]
 }
 
-/// What helps against a damaged file.
-const RETRAIN: &str = "train again, or use an undamaged copy";
-
 /// Reads what a checkpoint says of itself, without its tables: the header, and the number of voxels that are present.
 pub fn header(path: &Path) -> Result<(Header, usize)> {
-    /// The longest header that the format allows.
-    const LONGEST: u64 = 100_000_000;
-    let refused = |e| Error::io(path, e, "reading the checkpoint");
-    let mut file = File::open(path).map_err(refused)?;
-    let (mut length, mut text) = (Vec::new(), Vec::new());
-    file.by_ref().take(8).read_to_end(&mut length).map_err(refused)?;
-    let length = length.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
-    file.take(length.min(LONGEST)).read_to_end(&mut text).map_err(refused)?;
-    let metadata: Metadata = serde_json::from_slice(&text).map_err(|e| damaged(path, &e))?;
-    let shape = metadata.info("voxels").or_else(|| metadata.info("density")).map_or(&[][..], |info| &info.shape);
-    Ok((header_of(path, &metadata)?, shape.iter().product()))
+    let file = TensorFile::open(path)?;
+    let shape = file.info("voxels").or_else(|| file.info("density")).map_or(&[][..], |info| &info.shape);
+    Ok((header_of(path, &file)?, shape.iter().product()))
 }
 
 /// The header among the metadata of a file.
-fn header_of(path: &Path, metadata: &Metadata) -> Result<Header> {
-    let Some(text) = metadata.metadata().as_ref().and_then(|m| m.get(KEY)) else {
-        return Err(Error::input(
-            path,
-            format!("a safetensors file without `{KEY}` in its metadata"),
-            "give a checkpoint that this program wrote",
-        ));
-    };
+fn header_of(path: &Path, file: &TensorFile) -> Result<Header> {
     // The version first: a later one may have other fields.
-    let unreadable = |e: serde_json::Error| Error::input(path, format!("the header cannot be read ({e})"), RETRAIN);
-    let format = serde_json::from_str::<serde_json::Value>(text).map_err(unreadable)?["format"].as_str().unwrap_or("none").to_owned();
-    if ![FORMAT, SPARSE_FORMAT, REDUCED_FORMAT].contains(&&format[..]) {
+    let value = file.header()?;
+    let format = value["format"].as_str().unwrap_or("none");
+    if ![FORMAT, SPARSE_FORMAT, REDUCED_FORMAT].contains(&format) {
         return Err(Error::input(
             path,
             format!("format `{format}`"),
             format!("this program reads `{FORMAT}`, `{SPARSE_FORMAT}` and `{REDUCED_FORMAT}`; use the version that wrote the file"),
         ));
     }
-    let header: Header = serde_json::from_str(text).map_err(unreadable)?;
+    let format = format.to_owned();
+    let header: Header = serde_json::from_value(value).map_err(|e| file.unreadable(&e))?;
     let degree_known = header.sh_degree.is_none_or(|d| d <= crate::field::sh::MAX_DEGREE);
     if header.scene_transform != Header::IDENTITY {
         return Err(Error::input(
@@ -231,43 +199,25 @@ fn header_of(path: &Path, metadata: &Metadata) -> Result<Header> {
     Ok(header)
 }
 
-fn damaged(path: &Path, e: &dyn std::fmt::Display) -> Error {
-    Error::input(path, format!("not a whole safetensors file ({e})"), RETRAIN)
-}
-
 /// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
 pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
-    let file = std::fs::read(path).map_err(|e| Error::io(path, e, "reading the checkpoint"))?;
-    let tensors = SafeTensors::deserialize(&file).map_err(|e| damaged(path, &e))?;
-    let (_, metadata) = SafeTensors::read_metadata(&file).map_err(|e| damaged(path, &e))?;
-    let header = header_of(path, &metadata)?;
+    let mut file = TensorFile::open(path)?;
+    let header = header_of(path, &file)?;
     let shape = header.shape();
     let n = header.resolution;
-    let read = |name: &str, dtype: Dtype, expected: &[usize]| -> Result<&[u8]> {
-        let view = tensors.tensor(name).map_err(|_| Error::input(path, format!("no tensor `{name}`"), RETRAIN))?;
-        if view.dtype() != dtype || view.shape() != expected {
-            return Err(Error::input(
-                path,
-                format!("tensor `{name}` is {:?} {:?}", view.dtype(), view.shape()),
-                format!("{dtype:?} {expected:?} is expected; {RETRAIN}"),
-            ));
-        }
-        Ok(view.data())
-    };
-    let words = |data: &[u8]| data.as_chunks::<4>().0.to_vec();
-    let table = |name: &str, channels: usize, expected: &[usize]| -> Result<Tensor<T>> {
-        let values: Vec<T> =
-            words(read(name, Dtype::F32, expected)?).into_iter().map(|b| T::lit(f64::from(f32::from_le_bytes(b)))).collect();
-        let rows = values.len() / channels;
-        Ok(Tensor::from_vec(values, &[rows, channels]))
-    };
+    fn table<T: Real>(file: &mut TensorFile, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
+        let values = file.numbers(name, Dtype::F32, expected)?;
+        let rows = values.len() / width;
+        Ok(Tensor::from_vec(values, &[rows, width]))
+    }
     let channels = shape.color_width();
     let grid = if header.format == FORMAT {
-        VoxelGrid::from_row_major(shape, &table("density", 1, &[n, n, n])?, &table("color", channels, &[n, n, n, channels])?)
+        VoxelGrid::from_row_major(shape, &table(&mut file, "density", 1, &[n, n, n])?, &table(&mut file, "color", channels, &[n, n, n, channels])?)
     } else {
-        let list = |name: &str, n: usize| -> Result<Vec<u32>> {
-            let k = tensors.tensor(name).map_or(0, |view| view.shape().iter().product());
-            let voxels: Vec<u32> = words(read(name, Dtype::U32, &[k])?).into_iter().map(u32::from_le_bytes).collect();
+        let list = |file: &mut TensorFile, name: &str, n: usize| -> Result<Vec<u32>> {
+            let k = file.info(name).map_or(0, |info| info.shape.iter().product());
+            let bytes = file.read(name, Dtype::U32, &[k])?;
+            let voxels: Vec<u32> = bytes.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)).collect();
             if !voxels.is_sorted_by(|a, b| a < b) || voxels.last().is_none_or(|&last| last as usize >= n * n * n) {
                 return Err(Error::input(path, "a list of voxels that is empty, not ascending, or longer than the grid", RETRAIN));
             }
@@ -276,17 +226,17 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
         let placed = |listed: Tensor<T>, voxels: &[u32], lattice: &Lattice| {
             listed.scatter_rows(&Indices::from(rows_of(voxels, lattice)), lattice.rows())
         };
-        let voxels = list("voxels", n)?;
+        let voxels = list(&mut file, "voxels", n)?;
         let k = voxels.len();
         let lattice = Lattice::bricks_where([n; 3], |[x, y, z]| voxels.binary_search(&(((x * n + y) * n + z) as u32)).is_ok());
-        let fine = [table("density", 1, &[k])?, table("color", channels, &[k, channels])?];
+        let fine = [table(&mut file, "density", 1, &[k])?, table(&mut file, "color", channels, &[k, channels])?];
         let mut tables = fine.map(|table| placed(table, &voxels, &lattice)).to_vec();
         if let Some(lattice) = shape.harmonics_lattice(&lattice) {
-            let (voxels, width) = (list("harmonics_voxels", shape.harmonics_resolution())?, shape.harmonics_width());
+            let (voxels, width) = (list(&mut file, "harmonics_voxels", shape.harmonics_resolution())?, shape.harmonics_width());
             if voxels != present(&lattice) {
                 return Err(Error::input(path, "harmonics of other voxels than those around its own", RETRAIN));
             }
-            tables.push(placed(table("harmonics", width, &[voxels.len(), width])?, &voxels, &lattice));
+            tables.push(placed(table(&mut file, "harmonics", width, &[voxels.len(), width])?, &voxels, &lattice));
         }
         VoxelGrid::with_tables(shape, lattice, tables)
     };

@@ -5,7 +5,6 @@
 
 use crate::error::{Error, Result};
 use std::fs::{self, File};
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -14,13 +13,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 ///
 /// Errors: [`Error::Io`] if the folder is missing or refuses the file.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    atomically(path, |temporary| fs::write(temporary, bytes))
+}
+
+/// The same with a file that `write` makes, under the name it is given.
+pub(crate) fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>) -> Result<()> {
     let temporary = temporary_name(path);
-    let written = File::create(&temporary)
-        .and_then(|mut file| {
-            file.write_all(bytes)?;
-            file.sync_all()
-        })
-        .and_then(|()| fs::rename(&temporary, path));
+    let written = write(&temporary).and_then(|()| File::open(&temporary)?.sync_all()).and_then(|()| fs::rename(&temporary, path));
     written.map_err(|source| {
         // The write is what failed; a second failure while tidying up would only hide it.
         let _ = fs::remove_file(&temporary);

@@ -40,6 +40,7 @@ pub mod random;
 pub mod rays;
 pub mod render;
 pub mod sampling;
+mod tensor_file;
 pub mod train;
 
 /// The code of the repository's front page is compiled and run with the tests.

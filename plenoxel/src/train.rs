@@ -4,6 +4,7 @@
 
 pub mod config;
 mod start;
+mod state;
 
 use crate::dataset::View;
 use crate::error::{Error, Result};

@@ -1,9 +1,10 @@
 //! Adam, in the two algorithms that row gradients make of it.
 
-use super::{Memory, Optimizer, Rates, bounded, update};
+use super::{Memory, Optimizer, Rates, Remembered, bounded, update};
 use crate::gradients::{Grad, Gradients};
 use crate::parallel;
-use crate::param::Module;
+use crate::param::{Module, Param};
+use crate::pool::Buffer;
 use crate::real::Real;
 
 /// What happens to rows that a row gradient does not mention. These are different algorithms with different results.
@@ -75,13 +76,20 @@ impl<T: Real> Optimizer<T> for Adam<T> {
             });
         });
     }
+
+    fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
+        self.memory.of(param)
+    }
+
+    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
+        self.memory.recall(param, updates, arrays)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::index::Indices;
-    use crate::param::Param;
     use crate::tensor::Tensor;
     use approx::assert_relative_eq;
     use ndarray::{arr1, arr2};

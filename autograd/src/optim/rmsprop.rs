@@ -1,8 +1,9 @@
 //! RMSProp as Plenoxels use it.
 
-use super::{Memory, Optimizer, Rates, update};
+use super::{Memory, Optimizer, Rates, Remembered, update};
 use crate::gradients::Gradients;
-use crate::param::Module;
+use crate::param::{Module, Param};
+use crate::pool::Buffer;
 use crate::real::Real;
 
 /// v ← g² if v = 0, else β v + (1 − β) g²;  θ ← θ − lr · g / (√v + ε) (svox2).
@@ -54,13 +55,20 @@ impl<T: Real> Optimizer<T> for RmsProp<T> {
             });
         });
     }
+
+    fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
+        self.memory.of(param)
+    }
+
+    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
+        self.memory.recall(param, updates, arrays)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::index::Indices;
-    use crate::param::Param;
     use crate::tensor::Tensor;
     use approx::assert_relative_eq;
     use ndarray::{arr1, arr2};

@@ -1,8 +1,9 @@
 //! Gradient descent, plain and with momentum.
 
-use super::{Memory, Optimizer, Rates, update};
+use super::{Memory, Optimizer, Rates, Remembered, update};
 use crate::gradients::Gradients;
-use crate::param::Module;
+use crate::param::{Module, Param};
+use crate::pool::Buffer;
 use crate::real::Real;
 
 /// θ ← θ − lr · g. Remembers nothing, so a row gradient and the dense one with its zeros do the same.
@@ -26,6 +27,14 @@ impl<T: Real> Optimizer<T> for Sgd {
             let bounds = param.bounds();
             param.update(|theta| update([theta], grad, bounds, |[theta], g| [theta - rate * g]));
         });
+    }
+
+    fn memory_of(&self, _: &Param<T>) -> Option<Remembered<'_, T>> {
+        None
+    }
+
+    fn recall(&mut self, _: &Param<T>, _: u64, arrays: Vec<Buffer<T>>) -> bool {
+        arrays.is_empty()
     }
 }
 
@@ -61,13 +70,20 @@ impl<T: Real> Optimizer<T> for Momentum<T> {
             });
         });
     }
+
+    fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
+        self.memory.of(param)
+    }
+
+    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
+        self.memory.recall(param, updates, arrays)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::index::Indices;
-    use crate::param::Param;
     use approx::assert_relative_eq;
     use ndarray::{arr1, arr2};
 

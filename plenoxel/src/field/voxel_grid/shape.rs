@@ -160,6 +160,11 @@ impl GridShape {
         Layout::new(*self, lattice.clone()).harmonics
     }
 
+    /// Shapes of the tables of a grid with the voxels of a lattice: density, color and, where they are reduced, harmonics.
+    pub fn tables(&self, lattice: &Lattice) -> Vec<[usize; 2]> {
+        Layout::new(*self, lattice.clone()).tables()
+    }
+
     /// The voxels in which a sample can read one of `voxels`: the same with nearest look-up, their neighbours too with trilinear.
     pub fn reached_from(&self, voxels: &Occupancy) -> Occupancy {
         voxels.dilated(usize::from(self.interpolation == Interpolation::Trilinear))
