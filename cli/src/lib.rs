@@ -1,7 +1,8 @@
 //! The command line of plenoxel as a library: [`run`] takes arguments and two streams and returns an exit code, so that a test can call
 //! it like any function.
 //!
-//! Exit codes: 0 done, 2 usage or a setting that cannot be used, 3 bad input, 4 numbers that are not finite, 5 reading or writing.
+//! Exit codes: 0 done, 2 usage or a setting that cannot be used, 3 bad input, 4 numbers that are not finite, 5 reading or writing,
+//! 130 training that was interrupted, and saved.
 #![forbid(unsafe_code)]
 
 mod commands;
@@ -36,7 +37,8 @@ Examples:
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           its surface, for other programs
 
-Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing.";
+Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing,
+130 interrupted (what was trained is saved).";
 
 /// Voxel radiance fields from photographs with known cameras
 #[derive(Debug, Parser)]
@@ -95,16 +97,17 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     memory::limit(cli.machine.max_memory);
     let done = machine::with_threads(cli.machine.threads, || match &cli.command {
         Command::Train(args) => train::run(args, &console),
-        Command::Carve(args) => carve::run(args, &console),
-        Command::Render(args) => render::run(args, &console),
-        Command::Evaluate(args) => evaluate::run(args, &console),
-        Command::Export(args) => export::run(args, &console),
-        Command::Filter(args) => filter::run(args, &console),
-        Command::Info(args) => info::run(args, &console),
-        Command::Scene(args) => scene::run(args, &console),
+        Command::Carve(args) => carve::run(args, &console).map(|()| true),
+        Command::Render(args) => render::run(args, &console).map(|()| true),
+        Command::Evaluate(args) => evaluate::run(args, &console).map(|()| true),
+        Command::Export(args) => export::run(args, &console).map(|()| true),
+        Command::Filter(args) => filter::run(args, &console).map(|()| true),
+        Command::Info(args) => info::run(args, &console).map(|()| true),
+        Command::Scene(args) => scene::run(args, &console).map(|()| true),
     });
     match done {
-        Ok(()) => 0,
+        Ok(true) => 0,
+        Ok(false) => train::INTERRUPTED,
         Err(error) => {
             console.error(&error.to_string());
             error.exit_code()

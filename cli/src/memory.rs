@@ -25,7 +25,7 @@ pub struct Estimate {
     pub optimizer: u64,
     /// Samples, intermediate values and gradients of one step, or what evaluating or saving takes if that is more.
     pub step: u64,
-    /// An upper bound: it is of a grid with all voxels, and pruning takes some out.
+    /// An expectation: pruning leaves more or fewer voxels.
     pruned: bool,
     /// The setting that counts most, and what would help.
     key: String,
@@ -42,21 +42,25 @@ const EVALUATION_RAYS: u64 = 4096;
 impl Estimate {
     /// A training run with everything around it; `initial` bytes are of the grid that it starts from.
     pub fn of_training(config: &Config, dataset: &Dataset, initial: u64) -> Self {
-        let finest = config.stages.iter().enumerate();
-        let (index, resolution) =
-            finest.map(|(i, stage)| (i, stage.resolution)).max_by_key(|(_, resolution)| *resolution).unwrap_or((0, 0));
-        let shape = config.grid_shape(resolution);
-        let tables = shape.bytes() as u64;
-        let earlier = config.stages.iter().map(|stage| stage.resolution);
-        let earlier: u64 = earlier.filter(|n| *n < resolution).map(|n| config.grid_shape(n).bytes() as u64).sum();
-        let optimizer = tables
-            * match config.optimizer {
-                OptimizerConfig::Sgd => 0,
-                OptimizerConfig::Momentum { .. } | OptimizerConfig::RmsProp { .. } => 1,
-                OptimizerConfig::LazyAdam { .. } => 2,
-            };
+        let states = match config.optimizer {
+            OptimizerConfig::Sgd => 0,
+            OptimizerConfig::Momentum { .. } | OptimizerConfig::RmsProp { .. } => 1,
+            OptimizerConfig::LazyAdam { .. } => 2,
+        };
+        // Bytes of a stage's tables, and what is held of it and of the one before while it begins.
+        let tables = |index: usize| (share(config, index) * config.grid_shape(config.stages[index].resolution).bytes() as f64) as u64;
+        let begins = |index: usize| {
+            let before = share(config, index.saturating_sub(1));
+            let outline = OUTLINE as f64 * before * config.grid_shape(config.stages[index].resolution).voxels() as f64;
+            // Of all before it, for they may be kept for their figures.
+            (0..index).map(tables).sum::<u64>() + (outline as u64).max(tables(index))
+        };
+        let finest = (0..config.stages.len()).max_by_key(|&index| tables(index) * (1 + states));
+        let index = finest.unwrap_or(0);
+        let shape = config.grid_shape(config.stages[index].resolution);
+        let optimizer = states * tables(index);
         let rays = config.rays_per_step as u64;
-        let step = config.stages.iter().map(|stage| {
+        let step = config.stages.iter().enumerate().map(|(index, stage)| {
             let shape = config.grid_shape(stage.resolution);
             let samples = rays * mean_samples(stage.sampling, &shape);
             // What the fused engine keeps is bounded; it then adds rows up chunk by chunk: those so far, those of a chunk, and their sum.
@@ -64,7 +68,7 @@ impl Estimate {
             let kept = if chunked { samples / rays * CHUNK as u64 } else { samples };
             let gradient = match whole_grid_losses(config) {
                 // Dense gradients, and the roots that a total variation keeps for them.
-                true => 2 * shape.bytes() as u64,
+                true => 2 * tables(index),
                 false => 0,
             };
             // Else it adds rows up where the optimizer wants them.
@@ -79,10 +83,10 @@ impl Estimate {
         });
         let step = step.max().unwrap_or(0);
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
-        // The file is put together beside the tables, once in pieces and once whole.
-        let saving = 2 * tables;
+        // A table's bytes beside it.
+        let saving = tables(index);
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
-        let grid = tables + earlier + 2 * initial;
+        let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, a lower sh_degree, or a higher sh_reduction");
         let parts = [
             (images, ("downscale".to_owned(), "a larger factor, so that the images fit")),
@@ -91,7 +95,15 @@ impl Estimate {
             (grid + optimizer + saving, voxels),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
-        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: prunes(config), key, advice }
+        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: config.prune_from_stage.is_some(), key, advice }
+    }
+
+    /// The most rows of tables that fit into the memory that is free, if that is known: what pruning leaves is only known when it has.
+    pub fn most_rows(&self, config: &Config) -> Option<usize> {
+        let held = self.grid + self.optimizer;
+        let row = config.grid_shape(1).voxel_bytes() as u64;
+        // Tables, two states of the optimizer, and those of the stage before, of a file, or of gradients.
+        available().map(|available| (available.saturating_sub(self.total() - held) / (4 * row)) as usize)
     }
 
     /// Rendering a trained grid of so many voxels, and comparing it with the views of a split where `compare` is set.
@@ -150,7 +162,7 @@ impl Estimate {
             optimizer: 0,
             // Places, rows, normals and colors.
             step: 100 * voxels as u64,
-            pruned: true,
+            pruned: false,
             key: "RUN".to_owned(),
             advice: "a machine with more",
         }
@@ -168,7 +180,7 @@ impl Estimate {
     }
 
     fn how_much(&self) -> &'static str {
-        if self.pruned { "up to" } else { "about" }
+        if self.pruned { "perhaps" } else { "about" }
     }
 
     /// One line for people.
@@ -202,9 +214,14 @@ impl Estimate {
     }
 }
 
-/// True if a stage begins by taking voxels out.
-fn prunes(config: &Config) -> bool {
-    config.prune_from_stage.is_some_and(|first| first < config.stages.len())
+/// Bytes for each voxel while it is found out which of them there will be: its density, and a color that is not used.
+const OUTLINE: u64 = 16;
+/// The share of the voxels that is expected to be left by pruning. Of lego's at 256 voxels a side a twentieth is, of what fills its cube more.
+const LEFT: f64 = 0.125;
+
+/// The share of the voxels that is expected to be there in a stage.
+fn share(config: &Config, stage: usize) -> f64 {
+    if config.prune_from_stage.is_some_and(|first| first <= stage) { LEFT } else { 1.0 }
 }
 
 /// Bytes that a command may take in all, if the user set them; 0 if not.

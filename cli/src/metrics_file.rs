@@ -1,8 +1,10 @@
 //! `metrics.jsonl`: what a run did, line by line, while it does it.
 
 use plenoxel::error::{Error, Result};
+use plenoxel::files;
 use plenoxel::train::{PlannedStage, Report};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
@@ -21,15 +23,27 @@ pub struct MetricsFile {
     samples: u64,
 }
 
+/// What the lines of a run tell that goes on.
+#[derive(Default)]
+pub struct Past {
+    /// Of each step: the mean of its line.
+    pub losses: Vec<f64>,
+    /// The last step of each stage that has ended, its resolution, and the seconds of training by then.
+    pub stages: Vec<(u64, usize, f64)>,
+    /// Seconds of training.
+    pub seconds: f64,
+}
+
 /// A line: means of the losses and the PSNR since the line before, everything else as it is now.
-#[derive(Serialize)]
+#[derive(Serialize, Deserialize)]
 struct Line<'a> {
     step: u64,
     stage: usize,
     resolution: usize,
     ends_stage: bool,
     loss: f64,
-    losses: BTreeMap<&'a str, f64>,
+    #[serde(borrow)]
+    losses: BTreeMap<Cow<'a, str>, f64>,
     psnr: f64,
     rays: u64,
     samples: u64,
@@ -61,8 +75,29 @@ impl MetricsFile {
         })
     }
 
-    /// A step was taken; `seconds` of training have passed.
-    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seconds: f64) -> Result<()> {
+    /// The file of a run that goes on after so many steps: lines about later ones go.
+    pub fn resume(path: &Path, total_steps: u64, taken: u64) -> Result<(Self, Past)> {
+        let text = std::fs::read_to_string(path).unwrap_or_default();
+        let (mut kept, mut past, mut counts) = (String::new(), Past::default(), (0, 0));
+        for text in text.lines() {
+            // A line that was cut short, and what is no line of a step, say nothing.
+            let Some(line) = serde_json::from_str::<Line<'_>>(text).ok().filter(|line| line.step < taken) else { continue };
+            kept += text;
+            kept += "\n";
+            past.losses.resize(line.step as usize + 1, line.loss);
+            past.seconds = line.seconds;
+            if line.ends_stage {
+                past.stages.push((line.step, line.resolution, line.seconds));
+            }
+            counts = (line.rays, line.samples);
+        }
+        files::write_atomically(path, kept.as_bytes())?;
+        let (rays, samples) = counts;
+        Ok((MetricsFile { rays, samples, ..Self::create(path, total_steps)? }, past))
+    }
+
+    /// A step was taken; `seconds` of training have passed. A line is written if it is time to, or it must be.
+    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seconds: f64, must: bool) -> Result<()> {
         self.rays += report.rays as u64;
         self.samples += report.samples as u64;
         let since = &mut self.since;
@@ -75,7 +110,7 @@ impl MetricsFile {
                 None => since.losses.push((name.clone(), *value)),
             }
         }
-        if !(report.step + 1).is_multiple_of(self.every) && !report.ends_stage {
+        if !(report.step + 1).is_multiple_of(self.every) && !report.ends_stage && !must {
             return Ok(());
         }
         let since = std::mem::take(&mut self.since);
@@ -86,7 +121,7 @@ impl MetricsFile {
             resolution: plan[report.stage].stage.resolution,
             ends_stage: report.ends_stage,
             loss: mean(since.loss),
-            losses: since.losses.iter().map(|(name, sum)| (name.as_str(), mean(*sum))).collect(),
+            losses: since.losses.iter().map(|(name, sum)| (name.into(), mean(*sum))).collect(),
             psnr: -10.0 * mean(since.squared_error).log10(),
             rays: self.rays,
             samples: self.samples,

@@ -66,8 +66,8 @@ impl<'a> Console<'a> {
         Count { meter: Meter::new(self, total as u64), what: what.to_owned() }
     }
 
-    /// Progress of a training run.
-    pub fn training(&self, plan: &[PlannedStage], prune_from_stage: Option<usize>) -> Training<'_, 'a> {
+    /// Progress of a training run that has taken so many seconds.
+    pub fn training(&self, plan: &[PlannedStage], prune_from_stage: Option<usize>, seconds: f64) -> Training<'_, 'a> {
         let total = plan.iter().map(|p| p.steps).sum();
         Training {
             meter: Meter::new(self, total),
@@ -79,7 +79,7 @@ impl<'a> Console<'a> {
             loss: Smoothed::new(0.01),
             samples: Smoothed::new(0.05),
             step_seconds: Smoothed::new(0.05),
-            seconds: 0.0,
+            seconds,
         }
     }
 }

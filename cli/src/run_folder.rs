@@ -39,6 +39,7 @@ const CONFIG: &str = "config.toml";
 const RECORD: &str = "run.json";
 const METRICS: &str = "metrics.jsonl";
 const CHECKPOINT: &str = "checkpoint.safetensors";
+const STATE: &str = "training.safetensors";
 const LOSS: &str = "loss.svg";
 const RESULT: &str = "result.json";
 const README: &str = "README.md";
@@ -74,7 +75,7 @@ impl RunFolder {
     /// the new one's; files of other kinds stay.
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
-        for name in [CHECKPOINT, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
+        for name in [CHECKPOINT, STATE, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
             let path = self.path.join(name);
             if path.exists() {
                 std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
@@ -149,9 +150,43 @@ impl RunFolder {
         let path = self.checkpoint();
         if !path.exists() {
             let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
-            return Err(Error::input(&self.path, found, "train again"));
+            return Err(Error::input(&self.path, found, "go on with `plenoxel train --resume`, or train again"));
         }
         Ok(path)
+    }
+
+    /// The file from which training goes on.
+    ///
+    /// Errors: there is none, because the run has ended, or never came so far.
+    pub fn existing_state(&self) -> Result<PathBuf> {
+        let path = self.state();
+        let (found, remedy) = match (path.exists(), self.checkpoint().exists()) {
+            (true, _) => return Ok(path),
+            (false, true) => ("this run has ended", "to train its grid further, use `--init-from`"),
+            (false, false) => ("this run left nothing from which to go on", "train again with its config.toml"),
+        };
+        Err(Error::input(&self.path, found, remedy))
+    }
+
+    /// Removes what only an unfinished run needs.
+    pub fn remove_state(&self) -> Result<()> {
+        let path = self.state();
+        if path.exists() {
+            std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
+        }
+        Ok(())
+    }
+
+    /// Removes files that were being written when a run was killed.
+    pub fn remove_fragments(&self) -> Result<()> {
+        let fragment = |path: &PathBuf| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            name.starts_with(".tmp") || name.starts_with('.') && name.ends_with(".tmp")
+        };
+        for path in std::fs::read_dir(&self.path).into_iter().flatten().flatten().map(|entry| entry.path()).filter(fragment) {
+            std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
+        }
+        Ok(())
     }
 
     /// Writes the final figures.
@@ -183,6 +218,11 @@ impl RunFolder {
     /// The trained grid.
     pub fn checkpoint(&self) -> PathBuf {
         self.path.join(CHECKPOINT)
+    }
+
+    /// What an unfinished run goes on from.
+    pub fn state(&self) -> PathBuf {
+        self.path.join(STATE)
     }
 
     /// A picture of the run.
@@ -234,6 +274,7 @@ Of these files, those that apply: a carved run has no training to tell of.
   training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training.
 - `loss.svg`: the loss over the steps.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
+- `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.
 - `result.json`: the final figures. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring.
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,

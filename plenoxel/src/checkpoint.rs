@@ -212,7 +212,11 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     }
     let channels = shape.color_width();
     let grid = if header.format == FORMAT {
-        VoxelGrid::from_row_major(shape, &table(&mut file, "density", 1, &[n, n, n])?, &table(&mut file, "color", channels, &[n, n, n, channels])?)
+        VoxelGrid::from_row_major(
+            shape,
+            &table(&mut file, "density", 1, &[n, n, n])?,
+            &table(&mut file, "color", channels, &[n, n, n, channels])?,
+        )
     } else {
         let list = |file: &mut TensorFile, name: &str, n: usize| -> Result<Vec<u32>> {
             let k = file.info(name).map_or(0, |info| info.shape.iter().product());

@@ -6,8 +6,8 @@
 use crate::error::{Error, Result};
 use crate::files;
 use autograd::Real;
-use safetensors::tensor::{Metadata, View};
 pub(crate) use safetensors::tensor::{Dtype, TensorInfo};
+use safetensors::tensor::{Metadata, View};
 use serde::Serialize;
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -63,10 +63,13 @@ pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>])
     })?;
     let views = entries.iter().map(|entry| (&entry.name, entry));
     files::atomically(path, |temporary| {
+        // The library makes files that nobody else may read.
+        let permissions = File::create(temporary)?.metadata()?.permissions();
         safetensors::serialize_to_file(views, Some(HashMap::from([(KEY.to_owned(), header)])), temporary).map_err(|e| match e {
             safetensors::SafeTensorError::IoError(e) => e,
             e => std::io::Error::other(e),
-        })
+        })?;
+        std::fs::set_permissions(temporary, permissions)
     })
 }
 

@@ -81,6 +81,7 @@ pub struct Trainer<'a, T: Real> {
     learning: Option<Occupancy>,
     optimizer: Box<dyn Optimizer<T>>,
     step: u64,
+    most_rows: usize,
 }
 
 impl<'a, T: Real> Trainer<'a, T> {
@@ -113,7 +114,26 @@ impl<'a, T: Real> Trainer<'a, T> {
         };
         let optimizer = optimizer(&config, &plan[0]);
         let scouts = scout.is_some();
-        Ok(Trainer { config, plan, views, rays, reduction: 1, silhouettes, scouts, objective, grid, learning: None, optimizer, step: 0 })
+        Ok(Trainer {
+            config,
+            plan,
+            views,
+            rays,
+            reduction: 1,
+            silhouettes,
+            scouts,
+            objective,
+            grid,
+            learning: None,
+            optimizer,
+            step: 0,
+            most_rows: usize::MAX,
+        })
+    }
+
+    /// The same run where a stage must not begin with more rows of tables than these, because they would not fit into memory.
+    pub fn with_most_rows(self, most_rows: usize) -> Self {
+        Trainer { most_rows, ..self }
     }
 
     /// The same run starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
@@ -182,7 +202,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         let rays = self.config.rays_per_step;
         let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
         let jitter = if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None };
-        let options = RenderOptions { occupancy: self.learning.as_ref(), ..self.options(&plan.stage, jitter) };
+        let options = RenderOptions { occupancy: self.learning.as_ref(), ..self.options(&self.grid, &plan.stage, jitter) };
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
             let rendered = render(&self.grid, &batch.rays, &options);
@@ -224,34 +244,51 @@ impl<'a, T: Real> Trainer<'a, T> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        let finer = plan.stage.resolution != self.grid.shape().resolution;
         if self.scouts && index == 1 {
-            let kept = self.worth_keeping(&self.plan[0].stage);
+            let kept = self.worth_keeping(&self.grid, &self.plan[0].stage)?;
             self.grid =
                 start::scouted(&self.grid, &kept, plan.stage.resolution, &self.config.initial).ok_or_else(|| self.pruned_to_nothing())?;
-        } else if finer {
-            release_free_buffers();
-            self.grid = self.grid.resample(plan.stage.resolution);
+        }
+        // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
+        release_free_buffers();
+        let finer = plan.stage.resolution != self.grid.shape().resolution;
+        let mut outline = self.grid.outline();
+        if finer {
+            outline = outline.resample(plan.stage.resolution);
         }
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
-            let pruned = self.grid.pruned(&silhouettes.voxels(&self.grid));
-            if pruned.lattice().present() == 0 {
+            outline = outline.pruned(&silhouettes.voxels(&outline));
+            if outline.lattice().present() == 0 {
                 return Err(Error::config(
                     "hull",
                     "\"auto\", with silhouettes that hold nothing of the grid,",
                     "\"off\"; or another half_width, or another run to start from",
                 ));
             }
-            self.grid = pruned;
         }
         if plan.stage.image_reduction != self.reduction {
             self.reduction = plan.stage.image_reduction;
             self.rays = self.all_rays();
         }
-        self.aim();
+        self.aim(Field::<T>::reach(&outline));
         if self.prunes_from().is_some_and(|first| index >= first) {
-            self.prune(&plan.stage)?;
-            self.aim();
+            outline = outline.pruned(&self.worth_keeping(&outline, &plan.stage)?);
+            self.aim(Field::<T>::reach(&outline));
+        }
+        let lattice = outline.lattice();
+        if lattice.rows() > self.most_rows {
+            let found = format!(
+                "{} voxels that would be left at {}³, where memory has room for {}",
+                lattice.rows(),
+                plan.stage.resolution,
+                self.most_rows
+            );
+            return Err(Error::config("prune_unseen_below", found, "a larger share of a pixel; or fewer voxels a side in the last stages"));
+        }
+        if finer {
+            self.grid = self.grid.resample_into(lattice);
+        } else if lattice.present() < self.grid.lattice().present() {
+            self.grid = self.grid.pruned(&outline.voxels_where(|_| true));
         }
         if self.config.project {
             self.grid.project();
@@ -260,20 +297,10 @@ impl<'a, T: Real> Trainer<'a, T> {
     }
 
     /// Leaves the rays out that pass what is left of the grid, if the config says so.
-    fn aim(&mut self) {
-        if let Some(reach) = Field::<T>::reach(&self.grid).filter(|_| self.config.aim) {
+    fn aim(&mut self, reach: Option<&Occupancy>) {
+        if let Some(reach) = reach.filter(|_| self.config.aim) {
             self.rays.aim_at(reach);
         }
-    }
-
-    /// Takes the voxels out of the grid that are not worth keeping.
-    fn prune(&mut self, stage: &Stage) -> Result<()> {
-        let kept = self.worth_keeping(stage);
-        if kept.fraction() == 0.0 {
-            return Err(self.pruned_to_nothing());
-        }
-        self.grid = self.grid.pruned(&kept);
-        Ok(())
     }
 
     fn pruned_to_nothing(&self) -> Error {
@@ -303,27 +330,32 @@ impl<'a, T: Real> Trainer<'a, T> {
     }
 
     /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees.
-    fn worth_keeping(&self, stage: &Stage) -> Occupancy {
-        let full = self.grid.occupancy(self.config.prune_below);
+    ///
+    /// Errors if they are none.
+    fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage) -> Result<Occupancy> {
+        let full = grid.occupancy(self.config.prune_below);
         let least = self.config.prune_unseen_below;
-        if least == 0.0 {
-            return full;
-        }
+        let kept = if least == 0.0 { full } else { full.intersection(&self.seen(grid, stage, least)) };
+        if kept.fraction() > 0.0 { Ok(kept) } else { Err(self.pruned_to_nothing()) }
+    }
+
+    /// The voxels that weigh at least so much in a pixel, and those around.
+    fn seen(&self, grid: &VoxelGrid<T>, stage: &Stage, least: f64) -> Occupancy {
         // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
         const MARGIN: usize = 2;
         // Where less light is left, no sample weighs as much.
         let stop_below = self.config.stop_below.max(least);
-        let options = RenderOptions { stop_below, ..self.options(stage, Jitter::None) };
-        let stride = self.rays.stride(self.grid.shape().voxel_side(), self.grid.aabb());
-        let weights = largest_weights(&self.grid, self.rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
-        full.intersection(&self.grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN))
+        let options = RenderOptions { stop_below, ..self.options(grid, stage, Jitter::None) };
+        let stride = self.rays.stride(grid.shape().voxel_side(), grid.aabb());
+        let weights = largest_weights(grid, self.rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
+        grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN)
     }
 
     /// How a stage renders.
-    fn options(&self, stage: &Stage, jitter: Jitter) -> RenderOptions<'static> {
+    fn options(&self, grid: &VoxelGrid<T>, stage: &Stage, jitter: Jitter) -> RenderOptions<'static> {
         RenderOptions {
-            aabb: self.grid.aabb(),
-            spacing: stage.sampling.spacing(self.grid.shape().voxel_side()),
+            aabb: grid.aabb(),
+            spacing: stage.sampling.spacing(grid.shape().voxel_side()),
             jitter,
             background: self.config.background,
             occupancy: None,

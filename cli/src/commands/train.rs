@@ -2,29 +2,42 @@
 
 mod budget;
 mod flags;
+mod interrupt;
 mod pictures;
 
 use super::new_run::{Stopwatch, announce, load, record};
 use crate::curves::loss_svg;
+use crate::data::DataSource;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
+use crate::images::Rgb;
 use crate::memory::{self, Estimate};
-use crate::metrics_file::MetricsFile;
+use crate::metrics_file::{MetricsFile, Past};
 use crate::progress::{Console, clock};
 use crate::run_folder::RunFolder;
 pub use flags::{TrainArgs, size};
+pub use interrupt::EXIT_CODE as INTERRUPTED;
 use pictures::Pictures;
 use plenoxel::checkpoint::Header;
-use plenoxel::dataset::{Split, View};
+use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::train::Trainer;
 use plenoxel::train::config::Config;
 use serde::Serialize;
 use serde_json::json;
-use std::time::Instant;
+use std::path::Path;
+use std::time::{Duration, Instant};
 
-/// Learns a scene and leaves a run folder.
-pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
+/// Learns a scene and leaves a run folder. True if it came to its end, and was not interrupted.
+pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
+    match &args.resume {
+        Some(path) => resume(path, args, console),
+        None => begin(args, console),
+    }
+}
+
+/// A run from its first step.
+fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
     let source = args.source();
     let (mut config, preset) = args.config()?;
     config.check_stages()?;
@@ -45,9 +58,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
         console.note(&format!("the grid it starts from is of another scene: {}, not {}", header.scene, dataset.name()));
     }
     let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
-    let estimate = Estimate::of_training(&config, &dataset, bytes as u64);
-    console.note(&estimate.describe());
-    estimate.check()?;
+    let most_rows = room(&config, &dataset, bytes as u64, console)?;
     let initial = initial.map(|folder| folder.load()).transpose()?.map(|(grid, _)| grid);
     let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
@@ -62,126 +73,199 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<()> {
     folder.prepare()?;
     folder.describe(&config, &record(&dataset, preset, &source))?;
     console.note(&format!("run: {}", folder.path().display()));
-    let mut pictures = Pictures::new(&folder, &config, &dataset, !args.no_images)?;
-    let trainer = clocks.train.time(|| {
-        let trainer = Trainer::new(config.clone(), &views)?;
+    let start = || {
+        let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows);
         Ok(initial.iter().fold(trainer, if carved { Trainer::starting_from_carved } else { Trainer::starting_from }))
-    })?;
+    };
+    let trainer = clocks.train.time(start)?;
     drop(initial);
     let half_width = trainer.grid().shape().half_width;
     if half_width != config.half_width {
         let chosen = if config.init_from.is_some() { "of the grid it starts from" } else { "around the silhouettes" };
         console.note(&format!("box: half width {half_width:.4}, {chosen}"));
     }
-    let mut learned = learn(trainer, &folder, args.keeps_stages(), console, &mut clocks, &mut pictures)?;
-    let header = Header::new(&learned.grid, dataset.name(), config.background, config.seed, learned.steps);
-    folder.save(&learned.grid, &header)?;
-    let mean_image = evaluation::mean_image(&views, config.background);
+    let metrics = MetricsFile::create(&folder.metrics(), trainer.total_steps())?;
+    let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &source, preset, args, console };
+    let learned = job.learn(trainer, metrics, Past::default(), &views, &mut clocks)?;
     drop(views);
+    job.conclude(learned, clocks)
+}
 
-    let test = clocks.load.time(|| load(console, &dataset, Split::Test, &source))?;
-    let scores = evaluate(&mut learned, &test, &config, &pictures, console, &mut clocks)?;
-    pictures.strip(test.first(), config.background)?;
-    let (width, height) = dataset.size();
-    let summary = Summary {
-        psnr: scores.psnr(),
-        ssim: scores.ssim(),
-        ssim_same: scores.ssim_same(),
-        baseline_background_psnr: evaluation::background_psnr(&test, config.background),
-        baseline_mean_image_psnr: mean_image.and_then(|image| evaluation::constant_psnr(&test, &image, config.background)),
-        views: test.len(),
-        width,
-        height,
-        background: config.background,
-        seconds: clocks.train.seconds(),
-        seconds_planned: args.time,
-        seconds_load: clocks.load.seconds(),
-        seconds_evaluate: clocks.evaluate.seconds(),
-        peak_memory_bytes: memory::peak(),
-        steps: learned.steps,
-        rays: learned.rays,
-        samples: learned.samples,
-        resolution: learned.grid.shape().resolution,
-        scene: dataset.name().to_owned(),
-        preset: preset.map(str::to_owned),
-        run: folder.path().display().to_string(),
-        stages: learned.stages,
-        per_view: scores.per_view.clone(),
-    };
-    folder.write_result(&summary)?;
-    learned.metrics.append(&Final { result: &summary })?;
-    conclude(console, &folder, &summary, &scores, &pictures)
+/// A run that was interrupted, from where it was last saved.
+fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
+    let (folder, config, record) = RunFolder::open(path)?;
+    let state = folder.existing_state()?;
+    let mut clocks = Clocks::default();
+    let dataset = clocks.load.time(|| record.data.reopen(&config))?;
+    announce(console, &dataset, &config);
+    let most_rows = room(&config, &dataset, 0, console)?;
+    let views = clocks.load.time(|| load(console, &dataset, Split::Train, &record.data))?;
+    let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows).resumed(&state)?;
+    folder.remove_fragments()?;
+    let (metrics, past) = MetricsFile::resume(&folder.metrics(), trainer.total_steps(), trainer.steps_taken())?;
+    clocks.train.0 = Duration::from_secs_f64(past.seconds);
+    let (taken, total) = (trainer.steps_taken(), trainer.total_steps());
+    console.note(&format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds)));
+    let preset = record.preset.as_deref();
+    let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &record.data, preset, args, console };
+    let learned = job.learn(trainer, metrics, past, &views, &mut clocks)?;
+    drop(views);
+    job.conclude(learned, clocks)
+}
+
+/// Says how much memory a run will take, and how many rows of tables there is room for.
+fn room(config: &Config, dataset: &Dataset, initial: u64, console: &Console<'_>) -> Result<usize> {
+    let estimate = Estimate::of_training(config, dataset, initial);
+    console.note(&estimate.describe());
+    estimate.check()?;
+    Ok(estimate.most_rows(config).unwrap_or(usize::MAX))
+}
+
+/// What a run is about, however it began.
+struct Job<'a, 'c> {
+    folder: &'a RunFolder,
+    config: &'a Config,
+    dataset: &'a Dataset,
+    source: &'a DataSource,
+    preset: Option<&'a str>,
+    args: &'a TrainArgs,
+    console: &'a Console<'c>,
+}
+
+impl Job<'_, '_> {
+    /// The training itself; only it is on the clock for training. `None` if it was interrupted: then all that is needed to go on is saved.
+    fn learn(
+        &self,
+        mut trainer: Trainer<'_, f32>,
+        mut metrics: MetricsFile,
+        past: Past,
+        views: &[View],
+        clocks: &mut Clocks,
+    ) -> Result<Option<Learned<'_>>> {
+        let Job { folder, config, dataset, console, .. } = *self;
+        let mut pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
+        let keep_stages = self.args.keeps_stages();
+        let clock = &mut clocks.train;
+        let plan = trainer.plan().to_vec();
+        let total = trainer.total_steps();
+        let mut progress = console.training(&plan, trainer.prunes_from(), past.seconds);
+        let mut losses = past.losses;
+        let mut stages: Vec<StageSummary> = Vec::new();
+        for (stage, (last, resolution, seconds)) in past.stages.into_iter().enumerate() {
+            pictures.earlier_stage(stage, resolution)?;
+            let steps = plan.iter().find(|p| p.first + p.steps == last + 1).map_or(0, |p| p.steps);
+            stages.push(StageSummary { resolution, steps, seconds, psnr: None, grid: None });
+        }
+        let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
+        let interrupt = interrupt::Watch::begin();
+        let mut saved = Instant::now();
+        loop {
+            let report = match clock.time(|| trainer.step()) {
+                Ok(Some(report)) => report,
+                Ok(None) => break,
+                Err(e) => {
+                    // The lines and the curve so far stay, to show how it came to this; there is no checkpoint.
+                    metrics.append(&json!({ "step": losses.len(), "failure": e.to_string() }))?;
+                    folder.write_loss(&loss_svg(&losses, &plan, &title))?;
+                    return Err(e);
+                }
+            };
+            let seconds = clock.seconds();
+            losses.push(report.loss);
+            let last = report.step + 1 == total;
+            let due = saved.elapsed().as_secs_f64() >= self.args.checkpoint_every;
+            let save = !last && (due || interrupt.requested());
+            metrics.step(&report, &plan, seconds, save)?;
+            progress.step(&report, seconds);
+            if report.ends_stage {
+                folder.write_loss(&loss_svg(&losses, &plan, &title))?;
+                let grid = trainer.grid();
+                pictures.stage(report.stage, grid)?;
+                stages.push(StageSummary {
+                    resolution: grid.shape().resolution,
+                    steps: plan[report.stage].steps,
+                    seconds,
+                    psnr: None,
+                    grid: (keep_stages && !last).then(|| copy(grid)),
+                });
+            }
+            if save {
+                trainer.save(&folder.state(), dataset.name())?;
+                saved = Instant::now();
+            }
+            if save && interrupt.requested() {
+                drop(progress);
+                let remedy = format!("go on with: plenoxel train --resume {}", folder.path().display());
+                console.error(&format!("interrupted after step {} of {total}, saved; {remedy}", report.step + 1));
+                return Ok(None);
+            }
+        }
+        drop(progress);
+        let grid = trainer.into_grid();
+        folder.save(&grid, &Header::new(&grid, dataset.name(), config.background, config.seed, total))?;
+        let mean_image = evaluation::mean_image(views, config.background);
+        let (rays, samples) = metrics.counts();
+        Ok(Some(Learned { grid, metrics, pictures, mean_image, stages, steps: total, rays, samples }))
+    }
+
+    /// Compares what was learned with the test views, and says what came of it. False if the run was interrupted.
+    fn conclude(&self, learned: Option<Learned<'_>>, mut clocks: Clocks) -> Result<bool> {
+        let Job { folder, config, dataset, console, .. } = *self;
+        let Some(mut learned) = learned else { return Ok(false) };
+        let test = clocks.load.time(|| load(console, dataset, Split::Test, self.source))?;
+        let scores = evaluate(&mut learned, &test, config, console, &mut clocks)?;
+        let pictures = &learned.pictures;
+        pictures.strip(test.first(), config.background)?;
+        let note = pictures.note();
+        let (width, height) = dataset.size();
+        let summary = Summary {
+            psnr: scores.psnr(),
+            ssim: scores.ssim(),
+            ssim_same: scores.ssim_same(),
+            baseline_background_psnr: evaluation::background_psnr(&test, config.background),
+            baseline_mean_image_psnr: learned.mean_image.and_then(|image| evaluation::constant_psnr(&test, &image, config.background)),
+            views: test.len(),
+            width,
+            height,
+            background: config.background,
+            seconds: clocks.train.seconds(),
+            seconds_planned: self.args.time,
+            seconds_load: clocks.load.seconds(),
+            seconds_evaluate: clocks.evaluate.seconds(),
+            peak_memory_bytes: memory::peak(),
+            steps: learned.steps,
+            rays: learned.rays,
+            samples: learned.samples,
+            resolution: learned.grid.shape().resolution,
+            scene: dataset.name().to_owned(),
+            preset: self.preset.map(str::to_owned),
+            run: folder.path().display().to_string(),
+            stages: learned.stages,
+            per_view: scores.per_view.clone(),
+        };
+        folder.write_result(&summary)?;
+        learned.metrics.append(&Final { result: &summary })?;
+        folder.remove_state()?;
+        say(console, folder, &summary, &scores, note.as_deref())?;
+        Ok(true)
+    }
 }
 
 /// A trained grid and how it came about.
-struct Learned {
+struct Learned<'a> {
     grid: VoxelGrid<f32>,
     metrics: MetricsFile,
+    pictures: Pictures<'a>,
+    /// The training views on the mean.
+    mean_image: Option<Rgb>,
     stages: Vec<StageSummary>,
     steps: u64,
     rays: u64,
     samples: u64,
 }
 
-/// The training itself; only it is on the clock for training.
-fn learn(
-    mut trainer: Trainer<'_, f32>,
-    folder: &RunFolder,
-    keep_stages: bool,
-    console: &Console<'_>,
-    clocks: &mut Clocks,
-    pictures: &mut Pictures<'_>,
-) -> Result<Learned> {
-    let clock = &mut clocks.train;
-    let plan = trainer.plan().to_vec();
-    let total = trainer.total_steps();
-    let mut metrics = MetricsFile::create(&folder.metrics(), total)?;
-    let mut progress = console.training(&plan, trainer.prunes_from());
-    let (mut losses, mut stages) = (Vec::new(), Vec::new());
-    let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
-    loop {
-        let report = match clock.time(|| trainer.step()) {
-            Ok(Some(report)) => report,
-            Ok(None) => break,
-            Err(e) => {
-                // The lines and the curve so far stay, to show how it came to this; there is no checkpoint.
-                metrics.append(&json!({ "step": losses.len(), "failure": e.to_string() }))?;
-                folder.write_loss(&loss_svg(&losses, &plan, &title))?;
-                return Err(e);
-            }
-        };
-        let seconds = clock.seconds();
-        losses.push(report.loss);
-        metrics.step(&report, &plan, seconds)?;
-        progress.step(&report, seconds);
-        if report.ends_stage {
-            folder.write_loss(&loss_svg(&losses, &plan, &title))?;
-            let grid = trainer.grid();
-            pictures.stage(report.stage, grid)?;
-            let last = report.step + 1 == total;
-            stages.push(StageSummary {
-                resolution: grid.shape().resolution,
-                steps: plan[report.stage].steps,
-                seconds,
-                psnr: None,
-                grid: (keep_stages && !last).then(|| copy(grid)),
-            });
-        }
-    }
-    drop(progress);
-    let (rays, samples) = metrics.counts();
-    Ok(Learned { grid: trainer.into_grid(), metrics, stages, steps: total, rays, samples })
-}
-
 /// Figures of the final grid, with panels, and of the grids of earlier stages that were kept.
-fn evaluate(
-    learned: &mut Learned,
-    test: &[View],
-    config: &Config,
-    pictures: &Pictures<'_>,
-    console: &Console<'_>,
-    clocks: &mut Clocks,
-) -> Result<Scores> {
+fn evaluate(learned: &mut Learned<'_>, test: &[View], config: &Config, console: &Console<'_>, clocks: &mut Clocks) -> Result<Scores> {
     let kept = learned.stages.iter().filter(|stage| stage.grid.is_some()).count();
     let total = (kept + 1) * test.len();
     let (count, mut done) = (console.count("evaluating", total), 0);
@@ -205,7 +289,7 @@ fn evaluate(
     let half_width = learned.grid.shape().half_width;
     let scores = viewer.compare(test, |i, view, target, picture| {
         advance();
-        drawing.time(|| pictures.panel(i, view, target, picture, half_width))
+        drawing.time(|| learned.pictures.panel(i, view, target, picture, half_width))
     })?;
     clocks.evaluate.0 += start.elapsed() - drawing.0;
     if let Some(last) = learned.stages.last_mut() {
@@ -276,9 +360,9 @@ struct Clocks {
     evaluate: Stopwatch,
 }
 
-fn conclude(console: &Console<'_>, folder: &RunFolder, summary: &Summary, scores: &Scores, pictures: &Pictures<'_>) -> Result<()> {
-    if let Some(note) = pictures.note() {
-        console.note(&note);
+fn say(console: &Console<'_>, folder: &RunFolder, summary: &Summary, scores: &Scores, note: Option<&str>) -> Result<()> {
+    if let Some(note) = note {
+        console.note(note);
     }
     let decibels = |x: Option<f64>| x.map_or("none".to_owned(), |x| format!("{x:.2} dB"));
     console.note(&format!(

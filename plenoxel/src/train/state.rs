@@ -9,6 +9,7 @@ use super::{PlannedStage, Trainer, optimizer, plan};
 use crate::checkpoint::Header;
 use crate::dataset::View;
 use crate::error::{Error, Result};
+use crate::field::Field;
 use crate::field::voxel_grid::{GridShape, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
@@ -112,7 +113,8 @@ impl<T: Real> Trainer<'_, T> {
         let scout = self.config.scout.filter(|_| state.scouts).map(|scout| scout.stage);
         let stages: Vec<_> = scout.into_iter().chain(self.config.stages.iter().copied()).collect();
         let left_out = stages.len().checked_sub(state.stages).filter(|left_out| *left_out < stages.len());
-        let plan = plan(&self.config, stages.into_iter().skip(left_out.ok_or_else(|| damaged("a plan of impossible stages"))?), self.rays.len());
+        let plan =
+            plan(&self.config, stages.into_iter().skip(left_out.ok_or_else(|| damaged("a plan of impossible stages"))?), self.rays.len());
         // The first step is not taken yet, and the file is of later.
         let last = state.grid.step.checked_sub(1);
         let current = last.and_then(|last| plan.iter().find(|p| (p.first..p.first + p.steps).contains(&last)));
@@ -162,7 +164,8 @@ impl<T: Real> Trainer<'_, T> {
         (self.plan, self.scouts, self.step) = (plan, state.scouts, state.grid.step);
         self.reduction = state.reduction;
         self.rays = self.all_rays();
-        self.aim();
+        let reach = Field::<T>::reach(&self.grid).cloned();
+        self.aim(reach.as_ref());
         Ok(self)
     }
 }
@@ -172,7 +175,8 @@ fn read(path: &Path, file: &TensorFile) -> Result<State> {
     let value = file.header()?;
     let format = value["format"].as_str().unwrap_or("none");
     if format != FORMAT {
-        let remedy = format!("this program goes on from `{FORMAT}`; use the version that wrote the file, or `--init-from` for a trained grid");
+        let remedy =
+            format!("this program goes on from `{FORMAT}`; use the version that wrote the file, or `--init-from` for a trained grid");
         return Err(Error::input(path, format!("format `{format}`"), remedy));
     }
     serde_json::from_value(value).map_err(|e| file.unreadable(&e))

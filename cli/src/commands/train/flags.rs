@@ -18,9 +18,35 @@ Examples:
   plenoxel train data/lego --preset paper --tv 1e-4
   plenoxel train data/lego --downscale 4 --half-width 1.3 --set stages[*].density_rate=30
   plenoxel train data/lego --config runs/lego/config.toml --seed 7
+  plenoxel train --resume runs/lego                go on with it after Ctrl-C or a power cut
 
 Settings are layered: defaults < preset < --config < flags. config.toml in the run folder lists all of them; --set
 reaches each by its path there, such as stages[0].sampling.step. The last line on stdout is one JSON object.";
+
+/// What a run that goes on was told when it began.
+const NOT_WHEN_RESUMED: [&str; 21] = [
+    "data",
+    "out",
+    "force",
+    "preset",
+    "time",
+    "config",
+    "set",
+    "seed",
+    "downscale",
+    "background",
+    "half_width",
+    "scene_size",
+    "scene_views",
+    "interpolation",
+    "color",
+    "sh_degree",
+    "sh_reduction",
+    "init_from",
+    "hull",
+    "engine",
+    "tv",
+];
 
 /// Learn a scene and leave a run folder with the trained grid, pictures and figures
 #[derive(Debug, Args)]
@@ -37,6 +63,14 @@ pub struct TrainArgs {
     /// Overwrite the run in the folder
     #[arg(long, help_heading = "Output")]
     pub force: bool,
+
+    /// Go on with the run in this folder from where it was last saved, with the settings and the data that it began with
+    #[arg(long, value_name = "RUN", help_heading = "Output", value_hint = ValueHint::DirPath, conflicts_with_all = NOT_WHEN_RESUMED)]
+    pub resume: Option<PathBuf>,
+
+    /// Save this often what is needed to go on, such as 30s or 10m; it is saved too when the run is interrupted (Ctrl-C)
+    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration, default_value = "5m")]
+    pub checkpoint_every: f64,
 
     /// Write no pictures
     #[arg(long, help_heading = "Output")]

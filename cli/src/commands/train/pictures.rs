@@ -4,11 +4,12 @@ use crate::evaluation::Viewer;
 use crate::images::{self, DepthRange, Rgb};
 use crate::run_folder::RunFolder;
 use plenoxel::camera::Camera;
-use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::dataset::{Dataset, Split, View, image};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::render::picture::Picture;
 use plenoxel::train::config::Config;
+use std::path::PathBuf;
 
 /// Panels of more views than this fill folders and nobody's eye.
 const MOST_PANELS: usize = 25;
@@ -53,11 +54,22 @@ impl<'a> Pictures<'a> {
         };
         let viewer = Viewer::new(grid, self.config.evaluation, self.config);
         let picture = viewer.see(camera).rgb;
-        let resolution = grid.shape().resolution;
-        let name = format!("stage_{}_{resolution}.png", stage + 1);
-        images::write(&self.folder.image(&name), &picture)?;
+        images::write(&self.stage_path(stage, grid.shape().resolution), &picture)?;
         self.stages.push(picture);
         Ok(())
+    }
+
+    /// A stage had ended when the run was interrupted: its picture is there, if it was wanted then too.
+    pub fn earlier_stage(&mut self, stage: usize, resolution: usize) -> Result<()> {
+        let path = self.stage_path(stage, resolution);
+        if self.camera.is_some() && path.exists() {
+            self.stages.push(image::composite(&image::read(&path)?, [1.0; 3]));
+        }
+        Ok(())
+    }
+
+    fn stage_path(&self, stage: usize, resolution: usize) -> PathBuf {
+        self.folder.image(&format!("stage_{}_{resolution}.png", stage + 1))
     }
 
     /// A test view was rendered with the final grid, which fills a cube of a half width.

@@ -4,7 +4,7 @@
 //! Harmonics that are reduced come along: where the new grid has them and the old one had none, they are the mean of those around.
 
 use super::layout::{Layout, dilated};
-use super::{GridShape, Interpolation, VoxelGrid};
+use super::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::field::neighbours;
 use crate::sampling::Occupancy;
 use autograd::ops::trilinear::nearest_node;
@@ -27,13 +27,7 @@ impl<T: Real> VoxelGrid<T> {
         let old = self.shape();
         assert!(half_width > 0.0 && half_width <= old.half_width, "half width {half_width} of a grid of half width {}", old.half_width);
         let shape = GridShape { resolution, half_width, ..*old };
-        let ratio = shape.voxel_side() / old.voxel_side();
-        // A new centre in voxels of the old grid that are `sides` of its sides wide.
-        let center_of = |sides: usize| {
-            let beyond = (old.half_width - half_width) / (old.voxel_side() * sides as f64);
-            move |k: usize| (k as f64 + 0.5) * ratio - 0.5 + beyond
-        };
-        let center = center_of(1);
+        let center = center_of(old, &shape, 1);
         let lattice = match &self.reach {
             None => shape.full(),
             Some(_) => {
@@ -53,9 +47,20 @@ impl<T: Real> VoxelGrid<T> {
                 })
             }
         };
+        self.read_at(shape, lattice)
+    }
+
+    /// The same with the voxels of a lattice, among those that [`VoxelGrid::resample`] gives.
+    pub fn resample_into(&self, lattice: &Lattice) -> Self {
+        self.read_at(GridShape { resolution: lattice.nodes()[0], ..*self.shape() }, lattice.clone())
+    }
+
+    /// The old field at the centres of other voxels.
+    fn read_at(&self, shape: GridShape, lattice: Lattice) -> Self {
+        let old = self.shape();
         let layout = Layout::new(shape, lattice);
         let read = |table: &Tensor<T>, from: &Lattice, to: &Lattice, sides: usize| {
-            let center = center_of(sides);
+            let center = center_of(old, &shape, sides);
             let width = table.shape()[1];
             let mut values = Buffer::stale(to.rows() * width);
             // A run of rows at a time bounds the memory for positions.
@@ -115,6 +120,13 @@ impl<T: Real> VoxelGrid<T> {
         Self::assembled(self.layout().clone(), tables)
     }
 
+    /// The same densities, and no colors.
+    pub fn outline(&self) -> Self {
+        let shape = GridShape { color: Color::Rgb, ..*self.shape() };
+        let tables = vec![self.density.tensor().detach(), Tensor::zeros(&[self.lattice().rows(), 3])];
+        Self::with_tables(shape, self.lattice().clone(), tables)
+    }
+
     /// The same grid with some of its voxels.
     fn in_lattice(&self, lattice: Lattice) -> Self {
         let [density, color] = [&self.density, &self.color].map(|table| moved(table.tensor(), self.lattice(), &lattice));
@@ -130,6 +142,13 @@ impl<T: Real> VoxelGrid<T> {
         }
         Self::assembled(layout, tables)
     }
+}
+
+/// Where the centre of voxel k along an axis of a grid lies in an old grid, both with voxels `sides` times as wide.
+fn center_of(old: &GridShape, new: &GridShape, sides: usize) -> impl Fn(usize) -> f64 + use<> {
+    let ratio = new.voxel_side() / old.voxel_side();
+    let beyond = (old.half_width - new.half_width) / (old.voxel_side() * sides as f64);
+    move |k| (k as f64 + 0.5) * ratio - 0.5 + beyond
 }
 
 /// A table in another layout of the same grid, with zeros where the old one has no node.
@@ -164,7 +183,6 @@ pub(super) fn spread<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) -
 
 #[cfg(test)]
 mod tests {
-    use super::super::Color;
     use super::*;
 
     #[test]

@@ -1,0 +1,42 @@
+//! Ctrl-C, and what else asks a process to end: the first time while a run trains, it is asked to save and stop; else the process ends.
+
+use std::sync::Once;
+use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
+
+/// Exit code of a process that was interrupted.
+pub const EXIT_CODE: u8 = 130;
+
+static WATCHED: AtomicBool = AtomicBool::new(false);
+static REQUESTED: AtomicBool = AtomicBool::new(false);
+
+/// While it lives, an interruption is something to ask for.
+pub struct Watch(());
+
+impl Watch {
+    /// Begins to watch. Where the system does not let it, an interruption ends the process as ever.
+    pub fn begin() -> Self {
+        static HANDLER: Once = Once::new();
+        HANDLER.call_once(|| {
+            let handled = ctrlc::set_handler(|| {
+                if !WATCHED.load(SeqCst) || REQUESTED.swap(true, SeqCst) {
+                    std::process::exit(EXIT_CODE.into());
+                }
+            });
+            drop(handled);
+        });
+        REQUESTED.store(false, SeqCst);
+        WATCHED.store(true, SeqCst);
+        Watch(())
+    }
+
+    /// True if somebody asked.
+    pub fn requested(&self) -> bool {
+        REQUESTED.load(SeqCst)
+    }
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        WATCHED.store(false, SeqCst);
+    }
+}
