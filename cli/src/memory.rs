@@ -25,7 +25,7 @@ pub struct Estimate {
     pub optimizer: u64,
     /// Samples, intermediate values and gradients of one step, or what evaluating or saving takes if that is more.
     pub step: u64,
-    /// An expectation: pruning leaves more or fewer voxels.
+    /// True if it is known only when pruning is done.
     pruned: bool,
     /// The setting that counts most, and what would help.
     key: String,
@@ -95,7 +95,7 @@ impl Estimate {
             (grid + optimizer + saving, voxels),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
-        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: config.prune_from_stage.is_some(), key, advice }
+        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: share(config, index) < 1.0, key, advice }
     }
 
     /// The most rows of tables that fit into the memory that is free, if that is known: what pruning leaves is only known when it has.
@@ -179,10 +179,6 @@ impl Estimate {
         BASE + self.images + self.grid + self.optimizer + self.step
     }
 
-    fn how_much(&self) -> &'static str {
-        if self.pruned { "perhaps" } else { "about" }
-    }
-
     /// One line for people.
     pub fn describe(&self) -> String {
         let part = |name: &str, n: u64| match n {
@@ -190,13 +186,13 @@ impl Estimate {
             n => format!(", {name} {}", bytes(n)),
         };
         format!(
-            "memory: {} {} (images {}{}{}{})",
-            self.how_much(),
+            "memory: about {} (images {}{}{}{}){}",
             bytes(self.total()),
             bytes(self.images),
             part("grid", self.grid),
             part("optimizer", self.optimizer),
             part("step", self.step),
+            if self.pruned { ", if pruning leaves an eighth of the voxels" } else { "" },
         )
     }
 
@@ -205,8 +201,7 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match available() {
             Some(available) if self.total() > available => {
-                let found =
-                    format!("what would need {} {} of memory, where {} are free,", self.how_much(), bytes(self.total()), bytes(available));
+                let found = format!("what would need about {} of memory, where {} are free,", bytes(self.total()), bytes(available));
                 Err(Error::config(&self.key, found, self.advice))
             }
             _ => Ok(()),

@@ -1,0 +1,110 @@
+//! A training run that is interrupted or killed goes on as if nothing had happened.
+#![cfg(unix)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+/// A run of some seconds, of the built-in scene: two stages, pruning, and an optimizer with a memory.
+const SETTINGS: [&str; 12] = [
+    "--preset=demo",
+    "--scene-size=32",
+    "--scene-views=8,0,1",
+    "--no-images",
+    "--set=stages[0].resolution=12",
+    "--set=stages[0].steps=60",
+    "--set=stages[1].steps=60",
+    "--set=stages[2].steps=60",
+    "--set=stages[3].resolution=32",
+    "--set=stages[3].steps=200",
+    "--set=rays_per_step=600",
+    "--threads=2",
+];
+
+fn folder() -> PathBuf {
+    let path = std::env::temp_dir().join(format!("plenoxel-interruption-{}", std::process::id()));
+    fs::create_dir_all(&path).expect("a temporary folder");
+    path
+}
+
+fn plenoxel(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_plenoxel"));
+    command.arg("train").args(arguments).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// Waits until a run has written so many lines of metrics, or has ended.
+fn wait_for_lines(run: &Path, lines: usize, child: &mut Child) {
+    let start = Instant::now();
+    while child.try_wait().expect("its state").is_none() && start.elapsed() < Duration::from_secs(60) {
+        if fs::read_to_string(run.join("metrics.jsonl")).is_ok_and(|text| text.lines().count() >= lines) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn text(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The trained grid, and the metrics without times.
+fn result(run: &Path) -> (Vec<u8>, Vec<serde_json::Value>) {
+    let lines = fs::read_to_string(run.join("metrics.jsonl")).expect("metrics");
+    let mut lines: Vec<serde_json::Value> = lines.lines().map(|line| serde_json::from_str(line).expect("a line of JSON")).collect();
+    // The last line is of the evaluation.
+    lines.pop();
+    for line in &mut lines {
+        line.as_object_mut().expect("an object").remove("seconds");
+    }
+    (fs::read(run.join("checkpoint.safetensors")).expect("the trained grid"), lines)
+}
+
+#[test]
+fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
+    let root = folder();
+    let path = |name: &str| root.join(name).to_string_lossy().into_owned();
+    let (straight, cut) = (path("straight"), path("cut"));
+    let begin = |out: &str| plenoxel(&[&SETTINGS[..], &["--out", out]].concat());
+    let output = begin(&straight).output().expect("it runs");
+    assert!(output.status.success(), "{}", text(&output));
+    let want = result(Path::new(&straight));
+    assert!(!Path::new(&straight).join("training.safetensors").exists(), "a run that has ended needs no state");
+
+    let mut child = begin(&cut).spawn().expect("it runs");
+    wait_for_lines(Path::new(&cut), 80, &mut child);
+    let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+    assert!(sent.success());
+    let output = child.wait_with_output().expect("it ends");
+    assert_eq!(output.status.code(), Some(130), "{}", text(&output));
+    assert!(text(&output).contains("saved; go on with: plenoxel train --resume"), "{}", text(&output));
+    assert!(Path::new(&cut).join("training.safetensors").exists() && !Path::new(&cut).join("checkpoint.safetensors").exists());
+
+    for lines in [150, 210, 300] {
+        let mut child =
+            plenoxel(&["--resume", &cut, "--no-images", "--checkpoint-every", "0.05s", "--threads", "1"]).spawn().expect("it runs");
+        wait_for_lines(Path::new(&cut), lines, &mut child);
+        child.kill().expect("it is killed");
+        child.wait().expect("it ends");
+    }
+    let output = plenoxel(&["--resume", &cut, "--no-images"]).output().expect("it runs");
+    assert!(output.status.success() && text(&output).contains("going on after step"), "{}", text(&output));
+    let found = result(Path::new(&cut));
+    assert!(found.0 == want.0, "another grid");
+    assert_eq!(found.1.last(), want.1.last());
+    let names: Vec<_> = fs::read_dir(&cut).expect("its folder").flatten().map(|entry| entry.file_name()).collect();
+    assert!(!names.iter().any(|name| name.to_string_lossy().contains("tmp")), "{names:?}");
+
+    // It has ended, and a folder without a run has nothing to go on with; what a run was told when it began is not told again.
+    for (arguments, code, reason) in [
+        (&["--resume", &cut][..], 3, "this run has ended"),
+        (&["--resume", &path("nowhere")], 3, "there is no such run"),
+        (&["--resume", &cut, "--seed", "1"], 2, "cannot be used with"),
+    ] {
+        let output = plenoxel(arguments).output().expect("it runs");
+        assert_eq!(output.status.code(), Some(code), "{}", text(&output));
+        assert!(text(&output).contains(reason), "{}", text(&output));
+    }
+    fs::remove_dir_all(root).expect("it is removed");
+}
