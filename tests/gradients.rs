@@ -133,6 +133,18 @@ fn the_kernel_of_total_variation_agrees_with_its_reference_in_both_precisions() 
             check_kernel::<f64>(|x| loss::total_variation(&x[0], &lattice), [table.clone()], 1e-12).unwrap_or_else(|e| panic!("{e}"));
             check_kernel::<f32>(|x| loss::total_variation(&x[0], &lattice), [table.mapv(|x| x as f32)], 1e-5)
                 .unwrap_or_else(|e| panic!("{e}"));
+            let bricks = lattice.rows() / 64;
+            for (first, count) in [(0, 1), (bricks / 2, bricks / 2), (bricks - 1, bricks), (bricks - 1, 1)] {
+                let part = |x: &[Tensor<f64>]| loss::total_variation_of_bricks(&x[0], &lattice, first, count);
+                check_kernel::<f64>(part, [table.clone()], 1e-12).unwrap_or_else(|e| panic!("{first}, {count}: {e}"));
+                // Of the same rows, whether their gradient is zero or not.
+                let x = Tensor::variable(table.clone());
+                let reference = loss::sampled_total_variation(&x, &lattice, first * 64, count * 64);
+                let gradient = |value: Tensor<f64>| value.backward();
+                let (a, b) = (gradient(part(std::slice::from_ref(&x))), gradient(reference));
+                let rows = |g: &autograd::Gradients<f64>| g.get(&x).and_then(|g| Some(g.as_rows()?.rows().to_vec())).unwrap_or_default();
+                assert_eq!(rows(&a), rows(&b), "width {width}, {first}, {count}");
+            }
         }
     }
 }

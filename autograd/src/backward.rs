@@ -237,7 +237,7 @@ impl<T: Real> Pending<T> {
     fn finish(self, shape: &IxDyn) -> Grad<T> {
         match self {
             Pending::Dense(t) => Grad::Dense(t),
-            Pending::Rows(parts) => match parts.into_iter().map(|p| p.merged(shape)).reduce(index::add_row_sparse) {
+            Pending::Rows(parts) => match parts.into_iter().map(|p| p.merged(shape)).reduce(RowSparse::plus) {
                 Some(rows) => Grad::Rows(rows),
                 None => Grad::Dense(Tensor::zeros(shape.slice())),
             },
@@ -260,7 +260,7 @@ fn add_in_place<T: Real>(mut a: Tensor<T>, mut b: Tensor<T>) -> Tensor<T> {
 
 pub(crate) fn add_grads<T: Real>(a: Grad<T>, b: Grad<T>) -> Grad<T> {
     match (a, b) {
-        (Grad::Rows(a), Grad::Rows(b)) => Grad::Rows(index::add_row_sparse(a, b)),
+        (Grad::Rows(a), Grad::Rows(b)) => Grad::Rows(a.plus(b)),
         (Grad::Dense(a), Grad::Dense(b)) => Grad::Dense(add_in_place(a, b)),
         (Grad::Dense(dense), Grad::Rows(rows)) | (Grad::Rows(rows), Grad::Dense(dense)) => {
             Grad::Dense(RowPart::Merged(rows).added_to(dense))

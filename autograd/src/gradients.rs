@@ -48,6 +48,44 @@ pub trait RowSums<T: Real>: Debug + Send + Sync {
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]);
 }
 
+/// Two of a table: what the first adds to a row, then the second.
+#[derive(Debug)]
+struct Both<T: Real> {
+    parts: [Arc<dyn RowSums<T>>; 2],
+    table_rows: usize,
+    width: usize,
+}
+
+impl<T: Real> Both<T> {
+    /// The buckets of one of them that lie in one of ours.
+    fn inside(&self, part: &dyn RowSums<T>, bucket: usize) -> std::ops::Range<usize> {
+        let finer = self.bucket_shift() - part.bucket_shift();
+        let all = self.table_rows.div_ceil(1 << part.bucket_shift());
+        bucket << finer..((bucket + 1) << finer).min(all)
+    }
+}
+
+impl<T: Real> RowSums<T> for Both<T> {
+    fn bucket_shift(&self) -> u32 {
+        self.parts[0].bucket_shift().max(self.parts[1].bucket_shift())
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.parts.iter().all(|part| self.inside(&**part, bucket).all(|b| part.is_empty(b)))
+    }
+
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        for part in &self.parts {
+            let rows = 1usize << part.bucket_shift();
+            let buckets = self.inside(&**part, bucket);
+            let chunks = sums.chunks_mut(rows * self.width).zip(touched.chunks_mut(rows / 64)).zip(buckets);
+            for ((sums, touched), b) in chunks.filter(|(_, b)| !part.is_empty(*b)) {
+                part.add(b, sums, touched);
+            }
+        }
+    }
+}
+
 impl<T: Real> RowSparse<T> {
     /// Panics if `rows` is not sorted and unique and below the table's length, or if `values` does not hold one table row for each.
     #[track_caller]
@@ -63,6 +101,18 @@ impl<T: Real> RowSparse<T> {
     pub fn deferred(shape: &[usize], sums: Arc<dyn RowSums<T>>) -> Self {
         assert!(sums.bucket_shift() >= 6, "RowSparse: a bucket has at least 64 rows");
         RowSparse { shape: IxDyn(shape), sums: Some(sums), merged: OnceLock::new() }
+    }
+
+    /// The sum of two of one table. It is not added up either, if neither is.
+    pub(crate) fn plus(self, other: Self) -> Self {
+        if let (Some(a), Some(b)) = (&self.sums, &other.sums)
+            && self.merged.get().is_none()
+            && other.merged.get().is_none()
+        {
+            let both = Both { parts: [a.clone(), b.clone()], table_rows: self.shape()[0], width: self.width() };
+            return Self::deferred(self.shape(), Arc::new(both));
+        }
+        crate::index::add_row_sparse(self, other)
     }
 
     /// The same rows, added up now: nothing of what they come from is held any longer.
@@ -291,6 +341,7 @@ mod tests {
     #[derive(Debug)]
     struct Some300 {
         width: usize,
+        shift: u32,
     }
 
     fn row(i: usize) -> usize {
@@ -299,14 +350,14 @@ mod tests {
 
     impl RowSums<f64> for Some300 {
         fn bucket_shift(&self) -> u32 {
-            7
+            self.shift
         }
         fn is_empty(&self, bucket: usize) -> bool {
-            bucket == 3
+            self.shift <= 7 && (bucket << self.shift) >> 7 == 3
         }
         fn add(&self, bucket: usize, sums: &mut [f64], touched: &mut [u64]) {
-            for i in (0..300).filter(|&i| row(i) >> 7 == bucket && bucket != 3) {
-                let local = row(i) & 127;
+            for i in (0..300).filter(|&i| row(i) >> self.shift == bucket && row(i) >> 7 != 3) {
+                let local = row(i) - (bucket << self.shift);
                 for c in 0..self.width {
                     sums[self.width * local + c] += if c % 2 == 0 { i as f64 } else { -(i as f64) };
                 }
@@ -316,7 +367,23 @@ mod tests {
     }
 
     fn deferred(width: usize) -> RowSparse<f64> {
-        RowSparse::deferred(&[1000, width], Arc::new(Some300 { width }))
+        deferred_by(7, width)
+    }
+
+    fn deferred_by(shift: u32, width: usize) -> RowSparse<f64> {
+        RowSparse::deferred(&[1000, width], Arc::new(Some300 { width, shift }))
+    }
+
+    #[test]
+    fn two_sums_for_later_are_one_whatever_their_buckets() {
+        let twice = deferred(3).to_dense() * 2.0;
+        for (a, b) in [(6, 6), (6, 9), (8, 7), (7, 12)] {
+            let both = deferred_by(a, 3).plus(deferred_by(b, 3));
+            assert!(both.unmerged().is_some());
+            assert_eq!(both.to_dense().data(), twice.data(), "buckets of 2^{a} and 2^{b} rows");
+            assert_eq!(both.rows(), deferred(3).rows());
+            assert_eq!(both.plus(deferred_by(a, 3)).to_dense().data(), (deferred(3).to_dense() * 3.0).data());
+        }
     }
 
     #[test]

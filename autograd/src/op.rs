@@ -202,7 +202,7 @@ impl<T: Real> GradSink<T> {
         use ndarray::Dimension;
         debug_assert_eq!(rows.shape(), self.shapes[i].slice());
         self.slots[i] = Some(Cotangent::Merged(match self.slots[i].take() {
-            Some(Cotangent::Merged(before)) => crate::index::add_row_sparse(before, rows),
+            Some(Cotangent::Merged(before)) => before.plus(rows),
             None => rows,
             Some(_) => panic!("rows for input {i}, which has a dense cotangent already"),
         }));

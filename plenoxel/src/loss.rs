@@ -18,7 +18,7 @@ mod total_variation;
 pub use opacity::{beta, entropy, opacity_supervision};
 pub use photometric::{charbonnier, huber, mse};
 pub use sparsity::{cauchy_sparsity, distortion};
-pub use total_variation::{Cells, sampled_total_variation, total_variation, tv_color, tv_density};
+pub use total_variation::{Cells, sampled_total_variation, total_variation, total_variation_of_bricks, tv_color, tv_density};
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;

@@ -5,8 +5,9 @@
 
 use super::Step;
 use crate::random::{Purpose, bits};
-use autograd::lattice::{BRICK, Neighbours};
-use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, Tensor, dispatched, parallel};
+use autograd::lattice::{BRICK, BRICK_ROWS, LOW, Neighbours, STRIDE};
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, RowSparse, RowSums, Tensor, dispatched, parallel};
+use std::sync::Arc;
 
 /// Keeps the root smooth (source paper).
 const EPSILON: f64 = 1e-5;
@@ -16,7 +17,7 @@ const EPSILON: f64 = 1e-5;
 pub enum Cells {
     /// All: a dense gradient.
     Whole,
-    /// A contiguous run of this share of the table's rows, at a random place each step (svox2): a row-sparse gradient.
+    /// A contiguous run of this share of the table's bricks, at a random place each step (svox2, of its rows): a row-sparse gradient.
     Share(f64),
 }
 
@@ -48,10 +49,10 @@ fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, lattice: &Lattice, cells: C
     match cells {
         Cells::Whole => total_variation(table.tensor(), lattice),
         Cells::Share(share) => {
-            let rows = lattice.rows();
-            let first = bits(step.seed, Purpose::Cells, step.number, stream) % rows.max(1) as u64;
-            let count = ((share * rows as f64).ceil() as usize).clamp(1, rows.max(1));
-            sampled_total_variation(table.tensor(), lattice, first as usize, count)
+            let bricks = lattice.rows() / BRICK_ROWS;
+            let first = bits(step.seed, Purpose::Cells, step.number, stream) % bricks.max(1) as u64;
+            let count = ((share * bricks as f64).ceil() as usize).clamp(1, bricks.max(1));
+            total_variation_of_bricks(table.tensor(), lattice, first as usize, count)
         }
     }
 }
@@ -62,33 +63,87 @@ fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, lattice: &Lattice, cells: C
 /// Panics if the layout is row-major or the table does not have its rows.
 #[track_caller]
 pub fn total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
+    of_run(table, lattice, None)
+}
+
+/// The same over the cells of `count` bricks from number `first` on, wrapping round, with a row-sparse gradient.
+///
+/// Panics too if there are not so many bricks.
+#[track_caller]
+pub fn total_variation_of_bricks<T: Real>(table: &Tensor<T>, lattice: &Lattice, first: usize, count: usize) -> Tensor<T> {
+    let all = lattice.rows() / BRICK_ROWS;
+    assert!(first < all.max(1) && count <= all.max(1), "bricks {first} and on, {count} of them, of {all}");
+    of_run(table, lattice, Some((first, count.min(all))))
+}
+
+/// Over all cells, or over those of a run of bricks.
+#[track_caller]
+fn of_run<T: Real>(table: &Tensor<T>, lattice: &Lattice, part: Option<(usize, usize)>) -> Tensor<T> {
     check(table, lattice);
     match table.shape()[1] {
-        1 => with_kernel::<T, 1, 4, 16>(table, lattice),
-        3 => with_kernel::<T, 3, 12, 48>(table, lattice),
-        4 => with_kernel::<T, 4, 16, 64>(table, lattice),
-        9 => with_kernel::<T, 9, 36, 144>(table, lattice),
-        12 => with_kernel::<T, 12, 48, 192>(table, lattice),
-        24 => with_kernel::<T, 24, 96, 384>(table, lattice),
-        27 => with_kernel::<T, 27, 108, 432>(table, lattice),
-        45 => with_kernel::<T, 45, 180, 720>(table, lattice),
-        48 => with_kernel::<T, 48, 192, 768>(table, lattice),
-        _ => sampled_total_variation(table, lattice, 0, lattice.rows()),
+        1 => with_kernel::<T, 1, 4, 16>(table, lattice, part),
+        3 => with_kernel::<T, 3, 12, 48>(table, lattice, part),
+        4 => with_kernel::<T, 4, 16, 64>(table, lattice, part),
+        9 => with_kernel::<T, 9, 36, 144>(table, lattice, part),
+        12 => with_kernel::<T, 12, 48, 192>(table, lattice, part),
+        24 => with_kernel::<T, 24, 96, 384>(table, lattice, part),
+        27 => with_kernel::<T, 27, 108, 432>(table, lattice, part),
+        45 => with_kernel::<T, 45, 180, 720>(table, lattice, part),
+        48 => with_kernel::<T, 48, 192, 768>(table, lattice, part),
+        _ => {
+            let (first, count) = part.map_or((0, lattice.rows()), |(first, count)| (first * BRICK_ROWS, count * BRICK_ROWS));
+            sampled_total_variation(table, lattice, first, count)
+        }
     }
 }
 
 /// Through the kernel for a width of `W`; `N` is 4 W, the length of a line, and `S` 16 W, that of a slab.
-fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
+fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(
+    table: &Tensor<T>,
+    lattice: &Lattice,
+    part: Option<(usize, usize)>,
+) -> Tensor<T> {
     const { assert!(N == 4 * W && S == 4 * N) };
     let bricks = lattice.neighbours();
-    let mut roots = Buffer::<T>::stale(table.len());
+    let (first, count) = part.unwrap_or((0, bricks.len()));
+    let run = Run { first, count, all: bricks.len() };
+    let mut roots = Buffer::<T>::stale(count * BRICK_ROWS * W);
     let values = table.data().as_chunks::<S>().0;
-    let runs: Vec<_> = roots.as_chunks_mut::<S>().0.chunks_mut(RUN * BRICK).collect();
-    let sums = parallel::map_items(runs, |run, roots| inverse_roots::<T, W, N, S>(values, bricks, run * RUN, roots));
-    let terms = bricks.iter().map(|b| b.cells.count_ones() as usize).sum::<usize>() * W;
+    let tasks: Vec<_> = roots.as_chunks_mut::<S>().0.chunks_mut(TASK * BRICK).collect();
+    let sums = parallel::map_items(tasks, |task, roots| inverse_roots::<T, W, N, S>(values, bricks, run, task * TASK, roots));
+    let terms = run.bricks().map(|brick| bricks[brick].cells.count_ones() as usize).sum::<usize>() * W;
     let value = sums.into_iter().sum::<T>() / T::lit(terms.max(1) as f64);
-    let kernel = TotalVariation::<T, W, N, S> { lattice: lattice.clone(), terms, roots };
+    let kernel = TotalVariation::<T, W, N, S> { lattice: lattice.clone(), run, sparse: part.is_some(), terms, roots };
     Tensor::from_kernel(vec![value].into(), &[], &[table], kernel)
+}
+
+/// Bricks one after another, wrapping round behind the last one.
+#[derive(Clone, Copy, Debug)]
+struct Run {
+    first: usize,
+    count: usize,
+    /// Bricks of the grid.
+    all: usize,
+}
+
+impl Run {
+    /// The k-th brick.
+    #[inline(always)]
+    fn brick(self, k: usize) -> usize {
+        let brick = self.first + k;
+        if brick < self.all { brick } else { brick - self.all }
+    }
+
+    /// The place of a brick in the run, if it is in it.
+    #[inline(always)]
+    fn place(self, brick: usize) -> Option<usize> {
+        let k = if brick >= self.first { brick - self.first } else { brick + self.all - self.first };
+        (k < self.count).then_some(k)
+    }
+
+    fn bricks(self) -> impl Iterator<Item = usize> {
+        (0..self.count).map(move |k| self.brick(k))
+    }
 }
 
 /// Total variation over those of `count` rows from number `first` on, wrapping round, that have a cell: a scalar, with a row-sparse gradient.
@@ -132,14 +187,18 @@ fn check<T: Real>(table: &Tensor<T>, lattice: &Lattice) {
 #[derive(Debug)]
 struct TotalVariation<T: Real, const W: usize, const N: usize, const S: usize> {
     lattice: Lattice,
+    /// Bricks whose cells count.
+    run: Run,
+    /// True if the gradient is one of rows.
+    sparse: bool,
     /// Cells times channels.
     terms: usize,
-    /// 1 / √(…) of each cell and channel, 0 where there is no cell: a table.
+    /// 1 / √(…) of each cell and channel of the run, 0 where there is no cell.
     roots: Buffer<T>,
 }
 
 /// Bricks that one task works on.
-const RUN: usize = 256;
+const TASK: usize = 256;
 
 /// With q = s / √(…) for each cell and channel, s = cotangent / number of terms: the cell gets −q (dx + dy + dz), each neighbour q d.
 /// Written as a gather, a node's gradient is what its own cell and the three cells behind it give: no two tasks write the same node.
@@ -152,18 +211,74 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
     }
 
     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
-        sampled_total_variation(&inputs[0], &self.lattice, 0, self.lattice.rows())
+        sampled_total_variation(&inputs[0], &self.lattice, self.run.first * BRICK_ROWS, self.run.count * BRICK_ROWS)
     }
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
         let table = call.input(0);
         let scale = call.cotangent().item() / T::lit(self.terms.max(1) as f64);
         let (values, roots) = (table.data().as_chunks::<S>().0, self.roots.as_chunks::<S>().0);
-        let mut gradient = Buffer::<T>::stale(table.len());
-        parallel::for_each_chunk(gradient.as_chunks_mut::<S>().0, RUN * BRICK, |start, slabs| {
-            gradients::<T, W, N, S>(values, roots, self.lattice.neighbours(), start / BRICK, scale, slabs);
+        let bricks = self.lattice.neighbours();
+        let reached: Vec<u32> = match self.sparse {
+            false => (0..bricks.len() as u32).collect(),
+            true => {
+                let ahead = self.run.bricks().flat_map(|b| [Some(b as u32)].into_iter().chain(bricks[b].ahead).flatten());
+                let mut reached: Vec<u32> = ahead.collect();
+                reached.sort_unstable();
+                reached.dedup();
+                reached
+            }
+        };
+        let mut gradient = Buffer::<T>::stale(reached.len() * BRICK_ROWS * W);
+        parallel::for_each_chunk(gradient.as_chunks_mut::<S>().0, TASK * BRICK, |start, slabs| {
+            gradients::<T, W, N, S>(values, roots, bricks, self.run, &reached[start / BRICK..], scale, slabs);
         });
-        out.dense(0, gradient);
+        if !self.sparse {
+            return out.dense(0, gradient);
+        }
+        let touched = reached.iter().map(|&brick| touched(bricks, self.run, brick as usize)).collect();
+        out.rows(0, RowSparse::deferred(table.shape(), Arc::new(RowsOfBricks { bricks: reached, touched, width: W, values: gradient })));
+    }
+}
+
+/// The nodes of a brick that a cell of the run reads: those with a cell, and those ahead of one.
+fn touched(bricks: &[Neighbours], run: Run, brick: usize) -> u64 {
+    let cells = |brick: usize| run.place(brick).map_or(0, |_| bricks[brick].cells);
+    let own = cells(brick);
+    (0..3).fold(own, |touched, a| {
+        let last = LOW[a] << (3 * STRIDE[a]);
+        let from_behind = bricks[brick].behind[a].map_or(0, |behind| cells(behind as usize) & last);
+        touched | (own & !last) << STRIDE[a] | from_behind >> (3 * STRIDE[a])
+    })
+}
+
+/// The rows of some bricks with what is added to them.
+#[derive(Debug)]
+struct RowsOfBricks<T: Real> {
+    /// Ascending.
+    bricks: Vec<u32>,
+    /// A bit for each row of a brick that something is added to.
+    touched: Vec<u64>,
+    width: usize,
+    values: Buffer<T>,
+}
+
+impl<T: Real> RowSums<T> for RowsOfBricks<T> {
+    fn bucket_shift(&self) -> u32 {
+        const { assert!(1 << 6 == BRICK_ROWS) };
+        6
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.bricks.binary_search(&(bucket as u32)).is_err()
+    }
+
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        if let Ok(k) = self.bricks.binary_search(&(bucket as u32)) {
+            let values = &self.values[k * BRICK_ROWS * self.width..][..BRICK_ROWS * self.width];
+            sums.iter_mut().zip(values).for_each(|(sum, &value)| *sum += value);
+            touched[0] |= self.touched[k];
+        }
     }
 }
 
@@ -196,15 +311,17 @@ fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
 }
 
 dispatched! {
-/// 1 / √(dx² + dy² + dz² + ε) of the cells of the bricks from number `first` on, 0 elsewhere; returns Σ √(…).
+/// 1 / √(dx² + dy² + dz² + ε) of the cells of the bricks of a run from its number `first` on, 0 elsewhere; returns Σ √(…).
 fn inverse_roots<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
     bricks: &[Neighbours],
+    run: Run,
     first: usize,
     roots: &mut [[T; S]],
 ) -> T {
     let mut sum = T::zero();
-    for (own, roots) in (first..).zip(roots.as_chunks_mut::<BRICK>().0) {
+    for (k, roots) in (first..).zip(roots.as_chunks_mut::<BRICK>().0) {
+        let own = run.brick(k);
         let mut lanes = [T::zero(); S];
         for x in 0..BRICK {
             let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, own, x, bricks[own].ahead);
@@ -245,19 +362,23 @@ fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
 }
 
 dispatched! {
-/// The gradient of the bricks from number `first` on, from the roots of their cells and of those behind.
+/// The gradient of some bricks, from the roots of their cells and of those behind; bricks that are not in the run have none.
 fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
     roots: &[[T; S]],
     bricks: &[Neighbours],
-    first: usize,
+    run: Run,
+    reached: &[u32],
     scale: T,
     out: &mut [[T; S]],
 ) {
-    for (own, out) in (first..).zip(out.as_chunks_mut::<BRICK>().0) {
+    let zeros = [T::zero(); S];
+    let roots_of = |brick: usize, x: usize| run.place(brick).map(|k| &roots[k * BRICK + x]);
+    for (&own, out) in reached.iter().zip(out.as_chunks_mut::<BRICK>().0) {
+        let own = own as usize;
         let behind = |axis: usize, x: usize| {
             let brick = bricks[own].behind[axis];
-            slab(table, brick, x).zip(slab(roots, brick, x))
+            slab(table, brick, x).zip(brick.and_then(|brick| roots_of(brick as usize, x)))
         };
         // What cells give to the node ahead: q d. That of a cell in the brick is also taken from its own node.
         let mut from_x = [T::zero(); S];
@@ -267,7 +388,7 @@ fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
         }
         for (x, g) in out.iter_mut().enumerate() {
             let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, own, x, bricks[own].ahead);
-            let (v, q) = (&table[own * BRICK + x], &roots[own * BRICK + x]);
+            let (v, q) = (&table[own * BRICK + x], roots_of(own, x).unwrap_or(&zeros));
             let (mut to_x, mut to_y, mut to_z) = ([T::zero(); S], [T::zero(); S], [T::zero(); S]);
             for l in 0..S {
                 (to_x[l], to_y[l], to_z[l]) = (q[l] * (next_x[l] - v[l]), q[l] * (next_y[l] - v[l]), q[l] * (next_z[l] - v[l]));
