@@ -52,7 +52,7 @@ fn configs() -> Vec<(&'static str, Config)> {
     let mut regular = base.losses.clone();
     regular.insert("tv_density_sampled".to_owned(), Weight::Until { weight: 1e-4, until: 120 });
     regular.insert("tv_color_sampled".to_owned(), Weight::Exponential { from: 1e-2, to: 1e-4, steps: 150 });
-    let scout = Scout { density: 1.0, stage: stage(6, 40) };
+    let scout = Scout { density: 1.0, prune_unseen_below: 1e-3, stages: vec![stage(6, 25), stage(7, 15)] };
     vec![
         ("colors", Config { color: ColorKind::Rgb, project: true, optimizer: OptimizerConfig::Sgd, ..base.clone() }),
         ("silhouettes", Config { hull: Hull::Auto, optimizer: OptimizerConfig::Momentum { decay: 0.9 }, ..base.clone() }),

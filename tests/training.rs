@@ -113,7 +113,7 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
 #[test]
 fn a_scout_finds_where_matter_is() {
     let train = views(Split::Train);
-    let scout = Scout { density: 0.1, stage: Stage { density_rate: 2.0, ..stage(16, 80) } };
+    let scout = Scout { density: 0.1, prune_unseen_below: 0.03, stages: vec![Stage { density_rate: 2.0, ..stage(16, 80) }] };
     let stages = vec![stage(32, 1), stage(32, 60)];
     let config = Config { scout: Some(scout), prune_unseen_below: 0.03, stages, rays_per_step: 2048, ..config() };
     let mut trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");

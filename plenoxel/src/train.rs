@@ -73,8 +73,8 @@ pub struct Trainer<'a, T: Real> {
     /// By how much the images are reduced whose pixels the rays are.
     reduction: usize,
     silhouettes: Option<Silhouettes<'a>>,
-    /// True if the first stage of the plan is the scout's.
-    scouts: bool,
+    /// How many stages of the plan are the scout's.
+    scouts: usize,
     objective: Objective<T>,
     grid: VoxelGrid<T>,
     /// Where the grid could learn when last looked at: samples elsewhere are left out.
@@ -101,19 +101,20 @@ impl<'a, T: Real> Trainer<'a, T> {
         }
         config.check_stages()?;
         let silhouettes = Silhouettes::new(&config, views);
-        let scout = config.scout.filter(|_| silhouettes.is_none());
-        let plan = plan(&config, scout.iter().map(|scout| scout.stage).chain(config.stages.iter().copied()), rays.len());
+        let scout = config.scout.as_ref().filter(|_| silhouettes.is_none());
+        let of_scout = scout.map_or(&[][..], |scout| &scout.stages);
+        let plan = plan(&config, of_scout.iter().chain(&config.stages).copied(), rays.len());
         let mut shape = config.grid_shape(plan[0].stage.resolution);
         if let Some(silhouettes) = &silhouettes {
             shape.half_width = silhouettes.half_width(shape.half_width);
         }
-        let initial = Initial { density: scout.map_or(config.initial.density, |scout| scout.density), ..config.initial };
+        let initial = initial(&config, !of_scout.is_empty());
         let grid = match initial.random {
             true => VoxelGrid::random(shape, initial.density, initial.color, config.seed),
             false => VoxelGrid::uniform(shape, initial.density, initial.color),
         };
         let optimizer = optimizer(&config, &plan[0]);
-        let scouts = scout.is_some();
+        let scouts = of_scout.len();
         Ok(Trainer {
             config,
             plan,
@@ -144,7 +145,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         assert_eq!(self.step, 0, "a run starts once");
         let stages = &self.config.stages;
         let coarser = stages.iter().take_while(|stage| stage.resolution < grid.shape().resolution).count();
-        self.scouts = false;
+        self.scouts = 0;
         self.plan = plan(&self.config, stages[coarser.min(stages.len() - 1)..].iter().copied(), self.rays.len());
         self.grid = start::adapted(grid, &self.config.grid_shape(self.plan[0].stage.resolution));
         self.optimizer = optimizer(&self.config, &self.plan[0]);
@@ -244,10 +245,14 @@ impl<'a, T: Real> Trainer<'a, T> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        if self.scouts && index == 1 {
-            let kept = self.worth_keeping(&self.grid, &self.plan[0].stage)?;
-            self.grid =
-                start::scouted(&self.grid, &kept, plan.stage.resolution, &self.config.initial).ok_or_else(|| self.pruned_to_nothing())?;
+        if (1..=self.scouts).contains(&index) {
+            let kept = self.worth_keeping(
+                &self.grid,
+                &self.plan[index - 1].stage,
+                self.config.scout.as_ref().map_or(0.0, |scout| scout.prune_unseen_below),
+            )?;
+            let initial = initial(&self.config, index < self.scouts);
+            self.grid = start::scouted(&self.grid, &kept, plan.stage.resolution, &initial).ok_or_else(|| self.pruned_to_nothing())?;
         }
         // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
         release_free_buffers();
@@ -272,7 +277,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         }
         self.aim(Field::<T>::reach(&outline));
         if self.prunes_from().is_some_and(|first| index >= first) {
-            outline = outline.pruned(&self.worth_keeping(&outline, &plan.stage)?);
+            outline = outline.pruned(&self.worth_keeping(&outline, &plan.stage, self.config.prune_unseen_below)?);
             self.aim(Field::<T>::reach(&outline));
         }
         let lattice = outline.lattice();
@@ -286,7 +291,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             return Err(Error::config("prune_unseen_below", found, "a larger share of a pixel; or fewer voxels a side in the last stages"));
         }
         if finer {
-            self.grid = self.grid.resample_into(lattice);
+            self.grid = self.grid.resample_as(&outline);
         } else if lattice.present() < self.grid.lattice().present() {
             self.grid = self.grid.pruned(&outline.voxels_where(|_| true));
         }
@@ -325,16 +330,15 @@ impl<'a, T: Real> Trainer<'a, T> {
 
     /// The first stage of the plan that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
     pub fn prunes_from(&self) -> Option<usize> {
-        let scout = usize::from(self.scouts);
-        self.config.prune_from_stage.map(|first| scout + first.saturating_sub(self.config.stages.len() + scout - self.plan.len()))
+        let left_out = self.config.stages.len() + self.scouts - self.plan.len();
+        self.config.prune_from_stage.map(|first| self.scouts + first.saturating_sub(left_out))
     }
 
     /// The voxels that pruning leaves: those that hold matter and, if the config asks for it, that a training ray sees.
     ///
     /// Errors if they are none.
-    fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage) -> Result<Occupancy> {
+    fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage, least: f64) -> Result<Occupancy> {
         let full = grid.occupancy(self.config.prune_below);
-        let least = self.config.prune_unseen_below;
         let kept = if least == 0.0 { full } else { full.intersection(&self.seen(grid, stage, least)) };
         if kept.fraction() > 0.0 { Ok(kept) } else { Err(self.pruned_to_nothing()) }
     }
@@ -372,6 +376,12 @@ impl<'a, T: Real> Trainer<'a, T> {
     fn numeric(&self, found: String) -> Error {
         Error::Numeric { place: format!("step {}", self.step), found, remedy: "lower the learning rates of this stage".to_owned() }
     }
+}
+
+/// Values before the first step, of a scout or of the training itself.
+fn initial(config: &Config, scouts: bool) -> Initial {
+    let density = config.scout.as_ref().filter(|_| scouts).map_or(config.initial.density, |scout| scout.density);
+    Initial { density, ..config.initial }
 }
 
 /// Stages one after another.

@@ -62,8 +62,7 @@ pub struct Config {
     /// share of a pixel. Of the pixels as many are looked along as make eight rays through every voxel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
     /// A short run before the first stage, where no silhouettes and no other run say which voxels exist: those of its grid that are worth
-    /// keeping (`prune_below`, `prune_unseen_below`) do, the cube becomes as small as they allow, and training starts from `initial` in them.
-    /// Needs no alpha.
+    /// keeping do, the cube becomes as small as they allow, and training starts from `initial` in them. Needs no alpha.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scout: Option<Scout>,
     /// Folder of the run whose grid training starts from.
@@ -210,13 +209,15 @@ pub struct Stage {
 }
 
 /// How to find out where matter is.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scout {
     /// Density before the first step, 1 / world length: thin enough that light gets through the cube.
     pub density: f64,
-    /// What is trained.
-    pub stage: Stage,
+    /// What is worth keeping after each stage: as in pruning, with the config's `prune_below` and this.
+    pub prune_unseen_below: f64,
+    /// What is trained, coarse to fine, each from `density` again in what the one before left.
+    pub stages: Vec<Stage>,
 }
 
 fn one<N: From<u8>>() -> N {
@@ -406,9 +407,11 @@ impl Config {
         }
         if let Some(scout) = &self.scout {
             positive("scout.density", scout.density)?;
+            check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one, or no scout")?;
         }
         let stages = self.stages.iter().enumerate().map(|(i, stage)| (format!("stages[{i}]"), stage));
-        for (place, stage) in stages.chain(self.scout.iter().map(|scout| ("scout.stage".to_owned(), &scout.stage))) {
+        let of_scout = self.scout.iter().flat_map(|scout| scout.stages.iter().enumerate());
+        for (place, stage) in stages.chain(of_scout.map(|(i, stage)| (format!("scout.stages[{i}]"), stage))) {
             let key = |name: &str| format!("{place}.{name}");
             check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels a side")?;
             let length = match (stage.epochs, stage.steps) {

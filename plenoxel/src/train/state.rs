@@ -35,8 +35,8 @@ struct State {
     views: String,
     /// Stages of the plan: fewer than there are if the run started from a finer grid.
     stages: usize,
-    /// True if the first of them is the scout's.
-    scouts: bool,
+    /// How many of them are the scout's.
+    scouts: usize,
     /// By how much the images were reduced.
     reduction: usize,
     /// Of each table how many updates it had, where the optimizer remembers something.
@@ -110,8 +110,8 @@ impl<T: Real> Trainer<'_, T> {
             return other("training views");
         }
         let damaged = |what: &str| Error::input(path, what, RETRAIN);
-        let scout = self.config.scout.filter(|_| state.scouts).map(|scout| scout.stage);
-        let stages: Vec<_> = scout.into_iter().chain(self.config.stages.iter().copied()).collect();
+        let scout = self.config.scout.iter().filter(|_| state.scouts > 0).flat_map(|scout| &scout.stages);
+        let stages: Vec<_> = scout.chain(&self.config.stages).copied().collect();
         let left_out = stages.len().checked_sub(state.stages).filter(|left_out| *left_out < stages.len());
         let plan =
             plan(&self.config, stages.into_iter().skip(left_out.ok_or_else(|| damaged("a plan of impossible stages"))?), self.rays.len());

@@ -50,9 +50,10 @@ impl<T: Real> VoxelGrid<T> {
         self.read_at(shape, lattice)
     }
 
-    /// The same with the voxels of a lattice, among those that [`VoxelGrid::resample`] gives.
-    pub fn resample_into(&self, lattice: &Lattice) -> Self {
-        self.read_at(GridShape { resolution: lattice.nodes()[0], ..*self.shape() }, lattice.clone())
+    /// The same with the resolution, the cube and the voxels of another grid, among those that [`VoxelGrid::resample_in`] gives.
+    pub fn resample_as(&self, other: &Self) -> Self {
+        let GridShape { resolution, half_width, .. } = *other.shape();
+        self.read_at(GridShape { resolution, half_width, ..*self.shape() }, other.lattice().clone())
     }
 
     /// The old field at the centres of other voxels.
