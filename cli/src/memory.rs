@@ -42,18 +42,15 @@ const EVALUATION_RAYS: u64 = 4096;
 impl Estimate {
     /// A training run with everything around it; `initial` bytes are of the grid that it starts from.
     pub fn of_training(config: &Config, dataset: &Dataset, initial: u64) -> Self {
-        let states = match config.optimizer {
-            OptimizerConfig::Sgd => 0,
-            OptimizerConfig::Momentum { .. } | OptimizerConfig::RmsProp { .. } => 1,
-            OptimizerConfig::LazyAdam { .. } => 2,
-        };
+        let states = states(config);
         // Bytes of a stage's tables, and what is held of it and of the one before while it begins.
         let tables = |index: usize| (share(config, index) * config.grid_shape(config.stages[index].resolution).bytes() as f64) as u64;
         let begins = |index: usize| {
             let before = share(config, index.saturating_sub(1));
             let outline = OUTLINE as f64 * before * config.grid_shape(config.stages[index].resolution).voxels() as f64;
-            // Of all before it, for they may be kept for their figures.
-            (0..index).map(tables).sum::<u64>() + (outline as u64).max(tables(index))
+            // The first is made whole. Those before may be kept for their figures.
+            let own = if index == 0 { config.grid_shape(config.stages[0].resolution).bytes() as u64 } else { tables(index) };
+            (0..index).map(tables).sum::<u64>() + (outline as u64).max(own)
         };
         let finest = (0..config.stages.len()).max_by_key(|&index| tables(index) * (1 + states));
         let index = finest.unwrap_or(0);
@@ -101,9 +98,9 @@ impl Estimate {
     /// The most rows of tables that fit into the memory that is free, if that is known: what pruning leaves is only known when it has.
     pub fn most_rows(&self, config: &Config) -> Option<usize> {
         let held = self.grid + self.optimizer;
-        let row = config.grid_shape(1).voxel_bytes() as u64;
-        // Tables, two states of the optimizer, and those of the stage before, of a file, or of gradients.
-        available().map(|available| (available.saturating_sub(self.total() - held) / (4 * row)) as usize)
+        // Tables, states of the optimizer, and the tables of the stage before.
+        let row = (2 + states(config)) * config.grid_shape(1).voxel_bytes() as u64;
+        available().map(|available| (available.saturating_sub(self.total() - held) / row) as usize)
     }
 
     /// Rendering a trained grid of so many voxels, and comparing it with the views of a split where `compare` is set.
@@ -206,6 +203,15 @@ impl Estimate {
             }
             _ => Ok(()),
         }
+    }
+}
+
+/// Numbers that the optimizer keeps for each one of the tables.
+fn states(config: &Config) -> u64 {
+    match config.optimizer {
+        OptimizerConfig::Sgd => 0,
+        OptimizerConfig::Momentum { .. } | OptimizerConfig::RmsProp { .. } => 1,
+        OptimizerConfig::LazyAdam { .. } => 2,
     }
 }
 

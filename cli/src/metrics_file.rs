@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// About so many lines in a run: enough for any curve.
 const LINES: u64 = 1000;
 
-/// The file, which is only ever appended to, a whole line at a time.
+/// The file, which grows by a whole line at a time; a run that goes on cuts it back to where it was saved.
 pub struct MetricsFile {
     path: PathBuf,
     file: File,
@@ -28,8 +28,8 @@ pub struct MetricsFile {
 pub struct Past {
     /// Of each step: the mean of its line.
     pub losses: Vec<f64>,
-    /// The last step of each stage that has ended, its resolution, and the seconds of training by then.
-    pub stages: Vec<(u64, usize, f64)>,
+    /// Each stage that has ended, its resolution, and the seconds of training by then.
+    pub stages: Vec<(usize, usize, f64)>,
     /// Seconds of training.
     pub seconds: f64,
 }
@@ -77,7 +77,11 @@ impl MetricsFile {
 
     /// The file of a run that goes on after so many steps: lines about later ones go.
     pub fn resume(path: &Path, total_steps: u64, taken: u64) -> Result<(Self, Past)> {
-        let text = std::fs::read_to_string(path).unwrap_or_default();
+        let bytes = match std::fs::read(path) {
+            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(Error::io(path, e, "reading the metrics")),
+            bytes => bytes.unwrap_or_default(),
+        };
+        let text = String::from_utf8_lossy(&bytes);
         let (mut kept, mut past, mut counts) = (String::new(), Past::default(), (0, 0));
         for text in text.lines() {
             // A line that was cut short, and what is no line of a step, say nothing.
@@ -87,10 +91,12 @@ impl MetricsFile {
             past.losses.resize(line.step as usize + 1, line.loss);
             past.seconds = line.seconds;
             if line.ends_stage {
-                past.stages.push((line.step, line.resolution, line.seconds));
+                past.stages.push((line.stage, line.resolution, line.seconds));
             }
             counts = (line.rays, line.samples);
         }
+        let last = past.losses.last().copied().unwrap_or(0.0);
+        past.losses.resize(taken as usize, last);
         files::write_atomically(path, kept.as_bytes())?;
         let (rays, samples) = counts;
         Ok((MetricsFile { rays, samples, ..Self::create(path, total_steps)? }, past))
@@ -129,6 +135,11 @@ impl MetricsFile {
             color_rate: report.color_rate,
             seconds,
         })
+    }
+
+    /// Has what was written on the disk.
+    pub fn sync(&self) -> Result<()> {
+        self.file.sync_data().map_err(|e| Error::io(&self.path, e, "writing the metrics"))
     }
 
     /// Appends a line.

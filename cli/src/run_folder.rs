@@ -75,6 +75,7 @@ impl RunFolder {
     /// the new one's; files of other kinds stay.
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
+        self.remove_fragments()?;
         for name in [CHECKPOINT, STATE, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
             let path = self.path.join(name);
             if path.exists() {
@@ -270,7 +271,7 @@ Of these files, those that apply: a carved run has no training to tell of.
 
 - `config.toml`: every setting, resolved; `plenoxel train DATA --config config.toml` repeats the run (`carve` one that was carved).
 - `run.json`: the data, the program, the machine.
-- `metrics.jsonl`: one line every few steps and at every stage end, then one with the final figures. `loss`, `losses` and `psnr` are of
+- `metrics.jsonl`: one line every few steps and at every stage end and whenever it is saved, then one with the final figures. `loss`, `losses` and `psnr` are of
   training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training.
 - `loss.svg`: the loss over the steps.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.

@@ -4,7 +4,7 @@
 //! leaves either the old file or the new one, never half of one.
 
 use crate::error::{Error, Result};
-use std::fs::{self, File};
+use std::fs::{self, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -19,7 +19,9 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
 /// The same with a file that `write` makes, under the name it is given.
 pub(crate) fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>) -> Result<()> {
     let temporary = temporary_name(path);
-    let written = write(&temporary).and_then(|()| File::open(&temporary)?.sync_all()).and_then(|()| fs::rename(&temporary, path));
+    let written = write(&temporary)
+        .and_then(|()| OpenOptions::new().write(true).open(&temporary)?.sync_all())
+        .and_then(|()| fs::rename(&temporary, path));
     written.map_err(|source| {
         // The write is what failed; a second failure while tidying up would only hide it.
         let _ = fs::remove_file(&temporary);

@@ -132,7 +132,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         })
     }
 
-    /// The same run where a stage must not begin with more rows of tables than these, because they would not fit into memory.
+    /// The same run where pruning must not leave more rows of tables than these, because they would not fit into memory.
     pub fn with_most_rows(self, most_rows: usize) -> Self {
         Trainer { most_rows, ..self }
     }
@@ -245,14 +245,12 @@ impl<'a, T: Real> Trainer<'a, T> {
         let plan = self.plan[index];
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &plan);
-        if (1..=self.scouts).contains(&index) {
-            let kept = self.worth_keeping(
-                &self.grid,
-                &self.plan[index - 1].stage,
-                self.config.scout.as_ref().map_or(0.0, |scout| scout.prune_unseen_below),
-            )?;
+        if let Some(scout) = self.config.scout.as_ref().filter(|_| (1..=self.scouts).contains(&index)) {
+            let least = scout.prune_unseen_below;
+            let kept = self.worth_keeping(&self.grid, &self.plan[index - 1].stage, least)?;
             let initial = initial(&self.config, index < self.scouts);
-            self.grid = start::scouted(&self.grid, &kept, plan.stage.resolution, &initial).ok_or_else(|| self.pruned_to_nothing())?;
+            let scouted = start::scouted(&self.grid, &kept, plan.stage.resolution, &initial);
+            self.grid = scouted.ok_or_else(|| self.pruned_to_nothing(least))?;
         }
         // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
         release_free_buffers();
@@ -281,7 +279,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.aim(Field::<T>::reach(&outline));
         }
         let lattice = outline.lattice();
-        if lattice.rows() > self.most_rows {
+        if lattice.rows() > self.most_rows && self.prunes_from().is_some_and(|first| index >= first) {
             let found = format!(
                 "{} voxels that would be left at {}³, where memory has room for {}",
                 lattice.rows(),
@@ -308,8 +306,8 @@ impl<'a, T: Real> Trainer<'a, T> {
         }
     }
 
-    fn pruned_to_nothing(&self) -> Error {
-        let Config { prune_below, prune_unseen_below, .. } = self.config;
+    fn pruned_to_nothing(&self, prune_unseen_below: f64) -> Error {
+        let prune_below = self.config.prune_below;
         Error::Numeric {
             place: format!("step {}", self.step),
             found: "pruning would leave nothing".to_owned(),
@@ -340,7 +338,7 @@ impl<'a, T: Real> Trainer<'a, T> {
     fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage, least: f64) -> Result<Occupancy> {
         let full = grid.occupancy(self.config.prune_below);
         let kept = if least == 0.0 { full } else { full.intersection(&self.seen(grid, stage, least)) };
-        if kept.fraction() > 0.0 { Ok(kept) } else { Err(self.pruned_to_nothing()) }
+        if kept.fraction() > 0.0 { Ok(kept) } else { Err(self.pruned_to_nothing(least)) }
     }
 
     /// The voxels that weigh at least so much in a pixel, and those around.

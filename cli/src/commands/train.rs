@@ -10,6 +10,7 @@ use crate::curves::loss_svg;
 use crate::data::DataSource;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
 use crate::images::Rgb;
+use crate::machine;
 use crate::memory::{self, Estimate};
 use crate::metrics_file::{MetricsFile, Past};
 use crate::progress::{Console, clock};
@@ -96,10 +97,14 @@ fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<bool> 
     let (folder, config, record) = RunFolder::open(path)?;
     let state = folder.existing_state()?;
     let mut clocks = Clocks::default();
-    let dataset = clocks.load.time(|| record.data.reopen(&config))?;
+    let source = args.moved_to().unwrap_or(record.data);
+    let dataset = clocks.load.time(|| source.open(&config))?;
+    if machine::instruction_set() != record.instruction_set {
+        console.note(&format!("it began with {}: other bits, the same picture", record.instruction_set));
+    }
     announce(console, &dataset, &config);
     let most_rows = room(&config, &dataset, 0, console)?;
-    let views = clocks.load.time(|| load(console, &dataset, Split::Train, &record.data))?;
+    let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
     let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows).resumed(&state)?;
     folder.remove_fragments()?;
     let (metrics, past) = MetricsFile::resume(&folder.metrics(), trainer.total_steps(), trainer.steps_taken())?;
@@ -107,7 +112,7 @@ fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<bool> 
     let (taken, total) = (trainer.steps_taken(), trainer.total_steps());
     console.note(&format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds)));
     let preset = record.preset.as_deref();
-    let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &record.data, preset, args, console };
+    let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &source, preset, args, console };
     let learned = job.learn(trainer, metrics, past, &views, &mut clocks)?;
     drop(views);
     job.conclude(learned, clocks)
@@ -144,16 +149,16 @@ impl Job<'_, '_> {
     ) -> Result<Option<Learned<'_>>> {
         let Job { folder, config, dataset, console, .. } = *self;
         let mut pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
-        let keep_stages = self.args.keeps_stages();
+        let keep_stages = self.args.keeps_stages(self.source);
         let clock = &mut clocks.train;
         let plan = trainer.plan().to_vec();
         let total = trainer.total_steps();
         let mut progress = console.training(&plan, trainer.prunes_from(), past.seconds);
         let mut losses = past.losses;
         let mut stages: Vec<StageSummary> = Vec::new();
-        for (stage, (last, resolution, seconds)) in past.stages.into_iter().enumerate() {
+        for (stage, resolution, seconds) in past.stages {
             pictures.earlier_stage(stage, resolution)?;
-            let steps = plan.iter().find(|p| p.first + p.steps == last + 1).map_or(0, |p| p.steps);
+            let steps = plan.get(stage).map_or(0, |p| p.steps);
             stages.push(StageSummary { resolution, steps, seconds, psnr: None, grid: None });
         }
         let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
@@ -190,7 +195,12 @@ impl Job<'_, '_> {
                 });
             }
             if save {
-                trainer.save(&folder.state(), dataset.name())?;
+                metrics.sync()?;
+                match trainer.save(&folder.state(), dataset.name()) {
+                    // There may be room on the disk the next time.
+                    Err(e) if !interrupt.requested() => console.note(&format!("not saved: {e}")),
+                    done => done?,
+                }
                 saved = Instant::now();
             }
             if save && interrupt.requested() {
@@ -203,6 +213,10 @@ impl Job<'_, '_> {
         drop(progress);
         let grid = trainer.into_grid();
         folder.save(&grid, &Header::new(&grid, dataset.name(), config.background, config.seed, total))?;
+        if interrupt.requested() {
+            console.error(&format!("interrupted after the last step; its figures: plenoxel evaluate {}", folder.path().display()));
+            return Ok(None);
+        }
         let mean_image = evaluation::mean_image(views, config.background);
         let (rays, samples) = metrics.counts();
         Ok(Some(Learned { grid, metrics, pictures, mean_image, stages, steps: total, rays, samples }))

@@ -407,6 +407,8 @@ impl Config {
         }
         if let Some(scout) = &self.scout {
             positive("scout.density", scout.density)?;
+            let least = scout.prune_unseen_below;
+            check((0.0..=1.0).contains(&least), "scout.prune_unseen_below", least, "a number in [0, 1]")?;
             check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one, or no scout")?;
         }
         let stages = self.stages.iter().enumerate().map(|(i, stage)| (format!("stages[{i}]"), stage));

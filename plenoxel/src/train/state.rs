@@ -110,9 +110,13 @@ impl<T: Real> Trainer<'_, T> {
             return other("training views");
         }
         let damaged = |what: &str| Error::input(path, what, RETRAIN);
+        if state.scouts != 0 && state.scouts != self.config.scout.as_ref().map_or(0, |scout| scout.stages.len()) {
+            return Err(damaged("a scout of impossible stages"));
+        }
         let scout = self.config.scout.iter().filter(|_| state.scouts > 0).flat_map(|scout| &scout.stages);
         let stages: Vec<_> = scout.chain(&self.config.stages).copied().collect();
-        let left_out = stages.len().checked_sub(state.stages).filter(|left_out| *left_out < stages.len());
+        let left_out =
+            stages.len().checked_sub(state.stages).filter(|left_out| *left_out < stages.len() && (state.scouts == 0 || *left_out == 0));
         let plan =
             plan(&self.config, stages.into_iter().skip(left_out.ok_or_else(|| damaged("a plan of impossible stages"))?), self.rays.len());
         // The first step is not taken yet, and the file is of later.
@@ -141,6 +145,9 @@ impl<T: Real> Trainer<'_, T> {
         }
         if self.config.project {
             self.grid.project();
+        }
+        if state.updates.len() != shapes.len() {
+            return Err(damaged("a memory of other tables"));
         }
         self.optimizer = optimizer(&self.config, &current);
         for (param, (shape, updates)) in self.grid.params().zip(shapes.iter().zip(&state.updates)) {

@@ -24,8 +24,7 @@ Settings are layered: defaults < preset < --config < flags. config.toml in the r
 reaches each by its path there, such as stages[0].sampling.step. The last line on stdout is one JSON object.";
 
 /// What a run that goes on was told when it began.
-const NOT_WHEN_RESUMED: [&str; 21] = [
-    "data",
+const NOT_WHEN_RESUMED: [&str; 20] = [
     "out",
     "force",
     "preset",
@@ -64,7 +63,8 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     pub force: bool,
 
-    /// Go on with the run in this folder from where it was last saved, with the settings and the data that it began with
+    /// Go on with the run in this folder from where it was last saved, with the settings that it began with, and the data, wherever they are
+    /// now
     #[arg(long, value_name = "RUN", help_heading = "Output", value_hint = ValueHint::DirPath, conflicts_with_all = NOT_WHEN_RESUMED)]
     pub resume: Option<PathBuf>,
 
@@ -172,8 +172,13 @@ impl TrainArgs {
     }
 
     /// True if the grids of earlier stages are evaluated too.
-    pub fn keeps_stages(&self) -> bool {
-        self.stage_psnr || self.data.is_none()
+    pub fn keeps_stages(&self, source: &DataSource) -> bool {
+        self.stage_psnr || matches!(source, DataSource::BuiltIn { .. })
+    }
+
+    /// Where the views of a run that goes on are now, if they are not where they were.
+    pub fn moved_to(&self) -> Option<DataSource> {
+        self.data.as_deref().map(DataSource::folder)
     }
 
     /// The configuration, and the preset it started from.

@@ -1,4 +1,4 @@
-//! Ctrl-C, and what else asks a process to end: the first time while a run trains, it is asked to save and stop; else the process ends.
+//! Ctrl-C: the first time while a run trains, it is asked to save and stop; else the process ends.
 
 use std::sync::Once;
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
@@ -17,6 +17,9 @@ impl Watch {
     pub fn begin() -> Self {
         static HANDLER: Once = Once::new();
         HANDLER.call_once(|| {
+            if ignored() {
+                return;
+            }
             let handled = ctrlc::set_handler(|| {
                 if !WATCHED.load(SeqCst) || REQUESTED.swap(true, SeqCst) {
                     std::process::exit(EXIT_CODE.into());
@@ -33,6 +36,14 @@ impl Watch {
     pub fn requested(&self) -> bool {
         REQUESTED.load(SeqCst)
     }
+}
+
+/// True if whoever started the process had it ignore Ctrl-C, as shells do for what runs in the background.
+fn ignored() -> bool {
+    const SIGINT: u64 = 1 << 1;
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    mask.is_some_and(|mask| mask & SIGINT != 0)
 }
 
 impl Drop for Watch {
