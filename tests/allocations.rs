@@ -4,7 +4,7 @@ use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::field::voxel_grid::Interpolation;
 use plenoxel::train::Trainer;
-use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Sampling, Stage};
+use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Stage};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
@@ -38,19 +38,7 @@ fn a_step_in_the_steady_state_takes_hardly_any_memory_from_the_system() {
     let scene = Dataset::procedural(ProceduralOptions { width: 32, height: 32, train: 20, val: 0, test: 3, supersample: 2 })
         .expect("the built-in scene");
     let views = scene.load(Split::Train, &|_, _| {}).expect("it renders");
-    let stage = Stage {
-        resolution: 64,
-        epochs: None,
-        steps: Some(1000),
-        sampling: Sampling::Step { step: 0.5 },
-        image_reduction: 1,
-        density_rate: 1.0,
-        color_rate: 0.05,
-        harmonics_rate: None,
-        density_warm_up: 0,
-        color_decay: None,
-        rate_decay: 1.0,
-    };
+    let stage = Stage { color_rate: 0.05, ..Stage::new(64, 1000) };
     for (interpolation, color) in [(Interpolation::Nearest, ColorKind::Rgb), (Interpolation::Trilinear, ColorKind::Sh)] {
         let stages = vec![stage];
         let config = Config { interpolation, color, rays_per_step: 4096, stages, optimizer: OptimizerConfig::Sgd, ..Config::default() };

@@ -24,19 +24,7 @@ fn views(split: Split) -> Vec<View> {
 }
 
 fn stage(resolution: usize, steps: u64) -> Stage {
-    Stage {
-        resolution,
-        epochs: None,
-        steps: Some(steps),
-        sampling: Sampling::Step { step: 0.7 },
-        image_reduction: 1,
-        density_rate: 1.0,
-        color_rate: 0.05,
-        harmonics_rate: None,
-        density_warm_up: 0,
-        color_decay: None,
-        rate_decay: 0.3,
-    }
+    Stage { sampling: Sampling::Step { step: 0.7 }, color_rate: 0.05, rate_decay: 0.3, ..Stage::new(resolution, steps) }
 }
 
 fn config() -> Config {

@@ -217,23 +217,10 @@ fn escaped(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use plenoxel::train::config::{Sampling, Stage};
+    use plenoxel::train::config::Stage;
 
     fn stages() -> Vec<PlannedStage> {
-        let stage = |resolution| Stage {
-            resolution,
-            epochs: None,
-            steps: Some(50),
-            sampling: Sampling::Step { step: 0.5 },
-            image_reduction: 1,
-            density_rate: 1.0,
-            color_rate: 1.0,
-            harmonics_rate: None,
-            density_warm_up: 0,
-            color_decay: None,
-            rate_decay: 1.0,
-        };
-        let planned = |(i, resolution)| PlannedStage { stage: stage(resolution), first: 50 * i as u64, steps: 50 };
+        let planned = |(i, resolution)| PlannedStage { stage: Stage::new(resolution, 50), first: 50 * i as u64, steps: 50 };
         [16, 32].into_iter().enumerate().map(planned).collect()
     }
 

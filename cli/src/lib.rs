@@ -95,19 +95,21 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     };
     let console = Console::new(streams, cli.machine.quiet);
     memory::limit(cli.machine.max_memory);
-    let done = machine::with_threads(cli.machine.threads, || match &cli.command {
-        Command::Train(args) => train::run(args, &console),
-        Command::Carve(args) => carve::run(args, &console).map(|()| true),
-        Command::Render(args) => render::run(args, &console).map(|()| true),
-        Command::Evaluate(args) => evaluate::run(args, &console).map(|()| true),
-        Command::Export(args) => export::run(args, &console).map(|()| true),
-        Command::Filter(args) => filter::run(args, &console).map(|()| true),
-        Command::Info(args) => info::run(args, &console).map(|()| true),
-        Command::Scene(args) => scene::run(args, &console).map(|()| true),
+    let code = machine::with_threads(cli.machine.threads, || {
+        let done = match &cli.command {
+            Command::Train(args) => return train::run(args, &console),
+            Command::Carve(args) => carve::run(args, &console),
+            Command::Render(args) => render::run(args, &console),
+            Command::Evaluate(args) => evaluate::run(args, &console),
+            Command::Export(args) => export::run(args, &console),
+            Command::Filter(args) => filter::run(args, &console),
+            Command::Info(args) => info::run(args, &console),
+            Command::Scene(args) => scene::run(args, &console),
+        };
+        done.map(|()| 0)
     });
-    match done {
-        Ok(true) => 0,
-        Ok(false) => train::INTERRUPTED,
+    match code {
+        Ok(code) => code,
         Err(error) => {
             console.error(&error.to_string());
             error.exit_code()

@@ -28,8 +28,8 @@ pub struct MetricsFile {
 pub struct Past {
     /// Of each step: the mean of its line.
     pub losses: Vec<f64>,
-    /// Each stage that has ended, its resolution, and the seconds of training by then.
-    pub stages: Vec<(usize, usize, f64)>,
+    /// Each stage that has ended, and the seconds of training by then.
+    pub stages: Vec<(usize, f64)>,
     /// Seconds of training.
     pub seconds: f64,
 }
@@ -91,7 +91,7 @@ impl MetricsFile {
             past.losses.resize(line.step as usize + 1, line.loss);
             past.seconds = line.seconds;
             if line.ends_stage {
-                past.stages.push((line.stage, line.resolution, line.seconds));
+                past.stages.push((line.stage, line.seconds));
             }
             counts = (line.rays, line.samples);
         }

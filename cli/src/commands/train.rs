@@ -16,21 +16,20 @@ use crate::metrics_file::{MetricsFile, Past};
 use crate::progress::{Console, clock};
 use crate::run_folder::RunFolder;
 pub use flags::{TrainArgs, size};
-pub use interrupt::EXIT_CODE as INTERRUPTED;
 use pictures::Pictures;
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::train::Trainer;
 use plenoxel::train::config::Config;
+use plenoxel::train::{PlannedStage, Trainer};
 use serde::Serialize;
 use serde_json::json;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Learns a scene and leaves a run folder. True if it came to its end, and was not interrupted.
-pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
+/// Learns a scene and leaves a run folder. Returns the exit code: 0, or another if it was interrupted.
+pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     match &args.resume {
         Some(path) => resume(path, args, console),
         None => begin(args, console),
@@ -38,7 +37,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
 }
 
 /// A run from its first step.
-fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
+fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let source = args.source();
     let (mut config, preset) = args.config()?;
     config.check_stages()?;
@@ -93,7 +92,7 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
 }
 
 /// A run that was interrupted, from where it was last saved.
-fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<bool> {
+fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let (folder, config, record) = RunFolder::open(path)?;
     let state = folder.existing_state()?;
     let mut clocks = Clocks::default();
@@ -108,7 +107,7 @@ fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<bool> 
     let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows).resumed(&state)?;
     folder.remove_fragments()?;
     let (metrics, past) = MetricsFile::resume(&folder.metrics(), trainer.total_steps(), trainer.steps_taken())?;
-    clocks.train.0 = Duration::from_secs_f64(past.seconds);
+    clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
     let (taken, total) = (trainer.steps_taken(), trainer.total_steps());
     console.note(&format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds)));
     let preset = record.preset.as_deref();
@@ -156,10 +155,10 @@ impl Job<'_, '_> {
         let mut progress = console.training(&plan, trainer.prunes_from(), past.seconds);
         let mut losses = past.losses;
         let mut stages: Vec<StageSummary> = Vec::new();
-        for (stage, resolution, seconds) in past.stages {
-            pictures.earlier_stage(stage, resolution)?;
-            let steps = plan.get(stage).map_or(0, |p| p.steps);
-            stages.push(StageSummary { resolution, steps, seconds, psnr: None, grid: None });
+        for (index, seconds) in past.stages {
+            let Some(PlannedStage { stage, steps, .. }) = plan.get(index) else { continue };
+            pictures.earlier_stage(index, stage.resolution);
+            stages.push(StageSummary { resolution: stage.resolution, steps: *steps, seconds, psnr: None, grid: None });
         }
         let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
         let interrupt = interrupt::Watch::begin();
@@ -222,10 +221,10 @@ impl Job<'_, '_> {
         Ok(Some(Learned { grid, metrics, pictures, mean_image, stages, steps: total, rays, samples }))
     }
 
-    /// Compares what was learned with the test views, and says what came of it. False if the run was interrupted.
-    fn conclude(&self, learned: Option<Learned<'_>>, mut clocks: Clocks) -> Result<bool> {
+    /// Compares what was learned with the test views, and says what came of it.
+    fn conclude(&self, learned: Option<Learned<'_>>, mut clocks: Clocks) -> Result<u8> {
         let Job { folder, config, dataset, console, .. } = *self;
-        let Some(mut learned) = learned else { return Ok(false) };
+        let Some(mut learned) = learned else { return Ok(interrupt::EXIT_CODE) };
         let test = clocks.load.time(|| load(console, dataset, Split::Test, self.source))?;
         let scores = evaluate(&mut learned, &test, config, console, &mut clocks)?;
         let pictures = &learned.pictures;
@@ -261,7 +260,7 @@ impl Job<'_, '_> {
         learned.metrics.append(&Final { result: &summary })?;
         folder.remove_state()?;
         say(console, folder, &summary, &scores, note.as_deref())?;
-        Ok(true)
+        Ok(0)
     }
 }
 

@@ -261,6 +261,24 @@ impl Sampling {
 }
 
 impl Stage {
+    /// So many steps at a resolution, and all else as plain as it can be: samples half a voxel apart (svox2), whole images, the density's rate 1
+    /// and that of colors 0.03 to the end.
+    pub fn new(resolution: usize, steps: u64) -> Self {
+        Stage {
+            resolution,
+            epochs: None,
+            steps: Some(steps),
+            sampling: Sampling::Step { step: 0.5 },
+            image_reduction: 1,
+            density_rate: 1.0,
+            color_rate: 0.03,
+            harmonics_rate: None,
+            density_warm_up: 0,
+            rate_decay: 1.0,
+            color_decay: None,
+        }
+    }
+
     /// The share of their first rates that colors and harmonics end with.
     pub fn color_decay(&self) -> f64 {
         self.color_decay.unwrap_or(self.rate_decay)
@@ -279,20 +297,6 @@ impl Stage {
 /// A recipe for small scenes of about unit size, photographed from all sides over white: what presets and files change.
 impl Default for Config {
     fn default() -> Self {
-        let stage = |resolution, steps, density_rate, rate_decay| Stage {
-            resolution,
-            epochs: None,
-            steps: Some(steps),
-            // svox2: half a voxel.
-            sampling: Sampling::Step { step: 0.5 },
-            image_reduction: 1,
-            density_rate,
-            color_rate: 0.03,
-            harmonics_rate: None,
-            density_warm_up: 0,
-            rate_decay,
-            color_decay: None,
-        };
         Config {
             seed: 42,
             downscale: 1,
@@ -325,7 +329,12 @@ impl Default for Config {
             losses: BTreeMap::from([("mse".to_owned(), Weight::Constant(1.0))]),
             // Ours, a first guess and not tuned: densities move by about one unit a step, so that a voxel is opaque or
             // empty within a few dozen steps, colors by 0.03; the last stage settles.
-            stages: vec![stage(16, 200, 1.0, 1.0), stage(32, 200, 1.0, 1.0), stage(64, 300, 1.5, 1.0), stage(128, 600, 2.0, 0.2)],
+            stages: vec![
+                Stage::new(16, 200),
+                Stage::new(32, 200),
+                Stage { density_rate: 1.5, ..Stage::new(64, 300) },
+                Stage { density_rate: 2.0, rate_decay: 0.2, ..Stage::new(128, 600) },
+            ],
             evaluation: Sampling::Step { step: 0.5 },
             carve: CarveConfig::default(),
         }

@@ -37,8 +37,6 @@ struct State {
     stages: usize,
     /// How many of them are the scout's.
     scouts: usize,
-    /// By how much the images were reduced.
-    reduction: usize,
     /// Of each table how many updates it had, where the optimizer remembers something.
     updates: Vec<Option<u64>>,
     /// Box and cells of `learning`.
@@ -70,14 +68,12 @@ impl<T: Real> Trainer<'_, T> {
             views: fingerprint(self.views),
             stages: self.plan.len(),
             scouts: self.scouts,
-            reduction: self.reduction,
             updates: remembered.iter().map(|memory| Some(memory.as_ref()?.updates)).collect(),
             learning: self.learning.as_ref().map(|o| Cells { min: o.aabb().min, max: o.aabb().max, cells: o.cells() }),
         };
-        let masks = |name: &'static str, masks: &'_ [u64]| {
-            let bytes: Vec<u8> = masks.iter().flat_map(|mask| mask.to_le_bytes()).collect();
-            Entry::new(name, Dtype::U64, vec![masks.len()], move || bytes.clone())
-        };
+        fn masks<'a>(name: &str, masks: &'a [u64]) -> Entry<'a> {
+            Entry::new(name, Dtype::U64, vec![masks.len()], || masks.iter().flat_map(|mask| mask.to_le_bytes()).collect())
+        }
         let mut entries = vec![masks("masks", self.grid.lattice().masks())];
         entries.extend(self.learning.as_ref().map(|learning| masks("learning", learning.masks())));
         for (param, memory) in self.grid.params().zip(&remembered) {
@@ -125,7 +121,7 @@ impl<T: Real> Trainer<'_, T> {
         let current: PlannedStage = *current.ok_or_else(|| damaged("a step that the plan does not have"))?;
         let shape = state.grid.shape();
         let configured = GridShape { half_width: shape.half_width, ..self.config.grid_shape(current.stage.resolution) };
-        if shape != configured || !(shape.half_width > 0.0 && shape.half_width.is_finite()) || state.reduction == 0 {
+        if shape != configured || !(shape.half_width > 0.0 && shape.half_width.is_finite()) {
             return Err(damaged("a grid that is not of its stage"));
         }
 
@@ -161,7 +157,7 @@ impl<T: Real> Trainer<'_, T> {
             }
         }
         if let Some(Cells { min, max, cells }) = state.learning {
-            let masks = match cells.iter().all(|&n| n <= shape.resolution + 1) && (0..3).all(|a| min[a] < max[a]) {
+            let masks = match cells.iter().all(|n| (1..=shape.resolution + 1).contains(n)) && (0..3).all(|a| min[a] < max[a]) {
                 true => self::masks(&mut file, "learning", cells)?,
                 false => None,
             };
@@ -169,7 +165,7 @@ impl<T: Real> Trainer<'_, T> {
             self.learning = Some(Occupancy::from_masks(Aabb { min, max }, cells, masks));
         }
         (self.plan, self.scouts, self.step) = (plan, state.scouts, state.grid.step);
-        self.reduction = state.reduction;
+        self.reduction = current.stage.image_reduction;
         self.rays = self.all_rays();
         let reach = Field::<T>::reach(&self.grid).cloned();
         self.aim(reach.as_ref());

@@ -59,13 +59,13 @@ impl<'a> Pictures<'a> {
         Ok(())
     }
 
-    /// A stage had ended when the run was interrupted: its picture is there, if it was wanted then too.
-    pub fn earlier_stage(&mut self, stage: usize, resolution: usize) -> Result<()> {
-        let path = self.stage_path(stage, resolution);
-        if self.camera.is_some() && path.exists() {
-            self.stages.push(image::composite(&image::read(&path)?, [1.0; 3]));
+    /// A stage had ended when the run was interrupted: its picture is there, if it was wanted then too; one that cannot be read is left out.
+    pub fn earlier_stage(&mut self, stage: usize, resolution: usize) {
+        if self.camera.is_some()
+            && let Ok(picture) = image::read(&self.stage_path(stage, resolution))
+        {
+            self.stages.push(image::composite(&picture, self.config.background));
         }
-        Ok(())
     }
 
     fn stage_path(&self, stage: usize, resolution: usize) -> PathBuf {
