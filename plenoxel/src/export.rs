@@ -8,6 +8,7 @@ pub mod mesh_file;
 mod palette;
 pub mod ply;
 pub mod vox;
+pub mod web;
 
 use crate::camera::Ray;
 use crate::field::voxel_grid::VoxelGrid;

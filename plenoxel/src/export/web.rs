@@ -1,0 +1,326 @@
+//! A grid made small for a page: what a viewer in a browser needs to render it, and what that costs, for it can be turned back.
+//!
+//! Only voxels that a sample with a density above 0 can read are in it. Densities are half floats; the mean color of each channel is one byte
+//! between the lowest and the highest in the grid, and a harmonic of degree 1 and more one byte b for (b − 128) / 127 of the largest there is,
+//! so that 0 stays 0.
+//!
+//! The bytes, a zlib stream, hold first the voxels, then the harmonics if there are any. Each begins with its places, unless harmonics share
+//! those of the voxels: one bit for each brick of 4³, bricks in row-major order and the lowest bit first, then 64 bits for each brick that
+//! has nodes, little-endian ([`Lattice::masks`]). Values follow, of one kind at a time, nodes in the order of their places: low bytes of the
+//! densities, high bytes, red, green, blue; or harmonic 1 of red, green and blue, then harmonic 2, and so on.
+
+use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::{Lattice, Tensor};
+use flate2::Compression;
+use flate2::write::ZlibEncoder;
+use half::f16;
+use serde::Serialize;
+use std::io::{self, Write};
+
+/// A grid in few bytes.
+#[derive(Debug)]
+pub struct WebGrid {
+    shape: GridShape,
+    lattice: Lattice,
+    harmonics_lattice: Option<Lattice>,
+    density: Vec<f16>,
+    means: Vec<Column>,
+    /// In the order of the bytes: red, green and blue of harmonic 1, then of harmonic 2, and so on.
+    harmonics: Vec<Column>,
+}
+
+/// One number of each voxel as a byte: `zero + byte · step`.
+#[derive(Debug)]
+struct Column {
+    bytes: Vec<u8>,
+    zero: f32,
+    step: f32,
+}
+
+/// What the bytes mean.
+#[derive(Debug, Serialize)]
+pub struct WebHeader {
+    resolution: usize,
+    half_width: f64,
+    interpolation: Interpolation,
+    /// Of the harmonics; none for plain colors.
+    degree: Option<usize>,
+    /// Added to the sum of the harmonics; 0 for plain colors.
+    offset: f64,
+    voxels: usize,
+    /// Of the mean colors: value of byte 0, and of one step, for red, green and blue.
+    zeros: Vec<f32>,
+    steps: Vec<f32>,
+    harmonics: Option<WebHarmonics>,
+}
+
+/// What the bytes of the harmonics mean.
+#[derive(Debug, Serialize)]
+struct WebHarmonics {
+    resolution: usize,
+    /// Voxels along each axis that share one; 1 if they have the places of the voxels.
+    reduction: usize,
+    voxels: usize,
+    /// Of one step of a byte, for red, green and blue of harmonic 1, then of harmonic 2, and so on. Byte 128 is 0.
+    steps: Vec<f32>,
+}
+
+impl WebGrid {
+    /// The voxels of a grid that can be seen.
+    pub fn new(grid: &VoxelGrid<f32>) -> Self {
+        let seen = grid.pruned(&grid.occupancy(0.0));
+        let shape = *seen.shape();
+        let (lattice, harmonics_lattice) = (seen.lattice().clone(), seen.harmonics_lattice().cloned());
+        let rows = rows(&lattice);
+        let column = |table: &Tensor<f32>, rows: &[usize], at: usize| -> Vec<f32> {
+            let width = table.shape()[1];
+            rows.iter().map(|row| table.data()[row * width + at]).collect()
+        };
+        let limit = f32::from(f16::MAX);
+        let density = column(seen.density.tensor(), &rows, 0).into_iter().map(|value| f16::from_f32(value.clamp(-limit, limit))).collect();
+        let color = seen.color.tensor();
+        let stride = shape.color_width() / 3;
+        let means = (0..3).map(|channel| Column::between(&column(color, &rows, channel * stride))).collect();
+        let count = shape.color.channels() / 3;
+        let kinds = (1..count).flat_map(|k| (0..3).map(move |channel| (k, channel)));
+        let harmonics = match (&seen.harmonics, &harmonics_lattice) {
+            (Some(table), Some(lattice)) => {
+                let rows = self::rows(lattice);
+                kinds.map(|(k, channel)| Column::around_zero(&column(table.tensor(), &rows, channel * (count - 1) + k - 1))).collect()
+            }
+            _ => kinds.map(|(k, channel)| Column::around_zero(&column(color, &rows, channel * count + k))).collect(),
+        };
+        WebGrid { shape, lattice, harmonics_lattice, density, means, harmonics }
+    }
+
+    /// The same in at most so many bytes: harmonics for fewer voxels, up to every fourth along each axis, and then larger voxels, until it
+    /// fits. Returns the bytes too.
+    ///
+    /// Errors: none in practice; the bytes are written to memory.
+    pub fn within(grid: &VoxelGrid<f32>, most: usize) -> io::Result<(Self, Vec<u8>)> {
+        let mut small = Self::new(grid);
+        let mut bytes = small.bytes()?;
+        let mut coarser: Option<VoxelGrid<f32>> = None;
+        while bytes.len() > most {
+            let grid = coarser.as_ref().unwrap_or(grid);
+            let shape = grid.shape();
+            let next = match () {
+                () if shape.color.channels() > 3 && shape.sh_reduction < 4 => grid.with_reduction(2 * shape.sh_reduction),
+                () if shape.resolution > 1 => grid.resample((shape.resolution * 4 / 5).max(1)),
+                () => break,
+            };
+            (small, coarser) = (Self::new(&next), Some(next));
+            bytes = small.bytes()?;
+        }
+        Ok((small, bytes))
+    }
+
+    /// Shape of the grid that a viewer sees.
+    pub fn shape(&self) -> &GridShape {
+        &self.shape
+    }
+
+    /// What the bytes mean.
+    pub fn header(&self) -> WebHeader {
+        let (degree, offset) = match self.shape.color {
+            Color::Rgb => (None, 0.0),
+            Color::Sh { degree, offset } => (Some(degree), offset),
+        };
+        let harmonics = self.harmonics.first().map(|first| WebHarmonics {
+            resolution: self.shape.harmonics_resolution(),
+            reduction: self.shape.sh_reduction,
+            voxels: first.bytes.len(),
+            steps: self.harmonics.iter().map(|column| column.step).collect(),
+        });
+        WebHeader {
+            resolution: self.shape.resolution,
+            half_width: self.shape.half_width,
+            interpolation: self.shape.interpolation,
+            degree,
+            offset,
+            voxels: self.density.len(),
+            zeros: self.means.iter().map(|column| column.zero).collect(),
+            steps: self.means.iter().map(|column| column.step).collect(),
+            harmonics,
+        }
+    }
+
+    /// The bytes, compressed.
+    ///
+    /// Errors: none in practice; they are written to memory.
+    pub fn bytes(&self) -> io::Result<Vec<u8>> {
+        let mut stream = ZlibEncoder::new(Vec::new(), Compression::default());
+        stream.write_all(&places(&self.lattice))?;
+        for byte in 0..2 {
+            stream.write_all(&self.density.iter().map(|value| value.to_le_bytes()[byte]).collect::<Vec<u8>>())?;
+        }
+        self.means.iter().try_for_each(|column| stream.write_all(&column.bytes))?;
+        if let Some(lattice) = &self.harmonics_lattice {
+            stream.write_all(&places(lattice))?;
+        }
+        self.harmonics.iter().try_for_each(|column| stream.write_all(&column.bytes))?;
+        stream.finish()
+    }
+
+    /// The grid that a viewer sees.
+    pub fn to_grid(&self) -> VoxelGrid<f32> {
+        let density: Vec<f32> = self.density.iter().map(|value| value.to_f32()).collect();
+        let [means, harmonics] = [&self.means, &self.harmonics].map(|columns| columns.iter().map(Column::values).collect::<Vec<_>>());
+        // Tables have all numbers of red first, then those of green, then those of blue.
+        let of_channel = |channel: usize| harmonics.iter().skip(channel).step_by(3);
+        let mut tables = vec![table(&self.lattice, &[&density])];
+        match &self.harmonics_lattice {
+            Some(lattice) => {
+                tables.push(table(&self.lattice, &means.iter().collect::<Vec<_>>()));
+                tables.push(table(lattice, &(0..3).flat_map(of_channel).collect::<Vec<_>>()));
+            }
+            None => {
+                let columns = means.iter().enumerate().flat_map(|(channel, mean)| [mean].into_iter().chain(of_channel(channel)));
+                tables.push(table(&self.lattice, &columns.collect::<Vec<_>>()));
+            }
+        }
+        VoxelGrid::with_tables(self.shape, self.lattice.clone(), tables)
+    }
+}
+
+impl Column {
+    /// Bytes between the lowest and the highest value.
+    fn between(values: &[f32]) -> Self {
+        let low = values.iter().copied().fold(f32::INFINITY, f32::min);
+        let high = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        // Where all are the same, and where there are none, any step will do.
+        let (zero, step) = if high > low { (low, (high - low) / 255.0) } else { (if values.is_empty() { 0.0 } else { low }, 1.0) };
+        Self::with(values, zero, step)
+    }
+
+    /// Bytes that have 0 in their middle.
+    fn around_zero(values: &[f32]) -> Self {
+        let largest = values.iter().fold(0.0, |largest: f32, value| largest.max(value.abs()));
+        let step = if largest > 0.0 { largest / 127.0 } else { 1.0 };
+        Self::with(values, -128.0 * step, step)
+    }
+
+    fn with(values: &[f32], zero: f32, step: f32) -> Self {
+        Column { bytes: values.iter().map(|value| ((value - zero) / step).round() as u8).collect(), zero, step }
+    }
+
+    fn values(&self) -> Vec<f32> {
+        self.bytes.iter().map(|byte| self.zero + f32::from(*byte) * self.step).collect()
+    }
+}
+
+/// The bricks of a lattice in row-major order: number and mask of those that have nodes.
+fn bricks(lattice: &Lattice) -> impl Iterator<Item = Option<(usize, u64)>> {
+    let [nx, ny, nz] = lattice.nodes().map(|n| n.div_ceil(BRICK));
+    (0..nx * ny * nz).map(move |b| lattice.brick([b / (ny * nz), b / nz % ny, b % nz]))
+}
+
+/// The rows of all nodes that are present, in the order of their places.
+fn rows(lattice: &Lattice) -> Vec<usize> {
+    let bits =
+        |(brick, mask): (usize, u64)| (0..BRICK_ROWS).filter(move |bit| mask >> bit & 1 == 1).map(move |bit| brick * BRICK_ROWS + bit);
+    bricks(lattice).flatten().flat_map(bits).collect()
+}
+
+/// A table from its columns, which have a value for each node that is present.
+fn table(lattice: &Lattice, columns: &[&Vec<f32>]) -> Tensor<f32> {
+    let width = columns.len();
+    let mut values = vec![0.0; lattice.rows() * width];
+    for (place, row) in rows(lattice).into_iter().enumerate() {
+        for (value, column) in values[row * width..][..width].iter_mut().zip(columns) {
+            *value = column[place];
+        }
+    }
+    Tensor::from_vec(values, &[lattice.rows(), width])
+}
+
+/// Which nodes there are: a bit for each brick, then the masks of those that have some.
+fn places(lattice: &Lattice) -> Vec<u8> {
+    let bricks: Vec<Option<(usize, u64)>> = bricks(lattice).collect();
+    let byte =
+        |bricks: &[Option<(usize, u64)>]| bricks.iter().enumerate().fold(0, |byte, (bit, brick)| byte | u8::from(brick.is_some()) << bit);
+    let masks = bricks.iter().flatten().flat_map(|(_, mask)| mask.to_le_bytes());
+    bricks.chunks(8).map(byte).chain(masks).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use flate2::read::ZlibDecoder;
+    use std::io::Read;
+
+    /// A ball of random colors in an empty box.
+    fn ball(color: Color, sh_reduction: usize) -> VoxelGrid<f32> {
+        let shape = GridShape { resolution: 18, half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction };
+        let grid = VoxelGrid::random(shape, 1.0, 1.0, 7);
+        let density = (0..grid.lattice().rows()).map(|row| {
+            let far = grid.lattice().node(row as u32).map_or(9.0, |node| node.map(|k| (k as f32 - 8.5).powi(2)).iter().sum::<f32>().sqrt());
+            100.0 * (6.0 - far)
+        });
+        let density = Tensor::from_vec(density.collect(), &[grid.lattice().rows(), 1]);
+        grid.with_density(density)
+    }
+
+    #[test]
+    fn what_can_be_seen_comes_back_with_the_precision_of_its_bytes() {
+        for (color, reduction) in [(Color::Rgb, 1), (Color::Sh { degree: 2, offset: 0.5 }, 1), (Color::Sh { degree: 1, offset: 0.5 }, 3)] {
+            let grid = ball(color, reduction);
+            let small = WebGrid::new(&grid);
+            let back = small.to_grid();
+            assert!(small.density.len() < 18 * 18 * 18 / 3 && back.lattice().present() == small.density.len());
+            for (table, tolerance) in [(0, 0.5), (1, 0.6 / 255.0), (2, 0.6 / 127.0)] {
+                let (Some(old), Some(new)) = (grid.params().nth(table), back.params().nth(table)) else { continue };
+                let (from, to) = match table {
+                    2 => (grid.harmonics_lattice(), back.harmonics_lattice()),
+                    _ => (Some(grid.lattice()), Some(back.lattice())),
+                };
+                // Harmonics lie next to the means in one table: one byte tells them less precisely.
+                let tolerance = if table == 1 && reduction == 1 { 0.6 / 127.0 } else { tolerance };
+                let width = old.tensor().shape()[1];
+                let mut compared = 0;
+                for row in 0..to.unwrap().rows() {
+                    let Some(node) = to.unwrap().node(row as u32) else { continue };
+                    let before = from.unwrap().row(node).unwrap() as usize;
+                    for at in 0..width {
+                        let (old, new) = (old.tensor().data()[before * width + at], new.tensor().data()[row * width + at]);
+                        assert!((old - new).abs() <= tolerance, "table {table}, {node:?}: {old} became {new}");
+                        compared += 1;
+                    }
+                }
+                assert!(compared > 100);
+            }
+        }
+    }
+
+    #[test]
+    fn the_bytes_are_as_many_as_the_header_says() {
+        for (color, reduction) in [(Color::Rgb, 1), (Color::Sh { degree: 2, offset: 0.5 }, 1), (Color::Sh { degree: 2, offset: 0.5 }, 4)] {
+            let small = WebGrid::new(&ball(color, reduction));
+            let mut bytes = Vec::new();
+            ZlibDecoder::new(small.bytes().unwrap().as_slice()).read_to_end(&mut bytes).unwrap();
+            let places = |lattice: &Lattice| {
+                let all = lattice.nodes()[0].div_ceil(BRICK).pow(3);
+                all.div_ceil(8) + 8 * lattice.rows() / BRICK_ROWS
+            };
+            let header = serde_json::to_value(small.header()).unwrap();
+            let voxels = header["voxels"].as_u64().unwrap() as usize;
+            let harmonics = &header["harmonics"];
+            let harmonics = harmonics["voxels"].as_u64().unwrap_or(0) as usize * harmonics["steps"].as_array().map_or(0, Vec::len);
+            let shared = small.harmonics_lattice.as_ref().map_or(0, places);
+            assert_eq!(bytes.len(), places(&small.lattice) + 5 * voxels + shared + harmonics);
+        }
+    }
+
+    #[test]
+    fn a_grid_becomes_coarser_until_it_fits() {
+        let grid = ball(Color::Sh { degree: 2, offset: 0.5 }, 1);
+        let whole = WebGrid::new(&grid).bytes().unwrap().len();
+        let (_, same) = WebGrid::within(&grid, whole).unwrap();
+        assert_eq!(same.len(), whole);
+        let (reduced, bytes) = WebGrid::within(&grid, whole / 2).unwrap();
+        assert!(bytes.len() <= whole / 2 && reduced.shape().resolution == 18 && reduced.shape().sh_reduction > 1);
+        let (coarse, bytes) = WebGrid::within(&grid, whole / 50).unwrap();
+        assert!(bytes.len() <= whole / 50 && coarse.shape().resolution < 18);
+    }
+}
