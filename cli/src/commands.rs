@@ -8,6 +8,7 @@ pub mod filter;
 pub mod info;
 mod new_run;
 pub mod render;
+pub mod report;
 pub mod scene;
 pub mod train;
 mod trained_run;

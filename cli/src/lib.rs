@@ -5,16 +5,19 @@
 //! 130 training that was interrupted, and saved.
 #![forbid(unsafe_code)]
 
+mod chart;
 mod commands;
 mod config;
 mod curves;
 mod data;
 mod evaluation;
+mod html;
 mod images;
 mod machine;
 mod memory;
 mod metrics_file;
 mod progress;
+mod report;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
@@ -34,6 +37,7 @@ Examples:
   plenoxel carve data/lego                   an opaque colored grid from silhouettes
   plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
   plenoxel render runs/lego-1 --view 0       a picture of it
+  plenoxel report runs/lego-1                its page again, to look around in
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           its surface, for other programs
 
@@ -55,6 +59,7 @@ enum Command {
     Train(Box<train::TrainArgs>),
     Carve(Box<carve::CarveArgs>),
     Render(render::RenderArgs),
+    Report(commands::report::ReportArgs),
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
     Filter(filter::FilterArgs),
@@ -100,6 +105,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Train(args) => return train::run(args, &console),
             Command::Carve(args) => carve::run(args, &console),
             Command::Render(args) => render::run(args, &console),
+            Command::Report(args) => commands::report::run(args, &console),
             Command::Evaluate(args) => evaluate::run(args, &console),
             Command::Export(args) => export::run(args, &console),
             Command::Filter(args) => filter::run(args, &console),

@@ -34,26 +34,26 @@ pub struct Past {
     pub seconds: f64,
 }
 
-/// A line: means of the losses and the PSNR since the line before, everything else as it is now.
+/// A line about training: means of the losses and the PSNR since the line before, everything else as it is now.
 #[derive(Serialize, Deserialize)]
-struct Line<'a> {
-    step: u64,
-    stage: usize,
-    resolution: usize,
-    ends_stage: bool,
-    loss: f64,
+pub struct Line<'a> {
+    pub step: u64,
+    pub stage: usize,
+    pub resolution: usize,
+    pub ends_stage: bool,
+    pub loss: f64,
     #[serde(borrow)]
-    losses: BTreeMap<Cow<'a, str>, f64>,
-    psnr: f64,
-    rays: u64,
-    samples: u64,
-    density_rate: f64,
-    color_rate: f64,
+    pub losses: BTreeMap<Cow<'a, str>, f64>,
+    pub psnr: f64,
+    pub rays: u64,
+    pub samples: u64,
+    pub density_rate: f64,
+    pub color_rate: f64,
     #[serde(default)]
-    voxels: usize,
+    pub voxels: usize,
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    validation_psnr: Option<f64>,
-    seconds: f64,
+    pub validation_psnr: Option<f64>,
+    pub seconds: f64,
 }
 
 /// What is known of a step besides what the trainer reports.
@@ -76,6 +76,19 @@ struct Sums {
     losses: Vec<(String, f64)>,
 }
 
+/// The text of a file, empty if there is none.
+pub fn read(path: &Path) -> Result<String> {
+    match std::fs::read(path) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path, e, "reading the metrics")),
+        bytes => Ok(String::from_utf8_lossy(&bytes.unwrap_or_default()).into_owned()),
+    }
+}
+
+/// The lines about training, as they are written and as they are meant. One that was cut short, and what is no line of a step, say nothing.
+pub fn lines(text: &str) -> impl Iterator<Item = (&str, Line<'_>)> {
+    text.lines().filter_map(|text| Some((text, serde_json::from_str(text).ok()?)))
+}
+
 impl MetricsFile {
     /// A new file for a run of so many steps.
     pub fn create(path: &Path, total_steps: u64) -> Result<Self> {
@@ -92,15 +105,9 @@ impl MetricsFile {
 
     /// The file of a run that goes on after so many steps: lines about later ones go.
     pub fn resume(path: &Path, total_steps: u64, taken: u64) -> Result<(Self, Past)> {
-        let bytes = match std::fs::read(path) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(Error::io(path, e, "reading the metrics")),
-            bytes => bytes.unwrap_or_default(),
-        };
-        let text = String::from_utf8_lossy(&bytes);
+        let all = read(path)?;
         let (mut kept, mut past, mut counts) = (String::new(), Past::default(), (0, 0));
-        for text in text.lines() {
-            // A line that was cut short, and what is no line of a step, say nothing.
-            let Some(line) = serde_json::from_str::<Line<'_>>(text).ok().filter(|line| line.step < taken) else { continue };
+        for (text, line) in lines(&all).filter(|(_, line)| line.step < taken) {
             kept += text;
             kept += "\n";
             past.losses.resize(line.step as usize + 1, line.loss);

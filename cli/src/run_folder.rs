@@ -43,6 +43,7 @@ const STATE: &str = "training.safetensors";
 const LOSS: &str = "loss.svg";
 const RESULT: &str = "result.json";
 const README: &str = "README.md";
+const REPORT: &str = "report.html";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
@@ -76,7 +77,7 @@ impl RunFolder {
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
         self.remove_fragments()?;
-        for name in [CHECKPOINT, STATE, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
+        for name in [CHECKPOINT, STATE, RESULT, METRICS, LOSS, REPORT, CONFIG, RECORD, README] {
             let path = self.path.join(name);
             if path.exists() {
                 std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
@@ -206,6 +207,22 @@ impl RunFolder {
         files::write_atomically(&self.path.join(LOSS), svg.as_bytes())
     }
 
+    /// Writes the report.
+    pub fn write_report(&self, page: &str) -> Result<()> {
+        files::write_atomically(&self.report(), page.as_bytes())
+    }
+
+    /// Reads the settings as they are written down.
+    pub fn settings(&self) -> Result<String> {
+        let path = self.path.join(CONFIG);
+        std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e, "reading the settings"))
+    }
+
+    /// The report.
+    pub fn report(&self) -> PathBuf {
+        self.path.join(REPORT)
+    }
+
     /// The folder itself.
     pub fn path(&self) -> &Path {
         &self.path
@@ -234,6 +251,11 @@ impl RunFolder {
     /// A picture made later.
     pub fn render(&self, name: &str) -> PathBuf {
         self.path.join(RENDERS).join(name)
+    }
+
+    /// Name of the picture of a test view.
+    pub fn panel_name(number: usize, view: &str) -> String {
+        format!("test_{number:03}_{view}.png")
     }
 
     /// Makes the folder for the pictures of the run.
@@ -274,6 +296,7 @@ Of these files, those that apply: a carved run has no training to tell of.
 - `metrics.jsonl`: one line every few steps and at every stage end and whenever it is saved, then one with the final figures. `loss`, `losses` and `psnr` are of
   training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training; `validation_psnr` is on
   lines of steps after which validation views were looked at.
+- `report.html`: all of this on one page, with a viewer of the grid; any browser opens it, without a network.
 - `loss.svg`: the loss over the steps.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
 - `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.

@@ -8,6 +8,7 @@ use crate::evaluation::Viewer;
 use crate::images;
 use crate::memory::{self, Estimate};
 use crate::progress::Console;
+use crate::report::Report;
 use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::carve::photo_hull::PhotoConfig;
@@ -50,6 +51,10 @@ pub struct CarveArgs {
     /// Write no pictures
     #[arg(long, help_heading = "Output")]
     no_images: bool,
+
+    /// Write no report.html
+    #[arg(long, help_heading = "Output")]
+    no_report: bool,
 
     /// TOML file of settings; a complete one, such as the config.toml of a run, replaces all others
     #[arg(long, value_name = "FILE", help_heading = "Settings", value_hint = ValueHint::FilePath)]
@@ -165,7 +170,8 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
 
     // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
     folder.prepare()?;
-    folder.describe(&config, &record(&dataset, preset, &source))?;
+    let record = record(&dataset, preset, &source);
+    folder.describe(&config, &record)?;
     console.note(&format!("run: {}", folder.path().display()));
     let mut color_clock = Stopwatch::default();
     let passes = match config.carve.fit {
@@ -209,7 +215,12 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
         "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; `plenoxel evaluate` compares it with test views"
     ))?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
-    console.result(&crate::json_line(&summary)?)
+    console.result(&crate::json_line(&summary)?)?;
+    if !args.no_report {
+        let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, grid: &colored.grid };
+        console.note(&report.write()?);
+    }
+    Ok(())
 }
 
 /// Writes what some cameras see of the grid, side by side, and says how many.

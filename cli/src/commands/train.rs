@@ -14,6 +14,7 @@ use crate::machine;
 use crate::memory::{self, Estimate};
 use crate::metrics_file::{MetricsFile, Past, Seen};
 use crate::progress::{Console, clock};
+use crate::report::Report;
 use crate::run_folder::RunFolder;
 pub use flags::{TrainArgs, size};
 use pictures::Pictures;
@@ -264,6 +265,11 @@ impl Job<'_, '_> {
         learned.metrics.append(&Final { result: &summary })?;
         folder.remove_state()?;
         say(console, folder, &summary, &scores, note.as_deref())?;
+        if !self.args.no_report {
+            let (_, _, record) = RunFolder::open(folder.path())?;
+            let report = Report { folder, config, record: &record, dataset, grid: &learned.grid };
+            console.note(&report.write()?);
+        }
         Ok(0)
     }
 }

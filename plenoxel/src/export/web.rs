@@ -48,7 +48,8 @@ pub struct WebHeader {
     degree: Option<usize>,
     /// Added to the sum of the harmonics; 0 for plain colors.
     offset: f64,
-    voxels: usize,
+    /// In the page.
+    pub voxels: usize,
     /// Of the mean colors: value of byte 0, and of one step, for red, green and blue.
     zeros: Vec<f32>,
     steps: Vec<f32>,

@@ -76,6 +76,10 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     pub no_images: bool,
 
+    /// Write no report.html
+    #[arg(long, help_heading = "Output")]
+    pub no_report: bool,
+
     /// Compute the test PSNR of each earlier stage too, which doubles the evaluation [default: for the built-in scene]
     #[arg(long, help_heading = "Output")]
     stage_psnr: bool,

@@ -78,8 +78,7 @@ impl<'a> Pictures<'a> {
             return Ok(());
         }
         let range = DepthRange::of(&view.camera, half_width);
-        let name = format!("test_{number:03}_{}.png", view.name);
-        images::write(&self.folder.image(&name), &images::panel(target, picture, range))
+        images::write(&self.folder.image(&RunFolder::panel_name(number, &view.name)), &images::panel(target, picture, range))
     }
 
     /// The stages side by side, and the photograph they are to become.

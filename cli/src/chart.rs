@@ -1,0 +1,204 @@
+//! A picture of curves as an SVG: values over steps or seconds, stages side by side, on a logarithmic scale where the values are positive and
+//! far apart.
+
+use crate::html::escaped;
+use std::fmt::Write;
+
+const WIDTH: f64 = 900.0;
+const HEIGHT: f64 = 480.0;
+const LEFT: f64 = 80.0;
+const RIGHT: f64 = 20.0;
+const TOP: f64 = 64.0;
+const BOTTOM: f64 = 56.0;
+
+const INK: &str = "#222";
+const FAINT: &str = "#e4e4e4";
+const MARK: &str = "#888";
+/// Colors of curves, in their order.
+const CURVES: [&str; 6] = ["#1f5fa8", "#c8501e", "#3a8a3a", "#7a4fa0", "#a07a20", "#3a8f8f"];
+
+/// What is to be drawn.
+#[derive(Debug, Default)]
+pub struct Chart {
+    /// Above it.
+    pub title: String,
+    /// What the horizontal axis counts, and how far it goes from 0 on.
+    pub across: (String, f64),
+    /// What the vertical axis measures.
+    pub up: String,
+    /// Parts of the horizontal axis: beginning and name.
+    pub parts: Vec<(f64, String)>,
+    /// The curves. Names are told where there are several.
+    pub curves: Vec<Curve>,
+}
+
+/// A curve, and a pale band around it.
+#[derive(Debug, Default)]
+pub struct Curve {
+    /// What it shows.
+    pub name: String,
+    /// Its points; a line goes from one to the next of a list.
+    pub lines: Vec<Vec<(f64, f64)>>,
+    /// Points with the lowest and the highest value there.
+    pub band: Vec<(f64, f64, f64)>,
+}
+
+impl Chart {
+    /// The picture.
+    pub fn svg(&self) -> String {
+        let (across, end) = (&self.across.0, self.across.1.max(f64::MIN_POSITIVE));
+        let x = |place: f64| LEFT + place / end * (WIDTH - LEFT - RIGHT);
+        let on_lines = self.curves.iter().flat_map(|curve| curve.lines.iter().flatten().map(|point| point.1));
+        let in_bands = self.curves.iter().flat_map(|curve| curve.band.iter().flat_map(|(_, low, high)| [*low, *high]));
+        let scale = Scale::of(on_lines.chain(in_bands));
+        let mut svg = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" font-family=\"Helvetica, Arial, sans-serif\" \
+             font-size=\"13\" fill=\"{INK}\">\n<title>{0}</title>\n<rect width=\"{WIDTH}\" height=\"{HEIGHT}\" fill=\"#fff\"/>\n\
+             <text x=\"{LEFT}\" y=\"24\" font-size=\"16\">{0}</text>\n",
+            escaped(&self.title),
+        );
+        let (bottom, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);
+        for (value, label) in scale.ticks() {
+            let y = scale.y(value);
+            line(&mut svg, [LEFT, y, right, y], FAINT, "");
+            text(&mut svg, LEFT - 8.0, y + 4.5, "end", &label);
+        }
+        for tick in linear_ticks(0.0, end, 8) {
+            line(&mut svg, [x(tick), bottom, x(tick), bottom + 5.0], INK, "");
+            text(&mut svg, x(tick), bottom + 20.0, "middle", &format!("{tick}"));
+        }
+        for (i, (from, name)) in self.parts.iter().enumerate() {
+            if *from > 0.0 {
+                line(&mut svg, [x(*from), TOP, x(*from), bottom], MARK, " stroke-dasharray=\"4 3\"");
+            }
+            let to = self.parts.get(i + 1).map_or(end, |next| next.0);
+            text(&mut svg, x(0.5 * (from + to)), TOP - 10.0, "middle", name);
+        }
+        for (i, curve) in self.curves.iter().enumerate() {
+            let color = CURVES[i % CURVES.len()];
+            let place = |at: f64, value: f64| format!("{:.1},{:.1} ", x(at), scale.y(value));
+            if !curve.band.is_empty() {
+                let above = curve.band.iter().map(|(at, _, high)| place(*at, *high));
+                let below = curve.band.iter().rev().map(|(at, low, _)| place(*at, *low));
+                let band: String = above.chain(below).collect();
+                let _ = writeln!(svg, "<polygon points=\"{band}\" fill=\"{color}\" fill-opacity=\"0.22\"/>");
+            }
+            for points in curve.lines.iter().filter(|points| !points.is_empty()) {
+                let points: String = points.iter().map(|(at, value)| place(*at, *value)).collect();
+                let style = "stroke-width=\"1.8\" stroke-linejoin=\"round\"";
+                let _ = writeln!(svg, "<polyline points=\"{points}\" fill=\"none\" stroke=\"{color}\" {style}/>");
+            }
+            if self.curves.len() > 1 {
+                let from = right - 125.0 * (self.curves.len() - i) as f64;
+                line(&mut svg, [from, 20.0, from + 22.0, 20.0], color, " stroke-width=\"3\"");
+                text(&mut svg, from + 28.0, 24.0, "start", &curve.name);
+            }
+        }
+        line(&mut svg, [LEFT, bottom, right, bottom], INK, "");
+        line(&mut svg, [LEFT, TOP, LEFT, bottom], INK, "");
+        text(&mut svg, 0.5 * (LEFT + right), HEIGHT - 12.0, "middle", across);
+        let y = 0.5 * (TOP + bottom);
+        let up = escaped(&self.up) + if scale.logarithmic { " (log scale)" } else { "" };
+        let _ = writeln!(svg, "<text transform=\"translate(20 {y}) rotate(-90)\" text-anchor=\"middle\">{up}</text>\n</svg>");
+        svg
+    }
+}
+
+/// From values to heights: logarithmic where all of them are positive and they differ by more than a factor of five.
+struct Scale {
+    logarithmic: bool,
+    low: f64,
+    high: f64,
+}
+
+impl Scale {
+    fn of(values: impl Iterator<Item = f64> + Clone) -> Self {
+        let finite = || values.clone().filter(|value| value.is_finite());
+        let low = finite().fold(f64::INFINITY, f64::min);
+        let high = finite().fold(f64::NEG_INFINITY, f64::max);
+        if low > high {
+            return Scale { logarithmic: false, low: 0.0, high: 1.0 };
+        }
+        // What touches 0, or is negative, has no logarithm; decibels are one already.
+        if low > 0.0 && high > 5.0 * low {
+            let (low, high) = (low / 1.15, high * 1.15);
+            return Scale { logarithmic: true, low, high };
+        }
+        let margin = 0.05 * (high - low).max(1e-12);
+        Scale { logarithmic: false, low: low - margin, high: high + margin }
+    }
+
+    fn y(&self, value: f64) -> f64 {
+        let place = match self.logarithmic {
+            true => (value / self.low).ln() / (self.high / self.low).ln(),
+            false => (value - self.low) / (self.high - self.low),
+        };
+        let bottom = HEIGHT - BOTTOM;
+        bottom - place.clamp(0.0, 1.0) * (bottom - TOP)
+    }
+
+    /// Values worth a line, with their labels: 1, 2, 5 in every decade, powers of ten alone where there are many.
+    fn ticks(&self) -> Vec<(f64, String)> {
+        if !self.logarithmic {
+            let ticks = linear_ticks(self.low, self.high, 6).into_iter();
+            return ticks.map(|v| (v, label(v))).collect();
+        }
+        let decades = (self.high / self.low).log10();
+        let steps: &[f64] = if decades > 3.0 { &[1.0] } else { &[1.0, 2.0, 5.0] };
+        let powers = self.low.log10().floor() as i32..=self.high.log10().ceil() as i32;
+        powers
+            .flat_map(|power| steps.iter().map(move |step| step * 10f64.powi(power)))
+            .filter(|v| (self.low..=self.high).contains(v))
+            .map(|v| (v, label(v)))
+            .collect()
+    }
+}
+
+fn label(value: f64) -> String {
+    // Rounded to two digits, so that 5 · 10⁻³ is not 0.0050000000000000001.
+    match value.abs() {
+        0.0 => "0".to_owned(),
+        v if !(1e-4..1e5).contains(&v) => format!("{value:.0e}"),
+        v => {
+            let digits = (1.0 - v.log10().floor()).max(0.0) as usize;
+            let text = format!("{value:.digits$}");
+            match text.contains('.') {
+                true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
+                false => text,
+            }
+        }
+    }
+}
+
+/// At most `most` + 1 round numbers between two bounds.
+fn linear_ticks(low: f64, high: f64, most: usize) -> Vec<f64> {
+    let rough = (high - low) / most as f64;
+    let power = 10f64.powf(rough.log10().floor());
+    let step = [1.0, 2.0, 5.0, 10.0].map(|k| k * power);
+    let step = step.into_iter().find(|s| *s >= rough).unwrap_or(10.0 * power);
+    let first = (low / step).ceil() as i64;
+    let last = (high / step).floor() as i64;
+    (first..=last).map(|k| k as f64 * step).collect()
+}
+
+fn line(svg: &mut String, [x1, y1, x2, y2]: [f64; 4], color: &str, more: &str) {
+    let _ = writeln!(svg, "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" stroke=\"{color}\"{more}/>");
+}
+
+fn text(svg: &mut String, x: f64, y: f64, anchor: &str, text: &str) {
+    let _ = writeln!(svg, "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{}</text>", escaped(text));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_round_numbers_with_short_labels() {
+        let scale = Scale::of([0.004, 0.11].into_iter());
+        let labels: Vec<String> = scale.ticks().into_iter().map(|(_, label)| label).collect();
+        assert_eq!(labels, ["0.005", "0.01", "0.02", "0.05", "0.1"]);
+        assert_eq!(linear_ticks(0.0, 4400.0, 8), [0.0, 1000.0, 2000.0, 3000.0, 4000.0]);
+        assert_eq!([label(0.0), label(2.5), label(1e-7), label(100.0)], ["0", "2.5", "1e-7", "100"]);
+    }
+}

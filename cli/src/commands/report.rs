@@ -1,0 +1,45 @@
+//! `plenoxel report`: the page about a run, made again.
+
+use crate::data::DataSource;
+use crate::memory::Estimate;
+use crate::progress::Console;
+use crate::report::Report;
+use crate::run_folder::RunFolder;
+use clap::{Args, ValueHint};
+use plenoxel::error::Result;
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel report runs/lego                        writes runs/lego/report.html
+  plenoxel report runs/lego --data elsewhere/lego
+
+`train` and `carve` write it too. It needs no other file and no network: settings, curves, pictures, figures, and the grid itself to look
+around in, with colors and densities of 8 and 16 bits; from 30 MB on it is made coarser, and the page says what that costs.";
+
+/// Write the page about a run again, with pictures, curves and an interactive view
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct ReportArgs {
+    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
+    #[arg(value_hint = ValueHint::DirPath)]
+    run: PathBuf,
+
+    /// Where the dataset is now [default: where it was when training]
+    #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
+    data: Option<PathBuf>,
+}
+
+/// Writes the page.
+pub fn run(args: &ReportArgs, console: &Console<'_>) -> Result<()> {
+    let (folder, config, record) = RunFolder::open(&args.run)?;
+    let source = args.data.as_deref().map_or(record.data.clone(), DataSource::folder);
+    let dataset = source.reopen(&config)?;
+    let (header, voxels) = folder.header()?;
+    let estimate = Estimate::of_evaluation(&config, config.evaluation, &header.shape(), voxels, &dataset, None);
+    console.note(&estimate.describe());
+    estimate.check()?;
+    let (grid, _) = folder.load()?;
+    let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, grid: &grid };
+    console.result(&report.write()?)
+}

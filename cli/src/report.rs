@@ -1,0 +1,160 @@
+//! `report.html`: what came of a run, on one page that needs no other file, no server and no network.
+//!
+//! It is made from what is in the run folder, and from the grid; so it can be made again later.
+
+mod curves;
+mod pictures;
+mod scene;
+
+use crate::html::escaped;
+use crate::metrics_file;
+use crate::progress::{bytes, clock};
+use crate::run_folder::{RunFolder, RunRecord};
+use plenoxel::dataset::Dataset;
+use plenoxel::error::Result;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::train::config::Config;
+use serde_json::Value;
+use std::fmt::Write;
+
+/// What a report is about.
+pub struct Report<'a> {
+    pub folder: &'a RunFolder,
+    pub config: &'a Config,
+    pub record: &'a RunRecord,
+    pub dataset: &'a Dataset,
+    pub grid: &'a VoxelGrid<f32>,
+}
+
+impl Report<'_> {
+    /// Writes the page. Returns what is to be said about it.
+    pub fn write(&self) -> Result<String> {
+        let result = self.folder.result().unwrap_or(Value::Null);
+        let metrics = metrics_file::read(&self.folder.metrics())?;
+        let lines: Vec<_> = metrics_file::lines(&metrics).map(|(_, line)| line).collect();
+        let scene = scene::Scene::new(self)?;
+        let title = format!("{} – {}", self.folder.path().file_name().unwrap_or_default().to_string_lossy(), self.record.scene);
+        let parts = [
+            facts(self, &result),
+            scene.figure(),
+            curves::section(&lines, &self.config.stages),
+            pictures::stages(self.folder)?,
+            stages(&result),
+            pictures::panels(self.folder, &result)?,
+            costs(self, &result),
+            self.settings()?,
+        ];
+        let page = format!(
+            "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{}</title>\n<style>\n{}</style>\n</head>\n\
+             <body>\n<h1>{}</h1>\n{}\n<script>\n{}</script>\n{}</body>\n</html>\n",
+            escaped(&title),
+            include_str!("report/style.css"),
+            escaped(&title),
+            parts.join("\n"),
+            include_str!("report/page.js"),
+            scene.scripts(),
+        );
+        self.folder.write_report(&page)?;
+        Ok(format!("report: {} ({}); {}", self.folder.report().display(), bytes(page.len() as u64), scene.note()))
+    }
+
+    /// Every setting, as the run folder has them.
+    fn settings(&self) -> Result<String> {
+        let text = self.folder.settings()?;
+        let again = if self.config.stages.is_empty() { "carve" } else { "train" };
+        Ok(format!(
+            "<section><h2>Settings</h2>\n<p>They repeat the run: <code>plenoxel {again} DATA --config config.toml</code></p>\n\
+             <details><summary>config.toml</summary><pre>{}</pre></details></section>",
+            escaped(&text)
+        ))
+    }
+}
+
+/// The figures that people look for first.
+fn facts(report: &Report<'_>, result: &Value) -> String {
+    let number = |key: &str, digits: usize, unit: &str| result[key].as_f64().map(|x| format!("{x:.digits$}{unit}"));
+    let views = result["views"].as_u64().unwrap_or(0);
+    let shape = report.grid.shape();
+    let facts = [
+        ("PSNR", number("psnr", 2, " dB")),
+        ("SSIM", number("ssim", 4, "")),
+        (if report.config.stages.is_empty() { "carving" } else { "training" }, result["seconds"].as_f64().map(clock)),
+        ("grid", Some(format!("{}³", shape.resolution))),
+        ("voxels", Some(thousands(report.grid.lattice().present() as u64))),
+        ("background alone", number("baseline_background_psnr", 2, " dB")),
+        ("mean training image", number("baseline_mean_image_psnr", 2, " dB")),
+    ];
+    let facts = facts.into_iter().filter_map(|(name, value)| Some(format!("<div><b>{}</b><span>{name}</span></div>", value?)));
+    let what = match (views, result["width"].as_u64(), result["height"].as_u64()) {
+        (1.., Some(width), Some(height)) => format!(
+            "PSNR and SSIM are means over {views} test views of {width} x {height} on a background of {:?}, predictions clamped to [0, 1].",
+            report.config.background
+        ),
+        _ => "It was not compared with test views.".to_owned(),
+    };
+    format!(
+        "<div class=\"facts\">{}</div>\n<p>{}, {}. {what}</p>",
+        facts.collect::<String>(),
+        escaped(&report.record.scene),
+        escaped(&report.record.format)
+    )
+}
+
+/// What each stage came to.
+fn stages(result: &Value) -> String {
+    let Some(stages) = result["stages"].as_array().filter(|stages| !stages.is_empty()) else { return String::new() };
+    let mut rows = String::new();
+    for stage in stages {
+        let psnr = stage["psnr"].as_f64().map_or("–".to_owned(), |psnr| format!("{psnr:.2} dB"));
+        let seconds = stage["seconds"].as_f64().map_or_else(String::new, clock);
+        let _ = write!(rows, "<tr><td>{}³</td><td>{}</td><td>{seconds}</td><td>{psnr}</td></tr>", stage["resolution"], stage["steps"]);
+    }
+    format!(
+        "<section><table><thead><tr><th>stage</th><th>steps</th><th>ended after</th><th>test PSNR</th></tr></thead>\
+         <tbody>{rows}</tbody></table></section>"
+    )
+}
+
+/// Time, memory and machine.
+fn costs(report: &Report<'_>, result: &Value) -> String {
+    let time = |key: &str| result[key].as_f64().map(clock);
+    let count = |key: &str| result[key].as_u64().map(thousands);
+    let per_ray = result["samples"].as_f64().zip(result["rays"].as_f64()).map(|(samples, rays)| format!("{:.1}", samples / rays.max(1.0)));
+    let rows = [
+        ("reading images", time("seconds_load")),
+        ("training", time("seconds").filter(|_| !report.config.stages.is_empty())),
+        ("carving the hull", time("seconds_hull")),
+        ("coloring it", time("seconds_color")),
+        ("rendering and comparing test views", time("seconds_evaluate")),
+        ("largest memory of the process", result["peak_memory_bytes"].as_u64().map(bytes)),
+        ("steps", count("steps")),
+        ("rays", count("rays")),
+        ("samples a ray", per_ray),
+        ("threads", Some(report.record.threads.to_string())),
+        ("vector instructions", Some(report.record.instruction_set.clone())),
+        ("program", Some(report.record.program.clone())),
+        ("preset", report.record.preset.clone()),
+        ("seed", Some(report.config.seed.to_string())),
+    ];
+    let rows = rows.into_iter().filter_map(|(name, value)| Some(format!("<tr><td>{name}</td><td>{}</td></tr>", escaped(&value?))));
+    format!("<section><h2>Time and memory</h2>\n<table><tbody>{}</tbody></table></section>", rows.collect::<String>())
+}
+
+/// A number with spaces between its thousands.
+fn thousands(n: u64) -> String {
+    let digits = n.to_string();
+    let first = digits.len() % 3;
+    let groups = (first..digits.len()).step_by(3).map(|at| &digits[at..at + 3]);
+    [&digits[..first]].into_iter().filter(|group| !group.is_empty()).chain(groups).collect::<Vec<_>>().join("\u{202f}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thousands_are_set_apart() {
+        assert_eq!([7, 999, 1000, 1234567].map(thousands), ["7", "999", "1\u{202f}000", "1\u{202f}234\u{202f}567"]);
+    }
+}

@@ -1,0 +1,107 @@
+//! Loss, PSNR, resolution and rates of a run, over its steps and over its seconds.
+
+use crate::chart::{Chart, Curve};
+use crate::metrics_file::Line;
+use plenoxel::train::config::Stage;
+use std::collections::BTreeSet;
+
+/// Points of a curve that are told apart.
+const POINTS: usize = 500;
+
+/// The section, or nothing if there was no training.
+pub fn section(lines: &[Line<'_>], stages: &[Stage]) -> String {
+    let Some(last) = lines.last().filter(|_| !stages.is_empty()) else { return String::new() };
+    let axes: [(&str, &str, &dyn Fn(&Line<'_>) -> f64, f64); 2] = [
+        ("steps", "training step", &|line| line.step as f64 + 1.0, last.step as f64 + 1.0),
+        ("seconds", "seconds of training", &|line| line.seconds, last.seconds),
+    ];
+    let mut page = String::from("<section><h2>Curves</h2>\n");
+    for (i, (name, ..)) in axes.iter().enumerate() {
+        let checked = if i == 0 { " checked" } else { "" };
+        page +=
+            &format!("<input type=\"radio\" name=\"axis\" id=\"over-{name}\"{checked}><label for=\"over-{name}\">over {name}</label>\n");
+    }
+    for (name, across, at, end) in axes {
+        let charts = charts(lines).into_iter().map(|(title, up, values)| {
+            let curves = values.into_iter().map(|(name, value)| curve(&name, lines, at, &*value)).filter(|curve| !curve.lines.is_empty());
+            Chart {
+                title: title.to_owned(),
+                across: (across.to_owned(), end),
+                up: up.to_owned(),
+                parts: parts(lines, at),
+                curves: curves.collect(),
+            }
+        });
+        page += &format!("<div class=\"charts\" data-over=\"{name}\">{}</div>\n", charts.map(|chart| chart.svg()).collect::<String>());
+    }
+    page + "</section>"
+}
+
+/// A number of a line, where it has it.
+type Value<'a> = Box<dyn Fn(&Line<'_>) -> Option<f64> + 'a>;
+
+/// Title, axis and curves of each chart.
+fn charts(lines: &[Line<'_>]) -> Vec<(&'static str, &'static str, Vec<(String, Value<'static>)>)> {
+    let whole: Vec<(String, Value<'static>)> = vec![("loss".to_owned(), Box::new(|line| Some(line.loss)))];
+    let names: BTreeSet<String> = lines.iter().flat_map(|line| line.losses.keys().map(|name| name.to_string())).collect();
+    let each = names.into_iter().map(|name| {
+        let key = name.clone();
+        (name, Box::new(move |line: &Line<'_>| line.losses.get(key.as_str()).copied()) as Value<'static>)
+    });
+    // One loss is the whole.
+    let each: Vec<_> = each.collect();
+    let losses = if each.len() > 1 { whole.into_iter().chain(each).collect() } else { whole };
+    vec![
+        ("Loss", "loss", losses),
+        (
+            "PSNR",
+            "dB",
+            vec![
+                ("training rays".to_owned(), Box::new(|line| Some(line.psnr))),
+                ("validation views".to_owned(), Box::new(|line| line.validation_psnr)),
+            ],
+        ),
+        (
+            "Size of the grid",
+            "number",
+            vec![
+                ("voxels a side".to_owned(), Box::new(|line| Some(line.resolution as f64))),
+                ("voxels".to_owned(), Box::new(|line| Some(line.voxels as f64).filter(|n| *n > 0.0))),
+            ],
+        ),
+        (
+            "Learning rates",
+            "rate",
+            vec![
+                ("density".to_owned(), Box::new(|line| Some(line.density_rate))),
+                ("color".to_owned(), Box::new(|line| Some(line.color_rate))),
+            ],
+        ),
+    ]
+}
+
+/// A curve with a break between stages.
+fn curve(name: &str, lines: &[Line<'_>], at: &dyn Fn(&Line<'_>) -> f64, value: &dyn Fn(&Line<'_>) -> Option<f64>) -> Curve {
+    let each = lines.len().div_ceil(POINTS).max(1);
+    let mean = |values: &mut dyn Iterator<Item = f64>| {
+        let (n, sum) = values.fold((0.0, 0.0), |(n, sum), value| (n + 1.0, sum + value));
+        sum / n
+    };
+    let stages = lines.chunk_by(|a, b| a.stage == b.stage).map(|stage| {
+        let known: Vec<(f64, f64)> = stage.iter().filter_map(|line| Some((at(line), value(line).filter(|v| v.is_finite())?))).collect();
+        let points = known.chunks(each).map(|part| (mean(&mut part.iter().map(|p| p.0)), mean(&mut part.iter().map(|p| p.1))));
+        points.collect::<Vec<_>>()
+    });
+    Curve { name: name.to_owned(), lines: stages.filter(|points| !points.is_empty()).collect(), band: Vec::new() }
+}
+
+/// Where stages begin.
+fn parts(lines: &[Line<'_>], at: &dyn Fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
+    let mut begin = 0.0;
+    let parts = lines.chunk_by(|a, b| a.stage == b.stage).map(|stage| {
+        let part = (begin, format!("{}³", stage[0].resolution));
+        begin = at(&stage[stage.len() - 1]);
+        part
+    });
+    parts.collect()
+}

@@ -1,0 +1,91 @@
+//! `report.html`: that the page is whole, needs nothing from elsewhere, and holds the grid.
+
+#[path = "support/command.rs"]
+mod command;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use command::{Folder, plenoxel};
+use flate2::read::ZlibDecoder;
+use serde_json::Value;
+use std::fs;
+use std::io::Read;
+
+const SHORT: &str = "stages=[\
+    {resolution=8, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05},\
+    {resolution=12, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]";
+
+/// What is between two texts of a page.
+fn between<'a>(page: &'a str, before: &str, after: &str) -> &'a str {
+    let from = page.find(before).unwrap_or_else(|| panic!("no {before}")) + before.len();
+    &page[from..from + page[from..].find(after).unwrap()]
+}
+
+/// Checks that nothing in a page makes a browser ask for something.
+fn check_alone(page: &str) {
+    // The name of the SVG namespace is no address.
+    let rest = page.replace("http://www.w3.org/2000/svg", "");
+    for word in ["http:", "https:", "//cdn", "@import", "<link", "fetch(", "XMLHttpRequest", "url("] {
+        assert!(!rest.contains(word), "{word} in the page");
+    }
+    let sources = rest.match_indices(" src=\"").map(|(at, found)| &rest[at + found.len()..at + found.len() + 5]);
+    assert!(sources.into_iter().all(|source| source == "data:"));
+}
+
+fn settings_of(page: &str) -> Value {
+    serde_json::from_str(between(page, "<script type=\"application/json\" id=\"scene\">", "</script>")).unwrap()
+}
+
+#[test]
+fn a_run_ends_with_a_page_that_holds_its_figures_its_pictures_and_its_grid() {
+    let folder = Folder::new("report");
+    let run = folder.path("a <run>");
+    let tiny = ["train", "--scene-size", "24", "--scene-views", "6,1,3", "--set", SHORT, "--set", "rays_per_step=256", "--out", &run];
+    let trained = plenoxel(&tiny);
+    let result = trained.json();
+    assert!(trained.err.contains("report.html") && trained.err.contains("dB"), "{}", trained.err);
+    let page = fs::read_to_string(folder.path("a <run>/report.html")).unwrap();
+    check_alone(&page);
+    assert!(page.contains("<h1>a &lt;run&gt; – procedural</h1>"));
+    assert!(page.contains(&format!("{:.2} dB", result["psnr"].as_f64().unwrap())));
+    for view in result["per_view"].as_array().unwrap() {
+        let caption = format!(
+            "{}: {:.2} dB, SSIM {:.4}",
+            view["name"].as_str().unwrap(),
+            view["psnr"].as_f64().unwrap(),
+            view["ssim"].as_f64().unwrap()
+        );
+        assert!(page.contains(&caption), "{caption}");
+    }
+    assert_eq!(page.matches("data:image/jpeg;base64,").count(), 4, "the stages, and three test views");
+    assert_eq!(page.matches("<svg").count(), 8, "four curves over steps, and over seconds");
+    assert!(page.contains(&fs::read_to_string(folder.path("a <run>/config.toml")).unwrap().replace('"', "&quot;")));
+
+    let settings = settings_of(&page);
+    assert_eq!((&settings["grid"]["resolution"], settings["views"].as_array().unwrap().len()), (&12.into(), 3));
+    let packed = STANDARD.decode(between(&page, "id=\"grid\">", "</script>")).unwrap();
+    let mut bytes = Vec::new();
+    ZlibDecoder::new(packed.as_slice()).read_to_end(&mut bytes).unwrap();
+    // Of each voxel two bytes of density, and one for each number of its color.
+    let grid = &settings["grid"];
+    let numbers = 3 + grid["harmonics"]["steps"].as_array().map_or(0, Vec::len) as u64;
+    assert!(bytes.len() as u64 > grid["voxels"].as_u64().unwrap() * (2 + numbers) && grid["voxels"].as_u64().unwrap() > 100);
+
+    // It can be made again, and left out.
+    fs::remove_file(folder.path("a <run>/report.html")).unwrap();
+    assert!(plenoxel(&["report", &run]).done().contains("report.html"));
+    assert_eq!(fs::read_to_string(folder.path("a <run>/report.html")).unwrap(), page);
+    plenoxel(&[&tiny[..], &["--force", "--no-report"]].concat()).done();
+    assert!(!fs::exists(folder.path("a <run>/report.html")).unwrap());
+}
+
+#[test]
+fn a_carved_run_has_a_page_too() {
+    let folder = Folder::new("report-carved");
+    let run = folder.path("run");
+    plenoxel(&["carve", "--resolution", "16", "--downscale", "8", "--out", &run]).done();
+    let page = fs::read_to_string(folder.path("run/report.html")).unwrap();
+    check_alone(&page);
+    assert!(page.contains("carving the hull") && page.contains("<h2>Carved</h2>") && !page.contains("<h2>Curves</h2>"));
+    assert_eq!(settings_of(&page)["grid"]["interpolation"], "nearest");
+}
