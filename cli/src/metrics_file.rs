@@ -49,7 +49,22 @@ struct Line<'a> {
     samples: u64,
     density_rate: f64,
     color_rate: f64,
+    #[serde(default)]
+    voxels: usize,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    validation_psnr: Option<f64>,
     seconds: f64,
+}
+
+/// What is known of a step besides what the trainer reports.
+#[derive(Clone, Copy, Default)]
+pub struct Seen {
+    /// Voxels that the grid has.
+    pub voxels: usize,
+    /// PSNR of validation views after the step, if they were looked at.
+    pub validation_psnr: Option<f64>,
+    /// Seconds of training that have passed.
+    pub seconds: f64,
 }
 
 /// Sums over the steps since the last line.
@@ -102,8 +117,8 @@ impl MetricsFile {
         Ok((MetricsFile { rays, samples, ..Self::create(path, total_steps)? }, past))
     }
 
-    /// A step was taken; `seconds` of training have passed. A line is written if it is time to, or it must be.
-    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seconds: f64, must: bool) -> Result<()> {
+    /// A step was taken. A line is written if it is time to, or it must be; it must if validation views were looked at.
+    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seen: Seen, must: bool) -> Result<()> {
         self.rays += report.rays as u64;
         self.samples += report.samples as u64;
         let since = &mut self.since;
@@ -116,7 +131,9 @@ impl MetricsFile {
                 None => since.losses.push((name.clone(), *value)),
             }
         }
-        if !(report.step + 1).is_multiple_of(self.every) && !report.ends_stage && !must {
+        let Seen { voxels, validation_psnr, seconds } = seen;
+        let must = must || report.ends_stage || validation_psnr.is_some();
+        if !(report.step + 1).is_multiple_of(self.every) && !must {
             return Ok(());
         }
         let since = std::mem::take(&mut self.since);
@@ -133,6 +150,8 @@ impl MetricsFile {
             samples: self.samples,
             density_rate: report.density_rate,
             color_rate: report.color_rate,
+            voxels,
+            validation_psnr,
             seconds,
         })
     }

@@ -272,7 +272,8 @@ Of these files, those that apply: a carved run has no training to tell of.
 - `config.toml`: every setting, resolved; `plenoxel train DATA --config config.toml` repeats the run (`carve` one that was carved).
 - `run.json`: the data, the program, the machine.
 - `metrics.jsonl`: one line every few steps and at every stage end and whenever it is saved, then one with the final figures. `loss`, `losses` and `psnr` are of
-  training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training.
+  training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training; `validation_psnr` is on
+  lines of steps after which validation views were looked at.
 - `loss.svg`: the loss over the steps.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
 - `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.

@@ -12,7 +12,7 @@ use crate::evaluation::{self, Scores, ViewScore, Viewer};
 use crate::images::Rgb;
 use crate::machine;
 use crate::memory::{self, Estimate};
-use crate::metrics_file::{MetricsFile, Past};
+use crate::metrics_file::{MetricsFile, Past, Seen};
 use crate::progress::{Console, clock};
 use crate::run_folder::RunFolder;
 pub use flags::{TrainArgs, size};
@@ -163,6 +163,7 @@ impl Job<'_, '_> {
         let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
         let interrupt = interrupt::Watch::begin();
         let mut saved = Instant::now();
+        let mut voxels = trainer.grid().lattice().present();
         loop {
             let report = match clock.time(|| trainer.step()) {
                 Ok(Some(report)) => report,
@@ -175,11 +176,14 @@ impl Job<'_, '_> {
                 }
             };
             let seconds = clock.seconds();
+            if report.step == plan[report.stage].first {
+                voxels = trainer.grid().lattice().present();
+            }
             losses.push(report.loss);
             let last = report.step + 1 == total;
             let due = saved.elapsed().as_secs_f64() >= self.args.checkpoint_every;
             let save = !last && (due || interrupt.requested());
-            metrics.step(&report, &plan, seconds, save)?;
+            metrics.step(&report, &plan, Seen { voxels, validation_psnr: None, seconds }, save)?;
             progress.step(&report, seconds);
             if report.ends_stage {
                 folder.write_loss(&loss_svg(&losses, &plan, &title))?;
