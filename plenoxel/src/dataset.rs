@@ -231,6 +231,13 @@ impl Dataset {
         views.into_iter().collect()
     }
 
+    /// Decodes (or renders) one view of a split, in the order of the files.
+    ///
+    /// Panics if there are not so many. Errors: it cannot be read.
+    pub fn load_view(&self, split: Split, number: usize) -> Result<View> {
+        self.load_frame(&self.frames(split)[number])
+    }
+
     /// Writes all views to the folder `path` in the NeRF-synthetic format, with 16-bit depth pictures beside the test views
     /// where depth is known (thousandths of a world unit, 0 where nothing was hit).
     ///
