@@ -2,6 +2,8 @@
 
 #[path = "support/command.rs"]
 mod command;
+#[path = "support/events.rs"]
+mod events;
 
 use command::{Answer, Folder, plenoxel};
 use plenoxel::dataset::image;
@@ -66,7 +68,9 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
 
     // The folder explains itself.
     let expected = ["README.md", "checkpoint.safetensors", "config.toml", "images", "loss.svg", "metrics.jsonl", "result.json", "run.json"];
-    assert_eq!(names(&run), expected);
+    let mut left = names(&run);
+    left.retain(|name| !name.starts_with("events.out.tfevents."));
+    assert_eq!(left, expected);
     let saved: Value = serde_json::from_str(&fs::read_to_string(format!("{run}/result.json")).unwrap()).unwrap();
     assert_eq!(saved, result);
     let metrics = fs::read_to_string(format!("{run}/metrics.jsonl")).unwrap();
@@ -80,11 +84,13 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
         .sum();
     assert!((sum - metrics[0]["loss"].as_f64().unwrap()).abs() < 1e-6 && metrics[9]["psnr"].is_f64());
     assert_eq!(metrics[10]["final"], result);
-    let pictures = ["stage_1_8.png", "stage_2_12.png", "stages.png", "test_000_r_0.png", "test_001_r_1.png", "test_002_r_2.png"];
+    let pictures =
+        ["preview.png", "stage_1_8.png", "stage_2_12.png", "stages.png", "test_000_r_0.png", "test_001_r_1.png", "test_002_r_2.png"];
     assert_eq!(names(&format!("{run}/images")), pictures);
     // Two stages and the target, and four panels, of 24 pixels with gaps of 2.
     let size = |name: &str| image::size(Path::new(&format!("{run}/images/{name}"))).unwrap();
     assert_eq!((size("stages.png"), size("test_000_r_0.png")), ((3 * 24 + 2 * 2, 24), (4 * 24 + 3 * 2, 24)));
+    assert_eq!(size("preview.png"), (2 * 24 + 2, 24));
     assert!(fs::read_to_string(format!("{run}/loss.svg")).unwrap().contains("12³"));
     assert!(trained.err.contains("memory: about ") && trained.err.contains("stage 2/2 (12³)  step 10/10"), "{}", trained.err);
 
@@ -162,7 +168,7 @@ fn without_test_views_training_ends_well_and_has_no_figures() {
     let result = train(&folder.path("built-in"), &["--scene-views", "4,0,0"]).json();
     assert!(result["psnr"].is_null() && result["views"] == 0 && result["stages"][0]["psnr"].is_null(), "{result}");
     let pictures = names(&folder.path("built-in/images"));
-    assert_eq!(pictures, ["stage_1_8.png", "stage_2_12.png", "stages.png"]);
+    assert_eq!(pictures, ["preview.png", "stage_1_8.png", "stage_2_12.png", "stages.png"]);
     let data = scene(&folder);
     fs::remove_file(format!("{data}/transforms_test.json")).unwrap();
     let result = train_on(&data, &folder.path("run"), &["--set", "validation_every=3"]).json();
@@ -197,6 +203,88 @@ fn a_run_is_overwritten_only_when_forced_and_leaves_nothing_of_the_old_one() {
     train(&folder.path("file"), &["--force"]).refused(2, &["is a file"]);
     // A folder cannot be made below a file.
     train(&folder.path("file/run"), &["--quiet"]).refused(2, &["file/run", "is a file"]);
+}
+
+#[test]
+fn who_watches_sees_the_same_figures_everywhere_and_changes_nothing() {
+    let folder = Folder::new("watched");
+    let [often, never] = ["often", "never"].map(|name| folder.path(name));
+    let watched = train(&often, &["--preview-every", "1h", "--log-format", "json"]);
+    let result = watched.json();
+    assert_eq!(train(&never, &["--preview-every", "off"]).code, 0);
+    let [checkpoint, of_never] = [&often, &never].map(|run| fs::read(format!("{run}/checkpoint.safetensors")).unwrap());
+    assert!(checkpoint == of_never, "watching changed the grid");
+    assert!(!names(&format!("{never}/images")).contains(&"preview.png".to_owned()));
+
+    // Whatever was seen of validation views is in the lines; the final figures name the best of it.
+    let lines = fs::read_to_string(format!("{often}/metrics.jsonl")).unwrap();
+    let lines: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let (lines, last) = lines.split_at(10);
+    let seen: Vec<(u64, f64)> = lines.iter().filter_map(|line| Some((line["step"].as_u64()?, line["validation_psnr"].as_f64()?))).collect();
+    assert!(seen.iter().any(|(step, _)| *step == 4) && seen.last().unwrap().0 == 9, "at the ends of the stages: {seen:?}");
+    let best = seen.iter().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+    assert_eq!((result["best_validation"]["step"].as_u64(), result["best_validation"]["psnr"].as_f64()), (Some(best.0), Some(best.1)));
+    assert_eq!((result["validation_psnr"].as_f64(), &last[0]["final"]), (Some(seen.last().unwrap().1), &result));
+    let voxels = lines[9]["voxels"].as_u64().unwrap();
+    assert!((1..=12 * 12 * 12).contains(&voxels) && lines[4]["voxels"].as_u64().unwrap() <= 8 * 8 * 8);
+    let lines_of_never = fs::read_to_string(format!("{never}/metrics.jsonl")).unwrap();
+    assert!(!lines_of_never.lines().take(10).any(|line| line.contains("validation")));
+
+    // And in the events for TensorBoard.
+    let files = events::files(Path::new(&often));
+    assert_eq!(files.len(), 1);
+    let events_of_run = events::read(&files[0]);
+    assert_eq!(events_of_run[0].version, "brain.Event:2");
+    let curves = events::scalars(Path::new(&often));
+    let curve = |key: &str| -> Vec<(u64, f32)> {
+        lines.iter().filter_map(|line| Some((line["step"].as_u64()?, line.pointer(key)?.as_f64()? as f32))).collect()
+    };
+    for (tag, key) in [
+        ("loss", "/loss"),
+        ("loss/mse", "/losses/mse"),
+        ("psnr/train", "/psnr"),
+        ("psnr/validation", "/validation_psnr"),
+        ("resolution", "/resolution"),
+        ("voxels", "/voxels"),
+        ("density_rate", "/density_rate"),
+        ("color_rate", "/color_rate"),
+    ] {
+        assert!(!curves[tag].is_empty() && curves[tag] == curve(key), "{tag}: {:?}", curves[tag]);
+    }
+    assert!(curves["rays_per_second"].len() == 10 && curves["rays_per_second"].iter().all(|(_, rays)| *rays > 0.0));
+    assert_eq!(
+        (curves["psnr/test"][0].1, curves["ssim/test"][0].1),
+        (result["psnr"].as_f64().unwrap() as f32, result["ssim"].as_f64().unwrap() as f32)
+    );
+    let images: Vec<_> = events_of_run.iter().flat_map(|event| event.images.iter().map(|image| (event.step, image))).collect();
+    assert_eq!(images.iter().map(|(step, _)| *step).collect::<Vec<_>>(), [4, 9]);
+    let (_, (tag, size, png)) = images[1];
+    assert_eq!((tag.as_str(), *size, png), ("preview", (2 * 24 + 2, 24), &fs::read(format!("{often}/images/preview.png")).unwrap()));
+
+    // Each line on stderr is an object.
+    let told: Vec<Value> = watched.err.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert!(
+        told.iter().all(|event| event["time"].is_f64())
+            && told.iter().any(|event| event["event"] == "note" && event["message"].is_string())
+    );
+    let progress = |what: &str| told.iter().filter(|event| event["event"] == "progress" && event["what"] == what).collect::<Vec<_>>();
+    assert_eq!(progress("rendering train images of the built-in scene").last().unwrap()["done"], 6);
+    let training = progress("training");
+    let last = training.last().unwrap();
+    for (key, value) in [("step", 10), ("steps", 10), ("stage", 2), ("stages", 2), ("resolution", 12), ("voxels", voxels)] {
+        assert_eq!(last[key], value, "{key}");
+    }
+    for key in ["loss", "psnr", "validation_psnr", "rays_per_second", "samples_per_ray", "eta_seconds", "seconds"] {
+        assert!(last[key].is_f64(), "{key}: {last}");
+    }
+    assert!(cfg!(not(target_os = "linux")) || last["memory_bytes"].as_u64().unwrap() > 1_000_000);
+    assert_eq!(last["validation_psnr"].as_f64(), result["validation_psnr"].as_f64());
+
+    let refused = plenoxel(&["evaluate", &folder.path("nowhere"), "--log-format", "json"]);
+    let error: Value = serde_json::from_str(&refused.err).unwrap();
+    assert_eq!((refused.code, &error["event"], &error["exit_code"]), (3, &"error".into(), &3.into()));
+    assert!(error["message"].as_str().unwrap().contains("there is no such run"), "{error}");
+    plenoxel(&["train", "--preview-every", "sometimes"]).refused(2, &["--preview-every", "or off"]);
 }
 
 #[test]
@@ -401,7 +489,7 @@ fn help_mentions_every_command_and_flag() {
     let version = plenoxel(&["--version"]);
     assert!(version.code == 0 && version.out.starts_with("plenoxel 0."), "{}", version.out);
     let flags = "--out --force --no-images --preset --config --set --seed --downscale --background --half-width --interpolation --color \
-        --sh-degree --sh-reduction --engine --tv --threads --quiet --scene-size --scene-views Examples:";
+        --sh-degree --sh-reduction --engine --tv --threads --quiet --log-format --preview-every --scene-size --scene-views Examples:";
     for (command, flags) in [
         ("train", flags),
         ("render", "--split --view --downscale --data Examples:"),

@@ -12,6 +12,7 @@ mod curves;
 mod data;
 mod evaluation;
 mod html;
+mod event_file;
 mod images;
 mod machine;
 mod memory;
@@ -23,7 +24,7 @@ mod run_folder;
 use clap::{Args, Parser, Subcommand};
 use commands::{carve, evaluate, export, filter, info, render, scene, train};
 use plenoxel::error::Error;
-use progress::Console;
+use progress::{Console, LogFormat};
 use std::ffi::OsString;
 use std::io::Write;
 
@@ -80,6 +81,10 @@ struct Machine {
     /// Print errors and results only
     #[arg(long, short, global = true, help_heading = "Machine")]
     quiet: bool,
+
+    /// What to write to stderr: lines for people, or a JSON object on each line for programs; stdout stays as it is
+    #[arg(long, global = true, value_name = "FORMAT", help_heading = "Machine", value_enum, default_value_t = LogFormat::Plain)]
+    log_format: LogFormat,
 }
 
 /// Where a command prints.
@@ -98,7 +103,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
         Ok(cli) => cli,
         Err(answer) => return answer_to_arguments(&answer, streams),
     };
-    let console = Console::new(streams, cli.machine.quiet);
+    let console = Console::new(streams, cli.machine.log_format, cli.machine.quiet);
     memory::limit(cli.machine.max_memory);
     let code = machine::with_threads(cli.machine.threads, || {
         let done = match &cli.command {
@@ -117,7 +122,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     match code {
         Ok(code) => code,
         Err(error) => {
-            console.error(&error.to_string());
+            console.error(&error.to_string(), error.exit_code());
             error.exit_code()
         }
     }

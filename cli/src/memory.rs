@@ -260,12 +260,21 @@ fn address_space(limits: &str) -> Option<u64> {
 
 /// Bytes of addresses that it has.
 fn taken() -> u64 {
-    std::fs::read_to_string("/proc/self/status").ok().and_then(|text| kilobytes(&text, "VmSize:")).unwrap_or(0)
+    of_process("VmSize:").unwrap_or(0)
 }
 
 /// The most memory this process ever had at once, in bytes; `None` where the system does not say.
 pub fn peak() -> Option<u64> {
-    kilobytes(&std::fs::read_to_string("/proc/self/status").ok()?, "VmHWM:")
+    of_process("VmHWM:")
+}
+
+/// The memory it has now.
+pub fn now() -> Option<u64> {
+    of_process("VmRSS:")
+}
+
+fn of_process(key: &str) -> Option<u64> {
+    kilobytes(&std::fs::read_to_string("/proc/self/status").ok()?, key)
 }
 
 fn kilobytes(text: &str, key: &str) -> Option<u64> {

@@ -1,5 +1,7 @@
-//! `metrics.jsonl`: what a run did, line by line, while it does it.
+//! `metrics.jsonl`: what a run did, line by line, while it does it; and the same figures for TensorBoard.
 
+use crate::event_file::EventFile;
+use crate::run_folder::RunFolder;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::train::{PlannedStage, Report};
@@ -17,10 +19,46 @@ const LINES: u64 = 1000;
 pub struct MetricsFile {
     path: PathBuf,
     file: File,
+    events: EventFile,
     every: u64,
     since: Sums,
     rays: u64,
     samples: u64,
+    known: Known,
+}
+
+/// The step after which validation views were seen best.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Best {
+    step: u64,
+    psnr: f64,
+}
+
+/// What the lines so far come to.
+#[derive(Default)]
+struct Known {
+    step: u64,
+    seconds: f64,
+    rays: u64,
+    samples: u64,
+    validation_psnr: Option<f64>,
+    best: Option<Best>,
+}
+
+impl Known {
+    fn add(&mut self, line: &Line<'_>) {
+        let seen = line.validation_psnr.map(|psnr| Best { step: line.step, psnr });
+        // Of equal ones the later: it has learned more.
+        let better = seen.filter(|seen| self.best.is_none_or(|best| seen.psnr >= best.psnr));
+        *self = Known {
+            step: line.step,
+            seconds: line.seconds,
+            rays: line.rays,
+            samples: line.samples,
+            validation_psnr: line.validation_psnr.or(self.validation_psnr),
+            best: better.or(self.best),
+        };
+    }
 }
 
 /// What the lines of a run tell that goes on.
@@ -54,6 +92,26 @@ pub struct Line<'a> {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub validation_psnr: Option<f64>,
     pub seconds: f64,
+}
+
+impl Line<'_> {
+    /// Its figures as TensorBoard shows them, rays a second from what was known before.
+    fn scalars(&self, before: &Known) -> Vec<(Cow<'_, str>, f64)> {
+        let rays_per_second = (self.rays - before.rays) as f64 / (self.seconds - before.seconds);
+        let each = self.losses.iter().map(|(name, value)| (format!("loss/{name}").into(), *value));
+        let others = [
+            ("loss", Some(self.loss)),
+            ("psnr/train", Some(self.psnr)),
+            ("psnr/validation", self.validation_psnr),
+            ("resolution", Some(self.resolution as f64)),
+            ("voxels", Some(self.voxels as f64)),
+            ("density_rate", Some(self.density_rate)),
+            ("color_rate", Some(self.color_rate)),
+            ("rays_per_second", Some(rays_per_second)),
+        ];
+        let others = others.into_iter().filter_map(|(name, value)| Some((name.into(), value?)));
+        others.chain(each).collect()
+    }
 }
 
 /// What is known of a step besides what the trainer reports.
@@ -91,22 +149,30 @@ pub fn lines(text: &str) -> impl Iterator<Item = (&str, Line<'_>)> {
 
 impl MetricsFile {
     /// A new file for a run of so many steps.
-    pub fn create(path: &Path, total_steps: u64) -> Result<Self> {
-        let file = OpenOptions::new().append(true).create(true).open(path);
+    pub fn create(folder: &RunFolder, total_steps: u64) -> Result<Self> {
+        Self::open(folder, total_steps, 0, Known::default())
+    }
+
+    fn open(folder: &RunFolder, total_steps: u64, taken: u64, known: Known) -> Result<Self> {
+        let path = folder.metrics();
+        let file = OpenOptions::new().append(true).create(true).open(&path);
         Ok(MetricsFile {
-            path: path.to_owned(),
-            file: file.map_err(|e| Error::io(path, e, "creating the metrics"))?,
+            file: file.map_err(|e| Error::io(&path, e, "creating the metrics"))?,
+            path,
+            events: EventFile::create(folder.path(), taken)?,
             every: (total_steps / LINES).max(1),
             since: Sums::default(),
-            rays: 0,
-            samples: 0,
+            rays: known.rays,
+            samples: known.samples,
+            known,
         })
     }
 
     /// The file of a run that goes on after so many steps: lines about later ones go.
-    pub fn resume(path: &Path, total_steps: u64, taken: u64) -> Result<(Self, Past)> {
-        let all = read(path)?;
-        let (mut kept, mut past, mut counts) = (String::new(), Past::default(), (0, 0));
+    pub fn resume(folder: &RunFolder, total_steps: u64, taken: u64) -> Result<(Self, Past)> {
+        let path = folder.metrics();
+        let all = read(&path)?;
+        let (mut kept, mut past, mut known) = (String::new(), Past::default(), Known::default());
         for (text, line) in lines(&all).filter(|(_, line)| line.step < taken) {
             kept += text;
             kept += "\n";
@@ -115,13 +181,12 @@ impl MetricsFile {
             if line.ends_stage {
                 past.stages.push((line.stage, line.seconds));
             }
-            counts = (line.rays, line.samples);
+            known.add(&line);
         }
         let last = past.losses.last().copied().unwrap_or(0.0);
         past.losses.resize(taken as usize, last);
-        files::write_atomically(path, kept.as_bytes())?;
-        let (rays, samples) = counts;
-        Ok((MetricsFile { rays, samples, ..Self::create(path, total_steps)? }, past))
+        files::write_atomically(&path, kept.as_bytes())?;
+        Ok((Self::open(folder, total_steps, taken, known)?, past))
     }
 
     /// A step was taken. A line is written if it is time to, or it must be; it must if validation views were looked at.
@@ -145,7 +210,7 @@ impl MetricsFile {
         }
         let since = std::mem::take(&mut self.since);
         let mean = |sum: f64| sum / since.steps;
-        self.append(&Line {
+        let line = Line {
             step: report.step,
             stage: report.stage,
             resolution: plan[report.stage].stage.resolution,
@@ -160,7 +225,23 @@ impl MetricsFile {
             voxels,
             validation_psnr,
             seconds,
-        })
+        };
+        let scalars = line.scalars(&self.known);
+        self.events.scalars(line.step, scalars.iter().map(|(name, value)| (name.as_ref(), *value)))?;
+        self.known.add(&line);
+        self.append(&line)
+    }
+
+    /// The last line, with the final figures; some of them are TensorBoard's too.
+    pub fn conclude(&mut self, line: &impl Serialize, figures: &[(&str, Option<f64>)]) -> Result<()> {
+        self.append(line)?;
+        self.events.scalars(self.known.step, figures.iter().filter_map(|(name, value)| Some((*name, (*value)?))))
+    }
+
+    /// A picture for TensorBoard, as the grid is seen after a step: a PNG file of so many pixels.
+    pub fn picture(&mut self, step: u64, size: (usize, usize), png: &Path) -> Result<()> {
+        let bytes = std::fs::read(png).map_err(|e| Error::io(png, e, "reading the picture"))?;
+        self.events.image(step, "preview", size, &bytes)
     }
 
     /// Has what was written on the disk.
@@ -178,5 +259,10 @@ impl MetricsFile {
     /// Rays and samples since the start of training.
     pub fn counts(&self) -> (u64, u64) {
         (self.rays, self.samples)
+    }
+
+    /// The PSNR of validation views when they were last looked at, and the best there was.
+    pub fn validation(&self) -> (Option<f64>, Option<Best>) {
+        (self.known.validation_psnr, self.known.best)
     }
 }

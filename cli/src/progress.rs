@@ -1,33 +1,48 @@
 //! The only printing: progress and notes to stderr, results to stdout.
 //!
-//! On a terminal progress is a bar; elsewhere, in a log file say, it is a plain line every few seconds and at the end of each stage.
+//! On a terminal progress is a bar; elsewhere, in a log file say, it is a plain line every few seconds and at the end of each stage. With
+//! `--log-format json` each line on stderr is one JSON object, for programs.
+
+mod training;
 
 use crate::Streams;
+use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use plenoxel::error::{Error, Result};
-use plenoxel::train::{PlannedStage, Report};
+use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+pub use training::Training;
 
-/// Time between plain lines.
+/// Time between lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Time between changes of a bar: as often as an eye can follow.
 const BAR_EVERY: Duration = Duration::from_millis(100);
+
+/// What is written to stderr.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// Lines for people; on a terminal, bars.
+    Plain,
+    /// A JSON object on each line.
+    Json,
+}
 
 /// Where everything is printed; usable from several threads.
 pub struct Console<'a> {
     streams: Mutex<Streams<'a>>,
     /// The bar on the screen, if there is one: other lines must not be written through it.
     bar: Mutex<Option<ProgressBar>>,
-    terminal: bool,
+    bars: bool,
+    format: LogFormat,
     quiet: bool,
 }
 
 impl<'a> Console<'a> {
     /// A console on two streams. `quiet` leaves only errors and results.
-    pub fn new(streams: Streams<'a>, quiet: bool) -> Self {
-        let terminal = streams.terminal;
-        Console { streams: Mutex::new(streams), bar: Mutex::new(None), terminal, quiet }
+    pub fn new(streams: Streams<'a>, format: LogFormat, quiet: bool) -> Self {
+        let bars = streams.terminal && format == LogFormat::Plain && !quiet;
+        Console { streams: Mutex::new(streams), bar: Mutex::new(None), bars, format, quiet }
     }
 
     /// A line of results on stdout. A reader that has gone away is no failure: the results are in files too.
@@ -41,14 +56,40 @@ impl<'a> Console<'a> {
 
     /// A line of information on stderr.
     pub fn note(&self, text: &str) {
+        #[derive(Serialize)]
+        struct Note<'t> {
+            message: &'t str,
+        }
         if !self.quiet {
-            self.write(text);
+            self.log("note", &Note { message: text }, || text.to_owned());
         }
     }
 
-    /// A line about a failure on stderr.
-    pub fn error(&self, text: &str) {
-        self.write(&format!("error: {text}"));
+    /// A line on stderr about why the command ends with an exit code.
+    pub fn error(&self, text: &str, exit_code: u8) {
+        #[derive(Serialize)]
+        struct Failure<'t> {
+            message: &'t str,
+            exit_code: u8,
+        }
+        self.log("error", &Failure { message: text, exit_code }, || format!("error: {text}"));
+    }
+
+    /// A line on stderr: what happened with its figures, or the same for people.
+    fn log(&self, event: &str, fields: &impl Serialize, plain: impl FnOnce() -> String) {
+        #[derive(Serialize)]
+        struct Line<'t, F> {
+            /// Seconds since 1970.
+            time: f64,
+            event: &'t str,
+            #[serde(flatten)]
+            fields: &'t F,
+        }
+        let time = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64());
+        match self.format {
+            LogFormat::Plain => self.write(&plain()),
+            LogFormat::Json => self.write(&crate::json_line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
+        }
     }
 
     fn write(&self, text: &str) {
@@ -65,30 +106,24 @@ impl<'a> Console<'a> {
     pub fn count(&self, what: &str, total: usize) -> Count<'_, 'a> {
         Count { meter: Meter::new(self, total as u64), what: what.to_owned() }
     }
-
-    /// Progress of a training run that has taken so many seconds.
-    pub fn training(&self, plan: &[PlannedStage], prune_from_stage: Option<usize>, seconds: f64) -> Training<'_, 'a> {
-        let total = plan.iter().map(|p| p.steps).sum();
-        Training {
-            meter: Meter::new(self, total),
-            plan: plan.to_vec(),
-            prune_from_stage,
-            total,
-            rays: 0,
-            mse: Smoothed::new(0.01),
-            loss: Smoothed::new(0.01),
-            samples: Smoothed::new(0.05),
-            step_seconds: Smoothed::new(0.05),
-            seconds,
-        }
-    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A bar or its plain lines.
+/// How far something is: its fields are what programs read.
+trait Standing: Serialize {
+    /// The same on a line for people.
+    fn line(&self) -> String;
+
+    /// The same beside a bar, the most important first, for a narrow terminal shows no more.
+    fn beside_bar(&self) -> String {
+        self.line()
+    }
+}
+
+/// A bar or its lines.
 struct Meter<'c, 'a> {
     console: &'c Console<'a>,
     bar: Option<ProgressBar>,
@@ -97,9 +132,8 @@ struct Meter<'c, 'a> {
 
 impl<'c, 'a> Meter<'c, 'a> {
     fn new(console: &'c Console<'a>, total: u64) -> Self {
-        let bar = (console.terminal && !console.quiet).then(|| {
-            let style =
-                ProgressStyle::with_template("{bar:12} {percent:>3} %  {wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
+        let bar = console.bars.then(|| {
+            let style = ProgressStyle::with_template("{bar:7} {percent:>3}%  {wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
             ProgressBar::new(total).with_style(style)
         });
         lock(&console.bar).clone_from(&bar);
@@ -107,8 +141,8 @@ impl<'c, 'a> Meter<'c, 'a> {
         Meter { console, bar, shown }
     }
 
-    /// Shows a position, if it is time to or it must be.
-    fn show(&self, position: u64, must: bool, line: impl FnOnce() -> String) {
+    /// Shows how far it is, if it is time to or it must be; what must be shown stays as a line above the bar.
+    fn show<S: Standing>(&self, (position, total): (u64, u64), must: bool, standing: impl FnOnce() -> S) {
         if self.console.quiet {
             return;
         }
@@ -118,12 +152,14 @@ impl<'c, 'a> Meter<'c, 'a> {
             return;
         }
         *shown = Instant::now();
-        match &self.bar {
-            Some(bar) => {
-                bar.set_position(position);
-                bar.set_message(line());
-            }
-            None => self.console.write(&line()),
+        let standing = standing();
+        if let Some(bar) = &self.bar {
+            bar.set_length(total);
+            bar.set_position(position);
+            bar.set_message(standing.beside_bar());
+        }
+        if must || self.bar.is_none() {
+            self.console.log("progress", &standing, || standing.line());
         }
     }
 }
@@ -146,99 +182,23 @@ pub struct Count<'c, 'a> {
 impl Count<'_, '_> {
     /// So many are done.
     pub fn at(&self, done: usize, total: usize) {
-        let line = || format!("{}  {done}/{total}", self.what);
-        self.meter.show(done as u64, false, line);
+        // People see that it is over; programs are told.
+        let must = done == total && self.meter.console.format == LogFormat::Json;
+        self.meter.show((done as u64, total as u64), must, || Counted { what: &self.what, done, total });
     }
 }
 
-/// A mean that forgets: each value moves it by `share` of the way, the first ones by more, so that it starts without a bias.
-#[derive(Debug, Clone, Copy)]
-struct Smoothed {
-    share: f64,
-    count: f64,
-    value: f64,
+/// So many of how many.
+#[derive(Serialize)]
+struct Counted<'w> {
+    what: &'w str,
+    done: usize,
+    total: usize,
 }
 
-impl Smoothed {
-    fn new(share: f64) -> Self {
-        Smoothed { share, count: 0.0, value: 0.0 }
-    }
-
-    fn add(&mut self, value: f64) {
-        self.count += 1.0;
-        self.value += (value - self.value) * self.share.max(1.0 / self.count);
-    }
-}
-
-/// Progress of a training run.
-pub struct Training<'c, 'a> {
-    meter: Meter<'c, 'a>,
-    plan: Vec<PlannedStage>,
-    prune_from_stage: Option<usize>,
-    total: u64,
-    rays: u64,
-    mse: Smoothed,
-    loss: Smoothed,
-    samples: Smoothed,
-    step_seconds: Smoothed,
-    seconds: f64,
-}
-
-impl Training<'_, '_> {
-    /// A step was taken; `seconds` of training have passed.
-    pub fn step(&mut self, report: &Report, seconds: f64) {
-        let took = seconds - self.seconds;
-        self.seconds = seconds;
-        self.rays += report.rays as u64;
-        self.mse.add(10f64.powf(-0.1 * report.psnr));
-        self.loss.add(report.loss);
-        if report.step == self.plan[report.stage].first {
-            // The first step of a stage also makes its grid: it says nothing about the next ones.
-            (self.step_seconds, self.samples) = (Smoothed::new(0.05), Smoothed::new(0.05));
-        } else {
-            self.step_seconds.add(took);
-        }
-        self.samples.add(report.samples as f64 / report.rays.max(1) as f64);
-        let line = || self.line(report);
-        self.meter.show(report.step + 1, report.ends_stage, line);
-    }
-
-    fn line(&self, report: &Report) -> String {
-        let stage = &self.plan[report.stage].stage;
-        let pace = match self.step_seconds.value {
-            0.0 => String::new(),
-            step => format!("{:.1} it/s  {}rays/s  ", 1.0 / step, metric(report.rays as f64 / step)),
-        };
-        format!(
-            "stage {}/{} ({}³)  step {}/{}  ETA {}  loss {:.5}  psnr {:.2} dB  {pace}{:.0} samples/ray",
-            report.stage + 1,
-            self.plan.len(),
-            stage.resolution,
-            report.step + 1,
-            self.total,
-            clock(self.remaining(report)),
-            self.loss.value,
-            -10.0 * self.mse.value.log10(),
-            self.samples.value,
-        )
-    }
-
-    /// Seconds to go: this stage at its pace, later ones at a pace in proportion to their resolution, as their samples are, and three
-    /// times faster once empty space is left out.
-    fn remaining(&self, report: &Report) -> f64 {
-        let now = &self.plan[report.stage];
-        let step = match self.step_seconds.count {
-            // The first of a stage: as all before it, on the mean.
-            0.0 => self.seconds / (report.step + 1) as f64,
-            _ => self.step_seconds.value,
-        };
-        let samples = |index: usize| {
-            let pruned = self.prune_from_stage.is_some_and(|first| index >= first);
-            self.plan[index].stage.resolution as f64 / if pruned { 3.0 } else { 1.0 }
-        };
-        let here = (now.first + now.steps - report.step - 1) as f64;
-        let later = (report.stage + 1..self.plan.len()).map(|i| self.plan[i].steps as f64 * samples(i) / samples(report.stage));
-        step * (here + later.sum::<f64>())
+impl Standing for Counted<'_> {
+    fn line(&self) -> String {
+        format!("{}  {}/{}", self.what, self.done, self.total)
     }
 }
 
@@ -282,12 +242,5 @@ mod tests {
         assert_eq!(metric(431_204.0) + "rays/s", "431 krays/s");
         assert_eq!(bytes(2_345_678_901), "2.3 GB");
         assert_eq!(bytes(99_000), "99 kB");
-    }
-
-    #[test]
-    fn a_smoothed_value_starts_as_the_plain_mean() {
-        let mut mean = Smoothed::new(0.1);
-        [1.0, 2.0, 6.0].into_iter().for_each(|x| mean.add(x));
-        assert!((mean.value - 3.0).abs() < 1e-12);
     }
 }

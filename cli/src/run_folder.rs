@@ -2,6 +2,7 @@
 
 use crate::config;
 use crate::data::DataSource;
+use crate::event_file;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
@@ -77,11 +78,10 @@ impl RunFolder {
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
         self.remove_fragments()?;
-        for name in [CHECKPOINT, STATE, RESULT, METRICS, LOSS, REPORT, CONFIG, RECORD, README] {
-            let path = self.path.join(name);
-            if path.exists() {
-                std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
-            }
+        let names = [CHECKPOINT, STATE, RESULT, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
+        let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| path.exists());
+        for path in paths.chain(event_file::present(&self.path)) {
+            std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
         for (folder, endings) in [(IMAGES, ["png"].as_slice()), (RENDERS, &["png"]), (EXPORTS, &["vox", "ply", "obj", "glb"])] {
             let Ok(entries) = std::fs::read_dir(self.path.join(folder)) else {
@@ -185,7 +185,8 @@ impl RunFolder {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             name.starts_with(".tmp") || name.starts_with('.') && name.ends_with(".tmp")
         };
-        for path in std::fs::read_dir(&self.path).into_iter().flatten().flatten().map(|entry| entry.path()).filter(fragment) {
+        let entries = [&self.path, &self.path.join(IMAGES)].map(std::fs::read_dir).into_iter().flatten().flatten().flatten();
+        for path in entries.map(|entry| entry.path()).filter(fragment) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
         Ok(())
@@ -295,13 +296,16 @@ Of these files, those that apply: a carved run has no training to tell of.
 - `run.json`: the data, the program, the machine.
 - `metrics.jsonl`: one line every few steps and at every stage end and whenever it is saved, then one with the final figures. `loss`, `losses` and `psnr` are of
   training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training; `validation_psnr` is on
-  lines of steps after which validation views were looked at.
+  lines of steps after which validation views were looked at: the mean of up to four, reduced to 128 pixels or less.
+- `events.out.tfevents.*`: the same for TensorBoard (`tensorboard --logdir` this folder, or the one it is in); one file each time that the run went on.
 - `report.html`: all of this on one page, with a viewer of the grid; any browser opens it, without a network.
 - `loss.svg`: the loss over the steps.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
 - `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.
-- `result.json`: the final figures. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring.
+- `result.json`: the final figures. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring. `best_validation`
+  names the step after which `validation_psnr` was highest; the grid is that of the last step all the same.
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
+- `images/preview.png`: replaced while it trains: a validation view, photograph and render, reduced; without validation views, what the camera of the stages sees.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
   pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.
 - `images/carved.png`: what was carved, seen by some test cameras.
@@ -346,7 +350,8 @@ mod tests {
         let path = std::env::temp_dir().join(format!("plenoxel-occupied-{}", std::process::id()));
         std::fs::create_dir_all(path.join(IMAGES)).unwrap();
         std::fs::create_dir_all(path.join(EXPORTS)).unwrap();
-        for name in [CHECKPOINT, "notes.txt", "images/old.png", "exports/mesh.glb", "exports/notes.txt"] {
+        for name in [CHECKPOINT, "events.out.tfevents.17.plenoxel", "notes.txt", "images/old.png", "exports/mesh.glb", "exports/notes.txt"]
+        {
             std::fs::write(path.join(name), "x").unwrap();
         }
         let refused = RunFolder::choose(Some(&path), "x", false).unwrap_err();
@@ -357,7 +362,7 @@ mod tests {
         std::fs::write(path.join(RECORD), "{}").unwrap();
         RunFolder::choose(Some(&path), "x", true).unwrap().prepare().unwrap();
         assert!(!path.join(CHECKPOINT).exists() && !path.join("images/old.png").exists());
-        assert!(!path.join("exports/mesh.glb").exists());
+        assert!(!path.join("exports/mesh.glb").exists() && !path.join("events.out.tfevents.17.plenoxel").exists());
         assert!(path.join("notes.txt").exists() && path.join("exports/notes.txt").exists());
         std::fs::remove_dir_all(path).unwrap();
     }

@@ -1,6 +1,9 @@
 //! A training run that is interrupted or killed goes on as if nothing had happened.
 #![cfg(unix)]
 
+#[path = "../../tests/support/events.rs"]
+mod events;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -93,6 +96,11 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
     let found = result(Path::new(&cut));
     assert!(found.0 == want.0, "another grid");
     assert_eq!(found.1.last(), want.1.last());
+    // TensorBoard is told each step once, in five files.
+    let curves = events::scalars(Path::new(&cut));
+    let told: Vec<(Option<u64>, Option<f32>)> = curves["loss"].iter().map(|&(step, loss)| (Some(step), Some(loss))).collect();
+    let wanted = found.1.iter().map(|line| (line["step"].as_u64(), line["loss"].as_f64().map(|loss| loss as f32)));
+    assert!(events::files(Path::new(&cut)).len() == 5 && told == wanted.collect::<Vec<_>>(), "{told:?}");
     let names: Vec<_> = fs::read_dir(&cut).expect("its folder").flatten().map(|entry| entry.file_name()).collect();
     assert!(!names.iter().any(|name| name.to_string_lossy().contains("tmp")), "{names:?}");
 

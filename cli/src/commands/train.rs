@@ -3,29 +3,28 @@
 mod budget;
 mod flags;
 mod interrupt;
+mod learning;
 mod pictures;
+mod preview;
+mod watching;
 
 use super::new_run::{Stopwatch, announce, load, record};
-use crate::curves::loss_svg;
 use crate::data::DataSource;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
-use crate::images::Rgb;
 use crate::machine;
 use crate::memory::{self, Estimate};
-use crate::metrics_file::{MetricsFile, Past, Seen};
+use crate::metrics_file::{Best, MetricsFile, Past};
 use crate::progress::{Console, clock};
 use crate::report::Report;
 use crate::run_folder::RunFolder;
 pub use flags::{TrainArgs, size};
-use pictures::Pictures;
-use plenoxel::checkpoint::Header;
+use learning::{Learned, StageSummary};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
-use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::train::Trainer;
 use plenoxel::train::config::Config;
-use plenoxel::train::{PlannedStage, Trainer};
+use preview::Preview;
 use serde::Serialize;
-use serde_json::json;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -62,6 +61,7 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let most_rows = room(&config, &dataset, bytes as u64, console)?;
     let initial = initial.map(|folder| folder.load()).transpose()?.map(|(grid, _)| grid);
     let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
+    let preview = clocks.load.time(|| Preview::new(&dataset, args.preview_every))?;
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
 
     if let Some(seconds) = args.time {
@@ -85,9 +85,9 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         let chosen = if config.init_from.is_some() { "of the grid it starts from" } else { "around the silhouettes" };
         console.note(&format!("box: half width {half_width:.4}, {chosen}"));
     }
-    let metrics = MetricsFile::create(&folder.metrics(), trainer.total_steps())?;
+    let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
     let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &source, preset, args, console };
-    let learned = job.learn(trainer, metrics, Past::default(), &views, &mut clocks)?;
+    let learned = job.learn(trainer, (metrics, Past::default()), preview, &views, &mut clocks)?;
     drop(views);
     job.conclude(learned, clocks)
 }
@@ -104,16 +104,17 @@ fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     }
     announce(console, &dataset, &config);
     let most_rows = room(&config, &dataset, 0, console)?;
+    let preview = clocks.load.time(|| Preview::new(&dataset, args.preview_every))?;
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
     let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows).resumed(&state)?;
     folder.remove_fragments()?;
-    let (metrics, past) = MetricsFile::resume(&folder.metrics(), trainer.total_steps(), trainer.steps_taken())?;
+    let (metrics, past) = MetricsFile::resume(&folder, trainer.total_steps(), trainer.steps_taken())?;
     clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
     let (taken, total) = (trainer.steps_taken(), trainer.total_steps());
     console.note(&format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds)));
     let preset = record.preset.as_deref();
     let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &source, preset, args, console };
-    let learned = job.learn(trainer, metrics, past, &views, &mut clocks)?;
+    let learned = job.learn(trainer, (metrics, past), preview, &views, &mut clocks)?;
     drop(views);
     job.conclude(learned, clocks)
 }
@@ -138,94 +139,6 @@ struct Job<'a, 'c> {
 }
 
 impl Job<'_, '_> {
-    /// The training itself; only it is on the clock for training. `None` if it was interrupted: then all that is needed to go on is saved.
-    fn learn(
-        &self,
-        mut trainer: Trainer<'_, f32>,
-        mut metrics: MetricsFile,
-        past: Past,
-        views: &[View],
-        clocks: &mut Clocks,
-    ) -> Result<Option<Learned<'_>>> {
-        let Job { folder, config, dataset, console, .. } = *self;
-        let mut pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
-        let keep_stages = self.args.keeps_stages(self.source);
-        let clock = &mut clocks.train;
-        let plan = trainer.plan().to_vec();
-        let total = trainer.total_steps();
-        let mut progress = console.training(&plan, trainer.prunes_from(), past.seconds);
-        let mut losses = past.losses;
-        let mut stages: Vec<StageSummary> = Vec::new();
-        for (index, seconds) in past.stages {
-            let Some(PlannedStage { stage, steps, .. }) = plan.get(index) else { continue };
-            pictures.earlier_stage(index, stage.resolution);
-            stages.push(StageSummary { resolution: stage.resolution, steps: *steps, seconds, psnr: None, grid: None });
-        }
-        let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
-        let interrupt = interrupt::Watch::begin();
-        let mut saved = Instant::now();
-        let mut voxels = trainer.grid().lattice().present();
-        loop {
-            let report = match clock.time(|| trainer.step()) {
-                Ok(Some(report)) => report,
-                Ok(None) => break,
-                Err(e) => {
-                    // The lines and the curve so far stay, to show how it came to this; there is no checkpoint.
-                    metrics.append(&json!({ "step": losses.len(), "failure": e.to_string() }))?;
-                    folder.write_loss(&loss_svg(&losses, &plan, &title))?;
-                    return Err(e);
-                }
-            };
-            let seconds = clock.seconds();
-            if report.step == plan[report.stage].first {
-                voxels = trainer.grid().lattice().present();
-            }
-            losses.push(report.loss);
-            let last = report.step + 1 == total;
-            let due = saved.elapsed().as_secs_f64() >= self.args.checkpoint_every;
-            let save = !last && (due || interrupt.requested());
-            metrics.step(&report, &plan, Seen { voxels, validation_psnr: None, seconds }, save)?;
-            progress.step(&report, seconds);
-            if report.ends_stage {
-                folder.write_loss(&loss_svg(&losses, &plan, &title))?;
-                let grid = trainer.grid();
-                pictures.stage(report.stage, grid)?;
-                stages.push(StageSummary {
-                    resolution: grid.shape().resolution,
-                    steps: plan[report.stage].steps,
-                    seconds,
-                    psnr: None,
-                    grid: (keep_stages && !last).then(|| copy(grid)),
-                });
-            }
-            if save {
-                metrics.sync()?;
-                match trainer.save(&folder.state(), dataset.name()) {
-                    // There may be room on the disk the next time.
-                    Err(e) if !interrupt.requested() => console.note(&format!("not saved: {e}")),
-                    done => done?,
-                }
-                saved = Instant::now();
-            }
-            if save && interrupt.requested() {
-                drop(progress);
-                let remedy = format!("go on with: plenoxel train --resume {}", folder.path().display());
-                console.error(&format!("interrupted after step {} of {total}, saved; {remedy}", report.step + 1));
-                return Ok(None);
-            }
-        }
-        drop(progress);
-        let grid = trainer.into_grid();
-        folder.save(&grid, &Header::new(&grid, dataset.name(), config.background, config.seed, total))?;
-        if interrupt.requested() {
-            console.error(&format!("interrupted after the last step; its figures: plenoxel evaluate {}", folder.path().display()));
-            return Ok(None);
-        }
-        let mean_image = evaluation::mean_image(views, config.background);
-        let (rays, samples) = metrics.counts();
-        Ok(Some(Learned { grid, metrics, pictures, mean_image, stages, steps: total, rays, samples }))
-    }
-
     /// Compares what was learned with the test views, and says what came of it.
     fn conclude(&self, learned: Option<Learned<'_>>, mut clocks: Clocks) -> Result<u8> {
         let Job { folder, config, dataset, console, .. } = *self;
@@ -236,6 +149,8 @@ impl Job<'_, '_> {
         pictures.strip(test.first(), config.background)?;
         let note = pictures.note();
         let (width, height) = dataset.size();
+        let (rays, samples) = learned.metrics.counts();
+        let (validation_psnr, best_validation) = learned.metrics.validation();
         let summary = Summary {
             psnr: scores.psnr(),
             ssim: scores.ssim(),
@@ -252,17 +167,19 @@ impl Job<'_, '_> {
             seconds_evaluate: clocks.evaluate.seconds(),
             peak_memory_bytes: memory::peak(),
             steps: learned.steps,
-            rays: learned.rays,
-            samples: learned.samples,
+            rays,
+            samples,
             resolution: learned.grid.shape().resolution,
             scene: dataset.name().to_owned(),
             preset: self.preset.map(str::to_owned),
             run: folder.path().display().to_string(),
+            validation_psnr,
+            best_validation,
             stages: learned.stages,
             per_view: scores.per_view.clone(),
         };
         folder.write_result(&summary)?;
-        learned.metrics.append(&Final { result: &summary })?;
+        learned.metrics.conclude(&Final { result: &summary }, &[("psnr/test", summary.psnr), ("ssim/test", summary.ssim)])?;
         folder.remove_state()?;
         say(console, folder, &summary, &scores, note.as_deref())?;
         if !self.args.no_report {
@@ -272,19 +189,6 @@ impl Job<'_, '_> {
         }
         Ok(0)
     }
-}
-
-/// A trained grid and how it came about.
-struct Learned<'a> {
-    grid: VoxelGrid<f32>,
-    metrics: MetricsFile,
-    pictures: Pictures<'a>,
-    /// The training views on the mean.
-    mean_image: Option<Rgb>,
-    stages: Vec<StageSummary>,
-    steps: u64,
-    rays: u64,
-    samples: u64,
 }
 
 /// Figures of the final grid, with panels, and of the grids of earlier stages that were kept.
@@ -321,11 +225,6 @@ fn evaluate(learned: &mut Learned<'_>, test: &[View], config: &Config, console: 
     Ok(scores)
 }
 
-/// A grid with the values that `grid` has now: the tables are shared until training changes them.
-fn copy(grid: &VoxelGrid<f32>) -> VoxelGrid<f32> {
-    grid.with_density(grid.density.tensor().detach())
-}
-
 /// Final figures, in the order in which people look for them.
 #[derive(Debug, Serialize)]
 struct Summary {
@@ -351,6 +250,9 @@ struct Summary {
     scene: String,
     preset: Option<String>,
     run: String,
+    /// Of reduced validation views, when they were last looked at.
+    validation_psnr: Option<f64>,
+    best_validation: Option<Best>,
     stages: Vec<StageSummary>,
     per_view: Vec<ViewScore>,
 }
@@ -360,19 +262,6 @@ struct Summary {
 struct Final<'a> {
     #[serde(rename = "final")]
     result: &'a Summary,
-}
-
-/// A stage in the final figures.
-#[derive(Debug, Serialize)]
-struct StageSummary {
-    resolution: usize,
-    steps: u64,
-    /// Of training, when it ended.
-    seconds: f64,
-    /// Of the test views, if the grid was kept until they were read.
-    psnr: Option<f64>,
-    #[serde(skip)]
-    grid: Option<VoxelGrid<f32>>,
 }
 
 /// What time was spent on; pictures are on none of the clocks.

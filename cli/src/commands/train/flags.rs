@@ -72,6 +72,11 @@ pub struct TrainArgs {
     #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration, default_value = "5m")]
     pub checkpoint_every: f64,
 
+    /// Look at the grid this often while it trains, such as 10s, or off: images/preview.png, and the PSNR of a few validation views. What is
+    /// trained does not depend on it, and it takes less than a twentieth of the time
+    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration_or_off, default_value = "10s")]
+    pub preview_every: f64,
+
     /// Write no pictures
     #[arg(long, help_heading = "Output")]
     pub no_images: bool,
@@ -245,6 +250,11 @@ fn duration(text: &str) -> std::result::Result<f64, String> {
     seconds.filter(|s| *s > 0.0 && *s <= 1e6).ok_or_else(|| "a duration above 0 and up to 1e6 seconds, such as 90s, 5m or 1h".to_owned())
 }
 
+/// The same, or `off`: infinitely many.
+fn duration_or_off(text: &str) -> std::result::Result<f64, String> {
+    if text == "off" { Ok(f64::INFINITY) } else { duration(text).map_err(|accepted| format!("{accepted}; or off")) }
+}
+
 /// Width and height from `SIDE` or `WIDTHxHEIGHT`.
 pub fn size(text: &str) -> std::result::Result<(usize, usize), String> {
     let (width, height) = text.split_once('x').unwrap_or((text, text));
@@ -291,7 +301,8 @@ mod tests {
             assert_eq!(duration(text), Ok(seconds), "{text}");
         }
         for text in ["", "s", "0", "-5s", "5 m", "1d", "nan", "inf", "1e9s"] {
-            assert!(duration(text).is_err(), "{text}");
+            assert!(duration(text).is_err() && duration_or_off(text).is_err(), "{text}");
         }
+        assert_eq!((duration_or_off("off"), duration_or_off("1m")), (Ok(f64::INFINITY), Ok(60.0)));
     }
 }

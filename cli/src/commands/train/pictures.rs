@@ -47,6 +47,11 @@ impl<'a> Pictures<'a> {
         })
     }
 
+    /// From where pictures of the stages are taken, if there are any.
+    pub fn camera(&self) -> Option<Camera> {
+        self.camera
+    }
+
     /// A stage has ended with this grid.
     pub fn stage(&mut self, stage: usize, grid: &VoxelGrid<f32>) -> Result<()> {
         let Some(camera) = &self.camera else {

@@ -1,0 +1,119 @@
+//! The training itself: steps, what looks on, and what is saved to go on from.
+
+use super::pictures::Pictures;
+use super::preview::Preview;
+use super::watching::Watching;
+use super::{Clocks, Job, interrupt};
+use crate::evaluation;
+use crate::images::Rgb;
+use crate::metrics_file::{MetricsFile, Past};
+use plenoxel::checkpoint::Header;
+use plenoxel::dataset::View;
+use plenoxel::error::Result;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::train::{PlannedStage, Trainer};
+use serde::Serialize;
+use std::time::Instant;
+
+/// A trained grid and how it came about.
+pub struct Learned<'a> {
+    pub grid: VoxelGrid<f32>,
+    pub metrics: MetricsFile,
+    pub pictures: Pictures<'a>,
+    /// The training views on the mean.
+    pub mean_image: Option<Rgb>,
+    pub stages: Vec<StageSummary>,
+    pub steps: u64,
+}
+
+/// A stage in the final figures.
+#[derive(Debug, Serialize)]
+pub struct StageSummary {
+    resolution: usize,
+    steps: u64,
+    /// Of training, when it ended.
+    seconds: f64,
+    /// Of the test views, if the grid was kept until they were read.
+    pub psnr: Option<f64>,
+    #[serde(skip)]
+    pub grid: Option<VoxelGrid<f32>>,
+}
+
+impl<'a> Job<'a, '_> {
+    /// The training; only its steps are on the clock for training. `None` if it was interrupted: then all that is needed to go on is saved.
+    pub fn learn(
+        &'a self,
+        mut trainer: Trainer<'_, f32>,
+        (metrics, past): (MetricsFile, Past),
+        preview: Preview,
+        views: &[View],
+        clocks: &mut Clocks,
+    ) -> Result<Option<Learned<'a>>> {
+        let Job { folder, config, dataset, console, .. } = *self;
+        let keep_stages = self.args.keeps_stages(self.source);
+        let plan = trainer.plan().to_vec();
+        let total = trainer.total_steps();
+        let earlier = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));
+        let summary = |planned: &PlannedStage, seconds, grid| StageSummary {
+            resolution: planned.stage.resolution,
+            steps: planned.steps,
+            seconds,
+            psnr: None,
+            grid,
+        };
+        let mut stages: Vec<StageSummary> = earlier.map(|(planned, seconds)| summary(planned, seconds, None)).collect();
+        let pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
+        let preview = preview.begin(pictures.camera().map(|camera| (folder.image("preview.png"), camera)));
+        let mut watching = Watching::begin((folder, config, console), &trainer, (metrics, past), pictures, preview);
+        let interrupt = interrupt::Watch::begin();
+        let mut saved = Instant::now();
+        loop {
+            let report = match clocks.train.time(|| trainer.step()) {
+                Ok(Some(report)) => report,
+                Ok(None) => break,
+                // There is no checkpoint.
+                Err(e) => return watching.failed(&e).and(Err(e)),
+            };
+            let seconds = clocks.train.seconds();
+            let last = report.step + 1 == total;
+            let due = saved.elapsed().as_secs_f64() >= self.args.checkpoint_every;
+            let save = !last && (due || interrupt.requested());
+            let grid = trainer.grid();
+            watching.step(&report, grid, seconds, save)?;
+            if report.ends_stage {
+                stages.push(summary(&plan[report.stage], seconds, (keep_stages && !last).then(|| copy(grid))));
+            }
+            if save {
+                watching.sync()?;
+                match trainer.save(&folder.state(), dataset.name()) {
+                    // There may be room on the disk the next time.
+                    Err(e) if !interrupt.requested() => console.note(&format!("not saved: {e}")),
+                    done => done?,
+                }
+                saved = Instant::now();
+            }
+            if save && interrupt.requested() {
+                drop(watching);
+                let remedy = format!("go on with: plenoxel train --resume {}", folder.path().display());
+                let text = format!("interrupted after step {} of {total}, saved; {remedy}", report.step + 1);
+                console.error(&text, interrupt::EXIT_CODE);
+                return Ok(None);
+            }
+        }
+        let (metrics, pictures) = watching.end();
+        let grid = trainer.into_grid();
+        folder.save(&grid, &Header::new(&grid, dataset.name(), config.background, config.seed, total))?;
+        if interrupt.requested() {
+            let text = format!("interrupted after the last step; its figures: plenoxel evaluate {}", folder.path().display());
+            console.error(&text, interrupt::EXIT_CODE);
+            return Ok(None);
+        }
+        let mean_image = evaluation::mean_image(views, config.background);
+        Ok(Some(Learned { grid, metrics, pictures, mean_image, stages, steps: total }))
+    }
+}
+
+/// A grid with the values that `grid` has now: the tables are shared until training changes them.
+fn copy(grid: &VoxelGrid<f32>) -> VoxelGrid<f32> {
+    grid.with_density(grid.density.tensor().detach())
+}

@@ -1,0 +1,184 @@
+//! A look at the grid while it is trained: a picture that is replaced again and again, and the PSNR of a few validation views.
+//!
+//! It informs and changes nothing: no bit of what is trained depends on it, and test views are not looked at.
+
+use crate::evaluation::Viewer;
+use crate::images;
+use plenoxel::camera::{Camera, Intrinsics};
+use plenoxel::dataset::image::RgbaImage;
+use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::error::Result;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::metrics::psnr;
+use plenoxel::train::config::Config;
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// So many validation views, evenly spaced.
+const VIEWS: usize = 4;
+/// Their longer side in pixels, at most: their PSNR is to cost little.
+const SIDE: usize = 128;
+/// That of the picture's, for eyes.
+const PICTURE_SIDE: usize = 256;
+/// The share of the time since training began that may be gone into looking when it is looked because time has passed, and when a stage ends.
+const SHARES: [f64; 2] = [0.03, 0.05];
+/// Seconds that it counts for at least: the stages of short runs have their look too.
+const LEAST: f64 = 20.0;
+
+/// A preview that is made from time to time.
+pub struct Preview {
+    views: Vec<View>,
+    pace: Pace,
+    /// The first of the views, larger.
+    shown: Option<View>,
+    /// Where the picture goes, if one is wanted, and who looks where there are no validation views.
+    picture: Option<(PathBuf, Camera)>,
+}
+
+/// What was seen.
+pub struct Look {
+    /// Mean PSNR of the validation views, if there are any.
+    pub psnr: Option<f64>,
+    /// The picture that was written, if one was wanted, and its width and height.
+    pub picture: Option<(PathBuf, (usize, usize))>,
+}
+
+impl Preview {
+    /// Previews every so many seconds at most, never for infinitely many; reads the few views that are needed.
+    pub fn new(dataset: &Dataset, every: f64) -> Result<Self> {
+        let chosen = match every.is_finite() {
+            true => images::evenly_spaced(dataset.count(Split::Val), VIEWS),
+            false => Vec::new(),
+        };
+        let (mut views, mut shown) = (Vec::new(), None);
+        // One after the other, so that one image of full size is in memory at a time.
+        for number in chosen {
+            let view = dataset.load_view(Split::Val, number)?;
+            views.push(reduced(&view, SIDE));
+            shown = shown.or_else(|| Some(reduced(&view, PICTURE_SIDE)));
+        }
+        Ok(Preview { views, pace: Pace::new(every), shown, picture: None })
+    }
+
+    /// The same for training that begins now; with a picture, if one is wanted, of what a camera sees if there are no validation views.
+    pub fn begin(self, picture: Option<(PathBuf, Camera)>) -> Self {
+        let picture = picture.map(|(path, camera)| {
+            let Intrinsics { width, height, .. } = camera.intrinsics;
+            let intrinsics = camera.intrinsics.downscaled(width.max(height).div_ceil(PICTURE_SIDE).min(width).min(height));
+            (path, Camera { intrinsics, ..camera })
+        });
+        Preview { pace: Pace::new(self.pace.every), picture, ..self }
+    }
+
+    /// Looks at the grid, if it is time to.
+    pub fn look(&mut self, grid: &VoxelGrid<f32>, ends_stage: bool, config: &Config) -> Result<Option<Look>> {
+        let nothing = self.views.is_empty() && self.picture.is_none();
+        if nothing || !self.pace.due(self.pace.now(), ends_stage) {
+            return Ok(None);
+        }
+        let start = self.pace.now();
+        let viewer = Viewer::new(grid, config.evaluation, config);
+        let psnr = self.views.iter().map(|view| {
+            let (picture, target) = (viewer.see(&view.camera).rgb, view.composite(config.background));
+            psnr(picture.view(), target.view())
+        });
+        let sum: f64 = psnr.sum();
+        let psnr = (!self.views.is_empty()).then(|| sum / self.views.len() as f64);
+        let mut written = None;
+        if let Some((path, camera)) = &self.picture {
+            let picture = match &self.shown {
+                Some(view) => images::strip(&[&view.composite(config.background), &viewer.see(&view.camera).rgb]),
+                None => viewer.see(camera).rgb,
+            };
+            images::write(path, &picture)?;
+            written = Some((path.clone(), (picture.dim().1, picture.dim().0)));
+        }
+        self.pace.took(start, self.pace.now());
+        Ok(Some(Look { psnr, picture: written }))
+    }
+}
+
+/// A view of at most so many pixels a side, without the last columns and rows that would make no whole pixel.
+fn reduced(view: &View, side: usize) -> View {
+    let (width, height) = view.image.dimensions();
+    let k = width.max(height).div_ceil(side as u32).min(width).min(height);
+    let whole = |side: u32| side - side % k;
+    let image = RgbaImage::from_fn(whole(width), whole(height), |x, y| *view.image.get_pixel(x, y));
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let camera = Camera { intrinsics: Intrinsics { width, height, ..view.camera.intrinsics }, ..view.camera };
+    View { name: view.name.clone(), camera, image, depth: None }.reduced(k as usize)
+}
+
+/// When to look: after some time, or when a stage ends, and always so that little of the time goes into it.
+struct Pace {
+    every: f64,
+    began: Instant,
+    /// Seconds since then at which the last look was over.
+    last: f64,
+    /// Seconds of all looks, and of the last one.
+    spent: f64,
+    cost: f64,
+}
+
+impl Pace {
+    fn new(every: f64) -> Self {
+        Pace { every, began: Instant::now(), last: 0.0, spent: 0.0, cost: 0.0 }
+    }
+
+    /// Seconds since training began.
+    fn now(&self) -> f64 {
+        self.began.elapsed().as_secs_f64()
+    }
+
+    fn due(&self, now: f64, ends_stage: bool) -> bool {
+        let affordable = self.spent + self.cost <= SHARES[usize::from(ends_stage)] * now.max(LEAST);
+        self.every.is_finite() && affordable && (ends_stage || now - self.last >= self.every)
+    }
+
+    fn took(&mut self, start: f64, end: f64) {
+        self.cost = end - start;
+        self.spent += self.cost;
+        self.last = end;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use plenoxel::dataset::procedural::ProceduralOptions;
+
+    #[test]
+    fn looking_takes_a_small_share_of_the_time() {
+        for (every, cost) in [(10.0, 0.1), (10.0, 3.0), (0.1, 0.2), (0.001, 0.01)] {
+            let (mut pace, mut now, mut looks, mut missed) = (Pace::new(every), 0.0, 0.0, 0);
+            for step in 1..20_000 {
+                now += 0.05;
+                let ends_stage = step % 5_000 == 0;
+                if pace.due(now, ends_stage) {
+                    pace.took(now, now + cost);
+                    now += cost;
+                    looks += 1.0;
+                } else if ends_stage {
+                    missed += 1;
+                }
+            }
+            assert!(pace.spent <= SHARES[1] * now && missed == 0, "{every} {cost}: {} of {now}, {missed} missed", pace.spent);
+            let most = (SHARES[0] * now / cost).min(now / every);
+            assert!(looks > 0.9 * most - 1.0, "{every} {cost}: {looks} of {most}");
+        }
+        let never = Pace::new(f64::INFINITY);
+        assert!(!never.due(1e6, true) && !never.due(1e6, false));
+    }
+
+    #[test]
+    fn a_reduced_view_shows_the_same_from_the_same_place() {
+        let options = ProceduralOptions { width: 53, height: 37, train: 1, val: 1, test: 0, ..ProceduralOptions::default() };
+        let view = Dataset::procedural(options).unwrap().load_view(Split::Val, 0).unwrap();
+        let small = reduced(&view, 12);
+        assert_eq!(small.image.dimensions(), (10, 7));
+        assert_eq!((small.camera.intrinsics.width, small.camera.intrinsics.height), (10, 7));
+        // The ray of a reduced pixel is that of the middle one of its twenty-five.
+        let (ray, middle) = (small.camera.ray(2.5, 3.5), view.camera.ray(12.5, 17.5));
+        assert!(ray.direction.distance(middle.direction) < 1e-12 && ray.origin == middle.origin);
+    }
+}

@@ -1,0 +1,149 @@
+//! TensorBoard's event files: the figures of `metrics.jsonl` for `tensorboard --logdir runs`.
+//!
+//! A file is a row of records, each a length, the length's checksum, so many bytes, and their checksum; the bytes are a protocol buffer, an
+//! `Event`. Records, masked checksums and the numbers of the fields are as in TensorFlow's `record_writer.h`, `event.proto` and
+//! `summary.proto`. A last record that was cut short is left out by who reads.
+
+use plenoxel::error::{Error, Result};
+use std::fs::{File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// What TensorBoard knows the files by; then comes the time in seconds, by which it sorts them.
+const PREFIX: &str = "events.out.tfevents.";
+/// What it expects in the first record.
+const VERSION: &str = "brain.Event:2";
+
+/// A file that grows by a record at a time.
+pub struct EventFile {
+    path: PathBuf,
+    file: File,
+}
+
+impl EventFile {
+    /// A new file in the folder of a run of which so many steps have been taken: what files that are there say of later ones is forgotten.
+    pub fn create(folder: &Path, taken: u64) -> Result<Self> {
+        let newest = present(folder).filter_map(|path| number(&path)).max();
+        let number = (seconds() as u64).max(newest.map_or(0, |newest| newest.saturating_add(1)));
+        let path = folder.join(format!("{PREFIX}{number}.plenoxel"));
+        let file = OpenOptions::new().append(true).create_new(true).open(&path);
+        let file = file.map_err(|e| Error::io(&path, e, "creating the events for TensorBoard"))?;
+        let mut events = EventFile { path, file };
+        events.append(0, field::FILE_VERSION, VERSION.as_bytes())?;
+        if taken > 0 {
+            // SessionLog { status: START }: TensorBoard drops this step and later ones, for they will be taken again.
+            events.append(taken, field::SESSION_LOG, &Message::default().varint(1, 1).0)?;
+        }
+        Ok(events)
+    }
+
+    /// Numbers after a step, each with its name.
+    pub fn scalars<'n>(&mut self, step: u64, values: impl IntoIterator<Item = (&'n str, f64)>) -> Result<()> {
+        let summary = values.into_iter().fold(Message::default(), |summary, (tag, value)| {
+            summary.bytes(field::VALUE, &Message::default().bytes(field::TAG, tag.as_bytes()).float(field::SIMPLE_VALUE, value as f32).0)
+        });
+        self.append(step, field::SUMMARY, &summary.0)
+    }
+
+    /// A picture after a step: the bytes of a PNG file of so many pixels.
+    pub fn image(&mut self, step: u64, tag: &str, (width, height): (usize, usize), png: &[u8]) -> Result<()> {
+        const RGB: u64 = 3;
+        let image = Message::default().varint(1, height as u64).varint(2, width as u64).varint(3, RGB).bytes(4, png);
+        let value = Message::default().bytes(field::TAG, tag.as_bytes()).bytes(field::IMAGE, &image.0);
+        self.append(step, field::SUMMARY, &Message::default().bytes(field::VALUE, &value.0).0)
+    }
+
+    /// Appends an event with one field besides the time and the step.
+    fn append(&mut self, step: u64, field: u64, content: &[u8]) -> Result<()> {
+        let event = Message::default().double(field::WALL_TIME, seconds()).varint(field::STEP, step).bytes(field, content);
+        let written = self.file.write_all(&record(&event.0));
+        written.map_err(|e| Error::io(&self.path, e, "writing the events for TensorBoard"))
+    }
+}
+
+/// The event files in a folder.
+pub fn present(folder: &Path) -> impl Iterator<Item = PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.map(|entry| entry.path()).filter(|path| name(path).is_some_and(|name| name.starts_with(PREFIX)))
+}
+
+fn name(path: &Path) -> Option<&str> {
+    path.file_name()?.to_str()
+}
+
+/// The time in the name of an event file.
+fn number(path: &Path) -> Option<u64> {
+    name(path)?.strip_prefix(PREFIX)?.split('.').next()?.parse().ok()
+}
+
+/// Seconds since 1970.
+fn seconds() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
+}
+
+/// Bytes with their length and the two checksums.
+fn record(bytes: &[u8]) -> Vec<u8> {
+    let length = (bytes.len() as u64).to_le_bytes();
+    [&length[..], &checksum(&length), bytes, &checksum(bytes)].concat()
+}
+
+/// CRC-32C, rotated and shifted by a constant, because a checksum of bytes that hold checksums is a weak one.
+fn checksum(bytes: &[u8]) -> [u8; 4] {
+    crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
+}
+
+/// Fields by their numbers: of `Event`, of `Summary`, of `Summary.Value`.
+mod field {
+    pub const WALL_TIME: u64 = 1;
+    pub const STEP: u64 = 2;
+    pub const FILE_VERSION: u64 = 3;
+    pub const SUMMARY: u64 = 5;
+    pub const SESSION_LOG: u64 = 7;
+
+    pub const VALUE: u64 = 1;
+
+    pub const TAG: u64 = 1;
+    pub const SIMPLE_VALUE: u64 = 2;
+    pub const IMAGE: u64 = 4;
+}
+
+/// A protocol buffer, field by field: before each comes its number and, in three bits, how it is written.
+#[derive(Default)]
+struct Message(Vec<u8>);
+
+impl Message {
+    fn varint(mut self, field: u64, value: u64) -> Self {
+        self.number(field << 3);
+        self.number(value);
+        self
+    }
+
+    fn double(mut self, field: u64, value: f64) -> Self {
+        self.number(field << 3 | 1);
+        self.0.extend(value.to_le_bytes());
+        self
+    }
+
+    fn bytes(mut self, field: u64, bytes: &[u8]) -> Self {
+        self.number(field << 3 | 2);
+        self.number(bytes.len() as u64);
+        self.0.extend(bytes);
+        self
+    }
+
+    fn float(mut self, field: u64, value: f32) -> Self {
+        self.number(field << 3 | 5);
+        self.0.extend(value.to_le_bytes());
+        self
+    }
+
+    /// Seven bits a byte, the lowest first; the eighth says that more follow.
+    fn number(&mut self, mut value: u64) {
+        while value >= 0x80 {
+            self.0.push(value as u8 | 0x80);
+            value >>= 7;
+        }
+        self.0.push(value as u8);
+    }
+}

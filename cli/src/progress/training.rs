@@ -1,0 +1,220 @@
+//! Progress of a training run: a bar for each stage, or lines.
+
+use super::{Console, Meter, Standing, bytes, clock, metric};
+use crate::memory;
+use crate::metrics_file::Seen;
+use plenoxel::train::{PlannedStage, Report};
+use serde::Serialize;
+
+/// A mean that forgets: each value moves it by `share` of the way, the first ones by more, so that it starts without a bias.
+#[derive(Debug, Clone, Copy)]
+struct Smoothed {
+    share: f64,
+    count: f64,
+    value: f64,
+}
+
+impl Smoothed {
+    fn new(share: f64) -> Self {
+        Smoothed { share, count: 0.0, value: 0.0 }
+    }
+
+    fn add(&mut self, value: f64) {
+        self.count += 1.0;
+        self.value += (value - self.value) * self.share.max(1.0 / self.count);
+    }
+}
+
+/// Progress of a training run.
+pub struct Training<'c, 'a> {
+    meter: Meter<'c, 'a>,
+    plan: Vec<PlannedStage>,
+    prune_from_stage: Option<usize>,
+    total: u64,
+    mse: Smoothed,
+    loss: Smoothed,
+    samples: Smoothed,
+    step_seconds: Smoothed,
+    seconds: f64,
+    validation_psnr: Option<f64>,
+}
+
+impl<'a> Console<'a> {
+    /// Progress of a training run that has taken so many seconds.
+    pub fn training(&self, plan: &[PlannedStage], prune_from_stage: Option<usize>, seconds: f64) -> Training<'_, 'a> {
+        let total = plan.iter().map(|p| p.steps).sum();
+        Training {
+            meter: Meter::new(self, total),
+            plan: plan.to_vec(),
+            prune_from_stage,
+            total,
+            mse: Smoothed::new(0.05),
+            loss: Smoothed::new(0.05),
+            samples: Smoothed::new(0.05),
+            step_seconds: Smoothed::new(0.05),
+            seconds,
+            validation_psnr: None,
+        }
+    }
+}
+
+impl Training<'_, '_> {
+    /// A step was taken.
+    pub fn step(&mut self, report: &Report, seen: Seen) {
+        let took = seen.seconds - self.seconds;
+        self.seconds = seen.seconds;
+        self.validation_psnr = seen.validation_psnr.or(self.validation_psnr);
+        self.mse.add(10f64.powf(-0.1 * report.psnr));
+        self.loss.add(report.loss);
+        let stage = self.plan[report.stage];
+        if report.step == stage.first {
+            // The first step of a stage also makes its grid: it says nothing about the next ones.
+            (self.step_seconds, self.samples) = (Smoothed::new(0.05), Smoothed::new(0.05));
+        } else {
+            self.step_seconds.add(took);
+        }
+        self.samples.add(report.samples as f64 / report.rays.max(1) as f64);
+        let place = (report.step + 1 - stage.first, stage.steps);
+        self.meter.show(place, report.ends_stage, || self.now(report, seen.voxels));
+    }
+
+    fn now(&self, report: &Report, voxels: usize) -> Now {
+        let pace = Some(self.step_seconds.value).filter(|step| *step > 0.0);
+        Now {
+            what: "training",
+            stage: report.stage + 1,
+            stages: self.plan.len(),
+            resolution: self.plan[report.stage].stage.resolution,
+            step: report.step + 1,
+            steps: self.total,
+            loss: self.loss.value,
+            psnr: -10.0 * self.mse.value.log10(),
+            validation_psnr: self.validation_psnr,
+            rays_per_second: pace.map(|step| report.rays as f64 / step),
+            samples_per_ray: self.samples.value,
+            voxels,
+            memory_bytes: memory::now(),
+            eta_seconds: self.remaining(report),
+            seconds: self.seconds,
+        }
+    }
+
+    /// Seconds to go: this stage at its pace, later ones at a pace in proportion to their resolution, as their samples are, and three
+    /// times faster once empty space is left out.
+    fn remaining(&self, report: &Report) -> f64 {
+        let now = &self.plan[report.stage];
+        let step = match self.step_seconds.count {
+            // The first of a stage: as all before it, on the mean.
+            0.0 => self.seconds / (report.step + 1) as f64,
+            _ => self.step_seconds.value,
+        };
+        let samples = |index: usize| {
+            let pruned = self.prune_from_stage.is_some_and(|first| index >= first);
+            self.plan[index].stage.resolution as f64 / if pruned { 3.0 } else { 1.0 }
+        };
+        let here = (now.first + now.steps - report.step - 1) as f64;
+        let later = (report.stage + 1..self.plan.len()).map(|i| self.plan[i].steps as f64 * samples(i) / samples(report.stage));
+        step * (here + later.sum::<f64>())
+    }
+}
+
+/// How far training is. Stages count from 1, steps are those that have been taken; losses, rates and the PSNR of training rays are smoothed, that of validation views
+/// is the last there was.
+#[derive(Debug, Clone, Serialize)]
+struct Now {
+    what: &'static str,
+    stage: usize,
+    stages: usize,
+    resolution: usize,
+    step: u64,
+    steps: u64,
+    loss: f64,
+    psnr: f64,
+    validation_psnr: Option<f64>,
+    rays_per_second: Option<f64>,
+    samples_per_ray: f64,
+    voxels: usize,
+    memory_bytes: Option<u64>,
+    eta_seconds: f64,
+    seconds: f64,
+}
+
+impl Now {
+    fn psnr(&self) -> String {
+        match self.validation_psnr {
+            Some(validation) => format!("train {:.2} val {validation:.2} dB", self.psnr),
+            None => format!("train {:.2} dB", self.psnr),
+        }
+    }
+
+    /// Rays a second, voxels and memory, as far as they are known.
+    fn sizes(&self) -> String {
+        let pace = self.rays_per_second.map(|rays| format!("  {}rays/s", metric(rays)));
+        let memory = self.memory_bytes.map(|n| format!("  {}", bytes(n)));
+        format!("{}  {}voxels{}", pace.unwrap_or_default(), metric(self.voxels as f64), memory.unwrap_or_default())
+    }
+}
+
+impl Standing for Now {
+    fn line(&self) -> String {
+        let Now { stage, stages, resolution, step, steps, loss, samples_per_ray, .. } = self;
+        format!(
+            "stage {stage}/{stages} ({resolution}³)  step {step}/{steps}  ETA {}  {}  loss {loss:.5}{}  {samples_per_ray:.0} samples/ray",
+            clock(self.eta_seconds),
+            self.psnr(),
+            self.sizes(),
+        )
+    }
+
+    fn beside_bar(&self) -> String {
+        let Now { stage, stages, resolution, loss, samples_per_ray, .. } = self;
+        format!(
+            "stage {stage}/{stages} {resolution}³  ETA {}  {}{}  loss {loss:.5}  {samples_per_ray:.0} samples/ray",
+            clock(self.eta_seconds),
+            self.psnr(),
+            self.sizes(),
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_smoothed_value_starts_as_the_plain_mean() {
+        let mut mean = Smoothed::new(0.1);
+        [1.0, 2.0, 6.0].into_iter().for_each(|x| mean.add(x));
+        assert!((mean.value - 3.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn lines_fit_into_a_log_and_what_matters_beside_a_bar_of_100_columns() {
+        let now = Now {
+            what: "training",
+            stage: 2,
+            stages: 4,
+            resolution: 256,
+            step: 10_203,
+            steps: 14_400,
+            loss: 0.001_234_5,
+            psnr: 29.876,
+            validation_psnr: Some(28.012),
+            rays_per_second: Some(431_204.0),
+            samples_per_ray: 38.2,
+            voxels: 1_234_567,
+            memory_bytes: Some(1_512_000_000),
+            eta_seconds: 754.0,
+            seconds: 100.0,
+        };
+        let line = now.line();
+        assert!(line.chars().count() <= 140, "{line}");
+        // A bar takes fourteen columns.
+        let seen: String = now.beside_bar().chars().take(100 - 14).collect();
+        for part in ["stage 2/4", "12:34", "29.88", "28.01", "431 krays/s", "1.23 Mvoxels", "1.5 GB"] {
+            assert!(line.contains(part) && seen.contains(part), "{part}: {line} | {seen}");
+        }
+        let unknown = Now { validation_psnr: None, rays_per_second: None, memory_bytes: None, ..now };
+        assert!(!unknown.line().contains("val ") && unknown.line().contains("train 29.88 dB"), "{}", unknown.line());
+    }
+}
