@@ -10,6 +10,7 @@ mod config;
 mod curves;
 mod data;
 mod evaluation;
+mod figures;
 mod images;
 mod machine;
 mod memory;
