@@ -2,11 +2,14 @@
 
 pub mod carve;
 mod cloud_filters;
+pub mod completions;
 pub mod evaluate;
 pub mod export;
 pub mod filter;
 pub mod info;
+pub mod man;
 mod new_run;
+pub mod presets;
 pub mod render;
 pub mod report;
 pub mod scene;

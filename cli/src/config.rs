@@ -4,30 +4,20 @@
 //! names that place: a line of a file, a preset, a flag.
 
 mod keys;
+mod presets;
 mod table;
 
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::train::config::Config;
+pub use presets::{CARVE, PRESETS, find};
+use std::io::Read;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// The presets by name: what they are for, and their text.
-pub const PRESETS: [(&str, &str, &str); 6] = [
-    ("demo", "the built-in scene in minutes", include_str!("../presets/demo.toml")),
-    ("fast", "a minute or two", include_str!("../presets/fast.toml")),
-    ("quality", "the best in eleven to fifteen minutes", include_str!("../presets/quality.toml")),
-    ("standard", "a dataset of your own", include_str!("../presets/standard.toml")),
-    ("plenoxels", "Plenoxels as published: hours", include_str!("../presets/plenoxels.toml")),
-    ("paper", "\"Plenoxels and extension to point clouds\", bugs repaired", include_str!("../presets/paper.toml")),
-];
-
-/// What `carve` starts from: no preset of training.
-pub const CARVE: (&str, &str, &str) = ("carve", "an opaque grid from silhouettes", include_str!("../presets/carve.toml"));
-
 /// A configuration in the making.
-#[derive(Debug)]
+#[derive(Debug, Default, Clone)]
 pub struct Layers {
     table: Table,
     /// Path of each value that was written, and where; later entries win.
@@ -37,20 +27,17 @@ pub struct Layers {
 impl Layers {
     /// The defaults alone.
     pub fn defaults() -> Result<Self> {
-        let mut layers = Layers { table: Table::new(), places: Vec::new() };
+        let mut layers = Layers::default();
         let text = toml::to_string(&Config::default()).map_err(|e| Error::config("the defaults", e, "a defect of the program"))?;
         layers.text(&text, &|_| "the defaults".to_owned())?;
         Ok(layers)
     }
 
-    /// Lays a preset over what is there.
-    pub fn preset(&mut self, name: &str) -> Result<()> {
-        let preset = PRESETS.iter().chain([&CARVE]).find(|(known, ..)| *known == name);
-        let Some((name, _, text)) = preset else {
-            let names: Vec<&str> = PRESETS.iter().map(|(name, ..)| *name).collect();
-            return Err(Error::config("--preset", name, names.join(", ")));
-        };
-        self.text(text, &|_| format!("preset {name}"))
+    /// With a preset laid over what is there.
+    pub fn with_preset(mut self, name: &str) -> Result<Self> {
+        let preset = find(name)?;
+        self.text(preset.text, &|_| format!("preset {name}"))?;
+        Ok(self)
     }
 
     /// Lays a text over what is there, once `place` can say for each path where it stands.
@@ -109,9 +96,10 @@ impl Layers {
             Some(place) => format!("{key} ({place})"),
             None => key.to_owned(),
         };
-        let config: Config = Value::Table(self.table).try_into().map_err(|e: toml::de::Error| {
-            let (key, accepted) = explain(&e.to_string());
-            Error::config(placed(&key), "the value", accepted)
+        let config: Config = serde_path_to_error::deserialize(Value::Table(self.table)).map_err(|e| {
+            let key = e.path().to_string();
+            let (found, accepted) = explain(e.inner().message());
+            Error::config(placed(&key), found, accepted)
         })?;
         config.validate().map_err(|e| match e {
             Error::Config { key, found, accepted } => Error::config(placed(&key), found, accepted),
@@ -120,6 +108,9 @@ impl Layers {
         Ok(config)
     }
 }
+
+/// Bytes that a configuration file may have: a hundred times those of the longest preset.
+const LARGEST_FILE: u64 = 1 << 20;
 
 /// The text of a configuration file.
 #[derive(Debug)]
@@ -134,12 +125,22 @@ impl ConfigFile {
     /// Reads a file. Errors: it is not there, or not TOML (with the line).
     pub fn read(path: &Path) -> Result<Self> {
         let remedy = "give the path of a TOML file, such as the config.toml of a run";
-        let bytes = std::fs::read(path).map_err(|e| match e.kind() {
+        let mut bytes = Vec::new();
+        let read = std::fs::File::open(path).and_then(|file| file.take(LARGEST_FILE + 1).read_to_end(&mut bytes));
+        read.map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => Error::input(path, "there is no such file", remedy),
             std::io::ErrorKind::IsADirectory => Error::input(path, "this is a folder", remedy),
             _ => Error::io(path, e, "reading the configuration"),
         })?;
+        if bytes.len() as u64 > LARGEST_FILE {
+            return Err(Error::input(path, "this file is larger than 1 MiB", remedy));
+        }
         let text = String::from_utf8(bytes).map_err(|_| Error::input(path, "this is not a text file", remedy))?;
+        Self::parse(path, text)
+    }
+
+    /// The file of a text. Errors: it is not TOML (with the line).
+    fn parse(path: &Path, text: String) -> Result<Self> {
         let mut lines = Vec::new();
         let line_of = |offset: usize| text[..offset].matches('\n').count() + 1;
         match DeTable::parse(&text) {
@@ -178,10 +179,11 @@ pub fn layered<'a>(
     let file = file.map(ConfigFile::read).transpose()?;
     let complete = file.as_ref().is_some_and(ConfigFile::is_complete);
     let preset = preset.or((!complete).then_some(default));
-    let mut layers = Layers::defaults()?;
-    if let Some(preset) = preset {
-        layers.preset(preset)?;
-    }
+    let mut layers = match preset {
+        Some(preset) => Layers::defaults()?.with_preset(preset)?,
+        // Not even the defaults shine through: a loss that they have may be none of the file's.
+        None => Layers::default(),
+    };
     if let Some(file) = &file {
         layers.file(file)?;
     }
@@ -189,19 +191,22 @@ pub fn layered<'a>(
     Ok((layers.resolve()?, preset))
 }
 
+/// A configuration as a text of which reading gives the same one, below a remark of one line or more.
+pub fn text(config: &Config, remark: &str) -> Result<String> {
+    let text = toml::to_string(config).map_err(|e| Error::config("the settings", e, "a defect of the program"))?;
+    let heading: String = remark.lines().map(|line| format!("# {line}\n")).collect();
+    Ok(format!("{heading}# Complete: no preset and no default shows through.\n\n{text}"))
+}
+
 /// Writes a configuration so that reading it gives the same one.
-pub fn write(path: &Path, config: &Config, origin: &str) -> Result<()> {
-    let text = toml::to_string(config).map_err(|e| Error::input(path, e.to_string(), "this is a defect of the program"))?;
-    let heading = format!(
-        "# {origin}\n# Complete: it needs no preset. `plenoxel train DATA --config THIS_FILE` (`carve`, if there are no stages) repeats the run.\n\n"
-    );
-    files::write_atomically(path, (heading + &text).as_bytes())
+pub fn write(path: &Path, config: &Config, remark: &str) -> Result<()> {
+    files::write_atomically(path, text(config, remark)?.as_bytes())
 }
 
 /// Reads what [`write`] wrote.
 pub fn read(path: &Path) -> Result<Config> {
     let file = ConfigFile::read(path)?;
-    let mut layers = Layers { table: Table::new(), places: Vec::new() };
+    let mut layers = Layers::default();
     layers.file(&file)?;
     layers.resolve()
 }
@@ -253,115 +258,29 @@ fn place_of<'a>(places: &'a [(String, String)], key: &str) -> Option<&'a str> {
     last.map(|(_, place)| place.as_str())
 }
 
-/// The key and the complaint in the message of a failed conversion: "complaint\nin `a.b`".
-fn explain(message: &str) -> (String, String) {
-    let mut lines = message.lines();
-    let complaint = lines.next().unwrap_or_default().to_owned();
-    let key = lines.find_map(|line| line.trim().strip_prefix("in `")?.strip_suffix('`'));
-    let accepted = if complaint.contains("enum Sampling") {
-        "{ step = voxel sides } or { samples = points, far = largest t }".to_owned()
-    } else if complaint.contains("enum Weight") {
-        "a number, { weight = …, until = step } or { from = …, to = …, steps = … }".to_owned()
-    } else {
-        complaint
+/// What was found and what is accepted, from the message of a failed conversion.
+fn explain(complaint: &str) -> (&str, &str) {
+    if complaint.contains("enum Sampling") {
+        return ("the value", "{ step = voxel sides } or { samples = points, far = largest t }");
+    }
+    if complaint.contains("enum Weight") {
+        return ("the value", "a number, { weight = …, until = step } or { from = …, to = …, steps = … }");
+    }
+    let Some((found, accepted)) = complaint.split_once(", expected ") else {
+        return (complaint, "a complete table");
     };
-    (key.unwrap_or("the configuration").to_owned(), accepted)
+    let found = ["invalid type: ", "invalid value: "].iter().fold(found, |found, start| found.trim_start_matches(start));
+    let accepted = match accepted {
+        "f64" | "f32" => "a number",
+        "u64" | "usize" => "a whole number of at least 0",
+        "a boolean" => "a boolean: true or false",
+        "a sequence" => "a list",
+        "path string" => "a path",
+        table if table.starts_with("struct ") || table == "a map" => "a table",
+        other => other,
+    };
+    (found, accepted)
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn preset(name: &str) -> Layers {
-        let mut layers = Layers::defaults().unwrap();
-        layers.preset(name).unwrap();
-        layers
-    }
-
-    fn refusal(assignments: &[&str]) -> String {
-        let mut layers = preset("paper");
-        let set = assignments.iter().try_for_each(|a| layers.assign(a));
-        set.and_then(|()| layers.resolve()).unwrap_err().to_string()
-    }
-
-    #[test]
-    fn every_preset_is_a_valid_configuration_that_survives_its_file() {
-        let path = std::env::temp_dir().join(format!("plenoxel-config-{}", std::process::id()));
-        for (name, ..) in PRESETS {
-            let config = preset(name).resolve().unwrap();
-            write(&path, &config, name).unwrap();
-            assert_eq!(read(&path).unwrap(), config, "{name}");
-            assert!(ConfigFile::read(&path).unwrap().is_complete());
-        }
-        std::fs::remove_file(path).unwrap();
-    }
-
-    #[test]
-    fn numbers_that_no_decimal_ends_survive_the_file() {
-        let path = std::env::temp_dir().join(format!("plenoxel-thirds-{}", std::process::id()));
-        let mut config = preset("paper").resolve().unwrap();
-        config.background = [1.0 / 3.0, 0.1, 2.0 / 3.0];
-        config.half_width = 4.0 / 3.0;
-        config.stages[0].density_rate = 1e-29 / 3.0;
-        write(&path, &config, "").unwrap();
-        assert_eq!(read(&path).unwrap(), config);
-        std::fs::remove_file(path).unwrap();
-    }
-
-    #[test]
-    fn the_command_line_reaches_every_kind_of_knob() {
-        let mut layers = preset("paper");
-        for assignment in [
-            "interpolation = trilinear",
-            "stages[3].epochs=0.5",
-            "stages[*].color_rate=7",
-            "evaluation={step=0.25}",
-            "losses.sparsity.from=1e-3",
-            "losses.sparsity.to=1e-5",
-            "losses.sparsity.steps=100",
-            "optimizer={kind=\"momentum\", decay=0.9}",
-            "background=[0, 0, 0]",
-            "prune_from_stage=2",
-        ] {
-            layers.assign(assignment).unwrap();
-        }
-        let config = layers.resolve().unwrap();
-        assert_eq!(config.stages[3].epochs, Some(0.5));
-        assert!(config.stages.iter().all(|stage| stage.color_rate == 7.0));
-        assert_eq!(config.background, [0.0; 3]);
-        assert_eq!(config.prune_from_stage, Some(2));
-    }
-
-    #[test]
-    fn a_refused_value_names_the_place_where_it_was_written() {
-        let message = refusal(&["stages[1].density_rate=-1"]);
-        assert!(message.starts_with("--set stages[1].density_rate: -1 cannot be used"), "{message}");
-        let message = refusal(&["stages[*].density_rate=-1"]);
-        assert!(message.starts_with("stages[0].density_rate (--set stages[*].density_rate): -1"), "{message}");
-        let message = refusal(&["half_width=wide"]);
-        assert!(message.starts_with("--set half_width") && message.contains("expected f64"), "{message}");
-        let message = refusal(&["evaluation={samples=5}"]);
-        assert!(message.starts_with("--set evaluation") && message.contains("far ="), "{message}");
-        let message = refusal(&["losses.mse=often"]);
-        assert!(message.contains("a number, { weight = ") && message.contains("{ from = "), "{message}");
-        assert!(refusal(&["stages"]).contains("key=value"));
-    }
-
-    #[test]
-    fn an_unknown_key_in_a_file_is_reported_with_its_line() {
-        let path = std::env::temp_dir().join(format!("plenoxel-unknown-{}.toml", std::process::id()));
-        std::fs::write(&path, "seed = 1\n\n[initial]\ndensitty = 1\n").unwrap();
-        let message = preset("paper").file(&ConfigFile::read(&path).unwrap()).unwrap_err().to_string();
-        assert!(message.contains(", line 4: the unknown key `densitty`"), "{message}");
-        assert!(message.contains("the nearest known key is `density`"), "{message}");
-        std::fs::write(&path, "seed = 1\nhalf_width = = 2\n").unwrap();
-        let error = ConfigFile::read(&path).unwrap_err();
-        assert!(error.exit_code() == 3 && error.to_string().contains("line 2 is not TOML"), "{error}");
-        std::fs::write(&path, "seed = 1\nhalf_width = -2\n").unwrap();
-        let mut layers = preset("paper");
-        layers.file(&ConfigFile::read(&path).unwrap()).unwrap();
-        let message = layers.resolve().unwrap_err().to_string();
-        assert!(message.starts_with("half_width (") && message.contains("line 2): -2"), "{message}");
-        std::fs::remove_file(path).unwrap();
-    }
-}
+mod tests;

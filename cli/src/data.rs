@@ -49,6 +49,20 @@ impl DataSource {
         DataSource::BuiltIn { width: options.width, height: options.height, train: options.train, val: options.val, test: options.test }
     }
 
+    /// The arguments that name it on a command line, each with a space before.
+    pub fn arguments(&self) -> String {
+        let plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c);
+        match self {
+            DataSource::Folder { path } if path.to_str().is_some_and(|path| path.chars().all(plain)) => format!(" {}", path.display()),
+            // Quoted, and nothing in it that a remark in a file may not hold.
+            DataSource::Folder { path } => format!(" {path:?}"),
+            built_in if *built_in == DataSource::of(None) => String::new(),
+            DataSource::BuiltIn { width, height, train, val, test } => {
+                format!(" --scene-size {width}x{height} --scene-views {train},{val},{test}")
+            }
+        }
+    }
+
     /// Opens the views with the reduction and the validation split of a configuration. The built-in scene is rendered at the reduced
     /// size right away.
     pub fn open(&self, config: &Config) -> Result<Dataset> {

@@ -53,9 +53,11 @@ impl<'a> Viewer<'a> {
             let picture = self.see(&view.camera);
             let target = view.composite(self.background);
             let (prediction, reference) = (picture.rgb.view(), target.view());
+            let mse = metrics::mse(prediction, reference);
             per_view.push(ViewScore {
                 name: view.name.clone(),
-                psnr: metrics::psnr(prediction, reference),
+                psnr: metrics::psnr_of(mse),
+                mse,
                 ssim: metrics::ssim(prediction, reference),
                 ssim_same: metrics::ssim_same(prediction, reference),
             });
@@ -72,6 +74,8 @@ pub struct ViewScore {
     pub name: String,
     /// In dB.
     pub psnr: f64,
+    /// Mean squared error, from which it is.
+    pub mse: f64,
     /// Over windows inside the image; none for images below 11 pixels.
     pub ssim: Option<f64>,
     /// With zeros around the image, as svox2 computes it.
@@ -89,6 +93,11 @@ impl Scores {
     /// Mean PSNR in dB.
     pub fn psnr(&self) -> Option<f64> {
         mean(self.per_view.iter().map(|view| Some(view.psnr)))
+    }
+
+    /// PSNR of the mean error, in dB: views with large errors count more than in the mean PSNR.
+    pub fn psnr_of_mean_mse(&self) -> Option<f64> {
+        mean(self.per_view.iter().map(|view| Some(view.mse))).map(metrics::psnr_of)
     }
 
     /// Mean SSIM.

@@ -13,6 +13,7 @@ mod data;
 mod evaluation;
 mod html;
 mod event_file;
+mod figures;
 mod images;
 mod machine;
 mod memory;
@@ -22,7 +23,7 @@ mod report;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{carve, evaluate, export, filter, info, render, scene, train};
+use commands::{carve, completions, evaluate, export, filter, info, man, presets, render, scene, train};
 use plenoxel::error::Error;
 use progress::{Console, LogFormat};
 use std::ffi::OsString;
@@ -41,8 +42,9 @@ Examples:
   plenoxel report runs/lego-1                its page again, to look around in
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           its surface, for other programs
+  plenoxel presets                           settings to start from, and how long they take
 
-Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing,
+Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
 130 interrupted (what was trained is saved).";
 
 /// Voxel radiance fields from photographs with known cameras
@@ -66,6 +68,9 @@ enum Command {
     Filter(filter::FilterArgs),
     Info(info::InfoArgs),
     Scene(scene::SceneArgs),
+    Presets(presets::PresetsArgs),
+    Completions(completions::CompletionsArgs),
+    Man(man::ManArgs),
 }
 
 #[derive(Debug, Args)]
@@ -116,6 +121,9 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Filter(args) => filter::run(args, &console),
             Command::Info(args) => info::run(args, &console),
             Command::Scene(args) => scene::run(args, &console),
+            Command::Presets(args) => presets::run(args, &console),
+            Command::Completions(args) => completions::run(args, &console),
+            Command::Man(args) => man::run(args, &console),
         };
         done.map(|()| 0)
     });
@@ -148,4 +156,81 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
 fn json_line(value: &impl serde::Serialize) -> Result<String, Error> {
     let defect = |e: serde_json::Error| Error::input("result", e.to_string(), "this is a defect of the program");
     serde_json::to_string(value).map_err(defect)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::{Command, CommandFactory};
+
+    /// A command with those below it, and the words that call it.
+    fn commands(command: &Command) -> Vec<Command> {
+        let below = command.get_subcommands().flat_map(commands);
+        std::iter::once(command.clone()).chain(below).collect()
+    }
+
+    fn all() -> Vec<Command> {
+        let mut command = Cli::command().disable_help_subcommand(true);
+        command.build();
+        commands(&command)
+    }
+
+    #[test]
+    fn the_definitions_of_the_command_line_hold_together() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn every_command_has_examples_and_every_argument_a_sentence() {
+        for command in all() {
+            let name = command.get_bin_name().unwrap_or_default().to_owned();
+            let help = command.clone().render_long_help().to_string();
+            assert!(help.contains("\nExamples:\n") && help.contains(&format!("\n  {name}")), "{help}");
+            for argument in command.get_arguments() {
+                let text = argument.get_help().unwrap_or_default().to_string();
+                assert!(text.len() > 5 && !text.ends_with('.'), "{name}: {argument}: {text}");
+            }
+        }
+    }
+
+    #[test]
+    fn defaults_that_the_help_of_train_names_are_those_of_the_presets() {
+        let train = all().into_iter().find(|command| command.get_name() == "train").expect("train");
+        for flag in ["seed", "downscale", "half-width", "interpolation", "color", "sh-degree", "sh-reduction", "hull", "engine"] {
+            let argument = train.get_arguments().find(|argument| argument.get_long() == Some(flag)).expect(flag);
+            let help = argument.get_help().unwrap_or_default().to_string();
+            let defaults = help.split("[default: ").nth(1).expect("a default");
+            let value = |preset: &str| {
+                let (settings, _) = config::layered(None, preset, None, |_| Ok(())).expect("a valid preset");
+                let settings = toml::Table::try_from(settings).expect("a table");
+                settings[&flag.replace('-', "_")].to_string().replace('"', "")
+            };
+            let usual = value("standard");
+            assert!(defaults.starts_with(&usual), "{flag}: {usual} in {defaults}");
+            for preset in config::PRESETS.map(|preset| preset.name) {
+                let value = value(preset);
+                let special = value != usual;
+                assert!(defaults.contains(preset) == special && defaults.contains(&value), "{flag}: {preset} has {value}, not {defaults}");
+            }
+        }
+    }
+
+    #[test]
+    fn every_command_line_that_we_show_is_understood() {
+        let readme = include_str!("../../README.md");
+        let shown = readme.lines().filter_map(|line| line.strip_prefix("cargo run --release -- "));
+        let shown = shown.map(|line| line.split('#').next().unwrap_or_default().to_owned());
+        let helps = all().into_iter().map(|command| command.get_after_help().unwrap_or_default().to_string());
+        // What an example does stands behind two spaces.
+        let example = |line: &str| Some(line.strip_prefix("  plenoxel ")?.split("  ").next()?.split(['>', '|']).next()?.to_owned());
+        let examples = helps.flat_map(|help| help.lines().filter_map(example).collect::<Vec<_>>());
+        let lines: Vec<String> = shown.chain(examples).collect();
+        assert!(lines.len() > 45, "{lines:?}");
+        for line in lines {
+            let parsed = Cli::try_parse_from(["plenoxel"].into_iter().chain(line.split_whitespace()));
+            // Help is an answer too.
+            let refused = parsed.err().filter(clap::Error::use_stderr);
+            assert!(refused.is_none(), "plenoxel {line}\n{refused:?}");
+        }
+    }
 }

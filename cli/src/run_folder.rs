@@ -97,8 +97,9 @@ impl RunFolder {
 
     /// Writes what is known before the first step.
     pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
-        let origin = format!("Configuration of a run of {}.", record.program);
-        config::write(&self.path.join(CONFIG), config, &origin)?;
+        let command = if config.stages.is_empty() { "carve" } else { "train" };
+        let again = format!("plenoxel {command}{} --config THIS_FILE", record.data.arguments());
+        config::write(&self.path.join(CONFIG), config, &format!("Settings of a run of {}. The same run again:\n{again}", record.program))?;
         self.write_json(RECORD, record)?;
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
     }
@@ -292,7 +293,7 @@ const EXPLANATION: &str = "\
 
 Of these files, those that apply: a carved run has no training to tell of.
 
-- `config.toml`: every setting, resolved; `plenoxel train DATA --config config.toml` repeats the run (`carve` one that was carved).
+- `config.toml`: every setting, resolved; its first lines say how to repeat the run with it, to the bit.
 - `run.json`: the data, the program, the machine.
 - `metrics.jsonl`: one line every few steps and at every stage end and whenever it is saved, then one with the final figures. `loss`, `losses` and `psnr` are of
   training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training; `validation_psnr` is on
@@ -302,7 +303,7 @@ Of these files, those that apply: a carved run has no training to tell of.
 - `loss.svg`: the loss over the steps.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
 - `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.
-- `result.json`: the final figures. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring. `best_validation`
+- `result.json`: the final figures, and how each is computed. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring. `best_validation`
   names the step after which `validation_psnr` was highest; the grid is that of the last step all the same.
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
 - `images/preview.png`: replaced while it trains: a validation view, photograph and render, reduced; without validation views, what the camera of the stages sees.

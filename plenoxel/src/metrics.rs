@@ -12,12 +12,24 @@ const WINDOW: usize = 11;
 /// Columns processed together, so that the running sums stay in the first-level cache.
 const BLOCK: usize = 64;
 
-/// Peak signal-to-noise ratio in dB for values in [0, 1]: -10 log10(mean over pixels and channels of squared error), the
-/// prediction clamped to [0, 1]. Infinite for equal images; NaN if the prediction contains NaN or the images are empty.
+/// Peak signal-to-noise ratio in dB: [`psnr_of`] the [`mse`].
 ///
 /// Both are [height, width, 3]; panics if the shapes differ.
 pub fn psnr(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 {
-    assert_eq!(prediction.shape(), target.shape(), "psnr: prediction and target differ in shape");
+    psnr_of(mse(prediction, target))
+}
+
+/// Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]: -10 log10(mse). Infinite for 0.
+pub fn psnr_of(mse: f64) -> f64 {
+    -10.0 * mse.log10()
+}
+
+/// Mean squared error over pixels and channels, the prediction clamped to [0, 1]. NaN if the prediction contains NaN or the images are
+/// empty.
+///
+/// Both are [height, width, 3]; panics if the shapes differ.
+pub fn mse(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 {
+    assert_eq!(prediction.shape(), target.shape(), "mse: prediction and target differ in shape");
     let row_sums: Vec<f64> = (0..target.shape()[0])
         .into_par_iter()
         .map(|y| {
@@ -26,7 +38,7 @@ pub fn psnr(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64
             prediction.iter().zip(&target).map(squared).sum()
         })
         .collect();
-    -10.0 * (row_sums.iter().sum::<f64>() / target.len() as f64).log10()
+    row_sums.iter().sum::<f64>() / target.len() as f64
 }
 
 /// Structural similarity (Wang et al. 2004): 11 x 11 Gaussian window of sigma 1.5, k1 = 0.01, k2 = 0.03, L = 1, per channel,

@@ -29,7 +29,7 @@ Examples:
   plenoxel carve data/lego --photo-consistency             hollows too, where colors contradict
   plenoxel train data/lego --init-from runs/lego-1         training goes on from what was carved
 
-The result is a run like a trained one: evaluate, render, export and info take it. Settings are layered as for train; --set
+The result is a run like a trained one: evaluate, render, export and info take it. Settings are layered as for train; --set \
 reaches those below carve. The last line on stdout is one JSON object.";
 
 /// Carve an opaque colored grid, without training, from the silhouettes of images with alpha or from colors that contradict
@@ -101,7 +101,7 @@ pub struct CarveArgs {
 
 impl CarveArgs {
     fn config(&self) -> Result<(Config, Option<&str>)> {
-        config::layered(None, CARVE.0, self.config.as_deref(), |layers| self.flags(layers))
+        config::layered(None, CARVE.name, self.config.as_deref(), |layers| self.flags(layers))
     }
 
     fn flags(&self, layers: &mut Layers) -> Result<()> {

@@ -2,14 +2,16 @@
 
 use super::new_run::load;
 use super::trained_run::{Opened, TrainedRun};
-use crate::evaluation::{Scores, ViewScore, Viewer};
+use crate::evaluation::{ViewScore, Viewer};
+use crate::figures::Figures;
 use crate::memory;
 use crate::progress::Console;
-use clap::Args;
-use plenoxel::dataset::Split;
+use clap::{Args, ValueHint};
 use plenoxel::error::Result;
+use plenoxel::files;
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::Value;
+use std::path::PathBuf;
 use std::time::Instant;
 
 const EXAMPLES: &str = "\
@@ -17,12 +19,13 @@ Examples:
   plenoxel evaluate runs/lego                      at the resolution it was trained at
   plenoxel evaluate runs/lego --downscale 1        at full resolution
   plenoxel evaluate runs/lego --split val --json
+  plenoxel evaluate runs/lego --out lego.json
 
---samples N places N samples on the longest line through the box, and as densely on shorter ones. Runs of the paper preset
+--samples N places N samples on the longest line through the box, and as densely on shorter ones. Runs of the paper preset \
 count samples from the camera to its far limit instead.
 
-PSNR and SSIM are means over views; predictions are clamped to [0, 1] and not rounded to 8 bits. ssim counts windows that
-lie inside the image, ssim_same pads with zeros as svox2 does. The last line on stdout is one JSON object.";
+PSNR and SSIM are means over views. The last line on stdout is one JSON object, which says how each figure is computed: what is \
+clamped, rounded and padded, over which background, at which size. LPIPS is not computed.";
 
 /// Compute PSNR and SSIM of a trained run on the views of a split
 #[derive(Debug, Args)]
@@ -34,6 +37,10 @@ pub struct EvaluateArgs {
     /// Print the JSON object alone
     #[arg(long, help_heading = "Output")]
     json: bool,
+
+    /// Write the JSON object to this file too, replacing what is there
+    #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
+    out: Option<PathBuf>,
 }
 
 /// Evaluates a run.
@@ -52,72 +59,45 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     })?;
     drop(count);
 
-    let (width, height) = dataset.size();
+    let figures = Figures::new(&scores, args.run.split, &dataset, &config, sampling, &grid);
     if !args.json {
         for view in &scores.per_view {
             let ssim = view.ssim.map_or("-".to_owned(), |ssim| format!("{ssim:.4}"));
             console.result(&format!("{:24} {:7.2} dB  ssim {ssim}", view.name, view.psnr))?;
         }
-        console.result(&sentence(&scores, args.run.split, width, height))?;
+        console.result(&figures.sentence())?;
     }
     let trained = folder.result().unwrap_or(Value::Null);
-    let figures = Figures {
-        psnr: scores.psnr(),
-        ssim: scores.ssim(),
-        ssim_same: scores.ssim_same(),
-        split: args.run.split.to_string(),
-        views: views.len(),
-        width,
-        height,
-        background: config.background,
-        sampling: json!(sampling),
+    let evaluation = Evaluation {
+        figures,
         seconds: trained["seconds"].as_f64(),
         seconds_load,
         seconds_evaluate: start.elapsed().as_secs_f64(),
         peak_memory_bytes: memory::peak(),
         steps: header.step,
         rays: trained["rays"].as_u64(),
-        resolution: header.resolution,
         scene: header.scene,
         preset,
         run: folder.path().display().to_string(),
         per_view: scores.per_view,
     };
-    console.result(&crate::json_line(&figures)?)
-}
-
-/// The figures as people say them.
-pub fn sentence(scores: &Scores, split: Split, width: usize, height: usize) -> String {
-    let Some(psnr) = scores.psnr() else {
-        return format!("no {split} views to evaluate on");
-    };
-    let ssim = match scores.ssim() {
-        Some(ssim) => format!(", SSIM {ssim:.4}"),
-        None => String::new(),
-    };
-    let views = scores.per_view.len();
-    format!("PSNR {psnr:.2} dB{ssim}: means over {views} {split} views of {width} x {height}")
+    let line = crate::json_line(&evaluation)?;
+    // Printed first, so that a file that cannot be written takes nothing with it.
+    console.result(&line)?;
+    args.out.iter().try_for_each(|file| files::write_atomically(file, (line.clone() + "\n").as_bytes()))
 }
 
 /// What `evaluate` prints last. `seconds` is the training time that the run remembers.
 #[derive(Debug, Serialize)]
-struct Figures {
-    psnr: Option<f64>,
-    ssim: Option<f64>,
-    ssim_same: Option<f64>,
-    split: String,
-    views: usize,
-    width: usize,
-    height: usize,
-    background: [f32; 3],
-    sampling: Value,
+struct Evaluation {
+    #[serde(flatten)]
+    figures: Figures,
     seconds: Option<f64>,
     seconds_load: f64,
     seconds_evaluate: f64,
     peak_memory_bytes: Option<u64>,
     steps: u64,
     rays: Option<u64>,
-    resolution: usize,
     scene: String,
     preset: Option<String>,
     run: String,

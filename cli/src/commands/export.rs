@@ -17,9 +17,16 @@ use plenoxel::files::write_atomically;
 use plenoxel::train::config::Config;
 use std::path::{Path, PathBuf};
 
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel export ply runs/lego       a colored point cloud: CloudCompare, MeshLab
+  plenoxel export vox runs/lego       MagicaVoxel
+  plenoxel export mesh runs/lego      a surface: Blender, and what reads PLY, OBJ or GLB
+  plenoxel export ply --help          the settings of one";
+
 /// Write a trained run as files of other programs
 #[derive(Debug, Args)]
-#[command(arg_required_else_help = true)]
+#[command(after_help = EXAMPLES, arg_required_else_help = true)]
 pub struct ExportArgs {
     #[command(subcommand)]
     what: What,

@@ -16,9 +16,9 @@ Examples:
   plenoxel filter scan.ply --out clean.ply --noise-radius 0.05 --remove-isolated
   plenoxel filter runs/lego/exports/cloud.ply --out clean.ply --min-value 0.5 --value-field opacity
 
-Filters are CloudCompare's and are applied in this order: bbox, value, noise, SOR. With the same settings value and SOR keep
-the same points; noise may keep others where the plane of the neighbours is not unique, or a point lies just as far from it
-as is allowed: such points stay here, and CloudCompare's rounding decides. Points between voxels are often such. The new file has the encoding of the old one, and of each point that stays all properties to the last digit;
+Filters are CloudCompare's and are applied in this order: bbox, value, noise, SOR. With the same settings value and SOR keep \
+the same points; noise may keep others where the plane of the neighbours is not unique, or a point lies just as far from it \
+as is allowed: such points stay here, and CloudCompare's rounding decides. Points between voxels are often such. The new file has the encoding of the old one, and of each point that stays all properties to the last digit; \
 faces and other elements are left out, for they name points by number.";
 
 /// Clean a point cloud with CloudCompare's filters

@@ -14,7 +14,7 @@ Examples:
   plenoxel render runs/lego --view 0 --view r_17   two of them, by number and by name
   plenoxel render runs/lego --split train --downscale 4
 
-Writes RUN/renders/<split>_<number>_<name>.png with the colors over the run's background, and the same with _depth
+Writes RUN/renders/<split>_<number>_<name>.png with the colors over the run's background, and the same with _depth \
 (red near, blue far, white empty) and _opacity.";
 
 /// Render the views of a trained run to PNG files

@@ -17,7 +17,7 @@ Examples:
   plenoxel scene data/still-life --size 400 --train 200 --force
   plenoxel train data/still-life
 
-Writes transforms_{train,val,test}.json and RGBA images with straight alpha, in the NeRF-synthetic format, and exact depth
+Writes transforms_{train,val,test}.json and RGBA images with straight alpha, in the NeRF-synthetic format, and exact depth \
 beside the test views: 16 bits, thousandths of a world unit, 0 where there is nothing.";
 
 /// The most pixels on a side.

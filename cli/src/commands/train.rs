@@ -11,6 +11,7 @@ mod watching;
 use super::new_run::{Stopwatch, announce, load, record};
 use crate::data::DataSource;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
+use crate::figures::Figures;
 use crate::machine;
 use crate::memory::{self, Estimate};
 use crate::metrics_file::{Best, MetricsFile, Past};
@@ -148,19 +149,13 @@ impl Job<'_, '_> {
         let pictures = &learned.pictures;
         pictures.strip(test.first(), config.background)?;
         let note = pictures.note();
-        let (width, height) = dataset.size();
         let (rays, samples) = learned.metrics.counts();
         let (validation_psnr, best_validation) = learned.metrics.validation();
+        let means = [("psnr/test", scores.psnr()), ("ssim/test", scores.ssim())];
         let summary = Summary {
-            psnr: scores.psnr(),
-            ssim: scores.ssim(),
-            ssim_same: scores.ssim_same(),
+            figures: Figures::new(&scores, Split::Test, dataset, config, config.evaluation, &learned.grid),
             baseline_background_psnr: evaluation::background_psnr(&test, config.background),
             baseline_mean_image_psnr: learned.mean_image.and_then(|image| evaluation::constant_psnr(&test, &image, config.background)),
-            views: test.len(),
-            width,
-            height,
-            background: config.background,
             seconds: clocks.train.seconds(),
             seconds_planned: self.args.time,
             seconds_load: clocks.load.seconds(),
@@ -169,19 +164,18 @@ impl Job<'_, '_> {
             steps: learned.steps,
             rays,
             samples,
-            resolution: learned.grid.shape().resolution,
             scene: dataset.name().to_owned(),
             preset: self.preset.map(str::to_owned),
             run: folder.path().display().to_string(),
             validation_psnr,
             best_validation,
             stages: learned.stages,
-            per_view: scores.per_view.clone(),
+            per_view: scores.per_view,
         };
         folder.write_result(&summary)?;
-        learned.metrics.conclude(&Final { result: &summary }, &[("psnr/test", summary.psnr), ("ssim/test", summary.ssim)])?;
+        learned.metrics.conclude(&Final { result: &summary }, &means)?;
         folder.remove_state()?;
-        say(console, folder, &summary, &scores, note.as_deref())?;
+        say(console, folder, &summary, note.as_deref())?;
         if !self.args.no_report {
             let (_, _, record) = RunFolder::open(folder.path())?;
             let report = Report { folder, config, record: &record, dataset, grid: &learned.grid };
@@ -228,15 +222,10 @@ fn evaluate(learned: &mut Learned<'_>, test: &[View], config: &Config, console: 
 /// Final figures, in the order in which people look for them.
 #[derive(Debug, Serialize)]
 struct Summary {
-    psnr: Option<f64>,
-    ssim: Option<f64>,
-    ssim_same: Option<f64>,
+    #[serde(flatten)]
+    figures: Figures,
     baseline_background_psnr: Option<f64>,
     baseline_mean_image_psnr: Option<f64>,
-    views: usize,
-    width: usize,
-    height: usize,
-    background: [f32; 3],
     seconds: f64,
     /// The time that was asked for.
     seconds_planned: Option<f64>,
@@ -246,7 +235,6 @@ struct Summary {
     steps: u64,
     rays: u64,
     samples: u64,
-    resolution: usize,
     scene: String,
     preset: Option<String>,
     run: String,
@@ -272,7 +260,7 @@ struct Clocks {
     evaluate: Stopwatch,
 }
 
-fn say(console: &Console<'_>, folder: &RunFolder, summary: &Summary, scores: &Scores, note: Option<&str>) -> Result<()> {
+fn say(console: &Console<'_>, folder: &RunFolder, summary: &Summary, note: Option<&str>) -> Result<()> {
     if let Some(note) = note {
         console.note(note);
     }
@@ -284,7 +272,7 @@ fn say(console: &Console<'_>, folder: &RunFolder, summary: &Summary, scores: &Sc
         decibels(summary.baseline_background_psnr),
         decibels(summary.baseline_mean_image_psnr),
     ));
-    console.result(&super::evaluate::sentence(scores, Split::Test, summary.width, summary.height))?;
+    console.result(&summary.figures.sentence())?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.result(&crate::json_line(summary)?)
 }

@@ -24,7 +24,7 @@ pub struct TrainedRun {
     #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
     pub data: Option<PathBuf>,
 
-    /// Views to look from
+    /// Views to look from: train, val or test
     #[arg(long, help_heading = "Scene", default_value_t = Split::Test, value_parser = super::split)]
     pub split: Split,
 

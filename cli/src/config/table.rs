@@ -41,7 +41,13 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
     let Some((name, index)) = segment.split_once('[') else {
         let Some(rest) = rest else {
             match value {
-                Some(value) => insert(table, segment, value.clone()),
+                Some(value) => {
+                    // The other keys would mean nothing to another kind.
+                    if segment == "kind" && table.get(segment) != Some(value) {
+                        table.clear();
+                    }
+                    insert(table, segment, value.clone());
+                }
                 None => drop(table.remove(segment)),
             }
             return Ok(());
@@ -69,8 +75,8 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
     let entries = match index {
         "*" => 0..length,
         index => {
-            let index = index.parse().map_err(|_| none(format!("`{segment}`")))?;
-            index..index + 1
+            let index: usize = index.parse().map_err(|_| none(format!("`{segment}`")))?;
+            index..index.saturating_add(1)
         }
     };
     if entries.is_empty() || entries.end > length {

@@ -359,40 +359,40 @@ impl Config {
 
     /// Checks every value; an error names the key as the file spells it.
     pub fn validate(&self) -> Result<()> {
-        let positive = |key: &str, value: f64| check(value > 0.0 && value.is_finite(), key, value, "a number above 0");
+        // What single precision can square and add up.
+        let density = |key: &str, value: f64| check((0.0..=1e12).contains(&value), key, value, "0 to 1e12");
+        let color = |key: &str, value: f64| check((-1e6..=1e6).contains(&value), key, value, "-1e6 to 1e6");
+        let decay = |key: &str, value: f64| check((0.0..1.0).contains(&value), key, value, "a number in [0, 1)");
+        let epsilon = |key: &str, value: f64| check((1e-30..=1e30).contains(&value), key, value, "1e-30 to 1e30");
         check((1..=64).contains(&self.downscale), "downscale", self.downscale, "1 to 64")?;
+        check(self.validation_every != 1, "validation_every", 1, "2 or more, or 0 for none")?;
         check(
             self.background.iter().all(|c| (0.0..=1.0).contains(c)),
             "background",
             format!("{:?}", self.background),
             "three numbers in [0, 1]",
         )?;
-        positive("half_width", self.half_width)?;
+        check((1e-9..=1e12).contains(&self.half_width), "half_width", self.half_width, "a number above 0, 1e-9 to 1e12")?;
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check((1..=64).contains(&self.sh_reduction), "sh_reduction", self.sh_reduction, "1 to 64")?;
-        check(self.sh_offset.is_finite(), "sh_offset", self.sh_offset, "a finite number")?;
+        color("sh_offset", self.sh_offset)?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
-        check((0.0..1.0).contains(&self.stop_below), "stop_below", self.stop_below, "a number in [0, 1)")?;
-        check(self.prune_below >= 0.0, "prune_below", self.prune_below, "a number of at least 0")?;
+        decay("stop_below", self.stop_below)?;
+        density("prune_below", self.prune_below)?;
         check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;
-        check(
-            self.initial.density.is_finite() && self.initial.density >= 0.0,
-            "initial.density",
-            self.initial.density,
-            "a number of at least 0",
-        )?;
-        check(self.initial.color.is_finite(), "initial.color", self.initial.color, "a finite number")?;
+        density("initial.density", self.initial.density)?;
+        color("initial.color", self.initial.color)?;
         match self.optimizer {
             OptimizerConfig::Sgd => {}
-            OptimizerConfig::Momentum { decay } => check((0.0..1.0).contains(&decay), "optimizer.decay", decay, "a number in [0, 1)")?,
-            OptimizerConfig::RmsProp { beta, epsilon } => {
-                check((0.0..1.0).contains(&beta), "optimizer.beta", beta, "a number in [0, 1)")?;
-                positive("optimizer.epsilon", epsilon)?;
+            OptimizerConfig::Momentum { decay: share } => decay("optimizer.decay", share)?,
+            OptimizerConfig::RmsProp { beta, epsilon: least } => {
+                decay("optimizer.beta", beta)?;
+                epsilon("optimizer.epsilon", least)?;
             }
-            OptimizerConfig::LazyAdam { beta1, beta2, epsilon } => {
-                check((0.0..1.0).contains(&beta1), "optimizer.beta1", beta1, "a number in [0, 1)")?;
-                check((0.0..1.0).contains(&beta2), "optimizer.beta2", beta2, "a number in [0, 1)")?;
-                positive("optimizer.epsilon", epsilon)?;
+            OptimizerConfig::LazyAdam { beta1, beta2, epsilon: least } => {
+                decay("optimizer.beta1", beta1)?;
+                decay("optimizer.beta2", beta2)?;
+                epsilon("optimizer.epsilon", least)?;
             }
         }
         for (name, weight) in &self.losses {
@@ -402,20 +402,23 @@ impl Config {
                 "an unknown loss",
                 &format!("one of {}", loss::NAMES.join(", ")),
             )?;
-            let fits = match *weight {
-                Weight::Constant(w) => w.is_finite() && w >= 0.0,
-                Weight::Until { weight, until } => weight.is_finite() && weight >= 0.0 && until > 0,
-                Weight::Exponential { from, to, steps } => from > 0.0 && from.is_finite() && to > 0.0 && to.is_finite() && steps > 0,
-            };
-            check(
-                fits,
-                &format!("losses.{name}"),
-                format!("{weight:?}"),
-                "a number of at least 0, { weight, until } with until above 0, or { from, to, steps } above 0",
-            )?;
+            let key = |part: &str| format!("losses.{name}{part}");
+            let fits = |part: &str, weight: f64| check((0.0..=1e12).contains(&weight), &key(part), weight, "0 to 1e12");
+            let changes = |part: &str, weight: f64| check((1e-30..=1e12).contains(&weight), &key(part), weight, "1e-30 to 1e12");
+            let lasts = |part: &str, steps: u64| check(steps > 0, &key(part), steps, "1 or more steps");
+            match *weight {
+                Weight::Constant(weight) => fits("", weight)?,
+                Weight::Until { weight, until } => fits(".weight", weight).and_then(|()| lasts(".until", until))?,
+                Weight::Exponential { from, to, steps } => {
+                    changes(".from", from)?;
+                    changes(".to", to)?;
+                    lasts(".steps", steps)?;
+                }
+            }
         }
         if let Some(scout) = &self.scout {
-            positive("scout.density", scout.density)?;
+            check(scout.density > 0.0, "scout.density", scout.density, "above 0 to 1e12")?;
+            density("scout.density", scout.density)?;
             let least = scout.prune_unseen_below;
             check((0.0..=1.0).contains(&least), "scout.prune_unseen_below", least, "a number in [0, 1]")?;
             check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one, or no scout")?;
@@ -425,13 +428,12 @@ impl Config {
         for (place, stage) in stages.chain(of_scout.map(|(i, stage)| (format!("scout.stages[{i}]"), stage))) {
             let key = |name: &str| format!("{place}.{name}");
             check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels a side")?;
-            let length = match (stage.epochs, stage.steps) {
-                (Some(epochs), None) => epochs > 0.0 && epochs <= 1e6,
-                (None, Some(steps)) => (1..=1_000_000_000).contains(&steps),
-                _ => false,
-            };
-            let found = format!("epochs {:?}, steps {:?}", stage.epochs, stage.steps);
-            check(length, &key("epochs"), found, "exactly one of `epochs`, above 0 to 1e6, and `steps`, 1 to 1e9")?;
+            match (stage.epochs, stage.steps) {
+                (Some(epochs), None) => check(epochs > 0.0 && epochs <= 1e6, &key("epochs"), epochs, "above 0 to 1e6")?,
+                (None, Some(steps)) => check((1..=1_000_000_000).contains(&steps), &key("steps"), steps, "1 to 1e9")?,
+                (Some(_), Some(_)) => check(false, &key("steps"), "`epochs` beside `steps`", "one of them")?,
+                (None, None) => check(false, &key("steps"), "neither `epochs` nor `steps`", "one of them")?,
+            }
             sampling(&key("sampling"), stage.sampling)?;
             let harmonics_rate = stage.harmonics_rate.unwrap_or(stage.color_rate);
             for (name, rate) in [("density_rate", stage.density_rate), ("color_rate", stage.color_rate), ("harmonics_rate", harmonics_rate)]
@@ -448,7 +450,7 @@ impl Config {
                 samples < f64::from(u32::MAX),
                 &key("sampling"),
                 format!("up to {samples:.0} samples in a step"),
-                "below 4294967295: longer steps or fewer rays",
+                "below 4294967295: longer steps, or a smaller rays_per_step",
             )?;
         }
         sampling("evaluation", self.evaluation)?;
@@ -474,5 +476,11 @@ fn sampling(key: &str, sampling: Sampling) -> Result<()> {
 }
 
 fn check(fits: bool, key: &str, found: impl ToString, accepted: &str) -> Result<()> {
-    if fits { Ok(()) } else { Err(Error::config(key, found, accepted)) }
+    if fits {
+        return Ok(());
+    }
+    let found = found.to_string();
+    // 1e300 would be written with all its zeros.
+    let short = if found.len() > 20 { found.parse().ok().map(|number: f64| format!("{number:e}")) } else { None };
+    Err(Error::config(key, short.unwrap_or(found), accepted))
 }

@@ -14,7 +14,7 @@ Examples:
   plenoxel export mesh runs/lego --format glb
   plenoxel export mesh runs/lego --level 20 --min-part 100 --out lego.obj
 
-Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the dataset's coordinates, z up. GLB files turn
+Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the dataset's coordinates, z up. GLB files turn \
 it, for glTF has y up. A higher level takes fog away, and thin parts with it.";
 
 /// Write the surface of a run as a colored mesh

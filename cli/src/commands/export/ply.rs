@@ -28,7 +28,7 @@ Examples:
   plenoxel export ply runs/lego --min-alpha 0 --min-weight 0 --min-object 0
   plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
 
-The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at
+The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at \
 the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbours. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
 
 /// Write the voxels of a run as a colored point cloud

@@ -12,7 +12,7 @@ Examples:
   plenoxel export vox runs/lego
   plenoxel export vox runs/lego --min-alpha 0.5 --out lego.vox
 
-Writes RUN/exports/grid.vox. Voxel (i, j, k) of the grid is voxel (i, j, k) of the file, z up; grids of more than 256 voxels
+Writes RUN/exports/grid.vox. Voxel (i, j, k) of the grid is voxel (i, j, k) of the file, z up; grids of more than 256 voxels \
 a side become tiles of 256 in one scene. The palette has up to 255 colors, chosen for the voxels that are written.";
 
 /// Write the voxels of a run as a MagicaVoxel .vox file

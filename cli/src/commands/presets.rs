@@ -1,0 +1,68 @@
+//! `plenoxel presets`: which there are, what one says, and what it amounts to.
+
+use crate::config::{self, CARVE, PRESETS, find};
+use crate::progress::Console;
+use clap::Args;
+use clap::builder::PossibleValuesParser;
+use plenoxel::error::Result;
+use plenoxel::train::config::{Config, Hull};
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel presets                               all of them, in a line each
+  plenoxel presets fast                          what it changes, and why
+  plenoxel presets fast --resolved > mine.toml   every setting, to be edited
+  plenoxel train data/lego --config mine.toml
+
+Times are of training on two cores, and say at what size of the images.";
+
+/// List the presets, or print one
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct PresetsArgs {
+    /// Print this one, with its comments: what it changes of the defaults
+    #[arg(value_parser = PossibleValuesParser::new(PRESETS.iter().chain([&CARVE]).map(|preset| preset.name)))]
+    name: Option<String>,
+
+    /// Print the complete configuration that it amounts to, which --config takes
+    #[arg(long, requires = "name")]
+    resolved: bool,
+}
+
+/// Lists the presets, or prints one.
+pub fn run(args: &PresetsArgs, console: &Console<'_>) -> Result<()> {
+    match &args.name {
+        None => list(console),
+        Some(name) if args.resolved => {
+            let (config, command) = (resolved(name)?, if *name == CARVE.name { "carve" } else { "train" });
+            let remark = format!("Preset {name} of {}.\nplenoxel {command} DATA --config THIS_FILE", crate::PROGRAM);
+            console.result(config::text(&config, &remark)?.trim_end())
+        }
+        Some(name) => console.result(find(name)?.text.trim_end()),
+    }
+}
+
+fn resolved(name: &str) -> Result<Config> {
+    Ok(config::layered(None, name, None, |_| Ok(()))?.0)
+}
+
+fn list(console: &Console<'_>) -> Result<()> {
+    console.result(&row(["preset", "time on two cores", "alpha decides", "for"]))?;
+    PRESETS.iter().chain([&CARVE]).try_for_each(|preset| {
+        let alpha = alpha_decides(&resolved(preset.name)?);
+        console.result(&row([preset.name, preset.time, alpha, preset.purpose]))
+    })
+}
+
+fn row([name, time, alpha, purpose]: [&str; 4]) -> String {
+    format!("{name:11}{time:27}{alpha:17}{purpose}")
+}
+
+/// What a configuration takes from images that have alpha, beside what they show over a background.
+fn alpha_decides(config: &Config) -> &'static str {
+    match (config.stages.is_empty(), config.hull) {
+        (true, _) => "the shape",
+        (false, Hull::Auto) => "box and voxels",
+        (false, Hull::Off) => "nothing",
+    }
+}

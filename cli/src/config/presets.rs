@@ -1,0 +1,62 @@
+//! The presets, and what is to be known of one before it is used.
+
+use plenoxel::error::{Error, Result};
+
+/// Settings with a name.
+#[derive(Debug)]
+pub struct Preset {
+    /// As `--preset` takes it.
+    pub name: &'static str,
+    /// What it is for.
+    pub purpose: &'static str,
+    /// How long it takes on two cores, and with what.
+    pub time: &'static str,
+    /// A layer over the defaults, with its reasons.
+    pub text: &'static str,
+}
+
+/// What `train` may start from.
+pub const PRESETS: [Preset; 6] = [
+    Preset { name: "demo", purpose: "the built-in scene", time: "40 s at 200 x 200", text: include_str!("../../presets/demo.toml") },
+    Preset { name: "fast", purpose: "a minute or two", time: "0.5 to 2 min at 800 x 800", text: include_str!("../../presets/fast.toml") },
+    Preset {
+        name: "quality",
+        purpose: "the best there is",
+        time: "8 to 15 min at 800 x 800",
+        text: include_str!("../../presets/quality.toml"),
+    },
+    Preset {
+        name: "standard",
+        purpose: "a dataset of your own, with few assumptions",
+        time: "minutes",
+        text: include_str!("../../presets/standard.toml"),
+    },
+    Preset {
+        name: "plenoxels",
+        purpose: "Plenoxels as published, for comparison",
+        time: "many hours at 800 x 800",
+        text: include_str!("../../presets/plenoxels.toml"),
+    },
+    Preset {
+        name: "paper",
+        purpose: "\"Plenoxels and extension to point clouds\", bugs repaired",
+        time: "23 s at 100 x 100",
+        text: include_str!("../../presets/paper.toml"),
+    },
+];
+
+/// What `carve` starts from.
+pub const CARVE: Preset = Preset {
+    name: "carve",
+    purpose: "an opaque grid, without training: for `plenoxel carve`",
+    time: "seconds",
+    text: include_str!("../../presets/carve.toml"),
+};
+
+/// The preset of a name.
+///
+/// Errors: there is none, with the names that there are.
+pub fn find(name: &str) -> Result<&'static Preset> {
+    let preset = PRESETS.iter().chain([&CARVE]).find(|preset| preset.name == name);
+    preset.ok_or_else(|| Error::config("preset", name, PRESETS.map(|preset| preset.name).join(", ")))
+}

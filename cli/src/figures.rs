@@ -1,0 +1,125 @@
+//! Final figures against the views of a split, with all that keeps them from being misread: the same for `train` and `evaluate`.
+
+use crate::evaluation::Scores;
+use plenoxel::dataset::{Dataset, Split};
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::train::config::{Config, Sampling};
+use serde::Serialize;
+
+/// Means over views, what they were computed of, and how.
+#[derive(Debug, Serialize)]
+pub struct Figures {
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    ssim_same: Option<f64>,
+    psnr_of_mean_mse: Option<f64>,
+    lpips: NotComputed,
+    split: String,
+    /// So many of the split were compared.
+    views: usize,
+    width: usize,
+    height: usize,
+    background: [f32; 3],
+    /// Voxels along each axis.
+    resolution: usize,
+    image: ImageFacts,
+    grid: GridFacts,
+    dataset: Counts,
+    sampling: Sampling,
+    definitions: Definitions,
+}
+
+#[derive(Debug, Serialize)]
+struct NotComputed {
+    computed: bool,
+    why: &'static str,
+}
+
+/// The images that were compared, in pixels.
+#[derive(Debug, Serialize)]
+struct ImageFacts {
+    width: usize,
+    height: usize,
+    /// They are the dataset's, reduced by this factor.
+    downscale: usize,
+}
+
+#[derive(Debug, Serialize)]
+struct GridFacts {
+    voxels_per_axis: usize,
+    /// Those that are left.
+    voxels_stored: usize,
+    half_width: f64,
+}
+
+/// Views of the dataset by split.
+#[derive(Debug, Serialize)]
+struct Counts {
+    train: usize,
+    val: usize,
+    test: usize,
+}
+
+/// How figures are computed, for who reads them elsewhere.
+#[derive(Debug, Serialize)]
+struct Definitions {
+    prediction: &'static str,
+    target: &'static str,
+    color_space: &'static str,
+    mse: &'static str,
+    psnr: &'static str,
+    psnr_of_mean_mse: &'static str,
+    ssim: &'static str,
+    ssim_same: &'static str,
+}
+
+const LPIPS: NotComputed =
+    NotComputed { computed: false, why: "it takes the weights of a trained network, which this program does not have" };
+
+const DEFINITIONS: Definitions = Definitions {
+    prediction: "one ray through each pixel's centre, clamped to [0, 1], not rounded to 8 bits",
+    target: "the 8-bit image with its alpha, composited over the background in floats, not rounded again",
+    color_space: "sRGB values as stored, not linearized",
+    mse: "mean of the squared error over the pixels and the three channels of a view",
+    psnr: "dB; -10 log10(mse) of each view, then the mean over views",
+    psnr_of_mean_mse: "dB; -10 log10 of the mean of the views' mse, as instant-ngp reports it",
+    ssim: "Gaussian window of 11 x 11 pixels, sigma 1.5, k1 0.01, k2 0.03, of each channel; mean over the windows inside the image (valid), channels and views",
+    ssim_same: "the same with a window at each pixel and zeros around the image (same), as svox2",
+};
+
+impl Figures {
+    /// What came of comparing a grid with the views of a split.
+    pub fn new(scores: &Scores, split: Split, dataset: &Dataset, config: &Config, sampling: Sampling, grid: &VoxelGrid<f32>) -> Self {
+        let (width, height) = dataset.size();
+        let (shape, voxels_stored) = (grid.shape(), grid.lattice().present());
+        let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
+        Figures {
+            psnr: scores.psnr(),
+            ssim: scores.ssim(),
+            ssim_same: scores.ssim_same(),
+            psnr_of_mean_mse: scores.psnr_of_mean_mse(),
+            lpips: LPIPS,
+            split: split.to_string(),
+            views: scores.per_view.len(),
+            width,
+            height,
+            background: config.background,
+            resolution: shape.resolution,
+            image: ImageFacts { width, height, downscale: config.downscale },
+            grid: GridFacts { voxels_per_axis: shape.resolution, voxels_stored, half_width: shape.half_width },
+            dataset: Counts { train, val, test },
+            sampling,
+            definitions: DEFINITIONS,
+        }
+    }
+
+    /// The figures as people say them.
+    pub fn sentence(&self) -> String {
+        let Figures { psnr, ssim, split, views, width, height, .. } = self;
+        let Some(psnr) = psnr else {
+            return format!("no {split} views to evaluate on");
+        };
+        let ssim = ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));
+        format!("PSNR {psnr:.2} dB{ssim}: means over {views} {split} views of {width} x {height}")
+    }
+}
