@@ -31,6 +31,11 @@ impl<'a> Viewer<'a> {
         Viewer { grid, sampling, background: config.background, engine: config.engine, occupancy: grid.matter() }
     }
 
+    /// A viewer of a grid over black, whatever the run's background: of what stands in place of colors, and is to be a plain sum.
+    pub fn over_black(grid: &'a VoxelGrid<f32>, sampling: Sampling, config: &Config) -> Self {
+        Viewer { background: [0.0; 3], ..Viewer::new(grid, sampling, config) }
+    }
+
     /// What a camera sees.
     pub fn see(&self, camera: &Camera) -> Picture {
         let shape = self.grid.shape();

@@ -79,6 +79,26 @@ pub fn opacity_map(picture: &Picture) -> Rgb {
     colored(h, w, |y, x| [opacity[[y, x]]; 3])
 }
 
+/// Unit normals `[h, w, 3]` of a picture that shows normals over black; zero where there is none.
+pub fn unit_normals(picture: &Picture) -> Rgb {
+    let mut normals = picture.rgb.clone();
+    for mut normal in normals.lanes_mut(Axis(2)) {
+        let length = normal.iter().map(|x| x * x).sum::<f32>().sqrt();
+        normal.mapv_inplace(|x| if length > 0.0 { x / length } else { 0.0 });
+    }
+    normals
+}
+
+/// Normals with x, y, z from -1 to 1 as red, green, blue from 0 to 1, over white where nothing is seen.
+pub fn normal_map(picture: &Picture) -> Rgb {
+    let normals = unit_normals(picture);
+    let (h, w, _) = normals.dim();
+    colored(h, w, |y, x| {
+        let opacity = picture.opacity[[y, x]].clamp(0.0, 1.0);
+        [0, 1, 2].map(|c| (0.5 + 0.5 * normals[[y, x, c]]) * opacity + 1.0 - opacity)
+    })
+}
+
 /// Writes a picture as PNG.
 pub fn write(path: &Path, picture: &Rgb) -> Result<()> {
     plenoxel::dataset::image::write_rgb(path, picture.view())
@@ -172,6 +192,18 @@ mod tests {
         assert!(near(pixel(1), color(&TURBO, 1.0)));
         // Half seen at 2.75 / 0.5 = 5.5: half the color of the far end, half white.
         assert!(near(pixel(2), color(&TURBO, 0.0).map(|c| 0.5 * c + 0.5)));
+    }
+
+    #[test]
+    fn normals_are_made_unit_and_shown_as_colors_over_white() {
+        let rgb = ndarray::array![[[0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [-0.3, 0.0, 0.4]]];
+        let picture = Picture { rgb, depth: Array2::zeros((1, 3)), opacity: ndarray::array![[0.0, 1.0, 0.5]] };
+        let units = unit_normals(&picture);
+        assert_eq!(units, ndarray::array![[[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]]]);
+        let map = normal_map(&picture);
+        let pixel = |x: usize| [0, 1, 2].map(|c| map[[0, x, c]]);
+        assert_eq!((pixel(0), pixel(1)), ([1.0; 3], [0.5, 0.5, 1.0]));
+        assert!(near(pixel(2), [0.6, 0.75, 0.95]));
     }
 
     #[test]

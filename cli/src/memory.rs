@@ -36,6 +36,8 @@ pub struct Estimate {
 const BASE: u64 = 60_000_000;
 /// Pixels whose voxels are in memory at a time when carving, 12 bytes each and in up to three copies.
 const CARVING_PIXELS: u64 = 1 << 16;
+/// Bytes of a pixel of rendered pictures: five numbers of the colors and of the normals each, what is made of them, and the file.
+const PICTURE_BYTES: u64 = 100;
 /// Rays that are rendered at a time when evaluating.
 const EVALUATION_RAYS: u64 = 4096;
 
@@ -103,18 +105,17 @@ impl Estimate {
         available().map(|available| (available.saturating_sub(self.total() - held) / row) as usize)
     }
 
-    /// Rendering a trained grid of so many voxels, and comparing it with the views of a split where `compare` is set.
+    /// Rendering a trained grid of so many voxels, and comparing it with the views of a split where there are some.
     pub fn of_evaluation(
         config: &Config,
         sampling: Sampling,
         shape: &GridShape,
         voxels: usize,
-        dataset: &Dataset,
-        compare: Option<Split>,
+        compare: Option<(&Dataset, Split)>,
     ) -> Self {
         let samples = EVALUATION_RAYS * mean_samples(sampling, shape);
         Estimate {
-            images: compare.map_or(0, |split| images(dataset, config.downscale, &[split])),
+            images: compare.map_or(0, |(dataset, split)| images(dataset, config.downscale, &[split])),
             // The file and the tables read from it.
             grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
@@ -123,6 +124,18 @@ impl Estimate {
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
         }
+    }
+
+    /// Rendering a trained grid of so many voxels to pictures of so many pixels, with or without its normals.
+    pub fn of_pictures(config: &Config, sampling: Sampling, shape: &GridShape, voxels: usize, pixels: usize, normals: bool) -> Self {
+        let rendering = Self::of_evaluation(config, sampling, shape, voxels, None);
+        let images = PICTURE_BYTES * pixels as u64;
+        let grid = rendering.grid + if normals { (voxels * 3 * size_of::<f32>()) as u64 } else { 0 };
+        let (key, advice) = match images > grid {
+            true => ("--size".to_owned(), "fewer pixels"),
+            false => (rendering.key, rendering.advice),
+        };
+        Estimate { images, grid, key, advice, ..rendering }
     }
 
     /// Carving: the images and the masks of the box; and, once it is known how many rows the tables of what is left have, their fit.

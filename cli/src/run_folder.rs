@@ -48,6 +48,8 @@ const REPORT: &str = "report.html";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
+/// Endings of what `render` writes.
+const RENDERED: [&str; 5] = ["png", "exr", "npy", "gif", "mp4"];
 
 impl RunFolder {
     /// The folder that a new run will have: the one asked for, or `runs/<scene>-<n>` with the first free n. Nothing is written yet.
@@ -83,14 +85,13 @@ impl RunFolder {
         for path in paths.chain(event_file::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
-        for (folder, endings) in [(IMAGES, ["png"].as_slice()), (RENDERS, &["png"]), (EXPORTS, &["vox", "ply", "obj", "glb"])] {
-            let Ok(entries) = std::fs::read_dir(self.path.join(folder)) else {
-                continue;
-            };
-            let ours = |path: &PathBuf| path.extension().is_some_and(|ending| endings.iter().any(|e| ending == *e));
-            for path in entries.flatten().map(|entry| entry.path()).filter(ours) {
-                std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
-            }
+        // Films have folders of their own.
+        let films = entries(&self.path.join(RENDERS)).filter(|path| path.is_dir());
+        for folder in films.chain([self.path.join(RENDERS)]) {
+            remove(entries(&folder).filter(|path| is_one_of(path, &RENDERED)))?;
+        }
+        for (folder, endings) in [(IMAGES, ["png"].as_slice()), (EXPORTS, &["vox", "ply", "obj", "glb"])] {
+            remove(entries(&self.path.join(folder)).filter(|path| is_one_of(path, endings)))?;
         }
         Ok(())
     }
@@ -182,15 +183,7 @@ impl RunFolder {
 
     /// Removes files that were being written when a run was killed.
     pub fn remove_fragments(&self) -> Result<()> {
-        let fragment = |path: &PathBuf| {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            name.starts_with(".tmp") || name.starts_with('.') && name.ends_with(".tmp")
-        };
-        let entries = [&self.path, &self.path.join(IMAGES)].map(std::fs::read_dir).into_iter().flatten().flatten().flatten();
-        for path in entries.map(|entry| entry.path()).filter(fragment) {
-            std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
-        }
-        Ok(())
+        [&self.path, &self.path.join(IMAGES)].into_iter().try_for_each(|folder| remove(entries(folder).filter(|path| is_fragment(path))))
     }
 
     /// Writes the final figures.
@@ -272,6 +265,19 @@ impl RunFolder {
         Ok(path)
     }
 
+    /// Makes the folder for the frames of a film, and says where it is. Those of an earlier film of this name go, and what they were joined to,
+    /// whose names are the film's with one of `suffixes`.
+    pub fn create_film(&self, name: &str, suffixes: &[&str]) -> Result<PathBuf> {
+        let renders = self.create_renders()?;
+        let path = renders.join(name);
+        files::create_dir(&path)?;
+        let frame = |path: &PathBuf| file_name(path).starts_with("frame_") && is_one_of(path, &RENDERED);
+        remove(entries(&path).filter(|path| frame(path) || is_fragment(path)))?;
+        let joined = suffixes.iter().flat_map(|suffix| ["gif", "mp4"].map(|ending| renders.join(format!("{name}{suffix}.{ending}"))));
+        remove(joined.filter(|path| path.exists()))?;
+        Ok(path)
+    }
+
     /// Makes the folder for what other programs read, and names a file in it.
     pub fn create_export(&self, name: &str) -> Result<PathBuf> {
         let path = self.path.join(EXPORTS);
@@ -285,6 +291,30 @@ impl RunFolder {
             serde_json::to_string_pretty(value).map_err(|e| Error::input(&path, e.to_string(), "this is a defect of the program"))?;
         files::write_atomically(&path, (text + "\n").as_bytes())
     }
+}
+
+/// What lies in a folder, as far as it can be listed.
+fn entries(folder: &Path) -> impl Iterator<Item = PathBuf> + use<> {
+    std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
+}
+
+fn file_name(path: &Path) -> std::borrow::Cow<'_, str> {
+    path.file_name().unwrap_or_default().to_string_lossy()
+}
+
+/// True for a name that ends in a dot and one of `endings`.
+fn is_one_of(path: &Path, endings: &[&str]) -> bool {
+    path.extension().is_some_and(|ending| endings.iter().any(|e| ending == *e))
+}
+
+/// True for a file that was being written.
+fn is_fragment(path: &Path) -> bool {
+    let name = file_name(path);
+    name.starts_with(".tmp") || name.starts_with('.') && name.ends_with(".tmp")
+}
+
+fn remove(files: impl Iterator<Item = PathBuf>) -> Result<()> {
+    files.into_iter().try_for_each(|path| std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it")))
 }
 
 /// The folder's own explanation.
@@ -310,7 +340,7 @@ Of these files, those that apply: a carved run has no training to tell of.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
   pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.
 - `images/carved.png`: what was carved, seen by some test cameras.
-- `renders/`: what `plenoxel render` wrote.
+- `renders/`: what `plenoxel render` wrote: views, and for each `--path` a folder of frames with the GIF and the MP4 beside it.
 - `exports/`: what `plenoxel export` wrote, for other programs.
 ";
 

@@ -17,7 +17,9 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 /// The same with a file that `write` makes, under the name it is given.
-pub(crate) fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>) -> Result<()> {
+///
+/// Errors: the same, and those of `write`.
+pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>) -> Result<()> {
     let temporary = temporary_name(path);
     let written = write(&temporary)
         .and_then(|()| OpenOptions::new().write(true).open(&temporary)?.sync_all())

@@ -6,6 +6,7 @@
 //! | --- | --- |
 //! | [`dataset`] | photographs with known cameras, in three splits |
 //! | [`camera`], [`geometry`] | pixel to ray; the box that rays are clipped to |
+//! | [`camera_path`] | where the camera of a film stands, by formula or from a file |
 //! | [`rays`] | training rays, made on the fly |
 //! | [`sampling`] | where a ray looks at the field |
 //! | [`field`] | what fills space: density and radiance |
@@ -22,6 +23,7 @@
 #![warn(missing_docs)]
 
 pub mod camera;
+pub mod camera_path;
 pub mod carve;
 pub mod checkpoint;
 pub mod dataset;
@@ -33,6 +35,7 @@ pub mod geometry;
 #[cfg(debug_assertions)]
 #[doc(hidden)]
 pub mod instances;
+mod json;
 pub mod loss;
 pub mod metrics;
 pub mod point_cloud;

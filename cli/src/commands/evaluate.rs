@@ -1,10 +1,10 @@
 //! `plenoxel evaluate`: figures of a trained run on the views of a split.
 
 use super::new_run::load;
-use super::trained_run::{Opened, TrainedRun};
+use super::trained_run::{Found, Loaded, TrainedRun};
 use crate::evaluation::{ViewScore, Viewer};
 use crate::figures::Figures;
-use crate::memory;
+use crate::memory::{self, Estimate};
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
@@ -46,7 +46,12 @@ pub struct EvaluateArgs {
 /// Evaluates a run.
 pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let start = Instant::now();
-    let Opened { folder, config, preset, source, dataset, sampling, grid, header } = args.run.open(console, true)?;
+    let found = args.run.find()?;
+    let dataset = args.run.views(&found)?;
+    let Loaded { sampling, grid, header } = args.run.load(&found, console, |sampling, shape, voxels| {
+        Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
+    })?;
+    let Found { folder, config, preset, source } = found;
     let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
 

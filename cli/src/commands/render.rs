@@ -1,23 +1,39 @@
-//! `plenoxel render`: pictures of a trained run from the cameras of its views.
+//! `plenoxel render`: pictures of a trained run, from the cameras of its views or along a path.
 
-use super::trained_run::{Opened, TrainedRun};
-use crate::evaluation::Viewer;
-use crate::images::{self, DepthRange};
+mod channels;
+mod float_files;
+mod movie;
+mod path;
+
+use super::trained_run::{Loaded, TrainedRun};
+use crate::memory::Estimate;
 use crate::progress::Console;
+use channels::{Channel, FileFormat, Pictures};
 use clap::Args;
+use path::{Film, PathArgs};
+use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
+use std::path::PathBuf;
+use std::time::Instant;
 
 const EXAMPLES: &str = "\
 Examples:
   plenoxel render runs/lego                        all test views
   plenoxel render runs/lego --view 0 --view r_17   two of them, by number and by name
   plenoxel render runs/lego --split train --downscale 4
+  plenoxel render runs/lego --path orbit           a turntable: 120 frames, a GIF, an MP4 if there is ffmpeg
+  plenoxel render runs/lego --path base_cam.json --size 1280x720 --fps 60
+  plenoxel render runs/lego --path spiral --channels color,depth,normal --format png,exr
 
-Writes RUN/renders/<split>_<number>_<name>.png with the colors over the run's background, and the same with _depth \
-(red near, blue far, white empty) and _opacity.";
+Views become RUN/renders/<split>_<number>_<name>.png, with the colors over the run's background, and the same with _depth (red near,
+blue far, white empty), _normal (x, y, z of the world as red, green, blue; white empty) and _opacity. Frames become
+RUN/renders/<path>/frame_0000.png and so on; their PNG files are joined to RUN/renders/<path>.gif and .mp4, which replace earlier ones.
 
-/// Render the views of a trained run to PNG files
+EXR and NPY files have 32-bit floats: depth is the distance along the ray in the dataset's units (NaN where nothing is seen), normals are
+unit vectors in the world (0 where nothing is seen), opacity is from 0 to 1. Color is linear light in EXR, sRGB in NPY, not clamped.";
+
+/// Render a trained run from its views, or along a camera path as a film
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct RenderArgs {
@@ -25,31 +41,90 @@ pub struct RenderArgs {
     run: TrainedRun,
 
     /// Render this view only, by number from 0 or by name; may be repeated
-    #[arg(long, value_name = "N|NAME", help_heading = "Scene")]
+    #[arg(long, value_name = "N|NAME", help_heading = "Scene", conflicts_with = "path")]
     view: Vec<String>,
+
+    #[command(flatten)]
+    path: PathArgs,
+
+    /// Kinds of pictures, with commas between them [default: all for views, color for paths]
+    #[arg(long, value_enum, value_name = "KINDS", value_delimiter = ',', help_heading = "Output")]
+    channels: Vec<Channel>,
+
+    /// File formats of single pictures, with commas between them
+    #[arg(long, value_enum, value_name = "FORMATS", value_delimiter = ',', default_value = "png", help_heading = "Output")]
+    format: Vec<FileFormat>,
 }
 
-/// Renders views of a run.
+/// Renders a run.
 pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
-    let Opened { folder, config, dataset, sampling, grid, .. } = args.run.open(console, false)?;
-    let split = args.run.split;
-    let chosen = choose(&dataset, split, &args.view)?;
-    let renders = folder.create_renders()?;
-    let viewer = Viewer::new(&grid, sampling, &config);
-    let (cameras, names) = (dataset.cameras(split), dataset.view_names(split));
-    let count = console.count("rendering", chosen.len());
-    for (done, &number) in chosen.iter().enumerate() {
-        let picture = viewer.see(&cameras[number]);
-        let range = DepthRange::of(&cameras[number], grid.shape().half_width);
-        let file = |kind: &str| folder.render(&format!("{}_{number:03}_{}{kind}.png", split, names[number]));
-        images::write(&file(""), &picture.rgb)?;
-        images::write(&file("_depth"), &images::depth_map(&picture, range))?;
-        images::write(&file("_opacity"), &images::opacity_map(&picture))?;
-        count.at(done + 1, chosen.len());
+    match &args.path.path {
+        Some(path) => film(args, path, console),
+        None => views(args, console),
     }
-    drop(count);
-    let views = if chosen.len() == 1 { "view" } else { "views" };
-    console.result(&format!("rendered {} {split} {views} to {}", chosen.len(), renders.display()))
+}
+
+fn views(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
+    let found = args.run.find()?;
+    let dataset = args.run.views(&found)?;
+    let split = args.run.split;
+    let (cameras, names) = (dataset.cameras(split), dataset.view_names(split));
+    let shots = choose(&dataset, split, &args.view)?.into_iter();
+    let renders = found.folder.create_renders()?;
+    let shots = shots.map(|number| (cameras[number], found.folder.render(&format!("{split}_{number:03}_{}", names[number])))).collect();
+    let views = render(args, &found, console, shots, &Channel::ALL)?;
+    let what = if views == 1 { "view" } else { "views" };
+    console.result(&format!("rendered {views} {split} {what} to {}", renders.display()))
+}
+
+fn film(args: &RenderArgs, path: &path::PathChoice, console: &Console<'_>) -> Result<()> {
+    let found = args.run.find()?;
+    let Film { name, cameras, fps } = args.path.film(path, &args.run, &found, console)?;
+    let folder = found.folder.create_film(&name, &Channel::ALL.map(Channel::suffix))?;
+    let stem = |number: usize| folder.join(format!("frame_{number:04}"));
+    let shots: Vec<(Camera, PathBuf)> = cameras.into_iter().enumerate().map(|(number, camera)| (camera, stem(number))).collect();
+    let start = Instant::now();
+    let frames = render(args, &found, console, shots, &[Channel::Color])?;
+    console.note(&format!("{:.2} seconds a frame", start.elapsed().as_secs_f64() / frames as f64));
+    let what = if frames == 1 { "frame" } else { "frames" };
+    console.result(&format!("rendered {frames} {what} to {}", folder.display()))?;
+    if args.format.contains(&FileFormat::Png) {
+        for channel in channels(args, &[Channel::Color]) {
+            let reel = movie::Reel { folder: &folder, suffix: channel.suffix(), frames, fps };
+            reel.write(console)?;
+        }
+    }
+    Ok(())
+}
+
+/// Renders what each camera sees to files whose names begin with a path, and says how many there were.
+fn render(
+    args: &RenderArgs,
+    found: &super::trained_run::Found,
+    console: &Console<'_>,
+    shots: Vec<(Camera, PathBuf)>,
+    default: &[Channel],
+) -> Result<usize> {
+    let channels = channels(args, default);
+    let normals = channels.contains(&Channel::Normal);
+    let pixels = shots.iter().map(|(camera, _)| camera.intrinsics.width * camera.intrinsics.height).max().unwrap_or(0);
+    let Loaded { sampling, grid, .. } = args
+        .run
+        .load(found, console, |sampling, shape, voxels| Estimate::of_pictures(&found.config, sampling, shape, voxels, pixels, normals))?;
+    let normals = normals.then(|| grid.normals());
+    let pictures = Pictures::new(&grid, normals.as_ref(), sampling, &found.config, &channels, &args.format);
+    let count = console.count("rendering", shots.len());
+    for (done, (camera, stem)) in shots.iter().enumerate() {
+        pictures.write(camera, stem)?;
+        count.at(done + 1, shots.len());
+    }
+    Ok(shots.len())
+}
+
+/// The kinds of pictures that were asked for, each once.
+fn channels(args: &RenderArgs, default: &[Channel]) -> Vec<Channel> {
+    let asked = if args.channels.is_empty() { default } else { &args.channels };
+    Channel::ALL.into_iter().filter(|channel| asked.contains(channel)).collect()
 }
 
 /// Numbers of the views that were asked for: all of the split unless some are named.

@@ -9,7 +9,7 @@ use clap::{Args, ValueHint};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
 use plenoxel::train::config::{Config, Sampling};
 use std::path::PathBuf;
 
@@ -37,33 +37,58 @@ pub struct TrainedRun {
     pub samples: Option<u32>,
 }
 
-/// All that there is to know of a run.
-pub struct Opened {
+/// What a run says of itself. Its views may be gone.
+pub struct Found {
     pub folder: RunFolder,
     pub config: Config,
     pub preset: Option<String>,
     pub source: DataSource,
-    pub dataset: Dataset,
+}
+
+/// Its grid, and where samples of it lie.
+pub struct Loaded {
     pub sampling: Sampling,
     pub grid: VoxelGrid<f32>,
     pub header: Header,
 }
 
 impl TrainedRun {
-    /// Opens it, once memory is known to suffice; `compare` says that the images of the split will be needed.
-    pub fn open(&self, console: &Console<'_>, compare: bool) -> Result<Opened> {
+    /// Finds it.
+    pub fn find(&self) -> Result<Found> {
         let (folder, mut config, record) = RunFolder::open(&self.run)?;
         config.downscale = self.downscale.unwrap_or(config.downscale);
         let source = self.data.as_deref().map_or(record.data, DataSource::folder);
-        let dataset = source.reopen(&config)?;
+        Ok(Found { folder, config, preset: record.preset, source })
+    }
+
+    /// Opens its views, of which some must be of the split.
+    pub fn views(&self, found: &Found) -> Result<Dataset> {
+        let dataset = found.source.reopen(&found.config)?;
         super::check_split(&dataset, self.split)?;
-        let (header, voxels) = folder.header()?;
-        let shape = header.shape();
-        let sampling = self.samples.map_or(config.evaluation, |samples| with_samples(config.evaluation, samples, &shape));
-        let estimate = Estimate::of_evaluation(&config, sampling, &shape, voxels, &dataset, compare.then_some(self.split));
+        Ok(dataset)
+    }
+
+    /// Reads its grid, once memory is known to suffice: what `estimate` says of sampling, shape and number of voxels.
+    pub fn load(
+        &self,
+        found: &Found,
+        console: &Console<'_>,
+        estimate: impl FnOnce(Sampling, &GridShape, usize) -> Estimate,
+    ) -> Result<Loaded> {
+        let (header, voxels) = found.folder.header()?;
+        let (shape, as_trained) = (header.shape(), found.config.evaluation);
+        let sampling = self.samples.map_or(as_trained, |samples| with_samples(as_trained, samples, &shape));
+        let estimate = estimate(sampling, &shape, voxels);
         console.note(&estimate.describe());
         estimate.check()?;
-        let (grid, header) = folder.load()?;
-        Ok(Opened { folder, config, preset: record.preset, source, dataset, sampling, grid, header })
+        let (grid, header) = found.folder.load()?;
+        Ok(Loaded { sampling, grid, header })
+    }
+}
+
+impl Found {
+    /// Half the side of the box of its grid, world length.
+    pub fn half_width(&self) -> Result<f64> {
+        self.folder.header().map(|(header, _)| header.shape().half_width)
     }
 }

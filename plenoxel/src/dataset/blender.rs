@@ -9,6 +9,7 @@ mod write;
 use super::{Dataset, Frame, OpenOptions, Source, Split, image};
 use crate::camera::{Camera, Intrinsics};
 use crate::error::{Error, Result};
+use crate::json;
 use glam::{DAffine3, DMat3, DMat4};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -70,15 +71,7 @@ fn file_name(root: &Path, split: Split) -> PathBuf {
 fn read_transforms(root: &Path, split: Split) -> Result<Vec<Listed>> {
     let path = file_name(root, split);
     let bytes = std::fs::read(&path).map_err(|source| Error::io(&path, source, "reading the cameras"))?;
-    let json: Value = serde_json::from_slice(&bytes).map_err(|error| {
-        let place = format!("line {}, column {}", error.line(), error.column());
-        let (found, remedy) = if error.is_eof() {
-            (format!("the JSON ends early, at {place}"), "the file is cut short: copy or download it again")
-        } else {
-            (format!("this is not valid JSON: {error}"), "correct it there; numbers must be finite")
-        };
-        Error::input(&path, found, remedy)
-    })?;
+    let json = json::parse(&path, &bytes)?;
     let bad = |found: String, remedy: &str| Error::input(&path, found, remedy);
     let fov_x = match json.get("camera_angle_x") {
         None => {
@@ -140,7 +133,7 @@ fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result
 }
 
 /// Checks and converts a 4 x 4 camera-to-world matrix; an error completes the sentence "transform_matrix of frame k ...".
-fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'static str)> {
+pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'static str)> {
     const SHAPE: &str = "it is a list of 4 rows of 4 numbers";
     let mut m = [[0.0; 4]; 4];
     let rows = matrix.as_array().ok_or_else(|| ("is not a list of rows".to_owned(), SHAPE))?;
@@ -157,6 +150,11 @@ fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'static str)>
             m[i][j] = number.ok_or_else(|| (format!("has {value} in row {i}, column {j}"), "every entry is a finite number"))?;
         }
     }
+    rigid(m)
+}
+
+/// Checks and converts the rows of a camera-to-world matrix, all of them finite; an error completes the same sentence.
+pub(crate) fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, &'static str)> {
     if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6) {
         return Err((format!("has the last row {:?}", m[3]), "the last row of a rigid motion is 0 0 0 1"));
     }

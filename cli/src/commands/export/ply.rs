@@ -151,7 +151,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     })?;
     check_split(&dataset, Split::Train)?;
     let mut estimate =
-        Estimate::of_evaluation(config, config.evaluation, grid.shape(), grid.lattice().present(), &dataset, Some(Split::Train));
+        Estimate::of_evaluation(config, config.evaluation, grid.shape(), grid.lattice().present(), Some((&dataset, Split::Train)));
     // What is added up for each row.
     estimate.grid += (grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>())) as u64;
     console.note(&estimate.describe());

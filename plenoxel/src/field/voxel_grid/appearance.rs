@@ -1,8 +1,8 @@
 //! What a voxel is by itself, without rays: how much matter, which way it faces, its color from there. What exports are made of.
 
-use super::VoxelGrid;
+use super::{Color, GridShape, VoxelGrid};
 use crate::sampling::Occupancy;
-use autograd::{Indices, Real, Tensor, no_grad};
+use autograd::{Buffer, Indices, Real, Tensor, no_grad, parallel};
 use glam::DVec3;
 
 /// Rows whose colors are computed at a time, which bounds the memory for their harmonics.
@@ -47,6 +47,21 @@ impl<T: Real> VoxelGrid<T> {
         DVec3::from([0, 1, 2].map(fall)) / 32.0
     }
 
+    /// The same matter with its unit normals in place of colors, [`VoxelGrid::outward`] of each voxel: what is rendered of it over black is
+    /// Σ wᵢ nᵢ, the mean normal of what a ray sees times its opacity. Zero where the neighbours say nothing.
+    pub fn normals(&self) -> Self {
+        let rows = self.lattice().rows();
+        let normal = |row: usize| self.lattice().node(row as u32).map_or(DVec3::ZERO, |voxel| self.outward(voxel.map(|k| k as isize)));
+        let mut normals = Buffer::stale(3 * rows);
+        parallel::for_each_chunk(&mut normals, 3 * RUN, |start, chunk| {
+            for (row, to) in (start / 3..).zip(chunk.as_chunks_mut::<3>().0) {
+                *to = normal(row).normalize_or_zero().to_array().map(T::lit);
+            }
+        });
+        let shape = GridShape { color: Color::Rgb, ..*self.shape() }.normalised();
+        Self::with_lattice(shape, self.lattice().clone(), self.density.tensor().detach(), Tensor::from_buffer(normals, &[rows, 3]))
+    }
+
     /// Colors of rows of the tables, each seen along its unit direction from the viewer into the scene: what [`super::Color::activate`] gives for a
     /// sample at the centre of the voxel. A direction of zero gives the mean over all directions (before the maximum with 0), for no harmonic but
     /// the first has a mean. sRGB as the photographs have it, not clamped.
@@ -78,11 +93,13 @@ impl<T: Real> VoxelGrid<T> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Color, GridShape, Interpolation};
+    use super::super::Interpolation;
     use super::*;
+    use crate::camera::Ray;
     use crate::field::Field;
     use crate::random::{Purpose, uniform};
-    use crate::sampling::Samples;
+    use crate::render::{Engine, RenderOptions, render};
+    use crate::sampling::{Jitter, Samples, Spacing};
 
     /// Harmonics are for every second voxel where there are any.
     fn reduced(color: Color) -> GridShape {
@@ -138,6 +155,21 @@ mod tests {
         let grid = VoxelGrid::<f64>::from_row_major(shape, &density, &Tensor::zeros(&[32 * 32 * 32, 3]));
         let border =
             |voxel: &&[isize; 3]| inside(voxel) && [0, 1, 2].iter().any(|&a| !inside(&[0, 1, 2].map(|b| voxel[b] + isize::from(a == b))));
+        // What is rendered of its normals over black is what a ray along -x sees: +x.
+        let normals = grid.normals();
+        let ray = Ray { origin: DVec3::new(2.0, 0.02, -0.03), direction: DVec3::NEG_X, stretch: 1.0 };
+        let options = RenderOptions {
+            aabb: normals.aabb(),
+            spacing: Spacing::Step(0.01),
+            jitter: Jitter::None,
+            background: [0.0; 3],
+            occupancy: Some(&normals.matter()),
+            engine: Engine::Fused,
+            stop_below: 1e-4,
+        };
+        let seen = render(&normals, &[ray], &options);
+        let normal = DVec3::from([0, 1, 2].map(|c| seen.rgb.data()[c])) / seen.opacity.data()[0];
+        assert!(normal.x > 0.95 && normal.length() <= 1.0 + 1e-12, "{normal}");
         let angles: Vec<f64> =
             voxels.iter().filter(border).map(|&voxel| grid.outward(voxel).angle_between(shape.center(voxel)).to_degrees()).collect();
         let mean = angles.iter().sum::<f64>() / angles.len() as f64;

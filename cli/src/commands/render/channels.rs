@@ -1,0 +1,154 @@
+//! Kinds of pictures, the formats of their files, and one camera's pictures in all of them.
+
+use super::float_files;
+use crate::evaluation::Viewer;
+use crate::images::{self, DepthRange, Rgb};
+use clap::ValueEnum;
+use ndarray::{Array2, Array3, Axis};
+use plenoxel::camera::Camera;
+use plenoxel::error::Result;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::files::write_atomically;
+use plenoxel::render::picture::Picture;
+use plenoxel::train::config::{Config, Sampling};
+use std::path::{Path, PathBuf};
+
+/// What a picture shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Channel {
+    Color,
+    Depth,
+    Normal,
+    Opacity,
+}
+
+impl Channel {
+    pub const ALL: [Channel; 4] = [Channel::Color, Channel::Depth, Channel::Normal, Channel::Opacity];
+
+    /// What its files have behind their name.
+    pub fn suffix(self) -> &'static str {
+        match self {
+            Channel::Color => "",
+            Channel::Depth => "_depth",
+            Channel::Normal => "_normal",
+            Channel::Opacity => "_opacity",
+        }
+    }
+}
+
+/// How a picture is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FileFormat {
+    /// 8 bits, to look at.
+    Png,
+    /// 32-bit floats, for compositing programs.
+    Exr,
+    /// 32-bit floats, for NumPy.
+    Npy,
+}
+
+/// What writes the pictures of a run.
+pub struct Pictures<'a> {
+    color: Viewer<'a>,
+    normals: Option<Viewer<'a>>,
+    half_width: f64,
+    channels: &'a [Channel],
+    formats: &'a [FileFormat],
+}
+
+impl<'a> Pictures<'a> {
+    /// Pictures of a grid and of its normals, which must be there if they are among the channels.
+    pub fn new(
+        grid: &'a VoxelGrid<f32>,
+        normals: Option<&'a VoxelGrid<f32>>,
+        sampling: Sampling,
+        config: &Config,
+        channels: &'a [Channel],
+        formats: &'a [FileFormat],
+    ) -> Self {
+        Pictures {
+            color: Viewer::new(grid, sampling, config),
+            normals: normals.map(|normals| Viewer::over_black(normals, sampling, config)),
+            half_width: grid.shape().half_width,
+            channels,
+            formats,
+        }
+    }
+
+    /// Writes what a camera sees to files whose names begin with `stem`.
+    pub fn write(&self, camera: &Camera, stem: &Path) -> Result<()> {
+        let normals = self.normals.as_ref().map(|viewer| viewer.see(camera));
+        // Depth and opacity are the same in both.
+        let color = (self.channels != [Channel::Normal]).then(|| self.color.see(camera));
+        let range = DepthRange::of(camera, self.half_width);
+        for &channel in self.channels {
+            let picture = if channel == Channel::Normal { &normals } else { &color };
+            let Some(picture) = picture else { continue };
+            for &format in self.formats {
+                let file = |ending: &str| file(stem, channel, ending);
+                match format {
+                    FileFormat::Png => images::write(&file("png"), &shown(channel, picture, range))?,
+                    FileFormat::Exr => {
+                        let values = if channel == Channel::Color { picture.rgb.mapv(linear) } else { values(channel, picture) };
+                        float_files::write_exr(&file("exr"), values.view())?;
+                    }
+                    FileFormat::Npy => write_atomically(&file("npy"), &float_files::npy(values(channel, picture).view()))?,
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// `<stem><suffix>.<ending>`; a stem may have dots of its own.
+fn file(stem: &Path, channel: Channel, ending: &str) -> PathBuf {
+    let mut path = stem.as_os_str().to_owned();
+    path.push(format!("{}.{ending}", channel.suffix()));
+    path.into()
+}
+
+/// A picture to look at.
+fn shown(channel: Channel, picture: &Picture, range: DepthRange) -> Rgb {
+    match channel {
+        Channel::Color => picture.rgb.clone(),
+        Channel::Depth => images::depth_map(picture, range),
+        Channel::Normal => images::normal_map(picture),
+        Channel::Opacity => images::opacity_map(picture),
+    }
+}
+
+/// A picture to compute with, `[h, w, 1 or 3]`.
+fn values(channel: Channel, picture: &Picture) -> Array3<f32> {
+    let one = |values: Array2<f32>| values.insert_axis(Axis(2));
+    match channel {
+        Channel::Color => picture.rgb.clone(),
+        // 0 / 0 is NaN, where nothing is seen.
+        Channel::Depth => one(&picture.depth / &picture.opacity),
+        Channel::Normal => images::unit_normals(picture),
+        Channel::Opacity => one(picture.opacity.clone()),
+    }
+}
+
+/// Linear light of an sRGB value (IEC 61966-2-1), odd around 0.
+fn linear(value: f32) -> f32 {
+    let size = value.abs();
+    let linear = if size <= 0.040_45 { size / 12.92 } else { ((size + 0.055) / 1.055).powf(2.4) };
+    linear.copysign(value)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn srgb_becomes_linear_light() {
+        assert_eq!((linear(0.0), linear(1.0), linear(-1.0)), (0.0, 1.0, -1.0));
+        // The middle gray of a screen, 0.735, has half of its light.
+        assert!((linear(0.735_357) - 0.5).abs() < 1e-5 && (linear(0.04) - 0.04 / 12.92).abs() < 1e-9);
+    }
+
+    #[test]
+    fn names_keep_the_dots_of_views() {
+        assert_eq!(file(Path::new("a/test_000_img.1"), Channel::Depth, "exr"), PathBuf::from("a/test_000_img.1_depth.exr"));
+    }
+}

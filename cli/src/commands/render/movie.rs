@@ -1,0 +1,136 @@
+//! The frames of a path as a GIF that repeats and, where there is `ffmpeg`, as an MP4.
+
+use crate::machine;
+use crate::progress::Console;
+use gif::{Encoder, Frame, Repeat};
+use plenoxel::dataset::image;
+use plenoxel::error::Result;
+use plenoxel::files::atomically;
+use rayon::prelude::*;
+use std::fs::File;
+use std::io::{self, BufWriter, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// How hard the colors of a GIF are looked for, 1 (hardest) to 30: at 10, what its makers call a good compromise.
+const GIF_SPEED: i32 = 10;
+/// The shortest time that viewers show a frame for, in hundredths of a second; they take less for "as you like".
+const SHORTEST: u64 = 2;
+
+/// The PNG files of a path.
+pub struct Reel<'a> {
+    /// Where they are: `frame_0000<suffix>.png` and so on.
+    pub folder: &'a Path,
+    pub suffix: &'a str,
+    /// How many, at least 1.
+    pub frames: usize,
+    /// Frames a second.
+    pub fps: f64,
+}
+
+impl Reel<'_> {
+    /// Writes `<folder><suffix>.gif` and `.mp4`, and says where.
+    pub fn write(&self, console: &Console<'_>) -> Result<()> {
+        let gif = self.file("gif");
+        self.write_gif(&gif, console)?;
+        console.result(&format!("wrote {}", gif.display()))?;
+        let mp4 = self.file("mp4");
+        match has_ffmpeg() {
+            true => {
+                self.write_mp4(&mp4)?;
+                console.result(&format!("wrote {}", mp4.display()))
+            }
+            false => {
+                console.note(&format!("there is no ffmpeg on PATH, so {} was not written", mp4.display()));
+                Ok(())
+            }
+        }
+    }
+
+    fn file(&self, ending: &str) -> PathBuf {
+        let mut path = self.folder.as_os_str().to_owned();
+        path.push(format!("{}.{ending}", self.suffix));
+        path.into()
+    }
+
+    /// Each frame has a palette of its own. As many are read and reduced to their colors at a time as there are threads.
+    fn write_gif(&self, path: &Path, console: &Console<'_>) -> Result<()> {
+        let (width, height) = image::size(&self.frame(0))?;
+        let count = console.count("joining the frames to a GIF", self.frames);
+        let numbers: Vec<usize> = (0..self.frames).collect();
+        atomically(path, |temporary| {
+            let file = BufWriter::new(File::create(temporary)?);
+            // Images have no more than 16384 pixels a side.
+            let mut encoder = Encoder::new(file, width as u16, height as u16, &[]).map_err(io::Error::other)?;
+            encoder.set_repeat(Repeat::Infinite).map_err(io::Error::other)?;
+            for numbers in numbers.chunks(machine::threads()) {
+                let frames: io::Result<Vec<Frame<'_>>> = numbers.par_iter().map(|&number| self.gif_frame(number)).collect();
+                for frame in frames? {
+                    encoder.write_lzw_pre_encoded_frame(&frame).map_err(io::Error::other)?;
+                }
+                count.at(numbers[0] + numbers.len(), self.frames);
+            }
+            Ok(())
+        })
+    }
+
+    fn gif_frame(&self, number: usize) -> io::Result<Frame<'static>> {
+        let picture = image::read(&self.frame(number)).map_err(io::Error::other)?;
+        let rgb: Vec<u8> = picture.pixels().flat_map(|pixel| [pixel.0[0], pixel.0[1], pixel.0[2]]).collect();
+        let mut frame = Frame::from_rgb_speed(picture.width() as u16, picture.height() as u16, &rgb, GIF_SPEED);
+        frame.delay = delay(number, self.fps);
+        frame.make_lzw_pre_encoded();
+        Ok(frame)
+    }
+
+    /// H.264 or what else ffmpeg makes MP4 files of, with the colors of screens (BT.709) in the form that every player takes: half of the
+    /// resolution in color, so width and height are rounded up to even numbers.
+    fn write_mp4(&self, path: &Path) -> Result<()> {
+        let even = "scale=ceil(iw/2)*2:ceil(ih/2)*2:out_color_matrix=bt709,format=yuv420p";
+        let (fps, frames, input) = (self.fps.to_string(), self.frames.to_string(), format!("frame_%04d{}.png", self.suffix));
+        atomically(path, |temporary| {
+            let output = std::path::absolute(temporary)?;
+            let mut ffmpeg = Command::new("ffmpeg");
+            // In its folder, whose name would otherwise be taken for a pattern too.
+            ffmpeg.current_dir(self.folder).stdin(Stdio::null());
+            ffmpeg.args(["-nostdin", "-loglevel", "error", "-y", "-framerate", &fps, "-start_number", "0", "-i", &input]);
+            ffmpeg.args(["-frames:v", &frames, "-vf", even, "-crf", "18", "-colorspace", "bt709", "-color_primaries", "bt709"]);
+            ffmpeg.args(["-color_trc", "bt709", "-movflags", "+faststart", "-f", "mp4"]).arg(&output);
+            let answer = ffmpeg.output()?;
+            if answer.status.success() {
+                return Ok(());
+            }
+            let told = String::from_utf8_lossy(&answer.stderr);
+            let last = told.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("no reason given");
+            Err(io::Error::other(format!("ffmpeg failed ({}): {last}", answer.status)))
+        })
+    }
+
+    fn frame(&self, number: usize) -> PathBuf {
+        self.folder.join(format!("frame_{number:04}{}.png", self.suffix))
+    }
+}
+
+/// True if there is a program of this name: any other failure will be told when it is used.
+fn has_ffmpeg() -> bool {
+    let answer = Command::new("ffmpeg").arg("-version").stdin(Stdio::null()).output();
+    !answer.is_err_and(|error| error.kind() == ErrorKind::NotFound)
+}
+
+/// How long a frame is shown, in hundredths of a second: whole numbers whose sums are as near to the rate as they can be.
+fn delay(number: usize, fps: f64) -> u16 {
+    let until = |frames: usize| (100.0 * frames as f64 / fps).round() as u64;
+    (until(number + 1) - until(number)).clamp(SHORTEST, u64::from(u16::MAX)) as u16
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn delays_add_up_to_the_length_of_the_film() {
+        assert_eq!((0..6).map(|n| delay(n, 30.0)).collect::<Vec<_>>(), [3, 4, 3, 3, 4, 3]);
+        assert_eq!((0..30).map(|n| u64::from(delay(n, 24.0))).sum::<u64>(), 125);
+        assert_eq!((delay(0, 100.0), delay(7, 0.1), delay(0, 0.001)), (2, 1000, u16::MAX));
+    }
+}

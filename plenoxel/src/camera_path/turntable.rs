@@ -1,0 +1,126 @@
+//! Paths around the scene, for runs of which nothing but the box is known.
+
+use super::{Fov, Shot};
+use crate::camera::{Camera, Intrinsics};
+use glam::DVec3;
+use std::f64::consts::{FRAC_PI_2, TAU};
+
+/// A camera that goes around the vertical axis of the world, +z, and looks at the origin, the centre of every grid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Turntable {
+    /// From the origin, world length, above 0.
+    pub distance: f64,
+    /// Above the horizon, in radians, within ± 80 degrees: straight from above there is no way up in a picture.
+    pub elevation: f64,
+    /// Angle of view across the shorter side of the picture, in radians.
+    pub fov: f64,
+}
+
+/// The highest elevation.
+const HIGHEST: f64 = 80.0 / 180.0 * std::f64::consts::PI;
+/// How far a spiral rises above its mean elevation and falls below.
+const SWING: f64 = 25.0 / 180.0 * std::f64::consts::PI;
+/// How often a spiral goes around while it rises and falls once.
+const TURNS: f64 = 2.0;
+
+impl Turntable {
+    /// As far away, as high and with as much in view as these cameras on the mean. `None` if none of them is away from the origin.
+    pub fn like(cameras: &[Camera]) -> Option<Self> {
+        let away: Vec<&Camera> = cameras.iter().filter(|camera| camera.position().length() > 0.0).collect();
+        let mean = |of: &dyn Fn(&Camera) -> f64| away.iter().map(|camera| of(camera)).sum::<f64>() / away.len() as f64;
+        let half_side = |k: &Intrinsics| (0.5 * k.width as f64 / k.fx).min(0.5 * k.height as f64 / k.fy);
+        (!away.is_empty()).then(|| Turntable {
+            distance: mean(&|camera| camera.position().length()),
+            elevation: mean(&|camera| camera.position().normalize().z.clamp(-1.0, 1.0).asin()).clamp(-HIGHEST, HIGHEST),
+            fov: 2.0 * mean(&|camera| half_side(&camera.intrinsics)).atan(),
+        })
+    }
+
+    /// From 30 degrees above, with the lens of the NeRF-synthetic scenes (50 mm on 36 mm), so far away that the ball around the cube from
+    /// −`half_width` to `half_width` that touches its faces fills the picture: half_width / sin(fov / 2).
+    pub fn around_box(half_width: f64) -> Self {
+        let fov = 2.0 * (0.5 * 36.0 / 50.0_f64).atan();
+        Turntable { distance: half_width / (0.5 * fov).sin(), elevation: 30.0_f64.to_radians(), fov }
+    }
+
+    /// A full turn, counterclockwise seen from above, from −y on. It ends one frame before it began, so that it can be shown again and again.
+    pub fn orbit(&self, frames: usize) -> Vec<Shot> {
+        self.turn(frames, 1.0, |_| self.elevation)
+    }
+
+    /// Two turns, in which the camera rises by 25 degrees, falls as far below its elevation, and comes back. It ends one frame before it began.
+    pub fn spiral(&self, frames: usize) -> Vec<Shot> {
+        self.turn(frames, TURNS, |share| (self.elevation + SWING * (TAU * share).sin()).clamp(-HIGHEST, HIGHEST))
+    }
+
+    fn turn(&self, frames: usize, turns: f64, elevation: impl Fn(f64) -> f64) -> Vec<Shot> {
+        // The intrinsics are the shot's own affair.
+        let any = Intrinsics::from_fov_x(1, 1, self.fov);
+        let shot = |i: usize| {
+            let share = i as f64 / frames as f64;
+            let (azimuth, elevation) = (TAU * turns * share - FRAC_PI_2, elevation(share));
+            let direction = DVec3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
+            let camera = Camera::look_at(self.distance * direction, DVec3::ZERO, DVec3::Z, any);
+            Shot { camera_to_world: camera.camera_to_world, fov: Fov::Shorter(self.fov) }
+        };
+        (0..frames).map(shot).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::Dataset;
+    use crate::dataset::Split;
+    use crate::dataset::procedural::ProceduralOptions;
+
+    const TABLE: Turntable = Turntable { distance: 3.0, elevation: 0.5, fov: 0.7 };
+
+    #[test]
+    fn an_orbit_keeps_its_distance_and_height_looks_at_the_centre_and_closes() {
+        let shots = TABLE.orbit(12);
+        for (i, shot) in shots.iter().enumerate() {
+            let camera = shot.camera((40, 30));
+            assert!((camera.position().length() - 3.0).abs() < 1e-12 && (camera.position().z - 3.0 * 0.5_f64.sin()).abs() < 1e-12);
+            let (x, y, _) = camera.project(DVec3::ZERO).unwrap();
+            assert!((x - 20.0).abs() < 1e-9 && (y - 15.0).abs() < 1e-9);
+            assert!(camera.project(DVec3::Z * 0.1).unwrap().1 < 15.0, "up is up");
+            // The angle to the next frame is the same everywhere, from the last to the first too.
+            let flat = |shot: &Shot| shot.camera_to_world.translation.truncate();
+            let step = flat(shot).angle_to(flat(&shots[(i + 1) % 12]));
+            assert!((step - TAU / 12.0).abs() < 1e-9, "frame {i}: {step}");
+        }
+        assert!(shots[0].camera_to_world.translation.y < 0.0 && shots[0].camera_to_world.translation.x.abs() < 1e-12);
+        assert_eq!(TABLE.orbit(1).len(), 1);
+    }
+
+    #[test]
+    fn a_spiral_rises_and_falls_at_one_distance_and_closes() {
+        let heights: Vec<f64> = TABLE.spiral(80).iter().map(|shot| shot.camera_to_world.translation.z / 3.0).collect();
+        let highest = heights.iter().copied().fold(f64::MIN, f64::max);
+        assert!((highest - (0.5 + SWING).sin()).abs() < 1e-9 && (heights[60] - (0.5 - SWING).sin()).abs() < 1e-9);
+        assert!((heights[0] - 0.5_f64.sin()).abs() < 1e-12 && (heights[79] - heights[0]).abs() < 0.05);
+        let steep = Turntable { elevation: HIGHEST, ..TABLE };
+        assert!(steep.spiral(40).iter().all(|shot| shot.camera_to_world.is_finite()));
+    }
+
+    #[test]
+    fn the_shorter_side_sees_the_same_whatever_the_shape() {
+        let focal = |size| TABLE.orbit(1)[0].camera(size).intrinsics.fx;
+        assert!((focal((80, 80)) - focal((160, 80))).abs() < 1e-12 && (focal((80, 80)) - focal((80, 200))).abs() < 1e-12);
+    }
+
+    #[test]
+    fn it_is_like_the_cameras_of_a_dataset_or_fits_the_box() {
+        let dataset = Dataset::procedural(ProceduralOptions { width: 40, height: 20, train: 50, val: 0, test: 0, supersample: 1 }).unwrap();
+        let cameras = dataset.cameras(Split::Train);
+        let table = Turntable::like(&cameras).unwrap();
+        assert!((table.distance - cameras[0].position().length()).abs() < 1e-9);
+        let camera = table.orbit(1)[0].camera((40, 20));
+        assert!((camera.intrinsics.fx - cameras[0].intrinsics.fx).abs() < 1e-9);
+        assert!(table.elevation > 0.3 && table.elevation < 0.8);
+        assert_eq!(Turntable::like(&[]), None);
+        let table = Turntable::around_box(1.5);
+        assert!(((1.5 / table.distance).asin() - table.fov / 2.0).abs() < 1e-12 && (4.0..5.0).contains(&table.distance));
+    }
+}
