@@ -9,6 +9,8 @@ pub mod info;
 mod new_run;
 pub mod render;
 pub mod scene;
+pub mod sweep;
+mod table;
 pub mod train;
 mod trained_run;
 

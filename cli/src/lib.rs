@@ -2,7 +2,8 @@
 //! it like any function.
 //!
 //! Exit codes: 0 done, 2 usage or a setting that cannot be used, 3 bad input, 4 numbers that are not finite, 5 reading or writing,
-//! 130 training that was interrupted, and saved.
+//! 130 interrupted: what was trained is saved. A sweep ends with the code of the
+//! first of its runs that failed.
 #![forbid(unsafe_code)]
 
 mod commands;
@@ -10,6 +11,7 @@ mod config;
 mod curves;
 mod data;
 mod evaluation;
+mod html;
 mod images;
 mod machine;
 mod memory;
@@ -18,7 +20,7 @@ mod progress;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{carve, evaluate, export, filter, info, render, scene, train};
+use commands::{carve, evaluate, export, filter, info, render, scene, sweep, train};
 use plenoxel::error::Error;
 use progress::Console;
 use std::ffi::OsString;
@@ -36,6 +38,7 @@ Examples:
   plenoxel render runs/lego-1 --view 0       a picture of it
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           its surface, for other programs
+  plenoxel sweep scenes.toml                 every scene with every method, and the table of what came of it
 
 Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing,
 130 interrupted (what was trained is saved).";
@@ -60,6 +63,7 @@ enum Command {
     Filter(filter::FilterArgs),
     Info(info::InfoArgs),
     Scene(scene::SceneArgs),
+    Sweep(sweep::SweepArgs),
 }
 
 #[derive(Debug, Args)]
@@ -75,6 +79,14 @@ struct Machine {
     /// Print errors and results only
     #[arg(long, short, global = true, help_heading = "Machine")]
     quiet: bool,
+}
+
+impl Machine {
+    /// The flags with which another process would use the machine in the same way.
+    fn flags(&self) -> Vec<String> {
+        let threads = self.threads.map(|n| format!("--threads={n}"));
+        threads.into_iter().chain(self.max_memory.map(|bytes| format!("--max-memory={bytes}"))).collect()
+    }
 }
 
 /// Where a command prints.
@@ -105,6 +117,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Filter(args) => filter::run(args, &console),
             Command::Info(args) => info::run(args, &console),
             Command::Scene(args) => scene::run(args, &console),
+            Command::Sweep(args) => return sweep::run(args, &cli.machine.flags(), &console),
         };
         done.map(|()| 0)
     });

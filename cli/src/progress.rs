@@ -66,6 +66,11 @@ impl<'a> Console<'a> {
         Count { meter: Meter::new(self, total as u64), what: what.to_owned() }
     }
 
+    /// Progress of a number of things that other processes do, who tell of it in lines.
+    pub fn relay(&self, total: usize) -> Relay<'_, 'a> {
+        Relay { meter: Meter::new(self, total as u64) }
+    }
+
     /// Progress of a training run that has taken so many seconds.
     pub fn training(&self, plan: &[PlannedStage], prune_from_stage: Option<usize>, seconds: f64) -> Training<'_, 'a> {
         let total = plan.iter().map(|p| p.steps).sum();
@@ -147,6 +152,18 @@ impl Count<'_, '_> {
     /// So many are done.
     pub fn at(&self, done: usize, total: usize) {
         let line = || format!("{}  {done}/{total}", self.what);
+        self.meter.show(done as u64, false, line);
+    }
+}
+
+/// Progress of what other processes do.
+pub struct Relay<'c, 'a> {
+    meter: Meter<'c, 'a>,
+}
+
+impl Relay<'_, '_> {
+    /// So many things are done, and the one that is being done says this of itself.
+    pub fn say(&self, done: usize, line: impl FnOnce() -> String) {
         self.meter.show(done as u64, false, line);
     }
 }

@@ -42,6 +42,7 @@ const CHECKPOINT: &str = "checkpoint.safetensors";
 const STATE: &str = "training.safetensors";
 const LOSS: &str = "loss.svg";
 const RESULT: &str = "result.json";
+const EVALUATION: &str = "evaluation.json";
 const README: &str = "README.md";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
@@ -76,7 +77,7 @@ impl RunFolder {
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
         self.remove_fragments()?;
-        for name in [CHECKPOINT, STATE, RESULT, METRICS, LOSS, CONFIG, RECORD, README] {
+        for name in [CHECKPOINT, STATE, RESULT, EVALUATION, METRICS, LOSS, CONFIG, RECORD, README] {
             let path = self.path.join(name);
             if path.exists() {
                 std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
@@ -100,6 +101,12 @@ impl RunFolder {
         config::write(&self.path.join(CONFIG), config, &origin)?;
         self.write_json(RECORD, record)?;
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
+    }
+
+    /// A folder for tests that look into none.
+    #[cfg(test)]
+    pub fn at(path: &Path) -> Self {
+        RunFolder { path: path.to_owned() }
     }
 
     /// Opens the folder of a run for reading.
@@ -197,7 +204,21 @@ impl RunFolder {
 
     /// Reads the final figures, as far as there are any.
     pub fn result(&self) -> Option<serde_json::Value> {
-        let text = std::fs::read_to_string(self.path.join(RESULT)).ok()?;
+        self.read_json(RESULT)
+    }
+
+    /// Writes what an evaluation found of a run whose final figures do not compare it with test views.
+    pub fn write_evaluation(&self, figures: &impl Serialize) -> Result<()> {
+        self.write_json(EVALUATION, figures)
+    }
+
+    /// Reads what an evaluation found, if one was written.
+    pub fn evaluation(&self) -> Option<serde_json::Value> {
+        self.read_json(EVALUATION)
+    }
+
+    fn read_json(&self, name: &str) -> Option<serde_json::Value> {
+        let text = std::fs::read_to_string(self.path.join(name)).ok()?;
         serde_json::from_str(&text).ok()
     }
 
@@ -229,6 +250,14 @@ impl RunFolder {
     /// A picture of the run.
     pub fn image(&self, name: &str) -> PathBuf {
         self.path.join(IMAGES).join(name)
+    }
+
+    /// The pictures of the run, by name; none if there are none.
+    pub fn images(&self) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(self.path.join(IMAGES));
+        let mut images: Vec<PathBuf> = entries.into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+        images.sort();
+        images
     }
 
     /// A picture made later.
@@ -277,6 +306,7 @@ Of these files, those that apply: a carved run has no training to tell of.
 - `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
 - `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.
 - `result.json`: the final figures. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring.
+- `evaluation.json`: what `plenoxel evaluate` said of a carved run that is part of a sweep.
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
   pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.

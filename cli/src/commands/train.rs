@@ -2,7 +2,7 @@
 
 mod budget;
 mod flags;
-mod interrupt;
+pub mod interrupt;
 mod pictures;
 
 use super::new_run::{Stopwatch, announce, load, record};
@@ -15,7 +15,7 @@ use crate::memory::{self, Estimate};
 use crate::metrics_file::{MetricsFile, Past};
 use crate::progress::{Console, clock};
 use crate::run_folder::RunFolder;
-pub use flags::{TrainArgs, size};
+pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use pictures::Pictures;
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, View};
