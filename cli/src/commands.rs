@@ -13,6 +13,8 @@ pub mod presets;
 pub mod render;
 pub mod report;
 pub mod scene;
+pub mod sweep;
+mod table;
 pub mod train;
 mod trained_run;
 

@@ -3,9 +3,13 @@
 //! Layers are merged as tables, so that a layer says only what it changes. Each value remembers where it was written, and an error
 //! names that place: a line of a file, a preset, a flag.
 
+mod difference;
 mod keys;
 mod presets;
 mod table;
+
+pub use difference::differences;
+pub use keys::unknown;
 
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
@@ -44,7 +48,7 @@ impl Layers {
     fn text(&mut self, text: &str, place: &dyn Fn(&str) -> String) -> Result<()> {
         let layer: Table = text.parse().map_err(|e: toml::de::Error| Error::config(place(""), e.message(), "valid TOML"))?;
         keys::check_table(&layer, place)?;
-        leaves("", &Value::Table(layer.clone()), &mut |path| {
+        leaves("", &Value::Table(layer.clone()), &mut |path, _| {
             self.places.push((path.to_owned(), place(path)));
         });
         table::merge(&mut self.table, layer);
@@ -53,11 +57,7 @@ impl Layers {
 
     /// Lays a file over what is there.
     pub fn file(&mut self, file: &ConfigFile) -> Result<()> {
-        let place = |path: &str| match file.line(path) {
-            Some(line) => format!("{}, line {line}", file.name),
-            None => file.name.clone(),
-        };
-        self.text(&file.text, &place)
+        self.text(&file.text, &|path| file.place(path))
     }
 
     /// Sets one value from the command line: `path` as in `stages[0].sampling.step`, `flag` for messages. No value removes it.
@@ -162,9 +162,17 @@ impl ConfigFile {
         toml::from_str::<Config>(&self.text).is_ok()
     }
 
-    fn line(&self, path: &str) -> Option<usize> {
-        let found = self.lines.iter().find(|(known, _)| known == path);
-        found.map(|(_, line)| *line)
+    /// What the file says.
+    pub fn text(&self) -> &str {
+        &self.text
+    }
+
+    /// The file and the line at which a key is written, for messages.
+    pub fn place(&self, path: &str) -> String {
+        match self.lines.iter().find(|(known, _)| known == path) {
+            Some((_, line)) => format!("{}, line {line}", self.name),
+            None => self.name.clone(),
+        }
     }
 }
 
@@ -211,8 +219,8 @@ pub fn read(path: &Path) -> Result<Config> {
     layers.resolve()
 }
 
-/// Calls `f` with the path of every value that is not a table.
-fn leaves(path: &str, value: &Value, f: &mut dyn FnMut(&str)) {
+/// Calls `f` with the path of every value that is not a table, and the value.
+fn leaves(path: &str, value: &Value, f: &mut dyn FnMut(&str, &Value)) {
     match value {
         Value::Table(table) => table.iter().for_each(|(key, value)| match path {
             "" => leaves(key, value, f),
@@ -222,7 +230,7 @@ fn leaves(path: &str, value: &Value, f: &mut dyn FnMut(&str)) {
             let entries = values.iter().enumerate();
             entries.for_each(|(i, value)| leaves(&format!("{path}[{i}]"), value, f));
         }
-        _ => f(path),
+        _ => f(path, value),
     }
 }
 
@@ -239,7 +247,9 @@ fn spans(path: &str, table: &DeTable<'_>, f: &mut dyn FnMut(String, usize)) {
             DeValue::Array(values) => {
                 for (i, value) in values.iter().enumerate() {
                     if let DeValue::Table(table) = value.get_ref() {
-                        spans(&format!("{inner}[{i}]"), table, f);
+                        let entry = format!("{inner}[{i}]");
+                        f(entry.clone(), value.span().start);
+                        spans(&entry, table, f);
                     }
                 }
             }

@@ -5,6 +5,7 @@ use plenoxel::dataset::{self, Dataset, OpenOptions, image};
 use plenoxel::error::{Error, Result};
 use plenoxel::train::config::Config;
 use serde::{Deserialize, Serialize};
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 /// Where views come from.
@@ -29,6 +30,17 @@ pub enum DataSource {
         /// Test views.
         test: usize,
     },
+}
+
+impl fmt::Display for DataSource {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            DataSource::Folder { path } => write!(f, "{}", path.display()),
+            DataSource::BuiltIn { width, height, train, val, test } => {
+                write!(f, "built in, {width} x {height}, {train} train, {val} val, {test} test views")
+            }
+        }
+    }
 }
 
 impl DataSource {

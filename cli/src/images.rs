@@ -41,12 +41,22 @@ pub fn strip(pictures: &[&Rgb]) -> Rgb {
         return Rgb::zeros((0, 0, 3));
     };
     let height = first.dim().0;
-    let gap = Rgb::from_elem((height, (height / 50).max(2), 3), 0.55);
+    let gap = Rgb::from_elem((height, gap(height), 3), 0.55);
     let mut parts = vec![first.view()];
     for picture in &pictures[1..] {
         parts.extend([gap.view(), picture.slice_axis(Axis(0), Slice::from(..height))]);
     }
     concatenate(Axis(1), &parts).unwrap_or_else(|_| (*first).clone())
+}
+
+/// Pixels between pictures of a strip of this height.
+fn gap(height: usize) -> usize {
+    (height / 50).max(2)
+}
+
+/// Where in a strip a picture begins, counted from 0, if all are of one size. In a panel 0 is the target and 1 the render.
+pub fn begins_at(number: usize, (width, height): (usize, usize)) -> usize {
+    number * (width + gap(height))
 }
 
 /// Mean absolute error over channels, black at 0 through red to pale yellow at [`ERROR_SCALE`] and above.
@@ -218,6 +228,7 @@ mod tests {
     fn a_strip_is_as_wide_as_its_pictures_and_gaps() {
         let picture = Rgb::zeros((100, 40, 3));
         assert_eq!(strip(&[&picture, &picture, &picture]).dim(), (100, 124, 3));
+        assert_eq!(begins_at(2, (40, 100)), 84);
         assert_eq!(strip(&[]).dim(), (0, 0, 3));
     }
 }

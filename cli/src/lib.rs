@@ -2,7 +2,8 @@
 //! it like any function.
 //!
 //! Exit codes: 0 done, 2 usage or a setting that cannot be used, 3 bad input, 4 numbers that are not finite, 5 reading or writing,
-//! 130 training that was interrupted, and saved.
+//! 130 interrupted: what was trained is saved. A sweep ends with the code of the
+//! first of its runs that failed.
 #![forbid(unsafe_code)]
 
 mod chart;
@@ -23,7 +24,7 @@ mod report;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{carve, completions, evaluate, export, filter, info, man, presets, render, scene, train};
+use commands::{carve, completions, evaluate, export, filter, info, man, presets, render, scene, sweep, train};
 use plenoxel::error::Error;
 use progress::{Console, LogFormat};
 use std::ffi::OsString;
@@ -43,6 +44,7 @@ Examples:
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           its surface, for other programs
   plenoxel presets                           settings to start from, and how long they take
+  plenoxel sweep scenes.toml                 every scene with every method, and the table of what came of it
 
 Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
 130 interrupted (what was trained is saved).";
@@ -71,6 +73,7 @@ enum Command {
     Presets(presets::PresetsArgs),
     Completions(completions::CompletionsArgs),
     Man(man::ManArgs),
+    Sweep(sweep::SweepArgs),
 }
 
 #[derive(Debug, Args)]
@@ -90,6 +93,14 @@ struct Machine {
     /// What to write to stderr: lines for people, or a JSON object on each line for programs; stdout stays as it is
     #[arg(long, global = true, value_name = "FORMAT", help_heading = "Machine", value_enum, default_value_t = LogFormat::Plain)]
     log_format: LogFormat,
+}
+
+impl Machine {
+    /// The flags with which another process would use the machine in the same way.
+    fn flags(&self) -> Vec<String> {
+        let threads = self.threads.map(|n| format!("--threads={n}"));
+        threads.into_iter().chain(self.max_memory.map(|bytes| format!("--max-memory={bytes}"))).collect()
+    }
 }
 
 /// Where a command prints.
@@ -124,6 +135,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Presets(args) => presets::run(args, &console),
             Command::Completions(args) => completions::run(args, &console),
             Command::Man(args) => man::run(args, &console),
+            Command::Sweep(args) => return sweep::run(args, &cli.machine.flags(), &console),
         };
         done.map(|()| 0)
     });

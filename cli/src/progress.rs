@@ -106,6 +106,11 @@ impl<'a> Console<'a> {
     pub fn count(&self, what: &str, total: usize) -> Count<'_, 'a> {
         Count { meter: Meter::new(self, total as u64), what: what.to_owned() }
     }
+
+    /// Progress of a number of things that other processes do, who tell of it in lines.
+    pub fn relay(&self, total: usize) -> Relay<'_, 'a> {
+        Relay { meter: Meter::new(self, total as u64) }
+    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -185,6 +190,32 @@ impl Count<'_, '_> {
         // People see that it is over; programs are told.
         let must = done == total && self.meter.console.format == LogFormat::Json;
         self.meter.show((done as u64, total as u64), must, || Counted { what: &self.what, done, total });
+    }
+}
+
+/// Progress of what other processes do.
+pub struct Relay<'c, 'a> {
+    meter: Meter<'c, 'a>,
+}
+
+impl Relay<'_, '_> {
+    /// So many of `total` things are done, and the one that is being done says this of itself.
+    pub fn say(&self, done: usize, total: usize, line: impl FnOnce() -> String) {
+        self.meter.show((done as u64, total as u64), false, || Relayed { done, total, message: line() });
+    }
+}
+
+/// So many of how many, and how far the next one is.
+#[derive(Serialize)]
+struct Relayed {
+    done: usize,
+    total: usize,
+    message: String,
+}
+
+impl Standing for Relayed {
+    fn line(&self) -> String {
+        self.message.clone()
     }
 }
 

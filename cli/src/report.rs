@@ -6,7 +6,7 @@ mod curves;
 mod pictures;
 mod scene;
 
-use crate::html::escaped;
+use crate::html::{self, escaped};
 use crate::metrics_file;
 use crate::progress::{bytes, clock};
 use crate::run_folder::{RunFolder, RunRecord};
@@ -44,17 +44,8 @@ impl Report<'_> {
             costs(self, &result),
             self.settings()?,
         ];
-        let page = format!(
-            "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{}</title>\n<style>\n{}</style>\n</head>\n\
-             <body>\n<h1>{}</h1>\n{}\n<script>\n{}</script>\n{}</body>\n</html>\n",
-            escaped(&title),
-            include_str!("report/style.css"),
-            escaped(&title),
-            parts.join("\n"),
-            include_str!("report/page.js"),
-            scene.scripts(),
-        );
+        let scripts = format!("<script>\n{}</script>\n{}", include_str!("report/page.js"), scene.scripts());
+        let page = html::page(&title, include_str!("report/style.css"), &(parts.join("\n") + &scripts));
         self.folder.write_report(&page)?;
         Ok(format!("report: {} ({}); {}", self.folder.report().display(), bytes(page.len() as u64), scene.note()))
     }

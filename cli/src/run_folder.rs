@@ -43,6 +43,7 @@ const CHECKPOINT: &str = "checkpoint.safetensors";
 const STATE: &str = "training.safetensors";
 const LOSS: &str = "loss.svg";
 const RESULT: &str = "result.json";
+const EVALUATION: &str = "evaluation.json";
 const README: &str = "README.md";
 const REPORT: &str = "report.html";
 const IMAGES: &str = "images";
@@ -80,7 +81,7 @@ impl RunFolder {
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
         self.remove_fragments()?;
-        let names = [CHECKPOINT, STATE, RESULT, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
+        let names = [CHECKPOINT, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
         let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| path.exists());
         for path in paths.chain(event_file::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
@@ -103,6 +104,12 @@ impl RunFolder {
         config::write(&self.path.join(CONFIG), config, &format!("Settings of a run of {}. The same run again:\n{again}", record.program))?;
         self.write_json(RECORD, record)?;
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
+    }
+
+    /// A folder for tests that look into none.
+    #[cfg(test)]
+    pub fn at(path: &Path) -> Self {
+        RunFolder { path: path.to_owned() }
     }
 
     /// Opens the folder of a run for reading.
@@ -193,7 +200,21 @@ impl RunFolder {
 
     /// Reads the final figures, as far as there are any.
     pub fn result(&self) -> Option<serde_json::Value> {
-        let text = std::fs::read_to_string(self.path.join(RESULT)).ok()?;
+        self.read_json(RESULT)
+    }
+
+    /// Writes what an evaluation found of a run whose final figures do not compare it with test views.
+    pub fn write_evaluation(&self, figures: &impl Serialize) -> Result<()> {
+        self.write_json(EVALUATION, figures)
+    }
+
+    /// Reads what an evaluation found, if one was written.
+    pub fn evaluation(&self) -> Option<serde_json::Value> {
+        self.read_json(EVALUATION)
+    }
+
+    fn read_json(&self, name: &str) -> Option<serde_json::Value> {
+        let text = std::fs::read_to_string(self.path.join(name)).ok()?;
         serde_json::from_str(&text).ok()
     }
 
@@ -241,6 +262,14 @@ impl RunFolder {
     /// A picture of the run.
     pub fn image(&self, name: &str) -> PathBuf {
         self.path.join(IMAGES).join(name)
+    }
+
+    /// The pictures of the run, by name; none if there are none.
+    pub fn images(&self) -> Vec<PathBuf> {
+        let entries = std::fs::read_dir(self.path.join(IMAGES));
+        let mut images: Vec<PathBuf> = entries.into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+        images.sort();
+        images
     }
 
     /// A picture made later.
@@ -335,6 +364,7 @@ Of these files, those that apply: a carved run has no training to tell of.
 - `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.
 - `result.json`: the final figures, and how each is computed. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring. `best_validation`
   names the step after which `validation_psnr` was highest; the grid is that of the last step all the same.
+- `evaluation.json`: what `plenoxel evaluate` said of a carved run that is part of a sweep.
 - `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
 - `images/preview.png`: replaced while it trains: a validation view, photograph and render, reduced; without validation views, what the camera of the stages sees.
 - `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,

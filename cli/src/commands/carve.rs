@@ -100,7 +100,13 @@ pub struct CarveArgs {
 }
 
 impl CarveArgs {
-    fn config(&self) -> Result<(Config, Option<&str>)> {
+    /// Where the views come from.
+    pub fn source(&self) -> DataSource {
+        DataSource::of(self.data.as_deref())
+    }
+
+    /// The configuration, and the preset it started from.
+    pub fn config(&self) -> Result<(Config, Option<&str>)> {
         config::layered(None, CARVE.name, self.config.as_deref(), |layers| self.flags(layers))
     }
 
@@ -132,7 +138,7 @@ const LARGE: usize = 256;
 
 /// Carves a scene and leaves a run folder.
 pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
-    let source = DataSource::of(args.data.as_deref());
+    let source = args.source();
     let (config, preset) = args.config()?;
     let mut load_clock = Stopwatch::default();
     let dataset = load_clock.time(|| source.open(&config))?;

@@ -81,11 +81,8 @@ fn of_run(path: &Path) -> Result<Lines> {
         ("preset", record.preset.unwrap_or_else(|| "none".to_owned())),
     ];
     let data = match &record.data {
-        DataSource::Folder { path } if path.exists() => path.display().to_string(),
-        DataSource::Folder { path } => format!("{}, not there any more", path.display()),
-        DataSource::BuiltIn { width, height, train, val, test } => {
-            format!("built in, {width} x {height}, {train} train, {val} val, {test} test views")
-        }
+        DataSource::Folder { path } if !path.exists() => format!("{}, not there any more", path.display()),
+        source => source.to_string(),
     };
     lines.push(("data", data));
     let stages = config.stages.iter().map(|stage| format!("{}³", stage.resolution));

@@ -2,7 +2,7 @@
 
 mod budget;
 mod flags;
-mod interrupt;
+pub mod interrupt;
 mod learning;
 mod pictures;
 mod preview;
@@ -18,7 +18,7 @@ use crate::metrics_file::{Best, MetricsFile, Past};
 use crate::progress::{Console, clock};
 use crate::report::Report;
 use crate::run_folder::RunFolder;
-pub use flags::{TrainArgs, size};
+pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use learning::{Learned, StageSummary};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};

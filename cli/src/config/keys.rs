@@ -120,16 +120,18 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
         let found = format!("the key `{key}` below `{pattern}`, which is no table,");
         return Err(Error::config(place, found, format!("a value for `{pattern}`")));
     };
-    if known.contains(&key) {
-        return Ok(());
-    }
-    // The nearest in spelling, if it is near; a word that resembles nothing gets the whole list.
-    let nearest = known.iter().min_by_key(|name| distance(key, name)).filter(|name| distance(key, name) <= 2 + name.len() / 4);
+    if known.contains(&key) { Ok(()) } else { Err(unknown("key", key, known, place)) }
+}
+
+/// The refusal of a name that is not among the known ones: it says which is nearest in spelling, if one is near; a word that resembles
+/// nothing gets the whole list.
+pub fn unknown(what: &str, name: &str, known: &[&str], place: &str) -> Error {
+    let nearest = known.iter().min_by_key(|known| distance(name, known)).filter(|known| distance(name, known) <= 2 + known.len() / 4);
     let accepted = match nearest {
-        Some(name) => format!("the nearest known key is `{name}`"),
+        Some(known) => format!("the nearest known {what} is `{known}`"),
         None => format!("one of {}", known.join(", ")),
     };
-    Err(Error::config(place, format!("the unknown key `{key}`"), accepted))
+    Error::config(place, format!("the unknown {what} `{name}`"), accepted)
 }
 
 /// Levenshtein's edit distance.

@@ -24,7 +24,7 @@ Settings are layered: defaults < preset < --config < flags. config.toml in the r
 reaches each by its path there, such as stages[0].sampling.step. The last line on stdout is one JSON object.";
 
 /// What a run that goes on was told when it began.
-const NOT_WHEN_RESUMED: [&str; 20] = [
+pub const NOT_WHEN_RESUMED: [&str; 20] = [
     "out",
     "force",
     "preset",

@@ -1,4 +1,4 @@
-//! Ctrl-C: the first time while a run trains, it is asked to save and stop; else the process ends.
+//! Ctrl-C: the first time while a run trains, or a sweep has runs made, it is asked to save and stop; else the process ends.
 
 use std::sync::Once;
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};

@@ -1,0 +1,115 @@
+//! A run as a process of its own: it may crash, or be killed for want of memory, and the sweep goes on; and its peak memory is its own.
+
+use plenoxel::error::{Error, Result};
+use std::ffi::OsString;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitStatus, Stdio};
+
+/// What the processes of a sweep have in common.
+pub struct Program {
+    /// This program.
+    pub path: PathBuf,
+    /// Flags for all: threads and memory.
+    pub machine: Vec<String>,
+    /// The lock of the sweep, which lasts until the last who has the file open ends: a run that outlives its sweep keeps it.
+    pub lock: File,
+}
+
+/// How a process ended.
+pub struct Ended {
+    /// Exit code; of one that a signal ended 128 and the signal's number, as shells count.
+    pub code: u8,
+    /// What it said on stdout.
+    pub out: String,
+    /// What it said last, its error if it said so.
+    pub last: String,
+}
+
+impl Program {
+    /// Runs the program to its end. What it says on stderr goes to the end of the file `log`, and line by line to `said`.
+    pub fn run(&self, arguments: &[OsString], log: &Path, mut said: impl FnMut(&str)) -> Result<Ended> {
+        let writing = |e| Error::io(log, e, "writing the log");
+        let starting = |e| Error::io(&self.path, e, "starting a run");
+        let mut file = File::options().append(true).create(true).open(log).map_err(writing)?;
+        let line: Vec<_> = arguments.iter().map(|argument| argument.to_string_lossy()).collect();
+        writeln!(file, "$ plenoxel {}", line.join(" ")).map_err(writing)?;
+        let mut child = Command::new(&self.path)
+            .args(&self.machine)
+            .args(arguments)
+            // Nothing is read from it: it is how a process is given an open file.
+            .stdin(self.lock.try_clone().map_err(starting)?)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(starting)?;
+        let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
+        let mut last = Last::default();
+        let out = std::thread::scope(|scope| {
+            let out = scope.spawn(|| {
+                let mut bytes = Vec::new();
+                // What cannot be read is not there.
+                drop(stdout.map(|mut stdout| stdout.read_to_end(&mut bytes)));
+                String::from_utf8_lossy(&bytes).into_owned()
+            });
+            let mut bytes = Vec::new();
+            if let Some(stderr) = stderr {
+                let mut stderr = BufReader::new(stderr);
+                while stderr.read_until(b'\n', &mut bytes).is_ok_and(|n| n > 0) {
+                    // A full disk is no reason for the run to fail, which may have its own elsewhere.
+                    drop(file.write_all(&bytes));
+                    let text = String::from_utf8_lossy(&bytes);
+                    last.hear(text.trim_end());
+                    said(text.trim_end());
+                    bytes.clear();
+                }
+            }
+            out.join().unwrap_or_default()
+        });
+        let status = child.wait().map_err(starting)?;
+        let code = code(status);
+        Ok(Ended { code, out, last: last.words(status) })
+    }
+}
+
+/// What a process said last that matters.
+#[derive(Default)]
+struct Last {
+    line: String,
+    error: Option<String>,
+}
+
+impl Last {
+    fn hear(&mut self, line: &str) {
+        if let Some(error) = line.strip_prefix("error: ") {
+            self.error = Some(error.to_owned());
+        }
+        if !line.trim().is_empty() {
+            self.line = line.to_owned();
+        }
+    }
+
+    fn words(self, status: ExitStatus) -> String {
+        match (self.error, signal(status)) {
+            (Some(error), _) => error,
+            (None, Some(signal)) => format!("ended by signal {signal} after: {}", self.line),
+            (None, None) => self.line,
+        }
+    }
+}
+
+fn code(status: ExitStatus) -> u8 {
+    let code = status.code().or_else(|| signal(status).map(|signal| 128 + signal));
+    code.and_then(|code| u8::try_from(code).ok()).unwrap_or(u8::MAX)
+}
+
+#[cfg(unix)]
+fn signal(status: ExitStatus) -> Option<i32> {
+    std::os::unix::process::ExitStatusExt::signal(&status)
+}
+
+#[cfg(not(unix))]
+fn signal(_: ExitStatus) -> Option<i32> {
+    None
+}

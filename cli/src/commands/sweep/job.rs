@@ -1,0 +1,187 @@
+//! One run of a sweep: the command line that makes it, and how far it is.
+
+use super::flags::Flag;
+use crate::commands::table::{Cell, Failure, Measured};
+use crate::commands::train::NOT_WHEN_RESUMED;
+use crate::config;
+use crate::data::DataSource;
+use crate::run_folder::RunFolder;
+use plenoxel::error::{Error, Result};
+use plenoxel::files;
+use plenoxel::train::config::Config;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+/// A run of a scene with a method.
+#[derive(Debug)]
+pub struct Job {
+    pub scene: String,
+    pub method: String,
+    /// Its run folder.
+    pub folder: PathBuf,
+    pub call: Call,
+    pub asked: Asked,
+}
+
+/// A command line, but for where the run goes.
+#[derive(Debug)]
+pub struct Call {
+    pub command: &'static str,
+    pub flags: Vec<Flag>,
+    /// The folder with the views; the built-in scene has none.
+    pub data: Option<PathBuf>,
+}
+
+/// What that command line amounts to.
+#[derive(Debug)]
+pub struct Asked {
+    pub config: Config,
+    pub source: DataSource,
+    /// Seconds that training was asked to take: then the lengths of stages are found out when it begins.
+    pub time: Option<f64>,
+}
+
+/// How far a run is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum State {
+    /// There is nothing of it.
+    New,
+    /// It ended before anything was saved from which it could go on.
+    CutShort,
+    /// It can go on from where it was saved.
+    Interrupted,
+    /// It is not compared with test views yet.
+    Unevaluated,
+    Finished,
+    /// The folder has a run with other settings: these.
+    Different(String),
+}
+
+impl Call {
+    /// The command line, with more flags.
+    pub fn arguments(&self, more: &[OsString]) -> Vec<OsString> {
+        let flags = self.flags.iter().map(|flag| OsString::from(&flag.text));
+        // What comes after -- is no flag, whatever it looks like.
+        let data = self.data.iter().flat_map(|data| ["--".into(), data.into()]);
+        [self.command.into()].into_iter().chain(flags).chain(more.iter().cloned()).chain(data).collect()
+    }
+}
+
+impl Job {
+    /// How far it is, by what lies in its folder.
+    pub fn state(&self) -> State {
+        let something = std::fs::read_dir(&self.folder).is_ok_and(|mut entries| entries.next().is_some());
+        if !something {
+            return State::New;
+        }
+        let (folder, config, source) = match RunFolder::open(&self.folder) {
+            Ok((folder, config, record)) => (folder, config, record.data),
+            Err(e) => return State::Different(e.to_string()),
+        };
+        let result = folder.result();
+        let planned = result.as_ref().and_then(|result| result["seconds_planned"].as_f64());
+        let different = self.asked.differences(&config, &source, planned);
+        if !different.is_empty() {
+            return State::Different(different.join("; "));
+        }
+        match result {
+            // A comparison with no test views is one too, and has no PSNR.
+            Some(result) if result.get("psnr").is_some() || folder.evaluation().is_some() => State::Finished,
+            Some(_) => State::Unevaluated,
+            None if folder.state().exists() => State::Interrupted,
+            None => State::CutShort,
+        }
+    }
+
+    /// The command line that brings it to its end from a state; none if there is nothing to do but to evaluate it.
+    pub fn command_line(&self, state: &State) -> Option<Vec<OsString>> {
+        let folder = || self.folder.clone().into_os_string();
+        let out = || ["--out".into(), folder()];
+        match state {
+            State::New => Some(self.call.arguments(&out())),
+            State::CutShort | State::Different(_) => Some(self.call.arguments(&[&out()[..], &["--force".into()]].concat())),
+            State::Interrupted => {
+                let again = self.call.flags.iter().filter(|flag| !NOT_WHEN_RESUMED.contains(&flag.key.as_str()));
+                let again = again.map(|flag| OsString::from(&flag.text));
+                Some(["train".into(), "--resume".into(), folder()].into_iter().chain(again).collect())
+            }
+            State::Unevaluated | State::Finished => None,
+        }
+    }
+
+    /// The command line that compares it with its test views and prints the figures.
+    pub fn evaluation(&self) -> Vec<OsString> {
+        vec!["evaluate".into(), self.folder.clone().into_os_string(), "--json".into()]
+    }
+
+    /// Writes down the figures that an evaluation printed.
+    pub fn write_evaluation(&self, printed: &str) -> Result<()> {
+        let (folder, ..) = RunFolder::open(&self.folder)?;
+        let figures: serde_json::Value = serde_json::from_str(printed.trim())
+            .map_err(|e| Error::input(&self.folder, format!("its evaluation is not JSON ({e})"), "this is a defect of the program"))?;
+        folder.write_evaluation(&figures)
+    }
+
+    /// What it said while it was made. Names of runs have no dots, so that no run can be in the way.
+    pub fn log(&self) -> PathBuf {
+        self.folder.with_extension("log")
+    }
+
+    fn failure_path(&self) -> PathBuf {
+        self.folder.with_extension("failure.json")
+    }
+
+    /// Writes down that it failed.
+    pub fn remember(&self, failure: &Failure) -> Result<()> {
+        files::write_atomically(&self.failure_path(), (crate::json_line(failure)? + "\n").as_bytes())
+    }
+
+    /// It may have failed once: that counts no longer.
+    pub fn forget(&self) -> Result<()> {
+        remove(&self.failure_path())
+    }
+
+    /// Removes what an earlier run said.
+    pub fn remove_log(&self) -> Result<()> {
+        remove(&self.log())
+    }
+
+    /// What came of it, so far.
+    pub fn cell(&self) -> Cell {
+        let failure = std::fs::read_to_string(self.failure_path()).ok().and_then(|text| serde_json::from_str(&text).ok());
+        match (failure, Measured::read(&self.folder)) {
+            (Some(failure), _) => Cell::Failed(failure),
+            (None, Ok(Some(measured))) => Cell::Measured(Box::new(measured)),
+            _ => Cell::Missing,
+        }
+    }
+}
+
+/// Removes a file, if it is there.
+fn remove(path: &Path) -> Result<()> {
+    match std::fs::remove_file(path) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path, e, "removing it")),
+        _ => Ok(()),
+    }
+}
+
+impl Asked {
+    /// Where a run is not what was asked for.
+    fn differences(&self, config: &Config, source: &DataSource, planned: Option<f64>) -> Vec<String> {
+        let mut asked = self.config.clone();
+        if let Some(seconds) = self.time {
+            if let Some(planned) = planned.filter(|planned| *planned != seconds) {
+                return vec![format!("time is {planned} s and not {seconds} s")];
+            }
+            if config.stages.len() == asked.stages.len() {
+                for (stage, found) in asked.stages.iter_mut().zip(&config.stages) {
+                    (stage.steps, stage.epochs, stage.density_warm_up) = (found.steps, found.epochs, found.density_warm_up);
+                }
+            }
+            // Weights may change after a number of steps.
+            asked.losses.clone_from(&config.losses);
+        }
+        let data = (source != &self.source).then(|| format!("data is {source} and not {}", self.source));
+        data.into_iter().chain(config::differences(config, &asked)).collect()
+    }
+}

@@ -1,0 +1,222 @@
+//! What a sweep is to do: its scenes, its methods, and the command line of each run.
+
+use super::flags::{self, Flag};
+use super::job::{Asked, Call, Job};
+use crate::commands::table::Published;
+use crate::config::{self, ConfigFile};
+use clap::Parser;
+use plenoxel::error::{Error, Result};
+use serde::Deserialize;
+use std::collections::BTreeSet;
+use std::path::Path;
+use toml::{Table, Value};
+
+/// The built-in scene's name where a folder could stand.
+const BUILT_IN: &str = "procedural";
+const COMMANDS: [&str; 2] = ["train", "carve"];
+
+/// All runs, scene by scene.
+#[derive(Debug)]
+pub struct Plan {
+    pub scenes: Vec<String>,
+    pub methods: Vec<String>,
+    pub published: Vec<Published>,
+    pub jobs: Vec<Job>,
+}
+
+/// A file, its keys checked; flags alone come to the same.
+#[derive(Debug, Default, Deserialize)]
+struct Sweep {
+    /// For all runs; those of scenes and methods count more.
+    #[serde(default)]
+    set: Vec<String>,
+    scenes: Vec<Table>,
+    methods: Vec<Table>,
+    #[serde(default)]
+    published: Vec<Published>,
+}
+
+/// A scene or a method under its name.
+struct Entry {
+    name: String,
+    /// Its path in the file.
+    path: String,
+    table: Table,
+}
+
+impl Plan {
+    /// The sweep that a file describes, into `out`; `set` are settings for all runs, which count more than any other.
+    pub fn from_file(path: &Path, set: &[String], out: &Path) -> Result<Self> {
+        let file = ConfigFile::read(path)?;
+        let wrong = |found: String| Error::input(path, found, "see the example in `plenoxel sweep --help`");
+        let root: Table = toml::from_str(file.text()).map_err(|e| wrong(e.message().to_owned()))?;
+        let known = |keys: &[&str]| keys.iter().map(|key| (*key).to_owned()).collect::<Vec<_>>();
+        flags::check_keys(&root, &known(&["set", "scenes", "methods", "published"]), &|key| file.place(key))?;
+        let tables = |key: &str| root.get(key).and_then(Value::as_array).into_iter().flatten().filter_map(Value::as_table);
+        for (index, table) in tables("published").enumerate() {
+            let place = |key: &str| file.place(&format!("published[{index}].{key}"));
+            flags::check_keys(table, &known(&["name", "source", "psnr", "ssim", "seconds"]), &place)?;
+        }
+        let sweep: Sweep = toml::from_str(file.text()).map_err(|e| {
+            let line = e.span().map_or(0, |span| file.text()[..span.start].matches('\n').count() + 1);
+            wrong(format!("line {line}: {}", e.message()))
+        })?;
+        let base = path.parent().unwrap_or(Path::new(""));
+        Self::new(sweep, set, base, out, &|path| file.place(path))
+    }
+
+    /// Some scenes, folders or the built-in one, with some presets.
+    pub fn from_flags(scenes: &[String], presets: &[String], set: &[String], out: &Path) -> Result<Self> {
+        let tables =
+            |key: &str, values: &[String]| values.iter().map(|value| Table::from_iter([(key.to_owned(), value.as_str().into())])).collect();
+        let sweep = Sweep { scenes: tables("data", scenes), methods: tables("preset", presets), ..Sweep::default() };
+        Self::new(sweep, set, Path::new(""), out, &|path| if path.starts_with("scenes") { "--scene".into() } else { "--preset".into() })
+    }
+
+    fn new(sweep: Sweep, set: &[String], base: &Path, out: &Path, place: &dyn Fn(&str) -> String) -> Result<Self> {
+        let scenes = named("scenes", sweep.scenes, place, |table| {
+            let data = folder_of(table).map(|data| Path::new(data).file_name().unwrap_or_default().to_string_lossy().into_owned());
+            data.unwrap_or_else(|| BUILT_IN.to_owned())
+        })?;
+        let methods = named("methods", sweep.methods, place, |table| {
+            let text = |key: &str| table.get(key).and_then(Value::as_str);
+            let config = text("config").and_then(|path| Path::new(path).file_stem()?.to_str());
+            text("preset").or(config).or(text("command")).unwrap_or("train").to_owned()
+        })?;
+        let mut plan = Plan { scenes: names(&scenes), methods: names(&methods), published: sweep.published, jobs: Vec::new() };
+        plan.check_published(place)?;
+        for scene in &scenes {
+            let chosen = chosen_methods(scene, &plan.methods, place)?;
+            for method in methods.iter().filter(|method| chosen.contains(&method.name)) {
+                plan.jobs.push(job(scene, method, &sweep.set, set, base, out, place)?);
+            }
+        }
+        Ok(plan)
+    }
+
+    /// Refuses a column that would be empty.
+    fn check_published(&self, place: &dyn Fn(&str) -> String) -> Result<()> {
+        for (index, published) in self.published.iter().enumerate() {
+            let mut named = [&published.psnr, &published.ssim, &published.seconds].into_iter().flat_map(|figures| figures.keys());
+            if !named.any(|scene| self.scenes.contains(scene)) {
+                let found = format!("`{}`, which has no figure of a scene of this sweep,", published.name);
+                let accepted = format!("such as psnr = {{ {} = 30.0 }}", self.scenes.join(" = 30.0, "));
+                return Err(Error::config(place(&format!("published[{index}]")), found, accepted));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn names(entries: &[Entry]) -> Vec<String> {
+    entries.iter().map(|entry| entry.name.clone()).collect()
+}
+
+/// The folder a scene's views are in; none for the built-in scene.
+fn folder_of(table: &Table) -> Option<&str> {
+    table.get("data").and_then(Value::as_str).filter(|data| *data != BUILT_IN)
+}
+
+/// Entries under the names they give themselves, or `default` does; they become folders.
+fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default: impl Fn(&Table) -> String) -> Result<Vec<Entry>> {
+    if tables.is_empty() {
+        return Err(Error::config(place(list), format!("no {list}"), format!("at least one entry [[{list}]]")));
+    }
+    let plain = |c: char| c.is_alphanumeric() || matches!(c, '-' | '_');
+    let (mut entries, mut taken) = (Vec::new(), BTreeSet::new());
+    for (index, mut table) in tables.into_iter().enumerate() {
+        let path = format!("{list}[{index}]");
+        let name = match table.remove("name") {
+            Some(Value::String(name)) => name,
+            Some(other) => return Err(Error::config(place(&format!("{path}.name")), other, "a name in quotes")),
+            None => default(&table).chars().map(|c| if plain(c) { c } else { '-' }).collect(),
+        };
+        if name.is_empty() || !name.chars().all(plain) {
+            let place = place(&format!("{path}.name"));
+            return Err(Error::config(place, format!("the name `{name}`"), "a name of letters, digits, - and _, for it becomes a folder"));
+        }
+        if !taken.insert(name.clone()) {
+            return Err(Error::config(
+                place(&path),
+                format!("`{name}`, which comes twice,"),
+                "a name of its own: name = \"…\" in the file",
+            ));
+        }
+        entries.push(Entry { name, path, table });
+    }
+    Ok(entries)
+}
+
+/// The methods that a scene is learned with: all, unless it says which.
+fn chosen_methods(scene: &Entry, methods: &[String], place: &dyn Fn(&str) -> String) -> Result<Vec<String>> {
+    let Some(value) = scene.table.get("methods") else {
+        return Ok(methods.to_vec());
+    };
+    let place = place(&format!("{}.methods", scene.path));
+    let names = value.as_array().and_then(|names| names.iter().map(Value::as_str).collect::<Option<Vec<_>>>());
+    let names = names.ok_or_else(|| Error::config(&place, value, "a list of names, such as [\"fast\", \"paper\"]"))?;
+    let known: Vec<&str> = methods.iter().map(String::as_str).collect();
+    match names.iter().find(|name| !known.contains(name)) {
+        Some(name) => Err(config::unknown("method", name, &known, &place)),
+        None => Ok(names.into_iter().map(str::to_owned).collect()),
+    }
+}
+
+/// The run of a scene with a method.
+fn job(
+    scene: &Entry,
+    method: &Entry,
+    first: &[String],
+    last: &[String],
+    base: &Path,
+    out: &Path,
+    place: &dyn Fn(&str) -> String,
+) -> Result<Job> {
+    let command = match method.table.get("command") {
+        None => COMMANDS[0],
+        Some(value) => match COMMANDS.iter().find(|command| value.as_str() == Some(command)) {
+            Some(command) => command,
+            None => return Err(Error::config(place(&format!("{}.command", method.path)), value, "\"train\" or \"carve\"")),
+        },
+    };
+    let set =
+        |assignments: &[String]| assignments.iter().map(|a| Flag { key: "set".to_owned(), text: format!("--set={a}") }).collect::<Vec<_>>();
+    let mut all = set(first);
+    for (entry, own) in [(scene, &["name", "data", "methods"][..]), (method, &["name", "command"])] {
+        let known =
+            || own.iter().map(|key| (*key).to_owned()).chain(COMMANDS.iter().flat_map(|command| flags::keys(command))).collect::<Vec<_>>();
+        flags::check_keys(&entry.table, &known(), &|key| place(&format!("{}.{key}", entry.path)))?;
+        for (key, value) in entry.table.iter().filter(|(key, _)| !own.contains(&key.as_str())) {
+            let place =
+                format!("{} (`{}` with `{}`, which is of `{command}`)", place(&format!("{}.{key}", entry.path)), scene.name, method.name);
+            all.extend(flags::flags(command, key, value, base, &place)?);
+        }
+    }
+    all.extend(set(last));
+    let data = match scene.table.get("data") {
+        Some(value) if !value.is_str() => return Err(Error::config(place(&format!("{}.data", scene.path)), value, "a folder in quotes")),
+        _ => folder_of(&scene.table).map(|data| base.join(data)),
+    };
+    let call = Call { command, flags: all, data };
+    let asked = asked(&call, &format!("{}, `{}` with `{}`", place(&method.path), scene.name, method.name))?;
+    let folder = out.join(&scene.name).join(&method.name);
+    Ok(Job { scene: scene.name.clone(), method: method.name.clone(), folder, call, asked })
+}
+
+/// What a run's command line amounts to.
+fn asked(call: &Call, place: &str) -> Result<Asked> {
+    let cli = crate::Cli::try_parse_from(["plenoxel".into()].into_iter().chain(call.arguments(&[])));
+    let asked = match cli.map(|cli| cli.command) {
+        Ok(crate::Command::Train(args)) => args.config().map(|(config, _)| Asked { config, source: args.source(), time: args.time }),
+        Ok(crate::Command::Carve(args)) => args.config().map(|(config, _)| Asked { config, source: args.source(), time: None }),
+        Ok(_) => Err(Error::config("command", call.command, COMMANDS.join(" or "))),
+        Err(answer) => return Err(flags::refusal(&answer, call.command, place)),
+    };
+    asked.map_err(|e| match e {
+        Error::Config { key, found, accepted } => Error::config(format!("{place}: {key}"), found, accepted),
+        other => other,
+    })
+}
+
+#[cfg(test)]
+mod tests;

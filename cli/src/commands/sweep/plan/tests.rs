@@ -1,0 +1,122 @@
+use super::*;
+use std::ffi::OsString;
+use std::path::PathBuf;
+
+/// Reads a sweep from a file of a test's own.
+fn read(name: &str, text: &str) -> Result<Plan> {
+    let path = std::env::temp_dir().join(format!("plenoxel-sweep-{}-{name}.toml", std::process::id()));
+    std::fs::write(&path, text).unwrap();
+    let plan = Plan::from_file(&path, &["seed=5".to_owned()], Path::new("out"));
+    std::fs::remove_file(path).unwrap();
+    plan
+}
+
+#[test]
+fn every_scene_meets_every_method_unless_it_chooses() {
+    let plan = read(
+        "whole",
+        r#"
+        set = ["seed=1", "rays_per_step=77"]
+        [[scenes]]
+        data = "data/my.lego"
+        downscale = 4
+        [[scenes]]
+        name = "small"
+        scene_size = "32x24"
+        scene_views = [6, 0, 2]
+        methods = ["fast"]
+        [[methods]]
+        preset = "fast"
+        no_images = true
+        stage_psnr = false
+        set = ["rays_per_step=99"]
+        [[methods]]
+        name = "hull"
+        command = "carve"
+        downscale = 8
+        photo_consistency = 0.2
+        background = [0, 0.5, 1]
+        [[published]]
+        name = "Others"
+        source = "their table"
+        psnr = { small = 30 }
+        "#,
+    )
+    .unwrap();
+    assert_eq!((plan.scenes, plan.methods), (vec!["my-lego".to_owned(), "small".to_owned()], vec!["fast".to_owned(), "hull".to_owned()]));
+    assert_eq!(plan.published[0].psnr["small"], 30.0);
+    let folders: Vec<&Path> = plan.jobs.iter().map(|job| job.folder.as_path()).collect();
+    assert_eq!(folders, ["out/my-lego/fast", "out/my-lego/hull", "out/small/fast"].map(Path::new));
+    let line = |job: &Job| -> Vec<String> {
+        let arguments: Vec<OsString> = job.call.arguments(&["--out".into()]);
+        arguments.into_iter().map(|a| a.into_string().unwrap()).collect()
+    };
+    // What is particular comes after what is general, and counts.
+    let data = std::env::temp_dir().join("data/my.lego").to_string_lossy().into_owned();
+    let sets = ["--set=seed=1", "--set=rays_per_step=77"];
+    let fast = ["--downscale=4", "--no-images", "--preset=fast", "--set=rays_per_step=99", "--set=seed=5", "--out", "--", &data];
+    assert_eq!(line(&plan.jobs[0]), [&["train"][..], &sets, &fast].concat());
+    let config = &plan.jobs[0].asked.config;
+    assert_eq!((config.seed, config.rays_per_step, config.downscale), (5, 99, 4));
+    let config = &plan.jobs[1].asked.config;
+    assert_eq!((config.downscale, config.background, config.stages.len()), (8, [0.0, 0.5, 1.0], 0));
+    assert_eq!(plan.jobs[2].asked.source.to_string(), "built in, 32 x 24, 6 train, 0 val, 2 test views");
+}
+
+#[test]
+fn mistakes_are_named_with_their_place_and_what_would_do() {
+    let good = "[[scenes]]\n[[methods]]\npreset = \"fast\"\n";
+    for (name, text, code, parts) in [
+        ("toml", "scenes = = 1", 3, &["line 1 is not TOML"][..]),
+        ("top", &format!("scnes = 1\n{good}"), 2, &["line 1: the unknown key `scnes`", "nearest known key is `scenes`"]),
+        ("none", "scenes = []\nmethods = []", 2, &["no scenes", "[[scenes]]"]),
+        ("lists", "scenes = 3\nmethods = []", 3, &["line 1", "expected a sequence"]),
+        ("scene", "[[scenes]]\ndownscal = 4\n[[methods]]\n", 2, &["line 2", "unknown key `downscal`", "`downscale`"]),
+        ("method", &format!("{good}prezet = \"fast\""), 2, &["line 4", "unknown key `prezet`", "`preset`"]),
+        ("out", &format!("{good}resume = \"x\""), 2, &["line 4", "unknown key `resume`"]),
+        (
+            "preset",
+            "[[scenes]]\n[[methods]]\npreset = \"fats\"",
+            2,
+            &["line 2, `procedural` with `fats`", "`fats` for --preset", "demo, fast"],
+        ),
+        ("value", &format!("{good}downscale = \"half\""), 2, &["`half` for --downscale", "a whole number from 1 to 64"]),
+        ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: the unknown key", "`half_width`"]),
+        ("range", &format!("{good}set = [\"half_width=-1\"]"), 2, &["`procedural` with `fast`: --set half_width: -1"]),
+        ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "as the flag takes it"]),
+        ("flag", "[[scenes]]\nscene_size = 32\n[[methods]]\ncommand = \"carve\"", 2, &["line 2", "which is of `carve`", "`scene_size`"]),
+        ("both", "[[scenes]]\ndata = \"a\"\nscene_size = 32\n[[methods]]", 2, &["--scene-size <SIZE> together with [DATA]"]),
+        ("data", "[[scenes]]\ndata = 3\n[[methods]]", 2, &["line 2", "3 cannot", "a folder in quotes"]),
+        ("command", "[[scenes]]\n[[methods]]\ncommand = \"render\"", 2, &["line 3", "\"train\" or \"carve\""]),
+        ("names", "[[scenes]]\nname = \"a/b\"\n[[methods]]", 2, &["line 2", "`a/b`", "letters, digits"]),
+        ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "`procedural`, which comes twice"]),
+        ("chosen", "[[scenes]]\nmethods = [\"fat\"]\n[[methods]]\npreset = \"fast\"", 2, &["line 2", "unknown method `fat`", "`fast`"]),
+        (
+            "published",
+            &format!("{good}[[published]]\nname = \"x\"\nsource = \"y\"\npsnr = {{ lego = 1 }}"),
+            2,
+            &["line 4", "psnr = { procedural"],
+        ),
+        ("source", &format!("{good}[[published]]\nname = \"x\""), 3, &["line 4", "missing field `source`"]),
+        ("figure", &format!("{good}[[published]]\npsn = 1"), 2, &["line 5", "unknown key `psn`", "`psnr`"]),
+    ] {
+        let error = read(name, text).unwrap_err();
+        let message = error.to_string();
+        assert!(parts.iter().all(|part| message.contains(part)), "{name}: {parts:?} in {message}");
+        assert_eq!(error.exit_code(), code, "{name}: {message}");
+    }
+}
+
+#[test]
+fn flags_alone_make_the_same_plan() {
+    let strings = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
+    let plan =
+        Plan::from_flags(&strings(&["data/lego", "procedural"]), &strings(&["fast", "paper"]), &strings(&["seed=3"]), Path::new("o"));
+    let plan = plan.unwrap();
+    assert_eq!(plan.jobs.len(), 4);
+    assert_eq!(plan.jobs[1].folder, PathBuf::from("o/lego/paper"));
+    assert_eq!((&plan.jobs[1].call.data, &plan.jobs[2].call.data), (&Some("data/lego".into()), &None));
+    assert!(plan.jobs.iter().all(|job| job.asked.config.seed == 3));
+    let twice = Plan::from_flags(&strings(&["a/lego", "b/lego"]), &strings(&["fast"]), &[], Path::new("o")).unwrap_err();
+    assert!(twice.to_string().starts_with("--scene: `lego`, which comes twice"), "{twice}");
+}

@@ -1,0 +1,155 @@
+//! The table of a comparison, scenes x methods, with what each run came to: as Markdown, CSV and an HTML page.
+
+mod csv;
+mod figures;
+mod html;
+mod markdown;
+mod thumbnail;
+
+pub use figures::{Failure, Measured, Scores};
+use plenoxel::error::Result;
+use plenoxel::files;
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Runs side by side.
+#[derive(Debug)]
+pub struct RunTable {
+    /// What is compared.
+    pub title: String,
+    /// The columns.
+    pub methods: Vec<String>,
+    /// One for each scene, with as many cells as there are methods.
+    pub rows: Vec<Row>,
+    /// More columns, of figures that others have published.
+    pub published: Vec<Published>,
+}
+
+/// What all methods make of a scene.
+#[derive(Debug)]
+pub struct Row {
+    pub scene: String,
+    pub cells: Vec<Cell>,
+}
+
+/// What a method made of a scene.
+#[derive(Debug)]
+pub enum Cell {
+    Measured(Box<Measured>),
+    Failed(Failure),
+    /// It was not asked for, or there is nothing of it yet.
+    Missing,
+}
+
+/// Figures from elsewhere, by scene.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+pub struct Published {
+    /// Whose they are.
+    pub name: String,
+    /// Where they are published, and what was measured.
+    pub source: String,
+    /// In dB.
+    #[serde(default)]
+    pub psnr: BTreeMap<String, f64>,
+    #[serde(default)]
+    pub ssim: BTreeMap<String, f64>,
+    /// Of training.
+    #[serde(default)]
+    pub seconds: BTreeMap<String, f64>,
+}
+
+impl Published {
+    /// Its figures of a scene.
+    fn scores(&self, scene: &str) -> Scores {
+        let of = |figures: &BTreeMap<String, f64>| figures.get(scene).copied();
+        Scores { psnr: of(&self.psnr), ssim: of(&self.ssim), seconds: of(&self.seconds) }
+    }
+}
+
+impl RunTable {
+    /// Writes `table.md`, `table.csv` and `table.html` into a folder, and returns the Markdown.
+    pub fn write(&self, folder: &Path) -> Result<String> {
+        let markdown = markdown::text(self);
+        for (name, text) in [("table.md", &markdown), ("table.csv", &csv::text(self)), ("table.html", &html::text(self))] {
+            files::write_atomically(&folder.join(name), text.as_bytes())?;
+        }
+        Ok(markdown)
+    }
+
+    /// The mean of a column over all scenes; of a figure that one of them lacks there is none.
+    fn mean(&self, method: usize) -> Scores {
+        Scores::mean(self.rows.iter().map(|row| row.cells.get(method).map(Cell::scores).unwrap_or_default()))
+    }
+
+    fn published_mean(&self, published: &Published) -> Scores {
+        Scores::mean(self.rows.iter().map(|row| published.scores(&row.scene)))
+    }
+
+    /// What one has to know to read the figures, a sentence each.
+    fn notes(&self) -> Vec<String> {
+        let mut notes =
+            vec!["PSNR in dB on test views, SSIM, and seconds of training; means are over all scenes, where none is missing.".to_owned()];
+        for row in &self.rows {
+            notes.extend(self.views_of(row));
+        }
+        for (row, (method, cell)) in self.rows.iter().flat_map(|row| self.methods.iter().zip(&row.cells).map(move |cell| (row, cell))) {
+            if let Cell::Failed(failure) = cell {
+                notes.push(format!("{}, {method}: failed with exit code {}: {}", row.scene, failure.code, failure.error));
+            }
+        }
+        notes.extend(self.published.iter().map(|p| format!("{}: published, not measured here: {}", p.name, p.source)));
+        notes
+    }
+
+    /// What a scene was measured on, method by method where they differ.
+    fn views_of(&self, row: &Row) -> Option<String> {
+        let first = row.cells.iter().find_map(Cell::measured)?;
+        if row.is_comparable() {
+            return Some(format!("{}: {}.", row.scene, first.views()));
+        }
+        let measured = self.methods.iter().zip(&row.cells).filter_map(|(method, cell)| Some((method, cell.measured()?)));
+        let each: Vec<String> = measured.map(|(method, measured)| format!("{method}, {}", measured.views())).collect();
+        Some(format!("{}: {}; these cannot be compared with each other.", row.scene, each.join("; ")))
+    }
+}
+
+impl Row {
+    /// True if all of it was measured on views of the same number, size and background.
+    fn is_comparable(&self) -> bool {
+        let mut views = self.cells.iter().filter_map(Cell::measured).map(Measured::views);
+        let first = views.next();
+        views.all(|views| Some(views) == first)
+    }
+}
+
+impl Cell {
+    fn measured(&self) -> Option<&Measured> {
+        match self {
+            Cell::Measured(measured) => Some(measured),
+            _ => None,
+        }
+    }
+
+    fn scores(&self) -> Scores {
+        self.measured().map(|measured| measured.figures.scores()).unwrap_or_default()
+    }
+}
+
+/// A figure of the table: PSNR, SSIM, seconds, or a line where there is none.
+fn said(value: Option<f64>, say: impl Fn(f64) -> String) -> String {
+    value.map_or("–".to_owned(), say)
+}
+
+fn decibels(psnr: Option<f64>) -> String {
+    said(psnr, |psnr| format!("{psnr:.2}"))
+}
+
+/// SSIM and the time, after the PSNR.
+fn beside(scores: &Scores) -> String {
+    let seconds = |s: f64| if s < 9.95 { format!("{s:.1} s") } else { format!("{s:.0} s") };
+    format!("{} · {}", said(scores.ssim, |ssim| format!("{ssim:.3}")), said(scores.seconds, seconds))
+}
+
+#[cfg(test)]
+mod tests;

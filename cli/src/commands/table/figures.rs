@@ -1,0 +1,118 @@
+//! What a run came to, as its folder says.
+
+use crate::run_folder::RunFolder;
+use plenoxel::error::Result;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// A run that has ended.
+#[derive(Debug)]
+pub struct Measured {
+    pub folder: RunFolder,
+    pub figures: Figures,
+}
+
+/// Its figures, as far as there are any.
+#[derive(Debug, Clone, Default, PartialEq, Deserialize)]
+#[serde(default)]
+pub struct Figures {
+    pub psnr: Option<f64>,
+    pub ssim: Option<f64>,
+    pub ssim_same: Option<f64>,
+    /// Of training or carving.
+    pub seconds: Option<f64>,
+    pub rays: Option<u64>,
+    pub steps: Option<u64>,
+    pub peak_memory_bytes: Option<u64>,
+    /// Stored ones, where the grid is still there.
+    pub voxels: Option<usize>,
+    pub resolution: Option<usize>,
+    pub background: [f32; 3],
+    /// Test views, and their size in pixels.
+    pub views: Option<usize>,
+    pub width: Option<usize>,
+    pub height: Option<usize>,
+}
+
+/// How a run failed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Failure {
+    /// Exit code; of a process that a signal ended 128 and the signal's number.
+    pub code: u8,
+    /// What it said last.
+    pub error: String,
+}
+
+/// The figures that a table shows.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Scores {
+    pub psnr: Option<f64>,
+    pub ssim: Option<f64>,
+    pub seconds: Option<f64>,
+}
+
+impl Measured {
+    /// The run in a folder; none if it has not ended.
+    ///
+    /// Errors: it is not the folder of a run.
+    pub fn read(path: &Path) -> Result<Option<Self>> {
+        let (folder, config, _) = RunFolder::open(path)?;
+        let Some(serde_json::Value::Object(mut all)) = folder.result() else {
+            return Ok(None);
+        };
+        // Carving compares nothing with test views: what it does not say, the evaluation does.
+        if let Some(serde_json::Value::Object(evaluation)) = folder.evaluation() {
+            for (key, value) in evaluation {
+                all.entry(key).or_insert(value);
+            }
+        }
+        let Ok(mut figures) = serde_json::from_value::<Figures>(all.into()) else {
+            return Ok(None);
+        };
+        figures.background = config.background;
+        figures.voxels = folder.header().ok().map(|(_, voxels)| voxels).or(figures.voxels);
+        Ok(Some(Measured { folder, figures }))
+    }
+
+    /// Its figures in few words.
+    pub fn sentence(&self) -> String {
+        let Figures { psnr, ssim, seconds, .. } = self.figures;
+        let psnr = psnr.map_or("no test views".to_owned(), |psnr| format!("PSNR {psnr:.2} dB"));
+        let ssim = ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));
+        format!("{psnr}{ssim}, {}", seconds.map_or("time unknown".to_owned(), |seconds| format!("{seconds:.1} s")))
+    }
+
+    /// What its figures were measured on, in words.
+    pub fn views(&self) -> String {
+        let Figures { views: Some(views), width: Some(width), height: Some(height), background, .. } = &self.figures else {
+            return "no test views".to_owned();
+        };
+        format!("{views} views of {width} × {height} over {}", background_name(*background))
+    }
+}
+
+impl Figures {
+    pub fn scores(&self) -> Scores {
+        Scores { psnr: self.psnr, ssim: self.ssim, seconds: self.seconds }
+    }
+}
+
+impl Scores {
+    /// The mean of each figure that all of them have.
+    pub fn mean(all: impl Iterator<Item = Scores> + Clone) -> Scores {
+        let mean = |figure: fn(Scores) -> Option<f64>| {
+            let values: Vec<f64> = all.clone().map(figure).collect::<Option<_>>()?;
+            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        Scores { psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim), seconds: mean(|s| s.seconds) }
+    }
+}
+
+/// A background in words.
+pub fn background_name(color: [f32; 3]) -> String {
+    match color {
+        [1.0, 1.0, 1.0] => "white".to_owned(),
+        [0.0, 0.0, 0.0] => "black".to_owned(),
+        [r, g, b] => format!("{r},{g},{b}"),
+    }
+}

@@ -1,0 +1,43 @@
+//! Where two configurations differ, in the words of their files.
+
+use super::leaves;
+use plenoxel::train::config::Config;
+use std::collections::{BTreeMap, BTreeSet};
+use toml::Value;
+
+/// Every key whose value is not the one asked for, as `key is x and not y`.
+pub fn differences(found: &Config, asked: &Config) -> Vec<String> {
+    let (found, asked) = (values(found), values(asked));
+    let keys: BTreeSet<&String> = found.keys().chain(asked.keys()).collect();
+    let said = |value: Option<&String>| value.map_or_else(|| "unset".to_owned(), String::clone);
+    let differs = keys.into_iter().filter(|key| found.get(*key) != asked.get(*key));
+    differs.map(|key| format!("{key} is {} and not {}", said(found.get(key)), said(asked.get(key)))).collect()
+}
+
+fn values(config: &Config) -> BTreeMap<String, String> {
+    let mut values = BTreeMap::new();
+    if let Ok(value) = Value::try_from(config) {
+        leaves("", &value, &mut |path, value| drop(values.insert(path.to_owned(), value.to_string())));
+    }
+    values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn differences_are_named_by_key_with_both_values() {
+        let found = Config::default();
+        assert!(differences(&found, &found).is_empty());
+        let mut asked = found.clone();
+        asked.seed = 7;
+        asked.stages.truncate(1);
+        asked.stages[0].resolution = 5;
+        let said = differences(&found, &asked);
+        assert!(said.contains(&"seed is 42 and not 7".to_owned()), "{said:?}");
+        let resolution = format!("stages[0].resolution is {} and not 5", found.stages[0].resolution);
+        assert!(said.contains(&resolution), "{said:?}");
+        assert!(said.iter().any(|line| line.starts_with("stages[1].resolution is") && line.ends_with("and not unset")), "{said:?}");
+    }
+}

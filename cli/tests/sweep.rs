@@ -1,0 +1,164 @@
+//! A sweep with the real program: its runs are processes, of which one fails and the others do not.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// Two scenes that are the built-in one, two methods of a few steps, one that asks for a reduction by 5 of images of 24 pixels, and
+/// a carved one.
+const FILE: &str = r#"
+set = ["rays_per_step=200"]
+
+[[scenes]]
+name = "few"
+scene_size = 24
+scene_views = [5, 0, 2]
+methods = ["coarse", "fine", "odd"]
+
+[[scenes]]
+name = "files"
+data = "scene"
+
+[[methods]]
+name = "coarse"
+preset = "demo"
+set = ["stages=[{resolution=6, steps=4, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]"]
+
+[[methods]]
+name = "fine"
+preset = "demo"
+set = ["stages=[{resolution=12, steps=6, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]"]
+
+[[methods]]
+name = "odd"
+preset = "demo"
+downscale = 5
+
+[[methods]]
+name = "hull"
+command = "carve"
+resolution = 16
+
+[[published]]
+name = "Elsewhere"
+source = "a table"
+psnr = { few = 12.25 }
+"#;
+
+fn folder(name: &str) -> PathBuf {
+    let path = std::env::temp_dir().join(format!("plenoxel-sweep-{}-{name}", std::process::id()));
+    drop(fs::remove_dir_all(&path));
+    fs::create_dir_all(&path).expect("a temporary folder");
+    path
+}
+
+fn plenoxel(root: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_plenoxel"));
+    let Output { status, stdout, stderr } = command.current_dir(root).args(arguments).arg("--threads=2").output().expect("it runs");
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("text");
+    (status.code(), text(stdout), text(stderr))
+}
+
+/// Ctrl-C on a terminal goes to the sweep and to the run that it waits for.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_sweep_has_its_run_saved_and_goes_on_with_it() {
+    use std::os::unix::process::CommandExt;
+    use std::time::{Duration, Instant};
+
+    let root = folder("interrupted");
+    let stage = "stages=[{resolution=12, steps=2000, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]";
+    let plan = format!(
+        "[[scenes]]\nscene_size = 24\nscene_views = [4, 0, 1]\n[[methods]]\nname = \"long\"\nset = [\"rays_per_step=100\", \"{stage}\"]\n[[methods]]\npreset=\"fast\"\ndownscale=7\n"
+    );
+    fs::write(root.join("plan.toml"), plan).expect("the file");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_plenoxel"));
+    let command =
+        command.current_dir(&root).args(["sweep", "plan.toml"]).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
+    let mut child = command.process_group(0).spawn().expect("it runs");
+    let start = Instant::now();
+    while child.try_wait().expect("its state").is_none() && start.elapsed() < Duration::from_secs(60) {
+        if fs::metadata(root.join("sweeps/plan/procedural/long/metrics.jsonl")).is_ok_and(|file| file.len() > 0) {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    // While it works nobody else does, there.
+    let (code, _, err) = plenoxel(&root, &["sweep", "plan.toml"]);
+    assert!(code == Some(2) && err.contains("another sweep"), "{err}");
+    let sent = Command::new("kill").args(["-INT", "--", &format!("-{}", child.id())]).status().expect("kill");
+    assert!(sent.success());
+    let output = child.wait_with_output().expect("it ends");
+    let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert_eq!(output.status.code(), Some(130), "{err}");
+    assert!(err.contains("the same command again goes on") && !err.contains("2/2") && out.contains("| procedural | – | – |"), "{err}{out}");
+    assert!(root.join("sweeps/plan/procedural/long/training.safetensors").exists());
+
+    let (code, out, err) = plenoxel(&root, &["sweep", "plan.toml"]);
+    assert!(code == Some(2) && err.contains("1/2 procedural long: going on\n"), "{err}");
+    assert!(out.contains("| procedural | **") && out.contains("| failed (2) |"), "{out}");
+    fs::remove_dir_all(root).expect("it is removed");
+}
+
+#[test]
+fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
+    let root = folder("whole");
+    let read = |name: &str| fs::read_to_string(root.join(name)).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let sweep = |more: &[&str]| plenoxel(&root, &[&["sweep", "plan.toml", "--out", "swept"], more].concat());
+    fs::write(root.join("plan.toml"), FILE).expect("the file");
+    let scene = ["scene", "scene", "--size", "24", "--train", "5", "--val", "0", "--test", "2"];
+    assert_eq!(plenoxel(&root, &scene).0, Some(0));
+
+    let (code, out, err) = sweep(&["--dry-run"]);
+    assert_eq!((code, out.matches(": to run").count()), (Some(0), 7), "{out}{err}");
+    assert!(out.contains("few fine: to run\n    plenoxel train --set=rays_per_step=200 ") && !root.join("swept").exists(), "{out}");
+
+    // The first to fail has a setting that cannot be used.
+    let (code, out, err) = sweep(&[]);
+    assert_eq!(code, Some(2), "{err}");
+    assert!(err.contains("3/7 few odd: failed with exit code 2: downscale: 5") && err.contains("2 of 7 runs failed"), "{err}");
+    assert!(out.contains("| scene | coarse | fine | odd | hull | Elsewhere (published) |\n"), "{out}");
+    let cells: Vec<Vec<&str>> =
+        out.lines().filter(|line| line.starts_with('|')).map(|line| line.split('|').map(str::trim).collect()).collect();
+    assert!(cells[2][1] == "few" && cells[2][2].starts_with("**") && cells[2][3].starts_with("**"), "{out}");
+    assert_eq!((cells[2][4], cells[2][5], cells[2][6]), ("failed (2)", "–", "**12.25** · – · –"), "{out}");
+    assert!(cells[3][1] == "files" && cells[3][5].starts_with("**") && cells[4][1] == "mean" && cells[4][2].starts_with("**"), "{out}");
+    assert_eq!(out, read("swept/table.md"));
+    let (csv, html) = (read("swept/table.csv"), read("swept/table.html"));
+    assert_eq!((csv.lines().count(), csv.matches(",finished,").count(), csv.matches(",failed,").count()), (1 + 8, 5, 2), "{csv}");
+    // Photographs of two scenes and five renders.
+    assert_eq!(html.matches("data:image/png;base64,").count(), 2 + 5);
+    assert!(read("swept/few/odd.log").contains("error: downscale") && read("swept/few/fine.log").starts_with("$ plenoxel train "));
+    assert!(read("swept/few/fine/result.json").contains("\"psnr\""));
+    assert!(read("swept/files/hull/evaluation.json").contains("\"psnr\""));
+
+    // Once more: what is finished stays as it is, what was cut short is made again, to the same bits.
+    let modified = |name: &str| fs::metadata(root.join(name)).and_then(|file| file.modified()).expect("its time");
+    let (before, grid) =
+        (modified("swept/few/coarse/result.json"), fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it"));
+    fs::remove_file(root.join("swept/few/fine/result.json")).expect("it is removed");
+    let (code, again, err) = sweep(&[]);
+    assert_eq!((code, err.matches("finished already: PSNR ").count()), (Some(2), 4), "{err}");
+    assert!(err.contains("2/7 few fine: begins") && err.contains("3/7 few odd: begins"), "{err}");
+    assert_eq!(modified("swept/few/coarse/result.json"), before);
+    assert!(fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it") == grid);
+    let psnr = |text: &str| text.lines().find_map(|line| line.strip_prefix("| few | ")?.split(" · ").next().map(str::to_owned));
+    assert_eq!(psnr(&again), psnr(&out));
+
+    // Without what fails nothing runs; with other settings nothing is overwritten.
+    fs::write(root.join("plan.toml"), FILE.replace("downscale = 5", "downscale = 2").replace("steps=6", "steps=7")).expect("the file");
+    let (code, _, err) = sweep(&[]);
+    assert_eq!(code, Some(2), "{err}");
+    assert!(err.contains("swept/few/fine, where there is another run (stages[0].steps is 6 and not 7), cannot be used"), "{err}");
+    fs::write(
+        root.join("plan.toml"),
+        FILE.replace(", \"odd\"]", "]")
+            .replace("name = \"odd\"\npreset = \"demo\"\ndownscale = 5", "name = \"odd\"\ncommand = \"carve\"\nresolution = 8"),
+    )
+    .expect("the file");
+    let (code, _, err) = sweep(&["--quiet"]);
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let (code, _, err) = sweep(&[]);
+    assert_eq!((code, err.matches("finished already").count()), (Some(0), 6), "{err}");
+    fs::remove_dir_all(root).expect("it is removed");
+}
