@@ -2,6 +2,7 @@
 
 pub mod carve;
 mod cloud_filters;
+pub mod compare;
 pub mod completions;
 pub mod evaluate;
 pub mod export;

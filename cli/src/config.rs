@@ -8,7 +8,7 @@ mod keys;
 mod presets;
 mod table;
 
-pub use difference::differences;
+pub use difference::{differences, values};
 pub use keys::unknown;
 
 use plenoxel::error::{Error, Result};

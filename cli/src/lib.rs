@@ -24,7 +24,7 @@ mod report;
 mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{carve, completions, evaluate, export, filter, info, man, presets, render, scene, sweep, train};
+use commands::{carve, compare, completions, evaluate, export, filter, info, man, presets, render, scene, sweep, train};
 use plenoxel::error::Error;
 use progress::{Console, LogFormat};
 use std::ffi::OsString;
@@ -44,6 +44,7 @@ Examples:
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           its surface, for other programs
   plenoxel presets                           settings to start from, and how long they take
+  plenoxel compare runs/a runs/b             figures, curves and pictures side by side
   plenoxel sweep scenes.toml                 every scene with every method, and the table of what came of it
 
 Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
@@ -64,6 +65,7 @@ enum Command {
     Train(Box<train::TrainArgs>),
     Carve(Box<carve::CarveArgs>),
     Render(render::RenderArgs),
+    Compare(compare::CompareArgs),
     Report(commands::report::ReportArgs),
     Evaluate(evaluate::EvaluateArgs),
     Export(export::ExportArgs),
@@ -126,6 +128,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Train(args) => return train::run(args, &console),
             Command::Carve(args) => carve::run(args, &console),
             Command::Render(args) => render::run(args, &console),
+            Command::Compare(args) => compare::run(args, &console),
             Command::Report(args) => commands::report::run(args, &console),
             Command::Evaluate(args) => evaluate::run(args, &console),
             Command::Export(args) => export::run(args, &console),

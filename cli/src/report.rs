@@ -2,8 +2,8 @@
 //!
 //! It is made from what is in the run folder, and from the grid; so it can be made again later.
 
-mod curves;
-mod pictures;
+pub mod curves;
+pub mod pictures;
 mod scene;
 
 use crate::html::{self, escaped};
@@ -16,6 +16,11 @@ use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::train::config::Config;
 use serde_json::Value;
 use std::fmt::Write;
+
+/// Looks of a report, and of other pages with curves and pictures.
+pub const STYLE: &str = include_str!("report/style.css");
+/// What makes pictures grow and change their order.
+pub const SCRIPT: &str = include_str!("report/page.js");
 
 /// What a report is about.
 pub struct Report<'a> {
@@ -44,8 +49,8 @@ impl Report<'_> {
             costs(self, &result),
             self.settings()?,
         ];
-        let scripts = format!("<script>\n{}</script>\n{}", include_str!("report/page.js"), scene.scripts());
-        let page = html::page(&title, include_str!("report/style.css"), &(parts.join("\n") + &scripts));
+        let scripts = format!("<script>\n{}</script>\n{}", SCRIPT, scene.scripts());
+        let page = html::page(&title, STYLE, &(parts.join("\n") + &scripts));
         self.folder.write_report(&page)?;
         Ok(format!("report: {} ({}); {}", self.folder.report().display(), bytes(page.len() as u64), scene.note()))
     }
@@ -133,7 +138,7 @@ fn costs(report: &Report<'_>, result: &Value) -> String {
 }
 
 /// A number with spaces between its thousands.
-fn thousands(n: u64) -> String {
+pub fn thousands(n: u64) -> String {
     let digits = n.to_string();
     let first = digits.len() % 3;
     let groups = (first..digits.len()).step_by(3).map(|at| &digits[at..at + 3]);

@@ -6,7 +6,7 @@ mod html;
 mod markdown;
 mod thumbnail;
 
-pub use figures::{Failure, Measured, Scores};
+pub use figures::{Failure, Figures, Measured, Scores};
 use plenoxel::error::Result;
 use plenoxel::files;
 use serde::Deserialize;

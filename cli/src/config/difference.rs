@@ -14,7 +14,8 @@ pub fn differences(found: &Config, asked: &Config) -> Vec<String> {
     differs.map(|key| format!("{key} is {} and not {}", said(found.get(key)), said(asked.get(key)))).collect()
 }
 
-fn values(config: &Config) -> BTreeMap<String, String> {
+/// The value of every key, as TOML.
+pub fn values(config: &Config) -> BTreeMap<String, String> {
     let mut values = BTreeMap::new();
     if let Ok(value) = Value::try_from(config) {
         leaves("", &value, &mut |path, value| drop(values.insert(path.to_owned(), value.to_string())));

@@ -1,4 +1,4 @@
-//! Loss, PSNR, resolution and rates of a run, over its steps and over its seconds.
+//! Loss, PSNR, resolution and rates of a run, or of several, over steps and over seconds.
 
 use crate::chart::{Chart, Curve};
 use crate::metrics_file::Line;
@@ -8,31 +8,66 @@ use std::collections::BTreeSet;
 /// Points of a curve that are told apart.
 const POINTS: usize = 500;
 
-/// The section, or nothing if there was no training.
+/// What curves are drawn over: its name, what it says below the axis, and where a line of the metrics is on it.
+type Axis = (&'static str, &'static str, fn(&Line<'_>) -> f64);
+const AXES: [Axis; 2] =
+    [("steps", "training step", |line| line.step as f64 + 1.0), ("seconds", "seconds of training", |line| line.seconds)];
+
+/// The curves of a run, or nothing if there was no training.
 pub fn section(lines: &[Line<'_>], stages: &[Stage]) -> String {
     let Some(last) = lines.last().filter(|_| !stages.is_empty()) else { return String::new() };
-    let axes: [(&str, &str, &dyn Fn(&Line<'_>) -> f64, f64); 2] = [
-        ("steps", "training step", &|line| line.step as f64 + 1.0, last.step as f64 + 1.0),
-        ("seconds", "seconds of training", &|line| line.seconds, last.seconds),
-    ];
-    let mut page = String::from("<section><h2>Curves</h2>\n");
-    for (i, (name, ..)) in axes.iter().enumerate() {
-        let checked = if i == 0 { " checked" } else { "" };
-        page +=
-            &format!("<input type=\"radio\" name=\"axis\" id=\"over-{name}\"{checked}><label for=\"over-{name}\">over {name}</label>\n");
-    }
-    for (name, across, at, end) in axes {
+    over_both(|(_, across, at)| {
         let charts = charts(lines).into_iter().map(|(title, up, values)| {
             let curves = values.into_iter().map(|(name, value)| curve(&name, lines, at, &*value)).filter(|curve| !curve.lines.is_empty());
             Chart {
                 title: title.to_owned(),
-                across: (across.to_owned(), end),
+                across: (across.to_owned(), at(last)),
                 up: up.to_owned(),
                 parts: parts(lines, at),
                 curves: curves.collect(),
             }
         });
-        page += &format!("<div class=\"charts\" data-over=\"{name}\">{}</div>\n", charts.map(|chart| chart.svg()).collect::<String>());
+        charts.collect()
+    })
+}
+
+/// The curves of several runs in the same charts, or nothing if none of them was trained.
+pub fn side_by_side(runs: &[(String, Vec<Line<'_>>)]) -> String {
+    type Shown = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
+    const SHOWN: [Shown; 4] = [
+        ("Loss", "loss", |line| Some(line.loss)),
+        ("PSNR of training rays", "dB", |line| Some(line.psnr)),
+        ("PSNR of validation views", "dB", |line| line.validation_psnr),
+        ("Voxels", "number", |line| Some(line.voxels as f64).filter(|n| *n > 0.0)),
+    ];
+    if runs.iter().all(|(_, lines)| lines.is_empty()) {
+        return String::new();
+    }
+    over_both(|(_, across, at)| {
+        let end = runs.iter().filter_map(|(_, lines)| lines.last()).map(at).fold(0.0, f64::max);
+        let charts = SHOWN.into_iter().filter_map(|(title, up, value)| {
+            // A run without such figures keeps its color for the other charts.
+            let curves: Vec<Curve> = runs.iter().map(|(name, lines)| curve(name, lines, at, &value)).collect();
+            let known = curves.iter().any(|curve| !curve.lines.is_empty());
+            let chart =
+                || Chart { title: title.to_owned(), across: (across.to_owned(), end), up: up.to_owned(), parts: Vec::new(), curves };
+            known.then(chart)
+        });
+        charts.collect()
+    })
+}
+
+/// A section with charts over steps, and the same over seconds, of which the reader sees one.
+fn over_both(charts: impl Fn(Axis) -> Vec<Chart>) -> String {
+    let mut page = String::from("<section><h2>Curves</h2>\n");
+    for (i, (name, ..)) in AXES.iter().enumerate() {
+        let checked = if i == 0 { " checked" } else { "" };
+        page +=
+            &format!("<input type=\"radio\" name=\"axis\" id=\"over-{name}\"{checked}><label for=\"over-{name}\">over {name}</label>\n");
+    }
+    for axis in AXES {
+        let charts: String = charts(axis).iter().map(Chart::svg).collect();
+        page += &format!("<div class=\"charts\" data-over=\"{}\">{charts}</div>\n", axis.0);
     }
     page + "</section>"
 }
@@ -81,7 +116,7 @@ fn charts(lines: &[Line<'_>]) -> Vec<(&'static str, &'static str, Vec<(String, V
 }
 
 /// A curve with a break between stages.
-fn curve(name: &str, lines: &[Line<'_>], at: &dyn Fn(&Line<'_>) -> f64, value: &dyn Fn(&Line<'_>) -> Option<f64>) -> Curve {
+fn curve(name: &str, lines: &[Line<'_>], at: fn(&Line<'_>) -> f64, value: &dyn Fn(&Line<'_>) -> Option<f64>) -> Curve {
     let each = lines.len().div_ceil(POINTS).max(1);
     let mean = |values: &mut dyn Iterator<Item = f64>| {
         let (n, sum) = values.fold((0.0, 0.0), |(n, sum), value| (n + 1.0, sum + value));
@@ -96,7 +131,7 @@ fn curve(name: &str, lines: &[Line<'_>], at: &dyn Fn(&Line<'_>) -> f64, value: &
 }
 
 /// Where stages begin.
-fn parts(lines: &[Line<'_>], at: &dyn Fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
+fn parts(lines: &[Line<'_>], at: fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
     let mut begin = 0.0;
     let parts = lines.chunk_by(|a, b| a.stage == b.stage).map(|stage| {
         let part = (begin, format!("{}³", stage[0].resolution));

@@ -7,7 +7,7 @@ use base64::engine::general_purpose::STANDARD;
 use image::codecs::jpeg::JpegEncoder;
 use image::imageops::{FilterType, resize};
 use image::{ExtendedColorType, ImageEncoder};
-use plenoxel::dataset::image as files;
+use plenoxel::dataset::image::{self as files, RgbaImage};
 use plenoxel::error::{Error, Result};
 use serde_json::Value;
 use std::fmt::Write;
@@ -63,9 +63,13 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
     ))
 }
 
-/// A picture as part of the page.
+/// A picture of a file as part of the page.
 fn embedded(path: &Path, what: &str) -> Result<String> {
-    let mut picture = files::read(path)?;
+    embed(files::read(path)?, path, what)
+}
+
+/// A picture as part of the page; `path` is where it came from, for messages.
+pub fn embed(mut picture: RgbaImage, path: &Path, what: &str) -> Result<String> {
     let (width, height) = picture.dimensions();
     if height > MOST_HEIGHT {
         picture = resize(&picture, (width * MOST_HEIGHT / height).max(1), MOST_HEIGHT, FilterType::Triangle);

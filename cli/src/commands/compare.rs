@@ -1,0 +1,136 @@
+//! `plenoxel compare`: runs side by side, as a table and as a page with curves and pictures.
+
+mod pictures;
+
+use super::table::{Figures, Measured};
+use crate::config;
+use crate::html::{self, escaped};
+use crate::metrics_file;
+use crate::progress::{Console, bytes, clock};
+use crate::report::{SCRIPT, STYLE, curves, thousands};
+use crate::run_folder::{RunFolder, RunRecord};
+use clap::{Args, ValueHint};
+use plenoxel::error::Result;
+use plenoxel::files;
+use plenoxel::train::config::Config;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel compare runs/lego-1 runs/lego-2         prints a table, writes compare.html
+  plenoxel compare runs/lego-* --out lego.html
+
+The page has the table, the settings that differ, curves over steps and over seconds, and the test views of which every run has a picture: \
+what each rendered, and how far it is from the photograph. Runs may be of different scenes; then there are no pictures.";
+
+/// Compare runs: a table, and a page with curves and pictures side by side
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct CompareArgs {
+    /// Folders of runs
+    #[arg(required = true, value_name = "RUN", value_hint = ValueHint::DirPath)]
+    runs: Vec<PathBuf>,
+
+    /// Page to write, replacing what is there
+    #[arg(long, short, value_name = "FILE", help_heading = "Output", default_value = "compare.html", value_hint = ValueHint::FilePath)]
+    out: PathBuf,
+}
+
+/// A run among others.
+struct Run {
+    /// As the command line has it, which tells runs of one name in several folders apart.
+    name: String,
+    folder: RunFolder,
+    config: Config,
+    record: RunRecord,
+    figures: Figures,
+    metrics: String,
+}
+
+impl Run {
+    fn read(path: &PathBuf) -> Result<Self> {
+        let (folder, config, record) = RunFolder::open(path)?;
+        let figures = Measured::read(path)?.map(|run| run.figures).unwrap_or_default();
+        let metrics = metrics_file::read(&folder.metrics())?;
+        Ok(Run { name: path.display().to_string(), folder, config, record, figures, metrics })
+    }
+
+    /// What the table says of it.
+    fn facts(&self) -> [(&'static str, String); 10] {
+        let Figures { psnr, ssim, seconds, voxels, resolution, rays, peak_memory_bytes, .. } = self.figures;
+        let or_dash = |text: Option<String>| text.unwrap_or_else(|| "–".to_owned());
+        [
+            ("run", self.name.clone()),
+            ("scene", self.record.scene.clone()),
+            ("preset", or_dash(self.record.preset.clone())),
+            ("PSNR", or_dash(psnr.map(|x| format!("{x:.2}")))),
+            ("SSIM", or_dash(ssim.map(|x| format!("{x:.4}")))),
+            ("time", or_dash(seconds.map(clock))),
+            ("grid", or_dash(resolution.map(|n| format!("{n}³")))),
+            ("voxels", or_dash(voxels.map(|n| thousands(n as u64)))),
+            ("rays", or_dash(rays.map(thousands))),
+            ("memory", or_dash(peak_memory_bytes.map(bytes))),
+        ]
+    }
+}
+
+/// Compares runs.
+pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
+    let runs: Vec<Run> = args.runs.iter().map(Run::read).collect::<Result<_>>()?;
+    let facts: Vec<_> = runs.iter().map(Run::facts).collect();
+    let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();
+    let cells: Vec<Vec<&str>> = facts.iter().map(|facts| facts.iter().map(|(_, value)| value.as_str()).collect()).collect();
+    let curves = runs.iter().map(|run| (run.name.clone(), metrics_file::lines(&run.metrics).map(|(_, line)| line).collect()));
+    let parts = [
+        format!("<section>{}</section>", table(&heads, &cells)),
+        settings(&runs),
+        curves::side_by_side(&curves.collect::<Vec<_>>()),
+        pictures::section(&runs)?,
+        format!("<script>\n{SCRIPT}</script>\n"),
+    ];
+    let page = html::page(&format!("{} runs", runs.len()), STYLE, &parts.join("\n"));
+    files::write_atomically(&args.out, page.as_bytes())?;
+    console.result(&aligned(&heads, &cells))?;
+    console.result(&format!("wrote {}", args.out.display()))
+}
+
+/// The settings that are not the same in all runs.
+fn settings(runs: &[Run]) -> String {
+    let values: Vec<BTreeMap<String, String>> = runs.iter().map(|run| config::values(&run.config)).collect();
+    let keys: BTreeSet<&String> = values.iter().flat_map(BTreeMap::keys).collect();
+    let differs = keys.into_iter().filter(|key| values.iter().any(|of| of.get(*key) != values[0].get(*key)));
+    let rows: Vec<Vec<&str>> = differs
+        .map(|key| [key.as_str()].into_iter().chain(values.iter().map(|of| of.get(key).map_or("–", String::as_str))).collect())
+        .collect();
+    if rows.is_empty() {
+        return "<section><h2>Settings</h2><p>All settings are the same.</p></section>".to_owned();
+    }
+    let heads: Vec<&str> = ["setting"].into_iter().chain(runs.iter().map(|run| run.name.as_str())).collect();
+    let table = table(&heads, &rows);
+    format!("<section><h2>Settings</h2>\n<details open><summary>{} that differ</summary>{table}</details></section>", rows.len())
+}
+
+/// A table for the page.
+fn table(heads: &[&str], rows: &[Vec<&str>]) -> String {
+    let line = |tag: &str, cells: &[&str]| {
+        let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
+        format!("<tr>{cells}</tr>\n")
+    };
+    let rows: String = rows.iter().map(|row| line("td", row)).collect();
+    format!("<div class=\"scroll\"><table>\n{}{rows}</table></div>", line("th", heads))
+}
+
+/// The same for a terminal, as Markdown.
+fn aligned(heads: &[&str], rows: &[Vec<&str>]) -> String {
+    let width =
+        |column: usize| rows.iter().map(|row| row[column]).chain([heads[column]]).map(|cell| cell.chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..heads.len()).map(width).collect();
+    let line = |cells: &[&str]| {
+        let padded = cells.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}"));
+        format!("| {} |", padded.collect::<Vec<_>>().join(" | "))
+    };
+    let rule: Vec<String> = widths.iter().map(|width| "-".repeat(*width)).collect();
+    let rule: Vec<&str> = rule.iter().map(String::as_str).collect();
+    [heads, &rule].into_iter().chain(rows.iter().map(Vec::as_slice)).map(line).collect::<Vec<_>>().join("\n")
+}

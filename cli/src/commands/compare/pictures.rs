@@ -1,0 +1,74 @@
+//! What each of several runs made of the same test views.
+
+use super::Run;
+use crate::html::escaped;
+use crate::images::{begins_at, evenly_spaced};
+use crate::report::pictures::embed;
+use crate::run_folder::RunFolder;
+use image::imageops::crop_imm;
+use plenoxel::dataset::image::{self as files, RgbaImage};
+use plenoxel::error::{Error, Result};
+use std::path::Path;
+
+/// Views that are shown.
+const MOST: usize = 8;
+
+/// Parts of a panel.
+const TARGET: usize = 0;
+const RENDER: usize = 1;
+const ERROR: usize = 2;
+
+/// Views of which every run has a panel: the photograph, and what each run rendered with its error below. Nothing if there are none.
+pub fn section(runs: &[Run]) -> Result<String> {
+    let views: Vec<Vec<(String, f64)>> = runs.iter().map(panels).collect();
+    let has = |run: &Run, panel: &str| run.record.scene == runs[0].record.scene && run.folder.image(panel).exists();
+    let shared = views[0].iter().map(|(panel, _)| panel).filter(|panel| runs.iter().all(|run| has(run, panel)));
+    let shared: Vec<&String> = shared.collect();
+    let mut page = String::new();
+    for &i in &evenly_spaced(shared.len(), MOST) {
+        let panel = shared[i];
+        page +=
+            &format!("<div class=\"views\"><figure>{}<figcaption>photograph</figcaption></figure>\n", part(&runs[0], panel, &[TARGET])?);
+        for (run, views) in runs.iter().zip(&views) {
+            let psnr = views.iter().find(|(known, _)| known == panel).map_or(String::new(), |(_, psnr)| format!(": {psnr:.2} dB"));
+            let name = escaped(&run.name);
+            page += &format!("<figure>{}<figcaption>{name}{psnr}</figcaption></figure>\n", part(run, panel, &[RENDER, ERROR])?);
+        }
+        page += "</div>\n";
+    }
+    if page.is_empty() {
+        return Ok(page);
+    }
+    Ok(format!(
+        "<section><h2>Test views</h2>\n<p>Each run's picture, and its error below: black at 0, pale yellow at 0.25 and above.</p>\n{page}</section>"
+    ))
+}
+
+/// File name and PSNR of the test views of a run.
+fn panels(run: &Run) -> Vec<(String, f64)> {
+    let result = run.folder.result().unwrap_or_default();
+    let views = result["per_view"].as_array().into_iter().flatten().enumerate();
+    let named = views.filter_map(|(number, view)| Some((RunFolder::panel_name(number, view["name"].as_str()?), view["psnr"].as_f64()?)));
+    named.collect()
+}
+
+/// Parts of a panel, one below the other.
+fn part(run: &Run, panel: &str, parts: &[usize]) -> Result<String> {
+    let path = run.folder.image(panel);
+    let whole = files::read(&path)?;
+    let (Some(width), Some(height)) = (run.figures.width, run.figures.height) else { return Err(unlike(&path)) };
+    let mut all = String::new();
+    for &part in parts {
+        let begin = begins_at(part, (width, height));
+        if begin.saturating_add(width) > whole.width() as usize || height != whole.height() as usize {
+            return Err(unlike(&path));
+        }
+        let cut: RgbaImage = crop_imm(&whole, begin as u32, 0, width as u32, height as u32).to_image();
+        all += &embed(cut, &path, &format!("{} of {}", ["photograph", "render", "error"][part], run.name))?;
+    }
+    Ok(all)
+}
+
+fn unlike(path: &Path) -> Error {
+    Error::input(path, "this picture is not as large as result.json says", "remove it, or train again")
+}
