@@ -144,7 +144,7 @@ fn settings_at_the_edge_of_what_is_accepted_train_or_end_with_a_reason() {
         (2, "evaluation", &["evaluation.step=0.01", "stages[0].resolution=64"]),
         (2, "losses", &["losses={}", "losses.mse="]),
         (2, "stages", &["stages=[]"]),
-        (3, "no such run", &["init_from=\"\""]),
+        (2, "init_from", &["init_from=\"\""]),
         (2, "stages[0] to stages[0]", &["stages[18446744073709551615].steps=1"]),
         (2, "downscale", &["downscale=64"]),
     ] {

@@ -112,3 +112,18 @@ impl DataSource {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_source_is_named_by_arguments_that_a_remark_in_a_file_can_hold() {
+        let folder = |path: &str| DataSource::Folder { path: path.into() }.arguments();
+        assert_eq!(folder("/data/lego-1_ä"), " /data/lego-1_ä");
+        assert_eq!(folder("/my data/a\nb\u{7f}"), " \"/my data/a\\nb\\u{7f}\"");
+        assert_eq!(DataSource::of(None).arguments(), "");
+        let small = ProceduralOptions { width: 8, val: 0, ..ProceduralOptions::default() };
+        assert_eq!(DataSource::built_in(&small).arguments(), " --scene-size 8x200 --scene-views 100,0,25");
+    }
+}

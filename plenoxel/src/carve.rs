@@ -172,7 +172,7 @@ impl<'a> Carving<'a> {
             0.0 => Err(Error::config("carve.photo.noise", photo.map_or(0.0, |photo| photo.noise), "more, for nothing is left")),
             1.0 => {
                 let found = format!("{resolution}, of which no image shows one voxel whole on background,");
-                Err(Error::config("carve.resolution", found, "more voxels along an axis, or a larger half_width"))
+                Err(Error::config("carve.resolution", found, "more voxels along an axis, a larger half_width, or a smaller carve.margin"))
             }
             _ => Ok(Carving { views, config, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }

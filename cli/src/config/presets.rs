@@ -17,8 +17,13 @@ pub struct Preset {
 
 /// What `train` may start from.
 pub const PRESETS: [Preset; 6] = [
-    Preset { name: "demo", purpose: "the built-in scene", time: "40 s at 200 x 200", text: include_str!("../../presets/demo.toml") },
-    Preset { name: "fast", purpose: "a minute or two", time: "0.5 to 2 min at 800 x 800", text: include_str!("../../presets/fast.toml") },
+    Preset {
+        name: "demo",
+        purpose: "the built-in scene: what `train` does without a folder",
+        time: "40 s at 200 x 200",
+        text: include_str!("../../presets/demo.toml"),
+    },
+    Preset { name: "fast", purpose: "a good grid soon", time: "0.5 to 2 min at 800 x 800", text: include_str!("../../presets/fast.toml") },
     Preset {
         name: "quality",
         purpose: "the best there is",
@@ -27,8 +32,8 @@ pub const PRESETS: [Preset; 6] = [
     },
     Preset {
         name: "standard",
-        purpose: "a dataset of your own, with few assumptions",
-        time: "minutes",
+        purpose: "a dataset of your own: what `train FOLDER` does",
+        time: "1 to 2 min at 800 x 800",
         text: include_str!("../../presets/standard.toml"),
     },
     Preset {
@@ -49,7 +54,7 @@ pub const PRESETS: [Preset; 6] = [
 pub const CARVE: Preset = Preset {
     name: "carve",
     purpose: "an opaque grid, without training: for `plenoxel carve`",
-    time: "seconds",
+    time: "20 s at 800 x 800",
     text: include_str!("../../presets/carve.toml"),
 };
 

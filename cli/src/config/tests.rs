@@ -233,7 +233,7 @@ fn each_value_out_of_range_or_of_another_type_is_refused_by_the_name_of_its_key(
         "9223372036854775808",
         "340282366920938463463374607431768211456",
     ];
-    const OTHERS: [&str; 9] = ["wide", "\"1\"", "true", "[]", "[1, 2]", "{}", "{ seed = 1 }", "1979-05-27", "[[[[]]]]"];
+    const OTHERS: [&str; 10] = ["wide", "\"\"", "\"1\"", "true", "[]", "[1, 2]", "{}", "{ seed = 1 }", "1979-05-27", "[[[[]]]]"];
     let (mut accepted, mut refused) = (0, 0);
     for (layers, path, value) in all_leaves() {
         for text in NUMBERS.iter().chain(&OTHERS) {
@@ -272,5 +272,5 @@ fn text_of(config: &Config) -> String {
 /// What a key takes beside numbers like the one it has.
 fn is_another_form(path: &str, text: &str) -> bool {
     let flags = ["aim", "jitter", "project", "initial.random"];
-    text == "true" && flags.contains(&path) || path == "stages" && text == "[]" || path == "init_from"
+    text == "true" && flags.contains(&path) || path == "stages" && text == "[]" || path == "init_from" && text != "\"\""
 }

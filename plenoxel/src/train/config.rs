@@ -380,6 +380,8 @@ impl Config {
         decay("stop_below", self.stop_below)?;
         density("prune_below", self.prune_below)?;
         check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;
+        let nowhere = self.init_from.as_ref().is_some_and(|path| path.as_os_str().is_empty());
+        check(!nowhere, "init_from", "\"\"", "the folder of a run")?;
         density("initial.density", self.initial.density)?;
         color("initial.color", self.initial.color)?;
         match self.optimizer {
