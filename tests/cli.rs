@@ -108,9 +108,9 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
 
     let rendered = plenoxel(&["render", &run, "--view", "2", "--view", "r_0"]);
     assert_eq!(rendered.code, 0, "{}", rendered.err);
-    let pictures = ["test_000_r_0.png", "test_000_r_0_depth.png", "test_000_r_0_opacity.png"];
-    assert_eq!(names(&format!("{run}/renders"))[..3], pictures);
-    assert_eq!(names(&format!("{run}/renders")).len(), 6);
+    let pictures = ["test_000_r_0.png", "test_000_r_0_depth.png", "test_000_r_0_normal.png", "test_000_r_0_opacity.png"];
+    assert_eq!(names(&format!("{run}/renders"))[..4], pictures);
+    assert_eq!(names(&format!("{run}/renders")).len(), 8);
     assert_eq!(plenoxel(&["render", &run, "--split", "train", "--downscale", "2", "-q"]).code, 0);
     assert_eq!(image::size(Path::new(&format!("{run}/renders/train_005_r_5.png"))).unwrap(), (12, 12));
 
@@ -492,7 +492,7 @@ fn help_mentions_every_command_and_flag() {
         --sh-degree --sh-reduction --engine --tv --threads --quiet --log-format --preview-every --scene-size --scene-views Examples:";
     for (command, flags) in [
         ("train", flags),
-        ("render", "--split --view --downscale --data Examples:"),
+        ("render", "--split --view --downscale --data --path --frames --size --fps --channels --format Examples:"),
         ("evaluate", "--split --downscale --samples --json --data Examples:"),
         ("info", "Examples:"),
         ("export", "ply vox mesh"),

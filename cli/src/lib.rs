@@ -40,6 +40,7 @@ Examples:
   plenoxel carve data/lego                   an opaque colored grid from silhouettes
   plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
   plenoxel render runs/lego-1 --view 0       a picture of it
+  plenoxel render runs/lego-1 --path orbit   a film of it
   plenoxel report runs/lego-1                its page again, to look around in
   plenoxel export ply runs/lego-1            its voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           its surface, for other programs

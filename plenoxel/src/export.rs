@@ -5,7 +5,7 @@
 
 pub mod mesh;
 pub mod mesh_file;
-mod palette;
+pub mod palette;
 pub mod ply;
 pub mod vox;
 pub mod web;

@@ -83,9 +83,7 @@ fn film(args: &RenderArgs, path: &path::PathChoice, console: &Console<'_>) -> Re
     let folder = found.folder.create_film(&name, &Channel::ALL.map(Channel::suffix))?;
     let stem = |number: usize| folder.join(format!("frame_{number:04}"));
     let shots: Vec<(Camera, PathBuf)> = cameras.into_iter().enumerate().map(|(number, camera)| (camera, stem(number))).collect();
-    let start = Instant::now();
     let frames = render(args, &found, console, shots, &[Channel::Color])?;
-    console.note(&format!("{:.2} seconds a frame", start.elapsed().as_secs_f64() / frames as f64));
     let what = if frames == 1 { "frame" } else { "frames" };
     console.result(&format!("rendered {frames} {what} to {}", folder.display()))?;
     if args.format.contains(&FileFormat::Png) {
@@ -114,10 +112,13 @@ fn render(
     let normals = normals.then(|| grid.normals());
     let pictures = Pictures::new(&grid, normals.as_ref(), sampling, &found.config, &channels, &args.format);
     let count = console.count("rendering", shots.len());
+    let start = Instant::now();
     for (done, (camera, stem)) in shots.iter().enumerate() {
         pictures.write(camera, stem)?;
         count.at(done + 1, shots.len());
     }
+    drop(count);
+    console.note(&format!("{:.2} seconds for each camera", start.elapsed().as_secs_f64() / shots.len().max(1) as f64));
     Ok(shots.len())
 }
 

@@ -7,8 +7,8 @@ use glam::DVec3;
 ///
 /// The box of colors of the largest squared error is cut in two where that helps most (Wu 1992), again and again; then entries move to the means
 /// of the colors nearest to them (Lloyd 1982). No random start: the same colors give the same palette. Equal colors share an entry, and where
-/// there are no more than `most` different ones, nothing is lost.
-pub(super) fn quantize(colors: &[[u8; 3]], most: usize) -> (Vec<[u8; 3]>, Vec<u8>) {
+/// there are no more than `most` different ones, nothing is lost. At most 256 entries have numbers.
+pub fn quantize(colors: &[[u8; 3]], most: usize) -> (Vec<[u8; 3]>, Vec<u8>) {
     let mut distinct = colors.to_vec();
     distinct.sort_unstable();
     distinct.dedup();

@@ -5,6 +5,7 @@ use crate::progress::Console;
 use gif::{Encoder, Frame, Repeat};
 use plenoxel::dataset::image;
 use plenoxel::error::Result;
+use plenoxel::export::palette::quantize;
 use plenoxel::files::atomically;
 use rayon::prelude::*;
 use std::fs::File;
@@ -12,8 +13,6 @@ use std::io::{self, BufWriter, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// How hard the colors of a GIF are looked for, 1 (hardest) to 30: at 10, what its makers call a good compromise.
-const GIF_SPEED: i32 = 10;
 /// The shortest time that viewers show a frame for, in hundredths of a second; they take less for "as you like".
 const SHORTEST: u64 = 2;
 
@@ -53,7 +52,8 @@ impl Reel<'_> {
         path.into()
     }
 
-    /// Each frame has a palette of its own. As many are read and reduced to their colors at a time as there are threads.
+    /// Each frame has a palette of its own, of the kind that .vox files have: that of the `gif` crate (NeuQuant) forgets small bright things, such
+    /// as the red lamps of lego. As many frames are read and reduced at a time as there are threads.
     fn write_gif(&self, path: &Path, console: &Console<'_>) -> Result<()> {
         let (width, height) = image::size(&self.frame(0))?;
         let count = console.count("joining the frames to a GIF", self.frames);
@@ -76,8 +76,10 @@ impl Reel<'_> {
 
     fn gif_frame(&self, number: usize) -> io::Result<Frame<'static>> {
         let picture = image::read(&self.frame(number)).map_err(io::Error::other)?;
-        let rgb: Vec<u8> = picture.pixels().flat_map(|pixel| [pixel.0[0], pixel.0[1], pixel.0[2]]).collect();
-        let mut frame = Frame::from_rgb_speed(picture.width() as u16, picture.height() as u16, &rgb, GIF_SPEED);
+        let colors: Vec<[u8; 3]> = picture.pixels().map(|pixel| [pixel.0[0], pixel.0[1], pixel.0[2]]).collect();
+        let (palette, entries) = quantize(&colors, 256);
+        let (width, height) = (picture.width() as u16, picture.height() as u16);
+        let mut frame = Frame::from_palette_pixels(width, height, entries, palette.into_flattened(), None);
         frame.delay = delay(number, self.fps);
         frame.make_lzw_pre_encoded();
         Ok(frame)
