@@ -107,8 +107,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
         plan.jobs.iter().zip(&states).try_for_each(|(job, state)| check(job, state))?;
     }
     files::create_dir(&out)?;
-    let path = std::env::current_exe().map_err(|e| Error::io("plenoxel", e, "finding this program"))?;
-    let program = Program { path, machine: machine.to_vec(), lock: lock(&out)? };
+    let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: lock(&out)? };
     // A child gets the Ctrl-C too, and saves; the sweep waits for it.
     let watch = Watch::begin();
     let (mut failed, mut interrupted) = (Vec::new(), false);
@@ -184,7 +183,9 @@ impl Sweep<'_, '_> {
             return Ok(Ok(ended.out));
         }
         let failure = Failure { code: ended.code, error: ended.last };
-        self.note(job, &format!("failed with exit code {}: {}", failure.code, failure.error));
+        if failure.code != EXIT_CODE {
+            self.note(job, &format!("failed with exit code {}: {}", failure.code, failure.error));
+        }
         Ok(Err(failure))
     }
 

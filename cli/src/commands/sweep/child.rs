@@ -27,6 +27,15 @@ pub struct Ended {
     pub last: String,
 }
 
+/// This very program: on Linux even if another has taken its place on the disk since, so that one sweep is made by one program.
+pub fn this_program() -> Result<PathBuf> {
+    let link = Path::new("/proc/self/exe");
+    if link.exists() {
+        return Ok(link.to_owned());
+    }
+    std::env::current_exe().map_err(|e| Error::io("plenoxel", e, "finding this program"))
+}
+
 impl Program {
     /// Runs the program to its end. What it says on stderr goes to the end of the file `log`, and line by line to `said`.
     pub fn run(&self, arguments: &[OsString], log: &Path, mut said: impl FnMut(&str)) -> Result<Ended> {
