@@ -227,9 +227,7 @@ fn describe(job: &Job, state: &State) -> String {
         (_, Cell::Failed(failure)) => format!("to run again, it failed with exit code {}: {}", failure.code, failure.error),
         (State::New | State::CutShort, _) => "to run".to_owned(),
     };
-    let arguments = job.command_line(state).unwrap_or_default();
-    let line: String = arguments.iter().map(|argument| format!(" {}", argument.to_string_lossy())).collect();
-    let line = if line.is_empty() { line } else { format!("\n    plenoxel{line}") };
+    let line = job.command_line(state).map_or(String::new(), |arguments| format!("\n    {}", child::command_line(&arguments)));
     format!("{} {}: {what}{line}", job.scene, job.method)
 }
 
