@@ -107,8 +107,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
         plan.jobs.iter().zip(&states).try_for_each(|(job, state)| check(job, state))?;
     }
     files::create_dir(&out)?;
-    let path = std::env::current_exe().map_err(|e| Error::io("plenoxel", e, "finding this program"))?;
-    let program = Program { path, machine: machine.to_vec(), lock: lock(&out)? };
+    let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: lock(&out)? };
     // A child gets the Ctrl-C too, and saves; the sweep waits for it.
     let watch = Watch::begin();
     let (mut failed, mut interrupted) = (Vec::new(), false);
@@ -187,7 +186,9 @@ impl Sweep<'_, '_> {
             return Ok(Ok(ended.out));
         }
         let failure = Failure { code: ended.code, error: ended.last };
-        self.note(job, &format!("failed with exit code {}: {}", failure.code, failure.error));
+        if failure.code != EXIT_CODE {
+            self.note(job, &format!("failed with exit code {}: {}", failure.code, failure.error));
+        }
         Ok(Err(failure))
     }
 
@@ -229,9 +230,7 @@ fn describe(job: &Job, state: &State) -> String {
         (_, Cell::Failed(failure)) => format!("to run again, it failed with exit code {}: {}", failure.code, failure.error),
         (State::New | State::CutShort, _) => "to run".to_owned(),
     };
-    let arguments = job.command_line(state).unwrap_or_default();
-    let line: String = arguments.iter().map(|argument| format!(" {}", argument.to_string_lossy())).collect();
-    let line = if line.is_empty() { line } else { format!("\n    plenoxel{line}") };
+    let line = job.command_line(state).map_or(String::new(), |arguments| format!("\n    {}", child::command_line(&arguments)));
     format!("{} {}: {what}{line}", job.scene, job.method)
 }
 

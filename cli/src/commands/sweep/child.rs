@@ -27,14 +27,22 @@ pub struct Ended {
     pub last: String,
 }
 
+/// This very program: on Linux even if another has taken its place on the disk since, so that one sweep is made by one program.
+pub fn this_program() -> Result<PathBuf> {
+    let link = Path::new("/proc/self/exe");
+    if link.exists() {
+        return Ok(link.to_owned());
+    }
+    std::env::current_exe().map_err(|e| Error::io("plenoxel", e, "finding this program"))
+}
+
 impl Program {
     /// Runs the program to its end. What it says on stderr goes to the end of the file `log`, and line by line to `said`.
     pub fn run(&self, arguments: &[OsString], log: &Path, mut said: impl FnMut(&str)) -> Result<Ended> {
         let writing = |e| Error::io(log, e, "writing the log");
         let starting = |e| Error::io(&self.path, e, "starting a run");
         let mut file = File::options().append(true).create(true).open(log).map_err(writing)?;
-        let line: Vec<_> = arguments.iter().map(|argument| argument.to_string_lossy()).collect();
-        writeln!(file, "$ plenoxel {}", line.join(" ")).map_err(writing)?;
+        writeln!(file, "$ {}", command_line(arguments)).map_err(writing)?;
         let mut child = Command::new(&self.path)
             .args(&self.machine)
             .args(arguments)
@@ -93,10 +101,22 @@ impl Last {
     fn words(self, status: ExitStatus) -> String {
         match (self.error, signal(status)) {
             (Some(error), _) => error,
+            // What a system does that runs out of memory.
+            (None, Some(9)) => format!("killed, perhaps for want of memory, after: {}", self.line),
             (None, Some(signal)) => format!("ended by signal {signal} after: {}", self.line),
             (None, None) => self.line,
         }
     }
+}
+
+/// A call of the program as one types it into a shell.
+pub fn command_line(arguments: &[OsString]) -> String {
+    let plain = |c: char| c.is_alphanumeric() || "-_=./,:+@%".contains(c);
+    let words = arguments.iter().map(|argument| {
+        let word = argument.to_string_lossy();
+        if !word.is_empty() && word.chars().all(plain) { word.into_owned() } else { format!("'{}'", word.replace('\'', r"'\''")) }
+    });
+    ["plenoxel".to_owned()].into_iter().chain(words).collect::<Vec<_>>().join(" ")
 }
 
 fn code(status: ExitStatus) -> u8 {
@@ -112,4 +132,26 @@ fn signal(status: ExitStatus) -> Option<i32> {
 #[cfg(not(unix))]
 fn signal(_: ExitStatus) -> Option<i32> {
     None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_line_can_be_typed_into_a_shell() {
+        let line = command_line(&["train", "--set=a=[{b=\"c\"}]", "it's", "", "data/lego"].map(OsString::from));
+        assert_eq!(line, r#"plenoxel train '--set=a=[{b="c"}]' 'it'\''s' '' data/lego"#);
+    }
+
+    #[test]
+    fn the_last_error_counts_more_than_the_last_line() {
+        let hear = |lines: &[&str]| {
+            let mut last = Last::default();
+            lines.iter().for_each(|line| last.hear(line));
+            last.words(ExitStatus::default())
+        };
+        assert_eq!(hear(&["step 1", "error: no room", "bye", ""]), "no room");
+        assert_eq!(hear(&["step 1", "thread panicked", " "]), "thread panicked");
+    }
 }

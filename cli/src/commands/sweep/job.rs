@@ -146,11 +146,12 @@ impl Job {
         remove(&self.log())
     }
 
-    /// What came of it, so far.
+    /// What came of it, so far; another run in its place is none of it.
     pub fn cell(&self) -> Cell {
         let failure = std::fs::read_to_string(self.failure_path()).ok().and_then(|text| serde_json::from_str(&text).ok());
         match (failure, Measured::read(&self.folder)) {
             (Some(failure), _) => Cell::Failed(failure),
+            _ if matches!(self.state(), State::Different(_)) => Cell::Missing,
             (None, Ok(Some(measured))) => Cell::Measured(Box::new(measured)),
             _ => Cell::Missing,
         }
