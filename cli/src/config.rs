@@ -9,6 +9,7 @@ mod table;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::train::config::Config;
+use std::collections::BTreeMap;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
@@ -126,8 +127,8 @@ impl Layers {
 pub struct ConfigFile {
     name: String,
     text: String,
-    /// Path of each key and the line it is on, from 1.
-    lines: Vec<(String, usize)>,
+    /// The line that each key is on, from 1, by its path.
+    lines: BTreeMap<String, usize>,
 }
 
 impl ConfigFile {
@@ -139,12 +140,19 @@ impl ConfigFile {
             std::io::ErrorKind::IsADirectory => Error::input(path, "this is a folder", remedy),
             _ => Error::io(path, e, "reading the configuration"),
         })?;
-        let text = String::from_utf8(bytes).map_err(|_| Error::input(path, "this is not a text file", remedy))?;
-        let mut lines = Vec::new();
-        let line_of = |offset: usize| text[..offset].matches('\n').count() + 1;
+        Self::parse(path, bytes)
+    }
+
+    /// The same from the bytes of a file; `path` names it in messages.
+    pub fn parse(path: &Path, bytes: Vec<u8>) -> Result<Self> {
+        let text = String::from_utf8(bytes)
+            .map_err(|_| Error::input(path, "this is not a text file", "a TOML file is expected, such as the config.toml of a run"))?;
+        let ends: Vec<usize> = text.match_indices('\n').map(|(end, _)| end).collect();
+        let line_of = |offset: usize| ends.partition_point(|end| *end < offset) + 1;
+        let mut lines = BTreeMap::new();
         match DeTable::parse(&text) {
             Ok(table) => spans("", table.get_ref(), &mut |path, offset| {
-                lines.push((path, line_of(offset)));
+                lines.entry(path).or_insert(line_of(offset));
             }),
             Err(e) => {
                 let line = e.span().map_or(1, |span| line_of(span.start));
@@ -162,8 +170,7 @@ impl ConfigFile {
     }
 
     fn line(&self, path: &str) -> Option<usize> {
-        let found = self.lines.iter().find(|(known, _)| known == path);
-        found.map(|(_, line)| *line)
+        self.lines.get(path).copied()
     }
 }
 
@@ -200,10 +207,20 @@ pub fn write(path: &Path, config: &Config, origin: &str) -> Result<()> {
 
 /// Reads what [`write`] wrote.
 pub fn read(path: &Path) -> Result<Config> {
-    let file = ConfigFile::read(path)?;
+    alone(&ConfigFile::read(path)?)
+}
+
+/// What a file says that stands by itself.
+pub fn alone(file: &ConfigFile) -> Result<Config> {
     let mut layers = Layers { table: Table::new(), places: Vec::new() };
-    layers.file(&file)?;
-    layers.resolve()
+    layers.file(file)?;
+    layers.resolve().map_err(|e| match e {
+        // A key that is not there has no line.
+        Error::Config { key, found, accepted } if !key.contains(&file.name) => {
+            Error::config(format!("{}: {key}", file.name), found, accepted)
+        }
+        other => other,
+    })
 }
 
 /// Calls `f` with the path of every value that is not a table.

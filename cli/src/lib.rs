@@ -14,6 +14,8 @@ mod images;
 mod machine;
 mod memory;
 mod metrics_file;
+#[doc(hidden)]
+pub mod parsers;
 mod progress;
 mod run_folder;
 

@@ -32,6 +32,31 @@ pub struct Past {
     pub stages: Vec<(usize, f64)>,
     /// Seconds of training.
     pub seconds: f64,
+    /// Rays and samples.
+    counts: (u64, u64),
+}
+
+impl Past {
+    /// What the bytes of a file tell of so many steps, and the lines that do.
+    pub fn of(bytes: &[u8], taken: u64) -> (String, Self) {
+        let text = String::from_utf8_lossy(bytes);
+        let (mut kept, mut past) = (String::new(), Past::default());
+        for text in text.lines() {
+            // A line that was cut short, and what is no line of a step, say nothing.
+            let Some(line) = serde_json::from_str::<Line<'_>>(text).ok().filter(|line| line.step < taken) else { continue };
+            kept += text;
+            kept += "\n";
+            past.losses.resize(line.step as usize + 1, line.loss);
+            past.seconds = line.seconds;
+            if line.ends_stage {
+                past.stages.push((line.stage, line.seconds));
+            }
+            past.counts = (line.rays, line.samples);
+        }
+        let last = past.losses.last().copied().unwrap_or(0.0);
+        past.losses.resize(taken as usize, last);
+        (kept, past)
+    }
 }
 
 /// A line: means of the losses and the PSNR since the line before, everything else as it is now.
@@ -81,31 +106,17 @@ impl MetricsFile {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(Error::io(path, e, "reading the metrics")),
             bytes => bytes.unwrap_or_default(),
         };
-        let text = String::from_utf8_lossy(&bytes);
-        let (mut kept, mut past, mut counts) = (String::new(), Past::default(), (0, 0));
-        for text in text.lines() {
-            // A line that was cut short, and what is no line of a step, say nothing.
-            let Some(line) = serde_json::from_str::<Line<'_>>(text).ok().filter(|line| line.step < taken) else { continue };
-            kept += text;
-            kept += "\n";
-            past.losses.resize(line.step as usize + 1, line.loss);
-            past.seconds = line.seconds;
-            if line.ends_stage {
-                past.stages.push((line.stage, line.seconds));
-            }
-            counts = (line.rays, line.samples);
-        }
-        let last = past.losses.last().copied().unwrap_or(0.0);
-        past.losses.resize(taken as usize, last);
+        let (kept, past) = Past::of(&bytes, taken);
         files::write_atomically(path, kept.as_bytes())?;
-        let (rays, samples) = counts;
+        let (rays, samples) = past.counts;
         Ok((MetricsFile { rays, samples, ..Self::create(path, total_steps)? }, past))
     }
 
     /// A step was taken; `seconds` of training have passed. A line is written if it is time to, or it must be.
     pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seconds: f64, must: bool) -> Result<()> {
-        self.rays += report.rays as u64;
-        self.samples += report.samples as u64;
+        // Lines of a damaged file may have said anything.
+        self.rays = self.rays.saturating_add(report.rays as u64);
+        self.samples = self.samples.saturating_add(report.samples as u64);
         let since = &mut self.since;
         since.steps += 1.0;
         since.loss += report.loss;
