@@ -13,6 +13,7 @@ use parsers::{PARSERS, Parser, try_arguments, try_out};
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::{RngSeed, TestError, TestRunner};
+use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 /// Numbers at the ends of what types hold, and what is none.
@@ -181,6 +182,22 @@ damaged! {
     damaged_assignments_are_read_or_refused: "assignments",
     damaged_metrics_are_read_or_refused: "metrics.jsonl",
     damaged_records_are_read_or_refused: "run.json",
+}
+
+#[test]
+#[ignore = "writes the files that fuzzing begins from"]
+fn seeds_for_fuzzing() {
+    let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fuzz/corpus");
+    let write = |target: &str, inputs: &[Vec<u8>]| {
+        let folder = corpus.join(target);
+        std::fs::create_dir_all(&folder).expect("a folder");
+        for (i, bytes) in inputs.iter().enumerate() {
+            std::fs::write(folder.join(format!("valid-{i}")), bytes).expect("it is written");
+        }
+    };
+    PARSERS.iter().for_each(|parser| write(parser.name.split('.').next().unwrap_or(parser.name), &(parser.valid)()));
+    let lines = ["train data --time 5m --max-memory 8GiB", "filter a --out b --bbox 0,0,0,1,1,1", "train --scene-size 32x24 --set seed=3"];
+    write("arguments", &lines.map(|line| line.replace(' ', "\n").into_bytes()));
 }
 
 #[test]

@@ -34,7 +34,7 @@ pub struct Parser {
     /// Reads, or refuses with a message.
     pub read: fn(&Path, &[u8]) -> Result<Then, String>,
     /// Lengths and checksums set right, so that damage elsewhere comes through.
-    pub repair: fn(&mut Vec<u8>),
+    pub repair: fn(&mut [u8]),
     /// The most memory that reading may take: so many bytes, and so many for each of the input.
     pub memory: [usize; 2],
 }
@@ -148,7 +148,7 @@ fn read_image(path: &Path, bytes: &[u8]) -> Result<Then, String> {
 }
 
 /// The checksums of all chunks.
-fn repair_image(bytes: &mut Vec<u8>) {
+fn repair_image(bytes: &mut [u8]) {
     let mut at = 8;
     while let Some(length) = bytes.get(at..at + 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]) as usize) {
         let end = at + 8 + length;
@@ -242,7 +242,7 @@ fn read_checkpoint(path: &Path, bytes: &[u8]) -> Result<Then, String> {
 }
 
 /// The safetensors header's length, by its braces.
-fn repair_tensors(bytes: &mut Vec<u8>) {
+fn repair_tensors(bytes: &mut [u8]) {
     let (mut depth, mut quoted, mut escaped) = (0usize, false, false);
     for at in 8..bytes.len() {
         match (bytes[at], quoted) {
