@@ -15,6 +15,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::train::config::Config;
 pub use presets::{CARVE, PRESETS, find};
+use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
@@ -117,8 +118,8 @@ const LARGEST_FILE: u64 = 1 << 20;
 pub struct ConfigFile {
     name: String,
     text: String,
-    /// Path of each key and the line it is on, from 1.
-    lines: Vec<(String, usize)>,
+    /// The line that each key is on, from 1, by its path.
+    lines: BTreeMap<String, usize>,
 }
 
 impl ConfigFile {
@@ -135,17 +136,19 @@ impl ConfigFile {
         if bytes.len() as u64 > LARGEST_FILE {
             return Err(Error::input(path, "this file is larger than 1 MiB", remedy));
         }
-        let text = String::from_utf8(bytes).map_err(|_| Error::input(path, "this is not a text file", remedy))?;
-        Self::parse(path, text)
+        Self::parse(path, bytes)
     }
 
-    /// The file of a text. Errors: it is not TOML (with the line).
-    fn parse(path: &Path, text: String) -> Result<Self> {
-        let mut lines = Vec::new();
-        let line_of = |offset: usize| text[..offset].matches('\n').count() + 1;
+    /// The same from the bytes of a file; `path` names it in messages.
+    pub fn parse(path: &Path, bytes: Vec<u8>) -> Result<Self> {
+        let text = String::from_utf8(bytes)
+            .map_err(|_| Error::input(path, "this is not a text file", "a TOML file is expected, such as the config.toml of a run"))?;
+        let ends: Vec<usize> = text.match_indices('\n').map(|(end, _)| end).collect();
+        let line_of = |offset: usize| ends.partition_point(|end| *end < offset) + 1;
+        let mut lines = BTreeMap::new();
         match DeTable::parse(&text) {
             Ok(table) => spans("", table.get_ref(), &mut |path, offset| {
-                lines.push((path, line_of(offset)));
+                lines.entry(path).or_insert(line_of(offset));
             }),
             Err(e) => {
                 let line = e.span().map_or(1, |span| line_of(span.start));
@@ -169,8 +172,8 @@ impl ConfigFile {
 
     /// The file and the line at which a key is written, for messages.
     pub fn place(&self, path: &str) -> String {
-        match self.lines.iter().find(|(known, _)| known == path) {
-            Some((_, line)) => format!("{}, line {line}", self.name),
+        match self.lines.get(path) {
+            Some(line) => format!("{}, line {line}", self.name),
             None => self.name.clone(),
         }
     }
@@ -213,10 +216,20 @@ pub fn write(path: &Path, config: &Config, remark: &str) -> Result<()> {
 
 /// Reads what [`write`] wrote.
 pub fn read(path: &Path) -> Result<Config> {
-    let file = ConfigFile::read(path)?;
+    alone(&ConfigFile::read(path)?)
+}
+
+/// What a file says that stands by itself.
+pub fn alone(file: &ConfigFile) -> Result<Config> {
     let mut layers = Layers::default();
-    layers.file(&file)?;
-    layers.resolve()
+    layers.file(file)?;
+    layers.resolve().map_err(|e| match e {
+        // A key that is not there has no line.
+        Error::Config { key, found, accepted } if !key.contains(&file.name) => {
+            Error::config(format!("{}: {key}", file.name), found, accepted)
+        }
+        other => other,
+    })
 }
 
 /// Calls `f` with the path of every value that is not a table, and the value.

@@ -19,6 +19,8 @@ mod images;
 mod machine;
 mod memory;
 mod metrics_file;
+#[doc(hidden)]
+pub mod parsers;
 mod progress;
 mod report;
 mod run_folder;

@@ -35,7 +35,7 @@ pub struct Best {
 }
 
 /// What the lines so far come to.
-#[derive(Default)]
+#[derive(Clone, Copy, Default)]
 struct Known {
     step: u64,
     seconds: f64,
@@ -70,6 +70,28 @@ pub struct Past {
     pub stages: Vec<(usize, f64)>,
     /// Seconds of training.
     pub seconds: f64,
+    /// What the last of them comes to.
+    known: Known,
+}
+
+impl Past {
+    /// What a file tells of so many steps, and the lines that do.
+    pub fn of(text: &str, taken: u64) -> (String, Self) {
+        let (mut kept, mut past) = (String::new(), Past::default());
+        for (text, line) in lines(text).filter(|(_, line)| line.step < taken) {
+            kept += text;
+            kept += "\n";
+            past.losses.resize(line.step as usize + 1, line.loss);
+            past.seconds = line.seconds;
+            if line.ends_stage {
+                past.stages.push((line.stage, line.seconds));
+            }
+            past.known.add(&line);
+        }
+        let last = past.losses.last().copied().unwrap_or(0.0);
+        past.losses.resize(taken as usize, last);
+        (kept, past)
+    }
 }
 
 /// A line about training: means of the losses and the PSNR since the line before, everything else as it is now.
@@ -97,7 +119,7 @@ pub struct Line<'a> {
 impl Line<'_> {
     /// Its figures as TensorBoard shows them, rays a second from what was known before.
     fn scalars(&self, before: &Known) -> Vec<(Cow<'_, str>, f64)> {
-        let rays_per_second = (self.rays - before.rays) as f64 / (self.seconds - before.seconds);
+        let rays_per_second = self.rays.saturating_sub(before.rays) as f64 / (self.seconds - before.seconds);
         let each = self.losses.iter().map(|(name, value)| (format!("loss/{name}").into(), *value));
         let others = [
             ("loss", Some(self.loss)),
@@ -171,28 +193,16 @@ impl MetricsFile {
     /// The file of a run that goes on after so many steps: lines about later ones go.
     pub fn resume(folder: &RunFolder, total_steps: u64, taken: u64) -> Result<(Self, Past)> {
         let path = folder.metrics();
-        let all = read(&path)?;
-        let (mut kept, mut past, mut known) = (String::new(), Past::default(), Known::default());
-        for (text, line) in lines(&all).filter(|(_, line)| line.step < taken) {
-            kept += text;
-            kept += "\n";
-            past.losses.resize(line.step as usize + 1, line.loss);
-            past.seconds = line.seconds;
-            if line.ends_stage {
-                past.stages.push((line.stage, line.seconds));
-            }
-            known.add(&line);
-        }
-        let last = past.losses.last().copied().unwrap_or(0.0);
-        past.losses.resize(taken as usize, last);
+        let (kept, past) = Past::of(&read(&path)?, taken);
         files::write_atomically(&path, kept.as_bytes())?;
-        Ok((Self::open(folder, total_steps, taken, known)?, past))
+        Ok((Self::open(folder, total_steps, taken, past.known)?, past))
     }
 
     /// A step was taken. A line is written if it is time to, or it must be; it must if validation views were looked at.
     pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seen: Seen, must: bool) -> Result<()> {
-        self.rays += report.rays as u64;
-        self.samples += report.samples as u64;
+        // Lines of a damaged file may have said anything.
+        self.rays = self.rays.saturating_add(report.rays as u64);
+        self.samples = self.samples.saturating_add(report.samples as u64);
         let since = &mut self.since;
         since.steps += 1.0;
         since.loss += report.loss;

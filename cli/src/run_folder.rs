@@ -30,6 +30,16 @@ pub struct RunRecord {
     pub data: DataSource,
 }
 
+impl RunRecord {
+    /// Reads the bytes of a file; `path` names it in messages.
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
+        serde_json::from_slice(bytes).map_err(|e| {
+            let found = format!("this does not describe a run ({e})");
+            Error::input(path, found, "train again, or use an undamaged copy")
+        })
+    }
+}
+
 /// The folder of a run.
 #[derive(Debug, Clone)]
 pub struct RunFolder {
@@ -126,15 +136,11 @@ impl RunFolder {
         }
         let folder = RunFolder { path: path.to_owned() };
         let record = path.join(RECORD);
-        let text = std::fs::read_to_string(&record).map_err(|e| match e.kind() {
+        let bytes = std::fs::read(&record).map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => Error::input(path, format!("there is no {RECORD} in this folder"), remedy),
-            std::io::ErrorKind::InvalidData => Error::input(&record, "this is not text", "train again, or use an undamaged copy"),
             _ => Error::io(&record, e, "reading the run"),
         })?;
-        let record = serde_json::from_str(&text).map_err(|e| {
-            let found = format!("this does not describe a run ({e})");
-            Error::input(&record, found, "train again, or use an undamaged copy")
-        })?;
+        let record = RunRecord::parse(&record, &bytes)?;
         Ok((folder, config::read(&path.join(CONFIG))?, record))
     }
 

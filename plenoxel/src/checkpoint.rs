@@ -10,9 +10,11 @@
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
-use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of};
+use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, open};
+use autograd::lattice::{BRICK, STRIDE};
 use autograd::{Indices, Lattice, Param, Real, Tensor};
 use serde::{Deserialize, Serialize};
+use std::io::{Read, Seek};
 use std::path::Path;
 
 /// Version of the format of grids with all their voxels.
@@ -163,15 +165,27 @@ fn node(voxel: u32, n: usize) -> [usize; 3] {
     [voxel / (n * n), voxel / n % n, voxel % n]
 }
 
+/// The lattice of n³ voxels of which these are present.
+fn with_voxels(voxels: &[u32], n: usize) -> Lattice {
+    let count = n.div_ceil(BRICK);
+    let mut masks = vec![0; count.pow(3)];
+    for place in voxels.iter().map(|&voxel| node(voxel, n)) {
+        let [x, y, z] = place.map(|k| k / BRICK);
+        let bit: usize = (0..3).map(|a| place[a] % BRICK * STRIDE[a]).sum();
+        masks[(x * count + y) * count + z] |= 1 << bit;
+    }
+    Lattice::from_masks([n; 3], masks)
+}
+
 /// Reads what a checkpoint says of itself, without its tables: the header, and the number of voxels that are present.
 pub fn header(path: &Path) -> Result<(Header, usize)> {
-    let file = TensorFile::open(path)?;
+    let file = TensorFile::new(path, open(path)?)?;
     let shape = file.info("voxels").or_else(|| file.info("density")).map_or(&[][..], |info| &info.shape);
     Ok((header_of(path, &file)?, shape.iter().product()))
 }
 
 /// The header among the metadata of a file.
-fn header_of(path: &Path, file: &TensorFile) -> Result<Header> {
+fn header_of<R: Read + Seek>(path: &Path, file: &TensorFile<R>) -> Result<Header> {
     // The version first: a later one may have other fields.
     let value = file.header()?;
     let format = value["format"].as_str().unwrap_or("none");
@@ -193,7 +207,7 @@ fn header_of(path: &Path, file: &TensorFile) -> Result<Header> {
         ));
     }
     let reduced = (1..=1024).contains(&header.sh_reduction) && header.shape().is_reduced() == (format == REDUCED_FORMAT);
-    if !((1..=1024).contains(&header.resolution) && degree_known && reduced && header.half_width > 0.0 && header.half_width.is_finite()) {
+    if !((1..=1024).contains(&header.resolution) && degree_known && reduced && GridShape::HALF_WIDTHS.contains(&header.half_width)) {
         return Err(Error::input(path, "a header with impossible values", RETRAIN));
     }
     Ok(header)
@@ -201,11 +215,16 @@ fn header_of(path: &Path, file: &TensorFile) -> Result<Header> {
 
 /// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
 pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
-    let mut file = TensorFile::open(path)?;
+    read(path, open(path)?)
+}
+
+/// The same from any source, a file or bytes; `path` names it in messages.
+pub fn read<T: Real, R: Read + Seek>(path: &Path, source: R) -> Result<(VoxelGrid<T>, Header)> {
+    let mut file = TensorFile::new(path, source)?;
     let header = header_of(path, &file)?;
     let shape = header.shape();
     let n = header.resolution;
-    fn table<T: Real>(file: &mut TensorFile, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
+    fn table<T: Real, R: Read + Seek>(file: &mut TensorFile<R>, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
         let values = file.numbers(name, Dtype::F32, expected)?;
         let rows = values.len() / width;
         Ok(Tensor::from_vec(values, &[rows, width]))
@@ -218,7 +237,7 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
             &table(&mut file, "color", channels, &[n, n, n, channels])?,
         )
     } else {
-        let list = |file: &mut TensorFile, name: &str, n: usize| -> Result<Vec<u32>> {
+        let list = |file: &mut TensorFile<R>, name: &str, n: usize| -> Result<Vec<u32>> {
             let k = file.info(name).map_or(0, |info| info.shape.iter().product());
             let bytes = file.read(name, Dtype::U32, &[k])?;
             let voxels: Vec<u32> = bytes.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)).collect();
@@ -232,7 +251,7 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
         };
         let voxels = list(&mut file, "voxels", n)?;
         let k = voxels.len();
-        let lattice = Lattice::bricks_where([n; 3], |[x, y, z]| voxels.binary_search(&(((x * n + y) * n + z) as u32)).is_ok());
+        let lattice = with_voxels(&voxels, n);
         let fine = [table(&mut file, "density", 1, &[k])?, table(&mut file, "color", channels, &[k, channels])?];
         let mut tables = fine.map(|table| placed(table, &voxels, &lattice)).to_vec();
         if let Some(lattice) = shape.harmonics_lattice(&lattice) {

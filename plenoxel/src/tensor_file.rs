@@ -74,30 +74,35 @@ pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>])
 }
 
 /// A file whose tables can be read.
-pub(crate) struct TensorFile {
+pub(crate) struct TensorFile<R> {
     path: PathBuf,
-    file: File,
+    source: R,
     metadata: Metadata,
     /// Where the tables begin.
     begin: u64,
 }
 
-impl TensorFile {
-    /// Errors: it cannot be read, or is not a whole file of this program.
-    pub fn open(path: &Path) -> Result<Self> {
-        let refused = |e| Error::io(path, e, "reading the checkpoint");
-        let mut file = File::open(path).map_err(refused)?;
-        let size = file.metadata().map_err(refused)?.len();
+/// Opens a file to be read as one of tables.
+pub(crate) fn open(path: &Path) -> Result<File> {
+    File::open(path).map_err(|e| refused(path, e))
+}
+
+impl<R: Read + Seek> TensorFile<R> {
+    /// The tables of a source, which `path` names in messages. Errors: it cannot be read, or is not a whole file of this program.
+    pub fn new(path: &Path, mut source: R) -> Result<Self> {
+        let refused = |e| refused(path, e);
+        let size = source.seek(SeekFrom::End(0)).map_err(refused)?;
+        source.rewind().map_err(refused)?;
         let (mut length, mut text) = (Vec::new(), Vec::new());
-        file.by_ref().take(8).read_to_end(&mut length).map_err(refused)?;
+        source.by_ref().take(8).read_to_end(&mut length).map_err(refused)?;
         let length = length.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
-        file.by_ref().take(length.min(LONGEST)).read_to_end(&mut text).map_err(refused)?;
+        source.by_ref().take(length.min(LONGEST)).read_to_end(&mut text).map_err(refused)?;
         let metadata: Metadata = serde_json::from_slice(&text).map_err(|e| damaged(path, &e))?;
         let (begin, expected) = (length.saturating_add(8), metadata.data_len() as u64);
         if size.checked_sub(begin) != Some(expected) {
             return Err(damaged(path, &format!("{size} bytes, where {} are announced", begin.saturating_add(expected))));
         }
-        Ok(TensorFile { path: path.to_owned(), file, metadata, begin })
+        Ok(TensorFile { path: path.to_owned(), source, metadata, begin })
     }
 
     /// What is to be known of the tables, as it was written.
@@ -131,8 +136,8 @@ impl TensorFile {
         let (from, to) = info.data_offsets;
         // As long as the file is: its length was compared.
         let mut bytes = vec![0; to - from];
-        let read = self.file.seek(SeekFrom::Start(self.begin + from as u64)).and_then(|_| self.file.read_exact(&mut bytes));
-        read.map_err(|e| Error::io(&self.path, e, "reading the checkpoint"))?;
+        let read = self.source.seek(SeekFrom::Start(self.begin + from as u64)).and_then(|_| self.source.read_exact(&mut bytes));
+        read.map_err(|e| refused(&self.path, e))?;
         Ok(bytes)
     }
 
@@ -144,6 +149,10 @@ impl TensorFile {
             _ => bytes.as_chunks::<4>().0.iter().map(|b| T::lit(f64::from(f32::from_le_bytes(*b)))).collect(),
         })
     }
+}
+
+fn refused(path: &Path, e: std::io::Error) -> Error {
+    Error::io(path, e, "reading the checkpoint")
 }
 
 fn damaged(path: &Path, e: &dyn std::fmt::Display) -> Error {

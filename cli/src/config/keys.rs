@@ -114,8 +114,12 @@ fn joined(path: &str, key: &str) -> String {
 }
 
 fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
-    let known =
-        TABLES.iter().find(|(table, _)| *table == pattern || table.strip_suffix('*').is_some_and(|start| pattern.starts_with(start)));
+    let fits = |table: &str| match (table.strip_suffix('*'), table == pattern) {
+        // The name is one of any, but nothing is below it.
+        (Some(start), _) => pattern.strip_prefix(start).is_some_and(|name| !name.contains(['.', '['])),
+        (None, same) => same,
+    };
+    let known = TABLES.iter().find(|(table, _)| fits(table));
     let Some((_, known)) = known else {
         let found = format!("the key `{key}` below `{pattern}`, which is no table,");
         return Err(Error::config(place, found, format!("a value for `{pattern}`")));
@@ -177,6 +181,9 @@ mod tests {
         assert!(message("losses.tv_densty").contains("`tv_density`"));
         assert!(message("zzzzzzzzzz").contains("one of seed, downscale"));
         assert!(message("seed.more").contains("which is no table"));
+        // However long: each part would take a table in a table.
+        let deep = format!("losses.mse{}", ".weight".repeat(20_000));
+        assert!(message(&deep).contains("the key `weight` below `losses.mse.weight`, which is no table"));
         assert!(check_path("losses.mse.from", "--set").is_ok());
         assert!(check_path("stages[*].sampling.step", "--set").is_ok());
     }

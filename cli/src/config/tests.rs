@@ -42,7 +42,7 @@ fn all_leaves() -> Vec<(Layers, String, Value)> {
     let mut found = Vec::new();
     for layers in complete() {
         let table: Table = text(&layers.clone().resolve().unwrap(), "").unwrap().parse().unwrap();
-        leaves("", &Value::Table(table.clone()), &mut |path| {
+        leaves("", &Value::Table(table.clone()), &mut |path, _| {
             let general: String = path.chars().filter(|c| !c.is_ascii_digit() || !path.contains('[')).collect();
             let steps = path.split(['.', '[']).map(|step| step.trim_end_matches(']'));
             let value = steps.fold(Value::Table(table.clone()), |value, step| match step.parse::<usize>() {
@@ -168,7 +168,7 @@ fn each_key_of_each_preset_misspelled_is_refused_with_the_right_one() {
     for mut layers in complete() {
         let table: Table = text(&layers.clone().resolve().unwrap(), "").unwrap().parse().unwrap();
         let mut paths = BTreeSet::new();
-        leaves("", &Value::Table(table), &mut |path| {
+        leaves("", &Value::Table(table), &mut |path, _| {
             paths.insert(path.to_owned());
         });
         assert!(paths.len() > 30, "{paths:?}");
@@ -190,7 +190,7 @@ fn each_key_of_each_preset_misspelled_is_refused_with_the_right_one() {
                         assert_eq!(error.exit_code(), 2, "{message}");
                     };
                     refused(layers.assign(&format!("{path}=1")).unwrap_err(), &format!("--set {path}: "));
-                    let file = ConfigFile::parse(Path::new("my.toml"), in_a_file(&path)).unwrap();
+                    let file = ConfigFile::parse(Path::new("my.toml"), in_a_file(&path).into_bytes()).unwrap();
                     refused(layers.file(&file).unwrap_err(), "my.toml, line 3: ");
                 }
             }

@@ -17,6 +17,12 @@ pub(super) use write::write;
 
 /// Largest accepted entry of RᵀR - 1. Files written in single precision stay below 1e-6; a scaled or sheared matrix does not.
 const ORTHONORMAL_WITHIN: f64 = 1e-3;
+/// Fields of view stay this far from 0 and pi, radians: nearer, focal lengths leave the numbers that can be computed with.
+const LEAST_ANGLE: f64 = 1e-6;
+/// Camera positions beyond this overflow when rays are cut with boxes.
+const FARTHEST: f64 = 1e12;
+/// As long as any system takes paths.
+const LONGEST_PATH: usize = 4096;
 
 /// Opens the NeRF-synthetic folder `root`. The training file must exist and list frames; without a validation or test file those
 /// splits are empty.
@@ -56,12 +62,21 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     })
 }
 
-/// One entry of `frames`, checked.
+/// One entry of `frames`, and its image.
 struct Listed {
     name: String,
     image: PathBuf,
     fov_x: f64,
     camera_to_world: DAffine3,
+}
+
+/// What a transforms file says, checked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Transforms {
+    /// Horizontal field of view, radians.
+    pub fov_x: f64,
+    /// The views: `file_path` as it is written, and the camera to world.
+    pub frames: Vec<(String, DAffine3)>,
 }
 
 fn file_name(root: &Path, split: Split) -> PathBuf {
@@ -71,46 +86,62 @@ fn file_name(root: &Path, split: Split) -> PathBuf {
 fn read_transforms(root: &Path, split: Split) -> Result<Vec<Listed>> {
     let path = file_name(root, split);
     let bytes = std::fs::read(&path).map_err(|source| Error::io(&path, source, "reading the cameras"))?;
-    let json = json::parse(&path, &bytes)?;
-    let bad = |found: String, remedy: &str| Error::input(&path, found, remedy);
-    let fov_x = match json.get("camera_angle_x") {
-        None => {
-            return Err(bad("there is no key \"camera_angle_x\"".into(), "give the horizontal field of view in radians"));
-        }
-        Some(value) => value.as_f64().filter(|angle| *angle > 0.0 && *angle < std::f64::consts::PI),
-    };
-    let Some(fov_x) = fov_x else {
-        return Err(bad(format!("camera_angle_x is {}", json["camera_angle_x"]), "it is a number of radians between 0 and pi"));
-    };
-    let Some(frames) = json.get("frames") else {
-        return Err(bad("there is no key \"frames\"".into(), "list the views, each with file_path and transform_matrix"));
-    };
-    let Some(frames) = frames.as_array() else {
-        return Err(bad("frames is not a list".into(), "list the views, each with file_path and transform_matrix"));
-    };
-    let mut listed = Vec::with_capacity(frames.len());
-    for (k, frame) in frames.iter().enumerate() {
-        let text = match frame.get("file_path") {
-            None => {
-                return Err(bad(format!("frame {k} has no key \"file_path\""), "name the image, without extension"));
-            }
-            Some(value) => value.as_str().filter(|text| !text.is_empty()),
-        };
-        let Some(text) = text else {
-            return Err(bad(format!("file_path of frame {k} is {}", frame["file_path"]), "name the image, without extension"));
-        };
-        let image = find_image(root, split, text).map_err(|tried| {
+    let Transforms { fov_x, frames } = Transforms::parse(&path, &bytes)?;
+    let listed = frames.into_iter().enumerate().map(|(k, (text, camera_to_world))| {
+        let image = find_image(root, split, &text).map_err(|tried| {
             let tried: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
-            bad(format!("the image \"{text}\" of frame {k} does not exist"), &format!("looked for {}", tried.join(" and ")))
+            let found = format!("the image \"{text}\" of frame {k} does not exist");
+            Error::input(&path, found, format!("looked for {}", tried.join(" and ")))
         })?;
         let name = image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        let Some(matrix) = frame.get("transform_matrix") else {
-            return Err(bad(format!("frame {k} has no key \"transform_matrix\""), "give the 4 x 4 camera-to-world matrix"));
+        Ok(Listed { name, image, fov_x, camera_to_world })
+    });
+    listed.collect()
+}
+
+impl Transforms {
+    /// Reads the bytes of a transforms file; `path` names it in messages.
+    ///
+    /// Errors: everything that is wrong with the JSON and the matrices, with the frame.
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
+        let bad = |found: String, remedy: &str| Error::input(path, found, remedy);
+        let json = json::parse(path, bytes)?;
+        let Some(angle) = json.get("camera_angle_x") else {
+            return Err(bad("there is no key \"camera_angle_x\"".into(), "give the horizontal field of view in radians"));
         };
-        let camera_to_world = pose(matrix).map_err(|(found, remedy)| bad(format!("transform_matrix of frame {k} {found}"), remedy))?;
-        listed.push(Listed { name, image, fov_x, camera_to_world });
+        let Some(fov_x) = angle.as_f64().filter(|angle| (LEAST_ANGLE..std::f64::consts::PI - LEAST_ANGLE).contains(angle)) else {
+            return Err(bad(format!("camera_angle_x is {}", shown(angle)), "it is a number of radians between 0 and pi"));
+        };
+        let Some(frames) = json.get("frames") else {
+            return Err(bad("there is no key \"frames\"".into(), "list the views, each with file_path and transform_matrix"));
+        };
+        let Some(frames) = frames.as_array() else {
+            return Err(bad("frames is not a list".into(), "list the views, each with file_path and transform_matrix"));
+        };
+        let frame = |(k, frame): (usize, &Value)| {
+            let Some(text) = frame.get("file_path") else {
+                return Err(bad(format!("frame {k} has no key \"file_path\""), "name the image, without extension"));
+            };
+            let Some(file_path) = text.as_str().filter(|text| (1..=LONGEST_PATH).contains(&text.len())) else {
+                return Err(bad(format!("file_path of frame {k} is {}", shown(text)), "name the image, without extension"));
+            };
+            let Some(matrix) = frame.get("transform_matrix") else {
+                return Err(bad(format!("frame {k} has no key \"transform_matrix\""), "give the 4 x 4 camera-to-world matrix"));
+            };
+            let pose = pose(matrix).map_err(|(found, remedy)| bad(format!("transform_matrix of frame {k} {found}"), remedy))?;
+            Ok((file_path.to_owned(), pose))
+        };
+        Ok(Transforms { fov_x, frames: frames.iter().enumerate().map(frame).collect::<Result<_>>()? })
     }
-    Ok(listed)
+}
+
+/// A value in a message: a file may have anything in its place.
+fn shown(value: &Value) -> String {
+    let text = value.to_string();
+    match text.char_indices().nth(60) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text,
+    }
 }
 
 /// The image a `file_path` means: relative to the scene as written, or by its last part in the split's folder; `.png` is
@@ -147,7 +178,7 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
         }
         for (j, value) in row.iter().enumerate() {
             let number = value.as_f64().filter(|number| number.is_finite());
-            m[i][j] = number.ok_or_else(|| (format!("has {value} in row {i}, column {j}"), "every entry is a finite number"))?;
+            m[i][j] = number.ok_or_else(|| (format!("has {} in row {i}, column {j}", shown(value)), "every entry is a finite number"))?;
         }
     }
     rigid(m)
@@ -169,7 +200,11 @@ pub(crate) fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, 
     if rotation.determinant() < 0.0 {
         return Err(("is a reflection: its determinant is -1".into(), "use OpenGL axes: x right, y up, z backwards"));
     }
-    Ok(DAffine3::from_mat4(matrix))
+    let pose = DAffine3::from_mat4(matrix);
+    if pose.translation.abs().max_element() > FARTHEST {
+        return Err((format!("puts the camera at {}", pose.translation), "coordinates of up to 1e12 are accepted"));
+    }
+    Ok(pose)
 }
 
 /// The size all images share.

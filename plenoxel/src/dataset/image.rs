@@ -9,7 +9,7 @@ use crate::files;
 use ::image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageError, ImageFormat, ImageReader, Limits};
 use ndarray::{Array2, Array3, ArrayView3};
 use std::fs::File;
-use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::io::{Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
 pub use ::image::RgbaImage;
@@ -18,29 +18,27 @@ pub use ::image::RgbaImage;
 pub const MAX_SIDE: u32 = 16384;
 
 const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
+/// Bytes up to the bit depth and the color type.
+const HEAD: usize = 26;
 /// The last chunk of every PNG: length 0, name, checksum.
 const END: [u8; 12] = *b"\0\0\0\0IEND\xae\x42\x60\x82";
 
-/// Width and height of the PNG file `path`, without decoding it: reads its first 24 bytes and its last 12.
+/// Deflate makes at most so many bytes of one: 258 of two bits.
+const MOST_INFLATION: u64 = 1032;
+/// Memory for what a file says beside its pixels: color profiles and the like.
+const MOST_BESIDE: u64 = 16 << 20;
+
+/// Width and height of the PNG file `path`, without decoding it: reads its first 26 bytes and its last 12.
 ///
 /// A file that does not end as a PNG ends is decoded at once, so that one cut short is reported when a dataset is opened and
-/// not hours later. Errors: missing, not a PNG, cut short, empty, or larger than [`MAX_SIDE`].
+/// not hours later. Errors: missing, not a PNG, cut short, empty, larger than [`MAX_SIDE`], or of more pixels than the file can hold.
 pub fn size(path: &Path) -> Result<(usize, usize)> {
+    let refused = |source| Error::io(path, source, "reading the image's header");
     let mut file = open(path)?;
-    let mut head = [0_u8; 24];
-    let length = read_up_to(&mut file, &mut head).map_err(|source| Error::io(path, source, "reading the image's header"))?;
-    if head[..length.min(8)] != SIGNATURE[..length.min(8)] || length == 0 {
-        return Err(not_png(path, &head[..length]));
-    }
-    if length < head.len() || &head[12..16] != b"IHDR" {
-        return Err(cut_short(path));
-    }
-    let number = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
-    let (width, height) = (number(16), number(20));
-    if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
-        let found = format!("the header says {width} x {height} pixels");
-        return Err(Error::input(path, found, format!("images of 1 to {MAX_SIDE} pixels a side are accepted")));
-    }
+    let length = file.metadata().map_err(refused)?.len();
+    let mut head = Vec::with_capacity(HEAD);
+    file.by_ref().take(HEAD as u64).read_to_end(&mut head).map_err(refused)?;
+    let (width, height) = size_in(path, &head, length)?;
     let mut tail = [0_u8; END.len()];
     let whole = file.seek(SeekFrom::End(-(END.len() as i64))).and_then(|_| file.read_exact(&mut tail)).is_ok() && tail == END;
     if !whole {
@@ -49,23 +47,52 @@ pub fn size(path: &Path) -> Result<(usize, usize)> {
     Ok((width as usize, height as usize))
 }
 
+/// Width and height by the first [`HEAD`] bytes of a file of so many.
+fn size_in(path: &Path, head: &[u8], length: u64) -> Result<(u32, u32)> {
+    if head.is_empty() || !SIGNATURE.starts_with(&head[..head.len().min(8)]) {
+        return Err(not_png(path, head));
+    }
+    if head.len() < HEAD || &head[12..16] != b"IHDR" {
+        return Err(cut_short(path));
+    }
+    let number = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+    let (width, height) = (number(16), number(20));
+    let refused = |remedy: String| Err(Error::input(path, format!("the header says {width} x {height} pixels"), remedy));
+    if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+        return refused(format!("images of 1 to {MAX_SIDE} pixels a side are accepted"));
+    }
+    // Gray and palettes, RGB, gray with alpha, RGBA.
+    let channels = [1, 0, 3, 1, 2, 0, 4].get(usize::from(head[25])).copied().unwrap_or(0);
+    let row = (u64::from(width) * channels * u64::from(head[24])).div_ceil(8);
+    if row * u64::from(height) > MOST_INFLATION * length {
+        return refused(format!("a file of {length} bytes cannot hold so many: copy or download it again"));
+    }
+    Ok((width, height))
+}
+
 /// Decodes the PNG file `path` (gray, RGB or palette, with or without alpha, of any bit depth) to 8-bit RGBA. 16-bit values are
 /// rounded; without alpha the picture is opaque.
 ///
-/// Errors: missing, not a PNG, cut short, damaged, or larger than [`MAX_SIDE`].
+/// Errors: missing, not a PNG, cut short, damaged, larger than [`MAX_SIDE`], or of more pixels than the file can hold.
 pub fn read(path: &Path) -> Result<RgbaImage> {
-    let mut reader = ImageReader::with_format(BufReader::new(open(path)?), ImageFormat::Png);
+    let mut bytes = Vec::new();
+    open(path)?.read_to_end(&mut bytes).map_err(|source| Error::io(path, source, "reading the image"))?;
+    decode(path, &bytes)
+}
+
+/// The same from the bytes of a file; `path` names it in messages.
+pub fn decode(path: &Path, bytes: &[u8]) -> Result<RgbaImage> {
+    let (width, height) = size_in(path, &bytes[..bytes.len().min(HEAD)], bytes.len() as u64)?;
+    let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Png);
     let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_SIDE);
-    limits.max_image_height = Some(MAX_SIDE);
-    // The largest picture within the limits: 16-bit RGBA.
-    limits.max_alloc = Some(8 * u64::from(MAX_SIDE) * u64::from(MAX_SIDE));
+    // The largest picture of this size: 16-bit RGBA.
+    limits.max_alloc = Some(8 * u64::from(width) * u64::from(height) + MOST_BESIDE);
     reader.limits(limits);
     reader.decode().map(DynamicImage::into_rgba8).map_err(|error| match error {
         ImageError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => cut_short(path),
-        ImageError::IoError(source) => Error::io(path, source, "decoding the image"),
         ImageError::Limits(_) => {
-            Error::input(path, "the header claims an enormous image", format!("images of 1 to {MAX_SIDE} pixels a side are accepted"))
+            let found = format!("what the file says beside its {width} x {height} pixels takes too much memory");
+            Error::input(path, found, "write it again as PNG, without metadata")
         }
         other => Error::input(path, format!("the image cannot be decoded ({other})"), "write it again as PNG"),
     })
@@ -80,7 +107,7 @@ pub fn check_downscale(k: usize, (width, height): (usize, usize)) -> Result<()> 
     if k > 0 && divides(k) {
         return Ok(());
     }
-    let divisors: Vec<String> = (1..=width.min(height)).filter(|&k| divides(k)).map(|k| k.to_string()).collect();
+    let divisors: Vec<String> = (1..=width.min(height).min(MAX_SIDE as usize)).filter(|&k| divides(k)).map(|k| k.to_string()).collect();
     let found = if k == 0 { "0".to_owned() } else { format!("{k}, which does not divide the {width} x {height} images,") };
     Err(Error::config("downscale", found, divisors.join(", ")))
 }
@@ -180,14 +207,6 @@ fn open(path: &Path) -> Result<File> {
     Ok(file)
 }
 
-/// Fills `buffer` as far as the file reaches and returns how far that is.
-fn read_up_to(file: &mut File, buffer: &mut [u8]) -> std::io::Result<usize> {
-    let mut bytes = Vec::with_capacity(buffer.len());
-    file.take(buffer.len() as u64).read_to_end(&mut bytes)?;
-    buffer[..bytes.len()].copy_from_slice(&bytes);
-    Ok(bytes.len())
-}
-
 fn not_png(path: &Path, head: &[u8]) -> Error {
     let found = match head {
         [] => "the file is empty",
@@ -207,6 +226,7 @@ fn cut_short(path: &Path) -> Error {
 mod tests {
     use super::*;
     use ::image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
+    use std::io::BufReader;
 
     fn temporary(name: &str) -> std::path::PathBuf {
         std::env::temp_dir().join(format!("plenoxel-image-{}-{name}", std::process::id()))
@@ -305,6 +325,13 @@ mod tests {
         let error = size(&path).unwrap_err();
         assert!(error.to_string().contains("60000 x 60000"), "{error}");
         assert_eq!((error.exit_code(), read(&path).unwrap_err().exit_code()), (3, 3));
+        // Of an acceptable size, but the file is too short for it.
+        let mut bytes = std::fs::read(&path).unwrap();
+        bytes[16..24].copy_from_slice(&[0, 0, 0x40, 0, 0, 0, 0x40, 0]);
+        std::fs::write(&path, bytes).unwrap();
+        for error in [size(&path).unwrap_err(), read(&path).unwrap_err()] {
+            assert!(error.exit_code() == 3 && error.to_string().contains("16384 x 16384 pixels; a file of"), "{error}");
+        }
         std::fs::remove_file(path).unwrap();
     }
 

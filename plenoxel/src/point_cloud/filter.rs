@@ -83,7 +83,7 @@ pub struct Kept {
 
 impl Filters {
     /// Numbers of the points that stay, ascending, and what each filter did. `values` are those that [`Filters::value`] looks at, one for
-    /// each point. Points whose coordinates are no numbers go first of all.
+    /// each point. Points whose coordinates are no numbers, or none of 32 bits, go first of all.
     ///
     /// Errors: a value filter without values; as many neighbours asked for as there are points.
     pub fn apply(&self, positions: &[DVec3], values: Option<&[f32]>) -> Result<(Vec<u32>, Vec<Kept>)> {
@@ -97,8 +97,9 @@ impl Filters {
             Ok(())
         };
         let position = |i: &u32| positions[*i as usize];
-        if positions.iter().any(|p| !p.is_finite()) {
-            filter("finite", &mut left, &|left| Ok(left.iter().map(|i| position(i).is_finite()).collect()))?;
+        let finite = |p: DVec3| p.abs().cmple(DVec3::splat(LARGEST)).all();
+        if !positions.iter().all(|p| finite(*p)) {
+            filter("finite", &mut left, &|left| Ok(left.iter().map(|i| finite(position(i))).collect()))?;
         }
         if let Some(within) = self.within {
             filter("bbox", &mut left, &|left| Ok(left.iter().map(|i| within.contains(position(i))).collect()))?;
@@ -117,6 +118,9 @@ impl Filters {
         Ok((left, report))
     }
 }
+
+/// Coordinates beyond this may have differences that 32 bits do not hold: then a point would not be near itself.
+const LARGEST: f64 = 0.25 * f32::MAX as f64;
 
 /// The coordinates in 32 bits. As CloudCompare does it, large ones are shifted, which changes no distance but keeps its digits.
 fn local(positions: &[DVec3], chosen: &[u32]) -> Vec<[f32; 3]> {

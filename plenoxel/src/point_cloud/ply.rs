@@ -48,7 +48,8 @@ impl PlyFile {
         Self::parse(path, bytes)
     }
 
-    fn parse(path: &Path, bytes: Vec<u8>) -> Result<Self> {
+    /// The same from the bytes of a file; `path` names it in messages.
+    pub fn parse(path: &Path, bytes: Vec<u8>) -> Result<Self> {
         let header = Header::parse(path, &bytes)?;
         let lower = |element: &Element| element.name.to_lowercase();
         let exact = header.elements.iter().position(|element| lower(element) == "vertex");

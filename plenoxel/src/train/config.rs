@@ -13,6 +13,9 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+/// The most stages of a run.
+const MOST_STAGES: usize = 100;
+
 /// A run, completely: the same config and the same data give the same bits.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -372,7 +375,8 @@ impl Config {
             format!("{:?}", self.background),
             "three numbers in [0, 1]",
         )?;
-        check((1e-9..=1e12).contains(&self.half_width), "half_width", self.half_width, "a number above 0, 1e-9 to 1e12")?;
+        let half_widths = "a number above 0, from 1e-9 to 1e9";
+        check(GridShape::HALF_WIDTHS.contains(&self.half_width), "half_width", self.half_width, half_widths)?;
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check((1..=64).contains(&self.sh_reduction), "sh_reduction", self.sh_reduction, "1 to 64")?;
         color("sh_offset", self.sh_offset)?;
@@ -425,6 +429,8 @@ impl Config {
             check((0.0..=1.0).contains(&least), "scout.prune_unseen_below", least, "a number in [0, 1]")?;
             check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one, or no scout")?;
         }
+        let longest = self.stages.len().max(self.scout.as_ref().map_or(0, |scout| scout.stages.len()));
+        check(longest <= MOST_STAGES, "stages", longest, "at most 100")?;
         let stages = self.stages.iter().enumerate().map(|(i, stage)| (format!("stages[{i}]"), stage));
         let of_scout = self.scout.iter().flat_map(|scout| scout.stages.iter().enumerate());
         for (place, stage) in stages.chain(of_scout.map(|(i, stage)| (format!("scout.stages[{i}]"), stage))) {

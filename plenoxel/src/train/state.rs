@@ -13,11 +13,12 @@ use crate::field::Field;
 use crate::field::voxel_grid::{GridShape, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
-use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, dtype_of};
+use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, dtype_of, open};
 use crate::train::config::Config;
 use autograd::{Buffer, Lattice, Param, Real, Tensor, parallel};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use std::io::{Read, Seek};
 use std::path::Path;
 
 /// Version of the format.
@@ -91,9 +92,14 @@ impl<T: Real> Trainer<'_, T> {
     /// Errors name the file and what is wrong with it: cut short, another program's, a later version's; of other settings or views.
     ///
     /// Panics if steps have been taken.
-    pub fn resumed(mut self, path: &Path) -> Result<Self> {
+    pub fn resumed(self, path: &Path) -> Result<Self> {
+        self.resumed_from(path, open(path)?)
+    }
+
+    /// The same from any source, a file or bytes; `path` names it in messages.
+    pub fn resumed_from(mut self, path: &Path, source: impl Read + Seek) -> Result<Self> {
         assert_eq!(self.step, 0, "a run starts once");
-        let mut file = TensorFile::open(path)?;
+        let mut file = TensorFile::new(path, source)?;
         let state = read(path, &file)?;
         let other = |what: &str| {
             let found = format!("the state of a run with other {what}");
@@ -121,7 +127,7 @@ impl<T: Real> Trainer<'_, T> {
         let current: PlannedStage = *current.ok_or_else(|| damaged("a step that the plan does not have"))?;
         let shape = state.grid.shape();
         let configured = GridShape { half_width: shape.half_width, ..self.config.grid_shape(current.stage.resolution) };
-        if shape != configured || !(shape.half_width > 0.0 && shape.half_width.is_finite()) {
+        if shape != configured || !GridShape::HALF_WIDTHS.contains(&shape.half_width) {
             return Err(damaged("a grid that is not of its stage"));
         }
 
@@ -148,6 +154,9 @@ impl<T: Real> Trainer<'_, T> {
         self.optimizer = optimizer(&self.config, &current);
         for (param, (shape, updates)) in self.grid.params().zip(shapes.iter().zip(&state.updates)) {
             let Some(updates) = *updates else { continue };
+            if updates > state.grid.step {
+                return Err(damaged("more updates than steps"));
+            }
             let mut arrays: Vec<Buffer<T>> = Vec::new();
             while file.info(&of_optimizer(param, arrays.len())).is_some() {
                 arrays.push(file.numbers(&of_optimizer(param, arrays.len()), dtype, shape)?.into());
@@ -157,7 +166,10 @@ impl<T: Real> Trainer<'_, T> {
             }
         }
         if let Some(Cells { min, max, cells }) = state.learning {
-            let masks = match cells.iter().all(|n| (1..=shape.resolution + 1).contains(n)) && (0..3).all(|a| min[a] < max[a]) {
+            // The grid's cube, or up to a voxel more on each side.
+            let sides = shape.half_width..=2.0 * shape.half_width;
+            let around = (0..3).all(|a| sides.contains(&-min[a]) && sides.contains(&max[a]));
+            let masks = match cells.iter().all(|n| (1..=shape.resolution + 1).contains(n)) && around {
                 true => self::masks(&mut file, "learning", cells)?,
                 false => None,
             };
@@ -174,7 +186,7 @@ impl<T: Real> Trainer<'_, T> {
 }
 
 /// What a file says, after its version.
-fn read(path: &Path, file: &TensorFile) -> Result<State> {
+fn read<R: Read + Seek>(path: &Path, file: &TensorFile<R>) -> Result<State> {
     let value = file.header()?;
     let format = value["format"].as_str().unwrap_or("none");
     if format != FORMAT {
@@ -186,7 +198,7 @@ fn read(path: &Path, file: &TensorFile) -> Result<State> {
 }
 
 /// Masks of bricks of so many cells; `None` if one has a cell outside of these.
-fn masks(file: &mut TensorFile, name: &str, cells: [usize; 3]) -> Result<Option<Vec<u64>>> {
+fn masks<R: Read + Seek>(file: &mut TensorFile<R>, name: &str, cells: [usize; 3]) -> Result<Option<Vec<u64>>> {
     let whole = Lattice::bricks(cells);
     let bytes = file.read(name, Dtype::U64, &[whole.masks().len()])?;
     let masks: Vec<u64> = bytes.as_chunks::<8>().0.iter().map(|b| u64::from_le_bytes(*b)).collect();

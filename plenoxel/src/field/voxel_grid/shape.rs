@@ -6,6 +6,7 @@ use crate::sampling::Occupancy;
 use autograd::{Indices, Lattice, Real, Tensor};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
 
 /// How values between voxel centres are found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -90,6 +91,9 @@ pub struct GridShape {
 }
 
 impl GridShape {
+    /// Half widths whose voxels can be computed with in 32 bits, whatever the resolution.
+    pub const HALF_WIDTHS: RangeInclusive<f64> = 1e-9..=1e9;
+
     /// The same shape with a reduction that means something.
     pub fn normalised(self) -> Self {
         GridShape { sh_reduction: if self.is_reduced() { self.sh_reduction } else { 1 }, ..self }

@@ -223,3 +223,13 @@ fn settings_that_fit_no_point_are_refused() {
     let noise = Noise { radius: 1.0, error: NoiseError::Relative(1.0), remove_isolated: true };
     assert_eq!(Filters { noise: Some(noise), ..Filters::default() }.apply(&[], None).unwrap().0, [0; 0]);
 }
+
+#[test]
+fn points_that_32_bits_do_not_hold_go_and_do_no_harm() {
+    // Noise once counted the neighbours of such a point, without itself, and there were -1.
+    let mut points = scattered(50, 3);
+    points.extend([DVec3::new(1e39, 0.0, 0.0), DVec3::new(0.0, -1e308, 0.0), DVec3::new(3e38, 0.0, -3e38), DVec3::splat(f64::INFINITY)]);
+    let noise = Noise { radius: 0.75, error: NoiseError::Relative(1.0), remove_isolated: false };
+    let filters = Filters { noise: Some(noise), outliers: Some(Outliers { neighbours: 6, sigma: 1.0 }), ..Filters::default() };
+    assert_eq!(kept(&points, &filters), kept(&points[..50], &filters));
+}

@@ -1,0 +1,40 @@
+//! What reads files and command lines, each by itself, for property tests and fuzzing: no promise to anybody else.
+
+use crate::Cli;
+use crate::config::{self, ConfigFile, Layers};
+pub use crate::data::DataSource;
+use crate::metrics_file::Past;
+pub use crate::run_folder::RunRecord;
+use clap::Parser;
+use plenoxel::error::Result;
+use plenoxel::train::config::Config;
+use std::path::Path;
+
+/// A file that changes a preset.
+pub fn layer(path: &Path, bytes: &[u8]) -> Result<Config> {
+    let mut layers = Layers::defaults()?.with_preset("standard")?;
+    layers.file(&ConfigFile::parse(path, bytes.to_vec())?)?;
+    layers.resolve()
+}
+
+/// The `config.toml` of a run.
+pub fn config(path: &Path, bytes: &[u8]) -> Result<Config> {
+    config::alone(&ConfigFile::parse(path, bytes.to_vec())?)
+}
+
+/// Assignments as `--set` takes them, over a preset.
+pub fn assignments<'a>(assignments: impl IntoIterator<Item = &'a str>) -> Result<Config> {
+    let mut layers = Layers::defaults()?.with_preset("standard")?;
+    assignments.into_iter().try_for_each(|assignment| layers.assign(assignment))?;
+    layers.resolve()
+}
+
+/// A command line, the program's name first; it is not carried out.
+pub fn arguments(arguments: &[&str]) -> std::result::Result<(), String> {
+    Cli::try_parse_from(arguments).map(drop).map_err(|e| e.to_string())
+}
+
+/// The losses of a run's first steps by its `metrics.jsonl`.
+pub fn losses(bytes: &[u8], taken: u64) -> Vec<f64> {
+    Past::of(&String::from_utf8_lossy(bytes), taken).1.losses
+}
