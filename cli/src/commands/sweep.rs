@@ -23,11 +23,12 @@ use std::path::{Path, PathBuf};
 const EXAMPLES: &str = "\
 Examples:
   plenoxel sweep --scene data/lego --scene procedural --preset fast --preset paper --out sweeps/first
-  plenoxel sweep nerf.toml                   into sweeps/nerf; the same again goes on after Ctrl-C, or tries again what failed
+  plenoxel sweep nerf.toml                   into sweeps/nerf; the same again goes on with the rest
   plenoxel sweep nerf.toml --dry-run
 
-A file of scenes and methods, every scene with every method. Keys are flags of train (or carve), `downscale = 4` for --downscale 4;
-those of a method count more than those of a scene. Paths are relative to the file:
+A file of scenes and methods, every scene with every method. Keys are flags of train (or carve):
+downscale = 4 for --downscale 4. Those of a method count more than those of a scene. Paths are
+relative to the file:
 
   [[scenes]]
   data = \"../data/lego\"                      # its name is lego, unless name = \"...\" says another
@@ -55,8 +56,9 @@ those of a method count more than those of a scene. Paths are relative to the fi
   source = \"Fridovich-Keil et al. 2022, at 800 x 800\"
   psnr = { lego = 34.10 }                    # ssim and seconds likewise
 
-Runs are in OUT/SCENE/METHOD, what they said beside them in METHOD.log. The table is table.md, table.csv with all figures, table.html
-with pictures; Markdown goes to stdout too. The exit code is that of the first run that failed, or 0.";
+Runs are in OUT/SCENE/METHOD, what they said beside them in METHOD.log. The table is table.md (on
+stdout too), table.csv with all figures, and table.html with pictures. After Ctrl-C the same command
+goes on; what failed it tries again. The exit code is that of the first run that failed, or 0.";
 
 /// Run a list of scenes with a list of methods, whatever of it is not finished, and print the table scene x method
 #[derive(Debug, Args)]

@@ -5,7 +5,8 @@ use super::{Cell, Row, RunTable, Scores, beside, decibels};
 use crate::html::{escaped, page, picture};
 
 const STYLE: &str = "\
-td img, th img { width: 200px; margin-bottom: .4rem; image-rendering: auto; }
+td { vertical-align: bottom; }
+td img, th img { width: 200px; margin-bottom: .4rem; }
 .psnr { font-size: 1.5rem; line-height: 1.2; font-variant-numeric: tabular-nums; }
 .best { font-weight: 700; color: light-dark(#06603a, #7fdca9); }
 .published, .published .psnr { font-style: italic; }

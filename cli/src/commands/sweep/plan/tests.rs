@@ -120,3 +120,12 @@ fn flags_alone_make_the_same_plan() {
     let twice = Plan::from_flags(&strings(&["a/lego", "b/lego"]), &strings(&["fast"]), &[], Path::new("o")).unwrap_err();
     assert!(twice.to_string().starts_with("--scene: `lego`, which comes twice"), "{twice}");
 }
+
+#[test]
+fn the_example_of_the_help_is_a_plan() {
+    let example = super::super::EXAMPLES.lines().skip_while(|line| *line != "relative to the file:").skip(1);
+    let text: Vec<&str> = example.take_while(|line| !line.starts_with("Runs are")).collect();
+    let plan = read("example", &text.join("\n")).unwrap();
+    assert_eq!(plan.methods, ["fast", "paper-tv", "hull"]);
+    assert_eq!(plan.jobs.len(), 4);
+}
