@@ -138,7 +138,7 @@ fn cameras_of_other_programs_are_recognised_and_damaged_ones_refused() {
 
     // A test view of the dataset along the dataset's own file: the same picture.
     plenoxel(&["render", &run, "--view", "1", "--quiet"]).done();
-    rendered(&format!("{data}/transforms_test.json"), &[], &["cameras of a transforms.json of 2 frames", "2 frames of 24 x 16"]);
+    rendered(&format!("{data}/transforms_test.json"), &[], &["cameras of a transforms.json of 2 frames", "frames: 2 of 24 x 16"]);
     let [view, shot] =
         ["test_001_r_1.png", "transforms_test/frame_0001.png"].map(|name| fs::read(format!("{run}/renders/{name}")).unwrap());
     assert!(view == shot, "the camera of a view is the camera of its frame");
@@ -151,7 +151,7 @@ fn cameras_of_other_programs_are_recognised_and_damaged_ones_refused() {
     let rows: Vec<f64> = (0..16).map(|k| number(k / 4, k % 4)).collect();
     let camera = json!({"camera_to_world": rows, "fov": fov, "aspect": 1.5});
     let path = write("studio.json", &json!({"render_width": 24, "render_height": 16, "fps": 12, "camera_path": [camera]}));
-    rendered(&path, &[], &["a nerfstudio camera path of 1 frame", "1 frames of 24 x 16"]);
+    rendered(&path, &[], &["a nerfstudio camera path of 1 frame", "frames: 1 of 24 x 16"]);
     let studio = fs::read(format!("{run}/renders/studio/frame_0000.png")).unwrap();
     assert!(studio == view, "nerfstudio");
     // Rows y, z, x of the matrix, its second and third column negated, and 0.33 p + 0.5.
@@ -161,11 +161,11 @@ fn cameras_of_other_programs_are_recognised_and_damaged_ones_refused() {
     let position = [1, 2, 0].map(|row| 0.33 * number(row, 3) + 0.5);
     let key = json!({"R": rotation.to_array(), "T": position, "slice": 0, "scale": 1, "fov": fov, "aperture_size": 0, "timestamp": 0});
     let path = write("base_cam.json", &json!({"loop": false, "path": [key, key], "time": 0}));
-    rendered(&path, &["--frames", "2"], &["an instant-ngp camera path of 2 keyframes", "2 frames"]);
+    rendered(&path, &["--frames", "2"], &["an instant-ngp camera path of 2 keyframes", "frames: 2"]);
     let ngp = image::read(Path::new(&format!("{run}/renders/base_cam/frame_0001.png"))).unwrap();
     let target = image::read(Path::new(&format!("{run}/renders/test_001_r_1.png"))).unwrap();
     assert!(ngp.as_raw().iter().zip(target.as_raw()).all(|(a, b)| a.abs_diff(*b) <= 1), "instant-ngp");
-    rendered(&path, &["--frames", "1", "--size", "10"], &["1 frames of 10 x 10"]);
+    rendered(&path, &["--frames", "1", "--size", "10"], &["frames: 1 of 10 x 10"]);
     assert_eq!(frame("base_cam/frame_0000.png"), (10, 10));
 
     let refused = |path: &str, code: u8, parts: &[&str]| plenoxel(&["render", &run, "--path", path]).refused(code, parts);

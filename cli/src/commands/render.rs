@@ -5,12 +5,12 @@ mod float_files;
 mod movie;
 mod path;
 
-use super::trained_run::{Loaded, TrainedRun};
+use super::trained_run::{Found, Loaded, TrainedRun};
 use crate::memory::Estimate;
 use crate::progress::Console;
 use channels::{Channel, FileFormat, Pictures};
 use clap::Args;
-use path::{Film, PathArgs};
+use path::{Film, PathArgs, PathChoice};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
@@ -77,7 +77,7 @@ fn views(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
     console.result(&format!("rendered {views} {split} {what} to {}", renders.display()))
 }
 
-fn film(args: &RenderArgs, path: &path::PathChoice, console: &Console<'_>) -> Result<()> {
+fn film(args: &RenderArgs, path: &PathChoice, console: &Console<'_>) -> Result<()> {
     let found = args.run.find()?;
     let Film { name, cameras, fps } = args.path.film(path, &args.run, &found, console)?;
     let folder = found.folder.create_film(&name, &Channel::ALL.map(Channel::suffix))?;
@@ -96,13 +96,7 @@ fn film(args: &RenderArgs, path: &path::PathChoice, console: &Console<'_>) -> Re
 }
 
 /// Renders what each camera sees to files whose names begin with a path, and says how many there were.
-fn render(
-    args: &RenderArgs,
-    found: &super::trained_run::Found,
-    console: &Console<'_>,
-    shots: Vec<(Camera, PathBuf)>,
-    default: &[Channel],
-) -> Result<usize> {
+fn render(args: &RenderArgs, found: &Found, console: &Console<'_>, shots: Vec<(Camera, PathBuf)>, default: &[Channel]) -> Result<usize> {
     let channels = channels(args, default);
     let normals = channels.contains(&Channel::Normal);
     let pixels = shots.iter().map(|(camera, _)| camera.intrinsics.width * camera.intrinsics.height).max().unwrap_or(0);

@@ -84,7 +84,7 @@ impl PathArgs {
             (None, PathChoice::Spiral) => ("spiral".to_owned(), table()?.spiral(self.frames.unwrap_or(FRAMES))),
             (None, _) => ("orbit".to_owned(), table()?.orbit(self.frames.unwrap_or(FRAMES))),
         };
-        console.note(&format!("path: {} frames of {} x {}", shots.len(), size.0, size.1));
+        console.note(&format!("frames: {} of {} x {}", shots.len(), size.0, size.1));
         let fps = self.fps.or(file.as_ref().and_then(|(_, path)| path.fps)).unwrap_or(FPS);
         Ok(Film { name, cameras: shots.iter().map(|shot| shot.camera(size)).collect(), fps })
     }
