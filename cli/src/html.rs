@@ -4,6 +4,9 @@
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
+use image::DynamicImage;
+use image::codecs::jpeg::JpegEncoder;
+use plenoxel::dataset::image::RgbaImage;
 
 /// Looks of all pages; they follow the reader's choice of light or dark.
 const STYLE: &str = "\
@@ -33,9 +36,24 @@ pub fn escaped(text: &str) -> String {
     safe
 }
 
-/// A picture within the page, from the bytes of a PNG file.
-pub fn picture(png: &[u8], description: &str) -> String {
-    format!("<img src=\"data:image/png;base64,{}\" alt=\"{}\">", STANDARD.encode(png), escaped(description))
+/// JPEG quality of pictures within a page; the files beside it are whole.
+const QUALITY: u8 = 88;
+
+/// A picture within the page, reduced to at most so many pixels a side. A fully transparent one is black: the caller's have no alpha.
+pub fn picture(picture: &RgbaImage, [width, height]: [u32; 2], description: &str) -> String {
+    let large = picture.width() > width || picture.height() > height;
+    let reduced = large.then(|| DynamicImage::from(picture.clone()).thumbnail(width, height).to_rgb8());
+    let rgb = reduced.unwrap_or_else(|| DynamicImage::from(picture.clone()).to_rgb8());
+    let (width, height, description) = (rgb.width(), rgb.height(), escaped(description));
+    let mut jpeg = Vec::new();
+    // Only pictures of more than 65535 pixels a side are refused.
+    match JpegEncoder::new_with_quality(&mut jpeg, QUALITY).encode_image(&rgb) {
+        Ok(()) => format!(
+            "<img width=\"{width}\" height=\"{height}\" alt=\"{description}\" src=\"data:image/jpeg;base64,{}\">",
+            STANDARD.encode(jpeg)
+        ),
+        Err(e) => format!("<p>{description}: {}</p>", escaped(&e.to_string())),
+    }
 }
 
 /// A whole page: a title as text, styles of its own, and the HTML below its heading.
@@ -56,6 +74,7 @@ mod tests {
         assert_eq!(escaped("a<b> & \"c\" 'd'"), "a&lt;b&gt; &amp; &quot;c&quot; &#39;d&#39;");
         let page = page("<script>", "", "<p>text</p>\n");
         assert!(!page.contains("<script>") && page.contains("<p>text</p>"), "{page}");
-        assert_eq!(picture(b"abc", "\"x"), "<img src=\"data:image/png;base64,YWJj\" alt=\"&quot;x\">");
+        let picture = picture(&RgbaImage::new(40, 20), [10, 10], "\"x");
+        assert!(picture.starts_with("<img width=\"10\" height=\"5\" alt=\"&quot;x\" src=\"data:image/jpeg;base64,/9j/"), "{picture}");
     }
 }

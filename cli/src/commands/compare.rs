@@ -14,7 +14,7 @@ use plenoxel::error::Result;
 use plenoxel::files;
 use plenoxel::train::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -49,7 +49,7 @@ struct Run {
 }
 
 impl Run {
-    fn read(path: &PathBuf) -> Result<Self> {
+    fn read(path: &Path) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
         let figures = Measured::read(path)?.map(|run| run.figures).unwrap_or_default();
         let metrics = metrics_file::read(&folder.metrics())?;
@@ -77,7 +77,7 @@ impl Run {
 
 /// Compares runs.
 pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
-    let runs: Vec<Run> = args.runs.iter().map(Run::read).collect::<Result<_>>()?;
+    let runs: Vec<Run> = args.runs.iter().map(|path| Run::read(path)).collect::<Result<_>>()?;
     let facts: Vec<_> = runs.iter().map(Run::facts).collect();
     let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();
     let cells: Vec<Vec<&str>> = facts.iter().map(|facts| facts.iter().map(|(_, value)| value.as_str()).collect()).collect();

@@ -33,8 +33,8 @@ pub fn section(lines: &[Line<'_>], stages: &[Stage]) -> String {
 
 /// The curves of several runs in the same charts, or nothing if none of them was trained.
 pub fn side_by_side(runs: &[(String, Vec<Line<'_>>)]) -> String {
-    type Shown = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
-    const SHOWN: [Shown; 4] = [
+    type OfEach = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
+    const SHOWN: [OfEach; 4] = [
         ("Loss", "loss", |line| Some(line.loss)),
         ("PSNR of training rays", "dB", |line| Some(line.psnr)),
         ("PSNR of validation views", "dB", |line| line.validation_psnr),
@@ -75,8 +75,10 @@ fn over_both(charts: impl Fn(Axis) -> Vec<Chart>) -> String {
 /// A number of a line, where it has it.
 type Value<'a> = Box<dyn Fn(&Line<'_>) -> Option<f64> + 'a>;
 
-/// Title, axis and curves of each chart.
-fn charts(lines: &[Line<'_>]) -> Vec<(&'static str, &'static str, Vec<(String, Value<'static>)>)> {
+/// Title, vertical axis and curves of a chart.
+type Shown = (&'static str, &'static str, Vec<(String, Value<'static>)>);
+
+fn charts(lines: &[Line<'_>]) -> Vec<Shown> {
     let whole: Vec<(String, Value<'static>)> = vec![("loss".to_owned(), Box::new(|line| Some(line.loss)))];
     let names: BTreeSet<String> = lines.iter().flat_map(|line| line.losses.keys().map(|name| name.to_string())).collect();
     let each = names.into_iter().map(|name| {

@@ -1,21 +1,15 @@
 //! The pictures of a run in its report: stages, and test views with their figures.
 
-use crate::html::escaped;
+use crate::html::{escaped, picture};
 use crate::run_folder::RunFolder;
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
-use image::codecs::jpeg::JpegEncoder;
-use image::imageops::{FilterType, resize};
-use image::{ExtendedColorType, ImageEncoder};
-use plenoxel::dataset::image::{self as files, RgbaImage};
-use plenoxel::error::{Error, Result};
+use plenoxel::dataset::image as files;
+use plenoxel::error::Result;
 use serde_json::Value;
 use std::fmt::Write;
 use std::path::Path;
 
-/// Pictures are made at most this high, and as JPEG of this quality: the files beside the report are whole.
-const MOST_HEIGHT: u32 = 400;
-const QUALITY: u8 = 88;
+/// Pictures are at most so wide and so high, in pixels: the files beside the report are whole.
+pub const LARGEST: [u32; 2] = [4000, 400];
 
 /// The stages of the run side by side, or what was carved.
 pub fn stages(folder: &RunFolder) -> Result<String> {
@@ -40,10 +34,10 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
         let ssim = view["ssim"].as_f64().map_or("–".to_owned(), |ssim| format!("{ssim:.4}"));
         let name_shown = escaped(name);
         let _ = write!(rows, "<tr><td>{number}</td><td>{name_shown}</td><td>{psnr:.2}</td><td>{ssim}</td></tr>");
-        let picture = folder.image(&RunFolder::panel_name(number, name));
-        if picture.exists() {
+        let path = folder.image(&RunFolder::panel_name(number, name));
+        if path.exists() {
             let caption = format!("{name_shown}: {psnr:.2} dB, SSIM {ssim}");
-            let picture = embedded(&picture, &caption)?;
+            let picture = embedded(&path, &caption)?;
             let _ = writeln!(figures, "<figure data-psnr=\"{psnr}\">{picture}<figcaption>{caption}</figcaption></figure>");
         }
     }
@@ -65,21 +59,5 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
 
 /// A picture of a file as part of the page.
 fn embedded(path: &Path, what: &str) -> Result<String> {
-    embed(files::read(path)?, path, what)
-}
-
-/// A picture as part of the page; `path` is where it came from, for messages.
-pub fn embed(mut picture: RgbaImage, path: &Path, what: &str) -> Result<String> {
-    let (width, height) = picture.dimensions();
-    if height > MOST_HEIGHT {
-        picture = resize(&picture, (width * MOST_HEIGHT / height).max(1), MOST_HEIGHT, FilterType::Triangle);
-    }
-    let (width, height) = picture.dimensions();
-    let rgb: Vec<u8> = picture.pixels().flat_map(|pixel| [pixel.0[0], pixel.0[1], pixel.0[2]]).collect();
-    let mut jpeg = Vec::new();
-    let encoder = JpegEncoder::new_with_quality(&mut jpeg, QUALITY);
-    let written = encoder.write_image(&rgb, width, height, ExtendedColorType::Rgb8);
-    written.map_err(|e| Error::input(path, format!("it cannot become part of the report: {e}"), "a smaller picture"))?;
-    let data = STANDARD.encode(jpeg);
-    Ok(format!("<img width=\"{width}\" height=\"{height}\" alt=\"{}\" src=\"data:image/jpeg;base64,{data}\">", escaped(what)))
+    Ok(picture(&files::read(path)?, LARGEST, what))
 }

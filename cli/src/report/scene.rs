@@ -50,7 +50,7 @@ impl Scene {
         let split = if report.dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
         let (cameras, names) = (report.dataset.cameras(split), report.dataset.view_names(split));
         let chosen = evenly_spaced(cameras.len(), VIEWS);
-        let views: Vec<Value> = chosen.into_iter().map(|i| view(&names[i], &cameras[i])).collect();
+        let views: Vec<Value> = chosen.into_iter().map(|i| view(names[i], &cameras[i])).collect();
         let size = cameras.first().map_or([1, 1], |camera| [camera.intrinsics.width, camera.intrinsics.height]);
         let settings = json!({
             "grid": small.header(),

@@ -1,12 +1,12 @@
 //! What each of several runs made of the same test views.
 
 use super::Run;
-use crate::html::escaped;
+use crate::html::{escaped, picture};
 use crate::images::{begins_at, evenly_spaced};
-use crate::report::pictures::embed;
+use crate::report::pictures::LARGEST;
 use crate::run_folder::RunFolder;
 use image::imageops::crop_imm;
-use plenoxel::dataset::image::{self as files, RgbaImage};
+use plenoxel::dataset::image as files;
 use plenoxel::error::{Error, Result};
 use std::path::Path;
 
@@ -63,8 +63,8 @@ fn part(run: &Run, panel: &str, parts: &[usize]) -> Result<String> {
         if begin.saturating_add(width) > whole.width() as usize || height != whole.height() as usize {
             return Err(unlike(&path));
         }
-        let cut: RgbaImage = crop_imm(&whole, begin as u32, 0, width as u32, height as u32).to_image();
-        all += &embed(cut, &path, &format!("{} of {}", ["photograph", "render", "error"][part], run.name))?;
+        let cut = crop_imm(&whole, begin as u32, 0, width as u32, height as u32).to_image();
+        all += &picture(&cut, LARGEST, &format!("{} of {}", ["photograph", "render", "error"][part], run.name));
     }
     Ok(all)
 }

@@ -4,6 +4,9 @@ use super::thumbnail::{self, Thumbnails};
 use super::{Cell, Row, RunTable, Scores, beside, decibels};
 use crate::html::{escaped, page, picture};
 
+/// Pixels of a picture.
+const LARGEST: [u32; 2] = [200, 200];
+
 const STYLE: &str = "\
 td { vertical-align: bottom; }
 td img, th img { width: 200px; margin-bottom: .4rem; }
@@ -24,13 +27,13 @@ pub fn text(table: &RunTable) -> String {
     body += "</tr>\n";
     for row in &table.rows {
         let pictures: Vec<Thumbnails> = row.cells.iter().map(|cell| cell.measured().map(thumbnail::of).unwrap_or_default()).collect();
-        let target = pictures.iter().find_map(|pictures| pictures.target.as_deref());
-        let target = target.map_or(String::new(), |png| picture(png, &format!("photograph of {}", row.scene)));
+        let target = pictures.iter().find_map(|pictures| pictures.target.as_ref());
+        let target = target.map_or(String::new(), |of| picture(of, LARGEST, &format!("photograph of {}", row.scene)));
         body += &format!("<tr><th>{target}{}</th>", escaped(&row.scene));
         let best = highest(row.cells.iter().map(Cell::scores)).filter(|_| row.is_comparable());
         for ((method, cell), pictures) in table.methods.iter().zip(&row.cells).zip(&pictures) {
-            let render = pictures.render.as_deref();
-            let render = render.map_or(String::new(), |png| picture(png, &format!("{} by {method}", row.scene)));
+            let render = pictures.render.as_ref();
+            let render = render.map_or(String::new(), |of| picture(of, LARGEST, &format!("{} by {method}", row.scene)));
             body += &match cell {
                 Cell::Failed(failure) => format!(
                     "<td class=\"failed\">failed with exit code {}<div class=\"small\">{}</div></td>",

@@ -1,22 +1,18 @@
-//! What a run looks like: the first test view, small, from the pictures in its folder.
+//! What a run looks like: the first test view, from the pictures in its folder.
 
 use super::figures::{Figures, Measured};
 use crate::images::begins_at;
-use image::{DynamicImage, ImageFormat, imageops};
-use plenoxel::dataset::image as files;
-use std::io::Cursor;
-
-/// Pixels of the longer side.
-const MOST: u32 = 200;
+use image::imageops;
+use plenoxel::dataset::image::{self as files, RgbaImage};
 
 /// The photograph and what was learned of it.
 #[derive(Default)]
 pub struct Thumbnails {
-    pub target: Option<Vec<u8>>,
-    pub render: Option<Vec<u8>>,
+    pub target: Option<RgbaImage>,
+    pub render: Option<RgbaImage>,
 }
 
-/// The pictures of a run as PNG files; what is not there or cannot be read is left out.
+/// The pictures of a run; what is not there or cannot be read is left out.
 pub fn of(run: &Measured) -> Thumbnails {
     let images = run.folder.images();
     let named = |test: &dyn Fn(&str) -> bool| images.iter().find(|path| path.file_name().is_some_and(|name| test(&name.to_string_lossy())));
@@ -27,17 +23,12 @@ pub fn of(run: &Measured) -> Thumbnails {
     if width.max(height) > files::MAX_SIDE as usize {
         return Thumbnails::default();
     }
-    let cut = |strip: &files::RgbaImage, number: usize| -> Option<Vec<u8>> {
+    let cut = |strip: &RgbaImage, number: usize| {
         let (x, width, height) = (begins_at(number, (width, height)) as u32, width as u32, height as u32);
         if x + width > strip.width() || height != strip.height() {
             return None;
         }
-        let part = imageops::crop_imm(strip, x, 0, width, height).to_image();
-        let small = DynamicImage::from(part);
-        let small = if width.max(height) > MOST { small.thumbnail(MOST, MOST) } else { small };
-        let mut png = Cursor::new(Vec::new());
-        small.to_rgb8().write_to(&mut png, ImageFormat::Png).ok()?;
-        Some(png.into_inner())
+        Some(imageops::crop_imm(strip, x, 0, width, height).to_image())
     };
     let read = |test: &dyn Fn(&str) -> bool| files::read(named(test)?).ok();
     if let Some(panel) = read(&|name| name.starts_with("test_") && name.ends_with(".png")) {
