@@ -216,6 +216,7 @@ fn missing_or_wrong_keys_are_named_with_their_frame() {
         ("0.6911112070083618", "0", ["camera_angle_x is 0", "between 0 and pi"]),
         ("0.6911112070083618", "3.2", ["camera_angle_x is 3.2", "between 0 and pi"]),
         ("0.6911112070083618", "null", ["camera_angle_x is null", "between 0 and pi"]),
+        ("0.6911112070083618", "1e-320", ["camera_angle_x is 1e-320", "between 0 and pi"]),
         ("0.6911112070083618", "1e999", ["not valid JSON", "line 2"]),
         (", [0, 0, 0, 1]]", "]", ["transform_matrix of frame 0 has 3 rows", "4 rows of 4"]),
         ("[0, 1, 0, 0]", "[0, 1, 0]", ["transform_matrix of frame 0 has 3 numbers in row 1", "4 rows of 4"]),
@@ -223,6 +224,7 @@ fn missing_or_wrong_keys_are_named_with_their_frame() {
         ("[0, 1, 0, 0]", "[0, 1, 0, 1e999]", ["not valid JSON", "out of range"]),
         ("[0, 1, 0, 0]", "[0, 1, 0, NaN]", ["not valid JSON", "finite"]),
         ("[0, 1, 0, 0]", "[0, 2, 0, 0]", ["transform_matrix of frame 0 is not a rotation", "scale"]),
+        ("[0, 0, 1, 4]", "[0, 0, 1, 1e300]", ["transform_matrix of frame 0 puts the camera at [0.0, 0.0, 1e300]", "up to 1e12"]),
         ("[0, 0, 0, 1]", "[0, 0, 1, 1]", ["transform_matrix of frame 0 has the last row", "0 0 0 1"]),
     ] {
         let folder = Folder::scene();

@@ -129,6 +129,10 @@ impl Transforms {
                 return Err(bad(format!("frame {k} has no key \"transform_matrix\""), "give the 4 x 4 camera-to-world matrix"));
             };
             let pose = pose(matrix).map_err(|(found, remedy)| bad(format!("transform_matrix of frame {k} {found}"), remedy))?;
+            if pose.translation.abs().max_element() > FARTHEST {
+                let found = format!("transform_matrix of frame {k} puts the camera at {:?}", pose.translation.to_array());
+                return Err(bad(found, "coordinates of up to 1e12 are accepted"));
+            }
             Ok((file_path.to_owned(), pose))
         };
         Ok(Transforms { fov_x, frames: frames.iter().enumerate().map(frame).collect::<Result<_>>()? })
@@ -200,11 +204,7 @@ pub(crate) fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, 
     if rotation.determinant() < 0.0 {
         return Err(("is a reflection: its determinant is -1".into(), "use OpenGL axes: x right, y up, z backwards"));
     }
-    let pose = DAffine3::from_mat4(matrix);
-    if pose.translation.abs().max_element() > FARTHEST {
-        return Err((format!("puts the camera at {}", pose.translation), "coordinates of up to 1e12 are accepted"));
-    }
-    Ok(pose)
+    Ok(DAffine3::from_mat4(matrix))
 }
 
 /// The size all images share.

@@ -292,6 +292,8 @@ mod tests {
         assert!(error.to_string().contains("does not divide the 8 x 12 images"), "{error}");
         assert!(error.to_string().ends_with("accepted: 1, 2, 4"), "{error}");
         assert!(check_downscale(0, (8, 12)).is_err() && check_downscale(4, (8, 12)).is_ok());
+        // What a damaged file says of the built-in scene was tried divisor by divisor.
+        assert!(check_downscale(7, (usize::MAX, usize::MAX - 1)).is_err());
     }
 
     #[test]
