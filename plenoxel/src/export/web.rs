@@ -1,8 +1,8 @@
 //! A grid made small for a page: what a viewer in a browser needs to render it, and what that costs, for it can be turned back.
 //!
-//! Only voxels that a sample with a density above 0 can read are in it. Densities are half floats; the mean color of each channel is one byte
-//! between the lowest and the highest in the grid, and a harmonic of degree 1 and more one byte b for (b − 128) / 127 of the largest there is,
-//! so that 0 stays 0.
+//! Only voxels that a sample with a density above 0 can read are in it. Densities are half floats, rounded to 6 of their 10 bits; the mean
+//! color of each channel is one byte between the lowest and the highest in the grid, and a harmonic of degree 1 and more one byte b for (b − 128) steps,
+//! so that 0 stays 0. The largest harmonic is 127 steps, or 63 or 31 where that makes it small enough: bytes that use few of their values compress well.
 //!
 //! The bytes, a zlib stream, hold first the voxels, then the harmonics if there are any. Each begins with its places, unless harmonics share
 //! those of the voxels: one bit for each brick of 4³, bricks in row-major order and the lowest bit first, then 64 bits for each brick that
@@ -17,6 +17,10 @@ use flate2::write::ZlibEncoder;
 use half::f16;
 use serde::Serialize;
 use std::io::{self, Write};
+
+/// Steps up to the largest harmonic, at best and at worst.
+const FINEST: u8 = 127;
+const COARSEST: u8 = 31;
 
 /// A grid in few bytes.
 #[derive(Debug)]
@@ -68,8 +72,8 @@ struct WebHarmonics {
 }
 
 impl WebGrid {
-    /// The voxels of a grid that can be seen.
-    pub fn new(grid: &VoxelGrid<f32>) -> Self {
+    /// The voxels of a grid that can be seen, and their harmonics in so many steps up to the largest, at most 127.
+    pub fn new(grid: &VoxelGrid<f32>, harmonic_steps: u8) -> Self {
         let seen = grid.pruned(&grid.occupancy(0.0));
         let shape = *seen.shape();
         let (lattice, harmonics_lattice) = (seen.lattice().clone(), seen.harmonics_lattice().cloned());
@@ -78,8 +82,7 @@ impl WebGrid {
             let width = table.shape()[1];
             rows.iter().map(|row| table.data()[row * width + at]).collect()
         };
-        let limit = f32::from(f16::MAX);
-        let density = column(seen.density.tensor(), &rows, 0).into_iter().map(|value| f16::from_f32(value.clamp(-limit, limit))).collect();
+        let density = column(seen.density.tensor(), &rows, 0).into_iter().map(rounded).collect();
         let color = seen.color.tensor();
         let stride = shape.color_width() / 3;
         let means = (0..3).map(|channel| Column::between(&column(color, &rows, channel * stride))).collect();
@@ -88,33 +91,41 @@ impl WebGrid {
         let harmonics = match (&seen.harmonics, &harmonics_lattice) {
             (Some(table), Some(lattice)) => {
                 let rows = self::rows(lattice);
-                kinds.map(|(k, channel)| Column::around_zero(&column(table.tensor(), &rows, channel * (count - 1) + k - 1))).collect()
+                kinds
+                    .map(|(k, channel)| Column::around_zero(&column(table.tensor(), &rows, channel * (count - 1) + k - 1), harmonic_steps))
+                    .collect()
             }
-            _ => kinds.map(|(k, channel)| Column::around_zero(&column(color, &rows, channel * count + k))).collect(),
+            _ => kinds.map(|(k, channel)| Column::around_zero(&column(color, &rows, channel * count + k), harmonic_steps)).collect(),
         };
         WebGrid { shape, lattice, harmonics_lattice, density, means, harmonics }
     }
 
-    /// The same in at most so many bytes: harmonics for fewer voxels, up to every fourth along each axis, and then larger voxels, until it
-    /// fits. Returns the bytes too.
+    /// The same in at most so many bytes: harmonics in fewer steps, then harmonics for fewer voxels, up to every fourth along each axis, and
+    /// then larger voxels, until it fits. Returns the bytes too.
     ///
     /// Errors: none in practice; the bytes are written to memory.
     pub fn within(grid: &VoxelGrid<f32>, most: usize) -> io::Result<(Self, Vec<u8>)> {
-        let mut small = Self::new(grid);
-        let mut bytes = small.bytes()?;
         let mut coarser: Option<VoxelGrid<f32>> = None;
-        while bytes.len() > most {
+        let mut steps = FINEST;
+        loop {
             let grid = coarser.as_ref().unwrap_or(grid);
             let shape = grid.shape();
-            let next = match () {
-                () if shape.color.channels() > 3 && shape.sh_reduction < 4 => grid.with_reduction(2 * shape.sh_reduction),
-                () if shape.resolution > 1 => grid.resample((shape.resolution * 4 / 5).max(1)),
-                () => break,
-            };
-            (small, coarser) = (Self::new(&next), Some(next));
-            bytes = small.bytes()?;
+            let small = Self::new(grid, steps);
+            let bytes = small.bytes()?;
+            if bytes.len() <= most || shape.resolution == 1 {
+                return Ok((small, bytes));
+            }
+            let has_harmonics = shape.color.channels() > 3;
+            if has_harmonics && steps > COARSEST {
+                steps /= 2;
+                continue;
+            }
+            steps = FINEST;
+            coarser = Some(match has_harmonics && shape.sh_reduction < 4 {
+                true => grid.with_reduction(2 * shape.sh_reduction),
+                false => grid.resample((shape.resolution * 4 / 5).max(1)),
+            });
         }
-        Ok((small, bytes))
     }
 
     /// Shape of the grid that a viewer sees.
@@ -195,10 +206,10 @@ impl Column {
         Self::with(values, zero, step)
     }
 
-    /// Bytes that have 0 in their middle.
-    fn around_zero(values: &[f32]) -> Self {
+    /// Bytes that have 0 in their middle, and so many steps from there to the largest value.
+    fn around_zero(values: &[f32], steps: u8) -> Self {
         let largest = values.iter().fold(0.0, |largest: f32, value| largest.max(value.abs()));
-        let step = if largest > 0.0 { largest / 127.0 } else { 1.0 };
+        let step = if largest > 0.0 { largest / f32::from(steps) } else { 1.0 };
         Self::with(values, -128.0 * step, step)
     }
 
@@ -209,6 +220,17 @@ impl Column {
     fn values(&self) -> Vec<f32> {
         self.bytes.iter().map(|byte| self.zero + f32::from(*byte) * self.step).collect()
     }
+}
+
+/// A density as a half float with 6 bits behind the leading one, which is 1 % of it at most.
+fn rounded(density: f32) -> f16 {
+    const DROPPED: u16 = 4;
+    let limit = f32::from(f16::MAX);
+    let bits = f16::from_f32(density.clamp(-limit, limit)).to_bits();
+    // Rounding up may reach the next exponent, but not that of infinity.
+    let up = (bits & 0x7fff) + (1 << (DROPPED - 1));
+    let bits = if up < f16::INFINITY.to_bits() { bits & 0x8000 | up } else { bits };
+    f16::from_bits(bits >> DROPPED << DROPPED)
 }
 
 /// The bricks of a lattice in row-major order: number and mask of those that have nodes.
@@ -267,10 +289,10 @@ mod tests {
     fn what_can_be_seen_comes_back_with_the_precision_of_its_bytes() {
         for (color, reduction) in [(Color::Rgb, 1), (Color::Sh { degree: 2, offset: 0.5 }, 1), (Color::Sh { degree: 1, offset: 0.5 }, 3)] {
             let grid = ball(color, reduction);
-            let small = WebGrid::new(&grid);
+            let small = WebGrid::new(&grid, FINEST);
             let back = small.to_grid();
             assert!(small.density.len() < 18 * 18 * 18 / 3 && back.lattice().present() == small.density.len());
-            for (table, tolerance) in [(0, 0.5), (1, 0.6 / 255.0), (2, 0.6 / 127.0)] {
+            for (table, tolerance) in [(0, 4.0), (1, 0.6 / 255.0), (2, 0.6 / 127.0)] {
                 let (Some(old), Some(new)) = (grid.params().nth(table), back.params().nth(table)) else { continue };
                 let (from, to) = match table {
                     2 => (grid.harmonics_lattice(), back.harmonics_lattice()),
@@ -295,9 +317,19 @@ mod tests {
     }
 
     #[test]
+    fn densities_are_rounded_to_the_nearest_and_stay_finite() {
+        let around = |x: f32| rounded(x).to_f32();
+        assert_eq!(
+            [0.0, 1.0, -1.0, 1.007, 1.009, 65504.0, 1e9, -1e9].map(around),
+            [0.0, 1.0, -1.0, 1.0, 1.015625, 65024.0, 65024.0, -65024.0]
+        );
+        assert!((1..2000).map(|k| 0.37 * k as f32).all(|x| (around(x) - x).abs() <= x / 128.0));
+    }
+
+    #[test]
     fn the_bytes_are_as_many_as_the_header_says() {
         for (color, reduction) in [(Color::Rgb, 1), (Color::Sh { degree: 2, offset: 0.5 }, 1), (Color::Sh { degree: 2, offset: 0.5 }, 4)] {
-            let small = WebGrid::new(&ball(color, reduction));
+            let small = WebGrid::new(&ball(color, reduction), FINEST);
             let mut bytes = Vec::new();
             ZlibDecoder::new(small.bytes().unwrap().as_slice()).read_to_end(&mut bytes).unwrap();
             let places = |lattice: &Lattice| {
@@ -316,11 +348,13 @@ mod tests {
     #[test]
     fn a_grid_becomes_coarser_until_it_fits() {
         let grid = ball(Color::Sh { degree: 2, offset: 0.5 }, 1);
-        let whole = WebGrid::new(&grid).bytes().unwrap().len();
+        let whole = WebGrid::new(&grid, FINEST).bytes().unwrap().len();
         let (_, same) = WebGrid::within(&grid, whole).unwrap();
         assert_eq!(same.len(), whole);
-        let (reduced, bytes) = WebGrid::within(&grid, whole / 2).unwrap();
-        assert!(bytes.len() <= whole / 2 && reduced.shape().resolution == 18 && reduced.shape().sh_reduction > 1);
+        let (rough, bytes) = WebGrid::within(&grid, whole * 9 / 10).unwrap();
+        assert!(bytes.len() <= whole * 9 / 10 && rough.shape().sh_reduction == 1 && rough.harmonics[0].step > 1.5 / 127.0);
+        let (reduced, bytes) = WebGrid::within(&grid, whole / 3).unwrap();
+        assert!(bytes.len() <= whole / 3 && reduced.shape().resolution == 18 && reduced.shape().sh_reduction > 1);
         let (coarse, bytes) = WebGrid::within(&grid, whole / 50).unwrap();
         assert!(bytes.len() <= whole / 50 && coarse.shape().resolution < 18);
     }
