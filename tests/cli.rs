@@ -67,7 +67,17 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
     assert!(result["psnr"].as_f64() > result["baseline_background_psnr"].as_f64(), "{result}");
 
     // The folder explains itself.
-    let expected = ["README.md", "checkpoint.safetensors", "config.toml", "images", "loss.svg", "metrics.jsonl", "result.json", "run.json"];
+    let expected = [
+        "README.md",
+        "checkpoint.safetensors",
+        "config.toml",
+        "images",
+        "loss.svg",
+        "metrics.jsonl",
+        "report.html",
+        "result.json",
+        "run.json",
+    ];
     let mut left = names(&run);
     left.retain(|name| !name.starts_with("events.out.tfevents."));
     assert_eq!(left, expected);

@@ -119,7 +119,7 @@ fn settings_at_the_edge_of_what_is_accepted_train_or_end_with_a_reason() {
     // Those that work, however little comes of them.
     for settings in [
         &["half_width=1e-9"][..],
-        &["half_width=1e12"],
+        &["half_width=1e9"],
         &["seed=9223372036854775807", "validation_every=9223372036854775807"],
         &["initial.density=0", "initial.color=0"],
         &["stages[0].epochs=1e-300", "stages[0].density_warm_up=9223372036854775807"],

@@ -106,7 +106,7 @@ fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     check_alone(&page);
     // The seed is all that differs.
     assert!(page.contains("1 that differ") && page.contains("<td>seed</td><td>1</td><td>2</td>"));
-    // Of two views the photograph, and the picture and the error of each run; loss, PSNR and voxels over two axes.
-    assert_eq!((page.matches("data:image/jpeg;base64,").count(), page.matches("<svg").count()), (10, 6));
+    // Of two views the photograph, and the picture and the error of each run; loss, both kinds of PSNR and voxels over two axes.
+    assert_eq!((page.matches("data:image/jpeg;base64,").count(), page.matches("<svg").count()), (10, 8));
     plenoxel(&["compare", &folder.path("none")]).refused(3, &["there is no such run"]);
 }

@@ -249,7 +249,7 @@ fn a_config_with_an_impossible_value_names_its_key() {
         ("half_width", |c| c.half_width = 0.0),
         ("sh_degree", |c| c.sh_degree = 4),
         ("rays_per_step", |c| c.rays_per_step = 0),
-        ("stages[1].epochs", |c| c.stages[1].epochs = Some(2.0)),
+        ("stages[1].steps", |c| c.stages[1].epochs = Some(2.0)),
         ("stages[0].resolution", |c| c.stages[0].resolution = 1),
         ("losses.tvv", |c| c.losses = BTreeMap::from([("tvv".to_owned(), Weight::Constant(1.0))])),
         ("background", |c| c.background[1] = f32::NAN),

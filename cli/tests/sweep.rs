@@ -127,7 +127,7 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     let (csv, html) = (read("swept/table.csv"), read("swept/table.html"));
     assert_eq!((csv.lines().count(), csv.matches(",finished,").count(), csv.matches(",failed,").count()), (1 + 8, 5, 2), "{csv}");
     // Photographs of two scenes and five renders.
-    assert_eq!(html.matches("data:image/png;base64,").count(), 2 + 5);
+    assert_eq!(html.matches("data:image/jpeg;base64,").count(), 2 + 5);
     assert!(read("swept/few/odd.log").contains("error: downscale") && read("swept/few/fine.log").starts_with("$ plenoxel train "));
     assert!(read("swept/few/fine/result.json").contains("\"psnr\""));
     assert!(read("swept/files/hull/evaluation.json").contains("\"psnr\""));
