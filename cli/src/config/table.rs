@@ -69,11 +69,11 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
     let entries = match index {
         "*" => 0..length,
         index => {
-            let index = index.parse().map_err(|_| none(format!("`{segment}`")))?;
-            index..index + 1
+            let index: Option<usize> = index.parse().ok().filter(|index| *index < length);
+            index.map_or(0..0, |index| index..index + 1)
         }
     };
-    if entries.is_empty() || entries.end > length {
+    if entries.is_empty() {
         return Err(none(format!("`{segment}`")));
     }
     let list = table.get_mut(name).and_then(Value::as_array_mut);
@@ -145,6 +145,7 @@ mod tests {
             set.unwrap_err().to_string()
         };
         assert!(message("s[2].n").contains("s[0] to s[1]"), "{}", message("s[2].n"));
+        assert!(message("s[18446744073709551615].n").contains("s[0] to s[1]"));
         assert!(message("s.n").contains("s[0].n"), "{}", message("s.n"));
         assert!(message("t[0].n").contains("`t` is none"), "{}", message("t[0].n"));
     }
