@@ -236,8 +236,19 @@ fn clouds_with_any_header_are_read_or_refused() {
 fn assignments_of_any_value_to_any_key_are_taken_or_refused() {
     let complete = toml::to_string(&plenoxel::train::config::Config::default()).expect("TOML");
     let mut keys: Vec<String> = complete.lines().filter_map(|line| Some(line.split_once(" = ")?.0.to_owned())).collect();
-    let below =
-        ["stages[0].", "stages[*].", "stages[9].", "scout.", "losses.", "losses.mse.", "carve.", "initial.", "optimizer.", "evaluation."];
+    let below = [
+        "stages[0].",
+        "stages[*].",
+        "stages[9].",
+        "stages[18446744073709551615].",
+        "scout.",
+        "losses.",
+        "losses.mse.",
+        "carve.",
+        "initial.",
+        "optimizer.",
+        "evaluation.",
+    ];
     keys.extend(below.map(str::to_owned));
     let more =
         ["resolution", "steps", "epochs", "sampling.step", "sampling.samples", "kind", "beta", "from", "until", "weight", "photo.noise"];

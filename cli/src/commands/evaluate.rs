@@ -47,7 +47,7 @@ pub struct EvaluateArgs {
 pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let start = Instant::now();
     let found = args.run.find()?;
-    let dataset = args.run.views(&found)?;
+    let dataset = args.run.views(&found, console)?;
     let Loaded { sampling, grid, header } = args.run.load(&found, console, |sampling, shape, voxels| {
         Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
     })?;

@@ -120,6 +120,8 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
         (None, same) => same,
     };
     let known = TABLES.iter().find(|(table, _)| fits(table));
+    // A damaged file may have one of any length, which is neither printed nor compared whole.
+    let key = key.char_indices().nth(60).map_or(key, |(end, _)| &key[..end]);
     let Some((_, known)) = known else {
         let found = format!("the key `{key}` below `{pattern}`, which is no table,");
         return Err(Error::config(place, found, format!("a value for `{pattern}`")));

@@ -79,7 +79,7 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
             index..index.saturating_add(1)
         }
     };
-    if entries.is_empty() || entries.end > length {
+    if entries.is_empty() {
         return Err(none(format!("`{segment}`")));
     }
     let list = table.get_mut(name).and_then(Value::as_array_mut);
@@ -151,6 +151,7 @@ mod tests {
             set.unwrap_err().to_string()
         };
         assert!(message("s[2].n").contains("s[0] to s[1]"), "{}", message("s[2].n"));
+        assert!(message("s[18446744073709551615].n").contains("s[0] to s[1]"));
         assert!(message("s.n").contains("s[0].n"), "{}", message("s.n"));
         assert!(message("t[0].n").contains("`t` is none"), "{}", message("t[0].n"));
     }
