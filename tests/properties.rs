@@ -14,7 +14,7 @@ use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::{RngSeed, TestError, TestRunner};
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Numbers at the ends of what types hold, and what is none.
 const EXTREMES: [&str; 24] = [
@@ -124,10 +124,14 @@ impl Damage {
     }
 }
 
-/// Runs a property on the same inputs each time, one property at a time: memory is counted for the whole process.
-fn hold<S: Strategy>(strategy: S, property: impl Fn(S::Value)) {
+/// Keeps other tests waiting, for memory is counted for the whole process: that for the inputs of another test too.
+fn alone() -> MutexGuard<'static, ()> {
     static ONE: Mutex<()> = Mutex::new(());
-    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+    ONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Runs a property on the same inputs each time.
+fn hold<S: Strategy>(strategy: S, property: impl Fn(S::Value)) {
     let mut config = ProptestConfig { failure_persistence: None, ..ProptestConfig::default() };
     if config.rng_seed == RngSeed::Random {
         config.rng_seed = RngSeed::Fixed(1);
@@ -145,6 +149,7 @@ fn hold<S: Strategy>(strategy: S, property: impl Fn(S::Value)) {
 
 /// Valid inputs are read, and damaged ones in some way.
 fn survives_damage(name: &str) {
+    let _alone = alone();
     let parser: &Parser = PARSERS.iter().find(|parser| parser.name == name).expect("a parser");
     let valid = (parser.valid)();
     hold(Just(()), |()| {
@@ -174,6 +179,7 @@ macro_rules! damaged {
 
 damaged! {
     damaged_cameras_are_read_or_refused: "transforms.json",
+    damaged_camera_paths_are_read_or_refused: "path.json",
     damaged_images_are_read_or_refused: "image.png",
     damaged_clouds_are_read_or_refused: "cloud.ply",
     damaged_checkpoints_are_read_or_refused: "checkpoint",
@@ -202,6 +208,7 @@ fn seeds_for_fuzzing() {
 
 #[test]
 fn every_parser_is_tried() {
+    let _alone = alone();
     // The list above is by name.
     let tried = include_str!("properties.rs");
     assert!(PARSERS.iter().all(|parser| tried.contains(&format!("refused: \"{}\"", parser.name))));
@@ -209,6 +216,7 @@ fn every_parser_is_tried() {
 
 #[test]
 fn clouds_with_any_header_are_read_or_refused() {
+    let _alone = alone();
     let number = || select(vec!["char", "uint8", "short", "ushort", "int", "uint32", "float", "double"]);
     let name = || select(vec!["x", "y", "z", "red", "nx", "scalar_a", "quality", "vertex_indices"]);
     let property = prop_oneof![
@@ -234,6 +242,7 @@ fn clouds_with_any_header_are_read_or_refused() {
 
 #[test]
 fn assignments_of_any_value_to_any_key_are_taken_or_refused() {
+    let _alone = alone();
     let complete = toml::to_string(&plenoxel::train::config::Config::default()).expect("TOML");
     let mut keys: Vec<String> = complete.lines().filter_map(|line| Some(line.split_once(" = ")?.0.to_owned())).collect();
     let below = [
@@ -267,6 +276,7 @@ fn assignments_of_any_value_to_any_key_are_taken_or_refused() {
 
 #[test]
 fn values_of_flags_are_taken_or_refused() {
+    let _alone = alone();
     let flags = vec![
         "train --time",
         "train --checkpoint-every",

@@ -5,6 +5,7 @@ use super::memory::peak_of;
 use glam::DVec3;
 use ndarray::{Array2, Array3};
 use plenoxel::camera::{Camera, Intrinsics};
+use plenoxel::camera_path::CameraPath;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::View;
 use plenoxel::dataset::blender::Transforms;
@@ -42,8 +43,9 @@ pub struct Parser {
 const MIB: usize = 1 << 20;
 
 /// All of them.
-pub const PARSERS: [Parser; 9] = [
+pub const PARSERS: [Parser; 10] = [
     Parser { name: "transforms.json", valid: transforms, read: read_transforms, repair: |_| (), memory: [MIB, 200] },
+    Parser { name: "path.json", valid: paths, read: read_path, repair: |_| (), memory: [2 * MIB, 400] },
     // Deflate makes 1032 of one byte, RGBA four of a gray one, or 24 of a palette's bit; and what profiles may take.
     Parser { name: "image.png", valid: images, read: read_image, repair: repair_image, memory: [20 * MIB, 1032 * 8 * 5] },
     Parser { name: "cloud.ply", valid: clouds, read: read_cloud, repair: |_| (), memory: [MIB, 64] },
@@ -117,6 +119,28 @@ fn read_transforms(path: &Path, bytes: &[u8]) -> Result<Then, String> {
         let intrinsics = Intrinsics::from_fov_x(8, 8, read.fov_x);
         for (_, camera_to_world) in read.frames {
             let ray = Camera { intrinsics, camera_to_world }.ray(0.5, 0.5);
+            assert!(ray.direction.is_normalized() && ray.origin.is_finite(), "{ray:?}");
+        }
+    }))
+}
+
+fn paths() -> Vec<Vec<u8>> {
+    let key = |k: usize| format!(r#"{{"R": [0.9, 0.1, {k}, 0.2], "T": [0.5, 0.6, {k}], "fov": 50.6, "scale": 1.2, "timestamp": {k}}}"#);
+    let keys: Vec<String> = (1..5).map(key).collect();
+    let ngp = format!(r#"{{"loop": true, "spline_order": 3, "path": [{}]}}"#, keys.join(",\n"));
+    let frame =
+        |k: usize| format!(r#"{{"camera_to_world": [1,0,0,{k}, 0,0.8,-0.6,-2.5, 0,0.6,0.8,4, 0,0,0,1], "fov": 40.5, "aspect": 1.5}}"#);
+    let frames: Vec<String> = (0..3).map(frame).collect();
+    let head = r#""camera_type": "perspective", "render_height": 20, "render_width": 30, "fps": 24, "seconds": 2"#;
+    let studio = format!(r#"{{{head}, "camera_path": [{}]}}"#, frames.join(", "));
+    [ngp.into_bytes(), studio.into_bytes()].into_iter().chain(transforms().into_iter().take(1)).collect()
+}
+
+fn read_path(path: &Path, bytes: &[u8]) -> Result<Then, String> {
+    let read = CameraPath::parse(path, bytes).map_err(text)?;
+    Ok(Box::new(move || {
+        for shot in read.shots(7) {
+            let ray = shot.camera((8, 6)).ray(0.5, 0.5);
             assert!(ray.direction.is_normalized() && ray.origin.is_finite(), "{ray:?}");
         }
     }))

@@ -75,8 +75,8 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
     let entries = match index {
         "*" => 0..length,
         index => {
-            let index: usize = index.parse().map_err(|_| none(format!("`{segment}`")))?;
-            index..index.saturating_add(1)
+            let index: Option<usize> = index.parse().ok().filter(|index| *index < length);
+            index.map_or(0..0, |index| index..index + 1)
         }
     };
     if entries.is_empty() {
