@@ -42,6 +42,10 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let Opened { folder, config, preset, source, dataset, sampling, grid, header } = args.run.open(console, true)?;
     let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
+    // A folder may have another name by now: no error.
+    if header.scene != dataset.name() {
+        console.note(&format!("the grid is of another scene: {}, not {}", header.scene, dataset.name()));
+    }
 
     let start = Instant::now();
     let viewer = Viewer::new(&grid, sampling, &config);

@@ -58,10 +58,6 @@ impl TrainedRun {
         let dataset = source.reopen(&config)?;
         super::check_split(&dataset, self.split)?;
         let (header, voxels) = folder.header()?;
-        // A folder may have another name by now: no error.
-        if header.scene != dataset.name() {
-            console.note(&format!("the grid is of another scene: {}, not {}", header.scene, dataset.name()));
-        }
         let shape = header.shape();
         let sampling = self.samples.map_or(config.evaluation, |samples| with_samples(config.evaluation, samples, &shape));
         let estimate = Estimate::of_evaluation(&config, sampling, &shape, voxels, &dataset, compare.then_some(self.split));
