@@ -47,13 +47,17 @@ pub struct EvaluateArgs {
 pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let start = Instant::now();
     let found = args.run.find()?;
-    let dataset = args.run.views(&found, console)?;
+    let dataset = args.run.views(&found)?;
     let Loaded { sampling, grid, header } = args.run.load(&found, console, |sampling, shape, voxels| {
         Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
     })?;
     let Found { folder, config, preset, source } = found;
     let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
+    // A folder may have another name by now: no error.
+    if header.scene != dataset.name() {
+        console.note(&format!("the grid is of another scene: {}, not {}", header.scene, dataset.name()));
+    }
 
     let start = Instant::now();
     let viewer = Viewer::new(&grid, sampling, &config);

@@ -66,7 +66,7 @@ pub fn run(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
 
 fn views(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
     let found = args.run.find()?;
-    let dataset = args.run.views(&found, console)?;
+    let dataset = args.run.views(&found)?;
     let split = args.run.split;
     let (cameras, names) = (dataset.cameras(split), dataset.view_names(split));
     let shots = choose(&dataset, split, &args.view)?.into_iter();

@@ -62,14 +62,9 @@ impl TrainedRun {
     }
 
     /// Opens its views, of which some must be of the split.
-    pub fn views(&self, found: &Found, console: &Console<'_>) -> Result<Dataset> {
+    pub fn views(&self, found: &Found) -> Result<Dataset> {
         let dataset = found.source.reopen(&found.config)?;
         super::check_split(&dataset, self.split)?;
-        // A folder may have another name by now: no error.
-        let (header, _) = found.folder.header()?;
-        if header.scene != dataset.name() {
-            console.note(&format!("the grid is of another scene: {}, not {}", header.scene, dataset.name()));
-        }
         Ok(dataset)
     }
 

@@ -83,6 +83,9 @@ pub fn read(path: &Path) -> Result<RgbaImage> {
 /// The same from the bytes of a file; `path` names it in messages.
 pub fn decode(path: &Path, bytes: &[u8]) -> Result<RgbaImage> {
     let (width, height) = size_in(path, &bytes[..bytes.len().min(HEAD)], bytes.len() as u64)?;
+    if !has_whole_palettes(bytes) {
+        return Err(Error::input(path, "the palette ends within a color", "write it again as PNG"));
+    }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Png);
     let mut limits = Limits::default();
     // The largest picture of this size: 16-bit RGBA.
@@ -96,6 +99,20 @@ pub fn decode(path: &Path, bytes: &[u8]) -> Result<RgbaImage> {
         }
         other => Error::input(path, format!("the image cannot be decoded ({other})"), "write it again as PNG"),
     })
+}
+
+/// False if a palette of a PNG file ends within a color, of which our decoder makes a panic (png 0.18.1, its issue 694).
+fn has_whole_palettes(bytes: &[u8]) -> bool {
+    let mut at = SIGNATURE.len();
+    while let Some(&[a, b, c, d, ref name @ ..]) = bytes.get(at..).and_then(|rest| rest.first_chunk::<8>()) {
+        let length = u32::from_be_bytes([a, b, c, d]);
+        if name == b"PLTE" && !length.is_multiple_of(3) {
+            return false;
+        }
+        // The name and the checksum too.
+        at = at.saturating_add(length as usize).saturating_add(12);
+    }
+    true
 }
 
 /// Checks that pictures of `width` x `height` can be reduced `k` times: k must divide both, since blocks of different sizes
@@ -335,6 +352,17 @@ mod tests {
             assert!(error.exit_code() == 3 && error.to_string().contains("16384 x 16384 pixels; a file of"), "{error}");
         }
         std::fs::remove_file(path).unwrap();
+    }
+
+    #[test]
+    fn a_palette_that_ends_within_a_color_is_refused() {
+        // One pixel, and four bytes of palette: the decoder once panicked at it.
+        let png = [
+            &b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\0\0\0\x01\0\0\0\x01\x08\x03\0\0\0(\xcb4\xbb\0\0\0\x04PLTE\x01\x02\x03\x04#\xdb\x8a\xab"[..],
+            b"\0\0\0\nIDATx\x9cc`\0\0\0\x02\0\x01H\xaf\xa4q\0\0\0\0IEND\xaeB`\x82",
+        ];
+        let error = decode(Path::new("palette.png"), &png.concat()).unwrap_err();
+        assert!(error.exit_code() == 3 && error.to_string().contains("palette.png: the palette ends within a color"), "{error}");
     }
 
     #[test]
