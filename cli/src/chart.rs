@@ -6,6 +6,8 @@ use std::fmt::Write;
 
 const WIDTH: f64 = 900.0;
 const HEIGHT: f64 = 480.0;
+/// Of a line of the legend, which is below where there are several curves.
+const LEGEND: f64 = 18.0;
 const LEFT: f64 = 80.0;
 const RIGHT: f64 = 20.0;
 const TOP: f64 = 64.0;
@@ -52,10 +54,11 @@ impl Chart {
         let in_bands = self.curves.iter().flat_map(|curve| curve.band.iter().flat_map(|(_, low, high)| [*low, *high]));
         let scale = Scale::of(on_lines.chain(in_bands));
         let mut svg = format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" font-family=\"Helvetica, Arial, sans-serif\" \
-             font-size=\"13\" fill=\"{INK}\">\n<title>{0}</title>\n<rect width=\"{WIDTH}\" height=\"{HEIGHT}\" fill=\"#fff\"/>\n\
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {1}\" font-family=\"Helvetica, Arial, sans-serif\" \
+             font-size=\"13\" fill=\"{INK}\">\n<title>{0}</title>\n<rect width=\"{WIDTH}\" height=\"{1}\" fill=\"#fff\"/>\n\
              <text x=\"{LEFT}\" y=\"24\" font-size=\"16\">{0}</text>\n",
             escaped(&self.title),
+            HEIGHT + if self.curves.len() > 1 { LEGEND * self.curves.len() as f64 + 4.0 } else { 0.0 },
         );
         let (bottom, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);
         for (value, label) in scale.ticks() {
@@ -63,9 +66,9 @@ impl Chart {
             line(&mut svg, [LEFT, y, right, y], FAINT, "");
             text(&mut svg, LEFT - 8.0, y + 4.5, "end", &label);
         }
-        for tick in linear_ticks(0.0, end, 8) {
+        for (tick, label) in linear_ticks(0.0, end, 8) {
             line(&mut svg, [x(tick), bottom, x(tick), bottom + 5.0], INK, "");
-            text(&mut svg, x(tick), bottom + 20.0, "middle", &format!("{tick}"));
+            text(&mut svg, x(tick), bottom + 20.0, "middle", &label);
         }
         for (i, (from, name)) in self.parts.iter().enumerate() {
             if *from > 0.0 {
@@ -76,6 +79,7 @@ impl Chart {
         }
         for (i, curve) in self.curves.iter().enumerate() {
             let color = CURVES[i % CURVES.len()];
+            let dashes = ["", " stroke-dasharray=\"6 3\"", " stroke-dasharray=\"2 3\""][i / CURVES.len() % 3];
             let place = |at: f64, value: f64| format!("{:.1},{:.1} ", x(at), scale.y(value));
             if !curve.band.is_empty() {
                 let above = curve.band.iter().map(|(at, _, high)| place(*at, *high));
@@ -85,13 +89,13 @@ impl Chart {
             }
             for points in curve.lines.iter().filter(|points| !points.is_empty()) {
                 let points: String = points.iter().map(|(at, value)| place(*at, *value)).collect();
-                let style = "stroke-width=\"1.8\" stroke-linejoin=\"round\"";
+                let style = format!("stroke-width=\"1.8\" stroke-linejoin=\"round\"{dashes}");
                 let _ = writeln!(svg, "<polyline points=\"{points}\" fill=\"none\" stroke=\"{color}\" {style}/>");
             }
             if self.curves.len() > 1 {
-                let from = right - 125.0 * (self.curves.len() - i) as f64;
-                line(&mut svg, [from, 20.0, from + 22.0, 20.0], color, " stroke-width=\"3\"");
-                text(&mut svg, from + 28.0, 24.0, "start", &curve.name);
+                let y = HEIGHT + LEGEND * i as f64;
+                line(&mut svg, [LEFT, y, LEFT + 30.0, y], color, &format!(" stroke-width=\"3\"{dashes}"));
+                text(&mut svg, LEFT + 38.0, y + 4.5, "start", &curve.name);
             }
         }
         line(&mut svg, [LEFT, bottom, right, bottom], INK, "");
@@ -124,7 +128,7 @@ impl Scale {
             let (low, high) = (low / 1.15, high * 1.15);
             return Scale { logarithmic: true, low, high };
         }
-        let margin = 0.05 * (high - low).max(1e-12);
+        let margin = 0.05 * (high - low).max(1e-6 * high.abs()).max(1e-12);
         Scale { logarithmic: false, low: low - margin, high: high + margin }
     }
 
@@ -140,8 +144,7 @@ impl Scale {
     /// Values worth a line, with their labels: 1, 2, 5 in every decade, powers of ten alone where there are many.
     fn ticks(&self) -> Vec<(f64, String)> {
         if !self.logarithmic {
-            let ticks = linear_ticks(self.low, self.high, 6).into_iter();
-            return ticks.map(|v| (v, label(v))).collect();
+            return linear_ticks(self.low, self.high, 6);
         }
         let decades = (self.high / self.low).log10();
         let steps: &[f64] = if decades > 3.0 { &[1.0] } else { &[1.0, 2.0, 5.0] };
@@ -170,15 +173,22 @@ fn label(value: f64) -> String {
     }
 }
 
-/// At most `most` + 1 round numbers between two bounds.
-fn linear_ticks(low: f64, high: f64, most: usize) -> Vec<f64> {
+/// At most `most` + 1 round numbers between two bounds, with as many decimals as tell them apart.
+fn linear_ticks(low: f64, high: f64, most: usize) -> Vec<(f64, String)> {
     let rough = (high - low) / most as f64;
     let power = 10f64.powf(rough.log10().floor());
     let step = [1.0, 2.0, 5.0, 10.0].map(|k| k * power);
     let step = step.into_iter().find(|s| *s >= rough).unwrap_or(10.0 * power);
+    let (unit, name) = match low.abs().max(high.abs()) {
+        1e6.. => (1e6, " M"),
+        1e4.. => (1e3, " k"),
+        _ => (1.0, ""),
+    };
+    let digits = (-(step / unit * 1.0001).log10().floor()).max(0.0) as usize;
+    let label = |value: f64| if value == 0.0 { "0".to_owned() } else { format!("{:.digits$}{name}", value / unit) };
     let first = (low / step).ceil() as i64;
     let last = (high / step).floor() as i64;
-    (first..=last).map(|k| k as f64 * step).collect()
+    (first..=last).map(|k| k as f64 * step).map(|value| (value, label(value))).collect()
 }
 
 fn line(svg: &mut String, [x1, y1, x2, y2]: [f64; 4], color: &str, more: &str) {
@@ -198,7 +208,11 @@ mod tests {
         let scale = Scale::of([0.004, 0.11].into_iter());
         let labels: Vec<String> = scale.ticks().into_iter().map(|(_, label)| label).collect();
         assert_eq!(labels, ["0.005", "0.01", "0.02", "0.05", "0.1"]);
-        assert_eq!(linear_ticks(0.0, 4400.0, 8), [0.0, 1000.0, 2000.0, 3000.0, 4000.0]);
+        let said = |low, high, most| linear_ticks(low, high, most).into_iter().map(|(_, label)| label).collect::<Vec<_>>();
+        assert_eq!(said(0.0, 4400.0, 8), ["0", "1000", "2000", "3000", "4000"]);
+        assert_eq!(said(28.2, 30.6, 6), ["28.5", "29.0", "29.5", "30.0", "30.5"]);
+        assert_eq!(said(0.95e6, 1.42e6, 6), ["1.0 M", "1.1 M", "1.2 M", "1.3 M", "1.4 M"]);
+        assert_eq!(said(0.0, 1.3, 8), ["0", "0.2", "0.4", "0.6", "0.8", "1.0", "1.2"]);
         assert_eq!([label(0.0), label(2.5), label(1e-7), label(100.0)], ["0", "2.5", "1e-7", "100"]);
     }
 }

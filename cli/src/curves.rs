@@ -89,7 +89,8 @@ mod tests {
 
     #[test]
     fn pictures_of_unusual_losses_hold_no_number_that_is_not_one() {
-        for losses in [vec![], vec![0.5], vec![0.0, 1.0], vec![-1.0, 2.0], vec![3.0; 100], vec![0.0; 7], vec![f64::NAN, 1.0]] {
+        for losses in [vec![], vec![0.5], vec![0.0, 1.0], vec![-1.0, 2.0], vec![3.0; 100], vec![0.0; 7], vec![2e6; 3], vec![f64::NAN, 1.0]]
+        {
             let svg = loss_svg(&losses, &stages(), "a < b & c");
             assert!(svg.contains("a &lt; b &amp; c") && svg.contains("32³"));
             let numbers = svg.split('"').filter(|part| part.starts_with(|c: char| c.is_ascii_digit() || c == '-' || c == 'N'));

@@ -1,7 +1,9 @@
 //! Pictures of results: panels target | render | error | depth, strips, and the color maps behind them.
 
+use image::imageops::crop_imm;
 use ndarray::{Array2, Array3, Axis, Slice, concatenate};
 use plenoxel::camera::Camera;
+use plenoxel::dataset::image::RgbaImage;
 use plenoxel::error::Result;
 use plenoxel::render::picture::Picture;
 use std::path::Path;
@@ -54,9 +56,15 @@ fn gap(height: usize) -> usize {
     (height / 50).max(2)
 }
 
-/// Where in a strip a picture begins, counted from 0, if all are of one size. In a panel 0 is the target and 1 the render.
-pub fn begins_at(number: usize, (width, height): (usize, usize)) -> usize {
-    number * (width + gap(height))
+/// A picture of a strip, counted from 0, if all of them are of one size: in a panel 0 is the target, 1 the render and 2 the error. `None` if the
+/// strip has no such picture.
+pub fn part(strip: &RgbaImage, number: usize, (width, height): (usize, usize)) -> Option<RgbaImage> {
+    // A file may say anything of its size.
+    if height != strip.height() as usize || width > strip.width() as usize {
+        return None;
+    }
+    let x = number * (width + gap(height));
+    (x + width <= strip.width() as usize).then(|| crop_imm(strip, x as u32, 0, width as u32, height as u32).to_image())
 }
 
 /// Mean absolute error over channels, black at 0 through red to pale yellow at [`ERROR_SCALE`] and above.
@@ -228,7 +236,12 @@ mod tests {
     fn a_strip_is_as_wide_as_its_pictures_and_gaps() {
         let picture = Rgb::zeros((100, 40, 3));
         assert_eq!(strip(&[&picture, &picture, &picture]).dim(), (100, 124, 3));
-        assert_eq!(begins_at(2, (40, 100)), 84);
+        let shades = RgbaImage::from_fn(124, 100, |x, _| [x as u8, 0, 0, 255].into());
+        let third = part(&shades, 2, (40, 100)).unwrap();
+        assert_eq!((third.dimensions(), third.get_pixel(0, 0)[0]), ((40, 100), 84));
+        assert!(
+            [(3, (40, 100)), (0, (40, 99)), (2, (usize::MAX, 100))].into_iter().all(|(number, size)| part(&shades, number, size).is_none())
+        );
         assert_eq!(strip(&[]).dim(), (0, 0, 3));
     }
 }

@@ -34,7 +34,8 @@ pub fn arguments(arguments: &[&str]) -> std::result::Result<(), String> {
     Cli::try_parse_from(arguments).map(drop).map_err(|e| e.to_string())
 }
 
-/// The losses of a run's first steps by its `metrics.jsonl`.
-pub fn losses(bytes: &[u8], taken: u64) -> Vec<f64> {
-    Past::of(&String::from_utf8_lossy(bytes), taken).1.losses
+/// Of the `metrics.jsonl` of a run the lines about its first steps, and their losses.
+pub fn losses(bytes: &[u8], taken: u64) -> (String, Vec<f64>) {
+    let (kept, past) = Past::of(&String::from_utf8_lossy(bytes), taken);
+    (kept, past.losses)
 }

@@ -28,6 +28,9 @@ pub struct RunRecord {
     pub preset: Option<String>,
     /// Where the views are.
     pub data: DataSource,
+    /// The time that training was planned for, if it was.
+    #[serde(default)]
+    pub seconds_planned: Option<f64>,
 }
 
 impl RunRecord {
@@ -219,6 +222,17 @@ impl RunFolder {
         self.read_json(EVALUATION)
     }
 
+    /// The final figures, and of a carved run, which compares nothing with test views, those of its evaluation.
+    pub fn figures(&self) -> Option<serde_json::Value> {
+        let mut all = self.result()?;
+        if let (Some(all), Some(serde_json::Value::Object(evaluation))) = (all.as_object_mut(), self.evaluation()) {
+            for (key, value) in evaluation {
+                all.entry(key).or_insert(value);
+            }
+        }
+        Some(all)
+    }
+
     fn read_json(&self, name: &str) -> Option<serde_json::Value> {
         let text = std::fs::read_to_string(self.path.join(name)).ok()?;
         serde_json::from_str(&text).ok()
@@ -353,32 +367,7 @@ fn remove(files: impl Iterator<Item = PathBuf>) -> Result<()> {
 }
 
 /// The folder's own explanation.
-const EXPLANATION: &str = "\
-# A run of plenoxel
-
-Of these files, those that apply: a carved run has no training to tell of.
-
-- `config.toml`: every setting, resolved; its first lines say how to repeat the run with it, to the bit.
-- `run.json`: the data, the program, the machine.
-- `metrics.jsonl`: one line every few steps and at every stage end and whenever it is saved, then one with the final figures. `loss`, `losses` and `psnr` are of
-  training rays, means since the line before; `rays`, `samples` and `seconds` count from the start of training; `validation_psnr` is on
-  lines of steps after which validation views were looked at: the mean of up to four, reduced to 128 pixels or less.
-- `events.out.tfevents.*`: the same for TensorBoard (`tensorboard --logdir` this folder, or the one it is in); one file each time that the run went on.
-- `report.html`: all of this on one page, with a viewer of the grid; any browser opens it, without a network.
-- `loss.svg`: the loss over the steps.
-- `checkpoint.safetensors`: the trained grid; it says in its metadata what its numbers mean.
-- `training.safetensors`: only while the run has not ended: what `plenoxel train --resume` goes on from.
-- `result.json`: the final figures, and how each is computed. `seconds` are of training alone (making grids, steps, pruning, upsampling), or of carving and coloring. `best_validation`
-  names the step after which `validation_psnr` was highest; the grid is that of the last step all the same.
-- `evaluation.json`: what `plenoxel evaluate` said of a carved run that is part of a sweep.
-- `images/stages.png`: one view at the end of each stage, then the photograph; `images/stage_*.png`: the same one by one.
-- `images/preview.png`: replaced while it trains: a validation view, photograph and render, reduced; without validation views, what the camera of the stages sees.
-- `images/test_*.png`: test views: target, render, error, depth. Error is the absolute difference averaged over channels, black at 0,
-  pale yellow at 0.25 and above. Depth is red where near and blue where far, over the ball that the box contains; white is empty.
-- `images/carved.png`: what was carved, seen by some test cameras.
-- `renders/`: what `plenoxel render` wrote: views, and for each `--path` a folder of frames with the GIF and the MP4 beside it.
-- `exports/`: what `plenoxel export` wrote, for other programs.
-";
+const EXPLANATION: &str = include_str!("run_folder/README.md");
 
 /// `root/<scene>-<n>` with the first n from 1 on that nothing has.
 fn first_free(root: &Path, scene: &str) -> PathBuf {

@@ -2,6 +2,7 @@
 
 mod pictures;
 
+use super::table::markdown::plain;
 use super::table::{Figures, Measured};
 use crate::config;
 use crate::html::{self, escaped};
@@ -123,6 +124,8 @@ fn table(heads: &[&str], rows: &[Vec<&str>]) -> String {
 
 /// The same for a terminal, as Markdown.
 fn aligned(heads: &[&str], rows: &[Vec<&str>]) -> String {
+    let rows: Vec<Vec<String>> = rows.iter().map(|row| row.iter().map(|cell| plain(cell)).collect()).collect();
+    let rows: Vec<Vec<&str>> = rows.iter().map(|row| row.iter().map(String::as_str).collect()).collect();
     let width =
         |column: usize| rows.iter().map(|row| row[column]).chain([heads[column]]).map(|cell| cell.chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..heads.len()).map(width).collect();

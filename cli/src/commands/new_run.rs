@@ -43,6 +43,7 @@ pub fn record(dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> R
         format: dataset.format().to_owned(),
         preset: preset.map(str::to_owned),
         data: source.clone(),
+        seconds_planned: None,
     }
 }
 

@@ -70,20 +70,20 @@ fn views(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
     let split = args.run.split;
     let (cameras, names) = (dataset.cameras(split), dataset.view_names(split));
     let shots = choose(&dataset, split, &args.view)?.into_iter();
-    let renders = found.folder.create_renders()?;
     let shots = shots.map(|number| (cameras[number], found.folder.render(&format!("{split}_{number:03}_{}", names[number])))).collect();
-    let views = render(args, &found, console, shots, &Channel::ALL)?;
+    let views = render(args, &found, console, shots, &Channel::ALL, || found.folder.create_renders())?;
     let what = if views == 1 { "view" } else { "views" };
-    console.result(&format!("rendered {views} {split} {what} to {}", renders.display()))
+    console.result(&format!("rendered {views} {split} {what} to {}", found.folder.render("").display()))
 }
 
 fn film(args: &RenderArgs, path: &PathChoice, console: &Console<'_>) -> Result<()> {
     let found = args.run.find()?;
     let Film { name, cameras, fps } = args.path.film(path, &args.run, &found, console)?;
-    let folder = found.folder.create_film(&name, &Channel::ALL.map(Channel::suffix))?;
+    let folder = found.folder.render(&name);
     let stem = |number: usize| folder.join(format!("frame_{number:04}"));
     let shots: Vec<(Camera, PathBuf)> = cameras.into_iter().enumerate().map(|(number, camera)| (camera, stem(number))).collect();
-    let frames = render(args, &found, console, shots, &[Channel::Color])?;
+    let make = || found.folder.create_film(&name, &Channel::ALL.map(Channel::suffix));
+    let frames = render(args, &found, console, shots, &[Channel::Color], make)?;
     let what = if frames == 1 { "frame" } else { "frames" };
     console.result(&format!("rendered {frames} {what} to {}", folder.display()))?;
     if args.format.contains(&FileFormat::Png) {
@@ -95,14 +95,23 @@ fn film(args: &RenderArgs, path: &PathChoice, console: &Console<'_>) -> Result<(
     Ok(())
 }
 
-/// Renders what each camera sees to files whose names begin with a path, and says how many there were.
-fn render(args: &RenderArgs, found: &Found, console: &Console<'_>, shots: Vec<(Camera, PathBuf)>, default: &[Channel]) -> Result<usize> {
+/// Renders what each camera sees to files whose names begin with a path, and says how many there were. `prepare` makes the folder for them, once it
+/// is known that they can be rendered.
+fn render(
+    args: &RenderArgs,
+    found: &Found,
+    console: &Console<'_>,
+    shots: Vec<(Camera, PathBuf)>,
+    default: &[Channel],
+    prepare: impl FnOnce() -> Result<PathBuf>,
+) -> Result<usize> {
     let channels = channels(args, default);
     let normals = channels.contains(&Channel::Normal);
     let pixels = shots.iter().map(|(camera, _)| camera.intrinsics.width * camera.intrinsics.height).max().unwrap_or(0);
     let Loaded { sampling, grid, .. } = args
         .run
         .load(found, console, |sampling, shape, voxels| Estimate::of_pictures(&found.config, sampling, shape, voxels, pixels, normals))?;
+    prepare()?;
     let normals = normals.then(|| grid.normals());
     let pictures = Pictures::new(&grid, normals.as_ref(), sampling, &found.config, &channels, &args.format);
     let count = console.count("rendering", shots.len());

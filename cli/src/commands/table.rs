@@ -3,7 +3,7 @@
 mod csv;
 mod figures;
 mod html;
-mod markdown;
+pub mod markdown;
 mod thumbnail;
 
 pub use figures::{Failure, Figures, Measured, Scores};

@@ -9,7 +9,6 @@ mod preview;
 mod watching;
 
 use super::new_run::{Stopwatch, announce, load, record};
-use crate::data::DataSource;
 use crate::evaluation::{self, Scores, ViewScore, Viewer};
 use crate::figures::Figures;
 use crate::machine;
@@ -17,7 +16,7 @@ use crate::memory::{self, Estimate};
 use crate::metrics_file::{Best, MetricsFile, Past};
 use crate::progress::{Console, clock};
 use crate::report::Report;
-use crate::run_folder::RunFolder;
+use crate::run_folder::{RunFolder, RunRecord};
 pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use learning::{Learned, StageSummary};
 use plenoxel::dataset::{Dataset, Split, View};
@@ -73,7 +72,8 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     }
     // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
     folder.prepare()?;
-    folder.describe(&config, &record(&dataset, preset, &source))?;
+    let record = RunRecord { seconds_planned: args.time, ..record(&dataset, preset, &source) };
+    folder.describe(&config, &record)?;
     console.note(&format!("run: {}", folder.path().display()));
     let start = || {
         let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows);
@@ -87,7 +87,7 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         console.note(&format!("box: half width {half_width:.4}, {chosen}"));
     }
     let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
-    let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &source, preset, args, console };
+    let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, args, console };
     let learned = job.learn(trainer, (metrics, Past::default()), preview, &views, &mut clocks)?;
     drop(views);
     job.conclude(learned, clocks)
@@ -95,26 +95,25 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
 
 /// A run that was interrupted, from where it was last saved.
 fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
-    let (folder, config, record) = RunFolder::open(path)?;
+    let (folder, config, mut record) = RunFolder::open(path)?;
     let state = folder.existing_state()?;
     let mut clocks = Clocks::default();
-    let source = args.moved_to().unwrap_or(record.data);
-    let dataset = clocks.load.time(|| source.open(&config))?;
+    record.data = args.moved_to().unwrap_or(record.data);
+    let dataset = clocks.load.time(|| record.data.open(&config))?;
     if machine::instruction_set() != record.instruction_set {
         console.note(&format!("it began with {}: other bits, the same picture", record.instruction_set));
     }
     announce(console, &dataset, &config);
     let most_rows = room(&config, &dataset, 0, console)?;
     let preview = clocks.load.time(|| Preview::new(&dataset, args.preview_every))?;
-    let views = clocks.load.time(|| load(console, &dataset, Split::Train, &source))?;
+    let views = clocks.load.time(|| load(console, &dataset, Split::Train, &record.data))?;
     let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows).resumed(&state)?;
     folder.remove_fragments()?;
     let (metrics, past) = MetricsFile::resume(&folder, trainer.total_steps(), trainer.steps_taken())?;
     clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
     let (taken, total) = (trainer.steps_taken(), trainer.total_steps());
     console.note(&format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds)));
-    let preset = record.preset.as_deref();
-    let job = Job { folder: &folder, config: &config, dataset: &dataset, source: &source, preset, args, console };
+    let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, args, console };
     let learned = job.learn(trainer, (metrics, past), preview, &views, &mut clocks)?;
     drop(views);
     job.conclude(learned, clocks)
@@ -133,8 +132,7 @@ struct Job<'a, 'c> {
     folder: &'a RunFolder,
     config: &'a Config,
     dataset: &'a Dataset,
-    source: &'a DataSource,
-    preset: Option<&'a str>,
+    record: &'a RunRecord,
     args: &'a TrainArgs,
     console: &'a Console<'c>,
 }
@@ -144,7 +142,7 @@ impl Job<'_, '_> {
     fn conclude(&self, learned: Option<Learned<'_>>, mut clocks: Clocks) -> Result<u8> {
         let Job { folder, config, dataset, console, .. } = *self;
         let Some(mut learned) = learned else { return Ok(interrupt::EXIT_CODE) };
-        let test = clocks.load.time(|| load(console, dataset, Split::Test, self.source))?;
+        let test = clocks.load.time(|| load(console, dataset, Split::Test, &self.record.data))?;
         let scores = evaluate(&mut learned, &test, config, console, &mut clocks)?;
         let pictures = &learned.pictures;
         pictures.strip(test.first(), config.background)?;
@@ -157,7 +155,7 @@ impl Job<'_, '_> {
             baseline_background_psnr: evaluation::background_psnr(&test, config.background),
             baseline_mean_image_psnr: learned.mean_image.and_then(|image| evaluation::constant_psnr(&test, &image, config.background)),
             seconds: clocks.train.seconds(),
-            seconds_planned: self.args.time,
+            seconds_planned: self.record.seconds_planned,
             seconds_load: clocks.load.seconds(),
             seconds_evaluate: clocks.evaluate.seconds(),
             peak_memory_bytes: memory::peak(),
@@ -165,7 +163,7 @@ impl Job<'_, '_> {
             rays,
             samples,
             scene: dataset.name().to_owned(),
-            preset: self.preset.map(str::to_owned),
+            preset: self.record.preset.clone(),
             run: folder.path().display().to_string(),
             validation_psnr,
             best_validation,
@@ -177,8 +175,7 @@ impl Job<'_, '_> {
         folder.remove_state()?;
         say(console, folder, &summary, note.as_deref())?;
         if !self.args.no_report {
-            let (_, _, record) = RunFolder::open(folder.path())?;
-            let report = Report { folder, config, record: &record, dataset, grid: &learned.grid };
+            let report = Report { folder, config, record: self.record, dataset, grid: &learned.grid };
             console.note(&report.write()?);
         }
         Ok(0)

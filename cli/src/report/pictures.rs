@@ -30,15 +30,17 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
     let (mut figures, mut rows) = (String::new(), String::new());
     for (number, view) in views.iter().enumerate() {
         let name = view["name"].as_str().unwrap_or_default();
-        let psnr = view["psnr"].as_f64().unwrap_or(f64::NAN);
+        // JSON has no number for that of equal pictures.
+        let psnr = view["psnr"].as_f64();
+        let (order, psnr) = (psnr.map_or("Infinity".to_owned(), |x| x.to_string()), psnr.map_or("∞".to_owned(), |x| format!("{x:.2}")));
         let ssim = view["ssim"].as_f64().map_or("–".to_owned(), |ssim| format!("{ssim:.4}"));
         let name_shown = escaped(name);
-        let _ = write!(rows, "<tr><td>{number}</td><td>{name_shown}</td><td>{psnr:.2}</td><td>{ssim}</td></tr>");
+        let _ = write!(rows, "<tr><td>{number}</td><td>{name_shown}</td><td>{psnr}</td><td>{ssim}</td></tr>");
         let path = folder.image(&RunFolder::panel_name(number, name));
         if path.exists() {
-            let caption = format!("{name_shown}: {psnr:.2} dB, SSIM {ssim}");
+            let caption = format!("{name_shown}: {psnr} dB, SSIM {ssim}");
             let picture = embedded(&path, &caption)?;
-            let _ = writeln!(figures, "<figure data-psnr=\"{psnr}\">{picture}<figcaption>{caption}</figcaption></figure>");
+            let _ = writeln!(figures, "<figure data-psnr=\"{order}\">{picture}<figcaption>{caption}</figcaption></figure>");
         }
     }
     let order = "<label>order <select id=\"order\"><option value=\"\">as they are</option><option value=\"1\">worst first</option>\

@@ -37,7 +37,8 @@ function valueAt(places, x, y, z) {
 }
 
 // The atlas of the bricks whose cells have a node that `counts`. `each` visits its texels: their place, and the number of their value.
-function buildAtlas(places, counts, most) {
+// No side of the texture is longer than `most`, even if `slabs` atlases lie one behind the other.
+function buildAtlas(places, counts, most, slabs = 1) {
   const { side } = places, links = new Uint32Array(side ** 3), bricks = [], corners = new Int32Array(CORNERS ** 3);
   for (let b = 0, x = 0; x < side; x++) for (let y = 0; y < side; y++) for (let z = 0; z < side; z++, b++) {
     let any = false, near = false;
@@ -48,8 +49,10 @@ function buildAtlas(places, counts, most) {
     }
     if (any) { bricks.push(corners.slice()); links[b] = bricks.length; }
   }
-  const across = Math.max(1, Math.min(Math.ceil(Math.cbrt(bricks.length)), Math.floor(most / CORNERS)));
+  const deepest = Math.floor(most / CORNERS / slabs);
+  const across = Math.max(1, Math.ceil(Math.cbrt(bricks.length)), Math.ceil(Math.sqrt(bricks.length / deepest)));
   const deep = Math.max(1, Math.ceil(bricks.length / across ** 2));
+  if (CORNERS * across > most) throw new Error('this grid is too large for the textures of this browser');
   const size = [CORNERS * across, CORNERS * across, CORNERS * deep];
   markDistances(links, side);
   for (let b = 0; b < links.length; b++) if (!(links[b] & DISTANCE)) {
@@ -87,7 +90,7 @@ function markDistances(links, side) {
   for (let b = 0; b < links.length; b++) if (!links[b]) links[b] = (DISTANCE | near[b]) >>> 0;
 }
 
-// A number as a half float, rounded down in size by at most one step of its last bit.
+// A number as a half float, the nearest.
 const float = new Float32Array(1), floatBits = new Uint32Array(float.buffer);
 function half(x) {
   float[0] = x;
@@ -114,16 +117,19 @@ const BASIS = [
 // The shader for a grid: `slabs` textures' worth of four harmonics each lie one behind the other in one texture.
 function shader(scene, slabs) {
   const { grid } = scene, nearest = grid.interpolation === 'nearest', count = grid.harmonics ? grid.harmonics.steps.length / 3 : 0;
+  // No ray has more samples.
+  const { step, samples } = scene.sampling, turns = Math.ceil(step ? Math.sqrt(3) * grid.resolution / step : samples) + 2;
   const lines = [];
   for (let s = 0; s < slabs; s++) {
-    lines.push(`h = (texelOrMean(atlas, float(${s}) * slab) * 255.0 - 128.0) * steps[${s}];`);
+    lines.push(`h = (textureLod(harmonics, (atlas + vec3(0.0, 0.0, float(${s}) * slab)) / harmonicSize, 0.0) * 255.0 - 128.0) * steps[${s}];`);
     for (let c = 0; c < 4 && 4 * s + c < 3 * count; c++)
       lines.push(`sum.${'rgb'[(4 * s + c) % 3]} += h.${'xyzw'[c]} * basis[${Math.floor((4 * s + c) / 3)}];`);
   }
   return `#version 300 es
 precision highp float; precision highp int; precision highp sampler3D; precision highp usampler3D;
-uniform usampler3D links, harmonicLinks;
-uniform sampler3D voxels, harmonics;
+uniform usampler3D links;
+uniform sampler3D voxels;
+${slabs ? 'uniform usampler3D harmonicLinks; uniform sampler3D harmonics;' : ''}
 uniform vec3 atlasSize, harmonicSize, eye, background;
 uniform mat3 rotation;
 uniform vec4 lens;              // focal lengths and principal point, pixels
@@ -142,9 +148,6 @@ vec3 inside(vec3 u, float n, out ivec3 brick) {
 }
 vec3 atlasPlace(uint link, vec3 local) {
   return vec3(link & 1023u, link >> 10 & 1023u, link >> 20 & 1023u) * 5.0 + local + 0.5;
-}
-vec4 texelOrMean(vec3 place, float behind) {
-  return textureLod(harmonics, (place + vec3(0.0, 0.0, behind)) / harmonicSize, 0.0);
 }
 
 void main() {
@@ -170,7 +173,7 @@ void main() {
   float side = 2.0 * halfWidth / resolution, k = 0.0, light = 1.0;
   vec3 sum, seen = vec3(0.0), origin = (eye + halfWidth) / side - 0.5, speed = d / side;
   vec4 h;
-  for (int turn = 0; turn < 8192; turn++) {
+  for (int turn = 0; turn < ${turns}; turn++) {
     if (k >= count) break;
     float begin = start + k * size, length_ = size, t = begin;
     if (half_ > 0.0) { length_ = min(size, far - begin); t = begin + 0.5 * length_; }
@@ -189,7 +192,7 @@ void main() {
     k += 1.0;
     vec4 voxel = textureLod(voxels, atlasPlace(link, local) / atlasSize, 0.0);
     if (voxel.a <= 0.0) continue;
-    float alpha = 1.0 - exp(-voxel.a * length_);
+    float alpha = 1.0 - exp(-voxel.a * length_ / side);
     sum = voxel.rgb + offset;
     ${slabs ? `ivec3 larger;
     vec3 inLarger = inside((u + 0.5) / reduction - 0.5, harmonicResolution, larger);
@@ -198,7 +201,7 @@ void main() {
       vec3 atlas = atlasPlace(harmonicLink, inLarger);
       ${lines.join('\n      ')}
     }` : ''}
-    seen += light * alpha * max(sum, 0.0);
+    seen += light * alpha * ${grid.degree === null ? 'sum' : 'max(sum, 0.0)'};
     light *= 1.0 - alpha;
     if (light < 1e-3) break;
   }
@@ -237,11 +240,10 @@ class Renderer {
     if (grid.harmonics) {
       const { resolution, reduction, voxels, steps } = grid.harmonics;
       const own = reduction === 1 ? places : readPlaces(reader, resolution);
-      const values = steps.map(() => reader.take(voxels)), larger = buildAtlas(own, () => true, most);
       slabs = Math.ceil(steps.length / 4);
+      const values = steps.map(() => reader.take(voxels)), larger = buildAtlas(own, () => true, most, slabs);
       const [w, h, d] = larger.size, slab = 4 * w * h * d, texels = new Uint8Array(slabs * slab).fill(128);
       larger.each((place, v) => values.forEach((bytes, f) => { texels[(f >> 2) * slab + 4 * place + (f & 3)] = bytes[v]; }));
-      if (slabs * d > most) throw new Error('this grid is too large for the textures of this browser');
       this.textures.harmonicLinks = this.texture([larger.side, larger.side, larger.side], gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT,
         larger.links, gl.NEAREST);
       this.textures.harmonics = this.texture([w, h, slabs * d], gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, texels, filter);
@@ -363,13 +365,17 @@ class Orbit {
 
   // Turns the scene as a hand would: by so many radians to the right, and down, but not over the poles.
   turn(right, down) {
-    if (Math.abs(Math.asin(Math.max(-1, Math.min(1, this.axis(2)[2]))) + down) > 1.55) down = 0;
+    const height = Math.asin(Math.max(-1, Math.min(1, this.axis(2)[2])));
+    if (Math.abs(height + down) > 1.55 && Math.abs(height + down) > Math.abs(height)) down = 0;
     const aside = rotated(this.axis(0), UP, -right), spin = v => rotated(rotated(v, UP, -right), aside, -down);
     this.eye = spin(this.eye.map((p, a) => p - this.pivot[a])).map((p, a) => p + this.pivot[a]);
     this.rotation = [0, 1, 2].flatMap(k => spin(this.axis(k)));
   }
 
-  zoom(factor) { this.eye = this.eye.map((p, a) => this.pivot[a] + (p - this.pivot[a]) * factor); }
+  zoom(factor) {
+    factor = Math.max(0.1, Math.min(10, factor));
+    this.eye = this.eye.map((p, a) => this.pivot[a] + (p - this.pivot[a]) * factor);
+  }
 
   shift(right, up) {
     const far = Math.hypot(...this.eye.map((p, a) => p - this.pivot[a]));
@@ -497,6 +503,7 @@ class Viewer {
   const figure = document.getElementById('viewer');
   try {
     const scene = JSON.parse(document.getElementById('scene').textContent);
+    if (!scene.views.length) throw new Error('there is no view to begin from');
     window.viewer = new Viewer(figure, scene, await unpack(document.getElementById('grid').textContent.trim()));
   } catch (error) {
     figure.querySelector('output').textContent = `The viewer cannot be shown: ${error.message}`;

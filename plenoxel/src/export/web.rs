@@ -1,6 +1,7 @@
 //! A grid made small for a page: what a viewer in a browser needs to render it, and what that costs, for it can be turned back.
 //!
-//! Only voxels that a sample with a density above 0 can read are in it. Densities are half floats, rounded to 6 of their 10 bits; the mean
+//! Only voxels that a sample with a density above 0 can read are in it. Densities are half floats, in 1 / side of a voxel, so that the unit of the
+//! world does not matter, and rounded to 6 of their 10 bits; the mean
 //! color of each channel is one byte between the lowest and the highest in the grid, and a harmonic of degree 1 and more one byte b for (b − 128) steps,
 //! so that 0 stays 0. The largest harmonic is 127 steps, or 63 or 31 where that makes it small enough: bytes that use few of their values compress well.
 //!
@@ -28,6 +29,7 @@ pub struct WebGrid {
     shape: GridShape,
     lattice: Lattice,
     harmonics_lattice: Option<Lattice>,
+    /// Times the side of a voxel.
     density: Vec<f16>,
     means: Vec<Column>,
     /// In the order of the bytes: red, green and blue of harmonic 1, then of harmonic 2, and so on.
@@ -76,13 +78,14 @@ impl WebGrid {
     pub fn new(grid: &VoxelGrid<f32>, harmonic_steps: u8) -> Self {
         let seen = grid.pruned(&grid.occupancy(0.0));
         let shape = *seen.shape();
+        let side = shape.voxel_side() as f32;
         let (lattice, harmonics_lattice) = (seen.lattice().clone(), seen.harmonics_lattice().cloned());
         let rows = rows(&lattice);
         let column = |table: &Tensor<f32>, rows: &[usize], at: usize| -> Vec<f32> {
             let width = table.shape()[1];
             rows.iter().map(|row| table.data()[row * width + at]).collect()
         };
-        let density = column(seen.density.tensor(), &rows, 0).into_iter().map(rounded).collect();
+        let density = column(seen.density.tensor(), &rows, 0).into_iter().map(|density| rounded(density * side)).collect();
         let color = seen.color.tensor();
         let stride = shape.color_width() / 3;
         let means = (0..3).map(|channel| Column::between(&column(color, &rows, channel * stride))).collect();
@@ -116,13 +119,14 @@ impl WebGrid {
                 return Ok((small, bytes));
             }
             let has_harmonics = shape.color.channels() > 3;
-            if has_harmonics && steps > COARSEST {
+            // Fewer steps halve it at best.
+            if has_harmonics && steps > COARSEST && bytes.len() < 2 * most {
                 steps /= 2;
                 continue;
             }
             steps = FINEST;
             coarser = Some(match has_harmonics && shape.sh_reduction < 4 {
-                true => grid.with_reduction(2 * shape.sh_reduction),
+                true => grid.with_reduction((2 * shape.sh_reduction).min(4)),
                 false => grid.resample((shape.resolution * 4 / 5).max(1)),
             });
         }
@@ -177,7 +181,8 @@ impl WebGrid {
 
     /// The grid that a viewer sees.
     pub fn to_grid(&self) -> VoxelGrid<f32> {
-        let density: Vec<f32> = self.density.iter().map(|value| value.to_f32()).collect();
+        let side = self.shape.voxel_side() as f32;
+        let density: Vec<f32> = self.density.iter().map(|value| value.to_f32() / side).collect();
         let [means, harmonics] = [&self.means, &self.harmonics].map(|columns| columns.iter().map(Column::values).collect::<Vec<_>>());
         // Tables have all numbers of red first, then those of green, then those of blue.
         let of_channel = |channel: usize| harmonics.iter().skip(channel).step_by(3);
@@ -274,12 +279,13 @@ mod tests {
     use std::io::Read;
 
     /// A ball of random colors in an empty box.
-    fn ball(color: Color, sh_reduction: usize) -> VoxelGrid<f32> {
-        let shape = GridShape { resolution: 18, half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction };
+    fn ball(color: Color, sh_reduction: usize, half_width: f64) -> VoxelGrid<f32> {
+        let shape = GridShape { resolution: 18, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction };
         let grid = VoxelGrid::random(shape, 1.0, 1.0, 7);
         let density = (0..grid.lattice().rows()).map(|row| {
             let far = grid.lattice().node(row as u32).map_or(9.0, |node| node.map(|k| (k as f32 - 8.5).powi(2)).iter().sum::<f32>().sqrt());
-            100.0 * (6.0 - far)
+            // Most of the light in a voxel of the middle, whatever the unit.
+            (6.0 - far) / half_width as f32
         });
         let density = Tensor::from_vec(density.collect(), &[grid.lattice().rows(), 1]);
         grid.with_density(density)
@@ -287,12 +293,13 @@ mod tests {
 
     #[test]
     fn what_can_be_seen_comes_back_with_the_precision_of_its_bytes() {
-        for (color, reduction) in [(Color::Rgb, 1), (Color::Sh { degree: 2, offset: 0.5 }, 1), (Color::Sh { degree: 1, offset: 0.5 }, 3)] {
-            let grid = ball(color, reduction);
+        let sh = |degree| Color::Sh { degree, offset: 0.5 };
+        for (color, reduction, half_width) in [(Color::Rgb, 1, 1e-6), (sh(2), 1, 1.0), (sh(1), 3, 1e6)] {
+            let grid = ball(color, reduction, half_width);
             let small = WebGrid::new(&grid, FINEST);
             let back = small.to_grid();
             assert!(small.density.len() < 18 * 18 * 18 / 3 && back.lattice().present() == small.density.len());
-            for (table, tolerance) in [(0, 4.0), (1, 0.6 / 255.0), (2, 0.6 / 127.0)] {
+            for (table, tolerance) in [(0, 6.0 / 120.0 / half_width as f32), (1, 0.6 / 255.0), (2, 0.6 / 127.0)] {
                 let (Some(old), Some(new)) = (grid.params().nth(table), back.params().nth(table)) else { continue };
                 let (from, to) = match table {
                     2 => (grid.harmonics_lattice(), back.harmonics_lattice()),
@@ -329,7 +336,7 @@ mod tests {
     #[test]
     fn the_bytes_are_as_many_as_the_header_says() {
         for (color, reduction) in [(Color::Rgb, 1), (Color::Sh { degree: 2, offset: 0.5 }, 1), (Color::Sh { degree: 2, offset: 0.5 }, 4)] {
-            let small = WebGrid::new(&ball(color, reduction), FINEST);
+            let small = WebGrid::new(&ball(color, reduction, 1.0), FINEST);
             let mut bytes = Vec::new();
             ZlibDecoder::new(small.bytes().unwrap().as_slice()).read_to_end(&mut bytes).unwrap();
             let places = |lattice: &Lattice| {
@@ -347,7 +354,7 @@ mod tests {
 
     #[test]
     fn a_grid_becomes_coarser_until_it_fits() {
-        let grid = ball(Color::Sh { degree: 2, offset: 0.5 }, 1);
+        let grid = ball(Color::Sh { degree: 2, offset: 0.5 }, 1, 1.0);
         let whole = WebGrid::new(&grid, FINEST).bytes().unwrap().len();
         let (_, same) = WebGrid::within(&grid, whole).unwrap();
         assert_eq!(same.len(), whole);

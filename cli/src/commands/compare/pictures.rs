@@ -2,10 +2,9 @@
 
 use super::Run;
 use crate::html::{escaped, picture};
-use crate::images::{begins_at, evenly_spaced};
+use crate::images::{self, evenly_spaced};
 use crate::report::pictures::LARGEST;
 use crate::run_folder::RunFolder;
-use image::imageops::crop_imm;
 use plenoxel::dataset::image as files;
 use plenoxel::error::{Error, Result};
 use std::path::Path;
@@ -58,13 +57,9 @@ fn part(run: &Run, panel: &str, parts: &[usize]) -> Result<String> {
     let whole = files::read(&path)?;
     let (Some(width), Some(height)) = (run.figures.width, run.figures.height) else { return Err(unlike(&path)) };
     let mut all = String::new();
-    for &part in parts {
-        let begin = begins_at(part, (width, height));
-        if begin.saturating_add(width) > whole.width() as usize || height != whole.height() as usize {
-            return Err(unlike(&path));
-        }
-        let cut = crop_imm(&whole, begin as u32, 0, width as u32, height as u32).to_image();
-        all += &picture(&cut, LARGEST, &format!("{} of {}", ["photograph", "render", "error"][part], run.name));
+    for &number in parts {
+        let Some(cut) = images::part(&whole, number, (width, height)) else { return Err(unlike(&path)) };
+        all += &picture(&cut, LARGEST, &format!("{} of {}", ["photograph", "render", "error"][number], run.name));
     }
     Ok(all)
 }

@@ -74,17 +74,15 @@ impl Job {
         if !something {
             return State::New;
         }
-        let (folder, config, source) = match RunFolder::open(&self.folder) {
-            Ok((folder, config, record)) => (folder, config, record.data),
+        let (folder, config, record) = match RunFolder::open(&self.folder) {
+            Ok(run) => run,
             Err(e) => return State::Different(e.to_string()),
         };
-        let result = folder.result();
-        let planned = result.as_ref().and_then(|result| result["seconds_planned"].as_f64());
-        let different = self.asked.differences(&config, &source, planned);
+        let different = self.asked.differences(&config, &record.data, record.seconds_planned);
         if !different.is_empty() {
             return State::Different(different.join("; "));
         }
-        match result {
+        match folder.result() {
             // A comparison with no test views is one too, and has no PSNR.
             Some(result) if result.get("psnr").is_some() || folder.evaluation().is_some() => State::Finished,
             Some(_) => State::Unevaluated,

@@ -57,16 +57,10 @@ impl Measured {
     /// Errors: it is not the folder of a run.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         let (folder, config, _) = RunFolder::open(path)?;
-        let Some(serde_json::Value::Object(mut all)) = folder.result() else {
+        let Some(all) = folder.figures() else {
             return Ok(None);
         };
-        // Carving compares nothing with test views: what it does not say, the evaluation does.
-        if let Some(serde_json::Value::Object(evaluation)) = folder.evaluation() {
-            for (key, value) in evaluation {
-                all.entry(key).or_insert(value);
-            }
-        }
-        let Ok(mut figures) = serde_json::from_value::<Figures>(all.into()) else {
+        let Ok(mut figures) = serde_json::from_value::<Figures>(all) else {
             return Ok(None);
         };
         figures.background = config.background;

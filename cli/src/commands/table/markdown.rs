@@ -43,6 +43,6 @@ fn scores(scores: &Scores) -> String {
 }
 
 /// Text on one line that ends no cell.
-fn plain(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ").replace('|', "\\|")
+pub fn plain(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ").replace('\\', "\\\\").replace('|', "\\|")
 }

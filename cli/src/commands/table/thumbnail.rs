@@ -1,8 +1,7 @@
 //! What a run looks like: the first test view, from the pictures in its folder.
 
 use super::figures::{Figures, Measured};
-use crate::images::begins_at;
-use image::imageops;
+use crate::images::part;
 use plenoxel::dataset::image::{self as files, RgbaImage};
 
 /// The photograph and what was learned of it.
@@ -19,17 +18,7 @@ pub fn of(run: &Measured) -> Thumbnails {
     let Figures { width: Some(width), height: Some(height), .. } = run.figures else {
         return Thumbnails::default();
     };
-    // A file may say anything.
-    if width.max(height) > files::MAX_SIDE as usize {
-        return Thumbnails::default();
-    }
-    let cut = |strip: &RgbaImage, number: usize| {
-        let (x, width, height) = (begins_at(number, (width, height)) as u32, width as u32, height as u32);
-        if x + width > strip.width() || height != strip.height() {
-            return None;
-        }
-        Some(imageops::crop_imm(strip, x, 0, width, height).to_image())
-    };
+    let cut = |strip: &RgbaImage, number: usize| part(strip, number, (width, height));
     let read = |test: &dyn Fn(&str) -> bool| files::read(named(test)?).ok();
     if let Some(panel) = read(&|name| name.starts_with("test_") && name.ends_with(".png")) {
         return Thumbnails { target: cut(&panel, 0), render: cut(&panel, 1) };

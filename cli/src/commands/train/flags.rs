@@ -73,7 +73,7 @@ pub struct TrainArgs {
     pub checkpoint_every: f64,
 
     /// Look at the grid this often while it trains, such as 10s, or off: images/preview.png, and the PSNR of a few validation views. What is
-    /// trained does not depend on it, and it takes less than a twentieth of the time
+    /// trained does not depend on it, and it takes less than a twentieth of the time, or a second
     #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration_or_off, default_value = "10s")]
     pub preview_every: f64,
 

@@ -50,7 +50,7 @@ impl<'a> Job<'a, '_> {
         clocks: &mut Clocks,
     ) -> Result<Option<Learned<'a>>> {
         let Job { folder, config, dataset, console, .. } = *self;
-        let keep_stages = self.args.keeps_stages(self.source);
+        let keep_stages = self.args.keeps_stages(&self.record.data);
         let plan = trainer.plan().to_vec();
         let total = trainer.total_steps();
         let earlier = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));

@@ -16,6 +16,7 @@ use serde_json::json;
 pub struct Watching<'a, 'c> {
     folder: &'a RunFolder,
     config: &'a Config,
+    console: &'a Console<'c>,
     plan: Vec<PlannedStage>,
     metrics: MetricsFile,
     progress: Training<'a, 'c>,
@@ -42,7 +43,7 @@ impl<'a, 'c> Watching<'a, 'c> {
         }
         let progress = console.training(&plan, trainer.prunes_from(), past.seconds);
         let voxels = trainer.grid().lattice().present();
-        Watching { folder, config, plan, metrics, progress, pictures, preview, losses: past.losses, voxels }
+        Watching { folder, config, console, plan, metrics, progress, pictures, preview, losses: past.losses, voxels }
     }
 
     /// A step was taken, after so many seconds of training; `save` says that the run can go on from here.
@@ -51,19 +52,26 @@ impl<'a, 'c> Watching<'a, 'c> {
         if report.step == self.plan[report.stage].first {
             self.voxels = grid.lattice().present();
         }
-        let look = self.preview.look(grid, report.ends_stage, self.config)?;
+        let look = self.preview.look(grid, report.ends_stage, self.config);
+        let look = self.drawn(look).flatten();
         let validation_psnr = look.as_ref().and_then(|look| look.psnr);
         let seen = Seen { voxels: self.voxels, validation_psnr, seconds };
         self.metrics.step(report, &self.plan, seen, save)?;
         self.progress.step(report, seen);
         if report.ends_stage {
-            self.draw_loss()?;
-            self.pictures.stage(report.stage, grid)?;
+            self.drawn(self.draw_loss());
+            let stage = self.pictures.stage(report.stage, grid);
+            self.drawn(stage);
             if let Some(Look { picture: Some((png, size)), .. }) = look {
                 self.metrics.picture(report.step, size, &png)?;
             }
         }
         Ok(())
+    }
+
+    /// What came of drawing: a picture that cannot be written is no reason to lose what was learned.
+    fn drawn<R>(&self, done: Result<R>) -> Option<R> {
+        done.map_err(|e| self.console.note(&format!("no picture: {e}"))).ok()
     }
 
     /// Training has failed: the lines and the curve so far stay, to show how it came to this.
