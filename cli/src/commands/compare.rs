@@ -22,8 +22,8 @@ Examples:
   plenoxel compare runs/lego-1 runs/lego-2         prints a table, writes compare.html
   plenoxel compare runs/lego-* --out lego.html
 
-The page has the table, the settings that differ, curves over steps and over seconds, and the test views of which every run has a picture: \
-what each rendered, and how far it is from the photograph. Runs may be of different scenes; then there are no pictures.";
+The page has the table, curves over steps and over seconds, the test views of which every run has a picture (what each rendered, and how far \
+it is from the photograph), and the settings that differ. Runs may be of different scenes; then there are no pictures.";
 
 /// Compare runs: a table, and a page with curves and pictures side by side
 #[derive(Debug, Args)]
@@ -85,9 +85,9 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
     let curves = runs.iter().map(|run| (run.name.clone(), metrics_file::lines(&run.metrics).map(|(_, line)| line).collect()));
     let parts = [
         format!("<section>{}</section>", table(&heads, &cells)),
-        settings(&runs),
         curves::side_by_side(&curves.collect::<Vec<_>>()),
         pictures::section(&runs)?,
+        settings(&runs),
         format!("<script>\n{SCRIPT}</script>\n"),
     ];
     let page = html::page(&format!("{} runs", runs.len()), STYLE, &parts.join("\n"));
