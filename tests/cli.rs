@@ -44,6 +44,23 @@ fn names(folder: &str) -> Vec<String> {
 }
 
 #[test]
+fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
+    let folder = Folder::new("figures");
+    let run = folder.path("run");
+    let whole = train(&run, &["--no-report"]).json();
+    let grid = fs::read(folder.path("run/checkpoint.safetensors")).unwrap();
+    fs::remove_file(folder.path("run/result.json")).unwrap();
+    let again = plenoxel(&["train", "--resume", &run]).json();
+    assert_eq!((&again["psnr"], &again["steps"], &again["rays"]), (&whole["psnr"], &whole["steps"], &whole["rays"]));
+    assert_eq!(
+        (again["stages"].as_array().unwrap().len(), fs::read(folder.path("run/checkpoint.safetensors")).unwrap() == grid),
+        (2, true)
+    );
+    assert!(fs::exists(folder.path("run/report.html")).unwrap());
+    plenoxel(&["train", "--resume", &run]).refused(3, &["this run has ended"]);
+}
+
+#[test]
 fn a_run_is_trained_evaluated_rendered_and_described() {
     let folder = Folder::new("whole");
     let run = folder.path("run");

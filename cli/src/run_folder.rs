@@ -175,13 +175,14 @@ impl RunFolder {
         Ok(path)
     }
 
-    /// The file from which training goes on.
+    /// The file from which training goes on; `None` if training has ended, and all that is missing are the final figures.
     ///
     /// Errors: there is none, because the run has ended, or never came so far.
-    pub fn existing_state(&self) -> Result<PathBuf> {
+    pub fn existing_state(&self) -> Result<Option<PathBuf>> {
         let path = self.state();
         let (found, remedy) = match (path.exists(), self.checkpoint().exists()) {
-            (true, _) => return Ok(path),
+            (true, _) => return Ok(Some(path)),
+            (false, true) if self.result().is_none() => return Ok(None),
             (false, true) => ("this run has ended", "to train its grid further, use `--init-from`"),
             (false, false) => ("this run left nothing from which to go on", "train again with its config.toml"),
         };

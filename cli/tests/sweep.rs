@@ -132,14 +132,14 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     assert!(read("swept/few/fine/result.json").contains("\"psnr\""));
     assert!(read("swept/files/hull/evaluation.json").contains("\"psnr\""));
 
-    // Once more: what is finished stays as it is, what was cut short is made again, to the same bits.
+    // Once more: what is finished stays as it is, what was killed before it had its figures gets them.
     let modified = |name: &str| fs::metadata(root.join(name)).and_then(|file| file.modified()).expect("its time");
     let (before, grid) =
         (modified("swept/few/coarse/result.json"), fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it"));
     fs::remove_file(root.join("swept/few/fine/result.json")).expect("it is removed");
     let (code, again, err) = sweep(&[]);
     assert_eq!((code, err.matches("finished already: PSNR ").count()), (Some(2), 4), "{err}");
-    assert!(err.contains("2/7 few fine: begins") && err.contains("3/7 few odd: begins"), "{err}");
+    assert!(err.contains("2/7 few fine: going on") && err.contains("3/7 few odd: begins"), "{err}");
     assert_eq!(modified("swept/few/coarse/result.json"), before);
     assert!(fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it") == grid);
     let psnr = |text: &str| text.lines().find_map(|line| line.strip_prefix("| few | ")?.split(" · ").next().map(str::to_owned));

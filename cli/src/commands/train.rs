@@ -107,14 +107,22 @@ fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let most_rows = room(&config, &dataset, 0, console)?;
     let preview = clocks.load.time(|| Preview::new(&dataset, args.preview_every))?;
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &record.data))?;
-    let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows).resumed(&state)?;
+    let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows);
+    let trainer = match &state {
+        Some(state) => trainer.resumed(state)?,
+        None => trainer,
+    };
     folder.remove_fragments()?;
-    let (metrics, past) = MetricsFile::resume(&folder, trainer.total_steps(), trainer.steps_taken())?;
+    let total = trainer.total_steps();
+    let taken = if state.is_some() { trainer.steps_taken() } else { total };
+    let (metrics, past) = MetricsFile::resume(&folder, total, taken)?;
     clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
-    let (taken, total) = (trainer.steps_taken(), trainer.total_steps());
     console.note(&format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds)));
     let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, args, console };
-    let learned = job.learn(trainer, (metrics, past), preview, &views, &mut clocks)?;
+    let learned = match state {
+        Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks)?,
+        None => Some(job.learned(trainer.plan(), (metrics, past), &views)?),
+    };
     drop(views);
     job.conclude(learned, clocks)
 }

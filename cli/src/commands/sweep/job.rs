@@ -86,7 +86,7 @@ impl Job {
             // A comparison with no test views is one too, and has no PSNR.
             Some(result) if result.get("psnr").is_some() || folder.evaluation().is_some() => State::Finished,
             Some(_) => State::Unevaluated,
-            None if folder.state().exists() => State::Interrupted,
+            None if !config.stages.is_empty() && folder.existing_state().is_ok() => State::Interrupted,
             None => State::CutShort,
         }
     }

@@ -53,15 +53,7 @@ impl<'a> Job<'a, '_> {
         let keep_stages = self.args.keeps_stages(&self.record.data);
         let plan = trainer.plan().to_vec();
         let total = trainer.total_steps();
-        let earlier = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));
-        let summary = |planned: &PlannedStage, seconds, grid| StageSummary {
-            resolution: planned.stage.resolution,
-            steps: planned.steps,
-            seconds,
-            psnr: None,
-            grid,
-        };
-        let mut stages: Vec<StageSummary> = earlier.map(|(planned, seconds)| summary(planned, seconds, None)).collect();
+        let mut stages = summaries(&past, &plan);
         let pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
         let preview = preview.begin(pictures.camera().map(|camera| (folder.image("preview.png"), camera)));
         let mut watching = Watching::begin((folder, config, console), &trainer, (metrics, past), pictures, preview);
@@ -81,7 +73,7 @@ impl<'a> Job<'a, '_> {
             let grid = trainer.grid();
             watching.step(&report, grid, seconds, save)?;
             if report.ends_stage {
-                stages.push(summary(&plan[report.stage], seconds, (keep_stages && !last).then(|| copy(grid))));
+                stages.push(StageSummary::new(&plan[report.stage], seconds, (keep_stages && !last).then(|| copy(grid))));
             }
             if save {
                 watching.sync()?;
@@ -104,13 +96,35 @@ impl<'a> Job<'a, '_> {
         let grid = trainer.into_grid();
         folder.save(&grid, &Header::new(&grid, dataset.name(), config.background, config.seed, total))?;
         if interrupt.requested() {
-            let text = format!("interrupted after the last step; its figures: plenoxel evaluate {}", folder.path().display());
+            let text = format!("interrupted after the last step; its figures: plenoxel train --resume {}", folder.path().display());
             console.error(&text, interrupt::EXIT_CODE);
             return Ok(None);
         }
         let mean_image = evaluation::mean_image(views, config.background);
         Ok(Some(Learned { grid, metrics, pictures, mean_image, stages, steps: total }))
     }
+
+    /// What a run has learned that was killed between its last step and its final figures.
+    pub fn learned(&'a self, plan: &[PlannedStage], (metrics, past): (MetricsFile, Past), views: &[View]) -> Result<Learned<'a>> {
+        let Job { folder, config, dataset, .. } = *self;
+        let mut pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
+        pictures.earlier_stages(&past, plan);
+        let (grid, header) = folder.load()?;
+        let mean_image = evaluation::mean_image(views, config.background);
+        Ok(Learned { grid, metrics, pictures, mean_image, stages: summaries(&past, plan), steps: header.step })
+    }
+}
+
+impl StageSummary {
+    fn new(planned: &PlannedStage, seconds: f64, grid: Option<VoxelGrid<f32>>) -> Self {
+        StageSummary { resolution: planned.stage.resolution, steps: planned.steps, seconds, psnr: None, grid }
+    }
+}
+
+/// Of the stages that ended before.
+fn summaries(past: &Past, plan: &[PlannedStage]) -> Vec<StageSummary> {
+    let ended = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));
+    ended.map(|(planned, seconds)| StageSummary::new(planned, seconds, None)).collect()
 }
 
 /// A grid with the values that `grid` has now: the tables are shared until training changes them.

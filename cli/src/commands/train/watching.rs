@@ -36,11 +36,7 @@ impl<'a, 'c> Watching<'a, 'c> {
         preview: Preview,
     ) -> Self {
         let plan = trainer.plan().to_vec();
-        for &(index, _) in &past.stages {
-            if let Some(PlannedStage { stage, .. }) = plan.get(index) {
-                pictures.earlier_stage(index, stage.resolution);
-            }
-        }
+        pictures.earlier_stages(&past, &plan);
         let progress = console.training(&plan, trainer.prunes_from(), past.seconds);
         let voxels = trainer.grid().lattice().present();
         Watching { folder, config, console, plan, metrics, progress, pictures, preview, losses: past.losses, voxels }
