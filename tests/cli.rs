@@ -5,18 +5,13 @@ mod command;
 #[path = "support/events.rs"]
 mod events;
 
-use command::{Answer, Folder, plenoxel};
+use command::{Answer, Folder, SHORT, plenoxel};
 use plenoxel::dataset::image;
 use plenoxel_cli::Streams;
 use serde_json::Value;
 use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-
-/// Two short stages on a coarse grid.
-const SHORT: &str = "stages=[\
-    {resolution=8, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05},\
-    {resolution=12, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]";
 
 /// `train` on the built-in scene, tiny, into `out`.
 fn train(out: &str, more: &[&str]) -> Answer {

@@ -5,15 +5,11 @@ mod command;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use command::{Folder, plenoxel};
+use command::{Folder, SHORT, plenoxel};
 use flate2::read::ZlibDecoder;
 use serde_json::Value;
 use std::fs;
 use std::io::Read;
-
-const SHORT: &str = "stages=[\
-    {resolution=8, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05},\
-    {resolution=12, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]";
 
 /// What is between two texts of a page.
 fn between<'a>(page: &'a str, before: &str, after: &str) -> &'a str {

@@ -4,11 +4,11 @@
 //! `Event`. Records, masked checksums and the numbers of the fields are as in TensorFlow's `record_writer.h`, `event.proto` and
 //! `summary.proto`. A last record that was cut short is left out by who reads.
 
+use crate::machine;
 use plenoxel::error::{Error, Result};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
 
 /// What TensorBoard knows the files by; then comes the time in seconds, by which it sorts them.
 const PREFIX: &str = "events.out.tfevents.";
@@ -25,7 +25,7 @@ impl EventFile {
     /// A new file in the folder of a run of which so many steps have been taken: what files that are there say of later ones is forgotten.
     pub fn create(folder: &Path, taken: u64) -> Result<Self> {
         let newest = present(folder).filter_map(|path| number(&path)).max();
-        let number = (seconds() as u64).max(newest.map_or(0, |newest| newest.saturating_add(1)));
+        let number = (machine::time() as u64).max(newest.map_or(0, |newest| newest.saturating_add(1)));
         let path = folder.join(format!("{PREFIX}{number}.plenoxel"));
         let file = OpenOptions::new().append(true).create_new(true).open(&path);
         let file = file.map_err(|e| Error::io(&path, e, "creating the events for TensorBoard"))?;
@@ -56,7 +56,7 @@ impl EventFile {
 
     /// Appends an event with one field besides the time and the step.
     fn append(&mut self, step: u64, field: u64, content: &[u8]) -> Result<()> {
-        let event = Message::default().double(field::WALL_TIME, seconds()).varint(field::STEP, step).bytes(field, content);
+        let event = Message::default().double(field::WALL_TIME, machine::time()).varint(field::STEP, step).bytes(field, content);
         let written = self.file.write_all(&record(&event.0));
         written.map_err(|e| Error::io(&self.path, e, "writing the events for TensorBoard"))
     }
@@ -75,11 +75,6 @@ fn name(path: &Path) -> Option<&str> {
 /// The time in the name of an event file.
 fn number(path: &Path) -> Option<u64> {
     name(path)?.strip_prefix(PREFIX)?.split('.').next()?.parse().ok()
-}
-
-/// Seconds since 1970.
-fn seconds() -> f64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
 
 /// Bytes with their length and the two checksums.

@@ -39,11 +39,11 @@ pub fn escaped(text: &str) -> String {
 /// JPEG quality of pictures within a page; the files beside it are whole.
 const QUALITY: u8 = 88;
 
-/// A picture within the page, reduced to at most so many pixels a side. A fully transparent one is black: the caller's have no alpha.
+/// An opaque picture within the page, reduced to at most this width and height in pixels.
 pub fn picture(picture: &RgbaImage, [width, height]: [u32; 2], description: &str) -> String {
     let large = picture.width() > width || picture.height() > height;
-    let reduced = large.then(|| DynamicImage::from(picture.clone()).thumbnail(width, height).to_rgb8());
-    let rgb = reduced.unwrap_or_else(|| DynamicImage::from(picture.clone()).to_rgb8());
+    let whole = DynamicImage::from(picture.clone());
+    let rgb = if large { whole.thumbnail(width, height) } else { whole }.into_rgb8();
     let (width, height, description) = (rgb.width(), rgb.height(), escaped(description));
     let mut jpeg = Vec::new();
     // Only pictures of more than 65535 pixels a side are refused.

@@ -2,6 +2,7 @@
 
 use plenoxel::error::{Error, Result};
 use std::num::NonZero;
+use std::time::{SystemTime, UNIX_EPOCH};
 
 /// More threads than any machine of today has cores are a slip of the finger.
 pub const MOST_THREADS: usize = 1024;
@@ -22,6 +23,11 @@ pub fn with_threads<R: Send>(threads: Option<usize>, f: impl FnOnce() -> Result<
 /// Threads of the pool a command runs on.
 pub fn threads() -> usize {
     rayon::current_num_threads()
+}
+
+/// Seconds since 1970.
+pub fn time() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
 
 /// The vector instructions that the numeric loops use on this machine; they are chosen at run time.

@@ -6,12 +6,13 @@
 mod training;
 
 use crate::Streams;
+use crate::machine;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use plenoxel::error::{Error, Result};
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 pub use training::Training;
 
 /// Time between lines.
@@ -85,7 +86,7 @@ impl<'a> Console<'a> {
             #[serde(flatten)]
             fields: &'t F,
         }
-        let time = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64());
+        let time = machine::time();
         match self.format {
             LogFormat::Plain => self.write(&plain()),
             LogFormat::Json => self.write(&crate::json_line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
@@ -109,7 +110,7 @@ impl<'a> Console<'a> {
 
     /// Progress of a number of things that other processes do, who tell of it in lines.
     pub fn relay(&self, total: usize) -> Relay<'_, 'a> {
-        Relay { meter: Meter::new(self, total as u64) }
+        Relay { meter: Meter::new(self, total as u64), total }
     }
 }
 
@@ -196,11 +197,13 @@ impl Count<'_, '_> {
 /// Progress of what other processes do.
 pub struct Relay<'c, 'a> {
     meter: Meter<'c, 'a>,
+    total: usize,
 }
 
 impl Relay<'_, '_> {
-    /// So many of `total` things are done, and the one that is being done says this of itself.
-    pub fn say(&self, done: usize, total: usize, line: impl FnOnce() -> String) {
+    /// So many things are done, and the one that is being done says this of itself.
+    pub fn say(&self, done: usize, line: impl FnOnce() -> String) {
+        let total = self.total;
         self.meter.show((done as u64, total as u64), false, || Relayed { done, total, message: line() });
     }
 }
@@ -261,6 +264,14 @@ pub fn bytes(n: u64) -> String {
     }
 }
 
+/// A number with spaces between its thousands.
+pub fn thousands(n: u64) -> String {
+    let digits = n.to_string();
+    let first = digits.len() % 3;
+    let groups = (first..digits.len()).step_by(3).map(|at| &digits[at..at + 3]);
+    [&digits[..first]].into_iter().filter(|group| !group.is_empty()).chain(groups).collect::<Vec<_>>().join("\u{202f}")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -273,5 +284,6 @@ mod tests {
         assert_eq!(metric(431_204.0) + "rays/s", "431 krays/s");
         assert_eq!(bytes(2_345_678_901), "2.3 GB");
         assert_eq!(bytes(99_000), "99 kB");
+        assert_eq!([7, 999, 1000, 1_234_567].map(thousands), ["7", "999", "1\u{202f}000", "1\u{202f}234\u{202f}567"]);
     }
 }

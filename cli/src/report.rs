@@ -8,7 +8,7 @@ mod scene;
 
 use crate::html::{self, escaped};
 use crate::metrics_file;
-use crate::progress::{bytes, clock};
+use crate::progress::{bytes, clock, thousands};
 use crate::run_folder::{RunFolder, RunRecord};
 use plenoxel::dataset::Dataset;
 use plenoxel::error::Result;
@@ -135,22 +135,4 @@ fn costs(report: &Report<'_>, result: &Value) -> String {
     ];
     let rows = rows.into_iter().filter_map(|(name, value)| Some(format!("<tr><td>{name}</td><td>{}</td></tr>", escaped(&value?))));
     format!("<section><h2>Time and memory</h2>\n<table><tbody>{}</tbody></table></section>", rows.collect::<String>())
-}
-
-/// A number with spaces between its thousands.
-pub fn thousands(n: u64) -> String {
-    let digits = n.to_string();
-    let first = digits.len() % 3;
-    let groups = (first..digits.len()).step_by(3).map(|at| &digits[at..at + 3]);
-    [&digits[..first]].into_iter().filter(|group| !group.is_empty()).chain(groups).collect::<Vec<_>>().join("\u{202f}")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn thousands_are_set_apart() {
-        assert_eq!([7, 999, 1000, 1234567].map(thousands), ["7", "999", "1\u{202f}000", "1\u{202f}234\u{202f}567"]);
-    }
 }

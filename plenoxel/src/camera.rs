@@ -27,7 +27,11 @@ impl Intrinsics {
     /// Square pixels and a centred principal point from the horizontal field of view in radians:
     /// f = W / (2 tan(fov / 2)), c = (W / 2, H / 2).
     pub fn from_fov_x(width: usize, height: usize, fov_x: f64) -> Self {
-        let focal = 0.5 * width as f64 / (0.5 * fov_x).tan();
+        Self::centred(width, height, 0.5 * width as f64 / (0.5 * fov_x).tan())
+    }
+
+    /// Square pixels and a centred principal point from the focal length in pixels.
+    pub fn centred(width: usize, height: usize, focal: f64) -> Self {
         Intrinsics { width, height, fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 }
     }
 
@@ -43,6 +47,12 @@ impl Intrinsics {
         let s = k as f64;
         Intrinsics { width: self.width / k, height: self.height / k, fx: self.fx / s, fy: self.fy / s, cx: self.cx / s, cy: self.cy / s }
     }
+}
+
+/// True for the angles of view in radians that a pinhole camera has: those of which the tangent of half is a number to compute with.
+pub(crate) fn is_angle_of_view(radians: f64) -> bool {
+    const LEAST: f64 = 1e-6;
+    (LEAST..std::f64::consts::PI - LEAST).contains(&radians)
 }
 
 /// Half-line from a camera through a point of its image, in world coordinates.

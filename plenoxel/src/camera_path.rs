@@ -24,14 +24,13 @@ mod nerfstudio;
 mod transforms;
 mod turntable;
 
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::dataset::image::MAX_SIDE;
 use crate::error::{Error, Result};
 use crate::json;
 use glam::{DAffine3, DQuat, DVec3};
 use instant_ngp::Keyframes;
 use serde_json::Value;
-use std::f64::consts::PI;
 use std::path::Path;
 pub use turntable::Turntable;
 
@@ -61,8 +60,7 @@ impl Fov {
             Fov::Vertical(angle) => (height, angle),
             Fov::Shorter(angle) => (width.min(height), angle),
         };
-        let focal = 0.5 * side as f64 / (0.5 * angle).tan();
-        Intrinsics { width, height, fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 }
+        Intrinsics::centred(width, height, 0.5 * side as f64 / (0.5 * angle).tan())
     }
 
     /// The angle between two of a kind; `self` if they are not.
@@ -213,7 +211,7 @@ impl<'a> Entry<'a> {
     fn wrong(&self, field: &str, accepted: &str) -> Error {
         let found = match self.value.get(field) {
             None => format!("there is no `{field}`{}", self.place),
-            Some(value) => format!("`{field}`{} is {}", self.place, shortened(value)),
+            Some(value) => format!("`{field}`{} is {}", self.place, json::shown(value)),
         };
         Error::input(self.path, found, accepted)
     }
@@ -250,7 +248,7 @@ impl<'a> Entry<'a> {
     /// An angle of view in radians, given in degrees.
     fn fov(&self) -> Result<f64> {
         let accepted = "it is an angle in degrees, above 0 and below 180";
-        self.number("fov", |degrees| is_angle(degrees.to_radians()), accepted).map(f64::to_radians)
+        self.number("fov", |degrees| is_angle_of_view(degrees.to_radians()), accepted).map(f64::to_radians)
     }
 
     /// Width and height in pixels, where both are given.
@@ -266,25 +264,6 @@ impl<'a> Entry<'a> {
         let near = camera_to_world.translation.abs().cmple(DVec3::splat(FARTHEST)).all();
         near.then_some(camera_to_world).ok_or_else(|| self.wrong(field, "cameras stand within a million units of the origin"))
     }
-}
-
-/// A value for a message.
-fn shortened(value: &Value) -> String {
-    const MOST: usize = 60;
-    match value {
-        Value::Array(list) if list.len() > 16 => format!("a list of {}", list.len()),
-        Value::Object(_) => "an object".to_owned(),
-        value => {
-            let text = value.to_string();
-            let short: String = text.chars().take(MOST).collect();
-            if short.len() < text.len() { short + "…" } else { text }
-        }
-    }
-}
-
-/// True for angles of view in radians that a pinhole camera can have.
-fn is_angle(radians: f64) -> bool {
-    radians > 0.0 && radians < PI
 }
 
 #[cfg(test)]

@@ -18,3 +18,19 @@ pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<Value> {
         Error::input(path, found, remedy)
     })
 }
+
+/// A value for a message: a file may have anything in its place.
+pub(crate) fn shown(value: &Value) -> String {
+    const MOST: usize = 60;
+    match value {
+        Value::Array(list) if list.len() > 16 => format!("a list of {}", list.len()),
+        Value::Object(_) => "an object".to_owned(),
+        value => {
+            let text = value.to_string();
+            match text.char_indices().nth(MOST) {
+                Some((end, _)) => format!("{}…", &text[..end]),
+                None => text,
+            }
+        }
+    }
+}

@@ -6,6 +6,11 @@ use serde_json::Value;
 use std::fs;
 use std::path::PathBuf;
 
+/// Two short stages on a coarse grid, for `--set`.
+pub const SHORT: &str = "stages=[\
+    {resolution=8, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05},\
+    {resolution=12, steps=5, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]";
+
 /// What a command line came to.
 pub struct Answer {
     pub code: u8,

@@ -2,13 +2,13 @@
 
 mod pictures;
 
+use super::table::Figures;
 use super::table::markdown::plain;
-use super::table::{Figures, Measured};
 use crate::config;
 use crate::html::{self, escaped};
 use crate::metrics_file;
-use crate::progress::{Console, bytes, clock};
-use crate::report::{SCRIPT, STYLE, curves, thousands};
+use crate::progress::{Console, bytes, clock, thousands};
+use crate::report::{SCRIPT, STYLE, curves};
 use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
@@ -52,7 +52,7 @@ struct Run {
 impl Run {
     fn read(path: &Path) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
-        let figures = Measured::read(path)?.map(|run| run.figures).unwrap_or_default();
+        let figures = Figures::of(&folder, &config).unwrap_or_default();
         let metrics = metrics_file::read(&folder.metrics())?;
         Ok(Run { name: path.display().to_string(), folder, config, record, figures, metrics })
     }

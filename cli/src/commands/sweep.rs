@@ -182,7 +182,7 @@ impl Sweep<'_, '_> {
     /// Has the program called, and returns what it said on stdout, or how it failed.
     fn process(&self, job: &Job, arguments: &[OsString]) -> Result<std::result::Result<String, Failure>> {
         let progress = self.console.relay(self.of);
-        let ended = self.program.run(arguments, &job.log(), |line| progress.say(self.index, self.of, || self.line(job, line)))?;
+        let ended = self.program.run(arguments, &job.log(), |line| progress.say(self.index, || self.line(job, line)))?;
         drop(progress);
         if ended.code == 0 {
             return Ok(Ok(ended.out));

@@ -1,10 +1,10 @@
 //! The grid in the page, for its viewer: how it is embedded, and what that costs.
 
-use super::{Report, thousands};
+use super::Report;
 use crate::evaluation::Viewer;
 use crate::html::escaped;
 use crate::images::evenly_spaced;
-use crate::progress::bytes;
+use crate::progress::{bytes, thousands};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use plenoxel::camera::Camera;
@@ -80,14 +80,14 @@ impl Scene {
         let reduction =
             if shape.sh_reduction > 1 { format!(", harmonics for every {} along each axis", shape.sh_reduction) } else { String::new() };
         let what = format!(
-            "viewer: {} voxels of {}³{reduction}, {}",
+            "the page holds {} voxels of {}³{reduction} in {}",
             thousands(header.voxels as u64),
             shape.resolution,
             bytes(self.bytes.len() as u64)
         );
         match &self.cost {
             Some(Cost { views, whole, small, between }) => format!(
-                "{what}; {small:.2} dB instead of {whole:.2} dB on {views} test views, {between:.1} dB against the whole grid's pictures"
+                "{what}, which show {views} test views with {small:.2} dB, the grid itself with {whole:.2} dB ({between:.1} dB between the two)"
             ),
             None => what,
         }

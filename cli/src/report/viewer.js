@@ -408,7 +408,7 @@ class Viewer {
     this.camera = new Orbit(scene.views[0]);
     // Pixels of a frame, and of a band: what was taken for the last ones tells how many.
     this.pixels = { frame: 10000, band: 10000 };
-    this.moving = { count: 0, worst: 0, last: 0, scale: 1 };
+    this.moving = { last: 0, scale: 1 };
     this.still = 0;
     this.listen(figure, scene);
     new ResizeObserver(() => this.moved()).observe(this.canvas);
@@ -462,7 +462,7 @@ class Viewer {
       const time = renderer.draw(camera, target);
       renderer.copy(target, null);
       this.learn('frame', time, FRAME, target.width * target.height);
-      this.moving = { count: this.moving.count + 1, worst: Math.max(this.moving.worst, time), last: time, scale };
+      this.moving = { last: time, scale };
       [this.still, this.stillTime] = [0, 0];
       clearTimeout(this.rest);
       this.rest = setTimeout(() => this.still === 0 && requestAnimationFrame(() => this.frame()), 200);

@@ -3,7 +3,8 @@
 //! An angle of view is looked for as instant-ngp does (`read_focal_length` in its `nerf_loader.cu`): `x_fov` in degrees, `fl_x` and `w` in pixels,
 //! `camera_angle_x` in radians, then the same for y; in the frame, and else in the file.
 
-use super::{CameraPath, Entries, Entry, Format, Fov, Shot, is_angle};
+use super::{CameraPath, Entries, Entry, Format, Fov, Shot};
+use crate::camera::is_angle_of_view;
 use crate::dataset::blender::pose;
 use crate::error::{Error, Result};
 
@@ -31,7 +32,9 @@ fn fov(entry: &Entry<'_>, size: Option<(usize, usize)>) -> Result<Option<Fov>> {
         ("x_fov", "fl_x", "camera_angle_x", width, Fov::Horizontal as fn(f64) -> Fov),
         ("y_fov", "fl_y", "camera_angle_y", height, Fov::Vertical),
     ] {
-        if let Some(angle) = entry.optional(degrees, |a| is_angle(a.to_radians()), "it is an angle in degrees, above 0 and below 180")? {
+        if let Some(angle) =
+            entry.optional(degrees, |a| is_angle_of_view(a.to_radians()), "it is an angle in degrees, above 0 and below 180")?
+        {
             return Ok(Some(kind(angle.to_radians())));
         }
         if let Some(side) = side
@@ -39,7 +42,7 @@ fn fov(entry: &Entry<'_>, size: Option<(usize, usize)>) -> Result<Option<Fov>> {
         {
             return Ok(Some(kind(2.0 * (0.5 * side as f64 / focal).atan())));
         }
-        if let Some(angle) = entry.optional(radians, is_angle, "it is an angle in radians, above 0 and below pi")? {
+        if let Some(angle) = entry.optional(radians, is_angle_of_view, "it is an angle in radians, above 0 and below pi")? {
             return Ok(Some(kind(angle)));
         }
     }

@@ -7,7 +7,7 @@
 mod write;
 
 use super::{Dataset, Frame, OpenOptions, Source, Split, image};
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::error::{Error, Result};
 use crate::json;
 use glam::{DAffine3, DMat3, DMat4};
@@ -17,8 +17,6 @@ pub(super) use write::write;
 
 /// Largest accepted entry of RᵀR - 1. Files written in single precision stay below 1e-6; a scaled or sheared matrix does not.
 const ORTHONORMAL_WITHIN: f64 = 1e-3;
-/// Fields of view stay this far from 0 and pi, radians: nearer, focal lengths leave the numbers that can be computed with.
-const LEAST_ANGLE: f64 = 1e-6;
 /// Camera positions beyond this overflow when rays are cut with boxes.
 const FARTHEST: f64 = 1e12;
 /// As long as any system takes paths.
@@ -109,8 +107,8 @@ impl Transforms {
         let Some(angle) = json.get("camera_angle_x") else {
             return Err(bad("there is no key \"camera_angle_x\"".into(), "give the horizontal field of view in radians"));
         };
-        let Some(fov_x) = angle.as_f64().filter(|angle| (LEAST_ANGLE..std::f64::consts::PI - LEAST_ANGLE).contains(angle)) else {
-            return Err(bad(format!("camera_angle_x is {}", shown(angle)), "it is a number of radians between 0 and pi"));
+        let Some(fov_x) = angle.as_f64().filter(|angle| is_angle_of_view(*angle)) else {
+            return Err(bad(format!("camera_angle_x is {}", json::shown(angle)), "it is a number of radians between 0 and pi"));
         };
         let Some(frames) = json.get("frames") else {
             return Err(bad("there is no key \"frames\"".into(), "list the views, each with file_path and transform_matrix"));
@@ -123,7 +121,7 @@ impl Transforms {
                 return Err(bad(format!("frame {k} has no key \"file_path\""), "name the image, without extension"));
             };
             let Some(file_path) = text.as_str().filter(|text| (1..=LONGEST_PATH).contains(&text.len())) else {
-                return Err(bad(format!("file_path of frame {k} is {}", shown(text)), "name the image, without extension"));
+                return Err(bad(format!("file_path of frame {k} is {}", json::shown(text)), "name the image, without extension"));
             };
             let Some(matrix) = frame.get("transform_matrix") else {
                 return Err(bad(format!("frame {k} has no key \"transform_matrix\""), "give the 4 x 4 camera-to-world matrix"));
@@ -136,15 +134,6 @@ impl Transforms {
             Ok((file_path.to_owned(), pose))
         };
         Ok(Transforms { fov_x, frames: frames.iter().enumerate().map(frame).collect::<Result<_>>()? })
-    }
-}
-
-/// A value in a message: a file may have anything in its place.
-fn shown(value: &Value) -> String {
-    let text = value.to_string();
-    match text.char_indices().nth(60) {
-        Some((end, _)) => format!("{}...", &text[..end]),
-        None => text,
     }
 }
 
@@ -182,7 +171,8 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
         }
         for (j, value) in row.iter().enumerate() {
             let number = value.as_f64().filter(|number| number.is_finite());
-            m[i][j] = number.ok_or_else(|| (format!("has {} in row {i}, column {j}", shown(value)), "every entry is a finite number"))?;
+            m[i][j] =
+                number.ok_or_else(|| (format!("has {} in row {i}, column {j}", json::shown(value)), "every entry is a finite number"))?;
         }
     }
     rigid(m)

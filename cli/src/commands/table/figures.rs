@@ -2,6 +2,7 @@
 
 use crate::run_folder::RunFolder;
 use plenoxel::error::Result;
+use plenoxel::train::config::Config;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -57,15 +58,7 @@ impl Measured {
     /// Errors: it is not the folder of a run.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         let (folder, config, _) = RunFolder::open(path)?;
-        let Some(all) = folder.figures() else {
-            return Ok(None);
-        };
-        let Ok(mut figures) = serde_json::from_value::<Figures>(all) else {
-            return Ok(None);
-        };
-        figures.background = config.background;
-        figures.voxels = folder.header().ok().map(|(_, voxels)| voxels).or(figures.voxels);
-        Ok(Some(Measured { folder, figures }))
+        Ok(Figures::of(&folder, &config).map(|figures| Measured { folder, figures }))
     }
 
     /// Its figures in few words.
@@ -86,6 +79,13 @@ impl Measured {
 }
 
 impl Figures {
+    /// Those of a run; none if it has not ended.
+    pub fn of(folder: &RunFolder, config: &Config) -> Option<Self> {
+        let figures = serde_json::from_value::<Figures>(folder.figures()?).ok()?;
+        let voxels = folder.header().ok().map(|(_, voxels)| voxels).or(figures.voxels);
+        Some(Figures { background: config.background, voxels, ..figures })
+    }
+
     pub fn scores(&self) -> Scores {
         Scores { psnr: self.psnr, ssim: self.ssim, seconds: self.seconds }
     }
