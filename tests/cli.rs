@@ -56,6 +56,29 @@ fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
 }
 
 #[test]
+fn a_grid_that_validation_views_liked_better_than_the_last_is_kept() {
+    let folder = Folder::new("best");
+    let run = folder.path("run");
+    // What the first stage learned, the second spoils.
+    let spoil = ["--set", "stages[0].steps=40", "--set", "stages[1].density_rate=500.0", "--set", "stages[1].color_rate=5.0"];
+    let answer = train(&run, &[&spoil[..], &["--checkpoint-every", "0.001s", "--no-report", "--no-images"]].concat());
+    assert!(answer.err.contains("an earlier grid shows validation views better"), "{}", answer.err);
+    let result = answer.json();
+    let best = &result["best_validation"];
+    let [last, kept] = [&[][..], &["--best"]].map(|flag| plenoxel(&[&["evaluate", run.as_str(), "--split", "val"], flag].concat()).json());
+    assert_eq!((&last["steps"], kept["steps"].as_u64()), (&45.into(), best["step"].as_u64().map(|step| step + 1)));
+    // At 24 x 24 validation views are not reduced.
+    assert!((kept["psnr"].as_f64().unwrap() - best["psnr"].as_f64().unwrap()).abs() < 0.01, "{kept} {best}");
+    assert!(kept["psnr"].as_f64().unwrap() > last["psnr"].as_f64().unwrap() + 1.0);
+    assert_eq!(plenoxel(&["export", "vox", &run, "--best"]).code, 0);
+    // A run whose last grid is its best keeps no other.
+    let good = folder.path("good");
+    train(&good, &["--checkpoint-every", "0.001s", "--no-report", "--no-images"]).done();
+    assert!(!fs::exists(folder.path("good/best.safetensors")).unwrap());
+    plenoxel(&["evaluate", &good, "--best"]).refused(3, &["best.safetensors", "leave --best away"]);
+}
+
+#[test]
 fn a_run_is_trained_evaluated_rendered_and_described() {
     let folder = Folder::new("whole");
     let run = folder.path("run");
@@ -495,7 +518,7 @@ impl Write for Closed {
 fn a_reader_that_went_away_is_no_failure_and_a_full_disk_is() {
     let info = |out: io::ErrorKind| {
         let (mut out, mut err) = (Closed(out), Closed(io::ErrorKind::BrokenPipe));
-        plenoxel_cli::run(["plenoxel", "info"], Streams { out: &mut out, err: &mut err, terminal: false })
+        plenoxel_cli::run(["plenoxel", "info"], Streams { out: &mut out, err: &mut err, terminal: false, read_by_people: false })
     };
     assert_eq!(info(io::ErrorKind::BrokenPipe), 0);
     assert_eq!(info(io::ErrorKind::StorageFull), 5);

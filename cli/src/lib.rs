@@ -116,6 +116,8 @@ pub struct Streams<'a> {
     pub err: &'a mut (dyn Write + Send),
     /// True if the process's stderr is a terminal: progress is then drawn there as a bar.
     pub terminal: bool,
+    /// True if its stdout is one: lines for programs are left out there.
+    pub read_by_people: bool,
 }
 
 /// Runs a command line, the program's name first, and returns the exit code.

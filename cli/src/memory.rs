@@ -38,6 +38,8 @@ const BASE: u64 = 60_000_000;
 const CARVING_PIXELS: u64 = 1 << 16;
 /// Bytes of a pixel of rendered pictures: five numbers of the colors and of the normals each, what is made of them, and the file.
 const PICTURE_BYTES: u64 = 100;
+/// Bytes of the page about a run while it is put together: the grid in it of up to 30 MB, compressed, as text, and as part of longer texts.
+const PAGE_BYTES: u64 = 150_000_000;
 /// Rays that are rendered at a time when evaluating.
 const EVALUATION_RAYS: u64 = 4096;
 
@@ -84,6 +86,8 @@ impl Estimate {
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // A table's bytes beside it.
         let saving = tables(index);
+        // When the optimizer is gone.
+        let page = (evaluation + page(tables(index))).saturating_sub(optimizer);
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
         let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, a lower sh_degree, or a higher sh_reduction");
@@ -94,7 +98,15 @@ impl Estimate {
             (grid + optimizer + saving, voxels),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
-        Estimate { images, grid, optimizer, step: step.max(evaluation).max(saving), pruned: share(config, index) < 1.0, key, advice }
+        Estimate {
+            images,
+            grid,
+            optimizer,
+            step: step.max(evaluation).max(saving).max(page),
+            pruned: share(config, index) < 1.0,
+            key,
+            advice,
+        }
     }
 
     /// The most rows of tables that fit into the memory that is free, if that is known: what pruning leaves is only known when it has.
@@ -126,6 +138,13 @@ impl Estimate {
         }
     }
 
+    /// Making the page about a run whose grid has so many voxels: it renders a few views.
+    pub fn of_report(config: &Config, shape: &GridShape, voxels: usize) -> Self {
+        let rendering = Self::of_evaluation(config, config.evaluation, shape, voxels, None);
+        let step = rendering.step + page((voxels * shape.voxel_bytes()) as u64);
+        Estimate { step, advice: "a machine with more", ..rendering }
+    }
+
     /// Rendering a trained grid of so many voxels to pictures of so many pixels, with or without its normals.
     pub fn of_pictures(config: &Config, sampling: Sampling, shape: &GridShape, voxels: usize, pixels: usize, normals: bool) -> Self {
         let rendering = Self::of_evaluation(config, sampling, shape, voxels, None);
@@ -154,7 +173,8 @@ impl Estimate {
         let fit = 4 * rows as u64 * (coefficients * (coefficients + 1) / 2 + 9 * coefficients + 2);
         let images = images(dataset, config.downscale, &[Split::Train]) + items;
         let kept = if rows > 0 { (KEPT_LIGHT as u64).min(12 * pixels * hits_of_pixel(config)) } else { 0 };
-        let step = step + kept;
+        let page = if rows > 0 { page((rows * shape.voxel_bytes()) as u64) } else { 0 };
+        let step = (step + kept).max(page);
         let grid = masks + fit;
         let (key, advice) = match images > grid {
             true => ("--downscale", "a larger factor, so that the images fit"),
@@ -211,12 +231,21 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match available() {
             Some(available) if self.total() > available => {
-                let found = format!("what would need about {} of memory, where {} are free,", bytes(self.total()), bytes(available));
-                Err(Error::config(&self.key, found, self.advice))
+                let limited = LIMIT.load(Relaxed) == available;
+                let why = if limited { "--max-memory allows" } else { "there is room for" };
+                let found = format!("what would need about {} of memory, where {why} {},", bytes(self.total()), bytes(available));
+                // A limit may be too low for anything.
+                let advice = format!("{}{}", self.advice, if limited { "; or a higher --max-memory" } else { "" });
+                Err(Error::config(&self.key, found, advice))
             }
             _ => Ok(()),
         }
     }
+}
+
+/// Bytes for the page about a run with a grid of so many: what can be seen of it, what a viewer will see, and the page.
+fn page(grid: u64) -> u64 {
+    2 * grid + PAGE_BYTES
 }
 
 /// Numbers that the optimizer keeps for each one of the tables.

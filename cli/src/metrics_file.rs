@@ -70,6 +70,8 @@ pub struct Past {
     pub stages: Vec<(usize, f64)>,
     /// Seconds of training.
     pub seconds: f64,
+    /// PSNR of validation views by the step after which they were looked at.
+    pub validation: BTreeMap<u64, f64>,
     /// What the last of them comes to.
     known: Known,
 }
@@ -86,6 +88,7 @@ impl Past {
             if line.ends_stage {
                 past.stages.push((line.stage, line.seconds));
             }
+            past.validation.extend(line.validation_psnr.map(|psnr| (line.step, psnr)));
             past.known.add(&line);
         }
         let last = past.losses.last().copied().unwrap_or(0.0);

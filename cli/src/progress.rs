@@ -55,6 +55,12 @@ impl<'a> Console<'a> {
         }
     }
 
+    /// The same as a JSON object, for programs; nothing where people read it.
+    pub fn record(&self, value: &impl Serialize) -> Result<()> {
+        let read_by_people = lock(&self.streams).read_by_people;
+        if read_by_people { Ok(()) } else { self.result(&crate::json_line(value)?) }
+    }
+
     /// A line of information on stderr.
     pub fn note(&self, text: &str) {
         #[derive(Serialize)]

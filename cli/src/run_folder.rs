@@ -47,12 +47,15 @@ impl RunRecord {
 #[derive(Debug, Clone)]
 pub struct RunFolder {
     path: PathBuf,
+    /// Which of its grids is meant.
+    grid: &'static str,
 }
 
 const CONFIG: &str = "config.toml";
 const RECORD: &str = "run.json";
 const METRICS: &str = "metrics.jsonl";
 const CHECKPOINT: &str = "checkpoint.safetensors";
+const BEST: &str = "best.safetensors";
 const STATE: &str = "training.safetensors";
 const LOSS: &str = "loss.svg";
 const RESULT: &str = "result.json";
@@ -66,12 +69,17 @@ const EXPORTS: &str = "exports";
 const RENDERED: [&str; 5] = ["png", "exr", "npy", "gif", "mp4"];
 
 impl RunFolder {
+    /// That at a path, whatever is there.
+    pub fn at(path: &Path) -> Self {
+        RunFolder { path: path.to_owned(), grid: CHECKPOINT }
+    }
+
     /// The folder that a new run will have: the one asked for, or `runs/<scene>-<n>` with the first free n. Nothing is written yet.
     ///
     /// Errors: it has something in it that is not a run, or a run that may not be overwritten; or it is a file.
     pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
         let Some(path) = out else {
-            return Ok(RunFolder { path: first_free(Path::new("runs"), scene) });
+            return Ok(Self::at(&first_free(Path::new("runs"), scene)));
         };
         if let Some(file) = path.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir()) {
             let found = format!("{}, where {} is a file,", path.display(), file.display());
@@ -86,7 +94,7 @@ impl RunFolder {
             let found = format!("{}, which holds something that is not a run,", path.display());
             return Err(Error::config("--out", found, "a new folder, or that of a run, which --force overwrites"));
         }
-        Ok(RunFolder { path: path.to_owned() })
+        Ok(Self::at(path))
     }
 
     /// Makes the folder. Of a run that is overwritten, the files go that this one may not write, so that nothing of it is mistaken for
@@ -94,7 +102,7 @@ impl RunFolder {
     pub fn prepare(&self) -> Result<()> {
         files::create_dir(&self.path)?;
         self.remove_fragments()?;
-        let names = [CHECKPOINT, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
+        let names = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
         let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| path.exists());
         for path in paths.chain(event_file::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
@@ -119,12 +127,6 @@ impl RunFolder {
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
     }
 
-    /// A folder for tests that look into none.
-    #[cfg(test)]
-    pub fn at(path: &Path) -> Self {
-        RunFolder { path: path.to_owned() }
-    }
-
     /// Opens the folder of a run for reading.
     ///
     /// Errors: it is not the folder of a run.
@@ -137,7 +139,7 @@ impl RunFolder {
             let found = "this is a file, not the folder of a run";
             return Err(Error::input(path, found, remedy));
         }
-        let folder = RunFolder { path: path.to_owned() };
+        let folder = Self::at(path);
         let record = path.join(RECORD);
         let bytes = std::fs::read(&record).map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => Error::input(path, format!("there is no {RECORD} in this folder"), remedy),
@@ -145,6 +147,35 @@ impl RunFolder {
         })?;
         let record = RunRecord::parse(&record, &bytes)?;
         Ok((folder, config::read(&path.join(CONFIG))?, record))
+    }
+
+    /// The same run with the best of its grids, as `--best` asks for.
+    ///
+    /// Errors: it kept no other than its last.
+    pub fn with_best(self) -> Result<Self> {
+        let best = RunFolder { grid: BEST, ..self };
+        if !best.checkpoint().exists() {
+            let found = format!("there is no {BEST} in this folder");
+            let remedy =
+                "leave --best away: the last grid was the best, or nothing was saved before it, or there were no validation views to tell";
+            return Err(Error::input(&best.path, found, remedy));
+        }
+        Ok(best)
+    }
+
+    /// The step after which the best grid so far was written, if there is one.
+    pub fn best_step(&self) -> Option<u64> {
+        checkpoint::header(&self.path.join(BEST)).ok().map(|(header, _)| header.step)
+    }
+
+    /// Writes the best grid so far.
+    pub fn save_best(&self, grid: &VoxelGrid<f32>, header: &Header) -> Result<()> {
+        checkpoint::save(&self.path.join(BEST), grid, header)
+    }
+
+    /// Removes the grid that was the best before the last.
+    pub fn remove_best(&self) -> Result<()> {
+        remove([self.path.join(BEST)].into_iter().filter(|path| path.exists()))
     }
 
     /// Writes the trained grid.
@@ -191,11 +222,7 @@ impl RunFolder {
 
     /// Removes what only an unfinished run needs.
     pub fn remove_state(&self) -> Result<()> {
-        let path = self.state();
-        if path.exists() {
-            std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
-        }
-        Ok(())
+        remove([self.state()].into_iter().filter(|path| path.exists()))
     }
 
     /// Removes files that were being written when a run was killed.
@@ -270,9 +297,9 @@ impl RunFolder {
         self.path.join(METRICS)
     }
 
-    /// The trained grid.
+    /// The trained grid: that of the last step, or the best.
     pub fn checkpoint(&self) -> PathBuf {
-        self.path.join(CHECKPOINT)
+        self.path.join(self.grid)
     }
 
     /// What an unfinished run goes on from.

@@ -44,7 +44,7 @@ impl Answer {
 pub fn plenoxel(args: &[&str]) -> Answer {
     let (mut out, mut err) = (Vec::new(), Vec::new());
     let line = ["plenoxel"].iter().chain(args);
-    let code = plenoxel_cli::run(line, Streams { out: &mut out, err: &mut err, terminal: false });
+    let code = plenoxel_cli::run(line, Streams { out: &mut out, err: &mut err, terminal: false, read_by_people: false });
     Answer { code, out: String::from_utf8(out).unwrap(), err: String::from_utf8(err).unwrap() }
 }
 

@@ -30,7 +30,8 @@ Examples:
   plenoxel train data/lego --init-from runs/lego-1         training goes on from what was carved
 
 The result is a run like a trained one: evaluate, render, export and info take it. Settings are layered as for train; --set \
-reaches those below carve. The last line on stdout is one JSON object.";
+reaches those below carve. The last line on stdout is one JSON object, \
+where it is no terminal.";
 
 /// Carve an opaque colored grid, without training, from the silhouettes of images with alpha or from colors that contradict
 #[derive(Debug, Args)]
@@ -221,7 +222,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
         "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; `plenoxel evaluate` compares it with test views"
     ))?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
-    console.result(&crate::json_line(&summary)?)?;
+    console.record(&summary)?;
     if !args.no_report {
         let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, grid: &colored.grid };
         console.note(&report.write()?);

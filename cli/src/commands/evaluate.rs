@@ -24,7 +24,7 @@ Examples:
 --samples N places N samples on the longest line through the box, and as densely on shorter ones. Runs of the paper preset \
 count samples from the camera to its far limit instead.
 
-PSNR and SSIM are means over views. The last line on stdout is one JSON object, which says how each figure is computed: what is \
+PSNR and SSIM are means over views. The last line on stdout, where it is no terminal, is one JSON object, which says how each figure is computed: what is \
 clamped, rounded and padded, over which background, at which size. LPIPS is not computed.";
 
 /// Compute PSNR and SSIM of a trained run on the views of a split
@@ -92,7 +92,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     };
     let line = crate::json_line(&evaluation)?;
     // Printed first, so that a file that cannot be written takes nothing with it.
-    console.result(&line)?;
+    if args.json { console.result(&line) } else { console.record(&evaluation) }?;
     args.out.iter().try_for_each(|file| files::write_atomically(file, (line.clone() + "\n").as_bytes()))
 }
 

@@ -55,6 +55,10 @@ struct Exported {
     #[arg(value_hint = ValueHint::DirPath)]
     run: PathBuf,
 
+    /// The grid that validation views liked best of those that were saved, where it is another than the last
+    #[arg(long)]
+    best: bool,
+
     /// File to write, replacing what is there [default: in RUN/exports]
     #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
@@ -77,6 +81,7 @@ impl Exported {
             return Err(Error::config("--out", found, format!("a name that ends in .{format}")));
         }
         let (folder, config, record) = RunFolder::open(&self.run)?;
+        let folder = if self.best { folder.with_best()? } else { folder };
         let (header, voxels) = folder.header()?;
         let estimate = Estimate::of_export(&header.shape(), voxels);
         console.note(&estimate.describe());

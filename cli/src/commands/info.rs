@@ -94,6 +94,9 @@ fn of_run(path: &Path) -> Result<Lines> {
     } else {
         lines.push(("grid", "none: the run did not end".to_owned()));
     }
+    if folder.existing_state().is_ok() {
+        lines.push(("go on with", format!("plenoxel train --resume {}", path.display())));
+    }
     if let Some(result) = folder.result() {
         let number = |key: &str| result[key].as_f64();
         if let (Some(psnr), Some(seconds)) = (number("psnr"), number("seconds")) {

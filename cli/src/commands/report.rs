@@ -36,7 +36,7 @@ pub fn run(args: &ReportArgs, console: &Console<'_>) -> Result<()> {
     let source = args.data.as_deref().map_or(record.data.clone(), DataSource::folder);
     let dataset = source.reopen(&config)?;
     let (header, voxels) = folder.header()?;
-    let estimate = Estimate::of_evaluation(&config, config.evaluation, &header.shape(), voxels, None);
+    let estimate = Estimate::of_report(&config, &header.shape(), voxels);
     console.note(&estimate.describe());
     estimate.check()?;
     let (grid, _) = folder.load()?;

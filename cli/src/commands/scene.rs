@@ -34,7 +34,7 @@ pub struct SceneArgs {
     dir: PathBuf,
 
     /// Size of the images in pixels, SIDE or WIDTHxHEIGHT [default: 200]
-    #[arg(long, help_heading = "Scene", value_parser = size, conflicts_with_all = ["width", "height"])]
+    #[arg(long, help_heading = "Scene", value_parser = size, conflicts_with_all = ["width", "height"], allow_hyphen_values = true)]
     size: Option<(usize, usize)>,
 
     /// Image width in pixels

@@ -110,11 +110,11 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     }
     files::create_dir(&out)?;
     let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: lock(&out)? };
-    // A child gets the Ctrl-C too, and saves; the sweep waits for it.
+    // A child is asked too, and saves; the sweep waits for it.
     let watch = Watch::begin();
     let (mut failed, mut interrupted) = (Vec::new(), false);
     for (index, job) in plan.jobs.iter().enumerate() {
-        let sweep = Sweep { program: &program, console, index, of: plan.jobs.len() };
+        let sweep = Sweep { program: &program, watch: &watch, console, index, of: plan.jobs.len() };
         let failure = sweep.finish(job)?;
         interrupted = watch.requested() || failure.as_ref().is_some_and(|failure| failure.code == EXIT_CODE);
         if interrupted {
@@ -144,6 +144,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
 /// One run among all.
 struct Sweep<'a, 'c> {
     program: &'a Program,
+    watch: &'a Watch,
     console: &'a Console<'c>,
     index: usize,
     of: usize,
@@ -182,7 +183,7 @@ impl Sweep<'_, '_> {
     /// Has the program called, and returns what it said on stdout, or how it failed.
     fn process(&self, job: &Job, arguments: &[OsString]) -> Result<std::result::Result<String, Failure>> {
         let progress = self.console.relay(self.of);
-        let ended = self.program.run(arguments, &job.log(), |line| progress.say(self.index, || self.line(job, line)))?;
+        let ended = self.program.run(arguments, &job.log(), self.watch, |line| progress.say(self.index, || self.line(job, line)))?;
         drop(progress);
         if ended.code == 0 {
             return Ok(Ok(ended.out));

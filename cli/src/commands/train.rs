@@ -279,5 +279,5 @@ fn say(console: &Console<'_>, folder: &RunFolder, summary: &Summary, note: Optio
     ));
     console.result(&summary.figures.sentence())?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
-    console.result(&crate::json_line(summary)?)
+    console.record(summary)
 }

@@ -20,6 +20,10 @@ pub struct TrainedRun {
     #[arg(value_hint = ValueHint::DirPath)]
     pub run: PathBuf,
 
+    /// The grid that validation views liked best of those that were saved, where it is another than the last
+    #[arg(long)]
+    pub best: bool,
+
     /// Where the dataset is now [default: where it was when training]
     #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
     pub data: Option<PathBuf>,
@@ -56,6 +60,7 @@ impl TrainedRun {
     /// Finds it.
     pub fn find(&self) -> Result<Found> {
         let (folder, mut config, record) = RunFolder::open(&self.run)?;
+        let folder = if self.best { folder.with_best()? } else { folder };
         config.downscale = self.downscale.unwrap_or(config.downscale);
         let source = self.data.as_deref().map_or(record.data, DataSource::folder);
         Ok(Found { folder, config, preset: record.preset, source })

@@ -405,6 +405,9 @@ class Viewer {
     this.canvas = figure.querySelector('canvas');
     this.status = figure.querySelector('output');
     this.renderer = new Renderer(this.canvas, scene, bytes);
+    // A machine that sleeps, or has too much to draw, takes textures away.
+    this.canvas.addEventListener('webglcontextlost', e => { e.preventDefault(); this.status.textContent = 'the browser took the picture away; waiting for it'; });
+    this.canvas.addEventListener('webglcontextrestored', () => { this.renderer = new Renderer(this.canvas, scene, bytes); this.moved(); });
     this.camera = new Orbit(scene.views[0]);
     // Pixels of a frame, and of a band: what was taken for the last ones tells how many.
     this.pixels = { frame: 10000, band: 10000 };
@@ -454,6 +457,7 @@ class Viewer {
   frame() {
     this.waiting = false;
     const { canvas, renderer, camera } = this, ratio = window.devicePixelRatio || 1;
+    if (renderer.gl.isContextLost()) return;
     const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     if (this.still < 0) {

@@ -4,7 +4,7 @@ use super::{Exported, Opened, SurfaceColors, ending};
 use crate::commands::{as_flag, number, whole};
 use crate::progress::Console;
 use clap::Args;
-use plenoxel::error::Result;
+use plenoxel::error::{Error, Result};
 use plenoxel::export::mesh::{MeshOptions, mesh};
 use plenoxel::export::mesh_file::MeshFormat;
 
@@ -42,8 +42,12 @@ pub struct MeshArgs {
 
 /// Writes the surface of a run.
 pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
-    let named = args.exported.out.as_deref().and_then(ending).and_then(|ending| ending.parse().ok());
-    let format = args.format.or(named).unwrap_or(MeshFormat::Ply);
+    let named = args.exported.out.as_deref().and_then(ending).map(|ending| format(&ending).map_err(|accepted| (ending, accepted)));
+    let format = match (args.format, named) {
+        (None, Some(Err((ending, accepted)))) => return Err(Error::config("--out", format!("a name that ends in .{ending}"), accepted)),
+        (None, Some(Ok(named))) => named,
+        (given, _) => given.unwrap_or(MeshFormat::Ply),
+    };
     let Opened { folder, grid, .. } = args.exported.open(console, &format.to_string())?;
     let options = MeshOptions { level: args.level, direction: args.colors.direction(), min_part: args.min_part };
     let surface = mesh(&grid, &options).map_err(as_flag)?;

@@ -1,11 +1,17 @@
 //! A run as a process of its own: it may crash, or be killed for want of memory, and the sweep goes on; and its peak memory is its own.
 
+use crate::commands::train::interrupt::Watch;
 use plenoxel::error::{Error, Result};
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
+use std::time::Duration;
+
+/// Time between looks whether the sweep was asked to stop.
+const LISTENING: Duration = Duration::from_millis(50);
 
 /// What the processes of a sweep have in common.
 pub struct Program {
@@ -37,8 +43,9 @@ pub fn this_program() -> Result<PathBuf> {
 }
 
 impl Program {
-    /// Runs the program to its end. What it says on stderr goes to the end of the file `log`, and line by line to `said`.
-    pub fn run(&self, arguments: &[OsString], log: &Path, mut said: impl FnMut(&str)) -> Result<Ended> {
+    /// Runs the program to its end. What it says on stderr goes to the end of the file `log`, and line by line to `said`. If the sweep is asked to
+    /// stop, so is the program.
+    pub fn run(&self, arguments: &[OsString], log: &Path, watch: &Watch, mut said: impl FnMut(&str)) -> Result<Ended> {
         let writing = |e| Error::io(log, e, "writing the log");
         let starting = |e| Error::io(&self.path, e, "starting a run");
         let mut file = File::options().append(true).create(true).open(log).map_err(writing)?;
@@ -54,7 +61,17 @@ impl Program {
             .map_err(starting)?;
         let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
         let mut last = Last::default();
+        let over = AtomicBool::new(false);
         let out = std::thread::scope(|scope| {
+            let child = &child;
+            scope.spawn(|| {
+                while !over.load(SeqCst) {
+                    if watch.requested() {
+                        return ask_to_stop(child);
+                    }
+                    std::thread::sleep(LISTENING);
+                }
+            });
             let out = scope.spawn(|| {
                 let mut bytes = Vec::new();
                 // What cannot be read is not there.
@@ -73,6 +90,7 @@ impl Program {
                     bytes.clear();
                 }
             }
+            over.store(true, SeqCst);
             out.join().unwrap_or_default()
         });
         let status = child.wait().map_err(starting)?;
@@ -123,6 +141,17 @@ fn code(status: ExitStatus) -> u8 {
     let code = status.code().or_else(|| signal(status).map(|signal| 128 + signal));
     code.and_then(|code| u8::try_from(code).ok()).unwrap_or(u8::MAX)
 }
+
+/// From a terminal it hears it too, at the same time.
+#[cfg(unix)]
+fn ask_to_stop(child: &Child) {
+    let process = i32::try_from(child.id()).ok().and_then(rustix::process::Pid::from_raw);
+    // One that has ended need not be asked.
+    let _ = process.map(|process| rustix::process::kill_process(process, rustix::process::Signal::TERM));
+}
+
+#[cfg(not(unix))]
+fn ask_to_stop(_: &Child) {}
 
 #[cfg(unix)]
 fn signal(status: ExitStatus) -> Option<i32> {

@@ -21,7 +21,8 @@ Examples:
   plenoxel train --resume runs/lego                go on with it after Ctrl-C or a power cut
 
 Settings are layered: defaults < preset < --config < flags. config.toml in the run folder lists all of them; --set \
-reaches each by its path there, such as stages[0].sampling.step. The last line on stdout is one JSON object.";
+reaches each by its path there, such as stages[0].sampling.step. The last line on stdout is one JSON object, \
+where it is no terminal; result.json has it too.";
 
 /// What a run that goes on was told when it began.
 pub const NOT_WHEN_RESUMED: [&str; 20] = [
@@ -68,7 +69,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "RUN", help_heading = "Output", value_hint = ValueHint::DirPath, conflicts_with_all = NOT_WHEN_RESUMED)]
     pub resume: Option<PathBuf>,
 
-    /// Save this often what is needed to go on, such as 30s or 10m; it is saved too when the run is interrupted (Ctrl-C)
+    /// Save this often what is needed to go on, such as 30s or 10m; it is saved too when the run is interrupted (Ctrl-C, SIGTERM). If an
+    /// earlier grid that was saved shows validation views better than the last, it is kept too: best.safetensors
     #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration, default_value = "5m")]
     pub checkpoint_every: f64,
 
@@ -124,7 +126,7 @@ pub struct TrainArgs {
     half_width: Option<f64>,
 
     /// Size of the built-in scene's images in pixels, SIDE or WIDTHxHEIGHT [default: 200]
-    #[arg(long, value_name = "SIZE", help_heading = "Scene", value_parser = size, conflicts_with = "data")]
+    #[arg(long, value_name = "SIZE", help_heading = "Scene", value_parser = size, conflicts_with = "data", allow_hyphen_values = true)]
     scene_size: Option<(usize, usize)>,
 
     /// Number of training, validation and test views of the built-in scene [default: 100,10,25]
@@ -268,8 +270,8 @@ pub fn size(text: &str) -> std::result::Result<(usize, usize), String> {
 fn three_counts(text: &str) -> std::result::Result<[usize; 3], String> {
     let counts: Vec<usize> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
     let fits = counts.len() == text.split(',').count();
-    let counts = counts.try_into().ok().filter(|_| fits);
-    counts.ok_or_else(|| "three numbers of views such as 100,10,25".to_owned())
+    let counts = counts.try_into().ok().filter(|[train, ..]: &[usize; 3]| fits && *train > 0);
+    counts.ok_or_else(|| "three numbers of views such as 100,10,25, the first of them at least 1".to_owned())
 }
 
 fn weight(text: &str) -> std::result::Result<f64, String> {
@@ -291,7 +293,7 @@ mod tests {
         assert_eq!(size("32x24"), Ok((32, 24)));
         assert!(size("0").is_err() && size("3x").is_err() && size("-1").is_err());
         assert_eq!(three_counts("6,1,3"), Ok([6, 1, 3]));
-        assert!(three_counts("6,1").is_err() && three_counts("6,x,3").is_err());
+        assert!(three_counts("6,1").is_err() && three_counts("0,1,3").is_err() && three_counts("6,x,3").is_err());
         assert_eq!(weight("1e-4"), Ok(1e-4));
         assert!(weight("-1").is_err() && weight("inf").is_err());
     }

@@ -1,13 +1,17 @@
-//! Ctrl-C: the first time while a run trains, or a sweep has runs made, it is asked to save and stop; else the process ends.
+//! Ctrl-C and SIGTERM: the first time while a run trains, or a sweep has runs made, it is asked to save and stop; else the process ends.
 
-use std::sync::Once;
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
+use std::sync::{Mutex, Once, PoisonError};
+use std::time::{Duration, Instant};
 
 /// Exit code of a process that was interrupted.
 pub const EXIT_CODE: u8 = 130;
 
+/// Who stops a process often tells it twice, as its parent and as its group: what comes so soon after the first is the same wish.
+const SAME_WISH: Duration = Duration::from_secs(1);
+
 static WATCHED: AtomicBool = AtomicBool::new(false);
-static REQUESTED: AtomicBool = AtomicBool::new(false);
+static REQUESTED: Mutex<Option<Instant>> = Mutex::new(None);
 
 /// While it lives, an interruption is something to ask for.
 pub struct Watch(());
@@ -15,39 +19,50 @@ pub struct Watch(());
 impl Watch {
     /// Begins to watch. Where the system does not let it, an interruption ends the process as ever.
     pub fn begin() -> Self {
-        static HANDLER: Once = Once::new();
-        HANDLER.call_once(|| {
-            if ignored() {
-                return;
-            }
-            let handled = ctrlc::set_handler(|| {
-                if !WATCHED.load(SeqCst) || REQUESTED.swap(true, SeqCst) {
-                    std::process::exit(EXIT_CODE.into());
-                }
-            });
-            drop(handled);
-        });
-        REQUESTED.store(false, SeqCst);
+        static LISTENING: Once = Once::new();
+        LISTENING.call_once(listen);
+        *requested() = None;
         WATCHED.store(true, SeqCst);
         Watch(())
     }
 
     /// True if somebody asked.
     pub fn requested(&self) -> bool {
-        REQUESTED.load(SeqCst)
+        requested().is_some()
     }
-}
-
-/// True if whoever started the process had it ignore Ctrl-C, as shells do for what runs in the background.
-fn ignored() -> bool {
-    const SIGINT: u64 = 1 << 1;
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
-    mask.is_some_and(|mask| mask & SIGINT != 0)
 }
 
 impl Drop for Watch {
     fn drop(&mut self) {
         WATCHED.store(false, SeqCst);
     }
+}
+
+fn requested() -> std::sync::MutexGuard<'static, Option<Instant>> {
+    REQUESTED.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Somebody wants the process to stop.
+fn wish() {
+    let first = *requested().get_or_insert_with(Instant::now);
+    if !WATCHED.load(SeqCst) || first.elapsed() > SAME_WISH {
+        std::process::exit(EXIT_CODE.into());
+    }
+}
+
+/// Has a thread listen, for as long as the process lives, to what it does not ignore: shells have what runs in the background ignore Ctrl-C.
+#[cfg(unix)]
+fn listen() {
+    use signal_hook::consts::{SIGINT, SIGTERM};
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    let heard = [SIGINT, SIGTERM].into_iter().filter(|signal| mask.is_none_or(|mask| mask >> (signal - 1) & 1 == 0));
+    if let Ok(mut signals) = signal_hook::iterator::Signals::new(heard) {
+        std::thread::spawn(move || signals.forever().for_each(|_| wish()));
+    }
+}
+
+#[cfg(not(unix))]
+fn listen() {
+    drop(ctrlc::set_handler(wish));
 }

@@ -42,13 +42,14 @@ impl<'a, 'c> Watching<'a, 'c> {
         Watching { folder, config, console, plan, metrics, progress, pictures, preview, losses: past.losses, voxels }
     }
 
-    /// A step was taken, after so many seconds of training; `save` says that the run can go on from here.
-    pub fn step(&mut self, report: &Report, grid: &VoxelGrid<f32>, seconds: f64, save: bool) -> Result<()> {
+    /// A step was taken, after so many seconds of training; `save` says that the run can go on from here. Returns the PSNR of validation views, if
+    /// they were looked at.
+    pub fn step(&mut self, report: &Report, grid: &VoxelGrid<f32>, seconds: f64, save: bool) -> Result<Option<f64>> {
         self.losses.push(report.loss);
         if report.step == self.plan[report.stage].first {
             self.voxels = grid.lattice().present();
         }
-        let look = self.preview.look(grid, report.ends_stage, self.config);
+        let look = self.preview.look(grid, report.ends_stage || save, self.config);
         let look = self.drawn(look).flatten();
         let validation_psnr = look.as_ref().and_then(|look| look.psnr);
         let seen = Seen { voxels: self.voxels, validation_psnr, seconds };
@@ -62,7 +63,7 @@ impl<'a, 'c> Watching<'a, 'c> {
                 self.metrics.picture(report.step, size, &png)?;
             }
         }
-        Ok(())
+        Ok(validation_psnr)
     }
 
     /// What came of drawing: a picture that cannot be written is no reason to lose what was learned.
