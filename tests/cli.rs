@@ -53,6 +53,22 @@ fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
     );
     assert!(fs::exists(folder.path("run/report.html")).unwrap());
     plenoxel(&["train", "--resume", &run]).refused(3, &["this run has ended"]);
+
+    // One that began with a grid left the coarser stage out.
+    let finer = folder.path("finer");
+    let stages = |result: &Value| result["stages"].as_array().unwrap().iter().map(|stage| stage["resolution"].clone()).collect::<Vec<_>>();
+    let whole = train(&finer, &["--no-report", "--init-from", &run]).json();
+    fs::remove_file(folder.path("finer/result.json")).unwrap();
+    let again = plenoxel(&["train", "--resume", &finer, "--no-report"]).json();
+    assert_eq!((stages(&again), &again["steps"]), (vec![Value::from(12)], &whole["steps"]));
+    assert_eq!(stages(&whole), [12]);
+
+    // One that was carved was not trained.
+    let carved = folder.path("carved");
+    plenoxel(&["carve", &scene(&folder), "--resolution", "8", "--no-report", "--out", &carved]).done();
+    fs::remove_file(folder.path("carved/result.json")).unwrap();
+    plenoxel(&["train", "--resume", &carved]).refused(3, &["this run was carved", "--init-from"]);
+    assert!(!plenoxel(&["info", &carved]).done().contains("--resume"));
 }
 
 #[test]
@@ -70,7 +86,9 @@ fn a_grid_that_validation_views_liked_better_than_the_last_is_kept() {
     // At 24 x 24 validation views are not reduced.
     assert!((kept["psnr"].as_f64().unwrap() - best["psnr"].as_f64().unwrap()).abs() < 0.01, "{kept} {best}");
     assert!(kept["psnr"].as_f64().unwrap() > last["psnr"].as_f64().unwrap() + 1.0);
+    assert!(kept["seconds"].is_null() && last["seconds"].is_f64());
     assert_eq!(plenoxel(&["export", "vox", &run, "--best"]).code, 0);
+    assert_eq!(names(&folder.path("run/exports/best")).len(), 1);
     // A run whose last grid is its best keeps no other.
     let good = folder.path("good");
     train(&good, &["--checkpoint-every", "0.001s", "--no-report", "--no-images"]).done();

@@ -38,14 +38,14 @@ const BASE: u64 = 60_000_000;
 const CARVING_PIXELS: u64 = 1 << 16;
 /// Bytes of a pixel of rendered pictures: five numbers of the colors and of the normals each, what is made of them, and the file.
 const PICTURE_BYTES: u64 = 100;
-/// Bytes of the page about a run while it is put together: the grid in it of up to 30 MB, compressed, as text, and as part of longer texts.
+/// The most bytes of the page about a run while it is put together: the grid in it of up to 30 MB, compressed, as text, and as part of longer texts.
 const PAGE_BYTES: u64 = 150_000_000;
 /// Rays that are rendered at a time when evaluating.
 const EVALUATION_RAYS: u64 = 4096;
 
 impl Estimate {
-    /// A training run with everything around it; `initial` bytes are of the grid that it starts from.
-    pub fn of_training(config: &Config, dataset: &Dataset, initial: u64) -> Self {
+    /// A training run with everything around it, the page about it if there is to be one; `initial` bytes are of the grid that it starts from.
+    pub fn of_training(config: &Config, dataset: &Dataset, initial: u64, report: bool) -> Self {
         let states = states(config);
         // Bytes of a stage's tables, and what is held of it and of the one before while it begins.
         let tables = |index: usize| (share(config, index) * config.grid_shape(config.stages[index].resolution).bytes() as f64) as u64;
@@ -86,8 +86,9 @@ impl Estimate {
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // A table's bytes beside it.
         let saving = tables(index);
-        // When the optimizer is gone.
-        let page = (evaluation + page(tables(index))).saturating_sub(optimizer);
+        let page = if report { page(tables(index)) } else { 0 };
+        // It renders, when the optimizer is gone.
+        let reporting = (evaluation + page).saturating_sub(optimizer);
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
         let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, a lower sh_degree, or a higher sh_reduction");
@@ -96,13 +97,14 @@ impl Estimate {
             (step, ("rays_per_step".to_owned(), "fewer rays in a step")),
             (evaluation, ("evaluation".to_owned(), "fewer samples on a ray")),
             (grid + optimizer + saving, voxels),
+            (page, ("report.html".to_owned(), "--no-report, which leaves it out")),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
         Estimate {
             images,
             grid,
             optimizer,
-            step: step.max(evaluation).max(saving).max(page),
+            step: step.max(evaluation).max(saving).max(reporting),
             pruned: share(config, index) < 1.0,
             key,
             advice,
@@ -231,7 +233,7 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match available() {
             Some(available) if self.total() > available => {
-                let limited = LIMIT.load(Relaxed) == available;
+                let limited = LIMIT.load(Relaxed) != 0 && LIMIT.load(Relaxed) == available;
                 let why = if limited { "--max-memory allows" } else { "there is room for" };
                 let found = format!("what would need about {} of memory, where {why} {},", bytes(self.total()), bytes(available));
                 // A limit may be too low for anything.
@@ -245,7 +247,7 @@ impl Estimate {
 
 /// Bytes for the page about a run with a grid of so many: what can be seen of it, what a viewer will see, and the page.
 fn page(grid: u64) -> u64 {
-    2 * grid + PAGE_BYTES
+    2 * grid + (2 * grid).min(PAGE_BYTES)
 }
 
 /// Numbers that the optimizer keeps for each one of the tables.

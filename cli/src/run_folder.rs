@@ -107,13 +107,13 @@ impl RunFolder {
         for path in paths.chain(event_file::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
-        // Films have folders of their own.
-        let films = entries(&self.path.join(RENDERS)).filter(|path| path.is_dir());
-        for folder in films.chain([self.path.join(RENDERS)]) {
-            remove(entries(&folder).filter(|path| is_one_of(path, &RENDERED)))?;
-        }
-        for (folder, endings) in [(IMAGES, ["png"].as_slice()), (EXPORTS, &["vox", "ply", "obj", "glb"])] {
-            remove(entries(&self.path.join(folder)).filter(|path| is_one_of(path, endings)))?;
+        for (folder, endings) in [(IMAGES, ["png"].as_slice()), (RENDERS, &RENDERED), (EXPORTS, &["vox", "ply", "obj", "glb"])] {
+            // Films have folders of their own, and so has what is made of the best grid, and its films.
+            let mut folders = vec![self.path.join(folder)];
+            while let Some(folder) = folders.pop() {
+                remove(entries(&folder).filter(|path| path.is_file() && is_one_of(path, endings)))?;
+                folders.extend(entries(&folder).filter(|path| path.is_dir() && !path.is_symlink()));
+            }
         }
         Ok(())
     }
@@ -322,7 +322,7 @@ impl RunFolder {
 
     /// A picture made later.
     pub fn render(&self, name: &str) -> PathBuf {
-        self.path.join(RENDERS).join(name)
+        self.of_grid(RENDERS).join(name)
     }
 
     /// Name of the picture of a test view.
@@ -335,9 +335,15 @@ impl RunFolder {
         files::create_dir(&self.path.join(IMAGES))
     }
 
+    /// Where something lies that is made of the grid: that of the best does not take the place of the last one's.
+    fn of_grid(&self, name: &str) -> PathBuf {
+        let path = self.path.join(name);
+        if self.grid == BEST { path.join("best") } else { path }
+    }
+
     /// Makes the folder for pictures made later, and says where it is.
     pub fn create_renders(&self) -> Result<PathBuf> {
-        let path = self.path.join(RENDERS);
+        let path = self.of_grid(RENDERS);
         files::create_dir(&path)?;
         Ok(path)
     }
@@ -357,7 +363,7 @@ impl RunFolder {
 
     /// Makes the folder for what other programs read, and names a file in it.
     pub fn create_export(&self, name: &str) -> Result<PathBuf> {
-        let path = self.path.join(EXPORTS);
+        let path = self.of_grid(EXPORTS);
         files::create_dir(&path)?;
         Ok(path.join(name))
     }

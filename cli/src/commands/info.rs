@@ -94,7 +94,7 @@ fn of_run(path: &Path) -> Result<Lines> {
     } else {
         lines.push(("grid", "none: the run did not end".to_owned()));
     }
-    if folder.existing_state().is_ok() {
+    if !config.stages.is_empty() && folder.existing_state().is_ok() {
         lines.push(("go on with", format!("plenoxel train --resume {}", path.display())));
     }
     if let Some(result) = folder.result() {

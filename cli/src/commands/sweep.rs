@@ -116,7 +116,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     for (index, job) in plan.jobs.iter().enumerate() {
         let sweep = Sweep { program: &program, watch: &watch, console, index, of: plan.jobs.len() };
         let failure = sweep.finish(job)?;
-        interrupted = watch.requested() || failure.as_ref().is_some_and(|failure| failure.code == EXIT_CODE);
+        interrupted = watch.requested();
         if interrupted {
             break;
         }
@@ -189,7 +189,7 @@ impl Sweep<'_, '_> {
             return Ok(Ok(ended.out));
         }
         let failure = Failure { code: ended.code, error: ended.last };
-        if failure.code != EXIT_CODE {
+        if !self.watch.requested() {
             self.note(job, &format!("failed with exit code {}: {}", failure.code, failure.error));
         }
         Ok(Err(failure))

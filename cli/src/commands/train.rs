@@ -1,5 +1,6 @@
 //! `plenoxel train`: from photographs to a run folder.
 
+mod best_grid;
 mod budget;
 mod flags;
 pub mod interrupt;
@@ -21,8 +22,8 @@ pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use learning::{Learned, StageSummary};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
-use plenoxel::train::Trainer;
 use plenoxel::train::config::Config;
+use plenoxel::train::{PlannedStage, Trainer};
 use preview::Preview;
 use serde::Serialize;
 use std::path::Path;
@@ -58,7 +59,7 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         console.note(&format!("the grid it starts from is of another scene: {}, not {}", header.scene, dataset.name()));
     }
     let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
-    let most_rows = room(&config, &dataset, bytes as u64, console)?;
+    let most_rows = room(&config, &dataset, bytes as u64, args, console)?;
     let initial = initial.map(|folder| folder.load()).transpose()?.map(|(grid, _)| grid);
     let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
     let preview = clocks.load.time(|| Preview::new(&dataset, args.preview_every))?;
@@ -96,6 +97,9 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
 /// A run that was interrupted, from where it was last saved.
 fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let (folder, config, mut record) = RunFolder::open(path)?;
+    if config.stages.is_empty() {
+        return Err(Error::input(path, "this run was carved", "to train its grid further, use `--init-from`"));
+    }
     let state = folder.existing_state()?;
     let mut clocks = Clocks::default();
     record.data = args.moved_to().unwrap_or(record.data);
@@ -104,7 +108,7 @@ fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         console.note(&format!("it began with {}: other bits, the same picture", record.instruction_set));
     }
     announce(console, &dataset, &config);
-    let most_rows = room(&config, &dataset, 0, console)?;
+    let most_rows = room(&config, &dataset, 0, args, console)?;
     let preview = clocks.load.time(|| Preview::new(&dataset, args.preview_every))?;
     let views = clocks.load.time(|| load(console, &dataset, Split::Train, &record.data))?;
     let trainer = Trainer::new(config.clone(), &views)?.with_most_rows(most_rows);
@@ -113,23 +117,35 @@ fn resume(path: &Path, args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         None => trainer,
     };
     folder.remove_fragments()?;
-    let total = trainer.total_steps();
-    let taken = if state.is_some() { trainer.steps_taken() } else { total };
+    let (plan, taken) = match state {
+        Some(_) => (trainer.plan(), trainer.steps_taken()),
+        None => {
+            let steps = folder.header()?.0.step;
+            (ends_after(trainer.plan(), steps), steps)
+        }
+    };
+    let total = plan.iter().map(|stage| stage.steps).sum();
     let (metrics, past) = MetricsFile::resume(&folder, total, taken)?;
     clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
     console.note(&format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds)));
     let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, args, console };
     let learned = match state {
         Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks)?,
-        None => Some(job.learned(trainer.plan(), (metrics, past), &views)?),
+        None => Some(job.learned(plan, (metrics, past), &views)?),
     };
     drop(views);
     job.conclude(learned, clocks)
 }
 
+/// The last stages, which so many steps were taken in: a run that begins with a grid leaves coarser ones out.
+fn ends_after(plan: &[PlannedStage], steps: u64) -> &[PlannedStage] {
+    let taken = |from: &usize| plan[*from..].iter().map(|stage| stage.steps).sum::<u64>() == steps;
+    &plan[(0..plan.len()).find(taken).unwrap_or(0)..]
+}
+
 /// Says how much memory a run will take, and how many rows of tables there is room for.
-fn room(config: &Config, dataset: &Dataset, initial: u64, console: &Console<'_>) -> Result<usize> {
-    let estimate = Estimate::of_training(config, dataset, initial);
+fn room(config: &Config, dataset: &Dataset, initial: u64, args: &TrainArgs, console: &Console<'_>) -> Result<usize> {
+    let estimate = Estimate::of_training(config, dataset, initial, !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
     Ok(estimate.most_rows(config).unwrap_or(usize::MAX))
@@ -180,7 +196,6 @@ impl Job<'_, '_> {
         };
         folder.write_result(&summary)?;
         learned.metrics.conclude(&Final { result: &summary }, &means)?;
-        folder.remove_state()?;
         say(console, folder, &summary, note.as_deref())?;
         if !self.args.no_report {
             let report = Report { folder, config, record: self.record, dataset, grid: &learned.grid };

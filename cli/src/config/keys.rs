@@ -126,7 +126,7 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
     let Some((_, known)) = known else {
         if is_list {
             let found = format!("the key `{key}` below the list `{pattern}`");
-            return Err(Error::config(place, found, format!("an index, as in {pattern}[0], or {pattern}[*] for all of them")));
+            return Err(Error::config(place, found, format!("{pattern}[0] or {pattern}[*] with --set, [[{pattern}]] in a file")));
         }
         let found = format!("the key `{key}` below `{pattern}`, which is no table,");
         return Err(Error::config(place, found, format!("a value for `{pattern}`")));
@@ -134,36 +134,37 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
     if known.contains(&key) {
         return Ok(());
     }
-    let elsewhere = elsewhere(key);
-    match (distance(key, nearest(key, known)), elsewhere.is_empty()) {
-        (2.., false) => Err(Error::config(place, format!("the key `{key}` here"), elsewhere.join(", "))),
-        _ => Err(unknown("key", key, known, place)),
+    // One that stands elsewhere; one that is spelled alike; one that ends in the same word.
+    let last_word = |key: &str| key.rsplit_once('_').map(|(_, word)| word.to_owned());
+    let word = last_word(key).filter(|_| nearest(key, known).is_none());
+    let places = match places(&|other| other == key) {
+        same if !same.is_empty() => same,
+        _ => places(&|other| word.is_some() && last_word(other) == word),
+    };
+    match places.is_empty() {
+        true => Err(unknown("key", key, known, place)),
+        false => Err(Error::config(place, format!("the key `{key}` here"), places.join(", "))),
     }
 }
 
-/// Where else in a configuration a key of this name may stand; or if nowhere, one that ends in the same word.
-fn elsewhere(key: &str) -> Vec<String> {
-    let keys = || TABLES.iter().flat_map(|(table, keys)| keys.iter().map(move |key| (table.replace("[]", "[*]"), *key)));
-    let found =
-        |fits: &dyn Fn(&str) -> bool| keys().filter(|(_, key)| fits(key)).map(|(table, key)| joined(&table, key)).collect::<Vec<_>>();
-    let same = found(&|known| known == key);
-    match key.rsplit_once('_') {
-        Some((_, word)) if same.is_empty() => found(&|known| known.rsplit_once('_').is_some_and(|(_, last)| last == word)),
-        _ => same,
-    }
+/// Where in a configuration keys may stand that are wanted.
+fn places(wanted: &dyn Fn(&str) -> bool) -> Vec<String> {
+    let keys = TABLES.iter().flat_map(|(table, keys)| keys.iter().map(move |key| (table.replace("[]", "[*]"), *key)));
+    keys.filter(|(_, key)| wanted(key)).map(|(table, key)| joined(&table, key)).collect()
 }
 
-fn nearest<'k>(name: &str, known: &[&'k str]) -> &'k str {
-    known.iter().min_by_key(|known| distance(name, known)).copied().unwrap_or_default()
+/// The known name that is nearest in spelling, if one is near.
+fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
+    let nearest = known.iter().min_by_key(|known| distance(name, known));
+    nearest.filter(|known| distance(name, known) <= 2 + known.len() / 4).copied()
 }
 
 /// The refusal of a name that is not among the known ones: it says which is nearest in spelling, if one is near; a word that resembles
 /// nothing gets the whole list.
 pub fn unknown(what: &str, name: &str, known: &[&str], place: &str) -> Error {
-    let nearest = nearest(name, known);
-    let accepted = match distance(name, nearest) <= 2 + nearest.len() / 4 {
-        true => format!("the nearest known {what} is `{nearest}`"),
-        false => format!("one of {}", known.join(", ")),
+    let accepted = match nearest(name, known) {
+        Some(known) => format!("the nearest known {what} is `{known}`"),
+        None => format!("one of {}", known.join(", ")),
     };
     Error::config(place, format!("the unknown {what} `{name}`"), accepted)
 }
@@ -211,8 +212,9 @@ mod tests {
         assert!(message("losses.tv_densty").contains("`tv_density`"));
         assert!(message("zzzzzzzzzz").contains("one of seed, downscale"));
         assert!(message("seed.more").contains("which is no table"));
-        assert!(message("stages.0.resolution").contains("stages[0], or stages[*]"));
+        assert!(message("stages.0.resolution").contains("stages[0] or stages[*]"));
         assert!(message("resolution").contains("stages[*].resolution, scout.stages[*].resolution, carve.resolution"));
+        assert!(message("stages[0].dnsty_rate").contains("the nearest known key is `density_rate`"));
         assert!(message("lerning_rate").contains("stages[*].density_rate, stages[*].color_rate"));
         // However long: each part would take a table in a table.
         let deep = format!("losses.mse{}", ".weight".repeat(20_000));

@@ -407,7 +407,12 @@ class Viewer {
     this.renderer = new Renderer(this.canvas, scene, bytes);
     // A machine that sleeps, or has too much to draw, takes textures away.
     this.canvas.addEventListener('webglcontextlost', e => { e.preventDefault(); this.status.textContent = 'the browser took the picture away; waiting for it'; });
-    this.canvas.addEventListener('webglcontextrestored', () => { this.renderer = new Renderer(this.canvas, scene, bytes); this.moved(); });
+    this.canvas.addEventListener('webglcontextrestored', () => {
+      try {
+        this.renderer = new Renderer(this.canvas, scene, bytes);
+        this.moved();
+      } catch (error) { this.status.textContent = `The picture cannot be shown again: ${error.message}`; }
+    });
     this.camera = new Orbit(scene.views[0]);
     // Pixels of a frame, and of a band: what was taken for the last ones tells how many.
     this.pixels = { frame: 10000, band: 10000 };
@@ -494,6 +499,7 @@ class Viewer {
 
   // Saves what the camera sees, in the size of the photographs.
   save() {
+    if (this.renderer.gl.isContextLost()) return;
     const picture = this.renderer.picture(this.camera), canvas = document.createElement('canvas'), link = document.createElement('a');
     [canvas.width, canvas.height] = [picture.width, picture.height];
     canvas.getContext('2d').putImageData(picture, 0, 0);

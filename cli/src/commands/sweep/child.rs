@@ -64,6 +64,8 @@ impl Program {
         let over = AtomicBool::new(false);
         let out = std::thread::scope(|scope| {
             let child = &child;
+            // However it ends.
+            let ends = Ends(&over);
             scope.spawn(|| {
                 while !over.load(SeqCst) {
                     if watch.requested() {
@@ -90,12 +92,21 @@ impl Program {
                     bytes.clear();
                 }
             }
-            over.store(true, SeqCst);
+            drop(ends);
             out.join().unwrap_or_default()
         });
         let status = child.wait().map_err(starting)?;
         let code = code(status);
         Ok(Ended { code, out, last: last.words(status) })
+    }
+}
+
+/// Says that something is over when it is dropped.
+struct Ends<'o>(&'o AtomicBool);
+
+impl Drop for Ends<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, SeqCst);
     }
 }
 

@@ -1,5 +1,6 @@
 //! The training itself: steps, what looks on, and what is saved to go on from.
 
+use super::best_grid::BestGrid;
 use super::pictures::Pictures;
 use super::preview::Preview;
 use super::watching::Watching;
@@ -7,8 +8,6 @@ use super::{Clocks, Job, interrupt};
 use crate::evaluation;
 use crate::images::Rgb;
 use crate::metrics_file::{MetricsFile, Past};
-use crate::progress::Console;
-use crate::run_folder::RunFolder;
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::View;
 use plenoxel::error::Result;
@@ -56,17 +55,17 @@ impl<'a> Job<'a, '_> {
         let plan = trainer.plan().to_vec();
         let total = trainer.total_steps();
         let mut stages = summaries(&past, &plan);
-        let mut best = Best::of(folder, &past);
+        let mut best = BestGrid::of(folder, &past, console);
         let header = |grid: &_, steps| Header::new(grid, dataset.name(), config.background, config.seed, steps);
         let pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
         let preview = preview.begin(pictures.camera().map(|camera| (folder.image("preview.png"), camera)));
         let mut watching = Watching::begin((folder, config, console), &trainer, (metrics, past), pictures, preview);
         let interrupt = interrupt::Watch::begin();
         let mut saved = Instant::now();
-        loop {
+        let last_psnr = loop {
             let report = match clocks.train.time(|| trainer.step()) {
                 Ok(Some(report)) => report,
-                Ok(None) => break,
+                Ok(None) => break None,
                 // There is no checkpoint.
                 Err(e) => return watching.failed(&e).and(Err(e)),
             };
@@ -81,17 +80,16 @@ impl<'a> Job<'a, '_> {
             }
             if save {
                 watching.sync()?;
-                let grid = trainer.grid();
-                let saved_now = trainer.save(&folder.state(), dataset.name());
-                match saved_now.and_then(|()| best.saved(validation_psnr, || folder.save_best(grid, &header(grid, report.step + 1)))) {
+                match trainer.save(&folder.state(), dataset.name()) {
+                    Ok(()) => best.saved(validation_psnr, trainer.grid(), &header(trainer.grid(), report.step + 1)),
                     // There may be room on the disk the next time.
                     Err(e) if !interrupt.requested() => console.note(&format!("not saved: {e}")),
-                    done => done?,
+                    Err(e) => return Err(e),
                 }
                 saved = Instant::now();
             }
             if last {
-                best.last(validation_psnr, console)?;
+                break validation_psnr;
             }
             if save && interrupt.requested() {
                 drop(watching);
@@ -100,15 +98,18 @@ impl<'a> Job<'a, '_> {
                 console.error(&text, interrupt::EXIT_CODE);
                 return Ok(None);
             }
-        }
+        };
         let (metrics, pictures) = watching.end();
         let grid = trainer.into_grid();
         folder.save(&grid, &header(&grid, total))?;
+        best.conclude(last_psnr);
+        folder.remove_state()?;
         if interrupt.requested() {
             let text = format!("interrupted after the last step; its figures: plenoxel train --resume {}", folder.path().display());
             console.error(&text, interrupt::EXIT_CODE);
             return Ok(None);
         }
+        drop(interrupt);
         let mean_image = evaluation::mean_image(views, config.background);
         Ok(Some(Learned { grid, metrics, pictures, mean_image, stages, steps: total }))
     }
@@ -121,43 +122,6 @@ impl<'a> Job<'a, '_> {
         let (grid, header) = folder.load()?;
         let mean_image = evaluation::mean_image(views, config.background);
         Ok(Learned { grid, metrics, pictures, mean_image, stages: summaries(&past, plan), steps: header.step })
-    }
-}
-
-/// `best.safetensors`: of the grids that were saved, the one that showed validation views best.
-struct Best<'a> {
-    folder: &'a RunFolder,
-    /// Mean PSNR of validation views that it shows, if there is one.
-    psnr: Option<f64>,
-}
-
-impl<'a> Best<'a> {
-    /// The best of a run, with what its lines tell of it.
-    fn of(folder: &'a RunFolder, past: &Past) -> Self {
-        let step = folder.best_step().and_then(|taken| taken.checked_sub(1));
-        Best { folder, psnr: step.and_then(|step| past.validation.get(&step)).copied() }
-    }
-
-    /// A grid is saved that shows validation views so well: is it the best, it is written.
-    fn saved(&mut self, psnr: Option<f64>, write: impl FnOnce() -> Result<()>) -> Result<()> {
-        if psnr.is_some() && psnr >= self.psnr {
-            write()?;
-            self.psnr = psnr;
-        }
-        Ok(())
-    }
-
-    /// So the last grid does. If it is the best, no other is kept.
-    fn last(&self, psnr: Option<f64>, console: &Console<'_>) -> Result<()> {
-        match (self.psnr, psnr) {
-            (Some(best), Some(last)) if best > last => {
-                let shown = "best.safetensors, which evaluate, render and export take with --best";
-                console.note(&format!("an earlier grid shows validation views better, {best:.2} dB instead of {last:.2} dB: {shown}"));
-                Ok(())
-            }
-            (Some(_), None) => Ok(()),
-            _ => self.folder.remove_best(),
-        }
     }
 }
 

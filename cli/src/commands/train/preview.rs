@@ -20,7 +20,7 @@ const VIEWS: usize = 4;
 const SIDE: usize = 128;
 /// That of the picture's, for eyes.
 const PICTURE_SIDE: usize = 256;
-/// The share of the time since training began that may be gone into looking when it is looked because time has passed, and at milestones.
+/// The share of the time since training began that may be gone into looking when it is looked because time has passed or a step is saved, and when a stage ends.
 const SHARES: [f64; 2] = [0.03, 0.05];
 /// Seconds that it counts for at least: the stages of short runs have their look too.
 const LEAST: f64 = 20.0;
@@ -70,10 +70,10 @@ impl Preview {
         Preview { pace: Pace::new(self.pace.every), picture, ..self }
     }
 
-    /// Looks at the grid, if it is time to: at a milestone, which is the end of a stage or a step that is saved, whenever there is time for it.
-    pub fn look(&mut self, grid: &VoxelGrid<f32>, at_milestone: bool, config: &Config) -> Result<Option<Look>> {
+    /// Looks at the grid, if it is time to: when a stage ends and when a step is saved whenever there is time for it.
+    pub fn look(&mut self, grid: &VoxelGrid<f32>, ends_stage: bool, saves: bool, config: &Config) -> Result<Option<Look>> {
         let nothing = self.views.is_empty() && self.picture.is_none();
-        if nothing || !self.pace.due(self.pace.now(), at_milestone) {
+        if nothing || !self.pace.due(self.pace.now(), ends_stage, saves) {
             return Ok(None);
         }
         let start = self.pace.now();
@@ -109,7 +109,7 @@ fn reduced(view: &View, side: usize) -> View {
     View { name: view.name.clone(), camera, image, depth: None }.reduced(k as usize)
 }
 
-/// When to look: after some time, or at milestones, and always so that little of the time goes into it.
+/// When to look: after some time, when a step is saved, or when a stage ends, and always so that little of the time goes into it.
 struct Pace {
     every: f64,
     began: Instant,
@@ -130,9 +130,9 @@ impl Pace {
         self.began.elapsed().as_secs_f64()
     }
 
-    fn due(&self, now: f64, at_milestone: bool) -> bool {
-        let affordable = self.spent + self.cost <= SHARES[usize::from(at_milestone)] * now.max(LEAST);
-        self.every.is_finite() && affordable && (at_milestone || now - self.last >= self.every)
+    fn due(&self, now: f64, ends_stage: bool, saves: bool) -> bool {
+        let affordable = self.spent + self.cost <= SHARES[usize::from(ends_stage)] * now.max(LEAST);
+        self.every.is_finite() && affordable && (ends_stage || saves || now - self.last >= self.every)
     }
 
     fn took(&mut self, start: f64, end: f64) {
@@ -154,7 +154,7 @@ mod tests {
             for step in 1..20_000 {
                 now += 0.05;
                 let ends_stage = step % 5_000 == 0;
-                if pace.due(now, ends_stage) {
+                if pace.due(now, ends_stage, false) {
                     pace.took(now, now + cost);
                     now += cost;
                     looks += 1.0;
@@ -167,7 +167,7 @@ mod tests {
             assert!(looks > 0.9 * most - 1.0, "{every} {cost}: {looks} of {most}");
         }
         let never = Pace::new(f64::INFINITY);
-        assert!(!never.due(1e6, true) && !never.due(1e6, false));
+        assert!(!never.due(1e6, true, true) && !never.due(1e6, false, false));
     }
 
     #[test]

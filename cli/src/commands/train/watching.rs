@@ -49,7 +49,7 @@ impl<'a, 'c> Watching<'a, 'c> {
         if report.step == self.plan[report.stage].first {
             self.voxels = grid.lattice().present();
         }
-        let look = self.preview.look(grid, report.ends_stage || save, self.config);
+        let look = self.preview.look(grid, report.ends_stage, save, self.config);
         let look = self.drawn(look).flatten();
         let validation_psnr = look.as_ref().and_then(|look| look.psnr);
         let seen = Seen { voxels: self.voxels, validation_psnr, seconds };
