@@ -142,6 +142,33 @@ fn a_stage_of_reduced_images_learns_from_what_reduced_views_show() {
 }
 
 #[test]
+fn small_images_have_large_voxels() {
+    // Of 32 x 32 pixels.
+    let train = views(Split::Train);
+    let camera = &train[0].camera;
+    let pixel = camera.position().length() / camera.intrinsics.fx;
+    let stages = vec![Stage { image_reduction: 4, ..stage(8, 6) }, Stage { image_reduction: 4, ..stage(128, 4) }];
+    let fitted = |pixels_per_voxel: f64, stages: &[Stage]| {
+        let config = Config { pixels_per_voxel, stages: stages.to_vec(), ..config() };
+        let trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
+        let again = trainer.config().fitted_to(train.iter().map(|view| &view.camera));
+        // What fits is left alone.
+        assert_eq!(again, *trainer.config());
+        trainer.plan().iter().map(|planned| planned.stage).collect::<Vec<_>>()
+    };
+    assert_eq!(fitted(0.0, &stages), stages);
+    assert_eq!(fitted(1e-3, &stages), stages);
+    let [coarse, fine] = fitted(1.5, &stages)[..] else { panic!("two stages") };
+    let finest = 2.0 * config().half_width / (1.5 * pixel);
+    assert_eq!(fine.resolution, finest as usize);
+    assert!((fine.density_rate - stages[1].density_rate * fine.resolution as f64 / 128.0).abs() < 1e-12);
+    assert_eq!((fine.image_reduction, coarse.image_reduction), (1, (finest / 8.0) as usize));
+    assert!(coarse.resolution == 8 && (2..4).contains(&coarse.image_reduction), "{coarse:?}");
+    // There are voxels at least.
+    assert_eq!(fitted(1e6, &stages)[1].resolution, 2);
+}
+
+#[test]
 fn voxels_that_no_training_ray_sees_much_of_go_without_harm() {
     let train = views(Split::Train);
     let stages = vec![stage(16, 40), stage(32, 140)];

@@ -95,6 +95,7 @@ impl<'a, T: Real> Trainer<'a, T> {
     /// A run with an objective of one's own; the config's losses are not used.
     pub fn with_objective(config: Config, views: &'a [View], objective: Objective<T>) -> Result<Self> {
         config.validate()?;
+        let config = config.fitted_to(views.iter().map(|view| &view.camera));
         let rays = RaySource::new(views, config.background, config.seed);
         if rays.is_empty() {
             return Err(Error::config("train views", "none", "at least one image to learn from"));

@@ -145,7 +145,12 @@ fn ends_after(plan: &[PlannedStage], steps: u64) -> &[PlannedStage] {
 
 /// Says how much memory a run will take, and how many rows of tables there is room for.
 fn room(config: &Config, dataset: &Dataset, initial: u64, args: &TrainArgs, console: &Console<'_>) -> Result<usize> {
-    let estimate = Estimate::of_training(config, dataset, initial, !args.no_report);
+    let fitted = config.fitted_to(&dataset.cameras(Split::Train));
+    if fitted.stages != config.stages {
+        let stages: Vec<String> = fitted.stages.iter().map(|stage| format!("{}³", stage.resolution)).collect();
+        console.note(&format!("stages as the size of the images allows (pixels_per_voxel): {}", stages.join(", ")));
+    }
+    let estimate = Estimate::of_training(&fitted, dataset, initial, !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
     Ok(estimate.most_rows(config).unwrap_or(usize::MAX))

@@ -43,6 +43,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "aim",
             "jitter",
             "project",
+            "pixels_per_voxel",
             "prune_from_stage",
             "prune_below",
             "prune_unseen_below",

@@ -2,6 +2,7 @@
 //!
 //! The same struct is the file `config.toml` of a run, a preset, and what flags change.
 
+use crate::camera::Camera;
 use crate::carve::CarveConfig;
 use crate::error::{Error, Result};
 use crate::field::sh;
@@ -56,6 +57,10 @@ pub struct Config {
     pub jitter: bool,
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
     pub project: bool,
+    /// Stages have no voxels that are smaller than so many pixels, seen from as far as the mean camera is; 0 for no such bound. See
+    /// [`Config::fitted_to`].
+    #[serde(default)]
+    pub pixels_per_voxel: f64,
     /// From this stage on (counted from 0), voxels that at the stage's start have, with all their neighbours, a density of at most
     /// `prune_below` are taken out of the grid: they are empty from then on, and are not looked at.
     pub prune_from_stage: Option<usize>,
@@ -282,6 +287,14 @@ impl Stage {
         }
     }
 
+    /// The same with at most `finest` voxels a side.
+    fn fitted(self, finest: f64) -> Self {
+        let resolution = self.resolution.min((finest as usize).max(2));
+        let image_reduction = self.image_reduction.min((finest / resolution as f64) as usize).max(1);
+        let density_rate = self.density_rate * resolution as f64 / self.resolution as f64;
+        Stage { resolution, image_reduction, density_rate, ..self }
+    }
+
     /// The share of their first rates that colors and harmonics end with.
     pub fn color_decay(&self) -> f64 {
         self.color_decay.unwrap_or(self.rate_decay)
@@ -319,6 +332,7 @@ impl Default for Config {
             aim: false,
             jitter: true,
             project: false,
+            pixels_per_voxel: 0.0,
             prune_from_stage: None,
             prune_below: 0.2,
             prune_unseen_below: 0.0,
@@ -355,6 +369,26 @@ impl Config {
         GridShape { resolution, half_width, interpolation, color, sh_reduction }.normalised()
     }
 
+    /// The same with stages that images of some cameras have pixels for. Small images say nothing of small voxels, which would learn what
+    /// single views show and no other.
+    ///
+    /// A pixel is d / f wide, for the mean camera's distance d from the middle of the cube, or its half width w if that is more, and focal length f
+    /// in pixels. The finest grid then has n = 2 w f / (`pixels_per_voxel` d) voxels a side. Stages that are finer get that many, and a rate of the
+    /// density that is less by as much. Images are reduced by no more than k where a stage has n / k voxels a side, so that what is true of voxels
+    /// and pixels is true of theirs.
+    pub fn fitted_to<'c>(&self, cameras: impl IntoIterator<Item = &'c Camera>) -> Self {
+        let pixel = |camera: &Camera| camera.position().length().max(self.half_width) / camera.intrinsics.fx.min(camera.intrinsics.fy);
+        let (sum, count) = cameras.into_iter().map(pixel).fold((0.0, 0.0), |(sum, count), pixel| (sum + pixel, count + 1.0));
+        let finest = 2.0 * self.half_width / (self.pixels_per_voxel * sum / count);
+        let mut fitted = self.clone();
+        // Without cameras, or a bound, it is no number, or infinite.
+        if finest.is_finite() {
+            let of_scout = fitted.scout.iter_mut().flat_map(|scout| &mut scout.stages);
+            fitted.stages.iter_mut().chain(of_scout).for_each(|stage| *stage = stage.fitted(finest));
+        }
+        fitted
+    }
+
     /// Checks that there is something to train.
     pub fn check_stages(&self) -> Result<()> {
         check(!self.stages.is_empty(), "stages", "no stage", "at least one")
@@ -380,6 +414,7 @@ impl Config {
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check((1..=64).contains(&self.sh_reduction), "sh_reduction", self.sh_reduction, "1 to 64")?;
         color("sh_offset", self.sh_offset)?;
+        check((0.0..=1e6).contains(&self.pixels_per_voxel), "pixels_per_voxel", self.pixels_per_voxel, "0 to 1e6")?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
         decay("stop_below", self.stop_below)?;
         density("prune_below", self.prune_below)?;

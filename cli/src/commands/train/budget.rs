@@ -41,7 +41,8 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     let speed = measure(&config, views, (CALIBRATION.0 * seconds).min(CALIBRATION.1))?;
     let steps: Vec<u64> = steps.collect();
     let growth = GROWTH[usize::from(config.sh_reduction < 4)];
-    let factor = factor(&config.stages, &steps, config.rays_per_step, seconds, &speed, growth)?;
+    let fitted = config.fitted_to(views.iter().map(|view| &view.camera));
+    let factor = factor(&fitted.stages, &steps, config.rays_per_step, seconds, &speed, growth)?;
     let scaled = |steps: u64| ((steps as f64 * factor).round() as u64).max(1);
     let stages = config.stages.iter().zip(&steps).map(|(&stage, &steps)| {
         let density_warm_up = if stage.density_warm_up == 0 { 0 } else { scaled(stage.density_warm_up) };
