@@ -143,7 +143,7 @@ fn ends_after(plan: &[PlannedStage], steps: u64) -> &[PlannedStage] {
     &plan[(0..plan.len()).find(taken).unwrap_or(0)..]
 }
 
-/// Says how much memory a run will take, and how many rows of tables there is room for.
+/// Says which stages the images are large enough for, and how much memory a run will take. Returns how many rows of tables there is room for.
 fn room(config: &Config, dataset: &Dataset, initial: u64, args: &TrainArgs, console: &Console<'_>) -> Result<usize> {
     let fitted = config.fitted_to(&dataset.cameras(Split::Train));
     if fitted.stages != config.stages {
