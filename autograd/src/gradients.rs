@@ -337,7 +337,7 @@ mod tests {
     use crate::optim::{Adam, AdamMode, Momentum, Optimizer, RmsProp, Sgd};
     use crate::param::Bounds;
 
-    /// Row (37 i) mod 1000 gets i in its even columns and −i in the others, for i below 300.
+    /// Row (37 i) mod 1003 gets i in its even columns and −i in the others, for i below 300.
     #[derive(Debug)]
     struct Some300 {
         width: usize,
@@ -345,7 +345,7 @@ mod tests {
     }
 
     fn row(i: usize) -> usize {
-        37 * i % 1000
+        37 * i % 1003
     }
 
     impl RowSums<f64> for Some300 {
@@ -371,7 +371,7 @@ mod tests {
     }
 
     fn deferred_by(shift: u32, width: usize) -> RowSparse<f64> {
-        RowSparse::deferred(&[1000, width], Arc::new(Some300 { width, shift }))
+        RowSparse::deferred(&[1003, width], Arc::new(Some300 { width, shift }))
     }
 
     #[test]
@@ -394,7 +394,7 @@ mod tests {
         assert!(rows.unmerged().is_some(), "the table alone does not need the rows");
         assert!(rows.rows().is_sorted_by(|a, b| a < b) && !rows.rows().iter().any(|row| row >> 7 == 3));
         assert!(rows.unmerged().is_none());
-        let mut want = vec![0.0; 2000];
+        let mut want = vec![0.0; 2006];
         for i in (0..300).filter(|&i| row(i) >> 7 != 3) {
             want[2 * row(i)] += i as f64;
             want[2 * row(i) + 1] -= i as f64;
@@ -416,7 +416,7 @@ mod tests {
         // The widths that have loops of their own, and one that has not.
         for (make, width) in optimizers.into_iter().flat_map(|make| [1, 2, 3, 24, 27].map(|width| (make, width))) {
             let run = |merge: bool| {
-                let mut param = Param::from_tensor("table", Tensor::full(&[1000, width], 0.5));
+                let mut param = Param::from_tensor("table", Tensor::full(&[1003, width], 0.5));
                 param.set_bounds(Bounds { low: 0.45, high: 0.55 });
                 let mut optimizer = make();
                 for step in 0..3 {

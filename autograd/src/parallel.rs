@@ -4,12 +4,14 @@
 //! the same bits for any thread count.
 
 mod gather;
+mod prefetch;
 pub(crate) mod streamed;
 mod update;
 
 use crate::pool::Pooled;
 use crate::real::Real;
 pub use gather::gathered;
+pub use prefetch::prefetch;
 use rayon::prelude::*;
 pub(crate) use update::{update, update_all_rows, update_deferred, update_rows};
 

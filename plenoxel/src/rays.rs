@@ -35,6 +35,9 @@ impl<T: Real> RayBatch<T> {
     }
 }
 
+/// Pixels between two entries of [`RaySource::guide`]; a tile of usual size has as many.
+const GUIDE: u64 = 64;
+
 /// The pixels of some views, all of them or those that can see something, in an order that is shuffled anew each epoch.
 #[derive(Debug)]
 pub struct RaySource<'a> {
@@ -44,6 +47,8 @@ pub struct RaySource<'a> {
     tiles: Vec<Tile>,
     /// `first[t]` is the number of pixels before tile t.
     first: Vec<u64>,
+    /// The tile of every [`GUIDE`]-th pixel: one search for a random pixel would wait for memory a dozen times.
+    guide: Vec<u32>,
     /// Pixels of all views.
     pixels: u64,
 }
@@ -55,7 +60,7 @@ impl<'a> RaySource<'a> {
     pub fn new(views: impl Into<Cow<'a, [View]>>, background: [f32; 3], seed: u64) -> Self {
         let views = views.into();
         let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
-        let mut source = RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), pixels: 0 };
+        let mut source = RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), guide: Vec::new(), pixels: 0 };
         source.set_tiles(tiles);
         source.pixels = source.len();
         source
@@ -65,6 +70,12 @@ impl<'a> RaySource<'a> {
         self.first = vec![0];
         for tile in &tiles {
             self.first.push(self.first[self.first.len() - 1] + tile.pixels() as u64);
+        }
+        self.guide.clear();
+        for (t, first) in self.first.windows(2).enumerate() {
+            while (self.guide.len() as u64) * GUIDE < first[1] {
+                self.guide.push(t as u32);
+            }
         }
         self.tiles = tiles;
     }
@@ -175,7 +186,8 @@ impl<'a> RaySource<'a> {
 
     /// Number of the view, column and row of one pixel of the set.
     fn place(&self, index: u64) -> (usize, usize, usize) {
-        let t = self.first.partition_point(|&f| f <= index) - 1;
+        let guide = self.guide[(index / GUIDE) as usize] as usize;
+        let t = guide + self.first[guide + 1..].iter().take_while(|&&f| f <= index).count();
         let Tile { view, x, y, width, .. } = self.tiles[t];
         let pixel = (index - self.first[t]) as u32;
         (view as usize, (x + pixel % width) as usize, (y + pixel / width) as usize)

@@ -1,6 +1,6 @@
 //! How optimizers change tables: dense, by rows, or by rows whose gradients are added up on the way.
 
-use super::{CHUNK, dispatched, for_each_item, rows_per_chunk};
+use super::{CHUNK, dispatched, for_each_item, prefetch, rows_per_chunk};
 use crate::gradients::{RowGroups, RowSums};
 use crate::real::Real;
 
@@ -176,9 +176,12 @@ fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl 
     }
 }
 
+/// Numbers that are updated together, and short rows.
+const LANES: usize = 8;
+
 dispatched! {
 /// Updates the rows whose bits are set and clears their sums and bits; `sums` has a row for each row of the tables. `W` is the width, or 0
-/// for one only known at run time. Neighbours are updated together, but short rows one by one: to look for runs costs more than it saves.
+/// for one only known at run time. Of short rows eight are updated together, and those that are not touched keep what they had.
 fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(
     mut x: [&mut [T]; N],
     width: usize,
@@ -187,33 +190,80 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
     f: &F,
 ) {
     let width = if W == 0 { width } else { W };
-    for (w, word) in touched.iter_mut().enumerate() {
-        let mut left = std::mem::take(word);
-        while (1..=4).contains(&W) && left != 0 {
-            let start = (w * 64 + left.trailing_zeros() as usize) * W;
-            left &= left - 1;
-            let g = &mut sums[start..][..W];
-            update_slices(x.each_mut().map(|x| &mut x[start..][..W]), W, |i| g[i], f);
-            g.fill(T::zero());
+    let short = (1..=4).contains(&W);
+    let rows = sums.len() / width.max(1);
+    ask_for(&x, width, 0, touched[0], short);
+    for w in 0..touched.len() {
+        // The rows of the next word come from memory while those of this one are updated.
+        if let Some(&next) = touched.get(w + 1) {
+            ask_for(&x, width, w + 1, next, short);
         }
+        let mut left = std::mem::take(&mut touched[w]);
         while left != 0 {
-            let bit = left.trailing_zeros();
-            let run = (left >> bit).trailing_ones();
-            left &= if bit + run == 64 { 0 } else { !0 << (bit + run) };
-            let start = (w * 64 + bit as usize) * width;
-            if W != 0 && run == 1 {
-                let g = &mut sums[start..][..W];
-                update_slices(x.each_mut().map(|x| &mut x[start..][..W]), W, |i| g[i], f);
-                g.fill(T::zero());
-            } else {
-                let len = run as usize * width;
-                let g = &mut sums[start..][..len];
-                update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
-                g.fill(T::zero());
+            let bit = left.trailing_zeros() as usize;
+            let eight = bit & !(LANES - 1);
+            if short && w * 64 + eight + LANES <= rows {
+                let start = (w * 64 + eight) * W;
+                update_eight::<T, N, W, F>(&mut x, &mut sums[start..][..LANES * W], start, (left >> eight) as u8, f);
+                left &= !(0xff << eight);
+                continue;
             }
+            let run = if W == 0 { (left >> bit).trailing_ones() as usize } else { 1 };
+            left &= if bit + run == 64 { 0 } else { !0 << (bit + run) };
+            let start = (w * 64 + bit) * width;
+            // A constant length is worth a copy of the loop.
+            let len = if W == 0 { run * width } else { W };
+            let g = &mut sums[start..][..len];
+            update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
+            g.fill(T::zero());
         }
     }
 }
+}
+
+/// Asks for the rows whose bits are set in word number `word`; of short rows for all eight that are updated together.
+#[inline(always)]
+fn ask_for<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, word: usize, mut left: u64, short: bool) {
+    while left != 0 {
+        let bit = left.trailing_zeros() as usize;
+        let (first, bits) = if short { (bit & !(LANES - 1), 0xff) } else { (bit, 1) };
+        left &= !(bits << first);
+        let start = (word * 64 + first) * width;
+        let len = if short { LANES * width } else { width };
+        x.iter().for_each(|x| prefetch(&x[start..x.len().min(start + len)]));
+    }
+}
+
+/// Updates those of eight rows from element `start` on whose bits are set, and clears all their sums.
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // N arrays are walked at once.
+fn update_eight<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(
+    x: &mut [&mut [T]; N],
+    sums: &mut [T],
+    start: usize,
+    bits: u8,
+    f: &F,
+) {
+    let sums = sums.as_chunks_mut::<LANES>().0;
+    for part in 0..W {
+        let at = start + part * LANES;
+        let mut values = [[T::zero(); LANES]; N];
+        for k in 0..N {
+            values[k].copy_from_slice(&x[k][at..at + LANES]);
+        }
+        for i in 0..LANES {
+            let old: [T; N] = std::array::from_fn(|k| values[k][i]);
+            let new = f(old, sums[part][i]);
+            let on = u32::from(bits) & (1 << ((part * LANES + i) / W)) != 0;
+            for k in 0..N {
+                values[k][i] = if on { new[k] } else { old[k] };
+            }
+        }
+        for k in 0..N {
+            x[k][at..at + LANES].copy_from_slice(&values[k]);
+        }
+        sums[part] = [T::zero(); LANES];
+    }
 }
 
 #[cfg(test)]

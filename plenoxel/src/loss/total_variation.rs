@@ -237,7 +237,13 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
             return out.dense(0, gradient);
         }
         let touched = reached.iter().map(|&brick| touched(bricks, self.run, brick as usize)).collect();
-        out.rows(0, RowSparse::deferred(table.shape(), Arc::new(RowsOfBricks { bricks: reached, touched, width: W, values: gradient })));
+        out.rows(
+            0,
+            RowSparse::deferred(
+                table.shape(),
+                Arc::new(RowsOfBricks { bricks: Members::new(&reached, bricks.len()), touched, width: W, values: gradient }),
+            ),
+        );
     }
 }
 
@@ -255,8 +261,7 @@ fn touched(bricks: &[Neighbours], run: Run, brick: usize) -> u64 {
 /// The rows of some bricks with what is added to them.
 #[derive(Debug)]
 struct RowsOfBricks<T: Real> {
-    /// Ascending.
-    bricks: Vec<u32>,
+    bricks: Members,
     /// A bit for each row of a brick that something is added to.
     touched: Vec<u64>,
     width: usize,
@@ -270,15 +275,41 @@ impl<T: Real> RowSums<T> for RowsOfBricks<T> {
     }
 
     fn is_empty(&self, bucket: usize) -> bool {
-        self.bricks.binary_search(&(bucket as u32)).is_err()
+        self.bricks.place(bucket).is_none()
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        if let Ok(k) = self.bricks.binary_search(&(bucket as u32)) {
+        if let Some(k) = self.bricks.place(bucket) {
             let values = &self.values[k * BRICK_ROWS * self.width..][..BRICK_ROWS * self.width];
             sums.iter_mut().zip(values).for_each(|(sum, &value)| *sum += value);
             touched[0] |= self.touched[k];
         }
+    }
+}
+
+/// Some of the numbers below a bound: an optimizer asks of each brick whether it is one of a few.
+#[derive(Debug)]
+struct Members {
+    bits: Vec<u64>,
+    /// Members before each word of bits.
+    before: Vec<u32>,
+}
+
+impl Members {
+    /// Of ascending numbers.
+    fn new(ascending: &[u32], bound: usize) -> Self {
+        let mut bits = vec![0u64; bound.div_ceil(64)];
+        ascending.iter().for_each(|&member| bits[member as usize / 64] |= 1 << (member % 64));
+        let count = |sum: &mut u32, word: &u64| Some(std::mem::replace(sum, *sum + word.count_ones()));
+        let before = bits.iter().scan(0, count).collect();
+        Members { bits, before }
+    }
+
+    /// How many members come before this one; `None` if it is not one.
+    #[inline(always)]
+    fn place(&self, number: usize) -> Option<usize> {
+        let (word, bit) = (self.bits[number / 64], number % 64);
+        (word >> bit & 1 == 1).then(|| self.before[number / 64] as usize + (word & ((1 << bit) - 1)).count_ones() as usize)
     }
 }
 

@@ -271,33 +271,37 @@ fn dilate(masks: &[u64], count: [usize; 3], axis: usize, back: bool) -> Vec<u64>
     out
 }
 
-/// Chebyshev distance of each brick to the nearest that is not empty.
+/// Chebyshev distance of each brick to the nearest that is not empty, [`FAR`] at most.
+///
+/// min over all bricks of max |coordinate difference|, an axis after the other: along z it is a distance, along y and x it takes
+/// min over k of max(k, what was found k bricks away).
 fn distances(masks: &[u64], count: [usize; 3]) -> Vec<u8> {
     let mut distance: Vec<u8> = masks.iter().map(|&m| if m == 0 { FAR } else { 0 }).collect();
-    // min over the cube around a brick of max |coordinate difference|: one step of growth at a time, an axis after the other.
-    for level in 1..FAR {
-        let mut near: Vec<bool> = distance.iter().map(|&d| d < level).collect();
-        for axis in 0..3 {
-            let stride = [count[1] * count[2], count[2], 1][axis];
-            let old = near.clone();
-            parallel::for_each_chunk(&mut near, parallel::CHUNK, |first, chunk| {
-                for (i, near) in chunk.iter_mut().enumerate() {
-                    let b = first + i;
-                    let at = place(b, count)[axis];
-                    *near |= at > 0 && old[b - stride] || at + 1 < count[axis] && old[b + stride];
+    for line in distance.chunks_mut(count[2].max(1)) {
+        let mut near = FAR;
+        let mut grow = |d: &mut u8| {
+            near = near.saturating_add(1).min(*d);
+            *d = near;
+        };
+        line.iter_mut().for_each(&mut grow);
+        line.iter_mut().rev().for_each(&mut grow);
+    }
+    for (n, inner) in [(count[1], count[2]), (count[0], count[1] * count[2])] {
+        let old = distance.clone();
+        parallel::for_each_chunk(&mut distance, inner, |start, row| {
+            let at = start / inner % n;
+            for k in 1..FAR {
+                if row.iter().all(|&d| d <= k) {
+                    break;
                 }
-            });
-        }
-        let mut changed = false;
-        for (d, near) in distance.iter_mut().zip(near) {
-            if near && *d > level {
-                *d = level;
-                changed = true;
+                let steps = usize::from(k) * inner;
+                let below = (at >= usize::from(k)).then(|| start - steps);
+                let above = (at + usize::from(k) < n).then(|| start + steps);
+                for from in below.into_iter().chain(above) {
+                    row.iter_mut().zip(&old[from..]).for_each(|(d, &there)| *d = (*d).min(there.max(k)));
+                }
             }
-        }
-        if !changed {
-            break;
-        }
+        });
     }
     distance
 }

@@ -5,6 +5,9 @@ use autograd::ops::trilinear::{corners_of_many, nearest_node};
 use autograd::{Buffer, Real, dispatched, parallel};
 use std::slice::from_mut;
 
+/// How many samples ahead rows are asked for.
+pub(super) const AHEAD: usize = 8;
+
 /// The eight rows around each of some samples, and their weights.
 #[derive(Debug)]
 pub(super) struct Corners<T: Real> {
@@ -137,7 +140,11 @@ pub(super) fn plain<T: Real, const K: usize>(
     out: &mut [[T; 3]],
 ) {
     let table = table.as_chunks::<3>().0;
+    let count = out.len();
     for (i, out) in out.iter_mut().enumerate() {
+        if i + AHEAD < count {
+            look(i + AHEAD).0.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch);
+        }
         let mut sum = [T::zero(); 3];
         if seen(i) {
             let (rows, weights) = look(i);

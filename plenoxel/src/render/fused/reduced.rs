@@ -5,7 +5,7 @@
 //! bucket by bucket like everything else.
 
 use super::forward::{Block, Scene};
-use super::lookup::{Corners, nearest_rows, weigh_all};
+use super::lookup::{AHEAD, Corners, nearest_rows, weigh_all};
 use super::{Batch, COLUMNS};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
@@ -119,6 +119,12 @@ fn add_to_means<T: Real, const K: usize, const W: usize, const N: usize>(
     let (none, mut sum) = ([T::zero(); W], [T::zero(); W]);
     for (own, basis) in offsets.windows(2).zip(basis.chunks_exact(N + 1)) {
         for i in (own[0] as usize..own[1] as usize).filter(|&i| seen(i)) {
+            if i + AHEAD < out.len() {
+                let later = look(i + AHEAD).0;
+                if later[0] != look(i + AHEAD - 1).0[0] {
+                    later.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch);
+                }
+            }
             let (rows, weights) = look(i);
             weigh_all::<T, K, W, false>(rows.map(|row| table.get(row as usize).unwrap_or(&none)), weights, &mut sum);
             for c in 0..3 {
@@ -253,7 +259,11 @@ fn add_runs<T: Real, const K: usize, const N: usize>(
     touched: &mut [u64],
 ) {
     let sums = sums.as_chunks_mut::<N>().0;
-    for &number in &runs.numbers[runs.starts[bucket] as usize..runs.starts[bucket + 1] as usize] {
+    let numbers = &runs.numbers[runs.starts[bucket] as usize..runs.starts[bucket + 1] as usize];
+    for (k, &number) in numbers.iter().enumerate() {
+        if let Some(&later) = numbers.get(k + 4) {
+            parallel::prefetch(&runs.runs[later as usize]);
+        }
         let run = &runs.runs[number as usize];
         let y: &[T; N] = basis[run.ray as usize * (N + 1) + 1..].first_chunk().expect("the harmonics of each ray");
         for (row, own) in run.rows.iter().zip(&run.sums) {
