@@ -75,9 +75,17 @@ impl Lattice {
 
     /// Bricks with the nodes that `present` names.
     pub fn bricks_where(nodes: [usize; 3], present: impl Fn([usize; 3]) -> bool + Sync) -> Self {
+        Self::bricks_among(nodes, |_| true, present)
+    }
+
+    /// The same of those bricks alone that `among` names by their place, x, y and z in bricks: with most of a grid empty, far fewer questions.
+    pub fn bricks_among(nodes: [usize; 3], among: impl Fn([usize; 3]) -> bool + Sync, present: impl Fn([usize; 3]) -> bool + Sync) -> Self {
         let count = nodes.map(|n| n.div_ceil(BRICK));
         let masks = crate::parallel::map_indices(count.iter().product(), |b| {
             let place = [b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]];
+            if !among(place) {
+                return 0;
+            }
             (0..BRICK_ROWS).fold(0u64, |mask, local| {
                 let node = node_at(place, local);
                 mask | u64::from((0..3).all(|a| node[a] < nodes[a]) && present(node)) << local

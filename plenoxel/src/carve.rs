@@ -10,7 +10,6 @@
 pub mod color;
 pub mod light;
 pub mod photo_hull;
-mod projection;
 pub mod visual_hull;
 
 use crate::dataset::{View, has_alpha};

@@ -2,7 +2,7 @@
 //!
 //! Background is what has alpha 0, and a reduced picture has alpha 0 only where its whole block has ([`crate::dataset::image::downscale`]).
 
-use super::projection::{Pixels, Projection, Rectangle, size};
+use crate::camera::projection::{Pixels, Projection, Rectangle, size};
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;

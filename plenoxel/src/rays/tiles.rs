@@ -1,10 +1,10 @@
 //! Which parts of the views can show something.
 
+use crate::camera::projection::{Projection, Rectangle};
 use crate::dataset::View;
 use crate::sampling::{Occupancy, place};
 use autograd::lattice::BRICK;
 use autograd::parallel;
-use glam::{DVec3, dvec3};
 
 /// Pixels along a side of a tile.
 const SIDE: u32 = 8;
@@ -37,24 +37,24 @@ impl Tile {
 pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
     let (aabb, cells) = (matter.aabb(), matter.cells());
     let count = cells.map(|n| n.div_ceil(BRICK));
-    let side = (aabb.max - aabb.min) / DVec3::from_array(cells.map(|n| n as f64));
     let bricks = matter.masks().iter().enumerate().filter(|(_, mask)| **mask != 0);
-    let boxes: Vec<[DVec3; 2]> = bricks
+    let boxes: Vec<[[usize; 3]; 2]> = bricks
         .map(|(b, _)| {
             let low = place(b, count).map(|k| k * BRICK);
-            let corner = |k: [usize; 3]| aabb.min + side * DVec3::from_array(k.map(|k| k as f64));
-            [corner(low), corner([0, 1, 2].map(|a| (low[a] + BRICK).min(cells[a])))]
+            [low, [0, 1, 2].map(|a| (low[a] + BRICK).min(cells[a]))]
         })
         .collect();
     let of_views = parallel::map_indices(views.len(), |v| {
         let all = Tile::of_view(v, &views[v]);
         let (columns, rows) = (all.width.div_ceil(SIDE), all.height.div_ceil(SIDE));
         let mut shows = vec![false; (columns * rows) as usize];
-        for corners in &boxes {
-            let Some([low, high]) = rectangle(&views[v], corners) else {
+        let projection = Projection::of(&views[v], aabb, cells);
+        for &[low, high] in &boxes {
+            let Some(corners) = projection.corners(low, high) else {
                 shows.fill(true);
                 break;
             };
+            let Rectangle { low, high } = Rectangle::around(&corners, 0.0);
             let range = |a: usize, n: u32| {
                 let clamped = |x: f64| (x / f64::from(SIDE)).floor().clamp(0.0, f64::from(n)) as u32;
                 clamped(low[a])..(clamped(high[a]) + 1).min(n)
@@ -73,19 +73,6 @@ pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
     of_views.concat()
 }
 
-/// The rectangle around the projection of a box into a view, in pixels; `None` if some of it is not before the camera.
-fn rectangle(view: &View, [min, max]: &[DVec3; 2]) -> Option<[[f64; 2]; 2]> {
-    let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-    for c in 0..8 {
-        let at = |bit: usize, min: f64, max: f64| if c >> bit & 1 == 1 { max } else { min };
-        let (x, y, _) = view.camera.project(dvec3(at(0, min.x, max.x), at(1, min.y, max.y), at(2, min.z, max.z)))?;
-        for (a, value) in [x, y].into_iter().enumerate() {
-            (low[a], high[a]) = (low[a].min(value), high[a].max(value));
-        }
-    }
-    Some([low, high])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -93,6 +80,7 @@ mod tests {
     use crate::dataset::{Dataset, Split};
     use crate::geometry::Aabb;
     use crate::sampling::walk::Walk;
+    use glam::dvec3;
     use std::ops::ControlFlow;
 
     #[test]

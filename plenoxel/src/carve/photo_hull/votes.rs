@@ -1,6 +1,6 @@
 //! What the views have to say about a voxel, and how far they disagree.
 
-use crate::carve::projection::{Pixels, Projection, Rectangle};
+use crate::camera::projection::{Pixels, Projection, Rectangle};
 use crate::dataset::View;
 use crate::dataset::image::RgbaImage;
 use crate::geometry::Aabb;

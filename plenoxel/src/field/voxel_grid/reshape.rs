@@ -7,8 +7,10 @@ use super::layout::{Layout, dilated};
 use super::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::field::neighbours;
 use crate::sampling::Occupancy;
+use autograd::lattice::BRICK;
 use autograd::ops::trilinear::nearest_node;
 use autograd::{Buffer, Lattice, Real, Tensor, no_grad, parallel};
+use std::ops::Range;
 
 impl<T: Real> VoxelGrid<T> {
     /// The same field at another resolution: the old field read at the new centres, with the look-up that renders it. So a nearest grid
@@ -42,9 +44,16 @@ impl<T: Real> VoxelGrid<T> {
                         low..(low + 2).min(last + 1)
                     }
                 };
-                Lattice::bricks_where([resolution; 3], |[i, j, k]| {
-                    corners(i).any(|a| corners(j).any(|b| corners(k).any(|c| self.lattice().row([a, b, c]).is_some())))
-                })
+                // The old bricks that a new one reads.
+                let bricks = |k: usize| {
+                    let last = (k * BRICK + BRICK - 1).min(resolution - 1);
+                    corners(k * BRICK).start / BRICK..corners(last).end.div_ceil(BRICK)
+                };
+                Lattice::bricks_among(
+                    [resolution; 3],
+                    |place| any_of(place.map(bricks), |old| self.lattice().brick(old).is_some()),
+                    |voxel| any_of(voxel.map(corners), |old| self.lattice().row(old).is_some()),
+                )
             }
         };
         self.read_at(shape, lattice)
@@ -143,6 +152,11 @@ impl<T: Real> VoxelGrid<T> {
         }
         Self::assembled(layout, tables)
     }
+}
+
+/// True if something is found at a place of a box.
+fn any_of([i, j, k]: [Range<usize>; 3], found: impl Fn([usize; 3]) -> bool) -> bool {
+    i.into_iter().any(|a| j.clone().any(|b| k.clone().any(|c| found([a, b, c]))))
 }
 
 /// Where the centre of voxel k along an axis of a grid lies in an old grid, both with voxels `sides` times as wide.

@@ -1,4 +1,4 @@
-//! How voxels project into a picture: what the visual hull and the photo hull look up.
+//! How the voxels of a box project into a picture: what carving looks up, and what rays are aimed by.
 
 use crate::camera::Camera;
 use crate::dataset::View;
