@@ -35,9 +35,6 @@ impl<T: Real> RayBatch<T> {
     }
 }
 
-/// Pixels between two entries of [`RaySource::guide`]; a tile of usual size has as many.
-const GUIDE: u64 = 64;
-
 /// The pixels of some views, all of them or those that can see something, in an order that is shuffled anew each epoch.
 #[derive(Debug)]
 pub struct RaySource<'a> {
@@ -47,8 +44,9 @@ pub struct RaySource<'a> {
     tiles: Vec<Tile>,
     /// `first[t]` is the number of pixels before tile t.
     first: Vec<u64>,
-    /// The tile of every [`GUIDE`]-th pixel: one search for a random pixel would wait for memory a dozen times.
+    /// The tile of every `apart`-th pixel, as many as there are tiles: one search for a random pixel would wait for memory a dozen times.
     guide: Vec<u32>,
+    apart: u64,
     /// Pixels of all views.
     pixels: u64,
 }
@@ -60,7 +58,8 @@ impl<'a> RaySource<'a> {
     pub fn new(views: impl Into<Cow<'a, [View]>>, background: [f32; 3], seed: u64) -> Self {
         let views = views.into();
         let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
-        let mut source = RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), guide: Vec::new(), pixels: 0 };
+        let mut source =
+            RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), guide: Vec::new(), apart: 1, pixels: 0 };
         source.set_tiles(tiles);
         source.pixels = source.len();
         source
@@ -71,13 +70,14 @@ impl<'a> RaySource<'a> {
         for tile in &tiles {
             self.first.push(self.first[self.first.len() - 1] + tile.pixels() as u64);
         }
+        self.tiles = tiles;
+        self.apart = self.len().div_ceil(self.tiles.len().max(1) as u64).max(1);
         self.guide.clear();
         for (t, first) in self.first.windows(2).enumerate() {
-            while (self.guide.len() as u64) * GUIDE < first[1] {
+            while (self.guide.len() as u64) * self.apart < first[1] {
                 self.guide.push(t as u32);
             }
         }
-        self.tiles = tiles;
     }
 
     /// From now on the pixels of the same views around the projections of what may hold matter. The others show the background whatever is
@@ -186,7 +186,7 @@ impl<'a> RaySource<'a> {
 
     /// Number of the view, column and row of one pixel of the set.
     fn place(&self, index: u64) -> (usize, usize, usize) {
-        let guide = self.guide[(index / GUIDE) as usize] as usize;
+        let guide = self.guide[(index / self.apart) as usize] as usize;
         let t = guide + self.first[guide + 1..].iter().take_while(|&&f| f <= index).count();
         let Tile { view, x, y, width, .. } = self.tiles[t];
         let pixel = (index - self.first[t]) as u32;
@@ -206,6 +206,18 @@ mod tests {
         let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, intrinsics);
         let image = RgbaImage::from_fn(pixels.len() as u32, 1, |x, _| pixels[x as usize].into());
         View { name: String::new(), camera, image, depth: None }
+    }
+
+    #[test]
+    fn every_pixel_of_tiles_of_any_size_has_its_place() {
+        let views = [view(&[[0; 4]; 1000])];
+        let mut source = RaySource::new(&views[..], [1.0; 3], 0);
+        let tiles = [(3, 1), (4, 0), (10, 500), (600, 1), (601, 2), (700, 300)];
+        source.set_tiles(tiles.map(|(x, width)| Tile { view: 0, x, y: 0, width, height: 1 }).into());
+        let want: Vec<usize> = tiles.iter().flat_map(|&(x, width)| (x..x + width).map(|x| x as usize)).collect();
+        assert!(source.len() == want.len() as u64 && source.guide.len() <= tiles.len());
+        let places = (0..source.len()).map(|index| source.place(index));
+        assert!(places.eq(want.iter().map(|&x| (0, x, 0))));
     }
 
     #[test]

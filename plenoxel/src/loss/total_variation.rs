@@ -237,13 +237,8 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
             return out.dense(0, gradient);
         }
         let touched = reached.iter().map(|&brick| touched(bricks, self.run, brick as usize)).collect();
-        out.rows(
-            0,
-            RowSparse::deferred(
-                table.shape(),
-                Arc::new(RowsOfBricks { bricks: Members::new(&reached, bricks.len()), touched, width: W, values: gradient }),
-            ),
-        );
+        let sums = RowsOfBricks { bricks: Members::new(&reached, bricks.len()), touched, width: W, values: gradient };
+        out.rows(0, RowSparse::deferred(table.shape(), Arc::new(sums)));
     }
 }
 

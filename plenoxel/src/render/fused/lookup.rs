@@ -8,6 +8,12 @@ use std::slice::from_mut;
 /// How many samples ahead rows are asked for.
 pub(super) const AHEAD: usize = 8;
 
+/// Asks for the memory of those rows that are in a table.
+#[inline(always)]
+pub(super) fn ask_for<E>(table: &[E], rows: &[u32]) {
+    rows.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch);
+}
+
 /// The eight rows around each of some samples, and their weights.
 #[derive(Debug)]
 pub(super) struct Corners<T: Real> {
@@ -143,7 +149,7 @@ pub(super) fn plain<T: Real, const K: usize>(
     let count = out.len();
     for (i, out) in out.iter_mut().enumerate() {
         if i + AHEAD < count {
-            look(i + AHEAD).0.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch);
+            ask_for(table, &look(i + AHEAD).0);
         }
         let mut sum = [T::zero(); 3];
         if seen(i) {

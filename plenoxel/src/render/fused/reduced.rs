@@ -5,7 +5,7 @@
 //! bucket by bucket like everything else.
 
 use super::forward::{Block, Scene};
-use super::lookup::{AHEAD, Corners, nearest_rows, weigh_all};
+use super::lookup::{AHEAD, Corners, ask_for, nearest_rows, weigh_all};
 use super::{Batch, COLUMNS};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
@@ -14,6 +14,9 @@ use std::sync::Arc;
 
 /// A bucket is this power of two of rows: 8 bricks. The table is small, and many tasks are to share it.
 const BUCKET_SHIFT: u32 = 9;
+
+/// How many runs ahead one is asked for: they are larger than a row.
+const RUNS_AHEAD: usize = 4;
 
 /// Red, green and blue, and a zero that makes a vector of them.
 type Rgb0<T> = [T; 4];
@@ -120,9 +123,10 @@ fn add_to_means<T: Real, const K: usize, const W: usize, const N: usize>(
     for (own, basis) in offsets.windows(2).zip(basis.chunks_exact(N + 1)) {
         for i in (own[0] as usize..own[1] as usize).filter(|&i| seen(i)) {
             if i + AHEAD < out.len() {
-                let later = look(i + AHEAD).0;
-                if later[0] != look(i + AHEAD - 1).0[0] {
-                    later.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch);
+                // Of samples that follow each other, most read the rows of the one before.
+                let [before, later] = [i + AHEAD - 1, i + AHEAD].map(|i| look(i).0);
+                if later != before {
+                    ask_for(table, &later);
                 }
             }
             let (rows, weights) = look(i);
@@ -261,8 +265,8 @@ fn add_runs<T: Real, const K: usize, const N: usize>(
     let sums = sums.as_chunks_mut::<N>().0;
     let numbers = &runs.numbers[runs.starts[bucket] as usize..runs.starts[bucket + 1] as usize];
     for (k, &number) in numbers.iter().enumerate() {
-        if let Some(&later) = numbers.get(k + 4) {
-            parallel::prefetch(&runs.runs[later as usize]);
+        if let Some(&later) = numbers.get(k + RUNS_AHEAD) {
+            ask_for(&runs.runs, &[later]);
         }
         let run = &runs.runs[number as usize];
         let y: &[T; N] = basis[run.ray as usize * (N + 1) + 1..].first_chunk().expect("the harmonics of each ray");
