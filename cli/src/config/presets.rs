@@ -23,7 +23,7 @@ pub const PRESETS: [Preset; 6] = [
         time: "40 s at 200 x 200",
         text: include_str!("../../presets/demo.toml"),
     },
-    Preset { name: "fast", purpose: "a good grid soon", time: "0.5 to 2 min at 800 x 800", text: include_str!("../../presets/fast.toml") },
+    Preset { name: "fast", purpose: "a good grid soon", time: "1 to 3 min at 800 x 800", text: include_str!("../../presets/fast.toml") },
     Preset {
         name: "quality",
         purpose: "the best there is",

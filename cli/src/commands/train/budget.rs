@@ -12,18 +12,19 @@ use plenoxel::train::Trainer;
 use plenoxel::train::config::{Config, Stage, Weight};
 use std::time::Instant;
 
-/// A step at k times the resolution takes k to this power times as long, 128 to 384 voxels a side: the first where harmonics are few and stay
-/// in the cache, for every fourth voxel or less, the other where there are more. Somewhat more than measured (0.5 and 0.9), for the next is less.
-const GROWTH: [f64; 2] = [0.65, 1.0];
-/// To begin a stage of 256 voxels a side counts as this many rays at 128, and more with the 1.5th power of the resolution: the grid is
+/// A step of the first stage takes so much of what its first ones take, which see the fog that a grid starts as.
+const SETTLED: f64 = 0.75;
+/// A step at k times the resolution takes k to this power times as long, 128 to 384 voxels a side.
+const GROWTH: f64 = 0.93;
+/// To begin a stage of 256 voxels a side takes as long as this many rays at 128, and more with the square of the resolution: the grid is
 /// resampled, and its voxels are looked at.
-const RAYS_TO_BEGIN: f64 = 500_000.0;
+const RAYS_TO_BEGIN: f64 = 2.2e6;
 /// The share of the time that goes into finding out how fast the machine is, and the seconds that are enough; a few steps it always takes.
-const CALIBRATION: (f64, f64) = (0.03, 20.0);
+const CALIBRATION: (f64, f64) = (0.05, 3.0);
 
 /// How fast the machine is, and what is gone by now.
 struct Speed {
-    /// Seconds for a step of the first stage.
+    /// Seconds for a step of the first stage, once it has settled.
     step: f64,
     /// Seconds before the first step: what can be known beforehand is.
     begin: f64,
@@ -40,9 +41,8 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     let steps = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step));
     let speed = measure(&config, views, (CALIBRATION.0 * seconds).min(CALIBRATION.1))?;
     let steps: Vec<u64> = steps.collect();
-    let growth = GROWTH[usize::from(config.sh_reduction < 4)];
     let fitted = config.fitted_to(views.iter().map(|view| &view.camera));
-    let factor = factor(&fitted.stages, &steps, config.rays_per_step, seconds, &speed, growth)?;
+    let factor = factor(&fitted.stages, &steps, config.rays_per_step, seconds, &speed)?;
     let scaled = |steps: u64| ((steps as f64 * factor).round() as u64).max(1);
     let stages = config.stages.iter().zip(&steps).map(|(&stage, &steps)| {
         let density_warm_up = if stage.density_warm_up == 0 { 0 } else { scaled(stage.density_warm_up) };
@@ -75,16 +75,15 @@ fn measure(config: &Config, views: &[View], seconds: f64) -> Result<Speed> {
         count += 1.0;
     }
     let spent = start.elapsed().as_secs_f64();
-    Ok(Speed { step: (spent - begin) / count, begin, spent })
+    Ok(Speed { step: SETTLED * (spent - begin) / count, begin, spent })
 }
 
 /// By how much all stages have to be longer for the time to be full.
-fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed, growth: f64) -> Result<f64> {
+fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed) -> Result<f64> {
     // Seconds for a step at a resolution.
-    let step = |resolution: usize| speed.step * (resolution as f64 / stages[0].resolution as f64).powf(growth);
-    let begins = stages.windows(2).filter(|pair| pair[1].resolution != pair[0].resolution);
-    let begins = begins.map(|pair| RAYS_TO_BEGIN / rays_per_step as f64 * step(128) * (pair[1].resolution as f64 / 256.0).powf(1.5));
-    let fixed = speed.spent + speed.begin + begins.sum::<f64>();
+    let step = |resolution: usize| speed.step * (resolution as f64 / stages[0].resolution as f64).powf(GROWTH);
+    let begin = |stage: &Stage| RAYS_TO_BEGIN / rays_per_step as f64 * step(128) * (stage.resolution as f64 / 256.0).powi(2);
+    let fixed = speed.spent + speed.begin + stages.iter().skip(1).map(begin).sum::<f64>();
     let cost = stages.iter().zip(steps).map(|(stage, &steps)| steps as f64 * step(stage.resolution)).sum::<f64>();
     // Shorter than this a stage does not get to where the next one can begin.
     const LEAST: f64 = 0.1;
@@ -106,15 +105,16 @@ mod tests {
         let stage = Config::default().stages[0];
         let stages = [64, 128, 256].map(|resolution| Stage { resolution, ..stage });
         let speed = Speed { step: 0.01, begin: 0.5, spent: 0.5 };
-        let of = |seconds: f64| factor(&stages, &[100, 200, 400], 10_000, seconds, &speed, 1.0);
+        let of = |seconds: f64| factor(&stages, &[100, 200, 400], 10_000, seconds, &speed);
         let factors = [10.0, 100.0, 1000.0].map(|seconds| of(seconds).unwrap());
         assert!(factors.is_sorted_by(|short, long| short < long), "{factors:?}");
-        // Two begins of a stage, at 2 first steps each, and steps that cost 1, 2 and 4.
-        let begins = 50.0 * 0.01 * 2.0 * (0.5f64.powf(1.5) + 1.0);
-        let steps = 0.01 * (100.0 + 200.0 * 2.0 + 400.0 * 4.0);
+        // What the grid of 128 voxels a side costs: a step, and what 220 steps do to begin another of 256, a quarter of it for its own.
+        let twice = 2f64.powf(GROWTH);
+        let begins = 220.0 * 0.01 * twice * (0.25 + 1.0);
+        let steps = 0.01 * (100.0 + 200.0 * twice + 400.0 * twice * twice);
         assert!((1.0 + begins + factors[1] * steps - 100.0).abs() < 1e-9, "{factors:?}");
         let error = of(2.0).unwrap_err().to_string();
-        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:05 or more"), "{error}");
+        assert!(error.contains("--time") && error.contains("2 seconds") && error.contains("0:09 or more"), "{error}");
     }
 
     #[test]

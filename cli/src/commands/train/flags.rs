@@ -97,7 +97,7 @@ pub struct TrainArgs {
     preset: Option<String>,
 
     /// Make all stages of the preset longer or shorter, so that training takes this long on this machine, such as 90s, 5m or 1h; how
-    /// long is found out once, and written into the settings in steps [default preset: fast, quality from 200 seconds on]
+    /// long is found out once, and written into the settings in steps [default preset: fast, quality from 240 seconds on]
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration)]
     pub time: Option<f64>,
 
@@ -196,8 +196,8 @@ impl TrainArgs {
     /// The configuration, and the preset it started from.
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
         let default = match (self.time, &self.data) {
-            // To begin with the finest voxels takes a fifth of this. Below, `fast` is as good or better.
-            (Some(200.0..), _) => "quality",
+            // Below, `fast` has more rays to learn from, and is as good or better.
+            (Some(240.0..), _) => "quality",
             (Some(_), _) => "fast",
             (None, Some(_)) => "standard",
             (None, None) => "demo",
