@@ -44,9 +44,9 @@ pub struct RaySource<'a> {
     tiles: Vec<Tile>,
     /// `first[t]` is the number of pixels before tile t.
     first: Vec<u64>,
-    /// The tile of every `apart`-th pixel, as many as there are tiles: one search for a random pixel would wait for memory a dozen times.
+    /// The tile of every [`apart`](Self::apart)-th pixel, about as many as there are tiles: one search for a random pixel would wait for memory a
+    /// dozen times.
     guide: Vec<u32>,
-    apart: u64,
     /// Pixels of all views.
     pixels: u64,
 }
@@ -58,8 +58,7 @@ impl<'a> RaySource<'a> {
     pub fn new(views: impl Into<Cow<'a, [View]>>, background: [f32; 3], seed: u64) -> Self {
         let views = views.into();
         let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
-        let mut source =
-            RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), guide: Vec::new(), apart: 1, pixels: 0 };
+        let mut source = RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), guide: Vec::new(), pixels: 0 };
         source.set_tiles(tiles);
         source.pixels = source.len();
         source
@@ -71,13 +70,18 @@ impl<'a> RaySource<'a> {
             self.first.push(self.first[self.first.len() - 1] + tile.pixels() as u64);
         }
         self.tiles = tiles;
-        self.apart = self.len().div_ceil(self.tiles.len().max(1) as u64).max(1);
+        let apart = self.apart();
         self.guide.clear();
         for (t, first) in self.first.windows(2).enumerate() {
-            while (self.guide.len() as u64) * self.apart < first[1] {
+            while (self.guide.len() as u64) * apart < first[1] {
                 self.guide.push(t as u32);
             }
         }
+    }
+
+    /// Pixels between two entries of the guide: those of a tile in the mean.
+    fn apart(&self) -> u64 {
+        self.len().div_ceil(self.tiles.len().max(1) as u64).max(1)
     }
 
     /// From now on the pixels of the same views around the projections of what may hold matter. The others show the background whatever is
@@ -186,7 +190,7 @@ impl<'a> RaySource<'a> {
 
     /// Number of the view, column and row of one pixel of the set.
     fn place(&self, index: u64) -> (usize, usize, usize) {
-        let guide = self.guide[(index / self.apart) as usize] as usize;
+        let guide = self.guide[(index / self.apart()) as usize] as usize;
         let t = guide + self.first[guide + 1..].iter().take_while(|&&f| f <= index).count();
         let Tile { view, x, y, width, .. } = self.tiles[t];
         let pixel = (index - self.first[t]) as u32;

@@ -27,7 +27,7 @@ pub const PRESETS: [Preset; 6] = [
     Preset {
         name: "quality",
         purpose: "the best there is",
-        time: "8 to 15 min at 800 x 800",
+        time: "5 to 15 min at 800 x 800",
         text: include_str!("../../presets/quality.toml"),
     },
     Preset {

@@ -287,12 +287,18 @@ impl Stage {
         }
     }
 
-    /// The same with at most `finest` voxels a side.
-    fn fitted(self, finest: f64) -> Self {
-        let resolution = self.resolution.min((finest as usize).max(2));
-        let image_reduction = self.image_reduction.min((finest / resolution as f64) as usize).max(1);
+    /// The same with at most `finest` voxels a side, but 2 at least, and a rate of the density that is less by as much.
+    pub fn at_most(self, finest: usize) -> Self {
+        let resolution = self.resolution.min(finest.max(2));
         let density_rate = self.density_rate * resolution as f64 / self.resolution as f64;
-        Stage { resolution, image_reduction, density_rate, ..self }
+        Stage { resolution, density_rate, ..self }
+    }
+
+    /// The same with at most `finest` voxels a side, and images that are reduced by as little.
+    fn fitted(self, finest: f64) -> Self {
+        let stage = self.at_most(finest as usize);
+        let image_reduction = stage.image_reduction.min((finest / stage.resolution as f64) as usize).max(1);
+        Stage { image_reduction, ..stage }
     }
 
     /// The share of their first rates that colors and harmonics end with.

@@ -97,7 +97,8 @@ pub struct TrainArgs {
     preset: Option<String>,
 
     /// Make all stages of the preset longer or shorter, so that training takes this long on this machine, such as 90s, 5m or 1h, and
-    /// the finest coarser if it is short; how long is found out once, and written into the settings in steps [default preset: fast, quality from 240 seconds on]
+    /// the finest coarser if it is short; how long is found out once, and written into the settings in steps [default preset: fast, quality
+    /// from 240 seconds on]
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration)]
     pub time: Option<f64>,
 
