@@ -194,7 +194,7 @@ fn a_scene_on_disk_is_learned_and_its_configuration_repeats_the_run_to_the_bit()
     let [a, b, c, d] = ["a", "b", "c", "d"].map(|name| folder.path(name));
     let flags = ["--background", "0.3,0.2,0.1", "--half-width", "1.4", "--sh-degree", "1", "--tv", "1e-3", "--seed", "7", "--threads", "1"];
     let first = train_on(&data, &a, &flags).json();
-    assert_eq!((&first["preset"], &first["views"]), (&"standard".into(), &2.into()));
+    assert_eq!((&first["preset"], &first["views"]), (&"fast".into(), &2.into()));
     assert_eq!(names(&a).iter().filter(|name| *name == "images").count(), 0);
 
     // Another number of threads, and the resolved configuration instead of the flags.

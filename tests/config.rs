@@ -11,7 +11,7 @@ fn plenoxel(args: &[&str]) -> Answer {
     command::plenoxel(&[args, &["--max-memory", "400MB", "--quiet"]].concat())
 }
 
-const PRESETS: [&str; 7] = ["demo", "fast", "quality", "standard", "plenoxels", "paper", "carve"];
+const PRESETS: [&str; 6] = ["demo", "fast", "quality", "plenoxels", "paper", "carve"];
 
 /// Assignments that keep all that a preset does and make it small: grids, steps and rays.
 fn shortened(preset: &str) -> Vec<String> {

@@ -12,7 +12,7 @@ use std::path::Path;
 
 /// A file that changes a preset.
 pub fn layer(path: &Path, bytes: &[u8]) -> Result<Config> {
-    let mut layers = Layers::defaults()?.with_preset("standard")?;
+    let mut layers = Layers::defaults()?.with_preset("fast")?;
     layers.file(&ConfigFile::parse(path, bytes.to_vec())?)?;
     layers.resolve()
 }
@@ -24,7 +24,7 @@ pub fn config(path: &Path, bytes: &[u8]) -> Result<Config> {
 
 /// Assignments as `--set` takes them, over a preset.
 pub fn assignments<'a>(assignments: impl IntoIterator<Item = &'a str>) -> Result<Config> {
-    let mut layers = Layers::defaults()?.with_preset("standard")?;
+    let mut layers = Layers::defaults()?.with_preset("fast")?;
     assignments.into_iter().try_for_each(|assignment| layers.assign(assignment))?;
     layers.resolve()
 }

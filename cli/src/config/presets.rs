@@ -16,25 +16,24 @@ pub struct Preset {
 }
 
 /// What `train` may start from.
-pub const PRESETS: [Preset; 6] = [
+pub const PRESETS: [Preset; 5] = [
     Preset {
         name: "demo",
         purpose: "the built-in scene: what `train` does without a folder",
         time: "40 s at 200 x 200",
         text: include_str!("../../presets/demo.toml"),
     },
-    Preset { name: "fast", purpose: "a good grid soon", time: "1 to 3 min at 800 x 800", text: include_str!("../../presets/fast.toml") },
+    Preset {
+        name: "fast",
+        purpose: "a good grid soon: what `train FOLDER` does",
+        time: "1 to 3 min at 800 x 800",
+        text: include_str!("../../presets/fast.toml"),
+    },
     Preset {
         name: "quality",
         purpose: "the best there is",
         time: "5 to 15 min at 800 x 800",
         text: include_str!("../../presets/quality.toml"),
-    },
-    Preset {
-        name: "standard",
-        purpose: "a dataset of your own: what `train FOLDER` does",
-        time: "1 to 2 min at 800 x 800",
-        text: include_str!("../../presets/standard.toml"),
     },
     Preset {
         name: "plenoxels",
