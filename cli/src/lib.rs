@@ -225,7 +225,7 @@ mod tests {
                 let settings = toml::Table::try_from(settings).expect("a table");
                 settings[&flag.replace('-', "_")].to_string().replace('"', "")
             };
-            let usual = value("demo");
+            let usual = value("fast");
             assert!(defaults.starts_with(&usual), "{flag}: {usual} in {defaults}");
             for preset in config::PRESETS.map(|preset| preset.name) {
                 let value = value(preset);
