@@ -78,7 +78,7 @@ fn the_settings_of_a_run_of_each_preset_repeat_it_to_the_bit() {
         is_repeated_by_its_settings(&folder, &format!("{preset}-scout"), &args, &settings);
     }
     // A loss of the defaults that a run does without, and carving by colors.
-    let settings = [&shortened("demo")[..], &["losses.mse=".to_owned(), "losses.huber=1".to_owned()]].concat();
+    let settings = [&shortened("fast")[..], &["losses.mse=".to_owned(), "losses.huber=1".to_owned()]].concat();
     is_repeated_by_its_settings(&folder, "huber", &["train", &scene], &settings);
     is_repeated_by_its_settings(&folder, "photo", &["carve", &scene, "--photo-consistency", "--sh-degree=1"], &shortened("carve"));
 }
