@@ -146,7 +146,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
     sh_degree: Option<i64>,
 
-    /// Store harmonics of degree 1 and more for every N-th voxel along each axis only, which takes less memory and time; 4 is a good start
+    /// Store harmonics of degree 1 and more for every N-th voxel along each axis only, which takes less memory and time
     /// [default: 4; presets quality: 3, demo, plenoxels and paper: 1]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64))]
     sh_reduction: Option<i64>,
