@@ -88,7 +88,7 @@ fn a_grid_that_validation_views_liked_better_than_the_last_is_kept() {
     assert!(kept["psnr"].as_f64().unwrap() > last["psnr"].as_f64().unwrap() + 1.0);
     assert!(kept["seconds"].is_null() && last["seconds"].is_f64());
     assert_eq!(plenoxel(&["export", "vox", &run, "--best"]).code, 0);
-    assert_eq!(names(&folder.path("run/exports/best")).len(), 1);
+    assert_eq!(names(&folder.path("run/exports-best")).len(), 1);
     // A run whose last grid is its best keeps no other.
     let good = folder.path("good");
     train(&good, &["--checkpoint-every", "0.001s", "--no-report", "--no-images"]).done();

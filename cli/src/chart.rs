@@ -88,6 +88,11 @@ impl Chart {
                 let _ = writeln!(svg, "<polygon points=\"{band}\" fill=\"{color}\" fill-opacity=\"0.22\"/>");
             }
             for points in curve.lines.iter().filter(|points| !points.is_empty()) {
+                // A line of one point would not be seen.
+                if let [(at, value)] = points[..] {
+                    let _ = writeln!(svg, "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"3\" fill=\"{color}\"/>", x(at), scale.y(value));
+                    continue;
+                }
                 let points: String = points.iter().map(|(at, value)| place(*at, *value)).collect();
                 let style = format!("stroke-width=\"1.8\" stroke-linejoin=\"round\"{dashes}");
                 let _ = writeln!(svg, "<polyline points=\"{points}\" fill=\"none\" stroke=\"{color}\" {style}/>");

@@ -125,7 +125,7 @@ pub struct ConfigFile {
 impl ConfigFile {
     /// Reads a file. Errors: it is not there, or not TOML (with the line).
     pub fn read(path: &Path) -> Result<Self> {
-        let remedy = "give the path of a TOML file, such as the config.toml of a run";
+        let remedy = "a TOML file is expected there";
         let mut bytes = Vec::new();
         let read = std::fs::File::open(path).and_then(|file| file.take(LARGEST_FILE + 1).read_to_end(&mut bytes));
         read.map_err(|e| match e.kind() {
@@ -181,6 +181,8 @@ impl ConfigFile {
 
 /// The settings of a command, defaults < preset < file < flags, and the preset they started from: the one asked for, or `default` unless the
 /// file is complete.
+///
+/// Errors: a preset beside a complete file, of which nothing would be left but its name; and those of [`Layers`].
 pub fn layered<'a>(
     preset: Option<&'a str>,
     default: &'a str,
@@ -189,6 +191,9 @@ pub fn layered<'a>(
 ) -> Result<(Config, Option<&'a str>)> {
     let file = file.map(ConfigFile::read).transpose()?;
     let complete = file.as_ref().is_some_and(ConfigFile::is_complete);
+    if let (Some(preset), true) = (preset, complete) {
+        return Err(Error::config("--preset", format!("{preset} beside a --config that says everything"), "one of the two"));
+    }
     let preset = preset.or((!complete).then_some(default));
     let mut layers = match preset {
         Some(preset) => Layers::defaults()?.with_preset(preset)?,
@@ -290,7 +295,7 @@ fn explain(complaint: &str) -> (&str, &str) {
         return ("the value", "a number, { weight = …, until = step } or { from = …, to = …, steps = … }");
     }
     let Some((found, accepted)) = complaint.split_once(", expected ") else {
-        return (complaint, "a complete table");
+        return (complaint, "a value for every key");
     };
     let found = ["invalid type: ", "invalid value: "].iter().fold(found, |found, start| found.trim_start_matches(start));
     let accepted = match accepted {

@@ -120,6 +120,7 @@ impl Figures {
             return format!("no {split} views to evaluate on");
         };
         let ssim = ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));
-        format!("PSNR {psnr:.2} dB{ssim}: means over {views} {split} views of {width} x {height}")
+        let of = if *views == 1 { format!("of 1 {split} view") } else { format!("means over {views} {split} views") };
+        format!("PSNR {psnr:.2} dB{ssim}: {of} of {width} x {height}")
     }
 }

@@ -159,8 +159,9 @@ impl Estimate {
         Estimate { images, grid, key, advice, ..rendering }
     }
 
-    /// Carving: the images and the masks of the box; and, once it is known how many rows the tables of what is left have, their fit.
-    pub fn of_carving(config: &Config, dataset: &Dataset, rows: usize) -> Self {
+    /// Carving: the images and the masks of the box; and, once it is known how many rows the tables of what is left have, their fit, and the
+    /// page about it if there is to be one.
+    pub fn of_carving(config: &Config, dataset: &Dataset, rows: usize, report: bool) -> Self {
         let shape = config.grid_shape(config.carve.resolution);
         let coefficients = shape.color.channels() as u64 / 3;
         // A bit for each voxel, in a few copies, and one byte for each brick.
@@ -175,13 +176,15 @@ impl Estimate {
         let fit = 4 * rows as u64 * (coefficients * (coefficients + 1) / 2 + 9 * coefficients + 2);
         let images = images(dataset, config.downscale, &[Split::Train]) + items;
         let kept = if rows > 0 { (KEPT_LIGHT as u64).min(12 * pixels * hits_of_pixel(config)) } else { 0 };
-        let page = if rows > 0 { page((rows * shape.voxel_bytes()) as u64) } else { 0 };
+        let page = if rows > 0 && report { page((rows * shape.voxel_bytes()) as u64) } else { 0 };
         let step = (step + kept).max(page);
         let grid = masks + fit;
-        let (key, advice) = match images > grid {
-            true => ("--downscale", "a larger factor, so that the images fit"),
-            false => ("--resolution", "fewer voxels a side, or a lower --sh-degree"),
-        };
+        let parts = [
+            (images, ("--downscale", "a larger factor, so that the images fit")),
+            (grid, ("--resolution", "fewer voxels a side, or a lower --sh-degree")),
+            (page, ("report.html", "--no-report, which leaves it out")),
+        ];
+        let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
         Estimate { images, grid, optimizer: 0, step, pruned: false, key: key.to_owned(), advice }
     }
 

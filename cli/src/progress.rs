@@ -109,6 +109,11 @@ impl<'a> Console<'a> {
         }
     }
 
+    /// What came of drawing: a picture that cannot be written is no reason to lose what was learned.
+    pub fn drawn<R>(&self, done: Result<R>) -> Option<R> {
+        done.map_err(|e| self.note(&format!("no picture: {e}"))).ok()
+    }
+
     /// Progress of something that is counted, such as images read.
     pub fn count(&self, what: &str, total: usize) -> Count<'_, 'a> {
         Count { meter: Meter::new(self, total as u64), what: what.to_owned() }

@@ -59,8 +59,9 @@ impl Report<'_> {
     fn settings(&self) -> Result<String> {
         let text = self.folder.settings()?;
         let again = if self.config.stages.is_empty() { "carve" } else { "train" };
+        let data = escaped(&self.record.data.arguments());
         Ok(format!(
-            "<section><h2>Settings</h2>\n<p>They repeat the run: <code>plenoxel {again} DATA --config config.toml</code></p>\n\
+            "<section><h2>Settings</h2>\n<p>They repeat the run: <code>plenoxel {again}{data} --config config.toml</code></p>\n\
              <details><summary>config.toml</summary><pre>{}</pre></details></section>",
             escaped(&text)
         ))

@@ -67,6 +67,8 @@ const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
 /// Endings of what `render` writes.
 const RENDERED: [&str; 5] = ["png", "exr", "npy", "gif", "mp4"];
+/// Endings of what `export` writes.
+const EXPORTED: [&str; 4] = ["vox", "ply", "obj", "glb"];
 
 impl RunFolder {
     /// That at a path, whatever is there.
@@ -107,12 +109,16 @@ impl RunFolder {
         for path in paths.chain(event_file::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
-        for (folder, endings) in [(IMAGES, ["png"].as_slice()), (RENDERS, &RENDERED), (EXPORTS, &["vox", "ply", "obj", "glb"])] {
-            // Films have folders of their own, and so has what is made of the best grid, and its films.
-            let mut folders = vec![self.path.join(folder)];
-            while let Some(folder) = folders.pop() {
-                remove(entries(&folder).filter(|path| path.is_file() && is_one_of(path, endings)))?;
-                folders.extend(entries(&folder).filter(|path| path.is_dir() && !path.is_symlink()));
+        let files = |folder: &Path, endings| remove(entries(folder).filter(|path| path.is_file() && is_one_of(path, endings)));
+        files(&self.path.join(IMAGES), &["png"])?;
+        for grid in [CHECKPOINT, BEST] {
+            let made = RunFolder { grid, ..self.clone() };
+            files(&made.of_grid(EXPORTS), &EXPORTED)?;
+            let renders = made.of_grid(RENDERS);
+            files(&renders, &RENDERED)?;
+            // Films have folders of their own, for their frames.
+            for film in entries(&renders).filter(|path| path.is_dir() && !path.is_symlink()) {
+                remove(entries(&film).filter(|path| is_frame(path)))?;
             }
         }
         Ok(())
@@ -201,7 +207,8 @@ impl RunFolder {
         let path = self.checkpoint();
         if !path.exists() {
             let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
-            return Err(Error::input(&self.path, found, "go on with `plenoxel train --resume`, or train again"));
+            let best = if self.path.join(BEST).exists() { "; or --best, for the best grid that was saved" } else { "" };
+            return Err(Error::input(&self.path, found, format!("go on with `plenoxel train --resume`, or train again{best}")));
         }
         Ok(path)
     }
@@ -337,8 +344,7 @@ impl RunFolder {
 
     /// Where something lies that is made of the grid: that of the best does not take the place of the last one's.
     fn of_grid(&self, name: &str) -> PathBuf {
-        let path = self.path.join(name);
-        if self.grid == BEST { path.join("best") } else { path }
+        if self.grid == BEST { self.path.join(format!("{name}-best")) } else { self.path.join(name) }
     }
 
     /// Makes the folder for pictures made later, and says where it is.
@@ -354,8 +360,7 @@ impl RunFolder {
         let renders = self.create_renders()?;
         let path = renders.join(name);
         files::create_dir(&path)?;
-        let frame = |path: &PathBuf| file_name(path).starts_with("frame_") && is_one_of(path, &RENDERED);
-        remove(entries(&path).filter(|path| frame(path) || is_fragment(path)))?;
+        remove(entries(&path).filter(|path| is_frame(path) || is_fragment(path)))?;
         let joined = suffixes.iter().flat_map(|suffix| ["gif", "mp4"].map(|ending| renders.join(format!("{name}{suffix}.{ending}"))));
         remove(joined.filter(|path| path.exists()))?;
         Ok(path)
@@ -388,6 +393,11 @@ fn file_name(path: &Path) -> std::borrow::Cow<'_, str> {
 /// True for a name that ends in a dot and one of `endings`.
 fn is_one_of(path: &Path, endings: &[&str]) -> bool {
     path.extension().is_some_and(|ending| endings.iter().any(|e| ending == *e))
+}
+
+/// True for a frame of a film.
+fn is_frame(path: &Path) -> bool {
+    file_name(path).starts_with("frame_") && is_one_of(path, &RENDERED)
 }
 
 /// True for a file that was being written.
@@ -438,12 +448,20 @@ mod tests {
     #[test]
     fn an_occupied_folder_is_refused_unless_forced_and_other_files_survive() {
         let path = std::env::temp_dir().join(format!("plenoxel-occupied-{}", std::process::id()));
-        std::fs::create_dir_all(path.join(IMAGES)).unwrap();
-        std::fs::create_dir_all(path.join(EXPORTS)).unwrap();
-        for name in [CHECKPOINT, "events.out.tfevents.17.plenoxel", "notes.txt", "images/old.png", "exports/mesh.glb", "exports/notes.txt"]
-        {
-            std::fs::write(path.join(name), "x").unwrap();
+        for folder in ["images/paper", "exports/blender", "renders/orbit", "renders-best/orbit"] {
+            std::fs::create_dir_all(path.join(folder)).unwrap();
         }
+        let mine = ["notes.txt", "exports/notes.txt", "exports/blender/final.glb", "images/paper/figure_1.png", "renders/orbit/title.png"];
+        let ours = [
+            CHECKPOINT,
+            "events.out.tfevents.17.plenoxel",
+            "images/old.png",
+            "exports/mesh.glb",
+            "renders/orbit.mp4",
+            "renders/orbit/frame_0001.png",
+            "renders-best/orbit/frame_0001.exr",
+        ];
+        mine.iter().chain(&ours).for_each(|name| std::fs::write(path.join(name), "x").unwrap());
         let refused = RunFolder::choose(Some(&path), "x", false).unwrap_err();
         assert!(refused.exit_code() == 2 && refused.to_string().contains("--force"));
         // What is not a run is not overwritten, come what may.
@@ -451,9 +469,8 @@ mod tests {
         assert!(refused.exit_code() == 2 && refused.to_string().contains("not a run"), "{refused}");
         std::fs::write(path.join(RECORD), "{}").unwrap();
         RunFolder::choose(Some(&path), "x", true).unwrap().prepare().unwrap();
-        assert!(!path.join(CHECKPOINT).exists() && !path.join("images/old.png").exists());
-        assert!(!path.join("exports/mesh.glb").exists() && !path.join("events.out.tfevents.17.plenoxel").exists());
-        assert!(path.join("notes.txt").exists() && path.join("exports/notes.txt").exists());
+        let there = |name: &&&str| path.join(name).exists();
+        assert_eq!((mine.iter().filter(there).count(), ours.iter().filter(there).count()), (mine.len(), 0));
         std::fs::remove_dir_all(path).unwrap();
     }
 }

@@ -56,7 +56,7 @@ pub struct Report {
 /// A stage with its place in the run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlannedStage {
-    /// As configured.
+    /// As configured, fitted to the images ([`Config::fitted_to`]).
     pub stage: Stage,
     /// Its first step.
     pub first: u64,
@@ -168,7 +168,7 @@ impl<'a, T: Real> Trainer<'a, T> {
         self.grid
     }
 
-    /// The config.
+    /// The config, fitted to the images ([`Config::fitted_to`]).
     pub fn config(&self) -> &Config {
         &self.config
     }

@@ -144,7 +144,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let mut load_clock = Stopwatch::default();
     let dataset = load_clock.time(|| source.open(&config))?;
     announce(console, &dataset, &config);
-    let estimate = Estimate::of_carving(&config, &dataset, 0);
+    let estimate = Estimate::of_carving(&config, &dataset, 0, !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
     let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
@@ -154,7 +154,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     // A coarse hull is too large. If not even half of what it says would fit, that is said before the work is done.
     if config.carve.resolution > LARGE {
         let expected = hull_clock.time(|| carve::voxels_expected(&views, &config)).unwrap_or(0.0);
-        Estimate::of_carving(&config, &dataset, (0.5 * expected) as usize).check()?;
+        Estimate::of_carving(&config, &dataset, (0.5 * expected) as usize, !args.no_report).check()?;
     }
     let count = console.count("carving, view", views.len());
     let progress = |progress| match progress {
@@ -171,7 +171,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
             "most of the box is left: the photographs contradict little of it; more views, alpha, or a smaller --half-width would help",
         );
     }
-    let estimate = Estimate::of_carving(&config, &dataset, carving.rows());
+    let estimate = Estimate::of_carving(&config, &dataset, carving.rows(), !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
 

@@ -58,6 +58,9 @@ fn describe(path: &Path) -> Result<Lines> {
     if path.join("run.json").is_file() {
         return of_run(path);
     }
+    if !path.exists() {
+        return Err(Error::input(path, "there is nothing", "give the folder of a run or of a dataset, or a checkpoint"));
+    }
     if path.is_dir() && !path.join("transforms_train.json").is_file() {
         let opened = dataset::open(path, &OpenOptions::default());
         return opened.map(|dataset| of_dataset(path, &dataset)).map_err(|e| match e {
@@ -85,9 +88,13 @@ fn of_run(path: &Path) -> Result<Lines> {
         source => source.to_string(),
     };
     lines.push(("data", data));
-    let stages = config.stages.iter().map(|stage| format!("{}³", stage.resolution));
-    let stages = if config.stages.is_empty() { "none: it was carved".to_owned() } else { stages.collect::<Vec<_>>().join(", ") };
-    lines.push(("stages", stages));
+    let result = folder.result();
+    // Small images have smaller grids than they were asked for.
+    let trained: Option<Vec<u64>> =
+        result.as_ref().and_then(|result| result["stages"].as_array()?.iter().map(|stage| stage["resolution"].as_u64()).collect());
+    let stages = trained.unwrap_or_else(|| config.stages.iter().map(|stage| stage.resolution as u64).collect());
+    let stages: Vec<String> = stages.iter().map(|resolution| format!("{resolution}³")).collect();
+    lines.push(("stages", if config.stages.is_empty() { "none: it was carved".to_owned() } else { stages.join(", ") }));
     if folder.checkpoint().exists() {
         let (grid, header) = folder.load()?;
         lines.extend(of_grid(&grid, &header));
@@ -97,7 +104,7 @@ fn of_run(path: &Path) -> Result<Lines> {
     if !config.stages.is_empty() && folder.existing_state().is_ok() {
         lines.push(("go on with", format!("plenoxel train --resume {}", path.display())));
     }
-    if let Some(result) = folder.result() {
+    if let Some(result) = result {
         let number = |key: &str| result[key].as_f64();
         if let (Some(psnr), Some(seconds)) = (number("psnr"), number("seconds")) {
             let ssim = number("ssim").map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));

@@ -30,7 +30,8 @@ pub fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
         config.background,
         config.half_width,
     ));
-    console.note(&format!("machine: {}, {} threads", machine::instruction_set(), machine::threads()));
+    let threads = machine::threads();
+    console.note(&format!("machine: {}, {threads} thread{}", machine::instruction_set(), if threads == 1 { "" } else { "s" }));
 }
 
 /// What is true of the run and not of its configuration.

@@ -1,7 +1,7 @@
 //! `plenoxel train`: from photographs to a run folder.
 
 mod best_grid;
-mod budget;
+pub mod budget;
 mod flags;
 pub mod interrupt;
 mod learning;
@@ -174,7 +174,7 @@ impl Job<'_, '_> {
         let test = clocks.load.time(|| load(console, dataset, Split::Test, &self.record.data))?;
         let scores = evaluate(&mut learned, &test, config, console, &mut clocks)?;
         let pictures = &learned.pictures;
-        pictures.strip(test.first(), config.background)?;
+        console.drawn(pictures.strip(test.first(), config.background));
         let note = pictures.note();
         let (rays, samples) = learned.metrics.counts();
         let (validation_psnr, best_validation) = learned.metrics.validation();
@@ -235,7 +235,8 @@ fn evaluate(learned: &mut Learned<'_>, test: &[View], config: &Config, console: 
     let half_width = learned.grid.shape().half_width;
     let scores = viewer.compare(test, |i, view, target, picture| {
         advance();
-        drawing.time(|| learned.pictures.panel(i, view, target, picture, half_width))
+        drawing.time(|| console.drawn(learned.pictures.panel(i, view, target, picture, half_width)));
+        Ok(())
     })?;
     clocks.evaluate.0 += start.elapsed() - drawing.0;
     if let Some(last) = learned.stages.last_mut() {

@@ -38,7 +38,7 @@ pub const PRESETS: [Preset; 5] = [
     Preset {
         name: "plenoxels",
         purpose: "Plenoxels as published, for comparison",
-        time: "many hours at 800 x 800",
+        time: "2 hours or more at 800 x 800",
         text: include_str!("../../presets/plenoxels.toml"),
     },
     Preset {

@@ -78,7 +78,7 @@ impl Scene {
     pub fn note(&self) -> String {
         let (shape, header) = (self.small.shape(), self.small.header());
         let reduction =
-            if shape.sh_reduction > 1 { format!(", harmonics for every {} along each axis", shape.sh_reduction) } else { String::new() };
+            if shape.sh_reduction > 1 { format!(", harmonics for each {} voxels", shape.sh_reduction.pow(3)) } else { String::new() };
         let what = format!(
             "the page holds {} voxels of {}³{reduction} in {}",
             thousands(header.voxels as u64),

@@ -57,8 +57,8 @@ pub struct Config {
     pub jitter: bool,
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
     pub project: bool,
-    /// Stages have no voxels that are smaller than so many pixels, seen from as far as the mean camera is; 0 for no such bound. See
-    /// [`Config::fitted_to`].
+    /// Stages have no more voxels than would be this many pixels wide in a cube of the configured half width, seen from as far as the mean camera is;
+    /// 0 for no such bound. Silhouettes and a scout shrink the cube afterwards, and with it the voxels. See [`Config::fitted_to`].
     #[serde(default)]
     pub pixels_per_voxel: f64,
     /// From this stage on (counted from 0), voxels that at the stage's start have, with all their neighbours, a density of at most
@@ -378,8 +378,8 @@ impl Config {
     /// The same with stages that images of some cameras have pixels for. Small images say nothing of small voxels, which would learn what
     /// single views show and no other.
     ///
-    /// A pixel is d / f wide, for the mean camera's distance d from the middle of the cube, or its half width w if that is more, and focal length f
-    /// in pixels. The finest grid then has n = 2 w f / (`pixels_per_voxel` d) voxels a side. Stages that are finer get that many, and a rate of the
+    /// A pixel of a camera is p = d / f wide, for its distance d from the middle of the cube, or the cube's half width w if that is more, and its focal
+    /// length f in pixels. The finest grid has n = 2 w / (`pixels_per_voxel` p) voxels a side, p in the mean of all cameras and w as configured. Stages that are finer get that many, and a rate of the
     /// density that is less by as much. Images are reduced by no more than k where a stage has n / k voxels a side, so that what is true of voxels
     /// and pixels is true of theirs.
     pub fn fitted_to<'c>(&self, cameras: impl IntoIterator<Item = &'c Camera>) -> Self {

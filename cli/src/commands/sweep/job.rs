@@ -2,7 +2,7 @@
 
 use super::flags::Flag;
 use crate::commands::table::{Cell, Failure, Measured};
-use crate::commands::train::NOT_WHEN_RESUMED;
+use crate::commands::train::{NOT_WHEN_RESUMED, budget};
 use crate::config;
 use crate::data::DataSource;
 use crate::run_folder::RunFolder;
@@ -167,19 +167,11 @@ fn remove(path: &Path) -> Result<()> {
 impl Asked {
     /// Where a run is not what was asked for.
     fn differences(&self, config: &Config, source: &DataSource, planned: Option<f64>) -> Vec<String> {
-        let mut asked = self.config.clone();
-        if let Some(seconds) = self.time {
-            if let Some(planned) = planned.filter(|planned| *planned != seconds) {
-                return vec![format!("time is {planned} s and not {seconds} s")];
-            }
-            if config.stages.len() == asked.stages.len() {
-                for (stage, found) in asked.stages.iter_mut().zip(&config.stages) {
-                    (stage.steps, stage.epochs, stage.density_warm_up) = (found.steps, found.epochs, found.density_warm_up);
-                }
-            }
-            // Weights may change after a number of steps.
-            asked.losses.clone_from(&config.losses);
-        }
+        let asked = match (self.time, planned) {
+            (Some(seconds), Some(planned)) if planned != seconds => return vec![format!("time is {planned} s and not {seconds} s")],
+            (Some(_), _) => budget::planned_like(self.config.clone(), config),
+            (None, _) => self.config.clone(),
+        };
         let data = (source != &self.source).then(|| format!("data is {source} and not {}", self.source));
         data.into_iter().chain(config::differences(config, &asked)).collect()
     }

@@ -99,10 +99,10 @@ pub struct TrainArgs {
     /// Make all stages of the preset longer or shorter, so that training takes this long on this machine, such as 90s, 5m or 1h, and
     /// the finest coarser if it is short; how long is found out once, and written into the settings in steps [default preset: fast, quality
     /// from 180 seconds on]
-    #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration)]
+    #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,
 
-    /// TOML file that changes the preset; a complete one, such as the config.toml of a run, replaces it
+    /// TOML file that changes the preset; a complete one, such as the config.toml of a run, stands in its place
     #[arg(long, value_name = "FILE", help_heading = "Settings", value_hint = ValueHint::FilePath)]
     config: Option<PathBuf>,
 
@@ -111,7 +111,7 @@ pub struct TrainArgs {
     set: Vec<String>,
 
     /// Seed of everything random [default: 42]
-    #[arg(long, help_heading = "Settings", value_parser = whole::<i64>(0, i64::MAX as u64))]
+    #[arg(long, help_heading = "Settings", value_parser = whole::<i64>(0, i64::MAX as u64), allow_negative_numbers = true)]
     seed: Option<i64>,
 
     /// Reduce the images by this factor, which must divide their width and height [default: 1; preset paper: 8]

@@ -39,8 +39,8 @@ pub struct Preview {
 pub struct Look {
     /// Mean PSNR of the validation views, if there are any.
     pub psnr: Option<f64>,
-    /// The picture that was written, if one was wanted, and its width and height.
-    pub picture: Option<(PathBuf, (usize, usize))>,
+    /// The picture that was written, if one was wanted, and its width and height; or why it could not be.
+    pub picture: Option<Result<(PathBuf, (usize, usize))>>,
 }
 
 impl Preview {
@@ -71,10 +71,10 @@ impl Preview {
     }
 
     /// Looks at the grid, if it is time to: when a stage ends and when a step is saved whenever there is time for it.
-    pub fn look(&mut self, grid: &VoxelGrid<f32>, ends_stage: bool, saves: bool, config: &Config) -> Result<Option<Look>> {
+    pub fn look(&mut self, grid: &VoxelGrid<f32>, ends_stage: bool, saves: bool, config: &Config) -> Option<Look> {
         let nothing = self.views.is_empty() && self.picture.is_none();
         if nothing || !self.pace.due(self.pace.now(), ends_stage, saves) {
-            return Ok(None);
+            return None;
         }
         let start = self.pace.now();
         let viewer = Viewer::new(grid, config.evaluation, config);
@@ -84,17 +84,15 @@ impl Preview {
         });
         let sum: f64 = psnr.sum();
         let psnr = (!self.views.is_empty()).then(|| sum / self.views.len() as f64);
-        let mut written = None;
-        if let Some((path, camera)) = &self.picture {
+        let picture = self.picture.as_ref().map(|(path, camera)| {
             let picture = match &self.shown {
                 Some(view) => images::strip(&[&view.composite(config.background), &viewer.see(&view.camera).rgb]),
                 None => viewer.see(camera).rgb,
             };
-            images::write(path, &picture)?;
-            written = Some((path.clone(), (picture.dim().1, picture.dim().0)));
-        }
+            images::write(path, &picture).map(|()| (path.clone(), (picture.dim().1, picture.dim().0)))
+        });
         self.pace.took(start, self.pace.now());
-        Ok(Some(Look { psnr, picture: written }))
+        Some(Look { psnr, picture })
     }
 }
 

@@ -49,26 +49,21 @@ impl<'a, 'c> Watching<'a, 'c> {
         if report.step == self.plan[report.stage].first {
             self.voxels = grid.lattice().present();
         }
-        let look = self.preview.look(grid, report.ends_stage, save, self.config);
-        let look = self.drawn(look).flatten();
-        let validation_psnr = look.as_ref().and_then(|look| look.psnr);
+        let (validation_psnr, picture) = match self.preview.look(grid, report.ends_stage, save, self.config) {
+            Some(Look { psnr, picture }) => (psnr, picture.and_then(|picture| self.console.drawn(picture))),
+            None => (None, None),
+        };
         let seen = Seen { voxels: self.voxels, validation_psnr, seconds };
         self.metrics.step(report, &self.plan, seen, save)?;
         self.progress.step(report, seen);
         if report.ends_stage {
-            self.drawn(self.draw_loss());
-            let stage = self.pictures.stage(report.stage, grid);
-            self.drawn(stage);
-            if let Some(Look { picture: Some((png, size)), .. }) = look {
-                self.metrics.picture(report.step, size, &png)?;
+            self.console.drawn(self.draw_loss());
+            self.console.drawn(self.pictures.stage(report.stage, grid));
+            if let Some((png, size)) = picture {
+                self.console.drawn(self.metrics.picture(report.step, size, &png));
             }
         }
         Ok(validation_psnr)
-    }
-
-    /// What came of drawing: a picture that cannot be written is no reason to lose what was learned.
-    fn drawn<R>(&self, done: Result<R>) -> Option<R> {
-        done.map_err(|e| self.console.note(&format!("no picture: {e}"))).ok()
     }
 
     /// Training has failed: the lines and the curve so far stay, to show how it came to this.
