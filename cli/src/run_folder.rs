@@ -109,13 +109,13 @@ impl RunFolder {
         for path in paths.chain(event_file::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
-        let files = |folder: &Path, endings| remove(entries(folder).filter(|path| path.is_file() && is_one_of(path, endings)));
-        files(&self.path.join(IMAGES), &["png"])?;
+        let clear = |folder: &Path, endings| remove(entries(folder).filter(|path| path.is_file() && is_one_of(path, endings)));
+        clear(&self.path.join(IMAGES), &["png"])?;
         for grid in [CHECKPOINT, BEST] {
             let made = RunFolder { grid, ..self.clone() };
-            files(&made.of_grid(EXPORTS), &EXPORTED)?;
+            clear(&made.of_grid(EXPORTS), &EXPORTED)?;
             let renders = made.of_grid(RENDERS);
-            files(&renders, &RENDERED)?;
+            clear(&renders, &RENDERED)?;
             // Films have folders of their own, for their frames.
             for film in entries(&renders).filter(|path| path.is_dir() && !path.is_symlink()) {
                 remove(entries(&film).filter(|path| is_frame(path)))?;

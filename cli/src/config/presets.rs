@@ -32,7 +32,7 @@ pub const PRESETS: [Preset; 5] = [
     Preset {
         name: "quality",
         purpose: "the best there is",
-        time: "11 to 30 min at 800 x 800",
+        time: "about 15 min at 800 x 800",
         text: include_str!("../../presets/quality.toml"),
     },
     Preset {

@@ -378,9 +378,9 @@ impl Config {
     /// The same with stages that images of some cameras have pixels for. Small images say nothing of small voxels, which would learn what
     /// single views show and no other.
     ///
-    /// A pixel of a camera is p = d / f wide, for its distance d from the middle of the cube, or the cube's half width w if that is more, and its focal
-    /// length f in pixels. The finest grid has n = 2 w / (`pixels_per_voxel` p) voxels a side, p in the mean of all cameras and w as configured. Stages that are finer get that many, and a rate of the
-    /// density that is less by as much. Images are reduced by no more than k where a stage has n / k voxels a side, so that what is true of voxels
+    /// A pixel of a camera is p = d / f wide, for its distance d from the middle of the cube, or the cube's half width w if that is more, and
+    /// its focal length f in pixels. The finest grid has n = 2 w / (`pixels_per_voxel` p) voxels a side, p in the mean of all cameras and w as
+    /// configured. Stages that are finer get that many, and a rate of the density that is less by as much. Images are reduced by no more than k where a stage has n / k voxels a side, so that what is true of voxels
     /// and pixels is true of theirs.
     pub fn fitted_to<'c>(&self, cameras: impl IntoIterator<Item = &'c Camera>) -> Self {
         let pixel = |camera: &Camera| camera.position().length().max(self.half_width) / camera.intrinsics.fx.min(camera.intrinsics.fy);
