@@ -101,13 +101,13 @@ fn the_same_seed_gives_the_same_bits_for_any_number_of_threads() {
 #[test]
 fn a_scout_finds_where_matter_is() {
     let train = views(Split::Train);
-    let scout = Scout { density: 0.1, prune_unseen_below: 0.03, stages: vec![Stage { density_rate: 2.0, ..stage(16, 80) }] };
+    let scout = Scout { density: 0.5, prune_unseen_below: 0.1, stages: vec![Stage { density_rate: 2.0, ..stage(24, 200) }] };
     let stages = vec![stage(32, 1), stage(32, 60)];
     let config = Config { scout: Some(scout), prune_unseen_below: 0.03, stages, rays_per_step: 2048, ..config() };
     let mut trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
-    assert_eq!(trainer.plan().iter().map(|p| (p.first, p.stage.resolution)).collect::<Vec<_>>(), [(0, 16), (80, 32), (81, 32)]);
+    assert_eq!(trainer.plan().iter().map(|p| (p.first, p.stage.resolution)).collect::<Vec<_>>(), [(0, 24), (200, 32), (201, 32)]);
     assert_eq!(trainer.prunes_from(), None);
-    while trainer.step().expect("finite numbers").is_some_and(|report| report.step < 80) {}
+    while trainer.step().expect("finite numbers").is_some_and(|report| report.step < 200) {}
     let (shape, present) = (*trainer.grid().shape(), trainer.grid().lattice().present());
     assert_eq!(shape.resolution, 32);
     assert!(shape.half_width <= config.half_width && present > 1000 && present < 32 * 32 * 32 * 3 / 4, "{present} in {}", shape.half_width);

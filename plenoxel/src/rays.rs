@@ -90,6 +90,11 @@ impl<'a> RaySource<'a> {
         self.set_tiles(tiles::showing(&self.views, matter));
     }
 
+    /// The views.
+    pub fn views(&self) -> &[View] {
+        &self.views
+    }
+
     /// The share of the pixels of the views that are in the set.
     pub fn share(&self) -> f64 {
         self.len() as f64 / self.pixels as f64

@@ -250,15 +250,24 @@ impl<'a, T: Real> Trainer<'a, T> {
             let least = scout.prune_unseen_below;
             let kept = self.worth_keeping(&self.grid, &self.plan[index - 1].stage, least)?;
             let initial = initial(&self.config, index < self.scouts);
-            let scouted = start::scouted(&self.grid, &kept, plan.stage.resolution, &initial);
-            self.grid = scouted.ok_or_else(|| self.pruned_to_nothing(least))?;
+            let half_width = kept.half_width().ok_or_else(|| self.pruned_to_nothing(least))?;
+            let kept = start::with_hidden(&kept, self.rays.views(), self.config.carve.margin);
+            self.grid = start::scouted(&self.grid, &kept, half_width, plan.stage.resolution, &initial);
         }
         // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
         release_free_buffers();
         let finer = plan.stage.resolution != self.grid.shape().resolution;
+        let prunes = self.prunes_from().is_some_and(|first| index >= first);
         let mut outline = self.grid.outline();
         if finer {
-            outline = outline.resample(plan.stage.resolution);
+            let mut half_width = outline.shape().half_width;
+            if self.scouts > 0 && prunes {
+                // The scout's cube was as coarse as its voxels.
+                let kept = self.worth_keeping(&outline, &self.plan[index - 1].stage, self.config.prune_unseen_below)?;
+                half_width = kept.half_width().unwrap_or(half_width);
+                outline = outline.pruned(&kept);
+            }
+            outline = outline.resample_in(plan.stage.resolution, half_width);
         }
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
             outline = outline.pruned(&silhouettes.voxels(&outline));
@@ -275,12 +284,12 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.rays = self.all_rays();
         }
         self.aim(Field::<T>::reach(&outline));
-        if self.prunes_from().is_some_and(|first| index >= first) {
+        if prunes {
             outline = outline.pruned(&self.worth_keeping(&outline, &plan.stage, self.config.prune_unseen_below)?);
             self.aim(Field::<T>::reach(&outline));
         }
         let lattice = outline.lattice();
-        if lattice.rows() > self.most_rows && self.prunes_from().is_some_and(|first| index >= first) {
+        if prunes && lattice.rows() > self.most_rows {
             let found = format!(
                 "{} voxels that would be left at {}³, where memory has room for {}",
                 lattice.rows(),
@@ -445,4 +454,43 @@ fn mean_squared_error<T: Real>(x: &[T], y: &[T]) -> f64 {
         x[range.clone()].iter().zip(&y[range]).map(|(&x, &y)| ((x - y) * (x - y)).as_f64()).sum::<f64>()
     });
     parts.into_iter().sum::<f64>() / x.len() as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::config::{Hull, Scout};
+    use super::*;
+    use crate::dataset::procedural::ProceduralOptions;
+    use crate::dataset::{Dataset, Split};
+    use autograd::Tensor;
+    use glam::DVec3;
+
+    #[test]
+    fn after_a_scout_the_cube_shrinks_to_what_a_finer_stage_begins_with() {
+        let options = ProceduralOptions { width: 32, height: 32, train: 8, val: 0, test: 0, supersample: 1 };
+        let views = Dataset::procedural(options).unwrap().load(Split::Train, &|_, _| {}).unwrap();
+        let half_width = |scout: Option<Scout>, prune_from_stage| {
+            let stages = vec![Stage::new(16, 1), Stage::new(32, 1)];
+            let config = Config { scout, prune_from_stage, prune_unseen_below: 0.1, hull: Hull::Off, stages, ..Config::default() };
+            let mut trainer = Trainer::<f64>::new(config, &views).unwrap();
+            // As if it had learned a ball of radius 0.4.
+            let grid = VoxelGrid::uniform(trainer.config.grid_shape(16), 0.0, 0.0);
+            let densities = (0..16 * 16 * 16).map(|row| {
+                let center =
+                    grid.lattice().node(row).map(|node| DVec3::from(node.map(|k| (k as f64 + 0.5) / 8.0 - 1.0)) * grid.shape().half_width);
+                if center.is_some_and(|center| center.length() < 0.4) { 50.0 } else { 0.0 }
+            });
+            trainer.grid = grid.with_density(Tensor::from_vec(densities.collect(), &[16 * 16 * 16, 1]));
+            trainer.step = trainer.plan[trainer.plan.len() - 1].first;
+            trainer.step().unwrap();
+            assert_eq!(trainer.grid.shape().resolution, 32);
+            trainer.grid.shape().half_width
+        };
+        let whole = Config::default().half_width;
+        let scout = Scout { density: 1.0, prune_unseen_below: 0.1, stages: vec![Stage::new(8, 1)] };
+        let fitted = half_width(Some(scout.clone()), Some(1));
+        assert!((0.4..0.8 * whole).contains(&fitted), "{fitted}");
+        assert_eq!(half_width(Some(scout), None), whole);
+        assert_eq!(half_width(None, Some(1)), whole);
+    }
 }

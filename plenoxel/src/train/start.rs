@@ -6,7 +6,10 @@ use crate::dataset::{View, has_alpha};
 use crate::field::voxel_grid::{GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
-use autograd::Real;
+use crate::sampling::walk::Walk;
+use autograd::{Real, parallel};
+use image::{Rgba, RgbaImage};
+use std::ops::ControlFlow;
 
 /// Voxels along each axis of the hull that the cube is fitted to.
 const COARSE: usize = 64;
@@ -39,12 +42,39 @@ impl<'a> Silhouettes<'a> {
     }
 }
 
-/// A grid with the voxels that read one of those to keep, in the smallest cube that holds these, at another resolution and as training starts;
-/// `None` if none are kept.
-pub fn scouted<T: Real>(grid: &VoxelGrid<T>, kept: &Occupancy, resolution: usize, initial: &Initial) -> Option<VoxelGrid<T>> {
-    let near = grid.pruned(kept).resample_in(resolution, kept.half_width()?);
+/// What may hold matter, and what it hides: the visual hull of its own silhouettes in the views.
+///
+/// What few rays get to, such as the ground under a machine, is fog or nothing to a scout; where no voxels are, nothing can be learned.
+pub fn with_hidden(matter: &Occupancy, views: &[View], margin: f64) -> Occupancy {
+    let Some(extent) = matter.extent() else { return matter.clone() };
+    let walk = Walk::new(matter.aabb(), matter.cells()).within(extent);
+    let silhouettes = parallel::map_indices(views.len(), |v| {
+        let View { name, camera, image, .. } = &views[v];
+        let image = RgbaImage::from_fn(image.width(), image.height(), |x, y| {
+            let mut alpha = 0;
+            walk.along(
+                &camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5),
+                |brick| matter.free(brick),
+                |crossing| {
+                    if matter.masks()[crossing.brick] >> crossing.bit & 1 == 0 {
+                        return ControlFlow::Continue(());
+                    }
+                    alpha = u8::MAX;
+                    ControlFlow::Break(())
+                },
+            );
+            Rgba([0, 0, 0, alpha])
+        });
+        View { name: name.clone(), camera: *camera, image, depth: None }
+    });
+    visual_hull::by_footprint(&silhouettes, matter.aabb(), matter.cells(), margin, &|_| ())
+}
+
+/// A grid with the voxels that read one of those to keep, in a smaller cube, at another resolution and as training starts.
+pub fn scouted<T: Real>(grid: &VoxelGrid<T>, kept: &Occupancy, half_width: f64, resolution: usize, initial: &Initial) -> VoxelGrid<T> {
+    let near = grid.pruned(kept).resample_in(resolution, half_width);
     let whole = VoxelGrid::uniform(*near.shape(), initial.density, initial.color);
-    Some(whole.pruned(&near.voxels_where(|_| true)))
+    whole.pruned(&near.voxels_where(|_| true))
 }
 
 /// Optical depth of a carved voxel along its side with which training starts. As opaque as carving leaves it, hardly a gradient gets past the
@@ -69,4 +99,33 @@ pub fn adapted<T: Real>(grid: &VoxelGrid<T>, shape: &GridShape) -> VoxelGrid<T> 
     let grid = grown.as_ref().unwrap_or(grid);
     // Harmonics last, so that they are averaged over what training will see.
     grid.with_color(shape.color).with_interpolation(shape.interpolation).with_reduction(shape.sh_reduction)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::procedural::ProceduralOptions;
+    use crate::dataset::{Dataset, Split};
+    use autograd::lattice::BRICK;
+    use glam::DVec3;
+
+    #[test]
+    fn what_matter_hides_is_kept_and_what_is_beside_it_is_not() {
+        let options = ProceduralOptions { width: 64, height: 64, train: 12, val: 0, test: 0, supersample: 1 };
+        let views = Dataset::procedural(options).unwrap().load(Split::Train, &|_, _| {}).unwrap();
+        let cells = 6 * BRICK;
+        let radius = |place: [usize; 3]| DVec3::from(place.map(|k| (k as f64 + 0.5) / (cells as f64 / 2.0) - 1.0)).length();
+        let places = || (0..cells.pow(3)).map(|c| [c / cells.pow(2), c / cells % cells, c % cells]);
+        let shell: Vec<bool> = places().map(|place| (0.45..0.65).contains(&radius(place))).collect();
+        let shell = Occupancy::new(Aabb::cube(1.0), [cells; 3], &shell);
+        let hull = with_hidden(&shell, &views, 0.5);
+        for place in places() {
+            let r = radius(place);
+            assert!(r >= 0.65 || hull.contains(place), "{place:?} is in the ball of radius 0.65, at {r}");
+            assert!(r <= 0.95 || !hull.contains(place), "{place:?} is beside it, at {r}");
+        }
+        // Nothing hides nothing.
+        let nothing = shell.intersection(&Occupancy::new(Aabb::cube(1.0), [cells; 3], &vec![false; cells.pow(3)]));
+        assert_eq!(with_hidden(&nothing, &views, 0.5).fraction(), 0.0);
+    }
 }
