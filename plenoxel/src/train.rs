@@ -251,8 +251,8 @@ impl<'a, T: Real> Trainer<'a, T> {
             let kept = self.worth_keeping(&self.grid, &self.plan[index - 1].stage, least)?;
             let initial = initial(&self.config, index < self.scouts);
             let half_width = kept.half_width().ok_or_else(|| self.pruned_to_nothing(least))?;
-            let kept = start::with_hidden(&kept, self.rays.views(), self.config.carve.margin);
-            self.grid = start::scouted(&self.grid, &kept, half_width, plan.stage.resolution, &initial);
+            let whole = start::with_hidden(&kept, self.rays.views(), self.config.carve.margin);
+            self.grid = start::scouted(&self.grid, &whole, half_width, plan.stage.resolution, &initial);
         }
         // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
         release_free_buffers();
