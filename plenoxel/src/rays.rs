@@ -90,7 +90,7 @@ impl<'a> RaySource<'a> {
         self.set_tiles(tiles::showing(&self.views, matter));
     }
 
-    /// The views.
+    /// The views whose pixels these are, at their present size, whether rays are aimed or not.
     pub fn views(&self) -> &[View] {
         &self.views
     }

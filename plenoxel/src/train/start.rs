@@ -70,7 +70,7 @@ pub fn with_hidden(matter: &Occupancy, views: &[View], margin: f64) -> Occupancy
     visual_hull::by_footprint(&silhouettes, matter.aabb(), matter.cells(), margin, &|_| ())
 }
 
-/// A grid with the voxels that read one of those to keep, in a smaller cube, at another resolution and as training starts.
+/// A grid with the voxels that read one of those to keep and lie in a smaller cube, at another resolution and as training starts.
 pub fn scouted<T: Real>(grid: &VoxelGrid<T>, kept: &Occupancy, half_width: f64, resolution: usize, initial: &Initial) -> VoxelGrid<T> {
     let near = grid.pruned(kept).resample_in(resolution, half_width);
     let whole = VoxelGrid::uniform(*near.shape(), initial.density, initial.color);
