@@ -29,11 +29,22 @@ pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64,
 
 /// The same of some of the voxels alone.
 pub fn by_footprint_of(views: &[View], of: &Occupancy, margin: f64, progress: &dyn Fn(usize)) -> Occupancy {
+    by_silhouettes(views, is_object, of, margin, progress)
+}
+
+/// The same with silhouettes that need no alpha: those of the pixels (x, y) of a view that `is_object` says yes to.
+pub fn by_silhouettes(
+    views: &[View],
+    is_object: impl Fn(&View, usize, usize) -> bool + Sync,
+    of: &Occupancy,
+    margin: f64,
+    progress: &dyn Fn(usize),
+) -> Occupancy {
     let (aabb, voxels) = (of.aabb(), of.cells());
     let count = voxels.map(|n| n.div_ceil(BRICK));
     let mut masks = of.masks().to_vec();
     for (chunk, views) in views.chunks(VIEWS).enumerate() {
-        let silhouettes = parallel::map_indices(views.len(), |v| Silhouette::of(&views[v], aabb, voxels));
+        let silhouettes = parallel::map_indices(views.len(), |v| Silhouette::of(&views[v], &is_object, aabb, voxels));
         parallel::for_each_chunk(&mut masks, BRICKS, |first, masks| {
             for (b, mask) in masks.iter_mut().enumerate() {
                 for silhouette in &silhouettes {
@@ -87,6 +98,10 @@ pub(super) fn is_background(view: &View, x: usize, y: usize) -> bool {
     view.image.get_pixel(x as u32, y as u32).0[3] == 0
 }
 
+fn is_object(view: &View, x: usize, y: usize) -> bool {
+    !is_background(view, x, y)
+}
+
 /// Masks of all voxels.
 pub(super) fn full(voxels: [usize; 3]) -> Vec<u64> {
     let count = voxels.map(|n| n.div_ceil(BRICK));
@@ -127,13 +142,13 @@ fn outside(silhouette: &Silhouette, place: [usize; 3], mask: u64, margin: f64) -
 }
 
 impl Silhouette {
-    fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
+    fn of(view: &View, is_object: impl Fn(&View, usize, usize) -> bool, aabb: Aabb, voxels: [usize; 3]) -> Self {
         let [width, height] = size(view);
         let mut sums = vec![0; (width + 1) * (height + 1)];
         for y in 0..height {
             let mut row = 0;
             for x in 0..width {
-                row += u32::from(!is_background(view, x, y));
+                row += u32::from(is_object(view, x, y));
                 sums[(y + 1) * (width + 1) + x + 1] = sums[y * (width + 1) + x + 1] + row;
             }
         }

@@ -98,7 +98,8 @@ impl Occupancy {
     /// The smallest box around the cells that may hold matter; `None` if none may.
     pub fn bounds(&self) -> Option<Aabb> {
         let side = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells.map(|n| n as f64));
-        let corner = |k: [usize; 3]| self.aabb.min + side * DVec3::from_array(k.map(|k| k as f64));
+        // Rounding must not lead out of the box.
+        let corner = |k: [usize; 3]| (self.aabb.min + side * DVec3::from_array(k.map(|k| k as f64))).min(self.aabb.max);
         self.extent().map(|[low, high]| Aabb { min: corner(low), max: corner(high) })
     }
 
@@ -157,8 +158,19 @@ impl Occupancy {
     ///
     /// Panics if the other has other cells.
     pub fn intersection(&self, other: &Self) -> Self {
-        assert_eq!(self.cells, other.cells, "occupancy: the intersection of different grids");
-        let masks = self.masks.iter().zip(&*other.masks).map(|(a, b)| a & b).collect();
+        self.combined(other, |a, b| a & b)
+    }
+
+    /// The cells that are in one of both.
+    ///
+    /// Panics if the other has other cells.
+    pub fn union(&self, other: &Self) -> Self {
+        self.combined(other, |a, b| a | b)
+    }
+
+    fn combined(&self, other: &Self, masks: fn(u64, u64) -> u64) -> Self {
+        assert_eq!(self.cells, other.cells, "occupancy: different grids");
+        let masks = self.masks.iter().zip(&*other.masks).map(|(&a, &b)| masks(a, b)).collect();
         Self::from_masks(self.aabb, self.cells, masks)
     }
 
@@ -315,6 +327,17 @@ mod tests {
         let n: usize = cells.iter().product();
         let mask: Vec<bool> = (0..n as u64).map(|c| uniform(3, Purpose::Initial, 0, c) < share).collect();
         Occupancy::new(Aabb::cube(1.0), cells, &mask)
+    }
+
+    #[test]
+    fn bounds_stay_in_the_box_whatever_rounding_does() {
+        for (half_width, n) in [(1.95, 320), (1.55, 384), (1.1, 7)] {
+            let mut line = vec![false; n];
+            let at_the_end = |line: &[bool]| Occupancy::new(Aabb::cube(half_width), [n, 1, 1], line).half_width();
+            assert_eq!(at_the_end(&line), None);
+            line[n - 1] = true;
+            assert_eq!(at_the_end(&line), Some(half_width));
+        }
     }
 
     #[test]

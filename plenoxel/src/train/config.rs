@@ -70,8 +70,8 @@ pub struct Config {
     /// share of a pixel. Of the pixels as many are looked along as make eight rays through every voxel. 0 for none; svox2: 0.256 / voxels a side.
     pub prune_unseen_below: f64,
     /// A short run before the first stage, where no silhouettes and no other run say which voxels exist: those of its grid that are worth
-    /// keeping do, and those that they hide from all views; the cube becomes as small as the first allow, again at each finer stage that
-    /// prunes, and training starts from `initial`. Needs no alpha.
+    /// keeping do, and those of the visual hull of their silhouettes; the cube becomes as small as the first allow, again at each finer stage
+    /// that prunes, and training starts from `initial`. Needs no alpha.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scout: Option<Scout>,
     /// Folder of the run whose grid training starts from.

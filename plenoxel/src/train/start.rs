@@ -7,8 +7,7 @@ use crate::field::voxel_grid::{GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
-use autograd::{Real, parallel};
-use image::{Rgba, RgbaImage};
+use autograd::Real;
 use std::ops::ControlFlow;
 
 /// Voxels along each axis of the hull that the cube is fitted to.
@@ -42,39 +41,44 @@ impl<'a> Silhouettes<'a> {
     }
 }
 
-/// What may hold matter, and what it hides: the visual hull of its own silhouettes in the views.
-///
-/// What few rays get to, such as the ground under a machine, is fog or nothing to a scout; where no voxels are, nothing can be learned.
-pub fn with_hidden(matter: &Occupancy, views: &[View], margin: f64) -> Occupancy {
-    let Some(extent) = matter.extent() else { return matter.clone() };
-    let walk = Walk::new(matter.aabb(), matter.cells()).within(extent);
-    let silhouettes = parallel::map_indices(views.len(), |v| {
-        let View { name, camera, image, .. } = &views[v];
-        let image = RgbaImage::from_fn(image.width(), image.height(), |x, y| {
-            let mut alpha = 0;
-            walk.along(
-                &camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5),
-                |brick| matter.free(brick),
-                |crossing| {
-                    if matter.masks()[crossing.brick] >> crossing.bit & 1 == 0 {
-                        return ControlFlow::Continue(());
-                    }
-                    alpha = u8::MAX;
-                    ControlFlow::Break(())
-                },
-            );
-            Rgba([0, 0, 0, alpha])
-        });
-        View { name: name.clone(), camera: *camera, image, depth: None }
-    });
-    visual_hull::by_footprint(&silhouettes, matter.aabb(), matter.cells(), margin, &|_| ())
-}
-
-/// A grid with the voxels that read one of those to keep and lie in a smaller cube, at another resolution and as training starts.
-pub fn scouted<T: Real>(grid: &VoxelGrid<T>, kept: &Occupancy, half_width: f64, resolution: usize, initial: &Initial) -> VoxelGrid<T> {
-    let near = grid.pruned(kept).resample_in(resolution, half_width);
+/// What a scout leaves to the stage after it: those voxels of its grid that read one of the visual hull of what is worth keeping, in the cube
+/// around the latter, at another resolution and as training starts. `margin` is that of [`visual_hull::by_footprint`], in pixels of these views.
+pub fn scouted<T: Real>(
+    grid: &VoxelGrid<T>,
+    kept: &Occupancy,
+    views: &[View],
+    margin: f64,
+    resolution: usize,
+    initial: &Initial,
+) -> VoxelGrid<T> {
+    let half_width = kept.half_width().unwrap_or(grid.shape().half_width);
+    let hull = hull_of(kept, &grid.voxels_where(|_| true), views, margin);
+    let near = grid.pruned(&hull).resample_in(resolution, half_width);
     let whole = VoxelGrid::uniform(*near.shape(), initial.density, initial.color);
     whole.pruned(&near.voxels_where(|_| true))
+}
+
+/// Some voxels, and those among others that the visual hull of their silhouettes has: what they hide, and what no view rules out.
+///
+/// What few rays get to, such as the ground under a machine, is fog or nothing to a scout; where no voxels are, nothing can be learned.
+fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -> Occupancy {
+    let Some(extent) = matter.extent() else { return matter.clone() };
+    let walk = Walk::new(matter.aabb(), matter.cells()).within(extent);
+    let hides = |view: &View, x: usize, y: usize| {
+        let mut found = false;
+        let ray = view.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
+        walk.along(
+            &ray,
+            |brick| matter.free(brick),
+            |crossing| {
+                found = matter.masks()[crossing.brick] >> crossing.bit & 1 == 1;
+                if found { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            },
+        );
+        found
+    };
+    // A ray may pass by the thinnest.
+    visual_hull::by_silhouettes(views, hides, among, margin, &|_| ()).union(matter)
 }
 
 /// Optical depth of a carved voxel along its side with which training starts. As opaque as carving leaves it, hardly a gradient gets past the
@@ -110,22 +114,26 @@ mod tests {
     use glam::DVec3;
 
     #[test]
-    fn what_matter_hides_is_kept_and_what_is_beside_it_is_not() {
+    fn the_hull_of_matter_is_matter_and_what_it_hides_and_nothing_beside_it() {
         let options = ProceduralOptions { width: 64, height: 64, train: 12, val: 0, test: 0, supersample: 1 };
         let views = Dataset::procedural(options).unwrap().load(Split::Train, &|_, _| {}).unwrap();
         let cells = 6 * BRICK;
+        let of = |present: &[bool]| Occupancy::new(Aabb::cube(1.0), [cells; 3], present);
+        let all = of(&vec![true; cells.pow(3)]);
         let radius = |place: [usize; 3]| DVec3::from(place.map(|k| (k as f64 + 0.5) / (cells as f64 / 2.0) - 1.0)).length();
         let places = || (0..cells.pow(3)).map(|c| [c / cells.pow(2), c / cells % cells, c % cells]);
         let shell: Vec<bool> = places().map(|place| (0.45..0.65).contains(&radius(place))).collect();
-        let shell = Occupancy::new(Aabb::cube(1.0), [cells; 3], &shell);
-        let hull = with_hidden(&shell, &views, 0.5);
+        let hull = hull_of(&of(&shell), &all, &views, 0.5);
         for place in places() {
             let r = radius(place);
             assert!(r >= 0.65 || hull.contains(place), "{place:?} is in the ball of radius 0.65, at {r}");
             assert!(r <= 0.95 || !hull.contains(place), "{place:?} is beside it, at {r}");
         }
-        // Nothing hides nothing.
-        let nothing = shell.intersection(&Occupancy::new(Aabb::cube(1.0), [cells; 3], &vec![false; cells.pow(3)]));
-        assert_eq!(with_hidden(&nothing, &views, 0.5).fraction(), 0.0);
+        // Matter so thin that rays of all pixels pass it by is matter all the same, and nothing hides nothing.
+        let coarse: Vec<View> = views.iter().map(|view| view.reduced(32)).collect();
+        let mut one = vec![false; cells.pow(3)];
+        assert_eq!(hull_of(&of(&one), &all, &views, 0.5).fraction(), 0.0);
+        one[cells.pow(3) / 2 + 5 * cells + 7] = true;
+        assert!(hull_of(&of(&one), &all, &coarse, 0.0).intersection(&of(&one)).fraction() > 0.0);
     }
 }

@@ -1,0 +1,219 @@
+//! What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
+
+use super::config::{Scout, Stage};
+use super::plan::{initial, optimizer};
+use super::{Trainer, start};
+use crate::dataset::View;
+use crate::error::{Error, Result};
+use crate::field::Field;
+use crate::field::voxel_grid::VoxelGrid;
+use crate::rays::RaySource;
+use crate::render::RenderOptions;
+use crate::render::fused::largest_weights;
+use crate::sampling::{Jitter, Occupancy};
+use autograd::{Real, parallel, release_free_buffers};
+use std::borrow::Cow;
+
+/// Rays that are rendered at a time to find out what is seen: bounds the memory.
+const RAYS_PER_BATCH: usize = 1 << 15;
+
+impl<'a, T: Real> Trainer<'a, T> {
+    /// Begins a stage.
+    pub(super) fn begin(&mut self, index: usize) -> Result<()> {
+        let stage = self.plan[index].stage;
+        // The old state goes before the finer grid comes.
+        self.optimizer = optimizer(&self.config, &self.plan[index]);
+        if let Some(scout) = self.config.scout.as_ref().filter(|_| (1..=self.scouts).contains(&index)) {
+            self.grid = self.scouted(scout, index)?;
+        }
+        // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
+        release_free_buffers();
+        let finer = stage.resolution != self.grid.shape().resolution;
+        let mut outline = self.grid.outline();
+        if finer {
+            outline = self.finer(outline, index)?;
+        }
+        if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
+            outline = outline.pruned(&silhouettes.voxels(&outline));
+            if outline.lattice().present() == 0 {
+                return Err(Error::config(
+                    "hull",
+                    "\"auto\", with silhouettes that hold nothing of the grid,",
+                    "\"off\"; or another half_width, or another run to start from",
+                ));
+            }
+        }
+        if stage.image_reduction != self.reduction {
+            self.reduction = stage.image_reduction;
+            self.rays = self.all_rays();
+        }
+        self.aim(Field::<T>::reach(&outline));
+        if self.prunes(index) {
+            outline = outline.pruned(&self.worth_keeping(&outline, &stage, None)?);
+            self.aim(Field::<T>::reach(&outline));
+            self.check_rows(&outline)?;
+        }
+        if finer {
+            self.grid = self.grid.resample_as(&outline);
+        } else if outline.lattice().present() < self.grid.lattice().present() {
+            self.grid = self.grid.pruned(&outline.voxels_where(|_| true));
+        }
+        if self.config.project {
+            self.grid.project();
+        }
+        Ok(())
+    }
+
+    /// What a stage of the scout leaves to the next stage.
+    fn scouted(&self, scout: &Scout, index: usize) -> Result<VoxelGrid<T>> {
+        let kept = self.worth_keeping(&self.grid, &self.plan[index - 1].stage, Some(scout))?;
+        let initial = initial(&self.config, index < self.scouts);
+        let resolution = self.plan[index].stage.resolution;
+        Ok(start::scouted(&self.grid, &kept, self.rays.views(), self.config.carve.margin, resolution, &initial))
+    }
+
+    /// An outline at the finer resolution of a stage. After a scout, whose cube was as coarse as its voxels, it loses what is not worth keeping
+    /// first, and the cube shrinks to the rest: the coarse voxels tell as much in a fraction of the time.
+    fn finer(&self, outline: VoxelGrid<T>, index: usize) -> Result<VoxelGrid<T>> {
+        let resolution = self.plan[index].stage.resolution;
+        if self.scouts == 0 || !self.prunes(index) {
+            return Ok(outline.resample(resolution));
+        }
+        let kept = self.worth_keeping(&outline, &self.plan[index - 1].stage, None)?;
+        let half_width = kept.half_width().unwrap_or(outline.shape().half_width);
+        Ok(outline.pruned(&kept).resample_in(resolution, half_width))
+    }
+
+    /// Errors if pruning leaves more than memory has room for.
+    fn check_rows(&self, outline: &VoxelGrid<T>) -> Result<()> {
+        let (rows, resolution, most) = (outline.lattice().rows(), outline.shape().resolution, self.most_rows);
+        if rows <= most {
+            return Ok(());
+        }
+        let found = format!("{rows} voxels that would be left at {resolution}³, where memory has room for {most}");
+        Err(Error::config("prune_unseen_below", found, "a larger share of a pixel; or fewer voxels a side in the last stages"))
+    }
+
+    /// Leaves the rays out that pass what is left of the grid, if the config says so.
+    pub(super) fn aim(&mut self, reach: Option<&Occupancy>) {
+        if let Some(reach) = reach.filter(|_| self.config.aim) {
+            self.rays.aim_at(reach);
+        }
+    }
+
+    /// The rays of all pixels of the images as reduced now.
+    pub(super) fn all_rays(&self) -> RaySource<'a> {
+        let views: Cow<'a, [View]> = match self.reduction {
+            1 => self.views.into(),
+            k => parallel::map_indices(self.views.len(), |v| self.views[v].reduced(k)).into(),
+        };
+        RaySource::new(views, self.config.background, self.config.seed)
+    }
+
+    /// The first stage of the plan that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
+    pub fn prunes_from(&self) -> Option<usize> {
+        let left_out = self.config.stages.len() + self.scouts - self.plan.len();
+        self.config.prune_from_stage.map(|first| self.scouts + first.saturating_sub(left_out))
+    }
+
+    fn prunes(&self, index: usize) -> bool {
+        self.prunes_from().is_some_and(|first| index >= first)
+    }
+
+    /// The voxels that pruning leaves, or that a scout does: those that hold matter and, if the config asks for it, that a training ray sees.
+    ///
+    /// Errors if they are none.
+    fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage, scout: Option<&Scout>) -> Result<Occupancy> {
+        let (below, least) = (self.config.prune_below, scout.map_or(self.config.prune_unseen_below, |scout| scout.prune_unseen_below));
+        let full = grid.occupancy(below);
+        let kept = if least == 0.0 { full } else { full.intersection(&self.seen(grid, stage, least)) };
+        if kept.fraction() > 0.0 {
+            return Ok(kept);
+        }
+        let remedy = match scout {
+            Some(_) => format!("set prune_below lower than {below}, or scout.prune_unseen_below lower than {least}"),
+            None => format!("set prune_below lower than {below}, prune_unseen_below lower than {least}, or prune_from_stage later"),
+        };
+        Err(Error::Numeric { place: format!("step {}", self.step), found: "pruning would leave nothing".to_owned(), remedy })
+    }
+
+    /// The voxels that weigh at least so much in a pixel, and those around.
+    fn seen(&self, grid: &VoxelGrid<T>, stage: &Stage, least: f64) -> Occupancy {
+        // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
+        const MARGIN: usize = 2;
+        // Where less light is left, no sample weighs as much.
+        let stop_below = self.config.stop_below.max(least);
+        let options = RenderOptions { stop_below, ..self.options(grid, stage, Jitter::None) };
+        let stride = self.rays.stride(grid.shape().voxel_side(), grid.aabb());
+        let weights = largest_weights(grid, self.rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
+        grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::procedural::ProceduralOptions;
+    use crate::dataset::{Dataset, Split};
+    use crate::field::voxel_grid::GridShape;
+    use crate::train::config::{Config, Hull};
+    use autograd::Tensor;
+    use glam::DVec3;
+    use std::ops::Range;
+
+    fn views() -> Vec<View> {
+        let options = ProceduralOptions { width: 32, height: 32, train: 8, val: 0, test: 0, supersample: 1 };
+        Dataset::procedural(options).unwrap().load(Split::Train, &|_, _| {}).unwrap()
+    }
+
+    fn config(scout: Option<usize>, prune_from_stage: Option<usize>) -> Config {
+        let scout = scout.map(|n| Scout { density: 1.0, prune_unseen_below: 0.1, stages: vec![Stage::new(n, 1)] });
+        let stages = vec![Stage::new(16, 1), Stage::new(32, 1)];
+        Config { scout, prune_from_stage, prune_unseen_below: 0.1, hull: Hull::Off, stages, ..Config::default() }
+    }
+
+    /// The grid with which a stage begins if the one before learned matter at these distances from the origin.
+    fn after(config: Config, stage: usize, matter: Range<f64>) -> VoxelGrid<f64> {
+        let views = views();
+        let mut trainer = Trainer::<f64>::new(config, &views).unwrap();
+        let n = trainer.plan[stage - 1].stage.resolution;
+        let grid = VoxelGrid::uniform(trainer.config.grid_shape(n), 0.0, 0.0);
+        let half = n as f64 / 2.0;
+        let place = |node: [usize; 3]| DVec3::from(node.map(|k| ((k as f64 + 0.5) / half - 1.0) * grid.shape().half_width));
+        let densities = (0..n.pow(3) as u32).map(|row| {
+            let inside = grid.lattice().node(row).is_some_and(|node| matter.contains(&place(node).length()));
+            if inside { 50.0 } else { 0.0 }
+        });
+        trainer.grid = grid.with_density(Tensor::from_vec(densities.collect(), &[n.pow(3), 1]));
+        trainer.step = trainer.plan[stage].first;
+        trainer.step().unwrap();
+        trainer.grid
+    }
+
+    #[test]
+    fn after_a_scout_what_its_matter_hides_is_there_and_the_cube_is_that_of_matter() {
+        let config = config(Some(24), None);
+        let whole = config.half_width;
+        let grid = after(config, 1, 0.6..0.8);
+        let GridShape { resolution, half_width, .. } = *grid.shape();
+        assert!(resolution == 16 && (0.8..0.8 * whole).contains(&half_width), "{half_width}");
+        // Three voxels from matter are more than the margin.
+        assert!(grid.lattice().row([8; 3]).is_some());
+        assert!(grid.lattice().row([0; 3]).is_none());
+    }
+
+    #[test]
+    fn after_a_scout_the_cube_shrinks_to_what_a_finer_stage_begins_with() {
+        let half_width = |scout: Option<usize>, prune_from_stage| {
+            let stage = 1 + scout.iter().len();
+            let grid = after(config(scout, prune_from_stage), stage, 0.0..0.4);
+            assert_eq!(grid.shape().resolution, 32);
+            grid.shape().half_width
+        };
+        let whole = Config::default().half_width;
+        let fitted = half_width(Some(8), Some(1));
+        assert!((0.4..0.8 * whole).contains(&fitted), "{fitted}");
+        assert_eq!(half_width(Some(8), None), whole);
+        assert_eq!(half_width(None, Some(1)), whole);
+    }
+}
