@@ -15,8 +15,7 @@ use std::path::{Path, PathBuf};
 
 /// `train` on the built-in scene, tiny, into `out`.
 fn train(out: &str, more: &[&str]) -> Answer {
-    let tiny = ["train", "--scene-size", "24", "--scene-views", "6,1,3", "--set", SHORT, "--set", "rays_per_step=256", "--out", out];
-    plenoxel(&[&tiny, more].concat())
+    command::train("6,1,3", out, more)
 }
 
 /// The built-in scene as files: 3 training views, 2 test views and no validation file, 16 x 16.

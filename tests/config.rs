@@ -11,7 +11,7 @@ fn plenoxel(args: &[&str]) -> Answer {
     command::plenoxel(&[args, &["--max-memory", "400MB", "--quiet"]].concat())
 }
 
-const PRESETS: [&str; 6] = ["demo", "fast", "quality", "plenoxels", "paper", "carve"];
+const PRESETS: [&str; 6] = ["fast", "quality", "plenoxels", "paper", "demo", "carve"];
 
 /// Assignments that keep all that a preset does and make it small: grids, steps and rays.
 fn shortened(preset: &str) -> Vec<String> {
@@ -112,7 +112,7 @@ fn settings_at_the_edge_of_what_is_accepted_train_or_end_with_a_reason() {
     let out = folder.path("run");
     let train = |settings: &[&str]| {
         let stage = "stages=[{resolution=4, steps=2, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]";
-        let start = ["train", "--scene-size=8", "--scene-views=3,0,1", "--no-images", "--force", "--out", &out];
+        let start = ["train", "--preset=demo", "--scene-size=8", "--scene-views=3,0,1", "--no-images", "--force", "--out", &out];
         let settings = [&[stage, "rays_per_step=64"], settings].concat();
         plenoxel(&start.into_iter().chain(settings.iter().flat_map(|assignment| ["--set", assignment])).collect::<Vec<_>>())
     };
@@ -181,7 +181,7 @@ fn figures_say_what_they_are_of_and_how_they_are_computed() {
     let (run, file) = (folder.path("run"), folder.path("figures.json"));
     let settings: Vec<String> = shortened("demo").into_iter().flat_map(|assignment| ["--set".to_owned(), assignment]).collect();
     let settings: Vec<&str> = settings.iter().map(String::as_str).collect();
-    let start = ["train", "--scene-size=48x24", "--scene-views=6,1,3", "--no-images", "--downscale=2", "--out", &run];
+    let start = ["train", "--preset=demo", "--scene-size=48x24", "--scene-views=6,1,3", "--no-images", "--downscale=2", "--out", &run];
     let trained = plenoxel(&[&start, &settings[..]].concat()).json();
     let evaluated = plenoxel(&["evaluate", &run, "--out", &file, "--split", "test"]).json();
     let written: serde_json::Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();

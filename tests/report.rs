@@ -5,7 +5,7 @@ mod command;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use command::{Folder, SHORT, plenoxel};
+use command::{Folder, plenoxel, train};
 use flate2::read::ZlibDecoder;
 use serde_json::Value;
 use std::fs;
@@ -36,8 +36,7 @@ fn settings_of(page: &str) -> Value {
 fn a_run_ends_with_a_page_that_holds_its_figures_its_pictures_and_its_grid() {
     let folder = Folder::new("report");
     let run = folder.path("a <run>");
-    let tiny = ["train", "--scene-size", "24", "--scene-views", "6,1,3", "--set", SHORT, "--set", "rays_per_step=256", "--out", &run];
-    let trained = plenoxel(&tiny);
+    let trained = train("6,1,3", &run, &[]);
     let result = trained.json();
     assert!(trained.err.contains("report.html") && trained.err.contains("dB"), "{}", trained.err);
     let page = fs::read_to_string(folder.path("a <run>/report.html")).unwrap();
@@ -71,7 +70,7 @@ fn a_run_ends_with_a_page_that_holds_its_figures_its_pictures_and_its_grid() {
     fs::remove_file(folder.path("a <run>/report.html")).unwrap();
     assert!(plenoxel(&["report", &run]).done().contains("report.html"));
     assert_eq!(fs::read_to_string(folder.path("a <run>/report.html")).unwrap(), page);
-    plenoxel(&[&tiny[..], &["--force", "--no-report"]].concat()).done();
+    train("6,1,3", &run, &["--force", "--no-report"]).done();
     assert!(!fs::exists(folder.path("a <run>/report.html")).unwrap());
 }
 
@@ -91,8 +90,7 @@ fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     let folder = Folder::new("compare");
     let [first, second, page] = ["first", "second", "page.html"].map(|name| folder.path(name));
     for (run, seed) in [(&first, "1"), (&second, "2")] {
-        let tiny = ["train", "--scene-size", "24", "--scene-views", "6,1,2", "--set", SHORT, "--set", "rays_per_step=256", "--no-report"];
-        plenoxel(&[&tiny[..], &["--seed", seed, "--out", run]].concat()).done();
+        train("6,1,2", run, &["--no-report", "--seed", seed]).done();
     }
     let said = plenoxel(&["compare", &first, &second, "--out", &page]).done();
     let lines: Vec<&str> = said.lines().collect();

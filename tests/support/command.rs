@@ -48,6 +48,13 @@ pub fn plenoxel(args: &[&str]) -> Answer {
     Answer { code, out: String::from_utf8(out).unwrap(), err: String::from_utf8(err).unwrap() }
 }
 
+/// `train` on the built-in scene, 24 x 24, so many views of each split, as plainly as can be and two short stages, into `out`.
+pub fn train(views: &str, out: &str, more: &[&str]) -> Answer {
+    let tiny =
+        ["train", "--preset=demo", "--scene-size=24", "--set", SHORT, "--set=rays_per_step=256", "--scene-views", views, "--out", out];
+    plenoxel(&[&tiny, more].concat())
+}
+
 /// A folder of a test's own, removed when the test has passed.
 pub struct Folder(pub PathBuf);
 

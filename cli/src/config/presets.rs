@@ -18,14 +18,8 @@ pub struct Preset {
 /// What `train` may start from.
 pub const PRESETS: [Preset; 5] = [
     Preset {
-        name: "demo",
-        purpose: "the built-in scene: what `train` does without a folder",
-        time: "40 s at 200 x 200",
-        text: include_str!("../../presets/demo.toml"),
-    },
-    Preset {
         name: "fast",
-        purpose: "a good grid soon: what `train FOLDER` does",
+        purpose: "a good grid soon: what `train` does by itself",
         time: "1 to 3 min at 800 x 800",
         text: include_str!("../../presets/fast.toml"),
     },
@@ -46,6 +40,12 @@ pub const PRESETS: [Preset; 5] = [
         purpose: "\"Plenoxels and extension to point clouds\", bugs repaired",
         time: "23 s at 100 x 100",
         text: include_str!("../../presets/paper.toml"),
+    },
+    Preset {
+        name: "demo",
+        purpose: "coarse to fine as plainly as can be, for the built-in scene",
+        time: "40 s at 200 x 200",
+        text: include_str!("../../presets/demo.toml"),
     },
 ];
 

@@ -91,14 +91,12 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     stage_psnr: bool,
 
-    /// Settings to start from; `plenoxel presets` says what each is for [default: demo for the built-in scene, fast for a folder; another
-    /// with --time]
+    /// Settings to start from; `plenoxel presets` says what each is for [default: fast; quality with --time from 180 seconds on]
     #[arg(long, help_heading = "Settings", value_parser = PossibleValuesParser::new(PRESETS.map(|preset| preset.name)))]
     preset: Option<String>,
 
     /// Make all stages of the preset longer or shorter, so that training takes this long on this machine, such as 90s, 5m or 1h, and
-    /// the finest coarser if it is short; how long is found out once, and written into the settings in steps [default preset: fast, quality
-    /// from 180 seconds on]
+    /// the finest coarser if it is short; how long is found out once, and written into the settings in steps
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,
 
@@ -196,12 +194,8 @@ impl TrainArgs {
 
     /// The configuration, and the preset it started from.
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
-        let default = match (self.time, &self.data) {
-            // In two minutes `fast` is 0.2 dB better, in four 0.6 worse.
-            (Some(180.0..), _) => "quality",
-            (Some(_), _) | (None, Some(_)) => "fast",
-            (None, None) => "demo",
-        };
+        // In two minutes `fast` is 0.2 dB better, in four 0.6 worse.
+        let default = if self.time.is_some_and(|seconds| seconds >= 180.0) { "quality" } else { "fast" };
         config::layered(self.preset.as_deref(), default, self.config.as_deref(), |layers| self.flags(layers))
     }
 
@@ -282,6 +276,7 @@ fn weight(text: &str) -> std::result::Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
 
     #[test]
     fn colors_sizes_and_counts_are_read_or_refused() {
@@ -296,6 +291,21 @@ mod tests {
         assert!(three_counts("6,1").is_err() && three_counts("0,1,3").is_err() && three_counts("6,x,3").is_err());
         assert_eq!(weight("1e-4"), Ok(1e-4));
         assert!(weight("-1").is_err() && weight("inf").is_err());
+    }
+
+    #[test]
+    fn what_says_nothing_of_a_preset_begins_with_fast_or_with_quality_where_there_is_time() {
+        let preset = |arguments: &[&str]| {
+            let cli = crate::Cli::try_parse_from(["plenoxel", "train"].iter().chain(arguments)).unwrap();
+            let crate::Command::Train(args) = cli.command else { panic!("train") };
+            args.config().unwrap().1.map(str::to_owned)
+        };
+        for arguments in [&[][..], &["data/lego"], &["--time", "179s"], &["data/lego", "--time", "1m"]] {
+            assert_eq!(preset(arguments).as_deref(), Some("fast"), "{arguments:?}");
+        }
+        assert_eq!(preset(&["--time", "3m"]).as_deref(), Some("quality"));
+        assert_eq!(preset(&["data/lego", "--time", "11m"]).as_deref(), Some("quality"));
+        assert_eq!(preset(&["--time", "3m", "--preset", "fast"]).as_deref(), Some("fast"));
     }
 
     #[test]

@@ -78,7 +78,7 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
             "preset",
             "[[scenes]]\n[[methods]]\npreset = \"fats\"",
             2,
-            &["line 2, `procedural` with `fats`", "`fats` for --preset", "demo, fast"],
+            &["line 2, `procedural` with `fats`", "`fats` for --preset", "fast, quality"],
         ),
         ("value", &format!("{good}downscale = \"half\""), 2, &["`half` for --downscale", "a whole number from 1 to 64"]),
         ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: the unknown key", "`half_width`"]),
