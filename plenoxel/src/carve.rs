@@ -32,7 +32,7 @@ pub struct CarveConfig {
     pub resolution: usize,
     /// What makes a voxel go.
     pub rule: Rule,
-    /// By footprint, pixels around a voxel's projection that must be background too. After a scout, pixels of the images as its last stage has them.
+    /// By footprint, pixels around a voxel's projection that must be background too. After a stage of a scout, pixels of the images as that stage had them.
     pub margin: f64,
     /// Optical depth of a voxel along its side, σ · side: how opaque what is left is.
     pub depth: f64,

@@ -1,6 +1,6 @@
 //! The visual hull: what the silhouettes of all views leave of a box of voxels.
 //!
-//! Background is what has alpha 0, and a reduced picture has alpha 0 only where its whole block has ([`crate::dataset::image::downscale`]).
+//! By footprint and by rays, background is what has alpha 0, and a reduced picture has alpha 0 only where its whole block has ([`crate::dataset::image::downscale`]).
 
 use crate::camera::projection::{Pixels, Projection, Rectangle, size};
 use crate::dataset::View;
@@ -32,7 +32,8 @@ pub fn by_footprint_of(views: &[View], of: &Occupancy, margin: f64, progress: &d
     by_silhouettes(views, is_object, of, margin, progress)
 }
 
-/// The same with silhouettes that need no alpha: those of the pixels (x, y) of a view that `is_object` says yes to.
+/// Of some voxels those that [`by_footprint`] leaves, with silhouettes that need no alpha: `is_object` says which pixels (x, y) of a view show
+/// the object, and is asked once for each, in parallel.
 pub fn by_silhouettes(
     views: &[View],
     is_object: impl Fn(&View, usize, usize) -> bool + Sync,

@@ -24,16 +24,16 @@ impl<'a, T: Real> Trainer<'a, T> {
         // The old state goes before the finer grid comes.
         self.optimizer = optimizer(&self.config, &self.plan[index]);
         if let Some(scout) = self.config.scout.as_ref().filter(|_| (1..=self.scouts).contains(&index)) {
-            self.grid = self.scouted(scout, index)?;
+            self.grid = self.after_scout(scout, index)?;
         }
         // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
         release_free_buffers();
-        let finer = stage.resolution != self.grid.shape().resolution;
+        let changes = stage.resolution != self.grid.shape().resolution;
         let mut outline = self.grid.outline();
-        if finer {
-            outline = self.finer(outline, index)?;
+        if changes {
+            outline = self.refined(outline, index)?;
         }
-        if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| finer || index == 0) {
+        if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| changes || index == 0) {
             outline = outline.pruned(&silhouettes.voxels(&outline));
             if outline.lattice().present() == 0 {
                 return Err(Error::config(
@@ -53,7 +53,7 @@ impl<'a, T: Real> Trainer<'a, T> {
             self.aim(Field::<T>::reach(&outline));
             self.check_rows(&outline)?;
         }
-        if finer {
+        if changes {
             self.grid = self.grid.resample_as(&outline);
         } else if outline.lattice().present() < self.grid.lattice().present() {
             self.grid = self.grid.pruned(&outline.voxels_where(|_| true));
@@ -65,16 +65,16 @@ impl<'a, T: Real> Trainer<'a, T> {
     }
 
     /// What a stage of the scout leaves to the next stage.
-    fn scouted(&self, scout: &Scout, index: usize) -> Result<VoxelGrid<T>> {
+    fn after_scout(&self, scout: &Scout, index: usize) -> Result<VoxelGrid<T>> {
         let kept = self.worth_keeping(&self.grid, &self.plan[index - 1].stage, Some(scout))?;
         let initial = initial(&self.config, index < self.scouts);
         let resolution = self.plan[index].stage.resolution;
         Ok(start::scouted(&self.grid, &kept, self.rays.views(), self.config.carve.margin, resolution, &initial))
     }
 
-    /// An outline at the finer resolution of a stage. After a scout, whose cube was as coarse as its voxels, it loses what is not worth keeping
+    /// An outline at the resolution of a stage. After a scout, whose cube was as coarse as its voxels, it loses what is not worth keeping
     /// first, and the cube shrinks to the rest: the coarse voxels tell as much in a fraction of the time.
-    fn finer(&self, outline: VoxelGrid<T>, index: usize) -> Result<VoxelGrid<T>> {
+    fn refined(&self, outline: VoxelGrid<T>, index: usize) -> Result<VoxelGrid<T>> {
         let resolution = self.plan[index].stage.resolution;
         if self.scouts == 0 || !self.prunes(index) {
             return Ok(outline.resample(resolution));
@@ -167,13 +167,13 @@ mod tests {
     }
 
     fn config(scout: Option<usize>, prune_from_stage: Option<usize>) -> Config {
-        let scout = scout.map(|n| Scout { density: 1.0, prune_unseen_below: 0.1, stages: vec![Stage::new(n, 1)] });
+        let scout = scout.map(|n| Scout { density: 1.0, prune_unseen_below: 0.5, stages: vec![Stage::new(n, 1)] });
         let stages = vec![Stage::new(16, 1), Stage::new(32, 1)];
         Config { scout, prune_from_stage, prune_unseen_below: 0.1, hull: Hull::Off, stages, ..Config::default() }
     }
 
-    /// The grid with which a stage begins if the one before learned matter at these distances from the origin.
-    fn after(config: Config, stage: usize, matter: Range<f64>) -> VoxelGrid<f64> {
+    /// The grid with which a stage begins if the one before learned matter of a density at these distances from the origin.
+    fn after(config: Config, stage: usize, matter: Range<f64>, density: f64) -> Result<VoxelGrid<f64>> {
         let views = views();
         let mut trainer = Trainer::<f64>::new(config, &views).unwrap();
         let n = trainer.plan[stage - 1].stage.resolution;
@@ -182,19 +182,18 @@ mod tests {
         let place = |node: [usize; 3]| DVec3::from(node.map(|k| ((k as f64 + 0.5) / half - 1.0) * grid.shape().half_width));
         let densities = (0..n.pow(3) as u32).map(|row| {
             let inside = grid.lattice().node(row).is_some_and(|node| matter.contains(&place(node).length()));
-            if inside { 50.0 } else { 0.0 }
+            if inside { density } else { 0.0 }
         });
         trainer.grid = grid.with_density(Tensor::from_vec(densities.collect(), &[n.pow(3), 1]));
         trainer.step = trainer.plan[stage].first;
-        trainer.step().unwrap();
-        trainer.grid
+        trainer.step().map(|_| trainer.grid)
     }
 
     #[test]
     fn after_a_scout_what_its_matter_hides_is_there_and_the_cube_is_that_of_matter() {
         let config = config(Some(24), None);
         let whole = config.half_width;
-        let grid = after(config, 1, 0.6..0.8);
+        let grid = after(config, 1, 0.6..0.8, 50.0).unwrap();
         let GridShape { resolution, half_width, .. } = *grid.shape();
         assert!(resolution == 16 && (0.8..0.8 * whole).contains(&half_width), "{half_width}");
         // Three voxels from matter are more than the margin.
@@ -206,7 +205,7 @@ mod tests {
     fn after_a_scout_the_cube_shrinks_to_what_a_finer_stage_begins_with() {
         let half_width = |scout: Option<usize>, prune_from_stage| {
             let stage = 1 + scout.iter().len();
-            let grid = after(config(scout, prune_from_stage), stage, 0.0..0.4);
+            let grid = after(config(scout, prune_from_stage), stage, 0.0..0.4, 50.0).unwrap();
             assert_eq!(grid.shape().resolution, 32);
             grid.shape().half_width
         };
@@ -215,5 +214,16 @@ mod tests {
         assert!((0.4..0.8 * whole).contains(&fitted), "{fitted}");
         assert_eq!(half_width(Some(8), None), whole);
         assert_eq!(half_width(None, Some(1)), whole);
+    }
+
+    #[test]
+    fn thin_matter_is_nothing_to_a_scout_and_something_to_pruning_which_say_what_to_lower() {
+        // A sample of it weighs about a fifth of a pixel.
+        let refusal = |result: Result<VoxelGrid<f64>>| result.err().map(|e| e.to_string()).unwrap_or_default();
+        let said = refusal(after(config(Some(24), None), 1, 0.0..0.4, 4.0));
+        assert!(said.contains("scout.prune_unseen_below lower than 0.5") && !said.contains("prune_from_stage"), "{said}");
+        assert!(after(config(None, Some(1)), 1, 0.0..0.4, 4.0).is_ok());
+        let said = refusal(after(config(None, Some(1)), 1, 0.0..0.4, 0.05));
+        assert!(said.contains(" prune_unseen_below lower than 0.1, or prune_from_stage later"), "{said}");
     }
 }

@@ -32,6 +32,7 @@ pub fn plan(config: &Config, stages: impl Iterator<Item = Stage>, rays: u64) -> 
     planned.collect()
 }
 
+/// A fresh optimizer for a stage.
 pub fn optimizer<T: Real>(config: &Config, plan: &PlannedStage) -> Box<dyn Optimizer<T>> {
     let Stage { color_rate: of_color, harmonics_rate, .. } = plan.stage;
     let of_harmonics = harmonics_rate.unwrap_or(of_color);

@@ -41,8 +41,9 @@ impl<'a> Silhouettes<'a> {
     }
 }
 
-/// What a scout leaves to the stage after it: those voxels of its grid that read one of the visual hull of what is worth keeping, in the cube
-/// around the latter, at another resolution and as training starts. `margin` is that of [`visual_hull::by_footprint`], in pixels of these views.
+/// What a scout leaves to the stage after it: a grid at another resolution, as training starts, in the cube around what is worth keeping, with
+/// those voxels that read one of its visual hull. What of the hull lies outside of the cube is lost. `margin` is that of
+/// [`visual_hull::by_footprint`], in pixels of these views.
 pub fn scouted<T: Real>(
     grid: &VoxelGrid<T>,
     kept: &Occupancy,
@@ -64,7 +65,7 @@ pub fn scouted<T: Real>(
 fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -> Occupancy {
     let Some(extent) = matter.extent() else { return matter.clone() };
     let walk = Walk::new(matter.aabb(), matter.cells()).within(extent);
-    let hides = |view: &View, x: usize, y: usize| {
+    let shows_matter = |view: &View, x: usize, y: usize| {
         let mut found = false;
         let ray = view.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
         walk.along(
@@ -78,7 +79,7 @@ fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -
         found
     };
     // A ray may pass by the thinnest.
-    visual_hull::by_silhouettes(views, hides, among, margin, &|_| ()).union(matter)
+    visual_hull::by_silhouettes(views, shows_matter, among, margin, &|_| ()).union(matter)
 }
 
 /// Optical depth of a carved voxel along its side with which training starts. As opaque as carving leaves it, hardly a gradient gets past the
