@@ -103,4 +103,8 @@ fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     // Of two views the photograph, and the picture and the error of each run; loss, both kinds of PSNR and voxels over two axes.
     assert_eq!((page.matches("data:image/jpeg;base64,").count(), page.matches("<svg").count()), (10, 8));
     plenoxel(&["compare", &folder.path("none")]).refused(3, &["there is no such run"]);
+    fs::write(folder.path("second/result.json"), "figures").unwrap();
+    plenoxel(&["compare", &first, &second]).refused(3, &["second", "no figures that can be read", "--resume"]);
+    plenoxel(&["report", &second]).done();
+    assert!(fs::read_to_string(folder.path("second/report.html")).unwrap().contains("no figures that can be read"));
 }

@@ -88,6 +88,7 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
             "PSNR and SSIM are means over {views} test views of {width} x {height} on a background of {:?}, predictions clamped to [0, 1].",
             report.config.background
         ),
+        _ if result.is_null() => "There are no figures that can be read: `plenoxel train --resume` writes them again.".to_owned(),
         _ => "It was not compared with test views.".to_owned(),
     };
     format!(

@@ -55,7 +55,7 @@ fn list(console: &Console<'_>) -> Result<()> {
 }
 
 fn row([name, time, alpha, purpose]: [&str; 4]) -> String {
-    format!("{name:11}{time:27}{alpha:17}{purpose}")
+    format!("{name:11}{time:29}{alpha:17}{purpose}")
 }
 
 /// What a configuration takes from images that have alpha, beside what they show over a background.

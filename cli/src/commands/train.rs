@@ -87,6 +87,9 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         let chosen = if config.init_from.is_some() { "of the grid it starts from" } else { "around the silhouettes" };
         console.note(&format!("box: half width {half_width:.4}, {chosen}"));
     }
+    if let scouts @ 1.. = trainer.plan().len().saturating_sub(config.stages.len()) {
+        console.note(&format!("scout: {scouts} short stages first find out where matter is, as no silhouettes say so"));
+    }
     let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
     let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, args, console };
     let learned = job.learn(trainer, (metrics, Past::default()), preview, &views, &mut clocks)?;

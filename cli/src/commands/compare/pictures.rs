@@ -55,7 +55,10 @@ fn panels(run: &Run) -> Vec<(String, f64)> {
 fn part(run: &Run, panel: &str, parts: &[usize]) -> Result<String> {
     let path = run.folder.image(panel);
     let whole = files::read(&path)?;
-    let (Some(width), Some(height)) = (run.figures.width, run.figures.height) else { return Err(unlike(&path)) };
+    let (Some(width), Some(height)) = (run.figures.width, run.figures.height) else {
+        let found = "this run has no figures that can be read in result.json";
+        return Err(Error::input(run.folder.path(), found, "`plenoxel train --resume` writes them again"));
+    };
     let mut all = String::new();
     for &number in parts {
         let Some(cut) = images::part(&whole, number, (width, height)) else { return Err(unlike(&path)) };

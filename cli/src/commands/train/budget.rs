@@ -142,7 +142,9 @@ fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, s
     if seconds < fixed + LEAST * cost {
         // Ten seconds more or less are what a machine with neighbours may differ by.
         let least = 10.0 * ((fixed + LEAST * cost) / 10.0).ceil();
-        let accepted = format!("{least}s or more, which these stages need here; or coarser ones, as in --set stages[*].resolution=64");
+        let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
+        let coarser = if finest > 64 { "; or coarser ones, as in --set stages[*].resolution=64" } else { "" };
+        let accepted = format!("{least}s or more, which these stages need here{coarser}");
         return Err(Error::config("--time", format!("{seconds}s"), accepted));
     }
     Ok((seconds - fixed) / cost)
