@@ -76,7 +76,7 @@ fn a_grid_that_validation_views_liked_better_than_the_last_is_kept() {
     let run = folder.path("run");
     // What the first stage learned, the second spoils.
     let spoil = ["--set", "stages[0].steps=40", "--set", "stages[1].density_rate=500.0", "--set", "stages[1].color_rate=5.0"];
-    let answer = train(&run, &[&spoil[..], &["--checkpoint-every", "0.001s", "--no-report", "--no-images"]].concat());
+    let answer = train(&run, &[&spoil[..], &["--checkpoint-every", "0.000001s", "--no-report", "--no-images"]].concat());
     assert!(answer.err.contains("an earlier grid shows validation views better"), "{}", answer.err);
     let result = answer.json();
     let best = &result["best_validation"];
@@ -90,7 +90,7 @@ fn a_grid_that_validation_views_liked_better_than_the_last_is_kept() {
     assert_eq!(names(&folder.path("run/exports-best")).len(), 1);
     // A run whose last grid is its best keeps no other.
     let good = folder.path("good");
-    train(&good, &["--checkpoint-every", "0.001s", "--no-report", "--no-images"]).done();
+    train(&good, &["--checkpoint-every", "0.000001s", "--no-report", "--no-images"]).done();
     assert!(!fs::exists(folder.path("good/best.safetensors")).unwrap());
     plenoxel(&["evaluate", &good, "--best"]).refused(3, &["best.safetensors", "leave --best away"]);
 }
