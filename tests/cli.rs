@@ -416,6 +416,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
     refused(&["--threads", "0"], &["--threads", "1 to 1024"]);
     refused(&["--threads", "5000"], &["--threads"]);
     refused(&["--sh-degree", "4"], &["--sh-degree", "from 0 to 3"]);
+    refused(&["--color", "rgb", "--sh-degree", "1"], &["--sh-degree", "--color rgb", "one of the two"]);
     refused(&["--background", "gray"], &["--background", "white, black"]);
     refused(&["--preset", "best"], &["--preset", "demo", "paper"]);
     refused(&["--engine", "magic"], &["--engine", "graph"]);

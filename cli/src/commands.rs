@@ -81,6 +81,15 @@ fn background(text: &str) -> Result<[f64; 3], String> {
     color.ok_or_else(|| "white, black, or three numbers in [0, 1] such as 0.2,0.5,1".to_owned())
 }
 
+/// A color as [`background`] reads it.
+fn background_name(color: [f32; 3]) -> String {
+    match color {
+        [1.0, 1.0, 1.0] => "white".to_owned(),
+        [0.0, 0.0, 0.0] => "black".to_owned(),
+        [r, g, b] => format!("{r},{g},{b}"),
+    }
+}
+
 /// A number of at least `least`, as the command line takes it.
 fn number(least: f64) -> impl Fn(&str) -> Result<f64, String> + Clone {
     move |text| match text.parse::<f64>() {

@@ -1,5 +1,6 @@
 //! What a new run begins with, whether it trains or carves.
 
+use super::background_name;
 use crate::data::DataSource;
 use crate::machine;
 use crate::progress::Console;
@@ -24,10 +25,10 @@ pub fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
     let (width, height) = dataset.size();
     let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
     console.note(&format!(
-        "scene: {}, {}, {train} train, {val} val, {test} test views of {width} x {height}, background {:?}, half width {}",
+        "scene: {}, {}, {train} train, {val} val, {test} test views of {width} x {height}, background {}, half width {}",
         dataset.name(),
         dataset.format(),
-        config.background,
+        background_name(config.background),
         config.half_width,
     ));
     let threads = machine::threads();

@@ -1,7 +1,8 @@
 //! The table in long form as CSV: a line for each run, with all of its figures.
 
-use super::figures::{Figures, background_name};
+use super::figures::Figures;
 use super::{Cell, RunTable};
+use crate::commands::background_name;
 use std::fmt::Display;
 
 const HEADS: &str = "scene,method,state,psnr,ssim,ssim_same,seconds,rays,steps,peak_memory_bytes,voxels,resolution,background,views,\

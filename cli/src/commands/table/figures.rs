@@ -1,5 +1,6 @@
 //! What a run came to, as its folder says.
 
+use crate::commands::background_name;
 use crate::run_folder::RunFolder;
 use plenoxel::error::Result;
 use plenoxel::train::config::Config;
@@ -99,14 +100,5 @@ impl Scores {
             (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
         };
         Scores { psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim), seconds: mean(|s| s.seconds) }
-    }
-}
-
-/// A background in words.
-pub fn background_name(color: [f32; 3]) -> String {
-    match color {
-        [1.0, 1.0, 1.0] => "white".to_owned(),
-        [0.0, 0.0, 0.0] => "black".to_owned(),
-        [r, g, b] => format!("{r},{g},{b}"),
     }
 }

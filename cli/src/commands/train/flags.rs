@@ -6,7 +6,7 @@ use crate::data::DataSource;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
-use plenoxel::error::Result;
+use plenoxel::error::{Error, Result};
 use plenoxel::train::config::Config;
 use std::path::PathBuf;
 use toml::Value;
@@ -202,9 +202,16 @@ impl TrainArgs {
     fn flags(&self, layers: &mut Layers) -> Result<()> {
         let integer = |value: Option<i64>| value.map(Value::Integer);
         let text = |value: &Option<String>| value.clone().map(Value::String);
-        let color = match (&self.color, self.sh_degree) {
+        let color = match (self.color.as_deref(), self.sh_degree) {
             (None, Some(_)) => Some(Value::String("sh".to_owned())),
-            (color, _) => text(color),
+            (Some("rgb"), Some(degree)) => {
+                return Err(Error::config(
+                    "--sh-degree",
+                    format!("{degree} beside --color rgb, which has no harmonics,"),
+                    "one of the two",
+                ));
+            }
+            _ => text(&self.color),
         };
         // Absolute, so that the settings repeat the run from anywhere.
         let init_from = self.init_from.as_deref().map(|path| path.canonicalize().unwrap_or_else(|_| path.to_owned()));
