@@ -1,8 +1,8 @@
 //! Training that ends on time: the length of the stages, planned once before the first step.
 //!
-//! A few steps that are thrown away say how fast this machine is. What stages cost against each other is taken from runs on lego of
-//! NeRF-synthetic at 800 x 800 (`benches/RESULTS.md`): it differs between scenes by a quarter or so, and so does the time that a run takes.
-//! The plan is in steps and part of the run's settings, so that they repeat the run bit by bit wherever it is run again.
+//! Steps that are thrown away, up to twenty seconds of them, say how fast this machine is. What stages cost against each other is taken from
+//! runs on lego of NeRF-synthetic at 800 x 800 (`benches/RESULTS.md`): it differs between scenes by a quarter or so, and so does the time that a
+//! run takes. The plan is in steps and part of the run's settings, so that they repeat the run bit by bit wherever it is run again.
 
 use plenoxel::dataset::View;
 use plenoxel::error::{Error, Result};
