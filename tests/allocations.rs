@@ -3,8 +3,8 @@
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::field::voxel_grid::Interpolation;
-use plenoxel::train::Trainer;
-use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Stage};
+use plenoxel::model::plenoxels::Trainer;
+use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Stage};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
@@ -42,7 +42,7 @@ fn a_step_in_the_steady_state_takes_hardly_any_memory_from_the_system() {
     for (interpolation, color) in [(Interpolation::Nearest, ColorKind::Rgb), (Interpolation::Trilinear, ColorKind::Sh)] {
         let stages = vec![stage];
         let config = Config { interpolation, color, rays_per_step: 4096, stages, optimizer: OptimizerConfig::Sgd, ..Config::default() };
-        let mut trainer = Trainer::<f32>::new(config, &views).expect("a valid config");
+        let mut trainer = Trainer::<f32>::new(config, &views[..]).expect("a valid config");
         let mut steps = || (0..STEPS).for_each(|_| drop(trainer.step().expect("finite numbers")));
         steps();
         let before = [&ALL, &LARGE_ONES].map(|n| n.load(Relaxed));

@@ -10,7 +10,7 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::field::sh;
 use plenoxel::geometry::Aabb;
 use plenoxel::sampling::Occupancy;
-use plenoxel::train::config::{ColorKind, Config, Hull};
+use plenoxel::model::plenoxels::config::{ColorKind, Config, Hull};
 use rayon::prelude::*;
 use std::ops::ControlFlow;
 
@@ -358,7 +358,7 @@ fn silhouettes_give_training_its_box_and_its_voxels() {
     config.stages.truncate(1);
     config.stages[0].steps = Some(1);
     let trained = |config: &Config| {
-        let mut trainer = plenoxel::train::Trainer::<f32>::new(config.clone(), &views).unwrap();
+        let mut trainer = plenoxel::model::plenoxels::Trainer::<f32>::new(config.clone(), &views[..]).unwrap();
         trainer.step().unwrap();
         trainer.into_grid()
     };
@@ -377,8 +377,8 @@ fn training_that_starts_from_a_carved_grid_sees_what_was_carved() {
     let carved = Carving::new(&views, &config(16, None), &|_| {}).unwrap().color(&|_| {}).grid;
     let mut config = Config { half_width: 0.8, rays_per_step: 512, jitter: false, ..Config::default() };
     let psnr = |config: &Config, carved: Option<_>| {
-        let trainer = plenoxel::train::Trainer::<f32>::new(config.clone(), &views).unwrap();
-        let mut trainer = carved.into_iter().fold(trainer, plenoxel::train::Trainer::starting_from);
+        let trainer = plenoxel::model::plenoxels::Trainer::<f32>::new(config.clone(), &views[..]).unwrap();
+        let mut trainer = carved.into_iter().fold(trainer, plenoxel::model::plenoxels::Trainer::starting_from);
         let plan: Vec<usize> = trainer.plan().iter().map(|p| p.stage.resolution).collect();
         (trainer.step().unwrap().unwrap().psnr, plan)
     };
@@ -389,7 +389,7 @@ fn training_that_starts_from_a_carved_grid_sees_what_was_carved() {
     assert!(warm > cold + 2.0, "{warm} against {cold}");
     // Coarser stages are left out, but never all of them.
     config.stages.truncate(1);
-    config.stages.insert(0, plenoxel::train::config::Stage { resolution: 4, ..config.stages[0] });
+    config.stages.insert(0, plenoxel::model::plenoxels::config::Stage { resolution: 4, ..config.stages[0] });
     assert_eq!(psnr(&config, Some(&carved)).1, [16]);
     config.stages.truncate(1);
     assert_eq!(psnr(&config, Some(&carved)).1, [4]);

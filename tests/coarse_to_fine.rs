@@ -6,7 +6,7 @@ use approx::assert_relative_eq;
 use autograd::{Tensor, no_grad};
 use glam::DVec3;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
-use plenoxel::render::fused::largest_weights;
+use plenoxel::field::voxel_grid::fused::largest_weights;
 use plenoxel::render::{Engine, RenderOptions, render};
 use plenoxel::sampling::{Jitter, Spacing};
 use support::{numbers, rays};

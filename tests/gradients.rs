@@ -6,10 +6,11 @@
 mod support;
 
 use autograd::{Gradcheck, Lattice, Tensor, check_kernel, grad};
-use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation};
+use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::field::{Field, sh};
 use plenoxel::geometry::Aabb;
-use plenoxel::loss::{self, Step};
+use plenoxel::loss::{self, Objective, Step};
+use plenoxel::model::plenoxels;
 use plenoxel::render::{Engine, RenderOptions, Rendered, render};
 use plenoxel::sampling::{Jitter, Spacing};
 use support::{batch, grid_of, numbers, rays, shape};
@@ -87,13 +88,13 @@ fn every_loss_agrees_with_finite_differences() {
             GridShape { sh_reduction: 2, ..shape(Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 }) },
         ),
     ] {
-        for name in loss::NAMES {
+        for name in plenoxels::LOSSES {
             // A closure over what a step needs, with sampled cells at a fixed place.
-            let objective = loss::Objective::<f64>::new().with_named(name, 1.0).expect("a loss of that name");
+            let objective = plenoxels::with_loss(Objective::<f64, VoxelGrid<f64>>::new(), name, 1.0, 2).expect("a loss of that name");
             let f = |x: &[Tensor<f64>]| {
                 let (grid, batch) = (grid_of(shape, x), batch());
                 let rendered = render(&grid, &batch.rays, &options());
-                objective.evaluate(&Step { number: 3, seed: 4, batch: &batch, rendered: &rendered, grid: &grid }).0
+                objective.evaluate(Step::new((3, 4), &batch, &rendered, &grid, (2.0, [1.0, 0.9, 0.8]))).total
             };
             let report =
                 Gradcheck::new(f, tables(&shape)).named(format!("{name}, {render_name}")).order(2).run().unwrap_or_else(|e| panic!("{e}"));

@@ -241,7 +241,7 @@ fn clouds_with_any_header_are_read_or_refused() {
 #[test]
 fn assignments_of_any_value_to_any_key_are_taken_or_refused() {
     let _alone = alone();
-    let complete = toml::to_string(&plenoxel::train::config::Config::default()).expect("TOML");
+    let complete = toml::to_string(&plenoxel::model::plenoxels::config::Config::default()).expect("TOML");
     let mut keys: Vec<String> = complete.lines().filter_map(|line| Some(line.split_once(" = ")?.0.to_owned())).collect();
     let below = [
         "stages[0].",

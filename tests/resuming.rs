@@ -4,8 +4,8 @@ use autograd::Real;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::train::Trainer;
-use plenoxel::train::config::{ColorKind, Config, Hull, OptimizerConfig, Sampling, Scout, Stage, Weight};
+use plenoxel::model::plenoxels::Trainer;
+use plenoxel::model::plenoxels::config::{ColorKind, Config, Hull, OptimizerConfig, Sampling, Scout, Stage, Weight};
 use std::path::PathBuf;
 
 fn views(seed_of_size: usize) -> Vec<View> {
@@ -49,7 +49,7 @@ fn configs() -> Vec<(&'static str, Config)> {
     ]
 }
 
-fn finish<T: Real>(mut trainer: Trainer<'_, T>) -> VoxelGrid<T> {
+fn finish<T: Real>(mut trainer: Trainer<T>) -> VoxelGrid<T> {
     while trainer.step().expect("finite numbers").is_some() {}
     trainer.into_grid()
 }
@@ -99,8 +99,8 @@ fn in_double_precision_too_and_from_a_grid_that_was_there() {
     check::<f64>(name, &config, &views);
     // A run that began with a grid leaves stages out; the grid is not needed to go on.
     let (_, config) = configs().swap_remove(3);
-    let grid = finish(Trainer::<f32>::new(Config { stages: vec![stage(10, 20)], ..config.clone() }, &views).expect("a valid config"));
-    let new = || Trainer::<f32>::new(config.clone(), &views).expect("a valid config");
+    let grid = finish(Trainer::<f32>::new(Config { stages: vec![stage(10, 20)], ..config.clone() }, &views[..]).expect("a valid config"));
+    let new = || Trainer::<f32>::new(config.clone(), &views[..]).expect("a valid config");
     let mut first = new().starting_from(&grid);
     assert_eq!(first.total_steps(), 100);
     let straight = finish(new().starting_from(&grid));
@@ -120,7 +120,7 @@ fn a_state_that_does_not_fit_or_is_damaged_is_refused_with_the_reason() {
     let views_of_it = views(16);
     let (_, config) = configs().swap_remove(2);
     let config = Config { stages: vec![stage(5, 30)], ..config };
-    let mut trainer = Trainer::<f32>::new(config.clone(), &views_of_it).expect("a valid config");
+    let mut trainer = Trainer::<f32>::new(config.clone(), &views_of_it[..]).expect("a valid config");
     for _ in 0..50 {
         trainer.step().expect("finite numbers");
     }
@@ -134,7 +134,7 @@ fn a_state_that_does_not_fit_or_is_damaged_is_refused_with_the_reason() {
     assert!(text.contains("other settings") && text.contains("damaged.safetensors"), "{text}");
     let text = refusal(config.clone(), &views(20));
     assert!(text.contains("other training views"), "{text}");
-    let double = Trainer::<f64>::new(config.clone(), &views_of_it).expect("a valid config").resumed(&path);
+    let double = Trainer::<f64>::new(config.clone(), &views_of_it[..]).expect("a valid config").resumed(&path);
     assert!(double.err().expect("it is refused").to_string().contains("F64"));
 
     let bytes = std::fs::read(&path).expect("it is there");
@@ -149,7 +149,7 @@ fn a_state_that_does_not_fit_or_is_damaged_is_refused_with_the_reason() {
         let mut changed = bytes.clone();
         changed[at] ^= 0x15;
         std::fs::write(&path, &changed).expect("it is written");
-        if let Ok(mut trainer) = Trainer::<f32>::new(config.clone(), &views_of_it).expect("a valid config").resumed(&path) {
+        if let Ok(mut trainer) = Trainer::<f32>::new(config.clone(), &views_of_it[..]).expect("a valid config").resumed(&path) {
             let _ = trainer.step();
         }
     }

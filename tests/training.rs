@@ -5,13 +5,13 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Error;
 use plenoxel::field::Field;
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::loss::Objective;
 use plenoxel::metrics::psnr;
 use plenoxel::render::picture::picture;
 use plenoxel::render::{Engine, RenderOptions};
 use plenoxel::sampling::{Jitter, Occupancy};
-use plenoxel::train::config::{ColorKind, Config, OptimizerConfig, Sampling, Scout, Stage, Weight};
-use plenoxel::train::{Report, Trainer};
+use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Sampling, Scout, Stage, Weight};
+use plenoxel::model::plenoxels::{Objective, Trainer};
+use plenoxel::train::Report;
 use std::collections::BTreeMap;
 
 fn scene() -> Dataset {
@@ -104,7 +104,7 @@ fn a_scout_finds_where_matter_is() {
     let scout = Scout { density: 0.5, prune_unseen_below: 0.1, stages: vec![Stage { density_rate: 2.0, ..stage(24, 200) }] };
     let stages = vec![stage(32, 1), stage(32, 60)];
     let config = Config { scout: Some(scout), prune_unseen_below: 0.03, stages, rays_per_step: 2048, ..config() };
-    let mut trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
+    let mut trainer = Trainer::<f32>::new(config.clone(), &train[..]).expect("a valid config");
     assert_eq!(trainer.plan().iter().map(|p| (p.first, p.stage.resolution)).collect::<Vec<_>>(), [(0, 24), (200, 32), (201, 32)]);
     assert_eq!(trainer.prunes_from(), None);
     while trainer.step().expect("finite numbers").is_some_and(|report| report.step < 200) {}
@@ -116,7 +116,7 @@ fn a_scout_finds_where_matter_is() {
     assert!(psnr > 16.5, "test PSNR {psnr}");
     // A run that starts from another needs none, and pruning counts the stages of the config.
     let pruning = Config { prune_from_stage: Some(1), ..config };
-    let trainer = Trainer::new(pruning, &train).expect("a valid config");
+    let trainer = Trainer::new(pruning, &train[..]).expect("a valid config");
     assert_eq!(trainer.prunes_from(), Some(2));
     let grid = VoxelGrid::<f32>::uniform(trainer.config().grid_shape(32), 0.1, 0.0);
     let trainer = trainer.starting_from(&grid);
@@ -150,7 +150,7 @@ fn small_images_have_large_voxels() {
     let stages = vec![Stage { image_reduction: 4, ..stage(8, 6) }, Stage { image_reduction: 4, ..stage(128, 4) }];
     let fitted = |pixels_per_voxel: f64, stages: &[Stage]| {
         let config = Config { pixels_per_voxel, stages: stages.to_vec(), ..config() };
-        let trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
+        let trainer = Trainer::<f32>::new(config.clone(), &train[..]).expect("a valid config");
         let again = trainer.config().fitted_to(train.iter().map(|view| &view.camera));
         // What fits is left alone.
         assert_eq!(again, *trainer.config());
@@ -179,7 +179,7 @@ fn voxels_that_no_training_ray_sees_much_of_go_without_harm() {
     // The scene fills what the density leaves, and most of that is surface.
     assert!(after < before - 100, "{after} of {before} voxels are seen");
     assert!(test_psnr(&seen) > test_psnr(&full) - 0.1, "{} dB after {}", test_psnr(&seen), test_psnr(&full));
-    let none = Trainer::<f32>::new(Config { prune_unseen_below: 1.0, ..config.clone() }, &train).and_then(|mut trainer| {
+    let none = Trainer::<f32>::new(Config { prune_unseen_below: 1.0, ..config.clone() }, &train[..]).and_then(|mut trainer| {
         while trainer.step()?.is_some() {}
         Ok(())
     });
@@ -190,7 +190,7 @@ fn voxels_that_no_training_ray_sees_much_of_go_without_harm() {
 fn a_pruned_run_is_trained_on_all_that_evaluation_sees() {
     let train = views(Split::Train);
     let config = Config { prune_from_stage: Some(1), prune_below: 0.2, ..config() };
-    let mut trainer = Trainer::<f32>::new(config.clone(), &train).expect("a valid config");
+    let mut trainer = Trainer::<f32>::new(config.clone(), &train[..]).expect("a valid config");
     while trainer.step().expect("finite numbers").is_some() {}
     let grid = trainer.grid();
     let looked_at = grid.reach().expect("space was pruned");
@@ -223,7 +223,7 @@ fn a_closure_of_the_user_is_a_loss_like_any_other() {
             (r.exp() + (-&r).exp()).ln().mean() - 2f64.ln()
         })
         .with("clear", 1e-3, |step| step.rendered.opacity.mean());
-    let mut trainer = Trainer::<f32>::with_objective(short, &train, objective).expect("a valid config");
+    let mut trainer = Trainer::<f32>::with_objective(short, &train[..], objective).expect("a valid config");
     let mut reports = Vec::new();
     while let Some(report) = trainer.step().expect("finite numbers") {
         reports.push(report);
@@ -239,14 +239,14 @@ fn weights_and_rates_follow_their_schedules() {
     let mut config = Config { stages: vec![first], ..config() };
     config.losses.insert("beta".to_owned(), Weight::Until { weight: 1e-6, until: 3 });
     let (density_rate, color_rate) = (first.density_rate, first.color_rate);
-    let mut trainer = Trainer::<f32>::new(config, &train).expect("a valid config");
+    let mut trainer = Trainer::<f32>::new(config, &train[..]).expect("a valid config");
     for step in 0..8 {
         let report = trainer.step().expect("finite numbers").expect("a step");
         assert_eq!(report.losses.iter().any(|(name, _)| name == "beta"), step < 3, "step {step}");
         let t = f64::from(step) / 8.0;
         let delay = 0.01 + 0.99 * (std::f64::consts::FRAC_PI_2 * (2.0 * t).min(1.0)).sin();
-        assert!((report.density_rate / (delay * density_rate * 0.5f64.powf(t)) - 1.0).abs() < 1e-9, "step {step}");
-        assert!((report.color_rate / (color_rate * 0.25f64.powf(t)) - 1.0).abs() < 1e-9, "step {step}");
+        assert!((report.rate("density").unwrap() / (delay * density_rate * 0.5f64.powf(t)) - 1.0).abs() < 1e-9, "step {step}");
+        assert!((report.rate("color").unwrap() / (color_rate * 0.25f64.powf(t)) - 1.0).abs() < 1e-9, "step {step}");
     }
 }
 
@@ -257,7 +257,7 @@ fn a_loss_that_is_not_finite_stops_the_run_with_its_step() {
         let value = step.rendered.rgb.mean();
         if step.number == 3 { value / 0.0 } else { value }
     });
-    let mut trainer = Trainer::<f32>::with_objective(config(), &train, objective).expect("a valid config");
+    let mut trainer = Trainer::<f32>::with_objective(config(), &train[..], objective).expect("a valid config");
     let error = (0..10).find_map(|_| trainer.step().err()).expect("it stops");
     assert!(matches!(error, Error::Numeric { .. }) && error.exit_code() == 4);
     assert!(error.to_string().contains("step 3") && error.to_string().contains("inf"), "{error}");
@@ -284,7 +284,7 @@ fn a_config_with_an_impossible_value_names_its_key() {
     for (key, break_it) in broken {
         let mut config = config();
         break_it(&mut config);
-        let error = Trainer::<f32>::new(config, &train).err().expect("it is refused");
+        let error = Trainer::<f32>::new(config, &train[..]).err().expect("it is refused");
         assert!(error.to_string().starts_with(key) && error.exit_code() == 2, "{error}");
     }
 }
@@ -298,7 +298,7 @@ fn training_in_f64_follows_the_same_path_as_in_f32() {
     short.stages[0].density_rate = 20.0;
     short.stages[0].color_rate = 20.0;
     let single = run(short.clone(), &train).1;
-    let mut trainer = Trainer::<f64>::new(short, &train).expect("a valid config");
+    let mut trainer = Trainer::<f64>::new(short, &train[..]).expect("a valid config");
     for a in single {
         let b = trainer.step().expect("finite numbers").expect("as many steps");
         assert!((a.loss - b.loss).abs() < 1e-5, "step {}: {} and {}", a.step, a.loss, b.loss);

@@ -32,6 +32,9 @@ pub trait Optimizer<T: Real>: Send {
     /// One step. `step` counts from 0 and is what schedules go by.
     fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64);
 
+    /// Learning rate of the parameter of this name at a step.
+    fn rate(&self, parameter: &str, step: u64) -> f64;
+
     /// What it remembers of a parameter, to be kept with its values; `None` if nothing.
     fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>>;
 

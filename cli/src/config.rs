@@ -13,7 +13,7 @@ pub use keys::unknown;
 
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 pub use presets::{CARVE, PRESETS, find};
 use std::collections::BTreeMap;
 use std::io::Read;

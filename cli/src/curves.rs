@@ -73,7 +73,7 @@ fn smooth(columns: &mut [Column]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use plenoxel::train::config::Stage;
+    use plenoxel::model::plenoxels::config::Stage;
 
     fn stages() -> Vec<PlannedStage> {
         let planned = |(i, resolution)| PlannedStage { stage: Stage::new(resolution, 50), first: 50 * i as u64, steps: 50 };

@@ -3,7 +3,7 @@
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{self, Dataset, OpenOptions, image};
 use plenoxel::error::{Error, Result};
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::{Path, PathBuf};

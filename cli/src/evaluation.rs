@@ -10,7 +10,7 @@ use plenoxel::metrics;
 use plenoxel::render::picture::{Picture, picture};
 use plenoxel::render::{Engine, RenderOptions};
 use plenoxel::sampling::{Jitter, Occupancy};
-use plenoxel::train::config::{Config, Sampling};
+use plenoxel::model::plenoxels::config::{Config, Sampling};
 use serde::Serialize;
 
 /// Pictures end a ray where less light than this comes from behind: no number of 8 bits changes by more than a fortieth of a step.

@@ -3,7 +3,7 @@
 use crate::evaluation::Scores;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::train::config::{Config, Sampling};
+use plenoxel::model::plenoxels::config::{Config, Sampling};
 use serde::Serialize;
 
 /// Means over views, what they were computed of, and how.

@@ -10,8 +10,8 @@ use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::{Color, GridShape};
 use plenoxel::render::Engine;
-use plenoxel::render::fused::CHUNK;
-use plenoxel::train::config::{Config, OptimizerConfig, Sampling};
+use plenoxel::field::voxel_grid::fused::CHUNK;
+use plenoxel::model::plenoxels::config::{Config, OptimizerConfig, Sampling};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Bytes by what they are for.

@@ -7,7 +7,7 @@ use crate::metrics_file::Past;
 pub use crate::run_folder::RunRecord;
 use clap::Parser;
 use plenoxel::error::Result;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::path::Path;
 
 /// A file that changes a preset.

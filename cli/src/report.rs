@@ -13,7 +13,7 @@ use crate::run_folder::{RunFolder, RunRecord};
 use plenoxel::dataset::Dataset;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use serde_json::Value;
 use std::fmt::Write;
 

@@ -7,7 +7,7 @@ use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 

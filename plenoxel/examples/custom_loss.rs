@@ -6,8 +6,8 @@ use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::loss::Objective;
-use plenoxel::train::Trainer;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::Trainer;
+use plenoxel::model::plenoxels::config::Config;
 
 fn main() -> Result<()> {
     run()

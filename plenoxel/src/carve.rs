@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
-use crate::train::config::Config;
+use crate::model::plenoxels::config::Config;
 use autograd::{Buffer, Lattice, Tensor};
 use color::{Fitted, Seen};
 use light::Opaque;

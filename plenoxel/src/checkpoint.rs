@@ -17,6 +17,8 @@ use serde::{Deserialize, Serialize};
 use std::io::{Read, Seek};
 use std::path::Path;
 
+/// Kind of model that these files hold.
+pub const KIND: &str = "plenoxels";
 /// Version of the format of grids with all their voxels.
 pub const FORMAT: &str = "plenoxel 1";
 /// Version of the format of sparse grids.
@@ -36,6 +38,9 @@ const REDUCED_CONVENTION: &str = "; `color` has the means of R, G, B alone; `har
 /// Everything about a checkpoint but its tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
+    /// [`KIND`]; files of earlier versions do not have it.
+    #[serde(default = "kind")]
+    pub kind: String,
     /// [`FORMAT`], [`SPARSE_FORMAT`] or [`REDUCED_FORMAT`].
     pub format: String,
     /// [`CONVENTION`] and what else is to be known, for a human reader.
@@ -67,6 +72,10 @@ pub struct Header {
     pub writer: String,
 }
 
+fn kind() -> String {
+    KIND.to_owned()
+}
+
 fn unreduced() -> usize {
     1
 }
@@ -92,6 +101,7 @@ impl Header {
             (false, false) => SPARSE_FORMAT,
         };
         Header {
+            kind: kind(),
             format: format.to_owned(),
             convention: CONVENTION.to_owned() + if shape.is_reduced() { REDUCED_CONVENTION } else { "" },
             resolution: shape.resolution,
@@ -185,9 +195,13 @@ pub fn header(path: &Path) -> Result<(Header, usize)> {
 }
 
 /// The header among the metadata of a file.
-fn header_of<R: Read + Seek>(path: &Path, file: &TensorFile<R>) -> Result<Header> {
+fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
     // The version first: a later one may have other fields.
-    let value = file.header()?;
+    let value = file.facts()?;
+    if let Some(kind) = value["kind"].as_str().filter(|kind| *kind != KIND) {
+        let found = format!("a model of kind `{kind}`, which has no voxels");
+        return Err(Error::input(path, found, format!("a model of kind `{KIND}` is expected; the program that trained this one can evaluate it")));
+    }
     let format = value["format"].as_str().unwrap_or("none");
     if ![FORMAT, SPARSE_FORMAT, REDUCED_FORMAT].contains(&format) {
         return Err(Error::input(
@@ -219,12 +233,12 @@ pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
 }
 
 /// The same from any source, a file or bytes; `path` names it in messages.
-pub fn read<T: Real, R: Read + Seek>(path: &Path, source: R) -> Result<(VoxelGrid<T>, Header)> {
+pub fn read<T: Real>(path: &Path, source: impl Read + Seek) -> Result<(VoxelGrid<T>, Header)> {
     let mut file = TensorFile::new(path, source)?;
     let header = header_of(path, &file)?;
     let shape = header.shape();
     let n = header.resolution;
-    fn table<T: Real, R: Read + Seek>(file: &mut TensorFile<R>, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
+    fn table<T: Real>(file: &mut TensorFile<'_>, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
         let values = file.numbers(name, Dtype::F32, expected)?;
         let rows = values.len() / width;
         Ok(Tensor::from_vec(values, &[rows, width]))
@@ -237,7 +251,7 @@ pub fn read<T: Real, R: Read + Seek>(path: &Path, source: R) -> Result<(VoxelGri
             &table(&mut file, "color", channels, &[n, n, n, channels])?,
         )
     } else {
-        let list = |file: &mut TensorFile<R>, name: &str, n: usize| -> Result<Vec<u32>> {
+        let list = |file: &mut TensorFile<'_>, name: &str, n: usize| -> Result<Vec<u32>> {
             let k = file.info(name).map_or(0, |info| info.shape.iter().product());
             let bytes = file.read(name, Dtype::U32, &[k])?;
             let voxels: Vec<u32> = bytes.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)).collect();

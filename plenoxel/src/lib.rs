@@ -12,7 +12,9 @@
 //! | [`field`] | what fills space: density and radiance |
 //! | [`render`] | from samples to pixels; [`render::composite`](mod@render::composite) is the specification |
 //! | [`loss`] | losses and their weighted sum |
-//! | [`train`] | batch → render → loss → gradients → optimizer, coarse to fine |
+//! | [`train`] | batch → render → loss → gradients → optimizer, for any [`Model`](train::Model) |
+//! | [`model`] | fields with their recipes: [`model::plenoxels`] |
+//! | [`evaluate`] | a model against photographs |
 //! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |
 //! | [`checkpoint`] | a trained grid on disk |
 //! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
@@ -28,6 +30,7 @@ pub mod carve;
 pub mod checkpoint;
 pub mod dataset;
 pub mod error;
+pub mod evaluate;
 pub mod export;
 pub mod field;
 pub mod files;
@@ -38,12 +41,13 @@ pub mod instances;
 mod json;
 pub mod loss;
 pub mod metrics;
+pub mod model;
 pub mod point_cloud;
 pub mod random;
 pub mod rays;
 pub mod render;
 pub mod sampling;
-mod tensor_file;
+pub mod tensor_file;
 pub mod train;
 
 /// The code of the repository's front page is compiled and run with the tests.

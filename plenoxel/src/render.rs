@@ -1,15 +1,15 @@
 //! From rays to pixels.
 
 pub mod composite;
-pub mod fused;
+mod field;
 pub mod picture;
 
 use crate::camera::Ray;
-use crate::field::Field;
 use crate::geometry::Aabb;
 use crate::sampling::{Jitter, Occupancy, Spacing, sample};
 use autograd::{Real, Tensor};
-pub use composite::{Rendered, composite};
+pub use composite::{Columns, PerSample, Rendered, composite};
+pub use field::{Field, Radiance};
 use serde::{Deserialize, Serialize};
 
 /// What computes a batch of pixels.

@@ -1,14 +1,16 @@
-//! Named tables in a `safetensors` file, which are made, written and read one at a time: a file may be as large as the memory.
+//! Named tensors in a `safetensors` file. They are made, written and read one at a time, so that a file may be as large as the memory.
 //!
-//! The metadata have one entry, `plenoxel`: a JSON object. (One entry, for several would be written in a random order, and equal grids are to
-//! be equal files.)
+//! The metadata have one entry, `plenoxel`: a JSON object. (It is one entry because several would be written in a random order, and equal models
+//! are to be equal files.)
 
 use crate::error::{Error, Result};
 use crate::files;
-use autograd::Real;
+use autograd::{Real, Tensor};
 pub(crate) use safetensors::tensor::{Dtype, TensorInfo};
 use safetensors::tensor::{Metadata, View};
 use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Value};
 use std::borrow::Cow;
 use std::collections::HashMap;
 use std::fs::File;
@@ -22,7 +24,7 @@ const LONGEST: u64 = 100_000_000;
 /// What helps against a damaged file.
 pub(crate) const RETRAIN: &str = "train again, or use an undamaged copy";
 
-/// A table to write.
+/// A tensor to write.
 pub(crate) struct Entry<'a> {
     pub name: String,
     dtype: Dtype,
@@ -31,7 +33,7 @@ pub(crate) struct Entry<'a> {
 }
 
 impl<'a> Entry<'a> {
-    /// What `bytes` makes, little-endian, when it is written.
+    /// A tensor whose bytes, little-endian, `bytes` makes when it is written.
     pub fn new(name: impl Into<String>, dtype: Dtype, shape: Vec<usize>, bytes: impl Fn() -> Vec<u8> + 'a) -> Self {
         Entry { name: name.into(), dtype, shape, bytes: Box::new(bytes) }
     }
@@ -55,7 +57,7 @@ impl View for &Entry<'_> {
     }
 }
 
-/// Writes tables and what is to be known of them, whole or not at all.
+/// Writes tensors and a header, whole or not at all.
 pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>]) -> Result<()> {
     let header = serde_json::to_string(header).map_err(|e| {
         let found = format!("the header cannot be put together ({e})");
@@ -73,23 +75,88 @@ pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>])
     })
 }
 
-/// A file whose tables can be read.
-pub(crate) struct TensorFile<R> {
+/// Tensors and facts on their way into a file, as [`Model::write`](crate::train::Model::write) adds them.
+pub struct TensorWriter<'a> {
+    dtype: Dtype,
+    facts: Map<String, Value>,
+    entries: Vec<Entry<'a>>,
+}
+
+impl<'a> TensorWriter<'a> {
+    /// A file of numbers in the precision of `T`.
+    pub(crate) fn of<T: Real>() -> Self {
+        TensorWriter { dtype: dtype_of::<T>(), facts: Map::new(), entries: Vec::new() }
+    }
+
+    /// A file of numbers in `f32`, whatever is written.
+    pub(crate) fn single() -> Self {
+        TensorWriter { dtype: Dtype::F32, facts: Map::new(), entries: Vec::new() }
+    }
+
+    /// Adds a fact to the JSON object in the file's metadata.
+    ///
+    /// Panics if the value cannot be written as JSON.
+    #[track_caller]
+    pub fn fact(&mut self, name: &str, value: impl Serialize) {
+        let value = serde_json::to_value(value).unwrap_or_else(|e| panic!("the fact `{name}` cannot be written as JSON: {e}"));
+        self.facts.insert(name.to_owned(), value);
+    }
+
+    /// Adds a tensor.
+    pub fn tensor<T: Real>(&mut self, name: impl Into<String>, tensor: &'a Tensor<T>) {
+        self.numbers(name, tensor.shape(), tensor.data());
+    }
+
+    /// Adds a tensor of this shape from its values in row-major order.
+    pub fn numbers<T: Real>(&mut self, name: impl Into<String>, shape: &[usize], values: &'a [T]) {
+        let dtype = self.dtype;
+        self.entries.push(Entry::new(name, dtype, shape.to_vec(), move || bytes_of(values, dtype)));
+    }
+
+    /// Adds a tensor that the file holds on to until it is written.
+    pub fn owned<T: Real>(&mut self, name: impl Into<String>, tensor: Tensor<T>) {
+        let dtype = self.dtype;
+        self.entries.push(Entry::new(name, dtype, tensor.shape().to_vec(), move || bytes_of(tensor.data(), dtype)));
+    }
+
+    /// Adds a list of words of 64 bits.
+    pub fn words(&mut self, name: impl Into<String>, words: &'a [u64]) {
+        let bytes = || words.iter().flat_map(|word| word.to_le_bytes()).collect();
+        self.entries.push(Entry::new(name, Dtype::U64, vec![words.len()], bytes));
+    }
+
+    /// Writes the file, whole or not at all.
+    pub(crate) fn write(&self, path: &Path) -> Result<()> {
+        write(path, &self.facts, &self.entries)
+    }
+}
+
+/// A source of bytes that can be read at any place.
+trait Source: Read + Seek {}
+impl<R: Read + Seek> Source for R {}
+
+/// A file whose tensors can be read.
+pub struct TensorFile<'a> {
     path: PathBuf,
-    source: R,
+    source: Box<dyn Source + 'a>,
     metadata: Metadata,
-    /// Where the tables begin.
+    /// Where the tensors begin.
     begin: u64,
 }
 
-/// Opens a file to be read as one of tables.
+/// Opens a file to be read as one of tensors.
 pub(crate) fn open(path: &Path) -> Result<File> {
     File::open(path).map_err(|e| refused(path, e))
 }
 
-impl<R: Read + Seek> TensorFile<R> {
-    /// The tables of a source, which `path` names in messages. Errors: it cannot be read, or is not a whole file of this program.
-    pub fn new(path: &Path, mut source: R) -> Result<Self> {
+impl<'a> TensorFile<'a> {
+    /// Opens a file. Errors: it cannot be read, or is not a whole file of this program.
+    pub fn open(path: &Path) -> Result<Self> {
+        Self::new(path, open(path)?)
+    }
+
+    /// Opens a source, which `path` names in messages. Errors: it cannot be read, or is not a whole file of this program.
+    pub(crate) fn new(path: &Path, mut source: impl Read + Seek + 'a) -> Result<Self> {
         let refused = |e| refused(path, e);
         let size = source.seek(SeekFrom::End(0)).map_err(refused)?;
         source.rewind().map_err(refused)?;
@@ -102,11 +169,16 @@ impl<R: Read + Seek> TensorFile<R> {
         if size.checked_sub(begin) != Some(expected) {
             return Err(damaged(path, &format!("{size} bytes, where {} are announced", begin.saturating_add(expected))));
         }
-        Ok(TensorFile { path: path.to_owned(), source, metadata, begin })
+        Ok(TensorFile { path: path.to_owned(), source: Box::new(source), metadata, begin })
     }
 
-    /// What is to be known of the tables, as it was written.
-    pub fn header(&self) -> Result<serde_json::Value> {
+    /// Path of the file, for messages.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The JSON object in the file's metadata.
+    pub fn facts(&self) -> Result<Value> {
         let Some(text) = self.metadata.metadata().as_ref().and_then(|m| m.get(KEY)) else {
             let found = format!("a safetensors file without `{KEY}` in its metadata");
             return Err(Error::input(&self.path, found, "give a checkpoint that this program wrote"));
@@ -114,18 +186,42 @@ impl<R: Read + Seek> TensorFile<R> {
         serde_json::from_str(text).map_err(|e| self.unreadable(&e))
     }
 
-    /// The header cannot be read, for this reason.
-    pub fn unreadable(&self, e: &dyn std::fmt::Display) -> Error {
+    /// A fact that was added with [`TensorWriter::fact`].
+    ///
+    /// Errors if it is missing or of another type.
+    pub fn fact<V: DeserializeOwned>(&self, name: &str) -> Result<V> {
+        serde_json::from_value(self.facts()?[name].take()).map_err(|e| self.unreadable(&format!("{name}: {e}")))
+    }
+
+    /// An error that says why the header cannot be read.
+    pub(crate) fn unreadable(&self, e: &dyn std::fmt::Display) -> Error {
         Error::input(&self.path, format!("the header cannot be read ({e})"), RETRAIN)
     }
 
-    /// Type, shape and place of a table, if it is there.
-    pub fn info(&self, name: &str) -> Option<&TensorInfo> {
+    /// An error about the contents of the file.
+    pub fn damaged(&self, found: impl Into<String>) -> Error {
+        Error::input(&self.path, found, RETRAIN)
+    }
+
+    /// Names and shapes of the tensors, by name.
+    pub fn tensors(&self) -> Vec<(String, Vec<usize>)> {
+        let mut all: Vec<_> = self.metadata.tensors().into_iter().map(|(name, info)| (name, info.shape.clone())).collect();
+        all.sort();
+        all
+    }
+
+    /// True if there is a tensor of this name.
+    pub fn contains(&self, name: &str) -> bool {
+        self.info(name).is_some()
+    }
+
+    /// Type, shape and place of a tensor, if it is there.
+    pub(crate) fn info(&self, name: &str) -> Option<&TensorInfo> {
         self.metadata.info(name)
     }
 
-    /// The bytes of a table of this type and shape.
-    pub fn read(&mut self, name: &str, dtype: Dtype, expected: &[usize]) -> Result<Vec<u8>> {
+    /// The bytes of a tensor of this type and shape.
+    pub(crate) fn read(&mut self, name: &str, dtype: Dtype, expected: &[usize]) -> Result<Vec<u8>> {
         let Some(info) = self.info(name) else {
             return Err(Error::input(&self.path, format!("no tensor `{name}`"), RETRAIN));
         };
@@ -141,8 +237,21 @@ impl<R: Read + Seek> TensorFile<R> {
         Ok(bytes)
     }
 
-    /// The numbers of a table.
-    pub fn numbers<T: Real>(&mut self, name: &str, dtype: Dtype, expected: &[usize]) -> Result<Vec<T>> {
+    /// A tensor of this shape, in single or double precision.
+    pub fn tensor<T: Real>(&mut self, name: &str, shape: &[usize]) -> Result<Tensor<T>> {
+        let dtype = self.info(name).map(|info| info.dtype).filter(|dtype| [Dtype::F32, Dtype::F64].contains(dtype));
+        let values = self.numbers(name, dtype.unwrap_or(dtype_of::<T>()), shape)?;
+        Ok(Tensor::from_vec(values, shape))
+    }
+
+    /// A list of words of 64 bits.
+    pub fn words(&mut self, name: &str, length: usize) -> Result<Vec<u64>> {
+        let bytes = self.read(name, Dtype::U64, &[length])?;
+        Ok(bytes.as_chunks::<8>().0.iter().map(|b| u64::from_le_bytes(*b)).collect())
+    }
+
+    /// The numbers of a tensor.
+    pub(crate) fn numbers<T: Real>(&mut self, name: &str, dtype: Dtype, expected: &[usize]) -> Result<Vec<T>> {
         let bytes = self.read(name, dtype, expected)?;
         Ok(match dtype {
             Dtype::F64 => bytes.as_chunks::<8>().0.iter().map(|b| T::lit(f64::from_le_bytes(*b))).collect(),

@@ -1,33 +1,60 @@
-//! Training: batch → render → objective → gradients → optimizer → projection, coarse to fine.
+//! Training: batch → render → objective → gradients → optimizer, stage after stage. It knows no field: [`Model`] is the seam.
 //!
 //! The trainer draws, computes and reports; it never prints and never reads a clock.
 
-mod between;
-pub mod config;
-mod plan;
-mod start;
+mod model;
 mod state;
 
-pub use plan::PlannedStage;
+pub use model::{CHECKPOINT_FORMAT, Model, Pass, StageLength, ViewOptions};
+pub use state::About;
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::field::voxel_grid::VoxelGrid;
-use crate::loss::{Objective, Step};
+use crate::loss::{Evaluation, Objective, Step};
 use crate::rays::RaySource;
-use crate::render::{Engine, RenderOptions, render};
-use crate::sampling::{Jitter, Occupancy};
-use autograd::optim::{Exponential, Optimizer, Piecewise};
-use autograd::{Real, parallel, value_and_grad};
-use config::{Config, Stage, Weight};
-use plan::{color_rate, density_rate, initial, optimizer, plan};
-use start::Silhouettes;
+use crate::sampling::Jitter;
+use autograd::optim::{Adam, Optimizer};
+use autograd::{Module, Real, parallel, value_and_grad};
+use ndarray::Array3;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
-/// After so many steps it is looked up anew where the grid can learn. What has a density below 0 all around has no gradient; it comes to
-/// have one when a voxel at its edge, which others have in common with it, rises.
-const STEPS_PER_LOOK: u64 = 64;
+/// Settings of a run that do not depend on the model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TrainOptions {
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Color behind the scene, sRGB in [0, 1].
+    pub background: [f32; 3],
+    /// Rays in a step.
+    pub rays_per_step: usize,
+    /// Steps of the run, for models that do not plan stages of their own.
+    pub steps: u64,
+    /// Shift the samples of each training ray by a random fraction of a step.
+    pub jitter: bool,
+}
 
-/// What one step did.
+/// 1000 steps of 4096 jittered rays over white.
+impl Default for TrainOptions {
+    fn default() -> Self {
+        TrainOptions { seed: 42, background: [1.0; 3], rays_per_step: 4096, steps: 1000, jitter: true }
+    }
+}
+
+/// A stage with its place in the run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PlannedStage {
+    /// Number of the stage, from 0.
+    pub index: usize,
+    /// Cells along each axis of what the model stores, if it stores a grid.
+    pub resolution: Option<usize>,
+    /// Its first step.
+    pub first: u64,
+    /// Number of its steps.
+    pub steps: u64,
+}
+
+/// Result of one step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
     /// Number of the step, from 0 over the whole run.
@@ -40,125 +67,105 @@ pub struct Report {
     pub loss: f64,
     /// Each loss by itself, unweighted.
     pub losses: Vec<(String, f64)>,
-    /// −10 log₁₀ of the batch's mean squared error: of training rays, before the update; with `aim`, as if rays that see nothing were in it.
+    /// −10 log₁₀ of the batch's mean squared error: of training rays, before the update. Where rays are aimed, those that were left out count
+    /// with an error of 0.
     pub psnr: f64,
     /// Rays in the batch.
     pub rays: usize,
     /// Samples they took.
     pub samples: usize,
-    /// Learning rate of the density.
-    pub density_rate: f64,
-    /// Learning rate of the colors.
-    pub color_rate: f64,
+    /// Learning rate of each parameter of the model, by its name.
+    pub rates: Vec<(String, f64)>,
 }
 
-/// A grid in training.
-pub struct Trainer<'a, T: Real> {
-    config: Config,
-    plan: Vec<PlannedStage>,
-    views: &'a [View],
-    rays: RaySource<'a>,
-    /// By how much the images are reduced whose pixels the rays are.
-    reduction: usize,
-    silhouettes: Option<Silhouettes<'a>>,
-    /// How many stages of the plan are the scout's.
-    scouts: usize,
-    objective: Objective<T>,
-    grid: VoxelGrid<T>,
-    /// Where the grid could learn when last looked at: samples elsewhere are left out.
-    learning: Option<Occupancy>,
-    optimizer: Box<dyn Optimizer<T>>,
-    step: u64,
-    most_rows: usize,
-}
-
-impl<'a, T: Real> Trainer<'a, T> {
-    /// A run from its beginning, with the losses that the config names.
-    pub fn new(config: Config, views: &'a [View]) -> Result<Self> {
-        config.validate()?;
-        let objective = objective(&config)?;
-        Self::with_objective(config, views, objective)
+impl Report {
+    /// Learning rate of the parameter of this name.
+    pub fn rate(&self, parameter: &str) -> Option<f64> {
+        self.rates.iter().find(|(name, _)| name == parameter).map(|(_, rate)| *rate)
     }
+}
 
-    /// A run with an objective of one's own; the config's losses are not used.
-    pub fn with_objective(config: Config, views: &'a [View], objective: Objective<T>) -> Result<Self> {
-        config.validate()?;
-        let config = config.fitted_to(views.iter().map(|view| &view.camera));
-        let rays = RaySource::new(views, config.background, config.seed);
+/// A model in training.
+pub struct Trainer<T: Real, M: Model<T>> {
+    model: M,
+    options: TrainOptions,
+    plan: Vec<PlannedStage>,
+    rays: RaySource,
+    objective: Objective<T, M>,
+    optimizer: Box<dyn Optimizer<T>>,
+    loss_optimizer: Adam<T>,
+    step: u64,
+}
+
+impl<T: Real, M: Model<T>> Trainer<T, M> {
+    /// A run of a model from its beginning.
+    ///
+    /// Errors if there is no image to learn from, or no step to take.
+    pub fn with_model(
+        model: M,
+        views: impl Into<Arc<[View]>>,
+        mut objective: Objective<T, M>,
+        options: TrainOptions,
+    ) -> Result<Self> {
+        let rays = RaySource::new(views, options.background, options.seed);
         if rays.is_empty() {
             return Err(Error::config("train views", "none", "at least one image to learn from"));
         }
-        config.check_stages()?;
-        let silhouettes = Silhouettes::new(&config, views);
-        let scout = config.scout.as_ref().filter(|_| silhouettes.is_none());
-        let of_scout = scout.map_or(&[][..], |scout| &scout.stages);
-        let plan = plan(&config, of_scout.iter().chain(&config.stages).copied(), rays.len());
-        let mut shape = config.grid_shape(plan[0].stage.resolution);
-        if let Some(silhouettes) = &silhouettes {
-            shape.half_width = silhouettes.half_width(shape.half_width);
-        }
-        let initial = initial(&config, !of_scout.is_empty());
-        let grid = match initial.random {
-            true => VoxelGrid::random(shape, initial.density, initial.color, config.seed),
-            false => VoxelGrid::uniform(shape, initial.density, initial.color),
-        };
-        let optimizer = optimizer(&config, &plan[0]);
-        let scouts = of_scout.len();
-        Ok(Trainer {
-            config,
-            plan,
-            views,
-            rays,
-            reduction: 1,
-            silhouettes,
-            scouts,
-            objective,
-            grid,
-            learning: None,
-            optimizer,
-            step: 0,
-            most_rows: usize::MAX,
-        })
+        let plan = plan(&model, &options, rays.len());
+        let Some(first) = plan.first() else { return Err(Error::config("stages", "no stage", "at least one")) };
+        let (optimizer, loss_optimizer) = (model.optimizer(first), objective.take_optimizer());
+        Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, step: 0 })
     }
 
-    /// The same run where pruning must not leave more rows of tables than these, because they would not fit into memory.
-    pub fn with_most_rows(self, most_rows: usize) -> Self {
-        Trainer { most_rows, ..self }
+    /// The same run, whose batches have [`RayBatch::depth`](crate::rays::RayBatch::depth) where views have a depth image.
+    pub fn with_depth(self) -> Self {
+        Trainer { rays: self.rays.with_depth(), ..self }
     }
 
-    /// The same run starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
-    /// the first stage, and stages coarser than it are left out, except the last.
+    /// The same run, whose batches have numbers of your own for each pixel: `images` are `[height, width, c]`, one for each training view. A loss
+    /// reads them with [`RayBatch::channel`](crate::rays::RayBatch::channel).
+    ///
+    /// Panics as [`RaySource::with_channel`] does.
+    #[track_caller]
+    pub fn with_channel(self, name: impl Into<String>, images: impl Into<Arc<[Array3<f32>]>>) -> Self {
+        Trainer { rays: self.rays.with_channel(name, images), ..self }
+    }
+
+    /// The same run with a model that `change` makes of its own, for which stages are planned anew.
     ///
     /// Panics if steps have been taken.
-    pub fn starting_from(mut self, grid: &VoxelGrid<T>) -> Self {
+    #[track_caller]
+    pub fn map_model(mut self, change: impl FnOnce(M) -> M) -> Self {
         assert_eq!(self.step, 0, "a run starts once");
-        let stages = &self.config.stages;
-        let coarser = stages.iter().take_while(|stage| stage.resolution < grid.shape().resolution).count();
-        self.scouts = 0;
-        self.plan = plan(&self.config, stages[coarser.min(stages.len() - 1)..].iter().copied(), self.rays.len());
-        self.grid = start::adapted(grid, &self.config.grid_shape(self.plan[0].stage.resolution));
-        self.optimizer = optimizer(&self.config, &self.plan[0]);
+        self.model = change(self.model);
+        self.plan = plan(&self.model, &self.options, self.rays.len());
+        self.optimizer = self.model.optimizer(&self.plan[0]);
         self
     }
 
-    /// The same from a carved grid, whose voxels are as opaque as each other: they are made thin, so that gradients reach what is behind them.
-    pub fn starting_from_carved(self, grid: &VoxelGrid<T>) -> Self {
-        self.starting_from(&start::thinned(grid))
+    /// The model as it is now.
+    pub fn model(&self) -> &M {
+        &self.model
     }
 
-    /// The grid as it is now.
-    pub fn grid(&self) -> &VoxelGrid<T> {
-        &self.grid
+    /// The trained model.
+    pub fn into_model(self) -> M {
+        self.model
     }
 
-    /// The trained grid.
-    pub fn into_grid(self) -> VoxelGrid<T> {
-        self.grid
+    /// The objective, with the parameters of its losses as they are now.
+    pub fn objective(&self) -> &Objective<T, M> {
+        &self.objective
     }
 
-    /// The config, fitted to the images ([`Config::fitted_to`]).
-    pub fn config(&self) -> &Config {
-        &self.config
+    /// Settings that do not depend on the model.
+    pub fn options(&self) -> &TrainOptions {
+        &self.options
+    }
+
+    /// The training views.
+    pub fn views(&self) -> &[View] {
+        self.rays.all_views()
     }
 
     /// The stages with their steps.
@@ -171,36 +178,41 @@ impl<'a, T: Real> Trainer<'a, T> {
         self.plan.iter().map(|p| p.steps).sum()
     }
 
-    /// Training rays of one epoch.
-    pub fn rays_per_epoch(&self) -> u64 {
-        self.rays.len()
+    /// Steps taken so far.
+    pub fn steps_taken(&self) -> u64 {
+        self.step
+    }
+
+    /// The stage of a step; `None` if the run is over by then.
+    fn stage_of(&self, step: u64) -> Option<PlannedStage> {
+        self.plan.iter().find(|p| step < p.first + p.steps).copied()
     }
 
     /// Takes the next step; `None` when the run is over.
     ///
-    /// Errors if the loss or the grid is no longer finite, naming the step.
+    /// Errors if the loss or the model is no longer finite, naming the step, and those of [`Model::begin_stage`].
     pub fn step(&mut self) -> Result<Option<Report>> {
-        let Some(index) = self.plan.iter().position(|p| self.step < p.first + p.steps) else { return Ok(None) };
-        let plan = self.plan[index];
-        if self.step == plan.first {
-            self.begin(index)?;
+        let Some(stage) = self.stage_of(self.step) else { return Ok(None) };
+        let in_stage = self.step - stage.first;
+        if in_stage == 0 {
+            // The memory of the old optimizer is free before the model grows.
+            self.optimizer = self.model.optimizer(&stage);
+            self.model.begin_stage(&stage, &mut self.rays).map_err(|e| at_step(e, self.step))?;
         }
-        let in_stage = self.step - plan.first;
-        if in_stage.is_multiple_of(STEPS_PER_LOOK) {
-            self.learning = Some(self.grid.learning());
-        }
-        let rays = self.config.rays_per_step;
-        let batch = self.rays.batch::<T>(self.step * rays as u64, rays);
-        let jitter = if self.config.jitter { Jitter::PerRay { seed: self.config.seed, step: self.step } } else { Jitter::None };
-        let options = RenderOptions { occupancy: self.learning.as_ref(), ..self.options(&self.grid, &plan.stage, jitter) };
+        self.model.begin_step(in_stage)?;
+        let TrainOptions { seed, background, rays_per_step, jitter, .. } = self.options;
+        let batch = self.rays.batch::<T>(self.step * rays_per_step as u64, rays_per_step);
+        let jitter = if jitter { Jitter::PerRay { seed, step: self.step } } else { Jitter::None };
+        let pass = Pass { background, jitter, keep_samples: self.objective.needs_samples(), stage: Some(stage.index) };
+        let extent = (self.model.aabb().max - self.model.aabb().min).max_element();
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
-            let rendered = render(&self.grid, &batch.rays, &options);
+            let rendered = self.model.render(&batch.rays, &pass);
             samples = rendered.sample_count;
-            squared_error = self.rays.share() * mean_squared_error(rendered.rgb.data(), batch.target.data());
-            let step = Step { number: self.step, seed: self.config.seed, batch: &batch, rendered: &rendered, grid: &self.grid };
-            let (total, values) = self.objective.evaluate(&step);
-            losses = values.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
+            let step = Step::new((self.step, seed), &batch, &rendered, &self.model, (extent, background));
+            let Evaluation { total, losses: values, prediction } = self.objective.evaluate(step);
+            squared_error = self.rays.share() * mean_squared_error(prediction.data(), batch.target.data());
+            losses = values;
             total
         });
         let loss = loss.as_f64();
@@ -208,43 +220,18 @@ impl<'a, T: Real> Trainer<'a, T> {
             let parts: Vec<String> = losses.iter().map(|(name, value)| format!("{name} {value}")).collect();
             return Err(self.numeric(format!("the loss is {loss} ({})", parts.join(", "))));
         }
-        self.optimizer.step(&mut self.grid, &gradients, in_stage);
-        let ends_stage = in_stage + 1 == plan.steps;
-        if ends_stage && !self.grid.is_finite() {
-            return Err(self.numeric("the grid holds numbers that are not finite".to_owned()));
+        self.optimizer.step(&mut self.model, &gradients, in_stage);
+        self.loss_optimizer.step(&mut self.objective, &gradients, self.step);
+        let ends_stage = in_stage + 1 == stage.steps;
+        if ends_stage && !(is_finite(&self.model) && is_finite(&self.objective)) {
+            return Err(self.numeric("the model holds numbers that are not finite".to_owned()));
         }
-        let report = Report {
-            step: self.step,
-            stage: index,
-            ends_stage,
-            loss,
-            losses,
-            psnr: -10.0 * squared_error.log10(),
-            rays: batch.len(),
-            samples,
-            density_rate: density_rate(&plan).at(in_stage),
-            color_rate: color_rate(&plan, plan.stage.color_rate).at(in_stage),
-        };
+        let mut rates = Vec::new();
+        self.model.visit(&mut |param| rates.push((param.name().to_owned(), self.optimizer.rate(param.name(), in_stage))));
+        let psnr = -10.0 * squared_error.log10();
+        let report = Report { step: self.step, stage: stage.index, ends_stage, loss, losses, psnr, rays: batch.len(), samples, rates };
         self.step += 1;
         Ok(Some(report))
-    }
-
-    /// How a stage renders.
-    fn options(&self, grid: &VoxelGrid<T>, stage: &Stage, jitter: Jitter) -> RenderOptions<'static> {
-        RenderOptions {
-            aabb: grid.aabb(),
-            spacing: stage.sampling.spacing(grid.shape().voxel_side()),
-            jitter,
-            background: self.config.background,
-            occupancy: None,
-            engine: self.engine(),
-            stop_below: self.config.stop_below,
-        }
-    }
-
-    /// The engine that the config asks for, unless a loss needs what only the graph has.
-    pub fn engine(&self) -> Engine {
-        if self.objective.needs_samples() { Engine::Graph } else { self.config.engine }
     }
 
     fn numeric(&self, found: String) -> Error {
@@ -252,16 +239,31 @@ impl<'a, T: Real> Trainer<'a, T> {
     }
 }
 
-/// The losses that a config names.
-pub fn objective<T: Real>(config: &Config) -> Result<Objective<T>> {
-    if config.losses.is_empty() {
-        return Err(Error::config("losses", "no loss", "at least one, as in `mse = 1.0`"));
+/// Stages one after another.
+fn plan<T: Real, M: Model<T>>(model: &M, options: &TrainOptions, rays_per_epoch: u64) -> Vec<PlannedStage> {
+    let mut first = 0;
+    let stages = model.stages(options, rays_per_epoch).into_iter().enumerate().map(|(index, StageLength { resolution, steps })| {
+        first += steps;
+        PlannedStage { index, resolution, first: first - steps, steps }
+    });
+    stages.collect()
+}
+
+/// An error of numbers with the step at which it was noticed, where the model did not say.
+fn at_step(error: Error, step: u64) -> Error {
+    match error {
+        Error::Numeric { place, found, remedy } if place.is_empty() => Error::Numeric { place: format!("step {step}"), found, remedy },
+        other => other,
     }
-    config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| match *weight {
-        Weight::Constant(weight) => objective.with_named(name, weight),
-        Weight::Until { weight, until } => objective.with_named(name, Piecewise::new(weight).then(until, 0.0)),
-        Weight::Exponential { from, to, steps } => objective.with_named(name, Exponential::new(from, to, steps)),
-    })
+}
+
+/// True if every number of a module is finite.
+fn is_finite<T: Real>(module: &impl Module<T>) -> bool {
+    let mut finite = true;
+    module.visit(&mut |param| {
+        finite &= parallel::sum(param.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero();
+    });
+    finite
 }
 
 fn mean_squared_error<T: Real>(x: &[T], y: &[T]) -> f64 {

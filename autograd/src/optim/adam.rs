@@ -77,6 +77,10 @@ impl<T: Real> Optimizer<T> for Adam<T> {
         });
     }
 
+    fn rate(&self, parameter: &str, step: u64) -> f64 {
+        self.rates.at(parameter, step)
+    }
+
     fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
         self.memory.of(param)
     }

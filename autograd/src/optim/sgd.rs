@@ -29,6 +29,10 @@ impl<T: Real> Optimizer<T> for Sgd {
         });
     }
 
+    fn rate(&self, parameter: &str, step: u64) -> f64 {
+        self.rates.at(parameter, step)
+    }
+
     fn memory_of(&self, _: &Param<T>) -> Option<Remembered<'_, T>> {
         None
     }
@@ -69,6 +73,10 @@ impl<T: Real> Optimizer<T> for Momentum<T> {
                 });
             });
         });
+    }
+
+    fn rate(&self, parameter: &str, step: u64) -> f64 {
+        self.rates.at(parameter, step)
     }
 
     fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {

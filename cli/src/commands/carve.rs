@@ -16,7 +16,7 @@ use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use serde::Serialize;
 use std::path::PathBuf;
 use toml::Value;

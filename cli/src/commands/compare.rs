@@ -13,7 +13,7 @@ use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::files;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 

@@ -14,7 +14,7 @@ use plenoxel::checkpoint::Header;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\

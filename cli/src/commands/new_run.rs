@@ -7,7 +7,7 @@ use crate::progress::Console;
 use crate::run_folder::RunRecord;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Result;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::time::{Duration, Instant};
 
 /// Reads or renders a split.

@@ -5,7 +5,7 @@ use crate::progress::Console;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use plenoxel::error::Result;
-use plenoxel::train::config::{Config, Hull};
+use plenoxel::model::plenoxels::config::{Config, Hull};
 
 const EXAMPLES: &str = "\
 Examples:

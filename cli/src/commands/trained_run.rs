@@ -10,7 +10,7 @@ use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
-use plenoxel::train::config::{Config, Sampling};
+use plenoxel::model::plenoxels::config::{Config, Sampling};
 use std::path::PathBuf;
 
 /// Which run, and how to look at it.

@@ -1,7 +1,7 @@
 //! Where two configurations differ, in the words of their files.
 
 use super::leaves;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use toml::Value;
 

@@ -188,7 +188,7 @@ fn distance(a: &str, b: &str) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use plenoxel::train::config::Config;
+    use plenoxel::model::plenoxels::config::Config;
 
     #[test]
     fn the_top_level_keys_are_those_of_the_library() {

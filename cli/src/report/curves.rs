@@ -2,7 +2,7 @@
 
 use crate::chart::{Chart, Curve};
 use crate::metrics_file::Line;
-use plenoxel::train::config::Stage;
+use plenoxel::model::plenoxels::config::Stage;
 use std::collections::BTreeSet;
 
 /// Points of a curve that are told apart.

@@ -11,6 +11,7 @@
 //! of side f · side with the same lowest corner. Its coordinates are (u + ½) / f − ½ of the voxel coordinates u.
 
 mod appearance;
+pub mod fused;
 pub(crate) mod layout;
 mod recolor;
 mod reshape;
@@ -20,7 +21,7 @@ use super::{Field, Radiance};
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
-use crate::render::{RenderOptions, Rendered, fused};
+use crate::render::{RenderOptions, Rendered};
 use crate::sampling::{Occupancy, Samples};
 use autograd::lattice::{BRICK, BRICK_ROWS};
 use autograd::{Bounds, Buffer, Lattice, Module, Param, Real, Tensor, parallel};
@@ -231,6 +232,12 @@ impl<T: Real> Field<T> for VoxelGrid<T> {
 
     fn render_fused(&self, rays: &[Ray], options: &RenderOptions<'_>) -> Option<Rendered<T>> {
         Some(fused::render(self, rays, options))
+    }
+}
+
+impl<T: Real> AsRef<Self> for VoxelGrid<T> {
+    fn as_ref(&self) -> &Self {
+        self
     }
 }
 

@@ -4,6 +4,7 @@
 //! averaged over cells and channels. The gradient is the exact one.
 
 use super::Step;
+use crate::field::voxel_grid::VoxelGrid;
 use crate::random::{Purpose, bits};
 use autograd::lattice::{BRICK, BRICK_ROWS, LOW, Neighbours, STRIDE};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, RowSparse, RowSums, Tensor, dispatched, parallel};
@@ -26,15 +27,19 @@ impl Cells {
     pub const SAMPLED: Cells = Cells::Share(0.01);
 }
 
-/// Total variation of the density.
-pub fn tv_density<T: Real>(cells: Cells) -> impl Fn(&Step<'_, T>) -> Tensor<T> + Send + Sync {
-    move |step| tv(step, &step.grid.density, step.grid.lattice(), cells, 0)
+/// Total variation of the density of a model that has a voxel grid.
+pub fn tv_density<T: Real, M: AsRef<VoxelGrid<T>>>(cells: Cells) -> impl Fn(&Step<'_, T, M>) -> Tensor<T> + Send + Sync {
+    move |step| {
+        let grid = step.model.as_ref();
+        tv(step, &grid.density, grid.lattice(), cells, 0)
+    }
 }
 
 /// Total variation of the colors or their harmonics: the mean over all their channels, each in the cells of its own table.
-pub fn tv_color<T: Real>(cells: Cells) -> impl Fn(&Step<'_, T>) -> Tensor<T> + Send + Sync {
+pub fn tv_color<T: Real, M: AsRef<VoxelGrid<T>>>(cells: Cells) -> impl Fn(&Step<'_, T, M>) -> Tensor<T> + Send + Sync {
     move |step| {
-        let (grid, color) = (step.grid, tv(step, &step.grid.color, step.grid.lattice(), cells, 1));
+        let grid = step.model.as_ref();
+        let color = tv(step, &grid.color, grid.lattice(), cells, 1);
         match (&grid.harmonics, grid.harmonics_lattice()) {
             (Some(table), Some(lattice)) => {
                 let share = grid.shape().harmonics_width() as f64 / grid.shape().color.channels() as f64;
@@ -45,7 +50,7 @@ pub fn tv_color<T: Real>(cells: Cells) -> impl Fn(&Step<'_, T>) -> Tensor<T> + S
     }
 }
 
-fn tv<T: Real>(step: &Step<'_, T>, table: &Param<T>, lattice: &Lattice, cells: Cells, stream: u64) -> Tensor<T> {
+fn tv<T: Real, M>(step: &Step<'_, T, M>, table: &Param<T>, lattice: &Lattice, cells: Cells, stream: u64) -> Tensor<T> {
     match cells {
         Cells::Whole => total_variation(table.tensor(), lattice),
         Cells::Share(share) => {

@@ -6,7 +6,7 @@
 use super::{PointCloud, ScalarField};
 use crate::export::{in_bytes, near_colors};
 use crate::field::voxel_grid::VoxelGrid;
-use crate::render::fused::Seen;
+use crate::field::voxel_grid::fused::Seen;
 use autograd::{Real, parallel};
 use glam::DVec3;
 

@@ -1,8 +1,7 @@
 //! Whole images, in chunks of rays.
 
-use crate::camera::Camera;
-use crate::field::Field;
-use crate::render::{RenderOptions, render};
+use super::{Field, RenderOptions, Rendered, render};
+use crate::camera::{Camera, Ray};
 use autograd::{Real, no_grad};
 use ndarray::{Array2, Array3};
 
@@ -20,14 +19,19 @@ pub struct Picture {
 /// Rays rendered at a time: bounds the memory.
 const CHUNK: usize = 4096;
 
-/// Renders what a camera sees.
+/// Renders what a camera sees of a field.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {
+    picture_by(|rays| render(field, rays, options), camera)
+}
+
+/// Renders what a camera sees, by a function from rays to pixels. No gradient is recorded.
+pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Camera) -> Picture {
     let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
     let (mut rgb, mut depth, mut opacity) = (Vec::with_capacity(3 * w * h), Vec::with_capacity(w * h), Vec::with_capacity(w * h));
     let as_f32 = |x: &T| x.as_f64() as f32;
     for start in (0..w * h).step_by(CHUNK) {
         let rays: Vec<_> = (start..(start + CHUNK).min(w * h)).map(|p| camera.ray((p % w) as f64 + 0.5, (p / w) as f64 + 0.5)).collect();
-        let rendered = no_grad(|| render(field, &rays, options));
+        let rendered = no_grad(|| render(&rays));
         rgb.extend(rendered.rgb.data().iter().map(as_f32));
         depth.extend(rendered.depth().data().iter().map(as_f32));
         opacity.extend(rendered.opacity.data().iter().map(as_f32));

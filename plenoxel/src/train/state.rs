@@ -1,90 +1,86 @@
 //! A run on disk, from which it goes on as if it had never stopped.
 //!
-//! A `safetensors` file: the grid's tables `density`, `color` and `harmonics` `[rows, width]` in the order of its lattice, whose `masks` of
-//! bricks say which voxels are present ([`autograd::Lattice::masks`]); of each what the optimizer remembers, `density.optimizer.0` and on;
-//! and `learning`, where samples were looked up when last looked at, as masks of bricks. Numbers are in the run's precision. Random numbers
-//! are a function of seed, step and ray, so that nothing of them is kept.
+//! A `safetensors` file. Its metadata say of which kind the model is, with which settings and which views it is trained, and how many steps were taken.
+//! Its tensors are those that [`Model::write`] adds; of each parameter what the optimizer remembers, `<name>.optimizer.0` and on; and the
+//! parameters of the losses with theirs, `loss.<name>` and `loss.<name>.optimizer.0`. Numbers are in the run's precision. Random numbers are a
+//! function of seed, step and ray, so that nothing of them is kept.
 
-use super::{PlannedStage, Trainer, optimizer, plan};
-use crate::checkpoint::Header;
+use super::model::check_kind;
+use super::{Model, TrainOptions, Trainer, is_finite, plan};
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::field::Field;
-use crate::field::voxel_grid::{GridShape, VoxelGrid};
-use crate::geometry::Aabb;
-use crate::sampling::Occupancy;
-use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, dtype_of, open};
-use crate::train::config::Config;
-use autograd::{Buffer, Lattice, Param, Real, Tensor, parallel};
-use glam::DVec3;
+use crate::tensor_file::{TensorFile, TensorWriter};
+use autograd::optim::{Optimizer, Remembered};
+use autograd::{Buffer, Module, Param, Real, parallel};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use std::io::{Read, Seek};
 use std::path::Path;
 
 /// Version of the format.
-const FORMAT: &str = "plenoxel training 1";
+const FORMAT: &str = "plenoxel training 2";
 
-/// Everything about a run but its tables.
+/// Facts about a trained model that every kind of checkpoint has.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct About {
+    /// Name of the scene.
+    pub scene: String,
+    /// Color behind the scene that it was trained with, sRGB in [0, 1].
+    pub background: [f32; 3],
+    /// Seed of the run.
+    pub seed: u64,
+    /// Steps taken.
+    pub step: u64,
+}
+
+/// Facts about a run beside those of its model.
 #[derive(Debug, Serialize, Deserialize)]
 struct State {
-    /// [`FORMAT`].
-    format: String,
-    /// What a checkpoint of the grid would say of itself.
-    grid: Header,
-    config: Config,
+    about: About,
+    options: TrainOptions,
+    settings: Value,
+    /// Bytes of a number.
+    precision: usize,
     /// A hash of cameras and pixels of the training views.
     views: String,
-    /// Stages of the plan: fewer than there are if the run started from a finer grid.
-    stages: usize,
-    /// How many of them are the scout's.
-    scouts: usize,
-    /// Of each table how many updates it had, where the optimizer remembers something.
+    /// Number of the stage of the last step.
+    stage: usize,
+    /// Of each parameter of the model the number of its updates, where the optimizer remembers something.
     updates: Vec<Option<u64>>,
-    /// Box and cells of `learning`.
-    learning: Option<Cells>,
+    /// The same of the losses.
+    loss_updates: Vec<Option<u64>>,
 }
 
-/// Where the bricks of an [`Occupancy`] are.
-#[derive(Debug, Serialize, Deserialize)]
-struct Cells {
-    min: DVec3,
-    max: DVec3,
-    cells: [usize; 3],
-}
-
-impl<T: Real> Trainer<'_, T> {
-    /// Steps taken so far.
-    pub fn steps_taken(&self) -> u64 {
-        self.step
+impl<T: Real, M: Model<T>> Trainer<T, M> {
+    /// Facts for a checkpoint of the model as it is now.
+    pub fn about(&self, scene: &str) -> About {
+        About { scene: scene.to_owned(), background: self.options.background, seed: self.options.seed, step: self.step }
     }
 
-    /// Writes all that the run needs to go on, beside its views, whole or not at all; `scene` is the dataset's name.
+    /// Writes everything that the run needs to go on, except its views, whole or not at all; `scene` is the dataset's name.
+    ///
+    /// Panics if no step has been taken.
     pub fn save(&self, path: &Path, scene: &str) -> Result<()> {
-        let dtype = dtype_of::<T>();
-        let remembered: Vec<_> = self.grid.params().map(|param| self.optimizer.memory_of(param)).collect();
-        let state = State {
-            format: FORMAT.to_owned(),
-            grid: Header::new(&self.grid, scene, self.config.background, self.config.seed, self.step),
-            config: self.config.clone(),
-            views: fingerprint(self.views),
-            stages: self.plan.len(),
-            scouts: self.scouts,
-            updates: remembered.iter().map(|memory| Some(memory.as_ref()?.updates)).collect(),
-            learning: self.learning.as_ref().map(|o| Cells { min: o.aabb().min, max: o.aabb().max, cells: o.cells() }),
+        let stage = self.stage_of(self.step.checked_sub(1).expect("a run is saved after its first step")).expect("the stage of a step");
+        let mut file = TensorWriter::of::<T>();
+        file.fact("format", FORMAT);
+        file.fact("kind", self.model.kind());
+        self.model.write(&mut file);
+        let updates = write_memory(&self.model, "", &*self.optimizer, &mut file);
+        self.objective.visit(&mut |param| file.owned(format!("loss.{}", param.name()), param.tensor().detach()));
+        let loss_updates = write_memory(&self.objective, "loss.", &self.loss_optimizer, &mut file);
+        let run = State {
+            about: self.about(scene),
+            options: self.options.clone(),
+            settings: self.model.settings(),
+            precision: size_of::<T>(),
+            views: fingerprint(self.views()),
+            stage: stage.index,
+            updates,
+            loss_updates,
         };
-        fn masks<'a>(name: &str, masks: &'a [u64]) -> Entry<'a> {
-            Entry::new(name, Dtype::U64, vec![masks.len()], || masks.iter().flat_map(|mask| mask.to_le_bytes()).collect())
-        }
-        let mut entries = vec![masks("masks", self.grid.lattice().masks())];
-        entries.extend(self.learning.as_ref().map(|learning| masks("learning", learning.masks())));
-        for (param, memory) in self.grid.params().zip(&remembered) {
-            let (shape, values) = (param.shape().to_vec(), param.tensor().data());
-            entries.push(Entry::new(param.name(), dtype, shape.clone(), move || bytes_of(values, dtype)));
-            for (i, &array) in memory.iter().flat_map(|memory| &memory.arrays).enumerate() {
-                entries.push(Entry::new(of_optimizer(param, i), dtype, shape.clone(), move || bytes_of(array, dtype)));
-            }
-        }
-        tensor_file::write(path, &state, &entries)
+        file.fact("run", run);
+        file.write(path)
     }
 
     /// The run whose state the file holds, to go on from there: the steps that follow have the bits they would have had.
@@ -93,122 +89,129 @@ impl<T: Real> Trainer<'_, T> {
     ///
     /// Panics if steps have been taken.
     pub fn resumed(self, path: &Path) -> Result<Self> {
-        self.resumed_from(path, open(path)?)
+        self.resumed_with(TensorFile::open(path)?)
     }
 
     /// The same from any source, a file or bytes; `path` names it in messages.
-    pub fn resumed_from(mut self, path: &Path, source: impl Read + Seek) -> Result<Self> {
+    pub fn resumed_from(self, path: &Path, source: impl Read + Seek) -> Result<Self> {
+        self.resumed_with(TensorFile::new(path, source)?)
+    }
+
+    fn resumed_with(mut self, mut file: TensorFile<'_>) -> Result<Self> {
         assert_eq!(self.step, 0, "a run starts once");
-        let mut file = TensorFile::new(path, source)?;
-        let state = read(path, &file)?;
+        let state = read(&file)?;
+        check_kind(&file, self.model.kind())?;
         let other = |what: &str| {
             let found = format!("the state of a run with other {what}");
-            Err(Error::input(path, found, "go on with the settings and the data that the run began with, or train again"))
+            Err(Error::input(file.path(), found, "go on with the settings and the data that the run began with, or train again"))
         };
-        if state.config != self.config {
+        if state.options != self.options || state.settings != self.model.settings() {
             return other("settings");
         }
-        if state.views != fingerprint(self.views) {
+        if state.precision != size_of::<T>() {
+            return other("precision");
+        }
+        if state.views != fingerprint(self.views()) {
             return other("training views");
         }
-        let damaged = |what: &str| Error::input(path, what, RETRAIN);
-        if state.scouts != 0 && state.scouts != self.config.scout.as_ref().map_or(0, |scout| scout.stages.len()) {
-            return Err(damaged("a scout of impossible stages"));
-        }
-        let scout = self.config.scout.iter().filter(|_| state.scouts > 0).flat_map(|scout| &scout.stages);
-        let stages: Vec<_> = scout.chain(&self.config.stages).copied().collect();
-        let left_out =
-            stages.len().checked_sub(state.stages).filter(|left_out| *left_out < stages.len() && (state.scouts == 0 || *left_out == 0));
-        let plan =
-            plan(&self.config, stages.into_iter().skip(left_out.ok_or_else(|| damaged("a plan of impossible stages"))?), self.rays.len());
+        self.model.read(&mut file, state.stage)?;
+        self.plan = plan(&self.model, &self.options, self.rays.len());
         // The first step is not taken yet, and the file is of later.
-        let last = state.grid.step.checked_sub(1);
-        let current = last.and_then(|last| plan.iter().find(|p| (p.first..p.first + p.steps).contains(&last)));
-        let current: PlannedStage = *current.ok_or_else(|| damaged("a step that the plan does not have"))?;
-        let shape = state.grid.shape();
-        let configured = GridShape { half_width: shape.half_width, ..self.config.grid_shape(current.stage.resolution) };
-        if shape != configured || !GridShape::HALF_WIDTHS.contains(&shape.half_width) {
-            return Err(damaged("a grid that is not of its stage"));
-        }
-
-        let n = [shape.resolution; 3];
-        let masks = masks(&mut file, "masks", n)?.filter(|masks| masks.iter().any(|mask| *mask != 0));
-        let lattice = Lattice::from_masks(n, masks.ok_or_else(|| damaged("voxels outside of the grid, or none"))?);
-        let dtype = dtype_of::<T>();
-        let mut table = |name: &str, shape: [usize; 2]| -> Result<Vec<T>> { file.numbers(name, dtype, &shape) };
-        let shapes = shape.tables(&lattice);
-        let names = ["density", "color", "harmonics"];
-        let tables = names.iter().zip(&shapes).map(|(name, shape)| Ok(Tensor::from_vec(table(name, *shape)?, shape)));
-        // The old grid goes first.
-        self.grid = VoxelGrid::uniform(GridShape { resolution: 1, ..shape }, 0.0, 0.0);
-        self.grid = VoxelGrid::with_tables(shape, lattice, tables.collect::<Result<_>>()?);
-        if !self.grid.is_finite() {
-            return Err(damaged("numbers that are not finite"));
-        }
-        if self.config.project {
-            self.grid.project();
-        }
-        if state.updates.len() != shapes.len() {
-            return Err(damaged("a memory of other tables"));
-        }
-        self.optimizer = optimizer(&self.config, &current);
-        for (param, (shape, updates)) in self.grid.params().zip(shapes.iter().zip(&state.updates)) {
-            let Some(updates) = *updates else { continue };
-            if updates > state.grid.step {
-                return Err(damaged("more updates than steps"));
+        let last = state.about.step.checked_sub(1);
+        let current = last.and_then(|last| self.stage_of(last)).filter(|stage| stage.index == state.stage);
+        let current = current.ok_or_else(|| file.damaged("a step that the plan does not have"))?;
+        self.optimizer = self.model.optimizer(&current);
+        read_memory(&self.model, "", &mut *self.optimizer, &state.updates, &mut file, state.about.step)?;
+        let mut done = Ok(());
+        self.objective.visit_mut(&mut |param| {
+            if done.is_ok() {
+                let read = file.tensor(&format!("loss.{}", param.name()), param.shape());
+                done = read.map(|read| param.update(|values| values.copy_from_slice(read.data())));
             }
-            let mut arrays: Vec<Buffer<T>> = Vec::new();
-            while file.info(&of_optimizer(param, arrays.len())).is_some() {
-                arrays.push(file.numbers(&of_optimizer(param, arrays.len()), dtype, shape)?.into());
-            }
-            if !self.optimizer.recall(param, updates, arrays) {
-                return Err(damaged("the memory of another optimizer"));
-            }
+        });
+        done?;
+        read_memory(&self.objective, "loss.", &mut self.loss_optimizer, &state.loss_updates, &mut file, state.about.step)?;
+        if !(is_finite(&self.model) && is_finite(&self.objective)) {
+            return Err(file.damaged("numbers that are not finite"));
         }
-        if let Some(Cells { min, max, cells }) = state.learning {
-            // The grid's cube, or up to a voxel more on each side.
-            let sides = shape.half_width..=2.0 * shape.half_width;
-            let around = (0..3).all(|a| sides.contains(&-min[a]) && sides.contains(&max[a]));
-            let masks = match cells.iter().all(|n| (1..=shape.resolution + 1).contains(n)) && around {
-                true => self::masks(&mut file, "learning", cells)?,
-                false => None,
-            };
-            let masks = masks.ok_or_else(|| damaged("samples outside of the grid"))?;
-            self.learning = Some(Occupancy::from_masks(Aabb { min, max }, cells, masks));
-        }
-        (self.plan, self.scouts, self.step) = (plan, state.scouts, state.grid.step);
-        self.reduction = current.stage.image_reduction;
-        self.rays = self.all_rays();
-        let reach = Field::<T>::reach(&self.grid).cloned();
-        self.aim(reach.as_ref());
+        self.step = state.about.step;
+        self.model.resume(&current, &mut self.rays);
         Ok(self)
     }
 }
 
-/// What a file says, after its version.
-fn read<R: Read + Seek>(path: &Path, file: &TensorFile<R>) -> Result<State> {
-    let value = file.header()?;
-    let format = value["format"].as_str().unwrap_or("none");
+/// Adds what an optimizer remembers of each parameter, and returns how many updates each had.
+fn write_memory<'a, T: Real>(
+    module: &impl Module<T>,
+    prefix: &str,
+    optimizer: &'a (impl Optimizer<T> + ?Sized),
+    file: &mut TensorWriter<'a>,
+) -> Vec<Option<u64>> {
+    let mut all = Vec::new();
+    module.visit(&mut |param| {
+        let memory: Option<Remembered<'a, T>> = optimizer.memory_of(param);
+        all.push(memory.as_ref().map(|memory| memory.updates));
+        for (i, array) in memory.into_iter().flat_map(|memory| memory.arrays).enumerate() {
+            file.numbers(of_optimizer(prefix, param, i), param.shape(), array);
+        }
+    });
+    all
+}
+
+/// Has an optimizer recall what was written of each parameter.
+fn read_memory<T: Real>(
+    module: &impl Module<T>,
+    prefix: &str,
+    optimizer: &mut (impl Optimizer<T> + ?Sized),
+    updates: &[Option<u64>],
+    file: &mut TensorFile<'_>,
+    steps: u64,
+) -> Result<()> {
+    let mut updates = updates.iter();
+    let mut recall = |param: &Param<T>| -> Result<()> {
+        let Some(updates) = updates.next() else { return Err(file.damaged("a memory of other parameters")) };
+        let Some(updates) = *updates else { return Ok(()) };
+        if updates > steps {
+            return Err(file.damaged("more updates than steps"));
+        }
+        let mut arrays: Vec<Buffer<T>> = Vec::new();
+        while file.contains(&of_optimizer(prefix, param, arrays.len())) {
+            let read = file.tensor::<T>(&of_optimizer(prefix, param, arrays.len()), param.shape())?;
+            arrays.push(Buffer::copy_of(read.data()));
+        }
+        match optimizer.recall(param, updates, arrays) {
+            true => Ok(()),
+            false => Err(file.damaged("the memory of another optimizer")),
+        }
+    };
+    let mut done = Ok(());
+    module.visit(&mut |param| {
+        if done.is_ok() {
+            done = recall(param);
+        }
+    });
+    done?;
+    match updates.next() {
+        None => Ok(()),
+        Some(_) => Err(file.damaged("a memory of other parameters")),
+    }
+}
+
+/// Facts of a file, after its version.
+fn read(file: &TensorFile<'_>) -> Result<State> {
+    let facts = file.facts()?;
+    let format = facts["format"].as_str().unwrap_or("none");
     if format != FORMAT {
         let remedy =
             format!("this program goes on from `{FORMAT}`; use the version that wrote the file, or `--init-from` for a trained grid");
-        return Err(Error::input(path, format!("format `{format}`"), remedy));
+        return Err(Error::input(file.path(), format!("format `{format}`"), remedy));
     }
-    serde_json::from_value(value).map_err(|e| file.unreadable(&e))
+    file.fact("run")
 }
 
-/// Masks of bricks of so many cells; `None` if one has a cell outside of these.
-fn masks<R: Read + Seek>(file: &mut TensorFile<R>, name: &str, cells: [usize; 3]) -> Result<Option<Vec<u64>>> {
-    let whole = Lattice::bricks(cells);
-    let bytes = file.read(name, Dtype::U64, &[whole.masks().len()])?;
-    let masks: Vec<u64> = bytes.as_chunks::<8>().0.iter().map(|b| u64::from_le_bytes(*b)).collect();
-    let inside = masks.iter().zip(whole.masks()).all(|(mask, whole)| mask & !whole == 0);
-    Ok(inside.then_some(masks))
-}
-
-/// Name of what an optimizer remembers of a parameter.
-fn of_optimizer<T: Real>(param: &Param<T>, i: usize) -> String {
-    format!("{}.optimizer.{i}", param.name())
+/// Name of an array that an optimizer remembers of a parameter.
+fn of_optimizer<T: Real>(prefix: &str, param: &Param<T>, i: usize) -> String {
+    format!("{prefix}{}.optimizer.{i}", param.name())
 }
 
 /// A hash of cameras and pixels: FNV-1a of each view, and of these.

@@ -16,9 +16,9 @@ use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, VoxelOptions};
 use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
-use plenoxel::render::fused::{Seen, seen};
+use plenoxel::field::voxel_grid::fused::{Seen, seen};
 use plenoxel::sampling::Jitter;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\

@@ -10,7 +10,7 @@ use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
 use plenoxel::render::picture::Picture;
-use plenoxel::train::config::{Config, Sampling};
+use plenoxel::model::plenoxels::config::{Config, Sampling};
 use std::path::{Path, PathBuf};
 
 /// What a picture shows.

@@ -8,7 +8,7 @@ use crate::data::DataSource;
 use crate::run_folder::RunFolder;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 

@@ -3,7 +3,7 @@
 use crate::commands::background_name;
 use crate::run_folder::RunFolder;
 use plenoxel::error::Result;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 

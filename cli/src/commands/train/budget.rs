@@ -7,8 +7,8 @@
 use plenoxel::dataset::View;
 use plenoxel::error::{Error, Result};
 use plenoxel::rays::RaySource;
-use plenoxel::train::Trainer;
-use plenoxel::train::config::{Config, Scout, Stage, Weight};
+use plenoxel::model::plenoxels::Trainer;
+use plenoxel::model::plenoxels::config::{Config, Scout, Stage, Weight};
 use std::time::Instant;
 
 /// The fog that a grid starts as clears: the k-th step of the first stage takes 1 + a ln(b / k) of what its steps take in the mean, and after

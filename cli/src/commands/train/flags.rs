@@ -7,7 +7,7 @@ use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::error::{Error, Result};
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 use toml::Value;
 

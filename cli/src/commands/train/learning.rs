@@ -12,7 +12,8 @@ use plenoxel::checkpoint::Header;
 use plenoxel::dataset::View;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::train::{PlannedStage, Trainer};
+use plenoxel::model::plenoxels::Trainer;
+use plenoxel::train::PlannedStage;
 use serde::Serialize;
 use std::time::Instant;
 
@@ -44,7 +45,7 @@ impl<'a> Job<'a, '_> {
     /// The training; only its steps are on the clock for training. `None` if it was interrupted: then all that is needed to go on is saved.
     pub fn learn(
         &'a self,
-        mut trainer: Trainer<'_, f32>,
+        mut trainer: Trainer<f32>,
         (metrics, past): (MetricsFile, Past),
         preview: Preview,
         views: &[View],

@@ -10,7 +10,7 @@ use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::render::picture::Picture;
 use plenoxel::train::PlannedStage;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 
 /// Panels of more views than this fill folders and nobody's eye.

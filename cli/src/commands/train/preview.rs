@@ -10,7 +10,7 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics::psnr;
-use plenoxel::train::config::Config;
+use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 use std::time::Instant;
 

@@ -8,8 +8,9 @@ use crate::progress::{Console, Training};
 use crate::run_folder::RunFolder;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::train::config::Config;
-use plenoxel::train::{PlannedStage, Report, Trainer};
+use plenoxel::model::plenoxels::config::Config;
+use plenoxel::model::plenoxels::Trainer;
+use plenoxel::train::{PlannedStage, Report};
 use serde_json::json;
 
 /// All that is told of a run while it trains.
@@ -30,7 +31,7 @@ impl<'a, 'c> Watching<'a, 'c> {
     /// Begins to watch a run, or one with a past.
     pub fn begin(
         (folder, config, console): (&'a RunFolder, &'a Config, &'a Console<'c>),
-        trainer: &Trainer<'_, f32>,
+        trainer: &Trainer<f32>,
         (metrics, past): (MetricsFile, Past),
         mut pictures: Pictures<'a>,
         preview: Preview,

@@ -2,7 +2,7 @@ use super::*;
 use crate::camera::Ray;
 use crate::field::voxel_grid::Color;
 use crate::field::voxel_grid::{GridShape, Interpolation};
-use crate::render::fused::{largest_weights, seen};
+use crate::field::voxel_grid::fused::{largest_weights, seen};
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
 use autograd::Tensor;

@@ -1,37 +1,32 @@
-//! What happens between stages: the field is read at a finer resolution, the optimizer starts afresh, empty space is left out.
+//! Changes of the grid between stages: it is resampled at a finer resolution, and empty space is left out.
 
 use super::config::{Scout, Stage};
-use super::plan::{initial, optimizer};
-use super::{Trainer, start};
-use crate::dataset::View;
+use super::{Plenoxels, start};
 use crate::error::{Error, Result};
 use crate::field::Field;
 use crate::field::voxel_grid::VoxelGrid;
+use crate::field::voxel_grid::fused::largest_weights;
 use crate::rays::RaySource;
 use crate::render::RenderOptions;
-use crate::render::fused::largest_weights;
 use crate::sampling::{Jitter, Occupancy};
-use autograd::{Real, parallel, release_free_buffers};
-use std::borrow::Cow;
+use autograd::{Real, release_free_buffers};
 
-/// Rays that are rendered at a time to find out what is seen: bounds the memory.
+/// Rays that are rendered at a time to find out which voxels are seen: it bounds the memory.
 const RAYS_PER_BATCH: usize = 1 << 15;
 
-impl<'a, T: Real> Trainer<'a, T> {
+impl<T: Real> Plenoxels<T> {
     /// Begins a stage.
-    pub(super) fn begin(&mut self, index: usize) -> Result<()> {
-        let stage = self.plan[index].stage;
-        // The old state goes before the finer grid comes.
-        self.optimizer = optimizer(&self.config, &self.plan[index]);
+    pub(super) fn begin(&mut self, index: usize, rays: &mut RaySource) -> Result<()> {
+        let stage = self.stages[index];
         if let Some(scout) = self.config.scout.as_ref().filter(|_| (1..=self.scouts).contains(&index)) {
-            self.grid = self.after_scout(scout, index)?;
+            self.grid = self.after_scout(scout, index, rays)?;
         }
         // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
         release_free_buffers();
         let changes = stage.resolution != self.grid.shape().resolution;
         let mut outline = self.grid.outline();
         if changes {
-            outline = self.refined(outline, index)?;
+            outline = self.refined(outline, index, rays)?;
         }
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| changes || index == 0) {
             outline = outline.pruned(&silhouettes.voxels(&outline));
@@ -43,14 +38,13 @@ impl<'a, T: Real> Trainer<'a, T> {
                 ));
             }
         }
-        if stage.image_reduction != self.reduction {
-            self.reduction = stage.image_reduction;
-            self.rays = self.all_rays();
+        if stage.image_reduction != rays.reduction() {
+            rays.set_reduction(stage.image_reduction);
         }
-        self.aim(Field::<T>::reach(&outline));
+        self.aim(Field::<T>::reach(&outline), rays);
         if self.prunes(index) {
-            outline = outline.pruned(&self.worth_keeping(&outline, &stage, None)?);
-            self.aim(Field::<T>::reach(&outline));
+            outline = outline.pruned(&self.worth_keeping(&outline, &stage, None, rays)?);
+            self.aim(Field::<T>::reach(&outline), rays);
             self.check_rows(&outline)?;
         }
         if changes {
@@ -64,22 +58,22 @@ impl<'a, T: Real> Trainer<'a, T> {
         Ok(())
     }
 
-    /// What a stage of the scout leaves to the next stage.
-    fn after_scout(&self, scout: &Scout, index: usize) -> Result<VoxelGrid<T>> {
-        let kept = self.worth_keeping(&self.grid, &self.plan[index - 1].stage, Some(scout))?;
-        let initial = initial(&self.config, index < self.scouts);
-        let resolution = self.plan[index].stage.resolution;
-        Ok(start::scouted(&self.grid, &kept, self.rays.views(), self.config.carve.margin, resolution, &initial))
+    /// The grid that a stage of the scout leaves to the next stage.
+    fn after_scout(&self, scout: &Scout, index: usize, rays: &RaySource) -> Result<VoxelGrid<T>> {
+        let kept = self.worth_keeping(&self.grid, &self.stages[index - 1], Some(scout), rays)?;
+        let initial = self.config.initial_of(index < self.scouts);
+        let resolution = self.stages[index].resolution;
+        Ok(start::scouted(&self.grid, &kept, rays.views(), self.config.carve.margin, resolution, &initial))
     }
 
     /// An outline at the resolution of a stage. After a scout, whose cube was as coarse as its voxels, it loses what is not worth keeping
     /// first, and the cube shrinks to the rest: the coarse voxels tell as much in a fraction of the time.
-    fn refined(&self, outline: VoxelGrid<T>, index: usize) -> Result<VoxelGrid<T>> {
-        let resolution = self.plan[index].stage.resolution;
+    fn refined(&self, outline: VoxelGrid<T>, index: usize, rays: &RaySource) -> Result<VoxelGrid<T>> {
+        let resolution = self.stages[index].resolution;
         if self.scouts == 0 || !self.prunes(index) {
             return Ok(outline.resample(resolution));
         }
-        let kept = self.worth_keeping(&outline, &self.plan[index - 1].stage, None)?;
+        let kept = self.worth_keeping(&outline, &self.stages[index - 1], None, rays)?;
         let half_width = kept.half_width().unwrap_or(outline.shape().half_width);
         Ok(outline.pruned(&kept).resample_in(resolution, half_width))
     }
@@ -95,24 +89,15 @@ impl<'a, T: Real> Trainer<'a, T> {
     }
 
     /// Leaves the rays out that pass what is left of the grid, if the config says so.
-    pub(super) fn aim(&mut self, reach: Option<&Occupancy>) {
+    pub(super) fn aim(&self, reach: Option<&Occupancy>, rays: &mut RaySource) {
         if let Some(reach) = reach.filter(|_| self.config.aim) {
-            self.rays.aim_at(reach);
+            rays.aim_at(reach);
         }
     }
 
-    /// The rays of all pixels of the images as reduced now.
-    pub(super) fn all_rays(&self) -> RaySource<'a> {
-        let views: Cow<'a, [View]> = match self.reduction {
-            1 => self.views.into(),
-            k => parallel::map_indices(self.views.len(), |v| self.views[v].reduced(k)).into(),
-        };
-        RaySource::new(views, self.config.background, self.config.seed)
-    }
-
-    /// The first stage of the plan that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
+    /// The first stage that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
     pub fn prunes_from(&self) -> Option<usize> {
-        let left_out = self.config.stages.len() + self.scouts - self.plan.len();
+        let left_out = self.config.stages.len() + self.scouts - self.stages.len();
         self.config.prune_from_stage.map(|first| self.scouts + first.saturating_sub(left_out))
     }
 
@@ -123,10 +108,10 @@ impl<'a, T: Real> Trainer<'a, T> {
     /// The voxels that pruning leaves, or that a scout does: those that hold matter and, if the config asks for it, that a training ray sees.
     ///
     /// Errors if they are none.
-    fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage, scout: Option<&Scout>) -> Result<Occupancy> {
+    fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage, scout: Option<&Scout>, rays: &RaySource) -> Result<Occupancy> {
         let (below, least) = (self.config.prune_below, scout.map_or(self.config.prune_unseen_below, |scout| scout.prune_unseen_below));
         let full = grid.occupancy(below);
-        let kept = if least == 0.0 { full } else { full.intersection(&self.seen(grid, stage, least)) };
+        let kept = if least == 0.0 { full } else { full.intersection(&self.seen(grid, stage, least, rays)) };
         if kept.fraction() > 0.0 {
             return Ok(kept);
         }
@@ -134,18 +119,19 @@ impl<'a, T: Real> Trainer<'a, T> {
             Some(_) => format!("set prune_below lower than {below}, or scout.prune_unseen_below lower than {least}"),
             None => format!("set prune_below lower than {below}, prune_unseen_below lower than {least}, or prune_from_stage later"),
         };
-        Err(Error::Numeric { place: format!("step {}", self.step), found: "pruning would leave nothing".to_owned(), remedy })
+        // The trainer says at which step.
+        Err(Error::Numeric { place: String::new(), found: "pruning would leave nothing".to_owned(), remedy })
     }
 
     /// The voxels that weigh at least so much in a pixel, and those around.
-    fn seen(&self, grid: &VoxelGrid<T>, stage: &Stage, least: f64) -> Occupancy {
+    fn seen(&self, grid: &VoxelGrid<T>, stage: &Stage, least: f64, rays: &RaySource) -> Occupancy {
         // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
         const MARGIN: usize = 2;
         // Where less light is left, no sample weighs as much.
         let stop_below = self.config.stop_below.max(least);
-        let options = RenderOptions { stop_below, ..self.options(grid, stage, Jitter::None) };
-        let stride = self.rays.stride(grid.shape().voxel_side(), grid.aabb());
-        let weights = largest_weights(grid, self.rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
+        let options = RenderOptions { stop_below, ..self.config.render_options(grid, stage.sampling, Jitter::None) };
+        let stride = rays.stride(grid.shape().voxel_side(), grid.aabb());
+        let weights = largest_weights(grid, rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
         grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN)
     }
 }
@@ -154,9 +140,11 @@ impl<'a, T: Real> Trainer<'a, T> {
 mod tests {
     use super::*;
     use crate::dataset::procedural::ProceduralOptions;
-    use crate::dataset::{Dataset, Split};
+    use crate::dataset::{Dataset, Split, View};
     use crate::field::voxel_grid::GridShape;
-    use crate::train::config::{Config, Hull};
+    use crate::model::plenoxels::Trainer;
+    use crate::model::plenoxels::config::{Config, Hull};
+    use crate::train::Model;
     use autograd::Tensor;
     use glam::DVec3;
     use std::ops::Range;
@@ -175,18 +163,20 @@ mod tests {
     /// The grid with which a stage begins if the one before learned matter of a density at these distances from the origin.
     fn after(config: Config, stage: usize, matter: Range<f64>, density: f64) -> Result<VoxelGrid<f64>> {
         let views = views();
-        let mut trainer = Trainer::<f64>::new(config, &views).unwrap();
-        let n = trainer.plan[stage - 1].stage.resolution;
-        let grid = VoxelGrid::uniform(trainer.config.grid_shape(n), 0.0, 0.0);
+        let trainer = Trainer::<f64>::new(config, &views[..]).unwrap();
+        let plan = trainer.plan().to_vec();
+        let n = plan[stage - 1].resolution.unwrap();
+        let grid = VoxelGrid::uniform(trainer.config().grid_shape(n), 0.0, 0.0);
         let half = n as f64 / 2.0;
         let place = |node: [usize; 3]| DVec3::from(node.map(|k| ((k as f64 + 0.5) / half - 1.0) * grid.shape().half_width));
         let densities = (0..n.pow(3) as u32).map(|row| {
             let inside = grid.lattice().node(row).is_some_and(|node| matter.contains(&place(node).length()));
             if inside { density } else { 0.0 }
         });
-        trainer.grid = grid.with_density(Tensor::from_vec(densities.collect(), &[n.pow(3), 1]));
-        trainer.step = trainer.plan[stage].first;
-        trainer.step().map(|_| trainer.grid)
+        let mut rays = RaySource::new(&views[..], trainer.config().background, trainer.config().seed);
+        let mut model = trainer.into_model();
+        model.grid = grid.with_density(Tensor::from_vec(densities.collect(), &[n.pow(3), 1]));
+        model.begin_stage(&plan[stage], &mut rays).map(|()| model.grid)
     }
 
     #[test]

@@ -9,27 +9,28 @@ use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
 use autograd::Real;
 use std::ops::ControlFlow;
+use std::sync::Arc;
 
 /// Voxels along each axis of the hull that the cube is fitted to.
 const COARSE: usize = 64;
 
 /// Silhouettes of the training views, where the config lets them decide and the images have alpha.
 #[derive(Debug)]
-pub struct Silhouettes<'a> {
-    views: &'a [View],
+pub struct Silhouettes {
+    views: Arc<[View]>,
     margin: f64,
 }
 
-impl<'a> Silhouettes<'a> {
-    /// `None` if they have no say.
-    pub fn new(config: &Config, views: &'a [View]) -> Option<Self> {
-        (config.hull == Hull::Auto && has_alpha(views)).then_some(Silhouettes { views, margin: config.carve.margin })
+impl Silhouettes {
+    /// `None` if the config does not let them decide, or there are none.
+    pub fn new(config: &Config, views: &Arc<[View]>) -> Option<Self> {
+        (config.hull == Hull::Auto && has_alpha(views)).then(|| Silhouettes { views: views.clone(), margin: config.carve.margin })
     }
 
     /// The half width of the smallest cube around the origin that holds all that the silhouettes leave of the cube of `half_width`, or
     /// that one itself if they leave nothing.
     pub fn half_width(&self, half_width: f64) -> f64 {
-        let hull = visual_hull::by_footprint(self.views, Aabb::cube(half_width), [COARSE; 3], self.margin, &|_| ());
+        let hull = visual_hull::by_footprint(&self.views, Aabb::cube(half_width), [COARSE; 3], self.margin, &|_| ());
         hull.half_width().unwrap_or(half_width)
     }
 
@@ -37,7 +38,7 @@ impl<'a> Silhouettes<'a> {
     pub fn voxels<T: Real>(&self, grid: &VoxelGrid<T>) -> Occupancy {
         let shape = grid.shape();
         let near = shape.reached_from(&grid.voxels_where(|_| true));
-        shape.reached_from(&visual_hull::by_footprint_of(self.views, &near, self.margin, &|_| ()))
+        shape.reached_from(&visual_hull::by_footprint_of(&self.views, &near, self.margin, &|_| ()))
     }
 }
 

@@ -1,4 +1,4 @@
-//! The pixels of [`composite()`](super::composite()) in one pass over a voxel grid, and its adjoint by hand.
+//! The pixels of [`composite()`] in one pass over a voxel grid, and its adjoint by hand.
 //!
 //! *Forward.* Rays are taken in blocks of fixed size. For each block: where the samples lie, what density is there, what weight that gives
 //! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept.
@@ -30,11 +30,11 @@ mod reduced;
 mod seen;
 mod sorted;
 
-use super::{RenderOptions, Rendered, composite, composite::Rest};
+use super::layout::Layout;
+use super::{Color, VoxelGrid};
 use crate::camera::Ray;
-use crate::field::voxel_grid::layout::Layout;
-use crate::field::voxel_grid::{Color, VoxelGrid};
 use crate::field::{Field, sh};
+use crate::render::{self, RenderOptions, Rendered, composite};
 use crate::sampling::{Occupancy, Samples};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Param, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
 use forward::{Block, Scene};
@@ -94,9 +94,9 @@ struct Rays {
     cells: Option<Occupancy>,
 }
 
-/// The columns that [`Rendered`] computes when asked.
-#[derive(Debug, Clone)]
-pub(crate) struct Columns<T: Real> {
+/// What the other columns of the pixels are computed from.
+#[derive(Debug)]
+struct Columns<T: Real> {
     /// `[n, COLUMNS]`
     pixels: Tensor<T>,
     state: Arc<State<T>>,
@@ -104,16 +104,16 @@ pub(crate) struct Columns<T: Real> {
     tables: Vec<Tensor<T>>,
 }
 
-impl<T: Real> Columns<T> {
-    pub(crate) fn depth(&self) -> Tensor<T> {
+impl<T: Real> render::Columns<T> for Columns<T> {
+    fn depth(&self) -> Tensor<T> {
         self.pixels.index_axis(1, column::DEPTH)
     }
 
-    pub(crate) fn distortion(&self) -> Tensor<T> {
+    fn distortion(&self) -> Tensor<T> {
         self.pixels.index_axis(1, column::DISTORTION)
     }
 
-    pub(crate) fn sparsity(&self) -> Tensor<T> {
+    fn sparsity(&self) -> Tensor<T> {
         let n = self.pixels.shape()[0];
         let mut values = Vec::with_capacity(n);
         self.state.for_each_chunk(&self.tables, |blocks| values.extend(blocks.iter().flat_map(Block::sparsity)));
@@ -161,7 +161,7 @@ impl<T: Real> Scene<'_, T> {
 }
 
 /// Renders a batch of rays through a grid.
-pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+pub(super) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let n = rays.len();
     let batch = Batch::new(grid, rays, options);
     let tables: Vec<&Tensor<T>> = grid.params().map(Param::tensor).collect();
@@ -182,13 +182,13 @@ pub(crate) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
     };
     let state = Arc::new(State { batch, kept });
     let pixels = Tensor::from_kernel(pixels, &[n, COLUMNS], &tables, Fused { state: state.clone(), output: Output::Pixels });
-    Rendered {
-        rgb: pixels.narrow(1, 0, 3),
-        opacity: pixels.index_axis(1, column::OPACITY),
-        log_transmittance: pixels.index_axis(1, column::LOG_TRANSMITTANCE),
+    Rendered::new(
+        pixels.narrow(1, 0, 3),
+        pixels.index_axis(1, column::OPACITY),
+        pixels.index_axis(1, column::LOG_TRANSMITTANCE),
         sample_count,
-        rest: Rest::Fused(Columns { pixels, state, tables: tables.into_iter().cloned().collect() }),
-    }
+        Columns { pixels, state, tables: tables.into_iter().cloned().collect() },
+    )
 }
 
 /// Which columns a kernel computed.

@@ -1,15 +1,17 @@
-//! Every knob of a run: its meaning, its unit, and what its default comes from.
+//! Every setting of a run: its meaning, its unit, and where its default comes from.
 //!
 //! The same struct is the file `config.toml` of a run, a preset, and what flags change.
 
+use super::objective::{LEARNED_LOSSES, LOSSES};
 use crate::camera::Camera;
 use crate::carve::CarveConfig;
 use crate::error::{Error, Result};
 use crate::field::sh;
-use crate::field::voxel_grid::{Color, GridShape, Interpolation};
-use crate::loss;
-use crate::render::Engine;
-use crate::sampling::Spacing;
+use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::render::{Engine, RenderOptions};
+use crate::sampling::{Jitter, Spacing};
+use crate::train::TrainOptions;
+use autograd::Real;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -86,6 +88,9 @@ pub struct Config {
     pub optimizer: OptimizerConfig,
     /// Weight of each loss: a number, `{ weight, until }` for one that ends, or `{ from, to, steps }` for an exponential change over the run.
     pub losses: BTreeMap<String, Weight>,
+    /// Learning rates of losses that have parameters (`robust`, `exposure`), by the name of the loss, where they differ from the loss's own.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub loss_rates: BTreeMap<String, f64>,
     /// Coarse to fine.
     pub stages: Vec<Stage>,
     /// Where samples lie when images are rendered for pictures and figures.
@@ -351,6 +356,7 @@ impl Default for Config {
             // Gradients of a mean over 4096 rays are small: the usual 1e-8 would damp them.
             optimizer: OptimizerConfig::LazyAdam { beta1: 0.9, beta2: 0.99, epsilon: 1e-12 },
             losses: BTreeMap::from([("mse".to_owned(), Weight::Constant(1.0))]),
+            loss_rates: BTreeMap::new(),
             // Ours, a first guess and not tuned: densities move by about one unit a step, so that a voxel is opaque or
             // empty within a few dozen steps, colors by 0.03; the last stage settles.
             stages: vec![
@@ -394,6 +400,31 @@ impl Config {
             fitted.stages.iter_mut().chain(of_scout).for_each(|stage| *stage = stage.fitted(finest));
         }
         fitted
+    }
+
+    /// How a grid is rendered with samples at these places.
+    pub(super) fn render_options<T: Real>(&self, grid: &VoxelGrid<T>, sampling: Sampling, jitter: Jitter) -> RenderOptions<'static> {
+        RenderOptions {
+            aabb: grid.aabb(),
+            spacing: sampling.spacing(grid.shape().voxel_side()),
+            jitter,
+            background: self.background,
+            occupancy: None,
+            engine: self.engine,
+            stop_below: self.stop_below,
+        }
+    }
+
+    /// Values before the first step, of the scout or of the training itself.
+    pub(super) fn initial_of(&self, scout: bool) -> Initial {
+        let density = self.scout.as_ref().filter(|_| scout).map_or(self.initial.density, |scout| scout.density);
+        Initial { density, ..self.initial }
+    }
+
+    /// Settings of the trainer, which do not depend on the model.
+    pub fn train_options(&self) -> TrainOptions {
+        let Config { seed, background, rays_per_step, jitter, .. } = *self;
+        TrainOptions { seed, background, rays_per_step, jitter, ..TrainOptions::default() }
     }
 
     /// Checks that there is something to train.
@@ -445,10 +476,10 @@ impl Config {
         }
         for (name, weight) in &self.losses {
             check(
-                loss::NAMES.contains(&name.as_str()),
+                LOSSES.contains(&name.as_str()),
                 &format!("losses.{name}"),
                 "an unknown loss",
-                &format!("one of {}", loss::NAMES.join(", ")),
+                &format!("one of {}", LOSSES.join(", ")),
             )?;
             let key = |part: &str| format!("losses.{name}{part}");
             let fits = |part: &str, weight: f64| check((0.0..=1e12).contains(&weight), &key(part), weight, "0 to 1e12");
@@ -463,6 +494,13 @@ impl Config {
                     lasts(".steps", steps)?;
                 }
             }
+        }
+        for (name, rate) in &self.loss_rates {
+            let key = format!("loss_rates.{name}");
+            let learned: Vec<&str> = LEARNED_LOSSES.into_iter().filter(|loss| self.losses.contains_key(*loss)).collect();
+            let accepted = if learned.is_empty() { "a rate for one of the losses robust and exposure".to_owned() } else { learned.join(", ") };
+            check(learned.contains(&name.as_str()), &key, "a rate for a loss that has no parameters here", &accepted)?;
+            check((1e-12..=1e6).contains(rate), &key, rate, "1e-12 to 1e6")?;
         }
         if let Some(scout) = &self.scout {
             check(scout.density > 0.0, "scout.density", scout.density, "above 0 to 1e12")?;

@@ -1,0 +1,325 @@
+//! Plenoxels: a voxel grid, learned coarse to fine, in which empty space is left out stage after stage (Fridovich-Keil et al. 2022, and
+//! Maruani 2022).
+//!
+//! [`Config`](config::Config) has every setting. [`Trainer::<f32>::new(config, views)`](Trainer) is a run with the losses that the config names,
+//! `Trainer::with_objective` one with losses of your own:
+//!
+//! ```
+//! use plenoxel::dataset::procedural::ProceduralOptions;
+//! use plenoxel::dataset::{Dataset, Split};
+//! use plenoxel::loss::mse;
+//! use plenoxel::model::plenoxels::config::{Config, Stage};
+//! use plenoxel::model::plenoxels::{Objective, Trainer};
+//!
+//! let scene = ProceduralOptions { width: 16, height: 16, train: 4, val: 0, test: 0, supersample: 1 };
+//! let views = Dataset::procedural(scene)?.load(Split::Train, &|_, _| {})?;
+//! let objective = Objective::<f32>::new().with("mse", 1.0, mse);
+//! let config = Config { stages: vec![Stage::new(8, 3)], ..Config::default() };
+//! let mut trainer = Trainer::with_objective(config, views, objective)?;
+//! while let Some(report) = trainer.step()? {
+//!     assert!(report.psnr > 0.0);
+//! }
+//! assert_eq!(trainer.grid().shape().resolution, 8);
+//! # Ok::<(), plenoxel::error::Error>(())
+//! ```
+
+pub mod config;
+mod file;
+mod objective;
+mod rates;
+mod stages;
+mod start;
+
+pub use objective::{LEARNED_LOSSES, LOSSES, objective, with_loss};
+
+use crate::camera::Ray;
+use crate::checkpoint::{self, Header};
+use crate::dataset::View;
+use crate::error::{Error, Result};
+use crate::field::Field;
+use crate::field::voxel_grid::{GridShape, VoxelGrid};
+use crate::geometry::Aabb;
+use crate::loss;
+use crate::rays::RaySource;
+use crate::render::{Engine, RenderOptions, Rendered, render};
+use crate::sampling::{Jitter, Occupancy};
+use crate::tensor_file::{TensorFile, TensorWriter};
+use crate::train::{self, About, Model, Pass, PlannedStage, StageLength, TrainOptions, ViewOptions};
+use autograd::optim::Optimizer;
+use autograd::{Module, Param, Real};
+use config::{Config, Sampling, Stage};
+use start::Silhouettes;
+use std::path::Path;
+use std::sync::Arc;
+
+/// A trainer of Plenoxels.
+pub type Trainer<T> = train::Trainer<T, Plenoxels<T>>;
+
+/// An objective of Plenoxels.
+pub type Objective<T> = loss::Objective<T, Plenoxels<T>>;
+
+/// Data of a training step of Plenoxels.
+pub type Step<'a, T> = loss::Step<'a, T, Plenoxels<T>>;
+
+/// Kind of model that checkpoints of voxel grids carry.
+pub const KIND: &str = checkpoint::KIND;
+
+/// Steps after which it is looked up anew where the grid can learn. A sample whose corners all have a density below 0 has no gradient; it comes
+/// to have one when a voxel at its edge, which it shares with others, rises.
+const STEPS_PER_LOOK: u64 = 64;
+
+/// Pictures end a ray where less light than this comes from behind: no number of 8 bits changes by more than a fortieth of a step.
+const STOP_BELOW: f64 = 1e-4;
+
+/// A voxel grid with the recipe of a config.
+#[derive(Debug)]
+pub struct Plenoxels<T: Real> {
+    /// Fitted to the images ([`Config::fitted_to`]).
+    config: Config,
+    /// Stages that are trained, those of the scout first.
+    stages: Vec<Stage>,
+    /// How many of them are the scout's.
+    scouts: usize,
+    silhouettes: Option<Silhouettes>,
+    grid: VoxelGrid<T>,
+    /// Where the grid could learn when last looked at: samples elsewhere are left out.
+    learning: Option<Occupancy>,
+    most_rows: usize,
+}
+
+impl<T: Real> Plenoxels<T> {
+    /// The grid that a config starts with, for these training views.
+    ///
+    /// Errors name the setting that cannot be used.
+    pub fn new(config: &Config, views: &Arc<[View]>) -> Result<Self> {
+        config.validate()?;
+        let config = config.fitted_to(views.iter().map(|view| &view.camera));
+        config.check_stages()?;
+        let silhouettes = Silhouettes::new(&config, views);
+        let scout = config.scout.as_ref().filter(|_| silhouettes.is_none());
+        let of_scout = scout.map_or(&[][..], |scout| &scout.stages);
+        let stages: Vec<Stage> = of_scout.iter().chain(&config.stages).copied().collect();
+        let mut shape = config.grid_shape(stages[0].resolution);
+        if let Some(silhouettes) = &silhouettes {
+            shape.half_width = silhouettes.half_width(shape.half_width);
+        }
+        let scouts = of_scout.len();
+        let initial = config.initial_of(scouts > 0);
+        let grid = match initial.random {
+            true => VoxelGrid::random(shape, initial.density, initial.color, config.seed),
+            false => VoxelGrid::uniform(shape, initial.density, initial.color),
+        };
+        Ok(Plenoxels { config, stages, scouts, silhouettes, grid, learning: None, most_rows: usize::MAX })
+    }
+
+    /// The same model, in which pruning must not leave more rows of tables than these, because they would not fit into memory.
+    pub fn with_most_rows(self, most_rows: usize) -> Self {
+        Plenoxels { most_rows, ..self }
+    }
+
+    /// The same recipe starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
+    /// the first stage, and stages coarser than it are left out, except the last.
+    pub fn starting_from(mut self, grid: &VoxelGrid<T>) -> Self {
+        let stages = &self.config.stages;
+        let coarser = stages.iter().take_while(|stage| stage.resolution < grid.shape().resolution).count();
+        self.scouts = 0;
+        self.stages = stages[coarser.min(stages.len() - 1)..].to_vec();
+        self.grid = start::adapted(grid, &self.config.grid_shape(self.stages[0].resolution));
+        self
+    }
+
+    /// The same from a carved grid, whose voxels are all equally opaque: they are made thin, so that gradients reach what is behind them.
+    pub fn starting_from_carved(self, grid: &VoxelGrid<T>) -> Self {
+        self.starting_from(&start::thinned(grid))
+    }
+
+    /// The grid as it is now.
+    pub fn grid(&self) -> &VoxelGrid<T> {
+        &self.grid
+    }
+
+    /// The trained grid.
+    pub fn into_grid(self) -> VoxelGrid<T> {
+        self.grid
+    }
+
+    /// The config, fitted to the images ([`Config::fitted_to`]).
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// Number of the stages of the plan that are the scout's; they come first.
+    pub fn scout_stages(&self) -> usize {
+        self.scouts
+    }
+}
+
+impl<T: Real> AsRef<VoxelGrid<T>> for Plenoxels<T> {
+    fn as_ref(&self) -> &VoxelGrid<T> {
+        &self.grid
+    }
+}
+
+impl<T: Real> Module<T> for Plenoxels<T> {
+    fn visit(&self, f: &mut dyn FnMut(&Param<T>)) {
+        self.grid.visit(f);
+    }
+
+    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>)) {
+        self.grid.visit_mut(f);
+    }
+}
+
+impl<T: Real> Model<T> for Plenoxels<T> {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn aabb(&self) -> Aabb {
+        self.grid.aabb()
+    }
+
+    fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {
+        let sampling = pass.stage.map_or(self.config.evaluation, |stage| self.stages[stage].sampling);
+        let occupancy = self.learning.as_ref().filter(|_| pass.stage.is_some());
+        let options = self.config.render_options(&self.grid, sampling, pass.jitter);
+        let engine = if pass.keep_samples { Engine::Graph } else { options.engine };
+        render(&self.grid, rays, &RenderOptions { occupancy, engine, background: pass.background, ..options })
+    }
+
+    fn viewer<'a>(&'a self, view: &ViewOptions) -> Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a> {
+        let sampling = self.config.evaluation;
+        let sampling = view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()));
+        let (matter, background) = (self.grid.matter(), view.background);
+        let options = self.config.render_options(&self.grid, sampling, Jitter::None);
+        Box::new(move |rays| {
+            render(&self.grid, rays, &RenderOptions { occupancy: Some(&matter), stop_below: STOP_BELOW, background, ..options.clone() })
+        })
+    }
+
+    fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
+        rates::optimizer(&self.config, &self.stages[stage.index], stage.steps)
+    }
+
+    fn stages(&self, options: &TrainOptions, rays_per_epoch: u64) -> Vec<StageLength> {
+        let length = |stage: &Stage| StageLength {
+            resolution: Some(stage.resolution),
+            steps: stage.step_count(rays_per_epoch, options.rays_per_step),
+        };
+        self.stages.iter().map(length).collect()
+    }
+
+    fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {
+        self.begin(stage.index, rays)
+    }
+
+    fn begin_step(&mut self, in_stage: u64) -> Result<()> {
+        if in_stage.is_multiple_of(STEPS_PER_LOOK) {
+            self.learning = Some(self.grid.learning());
+        }
+        Ok(())
+    }
+
+    fn facts(&self) -> Vec<(&'static str, f64)> {
+        vec![("voxels", self.grid.lattice().present() as f64)]
+    }
+
+    fn settings(&self) -> serde_json::Value {
+        serde_json::to_value(&self.config).unwrap_or_default()
+    }
+
+    fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {
+        file::write(self, file);
+    }
+
+    fn read(&mut self, file: &mut TensorFile<'_>, stage: usize) -> Result<()> {
+        file::read(self, file, stage)
+    }
+
+    fn resume(&mut self, stage: &PlannedStage, rays: &mut RaySource) {
+        rays.set_reduction(self.stages[stage.index].image_reduction);
+        let reach = Field::<T>::reach(&self.grid).cloned();
+        self.aim(reach.as_ref(), rays);
+    }
+
+    fn save(&self, path: &Path, about: &About) -> Result<()> {
+        checkpoint::save(path, &self.grid, &Header::new(&self.grid, &about.scene, about.background, about.seed, about.step))
+    }
+
+    fn load(&mut self, path: &Path) -> Result<About> {
+        let (grid, header) = checkpoint::load(path)?;
+        self.grid = grid;
+        Ok(About { scene: header.scene, background: header.background, seed: header.seed, step: header.step })
+    }
+}
+
+/// Construction from a config, and the grid.
+impl<T: Real> train::Trainer<T, Plenoxels<T>> {
+    /// A run from its beginning, with the losses that the config names.
+    pub fn new(config: Config, views: impl Into<Arc<[View]>>) -> Result<Self> {
+        config.validate()?;
+        let views = views.into();
+        let objective = objective(&config, views.len())?;
+        let model = Plenoxels::new(&config, &views)?;
+        Self::with_model(model, views, objective, config.train_options())
+    }
+
+    /// A run with an objective of your own. The config must name no losses but those of the default, a mean squared error: its losses would not
+    /// be used.
+    ///
+    /// Errors if the config names others.
+    pub fn with_objective(config: Config, views: impl Into<Arc<[View]>>, objective: Objective<T>) -> Result<Self> {
+        if !config.losses.is_empty() && config.losses != Config::default().losses {
+            let names: Vec<&str> = config.losses.keys().map(String::as_str).collect();
+            let accepted = "no losses in the config (`losses` empty), or Trainer::new without an objective; model::plenoxels::objective(&config, views) is one to add to";
+            return Err(Error::config("losses", format!("{} beside an objective of one's own", names.join(", ")), accepted));
+        }
+        let views = views.into();
+        let model = Plenoxels::new(&config, &views)?;
+        Self::with_model(model, views, objective, config.train_options())
+    }
+
+    /// The same run where pruning must not leave more rows of tables than these ([`Plenoxels::with_most_rows`]).
+    pub fn with_most_rows(self, most_rows: usize) -> Self {
+        self.map_model(|model| model.with_most_rows(most_rows))
+    }
+
+    /// The same run starting from a grid that is there already ([`Plenoxels::starting_from`]).
+    ///
+    /// Panics if steps have been taken.
+    pub fn starting_from(self, grid: &VoxelGrid<T>) -> Self {
+        self.map_model(|model| model.starting_from(grid))
+    }
+
+    /// The same run starting from a carved grid ([`Plenoxels::starting_from_carved`]).
+    ///
+    /// Panics if steps have been taken.
+    pub fn starting_from_carved(self, grid: &VoxelGrid<T>) -> Self {
+        self.map_model(|model| model.starting_from_carved(grid))
+    }
+
+    /// The grid as it is now.
+    pub fn grid(&self) -> &VoxelGrid<T> {
+        self.model().grid()
+    }
+
+    /// The trained grid.
+    pub fn into_grid(self) -> VoxelGrid<T> {
+        self.into_model().into_grid()
+    }
+
+    /// The config, fitted to the images ([`Config::fitted_to`]).
+    pub fn config(&self) -> &Config {
+        self.model().config()
+    }
+}
+
+impl Sampling {
+    /// `samples` points over the longest line through the box, or over the ray where the sampling is the source paper's.
+    pub fn with_samples(self, samples: u32, shape: &GridShape) -> Self {
+        match self {
+            Sampling::Points { far, .. } => Sampling::Points { samples: samples as usize, far },
+            Sampling::Step { .. } => Sampling::Step { step: 3f64.sqrt() * shape.resolution as f64 / f64::from(samples) },
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! Losses of a voxel grid by their names, and the objective that a config describes.
+
+use super::config::{Config, Weight};
+use super::Objective;
+use crate::error::{Error, Result};
+use crate::field::voxel_grid::VoxelGrid;
+use crate::loss::{self, Cells, EXPOSURE, tv_color, tv_density};
+use autograd::Real;
+use autograd::optim::{Exponential, Piecewise, Schedule};
+
+/// Losses that read the voxel grid.
+const OF_GRID: [&str; 4] = ["tv_density", "tv_color", "tv_density_sampled", "tv_color_sampled"];
+
+/// Every loss that a config may name: those of any model ([`loss::NAMES`]), and those that read the voxel grid.
+pub const LOSSES: [&str; loss::NAMES.len() + OF_GRID.len()] = {
+    let mut all = [""; loss::NAMES.len() + OF_GRID.len()];
+    let mut i = 0;
+    while i < all.len() {
+        all[i] = if i < loss::NAMES.len() { loss::NAMES[i] } else { OF_GRID[i - loss::NAMES.len()] };
+        i += 1;
+    }
+    all
+};
+
+/// Losses with parameters, whose learning rate a config may set.
+pub const LEARNED_LOSSES: [&str; 2] = ["robust", EXPOSURE];
+
+/// An objective with one more loss, by its name in [`LOSSES`], for a model that has a voxel grid; `views` is the number of training views.
+///
+/// Errors if the name is unknown.
+pub fn with_loss<T: Real, M: AsRef<VoxelGrid<T>> + 'static>(
+    objective: loss::Objective<T, M>,
+    name: &str,
+    weight: impl Schedule + 'static,
+    views: usize,
+) -> Result<loss::Objective<T, M>> {
+    Ok(match name {
+        "tv_density" => objective.with(name, weight, tv_density(Cells::Whole)),
+        "tv_color" => objective.with(name, weight, tv_color(Cells::Whole)),
+        "tv_density_sampled" => objective.with(name, weight, tv_density(Cells::SAMPLED)),
+        "tv_color_sampled" => objective.with(name, weight, tv_color(Cells::SAMPLED)),
+        _ if loss::NAMES.contains(&name) => objective.with_named(name, weight, views)?,
+        _ => return Err(Error::config(format!("losses.{name}"), "an unknown loss", format!("one of {}", LOSSES.join(", ")))),
+    })
+}
+
+/// The objective that a config describes, for a number of training views.
+pub fn objective<T: Real>(config: &Config, views: usize) -> Result<Objective<T>> {
+    if config.losses.is_empty() {
+        return Err(Error::config("losses", "no loss", "at least one, as in `mse = 1.0`"));
+    }
+    let all = config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| match *weight {
+        Weight::Constant(weight) => with_loss(objective, name, weight, views),
+        Weight::Until { weight, until } => with_loss(objective, name, Piecewise::new(weight).then(until, 0.0), views),
+        Weight::Exponential { from, to, steps } => with_loss(objective, name, Exponential::new(from, to, steps), views),
+    })?;
+    Ok(config.loss_rates.iter().fold(all, |objective, (loss, &rate)| {
+        let of_loss = |name: &&str| *name == loss || name.strip_prefix(loss.as_str()).is_some_and(|rest| rest.starts_with('.'));
+        let params: Vec<String> = objective.params().iter().map(|p| p.name()).filter(of_loss).map(str::to_owned).collect();
+        params.into_iter().fold(objective, |objective, name| objective.with_rate(&name, rate))
+    }))
+}
