@@ -12,6 +12,8 @@ pub enum Purpose {
     Initial = 3,
     /// Cells on which a regulariser is evaluated.
     Cells = 4,
+    /// Squares of neighbouring pixels.
+    Patches = 5,
 }
 
 /// 64 random bits for (seed, purpose, step, index).

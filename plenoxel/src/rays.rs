@@ -1,44 +1,33 @@
 //! Training rays, made on the fly: a ray is a view, a pixel and a camera, so a scene costs no more memory than its 8-bit images.
 
+mod batch;
+mod channel;
+mod patches;
+#[cfg(test)]
+mod tests;
+mod tiles;
+
+pub use batch::RayBatch;
+
 use crate::camera::Ray;
 use crate::dataset::{View, has_alpha};
 use crate::geometry::Aabb;
 use crate::random::{Permutation, Purpose};
 use crate::sampling::Occupancy;
 use autograd::{Buffer, Real, Tensor, parallel};
+use channel::Channel;
 use glam::DVec3;
-use std::borrow::Cow;
+use ndarray::Array3;
+use std::sync::Arc;
 use tiles::Tile;
-
-mod tiles;
-
-/// Rays with what the photographs show along them.
-#[derive(Debug, Clone)]
-pub struct RayBatch<T: Real> {
-    /// Origins and unit directions, world frame.
-    pub rays: Vec<Ray>,
-    /// `[n, 3]`, sRGB in [0, 1], composited over the background.
-    pub target: Tensor<T>,
-    /// `[n]`, in [0, 1]: how much of the pixel is object, where the images have an alpha channel; 1 where they have none.
-    pub alpha: Tensor<T>,
-}
-
-impl<T: Real> RayBatch<T> {
-    /// The number of rays.
-    pub fn len(&self) -> usize {
-        self.rays.len()
-    }
-
-    /// True if there are none.
-    pub fn is_empty(&self) -> bool {
-        self.rays.is_empty()
-    }
-}
 
 /// The pixels of some views, all of them or those that can see something, in an order that is shuffled anew each epoch.
 #[derive(Debug)]
-pub struct RaySource<'a> {
-    views: Cow<'a, [View]>,
+pub struct RaySource {
+    all_views: Arc<[View]>,
+    reduction: usize,
+    /// The views reduced by `reduction`, unless that is 1.
+    reduced: Option<Vec<View>>,
     background: [f32; 3],
     seed: u64,
     tiles: Vec<Tile>,
@@ -47,21 +36,86 @@ pub struct RaySource<'a> {
     /// The tile of every [`apart`](Self::apart)-th pixel, about as many as there are tiles: one search for a random pixel would wait for memory a
     /// dozen times.
     guide: Vec<u32>,
-    /// Pixels of all views.
+    /// Pixels of all views, as reduced now.
     pixels: u64,
+    with_depth: bool,
+    channels: Vec<Channel>,
 }
 
-impl<'a> RaySource<'a> {
-    /// The pixels of `views` over a background.
+impl RaySource {
+    /// All pixels of `views` over a background, in an order that follows from the seed.
     ///
-    /// Views that are owned stay in memory as long as the source.
-    pub fn new(views: impl Into<Cow<'a, [View]>>, background: [f32; 3], seed: u64) -> Self {
-        let views = views.into();
-        let tiles = views.iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
-        let mut source = RaySource { views, background, seed, tiles: Vec::new(), first: Vec::new(), guide: Vec::new(), pixels: 0 };
-        source.set_tiles(tiles);
-        source.pixels = source.len();
+    /// The source owns the views: a `Vec` is moved into it, an `Arc` is shared with it, and a slice is copied, pixels and all.
+    pub fn new(views: impl Into<Arc<[View]>>, background: [f32; 3], seed: u64) -> Self {
+        let mut source = RaySource {
+            all_views: views.into(),
+            reduction: 1,
+            reduced: None,
+            background,
+            seed,
+            tiles: Vec::new(),
+            first: Vec::new(),
+            guide: Vec::new(),
+            pixels: 0,
+            with_depth: false,
+            channels: Vec::new(),
+        };
+        source.set_reduction(1);
         source
+    }
+
+    /// The same source, whose batches have [`RayBatch::depth`] if some view has a depth image. Of a reduced pixel it is the mean over its k × k
+    /// pixels: infinite or NaN if one of them is.
+    pub fn with_depth(self) -> Self {
+        RaySource { with_depth: true, ..self }
+    }
+
+    /// The same source, whose batches have numbers of one's own for each pixel ([`RayBatch::channel`]): masks, weights, features.
+    ///
+    /// `images` are `[height, width, c]`, one for each view at its full size, all of the same c. Of a reduced pixel a number is the mean over
+    /// its k × k pixels. NaN stays NaN.
+    ///
+    /// Panics if images are too few or too many, of another size than their view (which is named), without channels, or of different numbers of
+    /// channels, and if there is a channel of this name already.
+    #[track_caller]
+    pub fn with_channel(mut self, name: impl Into<String>, images: impl Into<Arc<[Array3<f32>]>>) -> Self {
+        let name = name.into();
+        assert!(self.channels.iter().all(|channel| channel.name != name), "there is a channel `{name}` already");
+        self.channels.push(Channel::new(name, images.into(), &self.all_views));
+        self
+    }
+
+    /// From now on all pixels of the views reduced by k with a box filter, or by the largest number below that divides a view's sides
+    /// ([`View::reduced`]); not aimed. k = 1 is for the views themselves.
+    ///
+    /// Panics if k is 0.
+    #[track_caller]
+    pub fn set_reduction(&mut self, k: usize) {
+        assert!(k > 0, "set_reduction: images cannot be reduced by 0");
+        if k != self.reduction {
+            // The old ones go before the new ones come.
+            self.reduced = None;
+            self.reduced = (k > 1).then(|| parallel::map_indices(self.all_views.len(), |v| self.all_views[v].reduced(k)));
+            self.reduction = k;
+        }
+        let tiles = self.views().iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
+        self.set_tiles(tiles);
+        self.pixels = self.len();
+    }
+
+    /// By how much the views are reduced now, 1 at first.
+    pub fn reduction(&self) -> usize {
+        self.reduction
+    }
+
+    /// The views at their full size.
+    pub fn all_views(&self) -> &Arc<[View]> {
+        &self.all_views
+    }
+
+    /// The views whose pixels these are, as reduced now, whether rays are aimed or not.
+    pub fn views(&self) -> &[View] {
+        self.reduced.as_deref().unwrap_or(&self.all_views)
     }
 
     fn set_tiles(&mut self, tiles: Vec<Tile>) {
@@ -87,12 +141,7 @@ impl<'a> RaySource<'a> {
     /// From now on the pixels of the same views around the projections of what may hold matter. The others show the background whatever is
     /// learned, so they say nothing, except of the mean of the errors.
     pub fn aim_at(&mut self, matter: &Occupancy) {
-        self.set_tiles(tiles::showing(&self.views, matter));
-    }
-
-    /// The views whose pixels these are, at their present size, whether rays are aimed or not.
-    pub fn views(&self) -> &[View] {
-        &self.views
+        self.set_tiles(tiles::showing(self.views(), matter));
     }
 
     /// The share of the pixels of the views that are in the set.
@@ -116,18 +165,59 @@ impl<'a> RaySource<'a> {
         let epochs: Vec<Permutation> = (from / total..=(from + n as u64 - 1) / total)
             .map(|epoch| Permutation::new(total, self.seed, Purpose::RayOrder, epoch))
             .collect();
+        self.gathered(n, |i| {
+            let number = from + i as u64;
+            self.place(epochs[(number / total - from / total) as usize].at(number % total))
+        })
+    }
+
+    /// Rays of chosen pixels, in their order: (view, column, row) in the images as reduced now. Whether rays are aimed does not matter.
+    ///
+    /// Panics at the caller's line, naming the first pixel that is in no view.
+    #[track_caller]
+    pub fn batch_of<T: Real>(&self, pixels: &[(u32, u32, u32)]) -> RayBatch<T> {
+        let views = self.views();
+        let size = |v: u32| views.get(v as usize).map(|view| view.image.dimensions());
+        for &(v, x, y) in pixels {
+            let there = size(v).is_some_and(|(width, height)| x < width && y < height);
+            let of_view =
+                || size(v).map_or(format!("{} views", views.len()), |(width, height)| format!("a view of {width} x {height} pixels"));
+            assert!(there, "batch_of: pixel ({v}, {x}, {y}), as view, column and row, is not in {}", of_view());
+        }
+        self.gathered(pixels.len(), |i| {
+            let (v, x, y) = pixels[i];
+            (v as usize, x as usize, y as usize)
+        })
+    }
+
+    /// The rays of n pixels, given by view, column and row.
+    fn gathered<T: Real>(&self, n: usize, place: impl Fn(usize) -> (usize, usize, usize) + Sync) -> RayBatch<T> {
+        let views = self.views();
         let nowhere = Ray { origin: DVec3::ZERO, direction: DVec3::ZERO, stretch: 0.0 };
         let (mut rays, mut target, mut alpha) = (vec![nowhere; n], Buffer::stale(3 * n), Buffer::stale(n));
+        let (mut view, mut pixel) = (vec![0; n], vec![[0; 2]; n]);
         const RUN: usize = 512;
-        let runs = rays.chunks_mut(RUN).zip(target.chunks_mut(3 * RUN)).zip(alpha.chunks_mut(RUN)).collect();
-        parallel::for_each_item(runs, |run, ((rays, target), alpha)| {
+        let of_image = target.chunks_mut(3 * RUN).zip(alpha.chunks_mut(RUN));
+        let of_place = view.chunks_mut(RUN).zip(pixel.chunks_mut(RUN));
+        let runs = rays.chunks_mut(RUN).zip(of_image).zip(of_place).collect();
+        parallel::for_each_item(runs, |run, ((rays, (target, alpha)), (view, pixel))| {
             for (i, (ray, target)) in rays.iter_mut().zip(target.as_chunks_mut::<3>().0).enumerate() {
-                let number = from + (run * RUN + i) as u64;
-                let (found, color, a) = self.pixel(epochs[(number / total - from / total) as usize].at(number % total));
-                (*ray, *target, alpha[i]) = (found, color.map(|c| T::lit(f64::from(c))), T::lit(f64::from(a)));
+                let (v, x, y) = place(run * RUN + i);
+                let seen = &views[v];
+                *ray = seen.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
+                *target = seen.color(x, y, self.background).map(|c| T::lit(f64::from(c)));
+                alpha[i] = T::lit(f64::from(seen.alpha(x, y)));
+                (view[i], pixel[i]) = (v as u32, [x as u32, y as u32]);
             }
         });
-        RayBatch { rays, target: Tensor::from_buffer(target, &[n, 3]), alpha: Tensor::from_buffer(alpha, &[n]) }
+        let (target, alpha) = (Tensor::from_buffer(target, &[n, 3]), Tensor::from_buffer(alpha, &[n]));
+        let mut batch = RayBatch { rays, target, alpha, view, pixel, depth: None, channels: Vec::new() };
+        let block = |v: usize| (self.all_views[v].image.width() / views[v].image.width()) as usize;
+        if self.with_depth && self.all_views.iter().any(|view| view.depth.is_some()) {
+            batch.depth = Some(channel::depth(&batch, &self.all_views, block));
+        }
+        batch.channels = self.channels.iter().map(|channel| (channel.name.clone(), channel.at(&batch, block))).collect();
+        batch
     }
 
     /// Rays of the set through every `stride`-th column and row of the views, tile after tile, `size` at a time.
@@ -138,8 +228,9 @@ impl<'a> RaySource<'a> {
             along(y, height).flat_map(move |y| along(x, width).map(move |x| (view as usize, x, y)))
         };
         let mut pixels = self.tiles.iter().flat_map(of_tile);
+        let views = self.views();
         std::iter::from_fn(move || {
-            let ray = |(v, x, y): (usize, u32, u32)| self.views[v].camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let ray = |(v, x, y): (usize, u32, u32)| views[v].camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
             let rays: Vec<Ray> = pixels.by_ref().take(size).map(ray).collect();
             (!rays.is_empty()).then_some(rays)
         })
@@ -150,19 +241,20 @@ impl<'a> RaySource<'a> {
     pub fn stride(&self, side: f64, aabb: Aabb) -> u32 {
         const RAYS: f64 = 8.0;
         let reach = 0.5 * (aabb.max - aabb.min).length();
-        let pixels = self.views.iter().map(|view| {
+        let pixels = self.views().iter().map(|view| {
             let k = &view.camera.intrinsics;
             k.fx.min(k.fy) * side / (view.camera.position().distance(0.5 * (aabb.min + aabb.max)) + reach)
         });
-        let apart = (self.views.len() as f64 / RAYS).sqrt();
+        let apart = (self.views().len() as f64 / RAYS).sqrt();
         (apart * pixels.fold(f64::INFINITY, f64::min)).clamp(1.0, 64.0) as u32
     }
 
     /// All rays of the set, view after view and row after row, `size` at a time.
     fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
+        let views = self.views();
         let ray = |index: u64| {
             let (v, x, y) = self.place(index);
-            self.views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5)
+            views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5)
         };
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
@@ -170,11 +262,12 @@ impl<'a> RaySource<'a> {
     /// All rays of the set, view after view and row after row, `size` at a time, each with the alpha of its pixel. Where no
     /// view has a transparent pixel ([`has_alpha`]), alpha does not tell objects: it is 0 where the color is the background's then, else 1.
     pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
-        let has_alpha = has_alpha(&self.views);
+        let views = self.views();
+        let has_alpha = has_alpha(views);
         let in_bytes = |color: [f32; 3]| color.map(|c| (c * 255.0).round() as u8);
         let alpha = move |index: u64| {
             let (v, x, y) = self.place(index);
-            let view = &self.views[v];
+            let view = &views[v];
             match has_alpha {
                 true => view.alpha(x, y),
                 false => f32::from(u8::from(in_bytes(view.color(x, y, self.background)) != in_bytes(self.background))),
@@ -186,13 +279,6 @@ impl<'a> RaySource<'a> {
         })
     }
 
-    /// Ray, color over the background, and alpha of one pixel of the set.
-    fn pixel(&self, index: u64) -> (Ray, [f32; 3], f32) {
-        let (v, x, y) = self.place(index);
-        let view = &self.views[v];
-        (view.camera.ray(x as f64 + 0.5, y as f64 + 0.5), view.color(x, y, self.background), view.alpha(x, y))
-    }
-
     /// Number of the view, column and row of one pixel of the set.
     fn place(&self, index: u64) -> (usize, usize, usize) {
         let guide = self.guide[(index / self.apart()) as usize] as usize;
@@ -200,44 +286,5 @@ impl<'a> RaySource<'a> {
         let Tile { view, x, y, width, .. } = self.tiles[t];
         let pixel = (index - self.first[t]) as u32;
         (view as usize, (x + pixel % width) as usize, (y + pixel / width) as usize)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::camera::{Camera, Intrinsics};
-    use crate::dataset::image::RgbaImage;
-
-    /// A view of some pixels in a row.
-    fn view(pixels: &[[u8; 4]]) -> View {
-        let intrinsics = Intrinsics::from_fov_x(pixels.len(), 1, 0.7);
-        let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, intrinsics);
-        let image = RgbaImage::from_fn(pixels.len() as u32, 1, |x, _| pixels[x as usize].into());
-        View { name: String::new(), camera, image, depth: None }
-    }
-
-    #[test]
-    fn every_pixel_of_tiles_of_any_size_has_its_place() {
-        let views = [view(&[[0; 4]; 1000])];
-        let mut source = RaySource::new(&views[..], [1.0; 3], 0);
-        let tiles = [(3, 1), (4, 0), (10, 500), (600, 1), (601, 2), (700, 300)];
-        source.set_tiles(tiles.map(|(x, width)| Tile { view: 0, x, y: 0, width, height: 1 }).into());
-        let want: Vec<usize> = tiles.iter().flat_map(|&(x, width)| (x..x + width).map(|x| x as usize)).collect();
-        assert!(source.len() == want.len() as u64 && source.guide.len() <= tiles.len());
-        let places = (0..source.len()).map(|index| source.place(index));
-        assert!(places.eq(want.iter().map(|&x| (0, x, 0))));
-    }
-
-    #[test]
-    fn a_view_full_of_object_is_judged_by_alpha_if_another_one_has_some() {
-        let alphas = |views: &[View]| -> Vec<f32> {
-            RaySource::new(views, [1.0; 3], 0).in_order_with_alpha(3).flat_map(|(_, alphas)| alphas).collect()
-        };
-        let (white, red) = ([255, 255, 255, 255], [255, 0, 0, 255]);
-        // White parts of an object that fills its picture are object.
-        let [full, other] = [view(&[white, red]), view(&[white, [0; 4], [9, 9, 9, 51]])];
-        assert_eq!(alphas(&[full.clone(), other]), [1.0, 1.0, 1.0, 0.0, 0.2]);
-        assert_eq!(alphas(&[full.clone(), full]), [0.0, 1.0, 0.0, 1.0]);
     }
 }

@@ -57,9 +57,7 @@ pub struct Trainer<'a, T: Real> {
     config: Config,
     plan: Vec<PlannedStage>,
     views: &'a [View],
-    rays: RaySource<'a>,
-    /// By how much the images are reduced whose pixels the rays are.
-    reduction: usize,
+    rays: RaySource,
     silhouettes: Option<Silhouettes<'a>>,
     /// How many stages of the plan are the scout's.
     scouts: usize,
@@ -109,7 +107,6 @@ impl<'a, T: Real> Trainer<'a, T> {
             plan,
             views,
             rays,
-            reduction: 1,
             silhouettes,
             scouts,
             objective,

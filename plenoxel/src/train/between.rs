@@ -3,21 +3,18 @@
 use super::config::{Scout, Stage};
 use super::plan::{initial, optimizer};
 use super::{Trainer, start};
-use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::field::Field;
 use crate::field::voxel_grid::VoxelGrid;
-use crate::rays::RaySource;
 use crate::render::RenderOptions;
 use crate::render::fused::largest_weights;
 use crate::sampling::{Jitter, Occupancy};
-use autograd::{Real, parallel, release_free_buffers};
-use std::borrow::Cow;
+use autograd::{Real, release_free_buffers};
 
 /// Rays that are rendered at a time to find out what is seen: bounds the memory.
 const RAYS_PER_BATCH: usize = 1 << 15;
 
-impl<'a, T: Real> Trainer<'a, T> {
+impl<T: Real> Trainer<'_, T> {
     /// Begins a stage.
     pub(super) fn begin(&mut self, index: usize) -> Result<()> {
         let stage = self.plan[index].stage;
@@ -43,9 +40,8 @@ impl<'a, T: Real> Trainer<'a, T> {
                 ));
             }
         }
-        if stage.image_reduction != self.reduction {
-            self.reduction = stage.image_reduction;
-            self.rays = self.all_rays();
+        if stage.image_reduction != self.rays.reduction() {
+            self.rays.set_reduction(stage.image_reduction);
         }
         self.aim(Field::<T>::reach(&outline));
         if self.prunes(index) {
@@ -101,15 +97,6 @@ impl<'a, T: Real> Trainer<'a, T> {
         }
     }
 
-    /// The rays of all pixels of the images as reduced now.
-    pub(super) fn all_rays(&self) -> RaySource<'a> {
-        let views: Cow<'a, [View]> = match self.reduction {
-            1 => self.views.into(),
-            k => parallel::map_indices(self.views.len(), |v| self.views[v].reduced(k)).into(),
-        };
-        RaySource::new(views, self.config.background, self.config.seed)
-    }
-
     /// The first stage of the plan that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
     pub fn prunes_from(&self) -> Option<usize> {
         let left_out = self.config.stages.len() + self.scouts - self.plan.len();
@@ -154,7 +141,7 @@ impl<'a, T: Real> Trainer<'a, T> {
 mod tests {
     use super::*;
     use crate::dataset::procedural::ProceduralOptions;
-    use crate::dataset::{Dataset, Split};
+    use crate::dataset::{Dataset, Split, View};
     use crate::field::voxel_grid::GridShape;
     use crate::train::config::{Config, Hull};
     use autograd::Tensor;

@@ -177,8 +177,7 @@ impl<T: Real> Trainer<'_, T> {
             self.learning = Some(Occupancy::from_masks(Aabb { min, max }, cells, masks));
         }
         (self.plan, self.scouts, self.step) = (plan, state.scouts, state.grid.step);
-        self.reduction = current.stage.image_reduction;
-        self.rays = self.all_rays();
+        self.rays.set_reduction(current.stage.image_reduction);
         let reach = Field::<T>::reach(&self.grid).cloned();
         self.aim(reach.as_ref());
         Ok(self)

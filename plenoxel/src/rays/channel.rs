@@ -1,0 +1,67 @@
+//! Numbers beside the colors of the pixels: depth, and what a user supplies.
+
+use super::RayBatch;
+use crate::dataset::View;
+use autograd::{Buffer, Real, Tensor, parallel};
+use ndarray::Array3;
+use std::sync::Arc;
+
+/// Named numbers of every pixel of the views at their full size.
+#[derive(Debug, Clone)]
+pub struct Channel {
+    pub name: String,
+    /// `[height, width, c]` for each view.
+    images: Arc<[Array3<f32>]>,
+    /// Numbers of a pixel: c.
+    width: usize,
+}
+
+impl Channel {
+    /// Panics unless there is one image for each view, of its size, all of the same number of channels, one or more.
+    #[track_caller]
+    pub fn new(name: String, images: Arc<[Array3<f32>]>, views: &[View]) -> Self {
+        assert!(images.len() == views.len(), "channel `{name}`: {} images for {} views", images.len(), views.len());
+        let width = images.first().map_or(1, |image| image.dim().2);
+        assert!(width > 0, "channel `{name}`: images of shape {:?} hold no numbers", images[0].dim());
+        for (v, (image, view)) in images.iter().zip(views).enumerate() {
+            let (w, h) = view.image.dimensions();
+            let (found, expected) = (image.dim(), (h as usize, w as usize, width));
+            assert!(found == expected, "channel `{name}`, view {v} ({}): the image has shape {found:?}, expected {expected:?}", view.name);
+        }
+        Channel { name, images, width }
+    }
+
+    /// `[n, width]`: what the pixels of a batch hold.
+    pub fn at<T: Real>(&self, batch: &RayBatch<T>, block: impl Fn(usize) -> usize + Sync) -> Tensor<T> {
+        let values = gathered(batch, self.width, block, |v, [x, y], c| self.images[v][[y, x, c]]);
+        Tensor::from_buffer(values, &[batch.len(), self.width])
+    }
+}
+
+/// `[n]`: the depth of the pixels of a batch, NaN where a view has no depth image.
+pub fn depth<T: Real>(batch: &RayBatch<T>, views: &[View], block: impl Fn(usize) -> usize + Sync) -> Tensor<T> {
+    let at = |v: usize, [x, y]: [usize; 2], _| views[v].depth.as_ref().map_or(f32::NAN, |depth| depth[[y, x]]);
+    Tensor::from_buffer(gathered(batch, 1, block, at), &[batch.len()])
+}
+
+/// Numbers of the pixels of a batch, `width` for each: of a pixel that is the mean of k × k pixels of the full image the mean of theirs, where
+/// `block` says k by the number of the view and `at` the c-th number by view and place in the full image.
+fn gathered<T: Real>(
+    batch: &RayBatch<T>,
+    width: usize,
+    block: impl Fn(usize) -> usize + Sync,
+    at: impl Fn(usize, [usize; 2], usize) -> f32 + Sync,
+) -> Buffer<T> {
+    let mut values = Buffer::stale(batch.len() * width);
+    parallel::for_each_rows(&mut values, width, |first, rows| {
+        for (i, row) in rows.chunks_exact_mut(width).enumerate() {
+            let (v, [x, y]) = (batch.view[first + i] as usize, batch.pixel[first + i].map(|p| p as usize));
+            let k = block(v);
+            for (c, value) in row.iter_mut().enumerate() {
+                let of_block = (y * k..(y + 1) * k).flat_map(|y| (x * k..(x + 1) * k).map(move |x| [x, y]));
+                *value = T::lit(of_block.map(|place| f64::from(at(v, place, c))).sum::<f64>() / (k * k) as f64);
+            }
+        }
+    });
+    values
+}
