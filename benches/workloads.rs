@@ -72,7 +72,7 @@ fn open(args: &Arguments, downscale: usize) -> Dataset {
 /// W1 and W2: a step of training.
 fn step(args: &Arguments, name: &str, engine: Engine, work: &Work) {
     let views = open(args, 8).load(Split::Train, &|_, _| {}).expect("the images load");
-    let source = RaySource::new(&views, [1.0; 3], 42);
+    let source = RaySource::new(views, [1.0; 3], 42);
     let mut grid = grid(work);
     let mut optimizer = Sgd::new(Rates::new(work.rate));
     grid.project();

@@ -49,10 +49,10 @@ fn a_step_in_the_steady_state_takes_hardly_any_memory_from_the_system() {
         steps();
         let [all, large] = [&ALL, &LARGE_ONES].map(|n| n.load(Relaxed));
         let (all, large) = ((all - before[0]) as f64 / STEPS as f64, (large - before[1]) as f64 / STEPS as f64);
-        // One is the list of the batch's rays; now and then a batch has more samples than any before. With a pool for larger ones only, from
+        // Three are the lists of the batch's rays, of their views and of their pixels; now and then a batch has more samples than any before. With a pool for larger ones only, from
         // 64 KiB on, and lists made anew it was 144 and 118.
         println!("{interpolation:?}: {all} allocations a step, {large} of at least {LARGE} bytes");
-        assert!(large <= 3.0, "{interpolation:?}: {large} large allocations a step");
+        assert!(large <= 5.0, "{interpolation:?}: {large} large allocations a step");
         assert!(all < 1500.0, "{interpolation:?}: {all} allocations a step");
     }
 }

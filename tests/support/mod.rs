@@ -58,5 +58,13 @@ pub fn rays() -> Vec<Ray> {
 pub fn batch() -> RayBatch<f64> {
     let rays = rays();
     let n = rays.len();
-    RayBatch { rays, target: tensor(&[n, 3], 0.05, 0.95, 11), alpha: tensor(&[n], 0.1, 0.9, 12) }
+    RayBatch {
+        rays,
+        target: tensor(&[n, 3], 0.05, 0.95, 11),
+        alpha: tensor(&[n], 0.1, 0.9, 12),
+        view: vec![0; n],
+        pixel: (0..n as u32).map(|x| [x, 0]).collect(),
+        depth: None,
+        channels: Vec::new(),
+    }
 }

@@ -20,13 +20,13 @@ impl Channel {
     /// Panics unless there is one image for each view, of its size, all of the same number of channels, one or more.
     #[track_caller]
     pub fn new(name: String, images: Arc<[Array3<f32>]>, views: &[View]) -> Self {
-        assert_eq!(images.len(), views.len(), "channel `{name}`: {} images for {} views", images.len(), views.len());
+        assert!(images.len() == views.len(), "channel `{name}`: {} images for {} views", images.len(), views.len());
         let width = images.first().map_or(1, |image| image.dim().2);
         assert!(width > 0, "channel `{name}`: images of shape {:?} hold no numbers", images[0].dim());
         for (v, (image, view)) in images.iter().zip(views).enumerate() {
             let (w, h) = view.image.dimensions();
             let (found, expected) = (image.dim(), (h as usize, w as usize, width));
-            assert_eq!(found, expected, "channel `{name}`, view {v} ({}): the image has shape {found:?}, expected {expected:?}", view.name);
+            assert!(found == expected, "channel `{name}`, view {v} ({}): the image has shape {found:?}, expected {expected:?}", view.name);
         }
         Channel { name, images, width }
     }
@@ -40,7 +40,7 @@ impl Channel {
 
 /// `[n]`: the depth of the pixels of a batch, NaN where a view has no depth image.
 pub fn depth<T: Real>(batch: &RayBatch<T>, views: &[View], block: impl Fn(usize) -> usize + Sync) -> Tensor<T> {
-    let at = |v: usize, [x, y]: [usize; 2], _| views[v].depth.as_ref().map_or(f32::NAN, |depth: &ndarray::Array2<f32>| depth[[y, x]]);
+    let at = |v: usize, [x, y]: [usize; 2], _| views[v].depth.as_ref().map_or(f32::NAN, |depth| depth[[y, x]]);
     Tensor::from_buffer(gathered(batch, 1, block, at), &[batch.len()])
 }
 

@@ -142,8 +142,8 @@ fn what_does_not_fit_is_refused_by_its_name() {
     let two = message(|source| drop(source.with_channel("mask", vec![Array3::zeros((16, 24, 1)); 2])));
     assert_eq!(two, "channel `mask`: 2 images for 3 views");
     let turned = message(|source| drop(source.with_channel("mask", [(16, 24, 1), (24, 16, 1), (16, 24, 1)].map(Array3::zeros))));
-    assert!(turned.ends_with("the image has shape (24, 16, 1), expected (16, 24, 1)"), "{turned}");
     assert!(turned.starts_with("channel `mask`, view 1 ("), "{turned}");
+    assert!(turned.ends_with("the image has shape (24, 16, 1), expected (16, 24, 1)"), "{turned}");
     let wider = message(|source| drop(source.with_channel("mask", [(16, 24, 1), (16, 24, 1), (16, 24, 2)].map(Array3::zeros))));
     assert!(wider.contains("view 2 (") && wider.ends_with("shape (16, 24, 2), expected (16, 24, 1)"), "{wider}");
     let mask = |source: RaySource| source.with_channel("mask", vec![Array3::zeros((16, 24, 1)); 3]);

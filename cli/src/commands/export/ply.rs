@@ -157,7 +157,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     console.note(&estimate.describe());
     estimate.check()?;
     let views = load(console, &dataset, Split::Train, &source)?;
-    let rays = RaySource::new(&views, config.background, config.seed);
+    let rays = RaySource::new(views, config.background, config.seed);
     let occupancy = grid.matter();
     let options = RenderOptions {
         aabb: grid.aabb(),
