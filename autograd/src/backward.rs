@@ -4,14 +4,16 @@
 //! The same loop serves first derivatives to the leaves, on constants, and differentiable ones to chosen tensors, on tracked values.
 //! A kernel in a differentiable pass is replaced by its reference: the new nodes have the largest ids and are popped next.
 
-use crate::gradients::{Grad, Gradients, RowSparse};
+use crate::gradients::{Grad, Gradients};
 use crate::graph::{self, Node, Rule};
-use crate::index::{self, Indices};
+use crate::index::Indices;
 use crate::op::{Cotangent, GradSink, KernelCall, Vjp};
 use crate::ops::lookup::add_rows;
 use crate::parallel;
 use crate::pool::Buffer;
 use crate::real::Real;
+use crate::rows::sparse::RowSparse;
+use crate::rows::sum::sum_into_rows;
 use crate::tensor::Tensor;
 use ndarray::{Dimension, IxDyn};
 use std::collections::{BinaryHeap, HashMap};
@@ -147,6 +149,7 @@ impl<T: Real> Pass<T> {
             }
             Rule::Kernel(kernel) => {
                 let mut sink = GradSink {
+                    kernel: kernel.name(),
                     shapes: node.inputs.iter().map(|edge| edge.shape.clone()).collect(),
                     slots: node.inputs.iter().map(|_| None).collect(),
                 };
@@ -184,7 +187,7 @@ impl<T: Real> RowPart<T> {
         match self {
             RowPart::Merged(rows) => rows,
             RowPart::Touches { rows, values } => {
-                index::sum_into_rows(shape.slice(), rows.len(), |i| ([rows[i]], [T::one()]), values.data())
+                sum_into_rows("backward", shape.slice(), rows.len(), |i| ([rows[i]], [T::one()]), values.data())
             }
         }
     }

@@ -10,7 +10,7 @@
 //!    reference. All ops are in [`ops`], each beside its rule.
 //! 4. **Backward.** `backward.rs`: the largest id first, which is every node after all its users. [`Tensor::backward`] and
 //!    [`value_and_grad`] give numbers for an optimizer, [`grad`] gives tensors to go on computing with. [`Gradients`] (`gradients.rs`)
-//!    holds one [`Grad`] for each leaf, dense or rows.
+//!    holds one [`Grad`] for each leaf, dense or rows; [`rows`] is how contributions to rows are sorted and added up.
 //! 5. **Gradcheck.** [`gradcheck`](gradcheck()) (`gradcheck.rs`) holds a rule to finite differences, [`check_kernel`] a kernel to its
 //!    reference; `tests/gradcheck` has a row for each op.
 //!
@@ -32,12 +32,13 @@ pub mod parallel;
 mod param;
 mod pool;
 mod real;
+pub mod rows;
 mod tensor;
 
 pub use backward::{grad, value_and_grad};
 pub use error::GradcheckError;
 pub use gradcheck::{Closeness, Gradcheck, KernelReport, Report, check_kernel, gradcheck};
-pub use gradients::{Grad, Gradients, RowSparse, RowSums};
+pub use gradients::{Grad, Gradients};
 pub use graph::{no_grad, recording as is_recording};
 pub use index::Indices;
 pub use lattice::Lattice;
@@ -46,4 +47,6 @@ pub use ops::lookup::add_rows;
 pub use param::{Bounds, Module, Param};
 pub use pool::{Buffer, Pooled, release_free_buffers};
 pub use real::Real;
+pub use rows::deferred::RowSums;
+pub use rows::sparse::RowSparse;
 pub use tensor::Tensor;

@@ -4,12 +4,14 @@
 //! which is faster and cannot be differentiated; so it must also state the same computation in small ops, its `reference`, through
 //! which second derivatives go and against which tests hold the adjoint.
 
-use crate::gradients::RowSparse;
 use crate::graph::{Edge, Node};
 use crate::index::Indices;
 use crate::pool::Buffer;
 use crate::real::Real;
+use crate::rows::sparse::RowSparse;
+use crate::rows::sum::sum_into_rows;
 use crate::tensor::Tensor;
+use ndarray::Dimension;
 use std::fmt::Debug;
 
 /// Which values a rule reads: only those are kept until the backward pass.
@@ -124,7 +126,6 @@ impl<T: Real> Vjp<'_, T> {
 
     /// The shape of input `i`, kept or not.
     pub fn input_shape(&self, i: usize) -> &[usize] {
-        use ndarray::Dimension;
         self.node.inputs[i].shape.slice()
     }
 
@@ -179,6 +180,7 @@ impl<T: Real> KernelCall<'_, T> {
 
 /// Where a kernel's adjoint leaves its results.
 pub struct GradSink<T: Real> {
+    pub(crate) kernel: &'static str,
     pub(crate) shapes: Vec<ndarray::IxDyn>,
     pub(crate) slots: Vec<Option<Cotangent<T>>>,
 }
@@ -189,8 +191,7 @@ impl<T: Real> GradSink<T> {
     /// Panics if the input has a cotangent already.
     #[track_caller]
     pub fn dense(&mut self, i: usize, values: Buffer<T>) {
-        use ndarray::Dimension;
-        assert!(self.slots[i].is_none(), "a dense cotangent for input {i}, which has one already");
+        assert!(self.slots[i].is_none(), "{}: a dense cotangent for input {i}, which has one already", self.kernel);
         self.slots[i] = Some(Cotangent::Dense(Tensor::from_buffer(values, self.shapes[i].slice())));
     }
 
@@ -199,12 +200,148 @@ impl<T: Real> GradSink<T> {
     /// Panics if the input has a dense cotangent already.
     #[track_caller]
     pub fn rows(&mut self, i: usize, rows: RowSparse<T>) {
-        use ndarray::Dimension;
         debug_assert_eq!(rows.shape(), self.shapes[i].slice());
         self.slots[i] = Some(Cotangent::Merged(match self.slots[i].take() {
             Some(Cotangent::Merged(before)) => before.plus(rows),
             None => rows,
-            Some(_) => panic!("rows for input {i}, which has a dense cotangent already"),
+            Some(_) => panic!("{}: rows for input {i}, which has a dense cotangent already", self.kernel),
         }));
+    }
+
+    /// The cotangent of input `i`, a table `[R, …]`, as contributions to its rows: row j of `values`, `[rows.len(), …]`, is added to row `rows[j]`.
+    /// Rows come in any order and may repeat; those that do not come get nothing. Contributions are added in the order of j, with the same bits
+    /// for any number of threads; those of several calls are added to those before.
+    ///
+    /// Panics if `values` does not have a row for each of `rows`, if a row is R or more, or if the input has a dense cotangent already.
+    #[track_caller]
+    pub fn scatter(&mut self, i: usize, rows: &[u32], values: &[T]) {
+        let (found, want) = (values.len(), rows.len() * self.width(i));
+        assert_eq!(found, want, "{}: {found} values for {} rows of input {i}, {:?}", self.kernel, rows.len(), self.shapes[i].slice());
+        self.scatter_weighted(i, |j| ([rows[j]], [T::one()]), values);
+    }
+
+    /// The cotangent of input `i`, a table `[R, …]`, where each item contributes to `K` rows of it: with `(rows, weights) = touch(j)`, `weights[k]`
+    /// times row j of `values`, `[items, …]`, is added to row `rows[k]`, for each item j and each k. Order, repeats and several calls are as in
+    /// [`GradSink::scatter`]. `touch` is called several times for each item, from any thread, and must always return the same.
+    ///
+    /// A look-up between the rows of a table, yⱼ = (1 − f) x\[r\] + f x\[r + 1\] at position r + f:
+    ///
+    /// ```
+    /// use autograd::{GradSink, Indices, Kernel, KernelCall, Real, Tensor, check_kernel};
+    ///
+    /// #[derive(Debug)]
+    /// struct Between {
+    ///     positions: Vec<f64>,
+    /// }
+    ///
+    /// impl Between {
+    ///     fn touch<T: Real>(&self, j: usize) -> ([u32; 2], [T; 2]) {
+    ///         let (r, f) = (self.positions[j] as u32, self.positions[j].fract());
+    ///         ([r, r + 1], [T::lit(1.0 - f), T::lit(f)])
+    ///     }
+    /// }
+    ///
+    /// impl<T: Real> Kernel<T> for Between {
+    ///     fn name(&self) -> &'static str {
+    ///         "between"
+    ///     }
+    ///     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
+    ///         let n = self.positions.len();
+    ///         let part = |k: usize| {
+    ///             let (rows, weights) = (0..n).map(|j| self.touch::<T>(j)).map(|(rows, weights)| (rows[k], weights[k])).unzip();
+    ///             inputs[0].gather_rows(&Indices::from(rows)) * Tensor::from_vec(weights, &[n, 1])
+    ///         };
+    ///         part(0) + part(1)
+    ///     }
+    ///     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
+    ///         out.scatter_weighted(0, |j| self.touch(j), call.cotangent().data());
+    ///     }
+    /// }
+    ///
+    /// /// `[R, C]` to `[positions, C]`; positions lie in 0 .. R − 1.
+    /// fn between<T: Real>(table: &Tensor<T>, positions: Vec<f64>) -> Tensor<T> {
+    ///     let (kernel, width) = (Between { positions }, table.shape()[1]);
+    ///     let mut values = Vec::new();
+    ///     for j in 0..kernel.positions.len() {
+    ///         let ([low, high], [a, b]) = kernel.touch::<T>(j);
+    ///         let row = |r: u32| &table.data()[r as usize * width..][..width];
+    ///         values.extend(row(low).iter().zip(row(high)).map(|(&x, &y)| a * x + b * y));
+    ///     }
+    ///     Tensor::from_kernel(values.into(), &[kernel.positions.len(), width], &[table], kernel)
+    /// }
+    ///
+    /// let table = ndarray::arr2(&[[1.0, 5.0], [2.0, 7.0], [4.0, 3.0]]).into_dyn();
+    /// check_kernel(|x| between(&x[0], vec![1.25, 0.5, 1.75]), [table], 1e-12).unwrap();
+    /// ```
+    ///
+    /// Panics if `values` is not made of rows of the input's width, if a row is R or more, or if the input has a dense cotangent already.
+    #[track_caller]
+    pub fn scatter_weighted<const K: usize>(&mut self, i: usize, touch: impl Fn(usize) -> ([u32; K], [T; K]) + Sync, values: &[T]) {
+        let (shape, width) = (self.shapes[i].slice(), self.width(i));
+        let items = values.len() / width.max(1);
+        assert_eq!(items * width, values.len(), "{}: {} values for rows of input {i}, {shape:?}", self.kernel, values.len());
+        let rows = sum_into_rows(self.kernel, shape, items, touch, values);
+        self.rows(i, rows);
+    }
+
+    /// Elements of a row of input `i`.
+    #[track_caller]
+    fn width(&self, i: usize) -> usize {
+        let shape = self.shapes[i].slice();
+        assert!(!shape.is_empty(), "{}: rows for input {i}, which is a scalar", self.kernel);
+        shape[1..].iter().product()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sink(shape: &[usize]) -> GradSink<f64> {
+        GradSink { kernel: "test", shapes: vec![ndarray::IxDyn(shape)], slots: vec![None] }
+    }
+
+    fn rows(sink: &GradSink<f64>) -> &RowSparse<f64> {
+        let Some(Cotangent::Merged(rows)) = &sink.slots[0] else { panic!("rows") };
+        rows
+    }
+
+    #[test]
+    fn scattered_rows_come_in_any_order_repeat_and_add_up_over_calls() {
+        let mut sink = sink(&[5, 2]);
+        sink.scatter(0, &[3, 0, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!((rows(&sink).rows(), rows(&sink).data()), (&[0, 3][..], &[3.0, 4.0, 6.0, 8.0][..]));
+        // One item, and a row that it touches twice.
+        sink.scatter_weighted(0, |_| ([4, 0, 4], [1.0, 2.0, 0.5]), &[10.0, 20.0]);
+        assert_eq!((rows(&sink).rows(), rows(&sink).data()), (&[0, 3, 4][..], &[23.0, 44.0, 6.0, 8.0, 15.0, 30.0][..]));
+        sink.scatter(0, &[], &[]);
+        assert_eq!(rows(&sink).rows(), [0, 3, 4]);
+    }
+
+    #[test]
+    fn scattering_has_the_same_bits_for_any_number_of_threads() {
+        let n = 30_000;
+        let numbers: Vec<u32> = (0..n as u32).map(|j| j.wrapping_mul(2_654_435_761) % 1003).collect();
+        let values: Vec<f64> = (0..3 * n).map(|j| (j % 997) as f64 * 0.37 - 180.0).collect();
+        let run = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+            let mut sink = sink(&[1003, 3]);
+            pool.install(|| sink.scatter_weighted(0, |j| ([numbers[j], numbers[n - 1 - j]], [0.3, 0.7]), &values));
+            rows(&sink).data().to_vec()
+        };
+        let want = run(1);
+        assert!([2, 3, 8].into_iter().all(|threads| run(threads) == want));
+    }
+
+    #[test]
+    #[should_panic(expected = "test: 3 values for 2 rows of input 0, [5, 2]")]
+    fn rows_without_values_are_refused() {
+        sink(&[5, 2]).scatter(0, &[0, 1], &[1.0; 3]);
+    }
+
+    #[test]
+    #[should_panic(expected = "test: row 50000 of a table of 5 rows")]
+    fn a_row_beyond_the_input_is_refused() {
+        sink(&[5, 2]).scatter(0, &[0, 50_000, 2], &[1.0; 6]);
     }
 }

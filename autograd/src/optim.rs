@@ -11,6 +11,7 @@
 //! Every update is elementwise and in place, with the same bits for any number of threads.
 
 mod adam;
+mod elementwise;
 mod rmsprop;
 mod schedule;
 mod sgd;
@@ -20,19 +21,17 @@ pub use rmsprop::RmsProp;
 pub use schedule::{Exponential, Piecewise, Schedule, WarmUp};
 pub use sgd::{Momentum, Sgd};
 
-use crate::gradients::{Grad, Gradients};
-use crate::parallel;
-use crate::param::{Bounds, Module, Param};
+use crate::gradients::Gradients;
+use crate::param::{Module, Param};
 use crate::pool::Buffer;
 use crate::real::Real;
-use std::collections::HashMap;
 
 /// Changes parameters by their gradients.
 pub trait Optimizer<T: Real>: Send {
     /// One step. `step` counts from 0 and is what schedules go by.
     fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64);
 
-    /// Learning rate of the parameter of this name at a step.
+    /// The learning rate of the parameter of this name at a step.
     fn rate(&self, parameter: &str, step: u64) -> f64;
 
     /// What it remembers of a parameter, to be kept with its values; `None` if nothing.
@@ -43,6 +42,34 @@ pub trait Optimizer<T: Real>: Send {
     #[must_use]
     fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool;
 }
+
+/// Implements [`Optimizer`] for a type by handing every call on to what it holds.
+macro_rules! hand_on {
+    ([$($generics:tt)*] $type:ty, $self:ident => $inner:expr) => {
+        impl<$($generics)*> Optimizer<T> for $type {
+            fn step(&mut $self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
+                $inner.step(module, grads, step);
+            }
+
+            fn rate(&$self, parameter: &str, step: u64) -> f64 {
+                $inner.rate(parameter, step)
+            }
+
+            fn memory_of(&$self, param: &Param<T>) -> Option<Remembered<'_, T>> {
+                $inner.memory_of(param)
+            }
+
+            fn recall(&mut $self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
+                $inner.recall(param, updates, arrays)
+            }
+        }
+    };
+}
+
+hand_on!([T: Real] Momentum<T>, self => self.0);
+hand_on!([T: Real] RmsProp<T>, self => self.0);
+hand_on!([T: Real] Adam<T>, self => self.0);
+hand_on!([T: Real, O: Optimizer<T> + ?Sized] Box<O>, self => (**self));
 
 /// What an optimizer remembers of a parameter.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,6 +87,7 @@ pub struct Remembered<'a, T: Real> {
 /// let rates = Rates::new(0.01).with("density", Exponential::new(30.0, 0.05, 250_000));
 /// assert_eq!(rates.at("density", 250_000), 0.05);
 /// assert_eq!(rates.at("color", 250_000), 0.01);
+/// assert!(rates.names().eq(["density"]));
 /// ```
 #[derive(Debug)]
 pub struct Rates {
@@ -79,6 +107,11 @@ impl Rates {
         self
     }
 
+    /// The names that have a schedule of their own, in the order in which they were added.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.by_name.iter().map(|(name, _)| &name[..])
+    }
+
     /// The rate of a parameter at a step.
     pub fn at(&self, name: &str, step: u64) -> f64 {
         let named = self.by_name.iter().rev().find(|(n, _)| n == name).map(|(_, schedule)| schedule);
@@ -89,84 +122,6 @@ impl Rates {
 impl<S: Schedule + 'static> From<S> for Rates {
     fn from(schedule: S) -> Self {
         Rates::new(schedule)
-    }
-}
-
-/// What an optimizer remembers of each parameter: `N` numbers for each element, and how many updates it had.
-#[derive(Debug)]
-struct Memory<T: Real, const N: usize> {
-    by_id: HashMap<u64, Slot<T, N>>,
-    round: u64,
-}
-
-#[derive(Debug)]
-struct Slot<T: Real, const N: usize> {
-    state: Option<[Buffer<T>; N]>,
-    updates: u64,
-    last_seen: u64,
-}
-
-impl<T: Real, const N: usize> Memory<T, N> {
-    fn new() -> Self {
-        Memory { by_id: HashMap::new(), round: 0 }
-    }
-
-    /// Calls `f(parameter, gradient, state, updates)` for every parameter that has a gradient; `updates` counts this one, so it is at
-    /// least 1. The state is zeros the first time.
-    fn visit(
-        &mut self,
-        module: &mut dyn Module<T>,
-        grads: &Gradients<T>,
-        mut f: impl FnMut(&mut Param<T>, &Grad<T>, &mut [Buffer<T>; N], u64),
-    ) {
-        self.round += 1;
-        let round = self.round;
-        module.visit_mut(&mut |param| {
-            let slot = self.by_id.entry(param.id()).or_insert(Slot { state: None, updates: 0, last_seen: round });
-            slot.last_seen = round;
-            if let Some(grad) = grads.of(param) {
-                let len = param.tensor().len();
-                let state = slot.state.get_or_insert_with(|| std::array::from_fn(|_| Buffer::zeros(len)));
-                slot.updates += 1;
-                f(param, grad, state, slot.updates);
-            }
-        });
-        self.by_id.retain(|_, slot| slot.last_seen == round);
-    }
-
-    fn of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
-        let slot = self.by_id.get(&param.id())?;
-        let arrays = slot.state.as_ref()?.iter().map(|array| &array[..]).collect();
-        Some(Remembered { updates: slot.updates, arrays })
-    }
-
-    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
-        let fits = arrays.iter().all(|array| array.len() == param.tensor().len());
-        let Some(state) = arrays.try_into().ok().filter(|_| fits) else { return false };
-        self.by_id.insert(param.id(), Slot { state: Some(state), updates, last_seen: self.round });
-        true
-    }
-}
-
-/// Replaces the elements that have a gradient, and what is remembered of them, by `rule([θ, state…], g)`, θ then brought back to its bounds;
-/// untouched rows stay.
-fn update<T: Real, const N: usize>(tables: [&mut [T]; N], grad: &Grad<T>, bounds: Bounds<T>, rule: impl Fn([T; N], T) -> [T; N] + Sync) {
-    let rule = bounded(bounds, rule);
-    match grad {
-        Grad::Dense(g) => parallel::update(tables, g.data(), rule),
-        Grad::Rows(g) => match g.unmerged() {
-            Some(sums) => parallel::update_deferred(tables, g.width(), sums, rule),
-            None => parallel::update_rows(tables, g.width(), g.rows(), g.data(), rule),
-        },
-    }
-}
-
-/// A rule and the projection after it.
-fn bounded<T: Real, const N: usize>(bounds: Bounds<T>, rule: impl Fn([T; N], T) -> [T; N] + Sync) -> impl Fn([T; N], T) -> [T; N] + Sync {
-    move |x, g| {
-        let mut new = rule(x, g);
-        new[0] = bounds.nearest(new[0]);
-        new
     }
 }
 
@@ -266,13 +221,13 @@ mod tests {
         let grads = gradients(&params);
         optimizer.step(&mut params, &grads, 0);
         let id = params[0].id();
-        assert!(optimizer.memory.by_id.contains_key(&id));
+        assert!(optimizer.0.memory.by_id.contains_key(&id));
         let value = Tensor::zeros(&[3]);
         params[0].replace(value);
         let grads = gradients(&params);
         optimizer.step(&mut params, &grads, 1);
-        assert!(!optimizer.memory.by_id.contains_key(&id));
-        assert_eq!(optimizer.memory.by_id.len(), 2);
+        assert!(!optimizer.0.memory.by_id.contains_key(&id));
+        assert_eq!(optimizer.0.memory.by_id.len(), 2);
     }
 
     #[test]
@@ -309,6 +264,20 @@ mod tests {
             let grads = (params[0].tensor() + params[1].tensor()).sum().backward();
             optimizer.step(&mut params, &grads, step);
             assert_eq!([params[0].tensor().item(), params[1].tensor().item()], want);
+        }
+    }
+    #[test]
+    fn every_optimizer_tells_the_rate_it_goes_by_in_a_box_too() {
+        let rates = || Rates::new(1.0).with("b", Piecewise::new(0.0).then(1, 0.5));
+        let all: [Box<dyn Optimizer<f64>>; 4] = [
+            Box::new(Sgd::new(rates())),
+            Box::new(Momentum::new(rates(), 0.9)),
+            Box::new(RmsProp::new(rates())),
+            Box::new(Box::new(Adam::new(rates(), AdamMode::Lazy))),
+        ];
+        for optimizer in all {
+            assert_eq!(["a", "b"].map(|name| optimizer.rate(name, 0)), [1.0, 0.0]);
+            assert_eq!(["a", "b"].map(|name| optimizer.rate(name, 1)), [1.0, 0.5]);
         }
     }
 }

@@ -13,7 +13,7 @@ use crate::real::Real;
 pub use gather::gathered;
 pub use prefetch::prefetch;
 use rayon::prelude::*;
-pub(crate) use update::{update, update_all_rows, update_deferred, update_rows};
+pub(crate) use update::update;
 
 /// Compiles a function for several instruction sets and picks the best at run time. Their results differ where a loop multiplies and adds in
 /// one rounding on machines that can: see [`fused`]. Builds with debug assertions, in which the tests run, have the portable version only: every crate that uses

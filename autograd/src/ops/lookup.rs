@@ -1,10 +1,11 @@
 //! Rows of a table by number, and back: each other's adjoint.
 
-use crate::index::{self, Indices};
+use crate::index::Indices;
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::parallel::{self, dispatched, streamed};
 use crate::pool::Buffer;
 use crate::real::Real;
+use crate::rows::sum;
 use crate::tensor::Tensor;
 
 /// yₖ = x[rowsₖ].   ∂L/∂x is ∂L/∂y as rows, never a dense table
@@ -107,10 +108,10 @@ pub fn add_rows<T: Real>(table: &mut [T], width: usize, rows: &[u32], values: &[
     // More threads would spend more on looking through the rows than they save.
     let few = parallel::threads() <= 8;
     match width {
-        1 if few => index::add_short_rows::<T, 1>(table, rows, values),
-        3 if few => index::add_short_rows::<T, 3>(table, rows, values),
-        4 if few => index::add_short_rows::<T, 4>(table, rows, values),
-        _ => index::add_into_table(table, width, rows.len(), |i| ([rows[i]], [T::one()]), values),
+        1 if few => sum::add_short_rows::<T, 1>(table, rows, values),
+        3 if few => sum::add_short_rows::<T, 3>(table, rows, values),
+        4 if few => sum::add_short_rows::<T, 4>(table, rows, values),
+        _ => sum::add_into_table(table, width, rows, values),
     }
 }
 

@@ -4,7 +4,7 @@
 //! missing and then read as zeros. Positions are in cells, nodes at the integers; a position outside is clamped to the box of the nodes,
 //! where the gradient with respect to it is 0.
 
-use crate::index::{self, Indices};
+use crate::index::Indices;
 use crate::lattice::{Lattice, NodeMap, TOGETHER, with_map};
 use crate::op::{GradSink, Kernel, KernelCall};
 use crate::parallel::{self, dispatched};
@@ -184,9 +184,7 @@ impl<T: Real> Kernel<T> for Trilinear {
         let (table, positions, g) = (call.input(0), call.input(1), call.cotangent());
         let cells = points(&positions);
         if call.needs(0) {
-            let sums =
-                with_map!(self.lattice, map => index::sum_into_rows(table.shape(), cells.len(), |p| corners(cells[p], map), g.data()));
-            out.rows(0, sums);
+            with_map!(self.lattice, map => out.scatter_weighted(0, |p| corners(cells[p], map), g.data()));
         }
         if call.needs(1) {
             let width = table.shape()[1];

@@ -1,10 +1,7 @@
 //! Adam, in the two algorithms that row gradients make of it.
 
-use super::{Memory, Optimizer, Rates, Remembered, bounded, update};
-use crate::gradients::{Grad, Gradients};
-use crate::parallel;
-use crate::param::{Module, Param};
-use crate::pool::Buffer;
+use super::Rates;
+use super::elementwise::{Elementwise, Rule};
 use crate::real::Real;
 
 /// What happens to rows that a row gradient does not mention. These are different algorithms with different results.
@@ -26,67 +23,51 @@ pub enum AdamMode {
 ///
 /// A parameter that has no gradient at all in a step is left alone in both modes.
 #[derive(Debug)]
-pub struct Adam<T: Real> {
-    rates: Rates,
+pub struct Adam<T: Real>(pub(super) Elementwise<AdamRule, T, 3>);
+
+#[derive(Debug)]
+pub(super) struct AdamRule {
     mode: AdamMode,
     beta1: f64,
     beta2: f64,
     epsilon: f64,
-    memory: Memory<T, 2>,
 }
 
 impl<T: Real> Adam<T> {
     /// With these learning rates, β₁ = 0.9, β₂ = 0.99 (Instant-NGP's; the paper has 0.999) and ε = 1e-8.
     pub fn new(rates: impl Into<Rates>, mode: AdamMode) -> Self {
-        Adam { rates: rates.into(), mode, beta1: 0.9, beta2: 0.99, epsilon: 1e-8, memory: Memory::new() }
+        Adam(Elementwise::new(AdamRule { mode, beta1: 0.9, beta2: 0.99, epsilon: 1e-8 }, rates))
     }
 
     /// Other shares of the moments that stay in each step.
     pub fn betas(mut self, beta1: f64, beta2: f64) -> Self {
-        (self.beta1, self.beta2) = (beta1, beta2);
+        (self.0.rule.beta1, self.0.rule.beta2) = (beta1, beta2);
         self
     }
 
     /// Another ε.
     pub fn epsilon(mut self, epsilon: f64) -> Self {
-        self.epsilon = epsilon;
+        self.0.rule.epsilon = epsilon;
         self
     }
 }
 
-impl<T: Real> Optimizer<T> for Adam<T> {
-    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
+impl<T: Real> Rule<T, 3> for AdamRule {
+    fn at(&self, rate: f64, updates: u64) -> impl Fn([T; 3], T) -> [T; 3] + Sync {
         let (b1, b2, epsilon) = (T::lit(self.beta1), T::lit(self.beta2), T::lit(self.epsilon));
         let (r1, r2) = (T::lit(1.0 - self.beta1), T::lit(1.0 - self.beta2));
-        self.memory.visit(module, grads, |param, grad, [m, v], updates| {
-            let left = |beta: f64| 1.0 - beta.powf(updates as f64);
-            let rate = T::lit(self.rates.at(param.name(), step) / left(self.beta1));
-            let scale = T::lit(1.0 / left(self.beta2).sqrt());
-            let rule = |[theta, m, v]: [T; 3], g: T| {
-                let m = b1 * m + r1 * g;
-                let v = b2 * v + r2 * g * g;
-                [theta - rate * m / (v.sqrt() * scale + epsilon), m, v]
-            };
-            let bounds = param.bounds();
-            param.update(|theta| match (self.mode, grad) {
-                (AdamMode::Dense, Grad::Rows(g)) => {
-                    parallel::update_all_rows([theta, m, v], g.width(), g.rows(), g.data(), bounded(bounds, rule))
-                }
-                _ => update([theta, m, v], grad, bounds, rule),
-            });
-        });
+        let left = |beta: f64| 1.0 - beta.powf(updates as f64);
+        let rate = T::lit(rate / left(self.beta1));
+        let scale = T::lit(1.0 / left(self.beta2).sqrt());
+        move |[theta, m, v], g| {
+            let m = b1 * m + r1 * g;
+            let v = b2 * v + r2 * g * g;
+            [theta - rate * m / (v.sqrt() * scale + epsilon), m, v]
+        }
     }
 
-    fn rate(&self, parameter: &str, step: u64) -> f64 {
-        self.rates.at(parameter, step)
-    }
-
-    fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
-        self.memory.of(param)
-    }
-
-    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
-        self.memory.recall(param, updates, arrays)
+    fn visits_all_rows(&self) -> bool {
+        self.mode == AdamMode::Dense
     }
 }
 
@@ -94,6 +75,8 @@ impl<T: Real> Optimizer<T> for Adam<T> {
 mod tests {
     use super::*;
     use crate::index::Indices;
+    use crate::optim::Optimizer;
+    use crate::param::Param;
     use crate::tensor::Tensor;
     use approx::assert_relative_eq;
     use ndarray::{arr1, arr2};

@@ -1,9 +1,7 @@
 //! RMSProp as Plenoxels use it.
 
-use super::{Memory, Optimizer, Rates, Remembered, update};
-use crate::gradients::Gradients;
-use crate::param::{Module, Param};
-use crate::pool::Buffer;
+use super::Rates;
+use super::elementwise::{Elementwise, Rule};
 use crate::real::Real;
 
 /// v ← g² if v = 0, else β v + (1 − β) g²;  θ ← θ − lr · g / (√v + ε) (svox2).
@@ -15,57 +13,41 @@ use crate::real::Real;
 /// with Adam, whose moments would all have to decay in every step. A zero in a dense gradient moves nothing either, but it decays v, so
 /// an element that is often untouched takes larger steps with dense gradients than with rows.
 #[derive(Debug)]
-pub struct RmsProp<T: Real> {
-    rates: Rates,
+pub struct RmsProp<T: Real>(pub(super) Elementwise<RmsPropRule, T, 2>);
+
+#[derive(Debug)]
+pub(super) struct RmsPropRule {
     beta: f64,
     epsilon: f64,
-    pub(super) memory: Memory<T, 1>,
 }
 
 impl<T: Real> RmsProp<T> {
     /// With these learning rates, β = 0.95 and ε = 1e-8 (svox2's).
     pub fn new(rates: impl Into<Rates>) -> Self {
-        RmsProp { rates: rates.into(), beta: 0.95, epsilon: 1e-8, memory: Memory::new() }
+        RmsProp(Elementwise::new(RmsPropRule { beta: 0.95, epsilon: 1e-8 }, rates))
     }
 
     /// Another share of v that stays in each step.
     pub fn beta(mut self, beta: f64) -> Self {
-        self.beta = beta;
+        self.0.rule.beta = beta;
         self
     }
 
     /// Another ε.
     pub fn epsilon(mut self, epsilon: f64) -> Self {
-        self.epsilon = epsilon;
+        self.0.rule.epsilon = epsilon;
         self
     }
 }
 
-impl<T: Real> Optimizer<T> for RmsProp<T> {
-    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
-        let (beta, rest, epsilon) = (T::lit(self.beta), T::lit(1.0 - self.beta), T::lit(self.epsilon));
-        self.memory.visit(module, grads, |param, grad, [v], _| {
-            let rate = T::lit(self.rates.at(param.name(), step));
-            let bounds = param.bounds();
-            param.update(|theta| {
-                update([theta, v], grad, bounds, |[theta, v], g| {
-                    let v = if v == T::zero() { g * g } else { beta * v + rest * g * g };
-                    [theta - rate * g / (v.sqrt() + epsilon), v]
-                });
-            });
-        });
-    }
-
-    fn rate(&self, parameter: &str, step: u64) -> f64 {
-        self.rates.at(parameter, step)
-    }
-
-    fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
-        self.memory.of(param)
-    }
-
-    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
-        self.memory.recall(param, updates, arrays)
+impl<T: Real> Rule<T, 2> for RmsPropRule {
+    fn at(&self, rate: f64, _: u64) -> impl Fn([T; 2], T) -> [T; 2] + Sync {
+        let (rate, epsilon) = (T::lit(rate), T::lit(self.epsilon));
+        let (beta, rest) = (T::lit(self.beta), T::lit(1.0 - self.beta));
+        move |[theta, v], g| {
+            let v = if v == T::zero() { g * g } else { beta * v + rest * g * g };
+            [theta - rate * g / (v.sqrt() + epsilon), v]
+        }
     }
 }
 
@@ -73,6 +55,8 @@ impl<T: Real> Optimizer<T> for RmsProp<T> {
 mod tests {
     use super::*;
     use crate::index::Indices;
+    use crate::optim::Optimizer;
+    use crate::param::Param;
     use crate::tensor::Tensor;
     use approx::assert_relative_eq;
     use ndarray::{arr1, arr2};

@@ -1,6 +1,7 @@
 //! Gradient descent, plain and with momentum.
 
-use super::{Memory, Optimizer, Rates, Remembered, update};
+use super::elementwise::{Elementwise, Rule, update};
+use super::{Optimizer, Rates, Remembered};
 use crate::gradients::Gradients;
 use crate::param::{Module, Param};
 use crate::pool::Buffer;
@@ -22,10 +23,10 @@ impl Sgd {
 impl<T: Real> Optimizer<T> for Sgd {
     fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
         module.visit_mut(&mut |param| {
-            let Some(grad) = grads.of(param) else { return };
-            let rate = T::lit(self.rates.at(param.name(), step));
-            let bounds = param.bounds();
-            param.update(|theta| update([theta], grad, bounds, |[theta], g| [theta - rate * g]));
+            if let Some(grad) = grads.of(param) {
+                let rate = T::lit(self.rates.at(param.name(), step));
+                update(param, &mut [], grad, false, |[theta], g| [theta - rate * g]);
+            }
         });
     }
 
@@ -47,44 +48,27 @@ impl<T: Real> Optimizer<T> for Sgd {
 /// Of a row gradient only the touched rows are visited: the momentum of the others waits and moves nothing. That is another algorithm
 /// than with the dense gradient, where every row keeps rolling.
 #[derive(Debug)]
-pub struct Momentum<T: Real> {
-    rates: Rates,
+pub struct Momentum<T: Real>(pub(super) Elementwise<MomentumRule, T, 2>);
+
+#[derive(Debug)]
+pub(super) struct MomentumRule {
     momentum: f64,
-    memory: Memory<T, 1>,
 }
 
 impl<T: Real> Momentum<T> {
     /// With these learning rates and this share μ of the previous direction, usually 0.9.
     pub fn new(rates: impl Into<Rates>, momentum: f64) -> Self {
-        Momentum { rates: rates.into(), momentum, memory: Memory::new() }
+        Momentum(Elementwise::new(MomentumRule { momentum }, rates))
     }
 }
 
-impl<T: Real> Optimizer<T> for Momentum<T> {
-    fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
-        let mu = T::lit(self.momentum);
-        self.memory.visit(module, grads, |param, grad, [m], _| {
-            let rate = T::lit(self.rates.at(param.name(), step));
-            let bounds = param.bounds();
-            param.update(|theta| {
-                update([theta, m], grad, bounds, |[theta, m], g| {
-                    let m = mu * m + g;
-                    [theta - rate * m, m]
-                });
-            });
-        });
-    }
-
-    fn rate(&self, parameter: &str, step: u64) -> f64 {
-        self.rates.at(parameter, step)
-    }
-
-    fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>> {
-        self.memory.of(param)
-    }
-
-    fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
-        self.memory.recall(param, updates, arrays)
+impl<T: Real> Rule<T, 2> for MomentumRule {
+    fn at(&self, rate: f64, _: u64) -> impl Fn([T; 2], T) -> [T; 2] + Sync {
+        let (rate, mu) = (T::lit(rate), T::lit(self.momentum));
+        move |[theta, m], g| {
+            let m = mu * m + g;
+            [theta - rate * m, m]
+        }
     }
 }
 

@@ -1,69 +1,59 @@
 //! How optimizers change tables: dense, by rows, or by rows whose gradients are added up on the way.
 
 use super::{CHUNK, dispatched, for_each_item, prefetch, rows_per_chunk};
-use crate::gradients::{RowGroups, RowSums};
+use crate::gradients::Grad;
 use crate::real::Real;
+use crate::rows::deferred::{RowGroups, RowSums};
 
-/// `(x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i])`: how an optimizer changes values and what it remembers of them.
-pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
-    fn halves<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], g: &[T], f: &F) {
-        if g.len() <= CHUNK {
-            return update_loop(x, g, f);
-        }
-        let middle = (g.len() / 2).next_multiple_of(CHUNK);
-        let (low, high) = split(x, middle);
-        rayon::join(|| halves(low, &g[..middle], f), || halves(high, &g[middle..], f));
+/// `(x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i])` wherever there is a gradient g: how an optimizer changes values and what it remembers of
+/// them. Rows that a row gradient does not mention stay, or have g = 0 if it is `all_rows`.
+pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], grad: &Grad<T>, all_rows: bool, f: impl Fn([T; N], T) -> [T; N] + Sync) {
+    let rows = match grad {
+        Grad::Dense(g) => return update_dense(x, g.data(), &f),
+        Grad::Rows(rows) => rows,
+    };
+    if !all_rows && let Some(sums) = rows.unmerged() {
+        return update_deferred(x, rows.width(), sums, &f);
     }
-    halves(x, g, &f);
+    let part = TableRows { first: 0, width: rows.width(), rows: rows.rows(), g: rows.data() };
+    if all_rows { update_part::<T, N, true, _>(x, part, &f) } else { update_part::<T, N, false, _>(x, part, &f) }
 }
 
-/// The same for some rows of tables of `width` columns. `rows` ascend without repetition and `g` has one row for each; other rows stay.
-pub fn update_rows<T: Real, const N: usize>(x: [&mut [T]; N], width: usize, rows: &[u32], g: &[T], f: impl Fn([T; N], T) -> [T; N] + Sync) {
-    update_part::<T, N, false, _>(x, TableRows { first: 0, width, rows, g }, &f);
+/// Halves the work until it is a chunk.
+fn update_dense<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], g: &[T], f: &F) {
+    if g.len() <= CHUNK {
+        return update_loop(x, g, f);
+    }
+    let middle = (g.len() / 2).next_multiple_of(CHUNK);
+    let (low, high) = split(x, middle);
+    rayon::join(|| update_dense(low, &g[..middle], f), || update_dense(high, &g[middle..], f));
 }
 
-/// The same for the rows of a gradient that is not added up: each bucket's sums are computed and used while they are in the cache.
-pub(crate) fn update_deferred<T: Real, const N: usize>(
+/// For the rows of a gradient that is not added up: each bucket's sums are computed and used while they are in the cache.
+fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
     x: [&mut [T]; N],
     width: usize,
     rows: &dyn RowSums<T>,
-    f: impl Fn([T; N], T) -> [T; N] + Sync,
+    f: &F,
 ) {
     let bucket_rows = 1usize << rows.bucket_shift();
     let groups = RowGroups::new(x[0].len() / width.max(1), bucket_rows);
-    let mut parts: Vec<[&mut [T]; N]> = Vec::with_capacity(groups.count);
-    let mut rest = x;
-    for _ in 0..groups.count {
-        let at = (groups.rows_per_group() * width).min(rest[0].len());
-        let (part, tail) = split(rest, at);
-        parts.push(part);
-        rest = tail;
-    }
+    let mut parts = x.map(|x| x.chunks_mut((groups.rows_per_group() * width).max(1)));
+    let parts: Vec<[&mut [T]; N]> = (0..groups.count).map(|_| parts.each_mut().map(|parts| parts.next().unwrap_or_default())).collect();
     for_each_item(parts, |group, mut x| {
         let first = group * groups.rows_per_group();
         groups.for_each_bucket(group, width, rows, |bucket, sums, touched| {
             let start = (bucket * bucket_rows - first) * width;
             let x = x.each_mut().map(|x| &mut x[start..][..sums.len()]);
             match width {
-                1 => update_touched::<T, N, 1, _>(x, width, sums, touched, &f),
-                3 => update_touched::<T, N, 3, _>(x, width, sums, touched, &f),
-                24 => update_touched::<T, N, 24, _>(x, width, sums, touched, &f),
-                27 => update_touched::<T, N, 27, _>(x, width, sums, touched, &f),
-                _ => update_touched::<T, N, 0, _>(x, width, sums, touched, &f),
+                1 => update_touched::<T, N, 1, _>(x, width, sums, touched, f),
+                3 => update_touched::<T, N, 3, _>(x, width, sums, touched, f),
+                24 => update_touched::<T, N, 24, _>(x, width, sums, touched, f),
+                27 => update_touched::<T, N, 27, _>(x, width, sums, touched, f),
+                _ => update_touched::<T, N, 0, _>(x, width, sums, touched, f),
             }
         });
     });
-}
-
-/// The same for all rows, `g` being zero in those that `rows` does not list.
-pub fn update_all_rows<T: Real, const N: usize>(
-    x: [&mut [T]; N],
-    width: usize,
-    rows: &[u32],
-    g: &[T],
-    f: impl Fn([T; N], T) -> [T; N] + Sync,
-) {
-    update_part::<T, N, true, _>(x, TableRows { first: 0, width, rows, g }, &f);
 }
 
 /// A part of a table that begins at row `first`, and which of its rows have a gradient.
@@ -269,6 +259,8 @@ fn update_eight<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::rows::sparse::RowSparse;
+    use crate::tensor::Tensor;
 
     #[test]
     fn updates_of_rows_equal_a_plain_loop_for_every_width_and_leave_the_other_rows_alone() {
@@ -290,13 +282,14 @@ mod tests {
                 }
             }
             let (mut got_x, mut got_v) = (start.clone(), start.clone());
-            update_rows([&mut got_x, &mut got_v], width, &rows, &g, rule);
+            let g = Grad::Rows(RowSparse::new(&[table, width], rows.into(), g.into()));
+            update([&mut got_x, &mut got_v], &g, false, rule);
             assert!(got_x == x && got_v == v, "rows of width {width}");
 
             let (mut x, mut v) = (start.clone(), start.clone());
-            update([&mut x, &mut v], &dense, rule);
+            update([&mut x, &mut v], &Grad::Dense(Tensor::from_vec(dense.clone(), &[table, width])), false, rule);
             let (mut got_x, mut got_v) = (start.clone(), start.clone());
-            update_all_rows([&mut got_x, &mut got_v], width, &rows, &g, rule);
+            update([&mut got_x, &mut got_v], &g, true, rule);
             assert!(got_x == x && got_v == v, "all rows of width {width}");
             assert!(v.iter().zip(&start).zip(&dense).all(|((v, s), g)| *v == 0.5 * s + g));
         }

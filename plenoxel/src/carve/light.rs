@@ -8,6 +8,7 @@ use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
 use crate::sampling::{Occupancy, place};
 use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::rows::Buckets;
 use autograd::{Lattice, Tensor, no_grad, parallel};
 use std::ops::ControlFlow;
 
@@ -86,7 +87,7 @@ impl<'a> PartHits<'a> {
     pub fn iter(self) -> impl Iterator<Item = SeenBy<'a>> {
         let PartHits { light, part } = self;
         light.chunks.iter().flat_map(move |chunk| {
-            chunk.hits[chunk.bounds[part]..chunk.bounds[part + 1]].iter().map(move |hit| {
+            chunk.hits[chunk.parts.range(part)].iter().map(move |hit| {
                 let ray = hit.ray as usize;
                 SeenBy {
                     row: hit.row as usize - part * light.part,
@@ -102,7 +103,7 @@ impl<'a> PartHits<'a> {
 /// Consecutive pixels, and their hits: those of a part of the tables one after another.
 struct Chunk {
     hits: Vec<Hit>,
-    bounds: [usize; PARTS + 1],
+    parts: Buckets,
     /// What each pixel shows without the background behind the voxels.
     objects: Vec<[f32; 3]>,
     values: Vec<[f32; 3]>,
@@ -161,8 +162,8 @@ impl<'a> Opaque<'a> {
             let values: Vec<[f32; 3]> = pixels.iter().map(|pixel| pixel.color(views, background)).collect();
             let behind = |(value, rest): (&[f32; 3], f32)| [0, 1, 2].map(|c| value[c] - rest * background[c]);
             let objects = values.iter().zip(rests).map(behind).collect();
-            let (hits, bounds) = by_part(&hits, part);
-            Chunk { hits, bounds, objects, values, basis: basis(&rays, degree), missed }
+            let (hits, parts) = by_part(&hits, part);
+            Chunk { hits, parts, objects, values, basis: basis(&rays, degree), missed }
         });
         Light { chunks, count: sh::count(degree), part }
     }
@@ -188,20 +189,13 @@ fn to_weights(hits: &mut [Hit], ends: &[usize]) -> Vec<f32> {
     rests.collect()
 }
 
-/// Hits by the part of the tables that they belong to, in their order within each, and where each part begins.
-fn by_part(hits: &[Hit], part: usize) -> (Vec<Hit>, [usize; PARTS + 1]) {
+/// Hits by the part of the tables that they belong to, in their order within each.
+fn by_part(hits: &[Hit], part: usize) -> (Vec<Hit>, Buckets) {
     let part_of = |hit: &Hit| hit.row as usize / part;
-    let mut bounds = [0; PARTS + 1];
-    hits.iter().for_each(|hit| bounds[part_of(hit) + 1] += 1);
-    (0..PARTS).for_each(|p| bounds[p + 1] += bounds[p]);
-    let mut next = bounds;
+    let mut places = Buckets::count(PARTS, hits.iter().map(part_of));
     let mut sorted = vec![Hit { row: 0, ray: 0, weight: 0.0 }; hits.len()];
-    for hit in hits {
-        let to = &mut next[part_of(hit)];
-        sorted[*to] = *hit;
-        *to += 1;
-    }
-    (sorted, bounds)
+    hits.iter().for_each(|hit| sorted[places.take(part_of(hit))] = *hit);
+    (sorted, places.filled())
 }
 
 impl Light {

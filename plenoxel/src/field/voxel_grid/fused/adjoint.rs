@@ -11,6 +11,7 @@ use super::lookup::Corners;
 use super::{BUCKET_SHIFT, Batch, COLUMNS, Output, column};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
+use autograd::rows::{Buckets, buckets_of};
 use autograd::{Buffer, Real, RowSums, Tensor, dispatched, parallel};
 use std::ops::Range;
 use std::sync::Arc;
@@ -28,8 +29,7 @@ pub(super) struct Sums<T: Real> {
 /// The records of one block: a sample has one in every bucket that it reads.
 #[derive(Debug)]
 struct Records<T: Real> {
-    /// Where the records of each bucket begin; one more at the end.
-    starts: Vec<u32>,
+    buckets: Buckets,
     at: At<T>,
     /// ∂L/∂density
     density: Buffer<T>,
@@ -58,13 +58,13 @@ impl<T: Real> Sums<T> {
     }
 
     fn is_empty(&self, bucket: usize) -> bool {
-        self.blocks.iter().all(|records| records.starts[bucket] == records.starts[bucket + 1])
+        self.blocks.iter().all(|records| records.buckets.range(bucket).is_empty())
     }
 
     /// Calls `f(records, range)` for the records of a bucket, block after block.
     fn for_each(&self, bucket: usize, mut f: impl FnMut(&Records<T>, Range<usize>)) {
         for records in &self.blocks {
-            let range = records.starts[bucket] as usize..records.starts[bucket + 1] as usize;
+            let range = records.buckets.range(bucket);
             if !range.is_empty() {
                 f(records, range);
             }
@@ -134,16 +134,9 @@ impl<T: Real> Gradients<T> {
         buckets_of: impl Fn(usize) -> [u32; K],
         mut put: impl FnMut(usize, usize),
     ) -> Records<T> {
-        let mut starts = vec![0u32; buckets + 1];
-        for i in (0..block.len()).filter(|&i| block.density[i] >= T::zero()) {
-            for bucket in buckets_of(i).into_iter().take_while(|&b| b != NONE) {
-                starts[bucket as usize + 1] += 1;
-            }
-        }
-        for b in 0..buckets {
-            starts[b + 1] += starts[b];
-        }
-        let mut next = starts.clone();
+        let buckets_of = |i: usize| buckets_of(i).into_iter().take_while(|&b| b != NONE).map(|b| b as usize);
+        let live = (0..block.len()).filter(|&i| block.density[i] >= T::zero());
+        let mut places = Buckets::count(buckets, live.flat_map(buckets_of));
         let clamped = batch.layout.shape.color != Color::Rgb;
         let (mut density, mut color) = (Buffer::stale(most), Buffer::stale(3 * most));
         let harmonic = batch.harmonics() > 0;
@@ -161,9 +154,8 @@ impl<T: Real> Gradients<T> {
                 if clamped && !harmonic {
                     c = c.map(|c| c * T::lit(sh::Y0));
                 }
-                for bucket in buckets_of(i).into_iter().take_while(|&b| b != NONE) {
-                    let place = next[bucket as usize] as usize;
-                    next[bucket as usize] += 1;
+                for bucket in buckets_of(i) {
+                    let place = places.take(bucket);
                     density[place] = self.sigma[i];
                     to[place] = c;
                     if harmonic {
@@ -173,7 +165,7 @@ impl<T: Real> Gradients<T> {
                 }
             }
         }
-        Records { starts, at: At::Rows(Buffer::stale(0)), density, color, ray }
+        Records { buckets: places.filled(), at: At::Rows(Buffer::stale(0)), density, color, ray }
     }
 }
 
@@ -189,12 +181,10 @@ fn touch_buckets<T: Real>(corners: &Corners<T>, touched: &mut [[u32; 8]]) -> usi
         *touched = [NONE; 8];
         touched[0] = all[0];
         if all != [all[0]; 8] {
-            let mut found = 1;
-            for b in all {
-                if !touched[..found].contains(&b) {
-                    touched[found] = b;
-                    found += 1;
-                }
+            let mut found = 0;
+            for bucket in buckets_of(corners.of(i).0, BUCKET_SHIFT) {
+                touched[found] = bucket as u32;
+                found += 1;
             }
             more += found - 1;
         }

@@ -9,6 +9,7 @@ use super::lookup::{AHEAD, Corners, ask_for, nearest_rows, weigh_all};
 use super::{Batch, COLUMNS};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
+use autograd::rows::{Buckets, buckets_of};
 use autograd::{Buffer, Lattice, Real, RowSums, Tensor, dispatched, parallel};
 use std::sync::Arc;
 
@@ -163,9 +164,8 @@ struct HarmonicsSums<T: Real, const K: usize> {
 #[derive(Debug)]
 struct Runs<T: Real, const K: usize> {
     runs: Vec<Run<T, K>>,
-    /// Where the numbers of each bucket begin; one more at the end.
-    starts: Vec<u32>,
-    numbers: Vec<u32>,
+    buckets: Buckets,
+    numbers: Buffer<u32>,
 }
 
 /// Samples of a ray that read the same rows.
@@ -180,8 +180,7 @@ struct Run<T: Real, const K: usize> {
 impl<T: Real, const K: usize> Run<T, K> {
     /// The buckets of its rows, each once.
     fn buckets(&self, count: usize) -> impl Iterator<Item = usize> {
-        let all = self.rows.map(|row| row as usize >> BUCKET_SHIFT);
-        (0..K).filter(move |&k| all[k] < count && !all[..k].contains(&all[k])).map(move |k| all[k])
+        buckets_of(self.rows, BUCKET_SHIFT).filter(move |&bucket| bucket < count)
     }
 }
 
@@ -206,19 +205,12 @@ impl<T: Real, const K: usize> Runs<T, K> {
                 }
             }
         }
-        let mut starts = vec![0u32; buckets + 1];
-        runs.iter().flat_map(|run| run.buckets(buckets)).for_each(|bucket| starts[bucket + 1] += 1);
-        for b in 0..buckets {
-            starts[b + 1] += starts[b];
-        }
-        let (mut next, mut numbers) = (starts.clone(), vec![0; starts[buckets] as usize]);
+        let mut places = Buckets::count(buckets, runs.iter().flat_map(|run| run.buckets(buckets)));
+        let mut numbers = Buffer::stale(places.len());
         for (number, run) in runs.iter().enumerate() {
-            for bucket in run.buckets(buckets) {
-                numbers[next[bucket] as usize] = number as u32;
-                next[bucket] += 1;
-            }
+            run.buckets(buckets).for_each(|bucket| numbers[places.take(bucket)] = number as u32);
         }
-        Runs { runs, starts, numbers }
+        Runs { runs, buckets: places.filled(), numbers }
     }
 }
 
@@ -240,7 +232,7 @@ impl<T: Real, const K: usize> RowSums<T> for HarmonicsSums<T, K> {
     }
 
     fn is_empty(&self, bucket: usize) -> bool {
-        self.blocks.iter().all(|runs| runs.starts[bucket] == runs.starts[bucket + 1])
+        self.blocks.iter().all(|runs| runs.buckets.range(bucket).is_empty())
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
@@ -263,7 +255,7 @@ fn add_runs<T: Real, const K: usize, const N: usize>(
     touched: &mut [u64],
 ) {
     let sums = sums.as_chunks_mut::<N>().0;
-    let numbers = &runs.numbers[runs.starts[bucket] as usize..runs.starts[bucket + 1] as usize];
+    let numbers = &runs.numbers[runs.buckets.range(bucket)];
     for (k, &number) in numbers.iter().enumerate() {
         if let Some(&later) = numbers.get(k + RUNS_AHEAD) {
             ask_for(&runs.runs, &[later]);

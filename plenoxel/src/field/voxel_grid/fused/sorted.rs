@@ -7,8 +7,8 @@ use super::forward::{Block, Scene};
 use super::lookup::{self, Corners};
 use super::{BLOCK, BUCKET_SHIFT, COLUMNS};
 use crate::field::voxel_grid::Interpolation;
+use autograd::rows::Buckets;
 use autograd::{Buffer, Real, parallel};
-use std::ops::Range;
 
 /// Tasks, each with a range of buckets: some for every thread, so that a dense corner of the scene holds up no one.
 const TASKS: usize = 64;
@@ -18,8 +18,7 @@ const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
 
 /// The samples of a block that need a color, by the bucket of their lowest corner.
 struct Order {
-    /// Where each bucket begins; one more at the end.
-    starts: Vec<u32>,
+    buckets: Buckets,
     samples: Buffer<u32>,
     /// Number of the ray of each of them.
     rays: Buffer<u32>,
@@ -29,26 +28,15 @@ impl Order {
     fn new<T: Real>(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
         let seen = block.seen();
         let bucket = |i: usize| (corners.of(i).0[0] >> BUCKET_SHIFT) as usize;
-        let mut starts = vec![0u32; buckets + 1];
-        (0..block.len()).filter(|&i| seen(i)).for_each(|i| starts[bucket(i) + 1] += 1);
-        for b in 0..buckets {
-            starts[b + 1] += starts[b];
-        }
-        let mut next = starts.clone();
-        let count = starts[buckets] as usize;
-        let (mut samples, mut rays) = (Buffer::stale(count), Buffer::stale(count));
+        let mut places = Buckets::count(buckets, (0..block.len()).filter(|&i| seen(i)).map(bucket));
+        let (mut samples, mut rays) = (Buffer::stale(places.len()), Buffer::stale(places.len()));
         for (r, own) in block.rays().enumerate() {
             for i in own.filter(|&i| seen(i)) {
-                let next = &mut next[bucket(i)];
-                (samples[*next as usize], rays[*next as usize]) = (i as u32, (block.first + r) as u32);
-                *next += 1;
+                let place = places.take(bucket(i));
+                (samples[place], rays[place]) = (i as u32, (block.first + r) as u32);
             }
         }
-        Order { starts, samples, rays }
-    }
-
-    fn range(&self, buckets: Range<usize>) -> Range<usize> {
-        self.starts[buckets.start] as usize..self.starts[buckets.end] as usize
+        Order { buckets: places.filled(), samples, rays }
     }
 }
 
@@ -90,13 +78,13 @@ impl<T: Real> Scene<'_, T> {
         let mut colors: Vec<Buffer<T>> = orders.iter().map(|order| Buffer::stale(3 * order.samples.len())).collect();
         let mut tasks: Vec<Vec<&mut [T]>> = (0..buckets.div_ceil(per_task)).map(|_| Vec::with_capacity(blocks.len())).collect();
         for (order, colors) in orders.iter().zip(&mut colors) {
-            let lengths = (0..tasks.len()).map(|task| 3 * order.range(of_task(task)).len());
+            let lengths = (0..tasks.len()).map(|task| 3 * order.buckets.ranges(of_task(task)).len());
             tasks.iter_mut().zip(parallel::split_lengths(colors, lengths)).for_each(|(task, part)| task.push(part));
         }
         parallel::for_each_item(tasks, |task, mut parts| {
             for bucket in of_task(task) {
                 for ((block, order), part) in blocks.iter().zip(orders).zip(&mut parts) {
-                    let range = order.range(bucket..bucket + 1);
+                    let range = order.buckets.range(bucket);
                     if range.is_empty() {
                         continue;
                     }
