@@ -25,12 +25,14 @@ mod gradients;
 mod graph;
 mod index;
 pub mod lattice;
+pub mod nn;
 mod op;
 pub mod ops;
 pub mod optim;
 pub mod parallel;
 mod param;
 mod pool;
+pub mod random;
 mod real;
 mod tensor;
 

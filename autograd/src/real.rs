@@ -223,7 +223,7 @@ impl Real for f64 {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     /// |got − want| in units in the last place of `want`.
