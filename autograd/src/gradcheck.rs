@@ -11,6 +11,7 @@ pub use kernel::{Closeness, KernelReport, check_kernel};
 
 use crate::backward::grad;
 use crate::error::GradcheckError;
+use crate::random::Stream;
 use crate::tensor::Tensor;
 use ndarray::{ArrayD, Dimension, IxDyn};
 
@@ -133,7 +134,7 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
 
     /// Runs the check.
     pub fn run(&self) -> Result<Report, GradcheckError> {
-        let mut random = Random(self.seed);
+        let mut random = Random::new(self.seed);
         let by_order = (1..=self.order).map(|order| self.check(order, &mut random)).collect::<Result<Vec<f64>, _>>()?;
         Ok(Report { worst_relative_error: by_order.iter().copied().fold(0.0, f64::max), by_order })
     }
@@ -246,15 +247,20 @@ struct Probe {
     inputs: Vec<Vec<Tensor<f64>>>,
 }
 
-/// SplitMix64 (Steele, Lea, Flood 2014).
-struct Random(u64);
+/// Random directions, one after the other.
+struct Random {
+    stream: Stream,
+    drawn: u64,
+}
 
 impl Random {
+    fn new(seed: u64) -> Self {
+        Random { stream: Stream::new(seed), drawn: 0 }
+    }
+
     fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ z >> 31
+        self.drawn += 1;
+        self.stream.bits(self.drawn - 1)
     }
 
     /// Entries of magnitude 1/2 to 1 and either sign: none is so small that it hides an error.

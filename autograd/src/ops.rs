@@ -3,8 +3,10 @@
 //! | file | ops | gradient of the inputs |
 //! | --- | --- | --- |
 //! | [`arithmetic`] | `+ - * /` with tensors and numbers, `affine`, `maximum`, `minimum` | the textbook's; broadcasting is undone by the engine |
-//! | [`elementwise`] | `exp` `one_minus_exp_neg` `ln` `sqrt` `square` `abs` `sigmoid` `softplus` `relu` `clamp` `sin` `cos` `powi` | elementwise |
+//! | [`elementwise`] | `exp` `expm1` `one_minus_exp_neg` `ln` `sqrt` `square` `abs` `sigmoid` `softplus` `relu` `leaky_relu` `tanh` `clamp` `sin` `cos` `powi` | elementwise |
+//! | [`power`] | `pow` `powf` | elementwise; `pow`'s also in the exponent |
 //! | [`reduce`] | `sum` `mean` `max` `min`, over all or along an axis; `sum_to` | repeated; extrema share it among equals |
+//! | [`normalization`] | `log_sum_exp` `softmax` `norm` `normalize`, along an axis | compositions of the other ops |
 //! | [`shape`] | `reshape` `unsqueeze` `broadcast_to` `permute` `transpose` `narrow` `index_axis` `pad` `concat` `stack` | moved back |
 //! | [`linalg`] | `matmul`, batched | products with the transposes |
 //! | [`scan`] | `cumsum` `exclusive_cumsum` | the running sum from the other end |
@@ -17,6 +19,8 @@ pub mod arithmetic;
 pub mod elementwise;
 pub mod linalg;
 pub mod lookup;
+pub mod normalization;
+pub mod power;
 pub mod reduce;
 pub mod scan;
 pub mod segment;

@@ -148,6 +148,18 @@ pub fn map<T: Real>(x: &[T], out: &mut [T], f: impl Fn(T) -> T + Sync) {
     for_each_chunk(out, 2 * CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
 }
 
+/// `out[i] = outside(x[i])` where |x| > `limit`, and `inside(x[i])` elsewhere. The second is computed for every i, so that its
+/// loop vectorises, and what it gives outside of its range is overwritten.
+pub fn map_within<T: Real>(x: &[T], out: &mut [T], limit: T, inside: impl Fn(T) -> T + Sync, outside: impl Fn(T) -> T + Sync) {
+    for_each_chunk(out, 2 * CHUNK, |start, chunk| {
+        let x = &x[start..start + chunk.len()];
+        map_loop(x, chunk, &inside);
+        if x.iter().fold(false, |any, x| any | (x.abs() > limit)) {
+            chunk.iter_mut().zip(x).filter(|(_, x)| x.abs() > limit).for_each(|(y, &x)| *y = outside(x));
+        }
+    });
+}
+
 /// `out[i] = f(x[i], y[i])`
 pub fn zip<T: Real>(x: &[T], y: &[T], out: &mut [T], f: impl Fn(T, T) -> T + Sync) {
     for_each_chunk(out, CHUNK, |start, chunk| {

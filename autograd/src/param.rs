@@ -1,8 +1,11 @@
 //! [`Param`]: a named leaf that an optimizer may change. [`Module`]: a set of them.
 
+mod module;
+
 use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
+pub use module::Module;
 use ndarray::{Array, Dimension};
 use std::sync::Arc;
 
@@ -97,34 +100,5 @@ impl<T: Real> Param<T> {
 
     pub(crate) fn id(&self) -> u64 {
         self.tensor.id().expect("a parameter is a leaf")
-    }
-}
-
-/// Something with parameters.
-pub trait Module<T: Real> {
-    /// Visits every parameter, always in the same order.
-    fn visit(&self, f: &mut dyn FnMut(&Param<T>));
-
-    /// Visits every parameter for a change, in the same order.
-    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>));
-}
-
-impl<T: Real> Module<T> for Param<T> {
-    fn visit(&self, f: &mut dyn FnMut(&Param<T>)) {
-        f(self);
-    }
-
-    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>)) {
-        f(self);
-    }
-}
-
-impl<T: Real> Module<T> for Vec<Param<T>> {
-    fn visit(&self, f: &mut dyn FnMut(&Param<T>)) {
-        self.iter().for_each(f);
-    }
-
-    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>)) {
-        self.iter_mut().for_each(f);
     }
 }

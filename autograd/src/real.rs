@@ -2,8 +2,12 @@
 //!
 //! Precision is a type parameter and never a feature flag, so a gradient check in `f64` exercises the very code that trains in `f32`.
 //! The functions below that `num_traits::Float` already has are repeated here because a loop over them must vectorise:
-//! they are branch-free polynomials for `f32` and the standard library's for `f64`. They, and a loop that asks for it, use fused multiply-add
-//! where the machine has it: bits are equal for any number of threads, and between instruction sets up to that rounding.
+//! they are branch-free polynomials for `f32` and, of `exp_` and `absorb`, the standard library's for `f64`. Those with a parameter `FUSED`,
+//! and a loop that asks for it, use fused multiply-add where the machine has it: bits are equal for any number of threads, and between
+//! instruction sets up to that rounding. `sin_`, `cos_`, `expm1_` and `tanh_` have the same bits on every machine.
+
+mod expm1;
+mod sine;
 
 use crate::pool::Pooled;
 use ndarray::NdFloat;
@@ -34,6 +38,21 @@ pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + 
     /// `FUSED` says that the machine multiplies and adds in one instruction: [`crate::parallel::fused`].
     fn exp_<const FUSED: bool>(self) -> Self;
 
+    /// eˣ − 1 without cancellation for small x, to two units in the last place.
+    fn expm1_(self) -> Self;
+
+    /// tanh x to three units in the last place.
+    fn tanh_(self) -> Self;
+
+    /// sin x to one unit in the last place where |x| <= [`Real::SINE_LIMIT`]; beyond it, any number.
+    fn sin_(self) -> Self;
+
+    /// cos x to one unit in the last place where |x| <= [`Real::SINE_LIMIT`]; beyond it, any number.
+    fn cos_(self) -> Self;
+
+    /// The range of `sin_` and `cos_`: 2²⁰.
+    const SINE_LIMIT: Self;
+
     /// 1 − e⁻ˣ without cancellation for small x: the opacity of an optical depth.
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self;
 
@@ -48,6 +67,28 @@ pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + 
 }
 
 impl Real for f32 {
+    const SINE_LIMIT: Self = sine::LIMIT as f32;
+
+    #[inline(always)]
+    fn expm1_(self) -> Self {
+        expm1::single(self)
+    }
+
+    #[inline(always)]
+    fn tanh_(self) -> Self {
+        expm1::tanh_single(self)
+    }
+
+    #[inline(always)]
+    fn sin_(self) -> Self {
+        sine::single::<0>(self)
+    }
+
+    #[inline(always)]
+    fn cos_(self) -> Self {
+        sine::single::<1>(self)
+    }
+
     #[inline(always)]
     fn lit(x: f64) -> Self {
         x as f32
@@ -122,6 +163,28 @@ impl Real for f32 {
 }
 
 impl Real for f64 {
+    const SINE_LIMIT: Self = sine::LIMIT;
+
+    #[inline(always)]
+    fn expm1_(self) -> Self {
+        expm1::double(self)
+    }
+
+    #[inline(always)]
+    fn tanh_(self) -> Self {
+        expm1::tanh_double(self)
+    }
+
+    #[inline(always)]
+    fn sin_(self) -> Self {
+        sine::double::<0>(self)
+    }
+
+    #[inline(always)]
+    fn cos_(self) -> Self {
+        sine::double::<1>(self)
+    }
+
     #[inline(always)]
     fn lit(x: f64) -> Self {
         x
@@ -150,18 +213,23 @@ impl Real for f64 {
 
     #[inline(always)]
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self {
-        -(-self).exp_m1()
+        -(-self).expm1_()
     }
 
     #[inline(always)]
     fn absorb<const FUSED: bool>(self) -> (Self, Self) {
-        (self.one_minus_exp_neg::<FUSED>(), (-self).exp())
+        (-(-self).exp_m1(), (-self).exp())
     }
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+
+    /// |got − want| in units in the last place of `want`.
+    pub fn units_apart(got: f64, want: f64) -> f64 {
+        if got == want { 0.0 } else { (got - want).abs() / (want.abs().next_up() - want.abs()) }
+    }
 
     #[test]
     fn exp_is_right_to_two_units_in_the_last_place_over_its_whole_range() {

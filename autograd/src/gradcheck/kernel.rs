@@ -102,7 +102,7 @@ pub fn check_kernel<T: Real>(
         }
     };
     let value = compare("value".into(), fast.data(), slow.data())?;
-    let direction = super::Random(0).direction(fast.shape());
+    let direction = super::Random::new(0).direction(fast.shape());
     let direction = Tensor::from_vec(direction.data().iter().map(|&v| T::lit(v)).collect(), fast.shape());
     let (fast, slow) = (fast.backward_from(&direction), slow.backward_from(&direction));
     let gradients = inputs.iter().enumerate().map(|(i, x)| {

@@ -31,8 +31,15 @@ macro_rules! elementwise {
     )*};
 }
 
-/// Computes with a function; with the version for this machine, [`parallel::fused`], if it contains an exponential.
+/// Computes with a function; with the version for this machine, [`parallel::fused`], if it contains an exponential; with one function inside
+/// [`Real::SINE_LIMIT`] and another outside of it, if it is periodic.
 macro_rules! apply {
+    (periodic $x:expr, $op:ident, $f:expr) => {{
+        let (inside, outside) = $f;
+        let mut out = Buffer::stale($x.len());
+        parallel::map_within($x.data(), &mut out, T::SINE_LIMIT, inside, outside);
+        Tensor::from_op(out, $x.shape(), &[$x], $op)
+    }};
     (exponential $x:expr, $op:ident, $f:expr) => {
         if parallel::fused() {
             const FUSED: bool = true;
@@ -50,6 +57,9 @@ macro_rules! apply {
 elementwise! {
     /// y = eˣ.   ∂L/∂x = ∂L/∂y · y
     @exponential exp, Exp, Keep::OUTPUT, T::exp_::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * cx.output();
+
+    /// y = eˣ − 1, exact for small x, to two units in the last place.   ∂L/∂x = ∂L/∂y · eˣ, which y + 1 would lose where x is far below 0
+    expm1, Expm1, Keep::INPUTS, T::expm1_, |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).exp();
 
     /// y = 1 − e⁻ˣ, exact for small x: the opacity of an optical depth.   ∂L/∂x = ∂L/∂y · e⁻ˣ, which 1 − y would lose where y is near 1
     @exponential one_minus_exp_neg, OneMinusExpNeg, Keep::INPUTS, T::one_minus_exp_neg::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * (-cx.input(0)).exp();
@@ -88,11 +98,14 @@ elementwise! {
         cx.cotangent() * x.greater_equal(&Tensor::scalar(T::zero()))
     };
 
-    /// y = sin x.   ∂L/∂x = ∂L/∂y · cos x
-    sin, Sin, Keep::INPUTS, |x: T| x.sin(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).cos();
+    /// y = tanh x, to three units in the last place.   ∂L/∂x = ∂L/∂y · (1 − y²)
+    tanh, Tanh, Keep::OUTPUT, T::tanh_, |cx: &Vjp<'_, T>| cx.cotangent() * (1.0 - cx.output().square());
 
-    /// y = cos x.   ∂L/∂x = −∂L/∂y · sin x
-    cos, Cos, Keep::INPUTS, |x: T| x.cos(), |cx: &Vjp<'_, T>| -(cx.cotangent() * cx.input(0).sin());
+    /// y = sin x, to one unit in the last place. |x| > 2²⁰ goes to the system's mathematical library, one number at a time.   ∂L/∂x = ∂L/∂y · cos x
+    @periodic sin, Sin, Keep::INPUTS, (T::sin_, |x: T| x.sin()), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).cos();
+
+    /// y = cos x, computed like [`Tensor::sin`].   ∂L/∂x = −∂L/∂y · sin x
+    @periodic cos, Cos, Keep::INPUTS, (T::cos_, |x: T| x.cos()), |cx: &Vjp<'_, T>| -(cx.cotangent() * cx.input(0).sin());
 }
 
 /// y = xⁿ.   ∂L/∂x = ∂L/∂y · n xⁿ⁻¹
@@ -110,6 +123,24 @@ impl<T: Real> Op<T> for Powi {
             0 => Tensor::zeros(cx.cotangent().shape()),
             n => cx.cotangent() * cx.input(0).powi(n - 1).affine(f64::from(n), 0.0),
         })]
+    }
+}
+
+/// y = x where x >= 0, slope · x elsewhere.   ∂L/∂x = ∂L/∂y, times the slope where x < 0
+#[derive(Debug)]
+struct LeakyRelu {
+    slope: f64,
+}
+impl<T: Real> Op<T> for LeakyRelu {
+    fn name(&self) -> &'static str {
+        "leaky_relu"
+    }
+    fn keep(&self) -> Keep {
+        Keep::INPUTS
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        let slope = T::lit(self.slope);
+        vec![cx.wrt(0, || cx.cotangent() * cx.input(0).constant_map(|x| if x < T::zero() { slope } else { T::one() }))]
     }
 }
 
@@ -136,6 +167,12 @@ impl<T: Real> Tensor<T> {
     /// y = xⁿ for an integer n, which may be negative.   ∂L/∂x = ∂L/∂y · n xⁿ⁻¹
     pub fn powi(&self, n: i32) -> Self {
         unary(self, Powi(n), move |x: T| x.powi(n))
+    }
+
+    /// y = x where x >= 0, slope · x elsewhere, NaN staying NaN; at 0 the gradient is that of x > 0.
+    pub fn leaky_relu(&self, slope: f64) -> Self {
+        let factor = T::lit(slope);
+        unary(self, LeakyRelu { slope }, move |x: T| if x < T::zero() { factor * x } else { x })
     }
 
     /// y = min(max(x, low), high); the gradient passes where low <= x <= high.
@@ -173,8 +210,27 @@ impl<T: Real> Tensor<T> {
     }
 }
 
-fn unary<T: Real>(x: &Tensor<T>, op: impl Op<T>, f: impl Fn(T) -> T + Sync) -> Tensor<T> {
+pub(crate) fn unary<T: Real>(x: &Tensor<T>, op: impl Op<T>, f: impl Fn(T) -> T + Sync) -> Tensor<T> {
     let mut out = Buffer::stale(x.len());
     parallel::map(x.data(), &mut out, f);
     Tensor::from_op(out, x.shape(), &[x], op)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sines_beyond_the_range_of_the_polynomials_are_the_librarys() {
+        let x = [0.5f32, 1e6, -1e7, 3e30, f32::INFINITY, f32::NAN, -2.0];
+        let (sine, cosine) = (Tensor::from_vec(x.to_vec(), &[7]).sin(), Tensor::from_vec(x.to_vec(), &[7]).cos());
+        for (i, x) in x.into_iter().enumerate() {
+            if x.is_finite() {
+                assert!((f64::from(sine.data()[i]) - f64::from(x).sin()).abs() < 1e-7, "sin {x}");
+                assert!((f64::from(cosine.data()[i]) - f64::from(x).cos()).abs() < 1e-7, "cos {x}");
+            } else {
+                assert!(sine.data()[i].is_nan() && cosine.data()[i].is_nan());
+            }
+        }
+    }
 }

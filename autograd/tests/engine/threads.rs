@@ -38,6 +38,13 @@ fn families() -> Vec<Family> {
             (x[0].exp() + x[0].sigmoid() * x[0].softplus()).square().abs().sqrt() + x[0].sin().relu() + x[0].powi(3).clamp(-1.0, 1.0)
         }),
         ("opacity and logarithm", vec![numbers(&[N], 1)], |x| x[0].one_minus_exp_neg() + (x[0].square() + 1.0).ln() + x[0].cos()),
+        ("powers and hyperbolic functions", vec![numbers(&[N], 1), numbers(&[N], 2)], |x| {
+            (x[0].square() + 0.1).pow(&x[1].tanh()) + x[0].expm1() + (x[0].square() + 0.1).powf(0.3) + x[1].leaky_relu(0.1)
+        }),
+        ("sines far out", vec![numbers(&[N], 1)], |x| (&x[0] * 1e5).sin() + (&x[0] * 1e5).cos()),
+        ("normalisation", vec![numbers(&[N / 3, 3], 1)], |x| {
+            x[0].softmax(1) * x[0].normalize(0) + (x[0].log_sum_exp(1) * x[0].norm(1)).unsqueeze(1)
+        }),
         ("arithmetic", vec![numbers(&[N], 1), numbers(&[N], 2)], |x| {
             (&x[0] * &x[1] - &x[0] / (x[1].square() + 1.0)).maximum(&x[1]).minimum(&x[0])
         }),

@@ -19,10 +19,24 @@ macro_rules! rows {
 }
 
 pub fn all() -> Vec<Row> {
-    [arithmetic(), elementwise(), reduce(), shape(), linalg(), scan(), segment(), lookup(), trilinear(), select(), compositions()]
-        .into_iter()
-        .flatten()
-        .collect()
+    [
+        arithmetic(),
+        elementwise(),
+        power(),
+        reduce(),
+        normalization(),
+        shape(),
+        linalg(),
+        scan(),
+        segment(),
+        lookup(),
+        trilinear(),
+        select(),
+        compositions(),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
 }
 
 fn arithmetic() -> Vec<Row> {
@@ -57,6 +71,7 @@ fn arithmetic() -> Vec<Row> {
 fn elementwise() -> Vec<Row> {
     rows! {
         "exp", "both signs", [numbers(&[2, 3], 3)], |x| x[0].exp();
+        "expm1", "both signs", [numbers(&[2, 3], 3)], |x| x[0].expm1();
         "one_minus_exp_neg", "both signs", [numbers(&[2, 3], 3)], |x| x[0].one_minus_exp_neg();
         "one_minus_exp_neg", "at 0", [ArrayD::zeros(vec![3])], |x| x[0].one_minus_exp_neg() + 1.0;
         "ln", "x > 0", [positive(&[2, 3], 3)], |x| x[0].ln();
@@ -68,6 +83,8 @@ fn elementwise() -> Vec<Row> {
         "sigmoid", "both signs", [numbers(&[2, 3], 3)], |x| x[0].sigmoid();
         "softplus", "both signs", [numbers(&[2, 3], 3)], |x| x[0].softplus();
         "relu", "both signs", [numbers(&[2, 3], 3)], |x| x[0].relu().square(), kinks: |x| x[0].clone();
+        "leaky_relu", "both signs", [numbers(&[2, 3], 3)], |x| x[0].leaky_relu(0.1).square(), kinks: |x| x[0].clone();
+        "tanh", "both signs", [numbers(&[2, 3], 3)], |x| x[0].tanh();
         "clamp", "inside and on both sides", [numbers(&[3, 5], 3)], |x| x[0].clamp(-0.8, 0.7).square(), kinks: |x| (&x[0] + 0.8) * (&x[0] - 0.7);
         "sin", "both signs", [numbers(&[2, 3], 3)], |x| x[0].sin();
         "cos", "both signs", [numbers(&[2, 3], 3)], |x| x[0].cos();
@@ -75,6 +92,18 @@ fn elementwise() -> Vec<Row> {
         "powi", "-2", [numbers(&[2, 3], 3)], |x| x[0].powi(-2);
         "powi", "1", [numbers(&[2, 3], 3)], |x| x[0].powi(1).square();
         "powi", "0", [numbers(&[2, 3], 3)], |x| x[0].powi(0) * &x[0];
+    }
+}
+
+fn power() -> Vec<Row> {
+    rows! {
+        "pow", "same shape", [positive(&[2, 3], 19), numbers(&[2, 3], 20)], |x| x[0].pow(&x[1]);
+        "pow", "[2, 3] to the power [3]", [positive(&[2, 3], 19), numbers(&[3], 20)], |x| x[0].pow(&x[1]);
+        "pow", "[3] to the power [2, 1]", [positive(&[3], 19), numbers(&[2, 1], 20)], |x| x[0].pow(&x[1]);
+        "powf", "2.2", [positive(&[2, 3], 19)], |x| x[0].powf(2.2);
+        "powf", "-0.5", [positive(&[2, 3], 19)], |x| x[0].powf(-0.5);
+        "powf", "1", [positive(&[2, 3], 19)], |x| x[0].powf(1.0).square();
+        "powf", "0", [positive(&[2, 3], 19)], |x| x[0].powf(0.0) * &x[0];
     }
 }
 
@@ -95,6 +124,19 @@ fn reduce() -> Vec<Row> {
         "max_axis", "first", [distinct(&[3, 5])], |x| x[0].max_axis(0).exp(), kinks: |x| differences(&x[0]);
         "max_axis", "last", [distinct(&[3, 5])], |x| x[0].max_axis(1).exp(), kinks: |x| differences(&x[0]);
         "min_axis", "middle", [distinct(&[2, 4, 2])], |x| x[0].min_axis(1).exp(), kinks: |x| differences(&x[0]);
+    }
+}
+
+fn normalization() -> Vec<Row> {
+    rows! {
+        "log_sum_exp", "first axis", [numbers(&[4, 3], 21)], |x| x[0].log_sum_exp(0).square();
+        "log_sum_exp", "middle axis", [numbers(&[2, 4, 3], 21)], |x| x[0].log_sum_exp(1).square();
+        "softmax", "first axis", [numbers(&[4, 3], 21)], |x| x[0].softmax(0).square();
+        "softmax", "last axis", [numbers(&[2, 4, 3], 21)], |x| x[0].softmax(2).square();
+        "norm", "first axis", [numbers(&[3, 4], 21)], |x| x[0].norm(0).exp();
+        "norm", "middle axis", [numbers(&[2, 4, 3], 21)], |x| x[0].norm(1).exp();
+        "normalize", "first axis", [numbers(&[3, 4], 21)], |x| x[0].normalize(0).exp();
+        "normalize", "last axis", [numbers(&[2, 4, 3], 21)], |x| x[0].normalize(2).exp();
     }
 }
 

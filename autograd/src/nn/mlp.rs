@@ -1,0 +1,175 @@
+//! [`Mlp`]: a multilayer perceptron.
+
+use super::Linear;
+use crate::impl_module;
+use crate::random::Stream;
+use crate::real::Real;
+use crate::tensor::Tensor;
+
+/// The function after each layer of a network but the last.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Activation {
+    /// max(x, 0): [`Tensor::relu`].
+    Relu,
+    /// x, times `slope` where x < 0: [`Tensor::leaky_relu`].
+    LeakyRelu {
+        /// The slope below 0; PyTorch's default is 0.01.
+        slope: f64,
+    },
+    /// ln(1 + eˣ): [`Tensor::softplus`]. It has derivatives of all orders.
+    Softplus,
+    /// tanh x: [`Tensor::tanh`].
+    Tanh,
+    /// sin(ω x) (SIREN; Sitzmann et al. 2020), which wants initial weights of its own: [`Init::Uniform`](super::Init::Uniform) with the bound
+    /// 1 / inputs in the first layer and √(6 / inputs) / ω in the others.
+    Sine {
+        /// ω, 30 in the paper.
+        omega: f64,
+    },
+}
+
+impl Activation {
+    /// The function of each element.
+    pub fn apply<T: Real>(self, x: &Tensor<T>) -> Tensor<T> {
+        match self {
+            Activation::Relu => x.relu(),
+            Activation::LeakyRelu { slope } => x.leaky_relu(slope),
+            Activation::Softplus => x.softplus(),
+            Activation::Tanh => x.tanh(),
+            Activation::Sine { omega } => (x * omega).sin(),
+        }
+    }
+}
+
+/// A multilayer perceptron: linear layers, with an activation after each but the last.
+#[derive(Debug)]
+pub struct Mlp<T: Real> {
+    /// The layers, whose sizes fit each other.
+    pub layers: Vec<Linear<T>>,
+    /// The function between them.
+    pub activation: Activation,
+    /// The layer that gets the network's input, concatenated with the layer before: `[…, input + hidden]`.
+    pub skip: Option<usize>,
+}
+
+impl_module!(Mlp { layers });
+
+impl<T: Real> Mlp<T> {
+    /// A network of the given widths, those of input and output included: `&[63, 256, 256, 4]` has three layers. The parameters are called
+    /// `<name>.0.weight`, `<name>.0.bias`, `<name>.1.weight`, … and have values of the default [`Init`](super::Init).
+    ///
+    /// Panics if there are less than two widths.
+    #[track_caller]
+    pub fn new(name: &str, widths: &[usize], activation: Activation, random: &Stream) -> Self {
+        Self::of(name, widths, activation, None, random)
+    }
+
+    /// The network of [`Mlp::new`] with the input once more at layer `skip`, counted from 0: that of NeRF (Mildenhall et al. 2020) has 5.
+    ///
+    /// Panics if there are less than two widths, or no layer before or at `skip`.
+    #[track_caller]
+    pub fn with_skip(name: &str, widths: &[usize], activation: Activation, skip: usize, random: &Stream) -> Self {
+        assert!(skip >= 1 && skip + 1 < widths.len(), "Mlp: `{name}` of widths {widths:?} has no layer {skip} with one before it");
+        Self::of(name, widths, activation, Some(skip), random)
+    }
+
+    #[track_caller]
+    fn of(name: &str, widths: &[usize], activation: Activation, skip: Option<usize>, random: &Stream) -> Self {
+        assert!(widths.len() >= 2, "Mlp: `{name}` of widths {widths:?}; expected those of input and output at least");
+        let layer = |(i, pair): (usize, &[usize])| {
+            let more = if skip == Some(i) { widths[0] } else { 0 };
+            Linear::new(&format!("{name}.{i}"), pair[0] + more, pair[1], random)
+        };
+        Mlp { layers: widths.windows(2).enumerate().map(layer).collect(), activation, skip }
+    }
+
+    /// The output `[…, last width]` for x `[…, first width]` of two dimensions or more.
+    ///
+    /// Panics, naming the layer and the shapes, if x has another last dimension.
+    #[track_caller]
+    pub fn forward(&self, x: &Tensor<T>) -> Tensor<T> {
+        let mut hidden = x.clone();
+        for (i, layer) in self.layers.iter().enumerate() {
+            if i > 0 {
+                hidden = self.activation.apply(&hidden);
+            }
+            if self.skip == Some(i) {
+                hidden = Tensor::concat(&[x, &hidden], x.ndim() - 1);
+            }
+            hidden = layer.forward(&hidden);
+        }
+        hidden
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::Init;
+    use crate::{Gradcheck, Module, gradcheck};
+    use ndarray::{ArrayD, arr2};
+
+    const ALL: [Activation; 5] =
+        [Activation::Relu, Activation::LeakyRelu { slope: 0.01 }, Activation::Softplus, Activation::Tanh, Activation::Sine { omega: 3.0 }];
+
+    #[test]
+    fn names_shapes_and_initial_values_are_pytorchs() {
+        let net = Mlp::<f32>::new("mlp", &[3, 16, 2], Activation::Relu, &Stream::new(7));
+        assert_eq!(net.param_names(), ["mlp.0.weight", "mlp.0.bias", "mlp.1.weight", "mlp.1.bias"]);
+        let mut shapes = Vec::new();
+        net.visit(&mut |param| shapes.push(param.shape().to_vec()));
+        assert_eq!(shapes, [vec![3, 16], vec![16], vec![16, 2], vec![2]]);
+        for layer in &net.layers {
+            let bound = 1.0 / (layer.inputs() as f32).sqrt();
+            layer.visit(&mut |param| assert!(param.tensor().data().iter().all(|x| x.abs() <= bound && *x != 0.0)));
+        }
+        let again = Mlp::<f32>::new("mlp", &[3, 16, 2], Activation::Relu, &Stream::new(7));
+        assert_eq!(net.layers[1].weight.tensor().data(), again.layers[1].weight.tensor().data());
+        assert_ne!(net.layers[0].bias.tensor().data(), net.layers[0].weight.tensor().data()[..16].to_vec());
+    }
+
+    #[test]
+    fn the_output_is_what_the_layers_say_and_a_skip_sees_the_input() {
+        let mut net = Mlp::<f64>::with_skip("mlp", &[2, 3, 1], Activation::Relu, 1, &Stream::new(7));
+        assert_eq!(net.layers[1].inputs(), 5);
+        net.layers[0].initialize(Init::Zeros, Init::Zeros, &Stream::new(7));
+        net.layers[1].weight.update(|w| w.copy_from_slice(&[10.0, 1.0, 5.0, 6.0, 7.0]));
+        net.layers[1].bias.update(|b| b[0] = 0.5);
+        let x = Tensor::constant(arr2(&[[1.0, 2.0], [-3.0, 4.0]]));
+        assert_eq!(net.forward(&x).data(), [12.5, -25.5]);
+        assert_eq!(net.forward(&x.reshape(&[1, 2, 2])).shape(), [1, 2, 1]);
+    }
+
+    /// With respect to the input and to all parameters, which are bound to the inputs of the check.
+    #[test]
+    fn derivatives_of_both_orders_are_right_with_every_activation() {
+        for activation in ALL {
+            let net = Mlp::<f64>::with_skip("mlp", &[2, 4, 3, 1], activation, 1, &Stream::new(3));
+            let mut inputs: Vec<ArrayD<f64>> = vec![Stream::new(5).uniform_tensor::<f64>(&[3, 2], -1.0, 1.0).to_array()];
+            net.visit(&mut |param| inputs.push(param.tensor().to_array()));
+            let output = |x: &[Tensor<f64>]| {
+                let mut net = Mlp::<f64>::with_skip("mlp", &[2, 4, 3, 1], activation, 1, &Stream::new(3));
+                let mut given = x[1..].iter();
+                net.visit_mut(&mut |param| {
+                    let tensor = given.next().expect("a tensor for each parameter").clone();
+                    if tensor.is_tracked() { param.bind(tensor) } else { param.replace(tensor) }
+                });
+                net.forward(&x[0])
+            };
+            Gradcheck::new(output, inputs).named(format!("{activation:?}")).run().unwrap_or_else(|e| panic!("{e}"));
+        }
+        gradcheck(|x| Activation::Sine { omega: 30.0 }.apply(&x[0]), [arr2(&[[0.1, -0.2]]).into_dyn()]);
+    }
+
+    #[test]
+    #[should_panic(expected = "`mlp.0.weight` of shape [2, 3] got an input of shape [4, 3]; expected […, 2]")]
+    fn an_input_of_another_width_is_refused_by_the_name_of_the_layer() {
+        Mlp::<f32>::new("mlp", &[2, 3, 1], Activation::Relu, &Stream::new(0)).forward(&Tensor::ones(&[4, 3]));
+    }
+
+    #[test]
+    #[should_panic(expected = "no layer 2 with one before it")]
+    fn a_skip_to_a_layer_that_does_not_exist_is_refused() {
+        Mlp::<f32>::with_skip("mlp", &[2, 3, 1], Activation::Relu, 2, &Stream::new(0));
+    }
+}

@@ -1,0 +1,54 @@
+//! Powers with exponents that are not integers.
+
+use super::arithmetic::binary;
+use super::elementwise::unary;
+use crate::op::{Cotangent, Keep, Op, Vjp};
+use crate::real::Real;
+use crate::tensor::Tensor;
+
+/// z = xʸ.   ∂L/∂x = ∂L/∂z · y xʸ⁻¹, ∂L/∂y = ∂L/∂z · z ln x
+#[derive(Debug)]
+struct Pow;
+impl<T: Real> Op<T> for Pow {
+    fn name(&self) -> &'static str {
+        "pow"
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        let g = cx.cotangent();
+        vec![cx.wrt(0, || g * (cx.input(1) * cx.input(0).pow(&(cx.input(1) - 1.0)))), cx.wrt(1, || g * (cx.output() * cx.input(0).ln()))]
+    }
+}
+
+/// y = xᵖ with a number p.   ∂L/∂x = ∂L/∂y · p xᵖ⁻¹
+#[derive(Debug)]
+struct Powf(f64);
+impl<T: Real> Op<T> for Powf {
+    fn name(&self) -> &'static str {
+        "powf"
+    }
+    fn keep(&self) -> Keep {
+        Keep::INPUTS
+    }
+    fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
+        vec![cx.wrt(0, || match self.0 {
+            0.0 => Tensor::zeros(cx.cotangent().shape()),
+            p => cx.cotangent() * (p * cx.input(0).powf(p - 1.0)),
+        })]
+    }
+}
+
+impl<T: Real> Tensor<T> {
+    /// z = xʸ for x > 0, elementwise with broadcasting; x is `self`. Where x = 0 the gradients may be infinite or NaN, and where x < 0 the
+    /// gradient of y is NaN.   ∂L/∂x = ∂L/∂z · y xʸ⁻¹, ∂L/∂y = ∂L/∂z · z ln x
+    #[track_caller]
+    pub fn pow(&self, exponent: &Self) -> Self {
+        binary("pow", self, exponent, Pow, |x, y| x.powf(y))
+    }
+
+    /// y = xᵖ for x > 0 and a number p, rounded to the precision of x. Where x = 0 the gradient is infinite if p < 1; where x < 0 the result
+    /// is NaN unless p is an integer, for which there is [`Tensor::powi`].   ∂L/∂x = ∂L/∂y · p xᵖ⁻¹
+    pub fn powf(&self, p: f64) -> Self {
+        let exponent = T::lit(p);
+        unary(self, Powf(p), move |x: T| x.powf(exponent))
+    }
+}
