@@ -8,7 +8,6 @@
 
 mod chart;
 mod commands;
-mod config;
 mod curves;
 mod data;
 mod evaluation;
@@ -182,6 +181,8 @@ fn json_line(value: &impl serde::Serialize) -> Result<String, Error> {
 mod tests {
     use super::*;
     use clap::{Command, CommandFactory};
+    use plenoxel::run::settings::{CARVE, PRESETS};
+    use plenoxel::train::config::Config;
 
     /// A command with those below it, and the words that call it.
     fn commands(command: &Command) -> Vec<Command> {
@@ -214,6 +215,19 @@ mod tests {
     }
 
     #[test]
+    fn a_preset_of_the_library_is_what_the_command_line_resolves() {
+        let resolved = |line: &[&str]| match Cli::try_parse_from(line).expect("a command line").command {
+            super::Command::Train(args) => args.config().expect("valid settings").0,
+            super::Command::Carve(args) => args.config().expect("valid settings").0,
+            _ => panic!("{line:?}"),
+        };
+        for preset in PRESETS.map(|preset| preset.name) {
+            assert_eq!(Config::preset(preset).expect("a preset"), resolved(&["plenoxel", "train", "--preset", preset]), "{preset}");
+        }
+        assert_eq!(Config::preset(CARVE.name).expect("a preset"), resolved(&["plenoxel", "carve"]));
+    }
+
+    #[test]
     fn defaults_that_the_help_of_train_names_are_those_of_the_presets() {
         let train = all().into_iter().find(|command| command.get_name() == "train").expect("train");
         for flag in ["seed", "downscale", "half-width", "interpolation", "color", "sh-degree", "sh-reduction", "hull", "engine"] {
@@ -221,13 +235,12 @@ mod tests {
             let help = argument.get_help().unwrap_or_default().to_string();
             let defaults = help.split("[default: ").nth(1).expect("a default");
             let value = |preset: &str| {
-                let (settings, _) = config::layered(None, preset, None, |_| Ok(())).expect("a valid preset");
-                let settings = toml::Table::try_from(settings).expect("a table");
+                let settings = toml::Table::try_from(Config::preset(preset).expect("a valid preset")).expect("a table");
                 settings[&flag.replace('-', "_")].to_string().replace('"', "")
             };
             let usual = value("fast");
             assert!(defaults.starts_with(&usual), "{flag}: {usual} in {defaults}");
-            for preset in config::PRESETS.map(|preset| preset.name) {
+            for preset in PRESETS.map(|preset| preset.name) {
                 let value = value(preset);
                 let special = value != usual;
                 assert!(defaults.contains(preset) == special && defaults.contains(&value), "{flag}: {preset} has {value}, not {defaults}");

@@ -1,12 +1,12 @@
 //! A run folder, which explains itself: what each file in it is called, and when one may be overwritten.
 
-use crate::config;
 use crate::data::DataSource;
 use crate::event_file;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files;
+use plenoxel::run::settings::{self, ConfigFile};
 use plenoxel::train::config::Config;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -128,7 +128,11 @@ impl RunFolder {
     pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
         let command = if config.stages.is_empty() { "carve" } else { "train" };
         let again = format!("plenoxel {command}{} --config THIS_FILE", record.data.arguments());
-        config::write(&self.path.join(CONFIG), config, &format!("Settings of a run of {}. The same run again:\n{again}", record.program))?;
+        settings::write(
+            &self.path.join(CONFIG),
+            config,
+            &format!("Settings of a run of {}. The same run again:\n{again}", record.program),
+        )?;
         self.write_json(RECORD, record)?;
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
     }
@@ -152,7 +156,7 @@ impl RunFolder {
             _ => Error::io(&record, e, "reading the run"),
         })?;
         let record = RunRecord::parse(&record, &bytes)?;
-        Ok((folder, config::read(&path.join(CONFIG))?, record))
+        Ok((folder, ConfigFile::read(&path.join(CONFIG))?.complete()?, record))
     }
 
     /// The same run with the best of its grids, as `--best` asks for.

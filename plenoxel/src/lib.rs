@@ -15,6 +15,7 @@
 //! | [`train`] | batch → render → loss → gradients → optimizer, coarse to fine |
 //! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |
 //! | [`checkpoint`] | a trained grid on disk |
+//! | [`run`] | a run without a screen: settings, folder, metrics, evaluation |
 //! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
 //! | [`metrics`] | PSNR and SSIM |
 //! | [`point_cloud`], [`export`] | a trained grid as colored points; filters; files for other programs |
@@ -42,6 +43,7 @@ pub mod point_cloud;
 pub mod random;
 pub mod rays;
 pub mod render;
+pub mod run;
 pub mod sampling;
 mod tensor_file;
 pub mod train;

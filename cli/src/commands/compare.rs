@@ -4,7 +4,6 @@ mod pictures;
 
 use super::table::Figures;
 use super::table::markdown::plain;
-use crate::config;
 use crate::html::{self, escaped};
 use crate::metrics_file;
 use crate::progress::{Console, bytes, clock, thousands};
@@ -13,6 +12,7 @@ use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::files;
+use plenoxel::run::settings;
 use plenoxel::train::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -98,7 +98,7 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
 
 /// The settings that are not the same in all runs.
 fn settings(runs: &[Run]) -> String {
-    let values: Vec<BTreeMap<String, String>> = runs.iter().map(|run| config::values(&run.config)).collect();
+    let values: Vec<BTreeMap<String, String>> = runs.iter().map(|run| settings::values(&run.config)).collect();
     let keys: BTreeSet<&String> = values.iter().flat_map(BTreeMap::keys).collect();
     let differs = keys.into_iter().filter(|key| values.iter().any(|of| of.get(*key) != values[0].get(*key)));
     let rows: Vec<Vec<&str>> = differs

@@ -3,11 +3,11 @@
 use super::flags::Flag;
 use crate::commands::table::{Cell, Failure, Measured};
 use crate::commands::train::{NOT_WHEN_RESUMED, budget};
-use crate::config;
 use crate::data::DataSource;
 use crate::run_folder::RunFolder;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
+use plenoxel::run::settings;
 use plenoxel::train::config::Config;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -173,6 +173,6 @@ impl Asked {
             (None, _) => self.config.clone(),
         };
         let data = (source != &self.source).then(|| format!("data is {source} and not {}", self.source));
-        data.into_iter().chain(config::differences(config, &asked)).collect()
+        data.into_iter().chain(settings::differences(config, &asked)).collect()
     }
 }
