@@ -4,8 +4,8 @@
 //! `Event`. Records, masked checksums and the numbers of the fields are as in TensorFlow's `record_writer.h`, `event.proto` and
 //! `summary.proto`. A last record that was cut short is left out by who reads.
 
-use crate::machine;
 use plenoxel::error::{Error, Result};
+use plenoxel::run::machine;
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};

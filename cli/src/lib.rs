@@ -9,14 +9,11 @@
 mod chart;
 mod commands;
 mod curves;
-mod data;
 mod evaluation;
 mod event_file;
 mod figures;
 mod html;
 mod images;
-mod machine;
-mod memory;
 mod metrics_file;
 #[doc(hidden)]
 pub mod parsers;
@@ -27,6 +24,7 @@ mod run_folder;
 use clap::{Args, Parser, Subcommand};
 use commands::{carve, compare, completions, evaluate, export, filter, info, man, presets, render, scene, sweep, train};
 use plenoxel::error::Error;
+use plenoxel::run::{machine, memory};
 use progress::{Console, LogFormat};
 use std::ffi::OsString;
 use std::io::Write;
@@ -127,7 +125,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     };
     let console = Console::new(streams, cli.machine.log_format, cli.machine.quiet);
     memory::limit(cli.machine.max_memory);
-    let code = machine::with_threads(cli.machine.threads, || {
+    let code = machine::with_threads(cli.machine.threads, || -> Result<u8, Error> {
         let done = match &cli.command {
             Command::Train(args) => return train::run(args, &console),
             Command::Carve(args) => carve::run(args, &console),
@@ -146,7 +144,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
         };
         done.map(|()| 0)
     });
-    match code {
+    match code.map_err(commands::as_flag).flatten() {
         Ok(code) => code,
         Err(error) => {
             console.error(&error.to_string(), error.exit_code());

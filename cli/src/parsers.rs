@@ -1,11 +1,11 @@
 //! What reads files and command lines, each by itself, for property tests and fuzzing: no promise to anybody else.
 
 use crate::Cli;
-pub use crate::data::DataSource;
 use crate::metrics_file::Past;
 pub use crate::run_folder::RunRecord;
 use clap::Parser;
 use plenoxel::error::Result;
+pub use plenoxel::run::data::DataSource;
 use plenoxel::run::settings::{ConfigFile, Layers};
 use plenoxel::train::config::Config;
 use std::path::Path;

@@ -8,11 +8,12 @@ mod scene;
 
 use crate::html::{self, escaped};
 use crate::metrics_file;
-use crate::progress::{bytes, clock, thousands};
+use crate::progress::{clock, thousands};
 use crate::run_folder::{RunFolder, RunRecord};
 use plenoxel::dataset::Dataset;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::run::memory::bytes;
 use plenoxel::train::config::Config;
 use serde_json::Value;
 use std::fmt::Write;

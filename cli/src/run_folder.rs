@@ -1,11 +1,11 @@
 //! A run folder, which explains itself: what each file in it is called, and when one may be overwritten.
 
-use crate::data::DataSource;
 use crate::event_file;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files;
+use plenoxel::run::data::DataSource;
 use plenoxel::run::settings::{self, ConfigFile};
 use plenoxel::train::config::Config;
 use serde::{Deserialize, Serialize};

@@ -3,5 +3,10 @@
 //! | module | contents |
 //! | --- | --- |
 //! | [`settings`] | defaults < preset < file < assignments, resolved to a configuration |
+//! | [`data`] | the source of the views, as a run records it |
+//! | [`memory`], [`machine`] | an estimate of the memory before it is taken; threads, vector instructions, the time |
 
+pub mod data;
+pub mod machine;
+pub mod memory;
 pub mod settings;

@@ -2,10 +2,8 @@
 
 use super::new_run::{Stopwatch, announce, load, record};
 use super::{MOST_REDUCTION, whole};
-use crate::data::DataSource;
 use crate::evaluation::Viewer;
 use crate::images;
-use crate::memory::{self, Estimate};
 use crate::progress::Console;
 use crate::report::Report;
 use crate::run_folder::RunFolder;
@@ -15,6 +13,8 @@ use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
+use plenoxel::run::data::DataSource;
+use plenoxel::run::memory::{self, Estimate};
 use plenoxel::run::settings::{self, CARVE, Layers};
 use plenoxel::train::config::Config;
 use serde::Serialize;

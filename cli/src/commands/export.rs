@@ -5,7 +5,6 @@ mod ply;
 mod vox;
 
 use super::numbers;
-use crate::memory::Estimate;
 use crate::progress::Console;
 use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, Subcommand, ValueHint};
@@ -14,6 +13,7 @@ use plenoxel::checkpoint::Header;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
+use plenoxel::run::memory::Estimate;
 use plenoxel::train::config::Config;
 use std::path::{Path, PathBuf};
 

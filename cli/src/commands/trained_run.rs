@@ -1,8 +1,6 @@
 //! A trained run and the views to look at it from: what `evaluate` and `render` begin with.
 
-use crate::data::DataSource;
 use crate::evaluation::with_samples;
-use crate::memory::Estimate;
 use crate::progress::Console;
 use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
@@ -10,6 +8,8 @@ use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
+use plenoxel::run::data::DataSource;
+use plenoxel::run::memory::Estimate;
 use plenoxel::train::config::{Config, Sampling};
 use std::path::PathBuf;
 

@@ -1,8 +1,9 @@
 //! Progress of a training run: a bar for each stage, or lines.
 
-use super::{Console, Meter, Standing, bytes, clock, metric};
-use crate::memory;
+use super::{Console, Meter, Standing, clock, metric};
 use crate::metrics_file::Seen;
+use plenoxel::run::memory;
+use plenoxel::run::memory::bytes;
 use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;
 

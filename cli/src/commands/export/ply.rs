@@ -4,8 +4,6 @@ use super::{ColorChoice, Exported, MIN_ALPHA, Opened, color, min_alpha};
 use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
 use crate::commands::new_run::load;
 use crate::commands::{MOST_REDUCTION, as_flag, check_split, whole};
-use crate::data::DataSource;
-use crate::memory::Estimate;
 use crate::progress::Console;
 use crate::run_folder::RunRecord;
 use clap::{Args, ValueEnum, ValueHint};
@@ -17,6 +15,8 @@ use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, Vo
 use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
 use plenoxel::render::fused::{Seen, seen};
+use plenoxel::run::data::DataSource;
+use plenoxel::run::memory::Estimate;
 use plenoxel::sampling::Jitter;
 use plenoxel::train::config::Config;
 use std::path::PathBuf;

@@ -3,10 +3,10 @@
 use super::flags::Flag;
 use crate::commands::table::{Cell, Failure, Measured};
 use crate::commands::train::{NOT_WHEN_RESUMED, budget};
-use crate::data::DataSource;
 use crate::run_folder::RunFolder;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
+use plenoxel::run::data::DataSource;
 use plenoxel::run::settings;
 use plenoxel::train::config::Config;
 use std::ffi::OsString;

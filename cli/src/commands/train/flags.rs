@@ -1,11 +1,11 @@
 //! The flags of `train`, and the configuration they amount to.
 
 use crate::commands::{MOST_REDUCTION, background, whole};
-use crate::data::DataSource;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::error::{Error, Result};
+use plenoxel::run::data::DataSource;
 use plenoxel::run::settings::{self, Layers, PRESETS};
 use plenoxel::train::config::Config;
 use std::path::PathBuf;
