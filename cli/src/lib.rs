@@ -10,16 +10,13 @@ mod chart;
 mod commands;
 mod curves;
 mod evaluation;
-mod event_file;
 mod figures;
 mod html;
 mod images;
-mod metrics_file;
 #[doc(hidden)]
 pub mod parsers;
 mod progress;
 mod report;
-mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
 use commands::{carve, compare, completions, evaluate, export, filter, info, man, presets, render, scene, sweep, train};
@@ -167,12 +164,6 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
     }
     drop(write!(streams.out, "{text}"));
     0
-}
-
-/// A value as JSON on one line, its keys in the order of its fields. Numbers that are not finite become null.
-fn json_line(value: &impl serde::Serialize) -> Result<String, Error> {
-    let defect = |e: serde_json::Error| Error::input("result", e.to_string(), "this is a defect of the program");
-    serde_json::to_string(value).map_err(defect)
 }
 
 #[cfg(test)]

@@ -1,11 +1,11 @@
 //! What reads files and command lines, each by itself, for property tests and fuzzing: no promise to anybody else.
 
 use crate::Cli;
-use crate::metrics_file::Past;
-pub use crate::run_folder::RunRecord;
 use clap::Parser;
 use plenoxel::error::Result;
 pub use plenoxel::run::data::DataSource;
+pub use plenoxel::run::folder::RunRecord;
+use plenoxel::run::metrics::History;
 use plenoxel::run::settings::{ConfigFile, Layers};
 use plenoxel::train::config::Config;
 use std::path::Path;
@@ -36,6 +36,6 @@ pub fn arguments(arguments: &[&str]) -> std::result::Result<(), String> {
 
 /// Of the `metrics.jsonl` of a run the lines about its first steps, and their losses.
 pub fn losses(bytes: &[u8], taken: u64) -> (String, Vec<f64>) {
-    let (kept, past) = Past::of(&String::from_utf8_lossy(bytes), taken);
+    let (kept, past) = History::of(&String::from_utf8_lossy(bytes), taken);
     (kept, past.losses)
 }

@@ -9,6 +9,7 @@ use crate::Streams;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use plenoxel::error::{Error, Result};
+use plenoxel::json;
 use plenoxel::run::machine;
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -58,7 +59,7 @@ impl<'a> Console<'a> {
     /// The same as a JSON object, for programs; nothing where people read it.
     pub fn record(&self, value: &impl Serialize) -> Result<()> {
         let read_by_people = lock(&self.streams).read_by_people;
-        if read_by_people { Ok(()) } else { self.result(&crate::json_line(value)?) }
+        if read_by_people { Ok(()) } else { self.result(&json::line(value)?) }
     }
 
     /// A line of information on stderr.
@@ -95,7 +96,7 @@ impl<'a> Console<'a> {
         let time = machine::time();
         match self.format {
             LogFormat::Plain => self.write(&plain()),
-            LogFormat::Json => self.write(&crate::json_line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
+            LogFormat::Json => self.write(&json::line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
         }
     }
 

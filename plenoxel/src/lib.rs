@@ -19,7 +19,7 @@
 //! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
 //! | [`metrics`] | PSNR and SSIM |
 //! | [`point_cloud`], [`export`] | a trained grid as colored points; filters; files for other programs |
-//! | [`random`], [`files`], [`error`] | numbers by purpose, files whole or not at all, what can go wrong |
+//! | [`random`], [`files`], [`json`], [`error`] | numbers by purpose, files whole or not at all, JSON, what can go wrong |
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
@@ -36,7 +36,7 @@ pub mod geometry;
 #[cfg(debug_assertions)]
 #[doc(hidden)]
 pub mod instances;
-mod json;
+pub mod json;
 pub mod loss;
 pub mod metrics;
 pub mod point_cloud;

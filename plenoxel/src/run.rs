@@ -5,8 +5,13 @@
 //! | [`settings`] | defaults < preset < file < assignments, resolved to a configuration |
 //! | [`data`] | the source of the views, as a run records it |
 //! | [`memory`], [`machine`] | an estimate of the memory before it is taken; threads, vector instructions, the time |
+//! | [`folder`] | the files of a run, by name |
+//! | [`metrics`], [`tensorboard`] | the figures of each step, on lines of JSON and as TensorBoard reads them |
 
 pub mod data;
+pub mod folder;
 pub mod machine;
 pub mod memory;
+pub mod metrics;
 pub mod settings;
+pub mod tensorboard;

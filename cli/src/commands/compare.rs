@@ -5,14 +5,14 @@ mod pictures;
 use super::table::Figures;
 use super::table::markdown::plain;
 use crate::html::{self, escaped};
-use crate::metrics_file;
 use crate::progress::{Console, clock, thousands};
 use crate::report::{SCRIPT, STYLE, curves};
-use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::files;
+use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::bytes;
+use plenoxel::run::metrics;
 use plenoxel::run::settings;
 use plenoxel::train::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
@@ -54,7 +54,7 @@ impl Run {
     fn read(path: &Path) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
         let figures = Figures::of(&folder, &config).unwrap_or_default();
-        let metrics = metrics_file::read(&folder.metrics())?;
+        let metrics = metrics::read(&folder.metrics())?;
         Ok(Run { name: path.display().to_string(), folder, config, record, figures, metrics })
     }
 
@@ -83,7 +83,7 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
     let facts: Vec<_> = runs.iter().map(Run::facts).collect();
     let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();
     let cells: Vec<Vec<&str>> = facts.iter().map(|facts| facts.iter().map(|(_, value)| value.as_str()).collect()).collect();
-    let curves = runs.iter().map(|run| (run.name.clone(), metrics_file::lines(&run.metrics).map(|(_, line)| line).collect()));
+    let curves = runs.iter().map(|run| (run.name.clone(), metrics::lines(&run.metrics).map(|(_, line)| line).collect()));
     let parts = [
         format!("<section>{}</section>", table(&heads, &cells)),
         curves::side_by_side(&curves.collect::<Vec<_>>()),

@@ -6,13 +6,13 @@ mod vox;
 
 use super::numbers;
 use crate::progress::Console;
-use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, Subcommand, ValueHint};
 use glam::DVec3;
 use plenoxel::checkpoint::Header;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
+use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::Estimate;
 use plenoxel::train::config::Config;
 use std::path::{Path, PathBuf};

@@ -1,13 +1,13 @@
 //! `plenoxel info`: what a run, a checkpoint or a dataset is, and what machine this is.
 
 use crate::progress::{Console, clock};
-use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
 use plenoxel::run::memory;
 use plenoxel::run::memory::bytes;

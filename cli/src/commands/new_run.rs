@@ -2,10 +2,10 @@
 
 use super::background_name;
 use crate::progress::Console;
-use crate::run_folder::RunRecord;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Result;
 use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunRecord;
 use plenoxel::run::machine;
 use plenoxel::train::config::Config;
 use std::time::{Duration, Instant};

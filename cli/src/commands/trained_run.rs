@@ -2,13 +2,13 @@
 
 use crate::evaluation::with_samples;
 use crate::progress::Console;
-use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
 use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunFolder;
 use plenoxel::run::memory::Estimate;
 use plenoxel::train::config::{Config, Sampling};
 use std::path::PathBuf;

@@ -1,9 +1,9 @@
 //! Progress of a training run: a bar for each stage, or lines.
 
 use super::{Console, Meter, Standing, clock, metric};
-use crate::metrics_file::Seen;
 use plenoxel::run::memory;
 use plenoxel::run::memory::bytes;
+use plenoxel::run::metrics::Observation;
 use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;
 
@@ -61,7 +61,7 @@ impl<'a> Console<'a> {
 
 impl Training<'_, '_> {
     /// A step was taken.
-    pub fn step(&mut self, report: &Report, seen: Seen) {
+    pub fn step(&mut self, report: &Report, seen: Observation) {
         let took = seen.seconds - self.seconds;
         self.seconds = seen.seconds;
         self.validation_psnr = seen.validation_psnr.or(self.validation_psnr);

@@ -5,7 +5,6 @@ use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty,
 use crate::commands::new_run::load;
 use crate::commands::{MOST_REDUCTION, as_flag, check_split, whole};
 use crate::progress::Console;
-use crate::run_folder::RunRecord;
 use clap::{Args, ValueEnum, ValueHint};
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
@@ -16,6 +15,7 @@ use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
 use plenoxel::render::fused::{Seen, seen};
 use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunRecord;
 use plenoxel::run::memory::Estimate;
 use plenoxel::sampling::Jitter;
 use plenoxel::train::config::Config;

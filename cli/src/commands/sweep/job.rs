@@ -3,10 +3,11 @@
 use super::flags::Flag;
 use crate::commands::table::{Cell, Failure, Measured};
 use crate::commands::train::{NOT_WHEN_RESUMED, budget};
-use crate::run_folder::RunFolder;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
+use plenoxel::json;
 use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunFolder;
 use plenoxel::run::settings;
 use plenoxel::train::config::Config;
 use std::ffi::OsString;
@@ -131,7 +132,7 @@ impl Job {
 
     /// Writes down that it failed.
     pub fn remember(&self, failure: &Failure) -> Result<()> {
-        files::write_atomically(&self.failure_path(), (crate::json_line(failure)? + "\n").as_bytes())
+        files::write_atomically(&self.failure_path(), (json::line(failure)? + "\n").as_bytes())
     }
 
     /// It may have failed once: that counts no longer.

@@ -7,11 +7,11 @@ use super::watching::Watching;
 use super::{Clocks, Job, interrupt};
 use crate::evaluation;
 use crate::images::Rgb;
-use crate::metrics_file::{MetricsFile, Past};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::View;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::run::metrics::{History, MetricsFile};
 use plenoxel::train::{PlannedStage, Trainer};
 use serde::Serialize;
 use std::time::Instant;
@@ -45,7 +45,7 @@ impl<'a> Job<'a, '_> {
     pub fn learn(
         &'a self,
         mut trainer: Trainer<'_, f32>,
-        (metrics, past): (MetricsFile, Past),
+        (metrics, past): (MetricsFile, History),
         preview: Preview,
         views: &[View],
         clocks: &mut Clocks,
@@ -115,7 +115,7 @@ impl<'a> Job<'a, '_> {
     }
 
     /// What a run has learned that was killed between its last step and its final figures.
-    pub fn learned(&'a self, plan: &[PlannedStage], (metrics, past): (MetricsFile, Past), views: &[View]) -> Result<Learned<'a>> {
+    pub fn learned(&'a self, plan: &[PlannedStage], (metrics, past): (MetricsFile, History), views: &[View]) -> Result<Learned<'a>> {
         let Job { folder, config, dataset, .. } = *self;
         let mut pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
         pictures.earlier_stages(&past, plan);
@@ -132,7 +132,7 @@ impl StageSummary {
 }
 
 /// Of the stages that ended before.
-fn summaries(past: &Past, plan: &[PlannedStage]) -> Vec<StageSummary> {
+fn summaries(past: &History, plan: &[PlannedStage]) -> Vec<StageSummary> {
     let ended = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));
     ended.map(|(planned, seconds)| StageSummary::new(planned, seconds, None)).collect()
 }
