@@ -9,8 +9,6 @@
 mod chart;
 mod commands;
 mod curves;
-mod evaluation;
-mod figures;
 mod html;
 mod images;
 #[doc(hidden)]

@@ -2,7 +2,6 @@
 
 use super::new_run::{Stopwatch, announce, load, record};
 use super::{MOST_REDUCTION, whole};
-use crate::evaluation::Viewer;
 use crate::images;
 use crate::progress::Console;
 use crate::report::Report;
@@ -13,6 +12,7 @@ use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
 use plenoxel::run::data::DataSource;
+use plenoxel::run::evaluation::Viewer;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::memory::{self, Estimate};
 use plenoxel::run::settings::{self, CARVE, Layers};

@@ -2,13 +2,13 @@
 
 use super::new_run::load;
 use super::trained_run::{Found, Loaded, TrainedRun};
-use crate::evaluation::{ViewScore, Viewer};
-use crate::figures::Figures;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::files;
 use plenoxel::json;
+use plenoxel::run::evaluation::{ViewScore, Viewer};
+use plenoxel::run::figures::Figures;
 use plenoxel::run::memory::{self, Estimate};
 use serde::Serialize;
 use serde_json::Value;

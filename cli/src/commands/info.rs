@@ -9,8 +9,7 @@ use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
-use plenoxel::run::memory;
-use plenoxel::run::memory::bytes;
+use plenoxel::run::memory::{self, bytes};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\

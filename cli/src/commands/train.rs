@@ -1,7 +1,6 @@
 //! `plenoxel train`: from photographs to a run folder.
 
 mod best_grid;
-pub mod budget;
 mod flags;
 pub mod interrupt;
 mod learning;
@@ -10,14 +9,15 @@ mod preview;
 mod watching;
 
 use super::new_run::{Stopwatch, announce, load, record};
-use crate::evaluation::{self, Scores, ViewScore, Viewer};
-use crate::figures::Figures;
 use crate::progress::{Console, clock};
 use crate::report::Report;
 pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use learning::{Learned, StageSummary};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
+use plenoxel::run::budget;
+use plenoxel::run::evaluation::{self, Scores, ViewScore, Viewer};
+use plenoxel::run::figures::Figures;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::machine;
 use plenoxel::run::memory::{self, Estimate};

@@ -1,6 +1,5 @@
 //! A trained run and the views to look at it from: what `evaluate` and `render` begin with.
 
-use crate::evaluation::with_samples;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::checkpoint::Header;
@@ -8,6 +7,7 @@ use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
 use plenoxel::run::data::DataSource;
+use plenoxel::run::evaluation::with_samples;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::memory::Estimate;
 use plenoxel::train::config::{Config, Sampling};

@@ -1,8 +1,7 @@
 //! Progress of a training run: a bar for each stage, or lines.
 
 use super::{Console, Meter, Standing, clock, metric};
-use plenoxel::run::memory;
-use plenoxel::run::memory::bytes;
+use plenoxel::run::memory::{self, bytes};
 use plenoxel::run::metrics::Observation;
 use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;

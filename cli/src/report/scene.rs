@@ -1,7 +1,6 @@
 //! The grid in the page, for its viewer: how it is embedded, and what that costs.
 
 use super::Report;
-use crate::evaluation::Viewer;
 use crate::html::escaped;
 use crate::images::evenly_spaced;
 use crate::progress::thousands;
@@ -12,6 +11,7 @@ use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::export::web::WebGrid;
 use plenoxel::metrics;
+use plenoxel::run::evaluation::Viewer;
 use plenoxel::run::memory::bytes;
 use serde_json::{Value, json};
 

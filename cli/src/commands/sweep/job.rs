@@ -2,10 +2,11 @@
 
 use super::flags::Flag;
 use crate::commands::table::{Cell, Failure, Measured};
-use crate::commands::train::{NOT_WHEN_RESUMED, budget};
+use crate::commands::train::NOT_WHEN_RESUMED;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::json;
+use plenoxel::run::budget;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::settings;

@@ -1,12 +1,12 @@
 //! The pictures of a run: one view at the end of each stage, and panels of test views.
 
-use crate::evaluation::Viewer;
 use crate::images::{self, DepthRange, Rgb};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split, View, image};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::render::picture::Picture;
+use plenoxel::run::evaluation::Viewer;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::metrics::History;
 use plenoxel::train::PlannedStage;
