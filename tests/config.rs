@@ -89,7 +89,7 @@ fn presets_are_listed_printed_and_resolved() {
     assert_eq!(list.lines().count(), 1 + PRESETS.len(), "{list}");
     for (line, preset) in list.lines().skip(1).zip(PRESETS) {
         assert!(line.starts_with(preset) && line.len() <= 120, "{line}");
-        let file = fs::read_to_string(format!("cli/presets/{preset}.toml")).unwrap();
+        let file = fs::read_to_string(format!("plenoxel/presets/{preset}.toml")).unwrap();
         assert_eq!(plenoxel(&["presets", preset]).done().trim_end(), file.trim_end());
         // Its own switch says what alpha decides.
         let resolved = plenoxel(&["presets", preset, "--resolved"]).done();

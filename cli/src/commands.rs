@@ -34,7 +34,7 @@ fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
 }
 
 /// A setting of the library under the name that its flag has.
-fn as_flag(error: Error) -> Error {
+pub fn as_flag(error: Error) -> Error {
     match error {
         Error::Config { key, found, accepted } => Error::config(format!("--{}", key.replace('_', "-")), found, accepted),
         other => other,
@@ -108,3 +108,15 @@ fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
 
 /// By how much images may be reduced.
 const MOST_REDUCTION: u64 = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_units_of_1000_or_of_1024() {
+        let sizes = [("17", 17), ("500MB", 500_000_000), ("1.5g", 1_500_000_000), ("8 GiB", 8 << 30), ("2mib", 2 << 20)];
+        sizes.into_iter().for_each(|(text, bytes)| assert_eq!(memory_size(text), Ok(bytes), "{text}"));
+        ["", "GB", "-1GB", "8 apples", "0", "1.2.3MB", "nan"].into_iter().for_each(|text| assert!(memory_size(text).is_err(), "{text}"));
+    }
+}

@@ -8,26 +8,18 @@
 
 mod chart;
 mod commands;
-mod config;
 mod curves;
-mod data;
-mod evaluation;
-mod event_file;
-mod figures;
 mod html;
 mod images;
-mod machine;
-mod memory;
-mod metrics_file;
 #[doc(hidden)]
 pub mod parsers;
 mod progress;
 mod report;
-mod run_folder;
 
 use clap::{Args, Parser, Subcommand};
 use commands::{carve, compare, completions, evaluate, export, filter, info, man, presets, render, scene, sweep, train};
 use plenoxel::error::Error;
+use plenoxel::run::{machine, memory};
 use progress::{Console, LogFormat};
 use std::ffi::OsString;
 use std::io::Write;
@@ -128,7 +120,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     };
     let console = Console::new(streams, cli.machine.log_format, cli.machine.quiet);
     memory::limit(cli.machine.max_memory);
-    let code = machine::with_threads(cli.machine.threads, || {
+    let code = machine::with_threads(cli.machine.threads, || -> Result<u8, Error> {
         let done = match &cli.command {
             Command::Train(args) => return train::run(args, &console),
             Command::Carve(args) => carve::run(args, &console),
@@ -147,7 +139,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
         };
         done.map(|()| 0)
     });
-    match code {
+    match code.map_err(commands::as_flag).flatten() {
         Ok(code) => code,
         Err(error) => {
             console.error(&error.to_string(), error.exit_code());
@@ -172,16 +164,12 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
     0
 }
 
-/// A value as JSON on one line, its keys in the order of its fields. Numbers that are not finite become null.
-fn json_line(value: &impl serde::Serialize) -> Result<String, Error> {
-    let defect = |e: serde_json::Error| Error::input("result", e.to_string(), "this is a defect of the program");
-    serde_json::to_string(value).map_err(defect)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use clap::{Command, CommandFactory};
+    use plenoxel::run::settings::{CARVE, PRESETS};
+    use plenoxel::model::plenoxels::config::Config;
 
     /// A command with those below it, and the words that call it.
     fn commands(command: &Command) -> Vec<Command> {
@@ -214,6 +202,19 @@ mod tests {
     }
 
     #[test]
+    fn a_preset_of_the_library_is_what_the_command_line_resolves() {
+        let resolved = |line: &[&str]| match Cli::try_parse_from(line).expect("a command line").command {
+            super::Command::Train(args) => args.config().expect("valid settings").0,
+            super::Command::Carve(args) => args.config().expect("valid settings").0,
+            _ => panic!("{line:?}"),
+        };
+        for preset in PRESETS.map(|preset| preset.name) {
+            assert_eq!(Config::preset(preset).expect("a preset"), resolved(&["plenoxel", "train", "--preset", preset]), "{preset}");
+        }
+        assert_eq!(Config::preset(CARVE.name).expect("a preset"), resolved(&["plenoxel", "carve"]));
+    }
+
+    #[test]
     fn defaults_that_the_help_of_train_names_are_those_of_the_presets() {
         let train = all().into_iter().find(|command| command.get_name() == "train").expect("train");
         for flag in ["seed", "downscale", "half-width", "interpolation", "color", "sh-degree", "sh-reduction", "hull", "engine"] {
@@ -221,13 +222,12 @@ mod tests {
             let help = argument.get_help().unwrap_or_default().to_string();
             let defaults = help.split("[default: ").nth(1).expect("a default");
             let value = |preset: &str| {
-                let (settings, _) = config::layered(None, preset, None, |_| Ok(())).expect("a valid preset");
-                let settings = toml::Table::try_from(settings).expect("a table");
+                let settings = toml::Table::try_from(Config::preset(preset).expect("a valid preset")).expect("a table");
                 settings[&flag.replace('-', "_")].to_string().replace('"', "")
             };
             let usual = value("fast");
             assert!(defaults.starts_with(&usual), "{flag}: {usual} in {defaults}");
-            for preset in config::PRESETS.map(|preset| preset.name) {
+            for preset in PRESETS.map(|preset| preset.name) {
                 let value = value(preset);
                 let special = value != usual;
                 assert!(defaults.contains(preset) == special && defaults.contains(&value), "{flag}: {preset} has {value}, not {defaults}");

@@ -1,12 +1,12 @@
 //! What reads files and command lines, each by itself, for property tests and fuzzing: no promise to anybody else.
 
 use crate::Cli;
-use crate::config::{self, ConfigFile, Layers};
-pub use crate::data::DataSource;
-use crate::metrics_file::Past;
-pub use crate::run_folder::RunRecord;
 use clap::Parser;
 use plenoxel::error::Result;
+pub use plenoxel::run::data::DataSource;
+pub use plenoxel::run::folder::RunRecord;
+use plenoxel::run::metrics::History;
+use plenoxel::run::settings::{ConfigFile, Layers};
 use plenoxel::model::plenoxels::config::Config;
 use std::path::Path;
 
@@ -19,7 +19,7 @@ pub fn layer(path: &Path, bytes: &[u8]) -> Result<Config> {
 
 /// The `config.toml` of a run.
 pub fn config(path: &Path, bytes: &[u8]) -> Result<Config> {
-    config::alone(&ConfigFile::parse(path, bytes.to_vec())?)
+    ConfigFile::parse(path, bytes.to_vec())?.complete()
 }
 
 /// Assignments as `--set` takes them, over a preset.
@@ -36,6 +36,6 @@ pub fn arguments(arguments: &[&str]) -> std::result::Result<(), String> {
 
 /// Of the `metrics.jsonl` of a run the lines about its first steps, and their losses.
 pub fn losses(bytes: &[u8], taken: u64) -> (String, Vec<f64>) {
-    let (kept, past) = Past::of(&String::from_utf8_lossy(bytes), taken);
+    let (kept, past) = History::of(&String::from_utf8_lossy(bytes), taken);
     (kept, past.losses)
 }

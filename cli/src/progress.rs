@@ -6,10 +6,11 @@
 mod training;
 
 use crate::Streams;
-use crate::machine;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use plenoxel::error::{Error, Result};
+use plenoxel::json;
+use plenoxel::run::machine;
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -58,7 +59,7 @@ impl<'a> Console<'a> {
     /// The same as a JSON object, for programs; nothing where people read it.
     pub fn record(&self, value: &impl Serialize) -> Result<()> {
         let read_by_people = lock(&self.streams).read_by_people;
-        if read_by_people { Ok(()) } else { self.result(&crate::json_line(value)?) }
+        if read_by_people { Ok(()) } else { self.result(&json::line(value)?) }
     }
 
     /// A line of information on stderr.
@@ -95,7 +96,7 @@ impl<'a> Console<'a> {
         let time = machine::time();
         match self.format {
             LogFormat::Plain => self.write(&plain()),
-            LogFormat::Json => self.write(&crate::json_line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
+            LogFormat::Json => self.write(&json::line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
         }
     }
 
@@ -265,16 +266,6 @@ fn metric(x: f64) -> String {
     }
 }
 
-/// Bytes as people say them.
-pub fn bytes(n: u64) -> String {
-    match n as f64 {
-        n if n >= 1e10 => format!("{:.0} GB", n / 1e9),
-        n if n >= 1e9 => format!("{:.1} GB", n / 1e9),
-        n if n >= 1e6 => format!("{:.0} MB", n / 1e6),
-        n => format!("{:.0} kB", n / 1e3),
-    }
-}
-
 /// A number with spaces between its thousands.
 pub fn thousands(n: u64) -> String {
     let digits = n.to_string();
@@ -288,13 +279,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_and_sizes_read_well() {
+    fn times_and_numbers_read_well() {
         assert_eq!(clock(3.4), "0:03");
         assert_eq!(clock(59.6), "1:00");
         assert_eq!(clock(3725.0), "1:02:05");
         assert_eq!(metric(431_204.0) + "rays/s", "431 krays/s");
-        assert_eq!(bytes(2_345_678_901), "2.3 GB");
-        assert_eq!(bytes(99_000), "99 kB");
         assert_eq!([7, 999, 1000, 1_234_567].map(thousands), ["7", "999", "1\u{202f}000", "1\u{202f}234\u{202f}567"]);
     }
 }

@@ -7,12 +7,13 @@ pub mod pictures;
 mod scene;
 
 use crate::html::{self, escaped};
-use crate::metrics_file;
-use crate::progress::{bytes, clock, thousands};
-use crate::run_folder::{RunFolder, RunRecord};
+use crate::progress::{clock, thousands};
 use plenoxel::dataset::Dataset;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::run::folder::{RunFolder, RunRecord};
+use plenoxel::run::memory::bytes;
+use plenoxel::run::metrics;
 use plenoxel::model::plenoxels::config::Config;
 use serde_json::Value;
 use std::fmt::Write;
@@ -35,8 +36,8 @@ impl Report<'_> {
     /// Writes the page. Returns what is to be said about it.
     pub fn write(&self) -> Result<String> {
         let result = self.folder.figures().unwrap_or(Value::Null);
-        let metrics = metrics_file::read(&self.folder.metrics())?;
-        let lines: Vec<_> = metrics_file::lines(&metrics).map(|(_, line)| line).collect();
+        let metrics = metrics::read(&self.folder.metrics())?;
+        let lines: Vec<_> = metrics::lines(&metrics).map(|(_, line)| line).collect();
         let scene = scene::Scene::new(self)?;
         let title = format!("{} – {}", self.folder.path().file_name().unwrap_or_default().to_string_lossy(), self.record.scene);
         let parts = [

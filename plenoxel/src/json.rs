@@ -1,6 +1,7 @@
-//! JSON files, and what is wrong with them.
+//! JSON: values on one line, and files with what is wrong with them.
 
 use crate::error::{Error, Result};
+use serde::Serialize;
 use serde_json::Value;
 use std::path::Path;
 
@@ -17,6 +18,14 @@ pub(crate) fn parse(path: &Path, bytes: &[u8]) -> Result<Value> {
         };
         Error::input(path, found, remedy)
     })
+}
+
+/// A value as JSON on one line, its keys in the order of its fields. Numbers that are not finite become null.
+///
+/// Errors: the value has no JSON form, such as a map whose keys are no strings.
+pub fn line(value: &impl Serialize) -> Result<String> {
+    let defect = |e: serde_json::Error| Error::input("result", e.to_string(), "this is a defect of the program");
+    serde_json::to_string(value).map_err(defect)
 }
 
 /// A value for a message: a file may have anything in its place.

@@ -17,10 +17,11 @@
 //! | [`evaluate`] | a model against photographs |
 //! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |
 //! | [`checkpoint`] | a trained grid on disk |
+//! | [`run`] | a run without a screen: settings, folder, metrics, evaluation |
 //! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
 //! | [`metrics`] | PSNR and SSIM |
 //! | [`point_cloud`], [`export`] | a trained grid as colored points; filters; files for other programs |
-//! | [`random`], [`files`], [`error`] | numbers by purpose, files whole or not at all, what can go wrong |
+//! | [`random`], [`files`], [`json`], [`error`] | numbers by purpose, files whole or not at all, JSON, what can go wrong |
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
@@ -38,7 +39,7 @@ pub mod geometry;
 #[cfg(debug_assertions)]
 #[doc(hidden)]
 pub mod instances;
-mod json;
+pub mod json;
 pub mod loss;
 pub mod metrics;
 pub mod model;
@@ -46,6 +47,7 @@ pub mod point_cloud;
 pub mod random;
 pub mod rays;
 pub mod render;
+pub mod run;
 pub mod sampling;
 pub mod tensor_file;
 pub mod train;

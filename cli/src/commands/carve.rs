@@ -2,20 +2,20 @@
 
 use super::new_run::{Stopwatch, announce, load, record};
 use super::{MOST_REDUCTION, whole};
-use crate::config::{self, CARVE, Layers};
-use crate::data::DataSource;
-use crate::evaluation::Viewer;
 use crate::images;
-use crate::memory::{self, Estimate};
 use crate::progress::Console;
 use crate::report::Report;
-use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::carve::photo_hull::PhotoConfig;
 use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
+use plenoxel::run::data::DataSource;
+use plenoxel::run::evaluation::Viewer;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::memory::{self, Estimate};
+use plenoxel::run::settings::{self, CARVE, Layers};
 use plenoxel::model::plenoxels::config::Config;
 use serde::Serialize;
 use std::path::PathBuf;
@@ -108,7 +108,7 @@ impl CarveArgs {
 
     /// The configuration, and the preset it started from.
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
-        config::layered(None, CARVE.name, self.config.as_deref(), |layers| self.flags(layers))
+        settings::layered(None, CARVE.name, self.config.as_deref(), |layers| self.flags(layers))
     }
 
     fn flags(&self, layers: &mut Layers) -> Result<()> {

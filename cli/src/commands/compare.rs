@@ -4,15 +4,16 @@ mod pictures;
 
 use super::table::Figures;
 use super::table::markdown::plain;
-use crate::config;
 use crate::html::{self, escaped};
-use crate::metrics_file;
-use crate::progress::{Console, bytes, clock, thousands};
+use crate::progress::{Console, clock, thousands};
 use crate::report::{SCRIPT, STYLE, curves};
-use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::files;
+use plenoxel::run::folder::{RunFolder, RunRecord};
+use plenoxel::run::memory::bytes;
+use plenoxel::run::metrics;
+use plenoxel::run::settings;
 use plenoxel::model::plenoxels::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -53,7 +54,7 @@ impl Run {
     fn read(path: &Path) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
         let figures = Figures::of(&folder, &config).unwrap_or_default();
-        let metrics = metrics_file::read(&folder.metrics())?;
+        let metrics = metrics::read(&folder.metrics())?;
         Ok(Run { name: path.display().to_string(), folder, config, record, figures, metrics })
     }
 
@@ -82,7 +83,7 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
     let facts: Vec<_> = runs.iter().map(Run::facts).collect();
     let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();
     let cells: Vec<Vec<&str>> = facts.iter().map(|facts| facts.iter().map(|(_, value)| value.as_str()).collect()).collect();
-    let curves = runs.iter().map(|run| (run.name.clone(), metrics_file::lines(&run.metrics).map(|(_, line)| line).collect()));
+    let curves = runs.iter().map(|run| (run.name.clone(), metrics::lines(&run.metrics).map(|(_, line)| line).collect()));
     let parts = [
         format!("<section>{}</section>", table(&heads, &cells)),
         curves::side_by_side(&curves.collect::<Vec<_>>()),
@@ -98,7 +99,7 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
 
 /// The settings that are not the same in all runs.
 fn settings(runs: &[Run]) -> String {
-    let values: Vec<BTreeMap<String, String>> = runs.iter().map(|run| config::values(&run.config)).collect();
+    let values: Vec<BTreeMap<String, String>> = runs.iter().map(|run| settings::values(&run.config)).collect();
     let keys: BTreeSet<&String> = values.iter().flat_map(BTreeMap::keys).collect();
     let differs = keys.into_iter().filter(|key| values.iter().any(|of| of.get(*key) != values[0].get(*key)));
     let rows: Vec<Vec<&str>> = differs

@@ -2,13 +2,14 @@
 
 use super::new_run::load;
 use super::trained_run::{Found, Loaded, TrainedRun};
-use crate::evaluation::{ViewScore, Viewer};
-use crate::figures::Figures;
-use crate::memory::{self, Estimate};
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::files;
+use plenoxel::json;
+use plenoxel::run::evaluation::{ViewScore, Viewer};
+use plenoxel::run::figures::Figures;
+use plenoxel::run::memory::{self, Estimate};
 use serde::Serialize;
 use serde_json::Value;
 use std::path::PathBuf;
@@ -92,7 +93,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         run: folder.path().display().to_string(),
         per_view: scores.per_view,
     };
-    let line = crate::json_line(&evaluation)?;
+    let line = json::line(&evaluation)?;
     // Printed first, so that a file that cannot be written takes nothing with it.
     if args.json { console.result(&line) } else { console.record(&evaluation) }?;
     args.out.iter().try_for_each(|file| files::write_atomically(file, (line.clone() + "\n").as_bytes()))

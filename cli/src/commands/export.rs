@@ -5,15 +5,15 @@ mod ply;
 mod vox;
 
 use super::numbers;
-use crate::memory::Estimate;
 use crate::progress::Console;
-use crate::run_folder::{RunFolder, RunRecord};
 use clap::{Args, Subcommand, ValueHint};
 use glam::DVec3;
 use plenoxel::checkpoint::Header;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
+use plenoxel::run::folder::{RunFolder, RunRecord};
+use plenoxel::run::memory::Estimate;
 use plenoxel::model::plenoxels::config::Config;
 use std::path::{Path, PathBuf};
 

@@ -1,15 +1,15 @@
 //! `plenoxel info`: what a run, a checkpoint or a dataset is, and what machine this is.
 
-use crate::data::DataSource;
-use crate::machine;
-use crate::memory;
-use crate::progress::{Console, bytes, clock};
-use crate::run_folder::RunFolder;
+use crate::progress::{Console, clock};
 use clap::{Args, ValueHint};
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::machine;
+use plenoxel::run::memory::{self, bytes};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\

@@ -1,12 +1,12 @@
 //! What a new run begins with, whether it trains or carves.
 
 use super::background_name;
-use crate::data::DataSource;
-use crate::machine;
 use crate::progress::Console;
-use crate::run_folder::RunRecord;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Result;
+use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunRecord;
+use plenoxel::run::machine;
 use plenoxel::model::plenoxels::config::Config;
 use std::time::{Duration, Instant};
 

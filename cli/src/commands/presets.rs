@@ -1,10 +1,10 @@
 //! `plenoxel presets`: which there are, what one says, and what it amounts to.
 
-use crate::config::{self, CARVE, PRESETS, find};
 use crate::progress::Console;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use plenoxel::error::Result;
+use plenoxel::run::settings::{self, CARVE, PRESETS};
 use plenoxel::model::plenoxels::config::{Config, Hull};
 
 const EXAMPLES: &str = "\
@@ -34,22 +34,18 @@ pub fn run(args: &PresetsArgs, console: &Console<'_>) -> Result<()> {
     match &args.name {
         None => list(console),
         Some(name) if args.resolved => {
-            let (config, command) = (resolved(name)?, if *name == CARVE.name { "carve" } else { "train" });
+            let (config, command) = (Config::preset(name)?, if *name == CARVE.name { "carve" } else { "train" });
             let remark = format!("Preset {name} of {}.\nplenoxel {command} DATA --config THIS_FILE", crate::PROGRAM);
-            console.result(config::text(&config, &remark)?.trim_end())
+            console.result(settings::to_toml(&config, &remark)?.trim_end())
         }
-        Some(name) => console.result(find(name)?.text.trim_end()),
+        Some(name) => console.result(settings::preset(name)?.text.trim_end()),
     }
-}
-
-fn resolved(name: &str) -> Result<Config> {
-    Ok(config::layered(None, name, None, |_| Ok(()))?.0)
 }
 
 fn list(console: &Console<'_>) -> Result<()> {
     console.result(&row(["preset", "time on two cores", "alpha decides", "for"]))?;
     PRESETS.iter().chain([&CARVE]).try_for_each(|preset| {
-        let alpha = alpha_decides(&resolved(preset.name)?);
+        let alpha = alpha_decides(&Config::preset(preset.name)?);
         console.result(&row([preset.name, preset.time, alpha, preset.purpose]))
     })
 }

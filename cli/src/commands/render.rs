@@ -6,7 +6,6 @@ mod movie;
 mod path;
 
 use super::trained_run::{Found, Loaded, TrainedRun};
-use crate::memory::Estimate;
 use crate::progress::Console;
 use channels::{Channel, FileFormat, Pictures};
 use clap::Args;
@@ -14,6 +13,7 @@ use path::{Film, PathArgs, PathChoice};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
+use plenoxel::run::memory::Estimate;
 use std::path::PathBuf;
 use std::time::Instant;
 

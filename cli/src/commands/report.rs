@@ -1,12 +1,12 @@
 //! `plenoxel report`: the page about a run, made again.
 
-use crate::data::DataSource;
-use crate::memory::Estimate;
 use crate::progress::Console;
 use crate::report::Report;
-use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
+use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::memory::Estimate;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\

@@ -2,13 +2,13 @@
 
 use super::train::size;
 use super::whole;
-use crate::memory::Estimate;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::image;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
+use plenoxel::run::memory::Estimate;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\

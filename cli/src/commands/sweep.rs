@@ -7,7 +7,6 @@ mod plan;
 
 use super::table::{Cell, Failure, Row, RunTable};
 use super::train::interrupt::{EXIT_CODE, Watch};
-use crate::config::PRESETS;
 use crate::progress::Console;
 use child::Program;
 use clap::builder::PossibleValuesParser;
@@ -16,6 +15,7 @@ use job::{Job, State};
 use plan::Plan;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
+use plenoxel::run::settings::PRESETS;
 use std::ffi::OsString;
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};

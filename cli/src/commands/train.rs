@@ -1,7 +1,6 @@
 //! `plenoxel train`: from photographs to a run folder.
 
 mod best_grid;
-pub mod budget;
 mod flags;
 pub mod interrupt;
 mod learning;
@@ -10,18 +9,19 @@ mod preview;
 mod watching;
 
 use super::new_run::{Stopwatch, announce, load, record};
-use crate::evaluation::{self, Scores, ViewScore, Viewer};
-use crate::figures::Figures;
-use crate::machine;
-use crate::memory::{self, Estimate};
-use crate::metrics_file::{Best, MetricsFile, Past};
 use crate::progress::{Console, clock};
 use crate::report::Report;
-use crate::run_folder::{RunFolder, RunRecord};
 pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use learning::{Learned, StageSummary};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
+use plenoxel::run::budget;
+use plenoxel::run::evaluation::{self, Scores, ViewScore, Viewer};
+use plenoxel::run::figures::Figures;
+use plenoxel::run::folder::{RunFolder, RunRecord};
+use plenoxel::run::machine;
+use plenoxel::run::memory::{self, Estimate};
+use plenoxel::run::metrics::{Best, History, MetricsFile};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::model::plenoxels::Trainer;
 use plenoxel::train::PlannedStage;
@@ -93,7 +93,7 @@ fn begin(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     }
     let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
     let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, args, console };
-    let learned = job.learn(trainer, (metrics, Past::default()), preview, &views, &mut clocks)?;
+    let learned = job.learn(trainer, (metrics, History::default()), preview, &views, &mut clocks)?;
     drop(views);
     job.conclude(learned, clocks)
 }

@@ -1,15 +1,15 @@
 //! A trained run and the views to look at it from: what `evaluate` and `render` begin with.
 
-use crate::data::DataSource;
-use crate::evaluation::with_samples;
-use crate::memory::Estimate;
 use crate::progress::Console;
-use crate::run_folder::RunFolder;
 use clap::{Args, ValueHint};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
+use plenoxel::run::data::DataSource;
+use plenoxel::run::evaluation::with_samples;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::memory::Estimate;
 use plenoxel::model::plenoxels::config::{Config, Sampling};
 use std::path::PathBuf;
 

@@ -1,8 +1,8 @@
 //! Progress of a training run: a bar for each stage, or lines.
 
-use super::{Console, Meter, Standing, bytes, clock, metric};
-use crate::memory;
-use crate::metrics_file::Seen;
+use super::{Console, Meter, Standing, clock, metric};
+use plenoxel::run::memory::{self, bytes};
+use plenoxel::run::metrics::Observation;
 use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;
 
@@ -60,7 +60,7 @@ impl<'a> Console<'a> {
 
 impl Training<'_, '_> {
     /// A step was taken.
-    pub fn step(&mut self, report: &Report, seen: Seen) {
+    pub fn step(&mut self, report: &Report, seen: Observation) {
         let took = seen.seconds - self.seconds;
         self.seconds = seen.seconds;
         self.validation_psnr = seen.validation_psnr.or(self.validation_psnr);

@@ -1,7 +1,7 @@
 //! Loss, PSNR, resolution and rates of a run, or of several, over steps and over seconds.
 
 use crate::chart::{Chart, Curve};
-use crate::metrics_file::Line;
+use plenoxel::run::metrics::Line;
 use plenoxel::model::plenoxels::config::Stage;
 use std::collections::BTreeSet;
 

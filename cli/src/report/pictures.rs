@@ -1,9 +1,9 @@
 //! The pictures of a run in its report: stages, and test views with their figures.
 
 use crate::html::{escaped, picture};
-use crate::run_folder::RunFolder;
 use plenoxel::dataset::image as files;
 use plenoxel::error::Result;
+use plenoxel::run::folder::RunFolder;
 use serde_json::Value;
 use std::fmt::Write;
 use std::path::Path;

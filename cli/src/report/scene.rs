@@ -1,10 +1,9 @@
 //! The grid in the page, for its viewer: how it is embedded, and what that costs.
 
 use super::Report;
-use crate::evaluation::Viewer;
 use crate::html::escaped;
 use crate::images::evenly_spaced;
-use crate::progress::{bytes, thousands};
+use crate::progress::thousands;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use plenoxel::camera::Camera;
@@ -12,6 +11,8 @@ use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::export::web::WebGrid;
 use plenoxel::metrics;
+use plenoxel::run::evaluation::Viewer;
+use plenoxel::run::memory::bytes;
 use serde_json::{Value, json};
 
 /// The most bytes of a grid in a page, before base64 makes four of three: 30 MB after it.

@@ -4,9 +4,9 @@ use super::Run;
 use crate::html::{escaped, picture};
 use crate::images::{self, evenly_spaced};
 use crate::report::pictures::LARGEST;
-use crate::run_folder::RunFolder;
 use plenoxel::dataset::image as files;
 use plenoxel::error::{Error, Result};
+use plenoxel::run::folder::RunFolder;
 use std::path::Path;
 
 /// Views that are shown.

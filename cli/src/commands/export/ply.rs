@@ -4,10 +4,7 @@ use super::{ColorChoice, Exported, MIN_ALPHA, Opened, color, min_alpha};
 use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
 use crate::commands::new_run::load;
 use crate::commands::{MOST_REDUCTION, as_flag, check_split, whole};
-use crate::data::DataSource;
-use crate::memory::Estimate;
 use crate::progress::Console;
-use crate::run_folder::RunRecord;
 use clap::{Args, ValueEnum, ValueHint};
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
@@ -17,6 +14,9 @@ use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, Vo
 use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
 use plenoxel::field::voxel_grid::fused::{Seen, seen};
+use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunRecord;
+use plenoxel::run::memory::Estimate;
 use plenoxel::sampling::Jitter;
 use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
@@ -157,7 +157,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     console.note(&estimate.describe());
     estimate.check()?;
     let views = load(console, &dataset, Split::Train, &source)?;
-    let rays = RaySource::new(views, config.background, config.seed);
+    let rays = RaySource::new(&views, config.background, config.seed);
     let occupancy = grid.matter();
     let options = RenderOptions {
         aabb: grid.aabb(),

@@ -1,7 +1,6 @@
 //! Kinds of pictures, the formats of their files, and one camera's pictures in all of them.
 
 use super::float_files;
-use crate::evaluation::Viewer;
 use crate::images::{self, DepthRange, Rgb};
 use clap::ValueEnum;
 use ndarray::{Array2, Array3, Axis};
@@ -10,6 +9,7 @@ use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
 use plenoxel::render::picture::Picture;
+use plenoxel::run::evaluation::Viewer;
 use plenoxel::model::plenoxels::config::{Config, Sampling};
 use std::path::{Path, PathBuf};
 

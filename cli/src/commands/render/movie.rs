@@ -1,12 +1,12 @@
 //! The frames of a path as a GIF that repeats and, where there is `ffmpeg`, as an MP4.
 
-use crate::machine;
 use crate::progress::Console;
 use gif::{Encoder, Frame, Repeat};
 use plenoxel::dataset::image;
 use plenoxel::error::Result;
 use plenoxel::export::palette::quantize;
 use plenoxel::files::atomically;
+use plenoxel::run::machine;
 use rayon::prelude::*;
 use std::fs::File;
 use std::io::{self, BufWriter, ErrorKind};

@@ -1,10 +1,10 @@
 //! Flags of `train` and `carve` as keys of a sweep's file: `downscale = 4` is `--downscale=4`. Which there are, and what they take, is asked
 //! of the command line itself.
 
-use crate::config;
 use clap::error::{ContextKind, ContextValue};
 use clap::{Arg, ArgAction, CommandFactory, ValueHint};
 use plenoxel::error::{Error, Result};
+use plenoxel::run::settings;
 use std::path::Path;
 use toml::{Table, Value};
 
@@ -34,7 +34,7 @@ pub fn flags(command: &str, name: &str, value: &Value, base: &Path, place: &str)
     let mut arguments = cli.find_subcommand(command).into_iter().flat_map(clap::Command::get_arguments);
     let Some(argument) = arguments.find(|argument| key(argument).as_deref() == Some(name)) else {
         let known = keys(command);
-        return Err(config::unknown("key", name, &known.iter().map(String::as_str).collect::<Vec<_>>(), place));
+        return Err(settings::unknown_name("key", name, &known.iter().map(String::as_str).collect::<Vec<_>>(), place));
     };
     let flag = argument.get_long().unwrap_or_default();
     let is_path = matches!(argument.get_value_hint(), ValueHint::DirPath | ValueHint::FilePath | ValueHint::AnyPath);
@@ -70,7 +70,7 @@ fn text(value: &Value) -> Option<String> {
 pub fn check_keys(table: &Table, known: &[String], place: &dyn Fn(&str) -> String) -> Result<()> {
     let names: Vec<&str> = known.iter().map(String::as_str).collect();
     match table.keys().find(|key| !names.contains(&key.as_str())) {
-        Some(key) => Err(config::unknown("key", key, &names, &place(key))),
+        Some(key) => Err(settings::unknown_name("key", key, &names, &place(key))),
         None => Ok(()),
     }
 }

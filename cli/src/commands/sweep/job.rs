@@ -2,12 +2,14 @@
 
 use super::flags::Flag;
 use crate::commands::table::{Cell, Failure, Measured};
-use crate::commands::train::{NOT_WHEN_RESUMED, budget};
-use crate::config;
-use crate::data::DataSource;
-use crate::run_folder::RunFolder;
+use crate::commands::train::NOT_WHEN_RESUMED;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
+use plenoxel::json;
+use plenoxel::run::budget;
+use plenoxel::run::data::DataSource;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::settings;
 use plenoxel::model::plenoxels::config::Config;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -131,7 +133,7 @@ impl Job {
 
     /// Writes down that it failed.
     pub fn remember(&self, failure: &Failure) -> Result<()> {
-        files::write_atomically(&self.failure_path(), (crate::json_line(failure)? + "\n").as_bytes())
+        files::write_atomically(&self.failure_path(), (json::line(failure)? + "\n").as_bytes())
     }
 
     /// It may have failed once: that counts no longer.
@@ -173,6 +175,6 @@ impl Asked {
             (None, _) => self.config.clone(),
         };
         let data = (source != &self.source).then(|| format!("data is {source} and not {}", self.source));
-        data.into_iter().chain(config::differences(config, &asked)).collect()
+        data.into_iter().chain(settings::differences(config, &asked)).collect()
     }
 }

@@ -3,9 +3,9 @@
 use super::flags::{self, Flag};
 use super::job::{Asked, Call, Job};
 use crate::commands::table::Published;
-use crate::config::{self, ConfigFile};
 use clap::Parser;
 use plenoxel::error::{Error, Result};
+use plenoxel::run::settings::{self, ConfigFile};
 use serde::Deserialize;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -157,7 +157,7 @@ fn chosen_methods(scene: &Entry, methods: &[String], place: &dyn Fn(&str) -> Str
     let names = names.ok_or_else(|| Error::config(&place, value, "a list of names, such as [\"fast\", \"paper\"]"))?;
     let known: Vec<&str> = methods.iter().map(String::as_str).collect();
     match names.iter().find(|name| !known.contains(name)) {
-        Some(name) => Err(config::unknown("method", name, &known, &place)),
+        Some(name) => Err(settings::unknown_name("method", name, &known, &place)),
         None => Ok(names.into_iter().map(str::to_owned).collect()),
     }
 }

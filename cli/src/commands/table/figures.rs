@@ -1,8 +1,8 @@
 //! What a run came to, as its folder says.
 
 use crate::commands::background_name;
-use crate::run_folder::RunFolder;
 use plenoxel::error::Result;
+use plenoxel::run::folder::RunFolder;
 use plenoxel::model::plenoxels::config::Config;
 use serde::{Deserialize, Serialize};
 use std::path::Path;

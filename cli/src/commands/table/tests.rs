@@ -1,6 +1,6 @@
 use super::figures::Figures;
 use super::*;
-use crate::run_folder::RunFolder;
+use plenoxel::run::folder::RunFolder;
 
 fn measured(psnr: f64, seconds: f64, width: usize) -> Cell {
     let figures = Figures {

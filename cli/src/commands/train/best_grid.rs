@@ -1,10 +1,10 @@
 //! `best.safetensors`: of the grids that a run saved, the one that showed validation views best, as long as the last is not better.
 
-use crate::metrics_file::Past;
 use crate::progress::Console;
-use crate::run_folder::RunFolder;
 use plenoxel::checkpoint::Header;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::metrics::History;
 
 /// The best grid that was saved so far. Nothing that goes wrong with it stops a run.
 pub struct BestGrid<'a, 'c> {
@@ -16,7 +16,7 @@ pub struct BestGrid<'a, 'c> {
 
 impl<'a, 'c> BestGrid<'a, 'c> {
     /// That of a run, with what its lines tell of it.
-    pub fn of(folder: &'a RunFolder, past: &Past, console: &'a Console<'c>) -> Self {
+    pub fn of(folder: &'a RunFolder, past: &History, console: &'a Console<'c>) -> Self {
         let step = folder.best_step().and_then(|taken| taken.checked_sub(1));
         BestGrid { folder, console, psnr: step.and_then(|step| past.validation.get(&step)).copied() }
     }

@@ -1,12 +1,12 @@
 //! The flags of `train`, and the configuration they amount to.
 
 use crate::commands::{MOST_REDUCTION, background, whole};
-use crate::config::{self, Layers, PRESETS};
-use crate::data::DataSource;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::error::{Error, Result};
+use plenoxel::run::data::DataSource;
+use plenoxel::run::settings::{self, Layers, PRESETS};
 use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 use toml::Value;
@@ -196,7 +196,7 @@ impl TrainArgs {
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
         // In two minutes `fast` is 0.2 dB better, in four 0.6 worse.
         let default = if self.time.is_some_and(|seconds| seconds >= 180.0) { "quality" } else { "fast" };
-        config::layered(self.preset.as_deref(), default, self.config.as_deref(), |layers| self.flags(layers))
+        settings::layered(self.preset.as_deref(), default, self.config.as_deref(), |layers| self.flags(layers))
     }
 
     fn flags(&self, layers: &mut Layers) -> Result<()> {

@@ -5,13 +5,13 @@ use super::pictures::Pictures;
 use super::preview::Preview;
 use super::watching::Watching;
 use super::{Clocks, Job, interrupt};
-use crate::evaluation;
 use crate::images::Rgb;
-use crate::metrics_file::{MetricsFile, Past};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::View;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::run::evaluation;
+use plenoxel::run::metrics::{History, MetricsFile};
 use plenoxel::model::plenoxels::Trainer;
 use plenoxel::train::PlannedStage;
 use serde::Serialize;
@@ -46,7 +46,7 @@ impl<'a> Job<'a, '_> {
     pub fn learn(
         &'a self,
         mut trainer: Trainer<f32>,
-        (metrics, past): (MetricsFile, Past),
+        (metrics, past): (MetricsFile, History),
         preview: Preview,
         views: &[View],
         clocks: &mut Clocks,
@@ -116,7 +116,7 @@ impl<'a> Job<'a, '_> {
     }
 
     /// What a run has learned that was killed between its last step and its final figures.
-    pub fn learned(&'a self, plan: &[PlannedStage], (metrics, past): (MetricsFile, Past), views: &[View]) -> Result<Learned<'a>> {
+    pub fn learned(&'a self, plan: &[PlannedStage], (metrics, past): (MetricsFile, History), views: &[View]) -> Result<Learned<'a>> {
         let Job { folder, config, dataset, .. } = *self;
         let mut pictures = Pictures::new(folder, config, dataset, !self.args.no_images)?;
         pictures.earlier_stages(&past, plan);
@@ -133,7 +133,7 @@ impl StageSummary {
 }
 
 /// Of the stages that ended before.
-fn summaries(past: &Past, plan: &[PlannedStage]) -> Vec<StageSummary> {
+fn summaries(past: &History, plan: &[PlannedStage]) -> Vec<StageSummary> {
     let ended = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));
     ended.map(|(planned, seconds)| StageSummary::new(planned, seconds, None)).collect()
 }

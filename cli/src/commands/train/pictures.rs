@@ -1,14 +1,14 @@
 //! The pictures of a run: one view at the end of each stage, and panels of test views.
 
-use crate::evaluation::Viewer;
 use crate::images::{self, DepthRange, Rgb};
-use crate::metrics_file::Past;
-use crate::run_folder::RunFolder;
 use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split, View, image};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::render::picture::Picture;
+use plenoxel::run::evaluation::Viewer;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::metrics::History;
 use plenoxel::train::PlannedStage;
 use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
@@ -67,7 +67,7 @@ impl<'a> Pictures<'a> {
     }
 
     /// Stages had ended when the run was interrupted: their pictures are there, if they were wanted then too; one that cannot be read is left out.
-    pub fn earlier_stages(&mut self, past: &Past, plan: &[PlannedStage]) {
+    pub fn earlier_stages(&mut self, past: &History, plan: &[PlannedStage]) {
         for (index, planned) in past.stages.iter().filter_map(|&(index, _)| Some((index, plan.get(index)?))) {
             if self.camera.is_some()
                 && let Ok(picture) = image::read(&self.stage_path(index, planned.stage.resolution))

@@ -2,7 +2,6 @@
 //!
 //! It informs and changes nothing: no bit of what is trained depends on it, and test views are not looked at.
 
-use crate::evaluation::Viewer;
 use crate::images;
 use plenoxel::camera::{Camera, Intrinsics};
 use plenoxel::dataset::image::RgbaImage;
@@ -10,6 +9,7 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics::psnr;
+use plenoxel::run::evaluation::Viewer;
 use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 use std::time::Instant;

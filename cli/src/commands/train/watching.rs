@@ -3,11 +3,11 @@
 use super::pictures::Pictures;
 use super::preview::{Look, Preview};
 use crate::curves::loss_svg;
-use crate::metrics_file::{MetricsFile, Past, Seen};
 use crate::progress::{Console, Training};
-use crate::run_folder::RunFolder;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::metrics::{History, MetricsFile, Observation};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::model::plenoxels::Trainer;
 use plenoxel::train::{PlannedStage, Report};
@@ -32,7 +32,7 @@ impl<'a, 'c> Watching<'a, 'c> {
     pub fn begin(
         (folder, config, console): (&'a RunFolder, &'a Config, &'a Console<'c>),
         trainer: &Trainer<f32>,
-        (metrics, past): (MetricsFile, Past),
+        (metrics, past): (MetricsFile, History),
         mut pictures: Pictures<'a>,
         preview: Preview,
     ) -> Self {
@@ -54,7 +54,7 @@ impl<'a, 'c> Watching<'a, 'c> {
             Some(Look { psnr, picture }) => (psnr, picture.and_then(|picture| self.console.drawn(picture))),
             None => (None, None),
         };
-        let seen = Seen { voxels: self.voxels, validation_psnr, seconds };
+        let seen = Observation { voxels: self.voxels, validation_psnr, seconds };
         self.metrics.step(report, &self.plan, seen, save)?;
         self.progress.step(report, seen);
         if report.ends_stage {

@@ -1,6 +1,6 @@
 //! Merging tables and setting paths in them.
 
-use plenoxel::error::{Error, Result};
+use crate::error::{Error, Result};
 use toml::{Table, Value};
 
 /// Keys of which one excludes the others: writing the first takes away the rest. They are the two ways to place samples, the two ways to

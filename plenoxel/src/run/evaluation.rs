@@ -1,22 +1,25 @@
-//! A trained grid against photographs: PSNR and SSIM of each view, and their means.
+//! Evaluation of a trained grid against photographs: PSNR and SSIM of each view, and their means.
+//!
+//! One ray goes through the centre of each pixel. A rendered picture is clamped to [0, 1] and not rounded; a photograph is composited over the
+//! background in floats. [`crate::metrics`] has the formulas.
 
+use crate::camera::Camera;
+use crate::dataset::View;
+use crate::error::Result;
+use crate::field::voxel_grid::{GridShape, VoxelGrid};
+use crate::geometry::Aabb;
+use crate::metrics;
+use crate::render::picture::{Picture, picture};
+use crate::render::{Engine, RenderOptions};
+use crate::sampling::{Jitter, Occupancy};
+use crate::model::plenoxels::config::{Config, Sampling};
 use ndarray::Array3;
-use plenoxel::camera::Camera;
-use plenoxel::dataset::View;
-use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
-use plenoxel::geometry::Aabb;
-use plenoxel::metrics;
-use plenoxel::render::picture::{Picture, picture};
-use plenoxel::render::{Engine, RenderOptions};
-use plenoxel::sampling::{Jitter, Occupancy};
-use plenoxel::model::plenoxels::config::{Config, Sampling};
 use serde::Serialize;
 
-/// Pictures end a ray where less light than this comes from behind: no number of 8 bits changes by more than a fortieth of a step.
+/// Transmittance at which the ray of a picture ends: no 8-bit value changes by more than a fortieth of a step.
 const STOP_BELOW: f64 = 1e-4;
 
-/// A grid ready to be looked at: no jitter, empty cells left out, which changes no pixel.
+/// A grid with the options to render pictures of it: no jitter, and empty cells are skipped, which changes no pixel.
 pub struct Viewer<'a> {
     grid: &'a VoxelGrid<f32>,
     sampling: Sampling,
@@ -31,12 +34,12 @@ impl<'a> Viewer<'a> {
         Viewer { grid, sampling, background: config.background, engine: config.engine, occupancy: grid.matter() }
     }
 
-    /// A viewer of a grid over black, whatever the run's background: of what stands in place of colors, and is to be a plain sum.
+    /// A viewer of a grid over black, for grids that hold something else in place of colors, such as normals: a pixel is then a plain sum.
     pub fn over_black(grid: &'a VoxelGrid<f32>, sampling: Sampling, config: &Config) -> Self {
         Viewer { background: [0.0; 3], ..Viewer::new(grid, sampling, config) }
     }
 
-    /// What a camera sees.
+    /// Renders the picture of a camera.
     pub fn see(&self, camera: &Camera) -> Picture {
         let shape = self.grid.shape();
         let options = RenderOptions {
@@ -51,7 +54,10 @@ impl<'a> Viewer<'a> {
         picture(self.grid, camera, &options)
     }
 
-    /// Compares what is seen with each view. `seen(number, view, target, picture)` is called after each.
+    /// Renders each view and compares it with its photograph. `seen(number, view, target, picture)` is called after each; `target` is the
+    /// photograph over the background, `[h, w, 3]`.
+    ///
+    /// Errors: those of `seen`, which end the comparison.
     pub fn compare(&self, views: &[View], mut seen: impl FnMut(usize, &View, &Array3<f32>, &Picture) -> Result<()>) -> Result<Scores> {
         let mut per_view = Vec::with_capacity(views.len());
         for (i, view) in views.iter().enumerate() {
@@ -72,25 +78,25 @@ impl<'a> Viewer<'a> {
     }
 }
 
-/// Figures of one view.
+/// Scores of one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ViewScore {
-    /// The view's name.
+    /// Name of the view.
     pub name: String,
-    /// In dB.
+    /// PSNR in dB.
     pub psnr: f64,
-    /// Mean squared error, from which it is.
+    /// Mean squared error over pixels and channels, values in [0, 1].
     pub mse: f64,
-    /// Over windows inside the image; none for images below 11 pixels.
+    /// SSIM over the windows inside the image; `None` for images of less than 11 pixels a side.
     pub ssim: Option<f64>,
-    /// With zeros around the image, as svox2 computes it.
+    /// SSIM with zeros around the image, as svox2 computes it.
     pub ssim_same: f64,
 }
 
-/// Figures of several views. Means are of the views' figures; there are none of no views.
-#[derive(Debug, Clone, Default)]
+/// Scores of several views. Their means are `None` if there are no views.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Scores {
-    /// In the order of the views.
+    /// Scores of each view, in the order of the views.
     pub per_view: Vec<ViewScore>,
 }
 
@@ -100,12 +106,12 @@ impl Scores {
         mean(self.per_view.iter().map(|view| Some(view.psnr)))
     }
 
-    /// PSNR of the mean error, in dB: views with large errors count more than in the mean PSNR.
+    /// PSNR in dB of the mean squared error over the views. Views with large errors count more than in the mean PSNR.
     pub fn psnr_of_mean_mse(&self) -> Option<f64> {
         mean(self.per_view.iter().map(|view| Some(view.mse))).map(metrics::psnr_of)
     }
 
-    /// Mean SSIM.
+    /// Mean SSIM; `None` if a view has none.
     pub fn ssim(&self) -> Option<f64> {
         mean(self.per_view.iter().map(|view| view.ssim))
     }
@@ -116,7 +122,7 @@ impl Scores {
     }
 }
 
-/// Mean PSNR that the plain background has against some views.
+/// Mean PSNR in dB of the plain background against the views: a baseline.
 pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
     let (width, height) = views.first()?.image.dimensions();
     let shape = (height as usize, width as usize, 3);
@@ -124,7 +130,7 @@ pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
     constant_psnr(views, &plain, background)
 }
 
-/// The mean of some views over a background; `None` if there are none.
+/// Mean image of the views over a background, `[h, w, 3]`; `None` if there are no views.
 pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
     let mut sum = views.first()?.composite(background).mapv(f64::from);
     for view in &views[1..] {
@@ -133,7 +139,7 @@ pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
     Some(sum.mapv(|value| (value / views.len() as f64) as f32))
 }
 
-/// Mean PSNR that one picture has against some views of its size.
+/// Mean PSNR in dB of one picture, `[h, w, 3]`, against the views; `None` if there are no views or one has another size.
 pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]) -> Option<f64> {
     mean(views.iter().map(|view| {
         let target = view.composite(background);
@@ -141,7 +147,7 @@ pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]
     }))
 }
 
-/// `samples` points over the longest line through the box, or over the ray where the sampling is the source paper's.
+/// A sampling with `samples` points on the longest line through the box, or on each ray where the sampling is the source paper's.
 pub fn with_samples(sampling: Sampling, samples: u32, shape: &GridShape) -> Sampling {
     match sampling {
         Sampling::Points { far, .. } => Sampling::Points { samples: samples as usize, far },
@@ -149,7 +155,7 @@ pub fn with_samples(sampling: Sampling, samples: u32, shape: &GridShape) -> Samp
     }
 }
 
-/// The mean, if there are values and all of them are there.
+/// Mean of the values; `None` if there are no values or one is `None`.
 fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     let n = values.len();
     let sum: Option<f64> = values.sum();

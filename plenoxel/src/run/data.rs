@@ -1,9 +1,9 @@
 //! Where views come from: a folder, or the built-in scene; written down in a run so that it can be evaluated later.
 
-use plenoxel::dataset::procedural::ProceduralOptions;
-use plenoxel::dataset::{self, Dataset, OpenOptions, image};
-use plenoxel::error::{Error, Result};
-use plenoxel::model::plenoxels::config::Config;
+use crate::dataset::procedural::ProceduralOptions;
+use crate::dataset::{self, Dataset, OpenOptions, image};
+use crate::error::{Error, Result};
+use crate::model::plenoxels::config::Config;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::{Path, PathBuf};

@@ -1,11 +1,11 @@
-//! Where two configurations differ, in the words of their files.
+//! Differences between two configurations, by key.
 
 use super::leaves;
-use plenoxel::model::plenoxels::config::Config;
+use crate::model::plenoxels::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use toml::Value;
 
-/// Every key whose value is not the one asked for, as `key is x and not y`.
+/// Every key whose value differs from the one asked for, as `key is x and not y`.
 pub fn differences(found: &Config, asked: &Config) -> Vec<String> {
     let (found, asked) = (values(found), values(asked));
     let keys: BTreeSet<&String> = found.keys().chain(asked.keys()).collect();
@@ -14,7 +14,7 @@ pub fn differences(found: &Config, asked: &Config) -> Vec<String> {
     differs.map(|key| format!("{key} is {} and not {}", said(found.get(key)), said(asked.get(key)))).collect()
 }
 
-/// The value of every key, as TOML.
+/// The value of every key as TOML, by path.
 pub fn values(config: &Config) -> BTreeMap<String, String> {
     let mut values = BTreeMap::new();
     if let Ok(value) = Value::try_from(config) {

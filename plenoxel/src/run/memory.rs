@@ -1,20 +1,23 @@
-//! How much memory a command will take, said before it is taken.
+//! Estimates of the memory that a command will take, before it is taken, and the memory that there is.
 //!
 //! The parts are counted from what is known: images, tables, optimizer state, and the arrays that a training step keeps for its gradient.
 //! The last depends on how many samples the rays take: about as many as cross the box from face to face, fewer after pruning.
 
-use crate::progress::bytes;
-use plenoxel::carve::Fit;
-use plenoxel::carve::color::KEPT_LIGHT;
-use plenoxel::dataset::{Dataset, Split};
-use plenoxel::error::{Error, Result};
-use plenoxel::field::voxel_grid::{Color, GridShape};
-use plenoxel::render::Engine;
-use plenoxel::field::voxel_grid::fused::CHUNK;
-use plenoxel::model::plenoxels::config::{Config, OptimizerConfig, Sampling};
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+mod system;
 
-/// Bytes by what they are for.
+pub use system::{available, limit, now, peak};
+
+use super::machine;
+use crate::carve::Fit;
+use crate::carve::color::KEPT_LIGHT;
+use crate::dataset::{Dataset, Split};
+use crate::error::{Error, Result};
+use crate::field::voxel_grid::{Color, GridShape};
+use crate::render::Engine;
+use crate::field::voxel_grid::fused::CHUNK;
+use crate::model::plenoxels::config::{Config, OptimizerConfig, Sampling};
+
+/// An estimate in bytes, by purpose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate {
     /// 8-bit images of the largest split, and full-size ones in decoding.
@@ -236,7 +239,7 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match available() {
             Some(available) if self.total() > available => {
-                let limited = LIMIT.load(Relaxed) != 0 && LIMIT.load(Relaxed) == available;
+                let limited = system::is_limit(available);
                 let why = if limited { "--max-memory allows" } else { "there is room for" };
                 let found = format!("what would need about {} of memory, where {why} {},", bytes(self.total()), bytes(available));
                 // A limit may be too low for anything.
@@ -272,71 +275,13 @@ fn share(config: &Config, stage: usize) -> f64 {
     if config.prune_from_stage.is_some_and(|first| first <= stage) { LEFT } else { 1.0 }
 }
 
-/// Bytes that a command may take in all, if the user set them; 0 if not.
-static LIMIT: AtomicU64 = AtomicU64::new(0);
-
-/// Has the commands that follow take no more than this.
-pub fn limit(bytes: Option<u64>) {
-    LIMIT.store(bytes.unwrap_or(0), Relaxed);
-}
-
-/// Bytes of memory that can be taken now: what is free, and no more than the user allows.
-pub fn available() -> Option<u64> {
-    match LIMIT.load(Relaxed) {
-        0 => free(),
-        limit => Some(free().map_or(limit, |free| free.min(limit))),
-    }
-}
-
-/// What Linux counts as available, within the limits of the control group and of the process; elsewhere unknown.
-fn free() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
-    let free = kilobytes(&text, "MemAvailable:")?;
-    let number = |path: &str| -> Option<u64> { std::fs::read_to_string(path).ok()?.trim().parse().ok() };
-    let limit = number("/sys/fs/cgroup/memory.max");
-    let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0);
-    let free = limit.map_or(free, |limit| free.min(limit.saturating_sub(used)));
-    let limits = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
-    Some(address_space(&limits).map_or(free, |limit| free.min(limit.saturating_sub(taken()))))
-}
-
-/// Bytes of addresses this process may have (`ulimit -v`), by the kernel's table of limits.
-fn address_space(limits: &str) -> Option<u64> {
-    limits.lines().find_map(|line| line.strip_prefix("Max address space"))?.split_whitespace().next()?.parse().ok()
-}
-
-/// Bytes of addresses that it has.
-fn taken() -> u64 {
-    of_process("VmSize:").unwrap_or(0)
-}
-
-/// The most memory this process ever had at once, in bytes; `None` where the system does not say.
-pub fn peak() -> Option<u64> {
-    of_process("VmHWM:")
-}
-
-/// The memory it has now.
-pub fn now() -> Option<u64> {
-    of_process("VmRSS:")
-}
-
-fn of_process(key: &str) -> Option<u64> {
-    kilobytes(&std::fs::read_to_string("/proc/self/status").ok()?, key)
-}
-
-fn kilobytes(text: &str, key: &str) -> Option<u64> {
-    let line = text.lines().find_map(|line| line.strip_prefix(key))?;
-    let number: u64 = line.split_whitespace().next()?.parse().ok()?;
-    Some(1024 * number)
-}
-
 /// Images of the largest of some splits, with depth where the scene knows it, and the full-size ones that each thread decodes.
 fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
     let (width, height) = dataset.size();
     let pixels = (width * height) as u64;
     let views = splits.iter().map(|split| dataset.count(*split)).max();
     let per_pixel = if dataset.scene().is_some() { 8 } else { 4 };
-    let threads = crate::machine::threads() as u64;
+    let threads = machine::threads() as u64;
     // A file and its decoded pixels.
     let decoding = threads * 8 * pixels * (downscale * downscale) as u64;
     views.unwrap_or(0) as u64 * pixels * per_pixel + decoding
@@ -405,25 +350,23 @@ fn whole_grid_losses(config: &Config) -> bool {
     ["tv_density", "tv_color"].iter().any(|name| config.losses.contains_key(*name))
 }
 
+/// Bytes with a unit of powers of 1000, at two or three digits: `2.3 GB`, `99 kB`.
+pub fn bytes(n: u64) -> String {
+    match n as f64 {
+        n if n >= 1e10 => format!("{:.0} GB", n / 1e9),
+        n if n >= 1e9 => format!("{:.1} GB", n / 1e9),
+        n if n >= 1e6 => format!("{:.0} MB", n / 1e6),
+        n => format!("{:.0} kB", n / 1e3),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn sizes_have_units_of_1000_or_of_1024() {
-        use crate::commands::memory_size;
-        let sizes = [("17", 17), ("500MB", 500_000_000), ("1.5g", 1_500_000_000), ("8 GiB", 8 << 30), ("2mib", 2 << 20)];
-        sizes.into_iter().for_each(|(text, bytes)| assert_eq!(memory_size(text), Ok(bytes), "{text}"));
-        ["", "GB", "-1GB", "8 apples", "0", "1.2.3MB", "nan"].into_iter().for_each(|text| assert!(memory_size(text).is_err(), "{text}"));
-    }
-
-    #[test]
-    fn numbers_are_found_in_the_text_of_the_kernel() {
-        let text = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t 1 kB\n";
-        assert_eq!(kilobytes(text, "VmHWM:"), Some(2048 * 1024));
-        assert_eq!(kilobytes(text, "VmSwap:"), None);
-        let limits = "Limit                     Soft Limit           Hard Limit           Units\nMax address space         6144000000           unlimited            bytes\n";
-        assert_eq!(address_space(limits), Some(6_144_000_000));
-        assert_eq!(address_space("Max address space         unlimited            unlimited            bytes\n"), None);
+    fn sizes_read_well() {
+        assert_eq!(bytes(2_345_678_901), "2.3 GB");
+        assert_eq!(bytes(99_000), "99 kB");
     }
 }

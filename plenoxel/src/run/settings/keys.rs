@@ -1,7 +1,7 @@
 //! The keys that a configuration may have, so that a misspelled one is an error that names the right one.
 
-use plenoxel::error::{Error, Result};
-use plenoxel::loss;
+use crate::error::{Error, Result};
+use crate::loss;
 use toml::{Table, Value};
 
 /// The keys of a stage.
@@ -143,7 +143,7 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
         _ => places(&|other| word.is_some() && last_word(other) == word),
     };
     match places.is_empty() {
-        true => Err(unknown("key", key, known, place)),
+        true => Err(unknown_name("key", key, known, place)),
         false => Err(Error::config(place, format!("the key `{key}` here"), places.join(", "))),
     }
 }
@@ -162,7 +162,7 @@ fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
 
 /// The refusal of a name that is not among the known ones: it says which is nearest in spelling, if one is near; a word that resembles
 /// nothing gets the whole list.
-pub fn unknown(what: &str, name: &str, known: &[&str], place: &str) -> Error {
+pub fn unknown_name(what: &str, name: &str, known: &[&str], place: &str) -> Error {
     let accepted = match nearest(name, known) {
         Some(known) => format!("the nearest known {what} is `{known}`"),
         None => format!("one of {}", known.join(", ")),
@@ -188,7 +188,7 @@ fn distance(a: &str, b: &str) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use plenoxel::model::plenoxels::config::Config;
+    use crate::model::plenoxels::config::Config;
 
     #[test]
     fn the_top_level_keys_are_those_of_the_library() {

@@ -4,8 +4,8 @@
 //! `Event`. Records, masked checksums and the numbers of the fields are as in TensorFlow's `record_writer.h`, `event.proto` and
 //! `summary.proto`. A last record that was cut short is left out by who reads.
 
-use crate::machine;
-use plenoxel::error::{Error, Result};
+use super::machine;
+use crate::error::{Error, Result};
 use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -15,14 +15,16 @@ const PREFIX: &str = "events.out.tfevents.";
 /// What it expects in the first record.
 const VERSION: &str = "brain.Event:2";
 
-/// A file that grows by a record at a time.
+/// An event file that grows by one record at a time.
 pub struct EventFile {
     path: PathBuf,
     file: File,
 }
 
 impl EventFile {
-    /// A new file in the folder of a run of which so many steps have been taken: what files that are there say of later ones is forgotten.
+    /// A new file in the folder of a run after `taken` steps. TensorBoard drops what earlier files hold of later steps.
+    ///
+    /// Errors: the file cannot be created.
     pub fn create(folder: &Path, taken: u64) -> Result<Self> {
         let newest = present(folder).filter_map(|path| number(&path)).max();
         let number = (machine::time() as u64).max(newest.map_or(0, |newest| newest.saturating_add(1)));
@@ -38,7 +40,9 @@ impl EventFile {
         Ok(events)
     }
 
-    /// Numbers after a step, each with its name.
+    /// Appends numbers after a step, each with its name.
+    ///
+    /// Errors: the file cannot be written.
     pub fn scalars<'n>(&mut self, step: u64, values: impl IntoIterator<Item = (&'n str, f64)>) -> Result<()> {
         let summary = values.into_iter().fold(Message::default(), |summary, (tag, value)| {
             summary.bytes(field::VALUE, &Message::default().bytes(field::TAG, tag.as_bytes()).float(field::SIMPLE_VALUE, value as f32).0)
@@ -46,7 +50,9 @@ impl EventFile {
         self.append(step, field::SUMMARY, &summary.0)
     }
 
-    /// A picture after a step: the bytes of a PNG file of so many pixels.
+    /// Appends a picture after a step: the bytes of a PNG file, whose size in pixels is `(width, height)`.
+    ///
+    /// Errors: the file cannot be written.
     pub fn image(&mut self, step: u64, tag: &str, (width, height): (usize, usize), png: &[u8]) -> Result<()> {
         const RGB: u64 = 3;
         let image = Message::default().varint(1, height as u64).varint(2, width as u64).varint(3, RGB).bytes(4, png);

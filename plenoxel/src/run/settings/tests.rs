@@ -1,5 +1,4 @@
 use super::*;
-
 use std::collections::BTreeSet;
 
 fn preset(name: &str) -> Layers {
@@ -41,7 +40,7 @@ fn all_leaves() -> Vec<(Layers, String, Value)> {
     let mut known = BTreeSet::new();
     let mut found = Vec::new();
     for layers in complete() {
-        let table: Table = text(&layers.clone().resolve().unwrap(), "").unwrap().parse().unwrap();
+        let table: Table = to_toml(&layers.clone().resolve().unwrap(), "").unwrap().parse().unwrap();
         leaves("", &Value::Table(table.clone()), &mut |path, _| {
             let general: String = path.chars().filter(|c| !c.is_ascii_digit() || !path.contains('[')).collect();
             let steps = path.split(['.', '[']).map(|step| step.trim_end_matches(']'));
@@ -69,7 +68,8 @@ fn every_preset_is_a_valid_configuration_that_survives_its_file() {
     for name in presets() {
         let config = preset(name).resolve().unwrap();
         write(&path, &config, name).unwrap();
-        assert_eq!(read(&path).unwrap(), config, "{name}");
+        assert_eq!(ConfigFile::read(&path).unwrap().complete().unwrap(), config, "{name}");
+        assert_eq!((Config::read(&path).unwrap(), Config::preset(name).unwrap()), (config.clone(), config.clone()), "{name}");
         let (again, from) = layered(None, "demo", Some(&path), |_| Ok(())).unwrap();
         assert!(again == config && from.is_none(), "{name}");
         assert!(ConfigFile::read(&path).unwrap().is_complete());
@@ -85,8 +85,23 @@ fn numbers_that_no_decimal_ends_survive_the_file() {
     config.half_width = 4.0 / 3.0;
     config.stages[0].density_rate = 1e-29 / 3.0;
     write(&path, &config, "").unwrap();
-    assert_eq!(read(&path).unwrap(), config);
+    assert_eq!(ConfigFile::read(&path).unwrap().complete().unwrap(), config);
     std::fs::remove_file(path).unwrap();
+}
+
+#[test]
+fn a_text_that_is_not_complete_is_a_layer_over_the_defaults() {
+    assert_eq!(Config::from_toml("").unwrap(), Config::default());
+    assert_eq!(Config::from_toml("seed = 7").unwrap(), Config { seed: 7, ..Config::default() });
+    let mut layers = preset("quality");
+    ["losses.mse=", "losses.huber=1"].iter().try_for_each(|assignment| layers.assign(assignment)).unwrap();
+    let complete = layers.resolve().unwrap();
+    assert_eq!(Config::from_toml(&text_of(&complete)).unwrap(), complete, "nothing of the defaults is under a complete text");
+    let message = Config::from_toml("seed = 1\nsede = 2").unwrap_err().to_string();
+    assert!(message.starts_with("the settings, line 2: the unknown key `sede`"), "{message}");
+    let message = Config::from_toml("preset = \"fast\"").unwrap_err().to_string();
+    assert!(message.contains("the unknown key `preset`"), "{message}");
+    assert!(Config::preset("fats").unwrap_err().to_string().contains("fast, quality"));
 }
 
 #[test]
@@ -166,7 +181,7 @@ fn nothing_shines_through_a_complete_file() {
 #[test]
 fn each_key_of_each_preset_misspelled_is_refused_with_the_right_one() {
     for mut layers in complete() {
-        let table: Table = text(&layers.clone().resolve().unwrap(), "").unwrap().parse().unwrap();
+        let table: Table = to_toml(&layers.clone().resolve().unwrap(), "").unwrap().parse().unwrap();
         let mut paths = BTreeSet::new();
         leaves("", &Value::Table(table), &mut |path, _| {
             paths.insert(path.to_owned());
@@ -266,7 +281,7 @@ fn each_value_out_of_range_or_of_another_type_is_refused_by_the_name_of_its_key(
 }
 
 fn text_of(config: &Config) -> String {
-    text(config, "").unwrap()
+    to_toml(config, "").unwrap()
 }
 
 /// What a key takes beside numbers like the one it has.

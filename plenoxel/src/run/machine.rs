@@ -1,36 +1,37 @@
-//! The machine a command runs on: threads and vector instructions.
+//! The machine a run is on: threads, vector instructions, and the time.
 
-use plenoxel::error::{Error, Result};
+use crate::error::{Error, Result};
 use std::num::NonZero;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// More threads than any machine of today has cores are a slip of the finger.
+/// Upper bound of a number of threads that a user asks for; a larger one is taken for a typing error.
 pub const MOST_THREADS: usize = 1024;
 
-/// Calls `f` on a pool of so many threads; all cores if none are given. The number changes how long a command takes and no number it
-/// computes.
-pub fn with_threads<R: Send>(threads: Option<usize>, f: impl FnOnce() -> Result<R> + Send) -> Result<R> {
+/// Calls `f` on a pool of `threads` threads, or of one for each core. The number of threads changes the time it takes and no result.
+///
+/// Errors: the system refuses so many threads; the setting is called `threads`.
+pub fn with_threads<R: Send>(threads: Option<usize>, f: impl FnOnce() -> R + Send) -> Result<R> {
     let available = std::thread::available_parallelism().map_or(1, NonZero::get);
     let threads = threads.unwrap_or(available);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|e| {
         let found = format!("{threads} (the system refuses them: {e})");
-        Error::config("--threads", found, format!("about {available}"))
+        Error::config("threads", found, format!("about {available}"))
     })?;
-    pool.install(f)
+    Ok(pool.install(f))
 }
 
-/// Threads of the pool a command runs on.
+/// Number of threads of the current pool.
 pub fn threads() -> usize {
     rayon::current_num_threads()
 }
 
-/// Seconds since 1970.
+/// Wall-clock time: seconds since 1970-01-01 UTC.
 pub fn time() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
 
-/// The vector instructions that the numeric loops use on this machine; they are chosen at run time.
+/// Name of the vector instructions that the numeric loops use on this machine; they are chosen at run time.
 pub fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {

@@ -1,12 +1,12 @@
-//! Final figures against the views of a split, with all that keeps them from being misread: the same for `train` and `evaluate`.
+//! Final figures of a run against the views of a split, with the resolution, the background and the definitions they depend on.
 
-use crate::evaluation::Scores;
-use plenoxel::dataset::{Dataset, Split};
-use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::model::plenoxels::config::{Config, Sampling};
+use super::evaluation::Scores;
+use crate::dataset::{Dataset, Split};
+use crate::field::voxel_grid::VoxelGrid;
+use crate::model::plenoxels::config::{Config, Sampling};
 use serde::Serialize;
 
-/// Means over views, what they were computed of, and how.
+/// Mean scores over the views of a split, the images and the grid they are of, and their definitions.
 #[derive(Debug, Serialize)]
 pub struct Figures {
     psnr: Option<f64>,
@@ -15,7 +15,7 @@ pub struct Figures {
     psnr_of_mean_mse: Option<f64>,
     lpips: NotComputed,
     split: String,
-    /// So many of the split were compared.
+    /// Number of views that were compared.
     views: usize,
     width: usize,
     height: usize,
@@ -40,14 +40,14 @@ struct NotComputed {
 struct ImageFacts {
     width: usize,
     height: usize,
-    /// They are the dataset's, reduced by this factor.
+    /// Factor by which the dataset's images were reduced.
     downscale: usize,
 }
 
 #[derive(Debug, Serialize)]
 struct GridFacts {
     voxels_per_axis: usize,
-    /// Those that are left.
+    /// Voxels that are left after pruning.
     voxels_stored: usize,
     half_width: f64,
 }
@@ -60,7 +60,7 @@ struct Counts {
     test: usize,
 }
 
-/// How figures are computed, for who reads them elsewhere.
+/// Definitions of the figures, for readers of the file.
 #[derive(Debug, Serialize)]
 struct Definitions {
     prediction: &'static str,
@@ -88,7 +88,7 @@ const DEFINITIONS: Definitions = Definitions {
 };
 
 impl Figures {
-    /// What came of comparing a grid with the views of a split.
+    /// The figures of a grid against the views of a split, rendered with `sampling`.
     pub fn new(scores: &Scores, split: Split, dataset: &Dataset, config: &Config, sampling: Sampling, grid: &VoxelGrid<f32>) -> Self {
         let (width, height) = dataset.size();
         let (shape, voxels_stored) = (grid.shape(), grid.lattice().present());
@@ -113,7 +113,7 @@ impl Figures {
         }
     }
 
-    /// The figures as people say them.
+    /// The figures as one sentence.
     pub fn sentence(&self) -> String {
         let Figures { psnr, ssim, split, views, width, height, .. } = self;
         let Some(psnr) = psnr else {

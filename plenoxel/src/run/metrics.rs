@@ -1,10 +1,11 @@
-//! `metrics.jsonl`: what a run did, line by line, while it does it; and the same figures for TensorBoard.
+//! `metrics.jsonl`: the figures of a run, line by line while it trains; and the same figures for TensorBoard.
 
-use crate::event_file::EventFile;
-use crate::run_folder::RunFolder;
-use plenoxel::error::{Error, Result};
-use plenoxel::files;
-use plenoxel::train::{PlannedStage, Report};
+use super::folder::RunFolder;
+use super::tensorboard::EventFile;
+use crate::error::{Error, Result};
+use crate::files;
+use crate::json;
+use crate::train::{PlannedStage, Report};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -15,7 +16,7 @@ use std::path::{Path, PathBuf};
 /// About so many lines in a run: enough for any curve.
 const LINES: u64 = 1000;
 
-/// The file, which grows by a whole line at a time; a run that goes on cuts it back to where it was saved.
+/// The metrics of a run, which grow by one whole line at a time. A run that resumes cuts them back to the step at which it was saved.
 pub struct MetricsFile {
     path: PathBuf,
     file: File,
@@ -27,14 +28,16 @@ pub struct MetricsFile {
     known: Known,
 }
 
-/// The step after which validation views were seen best.
+/// The best validation PSNR of a run, and the step after which it was measured.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Best {
-    step: u64,
-    psnr: f64,
+    /// Number of the step, from 0.
+    pub step: u64,
+    /// Mean PSNR of the validation views, in dB.
+    pub psnr: f64,
 }
 
-/// What the lines so far come to.
+/// The last value of each figure that is needed later.
 #[derive(Clone, Copy, Default)]
 struct Known {
     step: u64,
@@ -61,25 +64,25 @@ impl Known {
     }
 }
 
-/// What the lines of a run tell that goes on.
+/// The figures of the steps before a run resumes, as its lines tell them.
 #[derive(Default)]
-pub struct Past {
-    /// Of each step: the mean of its line.
+pub struct History {
+    /// Loss of each step: the mean that its line has.
     pub losses: Vec<f64>,
-    /// Each stage that has ended, and the seconds of training by then.
+    /// Each stage that has ended, and the seconds of training at its end.
     pub stages: Vec<(usize, f64)>,
     /// Seconds of training.
     pub seconds: f64,
-    /// PSNR of validation views by the step after which they were looked at.
+    /// Mean PSNR of validation views, by the step after which it was measured.
     pub validation: BTreeMap<u64, f64>,
-    /// What the last of them comes to.
+    /// The figures of the last line.
     known: Known,
 }
 
-impl Past {
-    /// What a file tells of so many steps, and the lines that do.
+impl History {
+    /// The lines of a file about the first `taken` steps, and the history they tell.
     pub fn of(text: &str, taken: u64) -> (String, Self) {
-        let (mut kept, mut past) = (String::new(), Past::default());
+        let (mut kept, mut past) = (String::new(), History::default());
         for (text, line) in lines(text).filter(|(_, line)| line.step < taken) {
             kept += text;
             kept += "\n";
@@ -97,25 +100,39 @@ impl Past {
     }
 }
 
-/// A line about training: means of the losses and the PSNR since the line before, everything else as it is now.
+/// A line about training. Losses and PSNR are means over the steps since the line before.
 #[derive(Serialize, Deserialize)]
 pub struct Line<'a> {
+    /// Number of the last step it is about, from 0.
     pub step: u64,
+    /// Stage of that step, from 0.
     pub stage: usize,
+    /// Voxels along each axis.
     pub resolution: usize,
+    /// True if that step was the last of its stage.
     pub ends_stage: bool,
+    /// Weighted sum of the losses.
     pub loss: f64,
+    /// Each loss, unweighted.
     #[serde(borrow)]
     pub losses: BTreeMap<Cow<'a, str>, f64>,
+    /// PSNR of training rays, in dB.
     pub psnr: f64,
+    /// Rays since the start of training.
     pub rays: u64,
+    /// Samples since the start of training.
     pub samples: u64,
+    /// Learning rate of the density.
     pub density_rate: f64,
+    /// Learning rate of the colors.
     pub color_rate: f64,
+    /// Voxels of the grid.
     #[serde(default)]
     pub voxels: usize,
+    /// Mean PSNR of validation views in dB, if it was measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub validation_psnr: Option<f64>,
+    /// Seconds of training.
     pub seconds: f64,
 }
 
@@ -139,14 +156,14 @@ impl Line<'_> {
     }
 }
 
-/// What is known of a step besides what the trainer reports.
+/// Figures of a step that the trainer does not report.
 #[derive(Clone, Copy, Default)]
-pub struct Seen {
-    /// Voxels that the grid has.
+pub struct Observation {
+    /// Voxels of the grid.
     pub voxels: usize,
-    /// PSNR of validation views after the step, if they were looked at.
+    /// Mean PSNR of validation views after the step, if it was measured.
     pub validation_psnr: Option<f64>,
-    /// Seconds of training that have passed.
+    /// Seconds of training so far.
     pub seconds: f64,
 }
 
@@ -159,7 +176,7 @@ struct Sums {
     losses: Vec<(String, f64)>,
 }
 
-/// The text of a file, empty if there is none.
+/// Reads the text of a file; it is empty if there is no file.
 pub fn read(path: &Path) -> Result<String> {
     match std::fs::read(path) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path, e, "reading the metrics")),
@@ -167,13 +184,15 @@ pub fn read(path: &Path) -> Result<String> {
     }
 }
 
-/// The lines about training, as they are written and as they are meant. One that was cut short, and what is no line of a step, say nothing.
+/// The lines about training, each as text and parsed. Lines that are cut short, and those about other things, are left out.
 pub fn lines(text: &str) -> impl Iterator<Item = (&str, Line<'_>)> {
     text.lines().filter_map(|text| Some((text, serde_json::from_str(text).ok()?)))
 }
 
 impl MetricsFile {
-    /// A new file for a run of so many steps.
+    /// Creates the file of a run of `total_steps` steps.
+    ///
+    /// Errors: it cannot be created.
     pub fn create(folder: &RunFolder, total_steps: u64) -> Result<Self> {
         Self::open(folder, total_steps, 0, Known::default())
     }
@@ -193,16 +212,20 @@ impl MetricsFile {
         })
     }
 
-    /// The file of a run that goes on after so many steps: lines about later ones go.
-    pub fn resume(folder: &RunFolder, total_steps: u64, taken: u64) -> Result<(Self, Past)> {
+    /// Opens the file of a run that resumes after `taken` steps. Lines about later steps are removed.
+    ///
+    /// Errors: it cannot be read or written.
+    pub fn resume(folder: &RunFolder, total_steps: u64, taken: u64) -> Result<(Self, History)> {
         let path = folder.metrics();
-        let (kept, past) = Past::of(&read(&path)?, taken);
+        let (kept, past) = History::of(&read(&path)?, taken);
         files::write_atomically(&path, kept.as_bytes())?;
         Ok((Self::open(folder, total_steps, taken, past.known)?, past))
     }
 
-    /// A step was taken. A line is written if it is time to, or it must be; it must if validation views were looked at.
-    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seen: Seen, must: bool) -> Result<()> {
+    /// Adds a step. A line is written every few steps, at the end of a stage, after a look at validation views, and where `must` is true.
+    ///
+    /// Errors: the file cannot be written.
+    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seen: Observation, must: bool) -> Result<()> {
         // Lines of a damaged file may have said anything.
         self.rays = self.rays.saturating_add(report.rays as u64);
         self.samples = self.samples.saturating_add(report.samples as u64);
@@ -216,7 +239,7 @@ impl MetricsFile {
                 None => since.losses.push((name.clone(), *value)),
             }
         }
-        let Seen { voxels, validation_psnr, seconds } = seen;
+        let Observation { voxels, validation_psnr, seconds } = seen;
         let must = must || report.ends_stage || validation_psnr.is_some();
         if !(report.step + 1).is_multiple_of(self.every) && !must {
             return Ok(());
@@ -245,26 +268,34 @@ impl MetricsFile {
         self.append(&line)
     }
 
-    /// The last line, with the final figures; some of them are TensorBoard's too.
+    /// Appends the last line, with the final figures; `figures` go to TensorBoard too.
+    ///
+    /// Errors: the file cannot be written.
     pub fn conclude(&mut self, line: &impl Serialize, figures: &[(&str, Option<f64>)]) -> Result<()> {
         self.append(line)?;
         self.events.scalars(self.known.step, figures.iter().filter_map(|(name, value)| Some((*name, (*value)?))))
     }
 
-    /// A picture for TensorBoard, as the grid is seen after a step: a PNG file of so many pixels.
+    /// Adds a picture after a step for TensorBoard: the path of a PNG file, whose size in pixels is `(width, height)`.
+    ///
+    /// Errors: the picture cannot be read, or the events cannot be written.
     pub fn picture(&mut self, step: u64, size: (usize, usize), png: &Path) -> Result<()> {
         let bytes = std::fs::read(png).map_err(|e| Error::io(png, e, "reading the picture"))?;
         self.events.image(step, "preview", size, &bytes)
     }
 
-    /// Has what was written on the disk.
+    /// Waits until all lines are on the disk.
+    ///
+    /// Errors: they cannot be written.
     pub fn sync(&self) -> Result<()> {
         self.file.sync_data().map_err(|e| Error::io(&self.path, e, "writing the metrics"))
     }
 
-    /// Appends a line.
+    /// Appends a line, which need not be about a step.
+    ///
+    /// Errors: the file cannot be written.
     pub fn append(&mut self, line: &impl Serialize) -> Result<()> {
-        let text = crate::json_line(line)? + "\n";
+        let text = json::line(line)? + "\n";
         let written = self.file.write_all(text.as_bytes());
         written.map_err(|e| Error::io(&self.path, e, "writing the metrics"))
     }
@@ -274,7 +305,7 @@ impl MetricsFile {
         (self.rays, self.samples)
     }
 
-    /// The PSNR of validation views when they were last looked at, and the best there was.
+    /// The last and the best validation PSNR.
     pub fn validation(&self) -> (Option<f64>, Option<Best>) {
         (self.known.validation_psnr, self.known.best)
     }

@@ -1,13 +1,14 @@
-//! Training that ends on time: the length of the stages, planned once before the first step.
+//! A plan of time: the lengths of the stages for training of a given duration, found once before the first step.
 //!
 //! Steps that are thrown away, up to twenty seconds of them, say how fast this machine is. What stages cost against each other is taken from
 //! runs on lego of NeRF-synthetic at 800 x 800 (`benches/RESULTS.md`): it differs between scenes by a quarter or so, and so does the time that a
 //! run takes. The plan is in steps and part of the run's settings, so that they repeat the run bit by bit wherever it is run again.
 
-use plenoxel::dataset::View;
-use plenoxel::error::{Error, Result};
-use plenoxel::train::Trainer;
-use plenoxel::train::config::{Config, Scout, Stage, Weight};
+use crate::dataset::View;
+use crate::error::{Error, Result};
+use crate::rays::RaySource;
+use crate::model::plenoxels::Trainer;
+use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
 use std::time::Instant;
 
 /// The fog that a grid starts as clears: the k-th step of the first stage takes 1 + a ln(b / k) of what its steps take in the mean, and after
@@ -41,13 +42,17 @@ struct Speed {
     spent: f64,
 }
 
-/// The same settings with stages of such lengths, and where there is time for few steps with so few voxels, that training takes `seconds`, this
-/// included.
+/// Settings whose stages are as long as fits into `seconds` of training on this machine, the time of this measurement included. All that is
+/// counted in steps is scaled: stages, warm-ups, schedules of losses. Where the time is short, the finest stages are coarser.
+///
+/// The result depends on the speed of the machine. It is in steps, so that a run with it repeats to the bit.
+///
+/// Errors: the run starts from another; the time is too short for the stages; and those of [`Trainer::step`].
 pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     if config.init_from.is_some() {
         return Err(Error::config("--time", "a run that starts from another", "--time without --init-from, or stages with steps"));
     }
-    let rays = views.iter().map(|view| u64::from(view.image.width()) * u64::from(view.image.height())).sum();
+    let rays = RaySource::new(views, config.background, config.seed).len();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
     let config = config.fitted_to(views.iter().map(|view| &view.camera));
     let speed = measure(&config, views, (CALIBRATION.0 * seconds).min(CALIBRATION.1))?;
@@ -77,8 +82,8 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     Ok(Config { stages, losses: losses.collect(), ..config })
 }
 
-/// What was asked for, with all as `found` has it that a plan changes: how long stages are, how many voxels they have at most, with a rate of
-/// the density to match, and by how little images are reduced.
+/// `asked` with all that a plan of time changes taken from `found`: lengths of stages, their resolutions with the rates of the density, image
+/// reductions, and weights of losses. It equals `found` if `found` is a plan for `asked`.
 pub fn planned_like(asked: Config, found: &Config) -> Config {
     let like = |(asked, found): (Stage, &Stage)| {
         let planned = asked.at_most(found.resolution);
@@ -163,8 +168,8 @@ fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, s
 #[cfg(test)]
 mod tests {
     use super::*;
-    use plenoxel::dataset::procedural::ProceduralOptions;
-    use plenoxel::dataset::{Dataset, Split};
+    use crate::dataset::procedural::ProceduralOptions;
+    use crate::dataset::{Dataset, Split};
 
     #[test]
     fn fog_clears_until_a_step_is_cheaper_than_the_mean() {
