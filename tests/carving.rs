@@ -9,8 +9,8 @@ use plenoxel::dataset::procedural::{ProceduralOptions, Scene};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::field::sh;
 use plenoxel::geometry::Aabb;
-use plenoxel::sampling::Occupancy;
 use plenoxel::model::plenoxels::config::{ColorKind, Config, Hull};
+use plenoxel::sampling::Occupancy;
 use rayon::prelude::*;
 use std::ops::ControlFlow;
 

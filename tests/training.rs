@@ -6,11 +6,11 @@ use plenoxel::error::Error;
 use plenoxel::field::Field;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics::psnr;
+use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Sampling, Scout, Stage, Weight};
+use plenoxel::model::plenoxels::{Objective, Trainer};
 use plenoxel::render::picture::picture;
 use plenoxel::render::{Engine, RenderOptions};
 use plenoxel::sampling::{Jitter, Occupancy};
-use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Sampling, Scout, Stage, Weight};
-use plenoxel::model::plenoxels::{Objective, Trainer};
 use plenoxel::train::Report;
 use std::collections::BTreeMap;
 
@@ -105,8 +105,8 @@ fn a_scout_finds_where_matter_is() {
     let stages = vec![stage(32, 1), stage(32, 60)];
     let config = Config { scout: Some(scout), prune_unseen_below: 0.03, stages, rays_per_step: 2048, ..config() };
     let mut trainer = Trainer::<f32>::new(config.clone(), &train[..]).expect("a valid config");
-    assert_eq!(trainer.plan().iter().map(|p| (p.first, p.stage.resolution)).collect::<Vec<_>>(), [(0, 24), (200, 32), (201, 32)]);
-    assert_eq!(trainer.prunes_from(), None);
+    assert_eq!(trainer.plan().iter().map(|p| (p.first, p.resolution)).collect::<Vec<_>>(), [(0, Some(24)), (200, Some(32)), (201, Some(32))]);
+    assert_eq!(trainer.model().prunes_from(), None);
     while trainer.step().expect("finite numbers").is_some_and(|report| report.step < 200) {}
     let (shape, present) = (*trainer.grid().shape(), trainer.grid().lattice().present());
     assert_eq!(shape.resolution, 32);
@@ -117,10 +117,10 @@ fn a_scout_finds_where_matter_is() {
     // A run that starts from another needs none, and pruning counts the stages of the config.
     let pruning = Config { prune_from_stage: Some(1), ..config };
     let trainer = Trainer::new(pruning, &train[..]).expect("a valid config");
-    assert_eq!(trainer.prunes_from(), Some(2));
+    assert_eq!(trainer.model().prunes_from(), Some(2));
     let grid = VoxelGrid::<f32>::uniform(trainer.config().grid_shape(32), 0.1, 0.0);
     let trainer = trainer.starting_from(&grid);
-    assert_eq!((trainer.plan().len(), trainer.prunes_from()), (2, Some(1)));
+    assert_eq!((trainer.plan().len(), trainer.model().prunes_from()), (2, Some(1)));
 }
 
 #[test]
@@ -154,7 +154,7 @@ fn small_images_have_large_voxels() {
         let again = trainer.config().fitted_to(train.iter().map(|view| &view.camera));
         // What fits is left alone.
         assert_eq!(again, *trainer.config());
-        trainer.plan().iter().map(|planned| planned.stage).collect::<Vec<_>>()
+        trainer.model().stages().to_vec()
     };
     assert_eq!(fitted(0.0, &stages), stages);
     assert_eq!(fitted(1e-3, &stages), stages);

@@ -21,7 +21,7 @@ pub fn loss_svg(losses: &[f64], stages: &[PlannedStage], title: &str) -> String 
         title: title.to_owned(),
         across: ("training step".to_owned(), steps as f64),
         up: "loss".to_owned(),
-        parts: stages.iter().map(|stage| (stage.first as f64, format!("{}³", stage.stage.resolution))).collect(),
+        parts: stages.iter().map(|stage| (stage.first as f64, stage.resolution.map_or(String::new(), |n| format!("{n}³")))).collect(),
         curves: vec![curve],
     };
     chart.svg()
@@ -73,10 +73,9 @@ fn smooth(columns: &mut [Column]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use plenoxel::model::plenoxels::config::Stage;
 
     fn stages() -> Vec<PlannedStage> {
-        let planned = |(i, resolution)| PlannedStage { stage: Stage::new(resolution, 50), first: 50 * i as u64, steps: 50 };
+        let planned = |(i, resolution)| PlannedStage { index: i, resolution: Some(resolution), first: 50 * i as u64, steps: 50 };
         [16, 32].into_iter().enumerate().map(planned).collect()
     }
 

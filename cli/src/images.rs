@@ -122,14 +122,6 @@ pub fn write(path: &Path, picture: &Rgb) -> Result<()> {
     plenoxel::dataset::image::write_rgb(path, picture.view())
 }
 
-/// Numbers of at most `most` of `n` things, evenly spaced, the first and the last among them.
-pub fn evenly_spaced(n: usize, most: usize) -> Vec<usize> {
-    match n {
-        n if n <= most => (0..n).collect(),
-        n => (0..most).map(|i| i * (n - 1) / (most - 1).max(1)).collect(),
-    }
-}
-
 fn colored(h: usize, w: usize, color: impl Fn(usize, usize) -> [f32; 3]) -> Rgb {
     let mut picture = Rgb::zeros((h, w, 3));
     for y in 0..h {
@@ -222,14 +214,6 @@ mod tests {
         let pixel = |x: usize| [0, 1, 2].map(|c| map[[0, x, c]]);
         assert_eq!((pixel(0), pixel(1)), ([1.0; 3], [0.5, 0.5, 1.0]));
         assert!(near(pixel(2), [0.6, 0.75, 0.95]));
-    }
-
-    #[test]
-    fn views_are_chosen_evenly_with_both_ends() {
-        assert_eq!(evenly_spaced(3, 25), [0, 1, 2]);
-        let chosen = evenly_spaced(200, 25);
-        assert_eq!((chosen.len(), chosen[0], chosen[24]), (25, 0, 199));
-        assert!(chosen.windows(2).all(|pair| pair[1] > pair[0]));
     }
 
     #[test]

@@ -168,8 +168,8 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
 mod tests {
     use super::*;
     use clap::{Command, CommandFactory};
-    use plenoxel::run::settings::{CARVE, PRESETS};
     use plenoxel::model::plenoxels::config::Config;
+    use plenoxel::run::settings::{CARVE, PRESETS};
 
     /// A command with those below it, and the words that call it.
     fn commands(command: &Command) -> Vec<Command> {

@@ -3,11 +3,11 @@
 use crate::Cli;
 use clap::Parser;
 use plenoxel::error::Result;
+use plenoxel::model::plenoxels::config::Config;
 pub use plenoxel::run::data::DataSource;
 pub use plenoxel::run::folder::RunRecord;
 use plenoxel::run::metrics::History;
 use plenoxel::run::settings::{ConfigFile, Layers};
-use plenoxel::model::plenoxels::config::Config;
 use std::path::Path;
 
 /// A file that changes a preset.

@@ -11,10 +11,10 @@ use crate::progress::{clock, thousands};
 use plenoxel::dataset::Dataset;
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::bytes;
 use plenoxel::run::metrics;
-use plenoxel::model::plenoxels::config::Config;
 use serde_json::Value;
 use std::fmt::Write;
 
@@ -59,7 +59,7 @@ impl Report<'_> {
     /// Every setting, as the run folder has them.
     fn settings(&self) -> Result<String> {
         let text = self.folder.settings()?;
-        let again = if self.config.stages.is_empty() { "carve" } else { "train" };
+        let again = self.record.kind.command();
         let data = escaped(&self.record.data.arguments());
         Ok(format!(
             "<section><h2>Settings</h2>\n<p>They repeat the run: <code>plenoxel {again}{data} --config config.toml</code></p>\n\
@@ -77,7 +77,7 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
     let facts = [
         ("PSNR", number("psnr", 2, " dB")),
         ("SSIM", number("ssim", 4, "")),
-        (if report.config.stages.is_empty() { "carving" } else { "training" }, result["seconds"].as_f64().map(clock)),
+        (if report.record.is_carved() { "carving" } else { "training" }, result["seconds"].as_f64().map(clock)),
         ("grid", Some(format!("{}³", shape.resolution))),
         ("voxels", Some(thousands(report.grid.lattice().present() as u64))),
         ("background alone", number("baseline_background_psnr", 2, " dB")),
@@ -122,7 +122,7 @@ fn costs(report: &Report<'_>, result: &Value) -> String {
     let per_ray = result["samples"].as_f64().zip(result["rays"].as_f64()).map(|(samples, rays)| format!("{:.1}", samples / rays.max(1.0)));
     let rows = [
         ("reading images", time("seconds_load")),
-        ("training", time("seconds").filter(|_| !report.config.stages.is_empty())),
+        ("training", time("seconds").filter(|_| !report.record.is_carved())),
         ("carving the hull", time("seconds_hull")),
         ("coloring it", time("seconds_color")),
         ("rendering and comparing test views", time("seconds_evaluate")),

@@ -200,7 +200,11 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
     let value = file.facts()?;
     if let Some(kind) = value["kind"].as_str().filter(|kind| *kind != KIND) {
         let found = format!("a model of kind `{kind}`, which has no voxels");
-        return Err(Error::input(path, found, format!("a model of kind `{KIND}` is expected; the program that trained this one can evaluate it")));
+        return Err(Error::input(
+            path,
+            found,
+            format!("a model of kind `{KIND}` is expected; the program that trained this one can evaluate it"),
+        ));
     }
     let format = value["format"].as_str().unwrap_or("none");
     if ![FORMAT, SPARSE_FORMAT, REDUCED_FORMAT].contains(&format) {

@@ -1,71 +1,18 @@
-//! A trained model against photographs: PSNR and SSIM of each view, and their means.
+//! Evaluation of a trained model against photographs: PSNR and SSIM of each view, and their means.
+//!
+//! One ray goes through the centre of each pixel. A rendered picture is clamped to [0, 1] and not rounded; a photograph is composited over the
+//! background in floats. [`crate::metrics`] has the formulas.
 
+use crate::camera::{Camera, Ray};
 use crate::dataset::View;
+use crate::error::Result;
 use crate::metrics;
+use crate::render::Rendered;
 use crate::render::picture::{Picture, picture_by};
 use crate::train::{Model, ViewOptions};
 use autograd::Real;
 use ndarray::Array3;
 use serde::Serialize;
-
-/// Figures of one view.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct ViewScore {
-    /// Name of the view.
-    pub name: String,
-    /// In dB.
-    pub psnr: f64,
-    /// Mean squared error, from which it is computed.
-    pub mse: f64,
-    /// Over windows inside the image; none for images below 11 pixels.
-    pub ssim: Option<f64>,
-    /// With zeros around the image, as svox2 computes it.
-    pub ssim_same: f64,
-}
-
-impl ViewScore {
-    /// Compares a picture with the photograph of a view, both `[h, w, 3]` sRGB.
-    pub fn new(view: &View, prediction: &Array3<f32>, target: &Array3<f32>) -> Self {
-        let (prediction, target) = (prediction.view(), target.view());
-        let mse = metrics::mse(prediction, target);
-        ViewScore {
-            name: view.name.clone(),
-            psnr: metrics::psnr_of(mse),
-            mse,
-            ssim: metrics::ssim(prediction, target),
-            ssim_same: metrics::ssim_same(prediction, target),
-        }
-    }
-}
-
-/// Figures of several views. Means are over the views' figures; there are none of no views.
-#[derive(Debug, Clone, Default, Serialize)]
-pub struct Scores {
-    /// In the order of the views.
-    pub per_view: Vec<ViewScore>,
-}
-
-impl Scores {
-    /// Mean PSNR in dB.
-    pub fn psnr(&self) -> Option<f64> {
-        mean(self.per_view.iter().map(|view| Some(view.psnr)))
-    }
-
-    /// PSNR of the mean error, in dB: views with large errors count more than in the mean PSNR.
-    pub fn psnr_of_mean_mse(&self) -> Option<f64> {
-        mean(self.per_view.iter().map(|view| Some(view.mse))).map(metrics::psnr_of)
-    }
-
-    /// Mean SSIM.
-    pub fn ssim(&self) -> Option<f64> {
-        mean(self.per_view.iter().map(|view| view.ssim))
-    }
-
-    /// Mean SSIM with zeros around the images.
-    pub fn ssim_same(&self) -> Option<f64> {
-        mean(self.per_view.iter().map(|view| Some(view.ssim_same)))
-    }
-}
 
 /// Renders the views of a model and compares them with their photographs over the background of `options`.
 ///
@@ -77,28 +24,125 @@ impl Scores {
 /// # }
 /// ```
 pub fn evaluate<T: Real>(model: &impl Model<T>, views: &[View], options: &ViewOptions) -> Scores {
-    evaluate_with(model, views, options, |_, _, _, _| {})
+    Viewer::of(model, options).compare(views, |_, _, _, _| Ok(())).unwrap_or_default()
 }
 
-/// The same, with a function that is called after each view with its number, its photograph over the background, and the picture of the model.
-pub fn evaluate_with<T: Real>(
-    model: &impl Model<T>,
-    views: &[View],
-    options: &ViewOptions,
-    mut seen: impl FnMut(usize, &View, &Array3<f32>, &Picture),
-) -> Scores {
-    let viewer = model.viewer(options);
-    let per_view = views.iter().enumerate().map(|(i, view)| {
-        let picture = picture_by(|rays| viewer(rays), &view.camera);
-        let target = view.composite(options.background);
-        let score = ViewScore::new(view, &picture.rgb, &target);
-        seen(i, view, &target, &picture);
-        score
-    });
-    Scores { per_view: per_view.collect() }
+/// A model, or anything else that renders rays, ready for pictures.
+pub struct Viewer<'a, T: Real> {
+    show: Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a>,
+    background: [f32; 3],
 }
 
-/// The mean, if there are values and all of them are there.
+impl<'a, T: Real> Viewer<'a, T> {
+    /// A viewer of a function from rays to pixels over a background, sRGB in [0, 1].
+    pub fn new(show: impl Fn(&[Ray]) -> Rendered<T> + Sync + 'a, background: [f32; 3]) -> Self {
+        Viewer { show: Box::new(show), background }
+    }
+
+    /// A viewer of a model.
+    pub fn of(model: &'a impl Model<T>, options: &ViewOptions) -> Self {
+        Viewer { show: model.viewer(options), background: options.background }
+    }
+
+    /// Renders the picture of a camera.
+    pub fn see(&self, camera: &Camera) -> Picture {
+        picture_by(&self.show, camera)
+    }
+
+    /// Renders each view and compares it with its photograph over the background. `seen(number, view, target, picture)` is called after each;
+    /// `target` is the photograph over the background, `[h, w, 3]`.
+    ///
+    /// Errors: those of `seen`, which end the comparison.
+    pub fn compare(&self, views: &[View], mut seen: impl FnMut(usize, &View, &Array3<f32>, &Picture) -> Result<()>) -> Result<Scores> {
+        let mut per_view = Vec::with_capacity(views.len());
+        for (i, view) in views.iter().enumerate() {
+            let picture = self.see(&view.camera);
+            let target = view.composite(self.background);
+            let (prediction, reference) = (picture.rgb.view(), target.view());
+            let mse = metrics::mse(prediction, reference);
+            per_view.push(ViewScore {
+                name: view.name.clone(),
+                psnr: metrics::psnr_of(mse),
+                mse,
+                ssim: metrics::ssim(prediction, reference),
+                ssim_same: metrics::ssim_same(prediction, reference),
+            });
+            seen(i, view, &target, &picture)?;
+        }
+        Ok(Scores { per_view })
+    }
+}
+
+/// Scores of one view.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ViewScore {
+    /// Name of the view.
+    pub name: String,
+    /// PSNR in dB.
+    pub psnr: f64,
+    /// Mean squared error over pixels and channels, values in [0, 1].
+    pub mse: f64,
+    /// SSIM over the windows inside the image; `None` for images of less than 11 pixels a side.
+    pub ssim: Option<f64>,
+    /// SSIM with zeros around the image, as svox2 computes it.
+    pub ssim_same: f64,
+}
+
+/// Scores of several views. Their means are `None` if there are no views.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Scores {
+    /// Scores of each view, in the order of the views.
+    pub per_view: Vec<ViewScore>,
+}
+
+impl Scores {
+    /// Mean PSNR in dB.
+    pub fn psnr(&self) -> Option<f64> {
+        mean(self.per_view.iter().map(|view| Some(view.psnr)))
+    }
+
+    /// PSNR in dB of the mean squared error over the views. Views with large errors count more than in the mean PSNR.
+    pub fn psnr_of_mean_mse(&self) -> Option<f64> {
+        mean(self.per_view.iter().map(|view| Some(view.mse))).map(metrics::psnr_of)
+    }
+
+    /// Mean SSIM; `None` if a view has none.
+    pub fn ssim(&self) -> Option<f64> {
+        mean(self.per_view.iter().map(|view| view.ssim))
+    }
+
+    /// Mean SSIM with zeros around the images.
+    pub fn ssim_same(&self) -> Option<f64> {
+        mean(self.per_view.iter().map(|view| Some(view.ssim_same)))
+    }
+}
+
+/// Mean PSNR in dB of the plain background against the views: a baseline.
+pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
+    let (width, height) = views.first()?.image.dimensions();
+    let shape = (height as usize, width as usize, 3);
+    let plain = Array3::from_shape_fn(shape, |(_, _, c)| background[c]);
+    constant_psnr(views, &plain, background)
+}
+
+/// Mean image of the views over a background, `[h, w, 3]`; `None` if there are no views.
+pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
+    let mut sum = views.first()?.composite(background).mapv(f64::from);
+    for view in &views[1..] {
+        sum.zip_mut_with(&view.composite(background), |sum, value| *sum += f64::from(*value));
+    }
+    Some(sum.mapv(|value| (value / views.len() as f64) as f32))
+}
+
+/// Mean PSNR in dB of one picture, `[h, w, 3]`, against the views; `None` if there are no views or one has another size.
+pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]) -> Option<f64> {
+    mean(views.iter().map(|view| {
+        let target = view.composite(background);
+        (target.dim() == picture.dim()).then(|| metrics::psnr(picture.view(), target.view()))
+    }))
+}
+
+/// Mean of the values; `None` if there are no values or one is `None`.
 fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     let n = values.len();
     let sum: Option<f64> = values.sum();

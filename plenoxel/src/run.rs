@@ -8,13 +8,13 @@
 //! | [`budget`] | a plan of time: lengths of the stages for training of a given duration |
 //! | [`folder`] | the files of a run, by name |
 //! | [`metrics`], [`tensorboard`] | the figures of each step, on lines of JSON and as TensorBoard reads them |
-//! | [`evaluation`], [`figures`] | PSNR and SSIM of each view; their means with the definitions |
+//! | [`training`] | the run itself, in events |
+//! | [`figures`] | mean scores with their definitions |
 //!
 //! Modules here may read the clock and the system; [`train`](crate::train) may not.
 
 pub mod budget;
 pub mod data;
-pub mod evaluation;
 pub mod figures;
 pub mod folder;
 pub mod machine;
@@ -22,3 +22,28 @@ pub mod memory;
 pub mod metrics;
 pub mod settings;
 pub mod tensorboard;
+pub mod training;
+
+/// Program and version, as runs record it.
+pub const PROGRAM: &str = concat!("plenoxel ", env!("CARGO_PKG_VERSION"));
+
+/// Numbers of at most `most` of `n` things, evenly spaced, the first and the last among them.
+pub fn evenly_spaced(n: usize, most: usize) -> Vec<usize> {
+    match n {
+        n if n <= most => (0..n).collect(),
+        n => (0..most).map(|i| i * (n - 1) / (most - 1).max(1)).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn views_are_chosen_evenly_with_both_ends() {
+        assert_eq!(evenly_spaced(3, 25), [0, 1, 2]);
+        let chosen = evenly_spaced(200, 25);
+        assert_eq!((chosen.len(), chosen[0], chosen[24]), (25, 0, 199));
+        assert!(chosen.windows(2).all(|pair| pair[1] > pair[0]));
+    }
+}

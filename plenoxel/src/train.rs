@@ -101,12 +101,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     /// A run of a model from its beginning.
     ///
     /// Errors if there is no image to learn from, or no step to take.
-    pub fn with_model(
-        model: M,
-        views: impl Into<Arc<[View]>>,
-        mut objective: Objective<T, M>,
-        options: TrainOptions,
-    ) -> Result<Self> {
+    pub fn with_model(model: M, views: impl Into<Arc<[View]>>, mut objective: Objective<T, M>, options: TrainOptions) -> Result<Self> {
         let rays = RaySource::new(views, options.background, options.seed);
         if rays.is_empty() {
             return Err(Error::config("train views", "none", "at least one image to learn from"));

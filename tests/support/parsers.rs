@@ -12,11 +12,11 @@ use plenoxel::dataset::blender::Transforms;
 use plenoxel::dataset::image::{self, RgbaImage};
 use plenoxel::export;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use plenoxel::model::plenoxels::Trainer;
+use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Stage};
 use plenoxel::point_cloud::filter::{Filters, Noise, NoiseError, Outliers};
 use plenoxel::point_cloud::ply::PlyFile;
 use plenoxel::point_cloud::{PointCloud, ScalarField};
-use plenoxel::model::plenoxels::Trainer;
-use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Stage};
 use plenoxel_cli::parsers;
 use std::io::Cursor;
 use std::path::Path;
@@ -251,13 +251,13 @@ fn checkpoints() -> Vec<Vec<u8>> {
 }
 
 fn read_checkpoint(path: &Path, bytes: &[u8]) -> Result<Then, String> {
-    let (grid, header) = checkpoint::read::<f32, _>(path, Cursor::new(bytes)).map_err(text)?;
+    let (grid, header) = checkpoint::read::<f32>(path, Cursor::new(bytes)).map_err(text)?;
     Ok(Box::new(move || {
         if grid.shape().resolution > 64 {
             return;
         }
         let again = written(|path| checkpoint::save(path, &grid, &header).expect("it is written"));
-        let (again, header_again) = checkpoint::read::<f32, _>(Path::new("again"), Cursor::new(again)).expect("it is read");
+        let (again, header_again) = checkpoint::read::<f32>(Path::new("again"), Cursor::new(again)).expect("it is read");
         assert!(header_again == header && again.shape() == grid.shape() && again.lattice().masks() == grid.lattice().masks());
         for (a, b) in again.params().zip(grid.params()) {
             assert!(a.tensor().data() == b.tensor().data(), "{}", a.name());

@@ -1,6 +1,6 @@
 //! `plenoxel carve`: from silhouettes and colors to an opaque colored grid, without training.
 
-use super::new_run::{Stopwatch, announce, load, record};
+use super::new_run::{announce, load};
 use super::{MOST_REDUCTION, whole};
 use crate::images;
 use crate::progress::Console;
@@ -11,12 +11,14 @@ use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
 use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
+use plenoxel::model::plenoxels::config::Config;
+use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::run::data::DataSource;
-use plenoxel::run::evaluation::Viewer;
-use plenoxel::run::folder::RunFolder;
+use plenoxel::run::evenly_spaced;
+use plenoxel::run::folder::{RunFolder, RunKind, RunRecord};
 use plenoxel::run::memory::{self, Estimate};
 use plenoxel::run::settings::{self, CARVE, Layers};
-use plenoxel::model::plenoxels::config::Config;
+use plenoxel::run::training::Stopwatch;
 use serde::Serialize;
 use std::path::PathBuf;
 use toml::Value;
@@ -177,7 +179,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
 
     // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
     folder.prepare()?;
-    let record = record(&dataset, preset, &source);
+    let record = RunRecord::new(RunKind::Carved, &dataset, preset, &source);
     folder.describe(&config, &record)?;
     console.note(&format!("run: {}", folder.path().display()));
     let mut color_clock = Stopwatch::default();
@@ -235,8 +237,8 @@ fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, colored: &Colore
     const MOST: usize = 4;
     let split = if dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
     let cameras = dataset.cameras(split);
-    let viewer = Viewer::new(&colored.grid, config.evaluation, config);
-    let chosen = images::evenly_spaced(cameras.len(), MOST);
+    let viewer = grid_viewer(&colored.grid, config.evaluation, config.engine, config.background);
+    let chosen = evenly_spaced(cameras.len(), MOST);
     let pictures: Vec<_> = chosen.into_iter().map(|number| viewer.see(&cameras[number]).rgb).collect();
     folder.create_images()?;
     images::write(&folder.image("carved.png"), &images::strip(&pictures.iter().collect::<Vec<_>>()))?;

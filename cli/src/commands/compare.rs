@@ -10,11 +10,11 @@ use crate::report::{SCRIPT, STYLE, curves};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::files;
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::bytes;
 use plenoxel::run::metrics;
 use plenoxel::run::settings;
-use plenoxel::model::plenoxels::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 

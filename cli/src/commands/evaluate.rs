@@ -5,9 +5,10 @@ use super::trained_run::{Found, Loaded, TrainedRun};
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
+use plenoxel::evaluate::ViewScore;
 use plenoxel::files;
 use plenoxel::json;
-use plenoxel::run::evaluation::{ViewScore, Viewer};
+use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::run::figures::Figures;
 use plenoxel::run::memory::{self, Estimate};
 use serde::Serialize;
@@ -61,7 +62,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     }
 
     let start = Instant::now();
-    let viewer = Viewer::new(&grid, sampling, &config);
+    let viewer = grid_viewer(&grid, sampling, config.engine, config.background);
     let count = console.count("evaluating", views.len());
     let scores = viewer.compare(&views, |i, _, _, _| {
         count.at(i + 1, views.len());

@@ -12,9 +12,9 @@ use plenoxel::checkpoint::Header;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::Estimate;
-use plenoxel::model::plenoxels::config::Config;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\

@@ -77,6 +77,7 @@ fn describe(path: &Path) -> Result<Lines> {
 
 fn of_run(path: &Path) -> Result<Lines> {
     let (folder, config, record) = RunFolder::open(path)?;
+    let carved = record.is_carved();
     let mut lines = vec![
         ("run", path.display().to_string()),
         ("scene", format!("{}, {}", record.scene, record.format)),
@@ -94,14 +95,14 @@ fn of_run(path: &Path) -> Result<Lines> {
         result.as_ref().and_then(|result| result["stages"].as_array()?.iter().map(|stage| stage["resolution"].as_u64()).collect());
     let stages = trained.unwrap_or_else(|| config.stages.iter().map(|stage| stage.resolution as u64).collect());
     let stages: Vec<String> = stages.iter().map(|resolution| format!("{resolution}³")).collect();
-    lines.push(("stages", if config.stages.is_empty() { "none: it was carved".to_owned() } else { stages.join(", ") }));
+    lines.push(("stages", if carved { "none: it was carved".to_owned() } else { stages.join(", ") }));
     if folder.checkpoint().exists() {
         let (grid, header) = folder.load()?;
         lines.extend(of_grid(&grid, &header));
     } else {
         lines.push(("grid", "none: the run did not end".to_owned()));
     }
-    if !config.stages.is_empty() && folder.existing_state().is_ok() {
+    if !carved && folder.existing_state().is_ok() {
         lines.push(("go on with", format!("plenoxel train --resume {}", path.display())));
     }
     if let Some(result) = result {

@@ -4,8 +4,8 @@ use crate::progress::Console;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use plenoxel::error::Result;
-use plenoxel::run::settings::{self, CARVE, PRESETS};
 use plenoxel::model::plenoxels::config::{Config, Hull};
+use plenoxel::run::settings::{self, CARVE, PRESETS};
 
 const EXAMPLES: &str = "\
 Examples:

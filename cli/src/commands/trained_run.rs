@@ -6,11 +6,10 @@ use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
 use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
+use plenoxel::model::plenoxels::config::{Config, Sampling};
 use plenoxel::run::data::DataSource;
-use plenoxel::run::evaluation::with_samples;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::memory::Estimate;
-use plenoxel::model::plenoxels::config::{Config, Sampling};
 use std::path::PathBuf;
 
 /// Which run, and how to look at it.
@@ -82,7 +81,7 @@ impl TrainedRun {
     ) -> Result<Loaded> {
         let (header, voxels) = found.folder.header()?;
         let (shape, as_trained) = (header.shape(), found.config.evaluation);
-        let sampling = self.samples.map_or(as_trained, |samples| with_samples(as_trained, samples, &shape));
+        let sampling = self.samples.map_or(as_trained, |samples| as_trained.with_samples(samples, &shape));
         let estimate = estimate(sampling, &shape, voxels);
         console.note(&estimate.describe());
         estimate.check()?;

@@ -2,9 +2,10 @@
 
 use super::{Console, Meter, Standing, clock, metric};
 use plenoxel::run::memory::{self, bytes};
-use plenoxel::run::metrics::Observation;
+use plenoxel::run::metrics::{Observation, figures};
 use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;
+use std::collections::BTreeMap;
 
 /// A mean that forgets: each value moves it by `share` of the way, the first ones by more, so that it starts without a bias.
 #[derive(Debug, Clone, Copy)]
@@ -60,7 +61,7 @@ impl<'a> Console<'a> {
 
 impl Training<'_, '_> {
     /// A step was taken.
-    pub fn step(&mut self, report: &Report, seen: Observation) {
+    pub fn step(&mut self, report: &Report, seen: &Observation) {
         let took = seen.seconds - self.seconds;
         self.seconds = seen.seconds;
         self.validation_psnr = seen.validation_psnr.or(self.validation_psnr);
@@ -75,16 +76,16 @@ impl Training<'_, '_> {
         }
         self.samples.add(report.samples as f64 / report.rays.max(1) as f64);
         let place = (report.step + 1 - stage.first, stage.steps);
-        self.meter.show(place, report.ends_stage, || self.now(report, seen.voxels));
+        self.meter.show(place, report.ends_stage, || self.now(report, &seen.facts));
     }
 
-    fn now(&self, report: &Report, voxels: usize) -> Now {
+    fn now(&self, report: &Report, facts: &[(&'static str, f64)]) -> Now {
         let pace = Some(self.step_seconds.value).filter(|step| *step > 0.0);
         Now {
             what: "training",
             stage: report.stage + 1,
             stages: self.plan.len(),
-            resolution: self.plan[report.stage].stage.resolution,
+            resolution: self.plan[report.stage].resolution,
             step: report.step + 1,
             steps: self.total,
             loss: self.loss.value,
@@ -92,7 +93,8 @@ impl Training<'_, '_> {
             validation_psnr: self.validation_psnr,
             rays_per_second: pace.map(|step| report.rays as f64 / step),
             samples_per_ray: self.samples.value,
-            voxels,
+            facts: figures(facts, &[]),
+            size: facts.first().copied(),
             memory_bytes: memory::now(),
             eta_seconds: self.remaining(report),
             seconds: self.seconds,
@@ -110,7 +112,7 @@ impl Training<'_, '_> {
         };
         let samples = |index: usize| {
             let pruned = self.prune_from_stage.is_some_and(|first| index >= first);
-            self.plan[index].stage.resolution as f64 / if pruned { 3.0 } else { 1.0 }
+            self.plan[index].resolution.unwrap_or(1) as f64 / if pruned { 3.0 } else { 1.0 }
         };
         let here = (now.first + now.steps - report.step - 1) as f64;
         let later = (report.stage + 1..self.plan.len()).map(|i| self.plan[i].steps as f64 * samples(i) / samples(report.stage));
@@ -125,7 +127,8 @@ struct Now {
     what: &'static str,
     stage: usize,
     stages: usize,
-    resolution: usize,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    resolution: Option<usize>,
     step: u64,
     steps: u64,
     loss: f64,
@@ -133,7 +136,12 @@ struct Now {
     validation_psnr: Option<f64>,
     rays_per_second: Option<f64>,
     samples_per_ray: f64,
-    voxels: usize,
+    /// Facts about the model by name.
+    #[serde(flatten)]
+    facts: BTreeMap<String, serde_json::Number>,
+    /// The most important of them.
+    #[serde(skip)]
+    size: Option<(&'static str, f64)>,
     memory_bytes: Option<u64>,
     eta_seconds: f64,
     seconds: f64,
@@ -151,15 +159,17 @@ impl Now {
     fn sizes(&self) -> String {
         let pace = self.rays_per_second.map(|rays| format!("  {}rays/s", metric(rays)));
         let memory = self.memory_bytes.map(|n| format!("  {}", bytes(n)));
-        format!("{}  {}voxels{}", pace.unwrap_or_default(), metric(self.voxels as f64), memory.unwrap_or_default())
+        let size = self.size.map(|(name, number)| format!("  {}{name}", metric(number)));
+        [pace, size, memory].into_iter().flatten().collect()
     }
 }
 
 impl Standing for Now {
     fn line(&self) -> String {
-        let Now { stage, stages, resolution, step, steps, loss, samples_per_ray, .. } = self;
+        let Now { stage, stages, step, steps, loss, samples_per_ray, .. } = self;
+        let resolution = self.resolution.map_or(String::new(), |n| format!(" ({n}³)"));
         format!(
-            "stage {stage}/{stages} ({resolution}³)  step {step}/{steps}  ETA {}  {}  loss {loss:.5}{}  {samples_per_ray:.0} samples/ray",
+            "stage {stage}/{stages}{resolution}  step {step}/{steps}  ETA {}  {}  loss {loss:.5}{}  {samples_per_ray:.0} samples/ray",
             clock(self.eta_seconds),
             self.psnr(),
             self.sizes(),
@@ -167,9 +177,10 @@ impl Standing for Now {
     }
 
     fn beside_bar(&self) -> String {
-        let Now { stage, stages, resolution, loss, samples_per_ray, .. } = self;
+        let Now { stage, stages, loss, samples_per_ray, .. } = self;
+        let resolution = self.resolution.map_or(String::new(), |n| format!(" {n}³"));
         format!(
-            "stage {stage}/{stages} {resolution}³  ETA {}  {}{}  loss {loss:.5}  {samples_per_ray:.0} samples/ray",
+            "stage {stage}/{stages}{resolution}  ETA {}  {}{}  loss {loss:.5}  {samples_per_ray:.0} samples/ray",
             clock(self.eta_seconds),
             self.psnr(),
             self.sizes(),
@@ -194,7 +205,7 @@ mod tests {
             what: "training",
             stage: 2,
             stages: 4,
-            resolution: 256,
+            resolution: Some(256),
             step: 10_203,
             steps: 14_400,
             loss: 0.001_234_5,
@@ -202,7 +213,8 @@ mod tests {
             validation_psnr: Some(28.012),
             rays_per_second: Some(431_204.0),
             samples_per_ray: 38.2,
-            voxels: 1_234_567,
+            facts: BTreeMap::new(),
+            size: Some(("voxels", 1_234_567.0)),
             memory_bytes: Some(1_512_000_000),
             eta_seconds: 754.0,
             seconds: 100.0,

@@ -1,8 +1,8 @@
 //! Loss, PSNR, resolution and rates of a run, or of several, over steps and over seconds.
 
 use crate::chart::{Chart, Curve};
-use plenoxel::run::metrics::Line;
 use plenoxel::model::plenoxels::config::Stage;
+use plenoxel::run::metrics::Line;
 use std::collections::BTreeSet;
 
 /// Points of a curve that are told apart.
@@ -38,7 +38,7 @@ pub fn side_by_side(runs: &[(String, Vec<Line<'_>>)]) -> String {
         ("Loss", "loss", |line| Some(line.loss)),
         ("PSNR of training rays", "dB", |line| Some(line.psnr)),
         ("PSNR of validation views", "dB", |line| line.validation_psnr),
-        ("Voxels", "number", |line| Some(line.voxels as f64).filter(|n| *n > 0.0)),
+        ("Voxels", "number", |line| line.figure("voxels").filter(|n| *n > 0.0)),
     ];
     if runs.iter().all(|(_, lines)| lines.is_empty()) {
         return String::new();
@@ -102,19 +102,23 @@ fn charts(lines: &[Line<'_>]) -> Vec<Shown> {
             "Size of the grid",
             "number",
             vec![
-                ("voxels a side".to_owned(), Box::new(|line| Some(line.resolution as f64))),
-                ("voxels".to_owned(), Box::new(|line| Some(line.voxels as f64).filter(|n| *n > 0.0))),
+                ("voxels a side".to_owned(), Box::new(|line| line.resolution.map(|n| n as f64))),
+                ("voxels".to_owned(), Box::new(|line| line.figure("voxels").filter(|n| *n > 0.0))),
             ],
         ),
-        (
-            "Learning rates",
-            "rate",
-            vec![
-                ("density".to_owned(), Box::new(|line| Some(line.density_rate))),
-                ("color".to_owned(), Box::new(|line| Some(line.color_rate))),
-            ],
-        ),
+        ("Learning rates", "rate", rates(lines)),
     ]
+}
+
+/// The learning rate of each parameter.
+fn rates(lines: &[Line<'_>]) -> Vec<(String, Value<'static>)> {
+    let parameter = |figure: &String| figure.strip_suffix("_rate").map(str::to_owned);
+    let parameters: BTreeSet<String> = lines.iter().flat_map(|line| line.figures.keys().filter_map(parameter)).collect();
+    let curve = |parameter: String| {
+        let figure = format!("{parameter}_rate");
+        (parameter, Box::new(move |line: &Line<'_>| line.figure(&figure)) as Value<'static>)
+    };
+    parameters.into_iter().map(curve).collect()
 }
 
 /// A curve with a break between stages.
@@ -136,7 +140,7 @@ fn curve(name: &str, lines: &[Line<'_>], at: fn(&Line<'_>) -> f64, value: &dyn F
 fn parts(lines: &[Line<'_>], at: fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
     let mut begin = 0.0;
     let parts = lines.chunk_by(|a, b| a.stage == b.stage).map(|stage| {
-        let part = (begin, format!("{}³", stage[0].resolution));
+        let part = (begin, stage[0].resolution.map_or(String::new(), |n| format!("{n}³")));
         begin = at(&stage[stage.len() - 1]);
         part
     });

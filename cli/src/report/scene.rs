@@ -2,7 +2,6 @@
 
 use super::Report;
 use crate::html::escaped;
-use crate::images::evenly_spaced;
 use crate::progress::thousands;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -11,7 +10,8 @@ use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::export::web::WebGrid;
 use plenoxel::metrics;
-use plenoxel::run::evaluation::Viewer;
+use plenoxel::model::plenoxels::grid_viewer;
+use plenoxel::run::evenly_spaced;
 use plenoxel::run::memory::bytes;
 use serde_json::{Value, json};
 
@@ -113,7 +113,8 @@ impl Cost {
         let chosen = evenly_spaced(report.dataset.count(Split::Test), COMPARED);
         let background = report.config.background;
         let small = small.to_grid();
-        let [whole, small] = [report.grid, &small].map(|grid| Viewer::new(grid, report.config.evaluation, report.config));
+        let [whole, small] =
+            [report.grid, &small].map(|grid| grid_viewer(grid, report.config.evaluation, report.config.engine, report.config.background));
         let mut sums = [0.0; 3];
         for &i in &chosen {
             let view = report.dataset.load_view(Split::Test, i)?;

@@ -247,5 +247,4 @@ impl<T: Real, M> Objective<T, M> {
 }
 
 /// Every loss that [`Objective::with_named`] knows: those that no particular model is needed for.
-pub const NAMES: [&str; 10] =
-    ["mse", "charbonnier", "huber", "robust", "exposure", "sparsity", "entropy", "beta", "distortion", "opacity"];
+pub const NAMES: [&str; 10] = ["mse", "charbonnier", "huber", "robust", "exposure", "sparsity", "entropy", "beta", "distortion", "opacity"];

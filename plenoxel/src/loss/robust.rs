@@ -131,7 +131,11 @@ mod tests {
     #[test]
     fn its_derivatives_agree_with_finite_differences() {
         let alpha = arr1(&[0.02, 0.4, 1.0, 1.7, 1.95]).into_dyn();
-        Gradcheck::new(|x: &[Tensor<f64>]| log_partition(&x[0]), vec![alpha]).named("ln Z").order(2).run().unwrap_or_else(|e| panic!("{e}"));
+        Gradcheck::new(|x: &[Tensor<f64>]| log_partition(&x[0]), vec![alpha])
+            .named("ln Z")
+            .order(2)
+            .run()
+            .unwrap_or_else(|e| panic!("{e}"));
         let residuals = arr2(&[[0.3, -0.01, 2.0], [-0.7, 0.2, 0.1]]).into_dyn();
         let (alpha, log_scale) = (arr1(&[0.3, 1.0, 1.9]).into_dyn(), arr1(&[-1.0, 0.2, -3.0]).into_dyn());
         Gradcheck::new(|x: &[Tensor<f64>]| negative_log_likelihood(&x[0], &x[1], &x[2]), vec![residuals, alpha, log_scale])

@@ -36,6 +36,7 @@ use crate::camera::Ray;
 use crate::checkpoint::{self, Header};
 use crate::dataset::View;
 use crate::error::{Error, Result};
+use crate::evaluate::Viewer;
 use crate::field::Field;
 use crate::field::voxel_grid::{GridShape, VoxelGrid};
 use crate::geometry::Aabb;
@@ -148,9 +149,37 @@ impl<T: Real> Plenoxels<T> {
         &self.config
     }
 
-    /// Number of the stages of the plan that are the scout's; they come first.
+    /// Stages that are trained, fitted to the images; those of the scout come first.
+    pub fn stages(&self) -> &[Stage] {
+        &self.stages
+    }
+
+    /// Number of the stages that are the scout's.
     pub fn scout_stages(&self) -> usize {
         self.scouts
+    }
+}
+
+/// A viewer of a voxel grid: no jitter, and empty cells are skipped, which changes no pixel.
+pub fn grid_viewer<T: Real>(grid: &VoxelGrid<T>, sampling: Sampling, engine: Engine, background: [f32; 3]) -> Viewer<'_, T> {
+    Viewer::new(show(grid, sampling, engine, background), background)
+}
+
+/// A function from rays to the pixels of a grid.
+fn show<T: Real>(
+    grid: &VoxelGrid<T>,
+    sampling: Sampling,
+    engine: Engine,
+    background: [f32; 3],
+) -> impl Fn(&[Ray]) -> Rendered<T> + Sync + '_ {
+    let (matter, spacing) = (grid.matter(), sampling.spacing(grid.shape().voxel_side()));
+    move |rays| {
+        let occupancy = Some(&matter);
+        render(
+            grid,
+            rays,
+            &RenderOptions { aabb: grid.aabb(), spacing, jitter: Jitter::None, background, occupancy, engine, stop_below: STOP_BELOW },
+        )
     }
 }
 
@@ -190,11 +219,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     fn viewer<'a>(&'a self, view: &ViewOptions) -> Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a> {
         let sampling = self.config.evaluation;
         let sampling = view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()));
-        let (matter, background) = (self.grid.matter(), view.background);
-        let options = self.config.render_options(&self.grid, sampling, Jitter::None);
-        Box::new(move |rays| {
-            render(&self.grid, rays, &RenderOptions { occupancy: Some(&matter), stop_below: STOP_BELOW, background, ..options.clone() })
-        })
+        Box::new(show(&self.grid, sampling, self.config.engine, view.background))
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
@@ -260,8 +285,7 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
         config.validate()?;
         let views = views.into();
         let objective = objective(&config, views.len())?;
-        let model = Plenoxels::new(&config, &views)?;
-        Self::with_model(model, views, objective, config.train_options())
+        Self::with_losses(config, views, objective)
     }
 
     /// A run with an objective of your own. The config must name no losses but those of the default, a mean squared error: its losses would not
@@ -274,7 +298,11 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
             let accepted = "no losses in the config (`losses` empty), or Trainer::new without an objective; model::plenoxels::objective(&config, views) is one to add to";
             return Err(Error::config("losses", format!("{} beside an objective of one's own", names.join(", ")), accepted));
         }
-        let views = views.into();
+        Self::with_losses(config, views.into(), objective)
+    }
+
+    /// A run with an objective, which may have the config's losses or others.
+    pub(crate) fn with_losses(config: Config, views: Arc<[View]>, objective: Objective<T>) -> Result<Self> {
         let model = Plenoxels::new(&config, &views)?;
         Self::with_model(model, views, objective, config.train_options())
     }

@@ -6,9 +6,9 @@
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::rays::RaySource;
 use crate::model::plenoxels::Trainer;
 use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
+use crate::rays::RaySource;
 use std::time::Instant;
 
 /// The fog that a grid starts as clears: the k-th step of the first stage takes 1 + a ln(b / k) of what its steps take in the mean, and after

@@ -1,7 +1,7 @@
 //! Final figures of a run against the views of a split, with the resolution, the background and the definitions they depend on.
 
-use super::evaluation::Scores;
 use crate::dataset::{Dataset, Split};
+use crate::evaluate::Scores;
 use crate::field::voxel_grid::VoxelGrid;
 use crate::model::plenoxels::config::{Config, Sampling};
 use serde::Serialize;

@@ -3,7 +3,7 @@
 mod listing;
 mod record;
 
-pub use record::RunRecord;
+pub use record::{RunKind, RunRecord};
 
 use super::settings::{self, ConfigFile};
 use super::tensorboard;
@@ -96,7 +96,7 @@ impl RunFolder {
 
     /// Writes `config.toml`, `run.json` and `README.md`, which are known before the first step.
     pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
-        let command = if config.stages.is_empty() { "carve" } else { "train" };
+        let command = record.kind.command();
         let again = format!("plenoxel {command}{} --config THIS_FILE", record.data.arguments());
         settings::write(
             &self.path.join(CONFIG),
@@ -125,8 +125,12 @@ impl RunFolder {
             std::io::ErrorKind::NotFound => Error::input(path, format!("there is no {RECORD} in this folder"), remedy),
             _ => Error::io(&record, e, "reading the run"),
         })?;
-        let record = RunRecord::parse(&record, &bytes)?;
-        Ok((folder, ConfigFile::read(&path.join(CONFIG))?.complete()?, record))
+        let mut record = RunRecord::parse(&record, &bytes)?;
+        let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
+        if config.stages.is_empty() {
+            record.kind = RunKind::Carved;
+        }
+        Ok((folder, config, record))
     }
 
     /// The same folder with the best grid, by validation PSNR, in place of the last.

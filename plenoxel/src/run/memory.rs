@@ -12,10 +12,10 @@ use crate::carve::Fit;
 use crate::carve::color::KEPT_LIGHT;
 use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
-use crate::field::voxel_grid::{Color, GridShape};
-use crate::render::Engine;
 use crate::field::voxel_grid::fused::CHUNK;
+use crate::field::voxel_grid::{Color, GridShape};
 use crate::model::plenoxels::config::{Config, OptimizerConfig, Sampling};
+use crate::render::Engine;
 
 /// An estimate in bytes, by purpose.
 #[derive(Debug, Clone, PartialEq)]

@@ -107,8 +107,9 @@ pub struct Line<'a> {
     pub step: u64,
     /// Stage of that step, from 0.
     pub stage: usize,
-    /// Voxels along each axis.
-    pub resolution: usize,
+    /// Cells along each axis of what the model stores, if it stores a grid.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resolution: Option<usize>,
     /// True if that step was the last of its stage.
     pub ends_stage: bool,
     /// Weighted sum of the losses.
@@ -122,13 +123,9 @@ pub struct Line<'a> {
     pub rays: u64,
     /// Samples since the start of training.
     pub samples: u64,
-    /// Learning rate of the density.
-    pub density_rate: f64,
-    /// Learning rate of the colors.
-    pub color_rate: f64,
-    /// Voxels of the grid.
-    #[serde(default)]
-    pub voxels: usize,
+    /// Facts about the model, such as `voxels`, and learning rates of its parameters, such as `density_rate`.
+    #[serde(flatten)]
+    pub figures: BTreeMap<String, serde_json::Number>,
     /// Mean PSNR of validation views in dB, if it was measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub validation_psnr: Option<f64>,
@@ -137,6 +134,11 @@ pub struct Line<'a> {
 }
 
 impl Line<'_> {
+    /// A fact about the model or a learning rate, by name.
+    pub fn figure(&self, name: &str) -> Option<f64> {
+        self.figures.get(name)?.as_f64()
+    }
+
     /// Its figures as TensorBoard shows them, rays a second from what was known before.
     fn scalars(&self, before: &Known) -> Vec<(Cow<'_, str>, f64)> {
         let rays_per_second = self.rays.saturating_sub(before.rays) as f64 / (self.seconds - before.seconds);
@@ -145,26 +147,35 @@ impl Line<'_> {
             ("loss", Some(self.loss)),
             ("psnr/train", Some(self.psnr)),
             ("psnr/validation", self.validation_psnr),
-            ("resolution", Some(self.resolution as f64)),
-            ("voxels", Some(self.voxels as f64)),
-            ("density_rate", Some(self.density_rate)),
-            ("color_rate", Some(self.color_rate)),
+            ("resolution", self.resolution.map(|n| n as f64)),
             ("rays_per_second", Some(rays_per_second)),
         ];
         let others = others.into_iter().filter_map(|(name, value)| Some((name.into(), value?)));
-        others.chain(each).collect()
+        let figures = self.figures.iter().filter_map(|(name, value)| Some((name.as_str().into(), value.as_f64()?)));
+        others.chain(figures).chain(each).collect()
     }
 }
 
 /// Figures of a step that the trainer does not report.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Default)]
 pub struct Observation {
-    /// Voxels of the grid.
-    pub voxels: usize,
+    /// Facts about the model, the most important first ([`Model::facts`](crate::train::Model::facts)).
+    pub facts: Vec<(&'static str, f64)>,
     /// Mean PSNR of validation views after the step, if it was measured.
     pub validation_psnr: Option<f64>,
     /// Seconds of training so far.
     pub seconds: f64,
+}
+
+/// Facts about a model by name, and learning rates by the name of their parameter with `_rate` behind it. Whole numbers are written as such.
+pub fn figures(facts: &[(&'static str, f64)], rates: &[(String, f64)]) -> BTreeMap<String, serde_json::Number> {
+    let facts = facts.iter().filter_map(|&(name, value)| {
+        let whole = value.fract() == 0.0 && (0.0..9e15).contains(&value);
+        let number = if whole { Some((value as u64).into()) } else { serde_json::Number::from_f64(value) };
+        Some((name.to_owned(), number?))
+    });
+    let rates = rates.iter().filter_map(|(name, rate)| Some((format!("{name}_rate"), serde_json::Number::from_f64(*rate)?)));
+    facts.chain(rates).collect()
 }
 
 /// Sums over the steps since the last line.
@@ -225,7 +236,7 @@ impl MetricsFile {
     /// Adds a step. A line is written every few steps, at the end of a stage, after a look at validation views, and where `must` is true.
     ///
     /// Errors: the file cannot be written.
-    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seen: Observation, must: bool) -> Result<()> {
+    pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seen: &Observation, must: bool) -> Result<()> {
         // Lines of a damaged file may have said anything.
         self.rays = self.rays.saturating_add(report.rays as u64);
         self.samples = self.samples.saturating_add(report.samples as u64);
@@ -239,7 +250,8 @@ impl MetricsFile {
                 None => since.losses.push((name.clone(), *value)),
             }
         }
-        let Observation { voxels, validation_psnr, seconds } = seen;
+        let Observation { facts, validation_psnr, seconds } = seen;
+        let (validation_psnr, seconds) = (*validation_psnr, *seconds);
         let must = must || report.ends_stage || validation_psnr.is_some();
         if !(report.step + 1).is_multiple_of(self.every) && !must {
             return Ok(());
@@ -249,16 +261,14 @@ impl MetricsFile {
         let line = Line {
             step: report.step,
             stage: report.stage,
-            resolution: plan[report.stage].stage.resolution,
+            resolution: plan[report.stage].resolution,
             ends_stage: report.ends_stage,
             loss: mean(since.loss),
             losses: since.losses.iter().map(|(name, sum)| (name.into(), mean(*sum))).collect(),
             psnr: -10.0 * mean(since.squared_error).log10(),
             rays: self.rays,
             samples: self.samples,
-            density_rate: report.density_rate,
-            color_rate: report.color_rate,
-            voxels,
+            figures: figures(facts, &report.rates),
             validation_psnr,
             seconds,
         };

@@ -2,10 +2,11 @@
 
 use super::Run;
 use crate::html::{escaped, picture};
-use crate::images::{self, evenly_spaced};
+use crate::images;
 use crate::report::pictures::LARGEST;
 use plenoxel::dataset::image as files;
 use plenoxel::error::{Error, Result};
+use plenoxel::run::evenly_spaced;
 use plenoxel::run::folder::RunFolder;
 use std::path::Path;
 

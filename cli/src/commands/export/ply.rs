@@ -10,15 +10,15 @@ use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::export::ply::encode;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::field::voxel_grid::fused::{Seen, seen};
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, VoxelOptions};
 use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
-use plenoxel::field::voxel_grid::fused::{Seen, seen};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunRecord;
 use plenoxel::run::memory::Estimate;
 use plenoxel::sampling::Jitter;
-use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -157,7 +157,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     console.note(&estimate.describe());
     estimate.check()?;
     let views = load(console, &dataset, Split::Train, &source)?;
-    let rays = RaySource::new(&views, config.background, config.seed);
+    let rays = RaySource::new(views, config.background, config.seed);
     let occupancy = grid.matter();
     let options = RenderOptions {
         aabb: grid.aabb(),

@@ -6,11 +6,12 @@ use clap::ValueEnum;
 use ndarray::{Array2, Array3, Axis};
 use plenoxel::camera::Camera;
 use plenoxel::error::Result;
+use plenoxel::evaluate::Viewer;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
-use plenoxel::render::picture::Picture;
-use plenoxel::run::evaluation::Viewer;
 use plenoxel::model::plenoxels::config::{Config, Sampling};
+use plenoxel::model::plenoxels::grid_viewer;
+use plenoxel::render::picture::Picture;
 use std::path::{Path, PathBuf};
 
 /// What a picture shows.
@@ -49,8 +50,8 @@ pub enum FileFormat {
 
 /// What writes the pictures of a run.
 pub struct Pictures<'a> {
-    color: Viewer<'a>,
-    normals: Option<Viewer<'a>>,
+    color: Viewer<'a, f32>,
+    normals: Option<Viewer<'a, f32>>,
     half_width: f64,
     channels: &'a [Channel],
     formats: &'a [FileFormat],
@@ -67,8 +68,8 @@ impl<'a> Pictures<'a> {
         formats: &'a [FileFormat],
     ) -> Self {
         Pictures {
-            color: Viewer::new(grid, sampling, config),
-            normals: normals.map(|normals| Viewer::over_black(normals, sampling, config)),
+            color: grid_viewer(grid, sampling, config.engine, config.background),
+            normals: normals.map(|normals| grid_viewer(normals, sampling, config.engine, [0.0; 3])),
             half_width: grid.shape().half_width,
             channels,
             formats,

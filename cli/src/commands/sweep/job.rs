@@ -6,11 +6,11 @@ use crate::commands::train::NOT_WHEN_RESUMED;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::json;
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::budget;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::settings;
-use plenoxel::model::plenoxels::config::Config;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
@@ -88,7 +88,7 @@ impl Job {
             // A comparison with no test views is one too, and has no PSNR.
             Some(result) if result.get("psnr").is_some() || folder.evaluation().is_some() => State::Finished,
             Some(_) => State::Unevaluated,
-            None if !config.stages.is_empty() && folder.existing_state().is_ok() => State::Interrupted,
+            None if !record.is_carved() && folder.existing_state().is_ok() => State::Interrupted,
             None => State::CutShort,
         }
     }

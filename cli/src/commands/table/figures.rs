@@ -2,8 +2,8 @@
 
 use crate::commands::background_name;
 use plenoxel::error::Result;
-use plenoxel::run::folder::RunFolder;
 use plenoxel::model::plenoxels::config::Config;
+use plenoxel::run::folder::RunFolder;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 

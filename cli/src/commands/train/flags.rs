@@ -5,9 +5,9 @@ use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::error::{Error, Result};
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::settings::{self, Layers, PRESETS};
-use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 use toml::Value;
 

@@ -21,15 +21,20 @@ impl Watch {
     pub fn begin() -> Self {
         static LISTENING: Once = Once::new();
         LISTENING.call_once(listen);
-        *requested() = None;
+        *wished() = None;
         WATCHED.store(true, SeqCst);
         Watch(())
     }
 
     /// True if somebody asked.
     pub fn requested(&self) -> bool {
-        requested().is_some()
+        requested()
     }
+}
+
+/// True if somebody asked since the last watch began.
+pub fn requested() -> bool {
+    wished().is_some()
 }
 
 impl Drop for Watch {
@@ -38,13 +43,13 @@ impl Drop for Watch {
     }
 }
 
-fn requested() -> std::sync::MutexGuard<'static, Option<Instant>> {
+fn wished() -> std::sync::MutexGuard<'static, Option<Instant>> {
     REQUESTED.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Somebody wants the process to stop.
 fn wish() {
-    let first = *requested().get_or_insert_with(Instant::now);
+    let first = *wished().get_or_insert_with(Instant::now);
     if !WATCHED.load(SeqCst) || first.elapsed() > SAME_WISH {
         std::process::exit(EXIT_CODE.into());
     }

@@ -2,24 +2,23 @@
 
 use crate::images::{self, DepthRange, Rgb};
 use plenoxel::camera::Camera;
-use plenoxel::dataset::{Dataset, Split, View, image};
+use plenoxel::dataset::{Split, View, image};
 use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::render::picture::Picture;
-use plenoxel::run::evaluation::Viewer;
+use plenoxel::run::evenly_spaced;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::metrics::History;
+use plenoxel::run::training::Underway;
 use plenoxel::train::PlannedStage;
-use plenoxel::model::plenoxels::config::Config;
 use std::path::PathBuf;
 
 /// Panels of more views than this fill folders and nobody's eye.
 const MOST_PANELS: usize = 25;
 
 /// The pictures of a run.
-pub struct Pictures<'a> {
-    folder: &'a RunFolder,
-    config: &'a Config,
+pub struct Pictures {
+    folder: RunFolder,
+    background: [f32; 3],
     /// Of the first test view, or of the first training view where there is none. Its photograph is not looked at in training.
     camera: Option<Camera>,
     /// Test views that get a panel.
@@ -28,60 +27,54 @@ pub struct Pictures<'a> {
     stages: Vec<Rgb>,
 }
 
-impl<'a> Pictures<'a> {
+impl Pictures {
     /// Pictures for a run, or none at all.
-    pub fn new(folder: &'a RunFolder, config: &'a Config, dataset: &Dataset, wanted: bool) -> Result<Self> {
-        let views = dataset.count(Split::Test);
-        let first = |split| dataset.cameras(split).into_iter().next();
+    pub fn new(run: Underway<'_>, wanted: bool) -> Result<Self> {
+        let views = run.dataset.count(Split::Test);
+        let first = |split| run.dataset.cameras(split).into_iter().next();
         if wanted {
-            folder.create_images()?;
+            run.folder.create_images()?;
         }
         Ok(Pictures {
-            folder,
-            config,
+            folder: run.folder.clone(),
+            background: run.config.background,
             camera: first(Split::Test).or(first(Split::Train)).filter(|_| wanted),
-            panels: match wanted {
-                true => images::evenly_spaced(views, MOST_PANELS),
-                false => Vec::new(),
-            },
+            panels: if wanted { evenly_spaced(views, MOST_PANELS) } else { Vec::new() },
             views,
             stages: Vec::new(),
         })
     }
 
-    /// From where pictures of the stages are taken, if there are any.
-    pub fn camera(&self) -> Option<Camera> {
-        self.camera
+    /// The same with the pictures of stages that had ended when the run was interrupted, if they were wanted then too; one that cannot be read is
+    /// left out.
+    pub fn after(mut self, past: &History, plan: &[PlannedStage]) -> Self {
+        for stage in past.stages.iter().filter_map(|&(index, _)| plan.get(index)) {
+            if self.camera.is_some()
+                && let Ok(picture) = image::read(&self.stage_path(stage))
+            {
+                self.stages.push(image::composite(&picture, self.background));
+            }
+        }
+        self
     }
 
-    /// A stage has ended with this grid.
-    pub fn stage(&mut self, stage: usize, grid: &VoxelGrid<f32>) -> Result<()> {
+    /// A stage has ended with a model that `see` renders.
+    pub fn stage(&mut self, stage: &PlannedStage, see: &dyn Fn(&Camera) -> Picture) -> Result<()> {
         let Some(camera) = &self.camera else {
             return Ok(());
         };
-        let viewer = Viewer::new(grid, self.config.evaluation, self.config);
-        let picture = viewer.see(camera).rgb;
-        images::write(&self.stage_path(stage, grid.shape().resolution), &picture)?;
+        let picture = see(camera).rgb;
+        images::write(&self.stage_path(stage), &picture)?;
         self.stages.push(picture);
         Ok(())
     }
 
-    /// Stages had ended when the run was interrupted: their pictures are there, if they were wanted then too; one that cannot be read is left out.
-    pub fn earlier_stages(&mut self, past: &History, plan: &[PlannedStage]) {
-        for (index, planned) in past.stages.iter().filter_map(|&(index, _)| Some((index, plan.get(index)?))) {
-            if self.camera.is_some()
-                && let Ok(picture) = image::read(&self.stage_path(index, planned.stage.resolution))
-            {
-                self.stages.push(image::composite(&picture, self.config.background));
-            }
-        }
+    fn stage_path(&self, stage: &PlannedStage) -> PathBuf {
+        let resolution = stage.resolution.map_or(String::new(), |n| format!("_{n}"));
+        self.folder.image(&format!("stage_{}{resolution}.png", stage.index + 1))
     }
 
-    fn stage_path(&self, stage: usize, resolution: usize) -> PathBuf {
-        self.folder.image(&format!("stage_{}_{resolution}.png", stage + 1))
-    }
-
-    /// A test view was rendered with the final grid, which fills a cube of a half width.
+    /// A test view was rendered with the final model, whose box has a half width.
     pub fn panel(&self, number: usize, view: &View, target: &Rgb, picture: &Picture, half_width: f64) -> Result<()> {
         if !self.panels.contains(&number) {
             return Ok(());
@@ -100,7 +93,7 @@ impl<'a> Pictures<'a> {
         images::write(&self.folder.image("stages.png"), &images::strip(&all))
     }
 
-    /// What is to be said about views without a picture.
+    /// A note about views without a picture.
     pub fn note(&self) -> Option<String> {
         let shown = self.panels.len();
         (shown > 0 && shown < self.views)

@@ -475,12 +475,7 @@ impl Config {
             }
         }
         for (name, weight) in &self.losses {
-            check(
-                LOSSES.contains(&name.as_str()),
-                &format!("losses.{name}"),
-                "an unknown loss",
-                &format!("one of {}", LOSSES.join(", ")),
-            )?;
+            check(LOSSES.contains(&name.as_str()), &format!("losses.{name}"), "an unknown loss", &format!("one of {}", LOSSES.join(", ")))?;
             let key = |part: &str| format!("losses.{name}{part}");
             let fits = |part: &str, weight: f64| check((0.0..=1e12).contains(&weight), &key(part), weight, "0 to 1e12");
             let changes = |part: &str, weight: f64| check((1e-30..=1e12).contains(&weight), &key(part), weight, "1e-30 to 1e12");
@@ -498,7 +493,8 @@ impl Config {
         for (name, rate) in &self.loss_rates {
             let key = format!("loss_rates.{name}");
             let learned: Vec<&str> = LEARNED_LOSSES.into_iter().filter(|loss| self.losses.contains_key(*loss)).collect();
-            let accepted = if learned.is_empty() { "a rate for one of the losses robust and exposure".to_owned() } else { learned.join(", ") };
+            let accepted =
+                if learned.is_empty() { "a rate for one of the losses robust and exposure".to_owned() } else { learned.join(", ") };
             check(learned.contains(&name.as_str()), &key, "a rate for a loss that has no parameters here", &accepted)?;
             check((1e-12..=1e6).contains(rate), &key, rate, "1e-12 to 1e6")?;
         }

@@ -62,7 +62,8 @@ pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage:
     }
     let scout = config.scout.iter().filter(|_| facts.scouts > 0).flat_map(|scout| &scout.stages);
     let stages: Vec<_> = scout.chain(&config.stages).copied().collect();
-    let left_out = stages.len().checked_sub(facts.stages).filter(|left_out| *left_out < stages.len() && (facts.scouts == 0 || *left_out == 0));
+    let left_out =
+        stages.len().checked_sub(facts.stages).filter(|left_out| *left_out < stages.len() && (facts.scouts == 0 || *left_out == 0));
     let stages = stages[left_out.ok_or_else(|| file.damaged("a plan of impossible stages"))?..].to_vec();
     let current = stages.get(stage).ok_or_else(|| file.damaged("a stage that the plan does not have"))?;
     let shape = facts.grid.shape();

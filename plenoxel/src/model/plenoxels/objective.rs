@@ -1,7 +1,7 @@
 //! Losses of a voxel grid by their names, and the objective that a config describes.
 
-use super::config::{Config, Weight};
 use super::Objective;
+use super::config::{Config, Weight};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::loss::{self, Cells, EXPOSURE, tv_color, tv_density};

@@ -1,8 +1,8 @@
 use super::*;
 use crate::camera::Ray;
 use crate::field::voxel_grid::Color;
-use crate::field::voxel_grid::{GridShape, Interpolation};
 use crate::field::voxel_grid::fused::{largest_weights, seen};
+use crate::field::voxel_grid::{GridShape, Interpolation};
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
 use autograd::Tensor;

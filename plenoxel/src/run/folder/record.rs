@@ -1,13 +1,40 @@
 //! `run.json`: the facts of a run that its settings do not hold.
 
+use crate::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::run::data::DataSource;
+use crate::run::{PROGRAM, machine};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+
+/// How the grid of a run was made.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RunKind {
+    /// By training.
+    #[default]
+    Trained,
+    /// By carving, without training.
+    Carved,
+}
+
+impl RunKind {
+    /// The command that makes such a run.
+    pub fn command(self) -> &'static str {
+        match self {
+            RunKind::Trained => "train",
+            RunKind::Carved => "carve",
+        }
+    }
+}
 
 /// The facts of a run that its settings do not hold: program, machine, data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
+    /// How its grid was made. Runs of earlier versions do not say; [`RunFolder::open`](super::RunFolder::open) knows the carved ones by their settings,
+    /// which have no stages.
+    #[serde(default)]
+    pub kind: RunKind,
     /// Program and version that made the run.
     pub program: String,
     /// Vector instructions it used: results repeat to the bit on the same ones.
@@ -28,6 +55,26 @@ pub struct RunRecord {
 }
 
 impl RunRecord {
+    /// The record of a run that begins now, on this machine.
+    pub fn new(kind: RunKind, dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> Self {
+        RunRecord {
+            kind,
+            program: PROGRAM.to_owned(),
+            instruction_set: machine::instruction_set().to_owned(),
+            threads: machine::threads(),
+            scene: dataset.name().to_owned(),
+            format: dataset.format().to_owned(),
+            preset: preset.map(str::to_owned),
+            data: source.clone(),
+            seconds_planned: None,
+        }
+    }
+
+    /// True if the grid of the run was carved.
+    pub fn is_carved(&self) -> bool {
+        self.kind == RunKind::Carved
+    }
+
     /// Reads the bytes of a file; `path` names it in messages.
     ///
     /// Errors: they are not JSON with the keys of a record.

@@ -1,17 +1,15 @@
-//! A look at the grid while it is trained: a picture that is replaced again and again, and the PSNR of a few validation views.
+//! A look at the model while it is trained: a small picture, and the PSNR of a few validation views.
 //!
-//! It informs and changes nothing: no bit of what is trained depends on it, and test views are not looked at.
+//! No bit of what is trained depends on it, and test views are not looked at.
 
-use crate::images;
-use plenoxel::camera::{Camera, Intrinsics};
-use plenoxel::dataset::image::RgbaImage;
-use plenoxel::dataset::{Dataset, Split, View};
-use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::metrics::psnr;
-use plenoxel::run::evaluation::Viewer;
-use plenoxel::model::plenoxels::config::Config;
-use std::path::PathBuf;
+use crate::camera::{Camera, Intrinsics};
+use crate::dataset::image::RgbaImage;
+use crate::dataset::{Dataset, Split, View};
+use crate::error::Result;
+use crate::evaluate::Viewer;
+use crate::metrics::psnr;
+use crate::run::evenly_spaced;
+use ndarray::Array3;
 use std::time::Instant;
 
 /// So many validation views, evenly spaced.
@@ -31,23 +29,23 @@ pub struct Preview {
     pace: Pace,
     /// The first of the views, larger.
     shown: Option<View>,
-    /// Where the picture goes, if one is wanted, and who looks where there are no validation views.
-    picture: Option<(PathBuf, Camera)>,
+    /// Who looks where there are no validation views, if a picture is wanted.
+    camera: Option<Camera>,
 }
 
 /// What was seen.
 pub struct Look {
     /// Mean PSNR of the validation views, if there are any.
     pub psnr: Option<f64>,
-    /// The picture that was written, if one was wanted, and its width and height; or why it could not be.
-    pub picture: Option<Result<(PathBuf, (usize, usize))>>,
+    /// A picture, if one was wanted, and the photograph of the same view, if there is one.
+    pub picture: Option<(Array3<f32>, Option<Array3<f32>>)>,
 }
 
 impl Preview {
     /// Previews every so many seconds at most, never for infinitely many; reads the few views that are needed.
     pub fn new(dataset: &Dataset, every: f64) -> Result<Self> {
         let chosen = match every.is_finite() {
-            true => images::evenly_spaced(dataset.count(Split::Val), VIEWS),
+            true => evenly_spaced(dataset.count(Split::Val), VIEWS),
             false => Vec::new(),
         };
         let (mut views, mut shown) = (Vec::new(), None);
@@ -57,39 +55,42 @@ impl Preview {
             views.push(reduced(&view, SIDE));
             shown = shown.or_else(|| Some(reduced(&view, PICTURE_SIDE)));
         }
-        Ok(Preview { views, pace: Pace::new(every), shown, picture: None })
+        Ok(Preview { views, pace: Pace::new(every), shown, camera: None })
     }
 
-    /// The same for training that begins now; with a picture, if one is wanted, of what a camera sees if there are no validation views.
-    pub fn begin(self, picture: Option<(PathBuf, Camera)>) -> Self {
-        let picture = picture.map(|(path, camera)| {
+    /// The same for training that begins now; with a picture if there is a camera, which looks where there are no validation views.
+    pub fn begin(self, camera: Option<Camera>) -> Self {
+        let camera = camera.map(|camera| {
             let Intrinsics { width, height, .. } = camera.intrinsics;
             let intrinsics = camera.intrinsics.downscaled(width.max(height).div_ceil(PICTURE_SIDE).min(width).min(height));
-            (path, Camera { intrinsics, ..camera })
+            Camera { intrinsics, ..camera }
         });
-        Preview { pace: Pace::new(self.pace.every), picture, ..self }
+        Preview { pace: Pace::new(self.pace.every), camera, ..self }
     }
 
-    /// Looks at the grid, if it is time to: when a stage ends and when a step is saved whenever there is time for it.
-    pub fn look(&mut self, grid: &VoxelGrid<f32>, ends_stage: bool, saves: bool, config: &Config) -> Option<Look> {
-        let nothing = self.views.is_empty() && self.picture.is_none();
+    /// Looks at the model, if it is time to: when a stage ends and when a step is saved whenever there is time for it.
+    pub fn look<'a>(
+        &mut self,
+        viewer: impl FnOnce() -> Viewer<'a, f32>,
+        ends_stage: bool,
+        saves: bool,
+        background: [f32; 3],
+    ) -> Option<Look> {
+        let nothing = self.views.is_empty() && self.camera.is_none();
         if nothing || !self.pace.due(self.pace.now(), ends_stage, saves) {
             return None;
         }
         let start = self.pace.now();
-        let viewer = Viewer::new(grid, config.evaluation, config);
+        let viewer = viewer();
         let psnr = self.views.iter().map(|view| {
-            let (picture, target) = (viewer.see(&view.camera).rgb, view.composite(config.background));
+            let (picture, target) = (viewer.see(&view.camera).rgb, view.composite(background));
             psnr(picture.view(), target.view())
         });
         let sum: f64 = psnr.sum();
         let psnr = (!self.views.is_empty()).then(|| sum / self.views.len() as f64);
-        let picture = self.picture.as_ref().map(|(path, camera)| {
-            let picture = match &self.shown {
-                Some(view) => images::strip(&[&view.composite(config.background), &viewer.see(&view.camera).rgb]),
-                None => viewer.see(camera).rgb,
-            };
-            images::write(path, &picture).map(|()| (path.clone(), (picture.dim().1, picture.dim().0)))
+        let picture = self.camera.as_ref().map(|camera| match &self.shown {
+            Some(view) => (viewer.see(&view.camera).rgb, Some(view.composite(background))),
+            None => (viewer.see(camera).rgb, None),
         });
         self.pace.took(start, self.pace.now());
         Some(Look { psnr, picture })
@@ -143,7 +144,7 @@ impl Pace {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use plenoxel::dataset::procedural::ProceduralOptions;
+    use crate::dataset::procedural::ProceduralOptions;
 
     #[test]
     fn looking_takes_a_small_share_of_the_time() {

@@ -1,0 +1,129 @@
+//! What is shown of a run while it trains: lines and bars, the curve of the loss, pictures, and the page at the end.
+
+use super::interrupt::Watch;
+use super::pictures::Pictures;
+use super::say;
+use crate::commands::new_run::{announce, loading};
+use crate::curves::loss_svg;
+use crate::images;
+use crate::progress::{Console, Count, Training};
+use crate::report::Report;
+use plenoxel::error::Result;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::training::{Event, Finished};
+use plenoxel::train::PlannedStage;
+
+/// The listener to the events of a run.
+pub struct Screen<'c, 'a> {
+    console: &'c Console<'a>,
+    draws: bool,
+    reports: bool,
+    count: Option<Count<'c, 'a>>,
+    /// While the run trains.
+    interrupt: Option<Watch>,
+    progress: Option<Training<'c, 'a>>,
+    pictures: Option<Pictures>,
+    folder: Option<RunFolder>,
+    plan: Vec<PlannedStage>,
+    /// The first failure to print or to write the page.
+    failure: Result<()>,
+}
+
+impl<'c, 'a> Screen<'c, 'a> {
+    /// A screen that draws pictures and writes a page, or does not.
+    pub fn new(console: &'c Console<'a>, draws: bool, reports: bool) -> Self {
+        Screen {
+            console,
+            draws,
+            reports,
+            count: None,
+            interrupt: None,
+            progress: None,
+            pictures: None,
+            folder: None,
+            plan: Vec::new(),
+            failure: Ok(()),
+        }
+    }
+
+    /// Shows an event. Pictures that cannot be written are no reason to lose what was learned: it is said, and the run goes on.
+    pub fn show(&mut self, event: Event<'_>) {
+        let console = self.console;
+        match event {
+            Event::Note(text) => console.note(&text),
+            Event::Opened { dataset, config } => announce(console, dataset, config),
+            Event::Loading { split, source, done, total } => {
+                self.count.get_or_insert_with(|| console.count(&loading(split, source), total)).at(done, total);
+                if done == total {
+                    self.count = None;
+                }
+            }
+            Event::Started { run, plan, prunes_from, history } => {
+                self.plan = plan.to_vec();
+                let pictures = console.drawn(Pictures::new(run, self.draws));
+                self.pictures = pictures.map(|pictures| pictures.after(history, plan));
+                self.progress = Some(console.training(plan, prunes_from, history.seconds));
+                self.folder = Some(run.folder.clone());
+                self.interrupt = Some(Watch::begin());
+            }
+            Event::Step { report, observation } => {
+                if let Some(progress) = &mut self.progress {
+                    progress.step(report, observation);
+                }
+            }
+            Event::StageEnded { stage, losses, see } => {
+                console.drawn(self.draw_loss(losses));
+                if let Some(pictures) = &mut self.pictures {
+                    console.drawn(pictures.stage(&stage, see));
+                }
+            }
+            Event::Preview { step, ends_stage, picture, target, metrics } => {
+                let Some(folder) = &self.folder else { return };
+                let path = folder.image("preview.png");
+                let picture = target.map_or_else(|| picture.clone(), |target| images::strip(&[target, picture]));
+                let written = console.drawn(images::write(&path, &picture));
+                if ends_stage && written.is_some() {
+                    let (height, width, _) = picture.dim();
+                    console.drawn(metrics.picture(step, (width, height), &path));
+                }
+            }
+            Event::Saved { .. } => {}
+            Event::Failed { losses } => drop(console.drawn(self.draw_loss(losses))),
+            Event::Trained => (self.progress, self.interrupt) = (None, None),
+            Event::Evaluating { done, total } => {
+                self.count.get_or_insert_with(|| console.count("evaluating", total)).at(done, total);
+            }
+            Event::Compared { number, view, target, picture, half_width } => {
+                if let Some(pictures) = &self.pictures {
+                    console.drawn(pictures.panel(number, view, target, picture, half_width));
+                }
+            }
+            Event::Evaluated { summary, run } => {
+                self.count = None;
+                let pictures = self.pictures.as_ref();
+                pictures.map(|pictures| console.drawn(pictures.strip(run.test.first(), run.config.background)));
+                let note = pictures.and_then(Pictures::note);
+                let said = say(console, summary, note.as_deref());
+                let reported = said.and_then(|()| if self.reports { self.report(run) } else { Ok(()) });
+                self.failure = std::mem::replace(&mut self.failure, Ok(())).and(reported);
+            }
+        }
+    }
+
+    /// Ends the screen. Errors: the result could not be printed, or the page not be written.
+    pub fn finish(self) -> Result<()> {
+        self.failure
+    }
+
+    fn report(&self, run: Finished<'_>) -> Result<()> {
+        let Finished { folder, config, record, dataset, grid, .. } = run;
+        self.console.note(&Report { folder, config, record, dataset, grid }.write()?);
+        Ok(())
+    }
+
+    fn draw_loss(&self, losses: &[f64]) -> Result<()> {
+        let Some(folder) = &self.folder else { return Ok(()) };
+        let title = format!("Training loss of {}", folder.path().file_name().unwrap_or_default().display());
+        folder.write_loss(&loss_svg(losses, &self.plan, &title))
+    }
+}

@@ -1,0 +1,408 @@
+//! A training run from its settings to its figures: what `plenoxel train` does, without a screen. It speaks in [`Event`]s.
+//!
+//! ```no_run
+//! use plenoxel::model::plenoxels::config::Config;
+//! use plenoxel::run::data::DataSource;
+//! use plenoxel::run::training::{Event, RunSettings, train};
+//!
+//! let settings = RunSettings::new(Config::preset("fast")?, DataSource::folder("data/lego".as_ref()));
+//! train(&settings, &mut |event| {
+//!     if let Event::Step { report, .. } = event {
+//!         println!("step {}: {:.2} dB", report.step, report.psnr);
+//!     }
+//! })?;
+//! # Ok::<(), plenoxel::error::Error>(())
+//! ```
+
+mod best;
+mod event;
+mod learning;
+mod preview;
+mod summary;
+
+pub use event::{Event, Finished, Underway};
+pub use learning::StageSummary;
+pub use summary::Summary;
+
+use super::budget;
+use super::data::DataSource;
+use super::folder::{RunFolder, RunKind, RunRecord};
+use super::machine;
+use super::memory::{self, Estimate};
+use super::metrics::{History, MetricsFile};
+use crate::dataset::{Dataset, Split, View};
+use crate::error::{Error, Result};
+use crate::evaluate::{self, Scores};
+use crate::model::plenoxels::config::Config;
+use crate::model::plenoxels::{Objective, Trainer, grid_viewer, objective};
+use crate::run::figures::Figures;
+use crate::train::PlannedStage;
+use event::clock;
+use learning::Learned;
+use preview::Preview;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Settings of a new run.
+pub struct RunSettings {
+    /// The recipe.
+    pub config: Config,
+    /// Preset under the config, for the record.
+    pub preset: Option<String>,
+    /// Source of the views.
+    pub data: DataSource,
+    /// Folder to write; `None` for `runs/<scene>-<n>` with the first free n.
+    pub out: Option<PathBuf>,
+    /// Overwrite the run in the folder.
+    pub force: bool,
+    /// Seconds that training is planned to take on this machine; `None` for the steps of the config.
+    pub time: Option<f64>,
+    /// Settings that do not change what is trained.
+    pub options: RunOptions,
+}
+
+/// Settings of a run that do not change what is trained: a resumed run may have others.
+pub struct RunOptions {
+    /// Seconds between two saves of the state from which a run resumes.
+    pub checkpoint_every: f64,
+    /// Seconds between two previews; infinite for none. They take less than a twentieth of the time.
+    pub preview_every: f64,
+    /// True if somebody draws the pictures of [`Event::Preview`]; else validation views alone are looked at.
+    pub pictures: bool,
+    /// Keep the grid of each stage and compare it with the test views at the end.
+    pub stage_psnr: bool,
+    /// Count the memory that the page about the run takes.
+    pub report: bool,
+    /// Asked after each step: true saves the run and ends it.
+    pub stop: Box<dyn Fn() -> bool + Send + Sync>,
+}
+
+impl Default for RunOptions {
+    fn default() -> Self {
+        RunOptions {
+            checkpoint_every: 300.0,
+            preview_every: 10.0,
+            pictures: false,
+            stage_psnr: false,
+            report: false,
+            stop: Box::new(|| false),
+        }
+    }
+}
+
+impl RunSettings {
+    /// A run with a recipe on some views, and the default for everything else.
+    pub fn new(config: Config, data: DataSource) -> Self {
+        RunSettings { config, preset: None, data, out: None, force: false, time: None, options: RunOptions::default() }
+    }
+}
+
+/// End of a run.
+#[derive(Debug)]
+pub enum Outcome {
+    /// The run has its final figures.
+    Done(Box<Summary>),
+    /// The run was stopped and saved: it resumes from its folder.
+    Stopped {
+        /// Steps taken.
+        steps: u64,
+        /// Steps of the whole run.
+        total: u64,
+        /// Its folder.
+        folder: RunFolder,
+    },
+}
+
+/// A listener to events; those of loading come from several threads.
+pub type Listener<'l> = dyn FnMut(Event<'_>) + Send + 'l;
+
+/// Trains with the losses that the config names.
+///
+/// Errors: settings that cannot be used, data that cannot be read, numbers that are not finite, files that cannot be written.
+pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
+    train_with(settings, objective, on)
+}
+
+/// Trains with an objective of your own, which `objective` makes of the config and the number of training views. The losses of the config are used
+/// only if `objective` adds them, as [`plenoxels::objective`](objective()) does.
+///
+/// Errors as for [`train`], and those of `objective`.
+pub fn train_with(
+    settings: &RunSettings,
+    objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
+    on: &mut Listener<'_>,
+) -> Result<Outcome> {
+    let RunSettings { data: source, options, .. } = settings;
+    let mut config = settings.config.clone();
+    config.validate()?;
+    config.check_stages()?;
+    if let (Some(from), Some(to)) = (&config.init_from, &settings.out)
+        && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
+    {
+        return Err(Error::config("--init-from", format!("{}, which is --out too,", from.display()), "another folder to write"));
+    }
+    let mut clocks = Clocks::default();
+    let dataset = clocks.load.time(|| source.open(&config))?;
+    on(Event::Opened { dataset: &dataset, config: &config });
+    let from = config.init_from.as_deref().map(RunFolder::open).transpose()?;
+    let carved = from.as_ref().is_some_and(|(_, _, record)| record.is_carved());
+    let initial = from.map(|(folder, ..)| folder);
+    let known = initial.as_ref().map(RunFolder::header).transpose()?;
+    if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != dataset.name()) {
+        on(Event::note(format!("the grid it starts from is of another scene: {}, not {}", header.scene, dataset.name())));
+    }
+    let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
+    let most_rows = room(&config, &dataset, bytes as u64, options, on)?;
+    let initial = initial.map(|folder| folder.load()).transpose()?.map(|(grid, _)| grid);
+    let folder = RunFolder::choose(settings.out.as_deref(), dataset.name(), settings.force)?;
+    let preview = clocks.load.time(|| Preview::new(&dataset, options.preview_every))?;
+    let views: Arc<[View]> = clocks.load.time(|| load(&dataset, Split::Train, source, on))?.into();
+
+    if let Some(seconds) = settings.time {
+        on(Event::note("finding out how fast this machine is"));
+        config = clocks.train.time(|| budget::on_time(config, &views, seconds))?;
+        let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
+        on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
+    }
+    let objective = objective(&config, views.len())?;
+    // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
+    folder.prepare()?;
+    let record =
+        RunRecord { seconds_planned: settings.time, ..RunRecord::new(RunKind::Trained, &dataset, settings.preset.as_deref(), source) };
+    folder.describe(&config, &record)?;
+    on(Event::note(format!("run: {}", folder.path().display())));
+    let start = || {
+        let trainer = Trainer::with_losses(config.clone(), views.clone(), objective)?.with_most_rows(most_rows);
+        Ok(initial.iter().fold(trainer, if carved { Trainer::starting_from_carved } else { Trainer::starting_from }))
+    };
+    let trainer = clocks.train.time(start)?;
+    drop(initial);
+    let half_width = trainer.grid().shape().half_width;
+    if half_width != config.half_width {
+        let chosen = if config.init_from.is_some() { "of the grid it starts from" } else { "around the silhouettes" };
+        on(Event::note(format!("box: half width {half_width:.4}, {chosen}")));
+    }
+    if let scouts @ 1.. = trainer.model().scout_stages() {
+        on(Event::note(format!("scout: {scouts} short stages first find out where matter is, as no silhouettes say so")));
+    }
+    let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
+    let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
+    let learned = job.learn(trainer, (metrics, History::default()), preview, &views, &mut clocks, on)?;
+    drop(views);
+    job.conclude(learned, clocks, on)
+}
+
+/// Resumes a stopped run from where it was last saved, with the losses that its config names; `data` is the source of the views now, if it is
+/// not where it was.
+///
+/// Errors as for [`train`], and if the run has ended or left nothing to resume from.
+pub fn resume(path: &Path, data: Option<DataSource>, options: &RunOptions, on: &mut Listener<'_>) -> Result<Outcome> {
+    resume_with(path, data, options, objective, on)
+}
+
+/// Resumes a run that [`train_with`] began, with the same objective.
+///
+/// Errors as for [`resume`].
+pub fn resume_with(
+    path: &Path,
+    data: Option<DataSource>,
+    options: &RunOptions,
+    objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
+    on: &mut Listener<'_>,
+) -> Result<Outcome> {
+    let (folder, config, mut record) = RunFolder::open(path)?;
+    if record.is_carved() {
+        return Err(Error::input(path, "this run was carved", "to train its grid further, use `--init-from`"));
+    }
+    let state = folder.existing_state()?;
+    let mut clocks = Clocks::default();
+    record.data = data.unwrap_or(record.data);
+    let dataset = clocks.load.time(|| record.data.open(&config))?;
+    if machine::instruction_set() != record.instruction_set {
+        on(Event::note(format!("it began with {}: other bits, the same picture", record.instruction_set)));
+    }
+    on(Event::Opened { dataset: &dataset, config: &config });
+    let most_rows = room(&config, &dataset, 0, options, on)?;
+    let preview = clocks.load.time(|| Preview::new(&dataset, options.preview_every))?;
+    let views: Arc<[View]> = clocks.load.time(|| load(&dataset, Split::Train, &record.data, on))?.into();
+    let objective = objective(&config, views.len())?;
+    let trainer = Trainer::with_losses(config.clone(), views.clone(), objective)?.with_most_rows(most_rows);
+    let trainer = match &state {
+        Some(state) => trainer.resumed(state)?,
+        None => trainer,
+    };
+    folder.remove_fragments()?;
+    let (plan, taken) = match state {
+        Some(_) => (trainer.plan(), trainer.steps_taken()),
+        None => {
+            let steps = folder.header()?.0.step;
+            (ends_after(trainer.plan(), steps), steps)
+        }
+    };
+    let total = plan.iter().map(|stage| stage.steps).sum();
+    let (metrics, past) = MetricsFile::resume(&folder, total, taken)?;
+    clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
+    let text = format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds));
+    on(Event::note(text));
+    let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
+    let learned = match state {
+        Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks, on)?,
+        None => Ok(job.learned(plan, (metrics, past), &views, on)?),
+    };
+    drop(views);
+    job.conclude(learned, clocks, on)
+}
+
+/// The last stages, which so many steps were taken in: a run that begins with a grid leaves coarser ones out.
+fn ends_after(plan: &[PlannedStage], steps: u64) -> &[PlannedStage] {
+    let taken = |from: &usize| plan[*from..].iter().map(|stage| stage.steps).sum::<u64>() == steps;
+    &plan[(0..plan.len()).find(taken).unwrap_or(0)..]
+}
+
+/// Reads or renders a split.
+fn load(dataset: &Dataset, split: Split, source: &DataSource, on: &mut Listener<'_>) -> Result<Vec<View>> {
+    let on = Mutex::new(on);
+    dataset.load(split, &|done, total| {
+        let mut on = on.lock().unwrap_or_else(PoisonError::into_inner);
+        (*on)(Event::Loading { split, source, done, total });
+    })
+}
+
+/// Says which stages the images are large enough for, and how much memory a run will take. Returns how many rows of tables there is room for.
+fn room(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions, on: &mut Listener<'_>) -> Result<usize> {
+    let fitted = config.fitted_to(&dataset.cameras(Split::Train));
+    if fitted.stages != config.stages {
+        let stages: Vec<String> = fitted.stages.iter().map(|stage| format!("{}³", stage.resolution)).collect();
+        on(Event::note(format!("stages as the size of the images allows (pixels_per_voxel): {}", stages.join(", "))));
+    }
+    let estimate = Estimate::of_training(&fitted, dataset, initial, options.report);
+    on(Event::note(estimate.describe()));
+    estimate.check()?;
+    Ok(estimate.most_rows(config).unwrap_or(usize::MAX))
+}
+
+/// A run that is under way, however it began.
+struct Job<'a> {
+    folder: &'a RunFolder,
+    config: &'a Config,
+    dataset: &'a Dataset,
+    record: &'a RunRecord,
+    options: &'a RunOptions,
+}
+
+/// A run that was stopped: steps taken, and steps of the whole run.
+struct Stopped(u64, u64);
+
+impl Job<'_> {
+    /// Compares what was learned with the test views, and writes the figures.
+    fn conclude(&self, learned: std::result::Result<Learned, Stopped>, mut clocks: Clocks, on: &mut Listener<'_>) -> Result<Outcome> {
+        let Job { folder, config, dataset, .. } = *self;
+        let mut learned = match learned {
+            Ok(learned) => learned,
+            Err(Stopped(steps, total)) => return Ok(Outcome::Stopped { steps, total, folder: folder.clone() }),
+        };
+        let test = clocks.load.time(|| load(dataset, Split::Test, &self.record.data, on))?;
+        let scores = compare(&mut learned, &test, config, &mut clocks, on)?;
+        let (rays, samples) = learned.metrics.counts();
+        let (validation_psnr, best_validation) = learned.metrics.validation();
+        let means = [("psnr/test", scores.psnr()), ("ssim/test", scores.ssim())];
+        let background_psnr = evaluate::background_psnr(&test, config.background);
+        let mean_image_psnr = learned.mean_image.and_then(|image| evaluate::constant_psnr(&test, &image, config.background));
+        let summary = Summary {
+            figures: Figures::new(&scores, Split::Test, dataset, config, config.evaluation, &learned.grid),
+            baseline_background_psnr: background_psnr,
+            baseline_mean_image_psnr: mean_image_psnr,
+            seconds: clocks.train.seconds(),
+            seconds_planned: self.record.seconds_planned,
+            seconds_load: clocks.load.seconds(),
+            seconds_evaluate: clocks.evaluate.seconds(),
+            peak_memory_bytes: memory::peak(),
+            steps: learned.steps,
+            rays,
+            samples,
+            scene: dataset.name().to_owned(),
+            preset: self.record.preset.clone(),
+            run: folder.path().display().to_string(),
+            validation_psnr,
+            best_validation,
+            stages: learned.stages,
+            per_view: scores.per_view,
+        };
+        folder.write_result(&summary)?;
+        learned.metrics.conclude(&Final { result: &summary }, &means)?;
+        let about = event::Finished { folder, config, record: self.record, dataset, grid: &learned.grid, test: &test };
+        on(Event::Evaluated { summary: &summary, run: about });
+        Ok(Outcome::Done(Box::new(summary)))
+    }
+}
+
+/// Figures of the final grid, and of the grids of earlier stages that were kept.
+fn compare(learned: &mut Learned, test: &[View], config: &Config, clocks: &mut Clocks, on: &mut Listener<'_>) -> Result<Scores> {
+    let kept = learned.stages.iter().filter(|stage| stage.grid.is_some()).count();
+    let total = (kept + 1) * test.len();
+    let mut done = 0;
+    let start = Instant::now();
+    let mut listening = Stopwatch::default();
+    for stage in &mut learned.stages {
+        if let Some(grid) = stage.grid.take() {
+            let viewer = grid_viewer(&grid, config.evaluation, config.engine, config.background);
+            let scores = viewer.compare(test, |_, _, _, _| {
+                done += 1;
+                listening.time(|| on(Event::Evaluating { done, total }));
+                Ok(())
+            })?;
+            stage.psnr = scores.psnr();
+        }
+    }
+    let viewer = grid_viewer(&learned.grid, config.evaluation, config.engine, config.background);
+    let half_width = learned.grid.shape().half_width;
+    let scores = viewer.compare(test, |number, view, target, picture| {
+        done += 1;
+        listening.time(|| {
+            on(Event::Evaluating { done, total });
+            on(Event::Compared { number, view, target, picture, half_width });
+        });
+        Ok(())
+    })?;
+    clocks.evaluate.0 += start.elapsed().saturating_sub(listening.0);
+    if let Some(last) = learned.stages.last_mut() {
+        last.psnr = scores.psnr();
+    }
+    Ok(scores)
+}
+
+/// The last line of the metrics.
+#[derive(Serialize)]
+struct Final<'a> {
+    #[serde(rename = "final")]
+    result: &'a Summary,
+}
+
+/// Time by what it was spent on; listeners are on none of the clocks.
+#[derive(Debug, Default)]
+struct Clocks {
+    load: Stopwatch,
+    train: Stopwatch,
+    evaluate: Stopwatch,
+}
+
+/// Adds up the time of some things.
+#[derive(Debug, Default)]
+pub struct Stopwatch(pub Duration);
+
+impl Stopwatch {
+    /// Runs `f` on the clock.
+    pub fn time<R>(&mut self, f: impl FnOnce() -> R) -> R {
+        let start = Instant::now();
+        let result = f();
+        self.0 += start.elapsed();
+        result
+    }
+
+    /// Seconds so far.
+    pub fn seconds(&self) -> f64 {
+        self.0.as_secs_f64()
+    }
+}

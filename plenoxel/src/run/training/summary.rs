@@ -1,0 +1,49 @@
+//! Final figures of a training run.
+
+use super::StageSummary;
+use crate::evaluate::ViewScore;
+use crate::run::figures::Figures;
+use crate::run::metrics::Best;
+use serde::Serialize;
+
+/// Final figures, in the order in which people look for them: `result.json` of the run folder.
+#[derive(Debug, Serialize)]
+pub struct Summary {
+    /// Mean scores over the test views, with their definitions.
+    #[serde(flatten)]
+    pub figures: Figures,
+    /// Mean PSNR of the plain background.
+    pub baseline_background_psnr: Option<f64>,
+    /// Mean PSNR of the mean training image.
+    pub baseline_mean_image_psnr: Option<f64>,
+    /// Seconds of training.
+    pub seconds: f64,
+    /// Seconds that training was planned to take.
+    pub seconds_planned: Option<f64>,
+    /// Seconds of reading images.
+    pub seconds_load: f64,
+    /// Seconds of rendering and comparing test views.
+    pub seconds_evaluate: f64,
+    /// Largest amount of memory that the process had at once.
+    pub peak_memory_bytes: Option<u64>,
+    /// Steps taken.
+    pub steps: u64,
+    /// Training rays.
+    pub rays: u64,
+    /// Samples on them.
+    pub samples: u64,
+    /// Name of the scene.
+    pub scene: String,
+    /// Preset under the settings.
+    pub preset: Option<String>,
+    /// Folder of the run.
+    pub run: String,
+    /// Mean PSNR of reduced validation views, when they were last looked at.
+    pub validation_psnr: Option<f64>,
+    /// The step after which it was best.
+    pub best_validation: Option<Best>,
+    /// Each stage.
+    pub stages: Vec<StageSummary>,
+    /// Scores of each test view.
+    pub per_view: Vec<ViewScore>,
+}
