@@ -1,7 +1,9 @@
-//! What a check has to say when it fails. Misuse of shapes is no error value: it panics at the caller's line, naming op and shapes.
+//! What a check and a file have to say when they fail. Misuse of shapes is no error value: it panics at the caller's line, naming op and shapes.
 
 use crate::gradcheck::Closeness;
 use std::fmt;
+use std::io;
+use std::path::PathBuf;
 
 /// A gradient that is not the derivative of its function.
 #[derive(Debug, Clone, PartialEq)]
@@ -77,3 +79,58 @@ impl fmt::Display for GradcheckError {
 }
 
 impl std::error::Error for GradcheckError {}
+
+/// A file of tensors that cannot be written, read or used.
+#[derive(Debug)]
+pub enum FileError {
+    /// The system refuses to read or write it.
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// `reading the file` or `writing the file`.
+        doing: &'static str,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// It is of another format, or damaged.
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What it is.
+        found: String,
+        /// What it should be.
+        expected: String,
+    },
+    /// A tensor of it, or a parameter, is not the one that is wanted.
+    Tensor {
+        /// The file.
+        path: PathBuf,
+        /// The name of the tensor.
+        tensor: String,
+        /// What the file or the module has.
+        found: String,
+        /// What it should have.
+        expected: String,
+    },
+}
+
+impl fmt::Display for FileError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            FileError::Io { path, doing, source } => write!(f, "{}: {doing} failed: {source}", path.display()),
+            FileError::Format { path, found, expected } => write!(f, "{}: found {found}; expected {expected}", path.display()),
+            FileError::Tensor { path, tensor, found, expected } => {
+                write!(f, "{}: tensor `{tensor}`: found {found}; expected {expected}", path.display())
+            }
+        }
+    }
+}
+
+impl std::error::Error for FileError {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            FileError::Io { source, .. } => Some(source),
+            FileError::Format { .. } | FileError::Tensor { .. } => None,
+        }
+    }
+}

@@ -120,7 +120,7 @@ impl Lattice {
             let b = number(place.map(|c| c as usize), count);
             (links[b], linked_masks[brick]) = (brick as u32, masks[b]);
         }
-        let full = masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>() == nodes.iter().product();
+        let full = masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>() == nodes.iter().product::<usize>();
         Lattice { nodes, bricks: Some(Arc::new(Bricks { count, links, linked_masks, masks, full, places, neighbours: OnceLock::new() })) }
     }
 
@@ -426,7 +426,7 @@ mod tests {
                 rows.dedup();
                 assert_eq!(rows.len(), lattice.present());
                 assert!(rows.last().is_none_or(|&last| (last as usize) < lattice.rows()));
-                assert_eq!(lattice.is_full(), lattice.present() == nodes.iter().product());
+                assert_eq!(lattice.is_full(), lattice.present() == nodes.iter().product::<usize>());
                 assert_eq!((0..lattice.rows() as u32).filter(|&row| lattice.node(row).is_some()).count(), lattice.present());
             }
         }

@@ -20,6 +20,7 @@
 
 mod backward;
 mod error;
+mod files;
 mod gradcheck;
 mod gradients;
 mod graph;
@@ -38,12 +39,15 @@ pub mod rows;
 mod tensor;
 
 pub use backward::{grad, value_and_grad};
-pub use error::GradcheckError;
+pub use error::{FileError, GradcheckError};
+pub use files::{load_safetensors, save_safetensors};
 pub use gradcheck::{Closeness, Gradcheck, KernelReport, Report, check_kernel, gradcheck};
 pub use gradients::{Grad, Gradients};
 pub use graph::{no_grad, recording as is_recording};
 pub use index::Indices;
 pub use lattice::Lattice;
+#[doc(hidden)]
+pub use multiversion; // `dispatched!` uses it in other crates.
 pub use op::{Cotangent, GradSink, Keep, Kernel, KernelCall, Op, Vjp};
 pub use ops::lookup::add_rows;
 pub use param::{Bounds, Module, Param};

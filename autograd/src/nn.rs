@@ -11,7 +11,7 @@
 //! let x: Tensor<f32> = random.named("points").uniform_tensor(&[256, 2], -1.0, 1.0);
 //! let distance = x.norm(1).unsqueeze(1);
 //!
-//! let mut net = Mlp::new("distance", &[2, 32, 32, 1], Activation::Softplus, &random);
+//! let mut net = Mlp::new("distance", &[2, 32, 32, 1], Activation::Relu, &random);
 //! let mut adam = Adam::new(Exponential::new(0.01, 0.001, 200), AdamMode::Dense);
 //! let mut loss = 0.0;
 //! for step in 0..200 {
@@ -19,7 +19,7 @@
 //!     adam.step(&mut net, &gradients, step);
 //!     loss = value;
 //! }
-//! assert!(loss < 0.01);
+//! assert!(loss < 0.002);
 //! ```
 
 mod init;

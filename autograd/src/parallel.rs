@@ -15,14 +15,50 @@ pub use prefetch::prefetch;
 use rayon::prelude::*;
 pub(crate) use update::update;
 
-/// Compiles a function for several instruction sets and picks the best at run time. Their results differ where a loop multiplies and adds in
-/// one rounding on machines that can: see [`fused`]. Builds with debug assertions, in which the tests run, have the portable version only: every crate that uses
-/// a generic loop compiles it anew, and four versions of each would take minutes.
+/// Compiles a function for several instruction sets and picks the best at run time: AVX-512, AVX2 with FMA, NEON, or what every machine of the
+/// target has.
+///
+/// It is for the loops of a kernel. The function is generic or not, and so are its closures; it takes no `self`. What it calls must be
+/// `#[inline(always)]`, or is compiled once, for every machine. Results differ between the versions where a loop asks for fused
+/// multiply-add: see [`fused`](crate::parallel::fused).
+///
+/// A crate that uses it needs no dependency but this one: the macro brings the attribute of the crate `multiversion` along. Builds with debug
+/// assertions, in which the tests run, have the version for every machine only: every crate that uses a generic loop compiles it anew, and four
+/// versions of each would take minutes. So a test with `--release` is worth having.
+///
+/// ```
+/// use autograd::{Real, dispatched, parallel};
+///
+/// dispatched! {
+/// /// out[i] = a x[i] + y[i]
+/// fn axpy_loop<T: Real, const FUSED: bool>(a: T, x: &[T], y: &[T], out: &mut [T]) {
+///     for ((o, &x), &y) in out.iter_mut().zip(x).zip(y) {
+///         *o = a.multiply_add::<FUSED>(x, y);
+///     }
+/// }
+/// }
+///
+/// fn axpy<T: Real>(a: T, x: &[T], y: &[T], out: &mut [T]) {
+///     let chunk = |start: usize, out: &mut [T]| {
+///         let range = start..start + out.len();
+///         if parallel::fused() {
+///             axpy_loop::<T, true>(a, &x[range.clone()], &y[range], out);
+///         } else {
+///             axpy_loop::<T, false>(a, &x[range.clone()], &y[range], out);
+///         }
+///     };
+///     parallel::for_each_chunk(out, parallel::CHUNK, chunk);
+/// }
+///
+/// let mut out = [0.0; 2];
+/// axpy(2.0, &[1.0, 2.0], &[10.0, 20.0], &mut out);
+/// assert_eq!(out, [12.0, 24.0]);
+/// ```
 #[macro_export]
 macro_rules! dispatched {
     ($(#[$meta:meta])* $visibility:vis fn $($rest:tt)*) => {
         $(#[$meta])*
-        #[cfg_attr(not(debug_assertions), multiversion::multiversion(targets(
+        #[cfg_attr(not(debug_assertions), $crate::multiversion::multiversion(targets(
             "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
             "x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
             "aarch64+neon",
@@ -30,7 +66,7 @@ macro_rules! dispatched {
         $visibility fn $($rest)*
     };
 }
-pub(crate) use dispatched; // The macro is exported: a crate that uses it needs `multiversion`.
+pub(crate) use dispatched;
 
 /// True if the loops below run in a version that multiplies and adds in one instruction.
 pub fn fused() -> bool {

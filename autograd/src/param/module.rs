@@ -153,11 +153,11 @@ mod tests {
     #[test]
     fn every_kind_of_module_visits_its_parts_in_order_and_changes_them_alike() {
         type Part = Box<dyn Module<f64>>;
-        let mut module: (Param<f64>, [Param<f64>; 2], Vec<Part>, Option<Param<f64>>, Option<Param<f64>>) = (
+        let mut module = (
             param("a", 0.0),
             [param("b", 0.0), param("c", 0.0)],
-            vec![Box::new(param("d", 0.0)), Box::new((param("e", 0.0), param("f", 0.0)))],
-            None,
+            vec![Box::new(param("d", 0.0)) as Part, Box::new((param("e", 0.0), param("f", 0.0)))],
+            None::<Param<f64>>,
             Some(param("g", 0.0)),
         );
         let names = ["a", "b", "c", "d", "e", "f", "g"];
