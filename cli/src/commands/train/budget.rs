@@ -47,7 +47,7 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     if config.init_from.is_some() {
         return Err(Error::config("--time", "a run that starts from another", "--time without --init-from, or stages with steps"));
     }
-    let rays = views.iter().map(|view| u64::from(view.image.width()) * u64::from(view.image.height())).sum();
+    let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
     let config = config.fitted_to(views.iter().map(|view| &view.camera));
     let speed = measure(&config, views, (CALIBRATION.0 * seconds).min(CALIBRATION.1))?;
