@@ -225,7 +225,7 @@ fn config(resolution: usize, sh_degree: Option<usize>) -> Config {
 
 /// Mean squared error of the pixels that show voxels, composited by the walk itself.
 fn error_of(views: &[View], config: &Config) -> f64 {
-    let grid = Carving::new(views, config, &|_| {}).unwrap().color(&|_| {}).grid;
+    let grid = Carving::new(views, &config.carve_options(), &|_| {}).unwrap().color(&|_| {}).grid;
     let shape = *grid.shape();
     let count = if config.color == ColorKind::Rgb { 1 } else { sh::count(config.sh_degree) };
     let walk = plenoxel::sampling::walk::Walk::new(grid.aabb(), grid.lattice().nodes());
@@ -299,7 +299,7 @@ fn without_sweeps_a_color_is_the_mean_of_the_pixels_that_show_the_voxel() {
     let views = sphere(|_| [0.2, 0.6, 1.0]);
     let mut config = config(20, None);
     config.carve.sweeps = 0;
-    let grid = Carving::new(&views, &config, &|_| {}).unwrap().color(&|_| {}).grid;
+    let grid = Carving::new(&views, &config.carve_options(), &|_| {}).unwrap().color(&|_| {}).grid;
     for color in grid.color.tensor().data().chunks(3).filter(|color| color.iter().any(|c| *c > 0.0)) {
         for (c, want) in color.iter().zip([0.2, 0.6, 1.0]) {
             assert!((c - want).abs() < 1e-3, "{color:?}");
@@ -316,7 +316,7 @@ fn any_number_of_threads_carves_and_colors_to_the_same_bits() {
         let on = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
-                let grid = Carving::new(&views, &config, &|_| {}).unwrap().color(&|_| {}).grid;
+                let grid = Carving::new(&views, &config.carve_options(), &|_| {}).unwrap().color(&|_| {}).grid;
                 let bits: Vec<u32> = grid.color.tensor().data().iter().map(|x| x.to_bits()).collect();
                 (grid.lattice().masks().to_vec(), bits)
             })
@@ -328,7 +328,7 @@ fn any_number_of_threads_carves_and_colors_to_the_same_bits() {
 
 #[test]
 fn images_and_boxes_that_cannot_be_carved_are_refused_with_the_reason() {
-    let refused = |views: &[View], config: &Config| Carving::new(views, config, &|_| {}).unwrap_err().to_string();
+    let refused = |views: &[View], config: &Config| Carving::new(views, &config.carve_options(), &|_| {}).unwrap_err().to_string();
     let views = sphere(|_| [0.5; 3]);
     let with_alpha = |alpha: u8| {
         let mut views = views.clone();
@@ -340,7 +340,7 @@ fn images_and_boxes_that_cannot_be_carved_are_refused_with_the_reason() {
     let mut far = config(8, None);
     far.half_width = 1000.0;
     assert!(refused(&views, &far).contains("the camera of r_0 stands"), "{}", refused(&views, &far));
-    assert_eq!(Carving::new(&with_alpha(0), &far, &|_| {}).unwrap_err().exit_code(), 3);
+    assert_eq!(Carving::new(&with_alpha(0), &far.carve_options(), &|_| {}).unwrap_err().exit_code(), 3);
     let mut wide = config(8, None);
     wide.carve.margin = 100.0;
     assert!(refused(&views, &wide).contains("no image shows"), "{}", refused(&views, &wide));
@@ -374,7 +374,7 @@ fn silhouettes_give_training_its_box_and_its_voxels() {
 #[test]
 fn training_that_starts_from_a_carved_grid_sees_what_was_carved() {
     let views = sphere(|d| [0.5 + 0.3 * d.x, 0.4, 0.3]);
-    let carved = Carving::new(&views, &config(16, None), &|_| {}).unwrap().color(&|_| {}).grid;
+    let carved = Carving::new(&views, &config(16, None).carve_options(), &|_| {}).unwrap().color(&|_| {}).grid;
     let mut config = Config { half_width: 0.8, rays_per_step: 512, jitter: false, ..Config::default() };
     let psnr = |config: &Config, carved: Option<_>| {
         let trainer = plenoxel::model::plenoxels::Trainer::<f32>::new(config.clone(), &views[..]).unwrap();

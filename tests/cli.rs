@@ -6,7 +6,8 @@ mod command;
 mod events;
 
 use command::{Answer, Folder, SHORT, plenoxel};
-use plenoxel::dataset::image;
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::dataset::{self, Dataset, OpenOptions, Split, exposure, image};
 use plenoxel_cli::Streams;
 use serde_json::Value;
 use std::fs;
@@ -562,11 +563,36 @@ fn help_mentions_every_command_and_flag() {
         ("export ply", "--out --color --min-alpha --min-weight --min-object --coords --bbox --sor-sigma Examples:"),
         ("export vox", "--out --color --min-alpha --solid Examples:"),
         ("export mesh", "--out --color --format --level --min-part Examples:"),
-        ("scene", "--width --height --train --val --test --force Examples:"),
+        ("scene", "--width --height --train --val --test --exposure-spread --seed --force Examples:"),
     ] {
         let help = plenoxel(&[command.split(' ').collect(), vec!["--help"]].concat());
         assert_eq!(help.code, 0);
         assert!(flags.split_whitespace().all(|flag| help.out.contains(flag)), "{command}: {}", help.out);
+    }
+}
+
+#[test]
+fn a_scene_of_spread_exposures_has_other_training_views_and_the_same_test_views() {
+    let folder = Folder::new("exposure");
+    let data = folder.path("scene");
+    let scene = ["scene", &data, "--size", "16", "--train", "3", "--val", "1", "--test", "2"];
+    let with = |flags: &[&str]| plenoxel(&[&scene, flags].concat());
+    for wrong in ["-0.1", "2.5", "NaN", "much"] {
+        with(&[&format!("--exposure-spread={wrong}")]).refused(2, &["--exposure-spread", "a number from 0 to 2"]);
+    }
+    with(&["--seed", "7"]).refused(2, &["--exposure-spread"]);
+    with(&["--exposure-spread", "0.4", "--seed", "7"]).done();
+    let options = ProceduralOptions { width: 16, height: 16, train: 3, val: 1, test: 2, ..ProceduralOptions::default() };
+    let (made, read) = (Dataset::procedural(options).unwrap(), dataset::open(Path::new(&data), &OpenOptions::default()).unwrap());
+    for split in Split::ALL {
+        let images = |dataset: &Dataset, spread: f64| {
+            let mut views = dataset.load(split, &|_, _| {}).unwrap();
+            exposure::spread(&mut views, spread, 7);
+            views.into_iter().map(|view| view.image).collect::<Vec<_>>()
+        };
+        let spread = if split == Split::Train { 0.4 } else { 0.0 };
+        assert!(images(&read, 0.0) == images(&made, spread), "{split}");
+        assert!((images(&read, 0.0) == images(&made, 0.0)) == (split != Split::Train), "{split}");
     }
 }
 

@@ -17,7 +17,6 @@ use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
-use crate::model::plenoxels::config::Config;
 use autograd::{Buffer, Lattice, Tensor};
 use color::{Fitted, Seen};
 use light::Opaque;
@@ -85,11 +84,26 @@ impl Default for CarveConfig {
     }
 }
 
+/// A carving run, completely: what to carve, and how.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CarveOptions {
+    /// Half the side of the cube around the origin that is carved, world length.
+    pub half_width: f64,
+    /// Meaning of the colors to find.
+    pub color: Color,
+    /// Color behind the scene, sRGB in [0, 1].
+    pub background: [f32; 3],
+    /// Seed of everything random: the order of the pixels in [`Fit::Sgd`].
+    pub seed: u64,
+    /// How to carve.
+    pub config: CarveConfig,
+}
+
 /// A box carved to the visual hull.
 #[derive(Debug)]
 pub struct Carving<'a> {
     views: &'a [View],
-    config: &'a Config,
+    options: CarveOptions,
     lattice: Lattice,
 }
 
@@ -119,50 +133,43 @@ pub struct Colored {
 }
 
 /// About how many voxels silhouettes will leave, told by a coarse hull in no time; `None` if there are no silhouettes.
-pub fn voxels_expected(views: &[View], config: &Config) -> Option<f64> {
+pub fn voxels_expected(views: &[View], options: &CarveOptions) -> Option<f64> {
     const COARSE: usize = 64;
-    let hull = has_alpha(views).then(|| {
-        visual_hull::by_footprint(
-            views,
-            Aabb::cube(config.half_width),
-            [COARSE.min(config.carve.resolution); 3],
-            config.carve.margin,
-            &|_| (),
-        )
-    });
-    hull.map(|hull| hull.fraction() * (config.carve.resolution as f64).powi(3))
+    let CarveOptions { half_width, config: CarveConfig { resolution, margin, .. }, .. } = *options;
+    let hull =
+        has_alpha(views).then(|| visual_hull::by_footprint(views, Aabb::cube(half_width), [COARSE.min(resolution); 3], margin, &|_| ()));
+    hull.map(|hull| hull.fraction() * (resolution as f64).powi(3))
 }
 
 impl<'a> Carving<'a> {
-    /// Carves the box of a configuration: to the visual hull where images have alpha, and on to the photo hull if the config asks for it.
+    /// Carves a box: to the visual hull where images have alpha, and on to the photo hull if the config asks for it.
     ///
     /// Errors: no view has a transparent pixel (and only silhouettes are asked for), or one that is not; nothing is left of the box, or
     /// nothing goes.
-    pub fn new(views: &'a [View], config: &'a Config, progress: &dyn Fn(Progress)) -> Result<Self> {
+    pub fn new(views: &'a [View], options: &CarveOptions, progress: &dyn Fn(Progress)) -> Result<Self> {
+        let CarveOptions { half_width, config: CarveConfig { resolution, rule, margin, photo, .. }, .. } = *options;
         let images = |found: &str, remedy: &str| Err(Error::input("the training images", found, remedy));
-        if !has_alpha(views) && config.carve.photo.is_none() {
+        if !has_alpha(views) && photo.is_none() {
             let remedy = "silhouettes need an alpha channel that is 0 on the background; --photo-consistency carves without";
             return images("they have no transparent pixel", remedy);
         }
         if views.iter().all(|view| view.image.pixels().all(|pixel| pixel.0[3] == 0)) {
             return images("they are transparent all over", "give images that show an object");
         }
-        let CarveConfig { resolution, rule, margin, photo, .. } = config.carve;
-        let (aabb, voxels) = (Aabb::cube(config.half_width), [resolution; 3]);
+        let (aabb, voxels) = (Aabb::cube(half_width), [resolution; 3]);
         // No image shows the voxel that its camera stands in, so it would stay and hide everything.
         if let Some(view) = views.iter().find(|view| aabb.contains(view.camera.position())) {
             let nearest = views.iter().map(|view| view.camera.position().abs().max_element()).fold(f64::INFINITY, f64::min);
-            let found = format!("{}, a box in which the camera of {} stands,", config.half_width, view.name);
+            let found = format!("{half_width}, a box in which the camera of {} stands,", view.name);
             return Err(Error::config("half_width", found, format!("a box around the object alone, below {nearest:.3}")));
         }
         let mut hull = match rule {
             Rule::Footprint => visual_hull::by_footprint(views, aabb, voxels, margin, &|views| progress(Progress::Views(views))),
             Rule::Rays => visual_hull::by_rays(views, aabb, voxels, &|views| progress(Progress::Views(views))),
         };
-        let half_width =
-            |found: &str| Err(Error::config("half_width", format!("{}, {found},", config.half_width), "a box around the object"));
         if hull.fraction() == 0.0 {
-            return half_width("of which the silhouettes leave nothing");
+            let found = format!("{half_width}, of which the silhouettes leave nothing,");
+            return Err(Error::config("half_width", found, "a box around the object"));
         }
         if let Some(photo) = &photo {
             hull = photo_hull::photo_hull(views, &hull, photo, &|round, carved, left| progress(Progress::Round { round, carved, left }))?;
@@ -173,7 +180,7 @@ impl<'a> Carving<'a> {
                 let found = format!("{resolution}, of which no image shows one voxel whole on background,");
                 Err(Error::config("carve.resolution", found, "more voxels along an axis, a larger half_width, or a smaller carve.margin"))
             }
-            _ => Ok(Carving { views, config, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
+            _ => Ok(Carving { views, options: *options, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }
     }
 
@@ -189,24 +196,25 @@ impl<'a> Carving<'a> {
 
     /// Finds the colors. `progress(passes)` is called after each pass over the pixels.
     pub fn color(&self, progress: &dyn Fn(usize)) -> Colored {
-        let (config, lattice, rows) = (self.config, &self.lattice, self.lattice.rows());
+        let CarveOptions { half_width, color, background, seed, config } = self.options;
+        let (lattice, rows) = (&self.lattice, self.lattice.rows());
         // Colors are found for what one sees in the voxel that a point lies in, and for each voxel by itself, whatever training would do.
-        let shape = GridShape { interpolation: Interpolation::Nearest, sh_reduction: 1, ..config.grid_shape(config.carve.resolution) };
-        let density = config.carve.depth / shape.voxel_side();
+        let shape = GridShape { resolution: config.resolution, half_width, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
+        let density = config.depth / shape.voxel_side();
         let opaque = Opaque::new(lattice, Aabb::cube(shape.half_width), density);
-        let (degree, offset) = match shape.color {
+        let (degree, offset) = match color {
             Color::Rgb => (0, 0.0),
             Color::Sh { degree, offset } => (degree, offset as f32),
         };
-        let seen = Seen { opaque: &opaque, lattice, views: self.views, background: config.background, degree, offset };
-        let Fitted { mut table, missed } = match config.carve.fit {
-            Fit::Exact => color::fit_exactly(&seen, config.carve.ridge as f32, config.carve.sweeps, progress),
-            Fit::Sgd => color::fit_by_descent(&seen, config.seed, progress),
+        let seen = Seen { opaque: &opaque, lattice, views: self.views, background, degree, offset };
+        let Fitted { mut table, missed } = match config.fit {
+            Fit::Exact => color::fit_exactly(&seen, config.ridge as f32, config.sweeps, progress),
+            Fit::Sgd => color::fit_by_descent(&seen, seed, progress),
         };
-        if shape.color == Color::Rgb {
+        if color == Color::Rgb {
             table.iter_mut().for_each(|x| *x = (*x * sh::Y0 as f32).clamp(0.0, 1.0));
         }
-        let color = Tensor::from_buffer(Buffer::from(table), &[rows, shape.color.channels()]);
+        let color = Tensor::from_buffer(Buffer::from(table), &[rows, color.channels()]);
         let grid = VoxelGrid::with_lattice(shape, lattice.clone(), Tensor::full(&[rows, 1], density), color);
         Colored { grid, missed }
     }

@@ -5,6 +5,7 @@
 //! [`Dataset::procedural`] is the built-in scene, which needs no files and knows its exact depth.
 
 pub mod blender;
+pub mod exposure;
 pub mod image;
 pub mod procedural;
 
@@ -67,6 +68,11 @@ pub struct View {
 }
 
 impl View {
+    /// Width and height of the image in pixels.
+    pub fn size(&self) -> [usize; 2] {
+        [self.image.width() as usize, self.image.height() as usize]
+    }
+
     /// Color of pixel (x, y) over `background`: rgb a + background (1 - a) on sRGB values in [0, 1].
     #[inline]
     pub fn color(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
@@ -244,7 +250,12 @@ impl Dataset {
     /// Errors: a folder that is not empty unless `overwrite`; cameras without square pixels and a centred principal point,
     /// which the format cannot express; the disk's refusal.
     pub fn write_blender(&self, path: &Path, overwrite: bool) -> Result<()> {
-        blender::write(self, path, overwrite)
+        self.write_blender_changed(path, overwrite, &|_, _| ())
+    }
+
+    /// The same with images that `change` has changed, such as [`exposure::spread`]; it gets all views of a split at a time.
+    pub fn write_blender_changed(&self, path: &Path, overwrite: bool, change: &dyn Fn(Split, &mut [View])) -> Result<()> {
+        blender::write(self, path, overwrite, change)
     }
 
     fn frames(&self, split: Split) -> &[Frame] {

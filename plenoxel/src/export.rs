@@ -6,7 +6,6 @@
 pub mod mesh;
 pub mod mesh_file;
 pub mod palette;
-pub mod ply;
 pub mod vox;
 pub mod web;
 

@@ -1,7 +1,7 @@
 //! Point clouds with colors, normals and scalar fields: what is made of a voxel grid, and what others send.
 //!
 //! Coordinates are `f64`, in whatever frame they came; [`filter`] cleans a cloud as CloudCompare does, [`from_grid`] makes one of a grid,
-//! [`ply`] reads the PLY files of others and [`crate::export::ply`] writes them.
+//! [`ply`] reads the PLY files of others and writes them.
 
 pub mod filter;
 pub mod from_grid;

@@ -10,12 +10,11 @@ use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::View;
 use plenoxel::dataset::blender::Transforms;
 use plenoxel::dataset::image::{self, RgbaImage};
-use plenoxel::export;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::model::plenoxels::Trainer;
 use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Stage};
 use plenoxel::point_cloud::filter::{Filters, Noise, NoiseError, Outliers};
-use plenoxel::point_cloud::ply::PlyFile;
+use plenoxel::point_cloud::ply::{PlyFile, encode};
 use plenoxel::point_cloud::{PointCloud, ScalarField};
 use plenoxel_cli::parsers;
 use std::io::Cursor;
@@ -205,7 +204,7 @@ fn clouds() -> Vec<Vec<u8>> {
             .to_vec();
     binary.extend(b"\0\0\0\x01\x01\x02\x3f\x80\0\0\x3f\xf0\0\0\0\0\0\0\xff");
     binary.extend(b"\0\0\0\0\x3f\x80\0\0\x3f\xf0\0\0\0\0\0\0\x05");
-    vec![export::ply::encode(&cloud, &["made here".into()]), ascii.into(), binary]
+    vec![encode(&cloud, &["made here".into()]), ascii.into(), binary]
 }
 
 fn read_cloud(path: &Path, bytes: &[u8]) -> Result<Then, String> {

@@ -155,7 +155,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let mut hull_clock = Stopwatch::default();
     // A coarse hull is too large. If not even half of what it says would fit, that is said before the work is done.
     if config.carve.resolution > LARGE {
-        let expected = hull_clock.time(|| carve::voxels_expected(&views, &config)).unwrap_or(0.0);
+        let expected = hull_clock.time(|| carve::voxels_expected(&views, &config.carve_options())).unwrap_or(0.0);
         Estimate::of_carving(&config, &dataset, (0.5 * expected) as usize, !args.no_report).check()?;
     }
     let count = console.count("carving, view", views.len());
@@ -163,7 +163,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
         Progress::Views(done) => count.at(done, views.len()),
         Progress::Round { round, carved, left } => console.note(&format!("photo hull, round {round}: {carved} voxels carved, {left} left")),
     };
-    let carving = hull_clock.time(|| Carving::new(&views, &config, &progress))?;
+    let carving = hull_clock.time(|| Carving::new(&views, &config.carve_options(), &progress))?;
     drop(count);
     let (n, left) = (config.carve.resolution, carving.voxels());
     let share = 100.0 * left as f64 / (n as f64).powi(3);

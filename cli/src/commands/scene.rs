@@ -4,9 +4,9 @@ use super::train::size;
 use super::whole;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
-use plenoxel::dataset::image;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
+use plenoxel::dataset::{exposure, image};
 use plenoxel::error::{Error, Result};
 use plenoxel::run::memory::Estimate;
 use std::path::PathBuf;
@@ -15,6 +15,7 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel scene data/still-life
   plenoxel scene data/still-life --size 400 --train 200 --force
+  plenoxel scene data/still-life --exposure-spread 0.3    training views of different exposure
   plenoxel train data/still-life
 
 Writes transforms_{train,val,test}.json and RGBA images with straight alpha, in the NeRF-synthetic format, and exact depth \
@@ -24,6 +25,9 @@ beside the test views: 16 bits, thousandths of a world unit, 0 where there is no
 const MOST_PIXELS: u64 = image::MAX_SIDE as u64;
 /// The most views of a split.
 const MOST_VIEWS: u64 = 100_000;
+
+/// The largest spread of exposures: most views are nearly black or white then.
+const MOST_SPREAD: f64 = 2.0;
 
 /// Write the built-in scene to a folder in the NeRF-synthetic format
 #[derive(Debug, Args)]
@@ -57,9 +61,24 @@ pub struct SceneArgs {
     #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test, value_parser = whole::<usize>(0, MOST_VIEWS))]
     test: usize,
 
+    /// Change brightness and white balance of each training view at random, by about exp(±S), S from 0 to 2: sRGB values are multiplied by
+    /// exp(S z), and each channel by as much as exp(S/2 z) more or less; validation and test views stay [default: 0]
+    #[arg(long, value_name = "S", help_heading = "Scene", value_parser = spread)]
+    exposure_spread: Option<f64>,
+
+    /// Seed of these changes
+    #[arg(long, value_name = "SEED", help_heading = "Scene", default_value_t = 42, requires = "exposure_spread")]
+    seed: u64,
+
     /// Write into a folder that is not empty
     #[arg(long, help_heading = "Output")]
     force: bool,
+}
+
+/// A spread of exposures, as the command line takes it.
+fn spread(text: &str) -> std::result::Result<f64, String> {
+    let number = text.parse().ok().filter(|spread| (0.0..=MOST_SPREAD).contains(spread));
+    number.ok_or_else(|| format!("a number from 0 to {MOST_SPREAD}"))
 }
 
 /// Writes the built-in scene.
@@ -94,7 +113,12 @@ pub fn run(args: &SceneArgs, console: &Console<'_>) -> Result<()> {
     }
     let views = args.train + args.val + args.test;
     console.note(&format!("rendering {views} views of {width} x {height}"));
-    dataset.write_blender(&args.dir, args.force)?;
+    let spread = args.exposure_spread.unwrap_or(0.0);
+    dataset.write_blender_changed(&args.dir, args.force, &|split, views| {
+        if split == Split::Train {
+            exposure::spread(views, spread, args.seed);
+        }
+    })?;
     console.result(&format!(
         "wrote {} train, {} val and {} test views of {width} x {height} to {}",
         args.train,

@@ -1,12 +1,11 @@
 //! How the voxels of a box project into a picture: what carving looks up, and what rays are aimed by.
 
 use crate::camera::Camera;
-use crate::dataset::View;
 use crate::geometry::Aabb;
 use autograd::lattice::BRICK;
 use glam::{DVec3, dvec3};
 
-/// How the voxels of a box project into a view.
+/// How the voxels of a box project into an image.
 pub struct Projection {
     /// Width and height in pixels.
     pub size: [usize; 2],
@@ -16,12 +15,12 @@ pub struct Projection {
 }
 
 impl Projection {
-    /// Of the voxels of a box into a view.
-    pub fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
+    /// Of the voxels of a box into the image of a camera, of this width and height in pixels.
+    pub fn of(camera: &Camera, size: [usize; 2], aabb: Aabb, voxels: [usize; 3]) -> Self {
         let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
-        let origin = homogeneous(&view.camera, aabb.min);
-        let steps = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| homogeneous(&view.camera, aabb.min + axis * side) - origin);
-        Projection { size: size(view), origin, steps }
+        let origin = homogeneous(camera, aabb.min);
+        let steps = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| homogeneous(camera, aabb.min + axis * side) - origin);
+        Projection { size, origin, steps }
     }
 
     /// x·depth, y·depth and depth of a voxel's first corner, x and y in pixels.
@@ -61,7 +60,7 @@ impl Projection {
         BrickCorners(corners)
     }
 
-    /// The pixels of the view that a rectangle touches; none if it is beside the image.
+    /// The pixels of the image that a rectangle touches; none if it is beside the image.
     #[inline(always)]
     pub fn touched(&self, rectangle: Rectangle) -> Pixels {
         let along = |a: usize| {
@@ -84,11 +83,6 @@ impl BrickCorners {
         let corners = std::array::from_fn(|c| self.0[x + (c & 1)][y + (c >> 1 & 1)][z + (c >> 2)]);
         corners.iter().all(|corner: &[f64; 2]| !corner[0].is_nan()).then_some(corners)
     }
-}
-
-/// Width and height of a view's image, in pixels.
-pub fn size(view: &View) -> [usize; 2] {
-    [view.image.width() as usize, view.image.height() as usize]
 }
 
 /// x·depth, y·depth and depth of a point as a camera sees it, x and y in pixels: linear in the point.

@@ -2,7 +2,7 @@
 //!
 //! By footprint and by rays, background is what has alpha 0, and a reduced picture has alpha 0 only where its whole block has ([`crate::dataset::image::downscale`]).
 
-use crate::camera::projection::{Pixels, Projection, Rectangle, size};
+use crate::camera::projection::{Pixels, Projection, Rectangle};
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
@@ -144,7 +144,7 @@ fn outside(silhouette: &Silhouette, place: [usize; 3], mask: u64, margin: f64) -
 
 impl Silhouette {
     fn of(view: &View, is_object: impl Fn(&View, usize, usize) -> bool, aabb: Aabb, voxels: [usize; 3]) -> Self {
-        let [width, height] = size(view);
+        let [width, height] = view.size();
         let mut sums = vec![0; (width + 1) * (height + 1)];
         for y in 0..height {
             let mut row = 0;
@@ -153,7 +153,7 @@ impl Silhouette {
                 sums[(y + 1) * (width + 1) + x + 1] = sums[y * (width + 1) + x + 1] + row;
             }
         }
-        Silhouette { projection: Projection::of(view, aabb, voxels), sums, voxels }
+        Silhouette { projection: Projection::of(&view.camera, [width, height], aabb, voxels), sums, voxels }
     }
 
     /// True if the convex polygon around some points, and a margin around it, are inside of the image and on background.

@@ -1,4 +1,4 @@
-//! PLY files as others write them: text or binary of either byte order, with any properties in any order.
+//! PLY files as others write them, and the writer of our own ([`encode`]): text or binary of either byte order, with any properties in any order.
 //!
 //! A [`PlyFile`] keeps the bytes, so that [`PlyFile::chosen`] can write some of the points with everything the file says of them, whatever
 //! it may be, to the last digit. Memory is bounded by the size of the file: a header that promises more than the file holds is refused before
@@ -7,8 +7,10 @@
 //! (The crate `ply-rs-bw` was weighed. It refuses names such as `scalar_Coord._Z` and values such as `nan`, which CloudCompare writes.)
 
 mod header;
+mod write;
 
 pub use header::{Element, Encoding, Header, Kind, Number, Property};
+pub use write::encode;
 
 use crate::error::{Error, Result};
 use glam::DVec3;
@@ -231,7 +233,7 @@ fn field_name(property: &str) -> &str {
 }
 
 /// The header of a file with one element.
-pub(crate) fn header_lines(encoding: Encoding, remarks: &[String], comment: &str, element: &Element, count: usize) -> String {
+fn header_lines(encoding: Encoding, remarks: &[String], comment: &str, element: &Element, count: usize) -> String {
     let encoding = match encoding {
         Encoding::Ascii => "ascii",
         Encoding::LittleEndian => "binary_little_endian",

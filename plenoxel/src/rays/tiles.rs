@@ -48,7 +48,7 @@ pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
         let all = Tile::of_view(v, &views[v]);
         let (columns, rows) = (all.width.div_ceil(SIDE), all.height.div_ceil(SIDE));
         let mut shows = vec![false; (columns * rows) as usize];
-        let projection = Projection::of(&views[v], aabb, cells);
+        let projection = Projection::of(&views[v].camera, views[v].size(), aabb, cells);
         for &[low, high] in &boxes {
             let Some(corners) = projection.corners(low, high) else {
                 shows.fill(true);

@@ -8,7 +8,6 @@ use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::model::plenoxels::Trainer;
 use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
-use crate::rays::RaySource;
 use std::time::Instant;
 
 /// The fog that a grid starts as clears: the k-th step of the first stage takes 1 + a ln(b / k) of what its steps take in the mean, and after
@@ -52,7 +51,7 @@ pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
     if config.init_from.is_some() {
         return Err(Error::config("--time", "a run that starts from another", "--time without --init-from, or stages with steps"));
     }
-    let rays = RaySource::new(views, config.background, config.seed).len();
+    let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
     let config = config.fitted_to(views.iter().map(|view| &view.camera));
     let speed = measure(&config, views, (CALIBRATION.0 * seconds).min(CALIBRATION.1))?;

@@ -33,7 +33,10 @@ impl Witness {
     /// Of the voxels of a box.
     pub fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
         let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
-        Witness { projection: Projection::of(view, aabb, voxels), scale: view.camera.intrinsics.fx * side.max_element() }
+        Witness {
+            projection: Projection::of(&view.camera, view.size(), aabb, voxels),
+            scale: view.camera.intrinsics.fx * side.max_element(),
+        }
     }
 
     /// What the pixels say of which a voxel, given by place and by number, is the first; `None` if there are none.

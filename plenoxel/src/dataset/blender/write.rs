@@ -2,7 +2,7 @@
 
 use super::file_name;
 use crate::camera::Intrinsics;
-use crate::dataset::{Dataset, Split, image};
+use crate::dataset::{Dataset, Split, View, image};
 use crate::error::{Error, Result};
 use crate::files;
 use glam::{DAffine3, DVec3};
@@ -11,8 +11,8 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Writes `dataset` to the folder `root`; see [`Dataset::write_blender`].
-pub fn write(dataset: &Dataset, root: &Path, overwrite: bool) -> Result<()> {
+/// Writes `dataset` to the folder `root`; see [`Dataset::write_blender_changed`].
+pub fn write(dataset: &Dataset, root: &Path, overwrite: bool, change: &dyn Fn(Split, &mut [View])) -> Result<()> {
     let occupied = root.exists() && !std::fs::read_dir(root).is_ok_and(|mut entries| entries.next().is_none());
     if occupied && !overwrite {
         return Err(Error::input(root, "this is not an empty folder", "choose a new folder or allow overwriting"));
@@ -25,7 +25,8 @@ pub fn write(dataset: &Dataset, root: &Path, overwrite: bool) -> Result<()> {
             return Err(Error::input(root, found, "only one camera with square pixels and a centred principal point can be written"));
         }
         files::create_dir(&root.join(split.to_string()))?;
-        let views = dataset.load(split, &|_, _| ())?;
+        let mut views = dataset.load(split, &|_, _| ())?;
+        change(split, &mut views);
         let written: Vec<Result<()>> = views
             .par_iter()
             .map(|view| {

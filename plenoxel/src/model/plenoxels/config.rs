@@ -4,7 +4,7 @@
 
 use super::objective::{LEARNED_LOSSES, LOSSES};
 use crate::camera::Camera;
-use crate::carve::CarveConfig;
+use crate::carve::{CarveConfig, CarveOptions};
 use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -380,6 +380,12 @@ impl Config {
         };
         let Config { half_width, interpolation, sh_reduction, .. } = *self;
         GridShape { resolution, half_width, interpolation, color, sh_reduction }.normalised()
+    }
+
+    /// What a carving run with these settings carves, and how.
+    pub fn carve_options(&self) -> CarveOptions {
+        let Config { half_width, background, seed, carve, .. } = *self;
+        CarveOptions { half_width, color: self.grid_shape(carve.resolution).color, background, seed, config: carve }
     }
 
     /// The same with stages that images of some cameras have pixels for. Small images say nothing of small voxels, which would learn what

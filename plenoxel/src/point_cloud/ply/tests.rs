@@ -1,5 +1,4 @@
 use super::*;
-use crate::export;
 use crate::point_cloud::{PointCloud, ScalarField};
 use crate::random::{Purpose, bits};
 
@@ -97,7 +96,7 @@ const ENCODINGS: [Encoding; 3] = [Encoding::Ascii, Encoding::LittleEndian, Encod
 #[test]
 fn what_is_written_is_read_again_to_the_last_bit() {
     let mut cloud = cloud();
-    let read = |cloud: &PointCloud| parse(&export::ply::encode(cloud, &["voxel_side 0.5".into()])).unwrap();
+    let read = |cloud: &PointCloud| parse(&encode(cloud, &["voxel_side 0.5".into()])).unwrap();
     let file = read(&cloud);
     assert_eq!(file.header().remarks[0], "comment voxel_side 0.5");
     let names: Vec<&str> = file.element().properties.iter().map(|p| &p.name[..]).collect();

@@ -4,8 +4,8 @@
 //! which CloudCompare takes as such; and `quality`, the first field once more, which MeshLab takes (CloudCompare without a window leaves
 //! it out). No property is a list: CloudCompare does not read those of points.
 
+use super::{Element, Encoding, Kind, Number, Property, SCALAR_PREFIX, header_lines};
 use crate::point_cloud::PointCloud;
-use crate::point_cloud::ply::{Element, Encoding, Kind, Number, Property, SCALAR_PREFIX, header_lines};
 
 /// The bytes of the file, with comments in its header, a line each. Coordinates are `float`, or `double` if some are not a `float`; spaces in names become `_`.
 pub fn encode(cloud: &PointCloud, comments: &[String]) -> Vec<u8> {
