@@ -14,7 +14,7 @@ use std::ops::Range;
 /// let rows = [70, 5, 130, 6];
 /// let bucket = |row: u32| row as usize >> 6;
 /// let mut places = Buckets::count(3, rows.iter().map(|&row| bucket(row)));
-/// let mut sorted = vec![0; places.len()];
+/// let mut sorted = vec![0; places.total()];
 /// for row in rows {
 ///     sorted[places.take(bucket(row))] = row;
 /// }
@@ -63,9 +63,8 @@ impl Buckets {
 }
 
 impl Places {
-    /// The number of entries.
-    #[expect(clippy::len_without_is_empty, reason = "nobody asks")]
-    pub fn len(&self) -> usize {
+    /// The number of entries of all buckets.
+    pub fn total(&self) -> usize {
         self.starts[self.starts.len() - 1] as usize
     }
 
@@ -121,8 +120,8 @@ mod tests {
             want.sort_by_key(|&(bucket, _)| bucket);
 
             let mut places = Buckets::count(buckets, rows.iter().flat_map(|&rows| buckets_of(rows, shift)));
-            assert_eq!(places.len(), want.len());
-            let mut got = vec![(usize::MAX, 0); places.len()];
+            assert_eq!(places.total(), want.len());
+            let mut got = vec![(usize::MAX, 0); places.total()];
             for (item, &rows) in rows.iter().enumerate() {
                 buckets_of(rows, shift).for_each(|bucket| got[places.take(bucket)] = (bucket, item));
             }

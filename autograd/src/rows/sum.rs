@@ -45,7 +45,7 @@ impl Grouping {
             if largest as usize >= table_rows {
                 return Err(largest);
             }
-            let mut numbers = Buffer::stale(places.len());
+            let mut numbers = Buffer::stale(places.total());
             for i in range {
                 buckets_of(touch(i).0, shift).for_each(|bucket| numbers[places.take(bucket)] = i as u32);
             }

@@ -206,7 +206,7 @@ impl<T: Real, const K: usize> Runs<T, K> {
             }
         }
         let mut places = Buckets::count(buckets, runs.iter().flat_map(|run| run.buckets(buckets)));
-        let mut numbers = Buffer::stale(places.len());
+        let mut numbers = Buffer::stale(places.total());
         for (number, run) in runs.iter().enumerate() {
             run.buckets(buckets).for_each(|bucket| numbers[places.take(bucket)] = number as u32);
         }

@@ -29,7 +29,7 @@ impl Order {
         let seen = block.seen();
         let bucket = |i: usize| (corners.of(i).0[0] >> BUCKET_SHIFT) as usize;
         let mut places = Buckets::count(buckets, (0..block.len()).filter(|&i| seen(i)).map(bucket));
-        let (mut samples, mut rays) = (Buffer::stale(places.len()), Buffer::stale(places.len()));
+        let (mut samples, mut rays) = (Buffer::stale(places.total()), Buffer::stale(places.total()));
         for (r, own) in block.rays().enumerate() {
             for i in own.filter(|&i| seen(i)) {
                 let place = places.take(bucket(i));
