@@ -379,7 +379,7 @@ fn training_that_starts_from_a_carved_grid_sees_what_was_carved() {
     let psnr = |config: &Config, carved: Option<_>| {
         let trainer = plenoxel::model::plenoxels::Trainer::<f32>::new(config.clone(), &views[..]).unwrap();
         let mut trainer = carved.into_iter().fold(trainer, plenoxel::model::plenoxels::Trainer::starting_from);
-        let plan: Vec<usize> = trainer.plan().iter().map(|p| p.stage.resolution).collect();
+        let plan: Vec<usize> = trainer.plan().iter().map(|p| p.resolution.unwrap()).collect();
         (trainer.step().unwrap().unwrap().psnr, plan)
     };
     let (cold, plan) = psnr(&config, None);

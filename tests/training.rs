@@ -105,7 +105,10 @@ fn a_scout_finds_where_matter_is() {
     let stages = vec![stage(32, 1), stage(32, 60)];
     let config = Config { scout: Some(scout), prune_unseen_below: 0.03, stages, rays_per_step: 2048, ..config() };
     let mut trainer = Trainer::<f32>::new(config.clone(), &train[..]).expect("a valid config");
-    assert_eq!(trainer.plan().iter().map(|p| (p.first, p.resolution)).collect::<Vec<_>>(), [(0, Some(24)), (200, Some(32)), (201, Some(32))]);
+    assert_eq!(
+        trainer.plan().iter().map(|p| (p.first, p.resolution)).collect::<Vec<_>>(),
+        [(0, Some(24)), (200, Some(32)), (201, Some(32))]
+    );
     assert_eq!(trainer.model().prunes_from(), None);
     while trainer.step().expect("finite numbers").is_some_and(|report| report.step < 200) {}
     let (shape, present) = (*trainer.grid().shape(), trainer.grid().lattice().present());

@@ -8,6 +8,7 @@ use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::model::plenoxels::Trainer;
 use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// The fog that a grid starts as clears: the k-th step of the first stage takes 1 + a ln(b / k) of what its steps take in the mean, and after
@@ -47,7 +48,7 @@ struct Speed {
 /// The result depends on the speed of the machine. It is in steps, so that a run with it repeats to the bit.
 ///
 /// Errors: the run starts from another; the time is too short for the stages; and those of [`Trainer::step`].
-pub fn on_time(config: Config, views: &[View], seconds: f64) -> Result<Config> {
+pub fn on_time(config: Config, views: &Arc<[View]>, seconds: f64) -> Result<Config> {
     if config.init_from.is_some() {
         return Err(Error::config("--time", "a run that starts from another", "--time without --init-from, or stages with steps"));
     }
@@ -117,10 +118,10 @@ fn coarser(config: Config) -> Config {
 }
 
 /// Takes steps like those of the first stage until the time is over.
-fn measure(config: &Config, views: &[View], seconds: f64) -> Result<Speed> {
+fn measure(config: &Config, views: &Arc<[View]>, seconds: f64) -> Result<Speed> {
     let start = Instant::now();
     let endless = Stage { steps: Some(1 << 20), epochs: None, ..config.stages[0] };
-    let mut trainer = Trainer::<f32>::new(Config { stages: vec![endless], ..config.clone() }, views)?;
+    let mut trainer = Trainer::<f32>::new(Config { stages: vec![endless], ..config.clone() }, views.clone())?;
     // The first step begins the stage; a scout comes before it.
     let last = trainer.plan().len() - 1;
     while trainer.step()?.is_some_and(|report| report.stage < last) {}
@@ -230,7 +231,7 @@ mod tests {
     #[test]
     fn all_that_is_counted_in_steps_is_planned() {
         let scene = ProceduralOptions { width: 8, height: 8, train: 4, val: 1, test: 1, ..ProceduralOptions::default() };
-        let views = Dataset::procedural(scene).unwrap().load(Split::Train, &|_, _| ()).unwrap();
+        let views = Dataset::procedural(scene).unwrap().load(Split::Train, &|_, _| ()).unwrap().into();
         let stage = Stage { resolution: 8, steps: Some(1000), density_warm_up: 500, ..Config::default().stages[0] };
         let losses = [("mse", Weight::Constant(1.0)), ("beta", Weight::Until { weight: 1e-9, until: 250 })];
         let losses = losses.map(|(name, weight)| (name.to_owned(), weight)).into();
