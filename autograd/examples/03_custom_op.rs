@@ -3,36 +3,36 @@
 use autograd::{Cotangent, Keep, Op, Real, Tensor, Vjp, grad, gradcheck};
 use ndarray::arr1;
 
-/// y = tanh x.   ∂L/∂x = ∂L/∂y · (1 − y²)
-fn tanh<T: Real>(x: &Tensor<T>) -> Tensor<T> {
-    let values: Vec<T> = x.data().iter().map(|x| x.tanh()).collect();
-    Tensor::from_op(values.into(), x.shape(), &[x], Tanh)
+/// y = arctan x.   ∂L/∂x = ∂L/∂y / (1 + x²)
+fn arctan<T: Real>(x: &Tensor<T>) -> Tensor<T> {
+    let values: Vec<T> = x.data().iter().map(|x| x.atan()).collect();
+    Tensor::from_op(values.into(), x.shape(), &[x], Arctan)
 }
 
 #[derive(Debug)]
-struct Tanh;
-impl<T: Real> Op<T> for Tanh {
+struct Arctan;
+impl<T: Real> Op<T> for Arctan {
     fn name(&self) -> &'static str {
-        "tanh"
+        "arctan"
     }
     fn keep(&self) -> Keep {
-        Keep::OUTPUT
+        Keep::INPUTS
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
-        vec![cx.wrt(0, || cx.cotangent() * (1.0 - cx.output().square()))]
+        vec![cx.wrt(0, || cx.cotangent() / (cx.input(0).square() + 1.0))]
     }
 }
 
 pub fn main() {
     // First and second derivatives against finite differences; panics with op, entry and both numbers if one is wrong.
-    let report = gradcheck(|x| tanh(&x[0]), [arr1(&[-1.5, 0.2, 0.9]).into_dyn()]);
-    println!("tanh: worst relative error {:.1e}", report.worst_relative_error);
+    let report = gradcheck(|x| arctan(&x[0]), [arr1(&[-1.5, 0.2, 0.9]).into_dyn()]);
+    println!("arctan: worst relative error {:.1e}", report.worst_relative_error);
 
-    let x = Tensor::variable(arr1(&[0.5]));
-    let slope = grad(&tanh(&x).sum(), &[&x]).remove(0);
+    let x = Tensor::variable(arr1(&[0.5f64]));
+    let slope = grad(&arctan(&x).sum(), &[&x]).remove(0);
     let curvature = grad(&slope.sum(), &[&x]).remove(0);
     println!("at 0.5: slope {:.6}, curvature {:.6}", slope.item(), curvature.item());
-    let t = 0.5f64.tanh();
-    assert!((slope.item() - (1.0 - t * t)).abs() < 1e-15);
-    assert!((curvature.item() + 2.0 * t * (1.0 - t * t)).abs() < 1e-15);
+    // 1 / (1 + x²) and −2x / (1 + x²)²
+    assert!((slope.item() - 0.8).abs() < 1e-15);
+    assert!((curvature.item() + 0.64).abs() < 1e-15);
 }

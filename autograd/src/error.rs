@@ -43,7 +43,7 @@ pub enum GradcheckError {
     Kernel {
         /// The kernel's name.
         name: String,
-        /// `value` or `gradient of input i`.
+        /// `value`, `gradient of input i`, or the latter with `, when the others are constants`.
         what: String,
         /// How far they are apart.
         closeness: Closeness,

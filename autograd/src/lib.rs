@@ -14,7 +14,9 @@
 //! 5. **Gradcheck.** [`gradcheck`](gradcheck()) (`gradcheck.rs`) holds a rule to finite differences, [`check_kernel`] a kernel to its
 //!    reference; `tests/gradcheck` has a row for each op.
 //!
-//! Then [`Lattice`] (`lattice.rs`), where the nodes of a grid lie in a table; [`Param`] and [`Module`] (`param.rs`), the leaves that training changes, and [`optim`], which changes them.
+//! Then [`Lattice`] (`lattice.rs`), where the nodes of a grid lie in a table; [`Param`] and [`Module`] (`param.rs`, `param/module.rs`), the
+//! leaves that training changes, and [`optim`], which changes them. For fields of one's own: [`nn`], layers and their initial values, drawn
+//! from a [`random::Stream`]; [`save_safetensors`], [`load_safetensors`], [`Tensor::save_npy`] and [`Tensor::load_npy`] (`files.rs`).
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 

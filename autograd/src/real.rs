@@ -1,10 +1,11 @@
 //! The scalar types: `f32` for work, `f64` for checking.
 //!
 //! Precision is a type parameter and never a feature flag, so a gradient check in `f64` exercises the very code that trains in `f32`.
-//! The functions below that `num_traits::Float` already has are repeated here because a loop over them must vectorise:
-//! they are branch-free polynomials for `f32` and, of `exp_` and `absorb`, the standard library's for `f64`. Those with a parameter `FUSED`,
-//! and a loop that asks for it, use fused multiply-add where the machine has it: bits are equal for any number of threads, and between
-//! instruction sets up to that rounding. `sin_`, `cos_`, `expm1_` and `tanh_` have the same bits on every machine.
+//! The functions below that `num_traits::Float` already has are repeated here because a loop over them must vectorise: they are polynomials
+//! without a branch. Only `exp_` and `absorb` are the standard library's for `f64`.
+//!
+//! Functions with a parameter `FUSED`, and loops that ask for it, use fused multiply-add where the machine has it: bits are equal for any
+//! number of threads, and between instruction sets up to that rounding. The others have the same bits on every machine.
 
 mod expm1;
 mod sine;
@@ -22,6 +23,9 @@ mod sealed {
 
 /// `f32` or `f64`.
 pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + sealed::Sealed {
+    /// The largest |x| for which `sin_` and `cos_` are right: 2²⁰.
+    const SINE_LIMIT: Self;
+
     /// A literal in this precision: `T::lit(0.5)`.
     fn lit(x: f64) -> Self;
 
@@ -49,9 +53,6 @@ pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + 
 
     /// cos x to one unit in the last place where |x| <= [`Real::SINE_LIMIT`]; beyond it, any number.
     fn cos_(self) -> Self;
-
-    /// The range of `sin_` and `cos_`: 2²⁰.
-    const SINE_LIMIT: Self;
 
     /// 1 − e⁻ˣ without cancellation for small x: the opacity of an optical depth.
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self;
@@ -218,6 +219,7 @@ impl Real for f64 {
 
     #[inline(always)]
     fn absorb<const FUSED: bool>(self) -> (Self, Self) {
+        // Both from the standard library, as `exp_`.
         (-(-self).exp_m1(), (-self).exp())
     }
 }

@@ -15,6 +15,9 @@ mod kernel_with_reference;
 #[path = "../examples/05_gradient_penalty.rs"]
 mod gradient_penalty;
 
+#[path = "../examples/06_fused_layer.rs"]
+mod fused_layer;
+
 #[test]
 fn the_first_gradient_is_the_expected_one() {
     first_gradient::main();
@@ -38,4 +41,9 @@ fn a_kernel_agrees_with_its_reference() {
 #[test]
 fn a_gradient_penalty_makes_a_distance_field() {
     gradient_penalty::main();
+}
+
+#[test]
+fn a_kernel_of_three_inputs_agrees_with_its_reference_in_both_orders() {
+    fused_layer::main();
 }

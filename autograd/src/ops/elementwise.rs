@@ -233,4 +233,19 @@ mod tests {
             }
         }
     }
+
+    /// In release builds the left side is compiled for this machine's instruction set.
+    #[test]
+    fn functions_without_fused_operations_have_the_same_bits_in_every_instruction_set() {
+        let x = crate::random::Stream::new(1).uniform_tensor::<f32>(&[1003], -9.0, 9.0);
+        let wide = Tensor::from_vec(x.data().iter().map(|&x| f64::from(x)).collect(), &[1003]);
+        let check = |name, single: (Tensor<f32>, fn(f32) -> f32), double: (Tensor<f64>, fn(f64) -> f64)| {
+            assert!(single.0.data().iter().zip(x.data()).all(|(y, &x)| y.to_bits() == single.1(x).to_bits()), "{name} in f32");
+            assert!(double.0.data().iter().zip(wide.data()).all(|(y, &x)| y.to_bits() == double.1(x).to_bits()), "{name} in f64");
+        };
+        check("sin", (x.sin(), Real::sin_), (wide.sin(), Real::sin_));
+        check("cos", (x.cos(), Real::cos_), (wide.cos(), Real::cos_));
+        check("tanh", (x.tanh(), Real::tanh_), (wide.tanh(), Real::tanh_));
+        check("expm1", (x.expm1(), Real::expm1_), (wide.expm1(), Real::expm1_));
+    }
 }
