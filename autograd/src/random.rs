@@ -37,6 +37,11 @@ impl Stream {
         Stream { key: mix(mix(self.key) ^ hash) }
     }
 
+    /// A stream of the same seed and name that is independent of this one and of those with other numbers: one for each step, say.
+    pub fn numbered(self, number: u64) -> Self {
+        Stream { key: mix(mix(self.key).wrapping_add(mix(number))) }
+    }
+
     /// 64 random bits: output `index` of SplitMix64, from 0.
     pub fn bits(self, index: u64) -> u64 {
         mix(self.key.wrapping_add(index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15)))

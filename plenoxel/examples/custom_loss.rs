@@ -5,9 +5,8 @@
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
-use plenoxel::loss::Objective;
-use plenoxel::model::plenoxels::Trainer;
 use plenoxel::model::plenoxels::config::Config;
+use plenoxel::model::plenoxels::{Objective, Trainer};
 
 fn main() -> Result<()> {
     run()
@@ -28,7 +27,7 @@ pub fn run() -> Result<()> {
     // The default recipe, its first two stages.
     let mut config = Config { rays_per_step: 2048, ..Config::default() };
     config.stages.truncate(2);
-    let mut trainer = Trainer::<f32>::with_objective(config, &views, objective)?;
+    let mut trainer = Trainer::<f32>::with_objective(config, views, objective)?;
     while let Some(report) = trainer.step()? {
         if report.step % 50 == 49 {
             println!("step {:3}: ln cosh {:.4}, {:.2} dB on training rays", report.step + 1, report.loss, report.psnr);

@@ -12,7 +12,7 @@ use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, open};
 use autograd::lattice::{BRICK, STRIDE};
-use autograd::{Indices, Lattice, Param, Real, Tensor};
+use autograd::{Indices, Lattice, Module, Param, Real, Tensor};
 use serde::{Deserialize, Serialize};
 use std::io::{Read, Seek};
 use std::path::Path;

@@ -1,4 +1,6 @@
-//! Radiance fields with their recipes, one assembled model in each file. [`Model`] is what they have in common.
+//! Radiance fields with their recipes, one assembled model in each file. [`Model`] is the trait that they have in common.
+//!
+#![doc = include_str!("../docs/own_field.md")]
 
 pub mod plenoxels;
 

@@ -11,7 +11,7 @@ pub use state::About;
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::loss::{Evaluation, Objective, Step};
-use crate::rays::RaySource;
+use crate::rays::{RayBatch, RaySource};
 use crate::sampling::Jitter;
 use autograd::optim::{Adam, Optimizer};
 use autograd::{Module, Real, parallel, value_and_grad};
@@ -94,8 +94,13 @@ pub struct Trainer<T: Real, M: Model<T>> {
     objective: Objective<T, M>,
     optimizer: Box<dyn Optimizer<T>>,
     loss_optimizer: Adam<T>,
+    /// Draws the batch of a step, where it is not the shuffled pixels.
+    draw: Option<Draw<T>>,
     step: u64,
 }
+
+/// A function from the rays of a run and the number of a step to the batch of the step.
+type Draw<T> = Box<dyn Fn(&RaySource, u64) -> RayBatch<T> + Send + Sync>;
 
 impl<T: Real, M: Model<T>> Trainer<T, M> {
     /// A run of a model from its beginning.
@@ -109,7 +114,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         let plan = plan(&model, &options, rays.len());
         let Some(first) = plan.first() else { return Err(Error::config("stages", "no stage", "at least one")) };
         let (optimizer, loss_optimizer) = (model.optimizer(first), objective.take_optimizer());
-        Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, step: 0 })
+        Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, draw: None, step: 0 })
     }
 
     /// The same run, whose batches have [`RayBatch::depth`](crate::rays::RayBatch::depth) where views have a depth image.
@@ -124,6 +129,19 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     #[track_caller]
     pub fn with_channel(self, name: impl Into<String>, images: impl Into<Arc<[Array3<f32>]>>) -> Self {
         Trainer { rays: self.rays.with_channel(name, images), ..self }
+    }
+
+    /// The same run with batches of your own, such as patches or chosen pixels, instead of the shuffled pixels: `draw` makes the batch of a
+    /// step, whose number counts over the whole run. A function of the number alone keeps runs repeatable.
+    ///
+    /// ```
+    /// # use plenoxel::{model::plenoxels::Trainer, train::Model};
+    /// # fn patches(trainer: Trainer<f32>) -> Trainer<f32> {
+    /// trainer.with_batches(|rays, step| rays.batch_of(&rays.patches(step, 16, 16)))
+    /// # }
+    /// ```
+    pub fn with_batches(self, draw: impl Fn(&RaySource, u64) -> RayBatch<T> + Send + Sync + 'static) -> Self {
+        Trainer { draw: Some(Box::new(draw)), ..self }
     }
 
     /// The same run with a model that `change` makes of its own, for which stages are planned anew.
@@ -196,7 +214,10 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         }
         self.model.begin_step(in_stage)?;
         let TrainOptions { seed, background, rays_per_step, jitter, .. } = self.options;
-        let batch = self.rays.batch::<T>(self.step * rays_per_step as u64, rays_per_step);
+        let batch = match &self.draw {
+            Some(draw) => draw(&self.rays, self.step),
+            None => self.rays.batch::<T>(self.step * rays_per_step as u64, rays_per_step),
+        };
         let jitter = if jitter { Jitter::PerRay { seed, step: self.step } } else { Jitter::None };
         let pass = Pass { background, jitter, keep_samples: self.objective.needs_samples(), stage: Some(stage.index) };
         let extent = (self.model.aabb().max - self.model.aabb().min).max_element();
@@ -218,7 +239,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         self.optimizer.step(&mut self.model, &gradients, in_stage);
         self.loss_optimizer.step(&mut self.objective, &gradients, self.step);
         let ends_stage = in_stage + 1 == stage.steps;
-        if ends_stage && !(is_finite(&self.model) && is_finite(&self.objective)) {
+        if ends_stage && !(self.model.is_finite() && self.objective.is_finite()) {
             return Err(self.numeric("the model holds numbers that are not finite".to_owned()));
         }
         let mut rates = Vec::new();
@@ -250,15 +271,6 @@ fn at_step(error: Error, step: u64) -> Error {
         Error::Numeric { place, found, remedy } if place.is_empty() => Error::Numeric { place: format!("step {step}"), found, remedy },
         other => other,
     }
-}
-
-/// True if every number of a module is finite.
-fn is_finite<T: Real>(module: &impl Module<T>) -> bool {
-    let mut finite = true;
-    module.visit(&mut |param| {
-        finite &= parallel::sum(param.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero();
-    });
-    finite
 }
 
 fn mean_squared_error<T: Real>(x: &[T], y: &[T]) -> f64 {

@@ -17,9 +17,9 @@ use ::image::Rgba;
 /// rounded, and clamped to [0, 1]; alpha and depth stay. Where nothing is clamped, a color of one view is that of another times g / g'.
 /// With a spread of 0 nothing changes.
 pub fn spread(views: &mut [View], spread: f64, seed: u64) {
-    let stream = Stream::new(seed, "exposure");
+    let stream = Stream::new(seed).named("exposure");
     for (v, view) in views.iter_mut().enumerate() {
-        let gains = gains(spread, [0, 1, 2, 3].map(|index| stream.normal(v as u64, index)));
+        let gains = gains(spread, [0, 1, 2, 3].map(|index| stream.numbered(v as u64).normal(index)));
         for Rgba([r, g, b, _]) in view.image.pixels_mut() {
             for (value, gain) in [r, g, b].into_iter().zip(gains) {
                 *value = (f64::from(*value) * gain).round().min(255.0) as u8;
@@ -65,7 +65,7 @@ mod tests {
         for (v, view) in views.iter().enumerate() {
             assert!(after[v].image == again[v].image && after[v].image != view.image && after[v].image != other[v].image);
             assert!(after[v].depth == view.depth && after[v].camera == view.camera);
-            let gains = gains(0.4, [0, 1, 2, 3].map(|index| Stream::new(1, "exposure").normal(v as u64, index)));
+            let gains = gains(0.4, [0, 1, 2, 3].map(|index| Stream::new(1).named("exposure").numbered(v as u64).normal(index)));
             for (before, after) in view.image.pixels().zip(after[v].image.pixels()) {
                 assert_eq!(before.0[3], after.0[3]);
                 for c in 0..3 {

@@ -207,11 +207,6 @@ impl<T: Real> VoxelGrid<T> {
         });
         Occupancy::from_masks(self.aabb(), self.lattice().nodes(), masks)
     }
-
-    /// True if every stored number is finite.
-    pub fn is_finite(&self) -> bool {
-        self.params().all(|p| parallel::sum(p.tensor().data(), |v| if v.is_finite() { T::zero() } else { T::one() }) == T::zero())
-    }
 }
 
 impl<T: Real> Field<T> for VoxelGrid<T> {

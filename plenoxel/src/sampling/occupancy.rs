@@ -3,7 +3,7 @@
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use autograd::lattice::{BRICK, BRICK_ROWS, LOW, STRIDE};
-use autograd::parallel;
+use autograd::{Real, Tensor, no_grad, parallel};
 use glam::DVec3;
 use std::sync::Arc;
 
@@ -47,6 +47,26 @@ impl Occupancy {
             masks[brick] |= 1 << bit;
         }
         Self::from_masks(aabb, cells, masks)
+    }
+
+    /// The cells of a box at whose centres a density is above a threshold, 1 / world length. `density` maps world positions `[m, 3]` to
+    /// `[m]`: that of any field, evaluated without recording a gradient. Matter that is thinner than a cell can be missed: dilate, or take
+    /// a lower threshold.
+    pub fn where_dense<T: Real>(aabb: Aabb, cells: [usize; 3], threshold: f64, density: impl Fn(&Tensor<T>) -> Tensor<T>) -> Self {
+        const AT_A_TIME: usize = 1 << 16;
+        let sides = (aabb.max - aabb.min) / DVec3::from_array(cells.map(|n| n as f64));
+        let center = |c: usize| {
+            let cell = [c / (cells[1] * cells[2]), c / cells[2] % cells[1], c % cells[2]];
+            (aabb.min + sides * DVec3::from_array(cell.map(|k| k as f64 + 0.5))).to_array().map(T::lit)
+        };
+        let total = cells.iter().product::<usize>();
+        let mut mask = Vec::with_capacity(total);
+        for start in (0..total).step_by(AT_A_TIME) {
+            let end = (start + AT_A_TIME).min(total);
+            let positions = Tensor::from_vec((start..end).flat_map(center).collect(), &[end - start, 3]);
+            mask.extend(no_grad(|| density(&positions)).data().iter().map(|d| d.as_f64() > threshold));
+        }
+        Self::new(aabb, cells, &mask)
     }
 
     /// Cells from one mask for each brick, as in [`autograd::Lattice::masks`].

@@ -6,7 +6,7 @@
 //! function of seed, step and ray, so that nothing of them is kept.
 
 use super::model::check_kind;
-use super::{Model, TrainOptions, Trainer, is_finite, plan};
+use super::{Model, TrainOptions, Trainer, plan};
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::tensor_file::{TensorFile, TensorWriter};
@@ -131,7 +131,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         });
         done?;
         read_memory(&self.objective, "loss.", &mut self.loss_optimizer, &state.loss_updates, &mut file, state.about.step)?;
-        if !(is_finite(&self.model) && is_finite(&self.objective)) {
+        if !(self.model.is_finite() && self.objective.is_finite()) {
             return Err(file.damaged("numbers that are not finite"));
         }
         self.step = state.about.step;
