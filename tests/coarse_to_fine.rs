@@ -3,6 +3,7 @@
 mod support;
 
 use approx::assert_relative_eq;
+use autograd::Module;
 use autograd::{Tensor, no_grad};
 use glam::DVec3;
 use plenoxel::field::voxel_grid::fused::largest_weights;

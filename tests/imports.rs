@@ -57,8 +57,11 @@ fn no_circle_of_imports_crosses_the_folders_of_the_library() {
         println!("{name:12} {}", imports.iter().map(String::as_str).collect::<Vec<_>>().join(" "));
     }
     // A module goes when everything that it imports has gone; what is left at the end is in circles.
-    let mut left: BTreeMap<&String, BTreeSet<&String>> =
-        graph.iter().filter(|(name, _)| *name != "lib").map(|(name, imports)| (name, imports.iter().filter(|i| *i != "lib").collect())).collect();
+    let mut left: BTreeMap<&String, BTreeSet<&String>> = graph
+        .iter()
+        .filter(|(name, _)| *name != "lib")
+        .map(|(name, imports)| (name, imports.iter().filter(|i| *i != "lib").collect()))
+        .collect();
     loop {
         let free: Vec<&String> = left.iter().filter(|(_, imports)| imports.is_empty()).map(|(name, _)| *name).collect();
         if free.is_empty() {

@@ -18,7 +18,8 @@ pub fn run(steps: u64) -> Result<()> {
     let scene = Dataset::procedural(ProceduralOptions { width: 64, height: 64, train: 30, val: 0, test: 8, supersample: 2 })?;
     let (views, test) = (scene.load(Split::Train, &|_, _| {})?, scene.load(Split::Test, &|_, _| {})?);
     // Distances to the first surface, 0 where there is none: `[h, w, 1]` for each view.
-    let depth = views.iter().flat_map(|view| view.depth.as_ref().map(|d| d.mapv(|d| if d.is_finite() { d } else { 0.0 }).insert_axis(Axis(2))));
+    let depth =
+        views.iter().flat_map(|view| view.depth.as_ref().map(|d| d.mapv(|d| if d.is_finite() { d } else { 0.0 }).insert_axis(Axis(2))));
     let depth: Vec<_> = depth.collect();
     let plain = || Objective::<f32>::new().with("mse", 1.0, mse);
     let deep = plain().with("depth", 1e-3, |step| {

@@ -1,7 +1,7 @@
 //! The keys that a configuration may have, so that a misspelled one is an error that names the right one.
 
 use crate::error::{Error, Result};
-use crate::loss;
+use crate::model::plenoxels::{LEARNED_LOSSES, LOSSES};
 use toml::{Table, Value};
 
 /// The keys of a stage.
@@ -53,6 +53,7 @@ const TABLES: &[(&str, &[&str])] = &[
             "initial",
             "optimizer",
             "losses",
+            "loss_rates",
             "stages",
             "evaluation",
             "carve",
@@ -60,7 +61,8 @@ const TABLES: &[(&str, &[&str])] = &[
     ),
     ("initial", &["density", "color", "random"]),
     ("optimizer", &["kind", "decay", "beta", "beta1", "beta2", "epsilon"]),
-    ("losses", &loss::NAMES),
+    ("losses", &LOSSES),
+    ("loss_rates", &LEARNED_LOSSES),
     ("losses.*", &["weight", "until", "from", "to", "steps"]),
     ("stages[]", STAGE),
     ("stages[].sampling", SAMPLING),
