@@ -12,6 +12,7 @@ use crate::ops::lookup::add_rows;
 use crate::parallel;
 use crate::pool::Buffer;
 use crate::real::Real;
+use crate::single::{cast, is_single};
 use crate::rows::sparse::RowSparse;
 use crate::rows::sum::sum_into_rows;
 use crate::tensor::Tensor;
@@ -69,6 +70,15 @@ pub fn value_and_grad<T: Real>(f: impl FnOnce() -> Tensor<T>) -> (T, Gradients<T
 /// First derivatives of ⟨seed, root⟩ to every leaf. Owning the root, it frees what it has passed. Rules see constants here, so nothing is
 /// recorded.
 pub(crate) fn to_leaves<T: Real>(root: Option<Arc<Node<T>>>, seed: Tensor<T>) -> Gradients<T> {
+    if const { is_single::<T>() } { cast(to_leaves_single(cast(root), cast(seed))) } else { to_leaves_of(root, seed) }
+}
+
+#[inline(never)]
+fn to_leaves_single(root: Option<Arc<Node<f32>>>, seed: Tensor<f32>) -> Gradients<f32> {
+    to_leaves_of(root, seed)
+}
+
+fn to_leaves_of<T: Real>(root: Option<Arc<Node<T>>>, seed: Tensor<T>) -> Gradients<T> {
     let mut pass = Pass { tracked: false, needed: None, pending: HashMap::new(), heap: BinaryHeap::new() };
     let mut by_leaf = HashMap::new();
     if let Some(root) = root {

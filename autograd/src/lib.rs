@@ -37,6 +37,7 @@ mod param;
 mod pool;
 pub mod random;
 mod real;
+pub mod single;
 pub mod rows;
 mod tensor;
 

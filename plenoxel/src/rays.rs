@@ -14,6 +14,7 @@ use crate::dataset::{View, has_alpha};
 use crate::geometry::Aabb;
 use crate::random::{Permutation, Purpose};
 use crate::sampling::Occupancy;
+use autograd::single::{cast, is_single};
 use autograd::{Buffer, Real, Tensor, parallel};
 use channel::Channel;
 use glam::DVec3;
@@ -161,6 +162,15 @@ impl RaySource {
 
     /// Rays number `from..from + n` of the endless sequence of epochs: a function of (seed, number) alone.
     pub fn batch<T: Real>(&self, from: u64, n: usize) -> RayBatch<T> {
+        if const { is_single::<T>() } { cast(self.batch_single(from, n)) } else { self.batch_in(from, n) }
+    }
+
+    #[inline(never)]
+    fn batch_single(&self, from: u64, n: usize) -> RayBatch<f32> {
+        self.batch_in(from, n)
+    }
+
+    fn batch_in<T: Real>(&self, from: u64, n: usize) -> RayBatch<T> {
         let total = self.len();
         let epochs: Vec<Permutation> = (from / total..=(from + n as u64 - 1) / total)
             .map(|epoch| Permutation::new(total, self.seed, Purpose::RayOrder, epoch))

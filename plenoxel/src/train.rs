@@ -13,7 +13,7 @@ use crate::error::{Error, Result};
 use crate::loss::{Evaluation, Objective, Step};
 use crate::rays::{RayBatch, RaySource};
 use crate::sampling::Jitter;
-use autograd::optim::{Adam, Optimizer};
+use autograd::optim::Optimizer;
 use autograd::{Module, Real, parallel, value_and_grad};
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
@@ -93,7 +93,7 @@ pub struct Trainer<T: Real, M: Model<T>> {
     rays: RaySource,
     objective: Objective<T, M>,
     optimizer: Box<dyn Optimizer<T>>,
-    loss_optimizer: Adam<T>,
+    loss_optimizer: Box<dyn Optimizer<T>>,
     /// Draws the batch of a step, where it is not the shuffled pixels.
     draw: Option<Draw<T>>,
     step: u64,

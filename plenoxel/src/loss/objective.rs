@@ -4,7 +4,8 @@ use super::{AdaptiveRobust, beta, cauchy_sparsity, charbonnier, distortion, entr
 use crate::error::{Error, Result};
 use crate::rays::RayBatch;
 use crate::render::{PerSample, Rendered};
-use autograd::optim::{Adam, AdamMode, Rates, Schedule};
+use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
+use autograd::single::{cast, is_single};
 use autograd::{Module, Param, Real, Tensor};
 
 /// The data of a training step that a loss may read. `M` is the type of the model; a loss that reads the model says so by this type.
@@ -213,8 +214,9 @@ impl<T: Real, M> Objective<T, M> {
     }
 
     /// The optimizer of the parameters of the losses, with their learning rates, which it takes over.
-    pub(crate) fn take_optimizer(&mut self) -> Adam<T> {
-        Adam::new(std::mem::replace(&mut self.rates, Rates::new(0.0)), AdamMode::Dense)
+    pub(crate) fn take_optimizer(&mut self) -> Box<dyn Optimizer<T>> {
+        let rates = std::mem::replace(&mut self.rates, Rates::new(0.0));
+        if const { is_single::<T>() } { cast(adam_single(rates)) } else { Box::new(Adam::new(rates, AdamMode::Dense)) }
     }
 
     /// Σ weight · loss at a step, with the value of each loss.
@@ -244,6 +246,11 @@ impl<T: Real, M> Objective<T, M> {
         }
         Evaluation { total: total.unwrap_or_else(|| Tensor::scalar(T::zero())), losses, prediction: step.prediction }
     }
+}
+
+#[inline(never)]
+fn adam_single(rates: Rates) -> Box<dyn Optimizer<f32>> {
+    Box::new(Adam::new(rates, AdamMode::Dense))
 }
 
 /// Every loss that [`Objective::with_named`] knows: those that no particular model is needed for.

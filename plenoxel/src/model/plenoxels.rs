@@ -27,6 +27,7 @@ pub mod config;
 mod file;
 mod objective;
 mod rates;
+mod single;
 mod stages;
 mod start;
 
@@ -47,6 +48,7 @@ use crate::sampling::{Jitter, Occupancy};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{self, About, Model, Pass, PlannedStage, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::Optimizer;
+use autograd::single::{cast, cast_mut, cast_ref, is_single};
 use autograd::{Module, Param, Real};
 use config::{Config, Sampling, Stage};
 use start::Silhouettes;
@@ -93,6 +95,10 @@ impl<T: Real> Plenoxels<T> {
     ///
     /// Errors name the setting that cannot be used.
     pub fn new(config: &Config, views: &Arc<[View]>) -> Result<Self> {
+        if const { is_single::<T>() } { cast(single::new(config, views)) } else { Self::start(config, views) }
+    }
+
+    fn start(config: &Config, views: &Arc<[View]>) -> Result<Self> {
         config.validate()?;
         let config = config.fitted_to(views.iter().map(|view| &view.camera));
         config.check_stages()?;
@@ -120,7 +126,11 @@ impl<T: Real> Plenoxels<T> {
 
     /// The same recipe starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
     /// the first stage, and stages coarser than it are left out, except the last.
-    pub fn starting_from(mut self, grid: &VoxelGrid<T>) -> Self {
+    pub fn starting_from(self, grid: &VoxelGrid<T>) -> Self {
+        if const { is_single::<T>() } { cast(single::from(cast(self), cast_ref(grid))) } else { self.from(grid) }
+    }
+
+    fn from(mut self, grid: &VoxelGrid<T>) -> Self {
         let stages = &self.config.stages;
         let coarser = stages.iter().take_while(|stage| stage.resolution < grid.shape().resolution).count();
         self.scouts = 0;
@@ -165,6 +175,15 @@ pub fn grid_viewer<T: Real>(grid: &VoxelGrid<T>, sampling: Sampling, engine: Eng
     Viewer::new(show(grid, sampling, engine, background), background)
 }
 
+/// Renders a batch of rays through a grid.
+fn render_grid<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    if const { is_single::<T>() } { cast(single::render(cast_ref(grid), rays, options)) } else { render(grid, rays, options) }
+}
+
+fn save<T: Real>(grid: &VoxelGrid<T>, path: &Path, about: &About) -> Result<()> {
+    checkpoint::save(path, grid, &Header::new(grid, &about.scene, about.background, about.seed, about.step))
+}
+
 /// A function from rays to the pixels of a grid.
 fn show<T: Real>(
     grid: &VoxelGrid<T>,
@@ -175,7 +194,7 @@ fn show<T: Real>(
     let (matter, spacing) = (grid.matter(), sampling.spacing(grid.shape().voxel_side()));
     move |rays| {
         let occupancy = Some(&matter);
-        render(
+        render_grid(
             grid,
             rays,
             &RenderOptions { aabb: grid.aabb(), spacing, jitter: Jitter::None, background, occupancy, engine, stop_below: STOP_BELOW },
@@ -213,7 +232,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         let occupancy = self.learning.as_ref().filter(|_| pass.stage.is_some());
         let options = self.config.render_options(&self.grid, sampling, pass.jitter);
         let engine = if pass.keep_samples { Engine::Graph } else { options.engine };
-        render(&self.grid, rays, &RenderOptions { occupancy, engine, background: pass.background, ..options })
+        render_grid(&self.grid, rays, &RenderOptions { occupancy, engine, background: pass.background, ..options })
     }
 
     fn viewer<'a>(&'a self, view: &ViewOptions) -> Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a> {
@@ -223,7 +242,11 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
-        rates::optimizer(&self.config, &self.stages[stage.index], stage.steps)
+        let of_stage = &self.stages[stage.index];
+        match const { is_single::<T>() } {
+            true => cast(single::optimizer(&self.config, of_stage, stage.steps)),
+            false => rates::optimizer(&self.config, of_stage, stage.steps),
+        }
     }
 
     fn stages(&self, options: &TrainOptions, rays_per_epoch: u64) -> Vec<StageLength> {
@@ -235,12 +258,12 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {
-        self.begin(stage.index, rays)
+        if const { is_single::<T>() } { single::begin(cast_mut(self), stage.index, rays) } else { self.begin(stage.index, rays) }
     }
 
     fn begin_step(&mut self, in_stage: u64) -> Result<()> {
         if in_stage.is_multiple_of(STEPS_PER_LOOK) {
-            self.learning = Some(self.grid.learning());
+            self.learning = Some(if const { is_single::<T>() } { single::learning(cast_ref(&self.grid)) } else { self.grid.learning() });
         }
         Ok(())
     }
@@ -258,7 +281,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn read(&mut self, file: &mut TensorFile<'_>, stage: usize) -> Result<()> {
-        file::read(self, file, stage)
+        if const { is_single::<T>() } { single::read(cast_mut(self), file, stage) } else { file::read(self, file, stage) }
     }
 
     fn resume(&mut self, stage: &PlannedStage, rays: &mut RaySource) {
@@ -268,11 +291,11 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn save(&self, path: &Path, about: &About) -> Result<()> {
-        checkpoint::save(path, &self.grid, &Header::new(&self.grid, &about.scene, about.background, about.seed, about.step))
+        if const { is_single::<T>() } { single::save(cast_ref(&self.grid), path, about) } else { save(&self.grid, path, about) }
     }
 
     fn load(&mut self, path: &Path) -> Result<About> {
-        let (grid, header) = checkpoint::load(path)?;
+        let (grid, header) = if const { is_single::<T>() } { cast(single::load(path)?) } else { checkpoint::load(path)? };
         self.grid = grid;
         Ok(About { scene: header.scene, background: header.background, seed: header.seed, step: header.step })
     }

@@ -68,7 +68,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         self.model.write(&mut file);
         let updates = write_memory(&self.model, "", &*self.optimizer, &mut file);
         self.objective.visit(&mut |param| file.owned(format!("loss.{}", param.name()), param.tensor().detach()));
-        let loss_updates = write_memory(&self.objective, "loss.", &self.loss_optimizer, &mut file);
+        let loss_updates = write_memory(&self.objective, "loss.", &*self.loss_optimizer, &mut file);
         let run = State {
             about: self.about(scene),
             options: self.options.clone(),
@@ -130,7 +130,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             }
         });
         done?;
-        read_memory(&self.objective, "loss.", &mut self.loss_optimizer, &state.loss_updates, &mut file, state.about.step)?;
+        read_memory(&self.objective, "loss.", &mut *self.loss_optimizer, &state.loss_updates, &mut file, state.about.step)?;
         if !(self.model.is_finite() && self.objective.is_finite()) {
             return Err(file.damaged("numbers that are not finite"));
         }

@@ -1,11 +1,12 @@
 //! Losses of a voxel grid by their names, and the objective that a config describes.
 
-use super::Objective;
+use super::{Objective, single};
 use super::config::{Config, Weight};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::loss::{self, Cells, EXPOSURE, tv_color, tv_density};
 use autograd::Real;
+use autograd::single::{cast, is_single};
 use autograd::optim::{Exponential, Piecewise, Schedule};
 
 /// Losses that read the voxel grid.
@@ -46,6 +47,10 @@ pub fn with_loss<T: Real, M: AsRef<VoxelGrid<T>> + 'static>(
 
 /// The objective that a config describes, for a number of training views.
 pub fn objective<T: Real>(config: &Config, views: usize) -> Result<Objective<T>> {
+    if const { is_single::<T>() } { single::objective(config, views).map(cast) } else { of_config(config, views) }
+}
+
+pub(super) fn of_config<T: Real>(config: &Config, views: usize) -> Result<Objective<T>> {
     if config.losses.is_empty() {
         return Err(Error::config("losses", "no loss", "at least one, as in `mse = 1.0`"));
     }
