@@ -37,8 +37,8 @@ mod param;
 mod pool;
 pub mod random;
 mod real;
-pub mod single;
 pub mod rows;
+pub mod single;
 mod tensor;
 
 pub use backward::{grad, value_and_grad};

@@ -17,7 +17,7 @@ use autograd::{Indices, Param, Real, Tensor};
 pub const EXPOSURE: &str = "exposure";
 
 /// Learning rate of the matrices: our choice, see `benches/RESULTS.md`.
-const RATE: f64 = 2e-3;
+const RATE: f64 = 5e-3;
 
 impl<T: Real, M: 'static> Objective<T, M> {
     /// Learns a color matrix for each of the training views, of which there are `views`. The prediction becomes the rendered color times the matrix

@@ -1,13 +1,13 @@
 //! Losses of a voxel grid by their names, and the objective that a config describes.
 
-use super::{Objective, single};
 use super::config::{Config, Weight};
+use super::{Objective, single};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::loss::{self, Cells, EXPOSURE, tv_color, tv_density};
 use autograd::Real;
-use autograd::single::{cast, is_single};
 use autograd::optim::{Exponential, Piecewise, Schedule};
+use autograd::single::{cast, is_single};
 
 /// Losses that read the voxel grid.
 const OF_GRID: [&str; 4] = ["tv_density", "tv_color", "tv_density_sampled", "tv_color_sampled"];
