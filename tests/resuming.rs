@@ -153,14 +153,14 @@ fn a_state_that_does_not_fit_or_is_damaged_is_refused_with_the_reason() {
             let _ = trainer.step();
         }
     }
-    let at = bytes.windows(11).position(|w| w == br#"updates\":["#).expect("what the optimizer says");
+    let at = bytes.windows(13).position(|w| w == br#"\"updates\":["#).expect("what the optimizer says");
     let mut changed = bytes.clone();
-    changed[at + 11] = b'9';
+    changed[at + 13] = b'9';
     std::fs::write(&path, &changed).expect("it is written");
     assert!(refusal(config.clone(), &views_of_it).contains("more updates than steps"));
-    let at = bytes.windows(19).position(|w| w == b"plenoxel training 1").expect("its version");
+    let at = bytes.windows(19).position(|w| w == b"plenoxel training 2").expect("its version");
     let mut changed = bytes;
-    changed[at + 18] = b'2';
+    changed[at + 18] = b'3';
     std::fs::write(&path, &changed).expect("it is written");
     assert!(refusal(config, &views_of_it).contains("use the version that wrote the file"));
 }

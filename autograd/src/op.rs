@@ -248,7 +248,7 @@ impl<T: Real> GradSink<T> {
     ///     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
     ///         let n = self.positions.len();
     ///         let part = |k: usize| {
-    ///             let (rows, weights) = (0..n).map(|j| self.touch::<T>(j)).map(|(rows, weights)| (rows[k], weights[k])).unzip();
+    ///             let (rows, weights) = (0..n).map(|j| self.touch::<T>(j)).map(|(rows, weights)| (rows[k], weights[k])).unzip::<u32, T, Vec<_>, Vec<_>>();
     ///             inputs[0].gather_rows(&Indices::from(rows)) * Tensor::from_vec(weights, &[n, 1])
     ///         };
     ///         part(0) + part(1)

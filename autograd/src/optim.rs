@@ -6,7 +6,7 @@
 //!
 //! What an optimizer remembers belongs to the identity of a parameter: after [`Param::replace`] it starts afresh, and what was
 //! remembered of an identity that the module no longer has is dropped. So an optimizer serves one module.
-//! A parameter with [`Bounds`] is brought back to them in the elements that were updated (projected descent): from a start within the
+//! A parameter with [`Bounds`](crate::Bounds) is brought back to them in the elements that were updated (projected descent): from a start within the
 //! bounds that equals clamping all of it.
 //! Every update is elementwise and in place, with the same bits for any number of threads.
 

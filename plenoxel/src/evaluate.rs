@@ -9,7 +9,7 @@ use crate::error::Result;
 use crate::metrics;
 use crate::render::Rendered;
 use crate::render::picture::{Picture, picture_by};
-use crate::train::{Model, ViewOptions};
+use crate::train::{Model, RenderFn, ViewOptions};
 use autograd::Real;
 use ndarray::Array3;
 use serde::Serialize;
@@ -29,7 +29,7 @@ pub fn evaluate<T: Real>(model: &impl Model<T>, views: &[View], options: &ViewOp
 
 /// A model, or anything else that renders rays, ready for pictures.
 pub struct Viewer<'a, T: Real> {
-    show: Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a>,
+    show: RenderFn<'a, T>,
     background: [f32; 3],
 }
 

@@ -68,8 +68,8 @@ mod tests {
             let gains = gains(0.4, [0, 1, 2, 3].map(|index| Stream::new(1).named("exposure").numbered(v as u64).normal(index)));
             for (before, after) in view.image.pixels().zip(after[v].image.pixels()) {
                 assert_eq!(before.0[3], after.0[3]);
-                for c in 0..3 {
-                    let want = (f64::from(before.0[c]) * gains[c]).min(255.0);
+                for (c, gain) in gains.into_iter().enumerate() {
+                    let want = (f64::from(before.0[c]) * gain).min(255.0);
                     assert!((f64::from(after.0[c]) - want).abs() <= 0.5, "view {v}, channel {c}");
                 }
             }

@@ -1,7 +1,7 @@
 //! Plenoxels: a voxel grid, learned coarse to fine, in which empty space is left out stage after stage (Fridovich-Keil et al. 2022, and
 //! Maruani 2022).
 //!
-//! [`Config`](config::Config) has every setting. [`Trainer::<f32>::new(config, views)`](Trainer) is a run with the losses that the config names,
+//! [`config::Config`] has every setting. [`Trainer::<f32>::new(config, views)`](Trainer) is a run with the losses that the config names,
 //! `Trainer::with_objective` one with losses of your own:
 //!
 //! ```
@@ -46,7 +46,7 @@ use crate::rays::RaySource;
 use crate::render::{Engine, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{self, About, Model, Pass, PlannedStage, StageLength, TrainOptions, ViewOptions};
+use crate::train::{self, About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::Optimizer;
 use autograd::single::{cast, cast_mut, cast_ref, is_single};
 use autograd::{Module, Param, Real};
@@ -235,7 +235,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         render_grid(&self.grid, rays, &RenderOptions { occupancy, engine, background: pass.background, ..options })
     }
 
-    fn viewer<'a>(&'a self, view: &ViewOptions) -> Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a> {
+    fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
         let sampling = self.config.evaluation;
         let sampling = view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()));
         Box::new(show(&self.grid, sampling, self.config.engine, view.background))

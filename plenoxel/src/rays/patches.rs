@@ -25,7 +25,7 @@ impl RaySource {
         assert!(total > 0, "patches: no view has {side} x {side} pixels");
         let corner = |square: usize| {
             let random = bits(self.seed, Purpose::Patches, step, square as u64);
-            let mut place = (u128::from(random) * u128::from(total) >> 64) as u64;
+            let mut place = ((u128::from(random) * u128::from(total)) >> 64) as u64;
             let mut view = 0;
             while place >= area(&places[view]) {
                 place -= area(&places[view]);

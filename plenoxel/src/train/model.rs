@@ -33,7 +33,7 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
 
     /// A function that renders pictures of the model as it is now: without jitter, and with whatever can be prepared once for many rays. It is
     /// called without recording gradients.
-    fn viewer<'a>(&'a self, view: &ViewOptions) -> Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a> {
+    fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
         let pass = Pass { background: view.background, jitter: Jitter::None, keep_samples: false, stage: None };
         Box::new(move |rays| self.render(rays, &pass))
     }
@@ -116,6 +116,9 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         file.fact("about")
     }
 }
+
+/// A function from rays to the pixels of a model.
+pub type RenderFn<'a, T> = Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a>;
 
 /// Version of the format of checkpoints that [`Model::save`] writes by default.
 pub const CHECKPOINT_FORMAT: &str = "plenoxel model 1";
