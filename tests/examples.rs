@@ -25,6 +25,16 @@ fn the_custom_field_is_short_and_trains_saves_resumes_and_is_evaluated() {
     // A field that learned nothing shows the mean: 12 dB.
     let psnr = custom_field::run(60).expect("the example runs");
     assert!(psnr > 13.0, "{psnr}");
+    // Files name the kind of their model, and the program says what it can do with another's.
+    let file = std::env::temp_dir().join(format!("custom-field-{}.safetensors", std::process::id()));
+    let refused = plenoxel::checkpoint::load::<f32>(&file).expect_err("it has no voxels").to_string();
+    assert!(refused.contains("a model of kind `encoded mlp`, which has no voxels"), "{refused}");
+    let mut out = Vec::new();
+    let streams = plenoxel_cli::Streams { out: &mut out, err: &mut std::io::sink(), terminal: false, read_by_people: true };
+    assert_eq!(plenoxel_cli::run(["plenoxel".as_ref(), "info".as_ref(), file.as_os_str()], streams), 0);
+    let said = String::from_utf8_lossy(&out).into_owned();
+    assert!(said.contains("encoded mlp") && said.contains("net.0.weight [30, 64]"), "{said}");
+    std::fs::remove_file(file).expect("the example wrote it");
 }
 
 #[test]

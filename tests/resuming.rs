@@ -45,6 +45,14 @@ fn configs() -> Vec<(&'static str, Config)> {
         ("colors", Config { color: ColorKind::Rgb, project: true, optimizer: OptimizerConfig::Sgd, ..base.clone() }),
         ("silhouettes", Config { hull: Hull::Auto, optimizer: OptimizerConfig::Momentum { decay: 0.9 }, ..base.clone() }),
         ("scout", Config { scout: Some(scout), optimizer: adam, sh_reduction: 2, losses: regular, ..base.clone() }),
+        (
+            "learned losses",
+            Config {
+                losses: [("robust", 0.01), ("exposure", 1e-3), ("mse", 1.0)].map(|(name, w)| (name.to_owned(), Weight::Constant(w))).into(),
+                loss_rates: [("robust".to_owned(), 0.02)].into(),
+                ..base.clone()
+            },
+        ),
         ("svox2", Config { optimizer: OptimizerConfig::RmsProp { beta: 0.95, epsilon: 1e-8 }, aim: false, ..base }),
     ]
 }

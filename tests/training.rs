@@ -7,6 +7,7 @@ use plenoxel::field::Field;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics::psnr;
 use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Sampling, Scout, Stage, Weight};
+use plenoxel::loss::mse;
 use plenoxel::model::plenoxels::{Objective, Trainer};
 use plenoxel::render::picture::picture;
 use plenoxel::render::{Engine, RenderOptions};
@@ -233,6 +234,27 @@ fn a_closure_of_the_user_is_a_loss_like_any_other() {
     }
     assert_eq!(reports[0].losses.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(), ["log_cosh", "clear"]);
     assert!(reports[39].psnr > reports[0].psnr + 3.0, "{} then {}", reports[0].psnr, reports[39].psnr);
+}
+
+#[test]
+fn losses_of_a_config_beside_an_objective_are_refused() {
+    let with = |losses: &[&str]| Config { losses: losses.iter().map(|name| (name.to_string(), Weight::Constant(1.0))).collect(), ..config() };
+    let refused = |losses: &[&str]| Trainer::<f32>::with_objective(with(losses), views(Split::Train), Objective::new().with("m", 1.0, mse)).err();
+    assert!(refused(&[]).is_none() && refused(&["mse"]).is_none());
+    let text = refused(&["mse", "tv_color"]).expect("it is refused").to_string();
+    assert!(text.starts_with("losses: mse, tv_color beside an objective"), "{text}");
+}
+
+#[test]
+fn batches_of_ones_own_are_what_a_loss_sees() {
+    let objective = Objective::<f32>::new().with("patches", 1.0, |step| {
+        let first = step.batch.pixel[0];
+        assert!(step.batch.len() == 4 * 64 && step.batch.pixel[63] == [first[0] + 7, first[1] + 7], "squares, row after row");
+        mse(step)
+    });
+    let mut trainer = Trainer::with_objective(config(), views(Split::Train), objective).expect("a valid config");
+    trainer = trainer.with_batches(|rays, step| rays.batch_of(&rays.patches(step, 4, 8)));
+    assert_eq!(trainer.step().expect("finite numbers").expect("a step").rays, 256);
 }
 
 #[test]

@@ -7,6 +7,7 @@ use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::run::data::DataSource;
+use plenoxel::tensor_file::TensorFile;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
 use plenoxel::run::memory::{self, bytes};
@@ -50,6 +51,9 @@ fn row(console: &Console<'_>, key: &str, value: &str) -> Result<()> {
 
 fn describe(path: &Path) -> Result<Lines> {
     if path.is_file() {
+        if let Some(lines) = of_other_kind(path)? {
+            return Ok(lines);
+        }
         let (grid, header) = checkpoint::load(path)?;
         let mut lines = vec![("checkpoint", path.display().to_string())];
         lines.extend(of_grid(&grid, &header));
@@ -73,6 +77,19 @@ fn describe(path: &Path) -> Result<Lines> {
     }
     let dataset = dataset::open(path, &OpenOptions::default())?;
     Ok(of_dataset(path, &dataset))
+}
+
+/// The facts of a checkpoint whose model this program has no code for: its kind and its parameters; `None` for a voxel grid.
+fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
+    let file = TensorFile::open(path)?;
+    let kind: Option<String> = file.facts()?["kind"].as_str().map(str::to_owned);
+    let Some(kind) = kind.filter(|kind| kind != checkpoint::KIND) else { return Ok(None) };
+    let mut lines = vec![
+        ("checkpoint", path.display().to_string()),
+        ("kind", format!("{kind}: a model of another program, which can render and evaluate it")),
+    ];
+    lines.extend(file.tensors().into_iter().map(|(name, shape)| ("parameter", format!("{name} {shape:?}"))));
+    Ok(Some(lines))
 }
 
 fn of_run(path: &Path) -> Result<Lines> {

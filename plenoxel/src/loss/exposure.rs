@@ -33,10 +33,41 @@ impl<T: Real, M: 'static> Objective<T, M> {
 
 /// Colors `[n, 3]` as the views of their rays show them.
 fn exposed<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
-    let (table, n) = (step.param(EXPOSURE), step.batch.len());
-    let deviations = table - table.mean_axis(0).unsqueeze(0);
-    let of_rays = deviations.gather_rows(&Indices::from(step.batch.view.clone())).reshape(&[n, 3, 3]);
     let background = Tensor::from_vec(step.background.map(|c| T::lit(f64::from(c))).to_vec(), &[1, 3]);
-    let emitted = &step.prediction - step.rendered.log_transmittance.exp().unsqueeze(1) * background;
-    &step.prediction + (of_rays * emitted.unsqueeze(1)).sum_axis(2)
+    let behind = step.rendered.log_transmittance.exp().unsqueeze(1) * background;
+    through_matrices(&step.prediction, &behind, step.param(EXPOSURE), &Indices::from(step.batch.view.clone()))
+}
+
+/// A (C − B) + B for colors C and what of them is background B, `[n, 3]`, with the matrix A of each one's view from the table of D, `[views, 9]`.
+fn through_matrices<T: Real>(colors: &Tensor<T>, behind: &Tensor<T>, table: &Tensor<T>, views: &Indices) -> Tensor<T> {
+    let deviations = table - table.mean_axis(0).unsqueeze(0);
+    let of_rays = deviations.gather_rows(views).reshape(&[views.len(), 3, 3]);
+    colors + (of_rays * (colors - behind).unsqueeze(1)).sum_axis(2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autograd::Gradcheck;
+    use ndarray::{Array, arr2};
+
+    #[test]
+    fn matrices_act_on_what_the_field_emits_and_have_the_identity_as_their_mean() {
+        let colors = Tensor::constant(arr2(&[[0.5, 0.25, 1.0], [0.5, 0.25, 1.0]]));
+        let behind = Tensor::constant(arr2(&[[0.25, 0.25, 0.25], [0.25, 0.25, 0.25]]));
+        // View 0 doubles red, view 1 does the opposite: 1.5 and 0.5 around the mean.
+        let mut table = Array::zeros((2, 9));
+        table[[0, 0]] = 1.0;
+        let shown = through_matrices(&colors, &behind, &Tensor::constant(table), &Indices::from(vec![0, 1]));
+        assert_eq!(shown.data(), [0.625, 0.25, 1.0, 0.375, 0.25, 1.0]);
+    }
+
+    #[test]
+    fn exposure_agrees_with_finite_differences() {
+        let views = Indices::from(vec![0, 2, 2, 1]);
+        let f = |x: &[Tensor<f64>]| through_matrices(&x[0], &x[1], &x[2], &views);
+        let numbers = |rows: usize, width: usize, k: f64| Array::from_shape_fn((rows, width), |(i, j)| (k * (7 * i + j) as f64).sin()).into_dyn();
+        let inputs = vec![numbers(4, 3, 1.1), numbers(4, 3, 0.7), numbers(3, 9, 1.7)];
+        Gradcheck::new(f, inputs).named("exposure").order(2).run().unwrap_or_else(|e| panic!("{e}"));
+    }
 }

@@ -350,6 +350,17 @@ mod tests {
     }
 
     #[test]
+    fn cells_of_a_density_are_those_whose_centres_are_dense() {
+        let ball = |at: &Tensor<f64>| 1.0 - at.square().sum_axis(1).sqrt();
+        let found = Occupancy::where_dense(Aabb::cube(1.0), [10, 8, 6], 0.5, ball);
+        for cell in (0..480).map(|c| [c / 48, c / 6 % 8, c % 6]) {
+            let at = |k: usize, n: usize| (k as f64 + 0.5) * 2.0 / n as f64 - 1.0;
+            let radius = (at(cell[0], 10).powi(2) + at(cell[1], 8).powi(2) + at(cell[2], 6).powi(2)).sqrt();
+            assert_eq!(found.contains(cell), radius < 0.5, "{cell:?}");
+        }
+    }
+
+    #[test]
     fn bounds_stay_in_the_box_whatever_rounding_does() {
         for (half_width, n) in [(1.95, 320), (1.55, 384)] {
             let mut line = vec![false; n];
