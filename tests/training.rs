@@ -5,9 +5,9 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Error;
 use plenoxel::field::Field;
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::loss::mse;
 use plenoxel::metrics::psnr;
 use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Sampling, Scout, Stage, Weight};
-use plenoxel::loss::mse;
 use plenoxel::model::plenoxels::{Objective, Trainer};
 use plenoxel::render::picture::picture;
 use plenoxel::render::{Engine, RenderOptions};
@@ -238,8 +238,10 @@ fn a_closure_of_the_user_is_a_loss_like_any_other() {
 
 #[test]
 fn losses_of_a_config_beside_an_objective_are_refused() {
-    let with = |losses: &[&str]| Config { losses: losses.iter().map(|name| (name.to_string(), Weight::Constant(1.0))).collect(), ..config() };
-    let refused = |losses: &[&str]| Trainer::<f32>::with_objective(with(losses), views(Split::Train), Objective::new().with("m", 1.0, mse)).err();
+    let with =
+        |losses: &[&str]| Config { losses: losses.iter().map(|name| (name.to_string(), Weight::Constant(1.0))).collect(), ..config() };
+    let refused =
+        |losses: &[&str]| Trainer::<f32>::with_objective(with(losses), views(Split::Train), Objective::new().with("m", 1.0, mse)).err();
     assert!(refused(&[]).is_none() && refused(&["mse"]).is_none());
     let text = refused(&["mse", "tv_color"]).expect("it is refused").to_string();
     assert!(text.starts_with("losses: mse, tv_color beside an objective"), "{text}");

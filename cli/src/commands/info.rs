@@ -7,10 +7,10 @@ use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::run::data::DataSource;
-use plenoxel::tensor_file::TensorFile;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
 use plenoxel::run::memory::{self, bytes};
+use plenoxel::tensor_file::TensorFile;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\

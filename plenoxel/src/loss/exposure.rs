@@ -66,7 +66,8 @@ mod tests {
     fn exposure_agrees_with_finite_differences() {
         let views = Indices::from(vec![0, 2, 2, 1]);
         let f = |x: &[Tensor<f64>]| through_matrices(&x[0], &x[1], &x[2], &views);
-        let numbers = |rows: usize, width: usize, k: f64| Array::from_shape_fn((rows, width), |(i, j)| (k * (7 * i + j) as f64).sin()).into_dyn();
+        let numbers =
+            |rows: usize, width: usize, k: f64| Array::from_shape_fn((rows, width), |(i, j)| (k * (7 * i + j) as f64).sin()).into_dyn();
         let inputs = vec![numbers(4, 3, 1.1), numbers(4, 3, 0.7), numbers(3, 9, 1.7)];
         Gradcheck::new(f, inputs).named("exposure").order(2).run().unwrap_or_else(|e| panic!("{e}"));
     }

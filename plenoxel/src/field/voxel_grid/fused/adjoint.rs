@@ -11,7 +11,7 @@ use super::lookup::Corners;
 use super::{BUCKET_SHIFT, Batch, COLUMNS, Output, column};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
-use autograd::rows::{Buckets, buckets_of};
+use autograd::rows::Buckets;
 use autograd::{Buffer, Real, RowSums, Tensor, dispatched, parallel};
 use std::ops::Range;
 use std::sync::Arc;
@@ -181,10 +181,13 @@ fn touch_buckets<T: Real>(corners: &Corners<T>, touched: &mut [[u32; 8]]) -> usi
         *touched = [NONE; 8];
         touched[0] = all[0];
         if all != [all[0]; 8] {
-            let mut found = 0;
-            for bucket in buckets_of(corners.of(i).0, BUCKET_SHIFT) {
-                touched[found] = bucket as u32;
-                found += 1;
+            // As `rows::buckets_of`, from the buckets that are there: rows and weights of the corners are not computed again.
+            let mut found = 1;
+            for b in all {
+                if !touched[..found].contains(&b) {
+                    touched[found] = b;
+                    found += 1;
+                }
             }
             more += found - 1;
         }
