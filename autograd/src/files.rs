@@ -57,17 +57,24 @@ fn read(path: &Path) -> Result<Vec<u8>, FileError> {
     fs::read(path).map_err(|source| FileError::Io { path: path.to_owned(), doing: "reading the file", source })
 }
 
-/// Puts a file at `path` that `write` makes under the name it is given, with the permissions that new files have.
-fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> Result<(), FileError> {
+/// [`atomically`], with an error that names the file.
+fn replace(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> Result<(), FileError> {
+    atomically(path, write).map_err(|source| FileError::Io { path: path.to_owned(), doing: "writing the file", source })
+}
+
+/// Replaces the file at `path` by one that `write` makes under the name it is given, a hidden one in the same folder: other processes see the
+/// old content or the new, and nothing is left behind on failure. The file has the permissions of a new file.
+///
+/// Errors: those of `write`, and of syncing and renaming the file.
+pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> io::Result<()> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
-    // Nobody else has this name, and it does not contain the file's own, which may be as long as is allowed.
+    // No other process and no other thread has this name, and it does not contain the file's own, which may be as long as is allowed.
     let temporary = path.with_file_name(format!(".{}-{}.tmp", std::process::id(), COUNTER.fetch_add(1, Ordering::Relaxed)));
     let written = write(&temporary)
         .and_then(|()| OpenOptions::new().write(true).open(&temporary)?.sync_all())
         .and_then(|()| fs::rename(&temporary, path));
-    written.map_err(|source| {
+    written.inspect_err(|_| {
         // The write is what failed; a second failure while tidying up would only hide it.
         let _ = fs::remove_file(&temporary);
-        FileError::Io { path: path.to_owned(), doing: "writing the file", source }
     })
 }

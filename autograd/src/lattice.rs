@@ -5,37 +5,32 @@
 //! Morton curve, so rows that are near in space are near in memory; those that nobody needs take no memory; and inside a brick a bit for
 //! each node says whether it is *present*. A node that is not present reads as a row of zeros and gets no gradient.
 
+mod bricks;
+
 use crate::parallel::gathered;
+use bricks::node_at;
+pub use bricks::{BRICK, BRICK_ROWS, BrickGrid, STRIDE, bit_of, bits, bits_where, has, local_of, next_in, previous_in};
 use std::sync::{Arc, OnceLock};
 
 /// Nodes that are looked up together: a vector of their numbers.
 pub const TOGETHER: usize = 16;
 
-/// Nodes along the side of a brick.
-pub const BRICK: usize = 4;
-/// Rows of a brick.
-pub const BRICK_ROWS: usize = BRICK * BRICK * BRICK;
-/// From a node of a brick to the next along x, y and z, in rows or bits of a mask.
-pub const STRIDE: [usize; 3] = [16, 4, 1];
-/// The nodes of a brick with x, y or z being 0.
-pub const LOW: [u64; 3] = [0xffff, 0x000f_000f_000f_000f, 0x1111_1111_1111_1111];
-
 /// The layout of a grid in a table. Cloning copies a pointer.
 #[derive(Clone, Debug)]
 pub struct Lattice {
     nodes: [usize; 3],
-    bricks: Option<Arc<Bricks>>,
+    bricks: Option<Arc<Linked>>,
 }
 
+/// Which bricks have rows, and which of their nodes are present.
 #[derive(Debug)]
-struct Bricks {
-    /// Bricks along each axis; the last ones may stick out of the grid.
-    count: [usize; 3],
+struct Linked {
+    grid: BrickGrid,
     /// Number of each brick among those that have rows, bricks in row-major order; how many these are for one that has none.
     links: Vec<u32>,
     /// The masks of the bricks that have rows, in their order, and an empty one at the end: a table that stays in the cache.
     linked_masks: Vec<u64>,
-    /// A bit for each node of a brick that is present, node (i, j, k) of the brick being bit 16 i + 4 j + k.
+    /// The nodes of each brick that are present.
     masks: Vec<u64>,
     /// True if every node of the grid is present.
     full: bool,
@@ -80,16 +75,10 @@ impl Lattice {
 
     /// The same of those bricks alone that `among` names by their place, x, y and z in bricks: with most of a grid empty, far fewer questions.
     pub fn bricks_among(nodes: [usize; 3], among: impl Fn([usize; 3]) -> bool + Sync, present: impl Fn([usize; 3]) -> bool + Sync) -> Self {
-        let count = nodes.map(|n| n.div_ceil(BRICK));
-        let masks = crate::parallel::map_indices(count.iter().product(), |b| {
-            let place = [b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]];
-            if !among(place) {
-                return 0;
-            }
-            (0..BRICK_ROWS).fold(0u64, |mask, local| {
-                let node = node_at(place, local);
-                mask | u64::from((0..3).all(|a| node[a] < nodes[a]) && present(node)) << local
-            })
+        let grid = BrickGrid::new(nodes);
+        let masks = crate::parallel::map_indices(grid.len(), |brick| {
+            let place = grid.place(brick);
+            if among(place) { bits_where(grid.inside(brick), |bit| present(node_at(place, bit))) } else { 0 }
         });
         Self::from_masks(nodes, masks)
     }
@@ -98,30 +87,24 @@ impl Lattice {
     ///
     /// Panics if there is not one mask for each brick, or a node outside of the grid is present.
     pub fn from_masks(nodes: [usize; 3], masks: Vec<u64>) -> Self {
-        let count = nodes.map(|n| n.div_ceil(BRICK));
-        assert_eq!(masks.len(), count.iter().product::<usize>(), "a lattice of {nodes:?} nodes has {count:?} bricks");
+        let grid = BrickGrid::new(nodes);
+        assert_eq!(masks.len(), grid.len(), "a lattice of {nodes:?} nodes has {:?} bricks", grid.count());
         let mut places: Vec<[u32; 3]> = Vec::new();
-        for (b, &mask) in masks.iter().enumerate() {
-            if mask != 0 {
-                let place = [b / (count[1] * count[2]), b / count[2] % count[1], b % count[2]];
-                let mut left = mask;
-                while left != 0 {
-                    let node = node_at(place, left.trailing_zeros() as usize);
-                    assert!((0..3).all(|a| node[a] < nodes[a]), "node {node:?} lies outside of a lattice of {nodes:?} nodes");
-                    left &= left - 1;
-                }
-                places.push(place.map(|c| c as u32));
+        for (brick, &mask) in masks.iter().enumerate().filter(|(_, mask)| **mask != 0) {
+            if let Some(bit) = bits(mask & !grid.inside(brick)).next() {
+                panic!("node {:?} lies outside of a lattice of {nodes:?} nodes", grid.node(brick, bit));
             }
+            places.push(grid.place(brick).map(|c| c as u32));
         }
         places.sort_unstable_by_key(|&place| morton(place));
         let mut links = vec![places.len() as u32; masks.len()];
         let mut linked_masks = vec![0; places.len() + 1];
         for (brick, place) in places.iter().enumerate() {
-            let b = number(place.map(|c| c as usize), count);
+            let b = grid.number(place.map(|c| c as usize));
             (links[b], linked_masks[brick]) = (brick as u32, masks[b]);
         }
         let full = masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>() == nodes.iter().product::<usize>();
-        Lattice { nodes, bricks: Some(Arc::new(Bricks { count, links, linked_masks, masks, full, places, neighbours: OnceLock::new() })) }
+        Lattice { nodes, bricks: Some(Arc::new(Linked { grid, links, linked_masks, masks, full, places, neighbours: OnceLock::new() })) }
     }
 
     /// Nodes along each axis.
@@ -169,7 +152,7 @@ impl Lattice {
             Some(bricks) => {
                 let place = bricks.places.get(row as usize / BRICK_ROWS)?.map(|c| c as usize);
                 let local = row as usize % BRICK_ROWS;
-                (bricks.masks[number(place, bricks.count)] >> local & 1 == 1).then(|| node_at(place, local))
+                has(bricks.masks[bricks.grid.number(place)], local).then(|| node_at(place, local))
             }
         }
     }
@@ -177,10 +160,10 @@ impl Lattice {
     /// Number and mask of the brick at a place; `None` if it has no rows, lies beyond the grid, or the layout is row-major.
     pub fn brick(&self, place: [usize; 3]) -> Option<(usize, u64)> {
         let bricks = self.bricks.as_ref()?;
-        if (0..3).any(|a| place[a] >= bricks.count[a]) {
+        if (0..3).any(|a| place[a] >= bricks.grid.count()[a]) {
             return None;
         }
-        let b = number(place, bricks.count);
+        let b = bricks.grid.number(place);
         (bricks.masks[b] != 0).then(|| (bricks.links[b] as usize, bricks.masks[b]))
     }
 
@@ -204,39 +187,31 @@ impl Lattice {
         let mut cells = mask;
         for a in 0..3 {
             let next = neighbour(a, 1).map_or(0, |(_, mask)| mask);
-            // The node ahead is in this brick, or the first of the next one.
-            cells &= (mask & !LOW[a]) >> STRIDE[a] | (next & LOW[a]) << (3 * STRIDE[a]);
+            cells &= next_in(mask, next, a);
         }
         let numbers = |step: isize| [0, 1, 2].map(|a| neighbour(a, step).map(|(brick, _)| brick as u32));
         Neighbours { ahead: numbers(1), behind: numbers(-1), cells }
     }
 
-    /// One mask of present nodes for each brick, in row-major order; empty for a row-major layout. Node (i, j, k) of a brick is bit
-    /// 16 i + 4 j + k.
+    /// One mask of present nodes for each brick ([`brick_grid`](Self::brick_grid)); empty for a row-major layout.
     pub fn masks(&self) -> &[u64] {
         self.bricks.as_ref().map_or(&[], |bricks| &bricks.masks)
     }
 
+    /// How the nodes are divided into bricks, whether the table is stored so or not.
+    pub fn brick_grid(&self) -> BrickGrid {
+        BrickGrid::new(self.nodes)
+    }
+
     /// The layout as kernels see it, or `None` if it is row-major.
     pub fn brick_map(&self) -> Option<BrickMap<'_>> {
-        self.bricks.as_ref().map(|b| BrickMap { nodes: self.nodes, count: b.count, links: &b.links, masks: &b.linked_masks })
+        self.bricks.as_ref().map(|b| BrickMap { grid: b.grid, links: &b.links, masks: &b.linked_masks })
     }
 
     /// The same if every node is present, which needs no masks.
     pub fn full_brick_map(&self) -> Option<FullBrickMap<'_>> {
         self.brick_map().filter(|_| self.is_full()).map(FullBrickMap)
     }
-}
-
-/// Number of a brick in row-major order.
-#[inline(always)]
-fn number(place: [usize; 3], count: [usize; 3]) -> usize {
-    (place[0] * count[1] + place[1]) * count[2] + place[2]
-}
-
-/// Node number `local` of the brick at a place.
-fn node_at(place: [usize; 3], local: usize) -> [usize; 3] {
-    [place[0] * BRICK + local / 16, place[1] * BRICK + local / 4 % 4, place[2] * BRICK + local % 4]
 }
 
 /// Bits of the three coordinates, interleaved, x above y above z.
@@ -308,11 +283,14 @@ impl NodeMap for RowMajor {
     }
 }
 
+/// [`BRICK`] and [`BRICK_ROWS`], as codes are counted.
+const SIDE: u32 = BRICK as u32;
+const ROWS: u32 = BRICK_ROWS as u32;
+
 /// Bricks behind a link table.
 #[derive(Clone, Copy, Debug)]
 pub struct BrickMap<'a> {
-    nodes: [usize; 3],
-    count: [usize; 3],
+    grid: BrickGrid,
     links: &'a [u32],
     masks: &'a [u64],
 }
@@ -321,7 +299,7 @@ impl BrickMap<'_> {
     /// The links of the bricks of many nodes.
     #[inline(always)]
     fn linked(self, codes: [u32; TOGETHER]) -> [u32; TOGETHER] {
-        gathered(self.links, codes.map(|code| code / 64))
+        gathered(self.links, codes.map(|code| code / ROWS))
     }
 }
 
@@ -329,18 +307,18 @@ impl NodeMap for BrickMap<'_> {
     const SPARSE: bool = true;
     #[inline(always)]
     fn nodes(self) -> [usize; 3] {
-        self.nodes
+        self.grid.nodes()
     }
-    /// Of the number of the brick times 64, and of the node in it.
+    /// The code of a node is the number of its brick times 64, and its bit.
     #[inline(always)]
     fn share(self, axis: usize, coordinate: u32) -> u32 {
-        let bricks = [self.count[1] * self.count[2], self.count[2], 1][axis] as u32;
-        coordinate / 4 * bricks * 64 + coordinate % 4 * STRIDE[axis] as u32
+        let bricks = self.grid.strides()[axis] as u32;
+        coordinate / SIDE * bricks * ROWS + coordinate % SIDE * STRIDE[axis] as u32
     }
     #[inline(always)]
     fn row_of(self, code: u32) -> Option<u32> {
-        let (link, local) = (self.links[code as usize / BRICK_ROWS], code % 64);
-        (self.masks[link as usize] >> local & 1 == 1).then_some(link * 64 + local)
+        let (link, local) = (self.links[(code / ROWS) as usize], code % ROWS);
+        has(self.masks[link as usize], local as usize).then_some(link * ROWS + local)
     }
     #[inline(always)]
     fn rows_of(self, codes: [u32; TOGETHER]) -> ([u32; TOGETHER], [u32; TOGETHER]) {
@@ -348,8 +326,8 @@ impl NodeMap for BrickMap<'_> {
         let masks = gathered(self.masks, links);
         let (mut rows, mut present) = ([0; TOGETHER], [0; TOGETHER]);
         for i in 0..TOGETHER {
-            let local = codes[i] % 64;
-            rows[i] = links[i] * 64 + local;
+            let local = codes[i] % ROWS;
+            rows[i] = links[i] * ROWS + local;
             present[i] = 0u32.wrapping_sub((masks[i] >> local) as u32 & 1);
         }
         (rows, present)
@@ -364,7 +342,7 @@ impl NodeMap for FullBrickMap<'_> {
     const SPARSE: bool = false;
     #[inline(always)]
     fn nodes(self) -> [usize; 3] {
-        self.0.nodes
+        self.0.nodes()
     }
     #[inline(always)]
     fn share(self, axis: usize, coordinate: u32) -> u32 {
@@ -372,14 +350,14 @@ impl NodeMap for FullBrickMap<'_> {
     }
     #[inline(always)]
     fn row_of(self, code: u32) -> Option<u32> {
-        Some(self.0.links[code as usize / BRICK_ROWS] * 64 + code % 64)
+        Some(self.0.links[(code / ROWS) as usize] * ROWS + code % ROWS)
     }
     #[inline(always)]
     fn rows_of(self, codes: [u32; TOGETHER]) -> ([u32; TOGETHER], [u32; TOGETHER]) {
         let links = self.0.linked(codes);
         let mut rows = [0; TOGETHER];
         for i in 0..TOGETHER {
-            rows[i] = links[i] * 64 + codes[i] % 64;
+            rows[i] = links[i] * ROWS + codes[i] % ROWS;
         }
         (rows, [!0; TOGETHER])
     }

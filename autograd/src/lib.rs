@@ -22,7 +22,7 @@
 
 mod backward;
 mod error;
-mod files;
+pub mod files;
 mod gradcheck;
 mod gradients;
 mod graph;

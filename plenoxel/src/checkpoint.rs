@@ -11,7 +11,7 @@
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, open};
-use autograd::lattice::{BRICK, STRIDE};
+use autograd::lattice::BrickGrid;
 use autograd::{Indices, Lattice, Module, Param, Real, Tensor};
 use serde::{Deserialize, Serialize};
 use std::io::{Read, Seek};
@@ -177,13 +177,7 @@ fn node(voxel: u32, n: usize) -> [usize; 3] {
 
 /// The lattice of n³ voxels of which these are present.
 fn with_voxels(voxels: &[u32], n: usize) -> Lattice {
-    let count = n.div_ceil(BRICK);
-    let mut masks = vec![0; count.pow(3)];
-    for place in voxels.iter().map(|&voxel| node(voxel, n)) {
-        let [x, y, z] = place.map(|k| k / BRICK);
-        let bit: usize = (0..3).map(|a| place[a] % BRICK * STRIDE[a]).sum();
-        masks[(x * count + y) * count + z] |= 1 << bit;
-    }
+    let masks = BrickGrid::new([n; 3]).masks_of(voxels.iter().map(|&voxel| node(voxel, n)));
     Lattice::from_masks([n; 3], masks)
 }
 

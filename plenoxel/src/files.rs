@@ -4,9 +4,8 @@
 //! leaves either the old file or the new one, never half of one.
 
 use crate::error::{Error, Result};
-use std::fs::{self, OpenOptions};
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::fs;
+use std::path::Path;
 
 /// Writes `bytes` to `path`, replacing what is there: a temporary file in the same folder is written, synced to disk and
 /// renamed. Other processes see the old content or the new, and nothing is left behind on failure.
@@ -20,15 +19,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
 ///
 /// Errors: the same, and those of `write`.
 pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>) -> Result<()> {
-    let temporary = temporary_name(path);
-    let written = write(&temporary)
-        .and_then(|()| OpenOptions::new().write(true).open(&temporary)?.sync_all())
-        .and_then(|()| fs::rename(&temporary, path));
-    written.map_err(|source| {
-        // The write is what failed; a second failure while tidying up would only hide it.
-        let _ = fs::remove_file(&temporary);
-        Error::io(path, source, "writing the file")
-    })
+    autograd::files::atomically(path, write).map_err(|source| Error::io(path, source, "writing the file"))
 }
 
 /// Creates the folder `path` and the folders above it; one that exists already is fine.
@@ -38,17 +29,10 @@ pub fn create_dir(path: &Path) -> Result<()> {
     fs::create_dir_all(path).map_err(|source| Error::io(path, source, "creating the folder"))
 }
 
-/// A hidden name beside `path` that no other process and no other thread of this one uses. It does not contain the file's own
-/// name, which may already be as long as the file system allows.
-fn temporary_name(path: &Path) -> PathBuf {
-    static COUNTER: AtomicU64 = AtomicU64::new(0);
-    let unique = COUNTER.fetch_add(1, Ordering::Relaxed);
-    path.with_file_name(format!(".{}-{unique}.tmp", std::process::id()))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::path::PathBuf;
 
     fn folder(name: &str) -> PathBuf {
         let path = std::env::temp_dir().join(format!("plenoxel-files-{}-{name}", std::process::id()));

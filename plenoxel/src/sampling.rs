@@ -12,7 +12,6 @@ use crate::random::{Purpose, uniform};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 pub use occupancy::Occupancy;
 use occupancy::{Along, Look};
-pub(crate) use occupancy::{inside, place, split};
 use serde::{Deserialize, Serialize};
 
 /// How samples are spaced along a ray.

@@ -1,6 +1,6 @@
 //! NumPy's format for one array, version 1.0 (`numpy.lib.format`): a magic number, a dictionary as Python writes it, and the numbers.
 
-use super::{Dtype, atomically, bytes_of, read, read_numbers};
+use super::{Dtype, bytes_of, read, read_numbers, replace};
 use crate::error::FileError;
 use crate::pool::Buffer;
 use crate::real::Real;
@@ -26,7 +26,7 @@ impl<T: Real> Tensor<T> {
     /// Errors: [`FileError::Io`] if the folder is missing or refuses the file.
     pub fn save_npy(&self, path: impl AsRef<Path>) -> Result<(), FileError> {
         let bytes = encode(self);
-        atomically(path.as_ref(), |temporary| std::fs::write(temporary, bytes))
+        replace(path.as_ref(), |temporary| std::fs::write(temporary, bytes))
     }
 
     /// The array of a NumPy file as a constant. It is of version 1.0, `<f4` or `<f8`, of which the other is converted to `T`, and in C order.

@@ -1,6 +1,6 @@
 //! The parameters of a module in a safetensors file, by their names.
 
-use super::{Dtype, atomically, bytes_of, read, read_numbers};
+use super::{Dtype, bytes_of, read, read_numbers, replace};
 use crate::error::FileError;
 use crate::param::Module;
 use crate::real::Real;
@@ -32,7 +32,7 @@ use std::path::Path;
 pub fn save_safetensors<T: Real>(module: &dyn Module<T>, path: impl AsRef<Path>) -> Result<(), FileError> {
     let path = path.as_ref();
     let values = by_name(module, path)?;
-    atomically(path, |temporary| {
+    replace(path, |temporary| {
         // The library makes files that nobody else may read.
         let permissions = File::create(temporary)?.metadata()?.permissions();
         let views = values.iter().map(|(name, value)| (name, Stored(value)));

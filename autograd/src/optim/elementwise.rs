@@ -65,7 +65,8 @@ pub(super) fn update<T: Real, const N: usize>(
     rule: impl Fn([T; N], T) -> [T; N] + Sync,
 ) {
     let bounds = param.bounds();
-    let bounded = |x: [T; N], g: T| {
+    // By value: behind a reference of its own, a rate could change with each number that is written, and no loop would be vectorised.
+    let bounded = move |x: [T; N], g: T| {
         let mut new = rule(x, g);
         new[0] = bounds.nearest(new[0]);
         new

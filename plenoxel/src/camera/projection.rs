@@ -2,7 +2,7 @@
 
 use crate::camera::Camera;
 use crate::geometry::Aabb;
-use autograd::lattice::BRICK;
+use autograd::lattice::{BRICK, local_of};
 use glam::{DVec3, dvec3};
 
 /// How the voxels of a box project into an image.
@@ -79,7 +79,7 @@ impl BrickCorners {
     /// Those of a voxel, given by its bit, in the order of [`Projection::corners`].
     #[inline(always)]
     pub fn of(&self, bit: usize) -> Option<[[f64; 2]; 8]> {
-        let [x, y, z] = [bit >> 4, bit >> 2 & 3, bit & 3];
+        let [x, y, z] = local_of(bit);
         let corners = std::array::from_fn(|c| self.0[x + (c & 1)][y + (c >> 1 & 1)][z + (c >> 2)]);
         corners.iter().all(|corner: &[f64; 2]| !corner[0].is_nan()).then_some(corners)
     }

@@ -5,9 +5,9 @@ use crate::camera::Ray;
 use crate::dataset::View;
 use crate::field::sh;
 use crate::geometry::Aabb;
+use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
-use crate::sampling::{Occupancy, place};
-use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::lattice::{BRICK_ROWS, has};
 use autograd::rows::Buckets;
 use autograd::{Lattice, Tensor, no_grad, parallel};
 use std::ops::ControlFlow;
@@ -116,9 +116,9 @@ struct Chunk {
 impl<'a> Opaque<'a> {
     /// All voxels of a lattice with the same density, 1 / world length.
     pub fn new(lattice: &'a Lattice, aabb: Aabb, density: f64) -> Self {
-        let count = lattice.nodes().map(|n| n.div_ceil(BRICK));
+        let bricks = lattice.brick_grid();
         let first_rows = parallel::map_indices(lattice.masks().len(), |b| {
-            let brick = lattice.brick(place(b, count));
+            let brick = lattice.brick(bricks.place(b));
             brick.map_or(0, |(brick, _)| (brick * BRICK_ROWS) as u32)
         });
         let occupancy = Occupancy::from_masks(aabb, lattice.nodes(), lattice.masks().to_vec());
@@ -135,7 +135,7 @@ impl<'a> Opaque<'a> {
             ray,
             |brick| self.occupancy.free(brick),
             |crossing| {
-                if masks[crossing.brick] >> crossing.bit & 1 == 1 {
+                if has(masks[crossing.brick], crossing.bit) {
                     depth += (density * (crossing.leave - crossing.enter)) as f32;
                     out.push(Hit { row: self.first_rows[crossing.brick] + crossing.bit as u32, ray: number, weight: depth });
                 }

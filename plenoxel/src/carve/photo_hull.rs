@@ -28,8 +28,8 @@ mod votes;
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::sampling::{Occupancy, place, split};
-use autograd::lattice::{BRICK, BRICK_ROWS};
+use crate::sampling::Occupancy;
+use autograd::lattice::{BrickGrid, bits_where};
 use autograd::parallel;
 use serde::{Deserialize, Serialize};
 use visible::FirstVoxels;
@@ -65,15 +65,15 @@ pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progr
     let mut masks = start.masks().to_vec();
     let witnesses: Vec<Witness> = views.iter().map(|view| Witness::of(view, aabb, voxels)).collect();
     let mut first = FirstVoxels::new(views, aabb, voxels);
-    let mut surface = Surface { voxels, visible: vec![0; masks.len()], inconsistent: vec![0; masks.len()] };
+    let mut surface = Surface { bricks: start.bricks(), visible: vec![0; masks.len()], inconsistent: vec![0; masks.len()] };
     for round in 1.. {
         let fresh = first.update(&masks);
         let inconsistent = parallel::map_indices(masks.len(), |brick| {
             let mut votes = Votes::default();
-            members(fresh[brick], |bit| {
+            bits_where(fresh[brick], |bit| {
                 votes.clear();
                 for (v, view) in views.iter().enumerate() {
-                    let voxel = surface.voxel(brick, bit);
+                    let voxel = surface.bricks.node(brick, bit);
                     votes.extend(witnesses[v].vote(&view.image, first.of_view(v), voxel, visible::number(brick, bit)));
                 }
                 votes.spread() > config.noise
@@ -84,7 +84,7 @@ pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progr
             surface.inconsistent[brick] = surface.inconsistent[brick] & !fresh[brick] | inconsistent;
         }
         let carved =
-            parallel::map_indices(masks.len(), |brick| members(surface.inconsistent[brick], |bit| surface.patch_agrees(brick, bit)));
+            parallel::map_indices(masks.len(), |brick| bits_where(surface.inconsistent[brick], |bit| surface.patch_agrees(brick, bit)));
         surface.remove(&carved);
         masks.iter_mut().zip(&carved).for_each(|(mask, carved)| *mask &= !carved);
         let ones = |masks: &[u64]| masks.iter().map(|mask| mask.count_ones() as usize).sum();
@@ -99,32 +99,22 @@ pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progr
 
 /// The voxels that pixels see, as masks of bricks.
 struct Surface {
-    voxels: [usize; 3],
+    bricks: BrickGrid,
     visible: Vec<u64>,
     /// Those among them that failed the test.
     inconsistent: Vec<u64>,
 }
 
 impl Surface {
-    fn bricks(&self) -> [usize; 3] {
-        self.voxels.map(|n| n.div_ceil(BRICK))
-    }
-
-    fn voxel(&self, brick: usize, bit: usize) -> [usize; 3] {
-        let count = self.bricks();
-        let place = place(brick, count);
-        [0, 1, 2].map(|a| place[a] * BRICK + (bit >> (4 - 2 * a) & 3))
-    }
-
     /// True if at least half of the visible neighbours are inconsistent.
     fn patch_agrees(&self, brick: usize, bit: usize) -> bool {
-        let (voxel, count) = (self.voxel(brick, bit), self.bricks());
+        let voxel = self.bricks.node(brick, bit);
         let (mut visible, mut inconsistent) = (0, 0);
         for k in (0..27).filter(|&k| k != 13) {
             let step = [k / 9, k / 3 % 3, k % 3];
             let around = [0, 1, 2].map(|a| (voxel[a] + step[a]).wrapping_sub(1));
-            if (0..3).all(|a| around[a] < self.voxels[a]) {
-                let (brick, bit) = split(around, count);
+            if (0..3).all(|a| around[a] < self.bricks.nodes()[a]) {
+                let (brick, bit) = self.bricks.split(around);
                 visible += self.visible[brick] >> bit & 1;
                 inconsistent += self.inconsistent[brick] >> bit & 1;
             }
@@ -138,11 +128,6 @@ impl Surface {
             self.inconsistent[brick] &= !carved;
         }
     }
-}
-
-/// The voxels of a mask for which something holds.
-fn members(mask: u64, mut holds: impl FnMut(usize) -> bool) -> u64 {
-    (0..BRICK_ROWS).filter(|&bit| mask >> bit & 1 == 1 && holds(bit)).fold(0, |out, bit| out | 1 << bit)
 }
 
 #[cfg(test)]

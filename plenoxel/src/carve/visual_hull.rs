@@ -5,9 +5,9 @@
 use crate::camera::projection::{Pixels, Projection, Rectangle};
 use crate::dataset::View;
 use crate::geometry::Aabb;
+use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
-use crate::sampling::{Occupancy, inside, place};
-use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::lattice::{BrickGrid, bits_where, has};
 use autograd::{dispatched, parallel};
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -42,15 +42,14 @@ pub fn by_silhouettes(
     progress: &dyn Fn(usize),
 ) -> Occupancy {
     let (aabb, voxels) = (of.aabb(), of.cells());
-    let count = voxels.map(|n| n.div_ceil(BRICK));
     let mut masks = of.masks().to_vec();
     for (chunk, views) in views.chunks(VIEWS).enumerate() {
         let silhouettes = parallel::map_indices(views.len(), |v| Silhouette::of(&views[v], &is_object, aabb, voxels));
         parallel::for_each_chunk(&mut masks, BRICKS, |first, masks| {
-            for (b, mask) in masks.iter_mut().enumerate() {
+            for (brick, mask) in (first..).zip(masks) {
                 for silhouette in &silhouettes {
                     if *mask != 0 {
-                        *mask &= !outside(silhouette, place(first + b, count), *mask, margin);
+                        *mask &= !outside(silhouette, of.bricks().bounds(brick), *mask, margin);
                     }
                 }
             }
@@ -80,7 +79,7 @@ pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3], progress: &dyn Fn
             for x in (0..view.image.width() as usize).filter(|&x| is_background(view, x, y)) {
                 let ray = view.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
                 walk.along(&ray, free, |crossing| {
-                    if masks[crossing.brick].load(Relaxed) >> crossing.bit & 1 == 1 {
+                    if has(masks[crossing.brick].load(Relaxed), crossing.bit) {
                         masks[crossing.brick].fetch_and(!(1 << crossing.bit), Relaxed);
                     }
                     ControlFlow::Continue(())
@@ -105,8 +104,8 @@ fn is_object(view: &View, x: usize, y: usize) -> bool {
 
 /// Masks of all voxels.
 pub(super) fn full(voxels: [usize; 3]) -> Vec<u64> {
-    let count = voxels.map(|n| n.div_ceil(BRICK));
-    parallel::map_indices(count.iter().product(), |b| inside(place(b, count), voxels))
+    let bricks = BrickGrid::new(voxels);
+    parallel::map_indices(bricks.len(), |brick| bricks.inside(brick))
 }
 
 /// Where a view shows the object, and how voxels project into it.
@@ -114,18 +113,15 @@ struct Silhouette {
     projection: Projection,
     /// Object pixels above and left of each corner of the pixels: a summed-area table (Crow 1984), width + 1 to a row.
     sums: Vec<u32>,
-    voxels: [usize; 3],
 }
 
 /// Pairs of corners ([`Projection::corners`]) that an edge joins.
 const EDGES: [(usize, usize); 12] = [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)];
 
 dispatched! {
-/// Those voxels of a brick, as a mask, whose projection lies on background.
-fn outside(silhouette: &Silhouette, place: [usize; 3], mask: u64, margin: f64) -> u64 {
-    let Silhouette { projection, voxels, .. } = silhouette;
-    let low = place.map(|c| c * BRICK);
-    let high = [0, 1, 2].map(|a| (low[a] + BRICK).min(voxels[a]));
+/// Those voxels of a brick within bounds, as a mask, whose projection lies on background.
+fn outside(silhouette: &Silhouette, [low, high]: [[usize; 3]; 2], mask: u64, margin: f64) -> u64 {
+    let projection = &silhouette.projection;
     if let Some(corners) = projection.corners(low, high) {
         let bounds = Rectangle::around(&corners, margin);
         match silhouette.object_pixels(bounds) {
@@ -138,7 +134,7 @@ fn outside(silhouette: &Silhouette, place: [usize; 3], mask: u64, margin: f64) -
     }
     let corners = projection.corners_in_brick(low);
     let on_background = |bit: usize| corners.of(bit).is_some_and(|corners| silhouette.is_on_background(&corners, margin));
-    (0..BRICK_ROWS).filter(|bit| mask >> bit & 1 == 1 && on_background(*bit)).fold(0, |out, bit| out | 1 << bit)
+    bits_where(mask, on_background)
 }
 }
 
@@ -153,7 +149,7 @@ impl Silhouette {
                 sums[(y + 1) * (width + 1) + x + 1] = sums[y * (width + 1) + x + 1] + row;
             }
         }
-        Silhouette { projection: Projection::of(&view.camera, [width, height], aabb, voxels), sums, voxels }
+        Silhouette { projection: Projection::of(&view.camera, [width, height], aabb, voxels), sums }
     }
 
     /// True if the convex polygon around some points, and a margin around it, are inside of the image and on background.

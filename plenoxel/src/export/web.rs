@@ -11,7 +11,7 @@
 //! densities, high bytes, red, green, blue; or harmonic 1 of red, green and blue, then harmonic 2, and so on.
 
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
-use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::lattice::{BRICK_ROWS, bits};
 use autograd::{Lattice, Tensor};
 use flate2::Compression;
 use flate2::write::ZlibEncoder;
@@ -240,15 +240,13 @@ fn rounded(density: f32) -> f16 {
 
 /// The bricks of a lattice in row-major order: number and mask of those that have nodes.
 fn bricks(lattice: &Lattice) -> impl Iterator<Item = Option<(usize, u64)>> {
-    let [nx, ny, nz] = lattice.nodes().map(|n| n.div_ceil(BRICK));
-    (0..nx * ny * nz).map(move |b| lattice.brick([b / (ny * nz), b / nz % ny, b % nz]))
+    let grid = lattice.brick_grid();
+    (0..grid.len()).map(move |b| lattice.brick(grid.place(b)))
 }
 
 /// The rows of all nodes that are present, in the order of their places.
 fn rows(lattice: &Lattice) -> Vec<usize> {
-    let bits =
-        |(brick, mask): (usize, u64)| (0..BRICK_ROWS).filter(move |bit| mask >> bit & 1 == 1).map(move |bit| brick * BRICK_ROWS + bit);
-    bricks(lattice).flatten().flat_map(bits).collect()
+    bricks(lattice).flatten().flat_map(|(brick, mask)| bits(mask).map(move |bit| brick * BRICK_ROWS + bit)).collect()
 }
 
 /// A table from its columns, which have a value for each node that is present.
@@ -339,10 +337,7 @@ mod tests {
             let small = WebGrid::new(&ball(color, reduction, 1.0), FINEST);
             let mut bytes = Vec::new();
             ZlibDecoder::new(small.bytes().unwrap().as_slice()).read_to_end(&mut bytes).unwrap();
-            let places = |lattice: &Lattice| {
-                let all = lattice.nodes()[0].div_ceil(BRICK).pow(3);
-                all.div_ceil(8) + 8 * lattice.rows() / BRICK_ROWS
-            };
+            let places = |lattice: &Lattice| lattice.brick_grid().len().div_ceil(8) + 8 * lattice.rows() / BRICK_ROWS;
             let header = serde_json::to_value(small.header()).unwrap();
             let voxels = header["voxels"].as_u64().unwrap() as usize;
             let harmonics = &header["harmonics"];

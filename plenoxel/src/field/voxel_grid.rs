@@ -23,7 +23,7 @@ use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
 use crate::render::{RenderOptions, Rendered};
 use crate::sampling::{Occupancy, Samples};
-use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::lattice::{BRICK_ROWS, bits_where};
 use autograd::{Bounds, Buffer, Lattice, Module, Param, Real, Tensor, parallel};
 use layout::Layout;
 use reshape::moved;
@@ -194,14 +194,11 @@ impl<T: Real> VoxelGrid<T> {
     /// The present voxels whose rows `full` names.
     pub fn voxels_where(&self, full: impl Fn(usize) -> bool + Sync) -> Occupancy {
         let mut masks = self.lattice().masks().to_vec();
-        let count = self.shape().resolution.div_ceil(BRICK);
+        let grid = self.lattice().brick_grid();
         parallel::for_each_chunk(&mut masks, 256, |first, chunk| {
-            for (b, mask) in chunk.iter_mut().enumerate() {
-                let b = first + b;
-                if let Some((brick, present)) = self.lattice().brick([b / (count * count), b / count % count, b % count]) {
-                    *mask = (0..BRICK_ROWS)
-                        .filter(|bit| present >> bit & 1 == 1 && full(brick * BRICK_ROWS + bit))
-                        .fold(0, |m, bit| m | 1 << bit);
+            for (b, mask) in (first..).zip(chunk) {
+                if let Some((brick, present)) = self.lattice().brick(grid.place(b)) {
+                    *mask = bits_where(present, |bit| full(brick * BRICK_ROWS + bit));
                 }
             }
         });

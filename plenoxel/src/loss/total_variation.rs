@@ -6,7 +6,7 @@
 use super::Step;
 use crate::field::voxel_grid::VoxelGrid;
 use crate::random::{Purpose, bits};
-use autograd::lattice::{BRICK, BRICK_ROWS, LOW, Neighbours, STRIDE};
+use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, STRIDE, has, previous_in};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, RowSparse, RowSums, Tensor, dispatched, parallel};
 use std::sync::Arc;
 
@@ -251,10 +251,9 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
 fn touched(bricks: &[Neighbours], run: Run, brick: usize) -> u64 {
     let cells = |brick: usize| run.place(brick).map_or(0, |_| bricks[brick].cells);
     let own = cells(brick);
-    (0..3).fold(own, |touched, a| {
-        let last = LOW[a] << (3 * STRIDE[a]);
-        let from_behind = bricks[brick].behind[a].map_or(0, |behind| cells(behind as usize) & last);
-        touched | (own & !last) << STRIDE[a] | from_behind >> (3 * STRIDE[a])
+    (0..3).fold(own, |touched, axis| {
+        let behind = bricks[brick].behind[axis].map_or(0, |behind| cells(behind as usize));
+        touched | previous_in(own, behind, axis)
     })
 }
 
@@ -363,9 +362,9 @@ fn inverse_roots<T: Real, const W: usize, const N: usize, const S: usize>(
                 square[l] = dx * dx + dy * dy + dz * dz + T::lit(EPSILON);
                 q[l] = square[l].inverse_sqrt();
             }
-            let cells = bricks[own].cells >> (16 * x) & 0xffff;
+            let cells = bricks[own].cells >> (STRIDE[0] * x) & 0xffff;
             if cells != 0xffff {
-                for node in (0..16).filter(|node| cells >> node & 1 == 0) {
+                for node in (0..16).filter(|&node| !has(cells, node)) {
                     q[node * W..(node + 1) * W].fill(T::zero());
                 }
             }

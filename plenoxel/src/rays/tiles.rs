@@ -2,8 +2,7 @@
 
 use crate::camera::projection::{Projection, Rectangle};
 use crate::dataset::View;
-use crate::sampling::{Occupancy, place};
-use autograd::lattice::BRICK;
+use crate::sampling::Occupancy;
 use autograd::parallel;
 
 /// Pixels along a side of a tile.
@@ -36,14 +35,8 @@ impl Tile {
 /// The tiles that bricks of cells project into, by the rectangle around each; all tiles of a view that has a brick beside or behind its camera.
 pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
     let (aabb, cells) = (matter.aabb(), matter.cells());
-    let count = cells.map(|n| n.div_ceil(BRICK));
     let bricks = matter.masks().iter().enumerate().filter(|(_, mask)| **mask != 0);
-    let boxes: Vec<[[usize; 3]; 2]> = bricks
-        .map(|(b, _)| {
-            let low = place(b, count).map(|k| k * BRICK);
-            [low, [0, 1, 2].map(|a| (low[a] + BRICK).min(cells[a]))]
-        })
-        .collect();
+    let boxes: Vec<[[usize; 3]; 2]> = bricks.map(|(brick, _)| matter.bricks().bounds(brick)).collect();
     let of_views = parallel::map_indices(views.len(), |v| {
         let all = Tile::of_view(v, &views[v]);
         let (columns, rows) = (all.width.div_ceil(SIDE), all.height.div_ceil(SIDE));

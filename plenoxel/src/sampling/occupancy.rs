@@ -2,7 +2,7 @@
 
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use autograd::lattice::{BRICK, BRICK_ROWS, LOW, STRIDE};
+use autograd::lattice::{BRICK, BrickGrid, bits, has, next_in, previous_in};
 use autograd::{Real, Tensor, no_grad, parallel};
 use glam::DVec3;
 use std::sync::Arc;
@@ -12,10 +12,8 @@ use std::sync::Arc;
 #[derive(Debug, Clone)]
 pub struct Occupancy {
     aabb: Aabb,
-    cells: [usize; 3],
-    /// Bricks along each axis.
-    count: [usize; 3],
-    /// One for each brick, in row-major order; cell (i, j, k) of a brick is bit 16 i + 4 j + k.
+    bricks: BrickGrid,
+    /// The cells of each brick that may hold matter.
     masks: Arc<[u64]>,
     /// For an empty brick, the Chebyshev distance in bricks to the next one that is not, at most [`FAR`]; 0 for that one.
     distance: Arc<[u8]>,
@@ -39,13 +37,8 @@ impl Occupancy {
     /// Panics if the mask does not have one entry for each cell.
     pub fn new(aabb: Aabb, cells: [usize; 3], mask: &[bool]) -> Self {
         assert_eq!(mask.len(), cells.iter().product::<usize>(), "occupancy: one entry for each of {cells:?} cells");
-        let count = cells.map(|n| n.div_ceil(BRICK));
-        let mut masks = vec![0u64; count.iter().product()];
-        for (c, _) in mask.iter().enumerate().filter(|(_, full)| **full) {
-            let cell = [c / (cells[1] * cells[2]), c / cells[2] % cells[1], c % cells[2]];
-            let (brick, bit) = split(cell, count);
-            masks[brick] |= 1 << bit;
-        }
+        let full = mask.iter().enumerate().filter(|(_, full)| **full);
+        let masks = BrickGrid::new(cells).masks_of(full.map(|(c, _)| cell_at(c, cells)));
         Self::from_masks(aabb, cells, masks)
     }
 
@@ -55,10 +48,7 @@ impl Occupancy {
     pub fn where_dense<T: Real>(aabb: Aabb, cells: [usize; 3], threshold: f64, density: impl Fn(&Tensor<T>) -> Tensor<T>) -> Self {
         const AT_A_TIME: usize = 1 << 16;
         let sides = (aabb.max - aabb.min) / DVec3::from_array(cells.map(|n| n as f64));
-        let center = |c: usize| {
-            let cell = [c / (cells[1] * cells[2]), c / cells[2] % cells[1], c % cells[2]];
-            (aabb.min + sides * DVec3::from_array(cell.map(|k| k as f64 + 0.5))).to_array().map(T::lit)
-        };
+        let center = |c: usize| (aabb.min + sides * DVec3::from_array(cell_at(c, cells).map(|k| k as f64 + 0.5))).to_array().map(T::lit);
         let total = cells.iter().product::<usize>();
         let mut mask = Vec::with_capacity(total);
         for start in (0..total).step_by(AT_A_TIME) {
@@ -73,10 +63,10 @@ impl Occupancy {
     ///
     /// Panics if there is not one mask for each brick.
     pub fn from_masks(aabb: Aabb, cells: [usize; 3], masks: Vec<u64>) -> Self {
-        let count = cells.map(|n| n.div_ceil(BRICK));
-        assert_eq!(masks.len(), count.iter().product::<usize>(), "occupancy: one mask for each of {count:?} bricks");
-        let distance = distances(&masks, count).into();
-        Occupancy { aabb, cells, count, masks: masks.into(), distance }
+        let bricks = BrickGrid::new(cells);
+        assert_eq!(masks.len(), bricks.len(), "occupancy: one mask for each of {:?} bricks", bricks.count());
+        let distance = distances(&masks, bricks.count()).into();
+        Occupancy { aabb, bricks, masks: masks.into(), distance }
     }
 
     /// The box.
@@ -86,10 +76,15 @@ impl Occupancy {
 
     /// Cells along each axis.
     pub fn cells(&self) -> [usize; 3] {
-        self.cells
+        self.bricks.nodes()
     }
 
-    /// One mask for each brick, in row-major order.
+    /// How the cells are divided into bricks.
+    pub fn bricks(&self) -> BrickGrid {
+        self.bricks
+    }
+
+    /// One mask for each brick ([`BrickGrid`]).
     pub fn masks(&self) -> &[u64] {
         &self.masks
     }
@@ -105,19 +100,19 @@ impl Occupancy {
     ///
     /// Panics if the cell lies outside of the box.
     pub fn contains(&self, cell: [usize; 3]) -> bool {
-        assert!((0..3).all(|a| cell[a] < self.cells[a]), "cell {cell:?} of {:?}", self.cells);
-        let (brick, bit) = split(cell, self.count);
-        self.masks[brick] >> bit & 1 == 1
+        assert!((0..3).all(|a| cell[a] < self.cells()[a]), "cell {cell:?} of {:?}", self.cells());
+        let (brick, bit) = self.bricks.split(cell);
+        has(self.masks[brick], bit)
     }
 
     /// The share of cells that may hold matter.
     pub fn fraction(&self) -> f64 {
-        self.masks.iter().map(|m| f64::from(m.count_ones())).sum::<f64>() / self.cells.iter().product::<usize>() as f64
+        self.masks.iter().map(|m| f64::from(m.count_ones())).sum::<f64>() / self.cells().iter().product::<usize>() as f64
     }
 
     /// The smallest box around the cells that may hold matter; `None` if none may.
     pub fn bounds(&self) -> Option<Aabb> {
-        let side = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells.map(|n| n as f64));
+        let side = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells().map(|n| n as f64));
         // Rounding must not lead out of the box.
         let corner = |k: [usize; 3]| (self.aabb.min + side * DVec3::from_array(k.map(|k| k as f64))).min(self.aabb.max);
         self.extent().map(|[low, high]| Aabb { min: corner(low), max: corner(high) })
@@ -130,13 +125,11 @@ impl Occupancy {
 
     /// The bounds in cells: the lowest along each axis, and one above the highest.
     pub fn extent(&self) -> Option<[[usize; 3]; 2]> {
-        let (mut low, mut high) = (self.cells, [0; 3]);
-        for (b, mask) in self.masks.iter().enumerate().filter(|(_, mask)| **mask != 0) {
-            let place = place(b, self.count);
-            for bit in (0..BRICK_ROWS).filter(|bit| mask >> bit & 1 == 1) {
+        let (mut low, mut high) = (self.cells(), [0; 3]);
+        for (brick, &mask) in self.masks.iter().enumerate() {
+            for cell in bits(mask).map(|bit| self.bricks.node(brick, bit)) {
                 for a in 0..3 {
-                    let k = place[a] * BRICK + (bit / STRIDE[a]) % BRICK;
-                    (low[a], high[a]) = (low[a].min(k), high[a].max(k + 1));
+                    (low[a], high[a]) = (low[a].min(cell[a]), high[a].max(cell[a] + 1));
                 }
             }
         }
@@ -148,28 +141,26 @@ impl Occupancy {
         let mut masks = self.masks.to_vec();
         for _ in 0..radius {
             for axis in 0..3 {
-                masks = dilate(&masks, self.count, axis, true);
+                masks = dilate(&masks, self.bricks, axis, true);
             }
         }
-        for (b, mask) in masks.iter_mut().enumerate() {
-            *mask &= inside(place(b, self.count), self.cells);
-        }
-        Self::from_masks(self.aabb, self.cells, masks)
+        masks.iter_mut().enumerate().for_each(|(brick, mask)| *mask &= self.bricks.inside(brick));
+        Self::from_masks(self.aabb, self.cells(), masks)
     }
 
     /// The cells between the centres of these: one more along each axis, in a box larger by half a cell on every side, so that cell (i, j, k)
     /// has its corners at the centres of the cells (i − 1, j − 1, k − 1) to (i, j, k). Those with one of these cells at a corner.
     pub fn between_centres(&self) -> Self {
-        let half = 0.5 * (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells.map(|n| n as f64));
+        let half = 0.5 * (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells().map(|n| n as f64));
         let aabb = Aabb { min: self.aabb.min - half, max: self.aabb.max + half };
-        let cells = self.cells.map(|n| n + 1);
-        let count = cells.map(|n| n.div_ceil(BRICK));
-        let mut masks = vec![0; count.iter().product()];
-        for (b, mask) in self.masks.iter().enumerate() {
-            masks[place_number(place(b, self.count), count)] = *mask;
+        let cells = self.cells().map(|n| n + 1);
+        let bricks = BrickGrid::new(cells);
+        let mut masks = vec![0; bricks.len()];
+        for (brick, mask) in self.masks.iter().enumerate() {
+            masks[bricks.number(self.bricks.place(brick))] = *mask;
         }
         for axis in 0..3 {
-            masks = dilate(&masks, count, axis, false);
+            masks = dilate(&masks, bricks, axis, false);
         }
         Self::from_masks(aabb, cells, masks)
     }
@@ -189,15 +180,15 @@ impl Occupancy {
     }
 
     fn combined(&self, other: &Self, join: fn(u64, u64) -> u64) -> Self {
-        assert_eq!(self.cells, other.cells, "occupancy: different grids");
+        assert_eq!(self.bricks, other.bricks, "occupancy: different grids");
         let masks = self.masks.iter().zip(&*other.masks).map(|(&a, &b)| join(a, b)).collect();
-        Self::from_masks(self.aabb, self.cells, masks)
+        Self::from_masks(self.aabb, self.cells(), masks)
     }
 
     /// What can be looked up along a ray.
     #[inline]
     pub(crate) fn along(&self, ray: &Ray) -> Along<'_> {
-        let per_length = DVec3::from_array(self.cells.map(|n| n as f64)) / (self.aabb.max - self.aabb.min);
+        let per_length = DVec3::from_array(self.cells().map(|n| n as f64)) / (self.aabb.max - self.aabb.min);
         let slope = ray.direction * per_length;
         Along { cells: self, start: (ray.origin - self.aabb.min) * per_length, slope, per_cell: slope.recip() }
     }
@@ -217,13 +208,13 @@ impl Along<'_> {
     /// What lies at a distance along the ray.
     #[inline]
     pub(crate) fn look(&self, t: f64) -> Look {
-        let Occupancy { cells, count, masks, distance, .. } = self.cells;
-        let cell: [usize; 3] = std::array::from_fn(|a| self.cell(a, t, cells[a]) as usize);
-        let (brick, bit) = split(cell, *count);
+        let Occupancy { bricks, masks, distance, .. } = self.cells;
+        let cell: [usize; 3] = std::array::from_fn(|a| self.cell(a, t, bricks.nodes()[a]) as usize);
+        let (brick, bit) = bricks.split(cell);
         // The distances are a table that stays in the cache, and most of what is looked at is far from everything.
         let free = distance[brick];
         if free == 0 {
-            return if masks[brick] >> bit & 1 == 1 { Look::Occupied } else { Look::Empty };
+            return if has(masks[brick], bit) { Look::Occupied } else { Look::Empty };
         }
         // All bricks nearer than `free` are empty: to where the ray leaves the cube of them.
         let exit = (0..3).fold(f64::INFINITY, |exit, a| {
@@ -244,59 +235,38 @@ impl Along<'_> {
     /// Which of some distances lie in occupied cells.
     #[inline(always)]
     pub(crate) fn occupied<const N: usize>(&self, t: &[f64; N]) -> [bool; N] {
-        let Occupancy { cells, count, masks, .. } = self.cells;
-        let (mut bricks, mut bits) = ([0; N], [0; N]);
+        let Occupancy { bricks, masks, .. } = self.cells;
+        let (mut numbers, mut bits) = ([0; N], [0; N]);
+        // As `BrickGrid::split`, one axis after the other: such loops vectorise.
         for a in 0..3 {
             for i in 0..N {
-                let cell = self.cell(a, t[i], cells[a]);
-                bricks[i] = bricks[i] * count[a] as u32 + cell / BRICK as u32;
+                let cell = self.cell(a, t[i], bricks.nodes()[a]);
+                numbers[i] = numbers[i] * bricks.count()[a] as u32 + cell / BRICK as u32;
                 bits[i] = bits[i] * BRICK as u32 + cell % BRICK as u32;
             }
         }
-        let masks = parallel::gathered(masks, bricks);
-        std::array::from_fn(|i| masks[i] >> bits[i] & 1 == 1)
+        let masks = parallel::gathered(masks, numbers);
+        std::array::from_fn(|i| has(masks[i], bits[i] as usize))
     }
 }
 
-/// Number of a cell's brick, and of the cell in it.
-#[inline(always)]
-pub(crate) fn split(cell: [usize; 3], count: [usize; 3]) -> (usize, usize) {
-    let brick = place_number(cell.map(|c| c / BRICK), count);
-    (brick, (cell[0] % BRICK) * 16 + (cell[1] % BRICK) * 4 + cell[2] % BRICK)
-}
-
-/// Number of the brick at a place.
-#[inline(always)]
-pub(super) fn place_number(place: [usize; 3], count: [usize; 3]) -> usize {
-    (place[0] * count[1] + place[1]) * count[2] + place[2]
-}
-
-/// Place of a brick.
-pub(crate) fn place(brick: usize, count: [usize; 3]) -> [usize; 3] {
-    [brick / (count[1] * count[2]), brick / count[2] % count[1], brick % count[2]]
-}
-
-/// The cells of a brick that lie in a box of `cells`.
-pub(crate) fn inside(place: [usize; 3], cells: [usize; 3]) -> u64 {
-    (0..64).filter(|bit| (0..3).all(|a| place[a] * BRICK + (bit >> (4 - 2 * a) & 3) < cells[a])).fold(0, |mask, bit| mask | 1 << bit)
+/// The cell with a number in row-major order.
+fn cell_at(number: usize, cells: [usize; 3]) -> [usize; 3] {
+    [number / (cells[1] * cells[2]), number / cells[2] % cells[1], number % cells[2]]
 }
 
 /// Every cell and the next one along an axis, and, if asked for, the one before it.
-fn dilate(masks: &[u64], count: [usize; 3], axis: usize, back: bool) -> Vec<u64> {
-    let step = STRIDE[axis];
-    let (low, high) = (LOW[axis], LOW[axis] << (3 * step));
-    let stride = [count[1] * count[2], count[2], 1][axis];
+fn dilate(masks: &[u64], bricks: BrickGrid, axis: usize, back: bool) -> Vec<u64> {
+    let stride = bricks.strides()[axis];
     let mut out = vec![0; masks.len()];
     parallel::for_each_chunk(&mut out, parallel::CHUNK, |first, chunk| {
-        for (i, out) in chunk.iter_mut().enumerate() {
-            let b = first + i;
-            let at = place(b, count)[axis];
-            let m = masks[b];
-            let before = if at > 0 { masks[b - stride] } else { 0 };
-            *out = m | (m & !high) << step | (before & high) >> (3 * step);
+        for (b, out) in (first..).zip(chunk) {
+            let (place, mask) = (bricks.place(b)[axis], masks[b]);
+            let behind = if place > 0 { masks[b - stride] } else { 0 };
+            *out = mask | previous_in(mask, behind, axis);
             if back {
-                let after = if at + 1 < count[axis] { masks[b + stride] } else { 0 };
-                *out |= (m & !low) >> step | (after & low) << (3 * step);
+                let ahead = if place + 1 < bricks.count()[axis] { masks[b + stride] } else { 0 };
+                *out |= next_in(mask, ahead, axis);
             }
         }
     });

@@ -1,10 +1,9 @@
 //! The voxels a ray passes through, each once, in order, with the exact chord (Amanatides and Woo 1987), over bricks of 4³ voxels of which
 //! the empty ones are crossed in one step.
 
-use super::occupancy::place_number;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use autograd::lattice::{BRICK, STRIDE};
+use autograd::lattice::{BRICK, BrickGrid, bit_of};
 use std::ops::ControlFlow;
 
 /// A voxel on a ray.
@@ -26,8 +25,7 @@ pub struct Crossing {
 #[derive(Clone, Copy, Debug)]
 pub struct Walk {
     aabb: Aabb,
-    voxels: [usize; 3],
-    bricks: [usize; 3],
+    bricks: BrickGrid,
     /// Planes before and behind which nothing is visited.
     extent: [[usize; 3]; 2],
 }
@@ -131,7 +129,7 @@ impl Front {
 impl Walk {
     /// The voxels of a box.
     pub fn new(aabb: Aabb, voxels: [usize; 3]) -> Self {
-        Walk { aabb, voxels, bricks: voxels.map(|n| n.div_ceil(BRICK)), extent: [[0; 3], voxels] }
+        Walk { aabb, bricks: BrickGrid::new(voxels), extent: [[0; 3], voxels] }
     }
 
     /// Only those from one corner on and before another ([`super::Occupancy::extent`]).
@@ -146,7 +144,7 @@ impl Walk {
     /// Chords add up to that of the extent within rounding.
     #[inline]
     pub fn along(&self, ray: &Ray, free: impl Fn(usize) -> u8, mut visit: impl FnMut(Crossing) -> ControlFlow<()>) {
-        let axis = |a: usize| Planes::new(self.voxels[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]);
+        let axis = |a: usize| Planes::new(self.bricks.nodes()[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]);
         let planes = [axis(0), axis(1), axis(2)];
         let (mut t, mut end) = (0.0_f64, f64::INFINITY);
         let [low, high] = self.extent;
@@ -166,8 +164,9 @@ impl Walk {
             front.place[a] = axis.cell(t, 0, axis.voxels) / BRICK;
             front.exits[a] = axis.leaves_bricks(front.place[a], 1);
         }
-        while t < end && front.place[0] < self.bricks[0] && front.place[1] < self.bricks[1] && front.place[2] < self.bricks[2] {
-            let brick = place_number(front.place, self.bricks);
+        let count = self.bricks.count();
+        while t < end && front.place[0] < count[0] && front.place[1] < count[1] && front.place[2] < count[2] {
+            let brick = self.bricks.number(front.place);
             let layers = usize::from(free(brick));
             if layers > 1 {
                 // To where the ray leaves the cube of empty bricks.
@@ -179,7 +178,7 @@ impl Walk {
                         true => front.place[a].wrapping_add(axis.step.wrapping_mul(layers)),
                         false => axis.cell(t, 0, axis.voxels) / BRICK,
                     };
-                    if front.place[a] >= self.bricks[a] {
+                    if front.place[a] >= count[a] {
                         return;
                     }
                     front.exits[a] = axis.leaves_bricks(front.place[a], 1);
@@ -222,7 +221,7 @@ fn cross(
         let [x, y, z] = front.place;
         if leave > t {
             let voxel = [low[0] + x, low[1] + y, low[2] + z];
-            visit(Crossing { voxel, brick, bit: x * STRIDE[0] + y * STRIDE[1] + z * STRIDE[2], enter: t, leave })?;
+            visit(Crossing { voxel, brick, bit: bit_of([x, y, z]), enter: t, leave })?;
             t = leave;
         }
         front.advance(spacing, step);

@@ -3,7 +3,7 @@
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
-use autograd::lattice::{BRICK, BRICK_ROWS};
+use autograd::lattice::{BRICK_ROWS, BrickGrid, has};
 use autograd::parallel;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -31,8 +31,10 @@ impl<'a> FirstVoxels<'a> {
     ///
     /// Panics if there are more voxels than numbers: some 1600³.
     pub fn new(views: &'a [View], aabb: Aabb, voxels: [usize; 3]) -> Self {
-        let bricks: usize = voxels.map(|n| n.div_ceil(BRICK)).iter().product();
-        assert!(bricks * BRICK_ROWS < UNKNOWN as usize, "photo hull: {voxels:?} voxels are more than 32 bits can number");
+        assert!(
+            BrickGrid::new(voxels).len() * BRICK_ROWS < UNKNOWN as usize,
+            "photo hull: {voxels:?} voxels are more than 32 bits can number"
+        );
         let of_alpha = |&alpha: &u8| if alpha == 0 { NOTHING } else { UNKNOWN };
         let numbers = views.iter().map(|view| view.image.as_raw().iter().skip(3).step_by(4).map(of_alpha).collect()).collect();
         FirstVoxels { views, walk: Walk::new(aabb, voxels), numbers }
@@ -46,7 +48,7 @@ impl<'a> FirstVoxels<'a> {
             let rows = numbers.chunks_mut(view.image.width() as usize).enumerate();
             rows.map(move |(y, row)| (view, y, row))
         });
-        let is_left = |number: u32| masks[number as usize / BRICK_ROWS] >> (number as usize % BRICK_ROWS) & 1 == 1;
+        let is_left = |number: u32| has(masks[number as usize / BRICK_ROWS], number as usize % BRICK_ROWS);
         let walk = &self.walk;
         parallel::for_each_item(rows.collect(), |_, (view, y, row)| {
             for (x, first) in row.iter_mut().enumerate() {
@@ -59,7 +61,7 @@ impl<'a> FirstVoxels<'a> {
                     &ray,
                     |brick| u8::from(masks[brick] == 0),
                     |crossing| {
-                        if masks[crossing.brick] >> crossing.bit & 1 == 0 {
+                        if !has(masks[crossing.brick], crossing.bit) {
                             return ControlFlow::Continue(());
                         }
                         *first = number(crossing.brick, crossing.bit);

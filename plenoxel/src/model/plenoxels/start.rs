@@ -8,6 +8,7 @@ use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
 use autograd::Real;
+use autograd::lattice::has;
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
@@ -73,7 +74,7 @@ fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -
             &ray,
             |brick| matter.free(brick),
             |crossing| {
-                found = matter.masks()[crossing.brick] >> crossing.bit & 1 == 1;
+                found = has(matter.masks()[crossing.brick], crossing.bit);
                 if found { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
             },
         );
