@@ -1,6 +1,6 @@
 //! `report.html`: what came of a run, on one page that needs no other file, no server and no network.
 //!
-//! It is made from what is in the run folder, and from the grid; so it can be made again later.
+//! It is made from what is in the run folder, and from the model; so it can be made again later.
 
 pub mod curves;
 pub mod pictures;
@@ -10,7 +10,7 @@ use crate::html::{self, escaped};
 use crate::progress::{clock, thousands};
 use plenoxel::dataset::Dataset;
 use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::model::Model;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::bytes;
@@ -29,7 +29,8 @@ pub struct Report<'a> {
     pub config: &'a Config,
     pub record: &'a RunRecord,
     pub dataset: &'a Dataset,
-    pub grid: &'a VoxelGrid<f32>,
+    /// The trained model; `None` if this program has no code for its kind.
+    pub model: Option<&'a dyn Model<f32>>,
 }
 
 impl Report<'_> {
@@ -38,11 +39,11 @@ impl Report<'_> {
         let result = self.folder.figures().unwrap_or(Value::Null);
         let metrics = metrics::read(&self.folder.metrics())?;
         let lines: Vec<_> = metrics::lines(&metrics).map(|(_, line)| line).collect();
-        let scene = scene::Scene::new(self)?;
+        let scene = scene::Scene::of(self)?;
         let title = format!("{} – {}", self.folder.path().file_name().unwrap_or_default().to_string_lossy(), self.record.scene);
         let parts = [
             facts(self, &result),
-            scene.figure(),
+            scene.as_ref().map_or_else(String::new, scene::Scene::figure),
             curves::section(&lines, &self.config.stages),
             pictures::stages(self.folder)?,
             stages(&result),
@@ -50,10 +51,11 @@ impl Report<'_> {
             costs(self, &result),
             self.settings()?,
         ];
-        let scripts = format!("<script>\n{}</script>\n{}", SCRIPT, scene.scripts());
+        let scripts = format!("<script>\n{}</script>\n{}", SCRIPT, scene.as_ref().map_or_else(String::new, scene::Scene::scripts));
         let page = html::page(&title, STYLE, &(parts.join("\n") + &scripts));
         self.folder.write_report(&page)?;
-        Ok(format!("report: {} ({}); {}", self.folder.report().display(), bytes(page.len() as u64), scene.note()))
+        let note = scene.map_or_else(|| "there are no voxels to look around in".to_owned(), |scene| scene.note());
+        Ok(format!("report: {} ({}); {note}", self.folder.report().display(), bytes(page.len() as u64)))
     }
 
     /// Every setting, as the run folder has them.
@@ -73,17 +75,23 @@ impl Report<'_> {
 fn facts(report: &Report<'_>, result: &Value) -> String {
     let number = |key: &str, digits: usize, unit: &str| result[key].as_f64().map(|x| format!("{x:.digits$}{unit}"));
     let views = result["views"].as_u64().unwrap_or(0);
-    let shape = report.grid.shape();
+    let of_model = report.model.map_or_else(Vec::new, |model| model.facts());
+    let of_model = of_model.into_iter().map(|(name, value)| (name, Some(thousands(value as u64))));
     let facts = [
         ("PSNR", number("psnr", 2, " dB")),
         ("SSIM", number("ssim", 4, "")),
         (if report.record.is_carved() { "carving" } else { "training" }, result["seconds"].as_f64().map(clock)),
-        ("grid", Some(format!("{}³", shape.resolution))),
-        ("voxels", Some(thousands(report.grid.lattice().present() as u64))),
+        ("grid", result["resolution"].as_u64().map(|resolution| format!("{resolution}³"))),
+    ];
+    let baselines = [
         ("background alone", number("baseline_background_psnr", 2, " dB")),
         ("mean training image", number("baseline_mean_image_psnr", 2, " dB")),
     ];
-    let facts = facts.into_iter().filter_map(|(name, value)| Some(format!("<div><b>{}</b><span>{name}</span></div>", value?)));
+    let facts = facts
+        .into_iter()
+        .chain(of_model)
+        .chain(baselines)
+        .filter_map(|(name, value)| Some(format!("<div><b>{}</b><span>{name}</span></div>", value?)));
     let what = match (views, result["width"].as_u64(), result["height"].as_u64()) {
         (1.., Some(width), Some(height)) => format!(
             "PSNR and SSIM are means over {views} test views of {width} x {height} on a background of {:?}, predictions clamped to [0, 1].",
@@ -107,7 +115,8 @@ fn stages(result: &Value) -> String {
     for stage in stages {
         let psnr = stage["psnr"].as_f64().map_or("–".to_owned(), |psnr| format!("{psnr:.2} dB"));
         let seconds = stage["seconds"].as_f64().map_or_else(String::new, clock);
-        let _ = write!(rows, "<tr><td>{}³</td><td>{}</td><td>{seconds}</td><td>{psnr}</td></tr>", stage["resolution"], stage["steps"]);
+        let resolution = stage["resolution"].as_u64().map_or_else(|| "–".to_owned(), |resolution| format!("{resolution}³"));
+        let _ = write!(rows, "<tr><td>{resolution}</td><td>{}</td><td>{seconds}</td><td>{psnr}</td></tr>", stage["steps"]);
     }
     format!(
         "<section><table><thead><tr><th>stage</th><th>steps</th><th>ended after</th><th>test PSNR</th></tr></thead>\

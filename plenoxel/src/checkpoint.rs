@@ -11,6 +11,7 @@
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, open};
+use crate::train::About;
 use autograd::lattice::BrickGrid;
 use autograd::{Indices, Lattice, Module, Param, Real, Tensor};
 use serde::{Deserialize, Serialize};
@@ -70,6 +71,12 @@ pub struct Header {
     pub step: u64,
     /// Program that wrote it.
     pub writer: String,
+}
+
+impl From<Header> for About {
+    fn from(header: Header) -> Self {
+        About { scene: header.scene, background: header.background, seed: header.seed, step: header.step }
+    }
 }
 
 fn kind() -> String {

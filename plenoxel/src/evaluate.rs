@@ -23,7 +23,7 @@ use serde::Serialize;
 /// println!("{:?} dB over {} views", scores.psnr(), scores.per_view.len());
 /// # }
 /// ```
-pub fn evaluate<T: Real>(model: &impl Model<T>, views: &[View], options: &ViewOptions) -> Scores {
+pub fn evaluate<T: Real>(model: &(impl Model<T> + ?Sized), views: &[View], options: &ViewOptions) -> Scores {
     Viewer::of(model, options).compare(views, |_, _, _, _| Ok(())).unwrap_or_default()
 }
 
@@ -40,7 +40,7 @@ impl<'a, T: Real> Viewer<'a, T> {
     }
 
     /// A viewer of a model.
-    pub fn of(model: &'a impl Model<T>, options: &ViewOptions) -> Self {
+    pub fn of(model: &'a (impl Model<T> + ?Sized), options: &ViewOptions) -> Self {
         Viewer { show: model.viewer(options), background: options.background }
     }
 

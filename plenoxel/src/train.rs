@@ -6,7 +6,7 @@ mod model;
 mod state;
 
 pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, ViewOptions};
-pub use state::About;
+pub use state::{About, about};
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
@@ -17,6 +17,7 @@ use autograd::optim::Optimizer;
 use autograd::{Module, Real, parallel, value_and_grad};
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 use std::sync::Arc;
 
 /// Settings of a run that do not depend on the model.
@@ -164,6 +165,14 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     /// The trained model.
     pub fn into_model(self) -> M {
         self.model
+    }
+
+    /// The model of a checkpoint that this trainer's run wrote at its end ([`Model::load`]), and facts about it.
+    ///
+    /// Errors name the file and what is wrong with it.
+    pub fn into_model_of(mut self, path: &Path) -> Result<(M, About)> {
+        let about = self.model.load(path)?;
+        Ok((self.model, about))
     }
 
     /// The objective, with the parameters of its losses as they are now.

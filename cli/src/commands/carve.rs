@@ -8,17 +8,18 @@ use crate::report::Report;
 use clap::{Args, ValueHint};
 use plenoxel::carve::photo_hull::PhotoConfig;
 use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
-use plenoxel::checkpoint::Header;
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
+use plenoxel::evaluate::Viewer;
+use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::model::plenoxels::config::Config;
-use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::evenly_spaced;
 use plenoxel::run::folder::{RunFolder, RunKind, RunRecord};
 use plenoxel::run::memory::{self, Estimate};
 use plenoxel::run::settings::{self, CARVE, Layers};
 use plenoxel::run::training::Stopwatch;
+use plenoxel::train::{About, ViewOptions};
 use serde::Serialize;
 use std::path::PathBuf;
 use toml::Value;
@@ -196,13 +197,14 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
             100.0 * colored.missed
         ));
     }
-    let header = Header::new(&colored.grid, dataset.name(), config.background, config.seed, 0);
-    folder.save(&colored.grid, &header)?;
+    let Colored { grid, missed } = colored;
+    let model = Plenoxels::of_grid(&config, grid);
+    folder.save(&model, &About { scene: dataset.name().to_owned(), background: config.background, seed: config.seed, step: 0 })?;
     drop(carving);
     drop(views);
 
     if !args.no_images {
-        console.note(&format!("pictures of {} views in images/carved.png", draw(&folder, &config, &dataset, &colored)?));
+        console.note(&format!("pictures of {} views in images/carved.png", draw(&folder, &config, &dataset, &model)?));
     }
     let summary = Summary {
         seconds: hull_clock.seconds() + color_clock.seconds(),
@@ -214,7 +216,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
         voxels: left,
         rule: config.carve.rule,
         fit: config.carve.fit,
-        missed_object_pixels: colored.missed,
+        missed_object_pixels: missed,
         scene: dataset.name().to_owned(),
         run: folder.path().display().to_string(),
     };
@@ -226,18 +228,18 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.record(&summary)?;
     if !args.no_report {
-        let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, grid: &colored.grid };
+        let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: Some(&model) };
         console.note(&report.write()?);
     }
     Ok(())
 }
 
-/// Writes what some cameras see of the grid, side by side, and says how many.
-fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, colored: &Colored) -> Result<usize> {
+/// Writes pictures of the model from some cameras, side by side, and returns how many.
+fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, model: &Plenoxels<f32>) -> Result<usize> {
     const MOST: usize = 4;
     let split = if dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
     let cameras = dataset.cameras(split);
-    let viewer = grid_viewer(&colored.grid, config.evaluation, config.engine, config.background);
+    let viewer = Viewer::of(model, &ViewOptions::over(config.background));
     let chosen = evenly_spaced(cameras.len(), MOST);
     let pictures: Vec<_> = chosen.into_iter().map(|number| viewer.see(&cameras[number]).rgb).collect();
     folder.create_images()?;

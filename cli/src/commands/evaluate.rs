@@ -5,10 +5,9 @@ use super::trained_run::{Found, Loaded, TrainedRun};
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
-use plenoxel::evaluate::ViewScore;
+use plenoxel::evaluate::{ViewScore, Viewer};
 use plenoxel::files;
 use plenoxel::json;
-use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::run::figures::Figures;
 use plenoxel::run::memory::{self, Estimate};
 use serde::Serialize;
@@ -50,19 +49,19 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let start = Instant::now();
     let found = args.run.find()?;
     let dataset = args.run.views(&found)?;
-    let Loaded { sampling, grid, header } = args.run.load(&found, console, |sampling, shape, voxels| {
+    let Loaded { model, about, view } = args.run.load(&found, console, |sampling, shape, voxels| {
         Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
     })?;
     let Found { folder, config, preset, source } = found;
     let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
     // A folder may have another name by now: no error.
-    if header.scene != dataset.name() {
-        console.note(&format!("the grid is of another scene: {}, not {}", header.scene, dataset.name()));
+    if about.scene != dataset.name() {
+        console.note(&format!("the run is of another scene: {}, not {}", about.scene, dataset.name()));
     }
 
     let start = Instant::now();
-    let viewer = grid_viewer(&grid, sampling, config.engine, config.background);
+    let viewer = Viewer::of(&*model, &view);
     let count = console.count("evaluating", views.len());
     let scores = viewer.compare(&views, |i, _, _, _| {
         count.at(i + 1, views.len());
@@ -70,7 +69,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     })?;
     drop(count);
 
-    let figures = Figures::new(&scores, args.run.split, &dataset, &config, sampling, &grid);
+    let figures = Figures::new(&scores, args.run.split, &dataset, &config, &*model, &view);
     if !args.json {
         for view in &scores.per_view {
             let ssim = view.ssim.map_or("-".to_owned(), |ssim| format!("{ssim:.4}"));
@@ -87,9 +86,9 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         seconds_load,
         seconds_evaluate: start.elapsed().as_secs_f64(),
         peak_memory_bytes: memory::peak(),
-        steps: header.step,
+        steps: about.step,
         rays: of_last("rays").and_then(Value::as_u64),
-        scene: header.scene,
+        scene: about.scene,
         preset,
         run: folder.path().display().to_string(),
         per_view: scores.per_view,

@@ -8,7 +8,7 @@ use super::numbers;
 use crate::progress::Console;
 use clap::{Args, Subcommand, ValueHint};
 use glam::DVec3;
-use plenoxel::checkpoint::Header;
+use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
@@ -82,11 +82,12 @@ impl Exported {
         }
         let (folder, config, record) = RunFolder::open(&self.run)?;
         let folder = if self.best { folder.with_best()? } else { folder };
-        let (header, voxels) = folder.header()?;
+        let path = folder.existing_checkpoint()?;
+        let (header, voxels) = checkpoint::header(&path)?;
         let estimate = Estimate::of_export(&header.shape(), voxels);
         console.note(&estimate.describe());
         estimate.check()?;
-        let (grid, header) = folder.load()?;
+        let (grid, header) = checkpoint::load(&path)?;
         Ok(Opened { folder, config, record, header, grid })
     }
 

@@ -6,6 +6,7 @@ use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::model;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
@@ -81,9 +82,11 @@ fn describe(path: &Path) -> Result<Lines> {
 
 /// The facts of a checkpoint whose model this program has no code for: its kind and its parameters; `None` for a voxel grid.
 fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
+    let kind = model::kind(path)?;
+    if model::KINDS.contains(&&kind[..]) {
+        return Ok(None);
+    }
     let file = TensorFile::open(path)?;
-    let kind: Option<String> = file.facts()?["kind"].as_str().map(str::to_owned);
-    let Some(kind) = kind.filter(|kind| kind != checkpoint::KIND) else { return Ok(None) };
     let mut lines = vec![
         ("checkpoint", path.display().to_string()),
         ("kind", format!("{kind}: a model of another program, which can render and evaluate it")),
@@ -114,8 +117,13 @@ fn of_run(path: &Path) -> Result<Lines> {
     let stages: Vec<String> = stages.iter().map(|resolution| format!("{resolution}³")).collect();
     lines.push(("stages", if carved { "none: it was carved".to_owned() } else { stages.join(", ") }));
     if folder.checkpoint().exists() {
-        let (grid, header) = folder.load()?;
-        lines.extend(of_grid(&grid, &header));
+        match of_other_kind(&folder.checkpoint())? {
+            Some(other) => lines.extend(other),
+            None => {
+                let (grid, header) = checkpoint::load(&folder.checkpoint())?;
+                lines.extend(of_grid(&grid, &header));
+            }
+        }
     } else {
         lines.push(("grid", "none: the run did not end".to_owned()));
     }

@@ -13,6 +13,8 @@ use path::{Film, PathArgs, PathChoice};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
+use plenoxel::model::plenoxels::Plenoxels;
+use plenoxel::model::voxel_grid;
 use plenoxel::run::memory::Estimate;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -108,12 +110,13 @@ fn render(
     let channels = channels(args, default);
     let normals = channels.contains(&Channel::Normal);
     let pixels = shots.iter().map(|(camera, _)| camera.intrinsics.width * camera.intrinsics.height).max().unwrap_or(0);
-    let Loaded { sampling, grid, .. } = args
+    let Loaded { model, view, .. } = args
         .run
         .load(found, console, |sampling, shape, voxels| Estimate::of_pictures(&found.config, sampling, shape, voxels, pixels, normals))?;
     prepare()?;
-    let normals = normals.then(|| grid.normals());
-    let pictures = Pictures::new(&grid, normals.as_ref(), sampling, &found.config, &channels, &args.format);
+    let grid = || voxel_grid(&*model, found.folder.path(), "a picture of normals");
+    let normals = normals.then(|| Ok(Plenoxels::of_grid(&found.config, grid()?.normals()))).transpose()?;
+    let pictures = Pictures::new(&*model, normals.as_ref(), &view, &channels, &args.format);
     let count = console.count("rendering", shots.len());
     let start = Instant::now();
     for (done, (camera, stem)) in shots.iter().enumerate() {

@@ -3,7 +3,9 @@
 use crate::progress::Console;
 use crate::report::Report;
 use clap::{Args, ValueHint};
+use plenoxel::checkpoint;
 use plenoxel::error::Result;
+use plenoxel::model;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::memory::Estimate;
@@ -35,11 +37,17 @@ pub fn run(args: &ReportArgs, console: &Console<'_>) -> Result<()> {
     let (folder, config, record) = RunFolder::open(&args.run)?;
     let source = args.data.as_deref().map_or(record.data.clone(), DataSource::folder);
     let dataset = source.reopen(&config)?;
-    let (header, voxels) = folder.header()?;
-    let estimate = Estimate::of_report(&config, &header.shape(), voxels);
-    console.note(&estimate.describe());
-    estimate.check()?;
-    let (grid, _) = folder.load()?;
-    let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, grid: &grid };
+    let path = folder.existing_checkpoint()?;
+    let model = if model::KINDS.contains(&&model::kind(&path)?[..]) {
+        let (header, voxels) = checkpoint::header(&path)?;
+        let estimate = Estimate::of_report(&config, &header.shape(), voxels);
+        console.note(&estimate.describe());
+        estimate.check()?;
+        Some(model::open(&path, &config)?.0)
+    } else {
+        console.note(&format!("the model is of kind `{}`: the page has no interactive view of it", record.model));
+        None
+    };
+    let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: model.as_deref() };
     console.result(&report.write()?)
 }

@@ -2,14 +2,16 @@
 
 use crate::progress::Console;
 use clap::{Args, ValueHint};
-use plenoxel::checkpoint::Header;
+use plenoxel::checkpoint;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::{GridShape, VoxelGrid};
+use plenoxel::field::voxel_grid::GridShape;
 use plenoxel::model::plenoxels::config::{Config, Sampling};
+use plenoxel::model::{self, Model};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::memory::Estimate;
+use plenoxel::train::{About, ViewOptions};
 use std::path::PathBuf;
 
 /// Which run, and how to look at it.
@@ -48,11 +50,11 @@ pub struct Found {
     pub source: DataSource,
 }
 
-/// Its grid, and where samples of it lie.
+/// Its model, and how to render it.
 pub struct Loaded {
-    pub sampling: Sampling,
-    pub grid: VoxelGrid<f32>,
-    pub header: Header,
+    pub model: Box<dyn Model<f32>>,
+    pub about: About,
+    pub view: ViewOptions,
 }
 
 impl TrainedRun {
@@ -72,27 +74,29 @@ impl TrainedRun {
         Ok(dataset)
     }
 
-    /// Reads its grid, once memory is known to suffice: what `estimate` says of sampling, shape and number of voxels.
+    /// Reads its model, once memory is known to suffice: what `estimate` says of sampling, shape and number of voxels.
     pub fn load(
         &self,
         found: &Found,
         console: &Console<'_>,
         estimate: impl FnOnce(Sampling, &GridShape, usize) -> Estimate,
     ) -> Result<Loaded> {
-        let (header, voxels) = found.folder.header()?;
+        let path = found.folder.existing_checkpoint()?;
+        let (header, voxels) = checkpoint::header(&path)?;
         let (shape, as_trained) = (header.shape(), found.config.evaluation);
         let sampling = self.samples.map_or(as_trained, |samples| as_trained.with_samples(samples, &shape));
         let estimate = estimate(sampling, &shape, voxels);
         console.note(&estimate.describe());
         estimate.check()?;
-        let (grid, header) = found.folder.load()?;
-        Ok(Loaded { sampling, grid, header })
+        let (model, about) = model::open(&path, &found.config)?;
+        Ok(Loaded { model, about, view: ViewOptions { background: found.config.background, samples: self.samples } })
     }
 }
 
 impl Found {
-    /// Half the side of the box of its grid, world length.
+    /// Half the side of the box of its model, world length.
     pub fn half_width(&self) -> Result<f64> {
-        self.folder.header().map(|(header, _)| header.shape().half_width)
+        let (header, _) = checkpoint::header(&self.folder.existing_checkpoint()?)?;
+        Ok(header.shape().half_width)
     }
 }

@@ -9,6 +9,7 @@ use plenoxel::camera::Camera;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::export::web::WebGrid;
+use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics;
 use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::run::evenly_spaced;
@@ -44,9 +45,10 @@ struct Cost {
 }
 
 impl Scene {
-    /// Makes the grid of a report small.
-    pub fn new(report: &Report<'_>) -> Result<Self> {
-        let packed = WebGrid::within(report.grid, MOST_BYTES);
+    /// The voxel grid of a report, made small; `None` if its model has none.
+    pub fn of(report: &Report<'_>) -> Result<Option<Self>> {
+        let Some(grid) = report.model.and_then(|model| model.content()?.downcast_ref()) else { return Ok(None) };
+        let packed = WebGrid::within(grid, MOST_BYTES);
         let (small, bytes) = packed.map_err(|e| Error::io("report.html", e, "compressing the grid"))?;
         let split = if report.dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
         let (cameras, names) = (report.dataset.cameras(split), report.dataset.view_names(split));
@@ -59,8 +61,8 @@ impl Scene {
             "background": report.config.background,
             "views": views,
         });
-        let cost = Cost::of(report, &small)?;
-        Ok(Scene { small, bytes, settings, cost, size })
+        let cost = Cost::of(report, grid, &small)?;
+        Ok(Some(Scene { small, bytes, settings, cost, size }))
     }
 
     /// The viewer.
@@ -109,12 +111,12 @@ impl Scene {
 
 impl Cost {
     /// Renders a few test views with both grids.
-    fn of(report: &Report<'_>, small: &WebGrid) -> Result<Option<Self>> {
+    fn of(report: &Report<'_>, grid: &VoxelGrid<f32>, small: &WebGrid) -> Result<Option<Self>> {
         let chosen = evenly_spaced(report.dataset.count(Split::Test), COMPARED);
         let background = report.config.background;
         let small = small.to_grid();
         let [whole, small] =
-            [report.grid, &small].map(|grid| grid_viewer(grid, report.config.evaluation, report.config.engine, report.config.background));
+            [grid, &small].map(|grid| grid_viewer(grid, report.config.evaluation, report.config.engine, report.config.background));
         let mut sums = [0.0; 3];
         for &i in &chosen {
             let view = report.dataset.load_view(Split::Test, i)?;

@@ -51,7 +51,9 @@ use autograd::optim::Optimizer;
 use autograd::single::{cast, cast_mut, cast_ref, is_single};
 use autograd::{Module, Param, Real};
 use config::{Config, Sampling, Stage};
+use serde_json::{Map, Value, json};
 use start::Silhouettes;
+use std::any::Any;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -119,6 +121,11 @@ impl<T: Real> Plenoxels<T> {
         Ok(Plenoxels { config, stages, scouts, silhouettes, grid, learning: None, most_rows: usize::MAX })
     }
 
+    /// A grid that is there already, to be looked at.
+    pub fn of_grid(config: &Config, grid: VoxelGrid<T>) -> Self {
+        Plenoxels { config: config.clone(), stages: Vec::new(), scouts: 0, silhouettes: None, grid, learning: None, most_rows: usize::MAX }
+    }
+
     /// The same model, in which pruning must not leave more rows of tables than these, because they would not fit into memory.
     pub fn with_most_rows(self, most_rows: usize) -> Self {
         Plenoxels { most_rows, ..self }
@@ -159,6 +166,12 @@ impl<T: Real> Plenoxels<T> {
         &self.config
     }
 
+    /// Sampling of pictures.
+    fn sampling(&self, view: &ViewOptions) -> Sampling {
+        let sampling = self.config.evaluation;
+        view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()))
+    }
+
     /// Stages that are trained, fitted to the images; those of the scout come first.
     pub fn stages(&self) -> &[Stage] {
         &self.stages
@@ -175,9 +188,22 @@ pub fn grid_viewer<T: Real>(grid: &VoxelGrid<T>, sampling: Sampling, engine: Eng
     Viewer::new(show(grid, sampling, engine, background), background)
 }
 
+/// The model of a run, from its checkpoint. Its config is the run's; stages are not needed to look at it.
+///
+/// Errors name the file and what is wrong with it.
+pub fn open(path: &Path, config: &Config) -> Result<(Plenoxels<f32>, About)> {
+    let (grid, header) = checkpoint::load(path)?;
+    Ok((Plenoxels::of_grid(config, grid), header.into()))
+}
+
 /// Renders a batch of rays through a grid.
 fn render_grid<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     if const { is_single::<T>() } { cast(single::render(cast_ref(grid), rays, options)) } else { render(grid, rays, options) }
+}
+
+/// A grid with the values that another has now: the tables are shared until training changes them.
+fn copy<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
+    grid.with_density(grid.density.tensor().detach())
 }
 
 fn save<T: Real>(grid: &VoxelGrid<T>, path: &Path, about: &About) -> Result<()> {
@@ -191,15 +217,21 @@ fn show<T: Real>(
     engine: Engine,
     background: [f32; 3],
 ) -> impl Fn(&[Ray]) -> Rendered<T> + Sync + '_ {
-    let (matter, spacing) = (grid.matter(), sampling.spacing(grid.shape().voxel_side()));
-    move |rays| {
-        let occupancy = Some(&matter);
-        render_grid(
-            grid,
-            rays,
-            &RenderOptions { aabb: grid.aabb(), spacing, jitter: Jitter::None, background, occupancy, engine, stop_below: STOP_BELOW },
-        )
-    }
+    let matter = grid.matter();
+    move |rays| show_within(grid, &matter, sampling, engine, background, rays)
+}
+
+/// The pixels of a grid along some rays, with samples in occupied cells alone.
+fn show_within<T: Real>(
+    grid: &VoxelGrid<T>,
+    matter: &Occupancy,
+    sampling: Sampling,
+    engine: Engine,
+    background: [f32; 3],
+    rays: &[Ray],
+) -> Rendered<T> {
+    let (aabb, spacing, occupancy) = (grid.aabb(), sampling.spacing(grid.shape().voxel_side()), Some(matter));
+    render_grid(grid, rays, &RenderOptions { aabb, spacing, jitter: Jitter::None, background, occupancy, engine, stop_below: STOP_BELOW })
 }
 
 impl<T: Real> AsRef<VoxelGrid<T>> for Plenoxels<T> {
@@ -236,9 +268,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
-        let sampling = self.config.evaluation;
-        let sampling = view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()));
-        Box::new(show(&self.grid, sampling, self.config.engine, view.background))
+        Box::new(show(&self.grid, self.sampling(view), self.config.engine, view.background))
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
@@ -272,7 +302,33 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         vec![("voxels", self.grid.lattice().present() as f64)]
     }
 
-    fn settings(&self) -> serde_json::Value {
+    fn figures(&self, view: &ViewOptions) -> Map<String, Value> {
+        let shape = self.grid.shape();
+        let grid = json!({
+            "voxels_per_axis": shape.resolution,
+            "voxels_stored": self.grid.lattice().present(),
+            "half_width": shape.half_width,
+        });
+        let figures = [("resolution", json!(shape.resolution)), ("grid", grid), ("sampling", json!(self.sampling(view)))];
+        figures.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+    }
+
+    /// The voxel grid, a [`VoxelGrid<T>`].
+    fn content(&self) -> Option<&dyn Any> {
+        Some(&self.grid)
+    }
+
+    fn frozen(&self, view: &ViewOptions) -> Option<RenderFn<'static, T>> {
+        let (grid, sampling, engine, background) = (copy(&self.grid), self.sampling(view), self.config.engine, view.background);
+        let matter = grid.matter();
+        Some(Box::new(move |rays| show_within(&grid, &matter, sampling, engine, background, rays)))
+    }
+
+    fn prunes_from(&self) -> Option<usize> {
+        self.prunes_from()
+    }
+
+    fn settings(&self) -> Value {
         serde_json::to_value(&self.config).unwrap_or_default()
     }
 
@@ -297,7 +353,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     fn load(&mut self, path: &Path) -> Result<About> {
         let (grid, header) = if const { is_single::<T>() } { cast(single::load(path)?) } else { checkpoint::load(path)? };
         self.grid = grid;
-        Ok(About { scene: header.scene, background: header.background, seed: header.seed, step: header.step })
+        Ok(header.into())
     }
 }
 

@@ -2,11 +2,12 @@
 
 use crate::dataset::{Dataset, Split};
 use crate::evaluate::Scores;
-use crate::field::voxel_grid::VoxelGrid;
-use crate::model::plenoxels::config::{Config, Sampling};
+use crate::model::plenoxels::config::Config;
+use crate::train::{Model, ViewOptions};
 use serde::Serialize;
+use serde_json::{Map, Value};
 
-/// Mean scores over the views of a split, the images and the grid they are of, and their definitions.
+/// Mean scores over the views of a split, the images and the model they are of, and their definitions.
 #[derive(Debug, Serialize)]
 pub struct Figures {
     psnr: Option<f64>,
@@ -20,12 +21,11 @@ pub struct Figures {
     width: usize,
     height: usize,
     background: [f32; 3],
-    /// Voxels along each axis.
-    resolution: usize,
+    /// Facts about the model, among them how it is sampled.
+    #[serde(flatten)]
+    model: Map<String, Value>,
     image: ImageFacts,
-    grid: GridFacts,
     dataset: Counts,
-    sampling: Sampling,
     definitions: Definitions,
 }
 
@@ -42,14 +42,6 @@ struct ImageFacts {
     height: usize,
     /// Factor by which the dataset's images were reduced.
     downscale: usize,
-}
-
-#[derive(Debug, Serialize)]
-struct GridFacts {
-    voxels_per_axis: usize,
-    /// Voxels that are left after pruning.
-    voxels_stored: usize,
-    half_width: f64,
 }
 
 /// Views of the dataset by split.
@@ -88,10 +80,9 @@ const DEFINITIONS: Definitions = Definitions {
 };
 
 impl Figures {
-    /// The figures of a grid against the views of a split, rendered with `sampling`.
-    pub fn new(scores: &Scores, split: Split, dataset: &Dataset, config: &Config, sampling: Sampling, grid: &VoxelGrid<f32>) -> Self {
+    /// The figures of a model against the views of a split, rendered like `view`.
+    pub fn new(scores: &Scores, split: Split, dataset: &Dataset, config: &Config, model: &dyn Model<f32>, view: &ViewOptions) -> Self {
         let (width, height) = dataset.size();
-        let (shape, voxels_stored) = (grid.shape(), grid.lattice().present());
         let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
         Figures {
             psnr: scores.psnr(),
@@ -103,12 +94,10 @@ impl Figures {
             views: scores.per_view.len(),
             width,
             height,
-            background: config.background,
-            resolution: shape.resolution,
+            background: view.background,
+            model: model.figures(view),
             image: ImageFacts { width, height, downscale: config.downscale },
-            grid: GridFacts { voxels_per_axis: shape.resolution, voxels_stored, half_width: shape.half_width },
             dataset: Counts { train, val, test },
-            sampling,
             definitions: DEFINITIONS,
         }
     }

@@ -7,11 +7,10 @@ pub use record::{RunKind, RunRecord};
 
 use super::settings::{self, ConfigFile};
 use super::tensorboard;
-use crate::checkpoint::{self, Header};
 use crate::error::{Error, Result};
-use crate::field::voxel_grid::VoxelGrid;
 use crate::files;
 use crate::model::plenoxels::config::Config;
+use crate::train::{self, About, Model};
 use listing::{RENDERED, entries, first_free, is_fragment, is_frame, is_one_of, remove};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -20,7 +19,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, Clone)]
 pub struct RunFolder {
     path: PathBuf,
-    /// File name of the grid that is read and written: the last or the best.
+    /// File name of the model that is read and written: the last or the best.
     grid: &'static str,
 }
 
@@ -149,12 +148,12 @@ impl RunFolder {
 
     /// The step after which the best grid so far was written, if there is one.
     pub fn best_step(&self) -> Option<u64> {
-        checkpoint::header(&self.path.join(BEST)).ok().map(|(header, _)| header.step)
+        train::about(&self.path.join(BEST)).ok().map(|about| about.step)
     }
 
-    /// Writes the grid with the best validation PSNR so far.
-    pub fn save_best(&self, grid: &VoxelGrid<f32>, header: &Header) -> Result<()> {
-        checkpoint::save(&self.path.join(BEST), grid, header)
+    /// Writes the model with the best validation PSNR so far.
+    pub fn save_best(&self, model: &impl Model<f32>, about: &About) -> Result<()> {
+        model.save(&self.path.join(BEST), about)
     }
 
     /// Removes the best grid, when the last is as good.
@@ -162,26 +161,15 @@ impl RunFolder {
         remove([self.path.join(BEST)].into_iter().filter(|path| path.exists()))
     }
 
-    /// Writes the trained grid.
-    pub fn save(&self, grid: &VoxelGrid<f32>, header: &Header) -> Result<()> {
-        checkpoint::save(&self.checkpoint(), grid, header)
+    /// Writes the trained model.
+    pub fn save(&self, model: &impl Model<f32>, about: &About) -> Result<()> {
+        model.save(&self.checkpoint(), about)
     }
 
-    /// Reads the trained grid.
+    /// Path of the trained model, which is there.
     ///
-    /// Errors: there is none, because the run did not end well; or it is damaged.
-    pub fn load(&self) -> Result<(VoxelGrid<f32>, Header)> {
-        checkpoint::load(&self.existing_checkpoint()?)
-    }
-
-    /// Reads the header of the trained grid, and the number of its voxels.
-    ///
-    /// Errors as for [`RunFolder::load`].
-    pub fn header(&self) -> Result<(Header, usize)> {
-        checkpoint::header(&self.existing_checkpoint()?)
-    }
-
-    fn existing_checkpoint(&self) -> Result<PathBuf> {
+    /// Errors: there is none, because the run did not end well.
+    pub fn existing_checkpoint(&self) -> Result<PathBuf> {
         let path = self.checkpoint();
         if !path.exists() {
             let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");

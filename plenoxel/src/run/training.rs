@@ -30,13 +30,14 @@ use super::folder::{RunFolder, RunKind, RunRecord};
 use super::machine;
 use super::memory::{self, Estimate};
 use super::metrics::{History, MetricsFile};
+use crate::checkpoint;
 use crate::dataset::{Dataset, Split, View};
 use crate::error::{Error, Result};
-use crate::evaluate::{self, Scores};
+use crate::evaluate::{self, Scores, Viewer};
 use crate::model::plenoxels::config::Config;
-use crate::model::plenoxels::{Objective, Trainer, grid_viewer, objective};
+use crate::model::plenoxels::{self, Objective, Trainer, objective};
 use crate::run::figures::Figures;
-use crate::train::PlannedStage;
+use crate::train::{self, Model, PlannedStage, ViewOptions};
 use event::clock;
 use learning::Learned;
 use preview::Preview;
@@ -118,15 +119,15 @@ pub enum Outcome {
 /// A listener to events; those of loading come from several threads.
 pub type Listener<'l> = dyn FnMut(Event<'_>) + Send + 'l;
 
-/// Trains with the losses that the config names.
+/// Trains Plenoxels with the losses that the config names.
 ///
 /// Errors: settings that cannot be used, data that cannot be read, numbers that are not finite, files that cannot be written.
 pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
     train_with(settings, objective, on)
 }
 
-/// Trains with an objective of your own, which `objective` makes of the config and the number of training views. The losses of the config are used
-/// only if `objective` adds them, as [`plenoxels::objective`](objective()) does.
+/// Trains Plenoxels with an objective of your own, which `objective` makes of the config and the number of training views. The losses of the config
+/// are used only if `objective` adds them, as [`plenoxels::objective`](objective()) does.
 ///
 /// Errors as for [`train`], and those of `objective`.
 pub fn train_with(
@@ -134,45 +135,36 @@ pub fn train_with(
     objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
-    let RunSettings { data: source, options, .. } = settings;
-    let mut config = settings.config.clone();
-    config.validate()?;
-    config.check_stages()?;
-    if let (Some(from), Some(to)) = (&config.init_from, &settings.out)
-        && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
-    {
-        return Err(Error::config("--init-from", format!("{}, which is --out too,", from.display()), "another folder to write"));
-    }
-    let mut clocks = Clocks::default();
-    let dataset = clocks.load.time(|| source.open(&config))?;
-    on(Event::Opened { dataset: &dataset, config: &config });
-    let from = config.init_from.as_deref().map(RunFolder::open).transpose()?;
+    train_plenoxels(settings, Box::new(objective), on)
+}
+
+/// A function from a config and the number of training views to an objective.
+type MakeObjective<'o> = Box<dyn FnOnce(&Config, usize) -> Result<Objective<f32>> + 'o>;
+
+/// [`train_with`], compiled once.
+fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
+    settings.config.check_stages()?;
+    let mut run = NewRun::open(settings, on)?;
+    let from = run.config.init_from.as_deref().map(RunFolder::open).transpose()?;
     let carved = from.as_ref().is_some_and(|(_, _, record)| record.is_carved());
-    let initial = from.map(|(folder, ..)| folder);
-    let known = initial.as_ref().map(RunFolder::header).transpose()?;
-    if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != dataset.name()) {
-        on(Event::note(format!("the grid it starts from is of another scene: {}, not {}", header.scene, dataset.name())));
+    let initial = from.map(|(folder, ..)| folder.existing_checkpoint()).transpose()?;
+    let known = initial.as_deref().map(checkpoint::header).transpose()?;
+    if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != run.dataset.name()) {
+        on(Event::note(format!("the grid it starts from is of another scene: {}, not {}", header.scene, run.dataset.name())));
     }
     let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
-    let most_rows = room(&config, &dataset, bytes as u64, options, on)?;
-    let initial = initial.map(|folder| folder.load()).transpose()?.map(|(grid, _)| grid);
-    let folder = RunFolder::choose(settings.out.as_deref(), dataset.name(), settings.force)?;
-    let preview = clocks.load.time(|| Preview::new(&dataset, options.preview_every))?;
-    let views: Arc<[View]> = clocks.load.time(|| load(&dataset, Split::Train, source, on))?.into();
-
+    let most_rows = room(&run.config, &run.dataset, bytes as u64, &settings.options, on)?;
+    let initial = initial.as_deref().map(checkpoint::load).transpose()?.map(|(grid, _)| grid);
+    run.read(on)?;
     if let Some(seconds) = settings.time {
         on(Event::note("finding out how fast this machine is"));
-        config = clocks.train.time(|| budget::on_time(config, &views, seconds))?;
+        let NewRun { config, views, clocks, .. } = &mut run;
+        *config = clocks.train.time(|| budget::on_time(config.clone(), views, seconds))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
         on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
     }
-    let objective = objective(&config, views.len())?;
-    // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
-    folder.prepare()?;
-    let record =
-        RunRecord { seconds_planned: settings.time, ..RunRecord::new(RunKind::Trained, &dataset, settings.preset.as_deref(), source) };
-    folder.describe(&config, &record)?;
-    on(Event::note(format!("run: {}", folder.path().display())));
+    let objective = objective(&run.config, run.views.len())?;
+    let NewRun { config, views, clocks, .. } = &mut run;
     let start = || {
         let trainer = Trainer::with_losses(config.clone(), views.clone(), objective)?.with_most_rows(most_rows);
         Ok(initial.iter().fold(trainer, if carved { Trainer::starting_from_carved } else { Trainer::starting_from }))
@@ -187,11 +179,86 @@ pub fn train_with(
     if let scouts @ 1.. = trainer.model().scout_stages() {
         on(Event::note(format!("scout: {scouts} short stages first find out where matter is, as no silhouettes say so")));
     }
-    let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
-    let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
-    let learned = job.learn(trainer, (metrics, History::default()), preview, &views, &mut clocks, on)?;
-    drop(views);
-    job.conclude(learned, clocks, on)
+    run.learn(trainer, on)
+}
+
+/// Trains a model of your own. `start` makes its trainer of the config, the dataset and the training views. Of the config it may use what it likes:
+/// [`Config::train_options`] has seed, background and rays of a step; the run itself uses the background and what concerns the images. The model is
+/// saved and evaluated by its [`Model`] methods; its own settings ([`Model::settings`]) are part of its checkpoint.
+///
+/// Errors as for [`train`], and those of `start`.
+pub fn train_model<M: Model<f32>>(
+    settings: &RunSettings,
+    start: impl FnOnce(&Config, &Dataset, Arc<[View]>) -> Result<train::Trainer<f32, M>>,
+    on: &mut Listener<'_>,
+) -> Result<Outcome> {
+    if settings.time.is_some() {
+        return Err(Error::config("--time", "a model of one's own", "a number of steps: only Plenoxels are planned by time"));
+    }
+    let mut run = NewRun::open(settings, on)?;
+    run.read(on)?;
+    let NewRun { config, dataset, views, clocks, .. } = &mut run;
+    let trainer = clocks.train.time(|| start(config, dataset, views.clone()))?;
+    run.learn(trainer, on)
+}
+
+/// A run that begins.
+struct NewRun<'s> {
+    settings: &'s RunSettings,
+    /// The recipe, with the steps that were planned.
+    config: Config,
+    dataset: Dataset,
+    folder: RunFolder,
+    /// The training views, once they are read.
+    views: Arc<[View]>,
+    preview: Preview,
+    clocks: Clocks,
+}
+
+impl<'s> NewRun<'s> {
+    /// Opens the dataset, and chooses the folder. Nothing is written.
+    fn open(settings: &'s RunSettings, on: &mut Listener<'_>) -> Result<Self> {
+        let config = settings.config.clone();
+        config.validate()?;
+        if let (Some(from), Some(to)) = (&config.init_from, &settings.out)
+            && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
+        {
+            return Err(Error::config("--init-from", format!("{}, which is --out too,", from.display()), "another folder to write"));
+        }
+        let mut clocks = Clocks::default();
+        let dataset = clocks.load.time(|| settings.data.open(&config))?;
+        on(Event::Opened { dataset: &dataset, config: &config });
+        let folder = RunFolder::choose(settings.out.as_deref(), dataset.name(), settings.force)?;
+        Ok(NewRun { settings, config, dataset, folder, views: Arc::new([]), preview: Preview::default(), clocks })
+    }
+
+    /// Reads the training views, and those that are looked at while training.
+    fn read(&mut self, on: &mut Listener<'_>) -> Result<()> {
+        let NewRun { settings, dataset, clocks, .. } = self;
+        self.preview = clocks.load.time(|| Preview::new(dataset, settings.options.preview_every))?;
+        self.views = clocks.load.time(|| load(dataset, Split::Train, &settings.data, on))?.into();
+        Ok(())
+    }
+
+    /// Writes the folder, trains and evaluates. Nothing is written, and nothing overwritten, before all that could be wrong with the input has been
+    /// found.
+    fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
+        let NewRun { settings, config, dataset, folder, views, preview, mut clocks } = self;
+        let RunSettings { data, preset, time, options, .. } = settings;
+        folder.prepare()?;
+        let record = RunRecord {
+            seconds_planned: *time,
+            model: trainer.model().kind().to_owned(),
+            ..RunRecord::new(RunKind::Trained, &dataset, preset.as_deref(), data)
+        };
+        folder.describe(&config, &record)?;
+        on(Event::note(format!("run: {}", folder.path().display())));
+        let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
+        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
+        let learned = job.learn(trainer, (metrics, History::default()), preview, &views, &mut clocks, on)?;
+        drop(views);
+        job.conclude(learned, clocks, on)
+    }
 }
 
 /// Resumes a stopped run from where it was last saved, with the losses that its config names; `data` is the source of the views now, if it is
@@ -212,47 +279,113 @@ pub fn resume_with(
     objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
-    let (folder, config, mut record) = RunFolder::open(path)?;
-    if record.is_carved() {
-        return Err(Error::input(path, "this run was carved", "to train its grid further, use `--init-from`"));
+    resume_plenoxels(path, data, options, Box::new(objective), on)
+}
+
+/// [`resume_with`], compiled once.
+fn resume_plenoxels(
+    path: &Path,
+    data: Option<DataSource>,
+    options: &RunOptions,
+    objective: MakeObjective<'_>,
+    on: &mut Listener<'_>,
+) -> Result<Outcome> {
+    let mut run = OldRun::open(path, data, options, on)?;
+    if run.record.model != plenoxels::KIND {
+        let found = format!("a run of a model of kind `{}`", run.record.model);
+        return Err(Error::input(path, found, "resume it with the program that began it (run::training::resume_model)"));
     }
-    let state = folder.existing_state()?;
-    let mut clocks = Clocks::default();
-    record.data = data.unwrap_or(record.data);
-    let dataset = clocks.load.time(|| record.data.open(&config))?;
-    if machine::instruction_set() != record.instruction_set {
-        on(Event::note(format!("it began with {}: other bits, the same picture", record.instruction_set)));
-    }
-    on(Event::Opened { dataset: &dataset, config: &config });
-    let most_rows = room(&config, &dataset, 0, options, on)?;
-    let preview = clocks.load.time(|| Preview::new(&dataset, options.preview_every))?;
-    let views: Arc<[View]> = clocks.load.time(|| load(&dataset, Split::Train, &record.data, on))?.into();
-    let objective = objective(&config, views.len())?;
-    let trainer = Trainer::with_losses(config.clone(), views.clone(), objective)?.with_most_rows(most_rows);
-    let trainer = match &state {
-        Some(state) => trainer.resumed(state)?,
-        None => trainer,
-    };
-    folder.remove_fragments()?;
-    let (plan, taken) = match state {
-        Some(_) => (trainer.plan(), trainer.steps_taken()),
-        None => {
-            let steps = folder.header()?.0.step;
-            (ends_after(trainer.plan(), steps), steps)
+    let most_rows = room(&run.config, &run.dataset, 0, options, on)?;
+    run.read(on)?;
+    let objective = objective(&run.config, run.views.len())?;
+    let trainer = Trainer::with_losses(run.config.clone(), run.views.clone(), objective)?.with_most_rows(most_rows);
+    run.learn(trainer, on)
+}
+
+/// Resumes a run that [`train_model`] began, with the same function.
+///
+/// Errors as for [`resume`], and those of `start`.
+pub fn resume_model<M: Model<f32>>(
+    path: &Path,
+    data: Option<DataSource>,
+    options: &RunOptions,
+    start: impl FnOnce(&Config, &Dataset, Arc<[View]>) -> Result<train::Trainer<f32, M>>,
+    on: &mut Listener<'_>,
+) -> Result<Outcome> {
+    let mut run = OldRun::open(path, data, options, on)?;
+    run.read(on)?;
+    let trainer = start(&run.config, &run.dataset, run.views.clone())?;
+    run.learn(trainer, on)
+}
+
+/// A run that goes on.
+struct OldRun<'o> {
+    folder: RunFolder,
+    config: Config,
+    record: RunRecord,
+    options: &'o RunOptions,
+    dataset: Dataset,
+    /// The state to resume from; `None` if only the final figures are missing.
+    state: Option<PathBuf>,
+    views: Arc<[View]>,
+    preview: Preview,
+    clocks: Clocks,
+}
+
+impl<'o> OldRun<'o> {
+    /// Opens a run and its dataset.
+    fn open(path: &Path, data: Option<DataSource>, options: &'o RunOptions, on: &mut Listener<'_>) -> Result<Self> {
+        let (folder, config, mut record) = RunFolder::open(path)?;
+        if record.is_carved() {
+            return Err(Error::input(path, "this run was carved", "to train its grid further, use `--init-from`"));
         }
-    };
-    let total = plan.iter().map(|stage| stage.steps).sum();
-    let (metrics, past) = MetricsFile::resume(&folder, total, taken)?;
-    clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
-    let text = format!("run: {}, going on after step {taken} of {total}, {} of training", folder.path().display(), clock(past.seconds));
-    on(Event::note(text));
-    let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
-    let learned = match state {
-        Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks, on)?,
-        None => Ok(job.learned(plan, (metrics, past), &views, on)?),
-    };
-    drop(views);
-    job.conclude(learned, clocks, on)
+        let state = folder.existing_state()?;
+        let mut clocks = Clocks::default();
+        record.data = data.unwrap_or(record.data);
+        let dataset = clocks.load.time(|| record.data.open(&config))?;
+        if machine::instruction_set() != record.instruction_set {
+            on(Event::note(format!("it began with {}: other bits, the same picture", record.instruction_set)));
+        }
+        on(Event::Opened { dataset: &dataset, config: &config });
+        Ok(OldRun { folder, config, record, options, dataset, state, views: Arc::new([]), preview: Preview::default(), clocks })
+    }
+
+    /// Reads the training views, and those that are looked at while training.
+    fn read(&mut self, on: &mut Listener<'_>) -> Result<()> {
+        let OldRun { options, dataset, record, clocks, .. } = self;
+        self.preview = clocks.load.time(|| Preview::new(dataset, options.preview_every))?;
+        self.views = clocks.load.time(|| load(dataset, Split::Train, &record.data, on))?.into();
+        Ok(())
+    }
+
+    /// Trains from the state on, with a trainer of the run before its first step, and evaluates.
+    fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
+        let OldRun { folder, config, record, options, dataset, state, views, preview, mut clocks } = self;
+        let trainer = match &state {
+            Some(state) => trainer.resumed(state)?,
+            None => trainer,
+        };
+        folder.remove_fragments()?;
+        let (plan, taken) = match state {
+            Some(_) => (trainer.plan().to_vec(), trainer.steps_taken()),
+            None => {
+                let steps = train::about(&folder.existing_checkpoint()?)?.step;
+                (ends_after(trainer.plan(), steps).to_vec(), steps)
+            }
+        };
+        let total = plan.iter().map(|stage| stage.steps).sum();
+        let (metrics, past) = MetricsFile::resume(&folder, total, taken)?;
+        clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
+        let path = folder.path().display();
+        on(Event::note(format!("run: {path}, going on after step {taken} of {total}, {} of training", clock(past.seconds))));
+        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
+        let learned = match state {
+            Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks, on)?,
+            None => Ok(job.learned(trainer, &plan, (metrics, past), &views, on)?),
+        };
+        drop(views);
+        job.conclude(learned, clocks, on)
+    }
 }
 
 /// The last stages, which so many steps were taken in: a run that begins with a grid leaves coarser ones out.
@@ -297,21 +430,27 @@ struct Stopped(u64, u64);
 
 impl Job<'_> {
     /// Compares what was learned with the test views, and writes the figures.
-    fn conclude(&self, learned: std::result::Result<Learned, Stopped>, mut clocks: Clocks, on: &mut Listener<'_>) -> Result<Outcome> {
+    fn conclude<M: Model<f32>>(
+        &self,
+        learned: std::result::Result<Learned<M>, Stopped>,
+        mut clocks: Clocks,
+        on: &mut Listener<'_>,
+    ) -> Result<Outcome> {
         let Job { folder, config, dataset, .. } = *self;
         let mut learned = match learned {
             Ok(learned) => learned,
             Err(Stopped(steps, total)) => return Ok(Outcome::Stopped { steps, total, folder: folder.clone() }),
         };
         let test = clocks.load.time(|| load(dataset, Split::Test, &self.record.data, on))?;
-        let scores = compare(&mut learned, &test, config, &mut clocks, on)?;
+        let view = ViewOptions::over(config.background);
+        let scores = compare(&mut learned, &test, &view, &mut clocks, on)?;
         let (rays, samples) = learned.metrics.counts();
         let (validation_psnr, best_validation) = learned.metrics.validation();
         let means = [("psnr/test", scores.psnr()), ("ssim/test", scores.ssim())];
         let background_psnr = evaluate::background_psnr(&test, config.background);
         let mean_image_psnr = learned.mean_image.and_then(|image| evaluate::constant_psnr(&test, &image, config.background));
         let summary = Summary {
-            figures: Figures::new(&scores, Split::Test, dataset, config, config.evaluation, &learned.grid),
+            figures: Figures::new(&scores, Split::Test, dataset, config, &learned.model, &view),
             baseline_background_psnr: background_psnr,
             baseline_mean_image_psnr: mean_image_psnr,
             seconds: clocks.train.seconds(),
@@ -332,32 +471,35 @@ impl Job<'_> {
         };
         folder.write_result(&summary)?;
         learned.metrics.conclude(&Final { result: &summary }, &means)?;
-        let about = event::Finished { folder, config, record: self.record, dataset, grid: &learned.grid, test: &test };
+        let about = event::Finished { folder, config, record: self.record, dataset, model: &learned.model, test: &test };
         on(Event::Evaluated { summary: &summary, run: about });
         Ok(Outcome::Done(Box::new(summary)))
     }
 }
 
-/// Figures of the final grid, and of the grids of earlier stages that were kept.
-fn compare(learned: &mut Learned, test: &[View], config: &Config, clocks: &mut Clocks, on: &mut Listener<'_>) -> Result<Scores> {
-    let kept = learned.stages.iter().filter(|stage| stage.grid.is_some()).count();
-    let total = (kept + 1) * test.len();
+/// Figures of the final model, and of those of earlier stages that were kept.
+fn compare<M: Model<f32>>(
+    learned: &mut Learned<M>,
+    test: &[View],
+    options: &ViewOptions,
+    clocks: &mut Clocks,
+    on: &mut Listener<'_>,
+) -> Result<Scores> {
+    let total = (learned.kept.len() + 1) * test.len();
     let mut done = 0;
     let start = Instant::now();
     let mut listening = Stopwatch::default();
-    for stage in &mut learned.stages {
-        if let Some(grid) = stage.grid.take() {
-            let viewer = grid_viewer(&grid, config.evaluation, config.engine, config.background);
-            let scores = viewer.compare(test, |_, _, _, _| {
-                done += 1;
-                listening.time(|| on(Event::Evaluating { done, total }));
-                Ok(())
-            })?;
-            stage.psnr = scores.psnr();
-        }
+    for (stage, show) in learned.kept.drain(..) {
+        let scores = Viewer::new(show, options.background).compare(test, |_, _, _, _| {
+            done += 1;
+            listening.time(|| on(Event::Evaluating { done, total }));
+            Ok(())
+        })?;
+        learned.stages[stage].psnr = scores.psnr();
     }
-    let viewer = grid_viewer(&learned.grid, config.evaluation, config.engine, config.background);
-    let half_width = learned.grid.shape().half_width;
+    let viewer = Viewer::of(&learned.model, options);
+    let aabb = learned.model.aabb();
+    let half_width = 0.5 * (aabb.max - aabb.min).max_element();
     let scores = viewer.compare(test, |number, view, target, picture| {
         done += 1;
         listening.time(|| {

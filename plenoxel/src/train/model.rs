@@ -10,7 +10,8 @@ use crate::sampling::Jitter;
 use crate::tensor_file::{TensorFile, TensorWriter};
 use autograd::optim::Optimizer;
 use autograd::{Module, Real};
-use serde_json::Value;
+use serde_json::{Map, Value, json};
+use std::any::Any;
 use std::path::Path;
 
 /// A radiance field with a recipe: how it is rendered, how its parameters are learned, and what happens to it at which step.
@@ -61,6 +62,33 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         let mut count = 0;
         self.visit(&mut |param| count += param.tensor().len());
         vec![("parameters", count as f64)]
+    }
+
+    /// Facts about the trained model, rendered like this, for the final figures of a run (`result.json`): by default its kind and its
+    /// [`facts`](Model::facts), under `model`.
+    fn figures(&self, view: &ViewOptions) -> Map<String, Value> {
+        let _ = view;
+        let facts = self.facts().into_iter().map(|(name, value)| (name.to_owned(), json!(value)));
+        let model = [("kind".to_owned(), json!(self.kind()))].into_iter().chain(facts).collect();
+        [("model".to_owned(), Value::Object(model))].into_iter().collect()
+    }
+
+    /// The part of the model that code for one representation can use, by its type: a voxel grid, say, which exports and the page's viewer ask
+    /// for. By default there is none.
+    fn content(&self) -> Option<&dyn Any> {
+        None
+    }
+
+    /// A function that renders pictures of the model as it is now, whatever becomes of the model afterwards; `None` if the model does not
+    /// support it. A run needs it to compare the models of earlier stages with test views.
+    fn frozen(&self, view: &ViewOptions) -> Option<RenderFn<'static, T>> {
+        let _ = view;
+        None
+    }
+
+    /// The first stage that begins by leaving out empty space and takes less time for it; `None` if there is none.
+    fn prunes_from(&self) -> Option<usize> {
+        None
     }
 
     /// Settings that must be the same for a saved run to go on.

@@ -33,6 +33,17 @@ pub struct About {
     pub step: u64,
 }
 
+/// Reads the facts about a trained model from its checkpoint, of whatever kind it is.
+///
+/// Errors name the file and what is wrong with it.
+pub fn about(path: &Path) -> Result<About> {
+    let file = TensorFile::open(path)?;
+    let mut facts = file.facts()?;
+    // Checkpoints of voxel grids have them among the others.
+    let about = if facts["about"].is_object() { facts["about"].take() } else { facts };
+    serde_json::from_value(about).map_err(|e| file.unreadable(&e))
+}
+
 /// Facts about a run beside those of its model.
 #[derive(Debug, Serialize, Deserialize)]
 struct State {

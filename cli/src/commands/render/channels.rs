@@ -7,11 +7,11 @@ use ndarray::{Array2, Array3, Axis};
 use plenoxel::camera::Camera;
 use plenoxel::error::Result;
 use plenoxel::evaluate::Viewer;
-use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files::write_atomically;
-use plenoxel::model::plenoxels::config::{Config, Sampling};
-use plenoxel::model::plenoxels::grid_viewer;
+use plenoxel::model::Model;
+use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::render::picture::Picture;
+use plenoxel::train::ViewOptions;
 use std::path::{Path, PathBuf};
 
 /// What a picture shows.
@@ -58,19 +58,20 @@ pub struct Pictures<'a> {
 }
 
 impl<'a> Pictures<'a> {
-    /// Pictures of a grid and of its normals, which must be there if they are among the channels.
+    /// Pictures of a model and of its normals, which must be there if they are among the channels.
     pub fn new(
-        grid: &'a VoxelGrid<f32>,
-        normals: Option<&'a VoxelGrid<f32>>,
-        sampling: Sampling,
-        config: &Config,
+        model: &'a dyn Model<f32>,
+        normals: Option<&'a Plenoxels<f32>>,
+        view: &ViewOptions,
         channels: &'a [Channel],
         formats: &'a [FileFormat],
     ) -> Self {
+        let of_normals = ViewOptions { background: [0.0; 3], ..view.clone() };
+        let aabb = model.aabb();
         Pictures {
-            color: grid_viewer(grid, sampling, config.engine, config.background),
-            normals: normals.map(|normals| grid_viewer(normals, sampling, config.engine, [0.0; 3])),
-            half_width: grid.shape().half_width,
+            color: Viewer::of(model, view),
+            normals: normals.map(|normals| Viewer::of(normals, &of_normals)),
+            half_width: 0.5 * (aabb.max - aabb.min).max_element(),
             channels,
             formats,
         }

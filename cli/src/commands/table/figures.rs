@@ -1,6 +1,7 @@
 //! What a run came to, as its folder says.
 
 use crate::commands::background_name;
+use plenoxel::checkpoint;
 use plenoxel::error::Result;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::RunFolder;
@@ -83,7 +84,7 @@ impl Figures {
     /// Those of a run; none if it has not ended.
     pub fn of(folder: &RunFolder, config: &Config) -> Option<Self> {
         let figures = serde_json::from_value::<Figures>(folder.figures()?).ok()?;
-        let voxels = folder.header().ok().map(|(_, voxels)| voxels).or(figures.voxels);
+        let voxels = checkpoint::header(&folder.checkpoint()).ok().map(|(_, voxels)| voxels).or(figures.voxels);
         Some(Figures { background: config.background, voxels, ..figures })
     }
 

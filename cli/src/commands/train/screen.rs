@@ -116,8 +116,8 @@ impl<'c, 'a> Screen<'c, 'a> {
     }
 
     fn report(&self, run: Finished<'_>) -> Result<()> {
-        let Finished { folder, config, record, dataset, grid, .. } = run;
-        self.console.note(&Report { folder, config, record, dataset, grid }.write()?);
+        let Finished { folder, config, record, dataset, model, .. } = run;
+        self.console.note(&Report { folder, config, record, dataset, model: Some(model) }.write()?);
         Ok(())
     }
 

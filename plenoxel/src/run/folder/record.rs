@@ -2,6 +2,7 @@
 
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
+use crate::model::plenoxels;
 use crate::run::data::DataSource;
 use crate::run::{PROGRAM, machine};
 use serde::{Deserialize, Serialize};
@@ -35,6 +36,9 @@ pub struct RunRecord {
     /// which have no stages.
     #[serde(default)]
     pub kind: RunKind,
+    /// Kind of its model. Runs of earlier versions do not say: they are Plenoxels.
+    #[serde(default = "plenoxels_kind")]
+    pub model: String,
     /// Program and version that made the run.
     pub program: String,
     /// Vector instructions it used: results repeat to the bit on the same ones.
@@ -54,11 +58,16 @@ pub struct RunRecord {
     pub seconds_planned: Option<f64>,
 }
 
+fn plenoxels_kind() -> String {
+    plenoxels::KIND.to_owned()
+}
+
 impl RunRecord {
-    /// The record of a run that begins now, on this machine.
+    /// The record of a run of Plenoxels that begins now, on this machine.
     pub fn new(kind: RunKind, dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> Self {
         RunRecord {
             kind,
+            model: plenoxels_kind(),
             program: PROGRAM.to_owned(),
             instruction_set: machine::instruction_set().to_owned(),
             threads: machine::threads(),

@@ -3,13 +3,12 @@
 use super::Summary;
 use crate::camera::Camera;
 use crate::dataset::{Dataset, Split, View};
-use crate::field::voxel_grid::VoxelGrid;
 use crate::model::plenoxels::config::Config;
 use crate::render::picture::Picture;
 use crate::run::data::DataSource;
 use crate::run::folder::{RunFolder, RunRecord};
 use crate::run::metrics::{History, MetricsFile, Observation};
-use crate::train::{PlannedStage, Report};
+use crate::train::{Model, PlannedStage, Report};
 use ndarray::Array3;
 
 /// An event of a run. Listeners change nothing of what is trained.
@@ -103,7 +102,7 @@ pub enum Event<'a> {
         target: &'a Array3<f32>,
         /// The picture of the model.
         picture: &'a Picture,
-        /// Half the side of the model's box.
+        /// Half the longest side of the model's box.
         half_width: f64,
     },
     /// The run has its figures; they are written.
@@ -137,8 +136,8 @@ pub struct Finished<'a> {
     pub record: &'a RunRecord,
     /// Its views.
     pub dataset: &'a Dataset,
-    /// The trained grid.
-    pub grid: &'a VoxelGrid<f32>,
+    /// The trained model.
+    pub model: &'a dyn Model<f32>,
     /// The test views.
     pub test: &'a [View],
 }

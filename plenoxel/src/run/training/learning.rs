@@ -1,30 +1,29 @@
 //! The training itself: steps, previews, metrics, and the state from which a run resumes.
 
-use super::best::BestGrid;
+use super::best::BestModel;
 use super::event::Underway;
 use super::preview::{Look, Preview};
 use super::{Clocks, Event, Job, Listener, Stopped};
 use crate::camera::Camera;
-use crate::checkpoint::Header;
 use crate::dataset::{Split, View};
 use crate::error::{Error, Result};
 use crate::evaluate::{self, Viewer};
-use crate::field::voxel_grid::VoxelGrid;
-use crate::model::plenoxels::Trainer;
 use crate::run::metrics::{History, MetricsFile, Observation};
-use crate::train::{Model, PlannedStage, ViewOptions};
+use crate::train::{Model, PlannedStage, RenderFn, Trainer, ViewOptions};
 use ndarray::Array3;
 use serde::Serialize;
 use serde_json::json;
 use std::time::Instant;
 
-/// A trained grid and how it came about.
-pub struct Learned {
-    pub grid: VoxelGrid<f32>,
+/// A trained model and how it came about.
+pub struct Learned<M> {
+    pub model: M,
     pub metrics: MetricsFile,
     /// Mean of the training views.
     pub mean_image: Option<Array3<f32>>,
     pub stages: Vec<StageSummary>,
+    /// Viewers of the models that stages ended with, by the number of the stage in `stages`, where they were kept.
+    pub kept: Vec<(usize, RenderFn<'static, f32>)>,
     pub steps: u64,
 }
 
@@ -35,29 +34,28 @@ pub struct StageSummary {
     steps: u64,
     /// Seconds of training when it ended.
     seconds: f64,
-    /// Mean PSNR of the test views, if the grid was kept until they were read.
+    /// Mean PSNR of the test views, if the model was kept until they were read.
     pub psnr: Option<f64>,
-    #[serde(skip)]
-    pub(super) grid: Option<VoxelGrid<f32>>,
 }
 
 impl Job<'_> {
     /// Trains; only the steps are on the clock for training. [`Stopped`] if the run was stopped: then everything that it needs to resume is saved.
-    pub fn learn(
+    pub fn learn<M: Model<f32>>(
         &self,
-        mut trainer: Trainer<f32>,
+        mut trainer: Trainer<f32, M>,
         (mut metrics, past): (MetricsFile, History),
         preview: Preview,
         views: &[View],
         clocks: &mut Clocks,
         on: &mut Listener<'_>,
-    ) -> Result<std::result::Result<Learned, Stopped>> {
+    ) -> Result<std::result::Result<Learned<M>, Stopped>> {
         let Job { folder, config, dataset, options, .. } = *self;
         let plan = trainer.plan().to_vec();
         let total = trainer.total_steps();
         let mut stages = summaries(&past, &plan);
-        let mut best = BestGrid::of(folder, &past);
-        let header = |grid: &_, steps| Header::new(grid, dataset.name(), config.background, config.seed, steps);
+        let mut kept = Vec::new();
+        let mut best = BestModel::of(folder, &past);
+        let options_of_view = ViewOptions::over(config.background);
         let first = |split| dataset.cameras(split).into_iter().next();
         let mut preview = preview.begin(first(Split::Test).or(first(Split::Train)).filter(|_| options.pictures));
         let run = Underway { folder, config, dataset };
@@ -81,7 +79,7 @@ impl Job<'_> {
                 facts = trainer.model().facts();
             }
             let model = trainer.model();
-            let viewer = || Viewer::of(model, &ViewOptions::over(config.background));
+            let viewer = || Viewer::of(model, &options_of_view);
             let seconds = clocks.train.seconds();
             let look = preview.look(viewer, report.ends_stage, save, config.background);
             let validation_psnr = look.as_ref().and_then(|look| look.psnr);
@@ -90,8 +88,10 @@ impl Job<'_> {
             on(Event::Step { report: &report, observation: &observation });
             if report.ends_stage {
                 on(Event::StageEnded { stage, losses: &losses, see: &|camera: &Camera| viewer().see(camera) });
-                let kept = (options.stage_psnr && !last).then(|| copy(trainer.grid()));
-                stages.push(StageSummary::new(&stage, seconds, kept));
+                kept.extend(
+                    (options.stage_psnr && !last).then(|| model.frozen(&options_of_view)).flatten().map(|show| (stages.len(), show)),
+                );
+                stages.push(StageSummary::new(&stage, seconds));
             }
             if let Some(Look { picture: Some((picture, target)), .. }) = &look {
                 let (step, ends_stage) = (report.step, report.ends_stage);
@@ -101,7 +101,7 @@ impl Job<'_> {
                 metrics.sync()?;
                 match trainer.save(&folder.state(), dataset.name()) {
                     Ok(()) => {
-                        best.saved(validation_psnr, trainer.grid(), &header(trainer.grid(), report.step + 1), on);
+                        best.saved(validation_psnr, trainer.model(), &trainer.about(dataset.name()), on);
                         on(Event::Saved { steps: report.step + 1 });
                     }
                     // There may be room on the disk the next time.
@@ -118,8 +118,9 @@ impl Job<'_> {
                 return Ok(Err(Stopped(report.step + 1, total)));
             }
         };
-        let grid = trainer.into_grid();
-        folder.save(&grid, &header(&grid, total))?;
+        let about = trainer.about(dataset.name());
+        let model = trainer.into_model();
+        folder.save(&model, &about)?;
         best.conclude(last_psnr, on);
         folder.remove_state()?;
         let stopped = (options.stop)();
@@ -128,23 +129,24 @@ impl Job<'_> {
             return Ok(Err(Stopped(total, total)));
         }
         let mean_image = evaluate::mean_image(views, config.background);
-        Ok(Ok(Learned { grid, metrics, mean_image, stages, steps: total }))
+        Ok(Ok(Learned { model, metrics, mean_image, stages, kept, steps: total }))
     }
 
-    /// What a run has learned that was killed between its last step and its final figures.
-    pub fn learned(
+    /// The result of a run that was killed between its last step and its final figures; `trainer` is one of the run before its first step.
+    pub fn learned<M: Model<f32>>(
         &self,
+        trainer: Trainer<f32, M>,
         plan: &[PlannedStage],
         (metrics, past): (MetricsFile, History),
         views: &[View],
         on: &mut Listener<'_>,
-    ) -> Result<Learned> {
+    ) -> Result<Learned<M>> {
         let Job { folder, config, dataset, .. } = *self;
         on(Event::Started { run: Underway { folder, config, dataset }, plan, prunes_from: None, history: &past });
         on(Event::Trained);
-        let (grid, header) = folder.load()?;
+        let (model, about) = trainer.into_model_of(&folder.existing_checkpoint()?)?;
         let mean_image = evaluate::mean_image(views, config.background);
-        Ok(Learned { grid, metrics, mean_image, stages: summaries(&past, plan), steps: header.step })
+        Ok(Learned { model, metrics, mean_image, stages: summaries(&past, plan), kept: Vec::new(), steps: about.step })
     }
 }
 
@@ -156,18 +158,13 @@ fn failed(error: Error, losses: &[f64], metrics: &mut MetricsFile, on: &mut List
 }
 
 impl StageSummary {
-    fn new(planned: &PlannedStage, seconds: f64, grid: Option<VoxelGrid<f32>>) -> Self {
-        StageSummary { resolution: planned.resolution, steps: planned.steps, seconds, psnr: None, grid }
+    fn new(planned: &PlannedStage, seconds: f64) -> Self {
+        StageSummary { resolution: planned.resolution, steps: planned.steps, seconds, psnr: None }
     }
 }
 
 /// Summaries of the stages that ended before.
 fn summaries(past: &History, plan: &[PlannedStage]) -> Vec<StageSummary> {
     let ended = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));
-    ended.map(|(planned, seconds)| StageSummary::new(planned, seconds, None)).collect()
-}
-
-/// A grid with the values that `grid` has now: the tables are shared until training changes them.
-fn copy(grid: &VoxelGrid<f32>) -> VoxelGrid<f32> {
-    grid.with_density(grid.density.tensor().detach())
+    ended.map(|(planned, seconds)| StageSummary::new(planned, seconds)).collect()
 }

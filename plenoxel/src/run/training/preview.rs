@@ -41,6 +41,13 @@ pub struct Look {
     pub picture: Option<(Array3<f32>, Option<Array3<f32>>)>,
 }
 
+/// Without validation views, never.
+impl Default for Preview {
+    fn default() -> Self {
+        Preview { views: Vec::new(), pace: Pace::new(f64::INFINITY), shown: None, camera: None }
+    }
+}
+
 impl Preview {
     /// Previews every so many seconds at most, never for infinitely many; reads the few views that are needed.
     pub fn new(dataset: &Dataset, every: f64) -> Result<Self> {
