@@ -9,9 +9,9 @@ pub use self::safetensors::{load_safetensors, save_safetensors};
 
 use crate::error::FileError;
 use crate::real::Real;
-use std::fs::{self, OpenOptions};
-use std::io;
-use std::path::Path;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// A number as files have it, little-endian.
@@ -63,18 +63,98 @@ fn replace(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> Result<(
 }
 
 /// Replaces the file at `path` by one that `write` makes under the name it is given, a hidden one in the same folder: other processes see the
-/// old content or the new, and nothing is left behind on failure. The file has the permissions of a new file.
+/// old content or the new, and nothing is left behind on failure. A link is followed, and a file that is replaced leaves its permissions to the
+/// new one. A device or a pipe is not replaced: what `write` made is copied into it.
 ///
-/// Errors: those of `write`, and of syncing and renaming the file.
+/// Errors: those of `write`, and of syncing, renaming or copying the file.
 pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> io::Result<()> {
-    static COUNTER: AtomicU64 = AtomicU64::new(0);
-    // No other process and no other thread has this name, and it does not contain the file's own, which may be as long as is allowed.
-    let temporary = path.with_file_name(format!(".{}-{}.tmp", std::process::id(), COUNTER.fetch_add(1, Ordering::Relaxed)));
+    let there = fs::metadata(path).ok();
+    if let Some(there) = &there
+        && !there.is_file()
+        && !there.is_dir()
+    {
+        let temporary = unused_name(&std::env::temp_dir());
+        let copied = write(&temporary).and_then(|()| {
+            let mut stream = OpenOptions::new().write(true).open(path)?;
+            io::copy(&mut File::open(&temporary)?, &mut stream)?;
+            stream.flush()
+        });
+        let _ = fs::remove_file(&temporary);
+        return copied;
+    }
+    let path = followed(path)?;
+    let temporary = unused_name(path.parent().unwrap_or(Path::new("")));
     let written = write(&temporary)
-        .and_then(|()| OpenOptions::new().write(true).open(&temporary)?.sync_all())
-        .and_then(|()| fs::rename(&temporary, path));
+        .and_then(|()| there.map_or(Ok(()), |there| fs::set_permissions(&temporary, there.permissions())))
+        .and_then(|()| OpenOptions::new().read(true).open(&temporary)?.sync_all())
+        .and_then(|()| fs::rename(&temporary, &path));
     written.inspect_err(|_| {
         // The write is what failed; a second failure while tidying up would only hide it.
         let _ = fs::remove_file(&temporary);
     })
+}
+
+/// A hidden name in a folder that no other process and no other thread has. It does not contain the name of the file that is replaced, which may
+/// be as long as is allowed.
+fn unused_name(folder: &Path) -> PathBuf {
+    static COUNTER: AtomicU64 = AtomicU64::new(0);
+    folder.join(format!(".{}-{}.tmp", std::process::id(), COUNTER.fetch_add(1, Ordering::Relaxed)))
+}
+
+/// The path that a chain of links leads to, which need not exist.
+fn followed(path: &Path) -> io::Result<PathBuf> {
+    // As many as Linux follows.
+    const MOST_LINKS: usize = 40;
+    let mut path = path.to_owned();
+    for _ in 0..MOST_LINKS {
+        if !path.is_symlink() {
+            return Ok(path);
+        }
+        let target = fs::read_link(&path)?;
+        path = path.parent().unwrap_or(Path::new("")).join(target);
+    }
+    Err(io::Error::other("too many levels of symbolic links"))
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::{FileTypeExt, PermissionsExt, symlink};
+
+    fn folder(name: &str) -> PathBuf {
+        let path = std::env::temp_dir().join(format!("autograd-files-{}-{name}", std::process::id()));
+        fs::create_dir_all(&path).unwrap();
+        path
+    }
+
+    #[test]
+    fn links_are_followed_and_modes_are_kept() {
+        let folder = folder("links");
+        let [file, link, next, dangling] = ["file", "link", "next", "dangling"].map(|name| folder.join(name));
+        fs::write(&file, "old").unwrap();
+        fs::set_permissions(&file, fs::Permissions::from_mode(0o600)).unwrap();
+        symlink("file", &link).unwrap();
+        symlink("link", &next).unwrap();
+        symlink("created", &dangling).unwrap();
+        for path in [&file, &next, &dangling] {
+            atomically(path, |temporary| fs::write(temporary, "new")).unwrap();
+        }
+        assert_eq!(fs::read_to_string(&file).unwrap(), "new");
+        assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o600);
+        assert!(link.is_symlink() && next.is_symlink() && dangling.is_symlink());
+        assert_eq!(fs::read_to_string(folder.join("created")).unwrap(), "new");
+        symlink("circle", folder.join("circle")).unwrap();
+        assert!(atomically(&folder.join("circle"), |temporary| fs::write(temporary, "new")).is_err());
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn devices_are_written_to_and_stay_devices() {
+        atomically(Path::new("/dev/null"), |temporary| fs::write(temporary, "x")).unwrap();
+        assert!(fs::metadata("/dev/null").unwrap().file_type().is_char_device());
+        if Path::new("/dev/full").exists() {
+            let error = atomically(Path::new("/dev/full"), |temporary| fs::write(temporary, "x")).unwrap_err();
+            assert_eq!(error.kind(), io::ErrorKind::StorageFull);
+        }
+    }
 }

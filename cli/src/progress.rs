@@ -9,9 +9,11 @@ use crate::Streams;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use plenoxel::error::{Error, Result};
+use plenoxel::files;
 use plenoxel::json;
 use plenoxel::run::machine;
 use serde::Serialize;
+use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 pub use training::Training;
@@ -54,6 +56,24 @@ impl<'a> Console<'a> {
             Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Error::io("stdout", e, "printing the result")),
             _ => Ok(()),
         }
+    }
+
+    /// Writes a file that the user named; `-` and `/dev/stdout` are stdout.
+    pub fn write_file(&self, path: &Path, bytes: &[u8]) -> Result<()> {
+        if !is_stdout(path) {
+            return files::write_atomically(path, bytes);
+        }
+        let out = &mut lock(&self.streams).out;
+        out.write_all(bytes).and_then(|()| out.flush()).map_err(|e| Error::io("stdout", e, "writing the result"))
+    }
+
+    /// Says what was written to a file: on stdout, or on stderr if stdout is the file.
+    pub fn wrote(&self, path: &Path, text: &str) -> Result<()> {
+        if is_stdout(path) {
+            self.note(text);
+            return Ok(());
+        }
+        self.result(text)
     }
 
     /// The same as a JSON object, for programs; nothing where people read it.
@@ -124,6 +144,11 @@ impl<'a> Console<'a> {
     pub fn relay(&self, total: usize) -> Relay<'_, 'a> {
         Relay { meter: Meter::new(self, total as u64), total }
     }
+}
+
+/// True for a name of stdout.
+pub fn is_stdout(path: &Path) -> bool {
+    ["-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"].iter().any(|name| path == Path::new(name))
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

@@ -3,6 +3,12 @@
 //! Everything this crate writes goes through [`write_atomically`], so that an interrupted run, a full disk or a power cut
 //! leaves either the old file or the new one, never half of one.
 
+mod lock;
+mod room;
+
+pub use lock::{FolderLock, is_abandoned};
+pub use room::check_room;
+
 use crate::error::{Error, Result};
 use std::fs;
 use std::path::Path;

@@ -64,6 +64,9 @@ pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>])
         Error::input(path, found, "this is a defect of the program")
     })?;
     let views = entries.iter().map(|entry| (&entry.name, entry));
+    let bytes = header.len() + entries.iter().map(|entry| entry.data_len()).sum::<usize>();
+    let folder = path.parent().unwrap_or(Path::new(""));
+    files::check_room(folder, bytes as u64, bytes as u64).map_err(|e| Error::io(path, e, "writing the file"))?;
     files::atomically(path, |temporary| {
         // The library makes files that nobody else may read.
         let permissions = File::create(temporary)?.metadata()?.permissions();

@@ -15,7 +15,7 @@ use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::evenly_spaced;
-use plenoxel::run::folder::{RunFolder, RunKind, RunRecord};
+use plenoxel::run::folder::{NewFolder, RunFolder, RunKind, RunRecord};
 use plenoxel::run::memory::{self, Estimate};
 use plenoxel::run::settings::{self, CARVE, Layers};
 use plenoxel::run::training::Stopwatch;
@@ -150,7 +150,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let estimate = Estimate::of_carving(&config, &dataset, 0, !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
-    let folder = RunFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
+    let folder = NewFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
     let views = load_clock.time(|| load(console, &dataset, Split::Train, &source))?;
 
     let mut hull_clock = Stopwatch::default();
@@ -179,7 +179,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     estimate.check()?;
 
     // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
-    folder.prepare()?;
+    let folder = folder.create()?;
     let record = RunRecord::new(RunKind::Carved, &dataset, preset, &source);
     folder.describe(&config, &record)?;
     console.note(&format!("run: {}", folder.path().display()));

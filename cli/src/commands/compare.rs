@@ -9,7 +9,6 @@ use crate::progress::{Console, clock, thousands};
 use crate::report::{SCRIPT, STYLE, curves};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
-use plenoxel::files;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::bytes;
@@ -92,9 +91,9 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
         format!("<script>\n{SCRIPT}</script>\n"),
     ];
     let page = html::page(&format!("{} runs", runs.len()), STYLE, &parts.join("\n"));
-    files::write_atomically(&args.out, page.as_bytes())?;
-    console.result(&aligned(&heads, &cells))?;
-    console.result(&format!("wrote {}", args.out.display()))
+    console.write_file(&args.out, page.as_bytes())?;
+    console.wrote(&args.out, &aligned(&heads, &cells))?;
+    console.wrote(&args.out, &format!("wrote {}", args.out.display()))
 }
 
 /// The settings that are not the same in all runs.

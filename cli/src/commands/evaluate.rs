@@ -2,11 +2,10 @@
 
 use super::new_run::load;
 use super::trained_run::{Found, Loaded, TrainedRun};
-use crate::progress::Console;
+use crate::progress::{Console, is_stdout};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::evaluate::{ViewScore, Viewer};
-use plenoxel::files;
 use plenoxel::json;
 use plenoxel::run::figures::Figures;
 use plenoxel::run::memory::{self, Estimate};
@@ -70,7 +69,8 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     drop(count);
 
     let figures = Figures::new(&scores, args.run.split, &dataset, &config, &*model, &view);
-    if !args.json {
+    let json = args.json || args.out.as_deref().is_some_and(is_stdout);
+    if !json {
         for view in &scores.per_view {
             let ssim = view.ssim.map_or("-".to_owned(), |ssim| format!("{ssim:.4}"));
             console.result(&format!("{:24} {:7.2} dB  ssim {ssim}", view.name, view.psnr))?;
@@ -95,8 +95,9 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     };
     let line = json::line(&evaluation)?;
     // Printed first, so that a file that cannot be written takes nothing with it.
-    if args.json { console.result(&line) } else { console.record(&evaluation) }?;
-    args.out.iter().try_for_each(|file| files::write_atomically(file, (line.clone() + "\n").as_bytes()))
+    if json { console.result(&line) } else { console.record(&evaluation) }?;
+    let file = args.out.iter().filter(|file| !is_stdout(file));
+    file.into_iter().try_for_each(|file| console.write_file(file, (line.clone() + "\n").as_bytes()))
 }
 
 /// What `evaluate` prints last. `seconds` is the training time that the run remembers.

@@ -5,13 +5,12 @@ mod ply;
 mod vox;
 
 use super::numbers;
-use crate::progress::Console;
+use crate::progress::{Console, is_stdout};
 use clap::{Args, Subcommand, ValueHint};
 use glam::DVec3;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::files::write_atomically;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::Estimate;
@@ -59,7 +58,7 @@ struct Exported {
     #[arg(long)]
     best: bool,
 
-    /// File to write, replacing what is there [default: in RUN/exports]
+    /// File to write, replacing what is there; - for stdout [default: in RUN/exports]
     #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
 }
@@ -76,7 +75,7 @@ struct Opened {
 impl Exported {
     /// The run with its grid, once memory is known to suffice, and the name of the file to be fit for its format.
     fn open(&self, console: &Console<'_>, format: &str) -> Result<Opened> {
-        if let Some(out) = self.out.as_deref().filter(|out| ending(out).as_deref() != Some(format)) {
+        if let Some(out) = self.out.as_deref().filter(|out| !is_stdout(out) && ending(out).as_deref() != Some(format)) {
             let found = format!("{}, for a file of the format {format},", out.display());
             return Err(Error::config("--out", found, format!("a name that ends in .{format}")));
         }
@@ -92,9 +91,9 @@ impl Exported {
     }
 
     /// Writes the file that was asked for, or else one of a name in the run's folder, and says which.
-    fn write(&self, folder: &RunFolder, name: &str, bytes: &[u8]) -> Result<PathBuf> {
+    fn write(&self, folder: &RunFolder, name: &str, bytes: &[u8], console: &Console<'_>) -> Result<PathBuf> {
         let file = self.out.clone().map_or_else(|| folder.create_export(name), Ok)?;
-        write_atomically(&file, bytes)?;
+        console.write_file(&file, bytes)?;
         Ok(file)
     }
 }

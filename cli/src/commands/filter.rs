@@ -5,7 +5,6 @@ use super::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe}
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::error::{Error, Result};
-use plenoxel::files;
 use plenoxel::point_cloud::filter::Filters;
 use plenoxel::point_cloud::ply::{Kind, PlyFile};
 use std::path::PathBuf;
@@ -68,6 +67,6 @@ pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
     let (left, report) = filters.apply(&file.positions()?, values.as_deref()).map_err(as_flag)?;
     let report = describe(file.len(), &report);
     check_not_empty(left.len(), &report)?;
-    files::write_atomically(&args.out, &file.chosen(&left, &format!("filtered by {}: {report}", crate::PROGRAM)))?;
-    console.result(&format!("wrote {} points to {} ({report})", left.len(), args.out.display()))
+    console.write_file(&args.out, &file.chosen(&left, &format!("filtered by {}: {report}", crate::PROGRAM)))?;
+    console.wrote(&args.out, &format!("wrote {} points to {} ({report})", left.len(), args.out.display()))
 }

@@ -9,7 +9,7 @@ use plenoxel::model;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::memory::Estimate;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -34,8 +34,13 @@ pub struct ReportArgs {
 
 /// Writes the page.
 pub fn run(args: &ReportArgs, console: &Console<'_>) -> Result<()> {
-    let (folder, config, record) = RunFolder::open(&args.run)?;
-    let source = args.data.as_deref().map_or(record.data.clone(), DataSource::folder);
+    write(&args.run, args.data.as_deref().map(DataSource::folder), console)
+}
+
+/// Writes the page about the run in a folder; `data` is the source of its views now, if it is not where it was.
+pub fn write(run: &Path, data: Option<DataSource>, console: &Console<'_>) -> Result<()> {
+    let (folder, config, record) = RunFolder::open(run)?;
+    let source = data.unwrap_or_else(|| record.data.clone());
     let dataset = source.reopen(&config)?;
     let path = folder.existing_checkpoint()?;
     let model = if model::KINDS.contains(&&model::kind(&path)?[..]) {

@@ -14,10 +14,9 @@ use clap::{Args, ValueHint};
 use job::{Job, State};
 use plan::Plan;
 use plenoxel::error::{Error, Result};
-use plenoxel::files;
+use plenoxel::files::{self, FolderLock};
 use plenoxel::run::settings::PRESETS;
 use std::ffi::OsString;
-use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -109,7 +108,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
         plan.jobs.iter().zip(&states).try_for_each(|(job, state)| check(job, state))?;
     }
     files::create_dir(&out)?;
-    let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: lock(&out)? };
+    let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: FolderLock::acquire(&out, "sweep.lock")? };
     // A child is asked too, and saves; the sweep waits for it.
     let watch = Watch::begin();
     let (mut failed, mut interrupted) = (Vec::new(), false);
@@ -235,20 +234,6 @@ fn describe(job: &Job, state: &State) -> String {
     };
     let line = job.command_line(state).map_or(String::new(), |arguments| format!("\n    {}", child::command_line(&arguments)));
     format!("{} {}: {what}{line}", job.scene, job.method)
-}
-
-/// Only one sweep at a time works in a folder.
-fn lock(out: &Path) -> Result<File> {
-    let path = out.join("sweep.lock");
-    let file = File::options().append(true).create(true).open(&path).map_err(|e| Error::io(&path, e, "creating it"))?;
-    match file.try_lock() {
-        Err(TryLockError::WouldBlock) => {
-            let found = format!("{}, where another sweep, or a run that it began, is at work,", out.display());
-            Err(Error::config("--out", found, "another folder, or the same when that has ended"))
-        }
-        // Some file systems know no locks.
-        Err(TryLockError::Error(_)) | Ok(()) => Ok(file),
-    }
 }
 
 /// The table of what there is now.

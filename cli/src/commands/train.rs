@@ -5,16 +5,23 @@ pub mod interrupt;
 mod pictures;
 mod screen;
 
+use super::report;
 use crate::progress::{Console, clock};
 pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use plenoxel::error::Result;
+use plenoxel::run::folder::RunFolder;
 use plenoxel::run::training::{self, Outcome, RunOptions, RunSettings, Summary};
 use screen::Screen;
+use std::path::Path;
 
 /// Learns a scene and leaves a run folder. Returns the exit code: 0, or another if it was interrupted.
 pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let mut screen = Screen::new(console, !args.no_images, !args.no_report);
     let outcome = match &args.resume {
+        Some(path) if lacks_page(path) && !args.no_report => {
+            console.note("this run has its figures; only the page is missing");
+            return report::write(path, args.moved_to(), console).map(|()| 0);
+        }
         Some(path) => {
             let data = args.moved_to();
             training::resume(path, data, &options(args, false), &mut |event| screen.show(event))
@@ -48,6 +55,12 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
             Ok(interrupt::EXIT_CODE)
         }
     }
+}
+
+/// True for a run that was killed between its figures and its page.
+fn lacks_page(path: &Path) -> bool {
+    let folder = RunFolder::at(path);
+    folder.result().is_some() && folder.checkpoint().exists() && !folder.state().exists() && !folder.report().exists()
 }
 
 fn options(args: &TrainArgs, stage_psnr: bool) -> RunOptions {

@@ -110,7 +110,12 @@ impl<T: Real> Plenoxels<T> {
         let stages: Vec<Stage> = of_scout.iter().chain(&config.stages).copied().collect();
         let mut shape = config.grid_shape(stages[0].resolution);
         if let Some(silhouettes) = &silhouettes {
-            shape.half_width = silhouettes.half_width(shape.half_width);
+            shape.half_width = match silhouettes.half_width(shape.half_width) {
+                Some(half_width) => half_width,
+                // A grid to start from brings its own box.
+                None if config.init_from.is_some() => shape.half_width,
+                None => return Err(Silhouettes::nothing_inside()),
+            };
         }
         let scouts = of_scout.len();
         let initial = config.initial_of(scouts > 0);

@@ -81,6 +81,10 @@ impl DataSource {
         let downscale = config.downscale;
         match self {
             DataSource::Folder { path } => {
+                if path.to_str().is_none() {
+                    let found = "the name of this folder is not UTF-8, so that a run could not record it";
+                    return Err(Error::input(path, found, "rename it, or give a link to it whose name is"));
+                }
                 let validation_every = match config.validation_every {
                     0 => None,
                     every => Some(every),

@@ -8,12 +8,13 @@ pub use record::{RunKind, RunRecord};
 use super::settings::{self, ConfigFile};
 use super::tensorboard;
 use crate::error::{Error, Result};
-use crate::files;
+use crate::files::{self, FolderLock, is_abandoned};
 use crate::model::plenoxels::config::Config;
 use crate::train::{self, About, Model};
-use listing::{RENDERED, entries, first_free, is_fragment, is_frame, is_one_of, remove};
+use listing::{RENDERED, entries, is_fragment, is_frame, is_one_of, remove, reserve};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// The folder of a run.
 #[derive(Debug, Clone)]
@@ -21,8 +22,11 @@ pub struct RunFolder {
     path: PathBuf,
     /// File name of the model that is read and written: the last or the best.
     grid: &'static str,
+    /// Held while the folder is written.
+    _lock: Option<Arc<FolderLock>>,
 }
 
+const LOCK: &str = "run.lock";
 const CONFIG: &str = "config.toml";
 const RECORD: &str = "run.json";
 const METRICS: &str = "metrics.jsonl";
@@ -40,38 +44,79 @@ const EXPORTS: &str = "exports";
 /// Endings of what `export` writes.
 const EXPORTED: [&str; 4] = ["vox", "ply", "obj", "glb"];
 
+/// The place of a run folder that will be created.
+#[derive(Debug)]
+pub struct NewFolder {
+    /// `None` for `runs/<scene>-<n>` with the first free n.
+    path: Option<PathBuf>,
+    scene: String,
+    overwrite: bool,
+}
+
+impl NewFolder {
+    /// The place for a new run: `out`, or `runs/<scene>-<n>` with the first n that is free when the folder is created. Nothing is written yet.
+    ///
+    /// Errors: `out` is a file; it is not empty and `overwrite` is false; it is not empty and not the folder of a run; another process is writing it.
+    pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
+        if let Some(path) = out {
+            if let Some(file) = path.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir()) {
+                let found = format!("{}, where {} is a file,", path.display(), file.display());
+                return Err(Error::config("--out", found, "a folder"));
+            }
+            FolderLock::check(path, LOCK)?;
+            check_vacant(path, overwrite)?;
+        }
+        Ok(NewFolder { path: out.map(Path::to_owned), scene: scene.to_owned(), overwrite })
+    }
+
+    /// Creates the folder and locks it, and removes the files of a run that is overwritten. Files of other kinds stay.
+    ///
+    /// Errors: those of [`choose`](Self::choose), which may have become true since; the folder cannot be written.
+    pub fn create(self) -> Result<RunFolder> {
+        let Some(path) = self.path else { return RunFolder::at(&reserve(Path::new("runs"), &self.scene)?).locked() };
+        files::create_dir(&path)?;
+        let folder = RunFolder::at(&path).locked()?;
+        check_vacant(&path, self.overwrite)?;
+        folder.clear()?;
+        Ok(folder)
+    }
+}
+
+/// Refuses a folder that may not be written: one with files, unless it is that of a run which is overwritten.
+fn check_vacant(path: &Path, overwrite: bool) -> Result<()> {
+    let occupied = !RunFolder::at(path).is_empty();
+    if occupied && !overwrite {
+        let found = format!("{}, which is not empty,", path.display());
+        return Err(Error::config("--out", found, "a new folder; or --force, which overwrites the run in it"));
+    }
+    if occupied && !path.join(RECORD).exists() {
+        let found = format!("{}, which holds something that is not a run,", path.display());
+        return Err(Error::config("--out", found, "a new folder, or that of a run, which --force overwrites"));
+    }
+    Ok(())
+}
+
 impl RunFolder {
     /// The run folder at a path; nothing is read, and nothing needs to be there.
     pub fn at(path: &Path) -> Self {
-        RunFolder { path: path.to_owned(), grid: CHECKPOINT }
+        RunFolder { path: path.to_owned(), grid: CHECKPOINT, _lock: None }
     }
 
-    /// The folder of a new run: `out`, or `runs/<scene>-<n>` with the first free n. Nothing is written yet.
+    /// The same folder, locked: no other process writes it before this value and its clones are dropped.
     ///
-    /// Errors: it is a file; it is not empty and `overwrite` is false; it is not empty and not the folder of a run.
-    pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
-        let Some(path) = out else {
-            return Ok(Self::at(&first_free(Path::new("runs"), scene)));
-        };
-        if let Some(file) = path.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir()) {
-            let found = format!("{}, where {} is a file,", path.display(), file.display());
-            return Err(Error::config("--out", found, "a folder"));
-        }
-        let occupied = std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_some());
-        if occupied && !overwrite {
-            let found = format!("{}, which is not empty,", path.display());
-            return Err(Error::config("--out", found, "a new folder; or --force, which overwrites the run in it"));
-        }
-        if occupied && !path.join(RECORD).exists() {
-            let found = format!("{}, which holds something that is not a run,", path.display());
-            return Err(Error::config("--out", found, "a new folder, or that of a run, which --force overwrites"));
-        }
-        Ok(Self::at(path))
+    /// Errors: another process is writing it.
+    pub fn locked(self) -> Result<Self> {
+        let lock = FolderLock::acquire(&self.path, LOCK)?;
+        Ok(RunFolder { _lock: Some(Arc::new(lock)), ..self })
     }
 
-    /// Creates the folder, and removes the files of a run that is overwritten. Files of other kinds stay.
-    pub fn prepare(&self) -> Result<()> {
-        files::create_dir(&self.path)?;
+    /// True if there is nothing in the folder but a lock and temporary files, or no such folder.
+    pub fn is_empty(&self) -> bool {
+        entries(&self.path).all(|path| path.ends_with(LOCK) || is_fragment(&path))
+    }
+
+    /// Removes the files of a run.
+    fn clear(&self) -> Result<()> {
         self.remove_fragments()?;
         let names = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
         let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| path.exists());
@@ -198,9 +243,9 @@ impl RunFolder {
         remove([self.state()].into_iter().filter(|path| path.exists()))
     }
 
-    /// Removes files that were being written when a run was killed.
+    /// Removes temporary files of processes that were killed.
     pub fn remove_fragments(&self) -> Result<()> {
-        [&self.path, &self.path.join(IMAGES)].into_iter().try_for_each(|folder| remove(entries(folder).filter(|path| is_fragment(path))))
+        [&self.path, &self.path.join(IMAGES)].into_iter().try_for_each(|folder| remove(entries(folder).filter(|path| is_abandoned(path))))
     }
 
     /// Writes the final figures.
@@ -326,7 +371,7 @@ impl RunFolder {
         let renders = self.create_renders()?;
         let path = renders.join(name);
         files::create_dir(&path)?;
-        remove(entries(&path).filter(|path| is_frame(path) || is_fragment(path)))?;
+        remove(entries(&path).filter(|path| is_frame(path) || is_abandoned(path)))?;
         let joined = suffixes.iter().flat_map(|suffix| ["gif", "mp4"].map(|ending| renders.join(format!("{name}{suffix}.{ending}"))));
         remove(joined.filter(|path| path.exists()))?;
         Ok(path)

@@ -217,6 +217,11 @@ impl Estimate {
         BASE + self.images + self.grid + self.optimizer + self.step
     }
 
+    /// Bytes of a saved state: the tables and what the optimizer remembers of them.
+    pub fn saved(&self) -> u64 {
+        self.grid + self.optimizer
+    }
+
     /// One line for people.
     pub fn describe(&self) -> String {
         let part = |name: &str, n: u64| match n {

@@ -26,7 +26,7 @@ pub use summary::Summary;
 
 use super::budget;
 use super::data::DataSource;
-use super::folder::{RunFolder, RunKind, RunRecord};
+use super::folder::{NewFolder, RunFolder, RunKind, RunRecord};
 use super::machine;
 use super::memory::{self, Estimate};
 use super::metrics::{History, MetricsFile};
@@ -34,6 +34,7 @@ use crate::checkpoint;
 use crate::dataset::{Dataset, Split, View};
 use crate::error::{Error, Result};
 use crate::evaluate::{self, Scores, Viewer};
+use crate::files;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::{self, Objective, Trainer, objective};
 use crate::run::figures::Figures;
@@ -153,7 +154,9 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
         on(Event::note(format!("the grid it starts from is of another scene: {}, not {}", header.scene, run.dataset.name())));
     }
     let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
-    let most_rows = room(&run.config, &run.dataset, bytes as u64, &settings.options, on)?;
+    let estimate = estimate(&run.config, &run.dataset, bytes as u64, &settings.options, on)?;
+    let most_rows = estimate.most_rows(&run.config).unwrap_or(usize::MAX);
+    run.saved = estimate.saved();
     let initial = initial.as_deref().map(checkpoint::load).transpose()?.map(|(grid, _)| grid);
     run.read(on)?;
     if let Some(seconds) = settings.time {
@@ -208,11 +211,13 @@ struct NewRun<'s> {
     /// The recipe, with the steps that were planned.
     config: Config,
     dataset: Dataset,
-    folder: RunFolder,
+    folder: NewFolder,
     /// The training views, once they are read.
     views: Arc<[View]>,
     preview: Preview,
     clocks: Clocks,
+    /// Bytes that a saved state is expected to take.
+    saved: u64,
 }
 
 impl<'s> NewRun<'s> {
@@ -228,8 +233,8 @@ impl<'s> NewRun<'s> {
         let mut clocks = Clocks::default();
         let dataset = clocks.load.time(|| settings.data.open(&config))?;
         on(Event::Opened { dataset: &dataset, config: &config });
-        let folder = RunFolder::choose(settings.out.as_deref(), dataset.name(), settings.force)?;
-        Ok(NewRun { settings, config, dataset, folder, views: Arc::new([]), preview: Preview::default(), clocks })
+        let folder = NewFolder::choose(settings.out.as_deref(), dataset.name(), settings.force)?;
+        Ok(NewRun { settings, config, dataset, folder, views: Arc::new([]), preview: Preview::default(), clocks, saved: 0 })
     }
 
     /// Reads the training views, and those that are looked at while training.
@@ -243,9 +248,10 @@ impl<'s> NewRun<'s> {
     /// Writes the folder, trains and evaluates. Nothing is written, and nothing overwritten, before all that could be wrong with the input has been
     /// found.
     fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
-        let NewRun { settings, config, dataset, folder, views, preview, mut clocks } = self;
+        let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved } = self;
         let RunSettings { data, preset, time, options, .. } = settings;
-        folder.prepare()?;
+        check_disk(settings.out.as_deref().unwrap_or(Path::new("runs")), saved, on)?;
+        let folder = folder.create()?;
         let record = RunRecord {
             seconds_planned: *time,
             model: trainer.model().kind().to_owned(),
@@ -295,7 +301,8 @@ fn resume_plenoxels(
         let found = format!("a run of a model of kind `{}`", run.record.model);
         return Err(Error::input(path, found, "resume it with the program that began it (run::training::resume_model)"));
     }
-    let most_rows = room(&run.config, &run.dataset, 0, options, on)?;
+    let estimate = estimate(&run.config, &run.dataset, 0, options, on)?;
+    let most_rows = estimate.most_rows(&run.config).unwrap_or(usize::MAX);
     run.read(on)?;
     let objective = objective(&run.config, run.views.len())?;
     let trainer = Trainer::with_losses(run.config.clone(), run.views.clone(), objective)?.with_most_rows(most_rows);
@@ -339,6 +346,7 @@ impl<'o> OldRun<'o> {
         if record.is_carved() {
             return Err(Error::input(path, "this run was carved", "to train its grid further, use `--init-from`"));
         }
+        let folder = folder.locked()?;
         let state = folder.existing_state()?;
         let mut clocks = Clocks::default();
         record.data = data.unwrap_or(record.data);
@@ -403,8 +411,10 @@ fn load(dataset: &Dataset, split: Split, source: &DataSource, on: &mut Listener<
     })
 }
 
-/// Says which stages the images are large enough for, and how much memory a run will take. Returns how many rows of tables there is room for.
-fn room(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions, on: &mut Listener<'_>) -> Result<usize> {
+/// Says which stages the images are large enough for, and how much memory a run will take.
+///
+/// Errors: there is less memory.
+fn estimate(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions, on: &mut Listener<'_>) -> Result<Estimate> {
     let fitted = config.fitted_to(&dataset.cameras(Split::Train));
     if fitted.stages != config.stages {
         let stages: Vec<String> = fitted.stages.iter().map(|stage| format!("{}³", stage.resolution)).collect();
@@ -413,7 +423,21 @@ fn room(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions, 
     let estimate = Estimate::of_training(&fitted, dataset, initial, options.report);
     on(Event::note(estimate.describe()));
     estimate.check()?;
-    Ok(estimate.most_rows(config).unwrap_or(usize::MAX))
+    Ok(estimate)
+}
+
+/// Refuses a run whose files will not fit on the disk, and says if they might not.
+///
+/// Errors: there is less room than a run takes of whose voxels pruning leaves a quarter of what is expected.
+fn check_disk(folder: &Path, saved: u64, on: &mut Listener<'_>) -> Result<()> {
+    // While a state is saved, the one before is there too; then the checkpoint, the pictures and the page.
+    const REST: u64 = 4_000_000;
+    let needed = |saved: u64| files::check_room(folder, 3 * saved + REST, saved);
+    needed(saved / 4).map_err(|e| Error::io(folder, e, "checking the room for the run"))?;
+    if let Err(e) = needed(saved) {
+        on(Event::note(format!("the disk may be too small: {e}, if the run takes as much as is expected")));
+    }
+    Ok(())
 }
 
 /// A run that is under way, however it began.

@@ -52,13 +52,12 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
     let options = MeshOptions { level: args.level, direction: args.colors.direction(), min_part: args.min_part };
     let surface = mesh(&grid, &options).map_err(as_flag)?;
     let bytes = format.encode(&surface, crate::PROGRAM).map_err(as_flag)?;
-    let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes)?;
+    let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes, console)?;
     let (vertices, triangles) = (surface.positions.len(), surface.triangles.len());
-    console.result(&format!(
-        "wrote {vertices} vertices and {triangles} triangles around {:.4} of volume to {}",
-        surface.volume(),
-        file.display()
-    ))
+    console.wrote(
+        &file,
+        &format!("wrote {vertices} vertices and {triangles} triangles around {:.4} of volume to {}", surface.volume(), file.display()),
+    )
 }
 
 /// A format as the command line takes it.

@@ -137,8 +137,8 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         "opacity = 1 - exp(-density * side of a voxel in the world); weight, object: what training views show of it".to_owned(),
         report.clone(),
     ];
-    let file = args.exported.write(&folder, "cloud.ply", &encode(&cloud.chosen(&left), &comments))?;
-    console.result(&format!("wrote {} points to {} ({report})", left.len(), file.display()))
+    let file = args.exported.write(&folder, "cloud.ply", &encode(&cloud.chosen(&left), &comments), console)?;
+    console.wrote(&file, &format!("wrote {} points to {} ({report})", left.len(), file.display()))
 }
 
 /// What the training cameras see of a grid.

@@ -38,6 +38,6 @@ pub fn run(args: &VoxArgs, console: &Console<'_>) -> Result<()> {
     let Opened { folder, grid, .. } = args.exported.open(console, "vox")?;
     let options = VoxOptions { min_alpha: args.min_alpha, solid: args.solid, direction: args.colors.direction() };
     let model = vox(&grid, &options).map_err(as_flag)?;
-    let file = args.exported.write(&folder, "grid.vox", &model.to_bytes().map_err(as_flag)?)?;
-    console.result(&format!("wrote {} voxels in {} colors to {}", model.voxels.len(), model.palette.len(), file.display()))
+    let file = args.exported.write(&folder, "grid.vox", &model.to_bytes().map_err(as_flag)?, console)?;
+    console.wrote(&file, &format!("wrote {} voxels in {} colors to {}", model.voxels.len(), model.palette.len(), file.display()))
 }

@@ -124,7 +124,9 @@ fn entries(path: &CameraPath) -> &'static str {
 
 /// The name of a file without its ending.
 fn stem(path: &Path) -> String {
-    path.file_stem().map_or_else(|| "path".to_owned(), |stem| stem.to_string_lossy().into_owned())
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    // Of a file `...json` it is `..`, which is no name for a folder.
+    if stem.trim_matches('.').is_empty() { "path".to_owned() } else { stem.into_owned() }
 }
 
 fn choice(text: &str) -> std::result::Result<PathChoice, String> {

@@ -2,6 +2,7 @@
 
 use crate::commands::train::interrupt::Watch;
 use plenoxel::error::{Error, Result};
+use plenoxel::files::FolderLock;
 use std::ffi::OsString;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -20,7 +21,7 @@ pub struct Program {
     /// Flags for all: threads and memory.
     pub machine: Vec<String>,
     /// The lock of the sweep, which lasts until the last who has the file open ends: a run that outlives its sweep keeps it.
-    pub lock: File,
+    pub lock: FolderLock,
 }
 
 /// How a process ended.
@@ -54,7 +55,7 @@ impl Program {
             .args(&self.machine)
             .args(arguments)
             // Nothing is read from it: it is how a process is given an open file.
-            .stdin(self.lock.try_clone().map_err(starting)?)
+            .stdin(self.lock.file().try_clone().map_err(starting)?)
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()

@@ -72,8 +72,7 @@ impl Call {
 impl Job {
     /// How far it is, by what lies in its folder.
     pub fn state(&self) -> State {
-        let something = std::fs::read_dir(&self.folder).is_ok_and(|mut entries| entries.next().is_some());
-        if !something {
+        if RunFolder::at(&self.folder).is_empty() {
             return State::New;
         }
         let (folder, config, record) = match RunFolder::open(&self.folder) {

@@ -1,6 +1,7 @@
 //! Changes of the grid between stages: it is resampled at a finer resolution, and empty space is left out.
 
 use super::config::{Scout, Stage};
+use super::start::Silhouettes;
 use super::{Plenoxels, start};
 use crate::error::{Error, Result};
 use crate::field::Field;
@@ -31,11 +32,7 @@ impl<T: Real> Plenoxels<T> {
         if let Some(silhouettes) = self.silhouettes.as_ref().filter(|_| changes || index == 0) {
             outline = outline.pruned(&silhouettes.voxels(&outline));
             if outline.lattice().present() == 0 {
-                return Err(Error::config(
-                    "hull",
-                    "\"auto\", with silhouettes that hold nothing of the grid,",
-                    "\"off\"; or another half_width, or another run to start from",
-                ));
+                return Err(Silhouettes::nothing_inside());
             }
         }
         if stage.image_reduction != rays.reduction() {

@@ -3,6 +3,7 @@
 use super::config::{Config, Hull, Initial};
 use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
+use crate::error::Error;
 use crate::field::voxel_grid::{GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
@@ -28,11 +29,16 @@ impl Silhouettes {
         (config.hull == Hull::Auto && has_alpha(views)).then(|| Silhouettes { views: views.clone(), margin: config.carve.margin })
     }
 
-    /// The half width of the smallest cube around the origin that holds all that the silhouettes leave of the cube of `half_width`, or
-    /// that one itself if they leave nothing.
-    pub fn half_width(&self, half_width: f64) -> f64 {
-        let hull = visual_hull::by_footprint(&self.views, Aabb::cube(half_width), [COARSE; 3], self.margin, &|_| ());
-        hull.half_width().unwrap_or(half_width)
+    /// The half width of the smallest cube around the origin that holds all that the silhouettes leave of the cube of `half_width`; `None` if they
+    /// leave nothing.
+    pub fn half_width(&self, half_width: f64) -> Option<f64> {
+        visual_hull::by_footprint(&self.views, Aabb::cube(half_width), [COARSE; 3], self.margin, &|_| ()).half_width()
+    }
+
+    /// The error if no voxel lies within the silhouettes of all views.
+    pub fn nothing_inside() -> Error {
+        let found = "\"auto\", where no voxel of the box lies within the silhouettes of all views,";
+        Error::config("hull", found, "\"off\"; or a half_width whose box holds the object; or another run to start from")
     }
 
     /// The voxels of a grid that a sample inside of the silhouettes can read.

@@ -1,6 +1,8 @@
 //! Files in a folder: listed, told apart by their names, removed; and names that are free.
 
 use crate::error::{Error, Result};
+use crate::files;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Endings of what `render` writes.
@@ -36,20 +38,22 @@ pub fn remove(files: impl Iterator<Item = PathBuf>) -> Result<()> {
     files.into_iter().try_for_each(|path| std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it")))
 }
 
-/// `root/<scene>-<n>` with the first n from 1 on that nothing has.
-pub fn first_free(root: &Path, scene: &str) -> PathBuf {
+/// Creates the folder `root/<scene>-<n>` with the first n from 1 on that nothing has: of two processes that do this at the same time, each gets a
+/// folder of its own.
+pub fn reserve(root: &Path, scene: &str) -> Result<PathBuf> {
+    files::create_dir(root)?;
     let plain = |c: char| {
         let keep = c.is_alphanumeric() || matches!(c, '-' | '_' | '.');
         if keep { c } else { '-' }
     };
     let scene: String = scene.chars().map(plain).collect();
-    let mut n = 1;
-    loop {
+    for n in 1.. {
         let path = root.join(format!("{scene}-{n}"));
-        // A dangling link exists too: nothing may be written through it.
-        if path.symlink_metadata().is_err() {
-            return path;
+        match std::fs::create_dir(&path) {
+            Ok(()) => return Ok(path),
+            Err(e) if e.kind() == ErrorKind::AlreadyExists => {}
+            Err(e) => return Err(Error::io(&path, e, "creating the folder")),
         }
-        n += 1;
     }
+    unreachable!("there are more numbers than folders")
 }

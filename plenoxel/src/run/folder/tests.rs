@@ -5,8 +5,10 @@ fn the_first_free_number_is_taken_and_names_become_plain() {
     let root = std::env::temp_dir().join(format!("plenoxel-runs-{}", std::process::id()));
     std::fs::create_dir_all(root.join("my-lego-1")).unwrap();
     std::fs::create_dir_all(root.join("my-lego-3")).unwrap();
-    assert_eq!(first_free(&root, "my lego"), root.join("my-lego-2"));
-    assert_eq!(first_free(&root, "../x"), root.join("..-x-1"));
+    for (scene, path) in [("my lego", "my-lego-2"), ("my lego", "my-lego-4"), ("../x", "..-x-1")] {
+        assert_eq!(reserve(&root, scene).unwrap(), root.join(path));
+        assert!(root.join(path).is_dir());
+    }
     std::fs::remove_dir_all(root).unwrap();
 }
 
@@ -27,13 +29,13 @@ fn an_occupied_folder_is_refused_unless_forced_and_other_files_survive() {
         "renders-best/orbit/frame_0001.exr",
     ];
     mine.iter().chain(&ours).for_each(|name| std::fs::write(path.join(name), "x").unwrap());
-    let refused = RunFolder::choose(Some(&path), "x", false).unwrap_err();
+    let refused = NewFolder::choose(Some(&path), "x", false).unwrap_err();
     assert!(refused.exit_code() == 2 && refused.to_string().contains("--force"));
     // What is not a run is not overwritten, come what may.
-    let refused = RunFolder::choose(Some(&path), "x", true).unwrap_err();
+    let refused = NewFolder::choose(Some(&path), "x", true).unwrap_err();
     assert!(refused.exit_code() == 2 && refused.to_string().contains("not a run"), "{refused}");
     std::fs::write(path.join(RECORD), "{}").unwrap();
-    RunFolder::choose(Some(&path), "x", true).unwrap().prepare().unwrap();
+    NewFolder::choose(Some(&path), "x", true).unwrap().create().unwrap();
     let there = |name: &&&str| path.join(name).exists();
     assert_eq!((mine.iter().filter(there).count(), ours.iter().filter(there).count()), (mine.len(), 0));
     std::fs::remove_dir_all(path).unwrap();

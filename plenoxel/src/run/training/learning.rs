@@ -120,7 +120,14 @@ impl Job<'_> {
         };
         let about = trainer.about(dataset.name());
         let model = trainer.into_model();
-        folder.save(&model, &about)?;
+        if let Err(e) = folder.save(&model, &about) {
+            let again = match folder.existing_state() {
+                Ok(_) => "once there is room, the run goes on from where it was last saved with `plenoxel train --resume`",
+                Err(_) => "it was not saved before: train again once there is room",
+            };
+            on(Event::note(format!("the trained model is not saved; {again}")));
+            return Err(e);
+        }
         best.conclude(last_psnr, on);
         folder.remove_state()?;
         let stopped = (options.stop)();
