@@ -105,7 +105,13 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
         facts.collect::<String>(),
         escaped(&report.record.scene),
         escaped(&report.record.format)
-    )
+    ) + &warnings(result)
+}
+
+/// Reasons to doubt the result.
+fn warnings(result: &Value) -> String {
+    let warnings = result["warnings"].as_array().into_iter().flatten().filter_map(Value::as_str);
+    warnings.map(|warning| format!("\n<p class=\"warning\"><b>Warning:</b> {}</p>", escaped(warning))).collect()
 }
 
 /// What each stage came to.

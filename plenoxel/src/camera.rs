@@ -4,6 +4,7 @@
 //! coordinates run x right and y *down* from the top left corner of the image, so the centre of pixel (i, j) is
 //! (i + 0.5, j + 0.5). Rays are unit: t along a ray is world distance.
 
+pub mod placement;
 pub(crate) mod projection;
 
 use glam::{DAffine3, DMat3, DVec3};

@@ -223,13 +223,22 @@ impl Dataset {
     ///
     /// Memory: 4 bytes a pixel, and 4 more where depth is known. Errors: the first view, in order, that cannot be read.
     pub fn load(&self, split: Split, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<Vec<View>> {
+        self.load_views(split, &(0..self.count(split)).collect::<Vec<_>>(), progress)
+    }
+
+    /// Reads or renders some views of a split, in the order of their numbers. `progress(done, total)` is called from several threads.
+    ///
+    /// Errors as for [`load`](Self::load).
+    ///
+    /// Panics if there is no such view.
+    pub fn load_views(&self, split: Split, numbers: &[usize], progress: &(dyn Fn(usize, usize) + Sync)) -> Result<Vec<View>> {
         let frames = self.frames(split);
         let done = AtomicUsize::new(0);
-        let views: Vec<Result<View>> = frames
+        let views: Vec<Result<View>> = numbers
             .par_iter()
-            .map(|frame| {
-                let view = self.load_frame(frame);
-                progress(done.fetch_add(1, Ordering::Relaxed) + 1, frames.len());
+            .map(|&number| {
+                let view = self.load_frame(&frames[number]);
+                progress(done.fetch_add(1, Ordering::Relaxed) + 1, numbers.len());
                 view
             })
             .collect();

@@ -150,6 +150,9 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let estimate = Estimate::of_carving(&config, &dataset, 0, !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
+    for warning in source.check_cameras(&dataset, &config)? {
+        console.note(&format!("warning: {warning}"));
+    }
     let folder = NewFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
     let views = load_clock.time(|| load(console, &dataset, Split::Train, &source))?;
 

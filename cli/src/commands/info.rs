@@ -2,11 +2,14 @@
 
 use crate::progress::{Console, clock};
 use clap::{Args, ValueHint};
+use plenoxel::camera::placement::Placement;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::geometry::Aabb;
 use plenoxel::model;
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
@@ -192,6 +195,9 @@ fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
     let distances = cameras.iter().map(|camera| camera.position().length());
     let nearest = distances.clone().fold(f64::INFINITY, f64::min);
     let farthest = distances.fold(0.0, f64::max);
+    let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), Aabb::cube(Config::default().half_width));
+    let findings = hopeless.map(|found| found.join("; ")).into_iter().chain(warnings);
+    lines.extend(findings.map(|finding| ("warning", finding)));
     if let Some(camera) = cameras.first() {
         let k = &camera.intrinsics;
         let fov = k.fov_x().to_degrees();

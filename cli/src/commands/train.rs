@@ -69,6 +69,7 @@ fn options(args: &TrainArgs, stage_psnr: bool) -> RunOptions {
         preview_every: args.preview_every,
         pictures: !args.no_images,
         stage_psnr,
+        test_views: if args.no_evaluate { 0 } else { args.test_views.unwrap_or(usize::MAX) },
         report: !args.no_report,
         stop: Box::new(interrupt::requested),
     }

@@ -1,11 +1,15 @@
 //! Progress of a training run: a bar for each stage, or lines.
 
 use super::{Console, Meter, Standing, clock, metric};
+use plenoxel::run::budget::step_cost;
 use plenoxel::run::memory::{self, bytes};
 use plenoxel::run::metrics::{Observation, figures};
 use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;
 use std::collections::BTreeMap;
+
+/// Time of a ray of a test view, in those of a training ray of the last stage.
+const EVALUATION_RAY: f64 = 0.15;
 
 /// A mean that forgets: each value moves it by `share` of the way, the first ones by more, so that it starts without a bias.
 #[derive(Debug, Clone, Copy)]
@@ -30,7 +34,8 @@ impl Smoothed {
 pub struct Training<'c, 'a> {
     meter: Meter<'c, 'a>,
     plan: Vec<PlannedStage>,
-    prune_from_stage: Option<usize>,
+    /// Rays of the evaluation that follows.
+    rays_to_evaluate: f64,
     total: u64,
     mse: Smoothed,
     loss: Smoothed,
@@ -41,13 +46,13 @@ pub struct Training<'c, 'a> {
 }
 
 impl<'a> Console<'a> {
-    /// Progress of a training run that has taken so many seconds.
-    pub fn training(&self, plan: &[PlannedStage], prune_from_stage: Option<usize>, seconds: f64) -> Training<'_, 'a> {
+    /// Progress of a training run that has taken so many seconds, and whose model is compared with so many pixels at the end.
+    pub fn training(&self, plan: &[PlannedStage], rays_to_evaluate: f64, seconds: f64) -> Training<'_, 'a> {
         let total = plan.iter().map(|p| p.steps).sum();
         Training {
             meter: Meter::new(self, total),
             plan: plan.to_vec(),
-            prune_from_stage,
+            rays_to_evaluate,
             total,
             mse: Smoothed::new(0.05),
             loss: Smoothed::new(0.05),
@@ -101,8 +106,8 @@ impl Training<'_, '_> {
         }
     }
 
-    /// Seconds to go: this stage at its pace, later ones at a pace in proportion to their resolution, as their samples are, and three
-    /// times faster once empty space is left out.
+    /// Seconds until the run has its figures: this stage at its pace, later ones at the pace that the plan of time expects of their resolution
+    /// ([`step_cost`]), and the comparison with the test views, whose rays are counted as `EVALUATION_RAY` of a training ray of the last stage.
     fn remaining(&self, report: &Report) -> f64 {
         let now = &self.plan[report.stage];
         let step = match self.step_seconds.count {
@@ -110,13 +115,11 @@ impl Training<'_, '_> {
             0.0 => self.seconds / (report.step + 1) as f64,
             _ => self.step_seconds.value,
         };
-        let samples = |index: usize| {
-            let pruned = self.prune_from_stage.is_some_and(|first| index >= first);
-            self.plan[index].resolution.unwrap_or(1) as f64 / if pruned { 3.0 } else { 1.0 }
-        };
+        let cost = |stage: &PlannedStage| step_cost(stage.resolution.unwrap_or(1)) / step_cost(now.resolution.unwrap_or(1));
         let here = (now.first + now.steps - report.step - 1) as f64;
-        let later = (report.stage + 1..self.plan.len()).map(|i| self.plan[i].steps as f64 * samples(i) / samples(report.stage));
-        step * (here + later.sum::<f64>())
+        let later = self.plan[report.stage + 1..].iter().map(|stage| stage.steps as f64 * cost(stage));
+        let evaluation = self.plan.last().map_or(0.0, cost) * EVALUATION_RAY * self.rays_to_evaluate / report.rays.max(1) as f64;
+        step * (here + later.sum::<f64>() + evaluation)
     }
 }
 

@@ -329,10 +329,6 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         Some(Box::new(move |rays| show_within(&grid, &matter, sampling, engine, background, rays)))
     }
 
-    fn prunes_from(&self) -> Option<usize> {
-        self.prunes_from()
-    }
-
     fn settings(&self) -> Value {
         serde_json::to_value(&self.config).unwrap_or_default()
     }

@@ -136,6 +136,11 @@ fn measure(config: &Config, views: &Arc<[View]>, seconds: f64) -> Result<Speed> 
     Ok(Speed { resolution: config.stages[0].resolution, step: (spent - begin) / steps, begin, spent })
 }
 
+/// Expected seconds of a step at a resolution, in units of one at a single voxel.
+pub fn step_cost(resolution: usize) -> f64 {
+    (resolution as f64).powf(GROWTH)
+}
+
 /// How many steps of the mean the k-th of the first stage is.
 fn in_fog(k: u32) -> f64 {
     let (slope, usual) = CLEARING;
@@ -145,7 +150,7 @@ fn in_fog(k: u32) -> f64 {
 /// By how much all stages have to be longer for the time to be full.
 fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed) -> Result<f64> {
     // Seconds for a step at a resolution.
-    let step = |resolution: usize| speed.step * (resolution as f64 / speed.resolution as f64).powf(GROWTH);
+    let step = |resolution: usize| speed.step * step_cost(resolution) / step_cost(speed.resolution);
     let begin = |stages: &[Stage]| {
         let share = if stages[0].resolution == stages[1].resolution { ONLY_LOOKED_AT } else { 1.0 };
         share * RAYS_TO_BEGIN / rays_per_step as f64 * step(128) * (stages[1].resolution as f64 / 256.0).powi(2)

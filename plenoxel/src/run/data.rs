@@ -1,8 +1,10 @@
 //! Where views come from: a folder, or the built-in scene; written down in a run so that it can be evaluated later.
 
+use crate::camera::placement::Placement;
 use crate::dataset::procedural::ProceduralOptions;
-use crate::dataset::{self, Dataset, OpenOptions, image};
+use crate::dataset::{self, Dataset, OpenOptions, Split, image};
 use crate::error::{Error, Result};
+use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -72,6 +74,18 @@ impl DataSource {
             DataSource::BuiltIn { width, height, train, val, test } => {
                 format!(" --scene-size {width}x{height} --scene-views {train},{val},{test}")
             }
+        }
+    }
+
+    /// What is likely to go wrong with training views whose cameras stand and look like these, as sentences for people.
+    ///
+    /// Errors: nothing can be learned from them in the box of the config.
+    pub fn check_cameras(&self, dataset: &Dataset, config: &Config) -> Result<Vec<String>> {
+        let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), Aabb::cube(config.half_width));
+        match hopeless {
+            // A grid to start from brings its own box.
+            Some([found, remedy]) if config.init_from.is_none() => Err(Error::input(self.to_string(), found, remedy)),
+            hopeless => Ok(hopeless.map(|found| found.join("; ")).into_iter().chain(warnings).collect()),
         }
     }
 

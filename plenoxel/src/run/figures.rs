@@ -18,6 +18,9 @@ pub struct Figures {
     split: String,
     /// Number of views that were compared.
     views: usize,
+    /// Number of views of the split.
+    #[serde(skip)]
+    of: usize,
     width: usize,
     height: usize,
     background: [f32; 3],
@@ -92,6 +95,7 @@ impl Figures {
             lpips: LPIPS,
             split: split.to_string(),
             views: scores.per_view.len(),
+            of: dataset.count(split),
             width,
             height,
             background: view.background,
@@ -104,12 +108,16 @@ impl Figures {
 
     /// The figures as one sentence.
     pub fn sentence(&self) -> String {
-        let Figures { psnr, ssim, split, views, width, height, .. } = self;
+        let Figures { psnr, ssim, split, views, of, width, height, .. } = self;
         let Some(psnr) = psnr else {
-            return format!("no {split} views to evaluate on");
+            return match of {
+                0 => format!("no {split} views to evaluate on"),
+                _ => format!("not compared with the {of} {split} views"),
+            };
         };
         let ssim = ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));
-        let of = if *views == 1 { format!("of 1 {split} view") } else { format!("means over {views} {split} views") };
-        format!("PSNR {psnr:.2} dB{ssim}: {of} of {width} x {height}")
+        let some = if views < of { format!(", evenly spaced among {of}") } else { String::new() };
+        let views = if *views == 1 { format!("of 1 {split} view") } else { format!("means over {views} {split} views") };
+        format!("PSNR {psnr:.2} dB{ssim}: {views} of {width} x {height}{some}")
     }
 }

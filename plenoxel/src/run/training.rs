@@ -26,6 +26,7 @@ pub use summary::Summary;
 
 use super::budget;
 use super::data::DataSource;
+use super::evenly_spaced;
 use super::folder::{NewFolder, RunFolder, RunKind, RunRecord};
 use super::machine;
 use super::memory::{self, Estimate};
@@ -75,6 +76,8 @@ pub struct RunOptions {
     pub pictures: bool,
     /// Keep the grid of each stage and compare it with the test views at the end.
     pub stage_psnr: bool,
+    /// Test views that the final model is compared with, evenly spaced among all of them; 0 for none.
+    pub test_views: usize,
     /// Count the memory that the page about the run takes.
     pub report: bool,
     /// Asked after each step: true saves the run and ends it.
@@ -88,6 +91,7 @@ impl Default for RunOptions {
             preview_every: 10.0,
             pictures: false,
             stage_psnr: false,
+            test_views: usize::MAX,
             report: false,
             stop: Box::new(|| false),
         }
@@ -218,6 +222,8 @@ struct NewRun<'s> {
     clocks: Clocks,
     /// Bytes that a saved state is expected to take.
     saved: u64,
+    /// What is likely to go wrong.
+    warnings: Vec<String>,
 }
 
 impl<'s> NewRun<'s> {
@@ -233,22 +239,24 @@ impl<'s> NewRun<'s> {
         let mut clocks = Clocks::default();
         let dataset = clocks.load.time(|| settings.data.open(&config))?;
         on(Event::Opened { dataset: &dataset, config: &config });
+        let warnings = settings.data.check_cameras(&dataset, &config)?;
+        warnings.iter().for_each(|warning| on(Event::warning(warning)));
         let folder = NewFolder::choose(settings.out.as_deref(), dataset.name(), settings.force)?;
-        Ok(NewRun { settings, config, dataset, folder, views: Arc::new([]), preview: Preview::default(), clocks, saved: 0 })
+        Ok(NewRun { settings, config, dataset, folder, views: Arc::new([]), preview: Preview::default(), clocks, saved: 0, warnings })
     }
 
     /// Reads the training views, and those that are looked at while training.
     fn read(&mut self, on: &mut Listener<'_>) -> Result<()> {
         let NewRun { settings, dataset, clocks, .. } = self;
         self.preview = clocks.load.time(|| Preview::new(dataset, settings.options.preview_every))?;
-        self.views = clocks.load.time(|| load(dataset, Split::Train, &settings.data, on))?.into();
+        self.views = clocks.load.time(|| load(dataset, Split::Train, &all(dataset, Split::Train), &settings.data, on))?.into();
         Ok(())
     }
 
     /// Writes the folder, trains and evaluates. Nothing is written, and nothing overwritten, before all that could be wrong with the input has been
     /// found.
     fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
-        let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved } = self;
+        let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved, warnings } = self;
         let RunSettings { data, preset, time, options, .. } = settings;
         check_disk(settings.out.as_deref().unwrap_or(Path::new("runs")), saved, on)?;
         let folder = folder.create()?;
@@ -260,7 +268,7 @@ impl<'s> NewRun<'s> {
         folder.describe(&config, &record)?;
         on(Event::note(format!("run: {}", folder.path().display())));
         let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
-        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
+        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options, warnings: &warnings };
         let learned = job.learn(trainer, (metrics, History::default()), preview, &views, &mut clocks, on)?;
         drop(views);
         job.conclude(learned, clocks, on)
@@ -362,7 +370,7 @@ impl<'o> OldRun<'o> {
     fn read(&mut self, on: &mut Listener<'_>) -> Result<()> {
         let OldRun { options, dataset, record, clocks, .. } = self;
         self.preview = clocks.load.time(|| Preview::new(dataset, options.preview_every))?;
-        self.views = clocks.load.time(|| load(dataset, Split::Train, &record.data, on))?.into();
+        self.views = clocks.load.time(|| load(dataset, Split::Train, &all(dataset, Split::Train), &record.data, on))?.into();
         Ok(())
     }
 
@@ -386,7 +394,8 @@ impl<'o> OldRun<'o> {
         clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
         let path = folder.path().display();
         on(Event::note(format!("run: {path}, going on after step {taken} of {total}, {} of training", clock(past.seconds))));
-        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options };
+        let warnings = record.data.check_cameras(&dataset, &config)?;
+        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options, warnings: &warnings };
         let learned = match state {
             Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks, on)?,
             None => Ok(job.learned(trainer, &plan, (metrics, past), &views, on)?),
@@ -402,10 +411,15 @@ fn ends_after(plan: &[PlannedStage], steps: u64) -> &[PlannedStage] {
     &plan[(0..plan.len()).find(taken).unwrap_or(0)..]
 }
 
-/// Reads or renders a split.
-fn load(dataset: &Dataset, split: Split, source: &DataSource, on: &mut Listener<'_>) -> Result<Vec<View>> {
+/// Numbers of all views of a split.
+fn all(dataset: &Dataset, split: Split) -> Vec<usize> {
+    (0..dataset.count(split)).collect()
+}
+
+/// Reads or renders some views of a split.
+fn load(dataset: &Dataset, split: Split, numbers: &[usize], source: &DataSource, on: &mut Listener<'_>) -> Result<Vec<View>> {
     let on = Mutex::new(on);
-    dataset.load(split, &|done, total| {
+    dataset.load_views(split, numbers, &|done, total| {
         let mut on = on.lock().unwrap_or_else(PoisonError::into_inner);
         (*on)(Event::Loading { split, source, done, total });
     })
@@ -447,12 +461,19 @@ struct Job<'a> {
     dataset: &'a Dataset,
     record: &'a RunRecord,
     options: &'a RunOptions,
+    /// Warnings about its cameras.
+    warnings: &'a [String],
 }
 
 /// A run that was stopped: steps taken, and steps of the whole run.
 struct Stopped(u64, u64);
 
 impl Job<'_> {
+    /// Numbers of the test views that the model is compared with.
+    fn test_views(&self) -> Vec<usize> {
+        evenly_spaced(self.dataset.count(Split::Test), self.options.test_views)
+    }
+
     /// Compares what was learned with the test views, and writes the figures.
     fn conclude<M: Model<f32>>(
         &self,
@@ -465,7 +486,7 @@ impl Job<'_> {
             Ok(learned) => learned,
             Err(Stopped(steps, total)) => return Ok(Outcome::Stopped { steps, total, folder: folder.clone() }),
         };
-        let test = clocks.load.time(|| load(dataset, Split::Test, &self.record.data, on))?;
+        let test = clocks.load.time(|| load(dataset, Split::Test, &self.test_views(), &self.record.data, on))?;
         let view = ViewOptions::over(config.background);
         let scores = compare(&mut learned, &test, &view, &mut clocks, on)?;
         let (rays, samples) = learned.metrics.counts();
@@ -473,6 +494,13 @@ impl Job<'_> {
         let means = [("psnr/test", scores.psnr()), ("ssim/test", scores.ssim())];
         let background_psnr = evaluate::background_psnr(&test, config.background);
         let mean_image_psnr = learned.mean_image.and_then(|image| evaluate::constant_psnr(&test, &image, config.background));
+        let mut warnings = self.warnings.to_vec();
+        let below = means[0].1.zip(mean_image_psnr).filter(|(psnr, mean)| psnr < mean).map(|(psnr, mean)| worse("test", psnr, mean));
+        let learned_nothing = learned.training_psnr.filter(|[psnr, mean]| psnr < mean).map(|[psnr, mean]| worse("training", psnr, mean));
+        for warning in below.into_iter().chain(learned_nothing) {
+            on(Event::warning(&warning));
+            warnings.push(warning);
+        }
         let summary = Summary {
             figures: Figures::new(&scores, Split::Test, dataset, config, &learned.model, &view),
             baseline_background_psnr: background_psnr,
@@ -491,6 +519,7 @@ impl Job<'_> {
             validation_psnr,
             best_validation,
             stages: learned.stages,
+            warnings,
             per_view: scores.per_view,
         };
         folder.write_result(&summary)?;
@@ -537,6 +566,14 @@ fn compare<M: Model<f32>>(
         last.psnr = scores.psnr();
     }
     Ok(scores)
+}
+
+/// A warning about views that are shown worse than by the mean of the training views.
+fn worse(split: &str, psnr: f64, mean: f64) -> String {
+    format!(
+        "{split} views are shown worse, {psnr:.2} dB, than by the mean training image, {mean:.2} dB: too few steps, or poses or intrinsics that do \
+         not belong to the images"
+    )
 }
 
 /// The last line of the metrics.

@@ -86,11 +86,6 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         None
     }
 
-    /// The first stage that begins by leaving out empty space and takes less time for it; `None` if there is none.
-    fn prunes_from(&self) -> Option<usize> {
-        None
-    }
-
     /// Settings that must be the same for a saved run to go on.
     fn settings(&self) -> Value {
         Value::Null

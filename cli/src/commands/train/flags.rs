@@ -79,6 +79,14 @@ pub struct TrainArgs {
     #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration_or_off, default_value = "10s")]
     pub preview_every: f64,
 
+    /// Compare the trained grid with N test views, evenly spaced, instead of all of them
+    #[arg(long, value_name = "N", help_heading = "Output", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "no_evaluate")]
+    pub test_views: Option<usize>,
+
+    /// Do not compare the trained grid with the test views; `plenoxel evaluate` does it later
+    #[arg(long, help_heading = "Output")]
+    pub no_evaluate: bool,
+
     /// Write no pictures
     #[arg(long, help_heading = "Output")]
     pub no_images: bool,

@@ -58,11 +58,12 @@ impl<'c, 'a> Screen<'c, 'a> {
                     self.count = None;
                 }
             }
-            Event::Started { run, plan, prunes_from, history } => {
+            Event::Started { run, plan, test_views, history } => {
                 self.plan = plan.to_vec();
                 let pictures = console.drawn(Pictures::new(run, self.draws));
                 self.pictures = pictures.map(|pictures| pictures.after(history, plan));
-                self.progress = Some(console.training(plan, prunes_from, history.seconds));
+                let (width, height) = run.dataset.size();
+                self.progress = Some(console.training(plan, (test_views * width * height) as f64, history.seconds));
                 self.folder = Some(run.folder.clone());
                 self.interrupt = Some(Watch::begin());
             }

@@ -39,8 +39,8 @@ pub enum Event<'a> {
         run: Underway<'a>,
         /// The stages with their steps.
         plan: &'a [PlannedStage],
-        /// The first stage that begins by pruning.
-        prunes_from: Option<usize>,
+        /// Number of the test views that the model is compared with at the end.
+        test_views: usize,
         /// What a resumed run did before.
         history: &'a History,
     },
@@ -145,6 +145,10 @@ pub struct Finished<'a> {
 impl Event<'_> {
     pub(super) fn note(text: impl Into<String>) -> Self {
         Event::Note(text.into())
+    }
+
+    pub(super) fn warning(text: &str) -> Self {
+        Event::Note(format!("warning: {text}"))
     }
 }
 

@@ -15,12 +15,19 @@ use serde::Serialize;
 use serde_json::json;
 use std::time::Instant;
 
+/// Training views that the mean image is compared with.
+const VIEWS_OF_MEAN: usize = 16;
+/// Share of a step in the smoothed error of training rays.
+const SMOOTHED: f64 = 0.05;
+
 /// A trained model and how it came about.
 pub struct Learned<M> {
     pub model: M,
     pub metrics: MetricsFile,
     /// Mean of the training views.
     pub mean_image: Option<Array3<f32>>,
+    /// PSNR of the training rays in the end, smoothed, and that of the mean training image; `None` if no steps were taken now.
+    pub training_psnr: Option<[f64; 2]>,
     pub stages: Vec<StageSummary>,
     /// Viewers of the models that stages ended with, by the number of the stage in `stages`, where they were kept.
     pub kept: Vec<(usize, RenderFn<'static, f32>)>,
@@ -59,10 +66,11 @@ impl Job<'_> {
         let first = |split| dataset.cameras(split).into_iter().next();
         let mut preview = preview.begin(first(Split::Test).or(first(Split::Train)).filter(|_| options.pictures));
         let run = Underway { folder, config, dataset };
-        on(Event::Started { run, plan: &plan, prunes_from: trainer.model().prunes_from(), history: &past });
+        on(Event::Started { run, plan: &plan, test_views: self.test_views().len(), history: &past });
         let mut losses = past.losses;
         let mut facts = trainer.model().facts();
         let mut saved = Instant::now();
+        let (mut mean_squared_error, mut taken) = (0.0, false);
         let last_psnr = loop {
             let report = match clocks.train.time(|| trainer.step()) {
                 Ok(Some(report)) => report,
@@ -71,6 +79,9 @@ impl Job<'_> {
                 Err(e) => return Err(failed(e, &losses, &mut metrics, on)),
             };
             losses.push(report.loss);
+            let error = 10f64.powf(-0.1 * report.psnr);
+            mean_squared_error += if taken { SMOOTHED * (error - mean_squared_error) } else { error };
+            taken = true;
             let stage = plan[report.stage];
             let last = report.step + 1 == total;
             let due = saved.elapsed().as_secs_f64() >= options.checkpoint_every;
@@ -136,7 +147,11 @@ impl Job<'_> {
             return Ok(Err(Stopped(total, total)));
         }
         let mean_image = evaluate::mean_image(views, config.background);
-        Ok(Ok(Learned { model, metrics, mean_image, stages, kept, steps: total }))
+        let of_mean = mean_image
+            .as_ref()
+            .and_then(|image| evaluate::constant_psnr(&views[..views.len().min(VIEWS_OF_MEAN)], image, config.background));
+        let training_psnr = of_mean.map(|of_mean| [-10.0 * mean_squared_error.log10(), of_mean]).filter(|_| taken);
+        Ok(Ok(Learned { model, metrics, mean_image, training_psnr, stages, kept, steps: total }))
     }
 
     /// The result of a run that was killed between its last step and its final figures; `trainer` is one of the run before its first step.
@@ -149,11 +164,11 @@ impl Job<'_> {
         on: &mut Listener<'_>,
     ) -> Result<Learned<M>> {
         let Job { folder, config, dataset, .. } = *self;
-        on(Event::Started { run: Underway { folder, config, dataset }, plan, prunes_from: None, history: &past });
+        on(Event::Started { run: Underway { folder, config, dataset }, plan, test_views: self.test_views().len(), history: &past });
         on(Event::Trained);
         let (model, about) = trainer.into_model_of(&folder.existing_checkpoint()?)?;
         let mean_image = evaluate::mean_image(views, config.background);
-        Ok(Learned { model, metrics, mean_image, stages: summaries(&past, plan), kept: Vec::new(), steps: about.step })
+        Ok(Learned { model, metrics, mean_image, training_psnr: None, stages: summaries(&past, plan), kept: Vec::new(), steps: about.step })
     }
 }
 

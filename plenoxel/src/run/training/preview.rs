@@ -1,4 +1,4 @@
-//! A look at the model while it is trained: a small picture, and the PSNR of a few validation views.
+//! A look at the model while it is trained: a small picture, and the PSNR of a few validation views by some of their pixels.
 //!
 //! No bit of what is trained depends on it, and test views are not looked at.
 
@@ -14,7 +14,7 @@ use std::time::Instant;
 
 /// So many validation views, evenly spaced.
 const VIEWS: usize = 4;
-/// Their longer side in pixels, at most: their PSNR is to cost little.
+/// Rays along their longer side, at most: their PSNR is to cost little.
 const SIDE: usize = 128;
 /// That of the picture's, for eyes.
 const PICTURE_SIDE: usize = 256;
@@ -35,7 +35,7 @@ pub struct Preview {
 
 /// What was seen.
 pub struct Look {
-    /// Mean PSNR of the validation views, if there are any.
+    /// Mean PSNR of the validation views over every k-th pixel of every k-th row, if there are any.
     pub psnr: Option<f64>,
     /// A picture, if one was wanted, and the photograph of the same view, if there is one.
     pub picture: Option<(Array3<f32>, Option<Array3<f32>>)>,
@@ -59,7 +59,7 @@ impl Preview {
         // One after the other, so that one image of full size is in memory at a time.
         for number in chosen {
             let view = dataset.load_view(Split::Val, number)?;
-            views.push(reduced(&view, SIDE));
+            views.push(thinned(&view, SIDE));
             shown = shown.or_else(|| Some(reduced(&view, PICTURE_SIDE)));
         }
         Ok(Preview { views, pace: Pace::new(every), shown, camera: None })
@@ -102,6 +102,26 @@ impl Preview {
         self.pace.took(start, self.pace.now());
         Some(Look { psnr, picture })
     }
+}
+
+/// Every k-th pixel of every k-th row of a view, at most so many a side, with a camera that has the rays of these pixels: unlike those of a reduced
+/// image, they show what training rays show.
+fn thinned(view: &View, side: usize) -> View {
+    let (width, height) = view.image.dimensions();
+    let k = width.max(height).div_ceil(side as u32).min(width).min(height);
+    let first = (k - 1) / 2;
+    let image = RgbaImage::from_fn(width / k, height / k, |x, y| *view.image.get_pixel(k * x + first, k * y + first));
+    let (all, step) = (view.camera.intrinsics, f64::from(k));
+    let moved = |center: f64| 0.5 - (f64::from(first) + 0.5 - center) / step;
+    let intrinsics = Intrinsics {
+        width: image.width() as usize,
+        height: image.height() as usize,
+        fx: all.fx / step,
+        fy: all.fy / step,
+        cx: moved(all.cx),
+        cy: moved(all.cy),
+    };
+    View { name: view.name.clone(), camera: Camera { intrinsics, ..view.camera }, image, depth: None }
 }
 
 /// A view of at most so many pixels a side, without the last columns and rows that would make no whole pixel.
@@ -186,5 +206,11 @@ mod tests {
         // The ray of a reduced pixel is that of the middle one of its twenty-five.
         let (ray, middle) = (small.camera.ray(2.5, 3.5), view.camera.ray(12.5, 17.5));
         assert!(ray.direction.distance(middle.direction) < 1e-12 && ray.origin == middle.origin);
+        // A thinned view has pixels and rays of the whole one.
+        let thin = thinned(&view, 12);
+        assert_eq!(thin.image.dimensions(), (10, 7));
+        let (ray, one) = (thin.camera.ray(2.5, 3.5), view.camera.ray(12.5, 17.5));
+        assert!(ray.direction.distance(one.direction) < 1e-12 && ray.origin == one.origin);
+        assert_eq!(thin.image.get_pixel(2, 3), view.image.get_pixel(12, 17));
     }
 }

@@ -44,6 +44,8 @@ pub struct Summary {
     pub best_validation: Option<Best>,
     /// Each stage.
     pub stages: Vec<StageSummary>,
+    /// Reasons to doubt the result.
+    pub warnings: Vec<String>,
     /// Scores of each test view.
     pub per_view: Vec<ViewScore>,
 }
