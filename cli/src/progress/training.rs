@@ -9,7 +9,7 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 
 /// Time of a ray of a test view, in those of a training ray of the last stage.
-const EVALUATION_RAY: f64 = 0.15;
+const EVALUATION_RAY: f64 = 0.17;
 
 /// A mean that forgets: each value moves it by `share` of the way, the first ones by more, so that it starts without a bias.
 #[derive(Debug, Clone, Copy)]

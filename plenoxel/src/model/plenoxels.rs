@@ -151,9 +151,16 @@ impl<T: Real> Plenoxels<T> {
         self
     }
 
-    /// The same from a carved grid, whose voxels are all equally opaque: they are made thin, so that gradients reach what is behind them.
-    pub fn starting_from_carved(self, grid: &VoxelGrid<T>) -> Self {
-        self.starting_from(&start::thinned(grid))
+    /// The same from a carved grid: its voxels and colors, in the smallest box around them, with the densities that training starts with, so that
+    /// gradients reach what is behind a surface. No stage is left out: a carved grid says where matter may be and not yet how much.
+    pub fn starting_from_carved(mut self, grid: &VoxelGrid<T>) -> Self {
+        self.scouts = 0;
+        self.stages = self.config.stages.clone();
+        let shape = self.config.grid_shape(self.stages[0].resolution);
+        let thin = start::thinned(grid, self.config.initial.density).with_interpolation(shape.interpolation);
+        let half_width = thin.matter().half_width().unwrap_or(grid.shape().half_width);
+        self.grid = start::adapted(&thin.resample_in(shape.resolution, half_width), &shape);
+        self
     }
 
     /// The grid as it is now.

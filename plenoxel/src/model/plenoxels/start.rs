@@ -90,15 +90,9 @@ fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -
     visual_hull::by_silhouettes(views, shows_matter, among, margin, &|_| ()).union(matter)
 }
 
-/// Optical depth of a carved voxel along its side with which training starts. As opaque as carving leaves it, hardly a gradient gets past the
-/// hull's surface to what is behind: on lego's training rays, 128 voxels a side, 0.875, 0.2 and 0.05 come to 24 dB after 550, 370 and 380
-/// steps, to 26 dB after 1480, 1010 and 1100, and to 27.4, 27.9 and 27.8 dB after 3000.
-const DEPTH: f64 = 0.2;
-
-/// A carved grid that lets light through: as thin as training starts from it.
-pub fn thinned<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
-    let density = grid.density.tensor().clamp(0.0, DEPTH / grid.shape().voxel_side());
-    grid.with_density(density)
+/// A carved grid that lets light through: its voxels have a density of at most so much, 1 / world length.
+pub fn thinned<T: Real>(grid: &VoxelGrid<T>, density: f64) -> VoxelGrid<T> {
+    grid.with_density(grid.density.tensor().clamp(0.0, density))
 }
 
 /// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
