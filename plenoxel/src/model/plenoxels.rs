@@ -49,7 +49,7 @@ use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{self, About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::Optimizer;
 use autograd::single::{cast, cast_mut, cast_ref, is_single};
-use autograd::{Module, Param, Real};
+use autograd::{Module, Param, Real, Tensor};
 use config::{Config, Sampling, Stage};
 use serde_json::{Map, Value, json};
 use start::Silhouettes;
@@ -151,15 +151,17 @@ impl<T: Real> Plenoxels<T> {
         self
     }
 
-    /// The same from a carved grid: its voxels and colors, in the smallest box around them, with the densities that training starts with, so that
-    /// gradients reach what is behind a surface. No stage is left out: a carved grid says where matter may be and not yet how much.
+    /// The same from a carved grid: its voxels and colors, in the smallest box around them, with the density that training starts with, so that
+    /// gradients reach what is behind a surface. No stage is left out: a carved grid says where matter may be and not how much.
     pub fn starting_from_carved(mut self, grid: &VoxelGrid<T>) -> Self {
         self.scouts = 0;
         self.stages = self.config.stages.clone();
         let shape = self.config.grid_shape(self.stages[0].resolution);
-        let thin = start::thinned(grid, self.config.initial.density).with_interpolation(shape.interpolation);
-        let half_width = thin.matter().half_width().unwrap_or(grid.shape().half_width);
-        self.grid = start::adapted(&thin.resample_in(shape.resolution, half_width), &shape);
+        let carved = grid.with_interpolation(shape.interpolation);
+        let half_width = grid.matter().half_width().unwrap_or(grid.shape().half_width);
+        let adapted = start::adapted(&carved.resample_in(shape.resolution, half_width), &shape);
+        let density = Tensor::full(adapted.density.shape(), T::lit(self.config.initial.density));
+        self.grid = adapted.with_density(density);
         self
     }
 

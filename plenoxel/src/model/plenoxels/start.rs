@@ -90,11 +90,6 @@ fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -
     visual_hull::by_silhouettes(views, shows_matter, among, margin, &|_| ()).union(matter)
 }
 
-/// A carved grid that lets light through: its voxels have a density of at most so much, 1 / world length.
-pub fn thinned<T: Real>(grid: &VoxelGrid<T>, density: f64) -> VoxelGrid<T> {
-    grid.with_density(grid.density.tensor().clamp(0.0, density))
-}
-
 /// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
 /// trilinear look-up will read them. The box stays that of the grid.
 pub fn adapted<T: Real>(grid: &VoxelGrid<T>, shape: &GridShape) -> VoxelGrid<T> {
