@@ -9,8 +9,8 @@ pub use self::safetensors::{load_safetensors, save_safetensors};
 
 use crate::error::FileError;
 use crate::real::Real;
-use std::fs::{self, OpenOptions};
-use std::io;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -52,9 +52,54 @@ fn read_numbers<T: Real>(bytes: &[u8], dtype: Dtype, out: &mut [T]) {
     }
 }
 
-/// The bytes of a file.
+/// The bytes of a plain file.
 fn read(path: &Path) -> Result<Vec<u8>, FileError> {
-    fs::read(path).map_err(|source| FileError::Io { path: path.to_owned(), doing: "reading the file", source })
+    let mut bytes = Vec::new();
+    let read = open_plain(path).and_then(|mut file| file.read_to_end(&mut bytes));
+    read.map_err(|source| FileError::Io { path: path.to_owned(), doing: "reading the file", source })?;
+    Ok(bytes)
+}
+
+/// Opens a plain file for reading. Links are followed. Pipes, devices and sockets are refused without being read, for that might never end.
+///
+/// Errors: those of the system; [`io::ErrorKind::IsADirectory`] for a folder; [`io::ErrorKind::InvalidInput`] with a message that says what it is
+/// for anything else that is no plain file.
+pub fn open_plain(path: &Path) -> io::Result<File> {
+    // To open a device may have effects already.
+    check_plain(&fs::metadata(path)?)?;
+    let mut options = OpenOptions::new();
+    options.read(true);
+    // Meanwhile there may be a pipe in its place, and to open one would be to wait for its writer.
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, libc::O_NONBLOCK);
+    let file = options.open(path)?;
+    check_plain(&file.metadata()?)?;
+    Ok(file)
+}
+
+fn check_plain(metadata: &fs::Metadata) -> io::Result<()> {
+    let kind = metadata.file_type();
+    match kind {
+        _ if kind.is_file() => Ok(()),
+        _ if kind.is_dir() => Err(io::ErrorKind::IsADirectory.into()),
+        _ => Err(io::Error::new(io::ErrorKind::InvalidInput, format!("this is {}, not a plain file", name_of(kind)))),
+    }
+}
+
+/// What a file that is neither plain nor a folder is.
+#[cfg(unix)]
+fn name_of(kind: fs::FileType) -> &'static str {
+    use std::os::unix::fs::FileTypeExt;
+    match kind {
+        _ if kind.is_fifo() => "a pipe",
+        _ if kind.is_socket() => "a socket",
+        _ => "a device",
+    }
+}
+
+#[cfg(not(unix))]
+fn name_of(_: fs::FileType) -> &'static str {
+    "something special"
 }
 
 /// [`atomically`], with an error that names the file.

@@ -11,6 +11,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use plenoxel::error::{Error, Result};
 use plenoxel::json;
 use plenoxel::run::machine;
+use plenoxel::text::one_line;
 use serde::Serialize;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -47,8 +48,14 @@ impl<'a> Console<'a> {
         Console { streams: Mutex::new(streams), bar: Mutex::new(None), bars, format, quiet }
     }
 
-    /// A line of results on stdout. A reader that has gone away is no failure: the results are in files too.
-    pub fn result(&self, text: &str) -> Result<()> {
+    /// A line of results on stdout, in which nothing does anything to a terminal.
+    pub fn result(&self, line: &str) -> Result<()> {
+        self.text(&one_line(line))
+    }
+
+    /// Lines of results on stdout as they are: they were made here, and [`one_line`] was asked about what came from elsewhere. A reader that has
+    /// gone away is no failure: the results are in files too.
+    pub fn text(&self, text: &str) -> Result<()> {
         let out = &mut lock(&self.streams).out;
         match writeln!(out, "{text}").and_then(|()| out.flush()) {
             Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Error::io("stdout", e, "printing the result")),
@@ -95,7 +102,7 @@ impl<'a> Console<'a> {
         }
         let time = machine::time();
         match self.format {
-            LogFormat::Plain => self.write(&plain()),
+            LogFormat::Plain => self.write(&one_line(&plain())),
             LogFormat::Json => self.write(&json::line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
         }
     }
@@ -174,7 +181,7 @@ impl<'c, 'a> Meter<'c, 'a> {
         if let Some(bar) = &self.bar {
             bar.set_length(total);
             bar.set_position(position);
-            bar.set_message(standing.beside_bar());
+            bar.set_message(one_line(&standing.beside_bar()));
         }
         if must || self.bar.is_none() {
             self.console.log("progress", &standing, || standing.line());

@@ -11,6 +11,7 @@ use crate::checkpoint::{self, Header};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::files;
+use crate::json;
 use crate::model::plenoxels::config::Config;
 use listing::{RENDERED, entries, first_free, is_fragment, is_frame, is_one_of, remove};
 use serde::Serialize;
@@ -121,11 +122,10 @@ impl RunFolder {
         }
         let folder = Self::at(path);
         let record = path.join(RECORD);
-        let bytes = std::fs::read(&record).map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => Error::input(path, format!("there is no {RECORD} in this folder"), remedy),
-            _ => Error::io(&record, e, "reading the run"),
-        })?;
-        let mut record = RunRecord::parse(&record, &bytes)?;
+        if !files::is_there(&record) {
+            return Err(Error::input(path, format!("there is no {RECORD} in this folder"), remedy));
+        }
+        let mut record = RunRecord::parse(&record, &files::read(&record, files::RECORD)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
         if config.stages.is_empty() {
             record.kind = RunKind::Carved;
@@ -198,7 +198,7 @@ impl RunFolder {
         let path = self.state();
         let (found, remedy) = match (path.exists(), self.checkpoint().exists()) {
             (true, _) => return Ok(Some(path)),
-            (false, true) if self.result().is_none() => return Ok(None),
+            (false, true) if self.result()?.is_none() => return Ok(None),
             (false, true) => ("this run has ended", "to train its grid further, use `--init-from`"),
             (false, false) => ("this run left nothing from which to go on", "train again with its config.toml"),
         };
@@ -221,7 +221,9 @@ impl RunFolder {
     }
 
     /// Reads the final figures, if there are any.
-    pub fn result(&self) -> Option<serde_json::Value> {
+    ///
+    /// Errors: the file cannot be read, or is not JSON.
+    pub fn result(&self) -> Result<Option<serde_json::Value>> {
         self.read_json(RESULT)
     }
 
@@ -231,24 +233,31 @@ impl RunFolder {
     }
 
     /// Reads the figures of an evaluation, if they were written.
-    pub fn evaluation(&self) -> Option<serde_json::Value> {
+    ///
+    /// Errors as for [`RunFolder::result`].
+    pub fn evaluation(&self) -> Result<Option<serde_json::Value>> {
         self.read_json(EVALUATION)
     }
 
     /// The final figures, with those of an evaluation where the final ones are without test views.
-    pub fn figures(&self) -> Option<serde_json::Value> {
-        let mut all = self.result()?;
-        if let (Some(all), Some(serde_json::Value::Object(evaluation))) = (all.as_object_mut(), self.evaluation()) {
+    ///
+    /// Errors as for [`RunFolder::result`].
+    pub fn figures(&self) -> Result<Option<serde_json::Value>> {
+        let Some(mut all) = self.result()? else { return Ok(None) };
+        if let (Some(all), Some(serde_json::Value::Object(evaluation))) = (all.as_object_mut(), self.evaluation()?) {
             for (key, value) in evaluation {
                 all.entry(key).or_insert(value);
             }
         }
-        Some(all)
+        Ok(Some(all))
     }
 
-    fn read_json(&self, name: &str) -> Option<serde_json::Value> {
-        let text = std::fs::read_to_string(self.path.join(name)).ok()?;
-        serde_json::from_str(&text).ok()
+    fn read_json(&self, name: &str) -> Result<Option<serde_json::Value>> {
+        let path = self.path.join(name);
+        if !files::is_there(&path) {
+            return Ok(None);
+        }
+        json::parse(&path, &files::read(&path, files::RECORD)?).map(Some)
     }
 
     /// Writes the chart of the loss, an SVG.
@@ -264,7 +273,7 @@ impl RunFolder {
     /// Reads the text of `config.toml`.
     pub fn settings(&self) -> Result<String> {
         let path = self.path.join(CONFIG);
-        std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e, "reading the settings"))
+        Ok(files::text(&path, &files::read(&path, files::SETTINGS)?)?.into_owned())
     }
 
     /// Path of the report.

@@ -3,9 +3,7 @@
 //! The parts are counted from what is known: images, tables, optimizer state, and the arrays that a training step keeps for its gradient.
 //! The last depends on how many samples the rays take: about as many as cross the box from face to face, fewer after pruning.
 
-mod system;
-
-pub use system::{available, limit, now, peak};
+pub use crate::memory::{available, bytes, limit, now, peak};
 
 use super::machine;
 use crate::carve::Fit;
@@ -14,6 +12,7 @@ use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
 use crate::field::voxel_grid::{Color, GridShape};
+use crate::memory;
 use crate::model::plenoxels::config::{Config, OptimizerConfig, Sampling};
 use crate::render::Engine;
 
@@ -237,13 +236,11 @@ impl Estimate {
     /// Refuses what does not fit into the memory that is free, naming the setting that counts most. Where the system does not say how
     /// much is free, nothing is refused.
     pub fn check(&self) -> Result<()> {
-        match available() {
-            Some(available) if self.total() > available => {
-                let limited = system::is_limit(available);
-                let why = if limited { "--max-memory allows" } else { "there is room for" };
-                let found = format!("what would need about {} of memory, where {why} {},", bytes(self.total()), bytes(available));
+        match memory::allowance() {
+            Some(allowance) if self.total() > allowance.bytes => {
+                let found = format!("what would need about {} of memory, where {allowance},", bytes(self.total()));
                 // A limit may be too low for anything.
-                let advice = format!("{}{}", self.advice, if limited { "; or a higher --max-memory" } else { "" });
+                let advice = format!("{}{}", self.advice, if allowance.is_limit { "; or a higher --max-memory" } else { "" });
                 Err(Error::config(&self.key, found, advice))
             }
             _ => Ok(()),
@@ -275,15 +272,15 @@ fn share(config: &Config, stage: usize) -> f64 {
     if config.prune_from_stage.is_some_and(|first| first <= stage) { LEFT } else { 1.0 }
 }
 
-/// Images of the largest of some splits, with depth where the scene knows it, and the full-size ones that each thread decodes.
+/// Images of the largest of some splits, with depth where the scene knows it, and the full-size ones that each thread reduces.
 fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
     let (width, height) = dataset.size();
     let pixels = (width * height) as u64;
     let views = splits.iter().map(|split| dataset.count(*split)).max();
     let per_pixel = if dataset.scene().is_some() { 8 } else { 4 };
     let threads = machine::threads() as u64;
-    // A file and its decoded pixels.
-    let decoding = threads * 8 * pixels * (downscale * downscale) as u64;
+    // Pixels are decoded row by row to 8 bits, whatever the file has, into the image that is counted already, unless it is to be reduced.
+    let decoding = if downscale > 1 { threads * 4 * pixels * (downscale * downscale) as u64 } else { 0 };
     views.unwrap_or(0) as u64 * pixels * per_pixel + decoding
 }
 
@@ -348,25 +345,4 @@ fn touched_rows(shape: &GridShape, samples: u64) -> u64 {
 /// True if a loss looks at the whole grid, so that gradients are dense.
 fn whole_grid_losses(config: &Config) -> bool {
     ["tv_density", "tv_color"].iter().any(|name| config.losses.contains_key(*name))
-}
-
-/// Bytes with a unit of powers of 1000, at two or three digits: `2.3 GB`, `99 kB`.
-pub fn bytes(n: u64) -> String {
-    match n as f64 {
-        n if n >= 1e10 => format!("{:.0} GB", n / 1e9),
-        n if n >= 1e9 => format!("{:.1} GB", n / 1e9),
-        n if n >= 1e6 => format!("{:.0} MB", n / 1e6),
-        n => format!("{:.0} kB", n / 1e3),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_read_well() {
-        assert_eq!(bytes(2_345_678_901), "2.3 GB");
-        assert_eq!(bytes(99_000), "99 kB");
-    }
 }
