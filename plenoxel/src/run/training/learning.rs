@@ -127,7 +127,7 @@ impl Job<'_> {
         if stopped {
             return Ok(Err(Stopped(total, total)));
         }
-        let mean_image = evaluate::mean_image(views, config.background);
+        let mean_image = self.mean_image(views);
         Ok(Ok(Learned { grid, metrics, mean_image, stages, steps: total }))
     }
 
@@ -143,8 +143,12 @@ impl Job<'_> {
         on(Event::Started { run: Underway { folder, config, dataset }, plan, prunes_from: None, history: &past });
         on(Event::Trained);
         let (grid, header) = folder.load()?;
-        let mean_image = evaluate::mean_image(views, config.background);
-        Ok(Learned { grid, metrics, mean_image, stages: summaries(&past, plan), steps: header.step })
+        Ok(Learned { grid, metrics, mean_image: self.mean_image(views), stages: summaries(&past, plan), steps: header.step })
+    }
+
+    /// What test views are compared with, if there are any.
+    fn mean_image(&self, views: &[View]) -> Option<Array3<f32>> {
+        if self.dataset.count(Split::Test) > 0 { evaluate::mean_image(views, self.config.background) } else { None }
     }
 }
 
