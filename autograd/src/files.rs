@@ -123,3 +123,25 @@ pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> i
         let _ = fs::remove_file(&temporary);
     })
 }
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_plain_file_is_refused_without_waiting_for_it() {
+        let place = std::env::temp_dir().join(format!("autograd-plain-{}", std::process::id()));
+        fs::create_dir_all(&place).expect("a folder");
+        let (link, pipe) = (place.join("link"), place.join("pipe"));
+        std::os::unix::fs::symlink("/dev/zero", &link).expect("a link");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
+        for (path, found) in [(&link, "this is a device"), (&pipe, "this is a pipe")] {
+            let error = crate::Tensor::<f32>::load_npy(path).expect_err("no file").to_string();
+            assert!(error.contains(found) && error.contains(&path.display().to_string()), "{error}");
+        }
+        assert_eq!(open_plain(&place).expect_err("a folder").kind(), io::ErrorKind::IsADirectory);
+        fs::write(place.join("file"), b"x").expect("written");
+        assert_eq!(read(&place.join("file")).expect("a file"), b"x");
+        fs::remove_dir_all(place).expect("removed");
+    }
+}

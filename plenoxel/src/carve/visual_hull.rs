@@ -14,6 +14,8 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Views whose silhouettes are in memory at a time.
 const VIEWS: usize = 8;
+/// Bytes of a pixel of all these: of its number in a summed-area table.
+pub(crate) const SILHOUETTE_BYTES: u64 = VIEWS as u64 * size_of::<u32>() as u64;
 /// Bricks that a thread takes at a time.
 const BRICKS: usize = 16;
 

@@ -157,6 +157,11 @@ pub fn write_gray16(path: &Path, values: &Array2<u16>) -> Result<()> {
 }
 
 fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<()> {
+    // Nothing is written that would not be read.
+    if width.max(height) > MAX_SIDE as usize {
+        let found = format!("a picture of {width} x {height} pixels is not written");
+        return Err(Error::input(path, found, format!("pictures of up to {MAX_SIDE} pixels a side are")));
+    }
     let mut png = Vec::new();
     ::image::codecs::png::PngEncoder::new(&mut png).write_image(bytes, width as u32, height as u32, color).map_err(|error| {
         Error::input(path, format!("a {width} x {height} image cannot be encoded ({error})"), "choose a usual image size")

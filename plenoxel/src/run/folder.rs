@@ -76,7 +76,7 @@ impl RunFolder {
         files::create_dir(&self.path)?;
         self.remove_fragments()?;
         let names = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
-        let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| path.exists());
+        let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| files::is_there(path));
         for path in paths.chain(tensorboard::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
@@ -138,7 +138,7 @@ impl RunFolder {
     /// Errors: there is no best grid besides the last.
     pub fn with_best(self) -> Result<Self> {
         let best = RunFolder { grid: BEST, ..self };
-        if !best.checkpoint().exists() {
+        if !files::is_there(&best.checkpoint()) {
             let found = format!("there is no {BEST} in this folder");
             let remedy =
                 "leave --best away: the last grid was the best, or nothing was saved before it, or there were no validation views to tell";
@@ -183,7 +183,7 @@ impl RunFolder {
 
     fn existing_checkpoint(&self) -> Result<PathBuf> {
         let path = self.checkpoint();
-        if !path.exists() {
+        if !files::is_there(&path) {
             let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
             let best = if self.path.join(BEST).exists() { "; or --best, for the best grid that was saved" } else { "" };
             return Err(Error::input(&self.path, found, format!("go on with `plenoxel train --resume`, or train again{best}")));
@@ -196,7 +196,7 @@ impl RunFolder {
     /// Errors: there is none, because the run has ended or has saved nothing yet.
     pub fn existing_state(&self) -> Result<Option<PathBuf>> {
         let path = self.state();
-        let (found, remedy) = match (path.exists(), self.checkpoint().exists()) {
+        let (found, remedy) = match (files::is_there(&path), files::is_there(&self.checkpoint())) {
             (true, _) => return Ok(Some(path)),
             (false, true) if self.result()?.is_none() => return Ok(None),
             (false, true) => ("this run has ended", "to train its grid further, use `--init-from`"),

@@ -8,12 +8,13 @@ pub use crate::memory::{available, bytes, limit, now, peak};
 use super::machine;
 use crate::carve::Fit;
 use crate::carve::color::KEPT_LIGHT;
+use crate::carve::visual_hull::SILHOUETTE_BYTES;
 use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
 use crate::field::voxel_grid::{Color, GridShape};
 use crate::memory;
-use crate::model::plenoxels::config::{Config, OptimizerConfig, Sampling};
+use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
 use crate::render::Engine;
 
 /// An estimate in bytes, by purpose.
@@ -40,6 +41,9 @@ const BASE: u64 = 60_000_000;
 const CARVING_PIXELS: u64 = 1 << 16;
 /// Bytes of a pixel of rendered pictures: five numbers of the colors and of the normals each, what is made of them, and the file.
 const PICTURE_BYTES: u64 = 100;
+/// Bytes of a pixel of a view while it is compared with its photograph: the picture, the photograph in floats, both in double precision for SSIM;
+/// then the error, the depth and the panel of all four.
+const COMPARED_BYTES: u64 = 120;
 /// The most bytes of the page about a run while it is put together: the grid in it of up to 30 MB, compressed, as text, and as part of longer texts.
 const PAGE_BYTES: u64 = 150_000_000;
 /// Rays that are rendered at a time when evaluating.
@@ -84,18 +88,22 @@ impl Estimate {
             let batch = rays * 200;
             kept * training_bytes_per_sample(config.engine, &shape) + batch + rows + gradient
         });
-        let step = step.max().unwrap_or(0);
+        let (width, height) = dataset.size();
+        let pixels = (width * height) as u64;
+        let hull = if config.hull == Hull::Auto { SILHOUETTE_BYTES * pixels } else { 0 };
+        let step = step.max().unwrap_or(0).max(hull);
+        let comparison = comparison(dataset, Split::Test);
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // A table's bytes beside it.
         let saving = tables(index);
         let page = if report { page(tables(index)) } else { 0 };
         // It renders, when the optimizer is gone.
-        let reporting = (evaluation + page).saturating_sub(optimizer);
+        let reporting = (evaluation + comparison.max(page)).saturating_sub(optimizer);
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
         let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, a lower sh_degree, or a higher sh_reduction");
         let parts = [
-            (images, ("downscale".to_owned(), "a larger factor, so that the images fit")),
+            (images + comparison.max(hull), ("downscale".to_owned(), "a larger factor, so that the images fit")),
             (step, ("rays_per_step".to_owned(), "fewer rays in a step")),
             (evaluation, ("evaluation".to_owned(), "fewer samples on a ray")),
             (grid + optimizer + saving, voxels),
@@ -135,7 +143,8 @@ impl Estimate {
             // The file and the tables read from it.
             grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
-            step: samples * evaluation_bytes_per_sample(config.engine, shape),
+            step: samples * evaluation_bytes_per_sample(config.engine, shape)
+                + compare.map_or(0, |(dataset, split)| comparison(dataset, split)),
             pruned: false,
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
@@ -170,7 +179,7 @@ impl Estimate {
         let masks = shape.voxels() as u64;
         let (width, height) = dataset.size();
         // Summed-area tables of some views, or the light of a batch of pixels.
-        let step = (32 * (width * height) as u64).max(CARVING_PIXELS * 36 * hits_of_pixel(config));
+        let step = (SILHOUETTE_BYTES * (width * height) as u64).max(CARVING_PIXELS * 36 * hits_of_pixel(config));
         // Which voxel each pixel sees; the list that descent draws pixels from.
         let pixels = (width * height * dataset.count(Split::Train)) as u64;
         let items = if config.carve.photo.is_some() { 4 * pixels } else { 0 } + if config.carve.fit == Fit::Sgd { 8 * pixels } else { 0 };
@@ -282,6 +291,12 @@ fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
     // Pixels are decoded row by row to 8 bits, whatever the file has, into the image that is counted already, unless it is to be reduced.
     let decoding = if downscale > 1 { threads * 4 * pixels * (downscale * downscale) as u64 } else { 0 };
     views.unwrap_or(0) as u64 * pixels * per_pixel + decoding
+}
+
+/// Comparing the views of a split, one after the other, if there are any.
+fn comparison(dataset: &Dataset, split: Split) -> u64 {
+    let (width, height) = dataset.size();
+    if dataset.count(split) > 0 { COMPARED_BYTES * (width * height) as u64 } else { 0 }
 }
 
 /// Voxels that a pixel may see in a carved grid: until it is opaque, or the box ends.

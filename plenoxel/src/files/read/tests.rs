@@ -105,7 +105,7 @@ mod unix {
         let inner = folder.0.join("inner");
         fs::create_dir(&inner).unwrap();
         let path = folder.write("inner/a", b"x");
-        fs::set_permissions(&inner, fs::Permissions::from_mode(0)).unwrap();
+        fs::set_permissions(&inner, fs::Permissions::from_mode(0o000)).unwrap();
         // Root may read everything.
         let result = read(&path, SMALL);
         fs::set_permissions(&inner, fs::Permissions::from_mode(0o700)).unwrap();
