@@ -11,7 +11,13 @@ mod parsers;
 
 use memory::peak_of;
 use parsers::{PARSERS, Parser, try_arguments, try_out};
-use plenoxel::dataset::image;
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::dataset::{Dataset, Split, image};
+use plenoxel::evaluate;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::model::plenoxels::config::Config;
+use plenoxel::model::plenoxels::grid_viewer;
+use plenoxel::run::memory::Estimate;
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::{RngSeed, TestError, TestRunner};
@@ -237,6 +243,22 @@ fn an_image_takes_the_memory_of_its_pixels_at_8_bits_and_to_look_at_it_takes_non
     let (read, peak) = peak_of(|| image::read(&path));
     assert!(read.is_ok_and(|image| image.width() == 2048) && peak < 4 * side * side + (1 << 20), "{peak} bytes to read it");
     std::fs::remove_file(path).expect("it is there");
+}
+
+#[test]
+fn what_comparing_large_views_takes_is_estimated() {
+    let _alone = alone();
+    let options = ProceduralOptions { width: 700, height: 700, train: 1, val: 0, test: 1, supersample: 1 };
+    let dataset = Dataset::procedural(options).expect("the scene");
+    let views = dataset.load(Split::Test, &|_, _| ()).expect("its view");
+    let config = Config::default();
+    let grid = VoxelGrid::<f32>::random(config.grid_shape(8), 1.0, 0.1, 1);
+    let estimate = Estimate::of_evaluation(&config, config.evaluation, grid.shape(), 512, Some((&dataset, Split::Test)));
+    let viewer = grid_viewer(&grid, config.evaluation, config.engine, config.background);
+    let (scores, peak) = peak_of(|| viewer.compare(&views, |_, _, _, _| Ok(())).expect("scores"));
+    assert!(scores.psnr().is_some() && peak as u64 <= estimate.step + (20 << 20), "{peak} bytes, and {} estimated", estimate.step);
+    let (mean, peak) = peak_of(|| evaluate::mean_image(&views, [1.0; 3]));
+    assert!(mean.is_some() && peak <= 12 * 700 * 700 + (1 << 20), "{peak} bytes for the mean image");
 }
 
 #[test]

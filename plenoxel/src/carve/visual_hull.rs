@@ -14,8 +14,6 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Views whose silhouettes are in memory at a time.
 const VIEWS: usize = 8;
-/// Bytes of a pixel of all these: of its number in a summed-area table.
-pub(crate) const SILHOUETTE_BYTES: u64 = VIEWS as u64 * size_of::<u32>() as u64;
 /// Bricks that a thread takes at a time.
 const BRICKS: usize = 16;
 
@@ -59,6 +57,11 @@ pub fn by_silhouettes(
         progress(chunk * VIEWS + views.len());
     }
     Occupancy::from_masks(aabb, voxels, masks)
+}
+
+/// Bytes of the silhouettes that are in memory at a time, for so many views of so many pixels: a number in a summed-area table for each.
+pub(crate) fn silhouette_bytes(views: usize, pixels: usize) -> u64 {
+    (views.min(VIEWS) * size_of::<u32>() * pixels) as u64
 }
 
 /// The voxels that the ray of no background pixel passes through: the source paper's rule, with every voxel on the ray instead of those

@@ -8,7 +8,7 @@ pub use crate::memory::{available, bytes, limit, now, peak};
 use super::machine;
 use crate::carve::Fit;
 use crate::carve::color::KEPT_LIGHT;
-use crate::carve::visual_hull::SILHOUETTE_BYTES;
+use crate::carve::visual_hull::silhouette_bytes;
 use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
@@ -41,9 +41,11 @@ const BASE: u64 = 60_000_000;
 const CARVING_PIXELS: u64 = 1 << 16;
 /// Bytes of a pixel of rendered pictures: five numbers of the colors and of the normals each, what is made of them, and the file.
 const PICTURE_BYTES: u64 = 100;
-/// Bytes of a pixel of a view while it is compared with its photograph: the picture, the photograph in floats, both in double precision for SSIM;
-/// then the error, the depth and the panel of all four.
-const COMPARED_BYTES: u64 = 120;
+/// Bytes of a pixel of a view while it is compared with its photograph: the picture, the photograph in floats, and both in double precision for SSIM.
+const COMPARED_BYTES: u64 = 82;
+/// The same while its panel is drawn at the end of training: picture, photograph, error and depth, all four side by side in floats and in 8 bits, and
+/// the mean of the training images.
+const DRAWN_BYTES: u64 = 130;
 /// The most bytes of the page about a run while it is put together: the grid in it of up to 30 MB, compressed, as text, and as part of longer texts.
 const PAGE_BYTES: u64 = 150_000_000;
 /// Rays that are rendered at a time when evaluating.
@@ -89,10 +91,9 @@ impl Estimate {
             kept * training_bytes_per_sample(config.engine, &shape) + batch + rows + gradient
         });
         let (width, height) = dataset.size();
-        let pixels = (width * height) as u64;
-        let hull = if config.hull == Hull::Auto { SILHOUETTE_BYTES * pixels } else { 0 };
+        let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let step = step.max().unwrap_or(0).max(hull);
-        let comparison = comparison(dataset, Split::Test);
+        let comparison = comparison(dataset, Split::Test, DRAWN_BYTES);
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // A table's bytes beside it.
         let saving = tables(index);
@@ -144,7 +145,7 @@ impl Estimate {
             grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
             step: samples * evaluation_bytes_per_sample(config.engine, shape)
-                + compare.map_or(0, |(dataset, split)| comparison(dataset, split)),
+                + compare.map_or(0, |(dataset, split)| comparison(dataset, split, COMPARED_BYTES)),
             pruned: false,
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
@@ -179,7 +180,7 @@ impl Estimate {
         let masks = shape.voxels() as u64;
         let (width, height) = dataset.size();
         // Summed-area tables of some views, or the light of a batch of pixels.
-        let step = (SILHOUETTE_BYTES * (width * height) as u64).max(CARVING_PIXELS * 36 * hits_of_pixel(config));
+        let step = silhouette_bytes(dataset.count(Split::Train), width * height).max(CARVING_PIXELS * 36 * hits_of_pixel(config));
         // Which voxel each pixel sees; the list that descent draws pixels from.
         let pixels = (width * height * dataset.count(Split::Train)) as u64;
         let items = if config.carve.photo.is_some() { 4 * pixels } else { 0 } + if config.carve.fit == Fit::Sgd { 8 * pixels } else { 0 };
@@ -294,9 +295,9 @@ fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
 }
 
 /// Comparing the views of a split, one after the other, if there are any.
-fn comparison(dataset: &Dataset, split: Split) -> u64 {
+fn comparison(dataset: &Dataset, split: Split, bytes_per_pixel: u64) -> u64 {
     let (width, height) = dataset.size();
-    if dataset.count(split) > 0 { COMPARED_BYTES * (width * height) as u64 } else { 0 }
+    if dataset.count(split) > 0 { bytes_per_pixel * (width * height) as u64 } else { 0 }
 }
 
 /// Voxels that a pixel may see in a carved grid: until it is opaque, or the box ends.
