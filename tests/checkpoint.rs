@@ -115,7 +115,7 @@ fn a_damaged_or_foreign_file_is_named_with_what_is_wrong() {
     assert!(message(&replace(&whole, br#"\"resolution\":5"#, br#"\"resolution\":7"#)).contains("expected"));
     let foreign = safetensors_without_metadata();
     assert!(message(&foreign).contains("without `plenoxel`"));
-    assert_eq!(checkpoint::load::<f32>(&dir.join("missing")).expect_err("there is none").exit_code(), 5);
+    assert_eq!(checkpoint::load::<f32>(&dir.join("missing")).expect_err("there is none").exit_code(), 3);
 }
 
 fn replace(bytes: &[u8], from: &[u8], to: &[u8]) -> Vec<u8> {

@@ -520,6 +520,57 @@ fn a_damaged_run_is_refused() {
     plenoxel(&["evaluate", &run]).refused(3, &["run.json", "does not describe a run"]);
 }
 
+/// A run whose files are replaced one by one.
+#[cfg(unix)]
+#[test]
+fn a_file_of_a_run_that_never_ends_is_refused_by_its_name() {
+    let folder = Folder::new("endless");
+    let run = folder.path("run");
+    assert_eq!(train(&run, &["--no-images", "--no-report", "--quiet"]).code, 0);
+    let all = [
+        ("run.json", "evaluate"),
+        ("config.toml", "evaluate"),
+        ("checkpoint.safetensors", "evaluate"),
+        ("result.json", "evaluate"),
+        ("result.json", "info"),
+        ("run.json", "info"),
+        ("metrics.jsonl", "report"),
+        ("result.json", "report"),
+    ];
+    for (name, command) in all {
+        let (path, kept) = (format!("{run}/{name}"), folder.path("kept"));
+        fs::rename(&path, &kept).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", &path).unwrap();
+        plenoxel(&[command, &run]).refused(3, &[name, "this is a device, not a plain file"]);
+        fs::remove_file(&path).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
+        plenoxel(&[command, &run]).refused(3, &[name, "this is a pipe, not a plain file"]);
+        fs::remove_file(&path).unwrap();
+        fs::rename(&kept, &path).unwrap();
+    }
+    fs::remove_file(format!("{run}/run.json")).unwrap();
+    plenoxel(&["evaluate", &run]).refused(3, &["there is no run.json in this folder"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn names_of_files_move_nothing_on_a_screen() {
+    let folder = Folder::new("names");
+    let data = scene(&folder);
+    let name = "a\x1b[2J\nerror: b\u{9b}";
+    fs::rename(&data, folder.path(name)).unwrap();
+    let shown = "a\\u{1b}[2J\\nerror: b\\u{9b}";
+    let info = plenoxel(&["info", &folder.path(name)]).done();
+    assert!(info.contains(&format!("scene          {shown}\n")) && !info.contains('\x1b'), "{info}");
+    fs::write(folder.path(&format!("{name}/transforms_test.json")), "{").unwrap();
+    let told = plenoxel(&["info", &folder.path(name)]);
+    assert_eq!((told.code, told.err.lines().count()), (3, 1), "{}", told.err);
+    assert!(told.err.contains(shown) && !told.err.contains(['\x1b', '\u{9b}']), "{}", told.err);
+    let told = plenoxel(&["info", &folder.path(name), "--log-format", "json"]);
+    let line: Value = serde_json::from_str(told.err.trim_end()).unwrap();
+    assert!(line["message"].as_str().unwrap().contains(shown), "{line}");
+}
+
 /// A stream that refuses everything.
 struct Closed(io::ErrorKind);
 

@@ -188,7 +188,98 @@ fn paths_that_are_no_scene_say_what_they_are() {
     refused(open(&parent.0), 3, &["it contains lego", "give one scene", "lego"]);
     let other = Folder::new();
     other.write("transforms.json", "{}");
-    refused(open(&other.0), 3, &["it contains transforms.json", "nerfstudio"]);
+    refused(
+        open(&other.0),
+        3,
+        &["it contains transforms.json", "a dataset in a single transforms.json", "nerfstudio", "not supported yet"],
+    );
+}
+
+#[test]
+fn cameras_that_are_there_and_cannot_be_read_are_never_said_to_be_missing() {
+    for split in ["train", "val", "test"] {
+        let folder = Folder::scene();
+        let name = format!("transforms_{split}.json");
+        fs::remove_file(folder.path(&name)).unwrap();
+        fs::create_dir(folder.path(&name)).unwrap();
+        folder.refused(3, &[&name, "this is a folder"]);
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn what_may_never_end_is_refused_wherever_a_file_is_expected() {
+    use std::os::unix::fs::symlink;
+    for name in ["transforms_train.json", "transforms_val.json", "transforms_test.json", "train/r_1.png", "test/r_0.png"] {
+        let folder = Folder::scene();
+        let path = folder.path(name);
+        fs::remove_file(&path).unwrap();
+        symlink("/dev/zero", &path).unwrap();
+        folder.refused(3, &[name, "this is a device, not a plain file"]);
+        fs::remove_file(&path).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
+        folder.refused(3, &[name, "this is a pipe, not a plain file"]);
+        fs::remove_file(&path).unwrap();
+        symlink("nowhere", &path).unwrap();
+        folder.refused(3, &[name, "a link to a file that is not there"]);
+    }
+}
+
+#[test]
+fn intrinsics_that_the_cameras_would_not_have_are_refused_by_name() {
+    let angle = "\"camera_angle_x\": 0.6911112070083618";
+    let with = |more: &str| {
+        let folder = Folder::scene();
+        folder.edit(angle, &format!("{angle}, {more}"));
+        folder
+    };
+    // 4 pixels and that angle: a focal length of 5.5556.
+    with(r#""fl_x": 5.5556, "fl_y": 5.5556, "cx": 2, "cy": 2.0, "w": 4, "h": 4, "k1": 0, "p2": 0.0, "camera_model": "OPENCV""#)
+        .open()
+        .unwrap();
+    for (more, words) in [
+        (r#""fl_x": 5.0"#, ["fl_x is 5", "5.5555"]),
+        (r#""fl_y": 9"#, ["fl_y is 9", "5.5555"]),
+        (r#""cx": 2.5"#, ["cx is 2.5", "2 is expected"]),
+        (r#""w": 800"#, ["w is 800", "images of 4 x 4 pixels"]),
+        (r#""k1": 0.01"#, ["k1 is 0.01", "lens distortion is not supported yet"]),
+        (r#""camera_model": "OPENCV_FISHEYE""#, ["camera_model is \"OPENCV_FISHEYE\"", "pinhole"]),
+    ] {
+        with(more).refused(3, &["transforms_train.json", words[0], words[1]]);
+    }
+    let folder = Folder::scene();
+    folder.edit(
+        "\"rotation\": 0.1, \"transform_matrix\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5]",
+        "\"cy\": 3, \"transform_matrix\": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5]",
+    );
+    folder.refused(3, &["cy of frame 1 is 3", "2 is expected"]);
+    let folder = Folder::scene();
+    folder.edit(angle, "\"fl_x\": 5.5556");
+    folder.refused(3, &["no key \"camera_angle_x\", but fl_x is 5.5556", "2 atan(w / (2 fl_x))"]);
+}
+
+#[test]
+fn cameras_are_read_from_every_unicode_encoding_that_marks_itself() {
+    let folder = Folder::scene();
+    let name = "transforms_train.json";
+    let text = fs::read_to_string(folder.path(name)).unwrap();
+    folder.write(name, &format!("\u{feff}{text}"));
+    assert_eq!(folder.open().unwrap().count(Split::Train), 4);
+    let utf16: Vec<u8> = format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
+    fs::write(folder.path(name), &utf16).unwrap();
+    assert_eq!(folder.open().unwrap().count(Split::Train), 4);
+    fs::write(folder.path(name), &utf16[..utf16.len() - 1]).unwrap();
+    folder.refused(3, &[name, "UTF-16", "save it as UTF-8"]);
+    fs::write(folder.path(name), text.replace("train/r_0", "train/r\u{e9}").chars().map(|c| c as u8).collect::<Vec<_>>()).unwrap();
+    folder.refused(3, &[name, "line 4 is no text in UTF-8"]);
+}
+
+#[test]
+fn what_files_say_moves_nothing_on_a_screen() {
+    let folder = Folder::scene();
+    folder.edit("./train/r_0", "a\\u001b[2J\\nb");
+    let message = folder.open().unwrap_err().to_string();
+    assert!(message.contains("\"a\\u{1b}[2J\\nb\" of frame 0") && !message.contains(['\n', '\x1b']), "{message}");
 }
 
 #[test]

@@ -9,10 +9,19 @@ mod memory;
 #[path = "support/parsers.rs"]
 mod parsers;
 
+use memory::peak_of;
 use parsers::{PARSERS, Parser, try_arguments, try_out};
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::dataset::{Dataset, Split, image};
+use plenoxel::evaluate;
+use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::model::plenoxels::config::Config;
+use plenoxel::model::plenoxels::grid_viewer;
+use plenoxel::run::memory::Estimate;
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::{RngSeed, TestError, TestRunner};
+use std::io::Write;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -210,6 +219,46 @@ fn every_parser_is_tried() {
     // The list above is by name.
     let tried = include_str!("properties.rs");
     assert!(PARSERS.iter().all(|parser| tried.contains(&format!("refused: \"{}\"", parser.name))));
+}
+
+#[test]
+fn an_image_takes_the_memory_of_its_pixels_at_8_bits_and_to_look_at_it_takes_none() {
+    let _alone = alone();
+    // 16-bit RGBA, with something behind its end: 32 MiB when it is not compressed.
+    let side = 2048_usize;
+    let mut zlib = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+    let row = vec![0; 1 + 8 * side];
+    (0..side).try_for_each(|_| zlib.write_all(&row)).expect("compressed");
+    let chunk = |name: &[u8], data: &[u8]| [&(data.len() as u32).to_be_bytes(), name, data, &[0; 4]].concat();
+    let size = (side as u32).to_be_bytes();
+    let header = [&size[..], &size, &[16, 6, 0, 0, 0]].concat();
+    let data = zlib.finish().expect("compressed");
+    let mut png = [b"\x89PNG\r\n\x1a\n".to_vec(), chunk(b"IHDR", &header), chunk(b"IDAT", &data), chunk(b"IEND", b"")].concat();
+    parsers::repair_image(&mut png);
+    png.extend([0; 1000]);
+    let path = std::env::temp_dir().join(format!("plenoxel-properties-{}.png", std::process::id()));
+    std::fs::write(&path, png).expect("it is written");
+    let (looked, peak) = peak_of(|| image::size(&path));
+    assert!(looked.is_ok_and(|size| size == (side, side)) && peak < 1 << 20, "{peak} bytes to look at it");
+    let (read, peak) = peak_of(|| image::read(&path));
+    assert!(read.is_ok_and(|image| image.width() == 2048) && peak < 4 * side * side + (1 << 20), "{peak} bytes to read it");
+    std::fs::remove_file(path).expect("it is there");
+}
+
+#[test]
+fn what_comparing_large_views_takes_is_estimated() {
+    let _alone = alone();
+    let options = ProceduralOptions { width: 700, height: 700, train: 1, val: 0, test: 1, supersample: 1 };
+    let dataset = Dataset::procedural(options).expect("the scene");
+    let views = dataset.load(Split::Test, &|_, _| ()).expect("its view");
+    let config = Config::default();
+    let grid = VoxelGrid::<f32>::random(config.grid_shape(8), 1.0, 0.1, 1);
+    let estimate = Estimate::of_evaluation(&config, config.evaluation, grid.shape(), 512, Some((&dataset, Split::Test)));
+    let viewer = grid_viewer(&grid, config.evaluation, config.engine, config.background);
+    let (scores, peak) = peak_of(|| viewer.compare(&views, |_, _, _, _| Ok(())).expect("scores"));
+    assert!(scores.psnr().is_some() && peak as u64 <= estimate.step + (20 << 20), "{peak} bytes, and {} estimated", estimate.step);
+    let (mean, peak) = peak_of(|| evaluate::mean_image(&views, [1.0; 3]));
+    assert!(mean.is_some() && peak <= 12 * 700 * 700 + (1 << 20), "{peak} bytes for the mean image");
 }
 
 #[test]

@@ -10,7 +10,7 @@ pub use self::safetensors::{load_safetensors, save_safetensors};
 use crate::error::FileError;
 use crate::real::Real;
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -52,9 +52,54 @@ fn read_numbers<T: Real>(bytes: &[u8], dtype: Dtype, out: &mut [T]) {
     }
 }
 
-/// The bytes of a file.
+/// The bytes of a plain file.
 fn read(path: &Path) -> Result<Vec<u8>, FileError> {
-    fs::read(path).map_err(|source| FileError::Io { path: path.to_owned(), doing: "reading the file", source })
+    let mut bytes = Vec::new();
+    let read = open_plain(path).and_then(|mut file| file.read_to_end(&mut bytes));
+    read.map_err(|source| FileError::Io { path: path.to_owned(), doing: "reading the file", source })?;
+    Ok(bytes)
+}
+
+/// Opens a plain file for reading. Links are followed. Pipes, devices and sockets are refused without being read, for that might never end.
+///
+/// Errors: those of the system; [`io::ErrorKind::IsADirectory`] for a folder; [`io::ErrorKind::InvalidInput`] with a message that says what it is
+/// for anything else that is no plain file.
+pub fn open_plain(path: &Path) -> io::Result<File> {
+    // To open a device may have effects already.
+    check_plain(&fs::metadata(path)?)?;
+    let mut options = OpenOptions::new();
+    options.read(true);
+    // Meanwhile there may be a pipe in its place, and to open one would be to wait for its writer.
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, libc::O_NONBLOCK);
+    let file = options.open(path)?;
+    check_plain(&file.metadata()?)?;
+    Ok(file)
+}
+
+fn check_plain(metadata: &fs::Metadata) -> io::Result<()> {
+    let kind = metadata.file_type();
+    match kind {
+        _ if kind.is_file() => Ok(()),
+        _ if kind.is_dir() => Err(io::ErrorKind::IsADirectory.into()),
+        _ => Err(io::Error::new(io::ErrorKind::InvalidInput, format!("this is {}, not a plain file", name_of(kind)))),
+    }
+}
+
+/// What a file that is neither plain nor a folder is.
+#[cfg(unix)]
+fn name_of(kind: fs::FileType) -> &'static str {
+    use std::os::unix::fs::FileTypeExt;
+    match kind {
+        _ if kind.is_fifo() => "a pipe",
+        _ if kind.is_socket() => "a socket",
+        _ => "a device",
+    }
+}
+
+#[cfg(not(unix))]
+fn name_of(_: fs::FileType) -> &'static str {
+    "something special"
 }
 
 /// [`atomically`], with an error that names the file.
@@ -156,5 +201,22 @@ mod tests {
             let error = atomically(Path::new("/dev/full"), |temporary| fs::write(temporary, "x")).unwrap_err();
             assert_eq!(error.kind(), io::ErrorKind::StorageFull);
         }
+    }
+
+    #[test]
+    fn what_is_no_plain_file_is_refused_without_waiting_for_it() {
+        let place = std::env::temp_dir().join(format!("autograd-plain-{}", std::process::id()));
+        fs::create_dir_all(&place).expect("a folder");
+        let (link, pipe) = (place.join("link"), place.join("pipe"));
+        std::os::unix::fs::symlink("/dev/zero", &link).expect("a link");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
+        for (path, found) in [(&link, "this is a device"), (&pipe, "this is a pipe")] {
+            let error = crate::Tensor::<f32>::load_npy(path).expect_err("no file").to_string();
+            assert!(error.contains(found) && error.contains(&path.display().to_string()), "{error}");
+        }
+        assert_eq!(open_plain(&place).expect_err("a folder").kind(), io::ErrorKind::IsADirectory);
+        fs::write(place.join("file"), b"x").expect("written");
+        assert_eq!(read(&place.join("file")).expect("a file"), b"x");
+        fs::remove_dir_all(place).expect("removed");
     }
 }

@@ -13,13 +13,13 @@ use std::path::Path;
 /// A file that changes a preset.
 pub fn layer(path: &Path, bytes: &[u8]) -> Result<Config> {
     let mut layers = Layers::defaults()?.with_preset("fast")?;
-    layers.file(&ConfigFile::parse(path, bytes.to_vec())?)?;
+    layers.file(&ConfigFile::parse(path, bytes)?)?;
     layers.resolve()
 }
 
 /// The `config.toml` of a run.
 pub fn config(path: &Path, bytes: &[u8]) -> Result<Config> {
-    ConfigFile::parse(path, bytes.to_vec())?.complete()
+    ConfigFile::parse(path, bytes)?.complete()
 }
 
 /// Assignments as `--set` takes them, over a preset.

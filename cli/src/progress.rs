@@ -12,6 +12,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::json;
 use plenoxel::run::machine;
+use plenoxel::text::one_line;
 use serde::Serialize;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -49,8 +50,14 @@ impl<'a> Console<'a> {
         Console { streams: Mutex::new(streams), bar: Mutex::new(None), bars, format, quiet }
     }
 
-    /// A line of results on stdout. A reader that has gone away is no failure: the results are in files too.
-    pub fn result(&self, text: &str) -> Result<()> {
+    /// A line of results on stdout, in which nothing does anything to a terminal.
+    pub fn result(&self, line: &str) -> Result<()> {
+        self.text(&one_line(line))
+    }
+
+    /// Lines of results on stdout as they are: they were made here, and [`one_line`] was asked about what came from elsewhere. A reader that has
+    /// gone away is no failure: the results are in files too.
+    pub fn text(&self, text: &str) -> Result<()> {
         let out = &mut lock(&self.streams).out;
         match writeln!(out, "{text}").and_then(|()| out.flush()) {
             Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Error::io("stdout", e, "printing the result")),
@@ -115,7 +122,7 @@ impl<'a> Console<'a> {
         }
         let time = machine::time();
         match self.format {
-            LogFormat::Plain => self.write(&plain()),
+            LogFormat::Plain => self.write(&one_line(&plain())),
             LogFormat::Json => self.write(&json::line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
         }
     }
@@ -199,7 +206,7 @@ impl<'c, 'a> Meter<'c, 'a> {
         if let Some(bar) = &self.bar {
             bar.set_length(total);
             bar.set_position(position);
-            bar.set_message(standing.beside_bar());
+            bar.set_message(one_line(&standing.beside_bar()));
         }
         if must || self.bar.is_none() {
             self.console.log("progress", &standing, || standing.line());

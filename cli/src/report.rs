@@ -36,7 +36,7 @@ pub struct Report<'a> {
 impl Report<'_> {
     /// Writes the page. Returns what is to be said about it.
     pub fn write(&self) -> Result<String> {
-        let result = self.folder.figures().unwrap_or(Value::Null);
+        let result = self.folder.figures()?.unwrap_or(Value::Null);
         let metrics = metrics::read(&self.folder.metrics())?;
         let lines: Vec<_> = metrics::lines(&metrics).map(|(_, line)| line).collect();
         let scene = scene::Scene::of(self)?;

@@ -17,7 +17,7 @@
 //!
 //! A path is for new pictures: principal points and lens distortion of photographs are left out, and so are depth of field and time.
 //!
-//! Parsers take any bytes: sizes are bounded, and no number that comes out is too large to compute with.
+//! Parsers take any bytes: files are bounded ([`CAMERA_PATH`](crate::files::CAMERA_PATH)), and no number that comes out is too large to compute with.
 
 mod instant_ngp;
 mod nerfstudio;
@@ -36,8 +36,6 @@ pub use turntable::Turntable;
 
 /// The most frames of a path: an hour of film.
 pub const MOST_FRAMES: usize = 100_000;
-/// The largest file that is read, in bytes: 50 000 frames of nerfstudio.
-pub const MOST_BYTES: u64 = 32 << 20;
 /// The farthest that a camera may stand from the origin, world length.
 const FARTHEST: f64 = 1e6;
 
@@ -145,10 +143,6 @@ impl CameraPath {
     ///
     /// Errors: everything that is wrong with it, with frame and field.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
-        if bytes.len() as u64 > MOST_BYTES {
-            let found = format!("the file has {} bytes", bytes.len());
-            return Err(Error::input(path, found, format!("camera paths of up to {MOST_BYTES} bytes are read")));
-        }
         let root = json::parse(path, bytes)?;
         let file = Entry { path, value: &root, place: String::new() };
         // A file of nerfstudio has keyframes beside its frames, and one of instant-ngp may have anything.

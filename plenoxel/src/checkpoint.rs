@@ -10,7 +10,9 @@
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
-use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of, open};
+use crate::files;
+use crate::memory;
+use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of};
 use crate::train::About;
 use autograd::lattice::BrickGrid;
 use autograd::{Indices, Lattice, Module, Param, Real, Tensor};
@@ -182,6 +184,9 @@ fn node(voxel: u32, n: usize) -> [usize; 3] {
     [voxel / (n * n), voxel / n % n, voxel % n]
 }
 
+/// Bytes for each brick of a grid while its lattice is made: masks, links, and their order along a Morton curve.
+const BRICK_BYTES: u64 = 72;
+
 /// The lattice of n³ voxels of which these are present.
 fn with_voxels(voxels: &[u32], n: usize) -> Lattice {
     let masks = BrickGrid::new([n; 3]).masks_of(voxels.iter().map(|&voxel| node(voxel, n)));
@@ -190,7 +195,7 @@ fn with_voxels(voxels: &[u32], n: usize) -> Lattice {
 
 /// Reads what a checkpoint says of itself, without its tables: the header, and the number of voxels that are present.
 pub fn header(path: &Path) -> Result<(Header, usize)> {
-    let file = TensorFile::new(path, open(path)?)?;
+    let file = TensorFile::open(path)?;
     let shape = file.info("voxels").or_else(|| file.info("density")).map_or(&[][..], |info| &info.shape);
     Ok((header_of(path, &file)?, shape.iter().product()))
 }
@@ -234,7 +239,7 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
 
 /// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
 pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
-    read(path, open(path)?)
+    read(path, files::open(path, files::TENSORS)?)
 }
 
 /// The same from any source, a file or bytes; `path` names it in messages.
@@ -243,6 +248,8 @@ pub fn read<T: Real>(path: &Path, source: impl Read + Seek) -> Result<(VoxelGrid
     let header = header_of(path, &file)?;
     let shape = header.shape();
     let n = header.resolution;
+    // There may be few voxels in many bricks.
+    memory::check(path, &format!("a grid of {n}³ voxels"), BRICK_BYTES * BrickGrid::new([n; 3]).len() as u64)?;
     fn table<T: Real>(file: &mut TensorFile<'_>, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
         let values = file.numbers(name, Dtype::F32, expected)?;
         let rows = values.len() / width;

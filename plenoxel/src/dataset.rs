@@ -11,6 +11,7 @@ pub mod procedural;
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
+use crate::files;
 use ndarray::{Array2, Array3};
 use procedural::ProceduralOptions;
 use rayon::prelude::*;
@@ -165,7 +166,8 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
     if !metadata.is_dir() {
         return Err(Error::input(path, "this is a file", "give the folder that contains transforms_train.json"));
     }
-    if !path.join("transforms_train.json").is_file() {
+    // What has that name and cannot be read is reported as such.
+    if !files::is_there(&path.join("transforms_train.json")) {
         return Err(unrecognized(path));
     }
     blender::open(path, options)
@@ -303,12 +305,11 @@ fn unrecognized(path: &Path) -> Error {
         n => format!("it contains {} and {} more", names[..8].join(", "), n - 8),
     };
     let has = |name: &str| names.iter().any(|found| found == name);
-    let below = names.iter().find(|name| path.join(name).join("transforms_train.json").is_file());
+    let below = names.iter().find(|name| path.join(name).join("transforms_train.json").exists());
     let remedy = if let Some(scene) = below {
         format!("give one scene, for instance {}", path.join(scene).display())
     } else if has("transforms.json") {
-        "a single transforms.json (instant-ngp, nerfstudio) is not read yet; split it into transforms_train.json and transforms_test.json"
-            .into()
+        "a dataset in a single transforms.json, as of instant-ngp and nerfstudio, is not supported yet; NeRF-synthetic folders are".into()
     } else if has("poses_bounds.npy") {
         "LLFF captures (poses_bounds.npy) are not read yet; NeRF-synthetic folders are".into()
     } else if has("sparse") {

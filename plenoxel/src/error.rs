@@ -3,16 +3,17 @@
 //! Mistakes of a programmer (shapes that do not fit) panic at the caller's line. Everything that comes from a file, a flag or
 //! the data is an [`Error`], and its message says where it happened, what was found, what is accepted and what to do.
 
-use std::path::PathBuf;
+use crate::text::one_line;
+use std::path::{Path, PathBuf};
 
 /// Result with this crate's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Everything a user, a disk or a diverging training run can cause.
+/// Everything a user, a disk or a diverging training run can cause. Displayed, it is one line that can be printed: see [`one_line`].
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file or folder does not hold what it should.
-    #[error("{}: {found}; {remedy}", path.display())]
+    #[error("{}: {}; {}", shown(path), one_line(found), one_line(remedy))]
     Input {
         /// The file or folder.
         path: PathBuf,
@@ -22,7 +23,7 @@ pub enum Error {
         remedy: String,
     },
     /// A setting (flag or configuration key) has a value that cannot be used.
-    #[error("{key}: {found} cannot be used; accepted: {accepted}")]
+    #[error("{}: {} cannot be used; accepted: {}", one_line(key), one_line(found), one_line(accepted))]
     Config {
         /// Name of the setting as the user writes it.
         key: String,
@@ -32,7 +33,7 @@ pub enum Error {
         accepted: String,
     },
     /// A computation left the finite numbers.
-    #[error("{place}: {found}; {remedy}")]
+    #[error("{}: {}; {}", one_line(place), one_line(found), one_line(remedy))]
     Numeric {
         /// Step, tensor or formula where it was noticed.
         place: String,
@@ -42,7 +43,7 @@ pub enum Error {
         remedy: String,
     },
     /// The operating system refused to read or write.
-    #[error("{}: {source} while {doing}; {}", path.display(), remedy(source))]
+    #[error("{}: {} while {doing}; {}", shown(path), one_line(&source.to_string()), remedy(source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -80,15 +81,34 @@ impl Error {
     }
 }
 
+/// A path as it can be printed.
+fn shown(path: &Path) -> String {
+    one_line(&path.display().to_string())
+}
+
+/// True if the process, or the system, has as many open files as it may have.
+fn has_too_many_files(refusal: &std::io::Error) -> bool {
+    #[cfg(unix)]
+    const CODES: [i32; 2] = [libc::EMFILE, libc::ENFILE];
+    // ERROR_TOO_MANY_OPEN_FILES
+    #[cfg(not(unix))]
+    const CODES: [i32; 1] = [4];
+    refusal.raw_os_error().is_some_and(|code| CODES.contains(&code))
+}
+
 /// What helps against a refusal of the operating system.
 fn remedy(refusal: &std::io::Error) -> &'static str {
     use std::io::ErrorKind::*;
+    if has_too_many_files(refusal) {
+        return "allow more open files, for instance with `ulimit -n 4096`, or close other programs";
+    }
     match refusal.kind() {
         NotFound => "check that the path is spelled rightly",
         PermissionDenied => "change its permissions, or choose another path",
         ReadOnlyFilesystem => "choose a place that may be written",
         InvalidData | UnexpectedEof => "the file is damaged: use an undamaged copy",
         AlreadyExists | NotADirectory | IsADirectory => "choose another path: a file is where a folder should be, or the other way round",
+        OutOfMemory => "use a smaller file, or a machine with more memory",
         StorageFull | QuotaExceeded | FileTooLarge => "make room on the disk, or choose another one",
         InvalidFilename => "choose a shorter or plainer name",
         _ => "check the disk, or choose another path",
@@ -119,6 +139,12 @@ mod tests {
             let text = Error::io("out", kind.into(), "writing").to_string();
             assert!(text.contains(remedy), "{text}");
         }
+        for code in [24, 23] {
+            #[cfg(unix)]
+            assert!(Error::io("out", std::io::Error::from_raw_os_error(code), "reading").to_string().contains("ulimit -n"), "{code}");
+        }
+        let foreign = Error::input("a\x1b[1mb", "the key \"x\ny\"", "a\u{9b}");
+        assert_eq!(foreign.to_string(), "a\\u{1b}[1mb: the key \"x\\ny\"; a\\u{9b}");
         let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
         assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }

@@ -12,6 +12,7 @@ use crate::render::picture::{Picture, picture_by};
 use crate::train::{Model, RenderFn, ViewOptions};
 use autograd::Real;
 use ndarray::Array3;
+use rayon::prelude::*;
 use serde::Serialize;
 
 /// Renders the views of a model and compares them with their photographs over the background of `options`.
@@ -125,13 +126,24 @@ pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
     constant_psnr(views, &plain, background)
 }
 
-/// Mean image of the views over a background, `[h, w, 3]`; `None` if there are no views.
+/// Mean image of the views over a background, `[h, w, 3]`; `None` if there are no views. Panics unless all are of one size.
+///
+/// Memory: that of the result.
 pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
-    let mut sum = views.first()?.composite(background).mapv(f64::from);
-    for view in &views[1..] {
-        sum.zip_mut_with(&view.composite(background), |sum, value| *sum += f64::from(*value));
-    }
-    Some(sum.mapv(|value| (value / views.len() as f64) as f32))
+    let [width, height] = views.first()?.size();
+    assert!(views.iter().all(|view| view.size() == [width, height]), "mean_image: views of several sizes");
+    let mut mean = vec![0.0; 3 * width * height];
+    mean.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
+        for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            let mut sum = [0.0; 3];
+            for view in views {
+                let color = view.color(x, y, background);
+                sum.iter_mut().zip(color).for_each(|(sum, value)| *sum += f64::from(value));
+            }
+            *pixel = sum.map(|sum: f64| (sum / views.len() as f64) as f32);
+        }
+    });
+    Array3::from_shape_vec((height, width, 3), mean).ok()
 }
 
 /// Mean PSNR in dB of one picture, `[h, w, 3]`, against the views; `None` if there are no views or one has another size.

@@ -1,7 +1,11 @@
-//! Files appear whole or not at all.
+//! Files are read within bounds, and appear whole or not at all.
 //!
-//! Everything this crate writes goes through [`write_atomically`], so that an interrupted run, a full disk or a power cut
-//! leaves either the old file or the new one, never half of one.
+//! Everything this crate reads goes through [`open`], [`read`] or [`read_named`]. Everything it writes goes through [`write_atomically`], so that
+//! an interrupted run, a full disk or a power cut leaves either the old file or the new one, never half of one.
+
+mod read;
+
+pub use read::{CAMERA_PATH, CAMERAS, CLOUD, IMAGE, Kind, METRICS, RECORD, SETTINGS, TENSORS, is_there, open, read, read_named, text};
 
 mod lock;
 mod room;

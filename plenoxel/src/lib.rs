@@ -21,7 +21,7 @@
 //! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
 //! | [`metrics`] | PSNR and SSIM |
 //! | [`point_cloud`], [`export`] | a trained grid as colored points; filters; files for other programs |
-//! | [`random`], [`files`], [`json`], [`error`] | numbers by purpose, files whole or not at all, JSON, what can go wrong |
+//! | [`random`], [`files`], [`json`], [`text`], [`error`] | numbers by purpose, files within bounds and whole, JSON, text of others on a screen, what can go wrong |
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
@@ -41,6 +41,7 @@ pub mod geometry;
 pub mod instances;
 pub mod json;
 pub mod loss;
+mod memory;
 pub mod metrics;
 pub mod model;
 pub mod point_cloud;
@@ -50,6 +51,7 @@ pub mod render;
 pub mod run;
 pub mod sampling;
 pub mod tensor_file;
+pub mod text;
 pub mod train;
 
 /// The code of the repository's front page is compiled and run with the tests.

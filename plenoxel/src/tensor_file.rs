@@ -5,6 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::files;
+use crate::memory;
 use autograd::{Real, Tensor};
 pub(crate) use safetensors::tensor::{Dtype, TensorInfo};
 use safetensors::tensor::{Metadata, View};
@@ -19,8 +20,8 @@ use std::path::{Path, PathBuf};
 
 /// Key of the metadata.
 const KEY: &str = "plenoxel";
-/// The longest header that the format allows.
-const LONGEST: u64 = 100_000_000;
+/// The longest header that is read: of a hundred thousand tensors. The format allows ten times as much.
+const LONGEST: u64 = 10_000_000;
 /// What helps against a damaged file.
 pub(crate) const RETRAIN: &str = "train again, or use an undamaged copy";
 
@@ -147,15 +148,10 @@ pub struct TensorFile<'a> {
     begin: u64,
 }
 
-/// Opens a file to be read as one of tensors.
-pub(crate) fn open(path: &Path) -> Result<File> {
-    File::open(path).map_err(|e| refused(path, e))
-}
-
 impl<'a> TensorFile<'a> {
-    /// Opens a file. Errors: it cannot be read, or is not a whole file of this program.
+    /// Opens a file. Errors: it cannot be read, is no plain file, or is not a whole file of this program.
     pub fn open(path: &Path) -> Result<Self> {
-        Self::new(path, open(path)?)
+        Self::new(path, files::open(path, files::TENSORS)?)
     }
 
     /// Opens a source, which `path` names in messages. Errors: it cannot be read, or is not a whole file of this program.
@@ -233,7 +229,8 @@ impl<'a> TensorFile<'a> {
             return Err(Error::input(&self.path, found, format!("{dtype:?} {expected:?} is expected; {RETRAIN}")));
         }
         let (from, to) = info.data_offsets;
-        // As long as the file is: its length was compared.
+        // As long as the file is, for its length was compared. Numbers are made of the bytes.
+        memory::check(&self.path, &format!("tensor `{name}`"), 2 * (to - from) as u64)?;
         let mut bytes = vec![0; to - from];
         let read = self.source.seek(SeekFrom::Start(self.begin + from as u64)).and_then(|_| self.source.read_exact(&mut bytes));
         read.map_err(|e| refused(&self.path, e))?;

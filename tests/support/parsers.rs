@@ -45,8 +45,8 @@ const MIB: usize = 1 << 20;
 pub const PARSERS: [Parser; 10] = [
     Parser { name: "transforms.json", valid: transforms, read: read_transforms, repair: |_| (), memory: [MIB, 200] },
     Parser { name: "path.json", valid: paths, read: read_path, repair: |_| (), memory: [2 * MIB, 400] },
-    // Deflate makes 1032 of one byte, RGBA four of a gray one, or 24 of a palette's bit; and what profiles may take.
-    Parser { name: "image.png", valid: images, read: read_image, repair: repair_image, memory: [20 * MIB, 1032 * 8 * 5] },
+    // Deflate makes 1032 of one byte, RGBA 32 of one that has 8 pixels; a row; and what stands beside the pixels.
+    Parser { name: "image.png", valid: images, read: read_image, repair: repair_image, memory: [18 * MIB, 1032 * 32] },
     Parser { name: "cloud.ply", valid: clouds, read: read_cloud, repair: |_| (), memory: [MIB, 64] },
     // The bricks of 1024³ voxels.
     Parser { name: "checkpoint", valid: checkpoints, read: read_checkpoint, repair: repair_tensors, memory: [1200 * MIB, 64] },
@@ -108,13 +108,21 @@ fn transforms() -> Vec<Vec<u8>> {
         format!("{{ \"file_path\": \"./train/r_{k}\", \"rotation\": 0.1, \"transform_matrix\": {pose} }}")
     };
     let frames: Vec<String> = (0..3).map(frame).collect();
-    let whole = |frames: &str| format!("{{\"camera_angle_x\": 0.6911112070083618, \"frames\": [{frames}]}}").into_bytes();
-    vec![whole(&frames.join(",\n")), whole("")]
+    let whole = |frames: &str| format!("{{\"camera_angle_x\": 0.6911112070083618, \"frames\": [{frames}]}}");
+    let stated = whole(&frames.join(",")).replace(": 0.1,", ": 0.1, \"fl_x\": 11.11, \"w\": 8, \"cy\": 4.0,").replacen(
+        ", ",
+        ", \"camera_angle_y\": 0.69, \"k1\": 0, \"camera_model\": \"OPENCV\", \"is_fisheye\": false, ",
+        1,
+    );
+    let utf16 = format!("\u{feff}{stated}").encode_utf16().flat_map(u16::to_be_bytes).collect();
+    vec![whole(&frames.join(",\n")).into_bytes(), format!("\u{feff}{}", whole("")).into_bytes(), stated.into_bytes(), utf16]
 }
 
 fn read_transforms(path: &Path, bytes: &[u8]) -> Result<Then, String> {
     let read = Transforms::parse(path, bytes).map_err(text)?;
     Ok(Box::new(move || {
+        // Whatever is stated is the same or another, for images of any size.
+        let _ = read.intrinsics.check(Path::new("again"), read.fov_x, (8, 8));
         let intrinsics = Intrinsics::from_fov_x(8, 8, read.fov_x);
         for (_, camera_to_world) in read.frames {
             let ray = Camera { intrinsics, camera_to_world }.ray(0.5, 0.5);
@@ -171,7 +179,7 @@ fn read_image(path: &Path, bytes: &[u8]) -> Result<Then, String> {
 }
 
 /// The checksums of all chunks.
-fn repair_image(bytes: &mut [u8]) {
+pub fn repair_image(bytes: &mut [u8]) {
     let mut at = 8;
     while let Some(length) = bytes.get(at..at + 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]) as usize) {
         let end = at + 8 + length;

@@ -206,8 +206,10 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     drop(carving);
     drop(views);
 
-    if !args.no_images {
-        console.note(&format!("pictures of {} views in images/carved.png", draw(&folder, &config, &dataset, &model)?));
+    if !args.no_images
+        && let Some(views) = console.drawn(draw(&folder, &config, &dataset, &model))
+    {
+        console.note(&format!("pictures of {views} views in images/carved.png"));
     }
     let summary = Summary {
         seconds: hull_clock.seconds() + color_clock.seconds(),

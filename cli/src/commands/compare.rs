@@ -3,9 +3,9 @@
 mod pictures;
 
 use super::table::Figures;
-use super::table::markdown::plain;
+use super::table::markdown::as_text;
 use crate::html::{self, escaped};
-use crate::progress::{Console, clock, thousands};
+use crate::progress::{Console, clock, is_stdout, thousands};
 use crate::report::{SCRIPT, STYLE, curves};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
@@ -52,7 +52,7 @@ struct Run {
 impl Run {
     fn read(path: &Path) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
-        let figures = Figures::of(&folder, &config).unwrap_or_default();
+        let figures = Figures::of(&folder, &config)?.unwrap_or_default();
         let metrics = metrics::read(&folder.metrics())?;
         Ok(Run { name: path.display().to_string(), folder, config, record, figures, metrics })
     }
@@ -92,7 +92,9 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
     ];
     let page = html::page(&format!("{} runs", runs.len()), STYLE, &parts.join("\n"));
     console.write_file(&args.out, page.as_bytes())?;
-    console.wrote(&args.out, &aligned(&heads, &cells))?;
+    if !is_stdout(&args.out) {
+        console.text(&aligned(&heads, &cells))?;
+    }
     console.wrote(&args.out, &format!("wrote {}", args.out.display()))
 }
 
@@ -124,7 +126,7 @@ fn table(heads: &[&str], rows: &[Vec<&str>]) -> String {
 
 /// The same for a terminal, as Markdown.
 fn aligned(heads: &[&str], rows: &[Vec<&str>]) -> String {
-    let rows: Vec<Vec<String>> = rows.iter().map(|row| row.iter().map(|cell| plain(cell)).collect()).collect();
+    let rows: Vec<Vec<String>> = rows.iter().map(|row| row.iter().map(|cell| as_text(cell)).collect()).collect();
     let rows: Vec<Vec<&str>> = rows.iter().map(|row| row.iter().map(String::as_str).collect()).collect();
     let width =
         |column: usize| rows.iter().map(|row| row[column]).chain([heads[column]]).map(|cell| cell.chars().count()).max().unwrap_or(0);

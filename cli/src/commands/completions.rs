@@ -27,5 +27,5 @@ pub fn run(args: &CompletionsArgs, console: &Console<'_>) -> Result<()> {
     let name = command.get_name().to_owned();
     let mut script = Vec::new();
     clap_complete::generate(args.shell, &mut command, name, &mut script);
-    console.result(String::from_utf8_lossy(&script).trim_end())
+    console.text(String::from_utf8_lossy(&script).trim_end())
 }

@@ -77,7 +77,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         }
         console.result(&figures.sentence())?;
     }
-    let trained = folder.result().unwrap_or(Value::Null);
+    let trained = folder.result()?.unwrap_or(Value::Null);
     // An earlier grid took less.
     let of_last = |key: &str| if args.run.best { None } else { trained.get(key) };
     let evaluation = Evaluation {

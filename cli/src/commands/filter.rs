@@ -38,9 +38,6 @@ pub struct FilterArgs {
 
 /// Filters a cloud.
 pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
-    if !args.cloud.exists() {
-        return Err(Error::input(&args.cloud, "there is no such file", "give a point cloud in PLY"));
-    }
     let file = PlyFile::open(&args.cloud)?;
     let side = file.header().remarks.iter().find_map(|line| line.strip_prefix("comment voxel_side ")?.trim().parse().ok());
     let side = side.filter(|side: &f64| side.is_finite() && *side > 0.0);

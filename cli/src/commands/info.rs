@@ -7,6 +7,7 @@ use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::files;
 use plenoxel::geometry::Aabb;
 use plenoxel::model;
 use plenoxel::model::plenoxels::config::Config;
@@ -63,24 +64,21 @@ fn describe(path: &Path) -> Result<Lines> {
         lines.extend(of_grid(&grid, &header));
         return Ok(lines);
     }
-    if path.join("run.json").is_file() {
+    if files::is_there(&path.join("run.json")) {
         return of_run(path);
     }
-    if !path.exists() {
+    if !files::is_there(path) {
         return Err(Error::input(path, "there is nothing", "give the folder of a run or of a dataset, or a checkpoint"));
     }
-    if path.is_dir() && !path.join("transforms_train.json").is_file() {
-        let opened = dataset::open(path, &OpenOptions::default());
-        return opened.map(|dataset| of_dataset(path, &dataset)).map_err(|e| match e {
-            Error::Input { path, found, remedy } => {
-                let found = format!("neither a run (no run.json) nor a dataset: {found}");
-                Error::input(path, found, remedy)
-            }
-            other => other,
-        });
-    }
-    let dataset = dataset::open(path, &OpenOptions::default())?;
-    Ok(of_dataset(path, &dataset))
+    let opened = dataset::open(path, &OpenOptions::default());
+    opened.map(|dataset| of_dataset(path, &dataset)).map_err(|e| match e {
+        // About the folder, and not about a file in it.
+        Error::Input { path: about, found, remedy } if about == path && path.is_dir() => {
+            let found = format!("neither a run (no run.json) nor a dataset: {found}");
+            Error::input(about, found, remedy)
+        }
+        other => other,
+    })
 }
 
 /// The facts of a checkpoint whose model this program has no code for: its kind and its parameters; `None` for a voxel grid.
@@ -112,7 +110,7 @@ fn of_run(path: &Path) -> Result<Lines> {
         source => source.to_string(),
     };
     lines.push(("data", data));
-    let result = folder.result();
+    let result = folder.result()?;
     // Small images have smaller grids than they were asked for.
     let trained: Option<Vec<u64>> =
         result.as_ref().and_then(|result| result["stages"].as_array()?.iter().map(|stage| stage["resolution"].as_u64()).collect());

@@ -29,7 +29,7 @@ pub fn run(args: &ManArgs, console: &Console<'_>) -> Result<()> {
     let mut command = Cli::command().disable_help_subcommand(true);
     command.build();
     let Some(folder) = &args.folder else {
-        return console.result(page(&command)?.trim_end());
+        return console.text(page(&command)?.trim_end());
     };
     files::create_dir(folder)?;
     let count = write(&command, folder)?;

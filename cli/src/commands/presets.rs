@@ -36,9 +36,9 @@ pub fn run(args: &PresetsArgs, console: &Console<'_>) -> Result<()> {
         Some(name) if args.resolved => {
             let (config, command) = (Config::preset(name)?, if *name == CARVE.name { "carve" } else { "train" });
             let remark = format!("Preset {name} of {}.\nplenoxel {command} DATA --config THIS_FILE", crate::PROGRAM);
-            console.result(settings::to_toml(&config, &remark)?.trim_end())
+            console.text(settings::to_toml(&config, &remark)?.trim_end())
         }
-        Some(name) => console.result(settings::preset(name)?.text.trim_end()),
+        Some(name) => console.text(settings::preset(name)?.text.trim_end()),
     }
 }
 

@@ -102,7 +102,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     };
     let states: Vec<State> = plan.jobs.iter().map(Job::state).collect();
     if args.dry_run {
-        return plan.jobs.iter().zip(&states).try_for_each(|(job, state)| console.result(&describe(job, state))).map(|()| 0);
+        return plan.jobs.iter().zip(&states).try_for_each(|(job, state)| describe(job, state, console)).map(|()| 0);
     }
     if !args.force {
         plan.jobs.iter().zip(&states).try_for_each(|(job, state)| check(job, state))?;
@@ -125,7 +125,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
         }
     }
     drop(watch);
-    console.result(table(&plan, &out).write(&out)?.trim_end())?;
+    console.text(table(&plan, &out).write(&out)?.trim_end())?;
     console.note(&format!("table: {}", out.join("table.html").display()));
     if interrupted {
         console.error("interrupted; the same command again goes on with what is not finished", EXIT_CODE);
@@ -222,8 +222,8 @@ fn check(job: &Job, state: &State) -> Result<()> {
     }
 }
 
-/// What would be done about a run.
-fn describe(job: &Job, state: &State) -> String {
+/// Says what would be done about a run, and with which command.
+fn describe(job: &Job, state: &State, console: &Console<'_>) -> Result<()> {
     let what = match (state, job.cell()) {
         (State::Finished, _) => format!("finished: {}", said(job)),
         (State::Different(how), _) => format!("in the way is another run: {how}"),
@@ -232,8 +232,9 @@ fn describe(job: &Job, state: &State) -> String {
         (_, Cell::Failed(failure)) => format!("to run again, it failed with exit code {}: {}", failure.code, failure.error),
         (State::New | State::CutShort, _) => "to run".to_owned(),
     };
-    let line = job.command_line(state).map_or(String::new(), |arguments| format!("\n    {}", child::command_line(&arguments)));
-    format!("{} {}: {what}{line}", job.scene, job.method)
+    console.result(&format!("{} {}: {what}", job.scene, job.method))?;
+    let arguments = job.command_line(state);
+    arguments.iter().try_for_each(|arguments| console.result(&format!("    {}", child::command_line(arguments))))
 }
 
 /// The table of what there is now.

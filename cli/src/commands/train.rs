@@ -60,7 +60,10 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
 /// True for a run that was killed between its figures and its page.
 fn lacks_page(path: &Path) -> bool {
     let folder = RunFolder::at(path);
-    folder.result().is_some() && folder.checkpoint().exists() && !folder.state().exists() && !folder.report().exists()
+    folder.result().is_ok_and(|result| result.is_some())
+        && folder.checkpoint().exists()
+        && !folder.state().exists()
+        && !folder.report().exists()
 }
 
 fn options(args: &TrainArgs, stage_psnr: bool) -> RunOptions {

@@ -59,6 +59,11 @@ pub fn by_silhouettes(
     Occupancy::from_masks(aabb, voxels, masks)
 }
 
+/// Bytes of the silhouettes that are in memory at a time, for so many views of so many pixels: a number in a summed-area table for each.
+pub(crate) fn silhouette_bytes(views: usize, pixels: usize) -> u64 {
+    (views.min(VIEWS) * size_of::<u32>() * pixels) as u64
+}
+
 /// The voxels that the ray of no background pixel passes through: the source paper's rule, with every voxel on the ray instead of those
 /// around 900 points. Rays are of pixel centres, so it carves into what thin parts leave between them.
 /// `progress(views)` is called as views are done.

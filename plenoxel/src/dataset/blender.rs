@@ -2,15 +2,19 @@
 //!
 //! A file has `camera_angle_x`, the horizontal field of view in radians, and `frames`, each with a `file_path` without
 //! extension and a 4 x 4 camera-to-world `transform_matrix` with OpenGL axes; world z is up. Only listed images are views: the
-//! depth and normal pictures that lie in the test folder of the original scenes never are. Other keys are ignored.
+//! depth and normal pictures that lie in the test folder of the original scenes never are. Other intrinsics must say the same as
+//! `camera_angle_x` and the images; keys that are none are ignored.
 
+mod intrinsics;
 mod write;
 
 use super::{Dataset, Frame, OpenOptions, Source, Split, image};
 use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::error::{Error, Result};
+use crate::files;
 use crate::json;
 use glam::{DAffine3, DMat3, DMat4};
+pub use intrinsics::StatedIntrinsics;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 pub(super) use write::write;
@@ -27,16 +31,22 @@ const LONGEST_PATH: usize = 4096;
 ///
 /// Errors: everything that is wrong with the JSON, the matrices and the images' headers, with file and frame.
 pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
-    let train = read_transforms(root, Split::Train)?;
-    if train.is_empty() {
-        let path = root.join("transforms_train.json");
-        return Err(Error::input(path, "frames is empty", "at least one training view is needed"));
+    let mut splits = [Vec::new(), Vec::new(), Vec::new()];
+    let mut stated = Vec::new();
+    let has_val = files::is_there(&file_name(root, Split::Val));
+    for split in Split::ALL {
+        let path = file_name(root, split);
+        if split == Split::Train || files::is_there(&path) {
+            let transforms = Transforms::parse(&path, &files::read(&path, files::CAMERAS)?)?;
+            splits[split as usize] = transforms.listed(root, split)?;
+            stated.push((path, transforms));
+        }
     }
-    let has_val = file_name(root, Split::Val).exists();
-    let val = if has_val { read_transforms(root, Split::Val)? } else { Vec::new() };
-    let test = if file_name(root, Split::Test).exists() { read_transforms(root, Split::Test)? } else { Vec::new() };
-    let mut splits = [train, val, test];
+    if splits[0].is_empty() {
+        return Err(Error::input(file_name(root, Split::Train), "frames is empty", "at least one training view is needed"));
+    }
     let size = common_size(splits.iter().flatten())?;
+    stated.iter().try_for_each(|(path, transforms)| transforms.intrinsics.check(path, transforms.fov_x, size))?;
     image::check_downscale(options.downscale, size)?;
 
     if let (Some(every), false) = (options.validation_every, has_val) {
@@ -75,29 +85,31 @@ pub struct Transforms {
     pub fov_x: f64,
     /// The views: `file_path` as it is written, and the camera to world.
     pub frames: Vec<(String, DAffine3)>,
+    /// What it says of the cameras beside that.
+    pub intrinsics: StatedIntrinsics,
 }
 
 fn file_name(root: &Path, split: Split) -> PathBuf {
     root.join(format!("transforms_{split}.json"))
 }
 
-fn read_transforms(root: &Path, split: Split) -> Result<Vec<Listed>> {
-    let path = file_name(root, split);
-    let bytes = std::fs::read(&path).map_err(|source| Error::io(&path, source, "reading the cameras"))?;
-    let Transforms { fov_x, frames } = Transforms::parse(&path, &bytes)?;
-    let listed = frames.into_iter().enumerate().map(|(k, (text, camera_to_world))| {
-        let image = find_image(root, split, &text).map_err(|tried| {
-            let tried: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
-            let found = format!("the image \"{text}\" of frame {k} does not exist");
-            Error::input(&path, found, format!("looked for {}", tried.join(" and ")))
-        })?;
-        let name = image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        Ok(Listed { name, image, fov_x, camera_to_world })
-    });
-    listed.collect()
-}
-
 impl Transforms {
+    /// The views with the images of the scene `root`.
+    ///
+    /// Errors: there is no such image.
+    fn listed(&self, root: &Path, split: Split) -> Result<Vec<Listed>> {
+        let listed = self.frames.iter().enumerate().map(|(k, (text, camera_to_world))| {
+            let image = find_image(root, split, text).map_err(|tried| {
+                let tried: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
+                let found = format!("the image \"{text}\" of frame {k} does not exist");
+                Error::input(file_name(root, split), found, format!("looked for {}", tried.join(" and ")))
+            })?;
+            let name = image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+            Ok(Listed { name, image, fov_x: self.fov_x, camera_to_world: *camera_to_world })
+        });
+        listed.collect()
+    }
+
     /// Reads the bytes of a transforms file; `path` names it in messages.
     ///
     /// Errors: everything that is wrong with the JSON and the matrices, with the frame.
@@ -105,7 +117,14 @@ impl Transforms {
         let bad = |found: String, remedy: &str| Error::input(path, found, remedy);
         let json = json::parse(path, bytes)?;
         let Some(angle) = json.get("camera_angle_x") else {
-            return Err(bad("there is no key \"camera_angle_x\"".into(), "give the horizontal field of view in radians"));
+            let found = "there is no key \"camera_angle_x\"";
+            return Err(match json.get("fl_x") {
+                Some(focal) => bad(
+                    format!("{found}, but fl_x is {}", json::shown(focal)),
+                    "focal lengths in pixels are not supported yet: give camera_angle_x = 2 atan(w / (2 fl_x)), in radians",
+                ),
+                None => bad(found.into(), "give the horizontal field of view in radians"),
+            });
         };
         let Some(fov_x) = angle.as_f64().filter(|angle| is_angle_of_view(*angle)) else {
             return Err(bad(format!("camera_angle_x is {}", json::shown(angle)), "it is a number of radians between 0 and pi"));
@@ -116,7 +135,10 @@ impl Transforms {
         let Some(frames) = frames.as_array() else {
             return Err(bad("frames is not a list".into(), "list the views, each with file_path and transform_matrix"));
         };
+        let mut intrinsics = StatedIntrinsics::default();
+        intrinsics.add(path, &json, None)?;
         let frame = |(k, frame): (usize, &Value)| {
+            intrinsics.add(path, frame, Some(k))?;
             let Some(text) = frame.get("file_path") else {
                 return Err(bad(format!("frame {k} has no key \"file_path\""), "name the image, without extension"));
             };
@@ -133,7 +155,8 @@ impl Transforms {
             }
             Ok((file_path.to_owned(), pose))
         };
-        Ok(Transforms { fov_x, frames: frames.iter().enumerate().map(frame).collect::<Result<_>>()? })
+        let frames = frames.iter().enumerate().map(frame).collect::<Result<_>>()?;
+        Ok(Transforms { fov_x, frames, intrinsics })
     }
 }
 
@@ -152,7 +175,9 @@ fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result
     tried.dedup();
     // An image with another extension is found too, so that the message can say that it is not a PNG.
     let as_written = root.join(file_path.trim_start_matches("./"));
-    let found = tried.iter().chain([&as_written]).find(|path| path.is_file()).cloned();
+    let all = || tried.iter().chain([&as_written]);
+    // What is there and no file is found last, so that the message can say what it is.
+    let found = all().find(|path| path.is_file()).or_else(|| all().find(|path| files::is_there(path))).cloned();
     found.ok_or(tried)
 }
 

@@ -4,115 +4,67 @@
 //! stays a choice until a color is asked for. Values are sRGB as stored; nothing here linearises, since every published number
 //! compares and composites the stored values.
 
+mod rows;
+
 use crate::error::{Error, Result};
 use crate::files;
-use ::image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageError, ImageFormat, ImageReader, Limits};
+use crate::memory;
+use ::image::{ExtendedColorType, ImageEncoder};
 use ndarray::{Array2, Array3, ArrayView3};
-use std::fs::File;
-use std::io::{Cursor, Read, Seek, SeekFrom};
+use rows::Rows;
+use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
 pub use ::image::RgbaImage;
+pub use rows::MAX_SIDE;
 
-/// Largest width or height that is accepted, in pixels. A header may claim anything; this bounds what it can make us allocate.
-pub const MAX_SIDE: u32 = 16384;
-
-const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
-/// Bytes up to the bit depth and the color type.
-const HEAD: usize = 26;
 /// The last chunk of every PNG: length 0, name, checksum.
 const END: [u8; 12] = *b"\0\0\0\0IEND\xae\x42\x60\x82";
-
-/// Deflate makes at most so many bytes of one: 258 of two bits.
-const MOST_INFLATION: u64 = 1032;
-/// Memory for what a file says beside its pixels: color profiles and the like.
-const MOST_BESIDE: u64 = 16 << 20;
 
 /// Width and height of the PNG file `path`, without decoding it: reads its first 26 bytes and its last 12.
 ///
 /// A file that does not end as a PNG ends is decoded at once, so that one cut short is reported when a dataset is opened and
-/// not hours later. Errors: missing, not a PNG, cut short, empty, larger than [`MAX_SIDE`], or of more pixels than the file can hold.
+/// not hours later; its pixels are not kept. Errors: missing, not a plain file, not a PNG, cut short, empty, larger than [`MAX_SIDE`], or of more
+/// pixels than the file can hold.
 pub fn size(path: &Path) -> Result<(usize, usize)> {
-    let refused = |source| Error::io(path, source, "reading the image's header");
-    let mut file = open(path)?;
-    let length = file.metadata().map_err(refused)?.len();
-    let mut head = Vec::with_capacity(HEAD);
-    file.by_ref().take(HEAD as u64).read_to_end(&mut head).map_err(refused)?;
-    let (width, height) = size_in(path, &head, length)?;
+    let mut file = files::open(path, files::IMAGE)?;
+    let (width, height) = rows::size(path, &mut file)?;
     let mut tail = [0_u8; END.len()];
     let whole = file.seek(SeekFrom::End(-(END.len() as i64))).and_then(|_| file.read_exact(&mut tail)).is_ok() && tail == END;
     if !whole {
-        read(path)?;
+        file.rewind().map_err(|e| Error::io(path, e, "reading the image"))?;
+        Rows::new(path, BufReader::new(file))?.check()?;
     }
     Ok((width as usize, height as usize))
-}
-
-/// Width and height by the first [`HEAD`] bytes of a file of so many.
-fn size_in(path: &Path, head: &[u8], length: u64) -> Result<(u32, u32)> {
-    if head.is_empty() || !SIGNATURE.starts_with(&head[..head.len().min(8)]) {
-        return Err(not_png(path, head));
-    }
-    if head.len() < HEAD || &head[12..16] != b"IHDR" {
-        return Err(cut_short(path));
-    }
-    let number = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
-    let (width, height) = (number(16), number(20));
-    let refused = |remedy: String| Err(Error::input(path, format!("the header says {width} x {height} pixels"), remedy));
-    if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
-        return refused(format!("images of 1 to {MAX_SIDE} pixels a side are accepted"));
-    }
-    // Gray and palettes, RGB, gray with alpha, RGBA.
-    let channels = [1, 0, 3, 1, 2, 0, 4].get(usize::from(head[25])).copied().unwrap_or(0);
-    let row = (u64::from(width) * channels * u64::from(head[24])).div_ceil(8);
-    if row * u64::from(height) > MOST_INFLATION * length {
-        return refused(format!("a file of {length} bytes cannot hold so many: copy or download it again"));
-    }
-    Ok((width, height))
 }
 
 /// Decodes the PNG file `path` (gray, RGB or palette, with or without alpha, of any bit depth) to 8-bit RGBA. 16-bit values are
 /// rounded; without alpha the picture is opaque.
 ///
-/// Errors: missing, not a PNG, cut short, damaged, larger than [`MAX_SIDE`], or of more pixels than the file can hold.
+/// Memory: 4 bytes a pixel, whatever the bit depth. Errors: missing, not a plain file, not a PNG, cut short, damaged, larger than [`MAX_SIDE`],
+/// of more pixels than the file can hold, or of more than there is memory for.
 pub fn read(path: &Path) -> Result<RgbaImage> {
-    let mut bytes = Vec::new();
-    open(path)?.read_to_end(&mut bytes).map_err(|source| Error::io(path, source, "reading the image"))?;
-    decode(path, &bytes)
+    let file = files::open(path, files::IMAGE)?;
+    picture(path, BufReader::new(file))
 }
 
 /// The same from the bytes of a file; `path` names it in messages.
 pub fn decode(path: &Path, bytes: &[u8]) -> Result<RgbaImage> {
-    let (width, height) = size_in(path, &bytes[..bytes.len().min(HEAD)], bytes.len() as u64)?;
-    if !has_whole_palettes(bytes) {
-        return Err(Error::input(path, "the palette ends within a color", "write it again as PNG"));
-    }
-    let mut reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Png);
-    let mut limits = Limits::default();
-    // The largest picture of this size: 16-bit RGBA.
-    limits.max_alloc = Some(8 * u64::from(width) * u64::from(height) + MOST_BESIDE);
-    reader.limits(limits);
-    reader.decode().map(DynamicImage::into_rgba8).map_err(|error| match error {
-        ImageError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => cut_short(path),
-        ImageError::Limits(_) => {
-            let found = format!("what the file says beside its {width} x {height} pixels takes too much memory");
-            Error::input(path, found, "write it again as PNG, without metadata")
-        }
-        other => Error::input(path, format!("the image cannot be decoded ({other})"), "write it again as PNG"),
-    })
+    picture(path, Cursor::new(bytes))
 }
 
-/// False if a palette of a PNG file ends within a color, of which our decoder makes a panic (png 0.18.1, its issue 694).
-fn has_whole_palettes(bytes: &[u8]) -> bool {
-    let mut at = SIGNATURE.len();
-    while let Some(&[a, b, c, d, ref name @ ..]) = bytes.get(at..).and_then(|rest| rest.first_chunk::<8>()) {
-        let length = u32::from_be_bytes([a, b, c, d]);
-        if name == b"PLTE" && !length.is_multiple_of(3) {
-            return false;
-        }
-        // The name and the checksum too.
-        at = at.saturating_add(length as usize).saturating_add(12);
-    }
-    true
+fn picture(path: &Path, mut source: impl BufRead + Seek) -> Result<RgbaImage> {
+    let (width, height) = rows::size(path, &mut source)?;
+    let rows = Rows::new(path, source)?;
+    let bytes = 4 * width as usize * height as usize;
+    memory::check(path, &format!("an image of {width} x {height} pixels"), bytes as u64)?;
+    let mut pixels = Vec::new();
+    // Address space may be short where memory is not.
+    pixels.try_reserve_exact(bytes).map_err(|_| Error::io(path, std::io::ErrorKind::OutOfMemory.into(), "decoding the image"))?;
+    pixels.resize(bytes, 0);
+    rows.read(&mut pixels)?;
+    // As many as there are: no pixel is black instead.
+    Ok(RgbaImage::from_raw(width, height, pixels).unwrap_or_default())
 }
 
 /// Checks that pictures of `width` x `height` can be reduced `k` times: k must divide both, since blocks of different sizes
@@ -205,6 +157,11 @@ pub fn write_gray16(path: &Path, values: &Array2<u16>) -> Result<()> {
 }
 
 fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<()> {
+    // Nothing is written that would not be read.
+    if width.max(height) > MAX_SIDE as usize {
+        let found = format!("a picture of {width} x {height} pixels is not written");
+        return Err(Error::input(path, found, format!("pictures of up to {MAX_SIDE} pixels a side are")));
+    }
     let mut png = Vec::new();
     ::image::codecs::png::PngEncoder::new(&mut png).write_image(bytes, width as u32, height as u32, color).map_err(|error| {
         Error::input(path, format!("a {width} x {height} image cannot be encoded ({error})"), "choose a usual image size")
@@ -212,38 +169,11 @@ fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: Ext
     files::write_atomically(path, &png)
 }
 
-fn open(path: &Path) -> Result<File> {
-    let file = File::open(path).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound => Error::input(path, "there is no such image", "put the file there or correct the path"),
-        _ => Error::io(path, source, "opening the image"),
-    })?;
-    // On Unix a folder can be opened like a file and only refuses to be read.
-    if file.metadata().is_ok_and(|data| data.is_dir()) {
-        return Err(Error::input(path, "this is a folder", "a PNG image is expected here"));
-    }
-    Ok(file)
-}
-
-fn not_png(path: &Path, head: &[u8]) -> Error {
-    let found = match head {
-        [] => "the file is empty",
-        [0xff, 0xd8, ..] => "this is a JPEG image, not a PNG",
-        [b'G', b'I', b'F', ..] => "this is a GIF image, not a PNG",
-        [b'R', b'I', b'F', b'F', ..] => "this is a RIFF file (perhaps WebP), not a PNG",
-        _ => "this is not a PNG image",
-    };
-    Error::input(path, found, "convert it to PNG (gray, RGB or RGBA)")
-}
-
-fn cut_short(path: &Path) -> Error {
-    Error::input(path, "the PNG ends early: it is cut short", "copy or download the file again")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ::image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
-    use std::io::BufReader;
+    use ::image::{DynamicImage, ImageBuffer, ImageFormat, ImageReader, Luma, LumaA, Rgb, Rgba};
+    use std::fs::File;
 
     fn temporary(name: &str) -> std::path::PathBuf {
         std::env::temp_dir().join(format!("plenoxel-image-{}-{name}", std::process::id()))
@@ -351,6 +281,44 @@ mod tests {
         for error in [size(&path).unwrap_err(), read(&path).unwrap_err()] {
             assert!(error.exit_code() == 3 && error.to_string().contains("16384 x 16384 pixels; a file of"), "{error}");
         }
+        std::fs::remove_file(path).unwrap();
+    }
+
+    #[test]
+    fn interlaced_rows_go_to_their_places() {
+        // The encoder knows no interlacing: 9 x 9 pixels of 16-bit gray, not compressed, pass by pass.
+        let passes = [(0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)];
+        let mut rows = Vec::new();
+        for (x0, y0, dx, dy) in passes {
+            for y in (y0..9).step_by(dy).filter(|_| x0 < 9) {
+                rows.push(0);
+                rows.extend((x0..9).step_by(dx).flat_map(|x| (257 * (9 * y + x) as u16).to_be_bytes()));
+            }
+        }
+        let mut zlib = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::none());
+        std::io::Write::write_all(&mut zlib, &rows).unwrap();
+        let mut png = b"\x89PNG\r\n\x1a\n".to_vec();
+        for (name, data) in [(b"IHDR", &b"\0\0\0\x09\0\0\0\x09\x10\0\0\0\x01"[..]), (b"IDAT", &zlib.finish().unwrap()), (b"IEND", b"")] {
+            let named = [name, data].concat();
+            let mut crc = flate2::Crc::new();
+            crc.update(&named);
+            png.extend([&(data.len() as u32).to_be_bytes()[..], &named, &crc.sum().to_be_bytes()].concat());
+        }
+        let image = decode(Path::new("interlaced.png"), &png).unwrap();
+        for (x, y, pixel) in image.enumerate_pixels() {
+            let gray = (9 * y + x) as u8;
+            assert_eq!(pixel.0, [gray, gray, gray, 255], "({x}, {y})");
+        }
+    }
+
+    #[test]
+    fn bytes_behind_the_end_are_no_damage() {
+        let path = temporary("behind");
+        write_rgba(&path, &RgbaImage::from_pixel(3, 2, Rgba([1, 2, 3, 4]))).unwrap();
+        let mut bytes = std::fs::read(&path).unwrap();
+        bytes.extend([7; 100]);
+        std::fs::write(&path, bytes).unwrap();
+        assert_eq!((size(&path).unwrap(), read(&path).unwrap().get_pixel(2, 1).0), ((3, 2), [1, 2, 3, 4]));
         std::fs::remove_file(path).unwrap();
     }
 

@@ -160,7 +160,7 @@ impl<T: Real> Plenoxels<T> {
         let carved = grid.with_interpolation(shape.interpolation);
         let half_width = grid.matter().half_width().unwrap_or(grid.shape().half_width);
         let adapted = start::adapted(&carved.resample_in(shape.resolution, half_width), &shape);
-        let density = Tensor::full(adapted.density.shape(), T::lit(self.config.initial.density));
+        let density = Tensor::full(adapted.density.shape(), self.config.initial.density);
         self.grid = adapted.with_density(density);
         self
     }

@@ -13,6 +13,7 @@ pub use header::{Element, Encoding, Header, Kind, Number, Property};
 pub use write::encode;
 
 use crate::error::{Error, Result};
+use crate::files;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
 
@@ -42,12 +43,11 @@ enum Rows {
 }
 
 impl PlyFile {
-    /// Reads a file and finds the points in it: the element `vertex`, or one whose name contains `vert` or `point`.
+    /// Reads what a user named, a file or a pipe, and finds the points in it: the element `vertex`, or one whose name contains `vert` or `point`.
     ///
-    /// Errors: it cannot be read, is no PLY file, is cut short, or has no points with x, y and z.
+    /// Errors: it cannot be read, is larger than there is memory for, is no PLY file, is cut short, or has no points with x, y and z.
     pub fn open(path: &Path) -> Result<Self> {
-        let bytes = std::fs::read(path).map_err(|e| Error::io(path, e, "reading the point cloud"))?;
-        Self::parse(path, bytes)
+        Self::parse(path, files::read_named(path, files::CLOUD)?)
     }
 
     /// The same from the bytes of a file; `path` names it in messages.

@@ -9,6 +9,7 @@ use super::settings::{self, ConfigFile};
 use super::tensorboard;
 use crate::error::{Error, Result};
 use crate::files::{self, FolderLock, is_abandoned};
+use crate::json;
 use crate::model::plenoxels::config::Config;
 use crate::train::{self, About, Model};
 use listing::{RENDERED, entries, is_fragment, is_frame, is_one_of, remove, reserve};
@@ -119,7 +120,7 @@ impl RunFolder {
     fn clear(&self) -> Result<()> {
         self.remove_fragments()?;
         let names = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
-        let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| path.exists());
+        let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| files::is_there(path));
         for path in paths.chain(tensorboard::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
@@ -165,11 +166,10 @@ impl RunFolder {
         }
         let folder = Self::at(path);
         let record = path.join(RECORD);
-        let bytes = std::fs::read(&record).map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => Error::input(path, format!("there is no {RECORD} in this folder"), remedy),
-            _ => Error::io(&record, e, "reading the run"),
-        })?;
-        let mut record = RunRecord::parse(&record, &bytes)?;
+        if !files::is_there(&record) {
+            return Err(Error::input(path, format!("there is no {RECORD} in this folder"), remedy));
+        }
+        let mut record = RunRecord::parse(&record, &files::read(&record, files::RECORD)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
         if config.stages.is_empty() {
             record.kind = RunKind::Carved;
@@ -182,7 +182,7 @@ impl RunFolder {
     /// Errors: there is no best grid besides the last.
     pub fn with_best(self) -> Result<Self> {
         let best = RunFolder { grid: BEST, ..self };
-        if !best.checkpoint().exists() {
+        if !files::is_there(&best.checkpoint()) {
             let found = format!("there is no {BEST} in this folder");
             let remedy =
                 "leave --best away: the last grid was the best, or nothing was saved before it, or there were no validation views to tell";
@@ -216,7 +216,7 @@ impl RunFolder {
     /// Errors: there is none, because the run did not end well.
     pub fn existing_checkpoint(&self) -> Result<PathBuf> {
         let path = self.checkpoint();
-        if !path.exists() {
+        if !files::is_there(&path) {
             let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
             let best = if self.path.join(BEST).exists() { "; or --best, for the best grid that was saved" } else { "" };
             return Err(Error::input(&self.path, found, format!("go on with `plenoxel train --resume`, or train again{best}")));
@@ -229,9 +229,9 @@ impl RunFolder {
     /// Errors: there is none, because the run has ended or has saved nothing yet.
     pub fn existing_state(&self) -> Result<Option<PathBuf>> {
         let path = self.state();
-        let (found, remedy) = match (path.exists(), self.checkpoint().exists()) {
+        let (found, remedy) = match (files::is_there(&path), files::is_there(&self.checkpoint())) {
             (true, _) => return Ok(Some(path)),
-            (false, true) if self.result().is_none() => return Ok(None),
+            (false, true) if self.result()?.is_none() => return Ok(None),
             (false, true) => ("this run has ended", "to train its grid further, use `--init-from`"),
             (false, false) => ("this run left nothing from which to go on", "train again with its config.toml"),
         };
@@ -254,7 +254,9 @@ impl RunFolder {
     }
 
     /// Reads the final figures, if there are any.
-    pub fn result(&self) -> Option<serde_json::Value> {
+    ///
+    /// Errors: the file cannot be read, or is not JSON.
+    pub fn result(&self) -> Result<Option<serde_json::Value>> {
         self.read_json(RESULT)
     }
 
@@ -264,24 +266,31 @@ impl RunFolder {
     }
 
     /// Reads the figures of an evaluation, if they were written.
-    pub fn evaluation(&self) -> Option<serde_json::Value> {
+    ///
+    /// Errors as for [`RunFolder::result`].
+    pub fn evaluation(&self) -> Result<Option<serde_json::Value>> {
         self.read_json(EVALUATION)
     }
 
     /// The final figures, with those of an evaluation where the final ones are without test views.
-    pub fn figures(&self) -> Option<serde_json::Value> {
-        let mut all = self.result()?;
-        if let (Some(all), Some(serde_json::Value::Object(evaluation))) = (all.as_object_mut(), self.evaluation()) {
+    ///
+    /// Errors as for [`RunFolder::result`].
+    pub fn figures(&self) -> Result<Option<serde_json::Value>> {
+        let Some(mut all) = self.result()? else { return Ok(None) };
+        if let (Some(all), Some(serde_json::Value::Object(evaluation))) = (all.as_object_mut(), self.evaluation()?) {
             for (key, value) in evaluation {
                 all.entry(key).or_insert(value);
             }
         }
-        Some(all)
+        Ok(Some(all))
     }
 
-    fn read_json(&self, name: &str) -> Option<serde_json::Value> {
-        let text = std::fs::read_to_string(self.path.join(name)).ok()?;
-        serde_json::from_str(&text).ok()
+    fn read_json(&self, name: &str) -> Result<Option<serde_json::Value>> {
+        let path = self.path.join(name);
+        if !files::is_there(&path) {
+            return Ok(None);
+        }
+        json::parse(&path, &files::read(&path, files::RECORD)?).map(Some)
     }
 
     /// Writes the chart of the loss, an SVG.
@@ -297,7 +306,7 @@ impl RunFolder {
     /// Reads the text of `config.toml`.
     pub fn settings(&self) -> Result<String> {
         let path = self.path.join(CONFIG);
-        std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e, "reading the settings"))
+        Ok(files::text(&path, &files::read(&path, files::SETTINGS)?)?.into_owned())
     }
 
     /// Path of the report.

@@ -3,18 +3,18 @@
 //! The parts are counted from what is known: images, tables, optimizer state, and the arrays that a training step keeps for its gradient.
 //! The last depends on how many samples the rays take: about as many as cross the box from face to face, fewer after pruning.
 
-mod system;
-
-pub use system::{available, limit, now, peak};
+pub use crate::memory::{available, bytes, limit, now, peak};
 
 use super::machine;
 use crate::carve::Fit;
 use crate::carve::color::KEPT_LIGHT;
+use crate::carve::visual_hull::silhouette_bytes;
 use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
 use crate::field::voxel_grid::{Color, GridShape};
-use crate::model::plenoxels::config::{Config, OptimizerConfig, Sampling};
+use crate::memory;
+use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
 use crate::render::Engine;
 
 /// An estimate in bytes, by purpose.
@@ -41,6 +41,11 @@ const BASE: u64 = 60_000_000;
 const CARVING_PIXELS: u64 = 1 << 16;
 /// Bytes of a pixel of rendered pictures: five numbers of the colors and of the normals each, what is made of them, and the file.
 const PICTURE_BYTES: u64 = 100;
+/// Bytes of a pixel of a view while it is compared with its photograph: the picture, the photograph in floats, and both in double precision for SSIM.
+const COMPARED_BYTES: u64 = 82;
+/// The same while its panel is drawn at the end of training: picture, photograph, error and depth, all four side by side in floats and in 8 bits, and
+/// the mean of the training images.
+const DRAWN_BYTES: u64 = 130;
 /// The most bytes of the page about a run while it is put together: the grid in it of up to 30 MB, compressed, as text, and as part of longer texts.
 const PAGE_BYTES: u64 = 150_000_000;
 /// Rays that are rendered at a time when evaluating.
@@ -85,18 +90,21 @@ impl Estimate {
             let batch = rays * 200;
             kept * training_bytes_per_sample(config.engine, &shape) + batch + rows + gradient
         });
-        let step = step.max().unwrap_or(0);
+        let (width, height) = dataset.size();
+        let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
+        let step = step.max().unwrap_or(0).max(hull);
+        let comparison = comparison(dataset, Split::Test, DRAWN_BYTES);
         let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // A table's bytes beside it.
         let saving = tables(index);
         let page = if report { page(tables(index)) } else { 0 };
         // It renders, when the optimizer is gone.
-        let reporting = (evaluation + page).saturating_sub(optimizer);
+        let reporting = (evaluation + comparison.max(page)).saturating_sub(optimizer);
         let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
         let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, a lower sh_degree, or a higher sh_reduction");
         let parts = [
-            (images, ("downscale".to_owned(), "a larger factor, so that the images fit")),
+            (images + comparison.max(hull), ("downscale".to_owned(), "a larger factor, so that the images fit")),
             (step, ("rays_per_step".to_owned(), "fewer rays in a step")),
             (evaluation, ("evaluation".to_owned(), "fewer samples on a ray")),
             (grid + optimizer + saving, voxels),
@@ -136,7 +144,8 @@ impl Estimate {
             // The file and the tables read from it.
             grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
-            step: samples * evaluation_bytes_per_sample(config.engine, shape),
+            step: samples * evaluation_bytes_per_sample(config.engine, shape)
+                + compare.map_or(0, |(dataset, split)| comparison(dataset, split, COMPARED_BYTES)),
             pruned: false,
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
@@ -171,7 +180,7 @@ impl Estimate {
         let masks = shape.voxels() as u64;
         let (width, height) = dataset.size();
         // Summed-area tables of some views, or the light of a batch of pixels.
-        let step = (32 * (width * height) as u64).max(CARVING_PIXELS * 36 * hits_of_pixel(config));
+        let step = silhouette_bytes(dataset.count(Split::Train), width * height).max(CARVING_PIXELS * 36 * hits_of_pixel(config));
         // Which voxel each pixel sees; the list that descent draws pixels from.
         let pixels = (width * height * dataset.count(Split::Train)) as u64;
         let items = if config.carve.photo.is_some() { 4 * pixels } else { 0 } + if config.carve.fit == Fit::Sgd { 8 * pixels } else { 0 };
@@ -242,13 +251,11 @@ impl Estimate {
     /// Refuses what does not fit into the memory that is free, naming the setting that counts most. Where the system does not say how
     /// much is free, nothing is refused.
     pub fn check(&self) -> Result<()> {
-        match available() {
-            Some(available) if self.total() > available => {
-                let limited = system::is_limit(available);
-                let why = if limited { "--max-memory allows" } else { "there is room for" };
-                let found = format!("what would need about {} of memory, where {why} {},", bytes(self.total()), bytes(available));
+        match memory::allowance() {
+            Some(allowance) if self.total() > allowance.bytes => {
+                let found = format!("what would need about {} of memory, where {allowance},", bytes(self.total()));
                 // A limit may be too low for anything.
-                let advice = format!("{}{}", self.advice, if limited { "; or a higher --max-memory" } else { "" });
+                let advice = format!("{}{}", self.advice, if allowance.is_limit { "; or a higher --max-memory" } else { "" });
                 Err(Error::config(&self.key, found, advice))
             }
             _ => Ok(()),
@@ -280,16 +287,22 @@ fn share(config: &Config, stage: usize) -> f64 {
     if config.prune_from_stage.is_some_and(|first| first <= stage) { LEFT } else { 1.0 }
 }
 
-/// Images of the largest of some splits, with depth where the scene knows it, and the full-size ones that each thread decodes.
+/// Images of the largest of some splits, with depth where the scene knows it, and the full-size ones that each thread reduces.
 fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
     let (width, height) = dataset.size();
     let pixels = (width * height) as u64;
     let views = splits.iter().map(|split| dataset.count(*split)).max();
     let per_pixel = if dataset.scene().is_some() { 8 } else { 4 };
     let threads = machine::threads() as u64;
-    // A file and its decoded pixels.
-    let decoding = threads * 8 * pixels * (downscale * downscale) as u64;
+    // Pixels are decoded row by row to 8 bits, whatever the file has, into the image that is counted already, unless it is to be reduced.
+    let decoding = if downscale > 1 { threads * 4 * pixels * (downscale * downscale) as u64 } else { 0 };
     views.unwrap_or(0) as u64 * pixels * per_pixel + decoding
+}
+
+/// Comparing the views of a split, one after the other, if there are any.
+fn comparison(dataset: &Dataset, split: Split, bytes_per_pixel: u64) -> u64 {
+    let (width, height) = dataset.size();
+    if dataset.count(split) > 0 { bytes_per_pixel * (width * height) as u64 } else { 0 }
 }
 
 /// Voxels that a pixel may see in a carved grid: until it is opaque, or the box ends.
@@ -353,25 +366,4 @@ fn touched_rows(shape: &GridShape, samples: u64) -> u64 {
 /// True if a loss looks at the whole grid, so that gradients are dense.
 fn whole_grid_losses(config: &Config) -> bool {
     ["tv_density", "tv_color"].iter().any(|name| config.losses.contains_key(*name))
-}
-
-/// Bytes with a unit of powers of 1000, at two or three digits: `2.3 GB`, `99 kB`.
-pub fn bytes(n: u64) -> String {
-    match n as f64 {
-        n if n >= 1e10 => format!("{:.0} GB", n / 1e9),
-        n if n >= 1e9 => format!("{:.1} GB", n / 1e9),
-        n if n >= 1e6 => format!("{:.0} MB", n / 1e6),
-        n => format!("{:.0} kB", n / 1e3),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_read_well() {
-        assert_eq!(bytes(2_345_678_901), "2.3 GB");
-        assert_eq!(bytes(99_000), "99 kB");
-    }
 }

@@ -188,11 +188,13 @@ struct Sums {
 }
 
 /// Reads the text of a file; it is empty if there is no file.
+///
+/// Errors: it cannot be read, is no plain file, or is larger than the metrics of a run may be.
 pub fn read(path: &Path) -> Result<String> {
-    match std::fs::read(path) {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path, e, "reading the metrics")),
-        bytes => Ok(String::from_utf8_lossy(&bytes.unwrap_or_default()).into_owned()),
+    if !files::is_there(path) {
+        return Ok(String::new());
     }
+    Ok(String::from_utf8_lossy(&files::read(path, files::METRICS)?).into_owned())
 }
 
 /// The lines about training, each as text and parsed. Lines that are cut short, and those about other things, are left out.
@@ -290,7 +292,7 @@ impl MetricsFile {
     ///
     /// Errors: the picture cannot be read, or the events cannot be written.
     pub fn picture(&mut self, step: u64, size: (usize, usize), png: &Path) -> Result<()> {
-        let bytes = std::fs::read(png).map_err(|e| Error::io(png, e, "reading the picture"))?;
+        let bytes = files::read(png, files::IMAGE)?;
         self.events.image(step, "preview", size, &bytes)
     }
 

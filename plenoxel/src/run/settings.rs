@@ -120,7 +120,7 @@ pub fn layered<'a>(
     file: Option<&Path>,
     flags: impl FnOnce(&mut Layers) -> Result<()>,
 ) -> Result<(Config, Option<&'a str>)> {
-    let file = file.map(ConfigFile::read).transpose()?;
+    let file = file.map(ConfigFile::read_named).transpose()?;
     let complete = file.as_ref().is_some_and(ConfigFile::is_complete);
     if let (Some(preset), true) = (preset, complete) {
         return Err(Error::config("--preset", format!("{preset} beside a --config that says everything"), "one of the two"));
@@ -144,14 +144,14 @@ impl Config {
     ///
     /// Errors: the text is not TOML, has an unknown key, or a value that cannot be used; the message names the line.
     pub fn from_toml(text: &str) -> Result<Self> {
-        ConfigFile::parse(Path::new("the settings"), text.as_bytes().to_vec())?.resolve()
+        ConfigFile::parse(Path::new("the settings"), text.as_bytes())?.resolve()
     }
 
-    /// Settings from a TOML file of at most 1 MiB, such as the `config.toml` of a run; as [`Config::from_toml`] otherwise.
+    /// Settings from a TOML file of at most 1 MiB ([`SETTINGS`](crate::files::SETTINGS)), such as the `config.toml` of a run; as [`Config::from_toml`] otherwise.
     ///
     /// Errors: the file cannot be read, and those of [`Config::from_toml`]; the message names file and line.
     pub fn read(path: &Path) -> Result<Self> {
-        ConfigFile::read(path)?.resolve()
+        ConfigFile::read_named(path)?.resolve()
     }
 }
 

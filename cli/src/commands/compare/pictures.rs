@@ -20,7 +20,7 @@ const ERROR: usize = 2;
 
 /// Views of which every run has a panel: the photograph, and what each run rendered with its error below. Nothing if there are none.
 pub fn section(runs: &[Run]) -> Result<String> {
-    let views: Vec<Vec<(String, f64)>> = runs.iter().map(panels).collect();
+    let views: Vec<Vec<(String, f64)>> = runs.iter().map(panels).collect::<Result<_>>()?;
     let has = |run: &Run, panel: &str| run.record.scene == runs[0].record.scene && run.folder.image(panel).exists();
     let shared = views[0].iter().map(|(panel, _)| panel).filter(|panel| runs.iter().all(|run| has(run, panel)));
     let shared: Vec<&String> = shared.collect();
@@ -45,11 +45,11 @@ pub fn section(runs: &[Run]) -> Result<String> {
 }
 
 /// File name and PSNR of the test views of a run.
-fn panels(run: &Run) -> Vec<(String, f64)> {
-    let result = run.folder.result().unwrap_or_default();
+fn panels(run: &Run) -> Result<Vec<(String, f64)>> {
+    let result = run.folder.result()?.unwrap_or_default();
     let views = result["per_view"].as_array().into_iter().flatten().enumerate();
     let named = views.filter_map(|(number, view)| Some((RunFolder::panel_name(number, view["name"].as_str()?), view["psnr"].as_f64()?)));
-    named.collect()
+    Ok(named.collect())
 }
 
 /// Parts of a panel, one below the other.

@@ -6,11 +6,10 @@ use crate::commands::whole;
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::camera::Camera;
-use plenoxel::camera_path::{CameraPath, MOST_BYTES, MOST_FRAMES, Turntable};
+use plenoxel::camera_path::{CameraPath, MOST_FRAMES, Turntable};
 use plenoxel::dataset::{Dataset, Split, image};
 use plenoxel::error::{Error, Result};
-use std::fs::File;
-use std::io::Read;
+use plenoxel::files;
 use std::path::{Path, PathBuf};
 
 /// Frames of a path that has no number of its own: the source paper's turntable.
@@ -103,13 +102,10 @@ fn views(run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Optio
 }
 
 fn read(path: &Path) -> Result<CameraPath> {
-    if !path.exists() {
+    if !files::is_there(path) {
         return Err(Error::config("--path", format!("{}, which is no file,", path.display()), "orbit, spiral, or a JSON file of cameras"));
     }
-    let mut bytes = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(MOST_BYTES + 1).read_to_end(&mut bytes));
-    read.map_err(|error| Error::io(path, error, "reading the camera path"))?;
-    CameraPath::parse(path, &bytes)
+    CameraPath::parse(path, &files::read_named(path, files::CAMERA_PATH)?)
 }
 
 /// What the entries of a path are called.

@@ -83,12 +83,13 @@ impl Job {
         if !different.is_empty() {
             return State::Different(different.join("; "));
         }
-        match folder.result() {
+        match (folder.result(), folder.evaluation()) {
+            (Err(e), _) | (_, Err(e)) => State::Different(e.to_string()),
             // A comparison with no test views is one too, and has no PSNR.
-            Some(result) if result.get("psnr").is_some() || folder.evaluation().is_some() => State::Finished,
-            Some(_) => State::Unevaluated,
-            None if !record.is_carved() && folder.existing_state().is_ok() => State::Interrupted,
-            None => State::CutShort,
+            (Ok(Some(result)), Ok(evaluation)) if result.get("psnr").is_some() || evaluation.is_some() => State::Finished,
+            (Ok(Some(_)), _) => State::Unevaluated,
+            (Ok(None), _) if !record.is_carved() && folder.existing_state().is_ok() => State::Interrupted,
+            (Ok(None), _) => State::CutShort,
         }
     }
 
@@ -147,7 +148,7 @@ impl Job {
 
     /// What came of it, so far; another run in its place is none of it.
     pub fn cell(&self) -> Cell {
-        let failure = std::fs::read_to_string(self.failure_path()).ok().and_then(|text| serde_json::from_str(&text).ok());
+        let failure = files::read(&self.failure_path(), files::RECORD).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
         match (failure, Measured::read(&self.folder)) {
             (Some(failure), _) => Cell::Failed(failure),
             _ if matches!(self.state(), State::Different(_)) => Cell::Missing,

@@ -47,7 +47,7 @@ struct Entry {
 impl Plan {
     /// The sweep that a file describes, into `out`; `set` are settings for all runs, which count more than any other.
     pub fn from_file(path: &Path, set: &[String], out: &Path) -> Result<Self> {
-        let file = ConfigFile::read(path)?;
+        let file = ConfigFile::read_named(path)?;
         let wrong = |found: String| Error::input(path, found, "see the example in `plenoxel sweep --help`");
         let root: Table = toml::from_str(file.text()).map_err(|e| wrong(e.message().to_owned()))?;
         let known = |keys: &[&str]| keys.iter().map(|key| (*key).to_owned()).collect::<Vec<_>>();

@@ -2,7 +2,7 @@
 
 use crate::commands::background_name;
 use plenoxel::checkpoint;
-use plenoxel::error::Result;
+use plenoxel::error::{Error, Result};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::RunFolder;
 use serde::{Deserialize, Serialize};
@@ -60,7 +60,7 @@ impl Measured {
     /// Errors: it is not the folder of a run.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         let (folder, config, _) = RunFolder::open(path)?;
-        Ok(Figures::of(&folder, &config).map(|figures| Measured { folder, figures }))
+        Ok(Figures::of(&folder, &config)?.map(|figures| Measured { folder, figures }))
     }
 
     /// Its figures in few words.
@@ -82,10 +82,15 @@ impl Measured {
 
 impl Figures {
     /// Those of a run; none if it has not ended.
-    pub fn of(folder: &RunFolder, config: &Config) -> Option<Self> {
-        let figures = serde_json::from_value::<Figures>(folder.figures()?).ok()?;
+    ///
+    /// Errors: they cannot be read.
+    pub fn of(folder: &RunFolder, config: &Config) -> Result<Option<Self>> {
+        let Some(figures) = folder.figures()? else { return Ok(None) };
+        let figures: Figures = serde_json::from_value(figures).map_err(|e| {
+            Error::input(folder.path(), format!("the figures in result.json cannot be read ({e})"), "`plenoxel evaluate` prints them again")
+        })?;
         let voxels = checkpoint::header(&folder.checkpoint()).ok().map(|(_, voxels)| voxels).or(figures.voxels);
-        Some(Figures { background: config.background, voxels, ..figures })
+        Ok(Some(Figures { background: config.background, voxels, ..figures }))
     }
 
     pub fn scores(&self) -> Scores {

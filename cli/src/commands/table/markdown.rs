@@ -1,31 +1,31 @@
 //! The table as Markdown, which also reads well as it is.
 
 use super::{Cell, RunTable, Scores, beside, decibels};
+use plenoxel::text::one_line;
 
 pub fn text(table: &RunTable) -> String {
-    let mut text = format!("# {}\n\n", plain(&table.title));
+    let mut text = format!("# {}\n\n", as_text(&table.title));
     let published = table.published.iter().map(|p| format!("{} (published)", p.name));
     let heads: Vec<String> = ["scene".to_owned()].into_iter().chain(table.methods.iter().cloned()).chain(published).collect();
-    text += &line(&heads);
-    text += &line(&vec!["---".to_owned(); heads.len()]);
+    text += &line(heads.iter().map(|head| as_text(head)));
+    text += &line(heads.iter().map(|_| "---".to_owned()));
     for row in &table.rows {
         let measured = row.cells.iter().map(cell);
         let published = table.published.iter().map(|p| scores(&p.scores(&row.scene)));
-        text += &line(&[row.scene.clone()].into_iter().chain(measured).chain(published).collect::<Vec<_>>());
+        text += &line([as_text(&row.scene)].into_iter().chain(measured).chain(published));
     }
     if table.rows.len() > 1 {
         let measured = (0..table.methods.len()).map(|method| scores(&table.mean(method)));
         let published = table.published.iter().map(|p| scores(&table.published_mean(p)));
-        text += &line(&["mean".to_owned()].into_iter().chain(measured).chain(published).collect::<Vec<_>>());
+        text += &line(["mean".to_owned()].into_iter().chain(measured).chain(published));
     }
     text += "\n";
-    table.notes().iter().for_each(|note| text += &format!("- {}\n", plain(note)));
+    table.notes().iter().for_each(|note| text += &format!("- {}\n", as_text(note)));
     text
 }
 
-fn line(cells: &[String]) -> String {
-    let cells: Vec<String> = cells.iter().map(|cell| plain(cell)).collect();
-    format!("| {} |\n", cells.join(" | "))
+fn line(cells: impl Iterator<Item = String>) -> String {
+    format!("| {} |\n", cells.collect::<Vec<_>>().join(" | "))
 }
 
 fn cell(cell: &Cell) -> String {
@@ -42,7 +42,25 @@ fn scores(scores: &Scores) -> String {
     format!("**{}** · {}", decibels(scores.psnr), beside(scores))
 }
 
-/// Text on one line that ends no cell.
-pub fn plain(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ").replace('\\', "\\\\").replace('|', "\\|")
+/// Text within a line of Markdown that is shown as it is: no markup, no HTML, no border of a cell, and nothing that a terminal would do.
+pub fn as_text(text: &str) -> String {
+    let text = one_line(&text.split_whitespace().collect::<Vec<_>>().join(" "));
+    let mut shown = String::with_capacity(text.len());
+    let mut before = None;
+    let mut all = text.chars().peekable();
+    while let Some(c) = all.next() {
+        let of_word = |other: Option<char>| other.is_some_and(char::is_alphanumeric);
+        let next = all.peek().copied();
+        let markup = match c {
+            '_' => !(of_word(before) && of_word(next)),
+            '&' => next == Some('#') || of_word(next),
+            c => "\\|<>`*[]~".contains(c),
+        };
+        if markup {
+            shown.push('\\');
+        }
+        shown.push(c);
+        before = Some(c);
+    }
+    shown
 }

@@ -53,8 +53,21 @@ fn markdown_has_a_cell_for_each_run_and_means_of_whole_columns_only() {
     assert_eq!(table, expected);
     assert!(notes.contains("- lego: fast, 3 views of 100 × 100 over white; slow, 3 views of 50 × 50 over white; these cannot"), "{notes}");
     assert!(notes.contains("- ship: 3 views of 100 × 100 over white.\n"), "{notes}");
-    assert!(notes.contains("- ship, slow: failed with exit code 4: loss is <NaN> \\| \"here\"\n"), "{notes}");
+    assert!(notes.contains("- ship, slow: failed with exit code 4: loss is \\<NaN\\> \\| \"here\"\n"), "{notes}");
     assert!(notes.contains("- Others: published, not measured here: their table\n"), "{notes}");
+}
+
+#[test]
+fn what_others_wrote_is_no_markup_in_the_table() {
+    let mut table = table();
+    table.rows[0].scene = "<script>alert(1)</script>".to_owned();
+    table.rows[1].scene = "a_b *c* [d](e) _f_ &lt; x\x1b[2J\n| y".to_owned();
+    table.methods[0] = "`m`".to_owned();
+    let text = markdown::text(&table);
+    assert!(text.contains("| \\<script\\>alert(1)\\</script\\> | **30.00**") && !text.contains("<script>"), "{text}");
+    assert!(text.contains(r"| a_b \*c\* \[d\](e) \_f\_ \&lt; x\\u{1b}\[2J \| y | **20.50**"), "{text}");
+    assert!(text.starts_with("# Two & two\n\n| scene | \\`m\\` | slow |"), "{text}");
+    assert_eq!(text.lines().filter(|line| line.starts_with('|')).count(), 5, "{text}");
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
+use crate::files;
 use crate::model::plenoxels;
 use crate::run::data::DataSource;
 use crate::run::{PROGRAM, machine};
@@ -88,7 +89,7 @@ impl RunRecord {
     ///
     /// Errors: they are not JSON with the keys of a record.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
-        serde_json::from_slice(bytes).map_err(|e| {
+        serde_json::from_str(&files::text(path, bytes)?).map_err(|e| {
             let found = format!("this does not describe a run ({e})");
             Error::input(path, found, "train again, or use an undamaged copy")
         })

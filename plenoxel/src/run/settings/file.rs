@@ -5,12 +5,8 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::model::plenoxels::config::Config;
 use std::collections::BTreeMap;
-use std::io::Read;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
-
-/// Bytes that a configuration file may have: a hundred times those of the longest preset.
-const LARGEST_FILE: u64 = 1 << 20;
 
 /// The text of a configuration file, with the line of each key.
 #[derive(Debug)]
@@ -22,30 +18,23 @@ pub struct ConfigFile {
 }
 
 impl ConfigFile {
-    /// Reads a file.
+    /// Reads a plain file, such as that of a run.
     ///
-    /// Errors: the file cannot be read, is larger than 1 MiB, or is not TOML; the last names the line.
+    /// Errors: the file cannot be read, is larger than a file of settings may be, or is not TOML; the last names the line.
     pub fn read(path: &Path) -> Result<Self> {
-        let remedy = "a TOML file is expected there";
-        let mut bytes = Vec::new();
-        let read = std::fs::File::open(path).and_then(|file| file.take(LARGEST_FILE + 1).read_to_end(&mut bytes));
-        read.map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => Error::input(path, "there is no such file", remedy),
-            std::io::ErrorKind::IsADirectory => Error::input(path, "this is a folder", remedy),
-            _ => Error::io(path, e, "reading the configuration"),
-        })?;
-        if bytes.len() as u64 > LARGEST_FILE {
-            return Err(Error::input(path, "this file is larger than 1 MiB", remedy));
-        }
-        Self::parse(path, bytes)
+        Self::parse(path, &files::read(path, files::SETTINGS)?)
+    }
+
+    /// The same of what a user named to be read, which may be a pipe too.
+    pub fn read_named(path: &Path) -> Result<Self> {
+        Self::parse(path, &files::read_named(path, files::SETTINGS)?)
     }
 
     /// Reads the bytes of a file; `path` names it in messages.
     ///
-    /// Errors: the bytes are not UTF-8, or not TOML; the latter names the line.
-    pub fn parse(path: &Path, bytes: Vec<u8>) -> Result<Self> {
-        let text = String::from_utf8(bytes)
-            .map_err(|_| Error::input(path, "this is not a text file", "a TOML file is expected, such as the config.toml of a run"))?;
+    /// Errors, with the line: the bytes are not text in UTF-8 or UTF-16, or not TOML.
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
+        let text = files::text(path, bytes)?.into_owned();
         let ends: Vec<usize> = text.match_indices('\n').map(|(end, _)| end).collect();
         let line_of = |offset: usize| ends.partition_point(|end| *end < offset) + 1;
         let mut lines = BTreeMap::new();

@@ -2,6 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::model::plenoxels::{LEARNED_LOSSES, LOSSES};
+use strsim::levenshtein;
 use toml::{Table, Value};
 
 /// The keys of a stage.
@@ -158,8 +159,8 @@ fn places(wanted: &dyn Fn(&str) -> bool) -> Vec<String> {
 
 /// The known name that is nearest in spelling, if one is near.
 fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
-    let nearest = known.iter().min_by_key(|known| distance(name, known));
-    nearest.filter(|known| distance(name, known) <= 2 + known.len() / 4).copied()
+    let nearest = known.iter().min_by_key(|known| levenshtein(name, known));
+    nearest.filter(|known| levenshtein(name, known) <= 2 + known.len() / 4).copied()
 }
 
 /// The refusal of a name that is not among the known ones: it says which is nearest in spelling, if one is near; a word that resembles
@@ -170,21 +171,6 @@ pub fn unknown_name(what: &str, name: &str, known: &[&str], place: &str) -> Erro
         None => format!("one of {}", known.join(", ")),
     };
     Error::config(place, format!("the unknown {what} `{name}`"), accepted)
-}
-
-/// Levenshtein's edit distance.
-fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut diagonal = std::mem::replace(&mut row[0], i + 1);
-        for (j, y) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(x != *y);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(row[j] + 1).min(row[j + 1] + 1);
-        }
-    }
-    row[b.len()]
 }
 
 #[cfg(test)]
@@ -198,14 +184,6 @@ mod tests {
         let message = toml::from_str::<Config>("zzz = 1").unwrap_err().to_string();
         let listed: Vec<&str> = message.split('`').skip(3).step_by(2).collect();
         assert_eq!(listed, TABLES[0].1, "{message}");
-    }
-
-    #[test]
-    fn edits_are_counted() {
-        assert_eq!(distance("half_widht", "half_width"), 2);
-        assert_eq!(distance("", "abc"), 3);
-        assert_eq!(distance("stages", "stages"), 0);
-        assert_eq!(distance("kitten", "sitting"), 3);
     }
 
     #[test]

@@ -205,7 +205,7 @@ fn each_key_of_each_preset_misspelled_is_refused_with_the_right_one() {
                         assert_eq!(error.exit_code(), 2, "{message}");
                     };
                     refused(layers.assign(&format!("{path}=1")).unwrap_err(), &format!("--set {path}: "));
-                    let file = ConfigFile::parse(Path::new("my.toml"), in_a_file(&path).into_bytes()).unwrap();
+                    let file = ConfigFile::parse(Path::new("my.toml"), in_a_file(&path).as_bytes()).unwrap();
                     refused(layers.file(&file).unwrap_err(), "my.toml, line 3: ");
                 }
             }

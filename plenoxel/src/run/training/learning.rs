@@ -146,7 +146,7 @@ impl Job<'_> {
         if stopped {
             return Ok(Err(Stopped(total, total)));
         }
-        let mean_image = evaluate::mean_image(views, config.background);
+        let mean_image = self.mean_image(views);
         let of_mean = mean_image
             .as_ref()
             .and_then(|image| evaluate::constant_psnr(&views[..views.len().min(VIEWS_OF_MEAN)], image, config.background));
@@ -167,8 +167,13 @@ impl Job<'_> {
         on(Event::Started { run: Underway { folder, config, dataset }, plan, test_views: self.test_views().len(), history: &past });
         on(Event::Trained);
         let (model, about) = trainer.into_model_of(&folder.existing_checkpoint()?)?;
-        let mean_image = evaluate::mean_image(views, config.background);
-        Ok(Learned { model, metrics, mean_image, training_psnr: None, stages: summaries(&past, plan), kept: Vec::new(), steps: about.step })
+        let (mean_image, stages) = (self.mean_image(views), summaries(&past, plan));
+        Ok(Learned { model, metrics, mean_image, training_psnr: None, stages, kept: Vec::new(), steps: about.step })
+    }
+
+    /// What test views are compared with, if there are any.
+    fn mean_image(&self, views: &[View]) -> Option<Array3<f32>> {
+        if self.test_views().is_empty() { None } else { evaluate::mean_image(views, self.config.background) }
     }
 }
 

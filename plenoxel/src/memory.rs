@@ -1,5 +1,7 @@
 //! The memory that there is: what the system has free, the limit that the user set, and what this process has.
 
+use crate::error::{Error, Result};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Bytes that a command may take in all, if the user set them; 0 if not.
@@ -10,18 +12,56 @@ pub fn limit(bytes: Option<u64>) {
     LIMIT.store(bytes.unwrap_or(0), Relaxed);
 }
 
-/// True if the limit is what leaves so many bytes.
-pub fn is_limit(bytes: u64) -> bool {
-    let limit = LIMIT.load(Relaxed);
-    limit != 0 && limit == bytes
-}
-
 /// Bytes of memory that can be taken now: the free memory or the limit, whichever is less. `None` where there is no limit and the system does
 /// not say how much is free.
 pub fn available() -> Option<u64> {
     match LIMIT.load(Relaxed) {
         0 => free(),
         limit => Some(free().map_or(limit, |free| free.min(limit))),
+    }
+}
+
+/// How much memory can be taken, and whose word that is: displayed, "--max-memory allows 500 MB" or "there is room for 2.3 GB".
+pub(crate) struct Allowance {
+    /// As [`available`] has them.
+    pub bytes: u64,
+    /// True if the user's limit is less than what is free.
+    pub is_limit: bool,
+}
+
+impl std::fmt::Display for Allowance {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let why = if self.is_limit { "--max-memory allows" } else { "there is room for" };
+        write!(f, "{why} {}", bytes(self.bytes))
+    }
+}
+
+/// How much memory can be taken now; `None` where nobody says.
+pub(crate) fn allowance() -> Option<Allowance> {
+    available().map(|bytes| Allowance { bytes, is_limit: LIMIT.load(Relaxed) == bytes })
+}
+
+/// Checks that `needed` bytes of memory can be taken to do `what` with the file `path`.
+///
+/// Errors: bad input, for the file is too large to be used here.
+pub(crate) fn check(path: &Path, what: &str, needed: u64) -> Result<()> {
+    match allowance() {
+        Some(allowance) if needed > allowance.bytes => {
+            let found = format!("{what} takes about {} of memory, where {allowance}", bytes(needed));
+            let more = if allowance.is_limit { "or a higher --max-memory" } else { "or a machine with more" };
+            Err(Error::input(path, found, format!("use a smaller one, {more}")))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Bytes with a unit of powers of 1000, at two or three digits: `2.3 GB`, `99 kB`.
+pub fn bytes(n: u64) -> String {
+    match n as f64 {
+        n if n >= 1e10 => format!("{:.0} GB", n / 1e9),
+        n if n >= 1e9 => format!("{:.1} GB", n / 1e9),
+        n if n >= 1e6 => format!("{:.0} MB", n / 1e6),
+        n => format!("{:.0} kB", n / 1e3),
     }
 }
 
@@ -70,6 +110,12 @@ fn kilobytes(text: &str, key: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sizes_read_well() {
+        assert_eq!(bytes(2_345_678_901), "2.3 GB");
+        assert_eq!(bytes(99_000), "99 kB");
+    }
 
     #[test]
     fn numbers_are_found_in_the_text_of_the_kernel() {

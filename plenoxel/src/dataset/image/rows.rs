@@ -1,0 +1,152 @@
+//! PNG images decoded row by row to 8-bit RGBA: memory is taken for what is kept, and for a row.
+
+use crate::error::{Error, Result};
+use png::{BitDepth, ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Reader, Transformations};
+use std::io::{BufRead, Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// Largest width or height that is accepted, in pixels. A header may claim anything; this bounds what it can make us allocate.
+pub const MAX_SIDE: u32 = 16384;
+
+const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
+/// Bytes up to the bit depth and the color type.
+const HEAD: usize = 26;
+/// Deflate makes at most so many bytes of one: 258 of two bits.
+const MOST_INFLATION: u64 = 1032;
+/// Memory for what a file says beside its pixels.
+const MOST_BESIDE: usize = 16 << 20;
+
+/// Width and height by the first bytes of a file, where `source` then stands again.
+pub(super) fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32, u32)> {
+    let mut head = Vec::with_capacity(HEAD);
+    let read = source.seek(SeekFrom::End(0)).and_then(|length| {
+        source.rewind()?;
+        source.by_ref().take(HEAD as u64).read_to_end(&mut head)?;
+        source.rewind()?;
+        Ok(length)
+    });
+    let length = read.map_err(|e| Error::io(path, e, "reading the image's header"))?;
+    if head.is_empty() || !SIGNATURE.starts_with(&head[..head.len().min(8)]) {
+        return Err(not_png(path, &head));
+    }
+    if head.len() < HEAD || &head[12..16] != b"IHDR" {
+        return Err(cut_short(path));
+    }
+    let number = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
+    let (width, height) = (number(16), number(20));
+    let refused = |remedy: String| Err(Error::input(path, format!("the header says {width} x {height} pixels"), remedy));
+    if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+        return refused(format!("images of 1 to {MAX_SIDE} pixels a side are accepted"));
+    }
+    // Gray and palettes, RGB, gray with alpha, RGBA.
+    let channels = [1, 0, 3, 1, 2, 0, 4].get(usize::from(head[25])).copied().unwrap_or(0);
+    let row = (u64::from(width) * channels * u64::from(head[24])).div_ceil(8);
+    if row * u64::from(height) > MOST_INFLATION * length {
+        return refused(format!("a file of {length} bytes cannot hold so many: copy or download it again"));
+    }
+    Ok((width, height))
+}
+
+/// A PNG image whose rows can be read.
+pub(super) struct Rows<'p, R: BufRead + Seek> {
+    path: &'p Path,
+    reader: Reader<R>,
+    row: Vec<u8>,
+}
+
+impl<'p, R: BufRead + Seek> Rows<'p, R> {
+    /// Reads what stands before the pixels; `path` names the file in messages.
+    pub fn new(path: &'p Path, source: R) -> Result<Self> {
+        let mut decoder = Decoder::new_with_limits(source, Limits { bytes: MOST_BESIDE });
+        decoder.set_ignore_text_chunk(true);
+        decoder.set_ignore_iccp_chunk(true);
+        // Palettes and fewer than 8 bits become 8 bits, a transparent color becomes alpha.
+        decoder.set_transformations(Transformations::EXPAND);
+        let reader = decoder.read_info().map_err(|e| refused(path, e))?;
+        // Our decoder makes a panic of it at the first row (png 0.18.1, its issue 694).
+        if reader.info().palette.as_ref().is_some_and(|colors| !colors.len().is_multiple_of(3)) {
+            return Err(Error::input(path, "the palette ends within a color", "write it again as PNG"));
+        }
+        Ok(Rows { path, reader, row: Vec::new() })
+    }
+
+    /// The next row, 4 bytes a pixel, and where it belongs; of an interlaced image rows have only some of the pixels. `None` at the end.
+    fn next(&mut self) -> Result<Option<(&[u8], InterlaceInfo)>> {
+        let (color, depth) = self.reader.output_color_type();
+        let Some(row) = self.reader.next_interlaced_row().map_err(|e| refused(self.path, e))? else { return Ok(None) };
+        self.row.clear();
+        match depth {
+            BitDepth::Sixteen => to_rgba(color, row.data().as_chunks::<2>().0, |bytes| rounded(u16::from_be_bytes(bytes)), &mut self.row),
+            _ => to_rgba(color, row.data(), |byte| byte, &mut self.row),
+        }
+        Ok(Some((&self.row, *row.interlace())))
+    }
+
+    /// Decodes the image into `pixels`, 4 bytes for each.
+    pub fn read(mut self, pixels: &mut [u8]) -> Result<()> {
+        let stride = 4 * self.reader.info().width as usize;
+        let mut y = 0;
+        while let Some((row, place)) = self.next()? {
+            match place {
+                InterlaceInfo::Null(_) => {
+                    pixels.chunks_exact_mut(stride).nth(y).into_iter().for_each(|line| line.copy_from_slice(row));
+                    y += 1;
+                }
+                InterlaceInfo::Adam7(place) => png::expand_interlaced_row(pixels, stride, row, &place, 32),
+            }
+        }
+        Ok(())
+    }
+
+    /// Decodes the image and keeps nothing of it.
+    pub fn check(mut self) -> Result<()> {
+        while self.next()?.is_some() {}
+        Ok(())
+    }
+}
+
+/// Appends pixels of any color as RGBA; without alpha they are opaque.
+fn to_rgba<S: Copy>(color: ColorType, samples: &[S], byte: impl Fn(S) -> u8, rgba: &mut Vec<u8>) {
+    match color {
+        ColorType::Grayscale | ColorType::Indexed => {
+            rgba.extend(samples.iter().map(|&gray| byte(gray)).flat_map(|gray| [gray, gray, gray, 255]))
+        }
+        ColorType::GrayscaleAlpha => rgba.extend(samples.as_chunks().0.iter().flat_map(|&[gray, alpha]| {
+            let gray = byte(gray);
+            [gray, gray, gray, byte(alpha)]
+        })),
+        ColorType::Rgb => rgba.extend(samples.as_chunks().0.iter().flat_map(|&[r, g, b]| [byte(r), byte(g), byte(b), 255])),
+        ColorType::Rgba => rgba.extend(samples.iter().map(|&sample| byte(sample))),
+    }
+}
+
+/// 16 bits to 8: value / 257, rounded to nearest.
+fn rounded(value: u16) -> u8 {
+    ((u32::from(value) + 128) / 257) as u8
+}
+
+fn refused(path: &Path, error: DecodingError) -> Error {
+    match error {
+        DecodingError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => cut_short(path),
+        DecodingError::IoError(source) => Error::io(path, source, "reading the image"),
+        DecodingError::LimitsExceeded => {
+            Error::input(path, "what the file says beside its pixels takes too much memory", "write it again as PNG, without metadata")
+        }
+        other => Error::input(path, format!("the image cannot be decoded ({other})"), "write it again as PNG"),
+    }
+}
+
+fn not_png(path: &Path, head: &[u8]) -> Error {
+    let found = match head {
+        [] => "the file is empty",
+        [0xff, 0xd8, ..] => "this is a JPEG image, not a PNG",
+        [b'G', b'I', b'F', ..] => "this is a GIF image, not a PNG",
+        [b'R', b'I', b'F', b'F', ..] => "this is a RIFF file (perhaps WebP), not a PNG",
+        _ => "this is not a PNG image",
+    };
+    Error::input(path, found, "convert it to PNG (gray, RGB or RGBA)")
+}
+
+fn cut_short(path: &Path) -> Error {
+    Error::input(path, "the PNG ends early: it is cut short", "copy or download the file again")
+}

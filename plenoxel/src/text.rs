@@ -1,0 +1,31 @@
+//! Text that others wrote, such as names of files and what files say, made fit to be printed.
+
+/// The text on one line, so that it can do nothing to a terminal but to be read: control characters, line breaks, and marks that change the
+/// direction of writing are escaped as Rust writes them, `\n` and `\u{1b}`. Everything else stays as it is.
+pub fn one_line(text: &str) -> String {
+    let mut line = String::with_capacity(text.len());
+    for c in text.chars() {
+        if is_unprintable(c) { line.extend(c.escape_default()) } else { line.push(c) }
+    }
+    line
+}
+
+/// True for characters that move something on a screen instead of being shown.
+pub(crate) fn is_unprintable(c: char) -> bool {
+    let separator = matches!(c, '\u{2028}' | '\u{2029}');
+    let direction = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    c.is_control() || separator || direction
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_moves_something_is_escaped_and_the_rest_stays() {
+        assert_eq!(one_line("a\x1b[2J\nb\u{9b}c\u{7f}\u{202e}d"), "a\\u{1b}[2J\\nb\\u{9b}c\\u{7f}\\u{202e}d");
+        let harmless = "Größe 1\u{202f}000 ³ – \"x\" \\ 日本";
+        assert_eq!(one_line(harmless), harmless);
+        assert_eq!(one_line(&one_line("\t")), one_line("\t"));
+    }
+}
