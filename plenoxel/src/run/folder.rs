@@ -39,7 +39,7 @@ const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
 /// Endings of what `export` writes.
-const EXPORTED: [&str; 4] = ["vox", "ply", "obj", "glb"];
+const EXPORTED: [&str; 5] = ["vox", "ply", "obj", "glb", "stl"];
 
 impl RunFolder {
     /// The run folder at a path; nothing is read, and nothing needs to be there.
