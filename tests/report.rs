@@ -86,6 +86,43 @@ fn a_carved_run_has_a_page_too() {
 }
 
 #[test]
+fn an_evaluated_carved_run_has_figures_in_the_comparison_and_the_report() {
+    let folder = Folder::new("report-evaluated");
+    let [carved, trained, page] = ["carved", "trained", "page.html"].map(|name| folder.path(name));
+    let data = folder.path("data");
+    plenoxel(&["scene", &data, "--size", "24", "--train", "6", "--val", "1", "--test", "2"]).done();
+    plenoxel(&["carve", &data, "--resolution", "16", "--out", &carved]).done();
+    train("6,1,2", &trained, &["--no-report"]).done();
+    let row = |run: &str| {
+        let said = plenoxel(&["compare", &trained, &carved, "--out", &page]).done();
+        let line = said.lines().find(|line| line.contains(&format!("| {run} "))).unwrap_or_else(|| panic!("{said}")).to_owned();
+        line.split('|').map(|cell| cell.trim().to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(row(&carved)[4..6], ["–", "–"]);
+    // Figures of other images are not those of the run.
+    plenoxel(&["evaluate", &carved, "--downscale", "2"]).json();
+    plenoxel(&["evaluate", &carved, "--split", "train"]).json();
+    assert_eq!(row(&carved)[4..6], ["–", "–"]);
+
+    let evaluated = plenoxel(&["evaluate", &carved]);
+    assert!(evaluated.err.contains("plenoxel compare"), "{}", evaluated.err);
+    let figures = evaluated.json();
+    let (psnr, ssim) = (figures["psnr"].as_f64().unwrap(), figures["ssim"].as_f64().unwrap());
+    assert_eq!(row(&carved)[4..6], [format!("{psnr:.2}"), format!("{ssim:.4}")]);
+    assert_ne!(row(&carved)[6], "–", "the time is that of carving");
+    plenoxel(&["report", &carved]).done();
+    let page = fs::read_to_string(folder.path("carved/report.html")).unwrap();
+    assert!(page.contains(&format!("<b>{psnr:.2} dB</b>")) && page.contains("figures of all 2 test views"));
+
+    // A trained run has its figures, and keeps them.
+    plenoxel(&["evaluate", &trained]).json();
+    assert!(!fs::exists(folder.path("trained/evaluation.json")).unwrap());
+    // A run that is carved again is another one.
+    plenoxel(&["carve", &data, "--resolution", "16", "--out", &carved, "--force"]).done();
+    assert_eq!(row(&carved)[4..6], ["–", "–"]);
+}
+
+#[test]
 fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     let folder = Folder::new("compare");
     let [first, second, page] = ["first", "second", "page.html"].map(|name| folder.path(name));

@@ -90,7 +90,9 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
             report.config.background
         ),
         _ if result.is_null() => "There are no figures that can be read: `plenoxel train --resume` writes them again.".to_owned(),
-        _ => "It was not compared with test views.".to_owned(),
+        _ => {
+            "It was not compared with test views. `plenoxel evaluate` does that; then `plenoxel report` writes this page again.".to_owned()
+        }
     };
     format!(
         "<div class=\"facts\">{}</div>\n<p>{}, {}. {what}</p>",
