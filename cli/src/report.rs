@@ -43,8 +43,8 @@ impl Report<'_> {
         let parts = [
             facts(self, &result),
             scene.figure(),
-            curves::section(&lines, &self.config.stages),
-            pictures::stages(self.folder)?,
+            curves::section(&lines, self.config),
+            pictures::stages(self.folder, &result)?,
             stages(&result),
             pictures::panels(self.folder, &result)?,
             costs(self, &result),
