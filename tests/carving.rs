@@ -307,6 +307,67 @@ fn without_sweeps_a_color_is_the_mean_of_the_pixels_that_show_the_voxel() {
     }
 }
 
+/// How far the colors that are found without sweeps are from the least squares of each voxel by itself, over the pixels that show it, each with
+/// `weight(w)` for its share w of the pixel: the largest of |Σ weight S (p − S x)| / Σ weight over harmonics and channels, in the mean over voxels and at most.
+fn off_the_least_squares(views: &[View], degree: Option<usize>, weight: impl Fn(f64) -> f64) -> [f64; 2] {
+    let mut config = config(24, degree);
+    (config.half_width, config.carve.sweeps, config.carve.ridge) = (HALF_WIDTH, 0, 0.0);
+    let grid = Carving::new(views, &config.carve_options(), &|_| {}).unwrap().color(&|_| {}).grid;
+    let (count, offset) = degree.map_or((1, 0.0), |degree| (sh::count(degree), config.sh_offset));
+    let walk = plenoxel::sampling::walk::Walk::new(grid.aabb(), grid.lattice().nodes());
+    let density = config.carve.depth / grid.shape().voxel_side();
+    // Of each voxel 3 · count sums, then that of the weights.
+    let width = 3 * count + 1;
+    let mut sums = vec![0.0; grid.lattice().rows() * width];
+    for view in views {
+        for (x, y, _) in view.image.enumerate_pixels().filter(|(.., p)| p.0[3] > 0) {
+            let ray = view.camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let target = view.color(x as usize, y as usize, config.background);
+            let d = autograd::Tensor::<f64>::from_vec(ray.direction.to_array().to_vec(), &[1, 3]);
+            let basis = degree.map_or(vec![1.0], |degree| sh::basis(&d, degree).data().to_vec());
+            let mut light = 1.0;
+            let visit = |crossing: plenoxel::sampling::walk::Crossing| {
+                if let Some(row) = grid.lattice().row(crossing.voxel) {
+                    // The voxel behind which hardly any light is left takes all of it.
+                    let behind = light * (-density * (crossing.leave - crossing.enter)).exp();
+                    let behind = if behind < 1.0 / 128.0 { 0.0 } else { behind };
+                    let w = weight(light - behind);
+                    light = behind;
+                    let color = &grid.color.tensor().data()[row as usize * 3 * count..][..3 * count];
+                    let sums = &mut sums[row as usize * width..][..width];
+                    for (c, color) in color.chunks(count).enumerate() {
+                        let seen: f64 = color.iter().zip(&basis).map(|(x, s)| f64::from(*x) * s).sum();
+                        for (k, s) in basis.iter().enumerate() {
+                            sums[c * count + k] += w * s * (f64::from(target[c]) - offset - seen);
+                        }
+                    }
+                    sums[width - 1] += w;
+                }
+                if light == 0.0 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+            };
+            walk.along(&ray, |_| 0, visit);
+        }
+    }
+    let shown = sums.chunks(width).filter(|sums| sums[width - 1] > 0.1);
+    let off: Vec<f64> =
+        shown.map(|sums| sums[..width - 1].iter().fold(0.0, |worst: f64, sum| worst.max(sum.abs())) / sums[width - 1]).collect();
+    assert!(off.len() > 1000);
+    [off.iter().sum::<f64>() / off.len() as f64, off.iter().copied().fold(0.0, f64::max)]
+}
+
+#[test]
+fn without_sweeps_colors_are_least_squares_weighted_by_the_light_that_voxels_give_to_pixels() {
+    let views = small();
+    for degree in [None, Some(1)] {
+        let [mean, worst] = off_the_least_squares(&views, degree, |share| share);
+        let [unweighted, _] = off_the_least_squares(&views, degree, |_| 1.0);
+        println!("degree {degree:?}: {mean:.6} in the mean, at most {worst:.6}; with equal weights {unweighted:.4}");
+        assert!(mean < 1e-4 && worst < 0.01, "degree {degree:?}: {mean}, at most {worst}");
+        // The scene has colors enough: a voxel behind others sees what they show.
+        assert!(unweighted > 0.03, "degree {degree:?}: {unweighted}");
+    }
+}
+
 #[test]
 fn any_number_of_threads_carves_and_colors_to_the_same_bits() {
     let views = small();

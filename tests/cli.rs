@@ -484,7 +484,9 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
     let export = |args: &[&str]| plenoxel(&[&["export"], args].concat());
     export(&["mesh", &run, "--out", &out, "--format", "obj"]).refused(2, &["--out", "fog.GLB", ".obj"]);
     export(&["mesh", &run, "--level", "1e9"]).refused(2, &["--level", "above 0 and below"]);
-    export(&["mesh", &run, "--level", "1e-3", "--min-part", "999999"]).refused(2, &["--min-part", "999999 faces", "the largest part"]);
+    export(&["mesh", &run, "--level", "1e-3", "--max-triangles", "3"]).refused(2, &["--max-triangles", "a whole number from 4"]);
+    let stl = export(&["mesh", &run, "--level", "1e-3", "--format", "stl", "--smooth", "2", "--max-triangles", "100"]);
+    assert!(stl.code == 0 && stl.err.contains("stl files have no colors"), "{}", stl.err);
     // What flags alone can tell is told before a run is looked for.
     let none = folder.path("none");
     for what in ["vox", "mesh"] {
@@ -613,7 +615,7 @@ fn help_mentions_every_command_and_flag() {
         ("export", "ply vox mesh"),
         ("export ply", "--out --color --min-alpha --min-weight --min-object --coords --bbox --sor-sigma Examples:"),
         ("export vox", "--out --color --min-alpha --solid Examples:"),
-        ("export mesh", "--out --color --format --level --min-part Examples:"),
+        ("export mesh", "--out --color --format --level --min-part --smooth --max-triangles Examples:"),
         ("scene", "--width --height --train --val --test --exposure-spread --seed --force Examples:"),
     ] {
         let help = plenoxel(&[command.split(' ').collect(), vec!["--help"]].concat());

@@ -4,6 +4,7 @@
 mod command;
 
 use command::{Answer, Folder};
+use plenoxel::model::plenoxels::config::{ColorKind, Config, Hull, Initial, OptimizerConfig, Sampling, Weight};
 use std::fs;
 
 /// The commands of this file run side by side in one process, where they share one limit of memory.
@@ -208,4 +209,44 @@ fn figures_say_what_they_are_of_and_how_they_are_computed() {
     // What cannot be written is on stdout all the same.
     let answer = plenoxel(&["evaluate", &run, "--json", "--out", &folder.path("none/a.json")]);
     assert!(answer.code == 5 && answer.err.contains("a.json") && answer.out.starts_with("{\"psnr\":"), "{}{}", answer.out, answer.err);
+}
+
+#[test]
+fn the_preset_paper_is_the_plain_grid_of_the_source_paper() {
+    let config = Config::preset("paper").unwrap();
+    let far = 10.0 / 1.2;
+    let stages: Vec<_> = config.stages.iter().map(|s| (s.resolution, s.epochs, s.sampling, s.density_rate, s.color_rate)).collect();
+    let stage = |resolution, epochs, samples| (resolution, Some(epochs), Sampling::Points { samples, far }, 1000.0, 1000.0);
+    assert_eq!(stages, [stage(16, 2.0, 50), stage(32, 4.0, 100), stage(64, 8.0, 200), stage(128, 8.0, 200)]);
+    assert!(config.stages.iter().all(|s| s.steps.is_none() && s.image_reduction == 1 && s.rate_decay == 1.0 && s.density_warm_up == 0));
+    // Squares summed over three channels, and no total variation, as in its program.
+    assert_eq!(config.losses.iter().collect::<Vec<_>>(), [(&"mse".to_owned(), &Weight::Constant(3.0))]);
+    assert_eq!((config.optimizer, config.rays_per_step), (OptimizerConfig::Sgd, 5000));
+    assert_eq!(config.initial, Initial { random: true, density: 1.0, color: 1.0 });
+    assert_eq!((config.downscale, config.half_width, config.color), (8, 1.4, ColorKind::Rgb));
+    assert!(config.project && config.jitter && config.hull == Hull::Off && config.scout.is_none());
+}
+
+#[test]
+fn the_preset_plenoxels_is_svox2_for_synthetic_scenes() {
+    let config = Config::preset("plenoxels").unwrap();
+    let stages: Vec<_> = config.stages.iter().map(|s| (s.resolution, s.steps, s.sampling, s.density_warm_up)).collect();
+    let half_voxels = Sampling::Step { step: 0.5 };
+    assert_eq!(stages, [(256, Some(38_400), half_voxels, 15_000), (512, Some(89_600), half_voxels, 0)]);
+    // Ten epochs of 12 800 batches of 5000 rays.
+    assert_eq!((stages.iter().filter_map(|s| s.1).sum::<u64>(), config.rays_per_step), (128_000, 5000));
+    // Its scene is 2/3 as large: densities are 2/3 of its 0.1, and what acts against a gradient by a density is 3/2.
+    assert!((config.initial.density * 1.5 - 0.1).abs() < 1e-4 && config.initial.color == 0.0 && !config.initial.random);
+    assert_eq!((config.half_width, config.downscale, config.jitter, config.project), (1.5, 1, false, false));
+    assert_eq!(config.optimizer, OptimizerConfig::RmsProp { beta: 0.95, epsilon: 1e-8 });
+    let until = |weight| Weight::Until { weight, until: 38_400 };
+    let losses: Vec<_> = config.losses.iter().map(|(name, weight)| (name.as_str(), *weight)).collect();
+    // 1e-5 · 3/2, and 1e-3 for the sum over 27 numbers of which ours is the mean.
+    assert_eq!(losses, [("mse", Weight::Constant(1.0)), ("tv_color_sampled", until(0.027)), ("tv_density_sampled", until(1.5e-5))]);
+    assert_eq!((config.color, config.sh_degree, config.sh_offset, config.sh_reduction), (ColorKind::Sh, 2, 0.5, 1));
+    assert_eq!(
+        (config.stop_below, config.prune_from_stage, config.prune_below, config.prune_unseen_below),
+        (1e-7, Some(1), 0.0, 0.256 / 512.0)
+    );
+    assert!(config.hull == Hull::Off && !config.aim && config.scout.is_none());
 }

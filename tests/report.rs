@@ -54,6 +54,8 @@ fn a_run_ends_with_a_page_that_holds_its_figures_its_pictures_and_its_grid() {
     }
     assert_eq!(page.matches("data:image/jpeg;base64,").count(), 4, "the stages, and three test views");
     assert_eq!(page.matches("<svg").count(), 8, "four curves over steps, and over seconds");
+    assert_eq!(page.matches("<span>target</span><span>render</span><span>error</span><span>depth</span>").count(), 3);
+    assert!(page.contains("<span>8³</span><span>12³</span><span>photograph</span>"), "the stages have names");
     assert!(page.contains("stages[0]") || page.contains("[[stages]]"), "the settings");
 
     let settings = settings_of(&page);
@@ -83,6 +85,43 @@ fn a_carved_run_has_a_page_too() {
     check_alone(&page);
     assert!(page.contains("carving the hull") && page.contains("<h2>Carved</h2>") && !page.contains("<h2>Curves</h2>"));
     assert_eq!(settings_of(&page)["grid"]["interpolation"], "nearest");
+}
+
+#[test]
+fn an_evaluated_carved_run_has_figures_in_the_comparison_and_the_report() {
+    let folder = Folder::new("report-evaluated");
+    let [carved, trained, page] = ["carved", "trained", "page.html"].map(|name| folder.path(name));
+    let data = folder.path("data");
+    plenoxel(&["scene", &data, "--size", "24", "--train", "6", "--val", "1", "--test", "2"]).done();
+    plenoxel(&["carve", &data, "--resolution", "16", "--out", &carved]).done();
+    train("6,1,2", &trained, &["--no-report"]).done();
+    let row = |run: &str| {
+        let said = plenoxel(&["compare", &trained, &carved, "--out", &page]).done();
+        let line = said.lines().find(|line| line.contains(&format!("| {run} "))).unwrap_or_else(|| panic!("{said}")).to_owned();
+        line.split('|').map(|cell| cell.trim().to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(row(&carved)[4..6], ["–", "–"]);
+    // Figures of other images are not those of the run.
+    plenoxel(&["evaluate", &carved, "--downscale", "2"]).json();
+    plenoxel(&["evaluate", &carved, "--split", "train"]).json();
+    assert_eq!(row(&carved)[4..6], ["–", "–"]);
+
+    let evaluated = plenoxel(&["evaluate", &carved]);
+    assert!(evaluated.err.contains("plenoxel compare"), "{}", evaluated.err);
+    let figures = evaluated.json();
+    let (psnr, ssim) = (figures["psnr"].as_f64().unwrap(), figures["ssim"].as_f64().unwrap());
+    assert_eq!(row(&carved)[4..6], [format!("{psnr:.2}"), format!("{ssim:.4}")]);
+    assert_ne!(row(&carved)[6], "–", "the time is that of carving");
+    plenoxel(&["report", &carved]).done();
+    let page = fs::read_to_string(folder.path("carved/report.html")).unwrap();
+    assert!(page.contains(&format!("<b>{psnr:.2} dB</b>")) && page.contains("figures of all 2 test views"));
+
+    // A trained run has its figures, and keeps them.
+    plenoxel(&["evaluate", &trained]).json();
+    assert!(!fs::exists(folder.path("trained/evaluation.json")).unwrap());
+    // A run that is carved again is another one.
+    plenoxel(&["carve", &data, "--resolution", "16", "--out", &carved, "--force"]).done();
+    assert_eq!(row(&carved)[4..6], ["–", "–"]);
 }
 
 #[test]

@@ -251,11 +251,108 @@ fn small_parts_are_left_out_and_the_others_are_as_they_were() {
     let options = |min_part| MeshOptions { level: Some(50.0), min_part, ..MeshOptions::default() };
     let [all, least, large] = [0, 8, 9].map(|min_part| mesh(&with_specks, &options(min_part)).unwrap());
     assert_eq!(all, least);
+    assert_eq!((all.parts_left_out, large.parts_left_out), (0, 2));
     assert_eq!(all.triangles.len(), large.triangles.len() + 2 * 8);
     assert_closed(&large);
-    assert_eq!(large, mesh(&grid(16, ball, color), &options(0)).unwrap());
-    let error = mesh(&with_specks, &options(1 << 20)).unwrap_err();
-    assert!(error.exit_code() == 2 && error.to_string().contains(&format!("up to {}", large.triangles.len())), "{error}");
+    assert_eq!(large, Mesh { parts_left_out: 2, ..mesh(&grid(16, ball, color), &options(0)).unwrap() });
+    // What is done by itself, and a bound that no part reaches: the largest part stays.
+    assert_eq!(large, mesh(&with_specks, &MeshOptions { level: Some(50.0), ..MeshOptions::default() }).unwrap());
+    assert_eq!(large, mesh(&with_specks, &options(1 << 20)).unwrap());
+}
+
+/// A ball of radius 0.9 as carving leaves it: voxels are opaque or not there.
+fn opaque_ball(center: DVec3) -> VoxelGrid<f64> {
+    let solid = grid(48, |p| if p.distance(center) < 0.9 { 1e4 } else { 0.0 }, |_| [0.5; 3]);
+    let shape = GridShape { interpolation: Interpolation::Nearest, ..*solid.shape() };
+    VoxelGrid::with_lattice(shape, solid.lattice().clone(), solid.density.tensor().clone(), solid.color.tensor().clone())
+}
+
+/// How far a surface is from a sphere of radius 0.9: the mean of its vertices' distances, their standard deviation, and the mean angles in degrees of the
+/// triangles' and of the vertices' normals.
+fn off_the_sphere(surface: &Mesh, center: DVec3) -> [f64; 4] {
+    let places: Vec<DVec3> = surface.positions.iter().map(|p| DVec3::from(p.map(f64::from)) - center).collect();
+    let count = places.len() as f64;
+    let mean = places.iter().map(|p| p.length() - 0.9).sum::<f64>() / count;
+    let variance = places.iter().map(|p| (p.length() - 0.9 - mean).powi(2)).sum::<f64>() / count;
+    let faces = surface.triangles.iter().map(|triangle| {
+        let [a, b, c] = triangle.map(|v| places[v as usize]);
+        (b - a).cross(c - a).angle_between(a + b + c)
+    });
+    let faces = faces.sum::<f64>() / surface.triangles.len() as f64;
+    let normals = places.iter().zip(&surface.normals).map(|(p, n)| p.angle_between(DVec3::from(n.map(f64::from)))).sum::<f64>() / count;
+    [mean, variance.sqrt(), faces.to_degrees(), normals.to_degrees()]
+}
+
+#[test]
+fn voxels_of_a_nearest_grid_end_at_their_faces_and_smoothing_takes_their_steps_away() {
+    let center = DVec3::new(0.013, -0.021, 0.017);
+    let ball = opaque_ball(center);
+    let [steps, smooth] = [0, 10].map(|smooth| mesh(&ball, &MeshOptions { smooth, ..MeshOptions::default() }).unwrap());
+    assert_closed(&smooth);
+    assert_eq!(steps.triangles, smooth.triangles);
+    let side = ball.shape().voxel_side();
+    let [mean, spread, faces, normals] = off_the_sphere(&steps, center);
+    assert!(mean.abs() < 0.01 * side && faces > 20.0 && normals > 6.0, "{mean} {spread} {faces}° {normals}°");
+    let [mean, smooth_spread, smooth_faces, smooth_normals] = off_the_sphere(&smooth, center);
+    assert!(mean.abs() < 0.02 * side, "{mean}");
+    assert!(
+        smooth_spread < 0.6 * spread && smooth_faces < 0.4 * faces && smooth_normals < 0.7 * normals,
+        "{smooth_spread} {smooth_faces}°"
+    );
+    let moved = |surface: &Mesh| {
+        let ways = surface.positions.iter().zip(&steps.positions).flat_map(|(a, b)| [0, 1, 2].map(|axis| (a[axis] - b[axis]).abs()));
+        f64::from(ways.fold(0.0, f32::max))
+    };
+    assert!(moved(&smooth) <= side / 2.0 + 1e-6);
+    let much = mesh(&ball, &MeshOptions { smooth: 300, ..MeshOptions::default() }).unwrap();
+    assert!(moved(&much) <= side / 2.0 + 1e-6);
+}
+
+#[test]
+fn a_decimated_surface_is_closed_and_near_what_it_was() {
+    let center = DVec3::new(0.013, -0.021, 0.017);
+    let ball = grid(48, |p| 50.0 + 100.0 * (0.9 - p.distance(center)), |p| p.to_array().map(|c| 0.5 + c / 4.0));
+    let options = MeshOptions { level: Some(50.0), ..MeshOptions::default() };
+    let whole = mesh(&ball, &options).unwrap();
+    let decimated = |most| mesh(&ball, &MeshOptions { max_triangles: Some(most), ..options }).unwrap();
+    assert_eq!(decimated(whole.triangles.len()), whole);
+    let tenth = decimated(whole.triangles.len() / 10);
+    assert!(tenth.triangles.len() <= whole.triangles.len() / 10 && tenth.triangles.len() + 2 > whole.triangles.len() / 10);
+    assert_closed(&tenth);
+    let side = ball.shape().voxel_side();
+    let [mean, spread, faces, normals] = off_the_sphere(&tenth, center);
+    assert!(mean.abs() < 0.06 * side && spread < 0.03 * side && faces < 3.0 && normals < 3.0, "{mean} {spread} {faces}° {normals}°");
+    // Colors are those of where a vertex is now.
+    for (position, rgb) in tenth.positions.iter().zip(&tenth.colors) {
+        assert!(
+            position.iter().zip(rgb).all(|(p, c)| (f64::from(*c) / 255.0 - 0.5 - f64::from(*p) / 4.0).abs() < 0.03),
+            "{position:?} {rgb:?}"
+        );
+    }
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+    assert_eq!(tenth, pool.install(|| decimated(whole.triangles.len() / 10)));
+    // A closed surface has four triangles at least.
+    assert_eq!(decimated(4).triangles.len(), 4);
+}
+
+#[test]
+fn a_decimated_surface_through_noise_is_closed_and_never_empty() {
+    let shape = GridShape {
+        resolution: 14,
+        half_width: 1.0,
+        interpolation: Interpolation::Trilinear,
+        color: Color::Sh { degree: 1, offset: 0.5 },
+        sh_reduction: 1,
+    };
+    let noise = VoxelGrid::<f32>::random(shape, 1.0, 1.0, 11);
+    let options = MeshOptions { level: Some(0.6), min_part: 0, ..MeshOptions::default() };
+    let whole = mesh(&noise, &options).unwrap().triangles.len();
+    for most in [whole / 2, whole / 4, whole / 20, 4] {
+        match mesh(&noise, &MeshOptions { max_triangles: Some(most), ..options }) {
+            Ok(surface) => assert_closed(&surface),
+            Err(error) => assert!(error.exit_code() == 2 && error.to_string().contains("--min-part"), "{error}"),
+        }
+    }
 }
 
 #[test]
@@ -310,6 +407,18 @@ fn mesh_files_hold_the_mesh() {
     let short = |i: usize| u16::from_le_bytes(glb[colors + 2 * i..colors + 2 * i + 2].try_into().unwrap());
     assert_eq!((short(0), short(2), short(3)), (65535, 0, 65535));
     assert!((f64::from(short(1)) / 65535.0 - 0.2159).abs() < 1e-4);
+
+    let stl = MeshFormat::Stl.encode(&surface, "test").unwrap();
+    assert_eq!(stl.len(), 84 + 50 * triangles);
+    assert!(stl.starts_with(b"binary STL, test ") && !MeshFormat::Stl.has_colors() && MeshFormat::Glb.has_colors());
+    assert_eq!(stl[80..84], (triangles as u32).to_le_bytes());
+    for (facet, triangle) in stl[84..].chunks_exact(50).zip(&surface.triangles) {
+        let vector = |at: usize| [0, 4, 8].map(|k| f32::from_le_bytes(facet[at + k..at + k + 4].try_into().unwrap()));
+        assert_eq!([12, 24, 36].map(vector), triangle.map(|v| surface.positions[v as usize]));
+        let [normal, a] = [vector(0), vector(12)].map(|v| DVec3::from(v.map(f64::from)));
+        assert!((normal.length() - 1.0).abs() < 1e-6 && normal.dot(a) > 0.0 && facet[48..] == [0, 0]);
+    }
+
     // The node's rotation takes the dataset's z to glTF's y.
     let q: Vec<f64> = json["nodes"][0]["rotation"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
     let turned = glam::DQuat::from_array(q.try_into().unwrap()) * DVec3::Z;

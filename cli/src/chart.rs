@@ -4,14 +4,17 @@
 use crate::html::escaped;
 use std::fmt::Write;
 
-const WIDTH: f64 = 900.0;
-const HEIGHT: f64 = 480.0;
+/// Small, so that text is large enough where a page shows it in the width of a phone.
+const WIDTH: f64 = 600.0;
+const HEIGHT: f64 = 380.0;
 /// Of a line of the legend, which is below where there are several curves.
-const LEGEND: f64 = 18.0;
-const LEFT: f64 = 80.0;
-const RIGHT: f64 = 20.0;
+const LEGEND: f64 = 20.0;
+const LEFT: f64 = 88.0;
+const RIGHT: f64 = 24.0;
 const TOP: f64 = 64.0;
 const BOTTOM: f64 = 56.0;
+/// Parts of the horizontal axis that are narrower than this have no room for their names.
+const NARROWEST: f64 = 40.0;
 
 const INK: &str = "#222";
 const FAINT: &str = "#e4e4e4";
@@ -52,13 +55,13 @@ impl Chart {
         let x = |place: f64| LEFT + place / end * (WIDTH - LEFT - RIGHT);
         let on_lines = self.curves.iter().flat_map(|curve| curve.lines.iter().flatten().map(|point| point.1));
         let in_bands = self.curves.iter().flat_map(|curve| curve.band.iter().flat_map(|(_, low, high)| [*low, *high]));
-        let scale = Scale::of(on_lines.chain(in_bands));
+        let scale = Scale::of(on_lines.chain(in_bands), self.up == DECIBELS);
         let mut svg = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {1}\" font-family=\"Helvetica, Arial, sans-serif\" \
-             font-size=\"13\" fill=\"{INK}\">\n<title>{0}</title>\n<rect width=\"{WIDTH}\" height=\"{1}\" fill=\"#fff\"/>\n\
-             <text x=\"{LEFT}\" y=\"24\" font-size=\"16\">{0}</text>\n",
+             font-size=\"15\" fill=\"{INK}\">\n<title>{0}</title>\n<rect width=\"{WIDTH}\" height=\"{1}\" fill=\"#fff\"/>\n\
+             <text x=\"{LEFT}\" y=\"24\" font-size=\"17\">{0}</text>\n",
             escaped(&self.title),
-            HEIGHT + if self.curves.len() > 1 { LEGEND * self.curves.len() as f64 + 4.0 } else { 0.0 },
+            HEIGHT + if self.curves.len() > 1 { LEGEND * self.curves.len() as f64 + 6.0 } else { 0.0 },
         );
         let (bottom, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);
         for (value, label) in scale.ticks() {
@@ -66,7 +69,7 @@ impl Chart {
             line(&mut svg, [LEFT, y, right, y], FAINT, "");
             text(&mut svg, LEFT - 8.0, y + 4.5, "end", &label);
         }
-        for (tick, label) in linear_ticks(0.0, end, 8) {
+        for (tick, label) in linear_ticks(0.0, end, 6) {
             line(&mut svg, [x(tick), bottom, x(tick), bottom + 5.0], INK, "");
             text(&mut svg, x(tick), bottom + 20.0, "middle", &label);
         }
@@ -75,7 +78,9 @@ impl Chart {
                 line(&mut svg, [x(*from), TOP, x(*from), bottom], MARK, " stroke-dasharray=\"4 3\"");
             }
             let to = self.parts.get(i + 1).map_or(end, |next| next.0);
-            text(&mut svg, x(0.5 * (from + to)), TOP - 10.0, "middle", name);
+            if x(to) - x(*from) >= NARROWEST {
+                text(&mut svg, x(0.5 * (from + to)), TOP - 10.0, "middle", name);
+            }
         }
         for (i, curve) in self.curves.iter().enumerate() {
             let color = CURVES[i % CURVES.len()];
@@ -98,7 +103,7 @@ impl Chart {
                 let _ = writeln!(svg, "<polyline points=\"{points}\" fill=\"none\" stroke=\"{color}\" {style}/>");
             }
             if self.curves.len() > 1 {
-                let y = HEIGHT + LEGEND * i as f64;
+                let y = HEIGHT + 6.0 + LEGEND * i as f64;
                 line(&mut svg, [LEFT, y, LEFT + 30.0, y], color, &format!(" stroke-width=\"3\"{dashes}"));
                 text(&mut svg, LEFT + 38.0, y + 4.5, "start", &curve.name);
             }
@@ -108,12 +113,17 @@ impl Chart {
         text(&mut svg, 0.5 * (LEFT + right), HEIGHT - 12.0, "middle", across);
         let y = 0.5 * (TOP + bottom);
         let up = escaped(&self.up) + if scale.logarithmic { " (log scale)" } else { "" };
-        let _ = writeln!(svg, "<text transform=\"translate(20 {y}) rotate(-90)\" text-anchor=\"middle\">{up}</text>\n</svg>");
+        let _ = writeln!(svg, "<text transform=\"translate(16 {y}) rotate(-90)\" text-anchor=\"middle\">{up}</text>\n</svg>");
         svg
     }
 }
 
-/// From values to heights: logarithmic where all of them are positive and they differ by more than a factor of five.
+/// The unit of values that are logarithms.
+pub const DECIBELS: &str = "dB";
+/// The longest logarithmic scale, as a factor: what is smaller lies on its lower end.
+const LONGEST: f64 = 1e4;
+
+/// From values to heights: logarithmic where none of them is negative and those above 0 differ by more than a factor of five, unless they are logarithms.
 struct Scale {
     logarithmic: bool,
     low: f64,
@@ -121,16 +131,16 @@ struct Scale {
 }
 
 impl Scale {
-    fn of(values: impl Iterator<Item = f64> + Clone) -> Self {
+    fn of(values: impl Iterator<Item = f64> + Clone, are_logarithms: bool) -> Self {
         let finite = || values.clone().filter(|value| value.is_finite());
         let low = finite().fold(f64::INFINITY, f64::min);
         let high = finite().fold(f64::NEG_INFINITY, f64::max);
         if low > high {
             return Scale { logarithmic: false, low: 0.0, high: 1.0 };
         }
-        // What touches 0, or is negative, has no logarithm; decibels are one already.
-        if low > 0.0 && high > 5.0 * low {
-            let (low, high) = (low / 1.15, high * 1.15);
+        let least = finite().filter(|value| *value > 0.0).fold(f64::INFINITY, f64::min);
+        if !are_logarithms && low >= 0.0 && high > 5.0 * least {
+            let (low, high) = (least.max(high / LONGEST) / 1.15, high * 1.15);
             return Scale { logarithmic: true, low, high };
         }
         let margin = 0.05 * (high - low).max(1e-6 * high.abs()).max(1e-12);
@@ -210,9 +220,13 @@ mod tests {
 
     #[test]
     fn ticks_are_round_numbers_with_short_labels() {
-        let scale = Scale::of([0.004, 0.11].into_iter());
+        let scale = Scale::of([0.004, 0.11].into_iter(), false);
         let labels: Vec<String> = scale.ticks().into_iter().map(|(_, label)| label).collect();
         assert_eq!(labels, ["0.005", "0.01", "0.02", "0.05", "0.1"]);
+        // Nothing is lost of a curve that begins at 0, and one that all but vanishes does not press the others together.
+        let scale = Scale::of([0.0, 1e-12, 0.01, 1.0].into_iter(), false);
+        assert!(scale.logarithmic && scale.low > 5e-5 && scale.y(0.0) == HEIGHT - BOTTOM && scale.y(0.01) < scale.y(1e-12));
+        assert!(!Scale::of([5.0, 33.0].into_iter(), true).logarithmic && !Scale::of([-1.0, 33.0].into_iter(), false).logarithmic);
         let said = |low, high, most| linear_ticks(low, high, most).into_iter().map(|(_, label)| label).collect::<Vec<_>>();
         assert_eq!(said(0.0, 4400.0, 8), ["0", "1000", "2000", "3000", "4000"]);
         assert_eq!(said(28.2, 30.6, 6), ["28.5", "29.0", "29.5", "30.0", "30.5"]);

@@ -44,8 +44,8 @@ impl Report<'_> {
         let parts = [
             facts(self, &result),
             scene.as_ref().map_or_else(String::new, scene::Scene::figure),
-            curves::section(&lines, &self.config.stages),
-            pictures::stages(self.folder)?,
+            curves::section(&lines, self.config),
+            pictures::stages(self.folder, &result)?,
             stages(&result),
             pictures::panels(self.folder, &result)?,
             costs(self, &result),
@@ -98,7 +98,9 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
             report.config.background
         ),
         _ if result.is_null() => "There are no figures that can be read: `plenoxel train --resume` writes them again.".to_owned(),
-        _ => "It was not compared with test views.".to_owned(),
+        _ => {
+            "It was not compared with test views. `plenoxel evaluate` does that; then `plenoxel report` writes this page again.".to_owned()
+        }
     };
     format!(
         "<div class=\"facts\">{}</div>\n<p>{}, {}. {what}</p>",

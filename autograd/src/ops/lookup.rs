@@ -54,6 +54,7 @@ impl<T: Real> Tensor<T> {
         shape[0] = rows.len();
         let mut out = Buffer::stale(rows.len() * width);
         let table = self.data();
+        // Widths of grids, and 4 and 28, which `benches/ops.rs` measures.
         match width {
             1 => gather_into::<T, 1>(table, rows, &mut out),
             3 => gather_into::<T, 3>(table, rows, &mut out),

@@ -250,8 +250,8 @@ impl<T: Real> Tensor<T> {
             match width {
                 1 => interpolate::<T, 1, _>(table, cells, map, width, chunk),
                 3 => interpolate::<T, 3, _>(table, cells, map, width, chunk),
-                4 => interpolate::<T, 4, _>(table, cells, map, width, chunk),
                 27 => interpolate::<T, 27, _>(table, cells, map, width, chunk),
+                // Of `benches/ops.rs`.
                 28 => interpolate::<T, 28, _>(table, cells, map, width, chunk),
                 _ => interpolate::<T, 0, _>(table, cells, map, width, chunk),
             }

@@ -21,6 +21,8 @@ Examples:
   plenoxel evaluate runs/lego --split val --json
   plenoxel evaluate runs/lego --out lego.json
 
+The figures of a carved run on its test views are kept in its folder, as evaluation.json.
+
 --samples N places N samples on the longest line through the box, and as densely on shorter ones. Runs of the paper preset \
 count samples from the camera to its far limit instead.
 
@@ -97,7 +99,16 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     // Printed first, so that a file that cannot be written takes nothing with it.
     if json { console.result(&line) } else { console.record(&evaluation) }?;
     let file = args.out.iter().filter(|file| !is_stdout(file));
-    file.into_iter().try_for_each(|file| console.write_file(file, (line.clone() + "\n").as_bytes()))
+    file.into_iter().try_for_each(|file| console.write_file(file, (line.clone() + "\n").as_bytes()))?;
+    // A carved run has no figures of its own, nor has one that was trained with --no-evaluate. One that did not end well has none either, and is no run
+    // to compare.
+    if args.run.is_as_trained() && trained.is_object() && !trained["psnr"].is_number() {
+        folder.write_evaluation(&evaluation)?;
+        console.note(
+            "kept in the run's folder: `plenoxel compare` shows these figures, and so does `plenoxel report`, which writes the page again",
+        );
+    }
+    Ok(())
 }
 
 /// What `evaluate` prints last. `seconds` is the training time that the run remembers.

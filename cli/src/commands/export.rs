@@ -20,7 +20,7 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel export ply runs/lego       a colored point cloud: CloudCompare, MeshLab
   plenoxel export vox runs/lego       MagicaVoxel
-  plenoxel export mesh runs/lego      a surface: Blender, and what reads PLY, OBJ or GLB
+  plenoxel export mesh runs/lego      a surface: Blender, and what reads PLY, OBJ, GLB or STL
   plenoxel export ply --help          the settings of one";
 
 /// Write a trained run as files of other programs

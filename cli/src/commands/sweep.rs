@@ -169,11 +169,10 @@ impl Sweep<'_, '_> {
             }
         }
         if job.state() == State::Unevaluated {
-            let figures = match self.process(job, &job.evaluation())? {
-                Ok(figures) => figures,
-                Err(failure) => return Ok(Some(failure)),
-            };
-            job.write_evaluation(&figures)?;
+            // The command keeps its figures in the folder.
+            if let Err(failure) = self.process(job, &job.evaluation())? {
+                return Ok(Some(failure));
+            }
         }
         self.note(job, &said(job));
         Ok(None)

@@ -67,6 +67,11 @@ impl TrainedRun {
         Ok(Found { folder, config, preset: record.preset, source })
     }
 
+    /// Whether it is looked at as figures of a run are defined: its last grid, on whole test views, sampled as its settings say.
+    pub fn is_as_trained(&self) -> bool {
+        !self.best && self.split == Split::Test && self.downscale.is_none() && self.samples.is_none()
+    }
+
     /// Opens its views, of which some must be of the split.
     pub fn views(&self, found: &Found) -> Result<Dataset> {
         let dataset = found.source.reopen(&found.config)?;

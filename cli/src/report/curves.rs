@@ -1,7 +1,7 @@
 //! Loss, PSNR, resolution and rates of a run, or of several, over steps and over seconds.
 
-use crate::chart::{Chart, Curve};
-use plenoxel::model::plenoxels::config::Stage;
+use crate::chart::{Chart, Curve, DECIBELS};
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::metrics::Line;
 use std::collections::BTreeSet;
 
@@ -14,10 +14,10 @@ const AXES: [Axis; 2] =
     [("steps", "training step", |line| line.step as f64 + 1.0), ("seconds", "seconds of training", |line| line.seconds)];
 
 /// The curves of a run, or nothing if there was no training.
-pub fn section(lines: &[Line<'_>], stages: &[Stage]) -> String {
-    let Some(last) = lines.last().filter(|_| !stages.is_empty()) else { return String::new() };
+pub fn section(lines: &[Line<'_>], config: &Config) -> String {
+    let Some(last) = lines.last().filter(|_| !config.stages.is_empty()) else { return String::new() };
     over_both(|(_, across, at)| {
-        let charts = charts(lines).into_iter().map(|(title, up, values)| {
+        let charts = charts(lines, config).into_iter().map(|(title, up, values)| {
             let curves = values.into_iter().map(|(name, value)| curve(&name, lines, at, &*value)).filter(|curve| !curve.lines.is_empty());
             Chart {
                 title: title.to_owned(),
@@ -36,8 +36,8 @@ pub fn side_by_side(runs: &[(String, Vec<Line<'_>>)]) -> String {
     type OfEach = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
     const SHOWN: [OfEach; 4] = [
         ("Loss", "loss", |line| Some(line.loss)),
-        ("PSNR of training rays", "dB", |line| Some(line.psnr)),
-        ("PSNR of validation views", "dB", |line| line.validation_psnr),
+        ("PSNR of training rays", DECIBELS, |line| Some(line.psnr)),
+        ("PSNR of validation views", DECIBELS, |line| line.validation_psnr),
         ("Voxels", "number", |line| line.figure("voxels").filter(|n| *n > 0.0)),
     ];
     if runs.iter().all(|(_, lines)| lines.is_empty()) {
@@ -76,23 +76,26 @@ fn over_both(charts: impl Fn(Axis) -> Vec<Chart>) -> String {
 type Value<'a> = Box<dyn Fn(&Line<'_>) -> Option<f64> + 'a>;
 
 /// Title, vertical axis and curves of a chart.
-type Shown = (&'static str, &'static str, Vec<(String, Value<'static>)>);
+type Shown<'a> = (&'static str, &'static str, Vec<(String, Value<'a>)>);
 
-fn charts(lines: &[Line<'_>]) -> Vec<Shown> {
-    let whole: Vec<(String, Value<'static>)> = vec![("loss".to_owned(), Box::new(|line| Some(line.loss)))];
+fn charts<'a>(lines: &[Line<'_>], config: &'a Config) -> Vec<Shown<'a>> {
+    let whole: Vec<(String, Value<'a>)> = vec![("loss".to_owned(), Box::new(|line| Some(line.loss)))];
     let names: BTreeSet<String> = lines.iter().flat_map(|line| line.losses.keys().map(|name| name.to_string())).collect();
+    // As it counts in the sum. A loss that the settings do not know was added by a program, with a weight that is not known.
     let each = names.into_iter().map(|name| {
-        let key = name.clone();
-        (name, Box::new(move |line: &Line<'_>| line.losses.get(key.as_str()).copied()) as Value<'static>)
+        let (key, weight) = (name.clone(), config.losses.get(&name));
+        let shown = if weight.is_some() { name } else { format!("{name}, without its weight") };
+        let counted = move |line: &Line<'_>| Some(line.losses.get(key.as_str())? * weight.map_or(1.0, |weight| weight.at(line.step)));
+        (shown, Box::new(counted) as Value<'a>)
     });
     // One loss is the whole.
     let each: Vec<_> = each.collect();
     let losses = if each.len() > 1 { whole.into_iter().chain(each).collect() } else { whole };
     vec![
-        ("Loss", "loss", losses),
+        ("Loss, and its parts with their weights", "loss", losses),
         (
             "PSNR",
-            "dB",
+            DECIBELS,
             vec![
                 ("training rays".to_owned(), Box::new(|line| Some(line.psnr))),
                 ("validation views".to_owned(), Box::new(|line| line.validation_psnr)),
@@ -145,4 +148,33 @@ fn parts(lines: &[Line<'_>], at: fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
         part
     });
     parts.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use plenoxel::model::plenoxels::config::Weight;
+    use plenoxel::run::metrics;
+
+    #[test]
+    fn parts_of_the_loss_are_shown_as_they_count_in_it() {
+        let mut config = Config::default();
+        config.losses =
+            [("mse", Weight::Constant(1.0)), ("sparsity", Weight::Until { weight: 0.01, until: 5 })].map(|(n, w)| (n.to_owned(), w)).into();
+        let line = |step: u64| {
+            format!(
+                r#"{{"step":{step},"stage":0,"ends_stage":false,"loss":0.6,"losses":{{"mse":0.5,"sparsity":10.0,"mine":2.0}},"psnr":3.0,"rays":1,"samples":1,"seconds":1.0}}"#
+            )
+        };
+        let text = [4, 5].map(line).join("\n");
+        let lines: Vec<Line<'_>> = metrics::lines(&text).map(|(_, line)| line).collect();
+        let (_, _, values) = charts(&lines, &config).swap_remove(0);
+        let shown: Vec<(&str, Vec<Option<f64>>)> =
+            values.iter().map(|(name, value)| (name.as_str(), lines.iter().map(&**value).collect())).collect();
+        let both = |a, b| vec![Some(a), Some(b)];
+        assert_eq!(
+            shown,
+            [("loss", both(0.6, 0.6)), ("mine, without its weight", both(2.0, 2.0)), ("mse", both(0.5, 0.5)), ("sparsity", both(0.1, 0.0)),]
+        );
+    }
 }

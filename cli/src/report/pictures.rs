@@ -11,17 +11,29 @@ use std::path::Path;
 /// Pictures are at most so wide and so high, in pixels: the files beside the report are whole.
 pub const LARGEST: [u32; 2] = [4000, 400];
 
+/// What the pictures of a panel show, from left to right.
+const PANEL: [&str; 4] = ["target", "render", "error", "depth"];
+
 /// The stages of the run side by side, or what was carved.
-pub fn stages(folder: &RunFolder) -> Result<String> {
+pub fn stages(folder: &RunFolder, result: &Value) -> Result<String> {
     let what = [
         ("stages.png", "Stages", "One view at the end of each stage, and its photograph."),
         ("carved.png", "Carved", "What some cameras see."),
     ];
     let Some((name, title, caption)) = what.into_iter().find(|(name, ..)| folder.image(name).exists()) else { return Ok(String::new()) };
-    Ok(format!(
-        "<section><h2>{title}</h2>\n<figure>{}<figcaption>{caption}</figcaption></figure></section>",
-        embedded(&folder.image(name), title)?
-    ))
+    let stages = result["stages"].as_array().into_iter().flatten().map(|stage| format!("{}³", stage["resolution"]));
+    // The photograph is of the first test view.
+    let photograph = result["views"].as_u64().filter(|views| *views > 0).map(|_| "photograph".to_owned());
+    let labels: Vec<String> = if name == "stages.png" { stages.chain(photograph).collect() } else { Vec::new() };
+    let picture = embedded(&folder.image(name), title)?;
+    Ok(format!("<section><h2>{title}</h2>\n{}</section>", strip(&picture, &labels, caption, "")))
+}
+
+/// Pictures side by side with a label below each, and a caption; `more` are attributes.
+fn strip(picture: &str, labels: &[impl AsRef<str>], caption: &str, more: &str) -> String {
+    let labels: String = labels.iter().map(|label| format!("<span>{}</span>", label.as_ref())).collect();
+    let labels = if labels.is_empty() { labels } else { format!("<div class=\"parts\">{labels}</div>") };
+    format!("<figure{more}><div class=\"strip\">{picture}{labels}</div><figcaption>{caption}</figcaption></figure>\n")
 }
 
 /// Test views as target | render | error | depth, each with its figures, and the figures of those without a picture.
@@ -40,7 +52,7 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
         if path.exists() {
             let caption = format!("{name_shown}: {psnr} dB, SSIM {ssim}");
             let picture = embedded(&path, &caption)?;
-            let _ = writeln!(figures, "<figure data-psnr=\"{order}\">{picture}<figcaption>{caption}</figcaption></figure>");
+            figures += &strip(&picture, &PANEL, &caption, &format!(" data-psnr=\"{order}\""));
         }
     }
     let order = "<label>order <select id=\"order\"><option value=\"\">as they are</option><option value=\"1\">worst first</option>\
@@ -48,8 +60,8 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
     let pictures = match figures.is_empty() {
         true => String::new(),
         false => format!(
-            "<p>Target, render, error and depth. Error is the absolute difference averaged over channels, black at 0, pale yellow at 0.25 and \
-             above. Depth is red where near and blue where far. {order}</p>\n<div id=\"panels\">\n{figures}</div>\n"
+            "<p>Error is the absolute difference averaged over channels, black at 0, pale yellow at 0.25 and above. \
+             Depth is red where near and blue where far. {order}</p>\n<div id=\"panels\">\n{figures}</div>\n"
         ),
     };
     Ok(format!(

@@ -69,9 +69,10 @@ impl Scene {
     pub fn figure(&self) -> String {
         let [width, height] = self.size;
         format!(
-            "<section><h2>Look around</h2>\n<figure id=\"viewer\"><canvas tabindex=\"0\" style=\"aspect-ratio: {width} / {height}\" \
+            "<section><h2>Look around</h2>\n<figure id=\"viewer\"><canvas tabindex=\"0\" style=\"--shape: calc({height} / {width})\" \
              aria-label=\"interactive view of the trained grid\"></canvas>\n<figcaption>Drag to turn, wheel or pinch to zoom, shift and drag or two \
-             fingers to move; arrow keys, + and −. <label>begin at <select></select></label> <button type=\"button\">save picture</button><br>\n\
+             fingers to move; arrow keys, + and −. <label>begin at <select></select></label> <button type=\"button\" \
+             id=\"fill\">full screen</button> <button type=\"button\" id=\"save\">save picture</button><br>\n\
              <output></output><br>{}</figcaption></figure></section>",
             escaped(&self.note())
         )

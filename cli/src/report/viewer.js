@@ -99,6 +99,32 @@ function half(x) {
   return exponent > 30 ? sign | 0x7bff : sign | exponent << 10 | bits >> 13 & 0x3ff;
 }
 
+// The textures of a grid from its bytes: mean colors and densities as half floats, and harmonics as bytes, four to a texel, in slabs.
+function readGrid(grid, bytes, most) {
+  let at = 0;
+  const reader = { take: n => bytes.subarray(at, at += n) };
+  const places = readPlaces(reader, grid.resolution), n = grid.voxels;
+  const low = reader.take(n), high = reader.take(n), means = [0, 1, 2].map(() => reader.take(n));
+  const dense = v => high[v] < 128 && (high[v] | low[v]) > 0;
+  const atlas = buildAtlas(places, dense, most);
+  const y0 = grid.degree === null ? 1 : 0.28209479177387814;
+  const table = means.map((_, c) => Uint16Array.from({ length: 256 }, (_, b) => half(y0 * (grid.zeros[c] + b * grid.steps[c]))));
+  const texels = new Uint16Array(4 * atlas.size[0] * atlas.size[1] * atlas.size[2]);
+  atlas.each((place, v) => {
+    for (let c = 0; c < 3; c++) texels[4 * place + c] = table[c][means[c][v]];
+    texels[4 * place + 3] = low[v] | high[v] << 8;
+  });
+  return { atlas, texels, harmonics: grid.harmonics ? readHarmonics(grid.harmonics, reader, places, most) : null };
+}
+
+function readHarmonics({ resolution, reduction, voxels, steps }, reader, places, most) {
+  const own = reduction === 1 ? places : readPlaces(reader, resolution), slabs = Math.ceil(steps.length / 4);
+  const values = steps.map(() => reader.take(voxels)), atlas = buildAtlas(own, () => true, most, slabs);
+  const [w, h, d] = atlas.size, slab = 4 * w * h * d, texels = new Uint8Array(slabs * slab).fill(128);
+  atlas.each((place, v) => values.forEach((bytes, f) => { texels[(f >> 2) * slab + 4 * place + (f & 3)] = bytes[v]; }));
+  return { atlas, texels, slabs };
+}
+
 const PASS = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
@@ -209,6 +235,9 @@ void main() {
 }`;
 }
 
+// How many pixels of a picture of this size show one pixel of a camera, if all that the camera sees is to be in it.
+const fitted = (camera, width, height) => Math.min(width / camera.width, height / camera.height);
+
 // What a scene looks like from anywhere.
 class Renderer {
   constructor(canvas, scene, bytes) {
@@ -216,19 +245,7 @@ class Renderer {
     if (!gl) throw new Error('this browser has no WebGL2');
     Object.assign(this, { gl, canvas, scene, targets: new Map() });
     const { grid } = scene, most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
-    let at = 0;
-    const reader = { take: n => bytes.subarray(at, at += n) };
-    const places = readPlaces(reader, grid.resolution), n = grid.voxels;
-    const low = reader.take(n), high = reader.take(n), means = [0, 1, 2].map(() => reader.take(n));
-    const dense = v => high[v] < 128 && (high[v] | low[v]) > 0;
-    const atlas = buildAtlas(places, dense, most);
-    const y0 = grid.degree === null ? 1 : 0.28209479177387814;
-    const table = means.map((_, c) => Uint16Array.from({ length: 256 }, (_, b) => half(y0 * (grid.zeros[c] + b * grid.steps[c]))));
-    const texels = new Uint16Array(4 * atlas.size[0] * atlas.size[1] * atlas.size[2]);
-    atlas.each((place, v) => {
-      for (let c = 0; c < 3; c++) texels[4 * place + c] = table[c][means[c][v]];
-      texels[4 * place + 3] = low[v] | high[v] << 8;
-    });
+    const { atlas, texels, harmonics } = readGrid(grid, bytes, most);
     const filter = grid.interpolation === 'nearest' ? gl.NEAREST : gl.LINEAR;
     this.textures = {
       links: this.texture([atlas.side, atlas.side, atlas.side], gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, atlas.links, gl.NEAREST),
@@ -236,23 +253,17 @@ class Renderer {
     };
     const uniforms = this.uniforms = { atlasSize: atlas.size, resolution: grid.resolution, halfWidth: grid.half_width, offset: grid.offset,
       background: scene.background };
-    let slabs = 0;
-    if (grid.harmonics) {
-      const { resolution, reduction, voxels, steps } = grid.harmonics;
-      const own = reduction === 1 ? places : readPlaces(reader, resolution);
-      slabs = Math.ceil(steps.length / 4);
-      const values = steps.map(() => reader.take(voxels)), larger = buildAtlas(own, () => true, most, slabs);
-      const [w, h, d] = larger.size, slab = 4 * w * h * d, texels = new Uint8Array(slabs * slab).fill(128);
-      larger.each((place, v) => values.forEach((bytes, f) => { texels[(f >> 2) * slab + 4 * place + (f & 3)] = bytes[v]; }));
-      this.textures.harmonicLinks = this.texture([larger.side, larger.side, larger.side], gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT,
-        larger.links, gl.NEAREST);
-      this.textures.harmonics = this.texture([w, h, slabs * d], gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, texels, filter);
-      Object.assign(uniforms, { harmonicSize: [w, h, slabs * d], slab: d, harmonicResolution: resolution, reduction,
-        steps: Array.from({ length: 4 * slabs }, (_, f) => steps[f] || 0) });
+    if (harmonics) {
+      const { side, links, size: [w, h, d] } = harmonics.atlas, size = [w, h, harmonics.slabs * d];
+      this.textures.harmonicLinks = this.texture([side, side, side], gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, links, gl.NEAREST);
+      this.textures.harmonics = this.texture(size, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, harmonics.texels, filter);
+      const { resolution, reduction, steps } = grid.harmonics;
+      Object.assign(uniforms, { harmonicSize: size, slab: d, harmonicResolution: resolution, reduction,
+        steps: Array.from({ length: 4 * harmonics.slabs }, (_, f) => steps[f] || 0) });
     }
     if (scene.sampling.step) uniforms.stepLength = scene.sampling.step * 2 * grid.half_width / grid.resolution;
     else Object.assign(uniforms, { stepLength: 1, points: [scene.sampling.samples, scene.sampling.far] });
-    this.link(shader(scene, slabs));
+    this.link(shader(scene, harmonics ? harmonics.slabs : 0));
   }
 
   texture([w, h, d], format, kind, type, data, filter) {
@@ -311,7 +322,7 @@ class Renderer {
 
   // Draws rows `from` to `to` of what a camera sees, and waits for them. Returns milliseconds.
   draw(camera, target, from = 0, to = target.height) {
-    const { gl } = this, begin = performance.now(), scale = target.height / camera.height;
+    const { gl } = this, begin = performance.now(), scale = fitted(camera, target.width, target.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.viewport(0, 0, target.width, target.height);
     gl.enable(gl.SCISSOR_TEST);
@@ -320,8 +331,8 @@ class Renderer {
     this.set('eye', camera.eye);
     this.set('height', target.height);
     // The picture's middle stays the middle, whatever the shape of the target.
-    const middle = 0.5 * target.width - scale * 0.5 * camera.width;
-    this.set('lens', [camera.fx * scale, camera.fy * scale, camera.cx * scale + middle, camera.cy * scale]);
+    const [left, above] = [0.5 * (target.width - scale * camera.width), 0.5 * (target.height - scale * camera.height)];
+    this.set('lens', [camera.fx * scale, camera.fy * scale, camera.cx * scale + left, camera.cy * scale + above]);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.disable(gl.SCISSOR_TEST);
     gl.readPixels(0, target.height - to, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
@@ -431,7 +442,7 @@ class Viewer {
     canvas.addEventListener('pointermove', e => {
       const old = fingers.get(e.pointerId);
       if (!old) return;
-      const before = fingers.size > 1 && span(), share = camera.height / canvas.clientHeight;
+      const before = fingers.size > 1 && span(), share = 1 / fitted(camera, canvas.clientWidth, canvas.clientHeight);
       const [dx, dy] = [(e.clientX - old[0]) * share, (e.clientY - old[1]) * share];
       fingers.set(e.pointerId, [e.clientX, e.clientY]);
       if (fingers.size > 1) { camera.zoom(before / Math.max(1, span())); camera.shift(dx / 2, -dy / 2); }
@@ -450,7 +461,10 @@ class Viewer {
     const select = figure.querySelector('select');
     select.append(...scene.views.map((view, i) => new Option(view.name, i)));
     select.addEventListener('change', () => { camera.from(scene.views[select.value]); this.moved(); });
-    figure.querySelector('button').addEventListener('click', () => this.save());
+    figure.querySelector('#save').addEventListener('click', () => this.save());
+    const fill = figure.querySelector('#fill');
+    fill.hidden = !document.fullscreenEnabled;
+    fill.addEventListener('click', () => { canvas.requestFullscreen().then(() => canvas.focus(), error => { this.status.textContent = error.message; }); });
   }
 
   // Something has moved: to be drawn at the next frame.
@@ -509,7 +523,8 @@ class Viewer {
   }
 }
 
-(async () => {
+// What is above can be tested where there is no page.
+if (typeof document !== 'undefined') (async () => {
   const figure = document.getElementById('viewer');
   try {
     const scene = JSON.parse(document.getElementById('scene').textContent);

@@ -7,13 +7,18 @@
 //!
 //! Outside of the box there is nothing, so a surface that reaches it is closed on its faces. Planes of centres are taken two at a time:
 //! memory is that of the grid, the mesh, and a few arrays of resolution².
+//!
+//! What was found may then lose its small parts (`mesh/parts.rs`), its steps (`mesh/smoothing.rs`), and triangles (`mesh/decimation.rs`). It stays
+//! closed.
 
 mod cases;
+mod decimation;
 mod parts;
+mod smoothing;
 
 use super::{SURFACE_ALPHA, directions, near_colors};
 use crate::error::{Error, Result};
-use crate::field::voxel_grid::VoxelGrid;
+use crate::field::voxel_grid::{Interpolation, VoxelGrid};
 use autograd::{Real, parallel};
 use cases::{CORNERS, EDGES};
 use glam::DVec3;
@@ -29,6 +34,8 @@ pub struct Mesh {
     pub colors: Vec<[u8; 3]>,
     /// Vertices of each triangle, counterclockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
+    /// Number of parts that were left out because they had fewer triangles than [`MeshOptions::min_part`].
+    pub parts_left_out: usize,
 }
 
 impl Mesh {
@@ -40,24 +47,37 @@ impl Mesh {
 }
 
 /// Which surface, and its colors.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub struct MeshOptions {
     /// The density on the surface, 1 / world length; `None` is where a voxel absorbs [`SURFACE_ALPHA`].
     pub level: Option<f64>,
     /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each vertex against its normal.
     pub direction: Option<DVec3>,
-    /// The least triangles of a part that is kept. Parts hang together by common vertices: specks are some, and so are the walls of hollows.
+    /// The least triangles of a part that is kept; the largest part is kept always. Parts hang together by common vertices: specks are some, and
+    /// so are the walls of hollows.
     pub min_part: usize,
+    /// Passes of smoothing over positions and normals. No vertex moves by more than half a voxel along each axis.
+    pub smooth: usize,
+    /// Edges are collapsed until no more triangles than these are left, or until each collapse that is left would join or tear the surface.
+    pub max_triangles: Option<usize>,
+}
+
+impl Default for MeshOptions {
+    /// The level of [`SURFACE_ALPHA`], colors against the normals, no parts of fewer than 100 triangles, and neither smoothing nor decimation.
+    fn default() -> Self {
+        MeshOptions { level: None, direction: None, min_part: 100, smooth: 0, max_triangles: None }
+    }
 }
 
 /// The surface on which the density of a grid has a level.
 ///
-/// Densities are read on the lines between neighbouring centres, linearly. That is what a trilinear grid renders; of a nearest grid it rounds the
-/// corners off. Normals are [`VoxelGrid::outward`], interpolated. A vertex has the color that a camera sees there.
+/// Of a trilinear grid, densities are read linearly on the lines between neighbouring centres, as they are rendered. Of a nearest grid a vertex lies
+/// halfway, on the face between two voxels; the corners are rounded off. Normals are [`VoxelGrid::outward`], interpolated. A vertex has the color that
+/// a camera sees there.
 ///
 /// The result does not depend on the number of threads.
 ///
-/// Errors: the level is not positive, or no voxel is denser; no part has so many triangles.
+/// Errors: the level is not positive, or no voxel is denser.
 pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh> {
     let shape = grid.shape();
     let level = options.level.unwrap_or_else(|| shape.density_of_alpha(SURFACE_ALPHA));
@@ -72,8 +92,14 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
         };
         return Err(Error::config("level", format!("{level:.4}"), accepted));
     }
-    let Surface { crossings, triangles } = surface(grid, level).without_parts_below(options.min_part)?;
-    let vertices = parallel::map_indices(crossings.len(), |v| crossings[v].vertex(grid, level));
+    let mut surface = surface(grid, level);
+    let parts_left_out = surface.leave_out_parts_below(options.min_part);
+    let Surface { crossings, mut triangles } = surface;
+    let mut vertices = parallel::map_indices(crossings.len(), |v| crossings[v].vertex(grid, level));
+    smoothing::smooth(&mut vertices, &triangles, options.smooth, shape.voxel_side() / 2.0);
+    if let Some(most) = options.max_triangles {
+        (vertices, triangles) = decimation::decimate(vertices, triangles, most)?;
+    }
     let rows: Vec<u32> = vertices.iter().map(|vertex| vertex.row).collect();
     let [points, normals] = [|v: &Vertex| v.position, |v: &Vertex| v.normal].map(|part| vertices.iter().map(part).collect::<Vec<_>>());
     let colors = near_colors(grid, &points, &directions(&normals, options.direction), &rows);
@@ -82,6 +108,7 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
         normals: normals.iter().map(|normal| normal.as_vec3().to_array()).collect(),
         colors,
         triangles,
+        parts_left_out,
     })
 }
 
@@ -93,6 +120,7 @@ struct Crossing {
 }
 
 /// What is known of a vertex.
+#[derive(Clone, Copy)]
 struct Vertex {
     position: DVec3,
     normal: DVec3,
@@ -113,10 +141,11 @@ impl Crossing {
         });
         let [a, b] = ends.map(|end| grid.density_at(end));
         let n = grid.shape().resolution as isize;
-        let t = match ends.as_flattened().iter().all(|k| (0..n).contains(k)) {
-            true => ((level - a) / (b - a)).clamp(NEAREST, 1.0 - NEAREST),
-            // The border voxel fills its outer half: matter ends at the face of the box.
-            false => 0.5,
+        let inside = ends.as_flattened().iter().all(|k| (0..n).contains(k));
+        let t = match grid.shape().interpolation {
+            Interpolation::Trilinear if inside => ((level - a) / (b - a)).clamp(NEAREST, 1.0 - NEAREST),
+            // Voxels of a nearest grid end at their faces, as those of the border do, whose outer half has no look-up.
+            Interpolation::Trilinear | Interpolation::Nearest => 0.5,
         };
         let [from, to] = ends.map(|end| grid.shape().center(end));
         let [dense, thin] = if a > b { [0, 1] } else { [1, 0] };

@@ -1,7 +1,8 @@
-//! A mesh as the bytes of a file: PLY, OBJ or binary glTF.
+//! A mesh as the bytes of a file: PLY, OBJ, binary glTF or STL.
 
 use super::mesh::Mesh;
 use crate::error::{Error, Result};
+use glam::DVec3;
 use serde_json::{Value, json};
 use std::fmt::{self, Display, Write};
 use std::str::FromStr;
@@ -16,11 +17,18 @@ pub enum MeshFormat {
     /// Binary glTF 2.0. Positions are the dataset's, and the node that holds them is turned so that the dataset's z is glTF's y, which is up. The
     /// material is unlit, for the colors have the light in them already, and colors are linear, as glTF demands.
     Glb,
+    /// Binary STL, z up: triangles alone, each with its own normal. The format has no colors.
+    Stl,
 }
 
 impl MeshFormat {
     /// All of them.
-    pub const ALL: [Self; 3] = [MeshFormat::Ply, MeshFormat::Obj, MeshFormat::Glb];
+    pub const ALL: [Self; 4] = [MeshFormat::Ply, MeshFormat::Obj, MeshFormat::Glb, MeshFormat::Stl];
+
+    /// Whether files of this format hold colors.
+    pub fn has_colors(self) -> bool {
+        self != MeshFormat::Stl
+    }
 
     /// The bytes of a file of this format. `comment` says where the mesh is from, on one line.
     ///
@@ -30,6 +38,7 @@ impl MeshFormat {
             MeshFormat::Ply => Ok(ply(mesh, comment)),
             MeshFormat::Obj => Ok(obj(mesh, comment)),
             MeshFormat::Glb => glb(mesh, comment),
+            MeshFormat::Stl => stl(mesh, comment),
         }
     }
 }
@@ -41,6 +50,7 @@ impl Display for MeshFormat {
             MeshFormat::Ply => "ply",
             MeshFormat::Obj => "obj",
             MeshFormat::Glb => "glb",
+            MeshFormat::Stl => "stl",
         })
     }
 }
@@ -50,7 +60,7 @@ impl FromStr for MeshFormat {
 
     fn from_str(text: &str) -> Result<Self> {
         let known = Self::ALL.into_iter().find(|format| format.to_string().eq_ignore_ascii_case(text));
-        known.ok_or_else(|| Error::config("format", format!("\"{text}\""), "ply, obj, glb"))
+        known.ok_or_else(|| Error::config("format", format!("\"{text}\""), "ply, obj, glb, stl"))
     }
 }
 
@@ -162,6 +172,26 @@ fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
     let word = |n: usize| (n as u32).to_le_bytes();
     let header = [b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes()].concat();
     Ok([header.as_slice(), &word(text.len()), b"JSON", &text, &word(binary.len()), b"BIN\0", &binary].concat())
+}
+
+fn stl(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
+    let Ok(count) = u32::try_from(mesh.triangles.len()) else {
+        let found = format!("stl, for a mesh of {} triangles,", mesh.triangles.len());
+        return Err(Error::config("format", found, "ply or obj: STL ends at 4294967295 triangles"));
+    };
+    // The word "solid" at the beginning would make it a text for many programs.
+    let mut file = format!("binary STL, {comment}").into_bytes();
+    file.resize(80, b' ');
+    file.extend(count.to_le_bytes());
+    file.reserve(50 * mesh.triangles.len());
+    for triangle in &mesh.triangles {
+        let corners = triangle.map(|v| mesh.positions[v as usize]);
+        let [a, b, c] = corners.map(|corner| DVec3::from(corner.map(f64::from)));
+        let normal = (b - a).cross(c - a).normalize_or_zero().as_vec3().to_array();
+        file.extend([normal].iter().chain(&corners).flatten().flat_map(|x| x.to_le_bytes()));
+        file.extend([0; 2]);
+    }
+    Ok(file)
 }
 
 /// An sRGB byte as 16 bits of linear light (IEC 61966-2-1).

@@ -43,7 +43,7 @@ const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
 /// Endings of what `export` writes.
-const EXPORTED: [&str; 4] = ["vox", "ply", "obj", "glb"];
+const EXPORTED: [&str; 5] = ["vox", "ply", "obj", "glb", "stl"];
 
 /// The place of a run folder that will be created.
 #[derive(Debug)]
@@ -272,15 +272,20 @@ impl RunFolder {
         self.read_json(EVALUATION)
     }
 
-    /// The final figures, with those of an evaluation where the final ones are without test views.
+    /// The final figures, with those of an evaluation where the final ones are without test views: of a carved run, or of one trained without evaluation.
     ///
     /// Errors as for [`RunFolder::result`].
     pub fn figures(&self) -> Result<Option<serde_json::Value>> {
         let Some(mut all) = self.result()? else { return Ok(None) };
         if let (Some(all), Some(serde_json::Value::Object(evaluation))) = (all.as_object_mut(), self.evaluation()?) {
-            for (key, value) in evaluation {
+            // What training or carving took stays; a run of `--no-evaluate` has the keys of figures without values.
+            const OF_THE_RUN: [&str; 2] = ["seconds_load", "peak_memory_bytes"];
+            let replaced = |key: &str| !all.get("psnr").is_some_and(serde_json::Value::is_number) && !OF_THE_RUN.contains(&key);
+            let (replaced, added): (Vec<_>, Vec<_>) = evaluation.into_iter().partition(|(key, _)| replaced(key));
+            for (key, value) in added {
                 all.entry(key).or_insert(value);
             }
+            all.extend(replaced);
         }
         Ok(Some(all))
     }

@@ -46,7 +46,7 @@ pub fn section(runs: &[Run]) -> Result<String> {
 
 /// File name and PSNR of the test views of a run.
 fn panels(run: &Run) -> Result<Vec<(String, f64)>> {
-    let result = run.folder.result()?.unwrap_or_default();
+    let result = run.folder.figures()?.unwrap_or_default();
     let views = result["per_view"].as_array().into_iter().flatten().enumerate();
     let named = views.filter_map(|(number, view)| Some((RunFolder::panel_name(number, view["name"].as_str()?), view["psnr"].as_f64()?)));
     Ok(named.collect())

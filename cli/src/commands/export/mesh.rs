@@ -12,10 +12,13 @@ const EXAMPLES: &str = "\
 Examples:
   plenoxel export mesh runs/lego
   plenoxel export mesh runs/lego --format glb
-  plenoxel export mesh runs/lego --level 20 --min-part 100 --out lego.obj
+  plenoxel export mesh runs/lego --level 20 --min-part 1000 --out lego.obj
+  plenoxel export mesh runs/lego --smooth 10 --max-triangles 200000
+  plenoxel export mesh runs/lego --format stl              for printers; without colors
 
 Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the dataset's coordinates, z up. GLB files turn \
-it, for glTF has y up. A higher level takes fog away, and thin parts with it.";
+it, for glTF has y up. A higher level takes fog away, and thin parts with it. Small parts go first, then the surface is smoothed, then \
+decimated.";
 
 /// Write the surface of a run as a colored mesh
 #[derive(Debug, Args)]
@@ -27,7 +30,7 @@ pub struct MeshArgs {
     #[command(flatten)]
     colors: SurfaceColors,
 
-    /// ply, obj or glb [default: as --out ends, else ply]
+    /// ply, obj, glb or stl [default: as --out ends, else ply]
     #[arg(long, value_name = "FORMAT", help_heading = "Output", value_parser = format)]
     format: Option<MeshFormat>,
 
@@ -35,9 +38,17 @@ pub struct MeshArgs {
     #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE))]
     level: Option<f64>,
 
-    /// Leave out separate parts of fewer triangles than this: specks of fog, and hollows that nobody sees
-    #[arg(long, value_name = "FACES", help_heading = "Surface", default_value_t = MeshOptions::default().min_part, value_parser = whole::<usize>(0, u64::from(u32::MAX)))]
+    /// Leave out separate parts of fewer triangles than this, specks of fog and hollows that nobody sees; 0 keeps all. The largest part stays
+    #[arg(long, value_name = "TRIANGLES", help_heading = "Surface", default_value_t = MeshOptions::default().min_part, value_parser = whole::<usize>(0, u64::from(u32::MAX)))]
     min_part: usize,
+
+    /// Passes of smoothing, which takes the steps of voxels away: no vertex moves by more than half a voxel along each axis
+    #[arg(long, value_name = "PASSES", help_heading = "Surface", default_value_t = MeshOptions::default().smooth, value_parser = whole::<usize>(0, 100))]
+    smooth: usize,
+
+    /// Collapse edges until no more triangles than this are left, those first that change the surface least
+    #[arg(long, value_name = "N", help_heading = "Surface", value_parser = whole::<usize>(4, u64::from(u32::MAX)))]
+    max_triangles: Option<usize>,
 }
 
 /// Writes the surface of a run.
@@ -49,11 +60,27 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
         (given, _) => given.unwrap_or(MeshFormat::Ply),
     };
     let Opened { folder, grid, .. } = args.exported.open(console, &format.to_string())?;
-    let options = MeshOptions { level: args.level, direction: args.colors.direction(), min_part: args.min_part };
+    let options = MeshOptions {
+        level: args.level,
+        direction: args.colors.direction(),
+        min_part: args.min_part,
+        smooth: args.smooth,
+        max_triangles: args.max_triangles,
+    };
     let surface = mesh(&grid, &options).map_err(as_flag)?;
+    if surface.parts_left_out > 0 {
+        let parts = if surface.parts_left_out == 1 { "part" } else { "parts" };
+        console.note(&format!("left out {} {parts} of fewer than {} triangles (--min-part)", surface.parts_left_out, args.min_part));
+    }
+    let (vertices, triangles) = (surface.positions.len(), surface.triangles.len());
+    if args.max_triangles.is_some_and(|most| triangles > most) {
+        console.note(&format!("{triangles} triangles are the fewest to which this surface collapses without being joined or torn"));
+    }
+    if !format.has_colors() {
+        console.note(&format!("{format} files have no colors: ply, obj and glb do"));
+    }
     let bytes = format.encode(&surface, crate::PROGRAM).map_err(as_flag)?;
     let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes, console)?;
-    let (vertices, triangles) = (surface.positions.len(), surface.triangles.len());
     console.wrote(
         &file,
         &format!("wrote {vertices} vertices and {triangles} triangles around {:.4} of volume to {}", surface.volume(), file.display()),
@@ -62,5 +89,5 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
 
 /// A format as the command line takes it.
 fn format(text: &str) -> std::result::Result<MeshFormat, String> {
-    text.parse().map_err(|_| "ply, obj or glb".to_owned())
+    text.parse().map_err(|_| "ply, obj, glb or stl".to_owned())
 }

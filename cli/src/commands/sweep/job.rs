@@ -114,14 +114,6 @@ impl Job {
         vec!["evaluate".into(), self.folder.clone().into_os_string(), "--json".into()]
     }
 
-    /// Writes down the figures that an evaluation printed.
-    pub fn write_evaluation(&self, printed: &str) -> Result<()> {
-        let (folder, ..) = RunFolder::open(&self.folder)?;
-        let figures: serde_json::Value = serde_json::from_str(printed.trim())
-            .map_err(|e| Error::input(&self.folder, format!("its evaluation is not JSON ({e})"), "this is a defect of the program"))?;
-        folder.write_evaluation(&figures)
-    }
-
     /// What it said while it was made. Names of runs have no dots, so that no run can be in the way.
     pub fn log(&self) -> PathBuf {
         self.folder.with_extension("log")

@@ -9,7 +9,7 @@ const LARGEST: [u32; 2] = [200, 200];
 
 const STYLE: &str = "\
 td { vertical-align: bottom; }
-td img, th img { width: 200px; margin-bottom: .4rem; }
+td img, th img { width: 200px; height: 200px; object-fit: contain; object-position: left bottom; margin-bottom: .4rem; }
 .psnr { font-size: 1.5rem; line-height: 1.2; font-variant-numeric: tabular-nums; }
 .best { font-weight: 700; color: light-dark(#06603a, #7fdca9); }
 .published, .published .psnr { font-style: italic; }

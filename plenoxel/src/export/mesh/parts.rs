@@ -1,25 +1,20 @@
 //! Parts of a surface: triangles that hang together by common vertices.
 
 use super::Surface;
-use crate::error::{Error, Result};
 
 impl Surface {
-    /// The same surface without its parts of fewer than `least` triangles.
-    ///
-    /// Errors: nothing is left.
-    pub fn without_parts_below(self, least: usize) -> Result<Self> {
+    /// Takes away the parts of fewer than `least` triangles, but never the largest part. Returns how many parts it took.
+    pub fn leave_out_parts_below(&mut self, least: usize) -> usize {
         let mut parts = Parts::new(self.crossings.len());
         for &[a, b, c] in &self.triangles {
             parts.join(a, b);
             parts.join(b, c);
         }
+        // The triangles of each part at the vertex that names it; every part has some.
         let mut count = vec![0; self.crossings.len()];
         self.triangles.iter().for_each(|triangle| count[parts.name(triangle[0]) as usize] += 1);
-        let largest = count.iter().copied().max().unwrap_or(0);
-        if least > largest {
-            let found = format!("{least} faces, more than any part of this surface has,");
-            return Err(Error::config("min_part", found, format!("up to {largest}, the faces of the largest part")));
-        }
+        let least = least.min(count.iter().copied().max().unwrap_or(0));
+        let left_out = count.iter().filter(|&&triangles| triangles > 0 && triangles < least).count();
         let mut left = Surface::default();
         // The new number of each vertex that stays; each has a triangle.
         let mut numbers = vec![0; self.crossings.len()];
@@ -31,7 +26,8 @@ impl Surface {
         }
         let stays = self.triangles.iter().filter(|triangle| count[parts.name(triangle[0]) as usize] >= least);
         left.triangles = stays.map(|triangle| triangle.map(|v| numbers[v as usize])).collect();
-        Ok(left)
+        *self = left;
+        left_out
     }
 }
 

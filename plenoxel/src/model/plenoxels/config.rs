@@ -12,6 +12,7 @@ use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
 use crate::train::TrainOptions;
 use autograd::Real;
+use autograd::optim::{Exponential, Piecewise, Schedule};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -184,6 +185,23 @@ pub enum Weight {
         /// Length of the change.
         steps: u64,
     },
+}
+
+impl Weight {
+    /// The weight at a step.
+    pub fn at(&self, step: u64) -> f64 {
+        match *self {
+            Weight::Constant(weight) => weight,
+            Weight::Until { weight, until } => Piecewise::new(weight).then(until, 0.0).at(step),
+            Weight::Exponential { from, to, steps } => Exponential::new(from, to, steps).at(step),
+        }
+    }
+}
+
+impl Schedule for Weight {
+    fn at(&self, step: u64) -> f64 {
+        self.at(step)
+    }
 }
 
 /// A resolution, and how long it is trained.

@@ -1,12 +1,12 @@
 //! Losses of a voxel grid by their names, and the objective that a config describes.
 
-use super::config::{Config, Weight};
+use super::config::Config;
 use super::{Objective, single};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::loss::{self, Cells, EXPOSURE, tv_color, tv_density};
 use autograd::Real;
-use autograd::optim::{Exponential, Piecewise, Schedule};
+use autograd::optim::Schedule;
 use autograd::single::{cast, is_single};
 
 /// Losses that read the voxel grid.
@@ -54,11 +54,7 @@ pub(super) fn of_config<T: Real>(config: &Config, views: usize) -> Result<Object
     if config.losses.is_empty() {
         return Err(Error::config("losses", "no loss", "at least one, as in `mse = 1.0`"));
     }
-    let all = config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| match *weight {
-        Weight::Constant(weight) => with_loss(objective, name, weight, views),
-        Weight::Until { weight, until } => with_loss(objective, name, Piecewise::new(weight).then(until, 0.0), views),
-        Weight::Exponential { from, to, steps } => with_loss(objective, name, Exponential::new(from, to, steps), views),
-    })?;
+    let all = config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| with_loss(objective, name, *weight, views))?;
     Ok(config.loss_rates.iter().fold(all, |objective, (loss, &rate)| {
         let of_loss = |name: &&str| *name == loss || name.strip_prefix(loss.as_str()).is_some_and(|rest| rest.starts_with('.'));
         let params: Vec<String> = objective.params().iter().map(|p| p.name()).filter(of_loss).map(str::to_owned).collect();

@@ -38,3 +38,36 @@ fn color_rate(stage: &Stage, start: f64, steps: u64) -> Box<dyn Schedule> {
 fn rate(start: f64, decay: f64, steps: u64) -> Box<dyn Schedule> {
     if start == 0.0 || decay == 1.0 { Box::new(start) } else { Box::new(Exponential::new(start, start * decay, steps)) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rates_of_the_preset_plenoxels_are_those_of_svox2() {
+        let config = Config::preset("plenoxels").unwrap();
+        // By step: 30 to 0.05 and 0.01 to 5e-6 over 250 000 steps, the first with svox2's delay of 15 000 steps.
+        let published = [
+            (0, 0.300, 0.0100),
+            (1000, 3.32, 0.00970),
+            (5000, 13.3, 0.00859),
+            (12_800, 21.1, 0.00678),
+            (15_000, 20.4, 0.00634),
+            (38_400, 11.2, 0.00311),
+            (64_000, 5.83, 0.00143),
+            (102_400, 2.18, 0.000_445),
+            (128_000, 1.13, 0.000_204),
+        ];
+        for (step, density, color) in published {
+            let [first, second] = &config.stages[..] else { panic!("two stages") };
+            let change = first.steps.unwrap();
+            let (stage, at) = if step < change { (first, step) } else { (second, step - change) };
+            let steps = stage.steps.unwrap();
+            // A unit of length is 2/3 of one there.
+            let found = [1.5 * density_rate(stage, steps).at(at), color_rate(stage, stage.color_rate, steps).at(at)];
+            for (found, published) in found.into_iter().zip([density, color]) {
+                assert!((found / published - 1.0).abs() < 0.005, "step {step}: {found}, published {published}");
+            }
+        }
+    }
+}

@@ -1,0 +1,69 @@
+//! Decimation: edges are collapsed in the order of their quadric errors (Garland and Heckbert 1997), by the crate `alum`.
+//!
+//! Quadrics are probabilistic (Trettner and Kobbelt 2020): planes have a variance, so that vertices of flat places have one best position too.
+//! A collapse that would join or tear the surface is not made.
+
+use super::Vertex;
+use crate::error::{Error, Result};
+use alum::decimate::quadric::{QuadricDecimater, QuadricType};
+use alum::{Handle, HasDecimation, HasIterators, HasTopology, PolyMeshF64};
+use glam::DVec3;
+
+/// The same surface with no more than `most` triangles, or the fewest that it can be brought to. Parts that shrink to two triangles, back to back,
+/// are gone. A vertex that stays keeps its row and its normal.
+///
+/// Errors: nothing is left.
+pub fn decimate(vertices: Vec<Vertex>, triangles: Vec<[u32; 3]>, most: usize) -> Result<(Vec<Vertex>, Vec<[u32; 3]>)> {
+    if triangles.len() <= most {
+        return Ok((vertices, triangles));
+    }
+    let (positions, mut left) = collapsed(&vertices, &triangles, most).map_err(|e| {
+        let found = format!("{most}, for a surface that cannot be decimated ({e:?}),");
+        Error::config("max_triangles", found, "none: leave it away")
+    })?;
+    // Each edge has two triangles, so two with the same vertices are a part of their own.
+    left.sort_unstable_by_key(sorted);
+    let left: Vec<[u32; 3]> = left.chunk_by(|a, b| sorted(a) == sorted(b)).filter(|same| same.len() == 1).map(|single| single[0]).collect();
+    if left.is_empty() {
+        let found = format!("{most}, which leaves nothing of this surface: its parts are too many,");
+        return Err(Error::config("max_triangles", found, "more; or a larger --min-part, which leaves small parts out"));
+    }
+    let mut numbers = vec![u32::MAX; vertices.len()];
+    let mut kept = Vec::new();
+    let triangles = left.iter().map(|triangle| {
+        triangle.map(|v| {
+            let number = &mut numbers[v as usize];
+            if *number == u32::MAX {
+                *number = kept.len() as u32;
+                kept.push(Vertex { position: positions[v as usize], ..vertices[v as usize] });
+            }
+            *number
+        })
+    });
+    let triangles = triangles.collect();
+    Ok((kept, triangles))
+}
+
+/// The position of each vertex after the collapses, of those too that are gone, and the triangles that are left.
+fn collapsed(vertices: &[Vertex], triangles: &[[u32; 3]], most: usize) -> std::result::Result<(Vec<DVec3>, Vec<[u32; 3]>), alum::Error> {
+    let mut mesh = PolyMeshF64::with_capacity(vertices.len(), 3 * triangles.len() / 2, triangles.len());
+    for vertex in vertices {
+        mesh.add_vertex(alum::DVec3(vertex.position.x, vertex.position.y, vertex.position.z))?;
+    }
+    for [a, b, c] in triangles {
+        mesh.add_tri_face((*a).into(), (*b).into(), (*c).into())?;
+    }
+    let mut decimater = QuadricDecimater::new(&mesh, QuadricType::ProbabilisticTriangle)?;
+    mesh.decimate_to_face_count(&mut decimater, most)?;
+    let (points, status) = (mesh.points(), mesh.face_status_prop());
+    let (points, status) = (points.try_borrow()?, status.try_borrow()?);
+    let positions = points.iter().map(|point| DVec3::new(point.0, point.1, point.2)).collect();
+    Ok((positions, mesh.triangulated_vertices(&status).map(|corners| corners.map(|v| v.index())).collect()))
+}
+
+/// The vertices of a triangle in ascending order.
+fn sorted(triangle: &[u32; 3]) -> [u32; 3] {
+    let mut sorted = *triangle;
+    sorted.sort_unstable();
+    sorted
+}
