@@ -170,7 +170,7 @@ fn cameras_of_other_programs_are_recognised_and_damaged_ones_refused() {
 
     let refused = |path: &str, code: u8, parts: &[&str]| plenoxel(&["render", &run, "--path", path]).refused(code, parts);
     refused("orbti", 2, &["--path", "orbti", "no file", "orbit, spiral"]);
-    refused(&data, 5, &["scene", "reading the camera path"]);
+    refused(&data, 3, &["scene", "this is a folder", "a JSON file of cameras is expected"]);
     refused(&write("empty.json", &json!({})), 3, &["empty.json", "none of the keys"]);
     refused(
         &write("broken.json", &json!({"path": [{"R": [0, 0, 0, 0], "T": [0, 0, 0], "fov": 9}]})),

@@ -46,13 +46,16 @@ pub(crate) fn allowance() -> Option<Allowance> {
 /// Errors: bad input, for the file is too large to be used here.
 pub(crate) fn check(path: &Path, what: &str, needed: u64) -> Result<()> {
     match allowance() {
-        Some(allowance) if needed > allowance.bytes => {
-            let found = format!("{what} takes about {} of memory, where {allowance}", bytes(needed));
-            let more = if allowance.is_limit { "or a higher --max-memory" } else { "or a machine with more" };
-            Err(Error::input(path, found, format!("use a smaller one, {more}")))
-        }
+        Some(allowance) if needed > allowance.bytes => Err(refusal(path, what, needed, &allowance)),
         _ => Ok(()),
     }
+}
+
+/// The error of [`check`].
+pub(crate) fn refusal(path: &Path, what: &str, needed: u64, allowance: &Allowance) -> Error {
+    let found = format!("{what} takes about {} of memory, where {allowance}", bytes(needed));
+    let more = if allowance.is_limit { "or a higher --max-memory" } else { "or a machine with more" };
+    Error::input(path, found, format!("use a smaller one, {more}"))
 }
 
 /// Bytes with a unit of powers of 1000, at two or three digits: `2.3 GB`, `99 kB`.

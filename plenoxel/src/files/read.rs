@@ -91,14 +91,15 @@ fn all(path: &Path, kind: Kind, file: File) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     bytes.try_reserve_exact(length as usize).map_err(|_| refused(path, kind, ErrorKind::OutOfMemory.into()))?;
     // A pipe has no length before its end, and a file may grow. A buffer that grows is copied.
-    let room = memory::available().map_or(u64::MAX, |free| free / (2 * kind.memory).max(1)).max(length);
+    let allowance = memory::allowance();
+    let room = allowance.as_ref().map_or(u64::MAX, |allowance| allowance.bytes / (2 * kind.memory).max(1)).max(length);
     (&file).take(room.min(kind.most) + 1).read_to_end(&mut bytes).map_err(|e| refused(path, kind, e))?;
     let read = bytes.len() as u64;
     check_size(path, kind, read)?;
-    if read > room {
-        memory::check(path, &what(read), 2 * kind.memory * read)?;
+    match allowance.filter(|_| read > room) {
+        Some(allowance) => Err(memory::refusal(path, &what(read), 2 * kind.memory * read, &allowance)),
+        None => Ok(bytes),
     }
-    Ok(bytes)
 }
 
 fn check_size(path: &Path, kind: Kind, length: u64) -> Result<()> {

@@ -253,9 +253,9 @@ impl RunFolder {
         self.write_json(RESULT, result)
     }
 
-    /// Reads the final figures, if there are any.
+    /// Reads the final figures, if there are any. Damaged ones count as none: resuming the run writes them again.
     ///
-    /// Errors: the file cannot be read, or is not JSON.
+    /// Errors: the file is there and cannot be read.
     pub fn result(&self) -> Result<Option<serde_json::Value>> {
         self.read_json(RESULT)
     }
@@ -295,7 +295,7 @@ impl RunFolder {
         if !files::is_there(&path) {
             return Ok(None);
         }
-        json::parse(&path, &files::read(&path, files::RECORD)?).map(Some)
+        Ok(json::parse(&path, &files::read(&path, files::RECORD)?).ok())
     }
 
     /// Writes the chart of the loss, an SVG.

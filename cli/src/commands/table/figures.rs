@@ -2,7 +2,7 @@
 
 use crate::commands::background_name;
 use plenoxel::checkpoint;
-use plenoxel::error::{Error, Result};
+use plenoxel::error::Result;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::RunFolder;
 use serde::{Deserialize, Serialize};
@@ -83,12 +83,10 @@ impl Measured {
 impl Figures {
     /// Those of a run; none if it has not ended.
     ///
-    /// Errors: they cannot be read.
+    /// Errors as for [`RunFolder::result`].
     pub fn of(folder: &RunFolder, config: &Config) -> Result<Option<Self>> {
-        let Some(figures) = folder.figures()? else { return Ok(None) };
-        let figures: Figures = serde_json::from_value(figures).map_err(|e| {
-            Error::input(folder.path(), format!("the figures in result.json cannot be read ({e})"), "`plenoxel evaluate` prints them again")
-        })?;
+        let figures = folder.figures()?.and_then(|figures| serde_json::from_value::<Figures>(figures).ok());
+        let Some(figures) = figures else { return Ok(None) };
         let voxels = checkpoint::header(&folder.checkpoint()).ok().map(|(_, voxels)| voxels).or(figures.voxels);
         Ok(Some(Figures { background: config.background, voxels, ..figures }))
     }

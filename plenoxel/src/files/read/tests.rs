@@ -74,6 +74,9 @@ mod unix {
         symlink("/dev/zero", &link).unwrap();
         refused(read(&link, SMALL), 3, "this is a device, not a plain file");
         refused(read_named(&link, SMALL), 3, "larger than");
+        if memory::available().is_some() {
+            refused(read_named(&link, Kind { most: 1 << 60, memory: 1 << 20, ..SMALL }), 3, "of memory, where");
+        }
         let socket = folder.0.join("socket");
         let _listener = std::os::unix::net::UnixListener::bind(&socket).unwrap();
         refused(read(&socket, SMALL), 3, "this is a socket");
