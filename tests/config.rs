@@ -244,6 +244,9 @@ fn the_preset_plenoxels_is_svox2_for_synthetic_scenes() {
     // 1e-5 · 3/2, and 1e-3 for the sum over 27 numbers of which ours is the mean.
     assert_eq!(losses, [("mse", Weight::Constant(1.0)), ("tv_color_sampled", until(0.027)), ("tv_density_sampled", until(1.5e-5))]);
     assert_eq!((config.color, config.sh_degree, config.sh_offset, config.sh_reduction), (ColorKind::Sh, 2, 0.5, 1));
-    assert_eq!((config.stop_below, config.prune_from_stage, config.prune_below, config.prune_unseen_below), (1e-7, 1, 0.0, 0.256 / 512.0));
+    assert_eq!(
+        (config.stop_below, config.prune_from_stage, config.prune_below, config.prune_unseen_below),
+        (1e-7, Some(1), 0.0, 0.256 / 512.0)
+    );
     assert!(config.hull == Hull::Off && !config.aim && config.scout.is_none());
 }

@@ -187,7 +187,7 @@ mod tests {
             let mut nodes = [BRICK; 3];
             nodes[axis] = 3 * BRICK;
             let grid = BrickGrid::new(nodes);
-            let holds = |node: [usize; 3]| (node[0] * 7 + node[1] * 3 + node[2]) % 5 == 0;
+            let holds = |node: [usize; 3]| (node[0] * 7 + node[1] * 3 + node[2]).is_multiple_of(5);
             let masks: Vec<u64> = (0..3).map(|brick| bits_where(!0, |bit| holds(grid.node(brick, bit)))).collect();
             for bit in 0..BRICK_ROWS {
                 let (mut next, mut previous) = (grid.node(1, bit), grid.node(1, bit));
