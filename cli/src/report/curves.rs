@@ -158,9 +158,9 @@ mod tests {
 
     #[test]
     fn parts_of_the_loss_are_shown_as_they_count_in_it() {
-        let mut config = Config::default();
-        config.losses =
-            [("mse", Weight::Constant(1.0)), ("sparsity", Weight::Until { weight: 0.01, until: 5 })].map(|(n, w)| (n.to_owned(), w)).into();
+        let losses = [("mse", Weight::Constant(1.0)), ("sparsity", Weight::Until { weight: 0.01, until: 5 })];
+        let losses = losses.map(|(name, weight)| (name.to_owned(), weight)).into();
+        let config = Config { losses, ..Config::default() };
         let line = |step: u64| {
             format!(
                 r#"{{"step":{step},"stage":0,"ends_stage":false,"loss":0.6,"losses":{{"mse":0.5,"sparsity":10.0,"mine":2.0}},"psnr":3.0,"rays":1,"samples":1,"seconds":1.0}}"#

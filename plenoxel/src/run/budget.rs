@@ -234,7 +234,7 @@ mod tests {
                 let steps = (1..=first).map(recorded).sum::<f64>() + FINE * second as f64;
                 let took = spent + slower * (BEGIN.iter().sum::<f64>() + steps);
                 assert!(
-                    (0.9..=1.02).contains(&(took / promised)),
+                    (0.95..=1.05).contains(&(took / promised)),
                     "{promised} s were promised, and {first} + {second} steps took {took} s"
                 );
             }
