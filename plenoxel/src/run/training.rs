@@ -134,7 +134,7 @@ pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
 /// Trains Plenoxels with an objective of your own, which `objective` makes of the config and the number of training views. The losses of the config
 /// are used only if `objective` adds them, as [`plenoxels::objective`](objective()) does.
 ///
-/// Errors as for [`train`], and those of `objective`.
+/// Errors as for [`train()`], and those of `objective`.
 pub fn train_with(
     settings: &RunSettings,
     objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
@@ -193,7 +193,7 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
 /// [`Config::train_options`] has seed, background and rays of a step; the run itself uses the background and what concerns the images. The model is
 /// saved and evaluated by its [`Model`] methods; its own settings ([`Model::settings`]) are part of its checkpoint.
 ///
-/// Errors as for [`train`], and those of `start`.
+/// Errors as for [`train()`], and those of `start`.
 pub fn train_model<M: Model<f32>>(
     settings: &RunSettings,
     start: impl FnOnce(&Config, &Dataset, Arc<[View]>) -> Result<train::Trainer<f32, M>>,
@@ -278,7 +278,7 @@ impl<'s> NewRun<'s> {
 /// Resumes a stopped run from where it was last saved, with the losses that its config names; `data` is the source of the views now, if it is
 /// not where it was.
 ///
-/// Errors as for [`train`], and if the run has ended or left nothing to resume from.
+/// Errors as for [`train()`], and if the run has ended or left nothing to resume from.
 pub fn resume(path: &Path, data: Option<DataSource>, options: &RunOptions, on: &mut Listener<'_>) -> Result<Outcome> {
     resume_with(path, data, options, objective, on)
 }
