@@ -99,7 +99,9 @@ fn focus(cameras: &[Camera]) -> Option<DVec3> {
 }
 
 fn point(p: DVec3) -> String {
-    format!("({:.2}, {:.2}, {:.2})", p.x, p.y, p.z)
+    // Adding 0 makes a positive zero of a negative one.
+    let [x, y, z] = p.to_array().map(|c| (100.0 * c).round() / 100.0 + 0.0);
+    format!("({x:.2}, {y:.2}, {z:.2})")
 }
 
 #[cfg(test)]
