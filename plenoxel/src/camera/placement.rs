@@ -71,10 +71,14 @@ impl Placement {
     }
 }
 
-/// True if one of some rays of a camera meets a box.
+/// True if a camera sees the middle of a box, or one of some of its rays meets it.
 fn meets(camera: &Camera, aabb: Aabb) -> bool {
     let at = |k: usize, n: usize| (k as f64 + 0.5) * n as f64 / TRIED as f64;
     let k = &camera.intrinsics;
+    let within = |x: f64, n: usize| (0.0..=n as f64).contains(&x);
+    if camera.project(0.5 * (aabb.min + aabb.max)).is_some_and(|(x, y, _)| within(x, k.width) && within(y, k.height)) {
+        return true;
+    }
     (0..TRIED * TRIED).any(|i| {
         let ray = camera.ray(at(i % TRIED, k.width), at(i / TRIED, k.height));
         aabb.intersect(ray.origin, ray.direction).is_some_and(|(enter, leave)| leave > enter.max(0.0))

@@ -484,7 +484,8 @@ impl Job<'_> {
         let Job { folder, config, dataset, .. } = *self;
         let mut learned = match learned {
             Ok(learned) => learned,
-            Err(Stopped(steps, total)) => return Ok(Outcome::Stopped { steps, total, folder: folder.clone() }),
+            // Without the lock: who holds the outcome may resume the run.
+            Err(Stopped(steps, total)) => return Ok(Outcome::Stopped { steps, total, folder: RunFolder::at(folder.path()) }),
         };
         let test = clocks.load.time(|| load(dataset, Split::Test, &self.test_views(), &self.record.data, on))?;
         let view = ViewOptions::over(config.background);
