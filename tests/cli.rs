@@ -674,7 +674,8 @@ fn what_is_carved_is_a_run_that_other_commands_take_and_training_starts_from() {
     let stages = "stages=[{resolution=24, steps=2, sampling={step=0.5}, density_rate=0.1, color_rate=0.01}]";
     let start = ["train", &data, "--out", &trained, "--init-from", &carved, "--set", stages, "--set", "rays_per_step=256", "--quiet"];
     let warm = plenoxel(&start).json()["psnr"].as_f64().unwrap();
-    let from_nothing = [&start[..2], &["--out", &folder.path("cold"), "--hull", "off"], &start[6..]].concat();
+    let cold = folder.path("cold");
+    let from_nothing = [&start[..2], &["--out", &cold, "--hull", "off"], &start[6..]].concat();
     let cold = plenoxel(&from_nothing).json()["psnr"].as_f64().unwrap();
     assert!(warm > cold + 0.5, "{warm} against {cold}");
     assert!(fs::read_to_string(format!("{trained}/config.toml")).unwrap().contains("init_from = "));
