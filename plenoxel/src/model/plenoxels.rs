@@ -38,8 +38,8 @@ use crate::checkpoint::{self, Header};
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::evaluate::Viewer;
-use crate::field::Field;
-use crate::field::voxel_grid::{GridShape, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
+use crate::field::{Field, sh};
 use crate::geometry::Aabb;
 use crate::loss;
 use crate::rays::RaySource;
@@ -157,7 +157,11 @@ impl<T: Real> Plenoxels<T> {
         self.scouts = 0;
         self.stages = self.config.stages.clone();
         let shape = self.config.grid_shape(self.stages[0].resolution);
-        let carved = grid.with_interpolation(shape.interpolation);
+        let gray = match shape.color {
+            Color::Rgb => self.config.initial.color,
+            Color::Sh { offset, .. } => offset + sh::Y0 * self.config.initial.color,
+        };
+        let carved = start::with_unseen_colors(grid, gray).with_interpolation(shape.interpolation);
         let half_width = grid.matter().half_width().unwrap_or(grid.shape().half_width);
         let adapted = start::adapted(&carved.resample_in(shape.resolution, half_width), &shape);
         let density = Tensor::full(adapted.density.shape(), self.config.initial.density);

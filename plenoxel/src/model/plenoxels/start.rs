@@ -4,12 +4,12 @@ use super::config::{Config, Hull, Initial};
 use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
 use crate::error::Error;
-use crate::field::voxel_grid::{GridShape, Interpolation, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
-use autograd::Real;
 use autograd::lattice::has;
+use autograd::{Real, Tensor};
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
@@ -88,6 +88,20 @@ fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -
     };
     // A ray may pass by the thinnest.
     visual_hull::by_silhouettes(views, shows_matter, among, margin, &|_| ()).union(matter)
+}
+
+/// A carved grid whose voxels that no pixel shows have a color, the same for each channel, instead of zeros. As black as that their colors would be
+/// clamped, and have no gradient, if training finds that they are seen after all.
+pub fn with_unseen_colors<T: Real>(grid: &VoxelGrid<T>, color: f64) -> VoxelGrid<T> {
+    if grid.shape().color != Color::Rgb {
+        // Coefficients of 0 are the color of the offset.
+        return grid.with_density(grid.density.tensor().detach());
+    }
+    let mut colors = grid.color.tensor().data().to_vec();
+    let unseen = colors.chunks_exact_mut(3).filter(|color| color.iter().all(|c| *c == T::zero()));
+    unseen.for_each(|unseen| unseen.fill(T::lit(color)));
+    let tables = vec![grid.density.tensor().detach(), Tensor::from_vec(colors, grid.color.shape())];
+    VoxelGrid::with_tables(*grid.shape(), grid.lattice().clone(), tables)
 }
 
 /// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
