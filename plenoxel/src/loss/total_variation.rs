@@ -88,6 +88,8 @@ fn of_run<T: Real>(table: &Tensor<T>, lattice: &Lattice, part: Option<(usize, us
     match table.shape()[1] {
         1 => with_kernel::<T, 1, 4, 16>(table, lattice, part),
         3 => with_kernel::<T, 3, 12, 48>(table, lattice, part),
+        // No grid has rows of 4; W3 of the workloads does, 5.8 ms with the kernel and 126 ms without (`benches/RESULTS.md`).
+        4 => with_kernel::<T, 4, 16, 64>(table, lattice, part),
         9 => with_kernel::<T, 9, 36, 144>(table, lattice, part),
         12 => with_kernel::<T, 12, 48, 192>(table, lattice, part),
         24 => with_kernel::<T, 24, 96, 384>(table, lattice, part),
