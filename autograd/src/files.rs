@@ -130,8 +130,9 @@ pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> i
     let path = followed(path)?;
     let temporary = unused_name(path.parent().unwrap_or(Path::new("")));
     let written = write(&temporary)
+        .and_then(|()| OpenOptions::new().write(true).open(&temporary)?.sync_all())
+        // After that: they may forbid to open it.
         .and_then(|()| there.map_or(Ok(()), |there| fs::set_permissions(&temporary, there.permissions())))
-        .and_then(|()| OpenOptions::new().read(true).open(&temporary)?.sync_all())
         .and_then(|()| fs::rename(&temporary, &path));
     written.inspect_err(|_| {
         // The write is what failed; a second failure while tidying up would only hide it.

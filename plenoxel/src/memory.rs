@@ -74,10 +74,18 @@ fn free() -> Option<u64> {
     let free = kilobytes(&text, "MemAvailable:")?;
     let number = |path: &str| -> Option<u64> { std::fs::read_to_string(path).ok()?.trim().parse().ok() };
     let limit = number("/sys/fs/cgroup/memory.max");
-    let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0);
+    // What the group has of files in memory goes when memory is needed.
+    let files = std::fs::read_to_string("/sys/fs/cgroup/memory.stat").map_or(0, |text| cached(&text));
+    let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0).saturating_sub(files);
     let free = limit.map_or(free, |limit| free.min(limit.saturating_sub(used)));
     let limits = std::fs::read_to_string("/proc/self/limits").unwrap_or_default();
     Some(address_space(&limits).map_or(free, |limit| free.min(limit.saturating_sub(taken()))))
+}
+
+/// Bytes of files in memory, by the kernel's table of a control group.
+fn cached(stat: &str) -> u64 {
+    let number = |line: &str| line.strip_prefix("active_file ").or(line.strip_prefix("inactive_file "))?.trim().parse::<u64>().ok();
+    stat.lines().filter_map(number).sum()
 }
 
 /// Bytes of addresses this process may have (`ulimit -v`), by the kernel's table of limits.
@@ -125,6 +133,7 @@ mod tests {
         let text = "Name:\tx\nVmHWM:\t   2048 kB\nVmRSS:\t 1 kB\n";
         assert_eq!(kilobytes(text, "VmHWM:"), Some(2048 * 1024));
         assert_eq!(kilobytes(text, "VmSwap:"), None);
+        assert_eq!(cached("anon 7\nfile 90\ninactive_file 40\nactive_file 20\nunevictable 3\n"), 60);
         let limits = "Limit                     Soft Limit           Hard Limit           Units\nMax address space         6144000000           unlimited            bytes\n";
         assert_eq!(address_space(limits), Some(6_144_000_000));
         assert_eq!(address_space("Max address space         unlimited            unlimited            bytes\n"), None);

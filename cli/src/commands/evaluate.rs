@@ -57,7 +57,8 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
     // A folder may have another name by now: no error.
-    if about.scene != dataset.name() {
+    let same_scene = about.scene == dataset.name();
+    if !same_scene {
         console.note(&format!("the run is of another scene: {}, not {}", about.scene, dataset.name()));
     }
 
@@ -102,7 +103,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     file.into_iter().try_for_each(|file| console.write_file(file, (line.clone() + "\n").as_bytes()))?;
     // A carved run has no figures of its own, nor has one that was trained with --no-evaluate. One that did not end well has none either, and is no run
     // to compare.
-    if args.run.is_as_trained() && trained.is_object() && !trained["psnr"].is_number() {
+    if args.run.is_as_trained() && same_scene && trained.is_object() && !trained["psnr"].is_number() {
         folder.write_evaluation(&evaluation)?;
         console.note(
             "kept in the run's folder: `plenoxel compare` shows these figures, and so does `plenoxel report`, which writes the page again",

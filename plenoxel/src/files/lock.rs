@@ -51,14 +51,16 @@ fn holder(file: &mut File) -> String {
     number.map_or_else(|| "another process".to_owned(), |number| format!("process {number}"))
 }
 
-/// True for a temporary file of [`atomically`](super::atomically) whose process has ended.
+/// True for a temporary file of [`atomically`](super::atomically) whose process has ended, and for one of the safetensors library, `.tmp` and six
+/// characters, which only the process that holds the lock of a run writes: so ask only while you hold it.
 pub fn is_abandoned(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let Some(inner) = name.strip_prefix('.').and_then(|name| name.strip_suffix(".tmp")) else { return false };
-    let Some(process) = inner.split('-').next().filter(|process| process.parse::<u32>().is_ok()) else {
-        // Of a library's own making.
-        return inner.starts_with("tmp");
-    };
+    if name.starts_with(".tmp") {
+        return true;
+    }
+    let inner = name.strip_prefix('.').and_then(|name| name.strip_suffix(".tmp"));
+    let process = inner.and_then(|inner| inner.split('-').next()).filter(|process| process.parse::<u32>().is_ok());
+    let Some(process) = process else { return false };
     let processes = PathBuf::from("/proc");
     if processes.join("self").exists() {
         return !processes.join(process).exists();
@@ -89,6 +91,7 @@ mod tests {
     #[test]
     fn temporary_files_of_processes_that_ended_are_abandoned() {
         let own = format!(".{}-3.tmp", std::process::id());
+        assert!(is_abandoned(Path::new("runs/x/.tmpAbCdEf")));
         assert!(!is_abandoned(Path::new(&own)) && !is_abandoned(Path::new("notes.tmp")) && !is_abandoned(Path::new(".hidden")));
         if Path::new("/proc/self").exists() {
             // No process has a number this large.

@@ -10,7 +10,7 @@ use super::tensorboard;
 use crate::error::{Error, Result};
 use crate::files::{self, FolderLock, is_abandoned};
 use crate::json;
-use crate::model::plenoxels::config::Config;
+use crate::model::plenoxels::{self, config::Config};
 use crate::train::{self, About, Model};
 use listing::{RENDERED, entries, is_fragment, is_frame, is_one_of, remove, reserve};
 use serde::Serialize;
@@ -171,7 +171,7 @@ impl RunFolder {
         }
         let mut record = RunRecord::parse(&record, &files::read(&record, files::RECORD)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
-        if config.stages.is_empty() {
+        if config.stages.is_empty() && record.model == plenoxels::KIND {
             record.kind = RunKind::Carved;
         }
         Ok((folder, config, record))
