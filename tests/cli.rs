@@ -704,3 +704,23 @@ fn carving_refuses_what_it_cannot_carve_and_writes_nothing() {
         .refused(3, &["no transparent pixel", "alpha channel", "--photo-consistency"]);
     assert!(!Path::new(&out).exists());
 }
+
+#[test]
+fn some_test_views_or_none_are_compared_and_the_figures_say_so() {
+    let folder = Folder::new("some-views");
+    let [some, none] = ["some", "none"].map(|name| folder.path(name));
+    let answer = command::train("4,0,5", &some, &["--test-views", "3"]);
+    assert!(answer.out.contains("means over 3 test views of 24 x 24, evenly spaced among 5"), "{}", answer.out);
+    let result = answer.json();
+    assert_eq!((result["views"].as_u64(), result["per_view"].as_array().map(Vec::len)), (Some(3), Some(3)));
+    let panels = names(&format!("{some}/images")).into_iter().filter(|name| name.starts_with("test_")).count();
+    assert_eq!(panels, 3);
+
+    let answer = command::train("4,0,5", &none, &["--no-evaluate"]);
+    assert!(answer.out.contains("not compared with the 5 test views"), "{}", answer.out);
+    assert!(answer.json()["psnr"].is_null());
+    let evaluated = plenoxel(&["evaluate", &none]).json();
+    let compared = plenoxel(&["compare", &none, &some, "--out", &folder.path("page.html")]).done();
+    let psnr = format!("| {:.2} |", evaluated["psnr"].as_f64().unwrap());
+    assert!(compared.contains(&psnr), "{psnr} in {compared}");
+}

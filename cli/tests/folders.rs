@@ -155,10 +155,11 @@ fn outputs_go_where_they_should() {
     let exported = folder.run(&["export", "vox", "run", "--min-alpha", "0.001", "--out", "-"]);
     assert!(code(&exported) == 0 && exported.stdout.starts_with(b"VOX "), "{}", err(&exported));
     // A path file whose name has no stem of its own.
-    let path = "{\"path\": [{\"R\": [1, 0, 0, 0], \"T\": [0, 0, 0], \"fov\": 50, \"scale\": 1}], \"time\": 1.0}";
-    fs::write(folder.0.join("...json"), path).expect("a file");
+    let key = serde_json::json!({"R": [1, 0, 0, 0], "T": [0.5, 0.5, 2], "fov": 50, "scale": 0, "slice": 0, "aperture_size": 0});
+    let path = serde_json::json!({"loop": false, "path": [key, key], "time": 0});
+    fs::write(folder.0.join("...json"), path.to_string()).expect("a file");
     let film = folder.run(&["render", "run", "--path", "...json", "--frames", "1", "--size", "8x8"]);
-    assert!(code(&film) != 0 || folder.0.join("run/renders/path").is_dir(), "{}", err(&film));
+    assert!(code(&film) == 0 && folder.0.join("run/renders/path/frame_0000.png").exists(), "{}", err(&film));
     assert!(!folder.0.join("run/frame_0000.png").exists());
 }
 

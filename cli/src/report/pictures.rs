@@ -21,7 +21,11 @@ pub fn stages(folder: &RunFolder, result: &Value) -> Result<String> {
         ("carved.png", "Carved", "What some cameras see."),
     ];
     let Some((name, title, caption)) = what.into_iter().find(|(name, ..)| folder.image(name).exists()) else { return Ok(String::new()) };
-    let stages = result["stages"].as_array().into_iter().flatten().map(|stage| format!("{}³", stage["resolution"]));
+    let stages = result["stages"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .map(|stage| stage["resolution"].as_u64().map_or_else(|| "stage".to_owned(), |resolution| format!("{resolution}³")));
     // The photograph is of the first test view.
     let photograph = result["views"].as_u64().filter(|views| *views > 0).map(|_| "photograph".to_owned());
     let labels: Vec<String> = if name == "stages.png" { stages.chain(photograph).collect() } else { Vec::new() };

@@ -157,7 +157,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64))]
     sh_reduction: Option<i64>,
 
-    /// Start from the grid of this run, trained or carved, in its box; stages coarser than it are left out
+    /// Start from the grid of this run. A trained grid keeps its box, and stages coarser than it are left out; a carved one gives the box of its
+    /// voxels, and all stages are trained
     #[arg(long, value_name = "RUN", help_heading = "Training", value_hint = ValueHint::DirPath)]
     init_from: Option<PathBuf>,
 

@@ -28,9 +28,8 @@ pub struct Pictures {
 }
 
 impl Pictures {
-    /// Pictures for a run, or none at all.
-    pub fn new(run: Underway<'_>, wanted: bool) -> Result<Self> {
-        let views = run.dataset.count(Split::Test);
+    /// Pictures for a run that is compared with so many test views, or none at all.
+    pub fn new(run: Underway<'_>, views: usize, wanted: bool) -> Result<Self> {
         let first = |split| run.dataset.cameras(split).into_iter().next();
         if wanted {
             run.folder.create_images()?;

@@ -60,7 +60,7 @@ impl<'c, 'a> Screen<'c, 'a> {
             }
             Event::Started { run, plan, test_views, history } => {
                 self.plan = plan.to_vec();
-                let pictures = console.drawn(Pictures::new(run, self.draws));
+                let pictures = console.drawn(Pictures::new(run, test_views, self.draws));
                 self.pictures = pictures.map(|pictures| pictures.after(history, plan));
                 let (width, height) = run.dataset.size();
                 self.progress = Some(console.training(plan, (test_views * width * height) as f64, history.seconds));

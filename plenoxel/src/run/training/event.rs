@@ -30,7 +30,7 @@ pub enum Event<'a> {
         source: &'a DataSource,
         /// Number of images that are there.
         done: usize,
-        /// Number of images of the split.
+        /// Number of images that are read.
         total: usize,
     },
     /// Training begins, or goes on.
@@ -94,7 +94,7 @@ pub enum Event<'a> {
     },
     /// A test view was compared with the final model.
     Compared {
-        /// Number of the view.
+        /// Number of the view among those that are compared.
         number: usize,
         /// The view.
         view: &'a View,

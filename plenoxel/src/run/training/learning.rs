@@ -85,7 +85,8 @@ impl Job<'_> {
             let stage = plan[report.stage];
             let last = report.step + 1 == total;
             let due = saved.elapsed().as_secs_f64() >= options.checkpoint_every;
-            let save = !last && (due || (options.stop)());
+            let stops = !last && (options.stop)();
+            let save = !last && (due || stops);
             if report.step == stage.first {
                 facts = trainer.model().facts();
             }
@@ -116,7 +117,7 @@ impl Job<'_> {
                         on(Event::Saved { steps: report.step + 1 });
                     }
                     // There may be room on the disk the next time.
-                    Err(e) if !(options.stop)() => on(Event::note(format!("not saved: {e}"))),
+                    Err(e) if !stops => on(Event::note(format!("not saved: {e}"))),
                     Err(e) => return Err(e),
                 }
                 saved = Instant::now();
@@ -124,7 +125,7 @@ impl Job<'_> {
             if last {
                 break validation_psnr;
             }
-            if save && (options.stop)() {
+            if stops {
                 on(Event::Trained);
                 return Ok(Err(Stopped(report.step + 1, total)));
             }

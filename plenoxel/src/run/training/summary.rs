@@ -38,7 +38,7 @@ pub struct Summary {
     pub preset: Option<String>,
     /// Folder of the run.
     pub run: String,
-    /// Mean PSNR of reduced validation views, when they were last looked at.
+    /// Mean PSNR of some pixels of validation views, when they were last looked at.
     pub validation_psnr: Option<f64>,
     /// The step after which it was best.
     pub best_validation: Option<Best>,
