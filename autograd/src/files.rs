@@ -12,7 +12,7 @@ use crate::real::Real;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use tempfile::TempPath;
 
 /// A number as files have it, little-endian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -109,42 +109,45 @@ fn replace(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> Result<(
 
 /// Replaces the file at `path` by one that `write` makes under the name it is given, a hidden one in the same folder: other processes see the
 /// old content or the new, and nothing is left behind on failure. A link is followed, and a file that is replaced leaves its permissions to the
-/// new one. A device or a pipe is not replaced: what `write` made is copied into it.
+/// new one. A device, a pipe and an open file of the process (`/dev/stderr`, `/dev/fd/3`) are not replaced: what `write` made is copied into them.
 ///
 /// Errors: those of `write`, and of syncing, renaming or copying the file.
 pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> io::Result<()> {
     let there = fs::metadata(path).ok();
-    if let Some(there) = &there
-        && !there.is_file()
-        && !there.is_dir()
-    {
-        let temporary = unused_name(&std::env::temp_dir());
-        let copied = write(&temporary).and_then(|()| {
-            let mut stream = OpenOptions::new().write(true).open(path)?;
-            io::copy(&mut File::open(&temporary)?, &mut stream)?;
-            stream.flush()
-        });
-        let _ = fs::remove_file(&temporary);
-        return copied;
+    if is_open_file(path) || there.as_ref().is_some_and(|there| !there.is_file() && !there.is_dir()) {
+        let temporary = temporary_in(&std::env::temp_dir())?;
+        write(&temporary)?;
+        // An open file goes on from where it is.
+        let mut stream = OpenOptions::new().append(true).open(path)?;
+        io::copy(&mut File::open(&temporary)?, &mut stream)?;
+        return stream.flush();
     }
     let path = followed(path)?;
-    let temporary = unused_name(path.parent().unwrap_or(Path::new("")));
-    let written = write(&temporary)
-        .and_then(|()| OpenOptions::new().write(true).open(&temporary)?.sync_all())
-        // After that: they may forbid to open it.
-        .and_then(|()| there.map_or(Ok(()), |there| fs::set_permissions(&temporary, there.permissions())))
-        .and_then(|()| fs::rename(&temporary, &path));
-    written.inspect_err(|_| {
-        // The write is what failed; a second failure while tidying up would only hide it.
-        let _ = fs::remove_file(&temporary);
-    })
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let temporary = temporary_in(folder)?;
+    write(&temporary)?;
+    OpenOptions::new().write(true).open(&temporary)?.sync_all()?;
+    // After that: they may forbid to open it.
+    there.map_or(Ok(()), |there| fs::set_permissions(&temporary, there.permissions()))?;
+    temporary.persist(&path).map_err(|failed| failed.error)
 }
 
-/// A hidden name in a folder that no other process and no other thread has. It does not contain the name of the file that is replaced, which may
-/// be as long as is allowed.
-fn unused_name(folder: &Path) -> PathBuf {
-    static COUNTER: AtomicU64 = AtomicU64::new(0);
-    folder.join(format!(".{}-{}.tmp", std::process::id(), COUNTER.fetch_add(1, Ordering::Relaxed)))
+/// True for the names under which a process finds its own open files.
+fn is_open_file(path: &Path) -> bool {
+    let named = ["/dev/stdin", "/dev/stdout", "/dev/stderr"].iter().any(|name| path == Path::new(name));
+    named || path.starts_with("/dev/fd") || (path.starts_with("/proc") && path.parent().is_some_and(|folder| folder.ends_with("fd")))
+}
+
+/// An empty hidden file in a folder, which is removed when it is dropped. Its name has the number of this process and six random characters, but not the
+/// name of the file that is replaced, which may be as long as is allowed.
+fn temporary_in(folder: &Path) -> io::Result<TempPath> {
+    let mut builder = tempfile::Builder::new();
+    let prefix = format!(".{}-", std::process::id());
+    builder.prefix(&prefix).suffix(".tmp");
+    // As other files: without what the user's mask takes away.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    Ok(builder.tempfile_in(folder)?.into_temp_path())
 }
 
 /// The path that a chain of links leads to, which need not exist.
@@ -202,6 +205,33 @@ mod tests {
             let error = atomically(Path::new("/dev/full"), |temporary| fs::write(temporary, "x")).unwrap_err();
             assert_eq!(error.kind(), io::ErrorKind::StorageFull);
         }
+    }
+
+    #[test]
+    fn open_files_of_the_process_are_written_on_and_not_replaced() {
+        use std::os::fd::AsRawFd;
+        let folder = folder("open");
+        let path = folder.join("log");
+        fs::write(&path, "before ").unwrap();
+        let open = OpenOptions::new().append(true).open(&path).unwrap();
+        let name = PathBuf::from(format!("/dev/fd/{}", open.as_raw_fd()));
+        if name.exists() {
+            atomically(&name, |temporary| fs::write(temporary, "after")).unwrap();
+            assert_eq!(fs::read_to_string(&path).unwrap(), "before after");
+        }
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn nothing_is_left_behind_by_a_write_that_fails() {
+        let folder = folder("fails");
+        let failed = atomically(&folder.join("file"), |temporary| {
+            fs::write(temporary, "half")?;
+            Err(io::ErrorKind::StorageFull.into())
+        });
+        assert_eq!(failed.unwrap_err().kind(), io::ErrorKind::StorageFull);
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+        fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! On a terminal progress is a bar; elsewhere, in a log file say, it is a plain line every few seconds and at the end of each stage. With
 //! `--log-format json` each line on stderr is one JSON object, for programs.
 
+mod terminal;
 mod training;
 
 use crate::Streams;
@@ -24,6 +25,9 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 /// Time between changes of a bar: as often as an eye can follow.
 const BAR_EVERY: Duration = Duration::from_millis(100);
 
+/// Columns of a bar and its percentage.
+const BAR_COLUMNS: usize = 14;
+
 /// What is written to stderr.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
@@ -39,6 +43,8 @@ pub struct Console<'a> {
     /// The bar on the screen, if there is one: other lines must not be written through it.
     bar: Mutex<Option<ProgressBar>>,
     bars: bool,
+    /// True if stderr is a terminal.
+    terminal: bool,
     format: LogFormat,
     quiet: bool,
 }
@@ -47,12 +53,15 @@ impl<'a> Console<'a> {
     /// A console on two streams. `quiet` leaves only errors and results.
     pub fn new(streams: Streams<'a>, format: LogFormat, quiet: bool) -> Self {
         let bars = streams.terminal && format == LogFormat::Plain && !quiet;
-        Console { streams: Mutex::new(streams), bar: Mutex::new(None), bars, format, quiet }
+        let terminal = streams.terminal;
+        Console { streams: Mutex::new(streams), bar: Mutex::new(None), bars, terminal, format, quiet }
     }
 
     /// A line of results on stdout, in which nothing does anything to a terminal.
     pub fn result(&self, line: &str) -> Result<()> {
-        self.text(&one_line(line))
+        let line = one_line(line);
+        let read_by_people = lock(&self.streams).read_by_people;
+        if read_by_people { self.text(&terminal::wrapped(&line, terminal::columns())) } else { self.text(&line) }
     }
 
     /// Lines of results on stdout as they are: they were made here, and [`one_line`] was asked about what came from elsewhere. A reader that has
@@ -100,6 +109,11 @@ impl<'a> Console<'a> {
         }
     }
 
+    /// How a page that was written is named, for a browser to open it: on a terminal by an address that can be clicked, elsewhere by its path.
+    pub fn address(&self, page: &Path) -> String {
+        if self.terminal { terminal::file_address(page) } else { page.display().to_string() }
+    }
+
     /// A line on stderr about why the command ends with an exit code.
     pub fn error(&self, text: &str, exit_code: u8) {
         #[derive(Serialize)]
@@ -122,6 +136,7 @@ impl<'a> Console<'a> {
         }
         let time = machine::time();
         match self.format {
+            LogFormat::Plain if self.terminal => self.write(&terminal::wrapped(&one_line(&plain()), terminal::columns())),
             LogFormat::Plain => self.write(&one_line(&plain())),
             LogFormat::Json => self.write(&json::line(&Line { time, event, fields }).unwrap_or_else(|e| e.to_string())),
         }
@@ -183,7 +198,7 @@ struct Meter<'c, 'a> {
 impl<'c, 'a> Meter<'c, 'a> {
     fn new(console: &'c Console<'a>, total: u64) -> Self {
         let bar = console.bars.then(|| {
-            let style = ProgressStyle::with_template("{bar:7} {percent:>3}%  {wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
+            let style = ProgressStyle::with_template("{bar:7} {percent:>3}%  {msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
             ProgressBar::new(total).with_style(style)
         });
         lock(&console.bar).clone_from(&bar);
@@ -206,7 +221,7 @@ impl<'c, 'a> Meter<'c, 'a> {
         if let Some(bar) = &self.bar {
             bar.set_length(total);
             bar.set_position(position);
-            bar.set_message(one_line(&standing.beside_bar()));
+            bar.set_message(terminal::fitted(&one_line(&standing.beside_bar()), BAR_COLUMNS, terminal::columns()));
         }
         if must || self.bar.is_none() {
             self.console.log("progress", &standing, || standing.line());
@@ -280,15 +295,6 @@ impl Standing for Counted<'_> {
     }
 }
 
-/// Minutes and seconds, with hours where there are any.
-pub fn clock(seconds: f64) -> String {
-    let s = seconds.max(0.0).round() as u64;
-    match s / 3600 {
-        0 => format!("{}:{:02}", s / 60, s % 60),
-        h => format!("{h}:{:02}:{:02}", s / 60 % 60, s % 60),
-    }
-}
-
 /// A number with three digits and k or M, and a space before the unit.
 fn metric(x: f64) -> String {
     match x {
@@ -311,10 +317,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_and_numbers_read_well() {
-        assert_eq!(clock(3.4), "0:03");
-        assert_eq!(clock(59.6), "1:00");
-        assert_eq!(clock(3725.0), "1:02:05");
+    fn numbers_read_well() {
         assert_eq!(metric(431_204.0) + "rays/s", "431 krays/s");
         assert_eq!([7, 999, 1000, 1_234_567].map(thousands), ["7", "999", "1\u{202f}000", "1\u{202f}234\u{202f}567"]);
     }

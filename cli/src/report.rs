@@ -7,7 +7,7 @@ pub mod pictures;
 mod scene;
 
 use crate::html::{self, escaped};
-use crate::progress::{clock, thousands};
+use crate::progress::{Console, thousands};
 use plenoxel::dataset::Dataset;
 use plenoxel::error::Result;
 use plenoxel::model::Model;
@@ -15,6 +15,7 @@ use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::bytes;
 use plenoxel::run::metrics;
+use plenoxel::text::clock;
 use serde_json::Value;
 use std::fmt::Write;
 
@@ -35,7 +36,7 @@ pub struct Report<'a> {
 
 impl Report<'_> {
     /// Writes the page. Returns what is to be said about it.
-    pub fn write(&self) -> Result<String> {
+    pub fn write(&self, console: &Console<'_>) -> Result<String> {
         let result = self.folder.figures()?.unwrap_or(Value::Null);
         let metrics = metrics::read(&self.folder.metrics())?;
         let lines: Vec<_> = metrics::lines(&metrics).map(|(_, line)| line).collect();
@@ -55,7 +56,8 @@ impl Report<'_> {
         let page = html::page(&title, STYLE, &(parts.join("\n") + &scripts));
         self.folder.write_report(&page)?;
         let note = scene.map_or_else(|| "there are no voxels to look around in".to_owned(), |scene| scene.note());
-        Ok(format!("report: {} ({}); {note}", self.folder.report().display(), bytes(page.len() as u64)))
+        console.note(&format!("page of {}: {note}", bytes(page.len() as u64)));
+        Ok(format!("report: {}", console.address(&self.folder.report())))
     }
 
     /// Every setting, as the run folder has them.

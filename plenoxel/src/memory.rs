@@ -3,9 +3,13 @@
 use crate::error::{Error, Result};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use sysinfo::{MemoryRefreshKind, ProcessRefreshKind, ProcessesToUpdate, System};
 
 /// Bytes that a command may take in all, if the user set them; 0 if not.
 static LIMIT: AtomicU64 = AtomicU64::new(0);
+
+/// The largest resident memory that [`now`] has returned.
+static PEAK: AtomicU64 = AtomicU64::new(0);
 
 /// Limits the memory that later commands of this process may take; `None` lifts the limit.
 pub fn limit(bytes: Option<u64>) {
@@ -68,10 +72,11 @@ pub fn bytes(n: u64) -> String {
     }
 }
 
-/// What Linux counts as available, within the limits of the control group and of the process; elsewhere unknown.
+/// Memory that the system counts as available, on Linux within the limits of the control group and of the process.
 fn free() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
-    let free = kilobytes(&text, "MemAvailable:")?;
+    let mut system = System::new().ok()?;
+    system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
+    let free = Some(system.available_memory()).filter(|free| *free > 0)?;
     let number = |path: &str| -> Option<u64> { std::fs::read_to_string(path).ok()?.trim().parse().ok() };
     let limit = number("/sys/fs/cgroup/memory.max");
     // What the group has of files in memory goes when memory is needed.
@@ -98,14 +103,21 @@ fn taken() -> u64 {
     of_process("VmSize:").unwrap_or(0)
 }
 
-/// The largest resident memory of this process so far, in bytes; `None` where the system does not say.
+/// Returns the largest resident memory of this process so far, in bytes: as Linux has it, elsewhere the largest that [`now`] has returned. `None` where the
+/// system does not say.
 pub fn peak() -> Option<u64> {
-    of_process("VmHWM:")
+    let now = now();
+    of_process("VmHWM:").or_else(|| now.map(|_| PEAK.load(Relaxed)))
 }
 
-/// The resident memory of this process now, in bytes; `None` where the system does not say.
+/// Returns the resident memory of this process now, in bytes; `None` where the system does not say.
 pub fn now() -> Option<u64> {
-    of_process("VmRSS:")
+    let process = sysinfo::get_current_pid().ok()?;
+    let mut system = System::new().ok()?;
+    system.refresh_processes_specifics(ProcessesToUpdate::Some(&[process]), false, ProcessRefreshKind::nothing().with_memory());
+    let bytes = system.process(process)?.memory();
+    PEAK.fetch_max(bytes, Relaxed);
+    Some(bytes)
 }
 
 fn of_process(key: &str) -> Option<u64> {
@@ -126,6 +138,15 @@ mod tests {
     fn sizes_read_well() {
         assert_eq!(bytes(2_345_678_901), "2.3 GB");
         assert_eq!(bytes(99_000), "99 kB");
+    }
+
+    #[test]
+    fn the_system_says_what_is_free_and_what_this_process_has() {
+        let (now, peak, free) = (now().unwrap(), peak().unwrap(), free().unwrap());
+        assert!(1_000_000 < now && now <= peak && peak < 1_000_000_000_000 && free > 1_000_000, "{now} {peak} {free}");
+        if let Some(resident) = of_process("VmRSS:") {
+            assert!(now.abs_diff(resident) < 50_000_000, "{now} {resident}");
+        }
     }
 
     #[test]

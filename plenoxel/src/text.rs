@@ -1,4 +1,4 @@
-//! Text that others wrote, such as names of files and what files say, made fit to be printed.
+//! Text for people: that of others, such as names of files and what files say, made fit to be printed, and times.
 
 /// The text on one line, so that it can do nothing to a terminal but to be read: control characters, line breaks, and marks that change the
 /// direction of writing are escaped as Rust writes them, `\n` and `\u{1b}`. Everything else stays as it is.
@@ -17,9 +17,23 @@ pub(crate) fn is_unprintable(c: char) -> bool {
     c.is_control() || separator || direction
 }
 
+/// Formats a time as minutes and seconds, with hours where there are any: `1:02:05`.
+pub fn clock(seconds: f64) -> String {
+    let s = seconds.max(0.0).round() as u64;
+    match s / 3600 {
+        0 => format!("{}:{:02}", s / 60, s % 60),
+        h => format!("{h}:{:02}:{:02}", s / 60 % 60, s % 60),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn times_read_well() {
+        assert_eq!([3.4, 59.6, 3725.0].map(clock), ["0:03", "1:00", "1:02:05"]);
+    }
 
     #[test]
     fn what_moves_something_is_escaped_and_the_rest_stays() {

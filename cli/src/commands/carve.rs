@@ -11,6 +11,7 @@ use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
 use plenoxel::evaluate::Viewer;
+use plenoxel::geometry::Aabb;
 use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
@@ -150,7 +151,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let estimate = Estimate::of_carving(&config, &dataset, 0, !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
-    for warning in source.check_cameras(&dataset, &config)? {
+    for warning in source.check_cameras(&dataset, Aabb::cube(config.half_width))? {
         console.note(&format!("warning: {warning}"));
     }
     let folder = NewFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
@@ -240,7 +241,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     console.record(&summary)?;
     if !args.no_report {
         let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: Some(&model) };
-        console.note(&report.write()?);
+        console.note(&report.write(console)?);
     }
     Ok(())
 }

@@ -5,7 +5,7 @@ mod pictures;
 use super::table::Figures;
 use super::table::markdown::as_text;
 use crate::html::{self, escaped};
-use crate::progress::{Console, clock, is_stdout, thousands};
+use crate::progress::{Console, is_stdout, thousands};
 use crate::report::{SCRIPT, STYLE, curves};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
@@ -14,6 +14,7 @@ use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::bytes;
 use plenoxel::run::metrics;
 use plenoxel::run::settings;
+use plenoxel::text::clock;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -58,8 +59,8 @@ impl Run {
     }
 
     /// What the table says of it.
-    fn facts(&self) -> [(&'static str, String); 10] {
-        let Figures { psnr, ssim, seconds, voxels, resolution, rays, peak_memory_bytes, .. } = self.figures;
+    fn facts(&self) -> [(&'static str, String); 11] {
+        let Figures { psnr, ssim, views, seconds, voxels, resolution, rays, peak_memory_bytes, .. } = self.figures;
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "–".to_owned());
         [
             ("run", self.name.clone()),
@@ -67,6 +68,7 @@ impl Run {
             ("preset", or_dash(self.record.preset.clone())),
             ("PSNR", or_dash(psnr.map(|x| format!("{x:.2}")))),
             ("SSIM", or_dash(ssim.map(|x| format!("{x:.4}")))),
+            ("views", or_dash(views.map(|n| n.to_string()))),
             ("time", or_dash(seconds.map(clock))),
             ("grid", or_dash(resolution.map(|n| format!("{n}³")))),
             ("voxels", or_dash(voxels.map(|n| thousands(n as u64)))),

@@ -49,6 +49,7 @@ pub struct EvaluateArgs {
 pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let start = Instant::now();
     let found = args.run.find()?;
+    let trained = found.folder.result()?.unwrap_or(Value::Null);
     let dataset = args.run.views(&found)?;
     let Loaded { model, about, view } = args.run.load(&found, console, |sampling, shape, voxels| {
         Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
@@ -80,7 +81,6 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         }
         console.result(&figures.sentence())?;
     }
-    let trained = folder.result()?.unwrap_or(Value::Null);
     // An earlier grid took less.
     let of_last = |key: &str| if args.run.best { None } else { trained.get(key) };
     let evaluation = Evaluation {
@@ -104,7 +104,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     // A carved run has no figures of its own, nor has one that was trained with --no-evaluate. One that did not end well has none either, and is no run
     // to compare.
     if args.run.is_as_trained() && same_scene && trained.is_object() && !trained["psnr"].is_number() {
-        folder.write_evaluation(&evaluation)?;
+        folder.shared("RUN")?.write_evaluation(&evaluation)?;
         console.note(
             "kept in the run's folder: `plenoxel compare` shows these figures, and so does `plenoxel report`, which writes the page again",
         );

@@ -1,6 +1,6 @@
 //! `plenoxel info`: what a run, a checkpoint or a dataset is, and what machine this is.
 
-use crate::progress::{Console, clock};
+use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::camera::placement::Placement;
 use plenoxel::checkpoint::{self, Header};
@@ -16,6 +16,7 @@ use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
 use plenoxel::run::memory::{self, bytes};
 use plenoxel::tensor_file::TensorFile;
+use plenoxel::text::clock;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\

@@ -40,6 +40,7 @@ pub fn run(args: &ReportArgs, console: &Console<'_>) -> Result<()> {
 /// Writes the page about the run in a folder; `data` is the source of its views now, if it is not where it was.
 pub fn write(run: &Path, data: Option<DataSource>, console: &Console<'_>) -> Result<()> {
     let (folder, config, record) = RunFolder::open(run)?;
+    let folder = folder.shared("RUN")?;
     let source = data.unwrap_or_else(|| record.data.clone());
     let dataset = source.reopen(&config)?;
     let path = folder.existing_checkpoint()?;
@@ -54,5 +55,5 @@ pub fn write(run: &Path, data: Option<DataSource>, console: &Console<'_>) -> Res
         None
     };
     let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: model.as_deref() };
-    console.result(&report.write()?)
+    console.result(&report.write(console)?)
 }

@@ -108,7 +108,8 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
         plan.jobs.iter().zip(&states).try_for_each(|(job, state)| check(job, state))?;
     }
     files::create_dir(&out)?;
-    let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: FolderLock::acquire(&out, "sweep.lock")? };
+    let program =
+        Program { path: child::this_program()?, machine: machine.to_vec(), lock: FolderLock::acquire(&out, "sweep.lock", "--out")? };
     // A child is asked too, and saves; the sweep waits for it.
     let watch = Watch::begin();
     let (mut failed, mut interrupted) = (Vec::new(), false);

@@ -6,11 +6,12 @@ mod pictures;
 mod screen;
 
 use super::report;
-use crate::progress::{Console, clock};
+use crate::progress::Console;
 pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use plenoxel::error::Result;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::training::{self, Outcome, RunOptions, RunSettings, Summary};
+use plenoxel::text::clock;
 use screen::Screen;
 use std::path::Path;
 

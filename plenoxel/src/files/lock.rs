@@ -13,28 +13,33 @@ pub struct FolderLock {
 }
 
 impl FolderLock {
-    /// Locks a folder that exists, by its file `name`.
+    /// Locks a folder that exists, by its file `name`. `key` is the flag or argument that names the folder, for messages.
     ///
     /// Errors: another process, or another part of this one, holds the lock; the file cannot be created. Where a file system has no locks, the folder
     /// counts as locked by this process alone.
-    pub fn acquire(folder: &Path, name: &str) -> Result<Self> {
+    pub fn acquire(folder: &Path, name: &str, key: &str) -> Result<Self> {
         let path = folder.join(name);
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
         let mut file = opened.map_err(|e| Error::io(&path, e, "creating the lock"))?;
         if let Err(TryLockError::WouldBlock) = file.try_lock() {
-            let found = format!("{}, which {} is writing,", folder.display(), holder(&mut file));
-            return Err(Error::config("--out", found, "another folder, or the same when that process has ended"));
+            return Err(refusal(folder, &mut file, key));
         }
         // The name is for messages alone: a full disk is found when something that matters is written.
         let _ = file.set_len(0).and_then(|()| writeln!(file, "process {}", std::process::id()));
         Ok(FolderLock { file })
     }
 
-    /// Refuses a folder that another process holds a lock of, without locking it.
+    /// Shares a folder with others that share it, so that nobody [acquires](Self::acquire) it meanwhile; returns `None` if nobody ever did. Nothing is
+    /// written.
     ///
-    /// Errors as for [`acquire`](Self::acquire).
-    pub fn check(folder: &Path, name: &str) -> Result<()> {
-        if folder.join(name).is_file() { Self::acquire(folder, name).map(drop) } else { Ok(()) }
+    /// Errors: another process holds the lock.
+    pub fn share(folder: &Path, name: &str, key: &str) -> Result<Option<Self>> {
+        // One that cannot be opened is not ours to respect: whatever is written next says why.
+        let Ok(mut file) = File::open(folder.join(name)) else { return Ok(None) };
+        match file.try_lock_shared() {
+            Err(TryLockError::WouldBlock) => Err(refusal(folder, &mut file, key)),
+            _ => Ok(Some(FolderLock { file })),
+        }
     }
 
     /// The locked file: a process that inherits it holds the lock too.
@@ -43,12 +48,18 @@ impl FolderLock {
     }
 }
 
-/// The process that a lock file names.
+/// The error if another process holds the lock of a folder.
+fn refusal(folder: &Path, file: &mut File, key: &str) -> Error {
+    let found = format!("{}, which {} is writing,", folder.display(), holder(file));
+    Error::config(key, found, "another folder, or this one when that process has ended")
+}
+
+/// The process that a lock file names; it may have left the lock to a process that it started.
 fn holder(file: &mut File) -> String {
     let mut text = String::new();
     let read = file.seek(SeekFrom::Start(0)).and_then(|_| file.take(64).read_to_string(&mut text));
     let number = read.ok().and_then(|_| text.trim().strip_prefix("process ")?.parse::<u32>().ok());
-    number.map_or_else(|| "another process".to_owned(), |number| format!("process {number}"))
+    number.map_or_else(|| "another process".to_owned(), |number| format!("process {number} or one that it started"))
 }
 
 /// True for a temporary file of [`atomically`](super::atomically) whose process has ended, and for one of the safetensors library, `.tmp` and six
@@ -78,13 +89,19 @@ mod tests {
     fn a_folder_has_one_writer_at_a_time_and_the_refusal_names_it() {
         let folder = std::env::temp_dir().join(format!("plenoxel-lock-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
-        let lock = FolderLock::acquire(&folder, "run.lock").unwrap();
-        let refused = FolderLock::acquire(&folder, "run.lock").unwrap_err();
-        assert!(refused.exit_code() == 2 && refused.to_string().contains(&format!("process {}", std::process::id())), "{refused}");
-        assert!(FolderLock::check(&folder, "run.lock").is_err() && FolderLock::check(&folder, "other.lock").is_ok());
+        let acquire = || FolderLock::acquire(&folder, "run.lock", "--out");
+        let share = || FolderLock::share(&folder, "run.lock", "RUN");
+        assert!(share().unwrap().is_none());
+        let lock = acquire().unwrap();
+        for (refused, key) in [(acquire().unwrap_err(), "--out"), (share().unwrap_err(), "RUN")] {
+            let (code, text) = (refused.exit_code(), refused.to_string());
+            assert!(code == 2 && text.contains(key) && text.contains(&format!("process {}", std::process::id())), "{text}");
+        }
         drop(lock);
-        FolderLock::check(&folder, "run.lock").unwrap();
-        FolderLock::acquire(&folder, "run.lock").unwrap();
+        let readers = [share().unwrap(), share().unwrap()];
+        assert!(readers.iter().all(Option::is_some) && acquire().is_err());
+        drop(readers);
+        acquire().unwrap();
         std::fs::remove_dir_all(folder).unwrap();
     }
 

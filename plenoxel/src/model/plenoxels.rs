@@ -46,7 +46,7 @@ use crate::rays::RaySource;
 use crate::render::{Engine, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{self, About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
+use crate::train::{self, About, Model, Pass, PlannedStage, Progress, RenderFn, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::Optimizer;
 use autograd::single::{cast, cast_mut, cast_ref, is_single};
 use autograd::{Module, Param, Real, Tensor};
@@ -97,14 +97,21 @@ impl<T: Real> Plenoxels<T> {
     ///
     /// Errors name the setting that cannot be used.
     pub fn new(config: &Config, views: &Arc<[View]>) -> Result<Self> {
-        if const { is_single::<T>() } { cast(single::new(config, views)) } else { Self::start(config, views) }
+        Self::with_progress(config, views, Arc::default())
     }
 
-    fn start(config: &Config, views: &Arc<[View]>) -> Result<Self> {
+    /// As [`new`](Self::new), with a counter for the views of visual hulls that another thread may read.
+    ///
+    /// Errors name the setting that cannot be used.
+    pub fn with_progress(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Result<Self> {
+        if const { is_single::<T>() } { cast(single::new(config, views, progress)) } else { Self::start(config, views, progress) }
+    }
+
+    fn start(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Result<Self> {
         config.validate()?;
         let config = config.fitted_to(views.iter().map(|view| &view.camera));
         config.check_stages()?;
-        let silhouettes = Silhouettes::new(&config, views);
+        let silhouettes = Silhouettes::new(&config, views, progress);
         let scout = config.scout.as_ref().filter(|_| silhouettes.is_none());
         let of_scout = scout.map_or(&[][..], |scout| &scout.stages);
         let stages: Vec<Stage> = of_scout.iter().chain(&config.stages).copied().collect();
@@ -309,6 +316,10 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         if const { is_single::<T>() } { single::begin(cast_mut(self), stage.index, rays) } else { self.begin(stage.index, rays) }
     }
 
+    fn progress(&self) -> Option<Arc<Progress>> {
+        self.silhouettes.as_ref().map(|silhouettes| silhouettes.progress.clone())
+    }
+
     fn begin_step(&mut self, in_stage: u64) -> Result<()> {
         if in_stage.is_multiple_of(STEPS_PER_LOOK) {
             self.learning = Some(if const { is_single::<T>() } { single::learning(cast_ref(&self.grid)) } else { self.grid.learning() });
@@ -378,7 +389,7 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
         config.validate()?;
         let views = views.into();
         let objective = objective(&config, views.len())?;
-        Self::with_losses(config, views, objective)
+        Self::with_losses(config, views, objective, Arc::default())
     }
 
     /// A run with an objective of your own. The config must name no losses but those of the default, a mean squared error: its losses would not
@@ -391,12 +402,12 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
             let accepted = "no losses in the config (`losses` empty), or Trainer::new without an objective; model::plenoxels::objective(&config, views) is one to add to";
             return Err(Error::config("losses", format!("{} beside an objective of one's own", names.join(", ")), accepted));
         }
-        Self::with_losses(config, views.into(), objective)
+        Self::with_losses(config, views.into(), objective, Arc::default())
     }
 
-    /// A run with an objective, which may have the config's losses or others.
-    pub(crate) fn with_losses(config: Config, views: Arc<[View]>, objective: Objective<T>) -> Result<Self> {
-        let model = Plenoxels::new(&config, &views)?;
+    /// A run with an objective, which may have the config's losses or others, and a counter for the views of visual hulls.
+    pub(crate) fn with_losses(config: Config, views: Arc<[View]>, objective: Objective<T>, progress: Arc<Progress>) -> Result<Self> {
+        let model = Plenoxels::with_progress(&config, &views, progress)?;
         Self::with_model(model, views, objective, config.train_options())
     }
 

@@ -79,13 +79,12 @@ impl DataSource {
 
     /// What is likely to go wrong with training views whose cameras stand and look like these, as sentences for people.
     ///
-    /// Errors: nothing can be learned from them in the box of the config.
-    pub fn check_cameras(&self, dataset: &Dataset, config: &Config) -> Result<Vec<String>> {
-        let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), Aabb::cube(config.half_width));
+    /// Errors: nothing can be learned from them in this box, world coordinates.
+    pub fn check_cameras(&self, dataset: &Dataset, aabb: Aabb) -> Result<Vec<String>> {
+        let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), aabb);
         match hopeless {
-            // A grid to start from brings its own box.
-            Some([found, remedy]) if config.init_from.is_none() => Err(Error::input(self.to_string(), found, remedy)),
-            hopeless => Ok(hopeless.map(|found| found.join("; ")).into_iter().chain(warnings).collect()),
+            Some([found, remedy]) => Err(Error::input(self.to_string(), found, remedy)),
+            None => Ok(warnings),
         }
     }
 

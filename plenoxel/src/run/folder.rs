@@ -10,7 +10,7 @@ use super::tensorboard;
 use crate::error::{Error, Result};
 use crate::files::{self, FolderLock, is_abandoned};
 use crate::json;
-use crate::model::plenoxels::{self, config::Config};
+use crate::model::plenoxels::config::Config;
 use crate::train::{self, About, Model};
 use listing::{RENDERED, entries, is_fragment, is_frame, is_one_of, remove, reserve};
 use serde::Serialize;
@@ -64,19 +64,25 @@ impl NewFolder {
                 let found = format!("{}, where {} is a file,", path.display(), file.display());
                 return Err(Error::config("--out", found, "a folder"));
             }
-            FolderLock::check(path, LOCK)?;
+            FolderLock::share(path, LOCK, "--out")?;
             check_vacant(path, overwrite)?;
         }
         Ok(NewFolder { path: out.map(Path::to_owned), scene: scene.to_owned(), overwrite })
+    }
+
+    /// Bytes of the files that are overwritten: the model and the state of the run that is there.
+    pub fn overwritten(&self) -> u64 {
+        let size = |name: &str| self.path.as_ref().and_then(|path| path.join(name).metadata().ok()).map_or(0, |file| file.len());
+        if self.overwrite { [CHECKPOINT, BEST, STATE].map(size).iter().sum() } else { 0 }
     }
 
     /// Creates the folder and locks it, and removes the files of a run that is overwritten. Files of other kinds stay.
     ///
     /// Errors: those of [`choose`](Self::choose), which may have become true since; the folder cannot be written.
     pub fn create(self) -> Result<RunFolder> {
-        let Some(path) = self.path else { return RunFolder::at(&reserve(Path::new("runs"), &self.scene)?).locked() };
+        let Some(path) = self.path else { return RunFolder::at(&reserve(Path::new("runs"), &self.scene)?).locked("--out") };
         files::create_dir(&path)?;
-        let folder = RunFolder::at(&path).locked()?;
+        let folder = RunFolder::at(&path).locked("--out")?;
         check_vacant(&path, self.overwrite)?;
         folder.clear()?;
         Ok(folder)
@@ -103,12 +109,21 @@ impl RunFolder {
         RunFolder { path: path.to_owned(), grid: CHECKPOINT, _lock: None }
     }
 
-    /// The same folder, locked: no other process writes it before this value and its clones are dropped.
+    /// The same folder, locked: no other process trains or carves into it before this value and its clones are dropped. `key` is the flag or argument that
+    /// names the folder, for messages.
     ///
     /// Errors: another process is writing it.
-    pub fn locked(self) -> Result<Self> {
-        let lock = FolderLock::acquire(&self.path, LOCK)?;
+    pub fn locked(self, key: &str) -> Result<Self> {
+        let lock = FolderLock::acquire(&self.path, LOCK, key)?;
         Ok(RunFolder { _lock: Some(Arc::new(lock)), ..self })
+    }
+
+    /// The same folder, shared with others that add to a finished run: no process trains or carves into it before this value and its clones are dropped.
+    ///
+    /// Errors: another process is training or carving into it.
+    pub fn shared(self, key: &str) -> Result<Self> {
+        let lock = FolderLock::share(&self.path, LOCK, key)?;
+        Ok(RunFolder { _lock: lock.map(Arc::new), ..self })
     }
 
     /// True if there is nothing in the folder but a lock and temporary files, or no such folder.
@@ -141,13 +156,17 @@ impl RunFolder {
 
     /// Writes `config.toml`, `run.json` and `README.md`, which are known before the first step.
     pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
-        let command = record.kind.command();
-        let again = format!("plenoxel {command}{} --config THIS_FILE", record.data.arguments());
-        settings::write(
-            &self.path.join(CONFIG),
-            config,
-            &format!("Settings of a run of {}. The same run again:\n{again}", record.program),
-        )?;
+        let about = match record.is_of_own_model() {
+            false => {
+                let again = format!("plenoxel {}{} --config THIS_FILE", record.kind.command(), record.data.arguments());
+                format!("Settings of a run of {}. The same run again:\n{again}", record.program)
+            }
+            true => format!(
+                "Settings of a run of a model of kind `{}`, on {}. The program that made it may not use all of them.",
+                record.model, record.data
+            ),
+        };
+        settings::write(&self.path.join(CONFIG), config, &about)?;
         self.write_json(RECORD, record)?;
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
     }
@@ -171,7 +190,7 @@ impl RunFolder {
         }
         let mut record = RunRecord::parse(&record, &files::read(&record, files::RECORD)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
-        if config.stages.is_empty() && record.model == plenoxels::KIND {
+        if config.stages.is_empty() && !record.is_of_own_model() {
             record.kind = RunKind::Carved;
         }
         Ok((folder, config, record))
@@ -219,7 +238,11 @@ impl RunFolder {
         if !files::is_there(&path) {
             let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
             let best = if self.path.join(BEST).exists() { "; or --best, for the best grid that was saved" } else { "" };
-            return Err(Error::input(&self.path, found, format!("go on with `plenoxel train --resume`, or train again{best}")));
+            return Err(Error::input(
+                &self.path,
+                found,
+                format!("resume it (`plenoxel train --resume`, if that began it), or train again{best}"),
+            ));
         }
         Ok(path)
     }

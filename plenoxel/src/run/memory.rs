@@ -1,11 +1,12 @@
 //! Estimates of the memory that a command will take, before it is taken, and the memory that there is.
 //!
 //! The parts are counted from what is known: images, tables, optimizer state, and the arrays that a training step keeps for its gradient.
-//! The last depends on how many samples the rays take: about as many as cross the box from face to face, fewer after pruning.
+//! The last depends on the number of samples on a ray: as many as fit between two faces of the box, or fewer where only voxels near surfaces are left.
 
 pub use crate::memory::{available, bytes, limit, now, peak};
 
 use super::machine;
+use super::training::RunOptions;
 use crate::carve::Fit;
 use crate::carve::color::KEPT_LIGHT;
 use crate::carve::visual_hull::silhouette_bytes;
@@ -20,7 +21,7 @@ use crate::render::Engine;
 /// An estimate in bytes, by purpose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate {
-    /// 8-bit images of the largest split, and full-size ones in decoding.
+    /// 8-bit images of the training views or of the test views, whichever are more, and full-size ones in decoding.
     pub images: u64,
     /// Tables of the finest grid, of the one before it, and of kept stages.
     pub grid: u64,
@@ -28,8 +29,8 @@ pub struct Estimate {
     pub optimizer: u64,
     /// Samples, intermediate values and gradients of one step, or what evaluating or saving takes if that is more.
     pub step: u64,
-    /// True if it is known only when pruning is done.
-    pruned: bool,
+    /// True if it depends on how many voxels are left near surfaces, of which only an expectation is known.
+    expected: bool,
     /// The setting that counts most, and what would help.
     key: String,
     advice: &'static str,
@@ -52,17 +53,18 @@ const PAGE_BYTES: u64 = 150_000_000;
 const EVALUATION_RAYS: u64 = 4096;
 
 impl Estimate {
-    /// A training run with everything around it, the page about it if there is to be one; `initial` bytes are of the grid that it starts from.
-    pub fn of_training(config: &Config, dataset: &Dataset, initial: u64, report: bool) -> Self {
+    /// Estimates a training run and its evaluation; `initial` is the size in bytes of the grid that it starts from, 0 if it starts from none.
+    pub fn of_training(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions) -> Self {
         let states = states(config);
         // Bytes of a stage's tables, and what is held of it and of the one before while it begins.
         let tables = |index: usize| (share(config, index) * config.grid_shape(config.stages[index].resolution).bytes() as f64) as u64;
         let begins = |index: usize| {
             let before = share(config, index.saturating_sub(1));
             let outline = OUTLINE as f64 * before * config.grid_shape(config.stages[index].resolution).voxels() as f64;
-            // The first is made whole. Those before may be kept for their figures.
+            // The first is made whole.
             let own = if index == 0 { config.grid_shape(config.stages[0].resolution).bytes() as u64 } else { tables(index) };
-            (0..index).map(tables).sum::<u64>() + (outline as u64).max(own)
+            let before = if options.stage_psnr { (0..index).map(tables).sum() } else { index.checked_sub(1).map_or(0, tables) };
+            before + (outline as u64).max(own)
         };
         let finest = (0..config.stages.len()).max_by_key(|&index| tables(index) * (1 + states));
         let index = finest.unwrap_or(0);
@@ -71,7 +73,7 @@ impl Estimate {
         let rays = config.rays_per_step as u64;
         let step = config.stages.iter().enumerate().map(|(index, stage)| {
             let shape = config.grid_shape(stage.resolution);
-            let samples = rays * mean_samples(stage.sampling, &shape);
+            let samples = rays * (mean_samples(stage.sampling, &shape) as f64 * crossed(config, index)).ceil() as u64;
             // What the fused engine keeps is bounded; it then adds rows up chunk by chunk: those so far, those of a chunk, and their sum.
             let chunked = config.engine == Engine::Fused && rays > CHUNK as u64;
             let kept = if chunked { samples / rays * CHUNK as u64 } else { samples };
@@ -93,14 +95,15 @@ impl Estimate {
         let (width, height) = dataset.size();
         let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let step = step.max().unwrap_or(0).max(hull);
-        let comparison = comparison(dataset, Split::Test, DRAWN_BYTES);
-        let evaluation = EVALUATION_RAYS * mean_samples(config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
+        let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
+        let evaluation = evaluation_samples(config, config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // A table's bytes beside it.
         let saving = tables(index);
-        let page = if report { page(tables(index)) } else { 0 };
+        let page = if options.report { page(tables(index)) } else { 0 };
         // It renders, when the optimizer is gone.
         let reporting = (evaluation + comparison.max(page)).saturating_sub(optimizer);
-        let images = images(dataset, config.downscale, &[Split::Train, Split::Test]);
+        let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
+        let images = images(dataset, config.downscale, views);
         let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "fewer voxels a side, a lower sh_degree, or a higher sh_reduction");
         let parts = [
@@ -115,8 +118,9 @@ impl Estimate {
             images,
             grid,
             optimizer,
-            step: step.max(evaluation).max(saving).max(reporting),
-            pruned: share(config, index) < 1.0,
+            // The graph's free buffers of training and of evaluation have different sizes, and both kinds are kept.
+            step: if config.engine == Engine::Graph { step + evaluation } else { step.max(evaluation) }.max(saving).max(reporting),
+            expected: share(config, index) < 1.0,
             key,
             advice,
         }
@@ -138,15 +142,15 @@ impl Estimate {
         voxels: usize,
         compare: Option<(&Dataset, Split)>,
     ) -> Self {
-        let samples = EVALUATION_RAYS * mean_samples(sampling, shape);
+        let samples = evaluation_samples(config, sampling, shape);
         Estimate {
-            images: compare.map_or(0, |(dataset, split)| images(dataset, config.downscale, &[split])),
+            images: compare.map_or(0, |(dataset, split)| images(dataset, config.downscale, dataset.count(split))),
             // The file and the tables read from it.
             grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
             step: samples * evaluation_bytes_per_sample(config.engine, shape)
                 + compare.map_or(0, |(dataset, split)| comparison(dataset, split, COMPARED_BYTES)),
-            pruned: false,
+            expected: false,
             key: "RUN".to_owned(),
             advice: "a machine with more, or fewer --samples",
         }
@@ -186,7 +190,7 @@ impl Estimate {
         let items = if config.carve.photo.is_some() { 4 * pixels } else { 0 } + if config.carve.fit == Fit::Sgd { 8 * pixels } else { 0 };
         // The two sides of the normal equations, the answer, its error, and how much a voxel weighs.
         let fit = 4 * rows as u64 * (coefficients * (coefficients + 1) / 2 + 9 * coefficients + 2);
-        let images = images(dataset, config.downscale, &[Split::Train]) + items;
+        let images = images(dataset, config.downscale, dataset.count(Split::Train)) + items;
         let kept = if rows > 0 { (KEPT_LIGHT as u64).min(12 * pixels * hits_of_pixel(config)) } else { 0 };
         let page = if rows > 0 && report { page((rows * shape.voxel_bytes()) as u64) } else { 0 };
         let step = (step + kept).max(page);
@@ -197,7 +201,7 @@ impl Estimate {
             (page, ("report.html", "--no-report, which leaves it out")),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
-        Estimate { images, grid, optimizer: 0, step, pruned: false, key: key.to_owned(), advice }
+        Estimate { images, grid, optimizer: 0, step, expected: false, key: key.to_owned(), advice }
     }
 
     /// Reading a trained grid of so many voxels, and making something of them: at most all of them.
@@ -209,7 +213,7 @@ impl Estimate {
             optimizer: 0,
             // Places, rows, normals and colors.
             step: 100 * voxels as u64,
-            pruned: false,
+            expected: false,
             key: "RUN".to_owned(),
             advice: "a machine with more",
         }
@@ -217,8 +221,8 @@ impl Estimate {
 
     /// The images of the largest split alone.
     pub fn of_images(dataset: &Dataset) -> Self {
-        let images = images(dataset, 1, &Split::ALL);
-        Estimate { images, grid: 0, optimizer: 0, step: 0, pruned: false, key: "DIR".to_owned(), advice: "fewer or smaller views" }
+        let images = images(dataset, 1, Split::ALL.into_iter().map(|split| dataset.count(split)).max().unwrap_or(0));
+        Estimate { images, grid: 0, optimizer: 0, step: 0, expected: false, key: "DIR".to_owned(), advice: "fewer or smaller views" }
     }
 
     /// All of it.
@@ -244,7 +248,7 @@ impl Estimate {
             part("grid", self.grid),
             part("optimizer", self.optimizer),
             part("step", self.step),
-            if self.pruned { ", if pruning leaves an eighth of the voxels" } else { "" },
+            if self.expected { ", for a scene of usual surfaces" } else { "" },
         )
     }
 
@@ -279,24 +283,50 @@ fn states(config: &Config) -> u64 {
 
 /// Bytes for each voxel while it is found out which of them there will be: its density, and a color that is not used.
 const OUTLINE: u64 = 16;
-/// The share of the voxels that is expected to be left by pruning. Of lego's at 256 voxels a side a twentieth is, of what fills its cube more.
-const LEFT: f64 = 0.125;
+/// Voxels near surfaces, over the voxels of a face of the box. Measured after pruning: 30 and 26 on the built-in scene at 128 and 206 voxels a side, 22 on lego at 320
+/// and 358, 16 on lego in a wide box at 512. They grow with the square of the resolution, because surfaces do.
+const SURFACE: f64 = 28.0;
+/// Samples of a ray that meets these voxels, over those of a ray through the same share of the box. Measured in first steps, where it is largest: 0.6 on the built-in
+/// scene at 128 voxels a side, 0.4 on lego at 320.
+const CROSSED: f64 = 0.6;
 
-/// The share of the voxels that is expected to be there in a stage.
+/// Expected share of the box's voxels that are present in a stage: those near surfaces once pruning, silhouettes or a scout have found them.
 fn share(config: &Config, stage: usize) -> f64 {
-    if config.prune_from_stage.is_some_and(|first| first <= stage) { LEFT } else { 1.0 }
+    let located = config.hull == Hull::Auto || config.scout.is_some() || config.prune_from_stage.is_some_and(|first| first <= stage);
+    if located { near_surfaces(config.stages[stage].resolution) } else { 1.0 }
 }
 
-/// Images of the largest of some splits, with depth where the scene knows it, and the full-size ones that each thread reduces.
-fn images(dataset: &Dataset, downscale: usize, splits: &[Split]) -> u64 {
+/// Expected share of the box's voxels that are near surfaces.
+fn near_surfaces(resolution: usize) -> f64 {
+    (SURFACE / resolution as f64).min(1.0)
+}
+
+/// Samples that are in memory at a time when evaluating. A batch may be of rays that all meet surfaces: twice the share of the box.
+fn evaluation_samples(config: &Config, sampling: Sampling, shape: &GridShape) -> u64 {
+    let last = config.stages.len().checked_sub(1);
+    let share = match last.map(|stage| share(config, stage)) {
+        Some(1.0) => 1.0,
+        // A carved grid has surfaces only.
+        _ => (2.0 * near_surfaces(shape.resolution)).min(1.0),
+    };
+    (EVALUATION_RAYS as f64 * mean_samples(sampling, shape) as f64 * share).ceil() as u64
+}
+
+/// Expected samples of a ray in a stage, over those of a ray through the whole box.
+fn crossed(config: &Config, stage: usize) -> f64 {
+    let share = share(config, stage);
+    if share < 1.0 { CROSSED * share } else { 1.0 }
+}
+
+/// Images of so many views, with depth where the scene knows it, and the full-size ones that each thread reduces.
+fn images(dataset: &Dataset, downscale: usize, views: usize) -> u64 {
     let (width, height) = dataset.size();
     let pixels = (width * height) as u64;
-    let views = splits.iter().map(|split| dataset.count(*split)).max();
     let per_pixel = if dataset.scene().is_some() { 8 } else { 4 };
     let threads = machine::threads() as u64;
     // Pixels are decoded row by row to 8 bits, whatever the file has, into the image that is counted already, unless it is to be reduced.
     let decoding = if downscale > 1 { threads * 4 * pixels * (downscale * downscale) as u64 } else { 0 };
-    views.unwrap_or(0) as u64 * pixels * per_pixel + decoding
+    views as u64 * pixels * per_pixel + decoding
 }
 
 /// Comparing the views of a split, one after the other, if there are any.

@@ -36,16 +36,19 @@ use crate::dataset::{Dataset, Split, View};
 use crate::error::{Error, Result};
 use crate::evaluate::{self, Scores, Viewer};
 use crate::files;
+use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
-use crate::model::plenoxels::{self, Objective, Trainer, objective};
+use crate::model::plenoxels::{Objective, Trainer, objective};
 use crate::run::figures::Figures;
-use crate::train::{self, Model, PlannedStage, ViewOptions};
-use event::clock;
+use crate::text::clock;
+use crate::train::{self, Model, PlannedStage, Progress, ViewOptions};
 use learning::Learned;
 use preview::Preview;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
 use std::time::{Duration, Instant};
 
 /// Settings of a new run.
@@ -154,6 +157,9 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     let carved = from.as_ref().is_some_and(|(_, _, record)| record.is_carved());
     let initial = from.map(|(folder, ..)| folder.existing_checkpoint()).transpose()?;
     let known = initial.as_deref().map(checkpoint::header).transpose()?;
+    // A grid to start from brings its own box.
+    let half_width = known.as_ref().map_or(run.config.half_width, |(header, _)| header.shape().half_width);
+    run.check_cameras(Aabb::cube(half_width), on)?;
     if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != run.dataset.name()) {
         on(Event::note(format!("the grid it starts from is of another scene: {}, not {}", header.scene, run.dataset.name())));
     }
@@ -172,11 +178,12 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     }
     let objective = objective(&run.config, run.views.len())?;
     let NewRun { config, views, clocks, .. } = &mut run;
+    let progress = Arc::new(Progress::default());
     let start = || {
-        let trainer = Trainer::with_losses(config.clone(), views.clone(), objective)?.with_most_rows(most_rows);
+        let trainer = Trainer::with_losses(config.clone(), views.clone(), objective, progress.clone())?.with_most_rows(most_rows);
         Ok(initial.iter().fold(trainer, if carved { Trainer::starting_from_carved } else { Trainer::starting_from }))
     };
-    let trainer = clocks.train.time(start)?;
+    let trainer = clocks.train.time(|| watched(&progress, on, start))?;
     drop(initial);
     let half_width = trainer.grid().shape().half_width;
     if half_width != config.half_width {
@@ -206,6 +213,7 @@ pub fn train_model<M: Model<f32>>(
     run.read(on)?;
     let NewRun { config, dataset, views, clocks, .. } = &mut run;
     let trainer = clocks.train.time(|| start(config, dataset, views.clone()))?;
+    run.check_cameras(trainer.model().aabb(), on)?;
     run.learn(trainer, on)
 }
 
@@ -239,10 +247,27 @@ impl<'s> NewRun<'s> {
         let mut clocks = Clocks::default();
         let dataset = clocks.load.time(|| settings.data.open(&config))?;
         on(Event::Opened { dataset: &dataset, config: &config });
-        let warnings = settings.data.check_cameras(&dataset, &config)?;
-        warnings.iter().for_each(|warning| on(Event::warning(warning)));
         let folder = NewFolder::choose(settings.out.as_deref(), dataset.name(), settings.force)?;
-        Ok(NewRun { settings, config, dataset, folder, views: Arc::new([]), preview: Preview::default(), clocks, saved: 0, warnings })
+        Ok(NewRun {
+            settings,
+            config,
+            dataset,
+            folder,
+            views: Arc::new([]),
+            preview: Preview::default(),
+            clocks,
+            saved: 0,
+            warnings: Vec::new(),
+        })
+    }
+
+    /// Looks for what is likely to go wrong with these cameras and a model in a box.
+    ///
+    /// Errors: no camera sees anything of the box.
+    fn check_cameras(&mut self, aabb: Aabb, on: &mut Listener<'_>) -> Result<()> {
+        self.warnings = self.settings.data.check_cameras(&self.dataset, aabb)?;
+        self.warnings.iter().for_each(|warning| on(Event::warning(warning)));
+        Ok(())
     }
 
     /// Reads the training views, and those that are looked at while training.
@@ -258,7 +283,7 @@ impl<'s> NewRun<'s> {
     fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
         let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved, warnings } = self;
         let RunSettings { data, preset, time, options, .. } = settings;
-        check_disk(settings.out.as_deref().unwrap_or(Path::new("runs")), saved, on)?;
+        check_disk(settings.out.as_deref().unwrap_or(Path::new("runs")), saved.saturating_sub(folder.overwritten()), on)?;
         let folder = folder.create()?;
         let record = RunRecord {
             seconds_planned: *time,
@@ -305,7 +330,7 @@ fn resume_plenoxels(
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
     let mut run = OldRun::open(path, data, options, on)?;
-    if run.record.model != plenoxels::KIND {
+    if run.record.is_of_own_model() {
         let found = format!("a run of a model of kind `{}`", run.record.model);
         return Err(Error::input(path, found, "resume it with the program that began it (run::training::resume_model)"));
     }
@@ -313,7 +338,9 @@ fn resume_plenoxels(
     let most_rows = estimate.most_rows(&run.config).unwrap_or(usize::MAX);
     run.read(on)?;
     let objective = objective(&run.config, run.views.len())?;
-    let trainer = Trainer::with_losses(run.config.clone(), run.views.clone(), objective)?.with_most_rows(most_rows);
+    let progress = Arc::new(Progress::default());
+    let start = || Trainer::with_losses(run.config.clone(), run.views.clone(), objective, progress.clone());
+    let trainer = watched(&progress, on, start)?.with_most_rows(most_rows);
     run.learn(trainer, on)
 }
 
@@ -354,7 +381,7 @@ impl<'o> OldRun<'o> {
         if record.is_carved() {
             return Err(Error::input(path, "this run was carved", "to train its grid further, use `--init-from`"));
         }
-        let folder = folder.locked()?;
+        let folder = folder.locked("--resume")?;
         let state = folder.existing_state()?;
         let mut clocks = Clocks::default();
         record.data = data.unwrap_or(record.data);
@@ -394,7 +421,9 @@ impl<'o> OldRun<'o> {
         clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
         let path = folder.path().display();
         on(Event::note(format!("run: {path}, going on after step {taken} of {total}, {} of training", clock(past.seconds))));
-        let warnings = record.data.check_cameras(&dataset, &config)?;
+        let as_it_began = !record.is_of_own_model() && config.init_from.is_none();
+        let aabb = if as_it_began { Aabb::cube(config.half_width) } else { trainer.model().aabb() };
+        let warnings = record.data.check_cameras(&dataset, aabb)?;
         let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options, warnings: &warnings };
         let learned = match state {
             Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks, on)?,
@@ -425,6 +454,27 @@ fn load(dataset: &Dataset, split: Split, numbers: &[usize], source: &DataSource,
     })
 }
 
+/// Runs a computation and tells of its progress.
+fn watched<R>(progress: &Progress, on: &mut Listener<'_>, compute: impl FnOnce() -> R) -> R {
+    const FIRST: Duration = Duration::from_secs(1);
+    const NEXT: Duration = Duration::from_millis(100);
+    let (end, ended) = mpsc::channel::<()>();
+    thread::scope(|scope| {
+        scope.spawn(move || {
+            let mut wait = FIRST;
+            while let Err(RecvTimeoutError::Timeout) = ended.recv_timeout(wait) {
+                if let Some((done, total)) = progress.now() {
+                    on(Event::Carving { done, total });
+                }
+                wait = NEXT;
+            }
+        });
+        let result = compute();
+        drop(end);
+        result
+    })
+}
+
 /// Says which stages the images are large enough for, and how much memory a run will take.
 ///
 /// Errors: there is less memory.
@@ -434,7 +484,7 @@ fn estimate(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptio
         let stages: Vec<String> = fitted.stages.iter().map(|stage| format!("{}³", stage.resolution)).collect();
         on(Event::note(format!("stages as the size of the images allows (pixels_per_voxel): {}", stages.join(", "))));
     }
-    let estimate = Estimate::of_training(&fitted, dataset, initial, options.report);
+    let estimate = Estimate::of_training(&fitted, dataset, initial, options);
     on(Event::note(estimate.describe()));
     estimate.check()?;
     Ok(estimate)
@@ -608,5 +658,31 @@ impl Stopwatch {
     /// Seconds so far.
     pub fn seconds(&self) -> f64 {
         self.0.as_secs_f64()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_computation_tells_of_its_progress_and_a_short_one_does_not() {
+        let progress = Progress::default();
+        let mut told = Vec::new();
+        let mut listen = |event: Event<'_>| {
+            if let Event::Carving { done, total } = event {
+                told.push((done, total));
+            }
+        };
+        let work = |seconds| {
+            progress.of(3, |done| {
+                done(2);
+                thread::sleep(Duration::from_secs_f64(seconds));
+            });
+        };
+        watched(&progress, &mut listen, || work(0.01));
+        watched(&progress, &mut listen, || work(1.5));
+        assert!(!told.is_empty() && told.iter().all(|told| *told == (2, 3)), "{told:?}");
+        assert_eq!(progress.now(), None);
     }
 }

@@ -13,6 +13,32 @@ use autograd::{Module, Real};
 use serde_json::{Map, Value, json};
 use std::any::Any;
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+/// Progress of a long computation, counted in items, that another thread may read while it goes on.
+#[derive(Debug, Default)]
+pub struct Progress {
+    done: AtomicUsize,
+    total: AtomicUsize,
+}
+
+impl Progress {
+    /// Runs a computation over `total` items, which calls the function it is given with the number of items that are done.
+    pub fn of<R>(&self, total: usize, compute: impl FnOnce(&dyn Fn(usize)) -> R) -> R {
+        self.done.store(0, Relaxed);
+        self.total.store(total, Relaxed);
+        let result = compute(&|done| self.done.store(done, Relaxed));
+        self.total.store(0, Relaxed);
+        result
+    }
+
+    /// Returns how many items are done, and of how many; `None` while nothing is computed.
+    pub fn now(&self) -> Option<(usize, usize)> {
+        let total = self.total.load(Relaxed);
+        (total > 0).then(|| (self.done.load(Relaxed).min(total), total))
+    }
+}
 
 /// A radiance field with a recipe: how it is rendered, how its parameters are learned, and what happens to it at which step.
 ///
@@ -49,6 +75,11 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {
         let _ = (stage, rays);
         Ok(())
+    }
+
+    /// Progress of [`begin_stage`](Model::begin_stage), for a model whose stages may take long to begin: another thread reads it meanwhile. By default there is none.
+    fn progress(&self) -> Option<Arc<Progress>> {
+        None
     }
 
     /// Changes the model before a step, whose number counts from the beginning of the stage.

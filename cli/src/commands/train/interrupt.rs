@@ -1,5 +1,6 @@
 //! Ctrl-C and SIGTERM: the first time while a run trains, or a sweep has runs made, it is asked to save and stop; else the process ends.
 
+use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
 use std::sync::{Mutex, Once, PoisonError};
 use std::time::{Duration, Instant};
@@ -12,6 +13,19 @@ const SAME_WISH: Duration = Duration::from_secs(1);
 
 static WATCHED: AtomicBool = AtomicBool::new(false);
 static REQUESTED: Mutex<Option<Instant>> = Mutex::new(None);
+/// What is said when the process is interrupted and nobody watches.
+static LAST_WORDS: Mutex<String> = Mutex::new(String::new());
+
+/// Has interruptions end the process with [`EXIT_CODE`] and a clean line on a terminal. Where the system does not let it, they end the process as ever.
+pub fn install() {
+    static LISTENING: Once = Once::new();
+    LISTENING.call_once(listen);
+}
+
+/// What is said on stderr if the process is interrupted from now on, while nobody watches.
+pub fn on_exit(words: String) {
+    *LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner) = words;
+}
 
 /// While it lives, an interruption is something to ask for.
 pub struct Watch(());
@@ -19,8 +33,7 @@ pub struct Watch(());
 impl Watch {
     /// Begins to watch. Where the system does not let it, an interruption ends the process as ever.
     pub fn begin() -> Self {
-        static LISTENING: Once = Once::new();
-        LISTENING.call_once(listen);
+        install();
         *wished() = None;
         WATCHED.store(true, SeqCst);
         Watch(())
@@ -51,6 +64,11 @@ fn wished() -> std::sync::MutexGuard<'static, Option<Instant>> {
 fn wish() {
     let first = *wished().get_or_insert_with(Instant::now);
     if !WATCHED.load(SeqCst) || first.elapsed() > SAME_WISH {
+        let words = LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut err = std::io::stderr();
+        // The bar goes, and with it what the terminal wrote behind it. Nobody can be told that stderr cannot be written.
+        let clear = if err.is_terminal() { "\r\x1b[2K" } else { "" };
+        drop(if words.is_empty() { write!(err, "{clear}") } else { writeln!(err, "{clear}error: {words}") });
         std::process::exit(EXIT_CODE.into());
     }
 }

@@ -1,6 +1,6 @@
 //! What is shown of a run while it trains: lines and bars, the curve of the loss, pictures, and the page at the end.
 
-use super::interrupt::Watch;
+use super::interrupt::{self, Watch};
 use super::pictures::Pictures;
 use super::say;
 use crate::commands::new_run::{announce, loading};
@@ -58,7 +58,15 @@ impl<'c, 'a> Screen<'c, 'a> {
                     self.count = None;
                 }
             }
+            Event::Carving { done, total } => {
+                const WHAT: &str = "visual hull of training views";
+                match &self.progress {
+                    Some(training) => training.count(WHAT, done, total),
+                    None => self.count.get_or_insert_with(|| console.count(WHAT, total)).at(done, total),
+                }
+            }
             Event::Started { run, plan, test_views, history } => {
+                self.count = None;
                 self.plan = plan.to_vec();
                 let pictures = console.drawn(Pictures::new(run, test_views, self.draws));
                 self.pictures = pictures.map(|pictures| pictures.after(history, plan));
@@ -90,7 +98,13 @@ impl<'c, 'a> Screen<'c, 'a> {
             }
             Event::Saved { .. } => {}
             Event::Failed { losses } => drop(console.drawn(self.draw_loss(losses))),
-            Event::Trained => (self.progress, self.interrupt) = (None, None),
+            Event::Trained => {
+                (self.progress, self.interrupt) = (None, None);
+                if let Some(folder) = &self.folder {
+                    let again = format!("plenoxel train --resume {}", folder.path().display());
+                    interrupt::on_exit(format!("interrupted; the trained model is saved; its figures and its page: {again}"));
+                }
+            }
             Event::Evaluating { done, total } => {
                 self.count.get_or_insert_with(|| console.count("evaluating", total)).at(done, total);
             }
@@ -118,7 +132,7 @@ impl<'c, 'a> Screen<'c, 'a> {
 
     fn report(&self, run: Finished<'_>) -> Result<()> {
         let Finished { folder, config, record, dataset, model, .. } = run;
-        self.console.note(&Report { folder, config, record, dataset, model: Some(model) }.write()?);
+        self.console.note(&Report { folder, config, record, dataset, model: Some(model) }.write(self.console)?);
         Ok(())
     }
 

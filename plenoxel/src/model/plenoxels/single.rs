@@ -12,14 +12,14 @@ use crate::rays::RaySource;
 use crate::render::{self, RenderOptions, Rendered};
 use crate::sampling::Occupancy;
 use crate::tensor_file::TensorFile;
-use crate::train::About;
+use crate::train::{About, Progress};
 use autograd::optim::Optimizer;
 use std::path::Path;
 use std::sync::Arc;
 
 #[inline(never)]
-pub fn new(config: &Config, views: &Arc<[View]>) -> Result<Plenoxels<f32>> {
-    Plenoxels::start(config, views)
+pub fn new(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Result<Plenoxels<f32>> {
+    Plenoxels::start(config, views, progress)
 }
 
 #[inline(never)]

@@ -8,6 +8,7 @@ use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
+use crate::train::Progress;
 use autograd::lattice::has;
 use autograd::{Real, Tensor};
 use std::ops::ControlFlow;
@@ -21,18 +22,23 @@ const COARSE: usize = 64;
 pub struct Silhouettes {
     views: Arc<[View]>,
     margin: f64,
+    /// Counts views while a visual hull is computed.
+    pub progress: Arc<Progress>,
 }
 
 impl Silhouettes {
     /// `None` if the config does not let them decide, or there are none.
-    pub fn new(config: &Config, views: &Arc<[View]>) -> Option<Self> {
-        (config.hull == Hull::Auto && has_alpha(views)).then(|| Silhouettes { views: views.clone(), margin: config.carve.margin })
+    pub fn new(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Option<Self> {
+        let margin = config.carve.margin;
+        (config.hull == Hull::Auto && has_alpha(views)).then(|| Silhouettes { views: views.clone(), margin, progress })
     }
 
     /// The half width of the smallest cube around the origin that holds all that the silhouettes leave of the cube of `half_width`; `None` if they
     /// leave nothing.
     pub fn half_width(&self, half_width: f64) -> Option<f64> {
-        visual_hull::by_footprint(&self.views, Aabb::cube(half_width), [COARSE; 3], self.margin, &|_| ()).half_width()
+        let cube = Aabb::cube(half_width);
+        let hull = |done: &dyn Fn(usize)| visual_hull::by_footprint(&self.views, cube, [COARSE; 3], self.margin, done);
+        self.progress.of(self.views.len(), hull).half_width()
     }
 
     /// The error if no voxel lies within the silhouettes of all views.
@@ -45,7 +51,8 @@ impl Silhouettes {
     pub fn voxels<T: Real>(&self, grid: &VoxelGrid<T>) -> Occupancy {
         let shape = grid.shape();
         let near = shape.reached_from(&grid.voxels_where(|_| true));
-        shape.reached_from(&visual_hull::by_footprint_of(&self.views, &near, self.margin, &|_| ()))
+        let hull = |done: &dyn Fn(usize)| visual_hull::by_footprint_of(&self.views, &near, self.margin, done);
+        shape.reached_from(&self.progress.of(self.views.len(), hull))
     }
 }
 

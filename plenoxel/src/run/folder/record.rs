@@ -85,6 +85,11 @@ impl RunRecord {
         self.kind == RunKind::Carved
     }
 
+    /// True for a run of a model that this crate's own commands do not train.
+    pub fn is_of_own_model(&self) -> bool {
+        self.model != plenoxels::KIND
+    }
+
     /// Reads the bytes of a file; `path` names it in messages.
     ///
     /// Errors: they are not JSON with the keys of a record.

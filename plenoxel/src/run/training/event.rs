@@ -33,6 +33,13 @@ pub enum Event<'a> {
         /// Number of images that are read.
         total: usize,
     },
+    /// The visual hull of the silhouettes is computed, which is told if it takes longer than a second.
+    Carving {
+        /// Number of views whose silhouettes were used.
+        done: usize,
+        /// Number of views to use.
+        total: usize,
+    },
     /// Training begins, or goes on.
     Started {
         /// The run.
@@ -149,14 +156,5 @@ impl Event<'_> {
 
     pub(super) fn warning(text: &str) -> Self {
         Event::Note(format!("warning: {text}"))
-    }
-}
-
-/// Minutes and seconds, with hours where there are any.
-pub fn clock(seconds: f64) -> String {
-    let s = seconds.max(0.0).round() as u64;
-    match s / 3600 {
-        0 => format!("{}:{:02}", s / 60, s % 60),
-        h => format!("{h}:{:02}:{:02}", s / 60 % 60, s % 60),
     }
 }

@@ -3,7 +3,7 @@
 use super::best::BestModel;
 use super::event::Underway;
 use super::preview::{Look, Preview};
-use super::{Clocks, Event, Job, Listener, Stopped};
+use super::{Clocks, Event, Job, Listener, Stopped, watched};
 use crate::camera::Camera;
 use crate::dataset::{Split, View};
 use crate::error::{Error, Result};
@@ -72,7 +72,13 @@ impl Job<'_> {
         let mut saved = Instant::now();
         let (mut mean_squared_error, mut taken) = (0.0, false);
         let last_psnr = loop {
-            let report = match clocks.train.time(|| trainer.step()) {
+            let begins = plan.iter().any(|stage| stage.first == trainer.steps_taken());
+            let progress = trainer.model().progress().filter(|_| begins);
+            let mut step = || trainer.step();
+            let report = match clocks.train.time(|| match &progress {
+                Some(progress) => watched(progress, on, step),
+                None => step(),
+            }) {
                 Ok(Some(report)) => report,
                 Ok(None) => break None,
                 // There is no checkpoint: the lines and the curve so far show how it came to this.
