@@ -1,10 +1,10 @@
-//! A loss is a function of tensors. This one fits a line to points of which one is far off, as if it were not there.
+//! A custom loss. A loss is a function of tensors. The robust loss of this example fits a line to points and ignores an outlier.
 
 use autograd::optim::{Adam, AdamMode, Exponential, Optimizer};
 use autograd::{Param, Real, Tensor, value_and_grad};
 use ndarray::arr1;
 
-/// Charbonnier's: quadratic for errors well below `scale`, linear above, smooth between.
+/// The Charbonnier loss: quadratic for errors well below `scale`, linear for errors well above it, and smooth.
 fn charbonnier<T: Real>(prediction: &Tensor<T>, target: &Tensor<T>, scale: f64) -> Tensor<T> {
     let error = prediction - target;
     (error.square() + scale * scale).sqrt().mean()
@@ -16,7 +16,7 @@ fn mean_squared<T: Real>(prediction: &Tensor<T>, target: &Tensor<T>, _: f64) -> 
 
 type Loss = fn(&Tensor<f64>, &Tensor<f64>, f64) -> Tensor<f64>;
 
-/// Slope and offset of the line through the points.
+/// Returns the slope and the offset of the line that minimizes a loss.
 fn fit(loss: Loss) -> [f64; 2] {
     // y = 2x + 1, except for the last point.
     let x = Tensor::constant(arr1(&[0.0, 1.0, 2.0, 3.0, 4.0, 5.0]));
@@ -34,5 +34,5 @@ pub fn main() {
     let [robust, squared] = [fit(charbonnier), fit(mean_squared)];
     println!("Charbonnier: y = {:.3} x + {:.3};  mean square: y = {:.3} x + {:.3}", robust[0], robust[1], squared[0], squared[1]);
     assert!((robust[0] - 2.0).abs() < 0.02 && (robust[1] - 1.0).abs() < 0.02);
-    assert!((squared[0] - 2.0).abs() > 1.0, "the square follows the point that is off");
+    assert!((squared[0] - 2.0).abs() > 1.0, "the mean square error should follow the outlier");
 }

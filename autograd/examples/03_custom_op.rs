@@ -1,4 +1,4 @@
-//! An op of your own: how it is computed, and its rule. The rule is written in tensor ops, so it can be differentiated again.
+//! A custom op: the computation and the gradient rule. The rule is written in tensor ops, so it can be differentiated again.
 
 use autograd::{Cotangent, Keep, Op, Real, Tensor, Vjp, grad, gradcheck};
 use ndarray::arr1;
@@ -24,7 +24,7 @@ impl<T: Real> Op<T> for Arctan {
 }
 
 pub fn main() {
-    // First and second derivatives against finite differences; panics with op, entry and both numbers if one is wrong.
+    // Compares first and second derivatives with finite differences. It panics with the order, the input and both numbers if a derivative is wrong.
     let report = gradcheck(|x| arctan(&x[0]), [arr1(&[-1.5, 0.2, 0.9]).into_dyn()]);
     println!("arctan: worst relative error {:.1e}", report.worst_relative_error);
 

@@ -1,9 +1,9 @@
-//! A kernel: one loop instead of five ops, with an adjoint by hand, and the reference that both are held to.
+//! A kernel: one loop instead of five ops, a hand-written adjoint, and the reference that both are compared with.
 
 use autograd::{Buffer, GradSink, Kernel, KernelCall, Real, Tensor, check_kernel, grad};
 use ndarray::{Array2, arr2};
 
-/// yᵣ = ln Σc e^x[r, c], for `[rows, columns]` to `[rows]`.
+/// Returns yᵣ = ln Σc e^x[r, c], of shape `[rows]`, for x of shape `[rows, columns]`.
 fn log_sum_exp<T: Real>(x: &Tensor<T>) -> Tensor<T> {
     let row_value = |row: &[T]| {
         let largest = row.iter().copied().fold(T::neg_infinity(), T::max);
@@ -20,7 +20,7 @@ impl<T: Real> Kernel<T> for LogSumExp {
         "log_sum_exp"
     }
 
-    /// The meaning, in small ops. Second derivatives go this way.
+    /// The reference: this function in small ops. Second derivatives are computed through it.
     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
         inputs[0].log_sum_exp(1)
     }
@@ -48,7 +48,7 @@ pub fn main() {
         println!("{precision}: value: {};  gradient: {}", report.value, report.gradients[0]);
     }
 
-    // With two equal numbers p = ½ each, and the Hessian is diag(p) − p pᵀ.
+    // For two equal numbers, the softmax p is ½ for each, and the Hessian is diag(p) − p pᵀ.
     let x = Tensor::variable(arr2(&[[1.0f64, 1.0]]));
     let softmax = grad(&log_sum_exp(&x).sum(), &[&x]).remove(0);
     let row = grad(&softmax.narrow(1, 0, 1).sum(), &[&x]).remove(0);

@@ -1,18 +1,18 @@
-//! A loss that contains a gradient: a small network learns the signed distance to a circle. It is only told that it is 0 on the circle and
-//! that its slope is 1 everywhere (the eikonal equation; Gropp et al. 2020).
+//! A loss that contains a gradient: a small network learns the signed distance to a circle. The loss requires only that the function is 0 on the circle and
+//! that its gradient has length 1 everywhere (the eikonal equation; Gropp et al. 2020).
 
 use autograd::optim::{Adam, AdamMode, Exponential, Optimizer};
 use autograd::{Param, Real, Tensor, grad, value_and_grad};
 use ndarray::{Array1, Array2, arr1, arr2};
 use std::f64::consts::TAU;
 
-/// One hidden layer, [n, 2] to [n]; softplus, because the loss needs second derivatives.
+/// A network with one hidden layer, `[n, 2]` to `[n]`. The activation is softplus, because the loss needs second derivatives.
 fn field<T: Real>(x: &Tensor<T>, net: &[Param<T>]) -> Tensor<T> {
     let hidden = (x.matmul(net[0].tensor()) + net[1].tensor()).softplus();
     hidden.matmul(net[2].tensor()).sum_axis(1) + net[3].tensor()
 }
 
-/// Mean of (|∇f| − 1)²: a gradient inside a loss, and nothing more.
+/// The eikonal loss, the mean of (|∇f| − 1)².
 fn eikonal<T: Real>(x: &Tensor<T>, net: &[Param<T>]) -> Tensor<T> {
     let x = x.clone().into_variable();
     let slope = &grad(&field(&x, net).sum(), &[&x])[0];
@@ -21,7 +21,7 @@ fn eikonal<T: Real>(x: &Tensor<T>, net: &[Param<T>]) -> Tensor<T> {
 
 pub fn main() {
     const HIDDEN: usize = 24;
-    // Unit vectors all around, and points spread over a square by multiples of the golden ratio.
+    // Unit vectors in all directions, and points that multiples of the golden ratio distribute over a square.
     let directions = |n: usize| Array2::from_shape_fn((n, 2), |(i, axis)| (TAU * (i as f64 / n as f64 - axis as f64 / 4.0)).cos());
     let spread = |i: usize| 2.0 * (i as f64 * 0.618_033_988_75).fract() - 1.0;
     let circle = Tensor::constant(directions(64));
@@ -41,7 +41,7 @@ pub fn main() {
     }
     let after = eikonal(&around, &net).item();
 
-    // Half a radius outside and inside, which nothing told apart but the slope.
+    // Points half a radius outside and inside the circle. Only the eikonal loss constrains the values there.
     let distances = field(&Tensor::constant(arr2(&[[1.5, 0.0], [0.5, 0.0]])), &net);
     println!("mean (|∇f| − 1)²: {before:.3}, then {after:.3};  f at radius 1.5 and 0.5: {:.2?}", distances.data());
     assert!(before > 0.1 && after < 0.05);

@@ -1,8 +1,8 @@
 //! The backward pass: one loop over a heap of node ids.
 //!
-//! Ids grow with creation, so popping the largest id first visits every node after all of its users: no recursion and no visit marks.
-//! The same loop serves first derivatives to the leaves, on constants, and differentiable ones to chosen tensors, on tracked values.
-//! A kernel in a differentiable pass is replaced by its reference: the new nodes have the largest ids and are popped next.
+//! Ids increase in the order of creation. Popping the largest id first therefore visits every node after all of its users, without recursion and
+//! without visit marks. The same loop computes first derivatives with respect to all leaves, on constants, and differentiable derivatives with respect
+//! to chosen tensors, on tracked values. A differentiable pass replaces a kernel by its reference: the new nodes have the largest ids and are popped next.
 
 use crate::gradients::{Grad, Gradients};
 use crate::graph::{self, Node, Rule};
@@ -20,7 +20,8 @@ use ndarray::{Dimension, IxDyn};
 use std::collections::{BinaryHeap, HashMap};
 use std::sync::Arc;
 
-/// Gradients of the scalar `y` with respect to `wrt`, as tensors that can be differentiated again. Where `y` does not depend on one, zeros.
+/// Returns the gradients of the scalar `y` with respect to each tensor in `wrt`, as tensors that can be differentiated again. The gradient is zero if
+/// `y` does not depend on the tensor.
 ///
 /// ```
 /// use autograd::{Tensor, grad};
@@ -30,12 +31,12 @@ use std::sync::Arc;
 /// assert_eq!(curvature.as_slice().unwrap(), [6.0, 12.0]);
 /// ```
 ///
-/// Panics if `y` has more than one element.
+/// Panics if `y` does not have exactly one element.
 #[track_caller]
 pub fn grad<T: Real>(y: &Tensor<T>, wrt: &[&Tensor<T>]) -> Vec<Tensor<T>> {
     assert_eq!(y.len(), 1, "grad: expected a scalar, got shape {:?}", y.shape());
     let targets: Vec<Option<u64>> = wrt.iter().map(|x| x.id()).collect();
-    // Inside `no_grad` the result is constant: a kernel's reference would record nothing to go through.
+    // Inside `no_grad` the pass must not be differentiable: the reference of a kernel would record no graph, and its gradient would be lost.
     let needed = Needed::new(targets.iter().flatten().copied());
     let mut pass = Pass { tracked: graph::recording(), needed: Some(needed), pending: HashMap::new(), heap: BinaryHeap::new() };
     if let Some(root) = &y.node
@@ -49,14 +50,15 @@ pub fn grad<T: Real>(y: &Tensor<T>, wrt: &[&Tensor<T>]) -> Vec<Tensor<T>> {
         if targets.contains(&Some(node.id)) {
             found.insert(node.id, cotangent.clone());
         }
-        pass.spread(node, cotangent);
+        pass.propagate(node, cotangent);
     }
     wrt.iter().map(|x| x.id().and_then(|id| found.get(&id).cloned()).unwrap_or_else(|| Tensor::zeros(x.shape()))).collect()
 }
 
-/// Runs `f`, then its backward pass; the graph is gone before the gradients are returned, so parameters can be changed in place.
+/// Runs `f` and the backward pass of its result, and returns the result and its gradients with respect to all leaves. The graph is freed before the
+/// function returns, so parameters can be updated in place.
 ///
-/// Panics if the result has more than one element.
+/// Panics if the result of `f` does not have exactly one element.
 #[track_caller]
 pub fn value_and_grad<T: Real>(f: impl FnOnce() -> Tensor<T>) -> (T, Gradients<T>) {
     let y = f();
@@ -67,8 +69,8 @@ pub fn value_and_grad<T: Real>(f: impl FnOnce() -> Tensor<T>) -> (T, Gradients<T
     (value, to_leaves(root, seed))
 }
 
-/// First derivatives of ⟨seed, root⟩ to every leaf. Owning the root, it frees what it has passed. Rules see constants here, so nothing is
-/// recorded.
+/// Computes the first derivatives of ⟨seed, root⟩ with respect to every leaf. If the caller holds no other reference to the root, each node is freed
+/// as soon as the pass has visited it. Rules receive constants, so nothing is recorded.
 pub(crate) fn to_leaves<T: Real>(root: Option<Arc<Node<T>>>, seed: Tensor<T>) -> Gradients<T> {
     if const { is_single::<T>() } { cast(to_leaves_single(cast(root), cast(seed))) } else { to_leaves_of(root, seed) }
 }
@@ -88,18 +90,23 @@ fn to_leaves_of<T: Real>(root: Option<Arc<Node<T>>>, seed: Tensor<T>) -> Gradien
         if matches!(node.rule, Rule::Leaf) {
             by_leaf.insert(node.id, pending.finish(&node.shape));
         } else {
-            // A row gradient that arrives at an op is made dense: look up first and apply activations after.
+            // A row-sparse gradient that reaches an op becomes dense. Models should therefore gather rows first and apply activations afterwards.
             let cotangent = pending.dense(&node.shape);
-            pass.spread(node, cotangent);
+            pass.propagate(node, cotangent);
         }
     }
     Gradients { by_leaf }
 }
 
+/// The state of a backward pass.
 struct Pass<T: Real> {
+    /// True if the pass is differentiable.
     tracked: bool,
+    /// Nodes that lead to the targets, or `None` if every leaf is a target.
     needed: Option<Needed>,
+    /// Sums of the contributions to nodes that have not been visited, by node id.
     pending: HashMap<u64, (Arc<Node<T>>, Pending<T>)>,
+    /// Ids of the nodes in `pending`.
     heap: BinaryHeap<u64>,
 }
 
@@ -128,8 +135,8 @@ impl<T: Real> Pass<T> {
         self.needed.as_mut().is_none_or(|needed| needed.contains(node))
     }
 
-    /// Hands a node's cotangent on to its inputs.
-    fn spread(&mut self, node: Arc<Node<T>>, cotangent: Tensor<T>) {
+    /// Applies the rule of a node: computes the cotangents of its inputs from the cotangent of its output and adds them to the pending sums.
+    fn propagate(&mut self, node: Arc<Node<T>>, cotangent: Tensor<T>) {
         let needed: Vec<bool> = node.inputs.iter().map(|edge| edge.node.as_ref().is_some_and(|n| self.is_needed(n))).collect();
         if !needed.contains(&true) {
             return;
@@ -151,7 +158,12 @@ impl<T: Real> Pass<T> {
             Rule::Kernel(kernel) if self.tracked => {
                 let inputs: Vec<Tensor<T>> = (0..node.inputs.len()).map(|i| crate::op::input(&node, i, true)).collect();
                 let output = kernel.reference(&inputs);
-                assert_eq!(output.shape(), node.shape.slice(), "{}: the reference has another shape than the kernel", kernel.name());
+                assert_eq!(
+                    output.shape(),
+                    node.shape.slice(),
+                    "{}: the outputs of the reference and the kernel differ in shape",
+                    kernel.name()
+                );
                 if let Some(reference) = &output.node {
                     self.push(reference.clone(), Pending::Dense(cotangent));
                 }
@@ -181,14 +193,17 @@ impl<T: Real> Pass<T> {
     }
 }
 
-/// What has arrived at a node so far.
+/// The sum of the contributions that have arrived at a node so far.
 enum Pending<T: Real> {
     Dense(Tensor<T>),
     Rows(Vec<RowPart<T>>),
 }
 
+/// A row-sparse contribution to a node.
 enum RowPart<T: Real> {
+    /// Unsorted rows, which may repeat.
     Touches { rows: Indices, values: Tensor<T> },
+    /// Sorted, unique rows.
     Merged(RowSparse<T>),
 }
 
@@ -202,7 +217,7 @@ impl<T: Real> RowPart<T> {
         }
     }
 
-    /// The sum with a dense gradient, in its buffer if nobody else holds it.
+    /// Returns the sum with a dense gradient. It reuses the buffer of the dense gradient if that buffer is not shared.
     fn added_to(self, mut dense: Tensor<T>) -> Tensor<T> {
         let width = dense.shape()[1..].iter().product();
         let table = Arc::<Buffer<T>>::make_mut(&mut dense.data);
@@ -258,7 +273,7 @@ impl<T: Real> Pending<T> {
     }
 }
 
-/// a + b in the buffer of whichever nobody else holds.
+/// Returns a + b. It reuses the buffer of `a` or `b` if one of them is not shared.
 fn add_in_place<T: Real>(mut a: Tensor<T>, mut b: Tensor<T>) -> Tensor<T> {
     if let Some(x) = Arc::<Buffer<T>>::get_mut(&mut a.data) {
         parallel::zip_in_place(x, b.data(), |x, y| x + y);
@@ -281,9 +296,11 @@ pub(crate) fn add_grads<T: Real>(a: Grad<T>, b: Grad<T>) -> Grad<T> {
     }
 }
 
-/// Which nodes lie between the result and the targets, found by a search that remembers.
+/// The nodes on the paths from the result to the targets, found by a memoized depth-first search.
 struct Needed {
+    /// True for each visited node that leads to a target, false for the other visited nodes.
     known: HashMap<u64, bool>,
+    /// Smallest id of a target. A node with a smaller id cannot lead to a target.
     smallest: u64,
 }
 
@@ -297,7 +314,7 @@ impl Needed {
     fn contains<T: Real>(&mut self, node: &Arc<Node<T>>) -> bool {
         let mut stack = vec![node];
         while let Some(top) = stack.last() {
-            let verdict = if self.known.contains_key(&top.id) {
+            let leads_to_target = if self.known.contains_key(&top.id) {
                 None
             } else if top.id < self.smallest {
                 Some(false)
@@ -312,8 +329,8 @@ impl Needed {
                     Some(false)
                 }
             };
-            if let Some(verdict) = verdict {
-                self.known.insert(top.id, verdict);
+            if let Some(leads_to_target) = leads_to_target {
+                self.known.insert(top.id, leads_to_target);
             }
             stack.pop();
         }

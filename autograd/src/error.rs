@@ -1,53 +1,53 @@
-//! What a check and a file have to say when they fail. Misuse of shapes is no error value: it panics at the caller's line, naming op and shapes.
+//! Errors of gradient checks and of tensor files. Misuse of shapes is not an error value: it panics at the caller's line with the op and the shapes.
 
 use crate::gradcheck::Closeness;
 use std::fmt;
 use std::io;
 use std::path::PathBuf;
 
-/// A gradient that is not the derivative of its function.
+/// The error of a gradient check.
 #[derive(Debug, Clone, PartialEq)]
 pub enum GradcheckError {
     /// A rule and finite differences disagree.
     Derivative {
-        /// The name the check was given.
+        /// Name of the check.
         name: String,
-        /// Which input, from 0.
+        /// Index of the input, from 0.
         input: usize,
-        /// Which entry of it, in an elementwise check; a directional one does not know.
+        /// Index of the entry in the input. `None` in a directional check, which does not determine the entry.
         index: Option<Vec<usize>>,
-        /// 1 for the gradient, 2 for the gradient of the gradient, …
+        /// Order of the derivative: 1 for the gradient, 2 for the gradient of the gradient, and so on.
         order: usize,
-        /// The pass that gave the wrong number: `backward` (on constants, kernels by their adjoints) or `grad` (differentiable, kernels by
+        /// Pass that computed the wrong value: `backward` (on constants; kernels use their adjoints) or `grad` (differentiable; kernels use
         /// their references).
         pass: &'static str,
-        /// What the rule gives.
+        /// Value from the rule.
         analytic: f64,
-        /// What finite differences give.
+        /// Value from finite differences.
         numeric: f64,
-        /// Their difference as a share of the gradient's size.
+        /// Difference of the two values relative to the magnitude of the gradient.
         relative_error: f64,
-        /// The share that was allowed.
+        /// Largest relative error that was allowed.
         tolerance: f64,
     },
-    /// Finite differences would step across a place where the function has no derivative, so they say nothing.
+    /// A finite difference would step across a point where the function is not differentiable, so it could not be compared.
     Kink {
-        /// The name the check was given.
+        /// Name of the check.
         name: String,
-        /// The input that was varied.
+        /// Index of the input that was varied.
         input: usize,
-        /// The number that must keep its sign, at the input and after a step.
+        /// Value of the kink function, which must keep its sign, at the input and after the step.
         distances: (f64, f64),
     },
     /// A kernel and its reference disagree.
     Kernel {
-        /// The kernel's name.
+        /// Name of the kernel.
         name: String,
-        /// `value`, `gradient of input i`, or the latter with `, when the others are constants`.
+        /// Compared quantity: `value`, `gradient of input i`, or `gradient of input i with the other inputs constant`.
         what: String,
-        /// How far they are apart.
+        /// Distance between the two results.
         closeness: Closeness,
-        /// The relative L2 distance that was allowed; the other measures have bounds made of it.
+        /// Largest relative L2 distance that was allowed. [`Closeness::within`] derives the limits of the other measures from it.
         tolerance: f64,
     },
 }
@@ -69,7 +69,7 @@ impl fmt::Display for GradcheckError {
             }
             GradcheckError::Kink { name, input, distances: (before, after) } => write!(
                 f,
-                "{name}: finite differences in input {input} step across a kink (its distance goes from {before:.3e} to {after:.3e}); move the input away from it"
+                "{name}: finite differences in input {input} step across a kink (the kink function changes from {before:.3e} to {after:.3e}); move the input away from it"
             ),
             GradcheckError::Kernel { name, what, closeness, tolerance } => {
                 write!(f, "{name}: the kernel differs from its reference in its {what}: {closeness} (allowed: relative L2 {tolerance:.1e})")
@@ -80,36 +80,36 @@ impl fmt::Display for GradcheckError {
 
 impl std::error::Error for GradcheckError {}
 
-/// A file of tensors that cannot be written, read or used.
+/// The error of reading or writing a tensor file.
 #[derive(Debug)]
 pub enum FileError {
-    /// The system refuses to read or write it.
+    /// The operating system reported an error.
     Io {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// `reading the file` or `writing the file`.
+        /// Failed operation: `reading the file` or `writing the file`.
         doing: &'static str,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// It is of another format, or damaged.
+    /// The file has another format or is damaged.
     Format {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What it is.
+        /// Content that was found.
         found: String,
-        /// What it should be.
+        /// Content that was expected.
         expected: String,
     },
-    /// A tensor of it, or a parameter, is not the one that is wanted.
+    /// A tensor in the file does not match the parameters of the module, or two parameters have the same name.
     Tensor {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The name of the tensor.
+        /// Name of the tensor.
         tensor: String,
-        /// What the file or the module has.
+        /// Property that was found in the file or the module.
         found: String,
-        /// What it should have.
+        /// Property that was expected.
         expected: String,
     },
 }

@@ -1,6 +1,6 @@
-//! Tensors on disk: one in a NumPy file, those of a module in a safetensors file.
+//! Tensor files: a NumPy file holds one tensor, and a safetensors file holds the parameters of a module.
 //!
-//! A file appears whole or not at all: it is written beside its place, under a name of its own, and then renamed.
+//! Files are written atomically: a temporary file in the same folder is written completely and then renamed.
 
 mod npy;
 mod safetensors;
@@ -14,7 +14,7 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use tempfile::TempPath;
 
-/// A number as files have it, little-endian.
+/// The type of the numbers in a file, which are little-endian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Dtype {
     F32,
@@ -22,12 +22,12 @@ enum Dtype {
 }
 
 impl Dtype {
-    /// The type that holds every number of T, and no more.
+    /// Returns the type with the precision of `T`.
     fn of<T: Real>() -> Self {
         if size_of::<T>() == 8 { Dtype::F64 } else { Dtype::F32 }
     }
 
-    /// Bytes of one number.
+    /// Returns the size of a number in bytes.
     fn size(self) -> usize {
         match self {
             Dtype::F32 => 4,
@@ -36,7 +36,7 @@ impl Dtype {
     }
 }
 
-/// Numbers as bytes of T's own type.
+/// Converts numbers to little-endian bytes.
 fn bytes_of<T: Real>(values: &[T]) -> Vec<u8> {
     match Dtype::of::<T>() {
         Dtype::F32 => values.iter().flat_map(|x| (x.as_f64() as f32).to_le_bytes()).collect(),
@@ -44,7 +44,7 @@ fn bytes_of<T: Real>(values: &[T]) -> Vec<u8> {
     }
 }
 
-/// Fills a slice with the numbers of as many bytes, rounded if they are of higher precision.
+/// Fills a slice from little-endian bytes. The numbers are rounded if `dtype` has a higher precision than `T`.
 fn read_numbers<T: Real>(bytes: &[u8], dtype: Dtype, out: &mut [T]) {
     match dtype {
         Dtype::F32 => out.iter_mut().zip(bytes.as_chunks().0).for_each(|(x, b)| *x = T::lit(f64::from(f32::from_le_bytes(*b)))),
@@ -52,7 +52,7 @@ fn read_numbers<T: Real>(bytes: &[u8], dtype: Dtype, out: &mut [T]) {
     }
 }
 
-/// The bytes of a plain file.
+/// Reads the bytes of a plain file.
 fn read(path: &Path) -> Result<Vec<u8>, FileError> {
     let mut bytes = Vec::new();
     let read = open_plain(path).and_then(|mut file| file.read_to_end(&mut bytes));
@@ -60,16 +60,16 @@ fn read(path: &Path) -> Result<Vec<u8>, FileError> {
     Ok(bytes)
 }
 
-/// Opens a plain file for reading. Links are followed. Pipes, devices and sockets are refused without being read, for that might never end.
+/// Opens a plain (regular) file for reading. Symbolic links are followed. Pipes, devices and sockets are refused, because reading them might never end.
 ///
-/// Errors: those of the system; [`io::ErrorKind::IsADirectory`] for a folder; [`io::ErrorKind::InvalidInput`] with a message that says what it is
-/// for anything else that is no plain file.
+/// Errors: [`io::ErrorKind::IsADirectory`] for a folder; [`io::ErrorKind::InvalidInput`] for a pipe, a device or a socket, with a message that names the kind;
+/// and the errors of the operating system.
 pub fn open_plain(path: &Path) -> io::Result<File> {
-    // To open a device may have effects already.
+    // The kind is checked before the file is opened, because opening a device can have side effects.
     check_plain(&fs::metadata(path)?)?;
     let mut options = OpenOptions::new();
     options.read(true);
-    // Meanwhile there may be a pipe in its place, and to open one would be to wait for its writer.
+    // The path may have been replaced by a pipe since the check, and a blocking open of a pipe would wait for a writer.
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, libc::O_NONBLOCK);
     let file = options.open(path)?;
@@ -86,7 +86,7 @@ fn check_plain(metadata: &fs::Metadata) -> io::Result<()> {
     }
 }
 
-/// What a file that is neither plain nor a folder is.
+/// Returns the name of the kind of a file that is neither plain nor a folder.
 #[cfg(unix)]
 fn name_of(kind: fs::FileType) -> &'static str {
     use std::os::unix::fs::FileTypeExt;
@@ -102,22 +102,24 @@ fn name_of(_: fs::FileType) -> &'static str {
     "something special"
 }
 
-/// [`atomically`], with an error that names the file.
+/// Writes a file by [`atomically`] and adds its path to an error.
 fn replace(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> Result<(), FileError> {
     atomically(path, write).map_err(|source| FileError::Io { path: path.to_owned(), doing: "writing the file", source })
 }
 
-/// Replaces the file at `path` by one that `write` makes under the name it is given, a hidden one in the same folder: other processes see the
-/// old content or the new, and nothing is left behind on failure. A link is followed, and a file that is replaced leaves its permissions to the
-/// new one. A device, a pipe and an open file of the process (`/dev/stderr`, `/dev/fd/3`) are not replaced: what `write` made is copied into them.
+/// Creates or replaces the file at `path` atomically: other processes see either the old or the new content.
 ///
-/// Errors: those of `write`, and of syncing, renaming or copying the file.
+/// `write` is called with the path of a temporary file, which has a hidden name in the same folder; the temporary file is then synced and renamed. If a step
+/// fails, it is removed. Symbolic links are followed, and the new file gets the permissions of the file that it replaces. A device, a pipe and an open file of the
+/// process (`/dev/stderr`, `/dev/fd/3`) are not replaced: the temporary file, which is then in the system's folder for temporary files, is copied into them.
+///
+/// Errors: the errors of `write`, and of syncing, renaming or copying the file.
 pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> io::Result<()> {
     let there = fs::metadata(path).ok();
     if is_open_file(path) || there.as_ref().is_some_and(|there| !there.is_file() && !there.is_dir()) {
         let temporary = temporary_in(&std::env::temp_dir())?;
         write(&temporary)?;
-        // An open file goes on from where it is.
+        // Text is added at the end of an open file.
         let mut stream = OpenOptions::new().append(true).open(path)?;
         io::copy(&mut File::open(&temporary)?, &mut stream)?;
         return stream.flush();
@@ -127,32 +129,32 @@ pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> io::Result<()>) -> i
     let temporary = temporary_in(folder)?;
     write(&temporary)?;
     OpenOptions::new().write(true).open(&temporary)?.sync_all()?;
-    // After that: they may forbid to open it.
+    // The permissions are set after syncing, because they may forbid opening the file.
     there.map_or(Ok(()), |there| fs::set_permissions(&temporary, there.permissions()))?;
     temporary.persist(&path).map_err(|failed| failed.error)
 }
 
-/// True for the names under which a process finds its own open files.
+/// Returns true for the names under which a process finds its own open files.
 fn is_open_file(path: &Path) -> bool {
     let named = ["/dev/stdin", "/dev/stdout", "/dev/stderr"].iter().any(|name| path == Path::new(name));
     named || path.starts_with("/dev/fd") || (path.starts_with("/proc") && path.parent().is_some_and(|folder| folder.ends_with("fd")))
 }
 
-/// An empty hidden file in a folder, which is removed when it is dropped. Its name has the number of this process and six random characters, but not the
-/// name of the file that is replaced, which may be as long as is allowed.
+/// Creates an empty hidden file in a folder; it is removed when the returned path is dropped. Its name has the number of this process and six random characters.
+/// It does not contain the name of the replaced file, since that name may already have the maximum length.
 fn temporary_in(folder: &Path) -> io::Result<TempPath> {
     let mut builder = tempfile::Builder::new();
     let prefix = format!(".{}-", std::process::id());
     builder.prefix(&prefix).suffix(".tmp");
-    // As other files: without what the user's mask takes away.
+    // The permissions that other new files have: the user's mask is subtracted.
     #[cfg(unix)]
     builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     Ok(builder.tempfile_in(folder)?.into_temp_path())
 }
 
-/// The path that a chain of links leads to, which need not exist.
+/// Returns the path that a chain of symbolic links leads to. That path need not exist.
 fn followed(path: &Path) -> io::Result<PathBuf> {
-    // As many as Linux follows.
+    // The limit of Linux.
     const MOST_LINKS: usize = 40;
     let mut path = path.to_owned();
     for _ in 0..MOST_LINKS {

@@ -1,9 +1,9 @@
-//! Are the gradients right? Rules are held to finite differences, kernels to their references.
+//! Gradient checks: comparison of rules with finite differences, and of kernels with their references.
 //!
-//! The check contracts everything to one number: s₁(x) = ⟨f(x), v⟩ for a random direction v, and for each further order
-//! s₂(x) = ⟨∇s₁(x), w⟩ and so on. The gradient of sₖ along a random direction u is then compared with a central difference of sₖ, which
-//! costs four evaluations whatever the size of the input, and sees every entry of the k-th derivative with probability one (Autograd's
-//! `check_grads`). Checks are in `f64`; a gradient in `f32` is better compared with that in `f64`, by [`Closeness`].
+//! The check contracts the derivatives to one number: s₁(x) = ⟨f(x), v⟩ for a random direction v, then s₂(x) = ⟨∇s₁(x), w⟩ for a random direction w, and so on
+//! for higher orders. The derivative of sₖ along a random direction u is compared with a central difference of sₖ. This takes four evaluations for any size of
+//! the input, and detects an error in any entry of the k-th derivative with probability one (`check_grads` of Autograd). The checks run in `f64`. A gradient in
+//! `f32` should be compared with the gradient in `f64` by [`Closeness`].
 
 mod kernel;
 
@@ -15,7 +15,9 @@ use crate::random::Stream;
 use crate::tensor::Tensor;
 use ndarray::{ArrayD, Dimension, IxDyn};
 
-/// Panics, with the text of the [`GradcheckError`], unless first and second derivatives of `f` are right at `inputs`.
+/// Checks the first and second derivatives of `f` at `inputs` by finite differences, with the default settings of [`Gradcheck`].
+///
+/// Panics with the message of the [`GradcheckError`] if the check fails.
 ///
 /// ```
 /// use autograd::gradcheck;
@@ -23,28 +25,28 @@ use ndarray::{ArrayD, Dimension, IxDyn};
 /// gradcheck(|x| x[0].sin() * &x[1], [arr1(&[0.3, 1.2]).into_dyn(), arr1(&[2.0, -0.5]).into_dyn()]);
 /// ```
 #[track_caller]
-pub fn gradcheck(f: impl Fn(&[Tensor<f64>]) -> Tensor<f64>, inputs: impl Into<Vec<ArrayD<f64>>>) -> Report {
+pub fn gradcheck(f: impl Fn(&[Tensor<f64>]) -> Tensor<f64>, inputs: impl Into<Vec<ArrayD<f64>>>) -> GradcheckReport {
     match Gradcheck::new(f, inputs).run() {
         Ok(report) => report,
         Err(error) => panic!("{error}"),
     }
 }
 
-/// How right the derivatives were.
+/// The result of a passed gradient check.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Report {
-    /// The largest of `by_order`.
+pub struct GradcheckReport {
+    /// Largest element of `by_order`.
     pub worst_relative_error: f64,
-    /// The worst relative error of the first derivative, of the second, …
+    /// Largest relative error for each order of derivative, from the first order on.
     pub by_order: Vec<f64>,
 }
 
-/// A check and its settings.
+/// A gradient check with settings.
 ///
 /// ```
 /// use autograd::Gradcheck;
 /// use ndarray::arr1;
-/// // |x| has a kink where x is 0, and the check would say so if it came near.
+/// // |x| has a kink at x = 0. The check would report it if a finite difference stepped across it.
 /// let check = Gradcheck::new(|x| x[0].abs(), [arr1(&[0.5, -2.0]).into_dyn()]).named("abs").away_from(|x| x[0].clone());
 /// let report = check.order(3).run()?;
 /// assert_eq!(report.by_order.len(), 3);
@@ -66,7 +68,7 @@ pub struct Gradcheck<F> {
 type Kinks = Box<dyn Fn(&[Tensor<f64>]) -> Tensor<f64>>;
 
 impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
-    /// A check of `f`, with a result of any shape, at `inputs`.
+    /// Creates a check of the function `f` at `inputs`. The result of `f` may have any shape.
     pub fn new(f: F, inputs: impl Into<Vec<ArrayD<f64>>>) -> Self {
         Gradcheck {
             f,
@@ -82,64 +84,64 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
         }
     }
 
-    /// The name to be used in an error.
+    /// Sets the name of the function in error messages.
     pub fn named(mut self, name: impl Into<String>) -> Self {
         self.name = name.into();
         self
     }
 
-    /// The highest derivative to check; all lower ones are checked too. 2 unless set.
+    /// Sets the highest order of derivative to check; all lower orders are also checked. The default is 2.
     pub fn order(mut self, order: usize) -> Self {
         self.order = order;
         self
     }
 
-    /// How many random directions to try for each input and order. 3 unless set.
+    /// Sets the number of random directions for each input and order. The default is 3.
     pub fn directions(mut self, directions: usize) -> Self {
         self.directions = directions;
         self
     }
 
-    /// Vary one entry of the inputs at a time, so that an error names it. For small inputs.
+    /// Varies one entry of the inputs at a time instead of random directions, so that an error names the entry. This is slow for large inputs.
     pub fn elementwise(mut self) -> Self {
         self.elementwise = true;
         self
     }
 
-    /// The relative error to allow: |analytic − numeric| / max(Σ|gᵢuᵢ|, |numeric|, 1e-5 Σ|terms of s|), where the last term is there
-    /// because a derivative of zero must not be compared with rounding errors. 1e-7 unless set.
+    /// Sets the largest allowed relative error, |analytic − numeric| / max(Σ|gᵢuᵢ|, |numeric|, 1e-5 Σ|terms of s|). The last term prevents a derivative of zero
+    /// from being compared with rounding errors. The default is 1e-7.
     pub fn tolerance(mut self, tolerance: f64) -> Self {
         self.tolerance = tolerance;
         self
     }
 
-    /// The step of the finite differences. Unless set, 1/2000 of the root mean square of the input that is varied.
+    /// Sets the step of the finite differences. The default is 1/2000 of the root mean square of the input that is varied, or 1/2000 if that is 0.
     pub fn step(mut self, step: f64) -> Self {
         self.step = Some(step);
         self
     }
 
-    /// Another seed for the random directions.
+    /// Sets the seed of the random directions. The default is 0.
     pub fn seed(mut self, seed: u64) -> Self {
         self.seed = seed;
         self
     }
 
-    /// Where the function has kinks: numbers, computed from the inputs, that are zero there and change sign across. A check whose finite
-    /// differences would change a sign fails with [`GradcheckError::Kink`] instead of comparing numbers that mean nothing.
+    /// Sets the kink function, which maps the inputs to numbers that are zero at a kink and change sign across it. If a finite difference would change a sign,
+    /// the check fails with [`GradcheckError::Kink`] instead of comparing meaningless numbers.
     pub fn away_from(mut self, kinks: impl Fn(&[Tensor<f64>]) -> Tensor<f64> + 'static) -> Self {
         self.kinks = Some(Box::new(kinks));
         self
     }
 
     /// Runs the check.
-    pub fn run(&self) -> Result<Report, GradcheckError> {
+    pub fn run(&self) -> Result<GradcheckReport, GradcheckError> {
         let mut random = Random::new(self.seed);
         let by_order = (1..=self.order).map(|order| self.check(order, &mut random)).collect::<Result<Vec<f64>, _>>()?;
-        Ok(Report { worst_relative_error: by_order.iter().copied().fold(0.0, f64::max), by_order })
+        Ok(GradcheckReport { worst_relative_error: by_order.iter().copied().fold(0.0, f64::max), by_order })
     }
 
-    /// The worst relative error of the derivative of one order.
+    /// Checks the derivative of one order and returns its largest relative error.
     fn check(&self, order: usize, random: &mut Random) -> Result<f64, GradcheckError> {
         let constants: Vec<Tensor<f64>> = self.inputs.iter().map(|x| Tensor::constant(x.clone())).collect();
         let shape = (self.f)(&constants).shape().to_vec();
@@ -184,7 +186,7 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
         Ok(worst)
     }
 
-    /// s and Σ|terms of s|, the scale of its rounding errors.
+    /// Returns s and Σ|terms of s|, which is the scale of the rounding errors of s.
     fn contract(&self, x: &[Tensor<f64>], probe: &Probe) -> (Tensor<f64>, f64) {
         let size = |terms: &Tensor<f64>| terms.data().iter().map(|t| t.abs()).sum::<f64>();
         let terms = (self.f)(x) * &probe.output;
@@ -199,7 +201,7 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
         (s, total)
     }
 
-    /// ds/dt at x + t u in one input, by the five-point stencil: its error is h⁴/30 of the fifth derivative.
+    /// Returns the derivative of s along a direction in one input, by the five-point stencil. Its error is h⁴/30 times the fifth derivative.
     fn difference(&self, x: &[Tensor<f64>], input: usize, direction: &Tensor<f64>, probe: &Probe) -> Result<f64, GradcheckError> {
         let mean_square = x[input].data().iter().map(|v| v * v).sum::<f64>() / x[input].len() as f64;
         let h = self.step.unwrap_or(if mean_square > 0.0 { mean_square.sqrt() / 2000.0 } else { 1.0 / 2000.0 });
@@ -212,7 +214,7 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
                     return Err(GradcheckError::Kink { name: self.name.clone(), input, distances: (b, a) });
                 }
             }
-            // Only a derivative of a derivative needs a graph.
+            // A graph is needed only if s contains gradients.
             if !probe.inputs.is_empty() {
                 moved.iter_mut().for_each(|x| *x = x.clone().into_variable());
             }
@@ -222,7 +224,7 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
         Ok((8.0 * near - far) / (12.0 * h))
     }
 
-    /// One random direction, or every entry with its index.
+    /// Returns one random direction or, in an elementwise check, the unit direction of each entry with its index.
     fn directions_of(&self, x: &Tensor<f64>, random: &mut Random) -> Vec<(Option<Vec<usize>>, Tensor<f64>)> {
         if x.is_empty() {
             Vec::new()
@@ -241,13 +243,13 @@ impl<F: Fn(&[Tensor<f64>]) -> Tensor<f64>> Gradcheck<F> {
     }
 }
 
-/// The directions that make one number of a function: v for its result, and w for the gradient of each lower order.
+/// The random directions that contract a function to one number: v for its result, and w for the gradient of each lower order.
 struct Probe {
     output: Tensor<f64>,
     inputs: Vec<Vec<Tensor<f64>>>,
 }
 
-/// Random directions, one after the other.
+/// A generator of random directions.
 struct Random {
     stream: Stream,
     drawn: u64,
@@ -263,7 +265,7 @@ impl Random {
         self.stream.bits(self.drawn - 1)
     }
 
-    /// Entries of magnitude 1/2 to 1 and either sign: none is so small that it hides an error.
+    /// Returns a direction whose entries have magnitudes from 1/2 to 1 and random signs, so that no entry is small enough to hide an error.
     fn direction(&mut self, shape: &[usize]) -> Tensor<f64> {
         let entry = |bits: u64| {
             let magnitude = 0.5 + (bits >> 12) as f64 / (1u64 << 53) as f64;
@@ -295,7 +297,7 @@ mod tests {
         assert_eq!(report.worst_relative_error, 0.0);
     }
 
-    /// x² whose gradient is lost: detached.
+    /// Checks x² with one factor detached, so that half of the gradient is lost.
     #[test]
     fn a_lost_gradient_is_found_and_named() {
         let f = |x: &[Tensor<f64>]| &x[0] * x[0].detach();
@@ -305,7 +307,7 @@ mod tests {
         assert!((numeric / analytic - 2.0).abs() < 1e-9, "{error}");
     }
 
-    /// With c = x detached: c² + 2c (x − c) has the value and the slope of x², and no curvature.
+    /// With c = x detached, c² + 2c (x − c) has the value and the first derivative of x², but a second derivative of zero.
     #[test]
     fn a_lost_second_derivative_is_found_though_the_first_is_right() {
         let f = |x: &[Tensor<f64>]| x[0].detach().square() + 2.0 * x[0].detach() * (&x[0] - x[0].detach());

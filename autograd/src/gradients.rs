@@ -1,4 +1,4 @@
-//! Gradients as optimizers take them: dense, or the rows that were touched.
+//! Gradients of leaves, dense or row-sparse: the input of optimizers.
 
 use crate::param::Param;
 use crate::real::Real;
@@ -10,14 +10,14 @@ use std::collections::HashMap;
 /// The gradient of one leaf.
 #[derive(Debug, Clone)]
 pub enum Grad<T: Real> {
-    /// One number for each element.
+    /// A dense gradient: one number for each element.
     Dense(Tensor<T>),
-    /// Only the rows that something looked up; all others are zero.
+    /// A row-sparse gradient: it stores only the touched rows; all other rows are zero.
     Rows(RowSparse<T>),
 }
 
 impl<T: Real> Grad<T> {
-    /// The whole gradient as an array.
+    /// Returns the whole gradient as a dense array.
     pub fn to_array(&self) -> ArrayD<T> {
         match self {
             Grad::Dense(g) => g.to_array(),
@@ -25,7 +25,7 @@ impl<T: Real> Grad<T> {
         }
     }
 
-    /// The dense gradient, or `None` if it is rows.
+    /// Returns the dense gradient, or `None` if the gradient is row-sparse.
     pub fn as_dense(&self) -> Option<ArrayViewD<'_, T>> {
         match self {
             Grad::Dense(g) => Some(g.value()),
@@ -33,7 +33,7 @@ impl<T: Real> Grad<T> {
         }
     }
 
-    /// The touched rows, or `None` if the gradient is dense.
+    /// Returns the row-sparse gradient, or `None` if the gradient is dense.
     pub fn as_rows(&self) -> Option<&RowSparse<T>> {
         match self {
             Grad::Dense(_) => None,
@@ -41,7 +41,7 @@ impl<T: Real> Grad<T> {
         }
     }
 
-    /// The values that are present: all of them, or those of the touched rows.
+    /// Returns the stored values in row-major order: all values of a dense gradient, or the values of the touched rows.
     pub fn data(&self) -> &[T] {
         match self {
             Grad::Dense(g) => g.data(),
@@ -50,29 +50,29 @@ impl<T: Real> Grad<T> {
     }
 }
 
-/// The gradients of one backward pass, by leaf.
+/// The gradients from a backward pass, one for each leaf that the result depends on.
 #[derive(Debug)]
 pub struct Gradients<T: Real> {
     pub(crate) by_leaf: HashMap<u64, Grad<T>>,
 }
 
 impl<T: Real> Gradients<T> {
-    /// The gradient of a leaf, or `None` if the result did not depend on it.
+    /// Returns the gradient of a leaf, or `None` if the result did not depend on it.
     pub fn get(&self, leaf: &Tensor<T>) -> Option<&Grad<T>> {
         self.by_leaf.get(&leaf.id()?)
     }
 
-    /// The gradient of a parameter, or `None` if the result did not depend on it.
+    /// Returns the gradient of a parameter, or `None` if the result did not depend on it.
     pub fn of(&self, param: &Param<T>) -> Option<&Grad<T>> {
         self.get(param.tensor())
     }
 
-    /// The gradient of a leaf as an array, zeros if there is none: convenient in tests and experiments.
+    /// Returns the gradient of a leaf as a dense array, or zeros if the result did not depend on it. This is convenient in tests and experiments.
     pub fn array(&self, leaf: &Tensor<T>) -> ArrayD<T> {
         self.get(leaf).map_or_else(|| ArrayD::zeros(leaf.shape()), Grad::to_array)
     }
 
-    /// Adds another pass's gradients to these: a batch may come in chunks.
+    /// Adds the gradients of another backward pass to these, for example if a batch is processed in chunks.
     pub fn add(&mut self, other: Gradients<T>) {
         for (id, grad) in other.by_leaf {
             let sum = match self.by_leaf.remove(&id) {

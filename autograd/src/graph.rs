@@ -1,7 +1,7 @@
-//! Nodes: what a tensor remembers of its computation.
+//! Graph nodes: the record of how a tensor was computed.
 //!
-//! A node points at the nodes of its inputs and at nothing else, so a graph is freed by dropping its last tensor. Ids grow with
-//! creation; an input's id is therefore always smaller than its user's, and "largest id first" is a reverse topological order.
+//! A node owns references to the nodes of its inputs and has no other links, so a graph is freed when its last tensor is dropped. Ids increase in the
+//! order of creation. The id of an input is therefore always smaller than the id of its user, and decreasing ids are a reverse topological order.
 
 use crate::op::{Kernel, Op};
 use crate::pool::Buffer;
@@ -11,15 +11,17 @@ use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+/// A node of the graph: one variable or one recorded op.
 pub(crate) struct Node<T: Real> {
     pub id: u64,
     pub shape: IxDyn,
     pub rule: Rule<T>,
     pub inputs: Vec<Edge<T>>,
-    /// The value of the node, if its rule asked to keep it.
+    /// Value of the node, if its rule keeps the output ([`crate::Keep`]).
     pub output: Option<Arc<Buffer<T>>>,
 }
 
+/// The gradient rule of a node.
 pub(crate) enum Rule<T: Real> {
     Leaf,
     Op(Box<dyn Op<T>>),
@@ -36,10 +38,12 @@ impl<T: Real> Rule<T> {
     }
 }
 
-/// An input of a node: where its gradient goes, and its value if the rule asked to keep it.
+/// An input of a node.
 pub(crate) struct Edge<T: Real> {
     pub shape: IxDyn,
+    /// Node that receives the gradient, or `None` for a constant.
     pub node: Option<Arc<Node<T>>>,
+    /// Value of the input, if the rule keeps it ([`crate::Keep`]).
     pub value: Option<Arc<Buffer<T>>>,
 }
 
@@ -50,7 +54,7 @@ impl<T: Real> Node<T> {
     }
 }
 
-/// A chain of a million nodes is dropped by a loop and not by a million nested calls.
+/// Drops the inputs in a loop: recursion would overflow the stack on a chain of a million nodes.
 impl<T: Real> Drop for Node<T> {
     fn drop(&mut self) {
         let mut orphans: Vec<Arc<Node<T>>> = self.inputs.drain(..).filter_map(|edge| edge.node).collect();
@@ -66,15 +70,16 @@ thread_local! {
     static RECORDING: Cell<bool> = const { Cell::new(true) };
 }
 
-/// True unless this thread is inside [`no_grad`].
+/// Returns true unless this thread is inside [`no_grad`].
 pub fn recording() -> bool {
     RECORDING.get()
 }
 
-/// Runs `f` without recording a graph, on this thread. Evaluation does not need it: ops on constants record nothing anyway.
+/// Runs `f` without recording a graph on this thread. Ops on constants never record a graph, so evaluation of a model on constants does not need this
+/// function.
 ///
-/// While `f` waits for a parallel op, rayon may run another task on this thread. Do not build graphs in tasks of rayon's that run beside a
-/// `no_grad`.
+/// While `f` waits for a parallel op, rayon may run another task on this thread, and that task would record no graph either. Do not build graphs in
+/// rayon tasks that run concurrently with `no_grad`.
 pub fn no_grad<R>(f: impl FnOnce() -> R) -> R {
     struct Restore(bool);
     impl Drop for Restore {

@@ -1,10 +1,10 @@
-//! Row numbers.
+//! [`Indices`]: shared arrays of row numbers.
 
 use crate::pool::Buffer;
 use std::ops::Deref;
 use std::sync::Arc;
 
-/// Row numbers, shared between the graph and whoever computed them.
+/// An immutable array of row numbers. A clone shares the array, so the graph and the caller can both hold it.
 #[derive(Clone, Debug)]
 pub struct Indices(Arc<Buffer<u32>>);
 

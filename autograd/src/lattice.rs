@@ -1,9 +1,11 @@
-//! Which row of a table each node of a three-dimensional grid has.
+//! [`Lattice`]: the mapping from the nodes of a three-dimensional grid to the rows of a table.
 //!
-//! Two layouts. *Row-major*: node (i, j, k) of `[nx, ny, nz]` is row (i·ny + j)·nz + k, and all nodes have one. *Bricks*: 4³ nodes are
-//! 64 neighbouring rows, in row-major order inside, and a link table says which 64 rows a brick has, if any. Bricks are numbered along a
-//! Morton curve, so rows that are near in space are near in memory; those that nobody needs take no memory; and inside a brick a bit for
-//! each node says whether it is *present*. A node that is not present reads as a row of zeros and gets no gradient.
+//! There are two layouts:
+//!
+//! * *Row-major*: node (i, j, k) of `[nx, ny, nz]` has row (i·ny + j)·nz + k, and every node has a row.
+//! * *Bricks*: a brick of 4³ nodes has 64 consecutive rows, in row-major order inside the brick. A link table stores the position of each brick in the table;
+//!   bricks without present nodes have no rows and take no memory. Bricks are ordered along a Morton curve, so nodes that are near in space are near in
+//!   memory. Each brick has a mask with a bit for each node that is *present*. A node that is not present reads as a row of zeros and gets no gradient.
 
 mod bricks;
 
@@ -12,41 +14,42 @@ use bricks::node_at;
 pub use bricks::{BRICK, BRICK_ROWS, BrickGrid, STRIDE, bit_of, bits, bits_where, has, local_of, next_in, previous_in};
 use std::sync::{Arc, OnceLock};
 
-/// Nodes that are looked up together: a vector of their numbers.
+/// Number of nodes that are looked up together.
 pub const TOGETHER: usize = 16;
 
 /// The layout of a grid in a table. Cloning copies a pointer.
 #[derive(Clone, Debug)]
 pub struct Lattice {
     nodes: [usize; 3],
-    bricks: Option<Arc<Linked>>,
+    /// Brick layout, or `None` if the layout is row-major.
+    bricks: Option<Arc<BrickTable>>,
 }
 
-/// Which bricks have rows, and which of their nodes are present.
+/// The brick layout: the bricks that have rows, and the masks of their nodes. A stored brick is a brick that has rows.
 #[derive(Debug)]
-struct Linked {
+struct BrickTable {
     grid: BrickGrid,
-    /// Number of each brick among those that have rows, bricks in row-major order; how many these are for one that has none.
+    /// For each brick of the grid, in row-major order, its index among the stored bricks; the number of stored bricks if it is not stored.
     links: Vec<u32>,
-    /// The masks of the bricks that have rows, in their order, and an empty one at the end: a table that stays in the cache.
+    /// Masks of the stored bricks, in the order of their rows, and an empty mask at the end. This array is small enough to stay in the cache.
     linked_masks: Vec<u64>,
-    /// The nodes of each brick that are present.
+    /// Mask of present nodes for each brick of the grid, in row-major order.
     masks: Vec<u64>,
     /// True if every node of the grid is present.
     full: bool,
-    /// Place of each brick that has rows, in bricks, in the order of the rows.
+    /// Brick coordinates of each stored brick, in the order of their rows.
     places: Vec<[u32; 3]>,
     neighbours: OnceLock<Vec<Neighbours>>,
 }
 
-/// The bricks around one, and which of its nodes have a cell.
+/// The neighbours of a brick, and the nodes of the brick that have a complete cell.
 #[derive(Clone, Copy, Debug)]
 pub struct Neighbours {
-    /// The next brick along each axis, if it has rows.
+    /// Number of the next brick along each axis, if it has rows.
     pub ahead: [Option<u32>; 3],
-    /// The one before.
+    /// Number of the previous brick along each axis, if it has rows.
     pub behind: [Option<u32>; 3],
-    /// A bit for each node that is present with all three nodes ahead of it.
+    /// Mask of the nodes that are present and whose next node along each of the three axes is present.
     pub cells: u64,
 }
 
@@ -63,17 +66,18 @@ impl From<&Lattice> for Lattice {
 }
 
 impl Lattice {
-    /// Bricks with all nodes present.
+    /// Returns a brick layout in which all nodes are present.
     pub fn bricks(nodes: [usize; 3]) -> Self {
         Self::bricks_where(nodes, |_| true)
     }
 
-    /// Bricks with the nodes that `present` names.
+    /// Returns a brick layout in which a node is present if `present(node)` is true.
     pub fn bricks_where(nodes: [usize; 3], present: impl Fn([usize; 3]) -> bool + Sync) -> Self {
         Self::bricks_among(nodes, |_| true, present)
     }
 
-    /// The same of those bricks alone that `among` names by their place, x, y and z in bricks: with most of a grid empty, far fewer questions.
+    /// Returns a brick layout in which a node is present if `among(brick)` is true for the coordinates of its brick, x, y and z in bricks, and `present(node)`
+    /// is true. `present` is called only for nodes of such bricks, so this is much faster than [`Lattice::bricks_where`] if most of the grid is empty.
     pub fn bricks_among(nodes: [usize; 3], among: impl Fn([usize; 3]) -> bool + Sync, present: impl Fn([usize; 3]) -> bool + Sync) -> Self {
         let grid = BrickGrid::new(nodes);
         let masks = crate::parallel::map_indices(grid.len(), |brick| {
@@ -83,16 +87,16 @@ impl Lattice {
         Self::from_masks(nodes, masks)
     }
 
-    /// Bricks from one mask of present nodes for each, bricks in row-major order.
+    /// Returns a brick layout from the mask of present nodes of each brick. The bricks are in row-major order.
     ///
-    /// Panics if there is not one mask for each brick, or a node outside of the grid is present.
+    /// Panics if the number of masks is not the number of bricks, or if a node outside the grid is present.
     pub fn from_masks(nodes: [usize; 3], masks: Vec<u64>) -> Self {
         let grid = BrickGrid::new(nodes);
-        assert_eq!(masks.len(), grid.len(), "a lattice of {nodes:?} nodes has {:?} bricks", grid.count());
+        assert_eq!(masks.len(), grid.len(), "from_masks: {} masks for a lattice of {:?} bricks", masks.len(), grid.count());
         let mut places: Vec<[u32; 3]> = Vec::new();
         for (brick, &mask) in masks.iter().enumerate().filter(|(_, mask)| **mask != 0) {
             if let Some(bit) = bits(mask & !grid.inside(brick)).next() {
-                panic!("node {:?} lies outside of a lattice of {nodes:?} nodes", grid.node(brick, bit));
+                panic!("from_masks: node {:?} is outside a lattice of {nodes:?} nodes", grid.node(brick, bit));
             }
             places.push(grid.place(brick).map(|c| c as u32));
         }
@@ -104,15 +108,18 @@ impl Lattice {
             (links[b], linked_masks[brick]) = (brick as u32, masks[b]);
         }
         let full = masks.iter().map(|mask| mask.count_ones() as usize).sum::<usize>() == nodes.iter().product::<usize>();
-        Lattice { nodes, bricks: Some(Arc::new(Linked { grid, links, linked_masks, masks, full, places, neighbours: OnceLock::new() })) }
+        Lattice {
+            nodes,
+            bricks: Some(Arc::new(BrickTable { grid, links, linked_masks, masks, full, places, neighbours: OnceLock::new() })),
+        }
     }
 
-    /// Nodes along each axis.
+    /// Returns the number of nodes along each axis.
     pub fn nodes(&self) -> [usize; 3] {
         self.nodes
     }
 
-    /// Rows of a table in this layout. Rows of a brick whose nodes are not present are in it, and nobody reads them.
+    /// Returns the number of rows of a table in this layout. It includes the rows of nodes that are not present in stored bricks; these are never read.
     pub fn rows(&self) -> usize {
         match &self.bricks {
             None => self.nodes.iter().product(),
@@ -120,7 +127,7 @@ impl Lattice {
         }
     }
 
-    /// Nodes that are present.
+    /// Returns the number of nodes that are present.
     pub fn present(&self) -> usize {
         match &self.bricks {
             None => self.nodes.iter().product(),
@@ -128,21 +135,21 @@ impl Lattice {
         }
     }
 
-    /// True if every node is present.
+    /// Returns true if every node is present.
     pub fn is_full(&self) -> bool {
         self.bricks.as_ref().is_none_or(|bricks| bricks.full)
     }
 
-    /// The row of a node, or `None` if it is not present.
+    /// Returns the row of a node, or `None` if the node is not present.
     ///
-    /// Panics if the node lies outside of the grid.
+    /// Panics if the node is outside the grid.
     #[inline]
     pub fn row(&self, node: [usize; 3]) -> Option<u32> {
-        assert!((0..3).all(|a| node[a] < self.nodes[a]), "node {node:?} of a lattice of {:?} nodes", self.nodes);
+        assert!((0..3).all(|a| node[a] < self.nodes[a]), "node {node:?} is outside a lattice of {:?} nodes", self.nodes);
         with_map!(self, map => map.row(node))
     }
 
-    /// The node of a row, or `None` if the row belongs to none that is present.
+    /// Returns the node of a row, or `None` if the row has no node that is present.
     pub fn node(&self, row: u32) -> Option<[usize; 3]> {
         match &self.bricks {
             None => {
@@ -157,7 +164,8 @@ impl Lattice {
         }
     }
 
-    /// Number and mask of the brick at a place; `None` if it has no rows, lies beyond the grid, or the layout is row-major.
+    /// Returns the number and the mask of the brick at the given brick coordinates, or `None` if the brick has no rows, is outside the grid, or the layout is
+    /// row-major. The rows of brick number b begin at 64 b.
     pub fn brick(&self, place: [usize; 3]) -> Option<(usize, u64)> {
         let bricks = self.bricks.as_ref()?;
         if (0..3).any(|a| place[a] >= bricks.grid.count()[a]) {
@@ -167,11 +175,11 @@ impl Lattice {
         (bricks.masks[b] != 0).then(|| (bricks.links[b] as usize, bricks.masks[b]))
     }
 
-    /// The neighbours of each brick that has rows, in the order of the rows: found once.
+    /// Returns the neighbours of each brick that has rows, in the order of the rows. They are computed on first use.
     ///
     /// Panics if the layout is row-major.
     pub fn neighbours(&self) -> &[Neighbours] {
-        let bricks = self.bricks.as_ref().expect("a layout in bricks");
+        let bricks = self.bricks.as_ref().expect("neighbours: the layout is row-major, expected bricks");
         bricks
             .neighbours
             .get_or_init(|| crate::parallel::map_indices(bricks.places.len(), |b| self.neighbours_of(bricks.places[b].map(|c| c as usize))))
@@ -193,28 +201,28 @@ impl Lattice {
         Neighbours { ahead: numbers(1), behind: numbers(-1), cells }
     }
 
-    /// One mask of present nodes for each brick ([`brick_grid`](Self::brick_grid)); empty for a row-major layout.
+    /// Returns the mask of present nodes of each brick of the grid ([`brick_grid`](Self::brick_grid)), or an empty slice for a row-major layout.
     pub fn masks(&self) -> &[u64] {
         self.bricks.as_ref().map_or(&[], |bricks| &bricks.masks)
     }
 
-    /// How the nodes are divided into bricks, whether the table is stored so or not.
+    /// Returns the division of the nodes into bricks, for both layouts.
     pub fn brick_grid(&self) -> BrickGrid {
         BrickGrid::new(self.nodes)
     }
 
-    /// The layout as kernels see it, or `None` if it is row-major.
+    /// Returns the brick layout as a [`NodeMap`] for kernels, or `None` if the layout is row-major.
     pub fn brick_map(&self) -> Option<BrickMap<'_>> {
         self.bricks.as_ref().map(|b| BrickMap { grid: b.grid, links: &b.links, masks: &b.linked_masks })
     }
 
-    /// The same if every node is present, which needs no masks.
+    /// Returns the brick layout as a [`NodeMap`] without masks, or `None` if the layout is row-major or a node is not present.
     pub fn full_brick_map(&self) -> Option<FullBrickMap<'_>> {
         self.brick_map().filter(|_| self.is_full()).map(FullBrickMap)
     }
 }
 
-/// Bits of the three coordinates, interleaved, x above y above z.
+/// Returns the Morton code: the interleaved bits of the three coordinates, in the order x, y, z from the most significant bit.
 fn morton(place: [u32; 3]) -> u64 {
     let spread = |c: u32| {
         let mut c = u64::from(c) & 0x1f_ffff;
@@ -232,34 +240,35 @@ fn morton(place: [u32; 3]) -> u64 {
     spread(place[0]) << 2 | spread(place[1]) << 1 | spread(place[2])
 }
 
-/// How kernels see a layout: copied into their loops.
+/// The mapping from nodes to rows, as used in the loops of kernels. It has a code for each node of the grid, and maps codes to rows.
 pub trait NodeMap: Copy + Sync {
-    /// Nodes along each axis.
+    /// Returns the number of nodes along each axis.
     fn nodes(self) -> [usize; 3];
-    /// What a coordinate adds to the number of a node.
+    /// Returns the contribution of one coordinate to the code of a node.
     fn share(self, axis: usize, coordinate: u32) -> u32;
-    /// The number of a node inside the grid: arithmetic alone, so that a loop over many nodes vectorises.
+    /// Returns the code of a node inside the grid. It is computed by arithmetic only, so that loops over many nodes vectorise.
     #[inline(always)]
     fn code(self, node: [u32; 3]) -> u32 {
         self.share(0, node[0]) + self.share(1, node[1]) + self.share(2, node[2])
     }
-    /// The row of the node with a number, if it is present.
+    /// Returns the row of the node with the given code, or `None` if the node is not present.
     fn row_of(self, code: u32) -> Option<u32>;
-    /// The rows of many nodes, and all bits for each that is present. What stands for the row of one that is not has no meaning.
+    /// Returns the rows of the nodes with the given codes, and for each node a word with all bits set if it is present, else 0. The row of a node that is not
+    /// present is unspecified.
     fn rows_of(self, codes: [u32; TOGETHER]) -> ([u32; TOGETHER], [u32; TOGETHER]);
-    /// The row of a node inside the grid.
+    /// Returns the row of a node inside the grid, or `None` if the node is not present.
     #[inline(always)]
     fn row(self, node: [usize; 3]) -> Option<u32> {
         self.row_of(self.code(node.map(|c| c as u32)))
     }
-    /// True if nodes may be missing.
+    /// True if some nodes may be missing.
     const SPARSE: bool;
 }
 
-/// All nodes, row-major.
+/// The [`NodeMap`] of the row-major layout.
 #[derive(Clone, Copy, Debug)]
 pub struct RowMajor {
-    /// Nodes along each axis.
+    /// Number of nodes along each axis.
     pub nodes: [usize; 3],
 }
 
@@ -283,11 +292,11 @@ impl NodeMap for RowMajor {
     }
 }
 
-/// [`BRICK`] and [`BRICK_ROWS`], as codes are counted.
+/// [`BRICK`] and [`BRICK_ROWS`] in the integer type of node codes.
 const SIDE: u32 = BRICK as u32;
 const ROWS: u32 = BRICK_ROWS as u32;
 
-/// Bricks behind a link table.
+/// The [`NodeMap`] of the brick layout.
 #[derive(Clone, Copy, Debug)]
 pub struct BrickMap<'a> {
     grid: BrickGrid,
@@ -296,7 +305,7 @@ pub struct BrickMap<'a> {
 }
 
 impl BrickMap<'_> {
-    /// The links of the bricks of many nodes.
+    /// Returns the links of the bricks that contain the nodes with the given codes.
     #[inline(always)]
     fn linked(self, codes: [u32; TOGETHER]) -> [u32; TOGETHER] {
         gathered(self.links, codes.map(|code| code / ROWS))
@@ -309,7 +318,7 @@ impl NodeMap for BrickMap<'_> {
     fn nodes(self) -> [usize; 3] {
         self.grid.nodes()
     }
-    /// The code of a node is the number of its brick times 64, and its bit.
+    /// Returns a share of the code, which is the number of the brick in the grid times 64, plus the bit of the node in the brick.
     #[inline(always)]
     fn share(self, axis: usize, coordinate: u32) -> u32 {
         let bricks = self.grid.strides()[axis] as u32;
@@ -334,7 +343,7 @@ impl NodeMap for BrickMap<'_> {
     }
 }
 
-/// Bricks behind a link table with no node missing.
+/// The [`NodeMap`] of a brick layout in which all nodes are present.
 #[derive(Clone, Copy, Debug)]
 pub struct FullBrickMap<'a>(BrickMap<'a>);
 
@@ -363,7 +372,7 @@ impl NodeMap for FullBrickMap<'_> {
     }
 }
 
-/// Runs an expression with the lattice as a [`NodeMap`], compiled for each layout.
+/// Evaluates an expression with the [`NodeMap`] of a lattice. The expression is compiled once for each layout.
 macro_rules! with_map {
     ($lattice:expr, $map:ident => $body:expr) => {
         match $lattice.brick_map() {
@@ -413,7 +422,7 @@ mod tests {
     #[test]
     fn rows_of_a_cube_of_bricks_are_neighbours_along_the_morton_curve() {
         let lattice = Lattice::bricks([32; 3]);
-        // The first 64 bricks are the cube of 16³ nodes at the origin.
+        // The first 64 bricks are the cube of 16³ nodes at the origin of the grid.
         let cube = |row: u32| lattice.node(row).is_some_and(|node| node.iter().all(|&c| c < 16));
         assert!((0..16 * 16 * 16).all(cube) && !(16 * 16 * 16..32 * 32 * 32).any(cube));
     }

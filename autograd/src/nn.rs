@@ -1,6 +1,6 @@
-//! Layers of neural networks: [`Linear`], [`Mlp`], and how their parameters begin ([`Init`]).
+//! Neural network layers: [`Linear`] and [`Mlp`], and the initialization of their parameters ([`Init`]).
 //!
-//! A layer is a [`Module`](crate::Module): an optimizer changes its parameters, [`save_safetensors`](crate::save_safetensors) writes them.
+//! A layer is a [`Module`](crate::Module): an optimizer updates its parameters, and [`save_safetensors`](crate::save_safetensors) writes them.
 //!
 //! ```
 //! use autograd::nn::{Activation, Mlp};

@@ -1,8 +1,8 @@
-//! The extension surface: what an author of an op implements.
+//! The interface for custom ops.
 //!
-//! An [`Op`] states its rule in tensor ops, so the rule can be differentiated again. A [`Kernel`] states its adjoint on plain arrays,
-//! which is faster and cannot be differentiated; so it must also state the same computation in small ops, its `reference`, through
-//! which second derivatives go and against which tests hold the adjoint.
+//! An [`Op`] expresses its rule in tensor ops, so the rule can be differentiated again. A [`Kernel`] computes its adjoint on plain arrays, which is
+//! faster but cannot be differentiated. A kernel must therefore also provide a `reference`: the same computation in small tensor ops. Second
+//! derivatives are computed through the reference, and tests compare the adjoint with it.
 
 use crate::graph::{Edge, Node};
 use crate::index::Indices;
@@ -14,7 +14,7 @@ use crate::tensor::Tensor;
 use ndarray::Dimension;
 use std::fmt::Debug;
 
-/// Which values a rule reads: only those are kept until the backward pass.
+/// The set of values that a rule reads. Only these are kept until the backward pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Keep {
     inputs: u32,
@@ -28,10 +28,10 @@ impl Keep {
     pub const INPUTS: Keep = Keep { inputs: u32::MAX, output: false };
     /// The output.
     pub const OUTPUT: Keep = Keep { inputs: 0, output: true };
-    /// Everything; what a rule gets that does not say.
+    /// All inputs and the output: the default of [`Op::keep`].
     pub const INPUTS_AND_OUTPUT: Keep = Keep { inputs: u32::MAX, output: true };
 
-    /// These inputs only.
+    /// Returns the set of the inputs with the given indices, which must be below 32.
     pub const fn some_inputs(which: &[usize]) -> Keep {
         let mut inputs = 0;
         let mut i = 0;
@@ -51,90 +51,96 @@ impl Keep {
     }
 }
 
-/// A differentiable operation whose rule is written in tensor ops.
+/// A differentiable op whose rule is written in tensor ops.
 pub trait Op<T: Real>: Debug + Send + Sync + 'static {
-    /// The name, for messages.
+    /// Returns the name of the op, for error messages.
     fn name(&self) -> &'static str;
 
-    /// What the rule reads. Forgetting to narrow it costs memory, not correctness.
+    /// Returns the values that the rule reads. The default keeps all inputs and the output; a smaller set saves memory.
     fn keep(&self) -> Keep {
         Keep::INPUTS_AND_OUTPUT
     }
 
-    /// The cotangent of each input, given that of the output. A contribution may have the output's (broadcast) shape: the engine sums
-    /// it down to the input's.
+    /// Computes the vector-Jacobian product: the cotangent of each input, given the cotangent of the output. A dense cotangent may have the
+    /// broadcast shape of the output; the engine sums it to the shape of the input. `None` means zero.
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>>;
 }
 
-/// A hand-written adjoint on arrays, with the reference it is held to.
+/// A differentiable op with a hand-written adjoint on arrays, and the reference that it is compared with.
 pub trait Kernel<T: Real>: Debug + Send + Sync + 'static {
-    /// The name, for messages.
+    /// Returns the name of the kernel, for error messages.
     fn name(&self) -> &'static str;
 
-    /// What adjoint and reference read; the reference reads the inputs.
+    /// Returns the values that the adjoint and the reference read. The reference needs all inputs.
     fn keep(&self) -> Keep {
         Keep::INPUTS
     }
 
-    /// The meaning of this kernel, in small ops. Derivatives of second and higher order go through it.
+    /// Computes the same function as the kernel in small tensor ops. Second and higher derivatives are computed through this reference.
     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T>;
 
-    /// Puts the cotangents of the inputs into `out`.
+    /// Computes the vector-Jacobian product and writes the cotangents of the inputs to `out`.
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>);
 }
 
-/// A share of an input's cotangent.
+/// A contribution to the cotangent of an input.
 pub enum Cotangent<T: Real> {
-    /// Of the input's shape, or of one that broadcasting made of it.
+    /// A dense contribution. Its shape is the shape of the input, or a shape that the input broadcasts to.
     Dense(Tensor<T>),
-    /// Zero except that `values[k]` is added to row `rows[k]` of the input; rows may repeat, in any order.
+    /// A row-sparse contribution: row k of `values` is added to row `rows[k]` of the input. Rows may repeat and may have any order.
     Rows {
         /// One row number for each row of `values`.
         rows: Indices,
-        /// `[rows.len(), …]`, trailing dimensions those of the input.
+        /// Values of the rows, `[rows.len(), …]`, with the trailing dimensions of the input.
         values: Tensor<T>,
     },
-    /// The same with rows sorted and unique, or to be so when somebody asks: from a kernel.
+    /// A row-sparse contribution of a kernel, whose rows are sorted and unique. The sums may be lazy ([`RowSparse::deferred`]).
     Merged(RowSparse<T>),
 }
 
-/// What a rule sees of the node it differentiates.
+/// The arguments of [`Op::vjp`]: the cotangent of the output and the kept values.
 pub struct Vjp<'a, T: Real> {
     pub(crate) node: &'a std::sync::Arc<Node<T>>,
     pub(crate) cotangent: &'a Tensor<T>,
     pub(crate) needed: &'a [bool],
-    /// True in a differentiable pass: inputs and output are then handed out with their place in the graph.
+    /// True in a differentiable pass: inputs and output are then returned with their graph nodes.
     pub(crate) tracked: bool,
 }
 
 impl<T: Real> Vjp<'_, T> {
-    /// The cotangent of the output, of the output's shape.
+    /// Returns the cotangent of the output, which has the shape of the output.
     pub fn cotangent(&self) -> &Tensor<T> {
         self.cotangent
     }
 
-    /// Input `i`. Panics, naming the op, if its [`Keep`] left it out.
+    /// Returns input `i`.
+    ///
+    /// Panics with the name of the op if [`Op::keep`] does not include the input.
     pub fn input(&self, i: usize) -> Tensor<T> {
         input(self.node, i, self.tracked)
     }
 
-    /// The output. Panics, naming the op, if its [`Keep`] left it out.
+    /// Returns the output.
+    ///
+    /// Panics with the name of the op if [`Op::keep`] does not include the output.
     pub fn output(&self) -> Tensor<T> {
-        let Some(data) = &self.node.output else { panic!("{}: the rule reads its output, which `keep` left out", self.node.rule.name()) };
+        let Some(data) = &self.node.output else {
+            panic!("{}: the rule reads its output, which `keep` does not include", self.node.rule.name())
+        };
         Tensor { data: data.clone(), shape: self.node.shape.clone(), node: self.tracked.then(|| self.node.clone()) }
     }
 
-    /// The shape of input `i`, kept or not.
+    /// Returns the shape of input `i`, which is available even if the value was not kept.
     pub fn input_shape(&self, i: usize) -> &[usize] {
         self.node.inputs[i].shape.slice()
     }
 
-    /// The dense cotangent of input `i`, computed only if somebody needs it.
+    /// Returns the dense cotangent of input `i`. `f` is called only if this cotangent is needed.
     pub fn wrt(&self, i: usize, f: impl FnOnce() -> Tensor<T>) -> Option<Cotangent<T>> {
         self.needed[i].then(|| Cotangent::Dense(f()))
     }
 
-    /// The cotangent of input `i` as rows, computed only if somebody needs it.
+    /// Returns the row-sparse cotangent of input `i`. `f` computes the values of the rows and is called only if this cotangent is needed.
     pub fn wrt_rows(&self, i: usize, rows: &Indices, f: impl FnOnce() -> Tensor<T>) -> Option<Cotangent<T>> {
         self.needed[i].then(|| Cotangent::Rows { rows: rows.clone(), values: f() })
     }
@@ -142,11 +148,11 @@ impl<T: Real> Vjp<'_, T> {
 
 pub(crate) fn input<T: Real>(node: &Node<T>, i: usize, tracked: bool) -> Tensor<T> {
     let Edge { shape, node: source, value } = &node.inputs[i];
-    let Some(data) = value else { panic!("{}: the rule reads input {i}, which `keep` left out", node.rule.name()) };
+    let Some(data) = value else { panic!("{}: the rule reads input {i}, which `keep` does not include", node.rule.name()) };
     Tensor { data: data.clone(), shape: shape.clone(), node: if tracked { source.clone() } else { None } }
 }
 
-/// What a kernel's adjoint sees: plain arrays.
+/// The arguments of [`Kernel::vjp`]: the cotangent of the output and the kept values, as constants.
 pub struct KernelCall<'a, T: Real> {
     pub(crate) node: &'a Node<T>,
     pub(crate) cotangent: &'a Tensor<T>,
@@ -154,31 +160,35 @@ pub struct KernelCall<'a, T: Real> {
 }
 
 impl<T: Real> KernelCall<'_, T> {
-    /// The cotangent of the output, of the output's shape.
+    /// Returns the cotangent of the output, which has the shape of the output.
     pub fn cotangent(&self) -> &Tensor<T> {
         self.cotangent
     }
 
-    /// Input `i` as a constant. Panics, naming the kernel, if its [`Keep`] left it out.
+    /// Returns input `i` as a constant.
+    ///
+    /// Panics with the name of the kernel if [`Kernel::keep`] does not include the input.
     pub fn input(&self, i: usize) -> Tensor<T> {
         input(self.node, i, false)
     }
 
-    /// The output as a constant. Panics, naming the kernel, if its [`Keep`] left it out.
+    /// Returns the output as a constant.
+    ///
+    /// Panics with the name of the kernel if [`Kernel::keep`] does not include the output.
     pub fn output(&self) -> Tensor<T> {
         let Some(data) = &self.node.output else {
-            panic!("{}: the adjoint reads its output, which `keep` left out", self.node.rule.name())
+            panic!("{}: the adjoint reads its output, which `keep` does not include", self.node.rule.name())
         };
         Tensor { data: data.clone(), shape: self.node.shape.clone(), node: None }
     }
 
-    /// True if somebody needs the cotangent of input `i`.
+    /// Returns true if the cotangent of input `i` is needed.
     pub fn needs(&self, i: usize) -> bool {
         self.needed[i]
     }
 }
 
-/// Where a kernel's adjoint leaves its results.
+/// The output of [`Kernel::vjp`]: collects the cotangents of the inputs.
 pub struct GradSink<T: Real> {
     pub(crate) kernel: &'static str,
     pub(crate) shapes: Vec<ndarray::IxDyn>,
@@ -186,33 +196,34 @@ pub struct GradSink<T: Real> {
 }
 
 impl<T: Real> GradSink<T> {
-    /// The cotangent of input `i`, in row-major order of its shape.
+    /// Sets the dense cotangent of input `i`, in row-major order of its shape.
     ///
-    /// Panics if the input has a cotangent already.
+    /// Panics if the input already has a cotangent, or if the number of values does not fit its shape.
     #[track_caller]
     pub fn dense(&mut self, i: usize, values: Buffer<T>) {
-        assert!(self.slots[i].is_none(), "{}: a dense cotangent for input {i}, which has one already", self.kernel);
+        assert!(self.slots[i].is_none(), "{}: a dense cotangent for input {i}, which already has a cotangent", self.kernel);
         self.slots[i] = Some(Cotangent::Dense(Tensor::from_buffer(values, self.shapes[i].slice())));
     }
 
-    /// The cotangent of input `i` as sorted, unique rows, added up now or later. Rows that are given in several calls are added to those before.
+    /// Adds a row-sparse cotangent to input `i`. Its rows are sorted and unique, and its sums may be lazy. The results of several calls are summed.
     ///
-    /// Panics if the input has a dense cotangent already.
+    /// Panics if the input already has a dense cotangent.
     #[track_caller]
     pub fn rows(&mut self, i: usize, rows: RowSparse<T>) {
         debug_assert_eq!(rows.shape(), self.shapes[i].slice());
         self.slots[i] = Some(Cotangent::Merged(match self.slots[i].take() {
             Some(Cotangent::Merged(before)) => before.plus(rows),
             None => rows,
-            Some(_) => panic!("{}: rows for input {i}, which has a dense cotangent already", self.kernel),
+            Some(_) => panic!("{}: rows for input {i}, which already has a dense cotangent", self.kernel),
         }));
     }
 
-    /// The cotangent of input `i`, a table `[R, …]`, as contributions to its rows: row j of `values`, `[rows.len(), …]`, is added to row `rows[j]`.
-    /// Rows come in any order and may repeat; those that do not come get nothing. Contributions are added in the order of j, with the same bits
-    /// for any number of threads; those of several calls are added to those before.
+    /// Adds contributions to rows of the cotangent of input `i`, a table `[R, …]`: row j of `values`, `[rows.len(), …]`, is added to row `rows[j]`.
     ///
-    /// Panics if `values` does not have a row for each of `rows`, if a row is R or more, or if the input has a dense cotangent already.
+    /// Rows may have any order and may repeat; the gradient of all other rows is zero. Contributions are added in the order of j, so the bits do not
+    /// depend on the number of threads. The results of several calls are summed.
+    ///
+    /// Panics if `values` does not have one row for each of `rows`, if a row number is R or more, or if the input already has a dense cotangent.
     #[track_caller]
     pub fn scatter(&mut self, i: usize, rows: &[u32], values: &[T]) {
         let (found, want) = (values.len(), rows.len() * self.width(i));
@@ -220,30 +231,32 @@ impl<T: Real> GradSink<T> {
         self.scatter_weighted(i, |j| ([rows[j]], [T::one()]), values);
     }
 
-    /// The cotangent of input `i`, a table `[R, …]`, where each item contributes to `K` rows of it: with `(rows, weights) = touch(j)`, `weights[k]`
-    /// times row j of `values`, `[items, …]`, is added to row `rows[k]`, for each item j and each k. Order, repeats and several calls are as in
-    /// [`GradSink::scatter`]. `touch` is called several times for each item, from any thread, and must always return the same.
+    /// Adds weighted contributions to rows of the cotangent of input `i`, a table `[R, …]`. Each item contributes to `K` rows: for each item j and
+    /// each k, with `(rows, weights) = touch(j)`, `weights[k]` times row j of `values`, `[items, …]`, is added to row `rows[k]`.
     ///
-    /// A look-up between the rows of a table, yⱼ = (1 − f) x\[r\] + f x\[r + 1\] at position r + f:
+    /// Order, repeated rows and several calls are handled as in [`GradSink::scatter`]. `touch` is called several times for each item, from any
+    /// thread, and must always return the same result.
+    ///
+    /// Example: linear interpolation between the rows of a table, yⱼ = (1 − f) x\[r\] + f x\[r + 1\] at position r + f:
     ///
     /// ```
     /// use autograd::{GradSink, Indices, Kernel, KernelCall, Real, Tensor, check_kernel};
     ///
     /// #[derive(Debug)]
-    /// struct Between {
+    /// struct InterpolateRows {
     ///     positions: Vec<f64>,
     /// }
     ///
-    /// impl Between {
+    /// impl InterpolateRows {
     ///     fn touch<T: Real>(&self, j: usize) -> ([u32; 2], [T; 2]) {
     ///         let (r, f) = (self.positions[j] as u32, self.positions[j].fract());
     ///         ([r, r + 1], [T::lit(1.0 - f), T::lit(f)])
     ///     }
     /// }
     ///
-    /// impl<T: Real> Kernel<T> for Between {
+    /// impl<T: Real> Kernel<T> for InterpolateRows {
     ///     fn name(&self) -> &'static str {
-    ///         "between"
+    ///         "interpolate_rows"
     ///     }
     ///     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
     ///         let n = self.positions.len();
@@ -258,9 +271,9 @@ impl<T: Real> GradSink<T> {
     ///     }
     /// }
     ///
-    /// /// `[R, C]` to `[positions, C]`; positions lie in 0 .. R − 1.
-    /// fn between<T: Real>(table: &Tensor<T>, positions: Vec<f64>) -> Tensor<T> {
-    ///     let (kernel, width) = (Between { positions }, table.shape()[1]);
+    /// /// Interpolates a table `[R, C]` at positions in [0, R − 1); the result is `[positions, C]`.
+    /// fn interpolate_rows<T: Real>(table: &Tensor<T>, positions: Vec<f64>) -> Tensor<T> {
+    ///     let (kernel, width) = (InterpolateRows { positions }, table.shape()[1]);
     ///     let mut values = Vec::new();
     ///     for j in 0..kernel.positions.len() {
     ///         let ([low, high], [a, b]) = kernel.touch::<T>(j);
@@ -271,10 +284,11 @@ impl<T: Real> GradSink<T> {
     /// }
     ///
     /// let table = ndarray::arr2(&[[1.0, 5.0], [2.0, 7.0], [4.0, 3.0]]).into_dyn();
-    /// check_kernel(|x| between(&x[0], vec![1.25, 0.5, 1.75]), [table], 1e-12).unwrap();
+    /// check_kernel(|x| interpolate_rows(&x[0], vec![1.25, 0.5, 1.75]), [table], 1e-12).unwrap();
     /// ```
     ///
-    /// Panics if `values` is not made of rows of the input's width, if a row is R or more, or if the input has a dense cotangent already.
+    /// Panics if the length of `values` is not a multiple of the row width, if a row number is R or more, or if the input already has a dense
+    /// cotangent.
     #[track_caller]
     pub fn scatter_weighted<const K: usize>(&mut self, i: usize, touch: impl Fn(usize) -> ([u32; K], [T; K]) + Sync, values: &[T]) {
         let (shape, width) = (self.shapes[i].slice(), self.width(i));
@@ -284,7 +298,7 @@ impl<T: Real> GradSink<T> {
         self.rows(i, rows);
     }
 
-    /// Elements of a row of input `i`.
+    /// Returns the number of elements in a row of input `i`.
     #[track_caller]
     fn width(&self, i: usize) -> usize {
         let shape = self.shapes[i].slice();
@@ -311,7 +325,7 @@ mod tests {
         let mut sink = sink(&[5, 2]);
         sink.scatter(0, &[3, 0, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
         assert_eq!((rows(&sink).rows(), rows(&sink).data()), (&[0, 3][..], &[3.0, 4.0, 6.0, 8.0][..]));
-        // One item, and a row that it touches twice.
+        // One item that contributes to row 4 twice.
         sink.scatter_weighted(0, |_| ([4, 0, 4], [1.0, 2.0, 0.5]), &[10.0, 20.0]);
         assert_eq!((rows(&sink).rows(), rows(&sink).data()), (&[0, 3, 4][..], &[23.0, 44.0, 6.0, 8.0, 15.0, 30.0][..]));
         sink.scatter(0, &[], &[]);
@@ -340,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "test: row 50000 of a table of 5 rows")]
+    #[should_panic(expected = "test: row 50000 is out of range for a table of 5 rows")]
     fn a_row_beyond_the_input_is_refused() {
         sink(&[5, 2]).scatter(0, &[0, 50_000, 2], &[1.0; 6]);
     }

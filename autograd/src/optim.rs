@@ -1,14 +1,16 @@
-//! Optimizers: how parameters follow their gradients.
+//! Optimizers and learning rate schedules.
 //!
-//! An optimizer sees a [`Module`], its [`Gradients`] and the number of the step, and nothing of models or losses. It says what a row
-//! gradient means to it: [`Sgd`], [`Momentum`], [`RmsProp`] and lazy [`Adam`] visit the touched rows only and leave all others and
-//! what is remembered of them as they are. A parameter without a gradient in a step is left alone by all of them.
+//! An optimizer reads a [`Module`], its [`Gradients`] and the step number. It does not depend on models or losses. Each optimizer documents how it treats
+//! row-sparse gradients: [`Sgd`], [`Momentum`], [`RmsProp`] and lazy [`Adam`] visit only the touched rows, and neither the values nor the state of other
+//! rows change. No optimizer changes a parameter in a step in which it has no gradient.
 //!
-//! What an optimizer remembers belongs to the identity of a parameter: after [`Param::replace`] it starts afresh, and what was
-//! remembered of an identity that the module no longer has is dropped. So an optimizer serves one module.
-//! A parameter with [`Bounds`](crate::Bounds) is brought back to them in the elements that were updated (projected descent): from a start within the
-//! bounds that equals clamping all of it.
-//! Every update is elementwise and in place, with the same bits for any number of threads.
+//! Optimizer state belongs to the identity of a parameter. After [`Param::replace`] the state starts again from zero. State of identities that the module
+//! no longer contains is dropped in the next step, so an optimizer must be used with one module only.
+//!
+//! Updated elements of a parameter with [`Bounds`](crate::Bounds) are clamped to them (projected gradient descent). If all values start within the bounds,
+//! this equals clamping the whole parameter.
+//!
+//! Every update is elementwise and in place, and has the same bits for any number of threads.
 
 mod adam;
 mod elementwise;
@@ -26,25 +28,25 @@ use crate::param::{Module, Param};
 use crate::pool::Buffer;
 use crate::real::Real;
 
-/// Changes parameters by their gradients.
+/// An algorithm that updates parameters from their gradients.
 pub trait Optimizer<T: Real>: Send {
-    /// One step. `step` counts from 0 and is what schedules go by.
+    /// Updates every parameter of the module that has a gradient. `step` counts from 0 and determines the learning rates.
     fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64);
 
-    /// The learning rate of the parameter of this name at a step.
+    /// Returns the learning rate at a step of the parameter with the given name.
     fn rate(&self, parameter: &str, step: u64) -> f64;
 
-    /// What it remembers of a parameter, to be kept with its values; `None` if nothing.
+    /// Returns the optimizer state of a parameter, for a checkpoint, or `None` if there is none.
     fn memory_of(&self, param: &Param<T>) -> Option<Remembered<'_, T>>;
 
-    /// Goes on with a parameter as one of its kind that remembered this. False, and nothing is done, if it does not remember so many numbers of
-    /// each element.
+    /// Restores the optimizer state of a parameter from a checkpoint; the arguments are the fields of [`Remembered`]. Returns false, and changes nothing,
+    /// if the number or the length of the arrays does not fit this optimizer and the parameter.
     #[must_use]
     fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool;
 }
 
-/// Implements [`Optimizer`] for a type by handing every call on to what it holds.
-macro_rules! hand_on {
+/// Implements [`Optimizer`] for a wrapper type by forwarding every call to the wrapped optimizer.
+macro_rules! forward_to {
     ([$($generics:tt)*] $type:ty, $self:ident => $inner:expr) => {
         impl<$($generics)*> Optimizer<T> for $type {
             fn step(&mut $self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
@@ -66,21 +68,21 @@ macro_rules! hand_on {
     };
 }
 
-hand_on!([T: Real] Momentum<T>, self => self.0);
-hand_on!([T: Real] RmsProp<T>, self => self.0);
-hand_on!([T: Real] Adam<T>, self => self.0);
-hand_on!([T: Real, O: Optimizer<T> + ?Sized] Box<O>, self => (**self));
+forward_to!([T: Real] Momentum<T>, self => self.0);
+forward_to!([T: Real] RmsProp<T>, self => self.0);
+forward_to!([T: Real] Adam<T>, self => self.0);
+forward_to!([T: Real, O: Optimizer<T> + ?Sized] Box<O>, self => (**self));
 
-/// What an optimizer remembers of a parameter.
+/// The state that an optimizer keeps for a parameter.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Remembered<'a, T: Real> {
-    /// Steps in which it had a gradient.
+    /// Number of steps in which the parameter had a gradient.
     pub updates: u64,
-    /// As many numbers in each as the parameter has values: of momentum the velocity, of [`RmsProp`] v, of [`Adam`] m and v.
+    /// State arrays, each of the length of the parameter: m for [`Momentum`], v for [`RmsProp`], m and v for [`Adam`].
     pub arrays: Vec<&'a [T]>,
 }
 
-/// Learning rates: a schedule for each parameter name, and one for the names that are not listed.
+/// Learning rates: schedules for listed parameter names, and a default schedule for all other names.
 ///
 /// ```
 /// use autograd::optim::{Exponential, Rates};
@@ -96,23 +98,23 @@ pub struct Rates {
 }
 
 impl Rates {
-    /// One schedule for all.
+    /// Creates learning rates with the given default schedule.
     pub fn new(default: impl Schedule + 'static) -> Self {
         Rates { default: Box::new(default), by_name: Vec::new() }
     }
 
-    /// Another schedule for the parameter of this name; the last one counts.
+    /// Sets the schedule of the parameter with the given name. If a name is set several times, the last schedule is used.
     pub fn with(mut self, name: impl Into<String>, schedule: impl Schedule + 'static) -> Self {
         self.by_name.push((name.into(), Box::new(schedule)));
         self
     }
 
-    /// The names that have a schedule of their own, in the order in which they were added.
+    /// Returns the names that have their own schedule, in the order in which they were set.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.by_name.iter().map(|(name, _)| &name[..])
     }
 
-    /// The rate of a parameter at a step.
+    /// Returns the learning rate of a parameter at a step.
     pub fn at(&self, name: &str, step: u64) -> f64 {
         let named = self.by_name.iter().rev().find(|(n, _)| n == name).map(|(_, schedule)| schedule);
         named.unwrap_or(&self.default).at(step)
@@ -146,7 +148,7 @@ mod tests {
         vec![Param::new("a", Array1::from_shape_fn(len, |i| (i % 101) as f32 * 0.01)), Param::new("b", arr1(&[1.0f32, 2.0]))]
     }
 
-    /// Σ a[rows]² with every third row looked up.
+    /// Gradients of Σ a[rows]², where `rows` is every third row.
     fn gradients(params: &[Param<f32>]) -> Gradients<f32> {
         let rows: Vec<u32> = (0..params[0].shape()[0] as u32).step_by(3).collect();
         params[0].tensor().gather_rows(&Indices::from(rows)).square().sum().backward()
@@ -163,7 +165,7 @@ mod tests {
             }
             let after = params[0].tensor().data();
             for i in 0..7 {
-                // Row 0 is 0, where the gradient of the square is 0.
+                // The value of row 0 is 0, so its gradient is 0.
                 assert_eq!(before[i] != after[i], i % 3 == 0 && i > 0, "{name}, row {i}");
             }
             assert_eq!(params[1].tensor().data(), [1.0, 2.0], "{name}");
@@ -232,7 +234,7 @@ mod tests {
 
     #[test]
     fn updates_are_in_place_and_have_the_same_bits_for_any_number_of_threads() {
-        // Several chunks, and a number of rows that no chunk size divides.
+        // The length spans several chunks and is not a multiple of any chunk size.
         let len = 300_001;
         let train = |threads: usize, optimizer: &mut dyn Optimizer<f32>| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");

@@ -1,7 +1,7 @@
-//! The only module that knows rayon: fixed chunks, in-order reductions, loops compiled for several instruction sets.
+//! Parallel loops with reproducible results, and loops compiled for several instruction sets. Only this module uses rayon.
 //!
-//! Chunk bounds depend on sizes and never on the number of threads, and partial sums are combined in chunk order, so every result has
-//! the same bits for any thread count.
+//! Chunk bounds depend on sizes and never on the number of threads, and partial sums are combined in chunk order. Every result therefore has the same bits
+//! for any number of threads.
 
 mod gather;
 mod prefetch;
@@ -15,16 +15,15 @@ pub use prefetch::prefetch;
 use rayon::prelude::*;
 pub(crate) use update::update;
 
-/// Compiles a function for several instruction sets and picks the best at run time: AVX-512, AVX2 with FMA, NEON, or what every machine of the
-/// target has.
+/// Compiles a function for several instruction sets and selects the best version at run time: AVX-512, AVX2 with FMA, NEON, or the baseline of the target.
 ///
-/// It is for the loops of a kernel. The function is generic or not, and so are its closures; it takes no `self`. What it calls must be
-/// `#[inline(always)]`, or is compiled once, for every machine. Results differ between the versions where a loop asks for fused
-/// multiply-add: see [`fused`](crate::parallel::fused).
+/// The macro is for the inner loops of kernels. The function may be generic and may take closures, but not `self`. Functions that it calls must be
+/// `#[inline(always)]`; otherwise they are compiled for the baseline only. Results differ between the versions if a loop uses fused multiply-add: see
+/// [`fused`](crate::parallel::fused).
 ///
-/// A crate that uses it needs no dependency but this one: the macro brings the attribute of the crate `multiversion` along. Builds with debug
-/// assertions, in which the tests run, have the version for every machine only: every crate that uses a generic loop compiles it anew, and four
-/// versions of each would take minutes. So a test with `--release` is worth having.
+/// A crate that uses the macro needs no dependency except this one, since the macro refers to the crate `multiversion` through it. Builds with debug
+/// assertions, including normal test builds, have the baseline version only: every crate that uses a generic loop compiles it again, and compiling four
+/// versions of each would take minutes. Tests should therefore also run with `--release`.
 ///
 /// ```
 /// use autograd::{Real, dispatched, parallel};
@@ -68,7 +67,7 @@ macro_rules! dispatched {
 }
 pub(crate) use dispatched;
 
-/// True if the loops below run in a version that multiplies and adds in one instruction.
+/// Returns true if [`dispatched!`](crate::dispatched) loops run in a version that has fused multiply-add instructions.
 pub fn fused() -> bool {
     #[cfg(target_arch = "x86_64")]
     let available = std::is_x86_feature_detected!("avx2")
@@ -82,15 +81,15 @@ pub fn fused() -> bool {
     available && !cfg!(debug_assertions)
 }
 
-/// Threads that work at once. A result must not depend on it.
+/// Returns the number of threads of the current pool. Results must not depend on it.
 pub fn threads() -> usize {
     rayon::current_num_threads()
 }
 
-/// Elements handed to a thread at a time: large enough to hide the hand-over, small enough to stay in a core's cache.
+/// Number of elements in a task: large enough to hide the overhead of scheduling, small enough for the cache of a core.
 pub const CHUNK: usize = 16 * 1024;
 
-/// Chunk length for rows of `width` elements, in rows.
+/// Returns the number of rows of `width` elements in a task.
 pub fn rows_per_chunk(width: usize) -> usize {
     (CHUNK / width.max(1)).max(1)
 }
@@ -112,7 +111,7 @@ pub fn for_each_chunk<E: Send>(out: &mut [E], size: usize, f: impl Fn(usize, &mu
     out.par_chunks_mut(size).enumerate().for_each(|(i, chunk)| f(i * size, chunk));
 }
 
-/// Calls `f(i)` for `0..n`, in parallel, and collects in order.
+/// Calls `f(i)` for each i in `0..n`, in parallel, and collects the results in order.
 pub fn map_indices<R: Send>(n: usize, f: impl Fn(usize) -> R + Sync + Send) -> Vec<R> {
     if n <= 1 {
         return (0..n).map(f).collect();
@@ -120,23 +119,23 @@ pub fn map_indices<R: Send>(n: usize, f: impl Fn(usize) -> R + Sync + Send) -> V
     (0..n).into_par_iter().map(f).collect()
 }
 
-/// Calls `f(i, item)` for every item, in parallel, in no particular order.
+/// Calls `f(i, item)` for every item, in parallel and in no particular order.
 pub fn for_each_item<I: Send>(items: Vec<I>, f: impl Fn(usize, I) + Sync + Send) {
     items.into_par_iter().enumerate().for_each(|(i, item)| f(i, item));
 }
 
-/// Calls `f(i, item)` for every item, in parallel, and collects in order.
+/// Calls `f(i, item)` for every item, in parallel, and collects the results in order.
 pub fn map_items<I: Send, R: Send>(items: Vec<I>, f: impl Fn(usize, I) -> R + Sync + Send) -> Vec<R> {
     items.into_par_iter().enumerate().map(|(i, item)| f(i, item)).collect()
 }
 
-/// Calls `f(start..end)` for consecutive chunks of `0..n` and collects the results in chunk order.
+/// Calls `f(start..end)` for consecutive chunks of `0..n`, in parallel, and collects the results in chunk order.
 pub fn map_chunks<R: Send>(n: usize, size: usize, f: impl Fn(std::ops::Range<usize>) -> R + Sync + Send) -> Vec<R> {
     let chunks = n.div_ceil(size);
     map_indices(chunks, |i| f(i * size..((i + 1) * size).min(n)))
 }
 
-/// Cuts a slice into parts of the given lengths, which must not exceed it.
+/// Splits a slice into consecutive parts of the given lengths. Panics if the slice is shorter than their sum.
 pub fn split_lengths<E>(mut rest: &mut [E], lengths: impl Iterator<Item = usize>) -> Vec<&mut [E]> {
     lengths
         .map(|n| {
@@ -147,7 +146,7 @@ pub fn split_lengths<E>(mut rest: &mut [E], lengths: impl Iterator<Item = usize>
         .collect()
 }
 
-/// Calls `f(k, row)` for the rows `rows[k]` of a table, in parallel. The row numbers are ascending and unique, so runs of them own
+/// Calls `f(k, row)` for row `rows[k]` of a table, for each k, in parallel. The row numbers must be ascending and unique, so that runs of them belong to
 /// disjoint parts of the table.
 pub fn for_each_table_row<E: Send>(table: &mut [E], width: usize, rows: &[u32], f: impl Fn(usize, &mut [E]) + Sync + Send) {
     let run = rows_per_chunk(width);
@@ -184,8 +183,8 @@ pub fn map<T: Real>(x: &[T], out: &mut [T], f: impl Fn(T) -> T + Sync) {
     for_each_chunk(out, 2 * CHUNK, |start, chunk| map_loop(&x[start..start + chunk.len()], chunk, &f));
 }
 
-/// `out[i] = outside(x[i])` where |x| > `limit`, and `inside(x[i])` elsewhere. The second is computed for every i, so that its
-/// loop vectorises, and what it gives outside of its range is overwritten.
+/// `out[i] = outside(x[i])` where |x| > `limit`, and `inside(x[i])` elsewhere. `inside` is computed for every i, so that its loop vectorises; its results
+/// for |x| > `limit` are overwritten.
 pub fn map_within<T: Real>(x: &[T], out: &mut [T], limit: T, inside: impl Fn(T) -> T + Sync, outside: impl Fn(T) -> T + Sync) {
     for_each_chunk(out, 2 * CHUNK, |start, chunk| {
         let x = &x[start..start + chunk.len()];
@@ -209,7 +208,7 @@ pub fn zip_in_place<T: Real>(x: &mut [T], y: &[T], f: impl Fn(T, T) -> T + Sync)
     for_each_chunk(x, CHUNK, |start, chunk| zip_in_place_loop(chunk, &y[start..start + chunk.len()], &f));
 }
 
-/// `Σ f(x[i])`: 64 running sums inside a chunk, chunk sums added in order.
+/// Returns `Σ f(x[i])`. Each chunk is summed with 64 accumulators, and the sums of the chunks are added in order.
 pub fn sum<T: Real>(x: &[T], f: impl Fn(T) -> T + Sync + Send) -> T {
     map_chunks(x.len(), 4 * CHUNK, |range| sum_loop(&x[range], &f)).into_iter().sum()
 }
@@ -251,7 +250,7 @@ fn sum_loop<T: Real, F: Fn(T) -> T>(x: &[T], f: &F) -> T {
     for (lane, &v) in lanes.iter_mut().zip(tail) {
         *lane += f(v);
     }
-    // Halving keeps the error small and the order fixed.
+    // A pairwise sum of the accumulators has a small rounding error and a fixed order.
     let mut width = LANES / 2;
     while width > 0 {
         for i in 0..width {

@@ -1,4 +1,4 @@
-//! [`Param`]: a named leaf that an optimizer may change. [`Module`]: a set of them.
+//! [`Param`]: a named leaf that optimizers update. [`Module`]: a set of parameters.
 
 mod module;
 
@@ -9,8 +9,10 @@ pub use module::Module;
 use ndarray::{Array, Dimension};
 use std::sync::Arc;
 
-/// A named leaf. Its identity survives updates and not a change of shape, so state that an optimizer keeps for it cannot be applied to
-/// something else.
+/// A trainable parameter: a named leaf of the graph.
+///
+/// A parameter has an identity, by which optimizers find the state that they keep for it. [`Param::update`] keeps the identity; [`Param::replace`]
+/// gives a new one, so old optimizer state is never applied to a new value.
 #[derive(Debug)]
 pub struct Param<T: Real> {
     name: String,
@@ -18,7 +20,7 @@ pub struct Param<T: Real> {
     bounds: Bounds<T>,
 }
 
-/// The values a parameter may take: an optimizer brings what it changed back to the nearest of them.
+/// The interval of values that a parameter may take. Optimizers clamp the elements that they update to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounds<T> {
     /// Smallest value, or −∞.
@@ -28,12 +30,12 @@ pub struct Bounds<T> {
 }
 
 impl<T: Real> Bounds<T> {
-    /// All values.
+    /// Returns the bounds that allow every value.
     pub fn none() -> Self {
         Bounds { low: T::neg_infinity(), high: T::infinity() }
     }
 
-    /// The allowed value nearest to x; NaN stays NaN.
+    /// Returns the allowed value nearest to `x`, or NaN if `x` is NaN.
     #[inline(always)]
     pub fn nearest(self, x: T) -> T {
         let x = if x < self.low { self.low } else { x };
@@ -42,54 +44,53 @@ impl<T: Real> Bounds<T> {
 }
 
 impl<T: Real> Param<T> {
-    /// A parameter; names are what rates, schedules and checkpoints go by.
+    /// Creates a parameter. Learning rates and parameter files refer to it by its name.
     pub fn new<D: Dimension>(name: impl Into<String>, value: Array<T, D>) -> Self {
         Self::from_tensor(name, Tensor::constant(value))
     }
 
-    /// A parameter that takes over a tensor's value.
+    /// Creates a parameter with the value of a tensor. The graph of the tensor is dropped.
     pub fn from_tensor(name: impl Into<String>, value: Tensor<T>) -> Self {
         Param { name: name.into(), tensor: value.into_variable(), bounds: Bounds::none() }
     }
 
-    /// The name.
+    /// Returns the name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// The leaf, to compute with.
+    /// Returns the tensor of the parameter, for use in computations.
     pub fn tensor(&self) -> &Tensor<T> {
         &self.tensor
     }
 
-    /// The shape.
+    /// Returns the shape.
     pub fn shape(&self) -> &[usize] {
         self.tensor.shape()
     }
 
-    /// The values it may take; all of them, unless [`Param::set_bounds`] said otherwise.
+    /// Returns the bounds of the values. By default every value is allowed.
     pub fn bounds(&self) -> Bounds<T> {
         self.bounds
     }
 
-    /// Says which values optimizers may give it. Values it has now are not changed.
+    /// Sets the bounds that optimizers enforce. The current values are not changed.
     pub fn set_bounds(&mut self, bounds: Bounds<T>) {
         self.bounds = bounds;
     }
 
-    /// Changes the values in place. If somebody still holds a graph or a clone with the old values, they keep them: the buffer is then
-    /// copied first, which is slower and never wrong.
+    /// Updates the values in place. If a graph or another tensor shares the buffer, the buffer is copied first and the other owners keep the old values.
     pub fn update<R>(&mut self, f: impl FnOnce(&mut [T]) -> R) -> R {
         f(Arc::<Buffer<T>>::make_mut(&mut self.tensor.data))
     }
 
-    /// Takes a new value, of any shape, and a new identity.
+    /// Replaces the value by a tensor of any shape. The parameter gets a new identity.
     pub fn replace(&mut self, value: Tensor<T>) {
         self.tensor = value.into_variable();
     }
 
-    /// Computes with `tensor` from now on and leaves it its place in a graph: gradients flow through the parameter to what the tensor came
-    /// from, be it another network's output or the input of a gradient check. The identity is the tensor's.
+    /// Replaces the value by a tracked tensor, which keeps its graph node. Gradients then flow through the parameter to the inputs of that tensor, for
+    /// example to the output of another network or to the input of a gradient check. The identity of the parameter becomes the identity of the tensor.
     ///
     /// Panics if the tensor is a constant.
     #[track_caller]

@@ -1,25 +1,26 @@
-//! Buffers of some kilobytes and more, kept and handed out again.
+//! A pool that recycles buffers of 4 KiB and more.
 //!
-//! A training step allocates the same few dozen arrays every time. Taking them fresh from the system costs a page fault for every 4 KiB,
-//! which is more than most ops compute; so a dropped [`Buffer`] goes to a pool and the next one of about its size comes from there.
-//! Buffers that nobody asks for again are given back. On Linux new buffers ask for 2 MiB pages: random look-ups in a large table
-//! otherwise miss the TLB at every row.
+//! Every training step allocates the same few dozen arrays. A new allocation from the system costs a page fault for every 4 KiB, which takes longer than
+//! most ops. A dropped [`Buffer`] therefore returns to a pool, and the next request of about the same size reuses it. Buffers that stay unused for many
+//! requests are freed. On Linux, new buffers request 2 MiB pages, because random lookups in a large table would otherwise miss the TLB at every row.
 //!
-//! The contents of a recycled buffer are stale, never uninitialised: there is nothing unsafe here except the `madvise` call.
+//! The contents of a recycled buffer are stale but never uninitialised. The only unsafe code here is the `madvise` call.
 
 use std::fmt::Debug;
 use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
 
-/// Below this the system allocator is as good.
+/// Size of the smallest pooled buffer, in bytes. For smaller buffers the system allocator is as fast.
 const SMALLEST: usize = 4 * 1024;
-/// A free buffer is given back after this many requests went by without it: some training steps of usual size.
+/// Number of requests after which an unused free buffer is returned to the system. It spans several typical training steps.
 const LIFETIME: u64 = 1000;
 
-/// Buffers of one element type that are free at the moment.
+/// The free buffers of one element type.
 #[derive(Debug)]
 pub struct Pool<E> {
+    /// Free buffers, each with the value of `clock` at which it was dropped.
     free: Vec<(u64, Vec<E>)>,
+    /// Number of requests so far.
     clock: u64,
 }
 
@@ -33,7 +34,7 @@ mod sealed {
     pub trait Sealed {}
 }
 
-/// Element types with a pool of their own: four kinds of plain numbers.
+/// Element types of pooled buffers: `f32`, `f64`, `u32` and `u64`. Each has its own pool.
 pub trait Pooled: Copy + Default + Send + Sync + Debug + sealed::Sealed + 'static {
     #[doc(hidden)]
     fn pool() -> &'static Mutex<Pool<Self>>;
@@ -55,16 +56,16 @@ pooled!(f32, f64, u32, u64);
 /// An owned array that returns to the pool when dropped.
 #[derive(Debug, Default)]
 pub struct Buffer<E: Pooled> {
-    /// All that has been written once, so that a buffer cut short need not be filled again.
+    /// All initialised elements. It may be longer than `len`, so a shortened buffer can be reused without filling it again.
     all: Vec<E>,
     len: usize,
 }
 
 impl<E: Pooled> Buffer<E> {
-    /// `len` elements of unspecified (but initialised) contents: for a caller who writes all of them.
+    /// Returns a buffer of `len` elements with unspecified (but initialised) contents, for a caller that overwrites all of them.
     pub fn stale(len: usize) -> Self {
         let all = take(len).map_or_else(
-            || fresh(len),
+            || allocate(len),
             |mut found| {
                 found.resize(found.len().max(len), E::default());
                 found
@@ -73,7 +74,7 @@ impl<E: Pooled> Buffer<E> {
         Buffer { all, len }
     }
 
-    /// `len` zeros.
+    /// Returns a buffer of `len` zeros.
     pub fn zeros(len: usize) -> Self {
         match take(len) {
             Some(mut all) => {
@@ -81,23 +82,23 @@ impl<E: Pooled> Buffer<E> {
                 crate::parallel::fill(&mut all[..len], E::default());
                 Buffer { all, len }
             }
-            None => Buffer { all: fresh(len), len },
+            None => Buffer { all: allocate(len), len },
         }
     }
 
-    /// A copy of a slice.
+    /// Returns a copy of a slice.
     pub fn copy_of(source: &[E]) -> Self {
         let mut out = Self::stale(source.len());
         crate::parallel::copy(source, &mut out);
         out
     }
 
-    /// Keeps the first `len` elements.
+    /// Shortens the buffer to its first `len` elements; does nothing if it is not longer.
     pub fn truncate(&mut self, len: usize) {
         self.len = self.len.min(len);
     }
 
-    /// At least `len` elements: those that are there, and then stale ones.
+    /// Extends the buffer to `len` elements; does nothing if it is not shorter. The contents of the new elements are unspecified.
     pub fn grow(&mut self, len: usize) {
         if len > self.len {
             let mut grown = Self::stale(len);
@@ -143,7 +144,7 @@ impl<E: Pooled> Drop for Buffer<E> {
     }
 }
 
-/// Gives every free buffer back to the system: worthwhile when the sizes in use change for good, as after an upsampling.
+/// Returns every free buffer to the system. This is useful when buffer sizes change permanently, for example after upsampling a grid.
 pub fn release_free_buffers() {
     fn clear<E: Pooled>() {
         let freed = std::mem::take(&mut E::pool().lock().unwrap_or_else(|e| e.into_inner()).free);
@@ -155,7 +156,8 @@ pub fn release_free_buffers() {
     clear::<u64>();
 }
 
-/// The smallest free buffer that holds `len` elements and wastes at most a quarter and 4 KiB.
+/// Takes the smallest free buffer with a capacity from `len` elements to `len` plus a quarter plus 4 KiB. Also frees the buffers that have been unused
+/// for more than [`LIFETIME`] requests.
 fn take<E: Pooled>(len: usize) -> Option<Vec<E>> {
     if len * size_of::<E>() < SMALLEST {
         return None;
@@ -185,8 +187,8 @@ fn take<E: Pooled>(len: usize) -> Option<Vec<E>> {
     found
 }
 
-/// Zeros from the system, with room for a slightly larger successor: sizes of packed samples change a little from step to step.
-fn fresh<E: Pooled>(len: usize) -> Vec<E> {
+/// Allocates `len` zeros. Spare capacity of 1/16 lets a slightly larger request reuse the buffer: the number of packed samples varies between steps.
+fn allocate<E: Pooled>(len: usize) -> Vec<E> {
     if len * size_of::<E>() < SMALLEST {
         return vec![E::default(); len];
     }
@@ -203,7 +205,7 @@ fn advise_huge_pages<E>(v: &[E]) {
     let start = (v.as_ptr() as usize).next_multiple_of(HUGE);
     let end = (v.as_ptr() as usize + size_of_val(v)) / HUGE * HUGE;
     if start < end {
-        // SAFETY: the range lies inside the live allocation `v`, and MADV_HUGEPAGE changes no contents. A failure is only slower.
+        // SAFETY: the range lies inside the live allocation `v`, and MADV_HUGEPAGE does not change its contents. A failure costs only speed.
         unsafe {
             libc::madvise(start as *mut libc::c_void, end - start, libc::MADV_HUGEPAGE);
         }

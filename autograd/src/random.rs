@@ -1,15 +1,15 @@
 //! Random numbers as a function of (seed, name, index), with the same bits on every machine.
 //!
-//! A [`Stream`] has no state: number `i` depends on the seed, the name and `i`, and not on threads or on what was drawn before. Uniform numbers
-//! are bits, scaled. Normal numbers are Box and Muller's, with a logarithm and a cosine of this crate, which add, multiply and divide in `f64`
-//! without fused operations; the square root is IEEE's. The system's mathematical library takes no part.
+//! A [`Stream`] has no state: number `i` depends only on the seed, the name and `i`, and not on threads or on earlier draws. Uniform numbers are scaled
+//! random bits. Normal numbers come from the Box–Muller transform. Its logarithm and cosine are functions of this crate that add, multiply and divide in
+//! `f64` without fused operations; its square root is the IEEE operation. The math library of the system is not used.
 
 use crate::parallel::{self, CHUNK};
 use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// A sequence of random numbers of which each can be asked for alone.
+/// A sequence of random numbers with random access by index.
 ///
 /// ```
 /// use autograd::random::Stream;
@@ -25,46 +25,48 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// The stream of a seed: the outputs of SplitMix64 (Steele, Lea, Flood 2014) with that seed.
+    /// Returns the stream of a seed. Its bits are the outputs of SplitMix64 (Steele, Lea, Flood 2014) with that seed.
     pub fn new(seed: u64) -> Self {
         Stream { key: seed }
     }
 
-    /// A stream of the same seed that is independent of this one and of those with other names.
+    /// Returns a stream that is derived from this one and a name. It is independent of this stream and of the streams with other names.
     pub fn named(self, name: &str) -> Self {
-        // FNV-1a.
+        // The FNV-1a hash of the name.
         let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
         Stream { key: mix(mix(self.key) ^ hash) }
     }
 
-    /// A stream of the same seed and name that is independent of this one and of those with other numbers: one for each step, say.
+    /// Returns a stream that is derived from this one and a number, for example the step of training. It is independent of this stream and of the streams
+    /// with other numbers.
     pub fn numbered(self, number: u64) -> Self {
         Stream { key: mix(mix(self.key).wrapping_add(mix(number))) }
     }
 
-    /// 64 random bits: output `index` of SplitMix64, from 0.
+    /// Returns 64 random bits: output number `index`, from 0, of SplitMix64.
     pub fn bits(self, index: u64) -> u64 {
         mix(self.key.wrapping_add(index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15)))
     }
 
-    /// A uniform number in [0, 1), a multiple of 2⁻⁵³.
+    /// Returns a uniform number in [0, 1), a multiple of 2⁻⁵³.
     pub fn uniform(self, index: u64) -> f64 {
         unit(self.bits(index))
     }
 
-    /// A number of the standard normal distribution: √(−2 ln(1 − u)) cos(2π v) (Box and Muller 1958), where u and v are the uniform numbers
-    /// 2 · `index` and 2 · `index` + 1. Its magnitude is at most 8.6.
+    /// Returns a number from the standard normal distribution: √(−2 ln(1 − u)) cos(2π v) (Box and Muller 1958), where u and v are the uniform numbers
+    /// with indices 2 · `index` and 2 · `index` + 1. Its magnitude is at most 8.6.
     pub fn normal(self, index: u64) -> f64 {
         let (u, v) = (self.uniform(2 * index), self.uniform(2 * index + 1));
         (-2.0 * ln(1.0 - u)).sqrt() * (std::f64::consts::TAU * v).cos_()
     }
 
-    /// Uniform numbers from `low` to `high`, computed in `f64` and rounded: element `i` is made of number `i`.
+    /// Returns a tensor of uniform numbers from `low` to `high`, computed in `f64` and rounded. Element `i` is computed from number `i` of the stream.
     pub fn uniform_tensor<T: Real>(self, shape: &[usize], low: f64, high: f64) -> Tensor<T> {
         filled(shape, |i| low + (high - low) * self.uniform(i))
     }
 
-    /// Normal numbers with this mean and standard deviation, computed in `f64` and rounded: element `i` is made of number `i`.
+    /// Returns a tensor of normal numbers with the given mean and standard deviation, computed in `f64` and rounded. Element `i` is computed from number
+    /// `i` of the stream.
     pub fn normal_tensor<T: Real>(self, shape: &[usize], mean: f64, deviation: f64) -> Tensor<T> {
         filled(shape, |i| mean + deviation * self.normal(i))
     }
@@ -78,19 +80,20 @@ fn filled<T: Real>(shape: &[usize], number: impl Fn(u64) -> f64 + Sync) -> Tenso
     Tensor::from_buffer(out, shape)
 }
 
-/// The upper 53 bits as a number in [0, 1).
+/// Converts the upper 53 bits to a number in [0, 1).
 fn unit(bits: u64) -> f64 {
     (bits >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Stafford's variant 13 of the MurmurHash3 finaliser, as in SplitMix64.
+/// Mixes the bits of `z` by variant 13 (Stafford) of the MurmurHash3 finaliser, as SplitMix64 does.
 fn mix(z: u64) -> u64 {
     let z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
     z ^ z >> 31
 }
 
-/// ln x of a positive normal number to two units in the last place: e ln 2 + 2 artanh((m − 1) / (m + 1)) for x = m 2ᵉ with m from √½ to √2.
+/// Returns ln x for a positive normal number, accurate to two units in the last place. It is e ln 2 + 2 artanh((m − 1) / (m + 1)) for x = m 2ᵉ with m
+/// from √½ to √2.
 fn ln(x: f64) -> f64 {
     const ROOT_HALF: u64 = std::f64::consts::FRAC_1_SQRT_2.to_bits();
     let shifted = x.to_bits().wrapping_sub(ROOT_HALF);
@@ -135,7 +138,7 @@ mod tests {
         assert!(mean.abs() < 0.01 && (variance - 1.0).abs() < 0.02 && skew.abs() < 0.05 && (kurtosis - 3.0).abs() < 0.1);
     }
 
-    /// What is drawn must not change, or nobody's training could be repeated.
+    /// Fixes the bits of normal numbers: if they changed, earlier training runs could not be reproduced.
     #[test]
     fn normal_numbers_have_these_bits() {
         let drawn = [0, 1, 2].map(|i| Stream::new(7).named("weight").normal(i).to_bits());

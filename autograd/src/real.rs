@@ -1,11 +1,11 @@
-//! The scalar types: `f32` for work, `f64` for checking.
+//! [`Real`]: the trait of the scalar types, `f32` for training and `f64` for gradient checks.
 //!
-//! Precision is a type parameter and never a feature flag, so a gradient check in `f64` exercises the very code that trains in `f32`.
-//! The functions below that `num_traits::Float` already has are repeated here because a loop over them must vectorise: they are polynomials
-//! without a branch. Only `exp_` and `absorb` are the standard library's for `f64`.
+//! Precision is a type parameter and never a feature flag, so a gradient check in `f64` runs the same code that trains in `f32`. Some functions of
+//! `num_traits::Float` have a second version here, with a trailing underscore, because loops over them must vectorise: these versions are polynomials without
+//! branches. The exceptions are `exp_` and `absorb` for `f64`, which call the standard library.
 //!
-//! Functions with a parameter `FUSED`, and loops that ask for it, use fused multiply-add where the machine has it: bits are equal for any
-//! number of threads, and between instruction sets up to that rounding. The others have the same bits on every machine.
+//! Functions with a parameter `FUSED`, and loops that use it, use fused multiply-add where the machine has it. Their bits do not depend on the number of
+//! threads, but differ between instruction sets by the rounding of that operation. All other functions have the same bits on every machine.
 
 mod expm1;
 mod sine;
@@ -21,49 +21,49 @@ mod sealed {
     impl Sealed for f64 {}
 }
 
-/// `f32` or `f64`.
+/// A scalar type: `f32` or `f64`.
 pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + sealed::Sealed {
-    /// The largest |x| for which `sin_` and `cos_` are right: 2²⁰.
+    /// Largest |x| for which `sin_` and `cos_` are accurate: 2²⁰.
     const SINE_LIMIT: Self;
 
-    /// A literal in this precision: `T::lit(0.5)`.
+    /// Converts a literal to this type, as in `T::lit(0.5)`.
     fn lit(x: f64) -> Self;
 
-    /// This value as `f64`, exactly.
+    /// Converts this value to `f64`, exactly.
     fn as_f64(self) -> f64;
 
-    /// The integer part of a number in [0, 2²³), without a branch; any integer for other numbers.
+    /// Returns the integer part of a number in [0, 2²³), without a branch. The result is unspecified for other numbers.
     fn index(self) -> u32;
 
-    /// x^(−1/2) of a positive number, to about two units in the last place.
+    /// Returns 1/√x for a positive x, accurate to about two units in the last place.
     fn inverse_sqrt(self) -> Self;
 
-    /// eˣ to about one unit in the last place, without a branch; results below 2⁻¹²⁵ are 0.
-    /// `FUSED` says that the machine multiplies and adds in one instruction: [`crate::parallel::fused`].
+    /// Returns eˣ. For `f32` it has no branch, is accurate to two units in the last place, and results below 2⁻¹²⁵ are 0; for `f64` it is the function of the
+    /// standard library. `FUSED` must be true only if the machine has fused multiply-add instructions: [`crate::parallel::fused`].
     fn exp_<const FUSED: bool>(self) -> Self;
 
-    /// eˣ − 1 without cancellation for small x, to two units in the last place.
+    /// Returns eˣ − 1 without cancellation for small x, accurate to two units in the last place.
     fn expm1_(self) -> Self;
 
-    /// tanh x to three units in the last place.
+    /// Returns tanh x, accurate to three units in the last place.
     fn tanh_(self) -> Self;
 
-    /// sin x to one unit in the last place where |x| <= [`Real::SINE_LIMIT`]; beyond it, any number.
+    /// Returns sin x, accurate to one unit in the last place for |x| <= [`Real::SINE_LIMIT`]. The result is unspecified for larger |x|.
     fn sin_(self) -> Self;
 
-    /// cos x to one unit in the last place where |x| <= [`Real::SINE_LIMIT`]; beyond it, any number.
+    /// Returns cos x, accurate to one unit in the last place for |x| <= [`Real::SINE_LIMIT`]. The result is unspecified for larger |x|.
     fn cos_(self) -> Self;
 
-    /// 1 − e⁻ˣ without cancellation for small x: the opacity of an optical depth.
+    /// Returns 1 − e⁻ˣ without cancellation for small x: the opacity for an optical depth x.
     fn one_minus_exp_neg<const FUSED: bool>(self) -> Self;
 
-    /// self · b + c, rounded once if `FUSED`.
+    /// Returns self · b + c, rounded once if `FUSED` is true and twice otherwise.
     #[inline(always)]
     fn multiply_add<const FUSED: bool>(self, b: Self, c: Self) -> Self {
         if FUSED { self.mul_add(b, c) } else { self * b + c }
     }
 
-    /// (1 − e⁻ˣ, e⁻ˣ), both without cancellation: what an optical depth absorbs and what it lets through.
+    /// Returns the opacity and the transmittance for an optical depth x, (1 − e⁻ˣ, e⁻ˣ), both without cancellation.
     fn absorb<const FUSED: bool>(self) -> (Self, Self);
 }
 
@@ -102,7 +102,7 @@ impl Real for f32 {
 
     #[inline(always)]
     fn inverse_sqrt(self) -> Self {
-        // A first guess from the exponent, then Newton's y ← y (3 − x y²) / 2 three times: a third of the time of a root and a division.
+        // A first estimate from the exponent, then three Newton steps y ← y (3 − x y²) / 2. This takes a third of the time of a square root and a division.
         let half = 0.5 * self;
         let mut y = f32::from_bits(0x5f37_5a86_u32.wrapping_sub(self.to_bits() >> 1));
         for _ in 0..3 {
@@ -113,13 +113,13 @@ impl Real for f32 {
 
     #[inline(always)]
     fn index(self) -> u32 {
-        // Integers from 2²³ on are one unit in the last place apart, so the low bits of the sum are the integer.
+        // From 2²³ on, a unit in the last place is 1, so the low bits of the sum are the integer.
         const UNIT: f32 = 8_388_608.0;
         (self.floor() + UNIT).to_bits() & 0x7f_ffff
     }
 
-    /// Cody and Waite's reduction x = n ln 2 + r with |r| <= ln 2 / 2, then a degree-6 polynomial (Cephes `expf`) and a scaling by
-    /// 2 · 2ⁿ⁻¹, for 2ⁿ itself may be too large.
+    /// Reduces x = n ln 2 + r with |r| <= ln 2 / 2 (Cody and Waite), evaluates a polynomial of degree 7 (Cephes `expf`), and scales by 2 · 2ⁿ⁻¹, since 2ⁿ may
+    /// overflow.
     #[inline(always)]
     fn exp_<const FUSED: bool>(self) -> Self {
         let x = self.clamp(-88.0, 89.0);
@@ -134,9 +134,8 @@ impl Real for f32 {
         let p = p.multiply_add::<FUSED>(r, 1.666_666_5e-1);
         let p = p.multiply_add::<FUSED>(r, 5.000_000_3e-1);
         let y = p.multiply_add::<FUSED>(r * r, r + 1.0);
-        // The integer stands in the low bits of `rounded`; a conversion `as i32` would check its range and not vectorise. NaN gives some
-        // scale or other, and y is NaN. Where n = −127 it is held at 0, as
-        // that of −126 is.
+        // The low bits of `rounded` contain the integer n; a conversion `as i32` would check the range and not vectorise. For NaN the scale is arbitrary, but
+        // y is NaN. For n = −127 the exponent bits are clamped to 0, so the scale is 0 as for n = −126.
         let n = rounded.to_bits().wrapping_sub(ROUND.to_bits());
         let half_scale = f32::from_bits((n.wrapping_add(126) as i32).max(0).wrapping_shl(23) as u32);
         (y + y) * half_scale
@@ -149,7 +148,8 @@ impl Real for f32 {
 
     #[inline(always)]
     fn absorb<const FUSED: bool>(self) -> (Self, Self) {
-        // Below 1/2 the Taylor polynomial x − x²/2 + … − x⁸/8! is exact to rounding; above, the difference loses at most one bit.
+        // For |x| < 1/2 the Taylor polynomial x − x²/2 + … − x⁸/8! is accurate to rounding. For larger |x| the subtraction loses less than one bit if x > 0,
+        // and less than two bits if x < 0.
         let x = self;
         let p = x.multiply_add::<FUSED>(-1.0 / 40_320.0, 1.0 / 5_040.0);
         let p = (-x).multiply_add::<FUSED>(p, 1.0 / 720.0);
@@ -219,7 +219,7 @@ impl Real for f64 {
 
     #[inline(always)]
     fn absorb<const FUSED: bool>(self) -> (Self, Self) {
-        // Both from the standard library, as `exp_`.
+        // Both values are computed by the standard library, as in `exp_`.
         (-(-self).exp_m1(), (-self).exp())
     }
 }
@@ -228,7 +228,7 @@ impl Real for f64 {
 pub(crate) mod tests {
     use super::*;
 
-    /// |got − want| in units in the last place of `want`.
+    /// Returns |got − want| in units in the last place of `want`.
     pub fn units_apart(got: f64, want: f64) -> f64 {
         if got == want { 0.0 } else { (got - want).abs() / (want.abs().next_up() - want.abs()) }
     }

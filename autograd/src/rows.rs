@@ -1,8 +1,8 @@
-//! Rows of tables: sorted by bucket, added up, and as gradients.
+//! Row-sparse gradients, and the sums of contributions to rows.
 //!
-//! A bucket is a power of two of consecutive rows, few enough for their values to fit a core's cache. Contributions to rows are sorted by bucket
-//! ([`Buckets`]), and each bucket then belongs to one task, which takes its contributions in order: no atomics, nothing shared for writing, and
-//! the same bits for any number of threads.
+//! A bucket is a range of consecutive rows whose values fit the cache of a core; its length is a power of two. Contributions to rows are sorted by bucket
+//! ([`Buckets`]). Each bucket then belongs to one task, which adds its contributions in order. This needs no atomics, no task writes to shared memory, and
+//! the bits are the same for any number of threads.
 
 mod buckets;
 pub(crate) mod deferred;
@@ -10,4 +10,4 @@ pub(crate) mod merge;
 pub(crate) mod sparse;
 pub(crate) mod sum;
 
-pub use buckets::{Buckets, Places, buckets_of};
+pub use buckets::{BucketCursors, Buckets, buckets_of};

@@ -1,7 +1,7 @@
-//! Instances in `f32` that a library has compiled, for the crates that use it.
+//! Precompiled `f32` instances of generic functions.
 //!
-//! Generic code is compiled anew in every crate that names its types, and an optimised renderer takes a minute. So a library may name the instance for
-//! `f32` itself, in a function that is not generic, and have its generic function call that one:
+//! Generic code is compiled again in every crate that instantiates it, which takes a minute for an optimised renderer. A library can avoid this for
+//! `f32`: it instantiates the code in a function that is not generic, and its generic function calls that one:
 //!
 //! ```
 //! use autograd::single::{cast, cast_ref, is_single};
@@ -23,34 +23,34 @@
 //! # assert_eq!(total(&Tensor::scalar(3.0f64)).item(), 9.0);
 //! ```
 //!
-//! The condition is a constant, so the other branch is not compiled for `f32`. The same code runs either way, and gives the same bits.
+//! The condition is a constant, so the second branch is not compiled for `f32`. Both branches run the same code and give the same bits.
 
 use std::any::Any;
 
-/// True for `f32` among the scalar types.
+/// Returns true if the scalar type `T` is `f32`. `T` must be `f32` or `f64`: only the size is compared.
 pub const fn is_single<T>() -> bool {
     size_of::<T>() == size_of::<f32>()
 }
 
-/// A value as the type that it has.
+/// Returns `value` as type `B`, which must be its own type `A`. Generic code uses this where the compiler cannot see that the types are equal.
 ///
-/// Panics if it has another.
+/// Panics if `A` and `B` are different types.
 pub fn cast<A: 'static, B: 'static>(value: A) -> B {
     let mut value = Some(value);
     let same = (&mut value as &mut dyn Any).downcast_mut::<Option<B>>();
-    same.and_then(Option::take).expect("cast: the value has another type")
+    same.and_then(Option::take).expect("cast: the types are different")
 }
 
-/// A reference as one to the type that the value has.
+/// Returns `value` as a reference to type `B`, which must be its own type `A`.
 ///
-/// Panics if it has another.
+/// Panics if `A` and `B` are different types.
 pub fn cast_ref<A: 'static, B: 'static>(value: &A) -> &B {
     (value as &dyn Any).downcast_ref().expect("cast_ref: the value has another type")
 }
 
-/// A mutable reference as one to the type that the value has.
+/// Returns `value` as a mutable reference to type `B`, which must be its own type `A`.
 ///
-/// Panics if it has another.
+/// Panics if `A` and `B` are different types.
 pub fn cast_mut<A: 'static, B: 'static>(value: &mut A) -> &mut B {
     (value as &mut dyn Any).downcast_mut().expect("cast_mut: the value has another type")
 }

@@ -1,4 +1,4 @@
-//! [`Tensor`]: an immutable array with an optional place in a graph.
+//! [`Tensor`]: an immutable array with an optional graph node.
 
 use crate::backward;
 use crate::gradients::Gradients;
@@ -10,10 +10,10 @@ use ndarray::{Array, ArrayD, ArrayViewD, Dimension, IxDyn};
 use std::fmt;
 use std::sync::Arc;
 
-/// An immutable array of `T` in standard (row-major) layout that remembers how it was computed, if anything it depends on is a variable.
+/// An immutable array of `T` in standard (row-major) layout. If it depends on a variable, it also has a graph node that records how it was computed.
 ///
-/// Cloning copies two pointers. Ops are methods and operators; those that get shapes they cannot use panic at the caller's line.
-/// Two tensors may share one buffer (a reshape copies nothing); nobody can change it while they do.
+/// A clone copies the shape and shares the buffer and the node. Ops are methods and operators; they panic at the caller's line if the shapes do not fit.
+/// Several tensors may share one buffer, since `reshape` does not copy. A shared buffer is never modified.
 #[derive(Clone)]
 pub struct Tensor<T: Real> {
     pub(crate) data: Arc<Buffer<T>>,
@@ -22,7 +22,7 @@ pub struct Tensor<T: Real> {
 }
 
 impl<T: Real> Tensor<T> {
-    /// A value that no gradient flows to.
+    /// Returns a constant: a tensor without a gradient.
     pub fn constant<D: Dimension>(value: Array<T, D>) -> Self {
         let shape = IxDyn(value.shape());
         let value = if value.is_standard_layout() { value } else { value.as_standard_layout().into_owned() };
@@ -35,17 +35,18 @@ impl<T: Real> Tensor<T> {
         Tensor { data: Arc::new(data.into()), shape, node: None }
     }
 
-    /// A leaf: a value that gradients flow to. Parameters of a model are better kept in a [`crate::Param`], which an optimizer can change.
+    /// Returns a variable: a leaf of the graph, for which gradients are computed. A model should store its parameters as [`crate::Param`], which
+    /// optimizers can update.
     pub fn variable<D: Dimension>(value: Array<T, D>) -> Self {
         Self::constant(value).into_variable()
     }
 
-    /// A constant of shape `[]`.
+    /// Returns a constant of shape `[]`.
     pub fn scalar(value: T) -> Self {
         Self::from_buffer(vec![value].into(), &[])
     }
 
-    /// A constant from values in row-major order.
+    /// Returns a constant from values in row-major order.
     ///
     /// Panics if the number of values is not the product of the shape.
     #[track_caller]
@@ -53,7 +54,7 @@ impl<T: Real> Tensor<T> {
         Self::from_buffer(values.into(), shape)
     }
 
-    /// A constant that takes over a buffer.
+    /// Returns a constant that owns `data`, in row-major order.
     ///
     /// Panics if the number of values is not the product of the shape.
     #[track_caller]
@@ -63,39 +64,43 @@ impl<T: Real> Tensor<T> {
         Tensor { data: Arc::new(data), shape, node: None }
     }
 
-    /// A constant of zeros.
+    /// Returns a constant of zeros.
     pub fn zeros(shape: &[usize]) -> Self {
         Self::from_buffer(Buffer::zeros(IxDyn(shape).size()), shape)
     }
 
-    /// A constant of ones.
+    /// Returns a constant of ones.
     pub fn ones(shape: &[usize]) -> Self {
         Self::full(shape, 1.0)
     }
 
-    /// A constant with one value everywhere.
+    /// Returns a constant whose elements all have the given value.
     pub fn full(shape: &[usize], value: f64) -> Self {
         let mut data = Buffer::stale(IxDyn(shape).size());
         crate::parallel::fill(&mut data, T::lit(value));
         Self::from_buffer(data, shape)
     }
 
-    /// The result of an op on `inputs`. `data` is what the op computed; `op` says how gradients go back.
-    /// If no input tracks, or inside [`crate::no_grad`], nothing is recorded and `op` is dropped.
+    /// Returns the result of an op on `inputs`. `data` is the computed value, and `op` is the gradient rule.
+    /// If no input is tracked, or inside [`crate::no_grad`], the result is a constant and `op` is dropped.
+    ///
+    /// Panics if the number of values is not the product of the shape.
     #[track_caller]
     pub fn from_op(data: Buffer<T>, shape: &[usize], inputs: &[&Tensor<T>], op: impl Op<T>) -> Self {
         let keep = op.keep();
         Self::from_buffer(data, shape).recorded(inputs, keep, || Rule::Op(Box::new(op)))
     }
 
-    /// The result of a kernel on `inputs`; see [`Kernel`].
+    /// Returns the result of a kernel on `inputs`; see [`Kernel`]. It is recorded under the same conditions as in [`Tensor::from_op`].
+    ///
+    /// Panics if the number of values is not the product of the shape.
     #[track_caller]
     pub fn from_kernel(data: Buffer<T>, shape: &[usize], inputs: &[&Tensor<T>], kernel: impl Kernel<T>) -> Self {
         let keep = kernel.keep();
         Self::from_buffer(data, shape).recorded(inputs, keep, || Rule::Kernel(Box::new(kernel)))
     }
 
-    /// Places this fresh value in the graph, if anybody will ask.
+    /// Attaches a graph node to this value if recording is on and at least one input is tracked.
     pub(crate) fn recorded(mut self, inputs: &[&Tensor<T>], keep: crate::op::Keep, rule: impl FnOnce() -> Rule<T>) -> Self {
         if graph::recording() && inputs.iter().any(|x| x.is_tracked()) {
             let edges = inputs
@@ -109,79 +114,81 @@ impl<T: Real> Tensor<T> {
         self
     }
 
-    /// The same value as a fresh leaf.
+    /// Returns the same value as a new variable, without its previous graph node.
     pub fn into_variable(mut self) -> Self {
         self.node = Some(Arc::new(Node::new(self.shape.clone(), Rule::Leaf, Vec::new(), None)));
         self
     }
 
-    /// The value.
+    /// Returns a view of the value.
     pub fn value(&self) -> ArrayViewD<'_, T> {
-        ArrayViewD::from_shape(self.shape.clone(), &self.data[..]).expect("a tensor's data fill its shape")
+        ArrayViewD::from_shape(self.shape.clone(), &self.data[..]).expect("the data fill the shape")
     }
 
-    /// The value, copied out.
+    /// Returns a copy of the value.
     pub fn to_array(&self) -> ArrayD<T> {
         self.value().to_owned()
     }
 
-    /// The values in row-major order.
+    /// Returns the values in row-major order.
     pub fn data(&self) -> &[T] {
         &self.data
     }
 
-    /// The shape.
+    /// Returns the shape.
     pub fn shape(&self) -> &[usize] {
         self.shape.slice()
     }
 
-    /// The number of dimensions.
+    /// Returns the number of dimensions.
     pub fn ndim(&self) -> usize {
         self.shape.ndim()
     }
 
-    /// The number of elements.
+    /// Returns the number of elements.
     pub fn len(&self) -> usize {
         self.data.len()
     }
 
-    /// True if there are no elements.
+    /// Returns true if there are no elements.
     pub fn is_empty(&self) -> bool {
         self.data.is_empty()
     }
 
-    /// The one element of a tensor that has one. Panics otherwise.
+    /// Returns the value of a tensor with exactly one element.
+    ///
+    /// Panics if the tensor has another number of elements.
     #[track_caller]
     pub fn item(&self) -> T {
         assert_eq!(self.len(), 1, "item: expected one element, got shape {:?}", self.shape());
         self.data[0]
     }
 
-    /// True if gradients flow to or through this tensor.
+    /// Returns true if this tensor has a graph node, so gradients flow to or through it.
     pub fn is_tracked(&self) -> bool {
         self.node.is_some()
     }
 
-    /// The same value, cut off from the graph.
+    /// Returns the same value as a constant, without its graph node.
     pub fn detach(&self) -> Self {
         Tensor { data: self.data.clone(), shape: self.shape.clone(), node: None }
     }
 
-    /// Gradients of this scalar with respect to every leaf it depends on. The graph stays, so it may be called again.
+    /// Returns the gradients of this scalar with respect to every leaf that it depends on. The graph is kept, so the function may be called again.
     ///
-    /// Panics if the tensor has more than one element; [`Tensor::backward_from`] takes a cotangent for those.
+    /// Panics if the tensor does not have exactly one element. [`Tensor::backward_from`] takes a cotangent for such tensors.
     #[track_caller]
     pub fn backward(&self) -> Gradients<T> {
         assert_eq!(self.len(), 1, "backward: expected a scalar, got shape {:?}; use backward_from with a cotangent", self.shape());
         self.backward_from(&Tensor::ones(self.shape()))
     }
 
-    /// Gradients of ⟨cotangent, self⟩ with respect to every leaf.
+    /// Returns the gradients of ⟨cotangent, self⟩ with respect to every leaf that this tensor depends on.
     ///
     /// Panics if the shapes differ.
     #[track_caller]
     pub fn backward_from(&self, cotangent: &Tensor<T>) -> Gradients<T> {
-        assert_eq!(self.shape(), cotangent.shape(), "backward_from: the cotangent must have the shape of the tensor");
+        assert_eq!(self.shape(), cotangent.shape(), "backward_from: the cotangent and the tensor must have the same shape");
         backward::to_leaves(self.node.clone(), cotangent.detach())
     }
 

@@ -1,4 +1,4 @@
-//! The examples run, and assert what they print.
+//! Runs the examples, which assert their results.
 
 #[path = "../examples/01_first_gradient.rs"]
 mod first_gradient;

@@ -1,4 +1,4 @@
-//! NumPy's format for one array, version 1.0 (`numpy.lib.format`): a magic number, a dictionary as Python writes it, and the numbers.
+//! The NumPy file format, version 1.0 (`numpy.lib.format`): a magic number, a header with a Python dictionary, and the numbers of one array.
 
 use super::{Dtype, bytes_of, read, read_numbers, replace};
 use crate::error::FileError;
@@ -10,7 +10,7 @@ use std::path::Path;
 const MAGIC: &[u8; 8] = b"\x93NUMPY\x01\x00";
 
 impl<T: Real> Tensor<T> {
-    /// Writes the value as a NumPy file that `numpy.load` reads: version 1.0, `<f4` or `<f8` as `T` is, C order.
+    /// Writes the value to a NumPy file, which `numpy.load` can read. The file has version 1.0 and C order; the type is `<f4` for `f32` and `<f8` for `f64`.
     ///
     /// ```
     /// use autograd::Tensor;
@@ -23,15 +23,15 @@ impl<T: Real> Tensor<T> {
     /// # Ok::<(), autograd::FileError>(())
     /// ```
     ///
-    /// Errors: [`FileError::Io`] if the folder is missing or refuses the file.
+    /// Errors: [`FileError::Io`] if the file cannot be written, for example because the folder does not exist.
     pub fn save_npy(&self, path: impl AsRef<Path>) -> Result<(), FileError> {
         let bytes = encode(self);
         replace(path.as_ref(), |temporary| std::fs::write(temporary, bytes))
     }
 
-    /// The array of a NumPy file as a constant. It is of version 1.0, `<f4` or `<f8`, of which the other is converted to `T`, and in C order.
+    /// Reads the array of a NumPy file as a constant. The file must have version 1.0, C order and the type `<f4` or `<f8`; the numbers are converted to `T`.
     ///
-    /// Errors: [`FileError::Io`] if the file cannot be read, [`FileError::Format`] if it is of another kind or not as long as it says.
+    /// Errors: [`FileError::Io`] if the file cannot be read; [`FileError::Format`] if it has another format or if its length does not fit its header.
     pub fn load_npy(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let path = path.as_ref();
         let bytes = read(path)?;
@@ -45,10 +45,10 @@ fn encode<T: Real>(x: &Tensor<T>) -> Vec<u8> {
         Dtype::F64 => "<f8",
     };
     let sizes: Vec<String> = x.shape().iter().map(usize::to_string).collect();
-    // Python's tuple of one has a comma.
+    // A Python tuple of one element has a trailing comma.
     let comma = if x.ndim() == 1 { "," } else { "" };
     let mut header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({}{comma}), }}", sizes.join(", "));
-    // Spaces and a line break up to a multiple of 64 bytes.
+    // Spaces and a line break pad the header to a multiple of 64 bytes.
     let length = (MAGIC.len() + 2 + header.len() + 1).next_multiple_of(64) - MAGIC.len() - 2;
     header = format!("{header:<width$}\n", width = length - 1);
     let mut bytes = [&MAGIC[..], &(length as u16).to_le_bytes(), header.as_bytes()].concat();
@@ -56,18 +56,18 @@ fn encode<T: Real>(x: &Tensor<T>) -> Vec<u8> {
     bytes
 }
 
-/// The array, or what was found and what is expected.
+/// Decodes the bytes of a NumPy file. The error is what was found and what was expected.
 fn decode<T: Real>(bytes: &[u8]) -> Result<Tensor<T>, (String, &'static str)> {
     let Some(rest) = bytes.strip_prefix(&MAGIC[..]) else {
         let found = match bytes.strip_prefix(&MAGIC[..6]) {
             Some([major, minor, ..]) => format!("a NumPy file of version {major}.{minor}"),
-            _ => "no NumPy file".to_owned(),
+            _ => "a file that is not a NumPy file".to_owned(),
         };
-        return Err((found, "one of version 1.0, as numpy.save writes"));
+        return Err((found, "a NumPy file of version 1.0, as written by numpy.save"));
     };
     let header = rest.split_first_chunk().and_then(|(length, rest)| rest.split_at_checked(usize::from(u16::from_le_bytes(*length))));
     let Some((header, data)) = header else {
-        return Err((format!("{} bytes, which end inside of the header", bytes.len()), "a whole file"));
+        return Err((format!("{} bytes, which end inside the header", bytes.len()), "a complete file"));
     };
     let header = String::from_utf8_lossy(header);
     let unreadable = || (format!("the header {:?}", header.trim_end()), "a dictionary with descr, fortran_order and shape");
@@ -75,7 +75,7 @@ fn decode<T: Real>(bytes: &[u8]) -> Result<Tensor<T>, (String, &'static str)> {
     let dtype = match value("descr").ok_or_else(unreadable)?.split('\'').nth(1).ok_or_else(unreadable)? {
         "<f4" => Dtype::F32,
         "<f8" => Dtype::F64,
-        other => return Err((format!("numbers of the type {other}"), "<f4 or <f8; astype(numpy.float32) converts")),
+        other => return Err((format!("numbers of type {other}"), "<f4 or <f8; astype(numpy.float32) converts")),
     };
     if !value("fortran_order").ok_or_else(unreadable)?.starts_with("False") {
         return Err(("an array in Fortran order".into(), "C order; numpy.ascontiguousarray converts"));
@@ -85,7 +85,7 @@ fn decode<T: Real>(bytes: &[u8]) -> Result<Tensor<T>, (String, &'static str)> {
     let shape: Vec<usize> = sizes.map(|size| size.parse().map_err(|_| unreadable())).collect::<Result<_, _>>()?;
     let count = shape.iter().try_fold(1usize, |count, &n| count.checked_mul(n));
     if count.and_then(|count| count.checked_mul(dtype.size())) != Some(data.len()) {
-        return Err((format!("{} bytes of numbers", data.len()), "as many as the shape in the header says"));
+        return Err((format!("{} bytes of numbers", data.len()), "the number of bytes for the shape in the header"));
     }
     let mut values = Buffer::stale(data.len() / dtype.size());
     read_numbers(data, dtype, &mut values);
@@ -96,7 +96,7 @@ fn decode<T: Real>(bytes: &[u8]) -> Result<Tensor<T>, (String, &'static str)> {
 mod tests {
     use super::*;
 
-    /// `numpy.array([1, -0.5], dtype='<f4')` in format 1.0, byte by byte.
+    /// The expected bytes are those of `numpy.array([1, -0.5], dtype='<f4')` in format 1.0.
     #[test]
     fn the_bytes_are_numpys() {
         let mut want = b"\x93NUMPY\x01\x00\x76\x00{'descr': '<f4', 'fortran_order': False, 'shape': (2,), }".to_vec();
@@ -129,7 +129,7 @@ mod tests {
             bytes
         };
         for (bytes, found) in [
-            (b"PNG".to_vec(), "no NumPy file"),
+            (b"PNG".to_vec(), "not a NumPy file"),
             (with("\u{1}\u{0}", "\u{2}\u{0}"), "version 2.0"),
             (whole[..9].to_vec(), "9 bytes, which end inside"),
             (whole[..100].to_vec(), "100 bytes, which end inside"),

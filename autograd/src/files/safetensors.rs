@@ -1,4 +1,4 @@
-//! The parameters of a module in a safetensors file, by their names.
+//! Saving and loading the parameters of a module in safetensors files. The tensors have the names of the parameters.
 
 use super::{Dtype, bytes_of, read, read_numbers, replace};
 use crate::error::FileError;
@@ -12,7 +12,8 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 
-/// Writes every parameter of a module under its name, as F32 or F64, as `T` is. What an optimizer remembers, and bounds, are not written.
+/// Writes every parameter of a module to a safetensors file, under its name, with type F32 for `f32` and F64 for `f64`. Bounds and optimizer state are not
+/// written.
 ///
 /// ```
 /// use autograd::nn::{Activation, Mlp};
@@ -28,12 +29,13 @@ use std::path::Path;
 /// # Ok::<(), autograd::FileError>(())
 /// ```
 ///
-/// Errors: [`FileError::Tensor`] if two parameters have one name, [`FileError::Io`] if the folder is missing or refuses the file.
+/// Errors: [`FileError::Tensor`] if two parameters have the same name; [`FileError::Io`] if the file cannot be written, for example because the folder does not
+/// exist.
 pub fn save_safetensors<T: Real>(module: &dyn Module<T>, path: impl AsRef<Path>) -> Result<(), FileError> {
     let path = path.as_ref();
     let values = by_name(module, path)?;
     replace(path, |temporary| {
-        // The library makes files that nobody else may read.
+        // The safetensors crate creates files that only their owner can read. This restores the default permissions.
         let permissions = File::create(temporary)?.metadata()?.permissions();
         let views = values.iter().map(|(name, value)| (name, Stored(value)));
         safetensors::serialize_to_file(views, None, temporary).map_err(|e| match e {
@@ -44,19 +46,19 @@ pub fn save_safetensors<T: Real>(module: &dyn Module<T>, path: impl AsRef<Path>)
     })
 }
 
-/// Gives every parameter of a module the value that a safetensors file has under its name. F32 and F64 are converted to `T`. Parameters keep
-/// their identity and their bounds. A linear layer of PyTorch's must be transposed before.
+/// Sets every parameter of a module to the tensor of its name in a safetensors file. F32 and F64 are converted to `T`. Parameters keep their identity and their
+/// bounds. Weights of linear layers from PyTorch must be transposed before they are saved to the file.
 ///
-/// Errors: [`FileError::Io`] if the file cannot be read; [`FileError::Format`] if it is no safetensors file; [`FileError::Tensor`] if a
-/// parameter is missing in the file or has another shape there or another type of numbers, if the file has a tensor that is no parameter, or if
-/// two parameters have one name. The module is then as it was.
+/// Errors: [`FileError::Io`] if the file cannot be read; [`FileError::Format`] if it is not a safetensors file; [`FileError::Tensor`] if a parameter is missing
+/// in the file or has another shape or another type there, if a tensor in the file is not a parameter, or if two parameters have the same name. On an error the
+/// module is not changed.
 pub fn load_safetensors<T: Real>(module: &mut dyn Module<T>, path: impl AsRef<Path>) -> Result<(), FileError> {
     let path = path.as_ref();
     let bytes = read(path)?;
     let file = SafeTensors::deserialize(&bytes).map_err(|e| FileError::Format {
         path: path.to_owned(),
-        found: format!("no whole safetensors file ({e})"),
-        expected: "one that save_safetensors or another program wrote".into(),
+        found: format!("not a complete safetensors file ({e})"),
+        expected: "a safetensors file".into(),
     })?;
     let values = by_name(module, path)?;
     let refused = |tensor: &str, found: String, expected: String| FileError::Tensor {
@@ -67,16 +69,16 @@ pub fn load_safetensors<T: Real>(module: &mut dyn Module<T>, path: impl AsRef<Pa
     };
     if let Some(name) = file.names().into_iter().filter(|name| !values.contains_key(*name)).min() {
         let known: Vec<&str> = values.keys().map(String::as_str).collect();
-        return Err(refused(name, "a tensor that is no parameter".into(), format!("only {}", known.join(", "))));
+        return Err(refused(name, "a tensor that is not a parameter of the module".into(), format!("only {}", known.join(", "))));
     }
     for (name, value) in &values {
         let expected = || format!("F32 or F64 {:?}", value.shape());
-        let Ok(stored) = file.tensor(name) else { return Err(refused(name, "no tensor of this name".into(), expected())) };
+        let Ok(stored) = file.tensor(name) else { return Err(refused(name, "no tensor with this name".into(), expected())) };
         if dtype_of(&stored).is_none() || stored.shape() != value.shape() {
             return Err(refused(name, format!("{:?} {:?}", stored.dtype(), stored.shape()), expected()));
         }
     }
-    // Nobody else holds the old values while they are overwritten.
+    // `values` shares the buffers of the parameters. Dropping it lets the parameters be overwritten in place.
     drop(values);
     module.visit_mut(&mut |param| {
         let stored = file.tensor(param.name()).ok().and_then(|stored| Some((dtype_of(&stored)?, stored)));
@@ -86,7 +88,7 @@ pub fn load_safetensors<T: Real>(module: &mut dyn Module<T>, path: impl AsRef<Pa
     Ok(())
 }
 
-/// The values of the parameters, if each has a name of its own.
+/// Returns the values of the parameters by name, or an error if two parameters have the same name.
 fn by_name<T: Real>(module: &dyn Module<T>, path: &Path) -> Result<BTreeMap<String, Tensor<T>>, FileError> {
     let (mut values, mut twice) = (BTreeMap::new(), None);
     module.visit(&mut |param| {
@@ -99,13 +101,13 @@ fn by_name<T: Real>(module: &dyn Module<T>, path: &Path) -> Result<BTreeMap<Stri
         Some(tensor) => Err(FileError::Tensor {
             path: path.to_owned(),
             tensor,
-            found: "two parameters of this name".into(),
-            expected: "a name of its own for each parameter of the module".into(),
+            found: "two parameters with this name".into(),
+            expected: "a unique name for each parameter of the module".into(),
         }),
     }
 }
 
-/// The type of its numbers, if it is one that can be read.
+/// Returns the type of the numbers of a tensor, or `None` if the type is not supported.
 fn dtype_of(stored: &TensorView<'_>) -> Option<Dtype> {
     match stored.dtype() {
         safetensors::Dtype::F32 => Some(Dtype::F32),
@@ -114,7 +116,7 @@ fn dtype_of(stored: &TensorView<'_>) -> Option<Dtype> {
     }
 }
 
-/// A tensor whose bytes are made when they are written.
+/// A tensor that is converted to bytes when it is written.
 struct Stored<'a, T: Real>(&'a Tensor<T>);
 
 impl<T: Real> View for Stored<'_, T> {
@@ -145,7 +147,7 @@ mod tests {
     use ndarray::{Array1, Array2};
     use std::path::PathBuf;
 
-    /// A path in a folder of its own, which is removed with it.
+    /// A temporary folder, which is removed when this value is dropped.
     struct Place(PathBuf);
 
     impl Place {
@@ -202,18 +204,18 @@ mod tests {
         };
         refusal(&["reading"]);
         std::fs::write(place.file(), b"no tensors").expect("a file");
-        refusal(&["no whole safetensors file"]);
+        refusal(&["not a complete safetensors file"]);
         let mut other = module::<f32>(1.0);
         other.pop();
         save_safetensors(&other, place.file()).expect("a file");
-        refusal(&["`offset`", "no tensor of this name", "[4]"]);
+        refusal(&["`offset`", "no tensor with this name", "[4]"]);
         other.push(Param::new("offset", Array1::zeros(5)));
         save_safetensors(&other, place.file()).expect("a file");
         refusal(&["`offset`", "F32 [5]", "F32 or F64 [4]"]);
         other[1] = Param::new("offset", Array1::zeros(4));
         other.push(Param::new("more", Array1::zeros(4)));
         save_safetensors(&other, place.file()).expect("a file");
-        refusal(&["`more`", "no parameter", "offset, table"]);
+        refusal(&["`more`", "not a parameter", "offset, table"]);
         let halves = TensorView::new(safetensors::Dtype::F16, vec![4], &[0; 8]).expect("four halves");
         std::fs::write(place.file(), safetensors::serialize([("offset", halves)], None).expect("bytes")).expect("a file");
         refusal(&["`offset`", "F16 [4]", "F32 or F64 [4]"]);

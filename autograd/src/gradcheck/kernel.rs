@@ -1,4 +1,4 @@
-//! Kernels against their references, compared as vectors.
+//! Comparison of kernels with their references.
 
 use crate::error::GradcheckError;
 use crate::graph::Rule;
@@ -8,21 +8,21 @@ use crate::tensor::Tensor;
 use ndarray::ArrayD;
 use std::fmt;
 
-/// How far one array is from another, as a vector. An absolute tolerance near zero hides a missing term; these do not (gsplat).
+/// Measures of the distance between two arrays, as vectors. An absolute tolerance for values near zero can hide a missing term; these measures do not (gsplat).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Closeness {
-    /// |got − want|₂ / |want|₂
+    /// Relative L2 distance, |got − want|₂ / |want|₂.
     pub relative_l2: f64,
-    /// ⟨got, want⟩ / |got|₂ |want|₂: 1 if they point the same way.
+    /// Cosine similarity, ⟨got, want⟩ / (|got|₂ |want|₂): 1 if the vectors have the same direction.
     pub cosine: f64,
-    /// Σ (got − want) / Σ |want|: rounding errors cancel in it, a systematic error does not.
+    /// Signed bias, Σ (got − want) / Σ |want|. Rounding errors mostly cancel in it; a systematic error does not.
     pub signed_bias: f64,
-    /// max |got − want| / max |want|
+    /// Largest error relative to the largest value, max |got − want| / max |want|.
     pub worst_element: f64,
 }
 
 impl Closeness {
-    /// Of `got` to `want`, which may be of another precision. Two arrays of zeros are equal.
+    /// Computes the measures between `got` and `want`, which may have different precisions. Two arrays of zeros are equal.
     ///
     /// Panics if their lengths differ.
     #[track_caller]
@@ -31,7 +31,7 @@ impl Closeness {
         let pairs = || got.iter().zip(want).map(|(a, b)| (a.as_f64(), b.as_f64()));
         let sum = |f: fn(f64, f64) -> f64| pairs().map(|(a, b)| f(a, b)).sum::<f64>();
         let largest = |f: fn(f64, f64) -> f64| pairs().map(|(a, b)| f(a, b)).fold(0.0, |m, v| if v > m || v.is_nan() { v } else { m });
-        // What both have none of, they agree on; 1 / 0 and NaN stay.
+        // 0 / 0 counts as equality; other divisions by zero and NaN are kept, so that they fail the comparison.
         let ratio = |a: f64, b: f64| if a == 0.0 && b == 0.0 { 0.0 } else { a / b };
         let (norm_got, norm_want) = (sum(|a, _| a * a).sqrt(), sum(|_, b| b * b).sqrt());
         Closeness {
@@ -42,7 +42,8 @@ impl Closeness {
         }
     }
 
-    /// True if relative L2 distance, bias and 1 − cosine are at most `tolerance` and the worst element is off by at most ten times that.
+    /// Returns true if the relative L2 distance, the magnitude of the signed bias and 1 − cosine are at most `tolerance`, and the error of the worst element is
+    /// at most 10 · `tolerance`.
     pub fn within(&self, tolerance: f64) -> bool {
         self.relative_l2 <= tolerance
             && self.signed_bias.abs() <= tolerance
@@ -64,20 +65,24 @@ impl fmt::Display for Closeness {
     }
 }
 
-/// How close a kernel is to its reference.
+/// The result of a passed comparison of a kernel with its reference.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KernelReport {
-    /// Of the result.
+    /// Closeness of the value.
     pub value: Closeness,
-    /// Of the gradient of each input.
+    /// Closeness of the gradient with respect to each input.
     pub gradients: Vec<Closeness>,
 }
 
-/// Compares the kernel that made the result of `f` with its own [`reference`](crate::Kernel::reference), in value and in the gradient of a
-/// random contraction with respect to each of `inputs`: with respect to all at once and, where there are several, to each while the others are
-/// constants, as a kernel may do less then. In `f64` a `tolerance` of 1e-12 is usual, in `f32` 1e-5; worth doing in both.
+/// Compares the kernel that computed the result of `f` with its [`reference`](crate::Kernel::reference): its value, and the gradient of a random contraction
+/// of the result with respect to each of `inputs`.
 ///
-/// Panics if the result of `f` was not made by a kernel.
+/// The gradients are computed with all inputs tracked. If there are several inputs, each gradient is also computed with the other inputs constant, because a
+/// kernel may then skip work. A `tolerance` of 1e-12 in `f64` and of 1e-5 in `f32` is usual; a kernel should be checked in both precisions.
+///
+/// Returns [`GradcheckError::Kernel`] if a distance exceeds the tolerance ([`Closeness::within`]).
+///
+/// Panics if the result of `f` was not computed by a kernel, or if the reference has another shape than the kernel.
 #[track_caller]
 pub fn check_kernel<T: Real>(
     f: impl Fn(&[Tensor<T>]) -> Tensor<T>,
@@ -88,11 +93,11 @@ pub fn check_kernel<T: Real>(
     let fast = f(&inputs);
     let node = fast.node.as_ref().expect("check_kernel: the result does not depend on the inputs");
     let Rule::Kernel(kernel) = &node.rule else {
-        panic!("check_kernel: the result was made by the op {}, not by a kernel", node.rule.name())
+        panic!("check_kernel: the result was computed by the op {}, not by a kernel", node.rule.name())
     };
     let operands: Vec<Tensor<T>> = (0..node.inputs.len()).map(|i| input(node, i, true)).collect();
     let slow = kernel.reference(&operands);
-    assert_eq!(fast.shape(), slow.shape(), "{}: the reference has another shape than the kernel", kernel.name());
+    assert_eq!(fast.shape(), slow.shape(), "{}: the outputs of the kernel and the reference differ in shape", kernel.name());
 
     let compare = |what: String, got: &[T], want: &[T]| {
         let closeness = Closeness::between(got, want);
@@ -113,7 +118,7 @@ pub fn check_kernel<T: Real>(
         if inputs.len() > 1 {
             let alone: Vec<Tensor<T>> = inputs.iter().enumerate().map(|(j, x)| if i == j { x.clone() } else { x.detach() }).collect();
             let got = flat(f(&alone).backward_from(&direction).array(x));
-            compare(format!("gradient of input {i}, when the others are constants"), &got, &want)?;
+            compare(format!("gradient of input {i} with the other inputs constant"), &got, &want)?;
         }
         Ok(closeness)
     });
@@ -127,7 +132,7 @@ mod tests {
     use crate::pool::Buffer;
     use ndarray::arr1;
 
-    /// y = x³ with an adjoint that is `share` of the right one.
+    /// y = x³ with an adjoint that is `share` times the correct one.
     #[derive(Debug)]
     struct Cube {
         share: f64,

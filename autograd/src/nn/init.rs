@@ -4,30 +4,30 @@ use crate::random::Stream;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// A distribution of initial values, by the number of inputs (`fan_in`) and of outputs (`fan_out`) of the layer they belong to.
+/// A distribution of initial values. It may depend on the number of inputs (`fan_in`) and of outputs (`fan_out`) of the layer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Init {
-    /// Uniform in ±√(6 / ((1 + a²) fan_in)), before a leaky ReLU of slope `a` (He et al. 2015). With a = √5 it is ±1/√fan_in, PyTorch's choice
-    /// for linear layers and the default here.
+    /// Uniform distribution in ±√(6 / ((1 + a²) fan_in)), for a layer that is followed by a leaky ReLU of slope `a` (He et al. 2015). With a = √5 the
+    /// bound is 1/√fan_in: PyTorch's choice for linear layers, and the default here.
     KaimingUniform {
-        /// The slope below 0 of the activation that follows; 0 for ReLU.
+        /// Negative slope of the activation that follows; 0 for ReLU.
         a: f64,
     },
-    /// Normal with deviation √(2 / ((1 + a²) fan_in)) (He et al. 2015).
+    /// Normal distribution with standard deviation √(2 / ((1 + a²) fan_in)) (He et al. 2015).
     KaimingNormal {
-        /// The slope below 0 of the activation that follows; 0 for ReLU.
+        /// Negative slope of the activation that follows; 0 for ReLU.
         a: f64,
     },
-    /// Uniform in ±√(6 / (fan_in + fan_out)) (Glorot and Bengio 2010).
+    /// Uniform distribution in ±√(6 / (fan_in + fan_out)) (Glorot and Bengio 2010).
     XavierUniform,
-    /// Normal with deviation √(2 / (fan_in + fan_out)) (Glorot and Bengio 2010).
+    /// Normal distribution with standard deviation √(2 / (fan_in + fan_out)) (Glorot and Bengio 2010).
     XavierNormal,
-    /// Uniform in ±`bound`.
+    /// Uniform distribution in ±`bound`.
     Uniform {
-        /// The largest magnitude.
+        /// Largest magnitude.
         bound: f64,
     },
-    /// Zero everywhere.
+    /// Zeros.
     Zeros,
 }
 
@@ -38,7 +38,7 @@ impl Default for Init {
 }
 
 impl Init {
-    /// Values of the given shape: element `i` is made of number `i` of the stream, so they have the same bits on every machine.
+    /// Returns initial values of the given shape. Element `i` is computed from number `i` of the stream, so the bits are the same on every machine.
     pub fn tensor<T: Real>(self, shape: &[usize], fan_in: usize, fan_out: usize, random: Stream) -> Tensor<T> {
         let (inputs, both) = (fan_in as f64, (fan_in + fan_out) as f64);
         let uniform = |bound: f64| random.uniform_tensor(shape, -bound, bound);

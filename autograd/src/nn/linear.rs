@@ -10,16 +10,16 @@ use crate::tensor::Tensor;
 /// A linear layer, y = x W + b.
 #[derive(Debug)]
 pub struct Linear<T: Real> {
-    /// W, `[inputs, outputs]`: the transpose of PyTorch's.
+    /// Weight W, `[inputs, outputs]`: the transpose of PyTorch's weight.
     pub weight: Param<T>,
-    /// b, `[outputs]`.
+    /// Bias b, `[outputs]`.
     pub bias: Param<T>,
 }
 
 impl_module!(Linear { weight, bias });
 
 impl<T: Real> Linear<T> {
-    /// A layer whose parameters are called `<name>.weight` and `<name>.bias`, with values of the default [`Init`].
+    /// Creates a layer whose parameters are named `<name>.weight` and `<name>.bias`. Their initial values come from the default [`Init`].
     pub fn new(name: &str, inputs: usize, outputs: usize, random: &Stream) -> Self {
         let mut layer = Linear {
             weight: Param::from_tensor(format!("{name}.weight"), Tensor::zeros(&[inputs, outputs])),
@@ -29,8 +29,8 @@ impl<T: Real> Linear<T> {
         layer
     }
 
-    /// Gives weight and bias new values. Both go by the inputs and outputs of the weight, and each has a stream of its own, by the name of the
-    /// parameter: other layers do not change what this one begins with.
+    /// Initializes weight and bias. `fan_in` and `fan_out` of both are the numbers of inputs and outputs of the layer. Each parameter uses the random stream
+    /// of its name, so the values do not depend on other layers.
     pub fn initialize(&mut self, weight: Init, bias: Init, random: &Stream) {
         let (fan_in, fan_out) = (self.inputs(), self.outputs());
         for (param, init) in [(&mut self.weight, weight), (&mut self.bias, bias)] {
@@ -39,9 +39,9 @@ impl<T: Real> Linear<T> {
         }
     }
 
-    /// x W + b, for x `[…, inputs]` of two dimensions or more: `[…, outputs]`.
+    /// Returns x W + b, of shape `[…, outputs]`, for x of shape `[…, inputs]` with at least two dimensions.
     ///
-    /// Panics, naming the parameter and the shapes, if x has another last dimension.
+    /// Panics with the name of the parameter and the shapes if x has fewer dimensions or another last dimension.
     #[track_caller]
     pub fn forward(&self, x: &Tensor<T>) -> Tensor<T> {
         assert!(
@@ -55,12 +55,12 @@ impl<T: Real> Linear<T> {
         x.matmul(self.weight.tensor()) + self.bias.tensor()
     }
 
-    /// The number of inputs.
+    /// Returns the number of inputs.
     pub fn inputs(&self) -> usize {
         self.weight.shape()[0]
     }
 
-    /// The number of outputs.
+    /// Returns the number of outputs.
     pub fn outputs(&self) -> usize {
         self.weight.shape()[1]
     }

@@ -6,30 +6,30 @@ use crate::random::Stream;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// The function after each layer of a network but the last.
+/// An activation function.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Activation {
-    /// max(x, 0): [`Tensor::relu`].
+    /// ReLU, max(x, 0): [`Tensor::relu`].
     Relu,
-    /// x, times `slope` where x < 0: [`Tensor::leaky_relu`].
+    /// Leaky ReLU, x for x >= 0 and `slope` · x for x < 0: [`Tensor::leaky_relu`].
     LeakyRelu {
-        /// The slope below 0; PyTorch's default is 0.01.
+        /// Slope for x < 0; PyTorch's default is 0.01.
         slope: f64,
     },
-    /// ln(1 + eˣ): [`Tensor::softplus`]. It has derivatives of all orders.
+    /// Softplus, ln(1 + eˣ): [`Tensor::softplus`]. It has derivatives of all orders.
     Softplus,
-    /// tanh x: [`Tensor::tanh`].
+    /// Hyperbolic tangent, tanh x: [`Tensor::tanh`].
     Tanh,
-    /// sin(ω x) (SIREN; Sitzmann et al. 2020), which wants initial weights of its own: [`Init::Uniform`](super::Init::Uniform) with the bound
+    /// Sine, sin(ω x) (SIREN; Sitzmann et al. 2020). The paper initializes the weights by [`Init::Uniform`](super::Init::Uniform) with the bound
     /// 1 / inputs in the first layer and √(6 / inputs) / ω in the others.
     Sine {
-        /// ω, 30 in the paper.
+        /// Frequency ω; 30 in the paper.
         omega: f64,
     },
 }
 
 impl Activation {
-    /// The function of each element.
+    /// Applies the function to each element.
     pub fn apply<T: Real>(self, x: &Tensor<T>) -> Tensor<T> {
         match self {
             Activation::Relu => x.relu(),
@@ -41,41 +41,45 @@ impl Activation {
     }
 }
 
-/// A multilayer perceptron: linear layers, with an activation after each but the last.
+/// A multilayer perceptron: linear layers with an activation after each layer except the last.
 #[derive(Debug)]
 pub struct Mlp<T: Real> {
-    /// The layers, whose sizes fit each other.
+    /// Linear layers, from input to output.
     pub layers: Vec<Linear<T>>,
-    /// The function between them.
+    /// Activation after each layer except the last.
     pub activation: Activation,
-    /// The layer that gets the network's input, concatenated with the layer before: `[…, input + hidden]`.
+    /// Index of the layer that reads the input of the network concatenated with the previous activations, `[…, input + hidden]`.
     pub skip: Option<usize>,
 }
 
 impl_module!(Mlp { layers });
 
 impl<T: Real> Mlp<T> {
-    /// A network of the given widths, those of input and output included: `&[63, 256, 256, 4]` has three layers. The parameters are called
-    /// `<name>.0.weight`, `<name>.0.bias`, `<name>.1.weight`, … and have values of the default [`Init`](super::Init).
+    /// Creates a network with the given widths, including the widths of the input and the output: `&[63, 256, 256, 4]` gives three layers. The parameters
+    /// are named `<name>.0.weight`, `<name>.0.bias`, `<name>.1.weight`, and so on. Their initial values come from the default [`Init`](super::Init).
     ///
-    /// Panics if there are less than two widths.
+    /// Panics if there are fewer than two widths.
     #[track_caller]
     pub fn new(name: &str, widths: &[usize], activation: Activation, random: &Stream) -> Self {
         Self::of(name, widths, activation, None, random)
     }
 
-    /// The network of [`Mlp::new`] with the input once more at layer `skip`, counted from 0: that of NeRF (Mildenhall et al. 2020) has 5.
+    /// Creates a network like [`Mlp::new`] with a skip connection: layer `skip`, counted from 0, also reads the input of the network. NeRF (Mildenhall et al.
+    /// 2020) uses `skip` = 5.
     ///
-    /// Panics if there are less than two widths, or no layer before or at `skip`.
+    /// Panics unless `skip` is the index of a layer other than the first.
     #[track_caller]
     pub fn with_skip(name: &str, widths: &[usize], activation: Activation, skip: usize, random: &Stream) -> Self {
-        assert!(skip >= 1 && skip + 1 < widths.len(), "Mlp: `{name}` of widths {widths:?} has no layer {skip} with one before it");
+        assert!(
+            skip >= 1 && skip + 1 < widths.len(),
+            "Mlp: `{name}` with widths {widths:?} got skip = {skip}; expected the index of a layer other than the first"
+        );
         Self::of(name, widths, activation, Some(skip), random)
     }
 
     #[track_caller]
     fn of(name: &str, widths: &[usize], activation: Activation, skip: Option<usize>, random: &Stream) -> Self {
-        assert!(widths.len() >= 2, "Mlp: `{name}` of widths {widths:?}; expected those of input and output at least");
+        assert!(widths.len() >= 2, "Mlp: `{name}` got widths {widths:?}; expected at least an input and an output width");
         let layer = |(i, pair): (usize, &[usize])| {
             let more = if skip == Some(i) { widths[0] } else { 0 };
             Linear::new(&format!("{name}.{i}"), pair[0] + more, pair[1], random)
@@ -83,9 +87,9 @@ impl<T: Real> Mlp<T> {
         Mlp { layers: widths.windows(2).enumerate().map(layer).collect(), activation, skip }
     }
 
-    /// The output `[…, last width]` for x `[…, first width]` of two dimensions or more.
+    /// Returns the output, of shape `[…, last width]`, for x of shape `[…, first width]` with at least two dimensions.
     ///
-    /// Panics, naming the layer and the shapes, if x has another last dimension.
+    /// Panics with the name of the layer and the shapes if x has fewer dimensions or another last dimension.
     #[track_caller]
     pub fn forward(&self, x: &Tensor<T>) -> Tensor<T> {
         let mut hidden = x.clone();
@@ -140,7 +144,7 @@ mod tests {
         assert_eq!(net.forward(&x.reshape(&[1, 2, 2])).shape(), [1, 2, 1]);
     }
 
-    /// With respect to the input and to all parameters, which are bound to the inputs of the check.
+    /// Checks derivatives with respect to the input and to all parameters, which are bound to the inputs of the check.
     #[test]
     fn derivatives_of_both_orders_are_right_with_every_activation() {
         for activation in ALL {
@@ -168,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "no layer 2 with one before it")]
+    #[should_panic(expected = "got skip = 2; expected the index of a layer other than the first")]
     fn a_skip_to_a_layer_that_does_not_exist_is_refused() {
         Mlp::<f32>::with_skip("mlp", &[2, 3, 1], Activation::Relu, 2, &Stream::new(0));
     }

@@ -1,4 +1,4 @@
-//! + − · / and their operators, with NumPy's broadcasting, scalars on either side.
+//! Addition, subtraction, multiplication and division, with operators, NumPy broadcasting, and numbers on either side; also `maximum` and `minimum`.
 
 use crate::graph::Rule;
 use crate::op::{Cotangent, Keep, Op, Vjp};
@@ -84,7 +84,7 @@ impl<T: Real> Op<T> for Affine {
     }
 }
 
-/// z = max(x, y) or min(x, y).   The cotangent goes to the larger (smaller) one, to x where they are equal: a kink.
+/// z = max(x, y) or min(x, y).   ∂L/∂z goes to the larger (smaller) input, and to x where they are equal, which is a kink.
 #[derive(Debug)]
 struct Extremum {
     largest: bool,
@@ -104,7 +104,7 @@ impl<T: Real> Op<T> for Extremum {
 }
 
 impl<T: Real> Tensor<T> {
-    /// scale · x + shift, elementwise.   ∂L/∂x = scale · ∂L/∂z
+    /// Returns z = scale · x + shift, elementwise.   ∂L/∂x = scale · ∂L/∂z
     pub fn affine(&self, scale: f64, shift: f64) -> Self {
         let (a, b) = (T::lit(scale), T::lit(shift));
         let mut out = Buffer::stale(self.len());
@@ -116,19 +116,23 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, self.shape(), &[self], Affine { scale })
     }
 
-    /// max(x, y), elementwise with broadcasting. Where they are equal the gradient goes to x.
+    /// Returns max(x, y), elementwise with broadcasting; x is `self`. The gradient goes to the larger input, and to x where the inputs are equal.
+    ///
+    /// Panics if the shapes do not broadcast.
     #[track_caller]
     pub fn maximum(&self, other: &Self) -> Self {
         binary("maximum", self, other, Extremum { largest: true }, |x, y| if x >= y || x.is_nan() { x } else { y })
     }
 
-    /// min(x, y), elementwise with broadcasting. Where they are equal the gradient goes to x.
+    /// Returns min(x, y), elementwise with broadcasting; x is `self`. The gradient goes to the smaller input, and to x where the inputs are equal.
+    ///
+    /// Panics if the shapes do not broadcast.
     #[track_caller]
     pub fn minimum(&self, other: &Self) -> Self {
         binary("minimum", self, other, Extremum { largest: false }, |x, y| if x <= y || x.is_nan() { x } else { y })
     }
 
-    /// (self · other) summed down to `shape`: what the cotangent of a broadcast product is.
+    /// Returns self · other, summed to `shape`: the cotangent of a factor of a product with broadcasting.
     fn mul_sum_to(&self, other: &Self, shape: &[usize]) -> Self {
         let product = self * other;
         if product.shape() == shape { product } else { product.sum_to(shape) }
@@ -189,7 +193,7 @@ macro_rules! operators {
 }
 operators! { Add add; Sub sub; Mul mul; Div div; }
 
-/// Operators with an `f64` literal on either side, whatever the precision of the tensor.
+/// Implements operators with an `f64` number on either side of a tensor of any precision.
 macro_rules! scalar_operators {
     ($($trait:ident $method:ident $right:expr, $left:expr;)*) => {$(
         impl<T: Real> $trait<f64> for &Tensor<T> {
@@ -239,7 +243,9 @@ impl<T: Real> Neg for Tensor<T> {
     }
 }
 
-/// f(x, y) with broadcasting, recorded as `op`. Panics, naming the op and both shapes, if they do not broadcast.
+/// Computes f(x, y), elementwise with broadcasting, and records it as `op`.
+///
+/// Panics with the name of the op and both shapes if the shapes do not broadcast.
 #[track_caller]
 pub(crate) fn binary<T: Real>(name: &str, x: &Tensor<T>, y: &Tensor<T>, op: impl Op<T>, f: impl Fn(T, T) -> T + Sync) -> Tensor<T> {
     if x.shape() == y.shape() {
@@ -264,7 +270,7 @@ pub(crate) fn binary<T: Real>(name: &str, x: &Tensor<T>, y: &Tensor<T>, op: impl
     Tensor::from_buffer(out, &shape).recorded(&[x, y], keep, || Rule::Op(Box::new(op)))
 }
 
-/// NumPy's rule: align from the last dimension; sizes are equal or one of them is 1.
+/// Returns the broadcast shape by the rule of NumPy: shapes are aligned at the last dimension, and sizes must be equal or one of them must be 1.
 pub(crate) fn broadcast_shape(a: &[usize], b: &[usize]) -> Option<Vec<usize>> {
     let n = a.len().max(b.len());
     let size = |s: &[usize], i: usize| if i + s.len() >= n { s[i + s.len() - n] } else { 1 };
@@ -278,7 +284,7 @@ pub(crate) fn broadcast_shape(a: &[usize], b: &[usize]) -> Option<Vec<usize>> {
         .collect()
 }
 
-/// Strides of a contiguous array of shape `from` seen as one of shape `to`: 0 where it is repeated.
+/// Returns the strides that read a contiguous array of shape `from` as an array of shape `to`. The stride of a repeated dimension is 0.
 pub(crate) fn broadcast_strides(from: &[usize], to: &[usize]) -> Vec<usize> {
     let mut strides = vec![0; to.len()];
     let mut step = 1;
@@ -292,7 +298,7 @@ pub(crate) fn broadcast_strides(from: &[usize], to: &[usize]) -> Vec<usize> {
     strides
 }
 
-/// The loop nest of a broadcast: adjacent dimensions that both operands walk alike are one.
+/// Returns the loop nest of a broadcast, as (size, stride of a, stride of b). Adjacent dimensions are merged where the strides of both operands permit it.
 fn collapse(shape: &[usize], a: &[usize], b: &[usize]) -> Vec<(usize, usize, usize)> {
     let mut dims: Vec<(usize, usize, usize)> = Vec::with_capacity(shape.len());
     for ((&n, &sa), &sb) in shape.iter().zip(a).zip(b) {
@@ -335,7 +341,7 @@ fn broadcast_loop<T: Real>(x: &Tensor<T>, y: &Tensor<T>, shape: &[usize], out: &
     });
 }
 
-/// An operand of a two-dimensional loop; a column stride is 0 or 1.
+/// An operand of a two-dimensional loop, with its row and column strides. The column stride is 0 or 1.
 #[derive(Clone, Copy)]
 struct Rows<'a, T> {
     data: &'a [T],
@@ -344,7 +350,7 @@ struct Rows<'a, T> {
 }
 
 dispatched! {
-/// `C` is the number of columns, or 0 for one only known at run time.
+/// Computes rows of f(x, y). `C` is the number of columns, or 0 if the number is known at run time only.
 fn rows_loop<T: Real, const C: usize, F: Fn(T, T) -> T>(x: Rows<'_, T>, y: Rows<'_, T>, cols: usize, out: &mut [T], f: &F) {
     let cols = if C == 0 { cols } else { C };
     for (r, row) in out.chunks_exact_mut(cols).enumerate() {

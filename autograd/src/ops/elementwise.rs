@@ -1,4 +1,4 @@
-//! Functions of one number, applied to each.
+//! Elementwise functions of one argument.
 
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::parallel;
@@ -6,7 +6,7 @@ use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// Function, rule and what the rule reads, in one place.
+/// Defines elementwise ops: for each, the method, the op struct, the values that the rule keeps, the function, and the rule.
 macro_rules! elementwise {
     ($($(#[$doc:meta])* $(@$kind:ident)? $name:ident, $op:ident, $keep:expr, $f:expr, $rule:expr;)*) => {$(
         #[derive(Debug)]
@@ -31,8 +31,8 @@ macro_rules! elementwise {
     )*};
 }
 
-/// Computes with a function; with the version for this machine, [`parallel::fused`], if it contains an exponential; with one function inside
-/// [`Real::SINE_LIMIT`] and another outside of it, if it is periodic.
+/// Applies a function to each element. A function marked `exponential` is used in the version for this machine ([`parallel::fused`]). A function marked
+/// `periodic` is a pair: the first is used for |x| <= [`Real::SINE_LIMIT`], the second for larger |x|.
 macro_rules! apply {
     (periodic $x:expr, $op:ident, $f:expr) => {{
         let (inside, outside) = $f;
@@ -55,31 +55,35 @@ macro_rules! apply {
 }
 
 elementwise! {
-    /// y = eˣ.   ∂L/∂x = ∂L/∂y · y
+    /// Returns y = eˣ.   ∂L/∂x = ∂L/∂y · y
     @exponential exp, Exp, Keep::OUTPUT, T::exp_::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * cx.output();
 
-    /// y = eˣ − 1, exact for small x, to two units in the last place.   ∂L/∂x = ∂L/∂y · eˣ, which y + 1 would lose where x is far below 0
+    /// Returns y = eˣ − 1 without cancellation for small x, accurate to two units in the last place.   ∂L/∂x = ∂L/∂y · eˣ
+    ///
+    /// The rule computes eˣ again, since y + 1 would lose its digits for large negative x.
     expm1, Expm1, Keep::INPUTS, T::expm1_, |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).exp();
 
-    /// y = 1 − e⁻ˣ, exact for small x: the opacity of an optical depth.   ∂L/∂x = ∂L/∂y · e⁻ˣ, which 1 − y would lose where y is near 1
+    /// Returns y = 1 − e⁻ˣ without cancellation for small x: the opacity for an optical depth x.   ∂L/∂x = ∂L/∂y · e⁻ˣ
+    ///
+    /// The rule computes e⁻ˣ again, since 1 − y would lose its digits where y is near 1.
     @exponential one_minus_exp_neg, OneMinusExpNeg, Keep::INPUTS, T::one_minus_exp_neg::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * (-cx.input(0)).exp();
 
-    /// y = ln x, for x > 0.   ∂L/∂x = ∂L/∂y / x
+    /// Returns y = ln x, for x > 0.   ∂L/∂x = ∂L/∂y / x
     ln, Ln, Keep::INPUTS, |x: T| x.ln(), |cx: &Vjp<'_, T>| cx.cotangent() / cx.input(0);
 
-    /// y = √x, for x >= 0; not differentiable at 0.   ∂L/∂x = ∂L/∂y / 2y
+    /// Returns y = √x, for x >= 0. It is not differentiable at 0.   ∂L/∂x = ∂L/∂y / 2y
     sqrt, Sqrt, Keep::OUTPUT, |x: T| x.sqrt(), |cx: &Vjp<'_, T>| cx.cotangent() / (2.0 * cx.output());
 
-    /// y = x².   ∂L/∂x = ∂L/∂y · 2x
+    /// Returns y = x².   ∂L/∂x = ∂L/∂y · 2x
     square, Square, Keep::INPUTS, |x: T| x * x, |cx: &Vjp<'_, T>| cx.cotangent() * (2.0 * cx.input(0));
 
-    /// y = |x|; the gradient at 0 is 0.   ∂L/∂x = ∂L/∂y · sign x
+    /// Returns y = |x|. The gradient at 0 is 0.   ∂L/∂x = ∂L/∂y · sign x
     abs, Abs, Keep::INPUTS, |x: T| x.abs(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sign();
 
-    /// y = 1 / (1 + e⁻ˣ).   ∂L/∂x = ∂L/∂y · y (1 − y)
+    /// Returns y = 1 / (1 + e⁻ˣ).   ∂L/∂x = ∂L/∂y · y (1 − y)
     @exponential sigmoid, Sigmoid, Keep::OUTPUT,
     |x: T| {
-        // Computed from e^-|x|, which cannot overflow.
+        // e^-|x| cannot overflow.
         let e = (-x.abs()).exp_::<FUSED>();
         let small = e / (T::one() + e);
         if x >= T::zero() { T::one() - small } else { small }
@@ -89,22 +93,24 @@ elementwise! {
         cx.cotangent() * (&y * (1.0 - &y))
     };
 
-    /// y = ln(1 + eˣ), computed as max(x, 0) + ln(1 + e^−|x|).   ∂L/∂x = ∂L/∂y · sigmoid x
+    /// Returns y = ln(1 + eˣ), computed as max(x, 0) + ln(1 + e^−|x|).   ∂L/∂x = ∂L/∂y · sigmoid x
     @exponential softplus, Softplus, Keep::INPUTS, |x: T| x.max(T::zero()) + (-x.abs()).exp_::<FUSED>().ln_1p(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sigmoid();
 
-    /// y = max(x, 0), NaN staying NaN; the gradient passes where x >= 0.
+    /// Returns y = max(x, 0), and NaN where x is NaN.   ∂L/∂x = ∂L/∂y where x >= 0, else 0
     relu, Relu, Keep::INPUTS, |x: T| if x < T::zero() { T::zero() } else { x }, |cx: &Vjp<'_, T>| {
         let x = cx.input(0).detach();
         cx.cotangent() * x.greater_equal(&Tensor::scalar(T::zero()))
     };
 
-    /// y = tanh x, to three units in the last place.   ∂L/∂x = ∂L/∂y · (1 − y²)
+    /// Returns y = tanh x, accurate to three units in the last place.   ∂L/∂x = ∂L/∂y · (1 − y²)
     tanh, Tanh, Keep::OUTPUT, T::tanh_, |cx: &Vjp<'_, T>| cx.cotangent() * (1.0 - cx.output().square());
 
-    /// y = sin x, to one unit in the last place. |x| > 2²⁰ goes to the system's mathematical library, one number at a time.   ∂L/∂x = ∂L/∂y · cos x
+    /// Returns y = sin x, accurate to one unit in the last place.   ∂L/∂x = ∂L/∂y · cos x
+    ///
+    /// For |x| > 2²⁰ the sine is computed by the math library of the system, one number at a time.
     @periodic sin, Sin, Keep::INPUTS, (T::sin_, |x: T| x.sin()), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).cos();
 
-    /// y = cos x, computed like [`Tensor::sin`].   ∂L/∂x = −∂L/∂y · sin x
+    /// Returns y = cos x, computed like [`Tensor::sin`].   ∂L/∂x = −∂L/∂y · sin x
     @periodic cos, Cos, Keep::INPUTS, (T::cos_, |x: T| x.cos()), |cx: &Vjp<'_, T>| -(cx.cotangent() * cx.input(0).sin());
 }
 
@@ -126,7 +132,7 @@ impl<T: Real> Op<T> for Powi {
     }
 }
 
-/// y = x where x >= 0, slope · x elsewhere.   ∂L/∂x = ∂L/∂y, times the slope where x < 0
+/// y = x where x >= 0, else slope · x.   ∂L/∂x = ∂L/∂y where x >= 0, else slope · ∂L/∂y
 #[derive(Debug)]
 struct LeakyRelu {
     slope: f64,
@@ -144,7 +150,7 @@ impl<T: Real> Op<T> for LeakyRelu {
     }
 }
 
-/// y = min(max(x, low), high); the gradient passes where low <= x <= high.
+/// y = min(max(x, low), high).   ∂L/∂x = ∂L/∂y where low <= x <= high, else 0
 #[derive(Debug)]
 struct Clamp {
     low: f64,
@@ -164,18 +170,18 @@ impl<T: Real> Op<T> for Clamp {
 }
 
 impl<T: Real> Tensor<T> {
-    /// y = xⁿ for an integer n, which may be negative.   ∂L/∂x = ∂L/∂y · n xⁿ⁻¹
+    /// Returns y = xⁿ for an integer n, which may be negative.   ∂L/∂x = ∂L/∂y · n xⁿ⁻¹
     pub fn powi(&self, n: i32) -> Self {
         unary(self, Powi(n), move |x: T| x.powi(n))
     }
 
-    /// y = x where x >= 0, slope · x elsewhere, NaN staying NaN; at 0 the gradient is that of x > 0.
+    /// Returns y = x where x >= 0, y = slope · x where x < 0, and NaN where x is NaN.   ∂L/∂x = ∂L/∂y where x >= 0, else slope · ∂L/∂y
     pub fn leaky_relu(&self, slope: f64) -> Self {
         let factor = T::lit(slope);
         unary(self, LeakyRelu { slope }, move |x: T| if x < T::zero() { factor * x } else { x })
     }
 
-    /// y = min(max(x, low), high); the gradient passes where low <= x <= high.
+    /// Returns y = min(max(x, low), high).   ∂L/∂x = ∂L/∂y where low <= x <= high, else 0
     pub fn clamp(&self, low: f64, high: f64) -> Self {
         let (a, b) = (T::lit(low), T::lit(high));
         unary(self, Clamp { low, high }, move |x: T| {
@@ -189,7 +195,7 @@ impl<T: Real> Tensor<T> {
         })
     }
 
-    /// −1, 0 or 1: a constant, whatever `self` is.
+    /// Returns the sign of each element, −1, 0 or 1, as a constant. The result is 0 where x is NaN.
     pub fn sign(&self) -> Self {
         self.constant_map(|x| {
             if x > T::zero() {
@@ -202,7 +208,7 @@ impl<T: Real> Tensor<T> {
         })
     }
 
-    /// f(x), elementwise, as a constant that no gradient flows through: masks, roundings, signs.
+    /// Returns f(x), elementwise, as a constant. It is for functions without a gradient, such as masks, rounding and signs.
     pub fn constant_map(&self, f: impl Fn(T) -> T + Sync) -> Self {
         let mut out = Buffer::stale(self.len());
         parallel::map(self.data(), &mut out, f);
@@ -210,6 +216,7 @@ impl<T: Real> Tensor<T> {
     }
 }
 
+/// Computes f(x), elementwise, and records it as `op`.
 pub(crate) fn unary<T: Real>(x: &Tensor<T>, op: impl Op<T>, f: impl Fn(T) -> T + Sync) -> Tensor<T> {
     let mut out = Buffer::stale(x.len());
     parallel::map(x.data(), &mut out, f);

@@ -1,7 +1,7 @@
-//! Matrix product, batched, by the `gemm` crate.
+//! The batched matrix product, computed by the `gemm` crate.
 //!
-//! The library takes pointers, hence the one unsafe call here, in `block`; its safe twin is the triple loop in the tests. Threads are ours:
-//! blocks of a fixed size, so that the bits do not depend on their number.
+//! The crate takes pointers, which requires one unsafe call, in `multiply_block`. The tests compare it with a safe triple loop. This module distributes the
+//! work over threads itself, in blocks of a fixed size, so the bits do not depend on the number of threads.
 #![allow(unsafe_code)]
 
 use crate::op::{Cotangent, Keep, Op, Vjp};
@@ -17,7 +17,7 @@ struct Matmul {
     transpose_b: bool,
 }
 
-/// With G = ∂L/∂C:  C = A B gives ∂L/∂A = G Bᵀ, ∂L/∂B = Aᵀ G; the transposed forms follow by transposing both sides.
+/// The gradient rule, with G = ∂L/∂C: C = A B has ∂L/∂A = G Bᵀ and ∂L/∂B = Aᵀ G. The rules of the transposed forms follow by transposing both sides.
 impl<T: Real> Op<T> for Matmul {
     fn name(&self) -> &'static str {
         "matmul"
@@ -36,9 +36,10 @@ impl<T: Real> Op<T> for Matmul {
 }
 
 impl<T: Real> Tensor<T> {
-    /// `[…, m, k]` times `[…, k, n]` gives `[…, m, n]`. Leading dimensions are equal, or one operand has none and serves every batch.
+    /// Returns the matrix product of `[…, m, k]` and `[…, k, n]`, of shape `[…, m, n]`. The leading (batch) dimensions must be equal, or one operand must have
+    /// none; that operand is then used for every matrix of the batch.
     ///
-    /// Panics, with both shapes, if they do not fit.
+    /// Panics with both shapes if they do not fit.
     #[track_caller]
     pub fn matmul(&self, other: &Self) -> Self {
         assert!(
@@ -53,6 +54,7 @@ impl<T: Real> Tensor<T> {
     }
 }
 
+/// Computes and records op(A) op(B).
 fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b: bool) -> Tensor<T> {
     let batch = if a.ndim() >= b.ndim() { &a.shape()[..a.ndim() - 2] } else { &b.shape()[..b.ndim() - 2] };
     let count: usize = batch.iter().product();
@@ -69,14 +71,14 @@ fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b
     let mut out = Buffer::stale(count * m * n);
     if count == 1 {
         let (x, y) = (Matrix::new(&a.data()[matrix(a, 0)], m, k, transpose_a), Matrix::new(&b.data()[matrix(b, 0)], k, n, transpose_b));
-        large(x, y, &mut out);
+        multiply_blocked(x, y, &mut out);
     } else {
-        // Many small products: a task takes as many as make a chunk.
+        // Many small products: each task computes as many as fill a chunk.
         parallel::for_each_rows(&mut out, m * n, |first, chunk| {
             for (i, c) in chunk.chunks_exact_mut((m * n).max(1)).enumerate() {
                 let x = Matrix::new(&a.data()[matrix(a, first + i)], m, k, transpose_a);
                 let y = Matrix::new(&b.data()[matrix(b, first + i)], k, n, transpose_b);
-                block(x, y, c);
+                multiply_block(x, y, c);
             }
         });
     }
@@ -85,7 +87,7 @@ fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b
     Tensor::from_op(out, &shape, &[a, b], Matmul { transpose_a, transpose_b })
 }
 
-/// A matrix in somebody's slice: entry (r, c) is at r · row + c · col.
+/// A view of a matrix in a slice. Entry (r, c) is at index r · row + c · col.
 #[derive(Clone, Copy)]
 struct Matrix<'a, T> {
     data: &'a [T],
@@ -96,7 +98,7 @@ struct Matrix<'a, T> {
 }
 
 impl<'a, T> Matrix<'a, T> {
-    /// The `rows` × `cols` matrix that a slice holds row by row or, transposed, column by column.
+    /// Returns a view of a `rows` × `cols` matrix that is stored in row-major order or, if `transposed`, in column-major order.
     fn new(data: &'a [T], rows: usize, cols: usize, transposed: bool) -> Self {
         assert_eq!(data.len(), rows * cols, "matmul: a matrix of {rows} × {cols}");
         let (row, col) = if transposed { (1, rows) } else { (cols, 1) };
@@ -113,22 +115,22 @@ impl<'a, T> Matrix<'a, T> {
         Matrix { data: &self.data[(range.start * self.col).min(self.data.len())..], cols: range.len(), ..self }
     }
 
-    /// One past the last place an entry is at.
+    /// Returns the index of the last entry plus one, or 0 for an empty matrix.
     fn reach(&self) -> usize {
         if self.rows == 0 || self.cols == 0 { 0 } else { (self.rows - 1) * self.row + (self.cols - 1) * self.col + 1 }
     }
 }
 
-/// out = a · b, on this thread.
-fn block<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
+/// Computes out = a · b on this thread.
+fn multiply_block<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
     let (m, k, n) = (a.rows, a.cols, b.cols);
     assert!(b.rows == k && out.len() == m * n && a.reach() <= a.data.len() && b.reach() <= b.data.len());
     if m == 0 || n == 0 || k == 0 {
         out.fill(T::zero());
         return;
     }
-    // SAFETY: by the assertion every entry the call reads or writes, at its strides, lies inside the three slices; `out` is borrowed
-    // uniquely, and `T` is f32 or f64, which the library knows.
+    // SAFETY: the assertion ensures that every entry that the call reads or writes, at the given strides, lies inside the three slices. `out` is borrowed
+    // uniquely, and `T` is f32 or f64, which the library supports.
     unsafe {
         gemm::gemm(
             m,
@@ -154,16 +156,16 @@ fn block<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
     }
 }
 
-/// One product, cut into blocks of fixed size: rows of the result or, when the inner dimension is the long one, partial sums that are
-/// added in order.
-fn large<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
+/// Computes out = a · b in parallel, in blocks of a fixed size. The blocks are rows of the result or, if the inner dimension is much longer than the
+/// others, ranges of the inner dimension, whose partial sums are added in order.
+fn multiply_blocked<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
     const ROWS: usize = 128;
     const DEEP: usize = 4096;
     let (m, k, n) = (a.rows, a.cols, b.cols);
     if k > 4 * m.max(n) && k > DEEP {
         let parts = parallel::map_chunks(k, DEEP, |range| {
             let mut part = Buffer::<T>::stale(m * n);
-            block(a.cols(range.clone()), b.rows(range), &mut part);
+            multiply_block(a.cols(range.clone()), b.rows(range), &mut part);
             part
         });
         out.fill(T::zero());
@@ -173,7 +175,7 @@ fn large<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
     } else {
         parallel::for_each_chunk(out, ROWS * n.max(1), |start, rows| {
             let first = start / n;
-            block(a.rows(first..first + rows.len() / n), b, rows);
+            multiply_block(a.rows(first..first + rows.len() / n), b, rows);
         });
     }
 }

@@ -1,4 +1,4 @@
-//! Rows of a table by number, and back: each other's adjoint.
+//! Gathering rows of a table and scattering values into rows. Each op is the adjoint of the other.
 
 use crate::index::Indices;
 use crate::op::{Cotangent, Keep, Op, Vjp};
@@ -8,7 +8,7 @@ use crate::real::Real;
 use crate::rows::sum;
 use crate::tensor::Tensor;
 
-/// yₖ = x[rowsₖ].   ∂L/∂x is ∂L/∂y as rows, never a dense table
+/// yₖ = x[rowsₖ].   ∂L/∂x is row-sparse: ∂L/∂yₖ is added to row rowsₖ
 #[derive(Debug)]
 struct GatherRows {
     rows: Indices,
@@ -25,7 +25,7 @@ impl<T: Real> Op<T> for GatherRows {
     }
 }
 
-/// y = zeros, with xₖ added to row rowsₖ.   ∂L/∂xₖ = ∂L/∂y[rowsₖ]
+/// y = Σ over k of xₖ in row rowsₖ.   ∂L/∂xₖ = ∂L/∂y[rowsₖ]
 #[derive(Debug)]
 struct ScatterRows {
     rows: Indices,
@@ -43,7 +43,8 @@ impl<T: Real> Op<T> for ScatterRows {
 }
 
 impl<T: Real> Tensor<T> {
-    /// `[R, …]` to `[k, …]`: row `rows[i]` of this table, for each i. The gradient is row-sparse.
+    /// Gathers rows of this table: row i of the result is row `rows[i]` of the table. The table has shape `[R, …]` and the result `[rows.len(), …]`. The
+    /// gradient of the table is row-sparse.
     ///
     /// Panics if a row number is R or more.
     #[track_caller]
@@ -54,7 +55,7 @@ impl<T: Real> Tensor<T> {
         shape[0] = rows.len();
         let mut out = Buffer::stale(rows.len() * width);
         let table = self.data();
-        // Widths of grids, and 4 and 28, which `benches/ops.rs` measures.
+        // Loops with a constant width: the widths of voxel grids (1, 3 and 27), and 4 and 28, which `benches/ops.rs` measures.
         match width {
             1 => gather_into::<T, 1>(table, rows, &mut out),
             3 => gather_into::<T, 3>(table, rows, &mut out),
@@ -70,9 +71,10 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, &[self], GatherRows { rows: rows.clone() })
     }
 
-    /// `[k, …]` to `[table_rows, …]`: zeros, with row i of this added to row `rows[i]`, in the order of i.
+    /// Adds the rows of this tensor to a table of zeros: row i is added to row `rows[i]`, in the order of i. This tensor has shape `[rows.len(), …]` and the
+    /// result `[table_rows, …]`.
     ///
-    /// Panics if there is not one row number for each row, or one is too large.
+    /// Panics if the number of row numbers differs from the number of rows, or if a row number is `table_rows` or more.
     #[track_caller]
     pub fn scatter_rows(&self, rows: &Indices, table_rows: usize) -> Self {
         assert_eq!(
@@ -91,7 +93,9 @@ impl<T: Real> Tensor<T> {
 }
 
 impl<T: Real> Tensor<T> {
-    /// The number of rows. Panics, naming the op, if there are none because this is a scalar.
+    /// Returns the size of the first dimension.
+    ///
+    /// Panics with the name of the op if the tensor has no dimensions.
     #[track_caller]
     pub(crate) fn first_len(&self, op: &str) -> usize {
         assert!(self.ndim() > 0, "{op}: expected rows, got a tensor of shape []");
@@ -99,14 +103,14 @@ impl<T: Real> Tensor<T> {
     }
 }
 
-/// Adds row i of `values` to row `rows[i]` of a table of `width` columns, in place and in the order of i.
+/// Adds row i of `values` to row `rows[i]` of a table with `width` columns, in place and in the order of i.
 ///
-/// Panics if a row number lies beyond the table.
+/// Panics if a row number is out of range, or if `values` does not have one row of `width` values for each row number.
 #[track_caller]
 pub fn add_rows<T: Real>(table: &mut [T], width: usize, rows: &[u32], values: &[T]) {
     check_rows("add_rows", rows, table.len() / width.max(1));
     assert_eq!(values.len(), rows.len() * width, "add_rows: {} values for {} rows of {width}", values.len(), rows.len());
-    // More threads would spend more on looking through the rows than they save.
+    // With more threads, scanning all row numbers on every thread costs more than sorting them.
     let few = parallel::threads() <= 8;
     match width {
         1 if few => sum::add_short_rows::<T, 1>(table, rows, values),
@@ -119,7 +123,7 @@ pub fn add_rows<T: Real>(table: &mut [T], width: usize, rows: &[u32], values: &[
 #[track_caller]
 fn check_rows(op: &str, rows: &[u32], table: usize) {
     let largest = parallel::map_chunks(rows.len(), parallel::CHUNK, |range| largest(&rows[range])).into_iter().max().unwrap_or(0);
-    assert!(rows.is_empty() || (largest as usize) < table, "{op}: row {largest} of a table of {table} rows");
+    assert!(rows.is_empty() || (largest as usize) < table, "{op}: row {largest} is out of range for a table of {table} rows");
 }
 
 dispatched! {

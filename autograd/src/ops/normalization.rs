@@ -1,11 +1,13 @@
-//! Exponentials and lengths along an axis, and what they normalise.
+//! Log-sum-exp, softmax, norm and normalization along an axis.
 
 use crate::real::Real;
 use crate::tensor::Tensor;
 
 impl<T: Real> Tensor<T> {
-    /// y = ln Σ eˣ along one axis, which disappears. The largest element m is subtracted and added again, y = m + ln Σ eˣ⁻ᵐ, so nothing
-    /// overflows. Where all elements are −∞, y is −∞ and the gradient NaN.   ∂L/∂x = ∂L/∂y · softmax x
+    /// Returns y = ln Σ eˣ along one axis, which is removed.   ∂L/∂x = ∂L/∂y · softmax x
+    ///
+    /// It is computed as y = m + ln Σ eˣ⁻ᵐ with the largest element m, so the exponentials do not overflow. Where all elements are −∞, y is −∞ and the
+    /// gradient is NaN.
     ///
     /// Panics if the axis does not exist or has no elements.
     #[track_caller]
@@ -15,8 +17,9 @@ impl<T: Real> Tensor<T> {
         (self - largest.unsqueeze(axis)).exp().sum_axis(axis).ln() + largest
     }
 
-    /// y = eˣ / Σ eˣ along one axis, of the shape of x. The largest element is subtracted first, so nothing overflows. Where all elements are
-    /// −∞, y is NaN.   ∂L/∂x = y (∂L/∂y − Σ y ∂L/∂y)
+    /// Returns y = eˣ / Σ eˣ along one axis, with the shape of x.   ∂L/∂x = y (∂L/∂y − Σ y ∂L/∂y)
+    ///
+    /// The largest element is subtracted first, so the exponentials do not overflow. Where all elements are −∞, y is NaN.
     ///
     /// Panics if the axis does not exist or has no elements.
     #[track_caller]
@@ -26,22 +29,24 @@ impl<T: Real> Tensor<T> {
         &weights / weights.sum_axis(axis).unsqueeze(axis)
     }
 
-    /// y = √Σ x² along one axis, which disappears: the Euclidean norm. It is not differentiable where y = 0; the gradient there is 0, in every
-    /// order. Squares overflow and underflow as they do.   ∂L/∂x = ∂L/∂y · x / y
+    /// Returns the Euclidean norm y = √Σ x² along one axis, which is removed.   ∂L/∂x = ∂L/∂y · x / y
+    ///
+    /// The norm is not differentiable where y = 0; derivatives of every order are 0 there. The squares are not scaled, so they may overflow or underflow.
     ///
     /// Panics if the axis does not exist.
     #[track_caller]
     pub fn norm(&self, axis: usize) -> Self {
         self.check_axis("norm", axis);
         let squared = self.square().sum_axis(axis);
-        // √ has an infinite slope at 0, and 0 · ∞ is NaN: the root is taken of 1 there, and left out of value and gradient.
+        // √ has an infinite derivative at 0, and 0 · ∞ is NaN. The sum is therefore replaced by 1 there, and a mask removes it from value and gradient.
         let zero = squared.equal(&Tensor::scalar(T::zero()));
         let positive = squared.constant_map(|y| if y == T::zero() { T::zero() } else { T::one() });
         (squared + zero).sqrt().masked(&positive)
     }
 
-    /// y = x / max(|x|, 10⁻¹²) along one axis, with the Euclidean norm |x|: unit vectors, and 0 where x is 0 (as
-    /// `torch.nn.functional.normalize`). The gradient at 0 is ∂L/∂y · 10¹², for the denominator is constant there; where |x| = 10⁻¹² is a kink.
+    /// Returns the unit vectors y = x / max(|x|, 10⁻¹²) along one axis, with the Euclidean norm |x|, as `torch.nn.functional.normalize` does.
+    ///
+    /// y is 0 where x is 0. The gradient there is ∂L/∂y · 10¹², since the denominator is constant. There is a kink at |x| = 10⁻¹².
     ///
     /// Panics if the axis does not exist.
     #[track_caller]
@@ -50,7 +55,7 @@ impl<T: Real> Tensor<T> {
         self / self.norm(axis).unsqueeze(axis).maximum(&Tensor::scalar(T::lit(1e-12)))
     }
 
-    /// The largest element along an axis, as a constant; 0 where it is infinite, since ∞ − ∞ is no number.
+    /// Returns the largest element along an axis, as a constant. It is replaced by 0 where it is infinite, because ∞ − ∞ is NaN.
     #[track_caller]
     fn largest(&self, axis: usize) -> Self {
         self.detach().max_axis(axis).constant_map(|m| if m.is_infinite() { T::zero() } else { m })

@@ -1,4 +1,4 @@
-//! Powers with exponents that are not integers.
+//! Powers with real exponents.
 
 use super::arithmetic::binary;
 use super::elementwise::unary;
@@ -19,7 +19,7 @@ impl<T: Real> Op<T> for Pow {
     }
 }
 
-/// y = xᵖ with a number p.   ∂L/∂x = ∂L/∂y · p xᵖ⁻¹
+/// y = xᵖ for a number p.   ∂L/∂x = ∂L/∂y · p xᵖ⁻¹
 #[derive(Debug)]
 struct Powf(f64);
 impl<T: Real> Op<T> for Powf {
@@ -38,15 +38,19 @@ impl<T: Real> Op<T> for Powf {
 }
 
 impl<T: Real> Tensor<T> {
-    /// z = xʸ for x > 0, elementwise with broadcasting; x is `self`. Where x = 0 the gradients may be infinite or NaN, and where x < 0 the
-    /// gradient of y is NaN.   ∂L/∂x = ∂L/∂z · y xʸ⁻¹, ∂L/∂y = ∂L/∂z · z ln x
+    /// Returns z = xʸ for x > 0, elementwise with broadcasting; x is `self`.   ∂L/∂x = ∂L/∂z · y xʸ⁻¹, ∂L/∂y = ∂L/∂z · z ln x
+    ///
+    /// Where x = 0, the gradients may be infinite or NaN. Where x < 0, the gradient with respect to y is NaN.
+    ///
+    /// Panics if the shapes do not broadcast.
     #[track_caller]
     pub fn pow(&self, exponent: &Self) -> Self {
         binary("pow", self, exponent, Pow, |x, y| x.powf(y))
     }
 
-    /// y = xᵖ for x > 0 and a number p, rounded to the precision of x. Where x = 0 the gradient is infinite if p < 1; where x < 0 the result
-    /// is NaN unless p is an integer, for which there is [`Tensor::powi`].   ∂L/∂x = ∂L/∂y · p xᵖ⁻¹
+    /// Returns y = xᵖ for x > 0 and a number p, which is rounded to the precision of x.   ∂L/∂x = ∂L/∂y · p xᵖ⁻¹
+    ///
+    /// Where x = 0, the gradient is infinite if p < 1 and p is not 0. Where x < 0, the result is NaN unless p is an integer; use [`Tensor::powi`] for integers.
     pub fn powf(&self, p: f64) -> Self {
         let exponent = T::lit(p);
         unary(self, Powf(p), move |x: T| x.powf(exponent))

@@ -1,4 +1,4 @@
-//! Sums, means and extrema, over everything or along one axis.
+//! Sums, means and extrema, over all elements or along one axis.
 
 use crate::graph::Rule;
 use crate::op::{Cotangent, Keep, Op, Vjp};
@@ -7,7 +7,7 @@ use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// y = sum of x down to a shape that broadcasts back to x's.   ∂L/∂x = ∂L/∂y, repeated
+/// y = x summed to a shape that broadcasts to the shape of x.   ∂L/∂x = ∂L/∂y, repeated
 #[derive(Debug)]
 struct SumTo {
     from: Vec<usize>,
@@ -24,7 +24,7 @@ impl<T: Real> Op<T> for SumTo {
     }
 }
 
-/// y = the largest or smallest of x.   ∂L/∂x = ∂L/∂y · shares, which are equal among those that equal y and constant
+/// y = max x or min x.   ∂L/∂x = ∂L/∂y · shares. The shares are constants: 1 / (number of ties) for each element that equals y, and 0 for the others
 #[derive(Debug)]
 struct Extremum<T: Real> {
     largest: bool,
@@ -43,17 +43,19 @@ impl<T: Real> Op<T> for Extremum<T> {
 }
 
 impl<T: Real> Tensor<T> {
-    /// Σ x, a scalar.   ∂L/∂x = ∂L/∂y everywhere
+    /// Returns y = Σ x, a scalar.   ∂L/∂x = ∂L/∂y for every element
     pub fn sum(&self) -> Self {
         self.sum_to(&[])
     }
 
-    /// The mean of all elements, a scalar.
+    /// Returns the mean of all elements, a scalar.
     pub fn mean(&self) -> Self {
         self.sum() / self.len() as f64
     }
 
-    /// Sum along one axis, which disappears.
+    /// Returns the sum along one axis, which is removed.
+    ///
+    /// Panics if the axis does not exist.
     #[track_caller]
     pub fn sum_axis(&self, axis: usize) -> Self {
         let mut kept = self.shape_without("sum_axis", axis);
@@ -62,42 +64,52 @@ impl<T: Real> Tensor<T> {
         reduced.reshape(&kept)
     }
 
-    /// Mean along one axis, which disappears.
+    /// Returns the mean along one axis, which is removed.
+    ///
+    /// Panics if the axis does not exist.
     #[track_caller]
     pub fn mean_axis(&self, axis: usize) -> Self {
         self.check_axis("mean_axis", axis);
         self.sum_axis(axis) / self.shape()[axis] as f64
     }
 
-    /// The largest element, a scalar. The gradient is shared by all that equal it: a kink.
+    /// Returns the largest element, a scalar. Ties divide the gradient equally; there is a kink at a tie.
+    ///
+    /// Panics if there are no elements.
     #[track_caller]
     pub fn max(&self) -> Self {
         self.extremum(self.shape().iter().map(|_| 1).collect(), true).reshape(&[])
     }
 
-    /// The smallest element, a scalar. The gradient is shared by all that equal it: a kink.
+    /// Returns the smallest element, a scalar. Ties divide the gradient equally; there is a kink at a tie.
+    ///
+    /// Panics if there are no elements.
     #[track_caller]
     pub fn min(&self) -> Self {
         self.extremum(self.shape().iter().map(|_| 1).collect(), false).reshape(&[])
     }
 
-    /// The largest element along one axis, which disappears. The gradient is shared by all that equal it.
+    /// Returns the largest element along one axis, which is removed. Ties divide the gradient equally; there is a kink at a tie.
+    ///
+    /// Panics if the axis does not exist or if there are no elements.
     #[track_caller]
     pub fn max_axis(&self, axis: usize) -> Self {
         let kept = self.shape_without("max_axis", axis);
         self.extremum(with_one(self.shape(), axis), true).reshape(&kept)
     }
 
-    /// The smallest element along one axis, which disappears. The gradient is shared by all that equal it.
+    /// Returns the smallest element along one axis, which is removed. Ties divide the gradient equally; there is a kink at a tie.
+    ///
+    /// Panics if the axis does not exist or if there are no elements.
     #[track_caller]
     pub fn min_axis(&self, axis: usize) -> Self {
         let kept = self.shape_without("min_axis", axis);
         self.extremum(with_one(self.shape(), axis), false).reshape(&kept)
     }
 
-    /// The sum over every dimension in which `shape` is 1 or absent: what undoes a broadcast from `shape` to this tensor's.
+    /// Returns the sum over every dimension that is 1 or absent in `shape`, with the shape `shape`. This is the adjoint of [`Tensor::broadcast_to`].
     ///
-    /// Panics if `shape` does not broadcast to this tensor's.
+    /// Panics if `shape` does not broadcast to the shape of this tensor.
     #[track_caller]
     pub fn sum_to(&self, shape: &[usize]) -> Self {
         let from = self.shape();
@@ -106,7 +118,7 @@ impl<T: Real> Tensor<T> {
         assert!(fits, "sum_to: shape {from:?} cannot be summed to {shape:?}");
         let kept: Vec<bool> =
             (0..from.len()).map(|i| i >= from.len() - shape.len() && shape[i + shape.len() - from.len()] == from[i]).collect();
-        // Runs of dimensions that are kept or summed together become one.
+        // Merges adjacent dimensions that are all kept or all summed.
         let mut dims: Vec<(usize, bool)> = Vec::new();
         for (&n, &kept) in from.iter().zip(&kept) {
             match dims.last_mut() {
@@ -163,7 +175,7 @@ impl<T: Real> Tensor<T> {
 
     #[track_caller]
     pub(crate) fn check_axis(&self, op: &str, axis: usize) {
-        assert!(axis < self.ndim(), "{op}: axis {axis} of a tensor of shape {:?}", self.shape());
+        assert!(axis < self.ndim(), "{op}: axis {axis} is out of range for a tensor of shape {:?}", self.shape());
     }
 
     #[track_caller]
@@ -181,7 +193,7 @@ fn with_one(shape: &[usize], axis: usize) -> Vec<usize> {
     shape
 }
 
-/// `[outer, middle, inner]` to `[outer, inner]`.
+/// Sums `[outer, middle, inner]` over the middle dimension, to `[outer, inner]`.
 fn sum_middle<T: Real>(x: &[T], outer: usize, middle: usize, inner: usize) -> Buffer<T> {
     let mut out = Buffer::stale(outer * inner);
     if inner == 1 && outer < 16 {
@@ -189,7 +201,7 @@ fn sum_middle<T: Real>(x: &[T], outer: usize, middle: usize, inner: usize) -> Bu
             *y = parallel::sum(&x[o * middle..(o + 1) * middle], |v| v);
         }
     } else if outer < 16 {
-        // Few results from many rows: fixed runs of rows in parallel, their sums added in order.
+        // There are few results and many rows: fixed runs of rows are summed in parallel, and the partial sums are added in order.
         let run = (CHUNK / inner.max(1)).max(1);
         for (o, y) in out.chunks_exact_mut(inner.max(1)).enumerate() {
             let block = &x[o * middle * inner..(o + 1) * middle * inner];
@@ -230,7 +242,7 @@ fn sum_blocks<T: Real>(x: &[T], middle: usize, inner: usize, out: &mut [T]) {
 }
 }
 
-/// Four running sums: enough to hide the latency of an addition.
+/// Sums a short slice with four accumulators, which hide the latency of additions.
 #[inline(always)]
 fn sum_short<T: Real>(x: &[T]) -> T {
     let mut lanes = [T::zero(); 4];
@@ -247,7 +259,7 @@ fn sum_short<T: Real>(x: &[T]) -> T {
     sum
 }
 
-/// Adds rows of `width` (compiled in as `W` unless that is 0) into `out`, from zero.
+/// Sets `out` to the sum of rows of `width` elements. `W` is the width, or 0 if the width is known at run time only.
 #[inline(always)]
 fn sum_rows<T: Real, const W: usize>(rows: &[T], width: usize, out: &mut [T]) {
     if W == 0 {

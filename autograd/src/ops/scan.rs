@@ -1,4 +1,4 @@
-//! Running sums along an axis.
+//! Cumulative sums along an axis.
 
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::parallel::{self, dispatched};
@@ -6,8 +6,8 @@ use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// yᵢ = Σ_{j<=i} xⱼ, or j < i if exclusive, or the sums from the other end if reversed.
-/// ∂L/∂x is the running sum of ∂L/∂y from the other end.
+/// yᵢ = Σ_{j<=i} xⱼ, or Σ_{j<i} xⱼ if exclusive; the sum runs over j >= i, or j > i, if reversed.
+/// ∂L/∂x is the cumulative sum of ∂L/∂y in the opposite direction.
 #[derive(Debug, Clone, Copy)]
 struct Cumsum {
     axis: usize,
@@ -27,17 +27,21 @@ impl<T: Real> Op<T> for Cumsum {
 }
 
 impl<T: Real> Tensor<T> {
-    /// yᵢ = Σ_{j<=i} xⱼ along an axis.
+    /// Returns the cumulative sum yᵢ = Σ_{j<=i} xⱼ along an axis.
+    ///
+    /// Panics if the axis does not exist.
     #[track_caller]
     pub fn cumsum(&self, axis: usize) -> Self {
-        assert!(axis < self.ndim(), "cumsum: axis {axis} of a tensor of shape {:?}", self.shape());
+        assert!(axis < self.ndim(), "cumsum: axis {axis} is out of range for a tensor of shape {:?}", self.shape());
         scan(self, Cumsum { axis, exclusive: false, reverse: false })
     }
 
-    /// yᵢ = Σ_{j<i} xⱼ along an axis; the first is 0.
+    /// Returns the exclusive cumulative sum yᵢ = Σ_{j<i} xⱼ along an axis. The first element is 0.
+    ///
+    /// Panics if the axis does not exist.
     #[track_caller]
     pub fn exclusive_cumsum(&self, axis: usize) -> Self {
-        assert!(axis < self.ndim(), "exclusive_cumsum: axis {axis} of a tensor of shape {:?}", self.shape());
+        assert!(axis < self.ndim(), "exclusive_cumsum: axis {axis} is out of range for a tensor of shape {:?}", self.shape());
         scan(self, Cumsum { axis, exclusive: true, reverse: false })
     }
 }
@@ -61,7 +65,7 @@ fn scan<T: Real>(x: &Tensor<T>, op: Cumsum) -> Tensor<T> {
 }
 
 dispatched! {
-/// Lines of `n` numbers. Eight at a time, for a running sum waits for its last addition.
+/// Computes the cumulative sums of lines of `n` numbers. Eight lines are processed together, because each addition of one line depends on the previous one.
 fn scan_lines<T: Real, const EXCLUSIVE: bool, const REVERSE: bool>(x: &[T], n: usize, out: &mut [T]) {
     const LINES: usize = 8;
     let mut groups = out.chunks_exact_mut(LINES * n);
@@ -90,7 +94,7 @@ fn scan_lines<T: Real, const EXCLUSIVE: bool, const REVERSE: bool>(x: &[T], n: u
 }
 }
 
-/// Lines of rows: every column has a running sum of its own.
+/// Computes the cumulative sums of blocks of `middle` rows, separately for each of the `inner` columns.
 fn scan_blocks<T: Real>(x: &[T], middle: usize, inner: usize, op: Cumsum, out: &mut [T]) {
     let width = middle * inner;
     for (out, x) in out.chunks_exact_mut(width).zip(x.chunks_exact(width)) {

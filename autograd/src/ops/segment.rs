@@ -1,4 +1,5 @@
-//! Sums over packed rays: values of all samples in one array, ray `r` owning the rows `offsets[r]..offsets[r + 1]`.
+//! Sums over the segments of a packed array. For packed rays, one array holds the values of all samples, and the segment of ray `r` is the rows
+//! `offsets[r]..offsets[r + 1]`.
 
 use crate::index::Indices;
 use crate::op::{Cotangent, Keep, Op, Vjp};
@@ -24,7 +25,7 @@ impl<T: Real> Op<T> for SegmentSum {
     }
 }
 
-/// Each row of segment r is yᵣ.   ∂L/∂y sums ∂L/∂x over the segment
+/// Each row of segment r of the result x is yᵣ.   ∂L/∂yᵣ = Σ of ∂L/∂x over the rows of segment r
 #[derive(Debug)]
 struct SegmentRepeat {
     offsets: Indices,
@@ -41,7 +42,7 @@ impl<T: Real> Op<T> for SegmentRepeat {
     }
 }
 
-/// yᵢ = Σ of the rows before i in its segment, or after it if reversed.   ∂L/∂x is the same from the other end
+/// yᵢ = Σ of the rows before row i in its segment, or after row i if reversed.   ∂L/∂x is the same sum of ∂L/∂y in the opposite direction
 #[derive(Debug)]
 struct SegmentScan {
     offsets: Indices,
@@ -60,7 +61,10 @@ impl<T: Real> Op<T> for SegmentScan {
 }
 
 impl<T: Real> Tensor<T> {
-    /// `[m, …]` to `[n, …]`: yᵣ = Σ of the rows of segment r; an empty segment gives 0. `offsets` has n + 1 entries, ascending from 0 to m.
+    /// Returns the sum of the rows of each segment. This tensor has shape `[m, …]` and the result `[n, …]`. The sum of an empty segment is 0. `offsets` has
+    /// n + 1 entries, ascending from 0 to m.
+    ///
+    /// Panics if the offsets do not ascend from 0 to m.
     #[track_caller]
     pub fn segment_sum(&self, offsets: &Indices) -> Self {
         let n = segments("segment_sum", offsets, self.first_len("segment_sum"));
@@ -98,10 +102,13 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, &[self], SegmentSum { offsets: offsets.clone() })
     }
 
-    /// `[n, …]` to `[m, …]`: every row of segment r is row r of this. The adjoint of [`Tensor::segment_sum`].
+    /// Repeats each row of this tensor for all rows of its segment: every row of segment r of the result is row r. This tensor has shape `[n, …]` and the
+    /// result `[m, …]`, where m is the last offset. This is the adjoint of [`Tensor::segment_sum`].
+    ///
+    /// Panics if `offsets` does not have n + 1 entries that ascend from 0.
     #[track_caller]
     pub fn segment_repeat(&self, offsets: &Indices) -> Self {
-        let m = *offsets.last().expect("segment_repeat: offsets have at least one entry") as usize;
+        let m = *offsets.last().expect("segment_repeat: the offsets are empty") as usize;
         let n = segments("segment_repeat", offsets, m);
         assert_eq!(n, self.first_len("segment_repeat"), "segment_repeat: {n} segments for a tensor of shape {:?}", self.shape());
         let width: usize = self.shape()[1..].iter().product();
@@ -130,7 +137,10 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, &[self], SegmentRepeat { offsets: offsets.clone() })
     }
 
-    /// `[m, …]` to `[m, …]`: yᵢ = Σ of the rows before i in its own segment; the first of a segment is 0.
+    /// Returns the exclusive cumulative sum within each segment: yᵢ = Σ of the rows before row i in its segment. The first row of each segment is 0. This
+    /// tensor and the result have shape `[m, …]`.
+    ///
+    /// Panics if the offsets do not ascend from 0 to m.
     #[track_caller]
     pub fn segment_exclusive_sum(&self, offsets: &Indices) -> Self {
         segments("segment_exclusive_sum", offsets, self.first_len("segment_exclusive_sum"));
@@ -178,7 +188,9 @@ fn scan<T: Real>(x: &Tensor<T>, offsets: &Indices, reverse: bool) -> Tensor<T> {
     Tensor::from_op(out, x.shape(), &[x], SegmentScan { offsets: offsets.clone(), reverse })
 }
 
-/// The number of segments. Panics, naming the op, if the offsets do not ascend from 0 to `rows`.
+/// Returns the number of segments.
+///
+/// Panics with the name of the op if the offsets do not ascend from 0 to `rows`.
 #[track_caller]
 fn segments(op: &str, offsets: &Indices, rows: usize) -> usize {
     let fits = offsets.first() == Some(&0) && offsets.last().is_some_and(|&m| m as usize == rows) && offsets.is_sorted();
@@ -186,7 +198,8 @@ fn segments(op: &str, offsets: &Indices, rows: usize) -> usize {
     offsets.len() - 1
 }
 
-/// Calls `f(first_segment, its_part_of_out)` for runs of 256 segments, in parallel; `length(r)` is what segment r owns of `out`.
+/// Calls `f(first_segment, part)` for runs of 256 segments, in parallel. `part` is the part of `out` that belongs to the run; segment r has `length(r)`
+/// elements of `out`.
 fn for_each_segments<T: Real>(
     offsets: &Indices,
     out: &mut [T],

@@ -1,11 +1,11 @@
-//! Comparisons and choices. A mask is a constant tensor of ones and zeros.
+//! Comparisons and selection by masks. A mask is a constant tensor of ones and zeros.
 
 use super::arithmetic::{binary, broadcast_shape};
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// A comparison: constant, so its rule is never run.
+/// A comparison. Its inputs are detached, so it is never recorded and its rule never runs.
 #[derive(Debug)]
 struct Compare;
 impl<T: Real> Op<T> for Compare {
@@ -20,7 +20,7 @@ impl<T: Real> Op<T> for Compare {
     }
 }
 
-/// z = mask · x, and 0 where the mask is 0 even if x is not finite there.
+/// z = x where the mask is not 0, else 0, even if x is infinite or NaN there.   ∂L/∂x = ∂L/∂z, masked in the same way
 #[derive(Debug)]
 struct Masked<T: Real> {
     mask: Tensor<T>,
@@ -38,25 +38,33 @@ impl<T: Real> Op<T> for Masked<T> {
 }
 
 impl<T: Real> Tensor<T> {
-    /// 1 where x >= y and 0 elsewhere, with broadcasting: a constant.
+    /// Returns a constant mask with broadcasting: 1 where x >= y, else 0.
+    ///
+    /// Panics if the shapes do not broadcast.
     #[track_caller]
     pub fn greater_equal(&self, other: &Self) -> Self {
         compare("greater_equal", self, other, |x, y| x >= y)
     }
 
-    /// 1 where x > y and 0 elsewhere, with broadcasting: a constant.
+    /// Returns a constant mask with broadcasting: 1 where x > y, else 0.
+    ///
+    /// Panics if the shapes do not broadcast.
     #[track_caller]
     pub fn greater(&self, other: &Self) -> Self {
         compare("greater", self, other, |x, y| x > y)
     }
 
-    /// 1 where x = y and 0 elsewhere, with broadcasting: a constant.
+    /// Returns a constant mask with broadcasting: 1 where x = y, else 0.
+    ///
+    /// Panics if the shapes do not broadcast.
     #[track_caller]
     pub fn equal(&self, other: &Self) -> Self {
         compare("equal", self, other, |x, y| x == y)
     }
 
-    /// x where the mask is not 0, and 0 elsewhere, even where x is infinite or NaN. The mask broadcasts to x.
+    /// Returns x where the mask is not 0, and 0 elsewhere, even if x is infinite or NaN there.
+    ///
+    /// Panics if the mask does not broadcast to the shape of x.
     #[track_caller]
     pub fn masked(&self, mask: &Self) -> Self {
         assert_eq!(
@@ -71,7 +79,9 @@ impl<T: Real> Tensor<T> {
         value.recorded(&[self], keep, || crate::graph::Rule::Op(Box::new(Masked { mask: mask.detach() })))
     }
 
-    /// x where the mask is not 0, y elsewhere. Neither's infinities leak into the other's places, in value or gradient.
+    /// Returns x where the mask is not 0, and y elsewhere. An infinite or NaN value that is not selected affects neither the result nor the gradient.
+    ///
+    /// Panics if the shapes do not fit.
     #[track_caller]
     pub fn where_(mask: &Self, x: &Self, y: &Self) -> Self {
         let otherwise = mask.constant_map(|m| if m != T::zero() { T::zero() } else { T::one() });

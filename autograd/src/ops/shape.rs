@@ -1,4 +1,4 @@
-//! Changes of shape.
+//! Ops that change the shape or the arrangement of a tensor.
 
 use super::arithmetic::{broadcast_shape, broadcast_strides};
 use crate::op::{Cotangent, Keep, Op, Vjp};
@@ -8,7 +8,7 @@ use crate::real::Real;
 use crate::tensor::Tensor;
 use ndarray::{Dimension, IxDyn};
 
-/// The same values in another shape.   ∂L/∂x = ∂L/∂y in the old shape
+/// y = x with another shape.   ∂L/∂x = ∂L/∂y with the shape of x
 #[derive(Debug)]
 struct Reshape {
     from: Vec<usize>,
@@ -25,7 +25,7 @@ impl<T: Real> Op<T> for Reshape {
     }
 }
 
-/// Values repeated along new or unit dimensions.   ∂L/∂x = ∂L/∂y, summed over the repetitions (by the engine)
+/// y = x repeated along new dimensions and dimensions of size 1.   ∂L/∂x = ∂L/∂y, which the engine sums over the repetitions
 #[derive(Debug)]
 struct Broadcast;
 impl<T: Real> Op<T> for Broadcast {
@@ -40,7 +40,7 @@ impl<T: Real> Op<T> for Broadcast {
     }
 }
 
-/// y = x with dimensions in the order `axes`.   ∂L/∂x = ∂L/∂y in the inverse order
+/// y = x with dimensions in the order `axes`.   ∂L/∂x = ∂L/∂y with dimensions in the inverse order
 #[derive(Debug)]
 struct Permute {
     axes: Vec<usize>,
@@ -61,7 +61,7 @@ impl<T: Real> Op<T> for Permute {
     }
 }
 
-/// y = x[…, start..start+len, …].   ∂L/∂x = ∂L/∂y between zeros
+/// y = x[…, start..start+len, …].   ∂L/∂x = ∂L/∂y, padded with zeros
 #[derive(Debug)]
 struct Narrow {
     axis: usize,
@@ -79,7 +79,7 @@ impl<T: Real> Op<T> for Narrow {
     }
 }
 
-/// The adjoint of [`Narrow`].
+/// y = x, padded with zeros along an axis: the adjoint of [`Narrow`].   ∂L/∂x = ∂L/∂y[…, start..start+len, …]
 #[derive(Debug)]
 struct Pad {
     axis: usize,
@@ -98,7 +98,7 @@ impl<T: Real> Op<T> for Pad {
     }
 }
 
-/// Tensors one after another along an axis.   Each gets its part of the cotangent.
+/// y = the inputs concatenated along an axis.   The cotangent of each input is its part of ∂L/∂y.
 #[derive(Debug)]
 struct Concat {
     axis: usize,
@@ -124,13 +124,15 @@ impl<T: Real> Op<T> for Concat {
 }
 
 impl<T: Real> Tensor<T> {
-    /// The same values in another shape of as many elements; nothing is copied.
+    /// Returns the same values with another shape. The buffer is shared, not copied.
+    ///
+    /// Panics if the number of elements differs.
     #[track_caller]
     pub fn reshape(&self, shape: &[usize]) -> Self {
         assert_eq!(
             shape.iter().product::<usize>(),
             self.len(),
-            "reshape: {:?} has {} elements, {shape:?} another number",
+            "reshape: a tensor of shape {:?} has {} elements, which do not fill the shape {shape:?}",
             self.shape(),
             self.len()
         );
@@ -142,16 +144,20 @@ impl<T: Real> Tensor<T> {
         value.recorded(&[self], Keep::NOTHING, || crate::graph::Rule::Op(Box::new(Reshape { from })))
     }
 
-    /// The same tensor with a dimension of size 1 inserted before `axis`.
+    /// Inserts a dimension of size 1 before `axis`.
+    ///
+    /// Panics if `axis` is larger than the number of dimensions.
     #[track_caller]
     pub fn unsqueeze(&self, axis: usize) -> Self {
-        assert!(axis <= self.ndim(), "unsqueeze: axis {axis} of a tensor of shape {:?}", self.shape());
+        assert!(axis <= self.ndim(), "unsqueeze: axis {axis} is out of range for a tensor of shape {:?}", self.shape());
         let mut shape = self.shape().to_vec();
         shape.insert(axis, 1);
         self.reshape(&shape)
     }
 
-    /// Values repeated to a larger shape by NumPy's rule.
+    /// Repeats the values to a larger shape, by the broadcasting rule of NumPy.
+    ///
+    /// Panics if this tensor does not broadcast to `shape`.
     #[track_caller]
     pub fn broadcast_to(&self, shape: &[usize]) -> Self {
         assert_eq!(
@@ -169,12 +175,14 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, shape, &[self], Broadcast)
     }
 
-    /// Dimensions in another order: dimension `i` of the result is dimension `axes[i]` of this.
+    /// Reorders the dimensions: dimension `i` of the result is dimension `axes[i]` of this tensor.
+    ///
+    /// Panics if `axes` is not a permutation of the dimensions.
     #[track_caller]
     pub fn permute(&self, axes: &[usize]) -> Self {
         let mut sorted = axes.to_vec();
         sorted.sort_unstable();
-        assert!(sorted.into_iter().eq(0..self.ndim()), "permute: {axes:?} is no order of the dimensions of {:?}", self.shape());
+        assert!(sorted.into_iter().eq(0..self.ndim()), "permute: {axes:?} is not a permutation of the dimensions of {:?}", self.shape());
         let mut strides = vec![1; self.ndim()];
         for i in (0..self.ndim().saturating_sub(1)).rev() {
             strides[i] = strides[i + 1] * self.shape()[i + 1];
@@ -186,22 +194,26 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, &[self], Permute { axes: axes.to_vec() })
     }
 
-    /// The last two dimensions exchanged.
+    /// Exchanges the last two dimensions.
+    ///
+    /// Panics if there are fewer than two dimensions.
     #[track_caller]
     pub fn transpose(&self) -> Self {
         let n = self.ndim();
-        assert!(n >= 2, "transpose: shape {:?} has no two dimensions", self.shape());
+        assert!(n >= 2, "transpose: shape {:?} has fewer than two dimensions", self.shape());
         let mut axes: Vec<usize> = (0..n).collect();
         axes.swap(n - 2, n - 1);
         self.permute(&axes)
     }
 
-    /// `len` entries of one axis from `start` on.
+    /// Returns the entries `start..start + len` of one axis.
+    ///
+    /// Panics if the axis does not exist or the range exceeds it.
     #[track_caller]
     pub fn narrow(&self, axis: usize, start: usize, len: usize) -> Self {
         assert!(
             axis < self.ndim() && start + len <= self.shape()[axis],
-            "narrow: {start}..{} of axis {axis} of a tensor of shape {:?}",
+            "narrow: the range {start}..{} of axis {axis} is out of range for a tensor of shape {:?}",
             start + len,
             self.shape()
         );
@@ -215,20 +227,24 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, &[self], Narrow { axis, start })
     }
 
-    /// One entry of an axis, which disappears.
+    /// Returns entry `at` of an axis, which is removed.
+    ///
+    /// Panics if the axis or the entry does not exist.
     #[track_caller]
     pub fn index_axis(&self, axis: usize, at: usize) -> Self {
         let shape = self.shape_without("index_axis", axis);
-        assert!(at < self.shape()[axis], "index_axis: entry {at} of axis {axis} of a tensor of shape {:?}", self.shape());
+        assert!(at < self.shape()[axis], "index_axis: index {at} of axis {axis} is out of range for a tensor of shape {:?}", self.shape());
         self.narrow(axis, at, 1).reshape(&shape)
     }
 
-    /// Zeros of length `total` along an axis, with this tensor from `start` on: the adjoint of [`Tensor::narrow`].
+    /// Pads an axis with zeros to the length `total`; this tensor begins at entry `start` of the result. This is the adjoint of [`Tensor::narrow`].
+    ///
+    /// Panics if the axis does not exist or if this tensor does not fit.
     #[track_caller]
     pub fn pad(&self, axis: usize, start: usize, total: usize) -> Self {
         self.check_axis("pad", axis);
         let len = self.shape()[axis];
-        assert!(start + len <= total, "pad: axis {axis} of a tensor of shape {:?} from {start} on does not fit into {total}", self.shape());
+        assert!(start + len <= total, "pad: axis {axis} of a tensor of shape {:?} does not fit into {start}..{total}", self.shape());
         let mut shape = self.shape().to_vec();
         shape[axis] = total;
         let inner: usize = shape[axis + 1..].iter().product();
@@ -245,15 +261,17 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, &[self], Pad { axis, start, len })
     }
 
-    /// Tensors one after another along an existing axis. Panics if the other dimensions differ.
+    /// Concatenates tensors along an existing axis.
+    ///
+    /// Panics if there are no tensors, if the axis does not exist, or if the other dimensions differ.
     #[track_caller]
     pub fn concat(parts: &[&Tensor<T>], axis: usize) -> Self {
         assert!(!parts.is_empty(), "concat: no tensors");
         let mut shape = parts[0].shape().to_vec();
-        assert!(axis < shape.len(), "concat: axis {axis} of tensors of shape {shape:?}");
+        assert!(axis < shape.len(), "concat: axis {axis} is out of range for tensors of shape {shape:?}");
         for part in parts {
             let same = part.ndim() == shape.len() && (0..shape.len()).all(|i| i == axis || part.shape()[i] == shape[i]);
-            assert!(same, "concat: shapes {:?} and {:?} differ beside axis {axis}", parts[0].shape(), part.shape());
+            assert!(same, "concat: shapes {:?} and {:?} differ outside axis {axis}", parts[0].shape(), part.shape());
         }
         shape[axis] = parts.iter().map(|p| p.shape()[axis]).sum();
         let inner: usize = shape[axis + 1..].iter().product();
@@ -272,7 +290,9 @@ impl<T: Real> Tensor<T> {
         Tensor::from_op(out, &shape, parts, Concat { axis })
     }
 
-    /// Tensors of one shape along a new axis. Panics if the shapes differ.
+    /// Stacks tensors of the same shape along a new axis.
+    ///
+    /// Panics if there are no tensors, if the shapes differ, or if `axis` is larger than their number of dimensions.
     #[track_caller]
     pub fn stack(parts: &[&Tensor<T>], axis: usize) -> Self {
         for part in parts {
@@ -287,13 +307,13 @@ fn copy_rows<'a, T: Real>(out: &mut [T], width: usize, row: impl Fn(usize) -> &'
     parallel::for_each_rows(out, width, |first, chunk| {
         for (r, target) in chunk.chunks_exact_mut(width.max(1)).enumerate() {
             let source = row(first + r);
-            // A short copy inline is faster than a call of memcpy.
+            // For short rows, an inline loop is faster than a call to memcpy.
             if width <= 4 { target.iter_mut().zip(source).for_each(|(t, &s)| *t = s) } else { target.copy_from_slice(source) }
         }
     });
 }
 
-/// out = x read with the given strides (0 repeats), in the order of `shape`.
+/// Copies `x`, read with the given strides in the order of `shape`, to `out`. A stride of 0 repeats values.
 fn copy_strided<T: Real>(x: &[T], strides: &[usize], shape: &[usize], out: &mut [T]) {
     let Some((&cols, outer)) = shape.split_last() else {
         out.copy_from_slice(&x[..out.len()]);

@@ -1,8 +1,8 @@
-//! Values between the nodes of a grid whose rows are stored in a table.
+//! Trilinear and nearest-neighbour interpolation of a grid whose node values are rows of a table.
 //!
-//! A [`Lattice`] says which row belongs to which node: row-major order, for which `[nx, ny, nz]` is enough, or bricks with nodes that may be
-//! missing and then read as zeros. Positions are in cells, nodes at the integers; a position outside is clamped to the box of the nodes,
-//! where the gradient with respect to it is 0.
+//! A [`Lattice`] maps nodes to rows: in row-major order, which `[nx, ny, nz]` converts to, or in bricks, where nodes may be missing. A missing node reads as
+//! zeros. Positions are in units of cells, and the nodes are at integer positions. A position outside the grid is clamped to the box of the nodes; the
+//! gradient with respect to a clamped coordinate is 0.
 
 use crate::index::Indices;
 use crate::lattice::{Lattice, NodeMap, TOGETHER, with_map};
@@ -12,15 +12,15 @@ use crate::pool::Buffer;
 use crate::real::Real;
 use crate::tensor::Tensor;
 
-/// The eight rows around a position and what each of them weighs; the last index of a corner runs fastest. A corner that is not present
-/// weighs nothing and stands in a row that another one has, so that it is not touched for its own sake.
+/// Returns the rows and the interpolation weights of the eight corners of the cell that contains a position. In the order of the corners, the last axis
+/// runs fastest. A corner that is not present has weight 0 and the row of a corner that is present, so it does not add a row to the gradient.
 #[inline(always)]
 pub fn corners<T: Real>(position: [T; 3], map: impl NodeMap) -> ([u32; 8], [T; 8]) {
     let (rows, weights, _) = corners_present(position, map);
     (rows, weights)
 }
 
-/// The same, and a bit for each corner that is present.
+/// Returns the rows and weights of [`corners`], and a mask with a bit for each corner that is present.
 #[inline(always)]
 fn corners_present<T: Real, M: NodeMap>(position: [T; 3], map: M) -> ([u32; 8], [T; 8], u32) {
     let mut shares = [[0; 2]; 3];
@@ -29,12 +29,13 @@ fn corners_present<T: Real, M: NodeMap>(position: [T; 3], map: M) -> ([u32; 8], 
         let (low, high, fraction, _) = axis_cell(position[a], map.nodes()[a]);
         (shares[a], f[a]) = ([map.share(a, low), map.share(a, high)], fraction);
     }
-    join(shares, f, map)
+    combine_axes(shares, f, map)
 }
 
-/// Corners from what the lower and the upper node of each axis add to a node's number, and the fractions between them.
+/// Computes the corners of a cell from the contributions of its lower and upper node along each axis to the node code ([`NodeMap::share`]), and from the
+/// fractional position `f` along each axis.
 #[inline(always)]
-fn join<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32; 8], [T; 8], u32) {
+fn combine_axes<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32; 8], [T; 8], u32) {
     let one = T::one();
     let w = [[one - f[0], f[0]], [one - f[1], f[1]], [one - f[2], f[2]]];
     let axes = |c: usize| [c >> 2, c >> 1 & 1, c & 1];
@@ -47,10 +48,11 @@ fn join<T: Real, M: NodeMap>(shares: [[u32; 2]; 3], f: [T; 3], map: M) -> ([u32;
     (rows, weights, present)
 }
 
-/// Eight corners, each of them present.
+/// The mask of eight corners that are all present.
 const ALL: u32 = 0xff;
 
-/// The rows of the eight corners of a cell with these numbers, and a bit for each that is present; the others stand in the row of one that is.
+/// Returns the rows of the eight corners with the given node codes, and a mask with a bit for each corner that is present. The other corners get the row of
+/// a corner that is present, or row 0 if there is none.
 #[inline(always)]
 fn rows_of<M: NodeMap>(codes: [u32; 8], map: M) -> ([u32; 8], u32) {
     let mut rows = [0; 8];
@@ -72,15 +74,17 @@ fn rows_of<M: NodeMap>(codes: [u32; 8], map: M) -> ([u32; 8], u32) {
 }
 
 dispatched! {
-/// The corners of many positions, given axis by axis: `rows[g][c][i]` is the row of corner c of position [`TOGETHER`] g + i, `weights` likewise;
-/// beyond the last position they have no meaning. Panics if a group begins beyond it.
+/// Computes the corners of many positions in groups of [`TOGETHER`]. `at` has one slice of coordinates for each axis. `rows[g][c][i]` is the row of corner c
+/// of position [`TOGETHER`] · g + i, and `weights[g][c][i]` its weight. Entries beyond the last position are unspecified.
+///
+/// Panics if a group begins beyond the last position.
 pub fn corners_of_many<T: Real, M: NodeMap>(
     at: [&[T]; 3],
     map: M,
     rows: &mut [[[u32; TOGETHER]; 8]],
     weights: &mut [[[T; TOGETHER]; 8]],
 ) {
-    // What is arithmetic is done in vectors, before the look-ups in the layout.
+    // The arithmetic of a whole group is vectorised; it precedes the lookups in the layout.
     let mut shares = [[[0u32; TOGETHER]; 2]; 3];
     let mut fractions = [[[T::zero(); TOGETHER]; 2]; 3];
     for (group, (rows, weights)) in rows.iter_mut().zip(weights).enumerate() {
@@ -128,13 +132,14 @@ pub fn corners_of_many<T: Real, M: NodeMap>(
 }
 }
 
-/// The node nearest to a position, halves rounded up.
+/// Returns the node nearest to a position; halves are rounded up.
 #[inline(always)]
 pub fn nearest_node<T: Real>(position: [T; 3], nodes: [usize; 3]) -> [u32; 3] {
     std::array::from_fn(|a| (position[a] + T::lit(0.5)).max(T::zero()).min(T::lit((nodes[a] - 1) as f64)).index())
 }
 
-/// Lower node, upper node, fraction between them, and whether the position lies inside (so that it has a gradient).
+/// Returns, for one axis, the lower node, the upper node, the fractional position between them, and whether the position is inside the grid. Only a position
+/// inside has a gradient.
 #[inline(always)]
 fn axis_cell<T: Real>(u: T, n: usize) -> (u32, u32, T, bool) {
     let last = T::lit((n - 1) as f64);
@@ -144,9 +149,9 @@ fn axis_cell<T: Real>(u: T, n: usize) -> (u32, u32, T, bool) {
     (low, (low + 1).min(n as u32 - 1), u - T::lit(f64::from(low)), inside)
 }
 
-/// yₚ = Σ over the eight corners c of wc(uₚ) · table[rowc(uₚ)]
+/// Trilinear interpolation at the positions uₚ: yₚ = Σc wc(uₚ) · table[rowc(uₚ)], over the eight corners c of the cell.
 ///
-/// ∂L/∂table[row] = Σ w ∂L/∂y, as rows;  ∂L/∂uₚ = Σc (∂L/∂yₚ · table[rowc]) ∂wc/∂u.
+/// ∂L/∂table is row-sparse: wc ∂L/∂yₚ is added to row rowc, for each p and c.  ∂L/∂uₚ = Σc (∂L/∂yₚ · table[rowc]) ∂wc/∂u.
 #[derive(Debug)]
 struct Trilinear {
     lattice: Lattice,
@@ -160,7 +165,7 @@ impl<T: Real> Kernel<T> for Trilinear {
     fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
         let [table, positions] = inputs else { unreachable!("trilinear has two inputs") };
         let (m, nodes) = (positions.shape()[0], self.lattice.nodes());
-        // Fractions and their complements per axis, as columns; the cell itself is constant.
+        // The fractions and their complements for each axis, as columns. The index of the cell is a constant.
         let column = |a: usize| {
             let last = (nodes[a] - 1) as f64;
             let u = positions.narrow(1, a, 1).clamp(0.0, last);
@@ -206,7 +211,7 @@ impl<T: Real> Kernel<T> for Trilinear {
     }
 }
 
-/// Σc dotc ∂wc/∂u
+/// Returns Σc dotc ∂wc/∂u, the gradient with respect to the position.
 fn slope_of<T: Real>(dots: [T; 8], position: [T; 3], nodes: [usize; 3]) -> [T; 3] {
     let one = T::one();
     let mut slope = [T::zero(); 3];
@@ -227,14 +232,17 @@ fn slope_of<T: Real>(dots: [T; 8], position: [T; 3], nodes: [usize; 3]) -> [T; 3
     slope
 }
 
+/// Returns the rows of a tensor `[m, 3]` as points.
 fn points<T: Real>(positions: &Tensor<T>) -> &[[T; 3]] {
     positions.data().as_chunks::<3>().0
 }
 
 impl<T: Real> Tensor<T> {
-    /// Trilinear interpolation of this table `[rows, C]` at `positions` `[m, 3]`, in cells with nodes at the integers: `[m, C]`. The layout of
-    /// the table is a [`Lattice`], or `[nx, ny, nz]` for row-major order.
-    /// Differentiable in the table (the gradient is row-sparse) and in the positions, where the slope jumps between cells.
+    /// Interpolates this table `[rows, C]` trilinearly at `positions` `[m, 3]`; the result is `[m, C]`. Positions are in units of cells, with the nodes at
+    /// the integers. The layout of the table is a [`Lattice`], or `[nx, ny, nz]` for row-major order.
+    ///
+    /// Differentiable with respect to the table, with a row-sparse gradient, and with respect to the positions. The derivative with respect to a position is
+    /// discontinuous between cells.
     ///
     /// Panics if the table does not have the rows of the layout or the positions are not `[m, 3]`.
     #[track_caller]
@@ -251,7 +259,7 @@ impl<T: Real> Tensor<T> {
                 1 => interpolate::<T, 1, _>(table, cells, map, width, chunk),
                 3 => interpolate::<T, 3, _>(table, cells, map, width, chunk),
                 27 => interpolate::<T, 27, _>(table, cells, map, width, chunk),
-                // Of `benches/ops.rs`.
+                // The width that `benches/ops.rs` measures.
                 28 => interpolate::<T, 28, _>(table, cells, map, width, chunk),
                 _ => interpolate::<T, 0, _>(table, cells, map, width, chunk),
             }
@@ -259,10 +267,10 @@ impl<T: Real> Tensor<T> {
         Tensor::from_kernel(out, &[cells.len(), width], &[self, positions], Trilinear { lattice })
     }
 
-    /// The row of this table `[rows, C]` whose node is nearest to each of `positions` `[m, 3]`: `[m, C]`; zeros where that node is not present.
-    /// The gradient is row-sparse; there is none with respect to the positions.
+    /// Returns the row of this table `[rows, C]` at the node nearest to each of `positions` `[m, 3]`; the result is `[m, C]`. It is zero where the nearest
+    /// node is not present. The gradient of the table is row-sparse. There is no gradient with respect to the positions.
     ///
-    /// Panics as [`Tensor::trilinear`] does.
+    /// Panics under the same conditions as [`Tensor::trilinear`].
     #[track_caller]
     pub fn nearest(&self, positions: &Self, lattice: impl Into<Lattice>) -> Self {
         let lattice = lattice.into();
@@ -287,7 +295,7 @@ impl<T: Real> Tensor<T> {
         let rows = lattice.rows();
         assert!(
             self.ndim() == 2 && self.shape()[0] == rows && rows > 0,
-            "{op}: a grid of {:?} nodes needs a table of [{rows}, C] rows, got {:?}",
+            "{op}: a grid of {:?} nodes needs a table of shape [{rows}, C], got {:?}",
             lattice.nodes(),
             self.shape()
         );
@@ -296,7 +304,7 @@ impl<T: Real> Tensor<T> {
 }
 
 dispatched! {
-/// `W` is the width, or 0 for one only known at run time.
+/// Interpolates at each position. `W` is the width, or 0 if the width is known at run time only.
 fn interpolate<T: Real, const W: usize, M: NodeMap>(table: &[T], cells: &[[T; 3]], map: M, width: usize, out: &mut [T]) {
     let width = if W == 0 { width } else { W };
     for (y, &cell) in out.chunks_exact_mut(width).zip(cells) {
@@ -330,7 +338,7 @@ mod tests {
     fn corners_of_many_are_those_of_each() {
         let nodes = [9, 14, 7];
         let holed = Lattice::bricks_where(nodes, |[i, j, k]| (i * 7 + j * 5 + k * 3) % 11 > 2 && (i / 4 + j / 4 + k / 4) % 2 == 0);
-        // Inside, on nodes, on the border and beyond it; not a whole number of groups.
+        // Positions inside cells, on nodes, on the border and outside the grid. Their number is not a multiple of the group size.
         let at: Vec<[f64; 3]> = (0..999).map(|i| std::array::from_fn(|a| f64::from((i * [7, 11, 13][a]) % 160) * 0.125 - 2.0)).collect();
         let columns: [Vec<f64>; 3] = std::array::from_fn(|a| at.iter().map(|p| p[a]).collect());
         for lattice in [Lattice::from(nodes), Lattice::bricks(nodes), holed] {

@@ -1,27 +1,28 @@
-//! Adam, in the two algorithms that row gradients make of it.
+//! [`Adam`], with two treatments of row-sparse gradients.
 
 use super::Rates;
 use super::elementwise::{Elementwise, Rule};
 use crate::real::Real;
 
-/// What happens to rows that a row gradient does not mention. These are different algorithms with different results.
+/// The treatment of rows that a row-sparse gradient does not contain. The two modes are different algorithms and give different results.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum AdamMode {
-    /// They and their moments wait: cheap, and a row learns at the same pace however rarely it is seen (TensorFlow's `LazyAdam`,
-    /// PyTorch's `SparseAdam`).
+    /// Lazy mode: neither the values nor the moments of these rows change. A step visits only the touched rows, and the step size of a row does not depend
+    /// on how rarely it is touched (TensorFlow's `LazyAdam`, PyTorch's `SparseAdam`).
     Lazy,
-    /// They have a gradient of zero: their moments decay and they keep moving by what is left. Adam as published, at the price of
-    /// visiting the whole table in every step.
+    /// Dense mode: these rows have a gradient of zero, so their moments decay and the values still change by the remaining momentum. This is Adam as
+    /// published, but every step visits the whole table.
     Dense,
 }
 
-/// m ← β₁ m + (1 − β₁) g;  v ← β₂ v + (1 − β₂) g²;  θ ← θ − lr · m̂ / (√v̂ + ε),  m̂ = m / (1 − β₁ᵏ), v̂ = v / (1 − β₂ᵏ) (Kingma & Ba 2015).
+/// Adam: m ← β₁ m + (1 − β₁) g;  v ← β₂ v + (1 − β₂) g²;  θ ← θ − lr · m̂ / (√v̂ + ε),  m̂ = m / (1 − β₁ᵏ), v̂ = v / (1 − β₂ᵏ) (Kingma & Ba 2015).
 ///
-/// k is the number of updates the parameter has had since it got its identity, this one included. It is counted for the parameter and not
-/// for each row, in both modes: with [`AdamMode::Lazy`] a row touched for the first time after many steps has moments near zero and no
-/// correction left, so its first step is lr (1 − β₁) / √(1 − β₂), with the defaults lr as at the start. With β₂ = 0.999 it would be 3.2 lr.
+/// k is the number of updates of the parameter since it got its identity, including the current one. In both modes it is counted for the whole parameter
+/// and not for each row. With [`AdamMode::Lazy`], a row that is touched for the first time after many steps starts from zero moments, but the bias
+/// correction has already vanished. Its first step is then lr (1 − β₁) / √(1 − β₂): lr with the defaults, as in the first step of training, but 3.2 lr with
+/// β₂ = 0.999.
 ///
-/// A parameter that has no gradient at all in a step is left alone in both modes.
+/// In both modes a parameter does not change in a step in which it has no gradient.
 #[derive(Debug)]
 pub struct Adam<T: Real>(pub(super) Elementwise<AdamRule, T, 3>);
 
@@ -34,18 +35,18 @@ pub(super) struct AdamRule {
 }
 
 impl<T: Real> Adam<T> {
-    /// With these learning rates, β₁ = 0.9, β₂ = 0.99 (Instant-NGP's; the paper has 0.999) and ε = 1e-8.
+    /// Creates an optimizer with the given learning rates, β₁ = 0.9, β₂ = 0.99 (the value of Instant-NGP; the Adam paper has 0.999) and ε = 1e-8.
     pub fn new(rates: impl Into<Rates>, mode: AdamMode) -> Self {
         Adam(Elementwise::new(AdamRule { mode, beta1: 0.9, beta2: 0.99, epsilon: 1e-8 }, rates))
     }
 
-    /// Other shares of the moments that stay in each step.
+    /// Sets the decay rates β₁ and β₂ of the moments.
     pub fn betas(mut self, beta1: f64, beta2: f64) -> Self {
         (self.0.rule.beta1, self.0.rule.beta2) = (beta1, beta2);
         self
     }
 
-    /// Another ε.
+    /// Sets ε.
     pub fn epsilon(mut self, epsilon: f64) -> Self {
         self.0.rule.epsilon = epsilon;
         self

@@ -1,4 +1,4 @@
-//! What optimizers that treat every element alike have in common: memory, rates, and the walk over the parameters.
+//! The common part of elementwise optimizers: state, learning rates, and the loop over the parameters.
 
 use super::{Optimizer, Rates, Remembered};
 use crate::gradients::{Grad, Gradients};
@@ -8,19 +8,19 @@ use crate::pool::Buffer;
 use crate::real::Real;
 use std::collections::HashMap;
 
-/// How one element changes: `N` numbers, the value θ first and then what is remembered of it.
+/// The update rule of one element, which has `N` numbers: the value θ and then its `N` − 1 state values.
 pub(super) trait Rule<T: Real, const N: usize>: Send {
-    /// The function from `[θ, …]` and g to the new `[θ, …]`, for a parameter that has this learning rate. `updates` counts its updates, this one
-    /// included.
+    /// Returns the function from `[θ, …]` and the gradient g to the new `[θ, …]`, for a parameter with the given learning rate. `updates` is the number of
+    /// updates of the parameter, including the current one.
     fn at(&self, rate: f64, updates: u64) -> impl Fn([T; N], T) -> [T; N] + Sync;
 
-    /// True if rows that a row gradient does not mention are updated too, with a gradient of 0.
+    /// Returns true if rows that a row-sparse gradient does not contain are also updated, with a gradient of 0.
     fn visits_all_rows(&self) -> bool {
         false
     }
 }
 
-/// The optimizer of a [`Rule`] that remembers `N` − 1 numbers of each element.
+/// An optimizer that applies a [`Rule`] and keeps `N` − 1 state values for each element.
 #[derive(Debug)]
 pub(super) struct Elementwise<R, T: Real, const N: usize> {
     pub(super) rule: R,
@@ -55,8 +55,8 @@ impl<R: Rule<T, N>, T: Real, const N: usize> Optimizer<T> for Elementwise<R, T, 
     }
 }
 
-/// Replaces the elements of a parameter that have a gradient, and what is remembered of them in `state`, by `rule([θ, …], g)`, θ then brought
-/// back to its bounds. Rows that a row gradient does not mention stay, or have a gradient of 0 if it is `all_rows`.
+/// Replaces the elements of a parameter that have a gradient, and their values in `state`, by `rule([θ, …], g)`, and clamps θ to the bounds of the
+/// parameter. Rows that a row-sparse gradient does not contain are unchanged, or have a gradient of 0 if `all_rows` is true.
 pub(super) fn update<T: Real, const N: usize>(
     param: &mut Param<T>,
     state: &mut [Buffer<T>],
@@ -65,7 +65,8 @@ pub(super) fn update<T: Real, const N: usize>(
     rule: impl Fn([T; N], T) -> [T; N] + Sync,
 ) {
     let bounds = param.bounds();
-    // By value: behind a reference of its own, a rate could change with each number that is written, and no loop would be vectorised.
+    // The closure captures by value. If it captured references, the compiler would have to assume that a store to a table may change the learning rate,
+    // and could not vectorise the loop.
     let bounded = move |x: [T; N], g: T| {
         let mut new = rule(x, g);
         new[0] = bounds.nearest(new[0]);
@@ -73,28 +74,34 @@ pub(super) fn update<T: Real, const N: usize>(
     };
     param.update(|theta| {
         let mut tables = std::iter::once(theta).chain(state.iter_mut().map(|array| &mut array[..]));
-        let tables = std::array::from_fn(|_| tables.next().expect("N - 1 numbers are remembered of each element"));
+        let tables = std::array::from_fn(|_| tables.next().expect("N - 1 state arrays"));
         parallel::update(tables, grad, all_rows, bounded);
     });
 }
 
-/// What an optimizer remembers of each parameter: some numbers for each element, and how many updates it had.
+/// The optimizer state of all parameters.
 #[derive(Debug)]
 pub(super) struct Memory<T: Real> {
-    pub(super) by_id: HashMap<u64, Slot<T>>,
+    /// State of each parameter, by the identity of the parameter.
+    pub(super) by_id: HashMap<u64, ParamState<T>>,
+    /// Number of steps of this optimizer so far.
     round: u64,
 }
 
+/// The optimizer state of one parameter.
 #[derive(Debug)]
-pub(super) struct Slot<T: Real> {
+pub(super) struct ParamState<T: Real> {
+    /// State arrays of the length of the parameter, or `None` before its first gradient.
     state: Option<Vec<Buffer<T>>>,
+    /// Number of updates of the parameter.
     updates: u64,
+    /// Last round in which the module contained the parameter.
     last_seen: u64,
 }
 
 impl<T: Real> Memory<T> {
-    /// Calls `f(parameter, gradient, state, updates)` for every parameter that has a gradient; `updates` counts this one, so it is at
-    /// least 1. The state is `arrays` times as many zeros as the parameter has values the first time.
+    /// Calls `f(parameter, gradient, state, updates)` for every parameter that has a gradient. `updates` includes the current update, so it is at least 1.
+    /// The state consists of `arrays` arrays of the length of the parameter, which are zero in its first update.
     fn visit(
         &mut self,
         module: &mut dyn Module<T>,
@@ -105,7 +112,7 @@ impl<T: Real> Memory<T> {
         self.round += 1;
         let round = self.round;
         module.visit_mut(&mut |param| {
-            let slot = self.by_id.entry(param.id()).or_insert(Slot { state: None, updates: 0, last_seen: round });
+            let slot = self.by_id.entry(param.id()).or_insert(ParamState { state: None, updates: 0, last_seen: round });
             slot.last_seen = round;
             if let Some(grad) = grads.of(param) {
                 let len = param.tensor().len();
@@ -126,7 +133,7 @@ impl<T: Real> Memory<T> {
     fn recall(&mut self, param: &Param<T>, updates: u64, arrays: Vec<Buffer<T>>) -> bool {
         let fits = arrays.iter().all(|array| array.len() == param.tensor().len());
         if fits {
-            self.by_id.insert(param.id(), Slot { state: Some(arrays), updates, last_seen: self.round });
+            self.by_id.insert(param.id(), ParamState { state: Some(arrays), updates, last_seen: self.round });
         }
         fits
     }

@@ -1,17 +1,17 @@
-//! RMSProp as Plenoxels use it.
+//! [`RmsProp`], as used by Plenoxels.
 
 use super::Rates;
 use super::elementwise::{Elementwise, Rule};
 use crate::real::Real;
 
-/// v ← g² if v = 0, else β v + (1 − β) g²;  θ ← θ − lr · g / (√v + ε) (svox2).
+/// RMSProp: v ← g² if v = 0, else β v + (1 − β) g²;  θ ← θ − lr · g / (√v + ε) (svox2).
 ///
-/// The rule for v = 0 makes the first step of every element lr · sign g. Gradients of a mean over a batch of rays are so small that ε
-/// is not negligible: summing instead of averaging a loss, or another batch size, changes what is learned.
+/// Because of the rule for v = 0, the first step of every element is lr · sign g if ε is negligible. It is not always negligible: the gradients of a mean
+/// over a batch of rays are very small. Summing the loss instead of averaging it, or another batch size, therefore changes the result of training.
 ///
-/// Of a row gradient only the touched rows are visited, all of their columns; that is why sparse grids are trained with this and not
-/// with Adam, whose moments would all have to decay in every step. A zero in a dense gradient moves nothing either, but it decays v, so
-/// an element that is often untouched takes larger steps with dense gradients than with rows.
+/// For a row-sparse gradient, only the touched rows are visited, with all of their columns. Sparse grids are trained with RMSProp and not with Adam for
+/// this reason: all moments of Adam would have to decay in every step. A zero in a dense gradient does not change the value either, but it decays v. An
+/// element that is rarely touched therefore takes larger steps with dense gradients than with row-sparse ones.
 #[derive(Debug)]
 pub struct RmsProp<T: Real>(pub(super) Elementwise<RmsPropRule, T, 2>);
 
@@ -22,18 +22,18 @@ pub(super) struct RmsPropRule {
 }
 
 impl<T: Real> RmsProp<T> {
-    /// With these learning rates, β = 0.95 and ε = 1e-8 (svox2's).
+    /// Creates an optimizer with the given learning rates, β = 0.95 and ε = 1e-8 (the values of svox2).
     pub fn new(rates: impl Into<Rates>) -> Self {
         RmsProp(Elementwise::new(RmsPropRule { beta: 0.95, epsilon: 1e-8 }, rates))
     }
 
-    /// Another share of v that stays in each step.
+    /// Sets the decay rate β of v.
     pub fn beta(mut self, beta: f64) -> Self {
         self.0.rule.beta = beta;
         self
     }
 
-    /// Another ε.
+    /// Sets ε.
     pub fn epsilon(mut self, epsilon: f64) -> Self {
         self.0.rule.epsilon = epsilon;
         self
@@ -85,7 +85,7 @@ mod tests {
         assert_relative_eq!(theta.tensor().item(), -0.5, max_relative = 1e-14);
     }
 
-    /// Row 0 is looked up in every step and row 1 only in the first and third.
+    /// Row 0 is gathered in every step, row 1 only in the first and the third.
     #[test]
     fn rows_equal_dense_where_touched_and_an_untouched_row_keeps_its_v_while_a_dense_zero_decays_it() {
         let value = arr2(&[[2.0f64], [2.0]]);

@@ -1,14 +1,14 @@
-//! Numbers that change with the step: learning rates and weights of losses.
+//! Schedules of learning rates and of loss weights.
 
 use std::fmt::Debug;
 
-/// A number for each step, counted from 0.
+/// A number as a function of the step, which counts from 0.
 pub trait Schedule: Send + Sync + Debug {
-    /// The number at a step.
+    /// Returns the number at a step.
     fn at(&self, step: u64) -> f64;
 }
 
-/// A number is the schedule that never changes.
+/// A constant schedule.
 impl Schedule for f64 {
     fn at(&self, _: u64) -> f64 {
         *self
@@ -21,7 +21,8 @@ impl<S: Schedule + ?Sized> Schedule for Box<S> {
     }
 }
 
-/// from^(1−t) · to^t with t = min(step / steps, 1): a straight line in the logarithm that stays at its end (JAXNeRF, svox2).
+/// Exponential decay: from^(1−t) · to^t with t = min(step / steps, 1). The logarithm changes linearly from step 0 to `steps`, then the value stays at `to`
+/// (JAXNeRF, svox2).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Exponential {
     from: f64,
@@ -30,7 +31,7 @@ pub struct Exponential {
 }
 
 impl Exponential {
-    /// From `from` at step 0 to `to` at step `steps` and ever after.
+    /// Creates a schedule that starts with `from` at step 0 and has the value `to` from step `steps` on.
     ///
     /// Panics unless both ends are positive and finite.
     #[track_caller]
@@ -53,7 +54,8 @@ impl Schedule for Exponential {
     }
 }
 
-/// Another schedule times D(s) = m + (1 − m) sin(π/2 · min(s / S, 1)): starts at the share m and reaches all of it at step S (svox2's delay).
+/// Warm-up: another schedule multiplied by D(s) = m + (1 − m) sin(π/2 · min(s / S, 1)) at step s. The factor starts at m and reaches 1 at step S (the delay
+/// of svox2).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WarmUp<S> {
     schedule: S,
@@ -62,7 +64,7 @@ pub struct WarmUp<S> {
 }
 
 impl<S: Schedule> WarmUp<S> {
-    /// `schedule`, of which only `share` is used at step 0 and all from step `steps` on.
+    /// Creates a schedule that multiplies `schedule` by a factor: `share` (m) at step 0, rising to 1 at step `steps` (S).
     pub fn new(schedule: S, share: f64, steps: u64) -> Self {
         WarmUp { schedule, share, steps }
     }
@@ -80,7 +82,7 @@ impl<S: Schedule> Schedule for WarmUp<S> {
     }
 }
 
-/// Constant between the steps at which it changes.
+/// A piecewise constant schedule.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piecewise {
     first: f64,
@@ -88,14 +90,14 @@ pub struct Piecewise {
 }
 
 impl Piecewise {
-    /// `first` until the first change; changes are added by [`Piecewise::then`].
+    /// Creates a schedule with the value `first`. [`Piecewise::then`] adds changes.
     pub fn new(first: f64) -> Self {
         Piecewise { first, changes: Vec::new() }
     }
 
-    /// `value` from step `from` on.
+    /// Changes the value to `value` from step `from` on.
     ///
-    /// Panics unless `from` is larger than that of the change before.
+    /// Panics unless `from` is larger than the step of the previous change and larger than 0.
     #[track_caller]
     pub fn then(mut self, from: u64, value: f64) -> Self {
         let last = self.changes.last().map_or(0, |&(step, _)| step);
@@ -117,7 +119,7 @@ mod tests {
     use super::*;
     use approx::assert_relative_eq;
 
-    /// Printed to three digits in notes made from the original's code, hence the tolerance of half a unit in the third digit.
+    /// Relative tolerance. The expected values come from notes on the original code and have three digits, so they may be off by half a unit in the third.
     const THREE_DIGITS: f64 = 5e-3;
 
     #[test]

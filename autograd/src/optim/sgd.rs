@@ -1,4 +1,4 @@
-//! Gradient descent, plain and with momentum.
+//! Gradient descent: [`Sgd`] and [`Momentum`].
 
 use super::elementwise::{Elementwise, Rule, update};
 use super::{Optimizer, Rates, Remembered};
@@ -7,14 +7,14 @@ use crate::param::{Module, Param};
 use crate::pool::Buffer;
 use crate::real::Real;
 
-/// θ ← θ − lr · g. Remembers nothing, so a row gradient and the dense one with its zeros do the same.
+/// Gradient descent: θ ← θ − lr · g. It has no state, so a row-sparse gradient and the equal dense gradient give the same result.
 #[derive(Debug)]
 pub struct Sgd {
     rates: Rates,
 }
 
 impl Sgd {
-    /// With these learning rates.
+    /// Creates an optimizer with the given learning rates.
     pub fn new(rates: impl Into<Rates>) -> Self {
         Sgd { rates: rates.into() }
     }
@@ -43,10 +43,10 @@ impl<T: Real> Optimizer<T> for Sgd {
     }
 }
 
-/// m ← μ m + g,  θ ← θ − lr · m (Polyak's heavy ball, as in PyTorch).
+/// Gradient descent with momentum: m ← μ m + g,  θ ← θ − lr · m (Polyak's heavy ball, as in PyTorch).
 ///
-/// Of a row gradient only the touched rows are visited: the momentum of the others waits and moves nothing. That is another algorithm
-/// than with the dense gradient, where every row keeps rolling.
+/// For a row-sparse gradient, only the touched rows are visited: neither the momentum nor the values of other rows change. This is not the same algorithm
+/// as with the equal dense gradient, where the momentum moves every row in every step.
 #[derive(Debug)]
 pub struct Momentum<T: Real>(pub(super) Elementwise<MomentumRule, T, 2>);
 
@@ -56,7 +56,7 @@ pub(super) struct MomentumRule {
 }
 
 impl<T: Real> Momentum<T> {
-    /// With these learning rates and this share μ of the previous direction, usually 0.9.
+    /// Creates an optimizer with the given learning rates and the momentum μ, usually 0.9.
     pub fn new(rates: impl Into<Rates>, momentum: f64) -> Self {
         Momentum(Elementwise::new(MomentumRule { momentum }, rates))
     }
@@ -96,12 +96,12 @@ mod tests {
         let grads = rows.tensor().gather_rows(&looked_up).square().sum().backward();
         assert!(grads.of(&rows).is_some_and(|g| g.as_rows().is_some()));
         Sgd::new(0.1).step(&mut rows, &grads, 0);
-        // Through an op the row gradient becomes dense.
+        // The row-sparse gradient becomes dense because it passes through an op.
         let grads = (1.0 * dense.tensor()).gather_rows(&looked_up).square().sum().backward();
         assert!(grads.of(&dense).is_some_and(|g| g.as_dense().is_some()));
         Sgd::new(0.1).step(&mut dense, &grads, 0);
         assert_eq!(rows.tensor().data(), dense.tensor().data());
-        // Row 2 was looked up twice: 5 − 0.1 · 2 · (2 · 5) = 3.
+        // Row 2 was gathered twice: 5 − 0.1 · 2 · (2 · 5) = 3.
         assert_relative_eq!(rows.tensor().data()[4], 3.0, max_relative = 1e-14);
     }
 

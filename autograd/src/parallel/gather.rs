@@ -1,24 +1,24 @@
-//! Look-ups of a whole vector at once.
+//! Vector lookups in a table.
 //!
-//! A loop over `table[at[i]]` stays a loop of single loads, each with a test of its own. With one test for all of them it becomes a gather
-//! where the machine has one. The safe twin is the plain loop in the tests.
+//! The compiler does not vectorise a loop over `table[at[i]]`, because each load has its own bounds check. With one bounds check for the whole vector, the
+//! loop becomes a gather instruction on machines that have it. The tests compare the function with the safe loop.
 
 #![allow(unsafe_code)]
 
-/// `table[at[i]]` for every i.
+/// Returns `table[at[i]]` for every i.
 ///
-/// Panics if one of them is beyond the table, or the table is empty.
+/// Panics if an index is out of range or the table is empty.
 #[inline(always)]
-#[allow(clippy::needless_range_loop)] // A `map` is sometimes left as a call, one for each vector.
+#[allow(clippy::needless_range_loop)] // The compiler does not always inline `map`, which would cost a call for each vector.
 pub fn gathered<T: Copy, const N: usize>(table: &[T], at: [u32; N]) -> [T; N] {
     let mut last = 0;
     for i in at {
         last = last.max(i);
     }
-    assert!((last as usize) < table.len(), "entry {last} of a table of {}", table.len());
+    assert!((last as usize) < table.len(), "index {last} is out of range for a table of {} entries", table.len());
     let mut found = [table[0]; N];
     for k in 0..N {
-        // SAFETY: none is larger than the largest, which lies in the table.
+        // SAFETY: `last` is the largest index, and the assertion ensures that it is in range.
         found[k] = unsafe { *table.get_unchecked(at[k] as usize) };
     }
     found
@@ -39,7 +39,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "entry 3 of a table of 3")]
+    #[should_panic(expected = "index 3 is out of range for a table of 3 entries")]
     fn beyond_the_table_is_a_panic() {
         gathered(&[1, 2, 3], [0, 3, 1]);
     }

@@ -1,14 +1,14 @@
-//! Asking for memory before it is read.
+//! Software prefetching.
 //!
-//! Look-ups in a large table wait for memory one after the other if much happens between two of them. Where the next rows are known in advance,
-//! asking for them lets the waits overlap. It changes no result; the safe twin is to leave it out.
+//! If there is much work between two lookups in a large table, each lookup waits for memory separately. Where the next rows are known in advance, a prefetch
+//! lets these waits overlap. A prefetch never changes a result.
 
 #![allow(unsafe_code)]
 
-/// Bytes that come from memory together.
+/// Size of a cache line, in bytes.
 const LINE: usize = 64;
 
-/// Asks for the memory of a value that will be read soon. A hint: nothing happens on machines without it.
+/// Prefetches the cache lines of a value that will be read soon. On targets other than x86-64 it does nothing.
 #[inline(always)]
 pub fn prefetch<E: ?Sized>(value: &E) {
     #[cfg(target_arch = "x86_64")]
@@ -17,12 +17,13 @@ pub fn prefetch<E: ?Sized>(value: &E) {
         let (start, size) = (std::ptr::from_ref(value).cast::<i8>(), size_of_val(value));
         let mut at = 0;
         while at < size {
-            // SAFETY: every x86-64 has the instruction, which changes nothing and fails on no address; this one lies in the value.
+            // SAFETY: every x86-64 machine has this instruction. It changes no memory and does not fault for any address; this address lies inside the value.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(start.add(at)) };
             at += LINE;
         }
         if size > 1 {
-            // SAFETY: as above; what began in the middle of a line may end in one more.
+            // A value that does not begin at the start of a cache line may end in one more line.
+            // SAFETY: as above.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(start.add(size - 1)) };
         }
     }

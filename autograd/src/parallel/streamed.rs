@@ -1,35 +1,35 @@
-//! Stores that go around the cache.
+//! Streaming stores, which bypass the cache.
 //!
-//! An ordinary store reads the line it writes to first. An op with a result too large for the cache waits for memory alone, and those reads
-//! are a large part of what it moves: without them a million random rows of 112 bytes take 0.88 of the time, and filling 64 MB 0.8
-//! (`gather28` and `sum_16M` in `benches/RESULTS.md`). Maps from one large array to another gain nothing. The safe twin of all this is the plain copy that small results and other
-//! machines get; the tests hold one against the other.
+//! An ordinary store first reads the cache line that it writes to. An op whose result does not fit into the cache is limited by memory bandwidth, and these
+//! reads are a large part of its traffic. With streaming stores, gathering a million random rows of 112 bytes takes 0.88 of the time, and filling 64 MB takes
+//! 0.8 of the time (`gather28` and `sum_16M` in `benches/RESULTS.md`). Elementwise ops from one large array to another do not become faster. Small results and
+//! other machines use an ordinary copy, which is safe code; the tests compare both.
 
 #![allow(unsafe_code)]
 
 use crate::pool::Pooled;
 
-/// Bytes from which on a result is not expected to be in the cache when it is next read.
+/// Size in bytes from which a result is not expected to stay in the cache until it is read. It is smaller in tests, so that they reach the streaming stores.
 const LARGE: usize = if cfg!(test) { 32 << 10 } else { 32 << 20 };
 
-/// True if a result is so large that it is better written past the cache, and this machine can.
+/// Returns true if `out` is so large that streaming stores are faster, and the machine supports them.
 pub(crate) fn worthwhile<T>(out: &[T]) -> bool {
     cfg!(target_arch = "x86_64") && size_of_val(out) >= LARGE
 }
 
-/// Bytes of a store. A slice that is not aligned to them, and what is left over at its end, is written the ordinary way.
+/// Size of a streaming store, in bytes. A slice that is not aligned to this size, and the remainder of an aligned slice, are written by ordinary stores.
 pub(crate) const UNIT: usize = 16;
 
-/// Fills a slice.
+/// Fills a slice by streaming stores.
 pub(crate) fn fill<T: Pooled>(out: &mut [T], value: T) {
     let block = [value; 64];
     let _fence = Fence;
     out.chunks_mut(block.len()).for_each(|out| store(&block[..out.len()], out));
 }
 
-/// `out[i] = table[rows[i]]`; worth it where a row is whole units.
+/// Sets `out[i] = table[rows[i]]` by streaming stores. It is fast only if the size of a row is a multiple of [`UNIT`].
 ///
-/// Panics if a row is not in the table.
+/// Panics if a row number is out of range.
 pub(crate) fn copy_rows<T: Pooled, const W: usize>(table: &[[T; W]], rows: &[u32], out: &mut [[T; W]]) {
     let _fence = Fence;
     for (target, &row) in out.iter_mut().zip(rows) {
@@ -37,7 +37,7 @@ pub(crate) fn copy_rows<T: Pooled, const W: usize>(table: &[[T; W]], rows: &[u32
     }
 }
 
-/// Copies a slice. Its caller holds a [`Fence`], and reads nothing of `to` before that is dropped.
+/// Copies a slice by streaming stores. The caller must hold a [`Fence`] and must not read `to` before the fence is dropped.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 fn store<T: Pooled>(from: &[T], to: &mut [T]) {
@@ -46,9 +46,9 @@ fn store<T: Pooled>(from: &[T], to: &mut [T]) {
     let units = if (to.as_ptr() as usize).is_multiple_of(UNIT) { size_of_val(to) / UNIT } else { 0 };
     let (source, target) = (from.as_ptr().cast::<__m128i>(), to.as_mut_ptr().cast::<__m128i>());
     for k in 0..units {
-        // SAFETY: both slices hold `units` units of 16 bytes, `target` is aligned to them and borrowed uniquely, and `source` may lie
-        // anywhere. The types with a pool are plain numbers: no padding, and every pattern is valid. What is stored is ordered before
-        // any other access by the fence that both callers in this file hold.
+        // SAFETY: both slices have at least `units` units of 16 bytes. `target` is aligned to 16 bytes and borrowed uniquely; `source` needs no alignment.
+        // Pooled types are plain numbers, which have no padding and for which every bit pattern is valid. The fence that both callers in this file hold
+        // orders these stores before any later access.
         unsafe { _mm_stream_si128(target.add(k), _mm_loadu_si128(source.add(k))) };
     }
     let done = units * UNIT / size_of::<T>();
@@ -60,14 +60,14 @@ fn store<T: Pooled>(from: &[T], to: &mut [T]) {
     to.copy_from_slice(from);
 }
 
-/// Orders the stores before it is dropped with what follows: nothing else does, and a thread that is told of the end of the work could
-/// otherwise still read what was there before.
+/// A guard that executes a store fence when it is dropped. Streaming stores are not ordered otherwise: without the fence, a thread that is notified that the
+/// work is done could still read the old contents.
 struct Fence;
 
 impl Drop for Fence {
     fn drop(&mut self) {
         #[cfg(target_arch = "x86_64")]
-        // SAFETY: every x86-64 has the instruction.
+        // SAFETY: every x86-64 machine has this instruction.
         unsafe {
             std::arch::x86_64::_mm_sfence();
         }
@@ -86,7 +86,7 @@ mod tests {
         let table: Vec<T> = (0..1000 * W).map(|i| T::lit(i as f64)).collect();
         let rows: Vec<u32> = (0..5000u32).map(|i| i.wrapping_mul(2_654_435_761) % 1000).collect();
         let right = |out: &[T]| out.chunks(W).zip(&rows).all(|(got, &row)| got == &table[row as usize * W..][..W]);
-        // From every alignment that a part of a buffer can have.
+        // All alignments that a part of a buffer can have.
         for shift in 0..5 {
             let mut out = vec![T::zero(); rows.len() * W + shift];
             copy_rows(table.as_chunks::<W>().0, &rows, out[shift..].as_chunks_mut::<W>().0);
@@ -94,7 +94,7 @@ mod tests {
             fill(&mut out[shift..], T::one());
             assert!(out[..shift].iter().all(|&v| v == T::zero()) && out[shift..].iter().all(|&v| v == T::one()));
         }
-        // In tests, large begins early enough for what calls these functions to call them.
+        // In tests `LARGE` is so small that the callers below use streaming stores.
         assert!(cfg!(not(target_arch = "x86_64")) || worthwhile(&vec![T::zero(); rows.len() * W]));
         let mut whole = vec![T::zero(); rows.len() * W];
         parallel::fill(&mut whole, T::one());

@@ -1,12 +1,12 @@
-//! How optimizers change tables: dense, by rows, or by rows whose gradients are added up on the way.
+//! Elementwise updates of tables by optimizers, for gradients that are dense, row-sparse, or row-sparse with lazy sums.
 
 use super::{CHUNK, dispatched, for_each_item, prefetch, rows_per_chunk};
 use crate::gradients::Grad;
 use crate::real::Real;
 use crate::rows::deferred::{RowGroups, RowSums};
 
-/// `(x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i])` wherever there is a gradient g: how an optimizer changes values and what it remembers of
-/// them. Rows that a row gradient does not mention stay, or have g = 0 if it is `all_rows`.
+/// Sets `(x₁[i], x₂[i], …) = f((x₁[i], x₂[i], …), g[i])` wherever there is a gradient g. An optimizer updates values and state arrays by this function. Rows
+/// that a row-sparse gradient does not contain are unchanged, or have g = 0 if `all_rows` is true.
 pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], grad: &Grad<T>, all_rows: bool, f: impl Fn([T; N], T) -> [T; N] + Sync) {
     let rows = match grad {
         Grad::Dense(g) => return update_dense(x, g.data(), &f),
@@ -19,7 +19,7 @@ pub fn update<T: Real, const N: usize>(x: [&mut [T]; N], grad: &Grad<T>, all_row
     if all_rows { update_part::<T, N, true, _>(x, part, &f) } else { update_part::<T, N, false, _>(x, part, &f) }
 }
 
-/// Halves the work until it is a chunk.
+/// Updates with a dense gradient. It splits the work recursively into chunks.
 fn update_dense<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(x: [&mut [T]; N], g: &[T], f: &F) {
     if g.len() <= CHUNK {
         return update_loop(x, g, f);
@@ -29,7 +29,7 @@ fn update_dense<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(x: [
     rayon::join(|| update_dense(low, &g[..middle], f), || update_dense(high, &g[middle..], f));
 }
 
-/// For the rows of a gradient that is not added up: each bucket's sums are computed and used while they are in the cache.
+/// Updates with lazy row sums: the sums of each bucket are computed and used while they are in the cache.
 fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
     x: [&mut [T]; N],
     width: usize,
@@ -56,7 +56,7 @@ fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
     });
 }
 
-/// A part of a table that begins at row `first`, and which of its rows have a gradient.
+/// A part of a table that begins at row `first`, and the rows in it that have a gradient `g`.
 #[derive(Clone, Copy)]
 struct TableRows<'a, T> {
     first: usize,
@@ -65,8 +65,8 @@ struct TableRows<'a, T> {
     g: &'a [T],
 }
 
-/// Halves the work until it is a chunk. A half of the ascending rows lies in a part of the table of its own, so nothing is shared.
-/// `ALL` visits the rows without a gradient too.
+/// Updates with a row-sparse gradient. It splits the work recursively into chunks; since the rows are ascending, each half of them lies in its own part of
+/// the table. If `ALL` is true, rows without a gradient are also visited.
 fn update_part<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N] + Sync>(
     x: [&mut [T]; N],
     part: TableRows<'_, T>,
@@ -91,6 +91,7 @@ fn update_part<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T;
     );
 }
 
+/// Splits each of `N` slices at index `at`.
 fn split<T, const N: usize>(x: [&mut [T]; N], at: usize) -> ([&mut [T]; N], [&mut [T]; N]) {
     let mut high = [const { None }; N];
     let mut k = 0;
@@ -110,7 +111,7 @@ fn update_loop<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]
 }
 
 dispatched! {
-/// Rows too short for a loop of their own are gathered, updated together and put back.
+/// Updates rows that are too short for a separate loop each: groups of rows are gathered, updated in one loop and scattered back.
 fn update_short_rows<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
     const TOGETHER: usize = 16;
     let mut x = x.map(|x| x.as_chunks_mut::<W>().0);
@@ -120,7 +121,7 @@ fn update_short_rows<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -
             block.iter_mut().zip(rows).for_each(|(to, &row)| *to = x[row as usize - part.first]);
         }
         let slices = block.each_mut().map(|b| b.as_flattened_mut());
-        // A constant length is worth a copy of the loop.
+        // The case of a constant length has its own copy of the loop, which is faster.
         if g.len() == TOGETHER * W { update_slices(slices, TOGETHER * W, |i| g[i], f) } else { update_slices(slices, g.len(), |i| g[i], f) }
         for (block, x) in block.iter().zip(&mut x) {
             block.iter().zip(rows).for_each(|(&from, &row)| x[row as usize - part.first] = from);
@@ -130,7 +131,7 @@ fn update_short_rows<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -
 }
 
 dispatched! {
-/// Neighbouring rows are updated as one run; `ALL` fills the gaps with zero gradients.
+/// Updates each run of consecutive rows in one loop. If `ALL` is true, rows between the runs are updated with zero gradients.
 fn update_runs<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T; N]>(mut x: [&mut [T]; N], part: TableRows<'_, T>, f: &F) {
     let TableRows { first, width, rows, g } = part;
     let mut done = 0;
@@ -154,7 +155,7 @@ fn update_runs<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T;
 }
 
 #[inline(always)]
-#[allow(clippy::needless_range_loop)] // N arrays are walked at once.
+#[allow(clippy::needless_range_loop)] // The loop indexes N arrays.
 fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl Fn(usize) -> T, f: &impl Fn([T; N], T) -> [T; N]) {
     let x = x.map(|x| &mut x[..len]);
     for i in 0..len {
@@ -165,12 +166,12 @@ fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl 
     }
 }
 
-/// Numbers that are updated together, and short rows.
+/// Number of elements, and of short rows, that are updated together.
 const LANES: usize = 8;
 
 dispatched! {
-/// Updates the rows whose bits are set and clears their sums and bits; `sums` has a row for each row of the tables. `W` is the width, or 0
-/// for one only known at run time. Of short rows eight are updated together, and those that are not touched keep what they had.
+/// Updates the rows whose bits are set in `touched`, and clears their sums and bits. `sums` has a row for each row of the tables. `W` is the width, or 0 if
+/// the width is known at run time only. Short rows are updated in groups of eight; rows of a group that are not touched keep their values.
 fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(
     mut x: [&mut [T]; N],
     width: usize,
@@ -181,11 +182,11 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
     let width = if W == 0 { width } else { W };
     let short = (1..=3).contains(&W);
     let rows = sums.len() / width.max(1);
-    ask_for(&x, width, 0, touched[0], short);
+    prefetch_rows(&x, width, 0, touched[0], short);
     for w in 0..touched.len() {
-        // The rows of the next word come from memory while those of this one are updated.
+        // The rows of the next word are prefetched while the rows of this word are updated.
         if let Some(&next) = touched.get(w + 1) {
-            ask_for(&x, width, w + 1, next, short);
+            prefetch_rows(&x, width, w + 1, next, short);
         }
         let mut left = std::mem::take(&mut touched[w]);
         while left != 0 {
@@ -200,7 +201,7 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
             let run = if W == 0 { (left >> bit).trailing_ones() as usize } else { 1 };
             left &= if bit + run == 64 { 0 } else { !0 << (bit + run) };
             let start = (w * 64 + bit) * width;
-            // A constant length is worth a copy of the loop.
+            // The case of a constant length has its own copy of the loop, which is faster.
             let len = if W == 0 { run * width } else { W };
             let g = &mut sums[start..][..len];
             update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
@@ -210,9 +211,9 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
 }
 }
 
-/// Asks for the rows whose bits are set in word number `word`; of short rows for all eight that are updated together.
+/// Prefetches the rows whose bits are set in word number `word` of the bitmap; for short rows, all eight rows of a group.
 #[inline(always)]
-fn ask_for<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, word: usize, mut left: u64, short: bool) {
+fn prefetch_rows<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, word: usize, mut left: u64, short: bool) {
     while left != 0 {
         let bit = left.trailing_zeros() as usize;
         let (first, bits) = if short { (bit & !(LANES - 1), 0xff) } else { (bit, 1) };
@@ -223,9 +224,9 @@ fn ask_for<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, word: usize
     }
 }
 
-/// Updates those of eight rows from element `start` on whose bits are set, and clears all their sums.
+/// Updates the rows whose bits are set among the eight rows from element `start` on, and clears the sums of all eight.
 #[inline(always)]
-#[allow(clippy::needless_range_loop)] // N arrays are walked at once.
+#[allow(clippy::needless_range_loop)] // The loop indexes N arrays.
 fn update_eight<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [T; N]>(
     x: &mut [&mut [T]; N],
     sums: &mut [T],
@@ -265,7 +266,7 @@ mod tests {
     fn updates_of_rows_equal_a_plain_loop_for_every_width_and_leave_the_other_rows_alone() {
         let rule = |[x, v]: [f64; 2], g: f64| [x - g, 0.5 * v + g];
         for width in [1usize, 2, 3, 4, 27] {
-            // Rows alone, rows in runs, and enough of both for several chunks.
+            // Single rows and runs of rows, enough of both for several chunks.
             let table = 100_000 / width.min(4);
             let rows: Vec<u32> = (0..table as u32).filter(|r| r % 7 != 0 && (r % 64 < 20 || r % 3 == 0)).collect();
             let g: Vec<f64> = (0..rows.len() * width).map(|i| (i % 1000) as f64 + 1.0).collect();

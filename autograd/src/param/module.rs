@@ -1,10 +1,10 @@
-//! [`Module`]: something with parameters, and what can be made of smaller ones.
+//! [`Module`]: a set of parameters, and its implementations for collections and structs.
 
 use crate::param::Param;
 use crate::real::Real;
 
-/// Something with parameters: a [`Param`], a layer, a network, or a tuple, array, vector, option or box of such. Of a structure,
-/// [`impl_module!`](crate::impl_module) makes one.
+/// A set of parameters. The trait is implemented for [`Param`], for layers and networks, and for tuples (of two to six), arrays, vectors, options and
+/// boxes of modules. [`impl_module!`](crate::impl_module) implements it for a struct.
 ///
 /// ```
 /// use autograd::{Module, nn::Linear, random::Stream};
@@ -18,24 +18,24 @@ pub trait Module<T: Real> {
     /// Visits every parameter, always in the same order.
     fn visit(&self, f: &mut dyn FnMut(&Param<T>));
 
-    /// Visits every parameter for a change, in the same order.
+    /// Visits every parameter mutably, in the same order as [`Module::visit`].
     fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>));
 
-    /// The number of elements of all parameters.
+    /// Returns the total number of elements of all parameters.
     fn param_count(&self) -> usize {
         let mut count = 0;
         self.visit(&mut |param| count += param.tensor().len());
         count
     }
 
-    /// The names of the parameters, in the order of a visit.
+    /// Returns the names of the parameters, in the order of [`Module::visit`].
     fn param_names(&self) -> Vec<String> {
         let mut names = Vec::new();
         self.visit(&mut |param| names.push(param.name().to_owned()));
         names
     }
 
-    /// True if no parameter contains an infinity or NaN.
+    /// Returns true if no parameter contains an infinity or NaN.
     fn is_finite(&self) -> bool {
         let mut finite = true;
         self.visit(&mut |param| finite &= param.tensor().data().iter().all(|x| x.is_finite()));
@@ -53,7 +53,7 @@ impl<T: Real> Module<T> for Param<T> {
     }
 }
 
-/// Modules of what can be iterated over, in its order.
+/// Implements [`Module`] for types with `iter` and `iter_mut`; the elements are visited in the order of the iterator.
 macro_rules! collections {
     ($([$($generics:tt)*] $t:ty;)*) => {$(
         impl<T: Real, $($generics)*> Module<T> for $t {
@@ -104,8 +104,8 @@ tuples! {
     A 0 B 1 C 2 D 3 E 4 F 5;
 }
 
-/// Implements [`Module`](crate::Module) for a structure that is generic over one scalar type, `T: Real`: the named fields, which are modules,
-/// are visited in this order, and the others are not parameters.
+/// Implements [`Module`](crate::Module) for a struct that is generic over one scalar type, `T: Real`. The listed fields must be modules and are visited in
+/// the listed order. Fields that are not listed are not parameters.
 ///
 /// ```
 /// use autograd::{Module, Param, Real, impl_module, nn::{Activation, Mlp}, random::Stream};

@@ -1,15 +1,15 @@
-//! eˣ − 1 and the hyperbolic tangent without a branch, so that a loop over them vectorises.
+//! eˣ − 1 and the hyperbolic tangent without branches, so that loops over them vectorise.
 //!
-//! Cody and Waite's reduction x = n ln 2 + r with |r| <= ln 2 / 2, the Taylor polynomial p of eʳ − 1, and eˣ − 1 = 2ⁿ p + (2ⁿ − 1). Where n
-//! is 0 the result is p, so small x lose nothing. There is no fused multiply-add: the bits are the same on every machine.
+//! The method is the reduction x = n ln 2 + r with |r| <= ln 2 / 2 (Cody and Waite), the Taylor polynomial p of eʳ − 1, and eˣ − 1 = 2ⁿ p + (2ⁿ − 1). For n = 0
+//! the result is p, so there is no cancellation for small x. The functions do not use fused multiply-add, so the bits are the same on every machine.
 
-/// eˣ − 1 and tanh x for one of the scalar types.
+/// Defines eˣ − 1 and tanh x for one of the scalar types.
 macro_rules! functions {
     ($t:ident, $expm1:ident, $tanh:ident, round: $round:expr, exponent: $exponent:expr, range: $low:expr, $high:expr, ln2: [$ln2_high:expr, $ln2_low:expr], degree: $degree:expr) => {
-        /// eˣ − 1 to two units in the last place: −1 far below 0, ∞ above the logarithm of the largest number.
+        /// Returns eˣ − 1, accurate to two units in the last place. It is −1 for large negative x, and ∞ above the logarithm of the largest number.
         #[inline(always)]
         pub fn $expm1(x: $t) -> $t {
-            /// Adding and subtracting it rounds to the nearest integer, which then stands in the low bits.
+            /// A constant whose addition rounds to the nearest integer; the low bits of the sum contain that integer.
             const ROUND: $t = $round;
             const COEFFICIENTS: [$t; $degree - 1] = inverse_factorials!($t, $degree);
             let bounded = x.clamp($low, $high);
@@ -21,14 +21,14 @@ macro_rules! functions {
                 q = q * r + c;
             }
             let p = r + r * r * q;
-            // 2ⁿ⁻¹, for 2ⁿ may be too large.
+            // The scale is 2ⁿ⁻¹, because 2ⁿ may overflow.
             let bits = rounded.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add($exponent - 1);
             let half = $t::from_bits(bits.wrapping_shl($t::MANTISSA_DIGITS - 1));
             let value = half * p + (half - 0.5);
             (if n == 0.0 { p } else { value + value }).copysign(x)
         }
 
-        /// tanh x = t / (2 + t) with t = e^(2|x|) − 1 turned around, so that nothing overflows; to three units in the last place.
+        /// Returns tanh x, accurate to three units in the last place. It is computed from t = e^(−2|x|) − 1, which cannot overflow: tanh |x| = −t / (2 + t).
         #[inline(always)]
         pub fn $tanh(x: $t) -> $t {
             let t = $expm1(-2.0 * x.abs());
@@ -37,7 +37,7 @@ macro_rules! functions {
     };
 }
 
-/// 1/2!, 1/3!, … 1/degree!
+/// Returns the array 1/2!, 1/3!, …, 1/degree!.
 macro_rules! inverse_factorials {
     ($t:ident, $degree:expr) => {{
         let mut out = [0.0; $degree - 1];
@@ -51,7 +51,7 @@ macro_rules! inverse_factorials {
     }};
 }
 
-// The high parts of ln 2 have so few bits that n times them is exact. The first term left out is below a tenth of a unit.
+// The high part of ln 2 has so few bits that its product with n is exact. The first omitted term of the series is below a tenth of a unit in the last place.
 functions!(f32, single, tanh_single, round: 12_582_912.0, exponent: 127, range: -40.0, 89.0, ln2: [0.693_359_4, -2.121_944_4e-4], degree: 8);
 functions!(f64, double, tanh_double, round: 6_755_399_441_055_744.0, exponent: 1023, range: -80.0, 710.0, ln2: [6.931_471_803_691_238e-1, 1.908_214_929_270_587_7e-10], degree: 14);
 

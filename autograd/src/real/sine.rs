@@ -1,33 +1,34 @@
-//! Sine and cosine without a branch, so that a loop over them vectorises.
+//! Sine and cosine without branches, so that loops over them vectorise.
 //!
-//! Cody and Waite's reduction x = n π/2 + r with |r| <= π/4, then the polynomials of FDLIBM (`k_sin.c`, `k_cos.c`; FreeBSD's `k_sinf.c` and
-//! `k_cosf.c` for `f32`), of which the last bits of n choose one and its sign. Both are computed, since a choice between two numbers is no
-//! branch. There is no fused multiply-add: the bits are the same on every machine.
+//! The method is the reduction x = n π/2 + r with |r| <= π/4 (Cody and Waite) and the polynomials of FDLIBM (`k_sin.c`, `k_cos.c`; for `f32` FreeBSD's
+//! `k_sinf.c` and `k_cosf.c`). Both polynomials are computed, and the last two bits of n select one of them and its sign, which needs no branch. The functions
+//! do not use fused multiply-add, so the bits are the same on every machine.
 
-/// Largest |x| for which the reduction is exact enough: n must be below 2²⁰, so that n times 33 bits of π/2 is exact.
+/// Largest |x| for which the reduction is accurate enough: n must be below 2²⁰, so that its product with 33 bits of π/2 is exact.
 pub const LIMIT: f64 = 1_048_576.0;
 
-/// Adding and subtracting 1.5·2⁵² rounds to the nearest integer, which then stands in the low bits.
+/// The constant 1.5·2⁵², whose addition rounds to the nearest integer; the low bits of the sum contain that integer.
 const ROUND: f64 = 6_755_399_441_055_744.0;
 
-/// n, and its low bits, for x = n π/2 + r.
+/// Returns n and its low bits, for x = n π/2 + r.
 #[inline(always)]
 fn quarter_turns(x: f64) -> (f64, u64) {
     let rounded = x * std::f64::consts::FRAC_2_PI + ROUND;
     (rounded - ROUND, rounded.to_bits())
 }
 
-/// ±sine or ±cosine, by the quadrant.
+/// Returns ±sine or ±cosine, depending on the quadrant.
 #[inline(always)]
-fn chosen(quadrant: u64, sine: f64, cosine: f64) -> f64 {
+fn select_by_quadrant(quadrant: u64, sine: f64, cosine: f64) -> f64 {
     let value = if quadrant & 1 == 0 { sine } else { cosine };
     f64::from_bits(value.to_bits() ^ (quadrant & 2) << 62)
 }
 
-/// Sine (`SHIFT` = 0) or cosine (`SHIFT` = 1) of an `f32`, computed in `f64`: right to 0.51 units in the last place for |x| <= [`LIMIT`].
+/// Returns the sine (`SHIFT` = 0) or cosine (`SHIFT` = 1) of an `f32`. It is computed in `f64` and accurate to 0.51 units in the last place of `f32` for
+/// |x| <= [`LIMIT`].
 #[inline(always)]
 pub fn single<const SHIFT: u64>(x: f32) -> f32 {
-    // 25 bits of π/2, whose product with n is exact, and the next 53.
+    // The first 25 bits of π/2, whose product with n is exact, and the next 53 bits.
     const HIGH: f64 = 1.570_796_310_901_641_8;
     const LOW: f64 = 1.589_325_477_352_819_6e-8;
     let x = f64::from(x);
@@ -35,23 +36,23 @@ pub fn single<const SHIFT: u64>(x: f32) -> f32 {
     let r = (x - n * HIGH) - n * LOW;
     let z = r * r;
     let w = z * z;
-    // As a product, so that −0 stays −0.
+    // The sine is a product with r, so that sin −0 is −0.
     let sine = r
         * ((1.0 + z * (-0.166_666_666_416_265_24 + z * 0.008_333_329_385_889_463))
             + w * z * (-0.000_198_393_348_360_966_32 + z * 0.000_002_718_311_493_989_822));
     let cosine = ((1.0 + z * -0.499_999_997_251_031) + w * 0.041_666_623_323_739_06)
         + w * z * (-0.001_388_676_377_460_993 + z * 0.000_024_390_448_796_277_41);
-    chosen(bits.wrapping_add(SHIFT), sine, cosine) as f32
+    select_by_quadrant(bits.wrapping_add(SHIFT), sine, cosine) as f32
 }
 
-/// Sine (`SHIFT` = 0) or cosine (`SHIFT` = 1) of an `f64`, right to one unit in the last place for |x| <= [`LIMIT`].
+/// Returns the sine (`SHIFT` = 0) or cosine (`SHIFT` = 1) of an `f64`, accurate to one unit in the last place for |x| <= [`LIMIT`].
 #[inline(always)]
 pub fn double<const SHIFT: u64>(x: f64) -> f64 {
-    // π/2 in three parts of 33 bits, whose products with n are exact, and the next 53 bits.
+    // Three parts of π/2 of 33 bits each, whose products with n are exact, and the next 53 bits.
     const PARTS: [f64; 3] = [1.570_796_326_734_125_6, 6.077_100_506_303_966e-11, 2.022_266_248_711_166_5e-21];
     const REST: f64 = 8.478_427_660_368_9e-32;
     let (n, bits) = quarter_turns(x);
-    // The first difference is exact; what the second and third lose is exact, and goes to the low part of r = high + low.
+    // The first difference is exact. The rounding errors of the second and third are computed exactly and go to the low part of r = high + low.
     let first = x - n * PARTS[0];
     let second = first - n * PARTS[1];
     let third = second - n * PARTS[2];
@@ -72,7 +73,7 @@ pub fn double<const SHIFT: u64>(x: f64) -> f64 {
     let half = 0.5 * z;
     let most = 1.0 - half;
     let cosine = most + (((1.0 - most) - half) + (z * p - high * low));
-    chosen(bits.wrapping_add(SHIFT), sine, cosine)
+    select_by_quadrant(bits.wrapping_add(SHIFT), sine, cosine)
 }
 
 #[cfg(test)]
@@ -80,7 +81,7 @@ mod tests {
     use super::*;
     use crate::real::tests::units_apart;
 
-    /// Numbers spread over ±`LIMIT`, small ones, and the neighbours of multiples of π/4, where the reduction cancels most.
+    /// Numbers spread over ±`LIMIT`, small numbers, and numbers near multiples of π/4, where the cancellation in the reduction is largest.
     fn arguments() -> impl Iterator<Item = f64> {
         let spread = (0..400_000).map(|i| (f64::from(i) * 0.618_033_988_749_894_9).fract() * 2.0 - 1.0);
         let near = (-300_000..300_000).map(|k| f64::from(k) * std::f64::consts::FRAC_PI_4);

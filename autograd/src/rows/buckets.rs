@@ -1,74 +1,74 @@
-//! Entries by bucket: a stable counting sort that leaves it to its caller what an entry is and where it is stored.
+//! A stable counting sort of entries by bucket. The caller stores the entries; this module computes their positions.
 
 use std::ops::Range;
 
-/// Where the entries of each bucket begin, once they are sorted by bucket.
+/// The index range of each bucket in an array of entries that is sorted by bucket.
 ///
-/// Sorting takes two passes over the entries. [`Buckets::count`] reads the bucket of each; then the caller takes them in the same order, asks
-/// [`Places::take`] for the place of each and stores there whatever belongs to it, in as many arrays as it likes. So the entries of a bucket keep
-/// their order.
+/// Sorting takes two passes over the entries. [`Buckets::count`] counts the entries of each bucket. Then the caller visits the entries again in the same
+/// order, gets the index of each from [`BucketCursors::take`], and stores its data at that index, in one or several arrays. The sort is stable: the entries
+/// of a bucket keep their order.
 ///
 /// ```
 /// use autograd::rows::Buckets;
 ///
 /// let rows = [70, 5, 130, 6];
 /// let bucket = |row: u32| row as usize >> 6;
-/// let mut places = Buckets::count(3, rows.iter().map(|&row| bucket(row)));
-/// let mut sorted = vec![0; places.total()];
+/// let mut cursors = Buckets::count(3, rows.iter().map(|&row| bucket(row)));
+/// let mut sorted = vec![0; cursors.total()];
 /// for row in rows {
-///     sorted[places.take(bucket(row))] = row;
+///     sorted[cursors.take(bucket(row))] = row;
 /// }
-/// let buckets = places.filled();
+/// let buckets = cursors.filled();
 /// assert_eq!(sorted, [5, 6, 70, 130]);
 /// assert_eq!(sorted[buckets.range(1)], [70]);
 /// ```
 #[derive(Clone, Debug)]
 pub struct Buckets {
-    /// Of bucket b at b; the number of all entries from the number of buckets on.
+    /// `starts[b]` is the index of the first entry of bucket b. The last two elements are the total number of entries.
     starts: Vec<u32>,
 }
 
-/// The places that the entries of each bucket will have, some of them taken.
+/// The next free index of each bucket, while the entries are being stored.
 #[derive(Debug)]
-pub struct Places {
-    /// The next free place of bucket b at b + 1. When all are taken, this is where bucket b + 1 begins.
+pub struct BucketCursors {
+    /// `starts[b + 1]` is the next free index of bucket b. When all entries are stored, it is the index of the first entry of bucket b + 1.
     starts: Vec<u32>,
 }
 
 impl Buckets {
-    /// Counts the entries of `count` buckets, given the bucket of each entry.
+    /// Counts the entries of each of `count` buckets, given the bucket of each entry. There must be fewer than 2³² entries.
     ///
-    /// Panics if an entry has a bucket of `count` or more. There must be fewer than 2³² entries.
+    /// Panics if the bucket of an entry is `count` or more.
     #[inline(always)]
-    pub fn count(count: usize, entries: impl IntoIterator<Item = usize>) -> Places {
+    pub fn count(count: usize, entries: impl IntoIterator<Item = usize>) -> BucketCursors {
         let mut starts = vec![0u32; count + 2];
         let counts = &mut starts[2..];
         entries.into_iter().for_each(|bucket| counts[bucket] += 1);
         for b in 2..starts.len() {
             starts[b] += starts[b - 1];
         }
-        Places { starts }
+        BucketCursors { starts }
     }
 
-    /// The places of the entries of a bucket.
+    /// Returns the index range of the entries of a bucket.
     #[inline(always)]
     pub fn range(&self, bucket: usize) -> Range<usize> {
         self.starts[bucket] as usize..self.starts[bucket + 1] as usize
     }
 
-    /// The places of the entries of consecutive buckets.
+    /// Returns the index range of the entries of consecutive buckets.
     pub fn ranges(&self, buckets: Range<usize>) -> Range<usize> {
         self.starts[buckets.start] as usize..self.starts[buckets.end] as usize
     }
 }
 
-impl Places {
-    /// The number of entries of all buckets.
+impl BucketCursors {
+    /// Returns the number of entries of all buckets.
     pub fn total(&self) -> usize {
         self.starts[self.starts.len() - 1] as usize
     }
 
-    /// The place of the next entry of a bucket.
+    /// Returns the index of the next entry of a bucket and advances the cursor of the bucket.
     #[inline(always)]
     pub fn take(&mut self, bucket: usize) -> usize {
         let next = &mut self.starts[bucket + 1];
@@ -76,13 +76,13 @@ impl Places {
         (*next - 1) as usize
     }
 
-    /// The buckets, for a caller who has taken a place for each entry that was counted.
+    /// Returns the index ranges of the buckets. The caller must have called [`BucketCursors::take`] once for each counted entry.
     pub fn filled(self) -> Buckets {
         Buckets { starts: self.starts }
     }
 }
 
-/// The buckets of `1 << shift` rows in which some rows lie: each once, in the order in which the rows come to them.
+/// Returns the buckets of `1 << shift` rows that contain the given rows. Each bucket is returned once, in the order of its first row in `rows`.
 #[inline(always)]
 pub fn buckets_of<const K: usize>(rows: [u32; K], shift: u32) -> impl Iterator<Item = usize> {
     let all = rows.map(|row| row >> shift);
@@ -102,12 +102,12 @@ mod tests {
     #[test]
     fn entries_are_those_of_a_stable_sort_for_any_sizes() {
         let state = &mut 7;
-        // No items, one bucket, and more buckets than entries are among them.
+        // The cases include no items, one bucket, and more buckets than entries.
         for case in 0..300 {
             let (items, shift) = (random(state, 1 + case), 6 + random(state, 3) as u32);
             let table = 1 + random(state, 1000);
             let buckets = table.div_ceil(1 << shift);
-            // An item has rows in several buckets, or repeats one.
+            // The rows of an item may lie in several buckets or in the same one.
             let rows: Vec<[u32; 4]> = (0..items).map(|_| std::array::from_fn(|_| random(state, table) as u32)).collect();
 
             let mut want: Vec<(usize, usize)> = Vec::new();
@@ -119,13 +119,13 @@ mod tests {
             }
             want.sort_by_key(|&(bucket, _)| bucket);
 
-            let mut places = Buckets::count(buckets, rows.iter().flat_map(|&rows| buckets_of(rows, shift)));
-            assert_eq!(places.total(), want.len());
-            let mut got = vec![(usize::MAX, 0); places.total()];
+            let mut cursors = Buckets::count(buckets, rows.iter().flat_map(|&rows| buckets_of(rows, shift)));
+            assert_eq!(cursors.total(), want.len());
+            let mut got = vec![(usize::MAX, 0); cursors.total()];
             for (item, &rows) in rows.iter().enumerate() {
-                buckets_of(rows, shift).for_each(|bucket| got[places.take(bucket)] = (bucket, item));
+                buckets_of(rows, shift).for_each(|bucket| got[cursors.take(bucket)] = (bucket, item));
             }
-            let sorted = places.filled();
+            let sorted = cursors.filled();
             assert_eq!(got, want, "{items} items, {buckets} buckets");
             assert_eq!(sorted.ranges(0..buckets), 0..want.len());
             for bucket in 0..buckets {

@@ -1,36 +1,38 @@
-//! Row gradients that are added up later, bucket by bucket.
+//! Row-sparse gradients with lazy sums, which are computed bucket by bucket.
 
 use crate::pool::Buffer;
 use crate::real::Real;
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// A row gradient that is not added up: what each bucket of rows gets can be computed by itself, in an order that only the data decide.
+/// A row-sparse gradient whose sums have not been computed. The sums of each bucket of rows can be computed independently, in an order that depends on the
+/// data only.
 pub trait RowSums<T: Real>: Debug + Send + Sync {
-    /// A bucket is this power of two of consecutive rows; at least 6.
+    /// Returns the base-2 logarithm of the number of consecutive rows in a bucket, at least 6.
     fn bucket_shift(&self) -> u32;
 
-    /// True if no row of the bucket gets anything.
+    /// Returns true if the bucket has no contributions.
     fn is_empty(&self, bucket: usize) -> bool;
 
-    /// Adds to `sums`, one row of values for each row of the bucket, and sets the bit of each row that something was added to.
+    /// Adds the contributions of a bucket to `sums`, which has one row of values for each row of the bucket, and sets the bit in `touched` of each row that has
+    /// contributions.
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]);
 }
 
-/// Two of a table: what the first adds to a row, then the second.
+/// The lazy sum of two row-sparse gradients of one table. For each row, the contributions of the first are added before those of the second.
 #[derive(Debug)]
-pub(super) struct Both<T: Real> {
+pub(super) struct LazySum<T: Real> {
     parts: [Arc<dyn RowSums<T>>; 2],
     table_rows: usize,
     width: usize,
 }
 
-impl<T: Real> Both<T> {
+impl<T: Real> LazySum<T> {
     pub fn new(parts: [Arc<dyn RowSums<T>>; 2], table_rows: usize, width: usize) -> Self {
-        Both { parts, table_rows, width }
+        LazySum { parts, table_rows, width }
     }
 
-    /// The buckets of one of them that lie in one of ours.
+    /// Returns the buckets of a part that lie in a bucket of the sum. A bucket of the sum has the larger of the two bucket sizes.
     fn inside(&self, part: &dyn RowSums<T>, bucket: usize) -> std::ops::Range<usize> {
         let finer = self.bucket_shift() - part.bucket_shift();
         let all = self.table_rows.div_ceil(1 << part.bucket_shift());
@@ -38,7 +40,7 @@ impl<T: Real> Both<T> {
     }
 }
 
-impl<T: Real> RowSums<T> for Both<T> {
+impl<T: Real> RowSums<T> for LazySum<T> {
     fn bucket_shift(&self) -> u32 {
         self.parts[0].bucket_shift().max(self.parts[1].bucket_shift())
     }
@@ -59,7 +61,7 @@ impl<T: Real> RowSums<T> for Both<T> {
     }
 }
 
-/// Buckets in groups of neighbours, of a number that does not depend on the threads: a group is what one task works on.
+/// The buckets of a table, in groups of consecutive buckets. One task processes one group. The number of groups does not depend on the number of threads.
 pub(crate) struct RowGroups {
     pub(crate) count: usize,
     buckets: usize,
@@ -75,13 +77,13 @@ impl RowGroups {
         RowGroups { count: buckets.div_ceil(buckets_per_group), buckets, bucket_rows, table_rows, buckets_per_group }
     }
 
-    /// Rows of one group; the last group may have fewer.
+    /// Returns the number of rows of a group; the last group may have fewer.
     pub(crate) fn rows_per_group(&self) -> usize {
         self.buckets_per_group * self.bucket_rows
     }
 
-    /// Calls `f(bucket, sums, touched)` for the buckets of a group that get anything. `f` finds sums of zero wherever nothing was added, and
-    /// must leave zeros everywhere and no bit set.
+    /// Calls `f(bucket, sums, touched)` for each bucket of a group that has contributions. The sums of rows without contributions are zero. `f` must reset all
+    /// sums to zero and clear all bits.
     pub(crate) fn for_each_bucket<T: Real>(
         &self,
         group: usize,

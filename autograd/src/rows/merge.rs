@@ -1,11 +1,11 @@
-//! The union of two row gradients.
+//! The sum of two merged row-sparse gradients.
 
 use super::sparse::RowSparse;
 use crate::parallel::{self, split_lengths};
 use crate::pool::Buffer;
 use crate::real::Real;
 
-/// The union of two row gradients, values of common rows added.
+/// Returns the sum of two row-sparse gradients: the union of their rows, with the values of common rows added.
 pub(crate) fn union<T: Real>(a: RowSparse<T>, b: RowSparse<T>) -> RowSparse<T> {
     let shape = a.shape().to_vec();
     let width = a.width();
@@ -34,7 +34,7 @@ pub(crate) fn union<T: Real>(a: RowSparse<T>, b: RowSparse<T>) -> RowSparse<T> {
             match (i.map(|i| &a.data()[(base_a + i) * width..][..width]), j.map(|j| &b.data()[(base_b + j) * width..][..width])) {
                 (Some(x), Some(y)) => out.iter_mut().zip(x).zip(y).for_each(|((o, &x), &y)| *o = x + y),
                 (Some(x), None) | (None, Some(x)) => out.copy_from_slice(x),
-                (None, None) => unreachable!("a merged row comes from somewhere"),
+                (None, None) => unreachable!("a row of the union is in one of the lists"),
             }
             n += 1;
         });
@@ -42,7 +42,7 @@ pub(crate) fn union<T: Real>(a: RowSparse<T>, b: RowSparse<T>) -> RowSparse<T> {
     RowSparse::new(&shape, rows, values)
 }
 
-/// Visits the union of two ascending lists: the row, and its place in each list that has it.
+/// Calls `visit` for each row in the union of two ascending lists, with the index of the row in each list, or `None` if the list does not contain it.
 fn merge_walk(a: &[u32], b: &[u32], mut visit: impl FnMut(u32, Option<usize>, Option<usize>)) {
     let (mut i, mut j) = (0, 0);
     while i < a.len() || j < b.len() {

@@ -1,6 +1,6 @@
-//! Gradients of which only some rows are present.
+//! [`RowSparse`]: row-sparse gradients.
 
-use super::deferred::{Both, RowGroups, RowSums};
+use super::deferred::{LazySum, RowGroups, RowSums};
 use super::merge::union;
 use crate::parallel::{self, split_lengths};
 use crate::pool::Buffer;
@@ -9,10 +9,10 @@ use crate::tensor::Tensor;
 use ndarray::{ArrayView2, Dimension, IxDyn};
 use std::sync::{Arc, OnceLock};
 
-/// Rows of a table `[R, …]`: sorted, unique, with one row of values each.
+/// A row-sparse gradient of a table `[R, …]`: sorted, unique row numbers, and one row of values for each.
 ///
-/// It may stand for sums that nobody has computed yet ([`RowSums`]). An optimizer then computes them bucket by bucket while it updates the
-/// table; whoever asks for rows or values gets them all. The numbers are the same.
+/// The sums may be lazy ([`RowSums`]). An optimizer then computes them bucket by bucket while it updates the table, and [`RowSparse::rows`],
+/// [`RowSparse::values`] and [`RowSparse::data`] compute all of them on first use. The values are the same in both cases.
 #[derive(Debug, Clone)]
 pub struct RowSparse<T: Real> {
     shape: IxDyn,
@@ -20,6 +20,7 @@ pub struct RowSparse<T: Real> {
     merged: OnceLock<Merged<T>>,
 }
 
+/// Sorted, unique rows and their sums.
 #[derive(Debug, Clone)]
 struct Merged<T: Real> {
     rows: Buffer<u32>,
@@ -27,74 +28,82 @@ struct Merged<T: Real> {
 }
 
 impl<T: Real> RowSparse<T> {
-    /// Panics if `rows` is not sorted and unique and below the table's length, or if `values` does not hold one table row for each.
+    /// Creates a row-sparse gradient of a table with the given shape from sorted, unique row numbers and one row of values for each.
+    ///
+    /// Panics if the row numbers are not sorted and unique, if one is out of range, or if the number of values does not fit.
     #[track_caller]
     pub fn new(shape: &[usize], rows: Buffer<u32>, values: Buffer<T>) -> Self {
         let width: usize = shape[1..].iter().product();
-        assert_eq!(rows.len() * width, values.len(), "RowSparse: {} rows of {width} values got {} values", rows.len(), values.len());
+        assert_eq!(rows.len() * width, values.len(), "RowSparse: {} values for {} rows of width {width}", values.len(), rows.len());
         assert!(rows.is_sorted_by(|a, b| a < b), "RowSparse: rows must be sorted and unique");
-        assert!(rows.last().is_none_or(|&last| (last as usize) < shape[0]), "RowSparse: a row lies beyond the table of {} rows", shape[0]);
+        assert!(
+            rows.last().is_none_or(|&last| (last as usize) < shape[0]),
+            "RowSparse: a row number is out of range for a table of {} rows",
+            shape[0]
+        );
         RowSparse { shape: IxDyn(shape), sums: None, merged: OnceLock::from(Merged { rows, values }) }
     }
 
-    /// Sums for later.
+    /// Creates a row-sparse gradient of a table with the given shape, with lazy sums.
+    ///
+    /// Panics if a bucket of the sums has fewer than 64 rows.
     pub fn deferred(shape: &[usize], sums: Arc<dyn RowSums<T>>) -> Self {
         assert!(sums.bucket_shift() >= 6, "RowSparse: a bucket has at least 64 rows");
         RowSparse { shape: IxDyn(shape), sums: Some(sums), merged: OnceLock::new() }
     }
 
-    /// The sum of two of one table. It is not added up either, if neither is.
+    /// Returns the sum of two gradients of the same table. The sum is lazy if both gradients are lazy and not yet computed.
     pub(crate) fn plus(self, other: Self) -> Self {
         if let (Some(a), Some(b)) = (&self.sums, &other.sums)
             && self.merged.get().is_none()
             && other.merged.get().is_none()
         {
-            let both = Both::new([a.clone(), b.clone()], self.shape()[0], self.width());
-            return Self::deferred(self.shape(), Arc::new(both));
+            let sum = LazySum::new([a.clone(), b.clone()], self.shape()[0], self.width());
+            return Self::deferred(self.shape(), Arc::new(sum));
         }
         union(self, other)
     }
 
-    /// The same rows, added up now: nothing of what they come from is held any longer.
+    /// Computes the sums now and drops the contributions, which frees their memory.
     pub fn added_up(mut self) -> Self {
         self.merged();
         self.sums = None;
         self
     }
 
-    /// Shape of the whole table.
+    /// Returns the shape of the table.
     pub fn shape(&self) -> &[usize] {
         self.shape.slice()
     }
 
-    /// Elements of one row.
+    /// Returns the number of elements in a row.
     pub fn width(&self) -> usize {
         self.shape()[1..].iter().product()
     }
 
-    /// The touched rows, ascending.
+    /// Returns the numbers of the touched rows, in ascending order.
     pub fn rows(&self) -> &[u32] {
         &self.merged().rows
     }
 
-    /// `[rows, width]`
+    /// Returns the values of the touched rows, `[rows, width]`.
     pub fn values(&self) -> ArrayView2<'_, T> {
         ArrayView2::from_shape((self.rows().len(), self.width()), self.data()).expect("one row of values for each row")
     }
 
-    /// The values, row after row.
+    /// Returns the values of the touched rows, in row-major order.
     pub fn data(&self) -> &[T] {
         &self.merged().values
     }
 
-    /// The same gradient with its zeros.
+    /// Returns the gradient as a dense tensor of the shape of the table.
     pub fn to_dense(&self) -> Tensor<T> {
         let mut out = Buffer::zeros(self.shape.size());
         self.add_to(&mut out);
         Tensor::from_buffer(out, self.shape())
     }
 
-    /// Adds the rows to a whole table.
+    /// Adds the gradient to a table.
     pub(crate) fn add_to(&self, table: &mut [T]) {
         let width = self.width();
         match self.unmerged() {
@@ -110,11 +119,12 @@ impl<T: Real> RowSparse<T> {
         }
     }
 
-    /// The sums, if nobody has computed them.
+    /// Returns the lazy sums, or `None` if they have already been computed.
     pub(crate) fn unmerged(&self) -> Option<&dyn RowSums<T>> {
         if self.merged.get().is_some() { None } else { self.sums.as_deref() }
     }
 
+    /// Returns the rows and their sums, which are computed on first use.
     fn merged(&self) -> &Merged<T> {
         self.merged.get_or_init(|| {
             let sums = self.sums.as_deref().expect("sums or their result");
@@ -147,7 +157,7 @@ impl<T: Real> RowSparse<T> {
     }
 }
 
-/// Calls `f` for each bit that is set, and clears it.
+/// Calls `f` with the index of each bit that is set, and clears the bit.
 fn take_bits(words: &mut [u64], mut f: impl FnMut(usize)) {
     for (w, word) in words.iter_mut().enumerate() {
         let mut left = std::mem::take(word);
@@ -166,7 +176,7 @@ mod tests {
     use crate::param::{Bounds, Param};
     use std::collections::HashMap;
 
-    /// Row (37 i) mod 1003 gets i in its even columns and −i in the others, for i below 300.
+    /// Adds i to the even columns and −i to the odd columns of row (37 i) mod 1003, for i below 300.
     #[derive(Debug)]
     struct Some300 {
         width: usize,
@@ -242,7 +252,7 @@ mod tests {
             || Box::new(Adam::new(0.1, AdamMode::Lazy)),
             || Box::new(Adam::new(0.1, AdamMode::Dense)),
         ];
-        // The widths that have loops of their own, and one that has not.
+        // The widths with specialised loops, and one without.
         for (make, width) in optimizers.into_iter().flat_map(|make| [1, 2, 3, 24, 27].map(|width| (make, width))) {
             let run = |merge: bool| {
                 let mut param = Param::from_tensor("table", Tensor::full(&[1003, width], 0.5));

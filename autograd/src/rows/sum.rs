@@ -1,9 +1,9 @@
-//! Adding many contributions to few rows, in parallel, always in the same order.
+//! Parallel sums of many contributions to few rows, in an order that does not depend on the number of threads.
 //!
-//! Each chunk of items sorts its own touches by bucket of rows (chunks of a size that does not depend on the threads); a bucket then belongs to one
-//! task, which takes the touches chunk after chunk, that is in the order of the items.
+//! A touch is one contribution of an item to a row. The items are divided into chunks of a size that does not depend on the number of threads, and each chunk
+//! sorts its touches by bucket of rows. Each bucket then belongs to one task, which adds the touches chunk by chunk, in the order of the items.
 //!
-//! Where rows are short and threads few, looking through all row numbers for one's own is less work than sorting them: [`add_short_rows`].
+//! With short rows and few threads, [`add_short_rows`] is faster: each thread scans all row numbers for the rows of its part of the table, without sorting.
 
 use super::buckets::{Buckets, buckets_of};
 use super::sparse::RowSparse;
@@ -11,15 +11,15 @@ use crate::parallel::{self, dispatched, split_lengths};
 use crate::pool::Buffer;
 use crate::real::Real;
 
-/// Bytes of row values that one task works on: half of a usual second-level cache.
+/// Size in bytes of the row values of a bucket: half of a typical second-level cache.
 const BUCKET_BYTES: usize = 256 * 1024;
 
-/// Which items touch which bucket of rows.
+/// The items that touch each bucket of rows.
 struct Grouping {
-    /// A bucket is `1 << shift` rows; at least 64, so that buckets own whole words of a bitmap.
+    /// A bucket has `1 << shift` rows, at least 64, so that each bucket has whole words of a bitmap.
     shift: u32,
     buckets: usize,
-    /// Of each chunk of items, their numbers sorted by bucket.
+    /// For each chunk of items, the item numbers sorted by bucket.
     chunks: Vec<(Buckets, Buffer<u32>)>,
 }
 
@@ -28,7 +28,9 @@ pub(crate) trait Touch<T, const K: usize>: Fn(usize) -> ([u32; K], [T; K]) + Syn
 impl<T, const K: usize, F: Fn(usize) -> ([u32; K], [T; K]) + Sync> Touch<T, K> for F {}
 
 impl Grouping {
-    /// Panics, naming the op, if an item touches a row beyond the table.
+    /// Groups items by bucket.
+    ///
+    /// Panics with the name of the op if an item touches a row that is out of range.
     #[track_caller]
     fn new<T: Real, const K: usize>(op: &str, table_rows: usize, width: usize, items: usize, touch: &impl Touch<T, K>) -> Self {
         let fitting = BUCKET_BYTES / (width.max(1) * size_of::<T>());
@@ -41,31 +43,32 @@ impl Grouping {
                 largest = rows.iter().fold(largest, |largest, &row| row.max(largest));
                 buckets_of(rows, shift).filter(|&bucket| bucket < buckets)
             });
-            let mut places = Buckets::count(buckets, entries);
+            let mut cursors = Buckets::count(buckets, entries);
             if largest as usize >= table_rows {
                 return Err(largest);
             }
-            let mut numbers = Buffer::stale(places.total());
+            let mut numbers = Buffer::stale(cursors.total());
             for i in range {
-                buckets_of(touch(i).0, shift).for_each(|bucket| numbers[places.take(bucket)] = i as u32);
+                buckets_of(touch(i).0, shift).for_each(|bucket| numbers[cursors.take(bucket)] = i as u32);
             }
-            Ok((places.filled(), numbers))
+            Ok((cursors.filled(), numbers))
         });
         match chunks.into_iter().collect() {
             Ok(chunks) => Grouping { shift, buckets, chunks },
-            Err(row) => panic!("{op}: row {row} of a table of {table_rows} rows"),
+            Err(row) => panic!("{op}: row {row} is out of range for a table of {table_rows} rows"),
         }
     }
 
-    /// The items that touch a bucket, in order.
+    /// Returns the items that touch a bucket, in order, one slice for each chunk.
     fn items_of(&self, bucket: usize) -> impl Iterator<Item = &[u32]> {
         self.chunks.iter().map(move |(buckets, numbers)| &numbers[buckets.range(bucket)])
     }
 }
 
-/// Σ over items and k of weights[k] · values[item] into rows[k]: the rows that were touched, sorted, and their sums.
+/// Adds weights[k] · values[item] to row rows[k], for each item and each k, with `(rows, weights) = touch(item)`. Returns the touched rows, sorted, and their
+/// sums.
 ///
-/// Panics, naming the op, if an item touches a row beyond the table.
+/// Panics with the name of the op if an item touches a row that is out of range.
 #[track_caller]
 pub(crate) fn sum_into_rows<T: Real, const K: usize>(
     op: &str,
@@ -139,8 +142,8 @@ pub(crate) fn add_into_table<T: Real>(table: &mut [T], width: usize, rows: &[u32
     parallel::for_each_item(parts, |b, part| accumulate(&grouping, b, &touch, values, width, part, &|local| local));
 }
 
-/// The same for short rows: each thread looks through all row numbers for those in its part of the table. That is less work
-/// than sorting them, as long as threads are few; the sums are the same.
+/// Adds row i of `values` to row `rows[i]` of a table with short rows, in the order of i. Each thread scans all row numbers for the rows of its part of the
+/// table. With few threads this is less work than sorting the rows; the sums are the same.
 pub(crate) fn add_short_rows<T: Real, const W: usize>(table: &mut [T], rows: &[u32], values: &[T]) {
     let part = (table.len() / W).div_ceil(parallel::threads()).max(1);
     let parts: Vec<&mut [T]> = table.chunks_mut(part * W).collect();
@@ -148,13 +151,13 @@ pub(crate) fn add_short_rows<T: Real, const W: usize>(table: &mut [T], rows: &[u
 }
 
 dispatched! {
-/// Adds to a part of a table that begins at row `first` what is its own.
+/// Adds the contributions to the rows of a part of the table that begins at row `first`, and skips all others.
 fn add_own_rows<T: Real, const W: usize>(first: u32, table: &mut [T], rows: &[u32], values: &[T]) {
     const RUN: usize = 1024;
     let table = table.as_chunks_mut::<W>().0;
     let mut own = [0u16; RUN];
     for (rows, values) in rows.chunks(RUN).zip(values.as_chunks::<W>().0.chunks(RUN)) {
-        // Whether a row is one's own cannot be foreseen: no branch depends on it.
+        // Whether a row belongs to this part is unpredictable, so the loop has no branch that depends on it.
         let mut n = 0;
         for (i, &row) in rows.iter().enumerate() {
             own[n] = i as u16;
@@ -170,8 +173,8 @@ fn add_own_rows<T: Real, const W: usize>(first: u32, table: &mut [T], rows: &[u3
 }
 }
 
-/// Adds the touches of one bucket, in the order of the items. The widths of usual tables are compiled in: density, RGB, harmonics of degree 2,
-/// and 4 and 28, which `benches/ops.rs` measures.
+/// Adds the touches of one bucket, in the order of the items. Loops with a constant width exist for density (1), RGB (3) and spherical harmonics of degree 2
+/// (27), and for the widths 4 and 28, which `benches/ops.rs` measures.
 fn accumulate<T: Real, const K: usize>(
     grouping: &Grouping,
     bucket: usize,
@@ -201,7 +204,7 @@ struct Bucket<'a, T> {
 }
 
 dispatched! {
-/// `W` is the width, or 0 for one only known at run time.
+/// Adds the touches of one bucket. `W` is the width, or 0 if the width is known at run time only.
 fn accumulate_rows<T: Real, const K: usize, const W: usize, F: Touch<T, K>, S: Fn(usize) -> usize>(
     args: Bucket<'_, T>,
     touch: &F,
@@ -284,7 +287,7 @@ mod tests {
                     want[r as usize * width + c] += values[i * width + c];
                 }
             }
-            // From nine threads on they are sorted.
+            // With nine or more threads the rows are sorted.
             for threads in [1, 2, 3, 8, 9] {
                 let mut got = vec![0.5f32; table * width];
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");

@@ -1,11 +1,11 @@
-//! Life and death of graphs, and derivatives of derivatives.
+//! Lifetime of graphs, and higher derivatives.
 
 use autograd::{Cotangent, GradSink, Kernel, KernelCall, Op, Param, Tensor, Vjp, grad, no_grad, value_and_grad};
 use ndarray::{arr0, arr1};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// y = x, with a witness: how many of these are alive can be counted from outside.
+/// y = x. The reference count of the witness tells how many ops are alive.
 #[derive(Debug)]
 struct Identity {
     _witness: Arc<()>,
@@ -38,10 +38,10 @@ fn a_chain_of_a_million_nodes_goes_backward_and_is_dropped_without_recursion_and
         assert_eq!(y.backward().array(&x)[[]], 1.0);
         drop(y);
         assert_eq!(alive(&witness), 0);
-        // Freed while it goes backward.
+        // The graph is freed during the backward pass.
         let (value, gradients) = value_and_grad(chain);
         assert_eq!((value, gradients.array(&x)[[]], alive(&witness)), (2.0, 1.0, 0));
-        // Differentiable: the search for what is needed and the new graph are as deep.
+        // In a differentiable pass, the search for the needed nodes and the new graph have the same depth.
         let y = chain();
         assert_eq!(grad(&y, &[&x])[0].item(), 1.0);
         drop(y);
@@ -79,7 +79,7 @@ fn an_update_while_somebody_holds_the_graph_leaves_the_old_values_to_the_graph()
     let before = w.tensor().clone();
     w.update(|w| w.fill(100.0));
     assert_eq!(before.data(), [1.0, 2.0]);
-    // The slope is that at the old values, and still belongs to the parameter.
+    // The gradient is computed at the old values and belongs to the parameter.
     assert_eq!(y.backward().of(&w).expect("a gradient").data(), [2.0, 4.0]);
     assert_eq!(w.tensor().square().sum().backward().of(&w).expect("a gradient").data(), [200.0, 200.0]);
 }
@@ -138,12 +138,12 @@ fn nothing_is_recorded_of_constants_or_without_gradients() {
     });
     assert!(!inside.is_tracked() && !x.detach().is_tracked());
     assert_eq!(alive(&witness), 0);
-    // Recording is on again afterwards, and on after a panic inside.
+    // Recording is on again afterwards, also after a panic inside `no_grad`.
     assert!(std::panic::catch_unwind(|| no_grad(|| panic!("inside no_grad"))).is_err());
     assert!(identity(&x, &witness).is_tracked());
 }
 
-/// y = x³ with an adjoint by hand; counts how often its reference is asked.
+/// y = x³ with a hand-written adjoint. It counts the calls of its reference.
 #[derive(Debug)]
 struct Cube {
     references: Arc<AtomicUsize>,
@@ -188,7 +188,7 @@ fn a_kernel_uses_its_adjoint_once_and_its_reference_for_higher_derivatives() {
     assert_eq!(curvature.sum().backward().array(&x).as_slice(), Some(&[960.0, -120.0][..]));
 }
 
-/// The reference used to be run, and to record nothing, so that the gradient was lost without a word.
+/// Regression test: inside `no_grad` the reference was called and recorded no graph, so the gradient was silently lost.
 #[test]
 fn grad_without_recording_is_the_same_number_as_a_constant_through_kernels_too() {
     let references = Arc::new(AtomicUsize::new(0));
@@ -199,7 +199,7 @@ fn grad_without_recording_is_the_same_number_as_a_constant_through_kernels_too()
     assert!(!slope.is_tracked());
 }
 
-/// Whether anybody asks for a gradient used to change the value: a weighted sum with weights 1/3 rounds, and 0 · ∞ is NaN.
+/// Regression test: the value used to depend on tracking. A tracked extremum was a weighted sum, where weights of 1/3 round and 0 · ∞ is NaN.
 #[test]
 fn an_extremum_has_the_same_value_tracked_or_not_and_infinities_elsewhere_do_no_harm() {
     let x = Tensor::variable(arr1(&[0.1, f64::NEG_INFINITY, 0.1, 0.1]));

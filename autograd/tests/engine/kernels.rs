@@ -1,9 +1,9 @@
-//! Kernels of several inputs.
+//! Kernels with several inputs.
 
 use autograd::{Buffer, GradSink, Gradcheck, Kernel, KernelCall, Tensor, check_kernel, grad};
 use ndarray::arr1;
 
-/// y = a x + b, elementwise, whose adjoint gives what is needed; a careless one forgets `a` when nobody wants `x`.
+/// y = a x + b, elementwise. The adjoint computes the cotangents that are needed. A careless adjoint omits the cotangent of `a` if `x` is a constant.
 #[derive(Debug)]
 struct MultiplyAdd {
     careless: bool,
@@ -73,9 +73,9 @@ fn one_tensor_may_be_several_inputs() {
     assert_eq!(slope.sum().backward().array(&x).as_slice(), Some(&[2.0, 2.0][..]));
 }
 
-/// With all inputs tracked the gradient is right: the check used to look no further.
+/// With all inputs tracked the gradient is correct. Earlier versions of the check tested only that case.
 #[test]
 fn a_gradient_that_is_lost_when_others_are_not_wanted_is_found() {
     let error = check_kernel(|x| multiply_add(&x[0], &x[1], &x[2], true), inputs(), 1e-14).expect_err("a lost gradient").to_string();
-    assert!(error.contains("multiply_add") && error.contains("input 0, when the others are constants"), "{error}");
+    assert!(error.contains("multiply_add") && error.contains("input 0 with the other inputs constant"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! What a user of the engine would notice: life and death of graphs, gradients as rows, messages, and bits that do not depend on threads.
+//! Tests of the public behaviour of the engine: lifetime of graphs, row-sparse gradients, messages, and bits that do not depend on threads.
 
 mod graphs;
 mod kernels;

@@ -1,4 +1,4 @@
-//! Misuse panics at the caller's line and says which op, which shapes.
+//! Misuse panics at the caller's line, with a message that names the op and the shapes.
 
 use autograd::{Cotangent, GradSink, Indices, Keep, Kernel, KernelCall, Op, Param, Tensor, Vjp, grad, value_and_grad};
 use std::cell::RefCell;
@@ -6,11 +6,11 @@ use std::panic::{self, AssertUnwindSafe};
 use std::sync::Once;
 
 thread_local! {
-    /// Message and file of the panic on this thread, while somebody waits for one.
+    /// Message and file of the panic on this thread, while `panic_of` runs.
     static CAUGHT: RefCell<Option<(String, String)>> = const { RefCell::new(None) };
 }
 
-/// The message of the panic in `f`, and the file it points to.
+/// Returns the message of the panic in `f` and the file of its location.
 fn panic_of<R>(f: impl FnOnce() -> R) -> (String, String) {
     static HOOK: Once = Once::new();
     HOOK.call_once(|| {
@@ -43,7 +43,7 @@ fn rows(rows: &[u32]) -> Indices {
     Indices::from(rows.to_vec())
 }
 
-/// Each line: a misuse, then what the message must contain.
+/// Each row has a misuse and the parts that its message must contain.
 #[test]
 fn misuse_of_shapes_names_the_op_and_the_shapes_at_the_line_of_the_caller() {
     type Misuse = (fn() -> Tensor<f32>, &'static [&'static str]);
@@ -131,7 +131,7 @@ fn backward_of_more_than_a_scalar_says_what_to_do() {
     assert!(message.contains("backward_from") && message.contains("[3]") && file.ends_with("messages.rs"), "{message} in {file}");
 }
 
-/// An op or kernel that keeps nothing and reads `reads` all the same.
+/// An op and kernel that keeps nothing, but whose rule reads a value.
 #[derive(Debug)]
 struct Forgetful {
     reads: &'static str,

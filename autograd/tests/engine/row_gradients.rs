@@ -1,4 +1,4 @@
-//! Gradients of look-ups: rows up to the leaf, dense where they must be.
+//! Gradients of lookups: row-sparse at a leaf, dense otherwise.
 
 use autograd::{Grad, Indices, Param, Tensor, value_and_grad};
 use ndarray::{Array2, arr2};
@@ -11,7 +11,7 @@ fn rows(rows: &[u32]) -> Indices {
     Indices::from(rows.to_vec())
 }
 
-/// The gradient of a loss with respect to the table: which rows, or `None` if dense; and all of it.
+/// Returns the rows of the gradient of a loss with respect to the table, or `None` if it is dense, and the whole gradient as a dense array.
 fn gradient(table: &Param<f64>, loss: impl FnOnce(&Tensor<f64>) -> Tensor<f64>) -> (Option<Vec<u32>>, Vec<f64>) {
     let (_, gradients) = value_and_grad(|| loss(table.tensor()));
     let gradient = gradients.of(table).expect("the loss depends on the table");
@@ -36,7 +36,7 @@ fn rows_and_rows_stay_rows() {
 fn rows_of_a_kernel_and_of_an_op_are_added() {
     let positions = Tensor::from_vec(vec![0.0, 0.25, 0.0], &[1, 3]);
     let (touched, values) = gradient(&table(), |t| t.gather_rows(&rows(&[3])).sum() + t.trilinear(&positions, [1, 6, 1]).sum());
-    // The one-node axes name their row twice, with weight 0 the second time.
+    // An axis with one node gives the same row twice, with weight 0 the second time.
     assert_eq!(touched, Some(vec![0, 1, 3]));
     assert_eq!(values, [0.75, 0.75, 0.25, 0.25, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
 }
@@ -71,7 +71,7 @@ fn gradients_of_the_chunks_of_a_batch_add_up() {
     assert_eq!((gradient.rows(), gradient.data()), (&[1, 2, 3][..], &[1.0, 1.0, 2.0, 2.0, 1.0, 1.0][..]));
     sum.add(value_and_grad(|| table.tensor().sum()).1);
     assert_eq!(sum.of(&table).expect("dense").data(), [1.0, 1.0, 2.0, 2.0, 3.0, 3.0, 2.0, 2.0, 1.0, 1.0, 1.0, 1.0]);
-    // What only the other pass has is taken over.
+    // A gradient that only the other pass has is added as it is.
     let other = Param::new("other", arr2(&[[1.0]]));
     sum.add(value_and_grad(|| other.tensor().square().sum()).1);
     assert_eq!(sum.of(&other).expect("taken over").data(), [2.0]);

@@ -3,7 +3,7 @@
 use autograd::{Indices, Tensor};
 use ndarray::Array;
 
-/// Numbers of different magnitudes, so that another order of additions gives other bits.
+/// Returns numbers of different magnitudes, so that another order of additions gives different bits.
 fn numbers(shape: &[usize], seed: u64) -> Tensor<f32> {
     let n: usize = shape.iter().product();
     let number = |i: usize| {
@@ -17,7 +17,7 @@ fn row_numbers(n: usize, table: u32) -> Indices {
     Indices::from((0..n as u32).map(|i| i.wrapping_mul(2_654_435_761) % table).collect::<Vec<_>>())
 }
 
-/// Segments of 0 to 12 rows.
+/// Returns the offsets of segments of 0 to 12 rows.
 fn segments(rows: usize) -> Indices {
     let mut offsets = vec![0u32];
     while let Some(&last) = offsets.last()
@@ -30,7 +30,7 @@ fn segments(rows: usize) -> Indices {
 
 type Family = (&'static str, Vec<Tensor<f32>>, fn(&[Tensor<f32>]) -> Tensor<f32>);
 
-/// Sizes of several chunks that no chunk size divides.
+/// Returns functions and inputs. The sizes span several chunks and are not multiples of a chunk size.
 fn families() -> Vec<Family> {
     const N: usize = 100_003;
     vec![
@@ -41,7 +41,7 @@ fn families() -> Vec<Family> {
         ("powers and hyperbolic functions", vec![numbers(&[N], 1), numbers(&[N], 2)], |x| {
             (x[0].square() + 0.1).pow(&x[1].tanh()) + x[0].expm1() + (x[0].square() + 0.1).powf(0.3) + x[1].leaky_relu(0.1)
         }),
-        ("sines far out", vec![numbers(&[N], 1)], |x| (&x[0] * 1e5).sin() + (&x[0] * 1e5).cos()),
+        ("sines of large arguments", vec![numbers(&[N], 1)], |x| (&x[0] * 1e5).sin() + (&x[0] * 1e5).cos()),
         ("normalisation", vec![numbers(&[N / 3, 3], 1)], |x| {
             x[0].softmax(1) * x[0].normalize(0) + (x[0].log_sum_exp(1) * x[0].norm(1)).unsqueeze(1)
         }),
@@ -73,10 +73,10 @@ fn families() -> Vec<Family> {
             let rays = segments(N);
             x[0].segment_exclusive_sum(&rays) * x[0].segment_sum(&rays).segment_repeat(&rays)
         }),
-        ("look-ups", vec![numbers(&[20_011, 4], 1)], |x| {
+        ("lookups", vec![numbers(&[20_011, 4], 1)], |x| {
             x[0].gather_rows(&row_numbers(N, 20_011)) * x[0].gather_rows(&row_numbers(N, 9973))
         }),
-        ("look-ups, dense in the end", vec![numbers(&[20_011, 5], 1)], |x| x[0].exp().gather_rows(&row_numbers(N, 20_011))),
+        ("lookups, dense in the end", vec![numbers(&[20_011, 5], 1)], |x| x[0].exp().gather_rows(&row_numbers(N, 20_011))),
         ("scattering", vec![numbers(&[N, 3], 1)], |x| x[0].scatter_rows(&row_numbers(N, 1009), 1009).square()),
         ("trilinear", vec![numbers(&[30 * 30 * 30, 4], 1), numbers(&[N, 3], 2)], |x| x[0].trilinear(&(15.0 + 0.5 * &x[1]), [30, 30, 30])),
         ("nearest", vec![numbers(&[30 * 30 * 30, 4], 1)], |x| x[0].nearest(&numbers(&[N, 3], 2), [30, 30, 30])),
@@ -86,7 +86,7 @@ fn families() -> Vec<Family> {
     ]
 }
 
-/// The bits of the result and of the gradients of a sum of squares.
+/// Returns the bits of the result and of the gradients of its sum of squares.
 fn bits((_, inputs, f): &Family) -> Vec<Vec<u32>> {
     let y = f(inputs);
     let gradients = (&y * &y).sum().backward();

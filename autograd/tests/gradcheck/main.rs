@@ -1,7 +1,7 @@
-//! The table of gradients: one row for each op and each way of using it.
+//! The table of gradient checks: one row for each op and each way of using it.
 //!
-//! Every row is checked in `f64` against finite differences, first and second derivatives, in the two passes (`backward`, where kernels use
-//! their adjoints, and `grad`, where they use their references); and its gradient in `f32` against that in `f64`, as a vector.
+//! For every row, first and second derivatives in `f64` are compared with finite differences, in both passes: `backward`, where kernels use their adjoints,
+//! and `grad`, where they use their references. The gradient in `f32` is compared with the gradient in `f64`, as a vector.
 //! `cargo test -p autograd --test gradcheck -- --nocapture` prints the table.
 
 mod rows;
@@ -30,7 +30,7 @@ fn every_op_has_right_derivatives_of_both_orders_and_in_both_precisions() {
     assert!(failures.is_empty(), "{}", failures.join("\n"));
 }
 
-/// The names in the list of ops, and those of the public functions in their files that return a tensor.
+/// Returns the names in the list of ops, and the names of the public functions in their files that return a tensor.
 fn names_of_ops() -> Vec<String> {
     let list = include_str!("../../src/ops.rs");
     let cells = list.lines().filter_map(|line| line.strip_prefix("//! | [`")?.split(" | ").nth(1));
@@ -53,7 +53,7 @@ fn every_op_has_a_row_in_the_table() {
     assert!(missing.is_empty(), "ops without a row in the table of gradients: {missing:?}");
 }
 
-/// The value of the one kernel of this crate, its adjoint in table and positions, and its row gradient, for every width it is compiled for.
+/// Checks the value of the only kernel of this crate and its gradients with respect to table and positions, for every width with a specialised loop.
 #[test]
 fn the_trilinear_kernel_is_what_its_reference_says_in_both_precisions() {
     for (width, nodes) in [1, 2, 3, 4, 12, 27, 28, 48].into_iter().zip([[3, 4, 5], [1, 4, 2], [2, 2, 2], [6, 1, 1]].into_iter().cycle()) {
@@ -66,7 +66,7 @@ fn the_trilinear_kernel_is_what_its_reference_says_in_both_precisions() {
     }
 }
 
-/// y = sin x, with a rule that forgets the cosine of the second entry.
+/// y = sin x, with a wrong rule that uses 1 instead of the cosine for the second entry.
 #[derive(Debug)]
 struct CarelessSine;
 impl Op<f64> for CarelessSine {
@@ -97,7 +97,7 @@ fn a_wrong_rule_is_caught_with_its_name_the_entry_and_both_numbers() {
     for part in ["careless_sine", "input 0", "[1]", &format!("{analytic:.9e}"), &format!("{numeric:.9e}")] {
         assert!(text.contains(part), "{part} is not in: {text}");
     }
-    // Along a random direction it shows as well, without naming the entry.
+    // A check along a random direction also fails, but does not name the entry.
     let error = Gradcheck::new(|x| careless_sine(&x[0]), [input]).named("careless_sine").run().expect_err("the rule is wrong");
     assert!(error.to_string().contains("elementwise"), "{error}");
 }

@@ -1,10 +1,10 @@
-//! The rows, in the order of the list of ops.
+//! The rows of the table, in the order of the list of ops.
 
 use crate::table::*;
 use autograd::Tensor;
 use ndarray::ArrayD;
 
-/// `op, case, [inputs], function` and, for functions with kinks, what is zero there.
+/// Each row is `op, case, [inputs], function` and, for a function with kinks, a kink function that is zero at them.
 macro_rules! rows {
     ($($op:literal, $case:literal, [$($input:expr),*], $f:expr $(, kinks: $kinks:expr)?;)*) => {
         vec![$(Row {
@@ -203,9 +203,9 @@ fn lookup() -> Vec<Row> {
         "gather_rows", "[5, 3], repeated", [numbers(&[5, 3], 10)], |x| x[0].gather_rows(&indices(&[4, 3, 3, 1, 3, 0])).square();
         "gather_rows", "[5, 2, 2]", [numbers(&[5, 2, 2], 10)], |x| x[0].gather_rows(&indices(&[4, 1])).square();
         "gather_rows", "no rows", [numbers(&[5, 2], 10)], |x| x[0].gather_rows(&indices(&[])).square();
-        "gather_rows", "two look-ups in one table", [numbers(&[5, 2], 10)],
+        "gather_rows", "two lookups in one table", [numbers(&[5, 2], 10)],
             |x| x[0].gather_rows(&indices(&[4, 1, 1])) * x[0].gather_rows(&indices(&[0, 1, 2]));
-        "gather_rows", "a look-up and a dense use of one table", [numbers(&[3, 2], 10)], |x| x[0].gather_rows(&indices(&[2, 1, 1])) * x[0].square();
+        "gather_rows", "a lookup and a dense use of one table", [numbers(&[3, 2], 10)], |x| x[0].gather_rows(&indices(&[2, 1, 1])) * x[0].square();
         "scatter_rows", "[4], repeated", [numbers(&[4], 10)], |x| x[0].scatter_rows(&indices(&[2, 0, 2, 4]), 6).square();
         "scatter_rows", "[4, 3], repeated", [numbers(&[4, 3], 10)], |x| x[0].scatter_rows(&indices(&[1, 1, 1, 0]), 3).square();
     }
@@ -239,7 +239,7 @@ fn select() -> Vec<Row> {
     }
 }
 
-/// What the ops are for: each row several of them at once.
+/// Typical compositions of several ops.
 fn compositions() -> Vec<Row> {
     rows! {
         "(composition)", "emission and absorption along packed rays", [numbers(&[8, 1], 14), numbers(&[8, 3], 15), positions(6, [2, 2, 2])],

@@ -1,26 +1,26 @@
-//! A row of the table, and the numbers it is evaluated at.
+//! A row of the table, and the inputs of the functions.
 
 use autograd::{Closeness, Gradcheck, Indices, Real, Tensor, grad};
 use ndarray::ArrayD;
 
 pub type Function<T> = fn(&[Tensor<T>]) -> Tensor<T>;
 
-/// A function in both precisions, and where to check it.
+/// A function in both precisions, and the inputs at which it is checked.
 pub struct Row {
     pub op: &'static str,
     pub case: &'static str,
     pub double: Function<f64>,
     pub single: Function<f32>,
     pub inputs: Vec<ArrayD<f64>>,
-    /// Zero where the function has a kink.
+    /// Kink function, which is zero where the function has a kink.
     pub kinks: Option<Function<f64>>,
 }
 
-/// A gradient in `f32` is a handful of roundings away from that in `f64`.
+/// Tolerance for a gradient in `f32`, which differs from the gradient in `f64` by a few rounding errors.
 const SINGLE_PRECISION: f64 = 2e-6;
 
 impl Row {
-    /// The relative errors of the first and the second derivative, and of the gradient in `f32`.
+    /// Checks the row. Returns the relative errors of the first and the second derivative, and of the gradient in `f32`.
     pub fn check(&self) -> Result<[f64; 3], String> {
         let name = format!("{} ({})", self.op, self.case);
         let mut check = Gradcheck::new(self.double, self.inputs.clone()).named(&name);
@@ -36,8 +36,8 @@ impl Row {
         }
     }
 
-    /// The gradient of the sum of squares, over all inputs: in `f32` as training computes it, in `f64` by the differentiable pass that the
-    /// finite differences have just confirmed.
+    /// Compares the gradient of the sum of squares with respect to all inputs in both precisions. The gradient in `f32` is computed by `backward`, as in training,
+    /// and the gradient in `f64` by the differentiable pass, which has been compared with finite differences.
     fn single_to_double(&self) -> Closeness {
         let single: Vec<Tensor<f32>> = self.inputs.iter().map(|x| Tensor::variable(x.mapv(|v| v as f32))).collect();
         let double: Vec<Tensor<f64>> = self.inputs.iter().map(|x| Tensor::variable(x.clone())).collect();
@@ -49,7 +49,7 @@ impl Row {
     }
 }
 
-/// Numbers of magnitude 0.3 to 1.5 and either sign.
+/// Returns numbers with magnitudes from 0.3 to 1.5 and both signs.
 pub fn numbers(shape: &[usize], seed: u64) -> ArrayD<f64> {
     let mut index = 0u64;
     ArrayD::from_shape_simple_fn(shape, || {
@@ -61,12 +61,12 @@ pub fn numbers(shape: &[usize], seed: u64) -> ArrayD<f64> {
     })
 }
 
-/// Numbers from 0.3 to 1.5.
+/// Returns numbers from 0.3 to 1.5.
 pub fn positive(shape: &[usize], seed: u64) -> ArrayD<f64> {
     numbers(shape, seed).mapv(f64::abs)
 }
 
-/// Different numbers, an eighth apart, in some disorder.
+/// Returns distinct multiples of 1/8, not sorted.
 pub fn distinct(shape: &[usize]) -> ArrayD<f64> {
     let n: usize = shape.iter().product();
     let mut index = 0;
@@ -77,7 +77,7 @@ pub fn distinct(shape: &[usize]) -> ArrayD<f64> {
     })
 }
 
-/// Positions of which every coordinate is at least a tenth of a cell away from the nodes; every fourth lies outside the grid along one axis.
+/// Returns positions whose coordinates are at least a tenth of a cell away from the nodes. Every fourth position is outside the grid along one axis.
 pub fn positions(m: usize, nodes: [usize; 3]) -> ArrayD<f64> {
     let fractions = positive(&[m, 3], 77).mapv(|x| 0.1 + 0.8 * (x - 0.3) / 1.2);
     ArrayD::from_shape_fn(vec![m, 3], |at| {
@@ -94,25 +94,25 @@ pub fn indices(rows: &[u32]) -> Indices {
     Indices::from(rows.to_vec())
 }
 
-/// Ones and zeros.
+/// Returns a mask of ones and zeros.
 pub fn mask<T: Real>(shape: &[usize]) -> Tensor<T> {
     let n = shape.iter().product();
     Tensor::from_vec((0..n).map(|i| if i % 3 == 1 { T::zero() } else { T::one() }).collect(), shape)
 }
 
-/// All differences between two elements: an extremum has a kink where one is zero.
+/// Returns the differences of all pairs of elements. An extremum has a kink where a difference is zero.
 pub fn differences(x: &Tensor<f64>) -> Tensor<f64> {
     let n = x.len();
     let identity = Tensor::constant(ndarray::Array2::<f64>::eye(n));
     x.reshape(&[n, 1]) - x.reshape(&[1, n]) + identity
 }
 
-/// Zero at the integers, where trilinear interpolation has kinks.
+/// Returns numbers that are zero at the integers, where trilinear interpolation has kinks.
 pub fn at_integers(u: &Tensor<f64>) -> Tensor<f64> {
     (u * std::f64::consts::PI).sin()
 }
 
-/// Zero half-way between the integers, where the nearest node changes.
+/// Returns numbers that are zero half-way between the integers, where the nearest node changes.
 pub fn at_halves(u: &Tensor<f64>) -> Tensor<f64> {
     (u * std::f64::consts::PI).cos()
 }
