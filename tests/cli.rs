@@ -724,3 +724,24 @@ fn some_test_views_or_none_are_compared_and_the_figures_say_so() {
     let psnr = format!("| {:.2} |", evaluated["psnr"].as_f64().unwrap());
     assert!(compared.contains(&psnr), "{psnr} in {compared}");
 }
+
+#[test]
+fn no_command_writes_its_result_over_what_it_reads() {
+    let folder = Folder::new("over");
+    let (run, data) = (folder.path("run"), scene(&folder));
+    assert_eq!(train_on(&data, &run, &[]).code, 0);
+    let (checkpoint, transforms) = (format!("{run}/checkpoint.safetensors"), format!("{data}/transforms_train.json"));
+    let before = [&checkpoint, &transforms].map(|path| fs::read(path).unwrap());
+    for (line, owner) in [
+        (vec!["evaluate", &run, "--out", &checkpoint], "the run"),
+        (vec!["evaluate", &run, "--out", &transforms], "the dataset"),
+        (vec!["compare", &run, "--out", &checkpoint], "the run"),
+        (vec!["sweep", "--scene", "procedural", "--preset", "demo", "--out", &run], "not a sweep"),
+    ] {
+        let answer = plenoxel(&line);
+        assert!(answer.code == 2 && answer.err.contains(owner) && answer.err.contains("--out"), "{}", answer.err);
+    }
+    assert!(before == [&checkpoint, &transforms].map(|path| fs::read(path).unwrap()));
+    let answer = plenoxel(&["train", "--set", "seed=9223372036854775808"]);
+    assert!(answer.code == 2 && answer.err.contains("a whole number from") && !answer.err.contains("string"), "{}", answer.err);
+}

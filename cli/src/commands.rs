@@ -21,6 +21,21 @@ mod trained_run;
 
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Error;
+use plenoxel::run::folder::RunFolder;
+use std::path::Path;
+
+/// Refuses to write `out` over a file of one of the runs, or of the dataset in the folder `data`, that a command reads.
+pub fn check_replaceable(out: &Path, runs: &[&RunFolder], data: Option<&Path>) -> Result<(), Error> {
+    let of_run = runs.iter().any(|run| run.owns(out));
+    let of_data = data.is_some_and(|data| {
+        out.canonicalize().is_ok_and(|out| out.is_file() && data.canonicalize().is_ok_and(|data| out.starts_with(data)))
+    });
+    if !of_run && !of_data {
+        return Ok(());
+    }
+    let found = format!("{}, which belongs to the {} that is read,", out.display(), if of_run { "run" } else { "dataset" });
+    Err(Error::config("--out", found, "the name of another file"))
+}
 
 /// Refuses a split without views.
 fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {

@@ -118,9 +118,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
         Ok(cli) => cli,
         Err(answer) => return answer_to_arguments(&answer, streams),
     };
-    if streams.terminal {
-        train::interrupt::install();
-    }
+    train::interrupt::install();
     let console = Console::new(streams, cli.machine.log_format, cli.machine.quiet);
     memory::limit(cli.machine.max_memory);
     let code = machine::with_threads(cli.machine.threads, || -> Result<u8, Error> {

@@ -25,8 +25,8 @@ const SETTINGS: [&str; 12] = [
     "--threads=2",
 ];
 
-fn folder() -> PathBuf {
-    let path = std::env::temp_dir().join(format!("plenoxel-interruption-{}", std::process::id()));
+fn folder(name: &str) -> PathBuf {
+    let path = std::env::temp_dir().join(format!("plenoxel-interruption-{name}-{}", std::process::id()));
     fs::create_dir_all(&path).expect("a temporary folder");
     path
 }
@@ -66,7 +66,7 @@ fn result(run: &Path) -> (Vec<u8>, Vec<serde_json::Value>) {
 
 #[test]
 fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
-    let root = folder();
+    let root = folder("bits");
     let path = |name: &str| root.join(name).to_string_lossy().into_owned();
     let (straight, cut) = (path("straight"), path("cut"));
     let begin = |out: &str| plenoxel(&[&SETTINGS[..], &["--out", out]].concat());
@@ -117,5 +117,49 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
         assert_eq!(output.status.code(), Some(code), "{}", text(&output));
         assert!(text(&output).contains(reason), "{}", text(&output));
     }
+    fs::remove_dir_all(root).expect("it is removed");
+}
+
+/// Sends a signal to a process.
+fn send(signal: &str, child: &Child) {
+    assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().expect("kill").success());
+}
+
+#[test]
+fn a_terminal_that_is_closed_stops_a_run_as_ctrl_c_does() {
+    let root = folder("hangup");
+    let run = root.join("run");
+    let mut child = plenoxel(&[&SETTINGS[..], &["--out", &run.to_string_lossy()]].concat()).spawn().expect("it runs");
+    wait_for_lines(&run, 80, &mut child);
+    send("-HUP", &child);
+    let output = child.wait_with_output().expect("it ends");
+    assert_eq!(output.status.code(), Some(130), "{}", text(&output));
+    assert!(
+        text(&output).contains("go on with: plenoxel train --resume") && run.join("training.safetensors").exists(),
+        "{}",
+        text(&output)
+    );
+    fs::remove_dir_all(root).expect("it is removed");
+}
+
+#[test]
+fn a_run_whose_folder_is_moved_and_replaced_keeps_its_model_and_touches_nothing() {
+    let root = folder("moved");
+    let (run, moved) = (root.join("run"), root.join("moved"));
+    let mut child = plenoxel(&[&SETTINGS[..], &["--out", &run.to_string_lossy()]].concat()).spawn().expect("it runs");
+    wait_for_lines(&run, 40, &mut child);
+    fs::rename(&run, &moved).expect("moved");
+    fs::create_dir(&run).expect("another folder");
+    let output = child.wait_with_output().expect("it ends");
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(5), "{said}");
+    assert!(said.contains("moved, deleted or replaced") && said.contains("the trained model is saved elsewhere"), "{said}");
+    assert_eq!(fs::read_dir(&run).expect("a folder").count(), 0);
+    let kept: Vec<_> = fs::read_dir(&root).expect("a folder").flatten().filter(|file| file.path().is_file()).collect();
+    assert!(kept.len() == 1 && kept[0].file_name().to_string_lossy().ends_with(".safetensors"), "{kept:?}");
+    // As the message says.
+    fs::rename(kept[0].path(), moved.join("checkpoint.safetensors")).expect("moved");
+    let output = plenoxel(&["--resume", &moved.to_string_lossy(), "--no-images"]).output().expect("it runs");
+    assert!(output.status.success() && moved.join("result.json").exists(), "{}", text(&output));
     fs::remove_dir_all(root).expect("it is removed");
 }

@@ -11,7 +11,7 @@ mod lock;
 mod room;
 
 pub use lock::{FolderLock, is_abandoned};
-pub use room::check_room;
+pub use room::{check_handles, check_room};
 
 use crate::error::{Error, Result};
 use std::fs;
@@ -36,7 +36,10 @@ pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>)
 ///
 /// Errors: [`Error::Io`] if it cannot be created, for instance because a file has that name.
 pub fn create_dir(path: &Path) -> Result<()> {
-    fs::create_dir_all(path).map_err(|source| Error::io(path, source, "creating the folder"))
+    fs::create_dir_all(path).map_err(|source| match path.ancestors().find(|path| path.is_symlink() && !path.exists()) {
+        Some(link) => Error::input(link, "this is a link to something that does not exist", "remove the link, or choose another folder"),
+        None => Error::io(path, source, "creating the folder"),
+    })
 }
 
 #[cfg(test)]

@@ -81,6 +81,7 @@ impl Run {
 /// Compares runs.
 pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
     let runs: Vec<Run> = args.runs.iter().map(|path| Run::read(path)).collect::<Result<_>>()?;
+    super::check_replaceable(&args.out, &runs.iter().map(|run| &run.folder).collect::<Vec<_>>(), None)?;
     let facts: Vec<_> = runs.iter().map(Run::facts).collect();
     let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();
     let cells: Vec<Vec<&str>> = facts.iter().map(|facts| facts.iter().map(|(_, value)| value.as_str()).collect()).collect();

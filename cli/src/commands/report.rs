@@ -41,6 +41,7 @@ pub fn run(args: &ReportArgs, console: &Console<'_>) -> Result<()> {
 pub fn write(run: &Path, data: Option<DataSource>, console: &Console<'_>) -> Result<()> {
     let (folder, config, record) = RunFolder::open(run)?;
     let folder = folder.shared("RUN")?;
+    folder.remove_fragments()?;
     let source = data.unwrap_or_else(|| record.data.clone());
     let dataset = source.reopen(&config)?;
     let path = folder.existing_checkpoint()?;

@@ -92,6 +92,20 @@ pub struct SweepArgs {
     set: Vec<String>,
 }
 
+/// File that is locked while a sweep is made; a folder that has it is that of a sweep.
+const LOCK: &str = "sweep.lock";
+
+/// Refuses a folder that holds something else: a run, a dataset.
+fn check_place(out: &Path) -> Result<()> {
+    let holds = |name: &str| out.join(name).exists();
+    let is_empty = std::fs::read_dir(out).map_or(true, |mut entries| entries.next().is_none());
+    if is_empty || ((holds(LOCK) || holds("table.csv")) && !holds("run.json")) {
+        return Ok(());
+    }
+    let found = format!("{}, which holds something that is not a sweep,", out.display());
+    Err(Error::config("--out", found, "a new folder, or that of a sweep"))
+}
+
 /// Makes the runs that are not finished, and the table of all. `machine` are flags that each run is to have. Returns the exit code.
 pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Result<u8> {
     let named = args.file.as_deref().and_then(Path::file_stem).unwrap_or_default();
@@ -107,9 +121,9 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     if !args.force {
         plan.jobs.iter().zip(&states).try_for_each(|(job, state)| check(job, state))?;
     }
+    check_place(&out)?;
     files::create_dir(&out)?;
-    let program =
-        Program { path: child::this_program()?, machine: machine.to_vec(), lock: FolderLock::acquire(&out, "sweep.lock", "--out")? };
+    let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: FolderLock::acquire(&out, LOCK, "--out")? };
     // A child is asked too, and saves; the sweep waits for it.
     let watch = Watch::begin();
     let (mut failed, mut interrupted) = (Vec::new(), false);

@@ -94,6 +94,9 @@ impl TrainedRun {
         console.note(&estimate.describe());
         estimate.check()?;
         let (model, about) = model::open(&path, &found.config)?;
+        if about.background != found.config.background {
+            console.note("warning: config.toml has another background than the model was trained with: figures and pictures are over that of config.toml");
+        }
         Ok(Loaded { model, about, view: ViewOptions { background: found.config.background, samples: self.samples } })
     }
 }

@@ -1,8 +1,9 @@
 //! One writer for each folder.
 
 use crate::error::{Error, Result};
+use same_file::Handle;
 use std::fs::{File, TryLockError};
-use std::io::{Read, Seek, SeekFrom, Write};
+use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 /// An advisory lock on a folder, held until it is dropped or its process ends: an exclusive lock of the system on a file in the folder. The file
@@ -40,6 +41,13 @@ impl FolderLock {
             Err(TryLockError::WouldBlock) => Err(refusal(folder, &mut file, key)),
             _ => Ok(Some(FolderLock { file })),
         }
+    }
+
+    /// True if the locked file is still the file of that name in the folder: neither was moved, deleted or replaced.
+    pub fn is_of(&self, folder: &Path, name: &str) -> bool {
+        let own = self.file.try_clone().and_then(Handle::from_file);
+        // Where the system cannot tell, nothing is wrong.
+        own.is_ok_and(|own| Handle::from_path(folder.join(name)).map_or_else(|e| e.kind() != ErrorKind::NotFound, |there| own == there))
     }
 
     /// The locked file: a process that inherits it holds the lock too.
@@ -97,6 +105,12 @@ mod tests {
             let (code, text) = (refused.exit_code(), refused.to_string());
             assert!(code == 2 && text.contains(key) && text.contains(&format!("process {}", std::process::id())), "{text}");
         }
+        assert!(lock.is_of(&folder, "run.lock"));
+        std::fs::rename(folder.join("run.lock"), folder.join("moved")).unwrap();
+        assert!(!lock.is_of(&folder, "run.lock"));
+        std::fs::write(folder.join("run.lock"), "another").unwrap();
+        assert!(!lock.is_of(&folder, "run.lock"));
+        std::fs::rename(folder.join("moved"), folder.join("run.lock")).unwrap();
         drop(lock);
         let readers = [share().unwrap(), share().unwrap()];
         assert!(readers.iter().all(Option::is_some) && acquire().is_err());

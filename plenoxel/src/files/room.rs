@@ -25,6 +25,15 @@ fn refuse(bytes: u64, free: Option<u64>, largest: u64, limit: Option<u64>) -> Re
     Ok(())
 }
 
+/// Refuses to begin if this process may not open a few more files: `file` and what is written at the end of a run.
+///
+/// Errors: those of the system, if there are too many open files.
+pub fn check_handles(file: &Path) -> Result<()> {
+    // Images are read by every thread; a save has a file and its folder.
+    const NEEDED: usize = 16;
+    (0..NEEDED).map(|_| std::fs::File::open(file)).collect::<Result<Vec<_>>>().map(drop)
+}
+
 /// Bytes of the largest file that this process may write, if there is such a limit.
 #[cfg(unix)]
 fn largest_file() -> Option<u64> {

@@ -24,7 +24,7 @@ pub struct RunFolder {
     /// File name of the model that is read and written: the last or the best.
     grid: &'static str,
     /// Held while the folder is written.
-    _lock: Option<Arc<FolderLock>>,
+    lock: Option<Arc<FolderLock>>,
 }
 
 const LOCK: &str = "run.lock";
@@ -42,6 +42,8 @@ const REPORT: &str = "report.html";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
+/// The files of a run, those that matter least last.
+const FILES: [&str; 11] = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
 /// Endings of what `export` writes.
 const EXPORTED: [&str; 5] = ["vox", "ply", "obj", "glb", "stl"];
 
@@ -91,8 +93,9 @@ impl NewFolder {
 
 /// Refuses a folder that may not be written: one with files, unless it is that of a run which is overwritten.
 fn check_vacant(path: &Path, overwrite: bool) -> Result<()> {
-    let occupied = !RunFolder::at(path).is_empty();
-    if occupied && !overwrite {
+    let folder = RunFolder::at(path);
+    let occupied = !folder.is_empty();
+    if occupied && !overwrite && !folder.has_saved_nothing() {
         let found = format!("{}, which is not empty,", path.display());
         return Err(Error::config("--out", found, "a new folder; or --force, which overwrites the run in it"));
     }
@@ -100,13 +103,20 @@ fn check_vacant(path: &Path, overwrite: bool) -> Result<()> {
         let found = format!("{}, which holds something that is not a run,", path.display());
         return Err(Error::config("--out", found, "a new folder, or that of a run, which --force overwrites"));
     }
-    Ok(())
+    // Found out before the first file is removed.
+    match FILES.iter().find(|name| path.join(name).is_dir()) {
+        Some(name) => {
+            let found = format!("{}, in which {name} is a folder,", path.display());
+            Err(Error::config("--out", found, "the folder of a run; or a new one"))
+        }
+        None => Ok(()),
+    }
 }
 
 impl RunFolder {
     /// The run folder at a path; nothing is read, and nothing needs to be there.
     pub fn at(path: &Path) -> Self {
-        RunFolder { path: path.to_owned(), grid: CHECKPOINT, _lock: None }
+        RunFolder { path: path.to_owned(), grid: CHECKPOINT, lock: None }
     }
 
     /// The same folder, locked: no other process trains or carves into it before this value and its clones are dropped. `key` is the flag or argument that
@@ -115,7 +125,7 @@ impl RunFolder {
     /// Errors: another process is writing it.
     pub fn locked(self, key: &str) -> Result<Self> {
         let lock = FolderLock::acquire(&self.path, LOCK, key)?;
-        Ok(RunFolder { _lock: Some(Arc::new(lock)), ..self })
+        Ok(RunFolder { lock: Some(Arc::new(lock)), ..self })
     }
 
     /// The same folder, shared with others that add to a finished run: no process trains or carves into it before this value and its clones are dropped.
@@ -123,7 +133,18 @@ impl RunFolder {
     /// Errors: another process is training or carving into it.
     pub fn shared(self, key: &str) -> Result<Self> {
         let lock = FolderLock::share(&self.path, LOCK, key)?;
-        Ok(RunFolder { _lock: lock.map(Arc::new), ..self })
+        Ok(RunFolder { lock: lock.map(Arc::new), ..self })
+    }
+
+    /// Checks that the folder is still the one that was locked: another of its name is not written.
+    ///
+    /// Errors: it was moved, deleted or replaced.
+    pub fn check_identity(&self) -> Result<()> {
+        if self.lock.as_ref().is_none_or(|lock| lock.is_of(&self.path, LOCK)) {
+            return Ok(());
+        }
+        let found = "this folder, or run.lock in it, was moved, deleted or replaced while the run was writing it";
+        Err(Error::io(&self.path, std::io::Error::new(std::io::ErrorKind::NotFound, found), "writing the run"))
     }
 
     /// True if there is nothing in the folder but a lock and temporary files, or no such folder.
@@ -131,11 +152,23 @@ impl RunFolder {
         entries(&self.path).all(|path| path.ends_with(LOCK) || is_fragment(&path))
     }
 
+    /// True for a run that ended before its first step, of which nothing is lost if it is overwritten.
+    fn has_saved_nothing(&self) -> bool {
+        let is_empty = |name: &str| self.path.join(name).metadata().map_or(true, |file| file.len() == 0);
+        self.path.join(RECORD).exists() && [CHECKPOINT, BEST, STATE, RESULT, METRICS].into_iter().all(is_empty)
+    }
+
+    /// True for a file that is one of the run's own: its settings, figures, metrics, models or pictures.
+    pub fn owns(&self, file: &Path) -> bool {
+        let (Ok(file), Ok(folder)) = (file.canonicalize(), self.path.canonicalize()) else { return false };
+        let own = FILES.iter().any(|name| file == folder.join(name));
+        own || file.starts_with(folder.join(IMAGES))
+    }
+
     /// Removes the files of a run.
     fn clear(&self) -> Result<()> {
         self.remove_fragments()?;
-        let names = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
-        let paths = names.map(|name| self.path.join(name)).into_iter().filter(|path| files::is_there(path));
+        let paths = FILES.map(|name| self.path.join(name)).into_iter().filter(|path| files::is_there(path));
         for path in paths.chain(tensorboard::present(&self.path)) {
             std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
         }
@@ -168,6 +201,8 @@ impl RunFolder {
         };
         settings::write(&self.path.join(CONFIG), config, &about)?;
         self.write_json(RECORD, record)?;
+        let config = self.path.join(CONFIG);
+        files::check_handles(&config).map_err(|e| Error::io(&config, e, "opening as many files as a run needs"))?;
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
     }
 
@@ -226,7 +261,10 @@ impl RunFolder {
     }
 
     /// Writes the trained model.
+    ///
+    /// Errors: the folder is no longer the one that was locked; the file cannot be written.
     pub fn save(&self, model: &impl Model<f32>, about: &About) -> Result<()> {
+        self.check_identity()?;
         model.save(&self.checkpoint(), about)
     }
 
@@ -273,6 +311,7 @@ impl RunFolder {
 
     /// Writes the final figures.
     pub fn write_result(&self, result: &impl Serialize) -> Result<()> {
+        self.check_identity()?;
         self.write_json(RESULT, result)
     }
 

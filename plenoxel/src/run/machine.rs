@@ -16,7 +16,11 @@ pub fn with_threads<R: Send>(threads: Option<usize>, f: impl FnOnce() -> R + Sen
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|e| {
         let found = format!("{threads} (the system refuses them: {e})");
-        Error::config("threads", found, format!("about {available}"))
+        Error::config(
+            "threads",
+            found,
+            format!("fewer than that, where {available} are usual; or higher limits of the system for threads and their memory"),
+        )
     })?;
     Ok(pool.install(f))
 }

@@ -81,6 +81,10 @@ impl Layers {
             "" => None,
             text => Some(match format!("value = {text}").parse::<Table>() {
                 Ok(mut table) => table.remove("value").unwrap_or_else(|| Value::String(text.to_owned())),
+                Err(_) if is_whole_number(text) => {
+                    let accepted = format!("a whole number from {} to {}", i64::MIN, i64::MAX);
+                    return Err(Error::config(format!("--set {path}"), text, accepted));
+                }
                 Err(_) => Value::String(text.to_owned()),
             }),
         };
@@ -202,6 +206,12 @@ fn explain(complaint: &str) -> (&str, &str) {
         other => other,
     };
     (found, accepted)
+}
+
+/// True for an optional sign and digits.
+fn is_whole_number(text: &str) -> bool {
+    let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
+    !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit())
 }
 
 #[cfg(test)]

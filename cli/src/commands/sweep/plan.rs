@@ -13,6 +13,8 @@ use toml::{Table, Value};
 
 /// The built-in scene's name where a folder could stand.
 const BUILT_IN: &str = "procedural";
+/// Bytes of the name of a scene or a method: file systems have 255 for a folder that is called after both.
+const LONGEST_NAME: usize = 100;
 const COMMANDS: [&str; 2] = ["train", "carve"];
 
 /// All runs, scene by scene.
@@ -131,9 +133,10 @@ fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default
             Some(other) => return Err(Error::config(place(&format!("{path}.name")), other, "a name in quotes")),
             None => default(&table).chars().map(|c| if plain(c) { c } else { '-' }).collect(),
         };
-        if name.is_empty() || !name.chars().all(plain) {
+        if name.is_empty() || name.len() > LONGEST_NAME || !name.chars().all(plain) {
             let place = place(&format!("{path}.name"));
-            return Err(Error::config(place, format!("the name `{name}`"), "a name of letters, digits, - and _, for it becomes a folder"));
+            let accepted = format!("a name of at most {LONGEST_NAME} letters, digits, - and _, for it becomes a folder");
+            return Err(Error::config(place, format!("the name `{name}`"), accepted));
         }
         if !taken.insert(name.clone()) {
             return Err(Error::config(

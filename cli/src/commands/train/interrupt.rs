@@ -1,4 +1,4 @@
-//! Ctrl-C and SIGTERM: the first time while a run trains, or a sweep has runs made, it is asked to save and stop; else the process ends.
+//! Ctrl-C, SIGTERM and SIGHUP, which a terminal sends when it is closed: the first time while a run trains, or a sweep has runs made, it is asked to save and stop; else the process ends.
 
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
@@ -68,18 +68,19 @@ fn wish() {
         let mut err = std::io::stderr();
         // The bar goes, and with it what the terminal wrote behind it. Nobody can be told that stderr cannot be written.
         let clear = if err.is_terminal() { "\r\x1b[2K" } else { "" };
-        drop(if words.is_empty() { write!(err, "{clear}") } else { writeln!(err, "{clear}error: {words}") });
+        drop(writeln!(err, "{clear}error: {}", if words.is_empty() { "interrupted" } else { &words }));
         std::process::exit(EXIT_CODE.into());
     }
 }
 
-/// Has a thread listen, for as long as the process lives, to what it does not ignore: shells have what runs in the background ignore Ctrl-C.
+/// Has a thread listen, for as long as the process lives, to what it does not ignore: shells have what runs in the background ignore Ctrl-C, and `nohup` has a
+/// program ignore SIGHUP.
 #[cfg(unix)]
 fn listen() {
-    use signal_hook::consts::{SIGINT, SIGTERM};
+    use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
-    let heard = [SIGINT, SIGTERM].into_iter().filter(|signal| mask.is_none_or(|mask| mask >> (signal - 1) & 1 == 0));
+    let heard = [SIGINT, SIGTERM, SIGHUP].into_iter().filter(|signal| mask.is_none_or(|mask| mask >> (signal - 1) & 1 == 0));
     if let Ok(mut signals) = signal_hook::iterator::Signals::new(heard) {
         std::thread::spawn(move || signals.forever().for_each(|_| wish()));
     }

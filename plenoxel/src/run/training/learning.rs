@@ -9,10 +9,11 @@ use crate::dataset::{Split, View};
 use crate::error::{Error, Result};
 use crate::evaluate::{self, Viewer};
 use crate::run::metrics::{History, MetricsFile, Observation};
-use crate::train::{Model, PlannedStage, RenderFn, Trainer, ViewOptions};
+use crate::train::{About, Model, PlannedStage, RenderFn, Trainer, ViewOptions};
 use ndarray::Array3;
 use serde::Serialize;
 use serde_json::json;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Training views that the mean image is compared with.
@@ -32,6 +33,15 @@ pub struct Learned<M> {
     /// Viewers of the models that stages ended with, by the number of the stage in `stages`, where they were kept.
     pub kept: Vec<(usize, RenderFn<'static, f32>)>,
     pub steps: u64,
+}
+
+/// Saves a trained model that cannot be saved in its run folder where it can: beside the folder, in the current one, or among temporary files.
+fn rescued(run: &Path, model: &impl Model<f32>, about: &About) -> Option<PathBuf> {
+    let beside = run.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let name = run.file_name().unwrap_or_default().to_string_lossy();
+    let places = [beside.to_owned(), PathBuf::from("."), std::env::temp_dir()];
+    let files = places.map(|folder| folder.join(format!("{name}-{}.safetensors", std::process::id())));
+    files.into_iter().find(|file| model.save(file, about).is_ok())
 }
 
 /// A stage in the final figures.
@@ -117,7 +127,7 @@ impl Job<'_> {
             }
             if save {
                 metrics.sync()?;
-                match trainer.save(&folder.state(), dataset.name()) {
+                match folder.check_identity().and_then(|()| trainer.save(&folder.state(), dataset.name())) {
                     Ok(()) => {
                         best.saved(validation_psnr, trainer.model(), &trainer.about(dataset.name()), on);
                         on(Event::Saved { steps: report.step + 1 });
@@ -139,11 +149,18 @@ impl Job<'_> {
         let about = trainer.about(dataset.name());
         let model = trainer.into_model();
         if let Err(e) = folder.save(&model, &about) {
-            let again = match folder.existing_state() {
-                Ok(_) => "once there is room, the run goes on from where it was last saved with `plenoxel train --resume`",
-                Err(_) => "it was not saved before: train again once there is room",
+            let kept = match rescued(folder.path(), &model, &about) {
+                Some(place) => format!(
+                    "the trained model is saved elsewhere, as {}; move it to checkpoint.safetensors in the run folder",
+                    place.display()
+                ),
+                None => "the trained model is not saved".to_owned(),
             };
-            on(Event::note(format!("the trained model is not saved; {again}")));
+            let again = match folder.existing_state() {
+                Ok(_) => "; `plenoxel train --resume` goes on from the last state that was saved",
+                Err(_) => "",
+            };
+            on(Event::note(format!("{kept}{again}")));
             return Err(e);
         }
         best.conclude(last_psnr, on);
