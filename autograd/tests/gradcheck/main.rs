@@ -2,7 +2,7 @@
 //!
 //! For every row, first and second derivatives in `f64` are compared with finite differences, in both passes: `backward`, where kernels use their adjoints,
 //! and `grad`, where they use their references. The gradient in `f32` is compared with the gradient in `f64`, as a vector.
-//! `cargo test -p autograd --test gradcheck -- --nocapture` prints the table.
+//! `cargo test -p plenoxel-autograd --test gradcheck -- --nocapture` prints the table.
 
 mod rows;
 mod table;
