@@ -362,11 +362,13 @@ impl RunFolder {
 
     /// Writes the chart of the loss, an SVG.
     pub fn write_loss(&self, svg: &str) -> Result<()> {
+        self.check_identity()?;
         files::write_atomically(&self.path.join(LOSS), svg.as_bytes())
     }
 
     /// Writes the report, an HTML page.
     pub fn write_report(&self, page: &str) -> Result<()> {
+        self.check_identity()?;
         files::write_atomically(&self.report(), page.as_bytes())
     }
 
