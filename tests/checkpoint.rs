@@ -106,7 +106,7 @@ fn a_damaged_or_foreign_file_is_named_with_what_is_wrong() {
         error.to_string()
     };
     for cut in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
-        assert!(message(&whole[..cut]).contains("not a whole safetensors file"), "cut to {cut} bytes");
+        assert!(message(&whole[..cut]).contains("not a complete safetensors file"), "cut to {cut} bytes");
     }
     let text = String::from_utf8_lossy(&whole).into_owned();
     assert!(text.contains("plenoxel 1"));
