@@ -62,8 +62,8 @@ impl Placement {
         let inside = positions().filter(|p| (*p - center).abs().max_element() < extent).count();
         if 2 * inside > cameras.len() {
             found.warnings.push(format!(
-                "{inside} of {} cameras are inside of the box, and may photograph objects outside of it; use a smaller --half-width, or poses \
-                 of another scale, so that the cameras are around the box",
+                "{inside} of {} cameras are inside of the box, and may photograph objects outside of it; use a smaller --half-width, or \
+                 poses of another scale, so that the cameras are around the box",
                 cameras.len()
             ));
         }
