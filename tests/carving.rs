@@ -409,7 +409,7 @@ fn images_and_boxes_that_cannot_be_carved_are_refused_with_the_reason() {
     beside.iter_mut().for_each(|view| view.camera.camera_to_world.translation += dvec3(0.0, 0.0, 3.0));
     let mut small = config(8, None);
     small.half_width = 0.2;
-    assert!(refused(&beside, &small).contains("leave nothing"), "{}", refused(&beside, &small));
+    assert!(refused(&beside, &small).contains("leave no voxel"), "{}", refused(&beside, &small));
 }
 
 #[test]

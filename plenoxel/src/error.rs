@@ -83,9 +83,10 @@ impl Error {
 
 /// Returns the problem with a setting: a value alone is introduced as invalid, a phrase is left as it is.
 fn problem(found: &str) -> String {
-    let found = one_line(found);
+    let found = one_line(found.trim_end_matches(','));
     if found.contains(' ') { found } else { format!("invalid value {found}") }
 }
+
 /// Returns a path as printable text.
 fn shown(path: &Path) -> String {
     one_line(&path.display().to_string())
