@@ -157,7 +157,7 @@ impl<'a> Carving<'a> {
             return images("they have no transparent pixel", remedy);
         }
         if views.iter().all(|view| view.image.pixels().all(|pixel| pixel.0[3] == 0)) {
-                return images("they are transparent all over", "use images that show an object");
+            return images("they are transparent all over", "use images that show an object");
         }
         let (aabb, voxels) = (Aabb::cube(half_width), [resolution; 3]);
         // No image shows the voxel that contains its camera: the voxel would not be carved, and would hide everything.

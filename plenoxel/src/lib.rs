@@ -56,7 +56,7 @@ pub mod tensor_file;
 pub mod text;
 pub mod train;
 
-/// The code of the repository's front page is compiled and run with the tests.
-# A test that compiles and runs the code of the repository's README.
+/// A test that compiles and runs the code of the repository's README.
+#[cfg(doctest)]
 #[doc = include_str!("../../README.md")]
 struct FrontPage;

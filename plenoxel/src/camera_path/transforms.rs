@@ -32,9 +32,7 @@ fn fov(entry: &Entry<'_>, size: Option<(usize, usize)>) -> Result<Option<Fov>> {
         ("x_fov", "fl_x", "camera_angle_x", width, Fov::Horizontal as fn(f64) -> Fov),
         ("y_fov", "fl_y", "camera_angle_y", height, Fov::Vertical),
     ] {
-        if let Some(angle) =
-            entry.optional(degrees, |a| is_angle_of_view(a.to_radians()), "an angle in degrees, above 0 and below 180")?
-        {
+        if let Some(angle) = entry.optional(degrees, |a| is_angle_of_view(a.to_radians()), "an angle in degrees, above 0 and below 180")? {
             return Ok(Some(kind(angle.to_radians())));
         }
         if let Some(side) = side

@@ -196,8 +196,7 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
         }
         for (j, value) in row.iter().enumerate() {
             let number = value.as_f64().filter(|number| number.is_finite());
-            m[i][j] =
-                number.ok_or_else(|| (format!("has {} in row {i}, column {j}", json::shown(value)), "accepted: finite numbers"))?;
+            m[i][j] = number.ok_or_else(|| (format!("has {} in row {i}, column {j}", json::shown(value)), "accepted: finite numbers"))?;
         }
     }
     rigid(m)

@@ -388,8 +388,7 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
     pub fn with_objective(config: Config, views: impl Into<Arc<[View]>>, objective: Objective<T>) -> Result<Self> {
         if !config.losses.is_empty() && config.losses != Config::default().losses {
             let names: Vec<&str> = config.losses.keys().map(String::as_str).collect();
-            let accepted =
-                "an empty `losses` table, or Trainer::new; model::plenoxels::objective(&config, views) returns the config's objective to extend";
+            let accepted = "an empty `losses` table, or Trainer::new; model::plenoxels::objective(&config, views) returns the config's objective to extend";
             return Err(Error::config("losses", format!("{} would be ignored beside a custom objective", names.join(", ")), accepted));
         }
         Self::with_losses(config, views.into(), objective)
