@@ -246,7 +246,7 @@ impl RaySource {
         })
     }
 
-    /// Returns the stride between pixels at which about 8 rays pass through a voxel of this side that is visible in all views. The stride
+    /// Returns the largest stride between pixels at which at least 8 rays pass through a voxel of this side that is visible in all views. The stride
     /// is computed for a voxel at the far end of the box, where its projection is smallest.
     pub fn stride(&self, side: f64, aabb: Aabb) -> u32 {
         const RAYS: f64 = 8.0;

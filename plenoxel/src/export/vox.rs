@@ -145,8 +145,8 @@ impl Vox {
         tiles
     }
 
-    /// Node 0 is the transform of the root, node 1 the group of all tiles. Tile m has its transform in node 2 m + 2 and its shape in node 2
-    /// m + 3.
+    /// Writes the scene graph. Node 0 is the transform of the root, node 1 the group of all tiles. Tile m has its transform in node 2 m + 2
+    /// and its shape in node 2 m + 3.
     fn scene_graph(&self, tiles: &[Tile], chunks: &mut Vec<u8>) {
         const NO_ATTRIBUTES: i32 = 0;
         const RESERVED: i32 = -1;

@@ -185,7 +185,7 @@ impl<T: Real> Plenoxels<T> {
         &self.config
     }
 
-    /// Sampling of rendered images.
+    /// Returns the sampling of rendered images.
     fn sampling(&self, view: &ViewOptions) -> Sampling {
         let sampling = self.config.evaluation;
         view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()))

@@ -76,7 +76,7 @@ pub(super) fn halves(part: Range<usize>) -> (Range<usize>, Range<usize>) {
     (part.start..middle, middle + 1..part.end)
 }
 
-/// Squared distance as in CloudCompare (CCCoreLib, `DgmOctree.cpp`).
+/// Returns the squared distance as in CloudCompare (CCCoreLib, `DgmOctree.cpp`).
 pub(super) fn squared_distance(a: Point, b: Point) -> f64 {
     (0..3).map(|axis| f64::from(a[axis] - b[axis])).map(|d| d * d).sum()
 }

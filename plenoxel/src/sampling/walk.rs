@@ -231,12 +231,13 @@ fn cross(
     ControlFlow::Continue(())
 }
 
-/// Minimum and maximum in one instruction each. The library's versions also handle NaN.
+/// Returns the minimum in one instruction. The library's version also handles NaN.
 #[inline(always)]
 fn smaller(x: f64, y: f64) -> f64 {
     if x < y { x } else { y }
 }
 
+/// Returns the maximum in one instruction. The library's version also handles NaN.
 #[inline(always)]
 fn larger(x: f64, y: f64) -> f64 {
     if x > y { x } else { y }

@@ -1,6 +1,6 @@
 //! All settings of a run: their meanings, their units, and the sources of their defaults.
 //!
-//! The same struct is the `config.toml` of a run, a preset, and the target of command-line flags.
+//! [`Config`] is the content of a run's `config.toml` and of a preset. Command-line flags change it.
 
 use super::objective::{LEARNED_LOSSES, LOSSES};
 use crate::camera::Camera;
@@ -73,7 +73,7 @@ pub struct Config {
     /// Density below which pruning treats a voxel as empty, in 1 / world length.
     pub prune_below: f64,
     /// Also prune voxels whose largest rendering weight over the training rays is below this; 0 disables it. A voxel stays if a voxel at
-    /// most two away has a larger weight. The rays are a subset of the training pixels with about eight rays per voxel. svox2 uses 0.256 /
+    /// most two away has a larger weight. The rays are a subset of the training pixels with at least eight rays per voxel. svox2 uses 0.256 /
     /// resolution.
     pub prune_unseen_below: f64,
     /// Short run before the first stage that finds the voxels of the grid. It is used if neither silhouettes nor an initial run determine
@@ -283,7 +283,7 @@ pub enum Sampling {
 }
 
 impl Sampling {
-    /// Largest number of samples that a ray can take through a grid.
+    /// Returns the largest number of samples that a ray can take through a grid.
     fn most(self, resolution: usize) -> f64 {
         match self {
             Sampling::Step { step } => 3f64.sqrt() * resolution as f64 / step + 2.0,

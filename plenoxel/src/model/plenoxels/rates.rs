@@ -22,7 +22,7 @@ pub fn optimizer<T: Real>(config: &Config, stage: &Stage, steps: u64) -> Box<dyn
     }
 }
 
-/// Learning rate of the density over the steps of a stage.
+/// Returns the learning rate of the density over the steps of a stage.
 fn density_rate(stage: &Stage, steps: u64) -> Box<dyn Schedule> {
     // Initial factor of the warm-up in svox2.
     const FIRST: f64 = 0.01;
@@ -30,7 +30,7 @@ fn density_rate(stage: &Stage, steps: u64) -> Box<dyn Schedule> {
     if stage.density_warm_up == 0 { whole } else { Box::new(WarmUp::new(whole, FIRST, stage.density_warm_up)) }
 }
 
-/// Learning rate of colors or harmonics over the steps of a stage. `start` is the rate of the first step.
+/// Returns the learning rate of colors or harmonics over the steps of a stage. `start` is the rate of the first step.
 fn color_rate(stage: &Stage, start: f64, steps: u64) -> Box<dyn Schedule> {
     rate(start, stage.color_decay(), steps)
 }

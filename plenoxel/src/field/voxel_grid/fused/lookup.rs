@@ -227,7 +227,7 @@ pub(super) fn harmonics_of<T: Real>(
 }
 
 dispatched! {
-/// `W` is the width of the table, `N` the number of harmonics.
+/// Implements [`harmonics`] for tables of width `W` with `N` harmonics.
 fn of_rays<T: Real, const K: usize, const W: usize, const N: usize, const FUSED: bool>(
     table: &[T],
     offsets: &[u32],
