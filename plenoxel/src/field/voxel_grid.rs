@@ -6,9 +6,12 @@
 //! empty. Values are stored raw and activated after interpolation: σ = max(0, density).
 //!
 //! View-dependent color varies slowly from voxel to voxel. Harmonics of degree 1 and more may therefore be stored for every f-th voxel
-//! along each axis only ([`GridShape::sh_reduction`]). A voxel then stores 3 color numbers, and overfits less: c(x, d) = max(0, offset + Y₀
-//! c₀(x) + Σ_{k≥1} Yₖ(d) cₖ(x)). Here c₀ is interpolated like the density, and cₖ likewise in a grid of ⌈n / f⌉³ voxels of side f · side
-//! with the same lowest corner. Voxel coordinates u have the coordinates (u + ½) / f − ½ in that grid.
+//! along each axis only ([`GridShape::sh_reduction`]). A voxel then stores 3 color numbers, and overfits less:
+//!
+//! c(x, d) = max(0, offset + Y₀ c₀(x) + Σ_{k≥1} Yₖ(d) cₖ(x)).
+//!
+//! Here c₀ is interpolated like the density, and cₖ likewise in a grid of ⌈n / f⌉³ voxels of side f · side with the same lowest corner.
+//! Voxel coordinates u have the coordinates (u + ½) / f − ½ in that grid.
 
 mod appearance;
 pub mod fused;
