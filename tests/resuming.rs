@@ -170,5 +170,5 @@ fn a_state_that_does_not_fit_or_is_damaged_is_refused_with_the_reason() {
     let mut changed = bytes;
     changed[at + 18] = b'3';
     std::fs::write(&path, &changed).expect("it is written");
-    assert!(refusal(config, &views_of_it).contains("use the version that wrote the file"));
+    assert!(refusal(config, &views_of_it).contains("use the program version that wrote the file"));
 }
