@@ -135,6 +135,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
 
     /// Replaces the shuffled pixels by custom batches, such as patches or chosen pixels. `draw` returns the batch of a step; steps are
     /// numbered over the whole run. Runs are reproducible if the batch depends only on the number.
+    ///
     /// ```
     /// # use plenoxel::{model::plenoxels::Trainer, train::Model};
     /// # fn patches(trainer: Trainer<f32>) -> Trainer<f32> {
