@@ -106,15 +106,15 @@ fn a_damaged_or_foreign_file_is_named_with_what_is_wrong() {
         error.to_string()
     };
     for cut in [0, 7, 100, whole.len() / 2, whole.len() - 1] {
-        assert!(message(&whole[..cut]).contains("not a whole safetensors file"), "cut to {cut} bytes");
+        assert!(message(&whole[..cut]).contains("not a complete safetensors file"), "cut to {cut} bytes");
     }
     let text = String::from_utf8_lossy(&whole).into_owned();
     assert!(text.contains("plenoxel 1"));
     let later: Vec<u8> = replace(&whole, b"plenoxel 1", b"plenoxel 9");
     assert!(message(&later).contains("format `plenoxel 9`"));
-    assert!(message(&replace(&whole, br#"\"resolution\":5"#, br#"\"resolution\":7"#)).contains("expected"));
+    assert!(message(&replace(&whole, br#"\"resolution\":5"#, br#"\"resolution\":7"#)).contains("accepted"));
     let foreign = safetensors_without_metadata();
-    assert!(message(&foreign).contains("without `plenoxel`"));
+    assert!(message(&foreign).contains("without the key `plenoxel`"));
     assert_eq!(checkpoint::load::<f32>(&dir.join("missing")).expect_err("there is none").exit_code(), 3);
 }
 

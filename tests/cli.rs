@@ -501,7 +501,7 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
     }
     export(&["ply", &none, "--out", "cloud.obj"]).refused(2, &["--out", "cloud.obj", ".ply"]);
     export(&["vox", &none]).refused(3, &["none", "there is no such run"]);
-    export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "spelled rightly"]);
+    export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "check the spelling"]);
 }
 
 #[test]

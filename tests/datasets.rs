@@ -393,6 +393,6 @@ fn the_built_in_scene_written_to_disk_reads_back_the_same() {
     }
     assert!(folder.path("test/r_0_depth_0000.png").exists() && !folder.path("train/r_0_depth_0000.png").exists());
 
-    refused(built_in.write_blender(&folder.0, false), 3, &["not an empty folder"]);
+    refused(built_in.write_blender(&folder.0, false), 3, &["the folder is not empty"]);
     built_in.write_blender(&folder.0, true).unwrap();
 }

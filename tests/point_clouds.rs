@@ -123,7 +123,7 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     refused(&["--max-value", "0.5"], 2, &["error: --max-value", "several scalar fields", "height, time"]);
     refused(&["--min-value", "0.5", "--value-field", "depth"], 2, &["--value-field", "depth", "height, time"]);
     refused(&["--noise-radius", "2", "--units", "voxel"], 2, &["--units", "voxel_side", "world"]);
-    refused(&["--sor-neighbours", "11"], 2, &["error: --sor-neighbours: 11 cannot", "fewer than the 11 points"]);
+    refused(&["--sor-neighbours", "11"], 2, &["error: --sor-neighbours: invalid value 11", "fewer than the 11 points"]);
     plenoxel(&["filter", &cloud, "-o", &clean, "--min-value", "0.5", "--value-field", "scalar_time", "--max-value", "6"]).done();
     assert_eq!(points(&clean), 6);
     let noise = plenoxel(&["filter", &cloud, "-o", &clean, "--noise-radius", "2.5", "--remove-isolated"]);

@@ -150,7 +150,7 @@ fn a_state_that_does_not_fit_or_is_damaged_is_refused_with_the_reason() {
     for cut in (0..header + 64).step_by(97).chain([header, bytes.len() - 1]) {
         std::fs::write(&path, &bytes[..cut]).expect("it is written");
         let text = refusal(config.clone(), &views_of_it);
-        assert!(text.contains("not a whole safetensors file"), "{cut}: {text}");
+        assert!(text.contains("not a complete safetensors file"), "{cut}: {text}");
     }
     // Every byte of the header and some of the tables changed: it is refused, or a run like any other.
     for at in (8..header).chain((header..bytes.len()).step_by(1009)) {
@@ -170,5 +170,5 @@ fn a_state_that_does_not_fit_or_is_damaged_is_refused_with_the_reason() {
     let mut changed = bytes;
     changed[at + 18] = b'3';
     std::fs::write(&path, &changed).expect("it is written");
-    assert!(refusal(config, &views_of_it).contains("use the version that wrote the file"));
+    assert!(refusal(config, &views_of_it).contains("use the program version that wrote the file"));
 }

@@ -1,4 +1,4 @@
-//! A field of your own: an encoded MLP, trained, saved, resumed and evaluated. `cargo run --release -p plenoxel --example custom_field`
+//! A custom field: an encoded MLP that is trained, saved, resumed and evaluated. `cargo run --release -p plenoxel --example custom_field`
 use autograd::nn::{Activation, Mlp};
 use autograd::optim::{Adam, AdamMode, Exponential, Optimizer};
 use autograd::{Real, Tensor, impl_module, random::Stream};
@@ -35,7 +35,7 @@ impl Model<f32> for Field<f32> {
     }
 }
 
-/// Trains for so many steps, and once more from a file in the middle; returns the mean PSNR of the test views in dB.
+/// Trains for `steps` steps, and again from a file saved halfway. Returns the mean PSNR of the test views in dB.
 pub fn run(steps: u64) -> Result<f64> {
     let scene = Dataset::procedural(ProceduralOptions { width: 50, height: 50, train: 40, val: 0, test: 8, supersample: 2 })?;
     let views = scene.load(Split::Train, &|_, _| {})?;

@@ -1,4 +1,4 @@
-//! A loss that is not part of the crate, trained on the built-in scene.
+//! A custom loss, trained on the built-in scene.
 //!
 //!     cargo run --release -p plenoxel --example custom_loss
 
@@ -12,19 +12,19 @@ fn main() -> Result<()> {
     run()
 }
 
-/// The program; the tests run it too.
+/// Runs the example. The tests call it too.
 pub fn run() -> Result<()> {
     let scene = Dataset::procedural(ProceduralOptions { width: 64, height: 64, train: 40, val: 0, test: 0, supersample: 2 })?;
     let views = scene.load(Split::Train, &|_, _| {})?;
 
-    // ln cosh: squared for small errors, absolute for large ones. Five lines, no gradient by hand.
+    // ln cosh: quadratic for small errors, absolute for large ones. The gradient is automatic.
     let objective = Objective::new().with("ln_cosh", 1.0, |step| {
         let error = (&step.rendered.rgb - &step.batch.target) * 10.0;
         let cosh = (error.exp() + (-&error).exp()) / 2.0;
         cosh.ln().mean()
     });
 
-    // The default recipe, its first two stages.
+    // The default settings, reduced to the first two stages.
     let mut config = Config { rays_per_step: 2048, ..Config::default() };
     config.stages.truncate(2);
     let mut trainer = Trainer::<f32>::with_objective(config, views, objective)?;

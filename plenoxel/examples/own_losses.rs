@@ -1,5 +1,5 @@
-//! Losses with parameters and per-pixel channels, on eight training views: depth supervision by a channel, the adaptive robust loss, and a color
-//! scale that is learned beside the grid.
+//! Losses with parameters and with per-pixel channels, on eight training views: depth supervision by a channel, the adaptive robust loss,
+//! and a color scale that is learned together with the grid.
 //!
 //!     cargo run --release -p plenoxel --example own_losses
 
@@ -13,12 +13,12 @@ use plenoxel::model::plenoxels::config::{Config, Stage};
 use plenoxel::model::plenoxels::{Objective, Trainer};
 use plenoxel::train::{Model, ViewOptions};
 
-/// Trains with mean squared error alone, and with each of the losses; prints the mean PSNR and depth error of the test views. `steps` are those of each
-/// stage.
+/// Trains with mean squared error alone, and with each of the losses, `steps` steps per stage. Prints the mean PSNR and depth error of the
+/// test views.
 pub fn run(steps: u64) -> Result<()> {
     let scene = Dataset::procedural(ProceduralOptions { width: 64, height: 64, train: 8, val: 0, test: 8, supersample: 2 })?;
     let (views, test) = (scene.load(Split::Train, &|_, _| {})?, scene.load(Split::Test, &|_, _| {})?);
-    // Distances to the first surface, 0 where there is none: `[h, w, 1]` for each view.
+    // Distances to the first surface, 0 for pixels without a surface: `[h, w, 1]` for each view.
     let depth =
         views.iter().flat_map(|view| view.depth.as_ref().map(|d| d.mapv(|d| if d.is_finite() { d } else { 0.0 }).insert_axis(Axis(2))));
     let depth: Vec<_> = depth.collect();
@@ -45,7 +45,7 @@ pub fn run(steps: u64) -> Result<()> {
     Ok(())
 }
 
-/// Mean absolute error of the depth over the pixels that show a surface, world length.
+/// Returns the mean absolute error of the depth over the pixels that show a surface, world length.
 fn depth_error(model: &impl Model<f32>, views: &[View], options: &ViewOptions) -> f64 {
     let viewer = Viewer::of(model, options);
     let errors = views.iter().filter_map(|view| {

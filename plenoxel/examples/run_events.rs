@@ -1,4 +1,4 @@
-//! A training run with a folder, driven by a closure on its events.
+//! A training run with a run folder. A closure handles its events.
 //!
 //!     cargo run --release -p plenoxel --example run_events
 use plenoxel::dataset::procedural::ProceduralOptions;

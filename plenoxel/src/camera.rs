@@ -1,8 +1,8 @@
-//! The one place for camera conventions.
+//! Camera conventions. All other modules use this one.
 //!
-//! World coordinates are the dataset's own. Camera axes are OpenGL's: x right, y up, the camera looks along -z. Pixel
-//! coordinates run x right and y *down* from the top left corner of the image, so the centre of pixel (i, j) is
-//! (i + 0.5, j + 0.5). Rays are unit: t along a ray is world distance.
+//! World coordinates are those of the dataset. Camera axes are those of OpenGL: x right, y up, the camera looks along -z. Pixel coordinates
+//! run x right and y *down* from the top left corner of the image, so the centre of pixel (i, j) is (i + 0.5, j + 0.5). Ray directions have
+//! unit length: t along a ray is world distance.
 
 pub mod placement;
 pub(crate) mod projection;
@@ -27,61 +27,61 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
-    /// Square pixels and a centred principal point from the horizontal field of view in radians:
-    /// f = W / (2 tan(fov / 2)), c = (W / 2, H / 2).
+    /// Creates intrinsics with square pixels and a centred principal point from the horizontal field of view in radians: f = W / (2 tan(fov
+    /// / 2)), c = (W / 2, H / 2).
     pub fn from_fov_x(width: usize, height: usize, fov_x: f64) -> Self {
         Self::centred(width, height, 0.5 * width as f64 / (0.5 * fov_x).tan())
     }
 
-    /// Square pixels and a centred principal point from the focal length in pixels.
+    /// Creates intrinsics with square pixels and a centred principal point from the focal length in pixels.
     pub fn centred(width: usize, height: usize, focal: f64) -> Self {
         Intrinsics { width, height, fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 }
     }
 
-    /// Horizontal field of view in radians, 2 atan(W / (2 fx)): the inverse of [`Intrinsics::from_fov_x`].
+    /// Returns the horizontal field of view in radians, 2 atan(W / (2 fx)): the inverse of [`Intrinsics::from_fov_x`].
     pub fn fov_x(&self) -> f64 {
         2.0 * (0.5 * self.width as f64 / self.fx).atan()
     }
 
-    /// The intrinsics of the image whose pixels are averages of `k` x `k` pixels of this one: everything divided by k. Rays
-    /// through pixel *centres* then belong to the averaged blocks' centres. `k` should divide width and height (else the
-    /// incomplete last blocks are dropped, as the integer division says) and must not be 0.
+    /// Returns the intrinsics of an image reduced by k, whose pixels are the means of `k` x `k` pixels: every parameter is divided by k.
+    /// Rays through pixel *centres* then pass through the centres of the blocks. `k` must not be 0 and should divide width and height;
+    /// otherwise incomplete blocks at the right and bottom are dropped.
     pub fn downscaled(&self, k: usize) -> Self {
         let s = k as f64;
         Intrinsics { width: self.width / k, height: self.height / k, fx: self.fx / s, fy: self.fy / s, cx: self.cx / s, cy: self.cy / s }
     }
 }
 
-/// True for the angles of view in radians that a pinhole camera has: those of which the tangent of half is a number to compute with.
+/// Returns true for valid fields of view of a pinhole camera in radians: the tangent of half the angle must be finite and not 0.
 pub(crate) fn is_angle_of_view(radians: f64) -> bool {
     const LEAST: f64 = 1e-6;
     (LEAST..std::f64::consts::PI - LEAST).contains(&radians)
 }
 
-/// Half-line from a camera through a point of its image, in world coordinates.
+/// Ray from a camera through a point of its image, in world coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Ray {
-    /// The camera's position.
+    /// Position of the camera.
     pub origin: DVec3,
     /// Unit direction.
     pub direction: DVec3,
-    /// Length the direction had when its camera z was -1, so t / stretch is depth along the optical axis: 1 in the image
-    /// centre, more towards the corners.
+    /// Length of the direction before normalisation, when its camera z was -1. t / stretch is the depth along the optical axis. The stretch
+    /// is 1 in the image centre and grows towards the corners.
     pub stretch: f64,
 }
 
-/// A pinhole camera: intrinsics and where it stands.
+/// Pinhole camera: intrinsics and pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     /// Image size, focal lengths, principal point.
     pub intrinsics: Intrinsics,
-    /// Camera to world: a rotation whose columns are the camera's right, up and backward axes, and the camera's position.
+    /// Camera-to-world transform: a rotation whose columns are the camera's right, up and backward axes, and the camera's position.
     pub camera_to_world: DAffine3,
 }
 
 impl Camera {
-    /// A camera at `eye` that sees `target` in the middle of its image, with `up` upwards in it. If `up` is parallel to the
-    /// line of sight, any perpendicular direction takes its place.
+    /// Creates a camera at `eye` with `target` in the middle of its image and `up` pointing up in it. If `up` is parallel to the line of
+    /// sight, an arbitrary perpendicular direction is used.
     pub fn look_at(eye: DVec3, target: DVec3, up: DVec3, intrinsics: Intrinsics) -> Self {
         let backward = (eye - target).normalize();
         let right = up.cross(backward).try_normalize().unwrap_or_else(|| backward.any_orthonormal_vector());
@@ -89,13 +89,13 @@ impl Camera {
         Camera { intrinsics, camera_to_world: DAffine3::from_mat3_translation(rotation, eye) }
     }
 
-    /// The camera's position in the world.
+    /// Returns the camera's position in the world.
     pub fn position(&self) -> DVec3 {
         self.camera_to_world.translation
     }
 
-    /// The ray through the point (`x`, `y`) of the image, in pixel coordinates: the centre of pixel (i, j) is
-    /// `ray(i + 0.5, j + 0.5)`. d = R ((x - cx)/fx, -(y - cy)/fy, -1), made unit.
+    /// Returns the ray through the point (`x`, `y`) of the image, in pixel coordinates. The ray through the centre of pixel (i, j) is
+    /// `ray(i + 0.5, j + 0.5)`. The direction is R ((x - cx)/fx, -(y - cy)/fy, -1), normalised.
     pub fn ray(&self, x: f64, y: f64) -> Ray {
         let k = &self.intrinsics;
         let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
@@ -104,9 +104,9 @@ impl Camera {
         Ray { origin: self.camera_to_world.translation, direction: direction / stretch, stretch }
     }
 
-    /// Where the world point `p` appears: `(x, y, depth)`, pixel coordinates and depth along the optical axis (the distance
-    /// along the ray is depth times its stretch). `None` for points beside or behind the camera, depth <= 0. Points outside
-    /// the image have coordinates outside of it.
+    /// Projects the world point `p`. Returns `(x, y, depth)`: pixel coordinates, and depth along the optical axis (the distance along the
+    /// ray is the depth times the ray's stretch). Returns `None` for points beside or behind the camera (depth <= 0). Points outside of the
+    /// image have coordinates outside of it.
     pub fn project(&self, p: DVec3) -> Option<(f64, f64, f64)> {
         let k = &self.intrinsics;
         let local = self.camera_to_world.inverse().transform_point3(p);

@@ -1,23 +1,26 @@
-//! Camera paths: where the camera of a film stands in each frame, by formula or from the files of other programs.
+//! Camera paths of films, by formula or from files of other programs.
 //!
-//! | path | recognised by | world | what lies between its entries |
+//! | path | recognised by | world frame | between entries |
 //! | --- | --- | --- | --- |
-//! | [`Turntable`] | | the dataset's | |
-//! | instant-ngp `base_cam.json` | `path` | its own: converted | B-splines, as there |
-//! | nerfstudio `camera_path.json` | `camera_path` | as the file has it | nothing: entries are frames |
-//! | `transforms.json` | `frames` | as the file has it | nothing: entries are frames |
+//! | [`Turntable`] | | dataset | |
+//! | instant-ngp `base_cam.json` | `path` | instant-ngp's, converted | B-splines, as in instant-ngp |
+//! | nerfstudio `camera_path.json` | `camera_path` | as in the file | nothing: entries are frames |
+//! | `transforms.json` | `frames` | as in the file | nothing: entries are frames |
 //!
-//! **instant-ngp's world.** It scales a dataset by 0.33 and moves it by ½, so that the box ±1.515 is the unit cube, and cycles the axes so that y is
-//! up; its cameras look along +z and have y down. With p in the dataset's world, (x, y, z)ngp = 0.33 (y, z, x) + ½; the second and third column
-//! of a rotation change their sign (`NerfDataset::ngp_matrix_to_nerf` and `NERF_SCALE` in its `nerf_loader.h`). A dataset whose JSON file has
-//! `scale`, `offset` or `aabb` is placed otherwise there, which a path does not say. Quaternions are x, y, z, w; fields of view are vertical and in
-//! degrees (`json_binding.h`, `Testbed::m_fov_axis`).
+//! **World frame of instant-ngp.** instant-ngp scales a dataset by 0.33 and moves it by ½, so that the box ±1.515 becomes the unit cube,
+//! and cycles the axes so that y is up. Its cameras look along +z, with y down. With p in the dataset's world, (x, y, z)ngp = 0.33 (y, z,
+//! x) + ½, and the second and third column of a rotation change sign (`NerfDataset::ngp_matrix_to_nerf` and `NERF_SCALE` in its
+//! `nerf_loader.h`). A dataset whose JSON file has `scale`, `offset` or `aabb` is transformed differently; a path does not contain these
+//! values. Quaternions are x, y, z, w. Fields of view are vertical, in degrees (`json_binding.h`, `Testbed::m_fov_axis`).
 //!
-//! **nerfstudio's world** is the dataset's for NeRF-synthetic scenes. Others it turns, centres and scales, and a path made there does not say how.
+//! **World frame of nerfstudio.** For NeRF-synthetic scenes it is that of the dataset. Other scenes are rotated, centred and scaled; a path
+//! does not contain this transform.
 //!
-//! A path is for new pictures: principal points and lens distortion of photographs are left out, and so are depth of field and time.
+//! A path is used to render new images: principal points and lens distortion of photographs are ignored, and so are depth of field and
+//! time.
 //!
-//! Parsers take any bytes: files are bounded ([`CAMERA_PATH`](crate::files::CAMERA_PATH)), and no number that comes out is too large to compute with.
+//! Parsers accept any bytes: the size of files is limited ([`CAMERA_PATH`](crate::files::CAMERA_PATH)), and all resulting numbers are in a
+//! range that is safe to compute with.
 
 mod instant_ngp;
 mod nerfstudio;
@@ -34,24 +37,24 @@ use serde_json::Value;
 use std::path::Path;
 pub use turntable::Turntable;
 
-/// The most frames of a path: an hour of film.
+/// Largest number of frames of a path: an hour of film.
 pub const MOST_FRAMES: usize = 100_000;
-/// The farthest that a camera may stand from the origin, world length.
+/// Largest distance of a camera from the origin along an axis, world length.
 const FARTHEST: f64 = 1e6;
 
-/// Angle of view in radians, in (0, π).
+/// Field of view in radians, in (0, π).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Fov {
     /// From the left to the right edge.
     Horizontal(f64),
     /// From the upper to the lower edge.
     Vertical(f64),
-    /// Across the shorter of both: what fits into a square picture fits into a wide or a tall one too.
+    /// Across the shorter side: what fits into a square image also fits into a wide or tall one.
     Shorter(f64),
 }
 
 impl Fov {
-    /// Of the picture that a pinhole camera takes, with square pixels.
+    /// Returns the intrinsics of a pinhole camera with square pixels for an image of this size.
     fn intrinsics(self, (width, height): (usize, usize)) -> Intrinsics {
         let (side, angle) = match self {
             Fov::Horizontal(angle) => (width, angle),
@@ -61,7 +64,7 @@ impl Fov {
         Intrinsics::centred(width, height, 0.5 * side as f64 / (0.5 * angle).tan())
     }
 
-    /// The angle between two of a kind; `self` if they are not.
+    /// Interpolates two angles of the same kind; returns `self` if the kinds differ.
     fn lerp(self, other: Self, t: f64) -> Self {
         let mix = |a: f64, b: f64| a + (b - a) * t;
         match (self, other) {
@@ -73,22 +76,23 @@ impl Fov {
     }
 }
 
-/// Where the camera stands in a frame, and how much it sees.
+/// Camera pose and field of view of a frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shot {
-    /// A rotation whose columns are the camera's right, up and backward axes, and its position: as in [`Camera`].
+    /// Camera-to-world transform as in [`Camera`]: a rotation whose columns are the camera's right, up and backward axes, and the camera's
+    /// position.
     pub camera_to_world: DAffine3,
-    /// How much it sees.
+    /// Field of view.
     pub fov: Fov,
 }
 
 impl Shot {
-    /// The camera for a picture of `(width, height)` pixels.
+    /// Returns the camera for an image of `(width, height)` pixels.
     pub fn camera(&self, size: (usize, usize)) -> Camera {
         Camera { intrinsics: self.fov.intrinsics(size), camera_to_world: self.camera_to_world }
     }
 
-    /// The shot at `t` in [0, 1] between two: position and angle of view linearly, rotation along the shorter arc.
+    /// Interpolates two shots at `t` in [0, 1]: position and field of view linearly, rotation along the shorter arc.
     fn lerp(&self, other: &Self, t: f64) -> Self {
         let rotation = |shot: &Self| DQuat::from_mat3(&shot.camera_to_world.matrix3).normalize();
         let position = self.camera_to_world.translation.lerp(other.camera_to_world.translation, t);
@@ -97,14 +101,14 @@ impl Shot {
     }
 }
 
-/// Which program a path comes from.
+/// File format of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// `base_cam.json`.
     InstantNgp,
     /// `camera_path.json`.
     Nerfstudio,
-    /// `transforms.json`, of NeRF-synthetic scenes and of both programs.
+    /// `transforms.json` of NeRF-synthetic scenes and of both programs.
     Transforms,
 }
 
@@ -118,34 +122,34 @@ impl std::fmt::Display for Format {
     }
 }
 
-/// A path as a file has it.
+/// Camera path read from a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraPath {
-    /// What the file was recognised as.
+    /// Recognised format of the file.
     pub format: Format,
-    /// Width and height of the pictures, if the file says so.
+    /// Width and height of the images, if stated in the file.
     pub size: Option<(usize, usize)>,
-    /// Frames a second, if the file says so.
+    /// Frames per second, if stated in the file.
     pub fps: Option<f64>,
     entries: Entries,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 enum Entries {
-    /// All of them.
+    /// Every frame.
     Frames(Vec<Shot>),
-    /// Between which frames lie.
+    /// Keyframes, between which frames are interpolated.
     Keyframes(Keyframes),
 }
 
 impl CameraPath {
-    /// Reads a path from the bytes of the file `path`, whose name is for messages alone.
+    /// Parses the bytes of a camera path file. `path` names the file in error messages.
     ///
-    /// Errors: everything that is wrong with it, with frame and field.
+    /// Errors if the content is invalid, naming frame and field.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
         let root = json::parse(path, bytes)?;
         let file = Entry { path, value: &root, place: String::new() };
-        // A file of nerfstudio has keyframes beside its frames, and one of instant-ngp may have anything.
+        // A file of nerfstudio contains keyframes in addition to its frames, and a file of instant-ngp may contain anything.
         for (key, read) in
             [("camera_path", nerfstudio::read as fn(&Entry<'_>) -> Result<Self>), ("frames", transforms::read), ("path", instant_ngp::read)]
         {
@@ -153,11 +157,11 @@ impl CameraPath {
                 return read(&file);
             }
         }
-        let remedy = "a camera path has one of them: `path` (instant-ngp), `camera_path` (nerfstudio) or `frames` (transforms.json)";
-        Err(Error::input(path, "none of the keys of a camera path is there", remedy))
+        let remedy = "accepted: one of `path` (instant-ngp), `camera_path` (nerfstudio) and `frames` (transforms.json)";
+        Err(Error::input(path, "it has none of the keys of a camera path", remedy))
     }
 
-    /// The number of entries in the file: frames, or keyframes.
+    /// Returns the number of entries in the file: frames or keyframes.
     pub fn entries(&self) -> usize {
         match &self.entries {
             Entries::Frames(shots) => shots.len(),
@@ -165,13 +169,13 @@ impl CameraPath {
         }
     }
 
-    /// True if frames are to be found between the entries.
+    /// Returns true if frames are interpolated between the entries.
     pub fn is_interpolated(&self) -> bool {
         matches!(self.entries, Entries::Keyframes(_))
     }
 
-    /// So many frames of the path, at least 1 and at most [`MOST_FRAMES`]. Of listed frames fewer are evenly chosen, the first and the last among
-    /// them, and more are found between them.
+    /// Returns `frames` frames of the path, clamped to 1 to [`MOST_FRAMES`]. If the file lists frames, fewer frames are a uniform selection
+    /// that includes the first and the last, and more frames are interpolated.
     pub fn shots(&self, frames: usize) -> Vec<Shot> {
         let frames = frames.clamp(1, MOST_FRAMES);
         match &self.entries {
@@ -181,7 +185,7 @@ impl CameraPath {
     }
 }
 
-/// Frame `i` of `frames` along listed shots, of which there is at least one.
+/// Returns frame `i` of `frames` along listed shots, of which there must be at least one.
 fn between(shots: &[Shot], i: usize, frames: usize) -> Shot {
     let last = shots.len() - 1;
     let place = if frames > 1 { (i * last) as f64 / (frames - 1) as f64 } else { 0.0 };
@@ -192,71 +196,71 @@ fn between(shots: &[Shot], i: usize, frames: usize) -> Shot {
     shots[before].lerp(&shots[(before + 1).min(last)], place - before as f64)
 }
 
-/// A part of a file, and its place in it.
+/// Part of a file, with its position.
 struct Entry<'a> {
     path: &'a Path,
     value: &'a Value,
-    /// Behind the name of a field: " of frame 3".
+    /// Suffix of a field's name in error messages, for example " of frame 3".
     place: String,
 }
 
 impl<'a> Entry<'a> {
-    /// The error that a field is not what it should be.
+    /// Returns the error for an invalid field.
     fn wrong(&self, field: &str, accepted: &str) -> Error {
         let found = match self.value.get(field) {
             None => format!("there is no `{field}`{}", self.place),
             Some(value) => format!("`{field}`{} is {}", self.place, json::shown(value)),
         };
-        Error::input(self.path, found, accepted)
+        Error::input(self.path, found, format!("accepted: {accepted}"))
     }
 
-    /// A number that a test accepts.
+    /// Reads a number that satisfies a predicate.
     fn number(&self, field: &str, accepts: impl Fn(f64) -> bool, accepted: &str) -> Result<f64> {
         let number = self.value.get(field).and_then(Value::as_f64).filter(|number| accepts(*number));
         number.ok_or_else(|| self.wrong(field, accepted))
     }
 
-    /// The same where there may be none.
+    /// Reads an optional number that satisfies a predicate.
     fn optional(&self, field: &str, accepts: impl Fn(f64) -> bool, accepted: &str) -> Result<Option<f64>> {
         self.value.get(field).map(|_| self.number(field, accepts, accepted)).transpose()
     }
 
-    /// So many finite numbers.
+    /// Reads N finite numbers.
     fn numbers<const N: usize>(&self, field: &str, accepted: &str) -> Result<[f64; N]> {
         let list = self.value.get(field).and_then(Value::as_array).filter(|list| list.len() == N);
         let numbers: Option<Vec<f64>> = list.and_then(|list| list.iter().map(|n| n.as_f64().filter(|n| n.is_finite())).collect());
         numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| self.wrong(field, accepted))
     }
 
-    /// The entries of a list: some, and not too many. `name` is what one of them is called.
+    /// Reads the entries of a list of 1 to [`MOST_FRAMES`]. `name` is the name of an entry.
     fn list(&self, field: &str, name: &'static str) -> Result<impl ExactSizeIterator<Item = Entry<'a>>> {
-        let list = self.value.get(field).and_then(Value::as_array).ok_or_else(|| self.wrong(field, "it is a list"))?;
+        let list = self.value.get(field).and_then(Value::as_array).ok_or_else(|| self.wrong(field, "a list"))?;
         if list.is_empty() || list.len() > MOST_FRAMES {
             let found = format!("`{field}` has {} entries", list.len());
-            return Err(Error::input(self.path, found, format!("paths of 1 to {MOST_FRAMES} are read")));
+            return Err(Error::input(self.path, found, format!("accepted: 1 to {MOST_FRAMES}")));
         }
         let path = self.path;
         Ok(list.iter().enumerate().map(move |(k, value)| Entry { path, value, place: format!(" of {name} {k}") }))
     }
 
-    /// An angle of view in radians, given in degrees.
+    /// Reads a field of view given in degrees. Returns radians.
     fn fov(&self) -> Result<f64> {
-        let accepted = "it is an angle in degrees, above 0 and below 180";
+        let accepted = "an angle in degrees, above 0 and below 180";
         self.number("fov", |degrees| is_angle_of_view(degrees.to_radians()), accepted).map(f64::to_radians)
     }
 
-    /// Width and height in pixels, where both are given.
+    /// Reads width and height in pixels, if both are given.
     fn size(&self, width: &str, height: &str) -> Result<Option<(usize, usize)>> {
         let pixels = |n: f64| (1.0..=f64::from(MAX_SIDE)).contains(&n);
-        let accepted = format!("it is a number of pixels from 1 to {MAX_SIDE}");
+        let accepted = format!("a number of pixels from 1 to {MAX_SIDE}");
         let [width, height] = [width, height].map(|field| self.optional(field, pixels, &accepted));
         Ok(width?.zip(height?).map(|(width, height)| (width as usize, height as usize)))
     }
 
-    /// Refuses a camera that stands nowhere.
+    /// Errors if a camera is too far from the origin.
     fn near_enough(&self, field: &str, camera_to_world: DAffine3) -> Result<DAffine3> {
         let near = camera_to_world.translation.abs().cmple(DVec3::splat(FARTHEST)).all();
-        near.then_some(camera_to_world).ok_or_else(|| self.wrong(field, "cameras stand within a million units of the origin"))
+        near.then_some(camera_to_world).ok_or_else(|| self.wrong(field, "positions within a million units of the origin"))
     }
 }
 

@@ -1,11 +1,11 @@
-//! Carving: from photographs to an opaque colored grid, without gradients.
+//! Carving: an opaque colored grid from photographs, without gradients.
 //!
-//! 1. [`mod@visual_hull`]: what the silhouettes of all views leave of the box;
-//! 2. [`mod@photo_hull`], if asked for: what the colors of all views leave of that;
-//! 3. [`light`]: which voxels a pixel shows, and how much of it each is;
-//! 4. [`color`]: the colors, or their harmonics, that explain the pixels best.
+//! 1. [`mod@visual_hull`]: carves voxels outside of the silhouettes of the views.
+//! 2. [`mod@photo_hull`], optional: carves voxels whose colors in the views do not agree.
+//! 3. [`light`]: computes which voxels a pixel shows, and their weights.
+//! 4. [`color`]: fits colors or harmonics to the pixels.
 //!
-//! [`Carving`] does one after the other. What comes out is a grid like any other: it renders, and training can start from it.
+//! [`Carving`] runs these steps. The result is an ordinary grid: it can be rendered, and training can start from it.
 
 pub mod color;
 pub mod light;
@@ -23,46 +23,47 @@ use light::Opaque;
 use photo_hull::PhotoConfig;
 use serde::{Deserialize, Serialize};
 
-/// How to carve.
+/// Settings of carving.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CarveConfig {
-    /// Voxels along each axis.
+    /// Number of voxels along each axis.
     pub resolution: usize,
-    /// What makes a voxel go.
+    /// Carving rule of the visual hull.
     pub rule: Rule,
-    /// By footprint, pixels around a voxel's projection that must be background too. After a stage of a scout, pixels of the images as that stage had them.
+    /// Margin in pixels around a voxel's projection that must be background too, for the rule `footprint`. After a stage of a scout, pixels
+    /// are those of the images as reduced in that stage.
     pub margin: f64,
-    /// Optical depth of a voxel along its side, σ · side: how opaque what is left is.
+    /// Optical depth of a remaining voxel along its side, σ · side.
     pub depth: f64,
-    /// Carve on, away from what the photographs contradict.
+    /// Settings of the photo hull; `None` to carve by silhouettes only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub photo: Option<PhotoConfig>,
-    /// How colors are found.
+    /// Method for fitting colors.
     pub fit: Fit,
-    /// Pull on the harmonics above the mean, as a share of what a voxel weighs in the pixels.
+    /// Ridge penalty on harmonics of degree 1 and more, relative to the total weight of the voxel in the pixels.
     pub ridge: f64,
-    /// Sweeps over all voxels together, after each was solved by itself.
+    /// Number of joint sweeps over all voxels, after each voxel was solved on its own.
     pub sweeps: usize,
 }
 
-/// What makes a voxel go.
+/// Rule for carving a voxel by silhouettes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Rule {
-    /// Some view shows all of it on background.
+    /// A voxel is carved if some view shows all of it on background.
     Footprint,
-    /// The ray of a background pixel passes through it: the source paper's.
+    /// A voxel is carved if the ray of a background pixel passes through it, as in the source paper.
     Rays,
 }
 
-/// How colors are found.
+/// Method for fitting colors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Fit {
-    /// Least squares, voxel by voxel and then together.
+    /// Least squares, for each voxel on its own and then jointly.
     Exact,
-    /// The source paper's stochastic gradient descent.
+    /// Stochastic gradient descent of the source paper.
     Sgd,
 }
 
@@ -71,35 +72,36 @@ impl Default for CarveConfig {
         CarveConfig {
             resolution: 256,
             rule: Rule::Footprint,
-            // Alpha is sampled: a pixel without any may still hold a little of the object.
+            // Alpha is sampled: a pixel with alpha 0 may still contain a small part of the object.
             margin: 0.5,
-            // The source paper's 40 per unit length at 128 voxels to 2.8. On held-out training views of lego, 0.5 and 1.5 are 0.4 and 0.2 dB worse.
+            // The source paper's density of 40 per unit length at 128 voxels to a side of 2.8. On held-out training views of lego, 0.5 and
+            // 1.5 are 0.4 and 0.2 dB worse.
             depth: 0.875,
             photo: None,
             fit: Fit::Exact,
-            // On the same views, of degree 2: 0.01 and 0.03 are 0.1 and 0.4 dB worse, three sweeps as good as one, ten worse.
+            // On the same views with degree 2: 0.01 and 0.03 are 0.1 and 0.4 dB worse; three sweeps are as good as one, ten are worse.
             ridge: 0.003,
             sweeps: 1,
         }
     }
 }
 
-/// A carving run, completely: what to carve, and how.
+/// Complete options of a carving run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CarveOptions {
-    /// Half the side of the cube around the origin that is carved, world length.
+    /// Half the side of the carved cube around the origin, world length.
     pub half_width: f64,
-    /// Meaning of the colors to find.
+    /// Color representation.
     pub color: Color,
-    /// Color behind the scene, sRGB in [0, 1].
+    /// Background color, sRGB in [0, 1].
     pub background: [f32; 3],
-    /// Seed of everything random: the order of the pixels in [`Fit::Sgd`].
+    /// Seed of all random numbers: the order of the pixels in [`Fit::Sgd`].
     pub seed: u64,
-    /// How to carve.
+    /// Settings of carving.
     pub config: CarveConfig,
 }
 
-/// A box carved to the visual hull.
+/// Box carved to its hull, before colors are fitted.
 #[derive(Debug)]
 pub struct Carving<'a> {
     views: &'a [View],
@@ -107,32 +109,33 @@ pub struct Carving<'a> {
     lattice: Lattice,
 }
 
-/// How far carving has come.
+/// Progress of carving.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Progress {
-    /// Views whose silhouettes have carved.
+    /// Number of views whose silhouettes were processed.
     Views(usize),
-    /// A round of the photo hull is over.
+    /// End of a round of the photo hull.
     Round {
-        /// Its number, from 1.
+        /// Number of the round, from 1.
         round: usize,
-        /// Voxels that went in it.
+        /// Number of voxels carved in the round.
         carved: usize,
-        /// Voxels that are left.
+        /// Number of remaining voxels.
         left: usize,
     },
 }
 
-/// A carved grid with its colors.
+/// Carved grid with colors.
 #[derive(Debug)]
 pub struct Colored {
-    /// Its voxels are those of the hull.
+    /// Grid whose voxels are those of the hull.
     pub grid: VoxelGrid<f32>,
-    /// The share of object pixels that show none of them.
+    /// Fraction of object pixels that show no voxel.
     pub missed: f64,
 }
 
-/// About how many voxels silhouettes will leave, told by a coarse hull in no time; `None` if there are no silhouettes.
+/// Estimates the number of voxels that silhouettes will leave, from a coarse hull that takes little time; `None` if there are no
+/// silhouettes.
 pub fn voxels_expected(views: &[View], options: &CarveOptions) -> Option<f64> {
     const COARSE: usize = 64;
     let CarveOptions { half_width, config: CarveConfig { resolution, margin, .. }, .. } = *options;
@@ -142,25 +145,25 @@ pub fn voxels_expected(views: &[View], options: &CarveOptions) -> Option<f64> {
 }
 
 impl<'a> Carving<'a> {
-    /// Carves a box: to the visual hull where images have alpha, and on to the photo hull if the config asks for it.
+    /// Carves a box to the visual hull, if images have alpha, and then to the photo hull, if the config asks for it.
     ///
-    /// Errors: no view has a transparent pixel (and only silhouettes are asked for), or one that is not; nothing is left of the box, or
-    /// nothing goes.
+    /// Errors if no pixel of the views is transparent although only silhouettes are used; if all pixels are transparent; if a camera is
+    /// inside of the box; if no voxel is left; or if no voxel is carved.
     pub fn new(views: &'a [View], options: &CarveOptions, progress: &dyn Fn(Progress)) -> Result<Self> {
         let CarveOptions { half_width, config: CarveConfig { resolution, rule, margin, photo, .. }, .. } = *options;
         let images = |found: &str, remedy: &str| Err(Error::input("the training images", found, remedy));
         if !has_alpha(views) && photo.is_none() {
-            let remedy = "silhouettes need an alpha channel that is 0 on the background; --photo-consistency carves without";
+            let remedy = "use images whose alpha channel is 0 on the background, or --photo-consistency, which needs no alpha channel";
             return images("they have no transparent pixel", remedy);
         }
         if views.iter().all(|view| view.image.pixels().all(|pixel| pixel.0[3] == 0)) {
-            return images("they are transparent all over", "give images that show an object");
+            return images("they are transparent all over", "use images that show an object");
         }
         let (aabb, voxels) = (Aabb::cube(half_width), [resolution; 3]);
-        // No image shows the voxel that its camera stands in, so it would stay and hide everything.
+        // No image shows the voxel that contains its camera: the voxel would not be carved, and would hide everything.
         if let Some(view) = views.iter().find(|view| aabb.contains(view.camera.position())) {
             let nearest = views.iter().map(|view| view.camera.position().abs().max_element()).fold(f64::INFINITY, f64::min);
-            let found = format!("{half_width}, a box in which the camera of {} stands,", view.name);
+            let found = format!("{half_width} is too large, the camera of {} is inside of the box", view.name);
             return Err(Error::config("half_width", found, format!("a box around the object alone, below {nearest:.3}")));
         }
         let mut hull = match rule {
@@ -168,37 +171,40 @@ impl<'a> Carving<'a> {
             Rule::Rays => visual_hull::by_rays(views, aabb, voxels, &|views| progress(Progress::Views(views))),
         };
         if hull.fraction() == 0.0 {
-            let found = format!("{half_width}, of which the silhouettes leave nothing,");
+            let found = format!("{half_width}, but the silhouettes leave no voxel of the box");
             return Err(Error::config("half_width", found, "a box around the object"));
         }
         if let Some(photo) = &photo {
             hull = photo_hull::photo_hull(views, &hull, photo, &|round, carved, left| progress(Progress::Round { round, carved, left }))?;
         }
         match hull.fraction() {
-            0.0 => Err(Error::config("carve.photo.noise", photo.map_or(0.0, |photo| photo.noise), "more, for nothing is left")),
+            0.0 => {
+                let noise = photo.map_or(0.0, |photo| photo.noise);
+                Err(Error::config("carve.photo.noise", format!("{noise} leaves no voxel"), "a larger value"))
+            }
             1.0 => {
-                let found = format!("{resolution}, of which no image shows one voxel whole on background,");
-                Err(Error::config("carve.resolution", found, "more voxels along an axis, a larger half_width, or a smaller carve.margin"))
+                let found = format!("{resolution}, but no image shows a whole voxel on background");
+                Err(Error::config("carve.resolution", found, "more voxels per axis, a larger half_width, or a smaller carve.margin"))
             }
             _ => Ok(Carving { views, options: *options, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }
     }
 
-    /// Voxels that are left.
+    /// Returns the number of remaining voxels.
     pub fn voxels(&self) -> usize {
         self.lattice.present()
     }
 
-    /// Rows that their tables have.
+    /// Returns the number of table rows of the remaining voxels.
     pub fn rows(&self) -> usize {
         self.lattice.rows()
     }
 
-    /// Finds the colors. `progress(passes)` is called after each pass over the pixels.
+    /// Fits the colors. `progress(passes)` is called after each pass over the pixels.
     pub fn color(&self, progress: &dyn Fn(usize)) -> Colored {
         let CarveOptions { half_width, color, background, seed, config } = self.options;
         let (lattice, rows) = (&self.lattice, self.lattice.rows());
-        // Colors are found for what one sees in the voxel that a point lies in, and for each voxel by itself, whatever training would do.
+        // Colors are fitted for nearest look-up and without reduction, whatever training uses.
         let shape = GridShape { resolution: config.resolution, half_width, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
         let density = config.depth / shape.voxel_side();
         let opaque = Opaque::new(lattice, Aabb::cube(shape.half_width), density);

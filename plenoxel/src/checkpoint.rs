@@ -1,12 +1,14 @@
-//! A trained grid on disk: a `safetensors` file that says what its numbers mean.
+//! Checkpoints of trained grids: `safetensors` files that state the meaning of their numbers.
 //!
-//! Of a grid with all its voxels, tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. Of a sparse one,
-//! `voxels` `[k]`, `u32`, ascending: those that are present, voxel (x, y, z) as the number (x n + y) n + z; and `density` `[k]` and `color`
-//! `[k, channels]` in that order. Where harmonics of degree 1 and more are reduced, a grid is written as a sparse one even if it has all its
-//! voxels, `color` is `[k, 3]`, the means, and the harmonics follow in the same manner: `harmonics_voxels` `[h]`, (x, y, z) of
-//! m = ⌈n / reduction⌉ voxels along an axis as the number (x m + y) m + z, and `harmonics` `[h, channels − 3]`.
+//! A dense grid has the tensors `density` `[n, n, n]` and `color` `[n, n, n, channels]`, `f32`, x slowest. A sparse grid has `voxels`
+//! `[k]`, `u32`, ascending: the present voxels, where voxel (x, y, z) has the number (x n + y) n + z; and `density` `[k]` and `color` `[k,
+//! channels]` in that order.
 //!
-//! The metadata have one entry, `plenoxel`: a JSON object with the version and every convention a reader must know.
+//! If harmonics of degree 1 and more are reduced, the grid is written as a sparse grid even if all voxels are present. `color` is `[k, 3]`,
+//! the coefficients of degree 0. The other harmonics follow in the same form: `harmonics_voxels` `[h]`, where (x, y, z) of m = ⌈n /
+//! reduction⌉ voxels per axis has the number (x m + y) m + z, and `harmonics` `[h, channels − 3]`.
+//!
+//! The metadata have one entry, `plenoxel`: a JSON object with the version and every convention that a reader needs.
 
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -20,58 +22,59 @@ use serde::{Deserialize, Serialize};
 use std::io::{Read, Seek};
 use std::path::Path;
 
-/// Kind of model that these files hold.
+/// Kind of model in these files.
 pub const KIND: &str = "plenoxels";
-/// Version of the format of grids with all their voxels.
+/// Format version of dense grids.
 pub const FORMAT: &str = "plenoxel 1";
-/// Version of the format of sparse grids.
+/// Format version of sparse grids.
 pub const SPARSE_FORMAT: &str = "plenoxel 2";
-/// Version of the format of grids whose harmonics are reduced.
+/// Format version of grids with reduced harmonics.
 pub const REDUCED_FORMAT: &str = "plenoxel 3";
-/// Where a voxel's value sits and what it means, in words.
+/// Position and meaning of a voxel's values, as text.
 pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; \
     sigma = max(0, density) after interpolation, per world length; \
     harmonics in the order and signs of svox2, blocks of R, G, B: \
     1, -y, z, -x, xy, -yz, 2zz-xx-yy, -xz, xx-yy, -y(3xx-yy), xyz, -y(4zz-xx-yy), z(2zz-3xx-3yy), -x(4zz-xx-yy), z(xx-yy), -x(xx-3yy), \
     orthonormal over the sphere; color = max(0, offset + sum)";
-/// What is said beside [`CONVENTION`] where harmonics are reduced.
+/// Addition to [`CONVENTION`] for reduced harmonics.
 const REDUCED_CONVENTION: &str = "; `color` has the means of R, G, B alone; `harmonics` has those of degree 1 and more, in voxels whose sides are \
     sh_reduction times as long and whose box begins at the same corner and may end beyond it; they are looked up as the other values are";
 
-/// Everything about a checkpoint but its tables.
+/// Header of a checkpoint: everything but its tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
-    /// [`KIND`]; files of earlier versions do not have it.
+    /// Kind of model, [`KIND`]. Files of early versions do not have it.
     #[serde(default = "kind")]
     pub kind: String,
     /// [`FORMAT`], [`SPARSE_FORMAT`] or [`REDUCED_FORMAT`].
     pub format: String,
-    /// [`CONVENTION`] and what else is to be known, for a human reader.
+    /// [`CONVENTION`] and additions, for human readers.
     pub convention: String,
-    /// Shape of the grid.
+    /// Number of voxels along each axis.
     pub resolution: usize,
-    /// Half the side of the cube, in the dataset's units.
+    /// Half the side of the cube, in units of the dataset.
     pub half_width: f64,
-    /// Look-up between centres.
+    /// Interpolation between voxel centres.
     pub interpolation: Interpolation,
-    /// `None` for RGB.
+    /// Degree of the harmonics; `None` for RGB.
     pub sh_degree: Option<usize>,
     /// Color of zero coefficients.
     pub sh_offset: f64,
-    /// Harmonics of degree 1 and more are there for every so many voxels along each axis; not written where it is 1.
+    /// Reduction of harmonics: those of degree 1 and more are stored for every n-th voxel along each axis. Not written if it is 1.
     #[serde(default = "unreduced", skip_serializing_if = "is_unreduced")]
     pub sh_reduction: usize,
-    /// Color behind the scene it was trained with.
+    /// Background color of training.
     pub background: [f32; 3],
-    /// Grid world to dataset world, a row-major 4 × 4 matrix: the identity as long as grids live in the dataset's own frame.
+    /// Transform from grid world to dataset world, a row-major 4 × 4 matrix. Always the identity, because grids are in the frame of the
+    /// dataset.
     pub scene_transform: [[f64; 4]; 4],
     /// Name of the scene.
     pub scene: String,
     /// Seed of the run.
     pub seed: u64,
-    /// Steps taken.
+    /// Number of steps taken.
     pub step: u64,
-    /// Program that wrote it.
+    /// Program that wrote the file.
     pub writer: String,
 }
 
@@ -94,10 +97,10 @@ fn is_unreduced(reduction: &usize) -> bool {
 }
 
 impl Header {
-    /// The frame of the dataset itself.
+    /// Transform of grids in the frame of the dataset.
     const IDENTITY: [[f64; 4]; 4] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
 
-    /// The header of a grid.
+    /// Creates the header of a grid.
     pub fn new<T: Real>(grid: &VoxelGrid<T>, scene: &str, background: [f32; 3], seed: u64, step: u64) -> Self {
         let shape = grid.shape();
         let (sh_degree, sh_offset) = match shape.color {
@@ -128,7 +131,7 @@ impl Header {
         }
     }
 
-    /// Shape of the grid it describes.
+    /// Returns the shape of the grid.
     pub fn shape(&self) -> GridShape {
         let color = self.sh_degree.map_or(Color::Rgb, |degree| Color::Sh { degree, offset: self.sh_offset });
         let Header { resolution, half_width, interpolation, sh_reduction, .. } = *self;
@@ -136,7 +139,7 @@ impl Header {
     }
 }
 
-/// Writes a grid, whole or not at all.
+/// Writes a grid atomically.
 pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Result<()> {
     let (n, channels) = (header.resolution, grid.shape().color_width());
     let mut entries: Vec<Entry<'_>> = Vec::new();
@@ -164,7 +167,7 @@ pub fn save<T: Real>(path: &Path, grid: &VoxelGrid<T>, header: &Header) -> Resul
     tensor_file::write(path, header, &entries)
 }
 
-/// The present voxels by number, ascending.
+/// Returns the numbers of the present voxels, ascending.
 fn present(lattice: &Lattice) -> Vec<u32> {
     let n = lattice.nodes()[0];
     let mut voxels: Vec<u32> =
@@ -173,43 +176,43 @@ fn present(lattice: &Lattice) -> Vec<u32> {
     voxels
 }
 
-/// The rows of voxels that are present, in the order of their numbers.
+/// Returns the rows of present voxels, in the order of their numbers.
 fn rows_of(voxels: &[u32], lattice: &Lattice) -> Vec<u32> {
     voxels.iter().filter_map(|&voxel| lattice.row(node(voxel, lattice.nodes()[0]))).collect()
 }
 
-/// The voxel of a number.
+/// Returns the voxel with a number.
 fn node(voxel: u32, n: usize) -> [usize; 3] {
     let voxel = voxel as usize;
     [voxel / (n * n), voxel / n % n, voxel % n]
 }
 
-/// Bytes for each brick of a grid while its lattice is made: masks, links, and their order along a Morton curve.
+/// Bytes per brick of a grid while its lattice is created: masks, links, and the order along a Morton curve.
 const BRICK_BYTES: u64 = 72;
 
-/// The lattice of n³ voxels of which these are present.
+/// Creates the lattice of n³ voxels in which these are present.
 fn with_voxels(voxels: &[u32], n: usize) -> Lattice {
     let masks = BrickGrid::new([n; 3]).masks_of(voxels.iter().map(|&voxel| node(voxel, n)));
     Lattice::from_masks([n; 3], masks)
 }
 
-/// Reads what a checkpoint says of itself, without its tables: the header, and the number of voxels that are present.
+/// Reads the header of a checkpoint and the number of present voxels, without its tables.
 pub fn header(path: &Path) -> Result<(Header, usize)> {
     let file = TensorFile::open(path)?;
     let shape = file.info("voxels").or_else(|| file.info("density")).map_or(&[][..], |info| &info.shape);
     Ok((header_of(path, &file)?, shape.iter().product()))
 }
 
-/// The header among the metadata of a file.
+/// Reads and validates the header in the metadata of a file.
 fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
-    // The version first: a later one may have other fields.
+    // Check the version first: later versions may have other fields.
     let value = file.facts()?;
     if let Some(kind) = value["kind"].as_str().filter(|kind| *kind != KIND) {
-        let found = format!("a model of kind `{kind}`, which has no voxels");
+        let found = format!("a model of kind `{kind}` has no voxels");
         return Err(Error::input(
             path,
             found,
-            format!("a model of kind `{KIND}` is expected; the program that trained this one can evaluate it"),
+            format!("use a model of kind `{KIND}`, or evaluate this one with the program that trained it"),
         ));
     }
     let format = value["format"].as_str().unwrap_or("none");
@@ -217,7 +220,7 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
         return Err(Error::input(
             path,
             format!("format `{format}`"),
-            format!("this program reads `{FORMAT}`, `{SPARSE_FORMAT}` and `{REDUCED_FORMAT}`; use the version that wrote the file"),
+            format!("accepted: `{FORMAT}`, `{SPARSE_FORMAT}` and `{REDUCED_FORMAT}`; use the program version that wrote the file"),
         ));
     }
     let format = format.to_owned();
@@ -226,29 +229,31 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
     if header.scene_transform != Header::IDENTITY {
         return Err(Error::input(
             path,
-            "a grid that is not in the frame of its dataset",
-            "this version reads grids whose scene_transform is the identity",
+            "the grid is not in the frame of its dataset",
+            "accepted: grids whose scene_transform is the identity",
         ));
     }
     let reduced = (1..=1024).contains(&header.sh_reduction) && header.shape().is_reduced() == (format == REDUCED_FORMAT);
     if !((1..=1024).contains(&header.resolution) && degree_known && reduced && GridShape::HALF_WIDTHS.contains(&header.half_width)) {
-        return Err(Error::input(path, "a header with impossible values", RETRAIN));
+        return Err(Error::input(path, "the header has values out of range", RETRAIN));
     }
     Ok(header)
 }
 
-/// Reads a grid. Errors name the file and what is wrong with it: cut short, another program's, a later version's.
+/// Reads a grid.
+///
+/// Errors if the file is truncated, or has another format or a later version; the error names the file and the problem.
 pub fn load<T: Real>(path: &Path) -> Result<(VoxelGrid<T>, Header)> {
     read(path, files::open(path, files::TENSORS)?)
 }
 
-/// The same from any source, a file or bytes; `path` names it in messages.
+/// Reads a grid from any source, such as a file or bytes. `path` names it in error messages.
 pub fn read<T: Real>(path: &Path, source: impl Read + Seek) -> Result<(VoxelGrid<T>, Header)> {
     let mut file = TensorFile::new(path, source)?;
     let header = header_of(path, &file)?;
     let shape = header.shape();
     let n = header.resolution;
-    // There may be few voxels in many bricks.
+    // A few voxels may be spread over many bricks.
     memory::check(path, &format!("a grid of {n}³ voxels"), BRICK_BYTES * BrickGrid::new([n; 3]).len() as u64)?;
     fn table<T: Real>(file: &mut TensorFile<'_>, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
         let values = file.numbers(name, Dtype::F32, expected)?;
@@ -268,7 +273,7 @@ pub fn read<T: Real>(path: &Path, source: impl Read + Seek) -> Result<(VoxelGrid
             let bytes = file.read(name, Dtype::U32, &[k])?;
             let voxels: Vec<u32> = bytes.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)).collect();
             if !voxels.is_sorted_by(|a, b| a < b) || voxels.last().is_none_or(|&last| last as usize >= n * n * n) {
-                return Err(Error::input(path, "a list of voxels that is empty, not ascending, or longer than the grid", RETRAIN));
+                return Err(Error::input(path, "the list of voxels is empty, not ascending, or beyond the grid", RETRAIN));
             }
             Ok(voxels)
         };
@@ -283,14 +288,14 @@ pub fn read<T: Real>(path: &Path, source: impl Read + Seek) -> Result<(VoxelGrid
         if let Some(lattice) = shape.harmonics_lattice(&lattice) {
             let (voxels, width) = (list(&mut file, "harmonics_voxels", shape.harmonics_resolution())?, shape.harmonics_width());
             if voxels != present(&lattice) {
-                return Err(Error::input(path, "harmonics of other voxels than those around its own", RETRAIN));
+                return Err(Error::input(path, "the file has harmonics of other voxels than the grid needs", RETRAIN));
             }
             tables.push(placed(table(&mut file, "harmonics", width, &[voxels.len(), width])?, &voxels, &lattice));
         }
         VoxelGrid::with_tables(shape, lattice, tables)
     };
     if !grid.is_finite() {
-        return Err(Error::input(path, "numbers that are not finite", RETRAIN));
+        return Err(Error::input(path, "the grid has values that are not finite", RETRAIN));
     }
     Ok((grid, header))
 }

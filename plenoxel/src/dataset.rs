@@ -1,8 +1,8 @@
-//! Photographs with known cameras, whatever the format they came in.
+//! Photographs with known cameras, independent of the file format.
 //!
-//! A [`Dataset`] is opened cheaply: all metadata is parsed and every image's header is checked, so that a broken file is
-//! reported at once, but pixels are decoded only when a split is loaded. [`open`] recognizes the format of a folder;
-//! [`Dataset::procedural`] is the built-in scene, which needs no files and knows its exact depth.
+//! Opening a [`Dataset`] is cheap: all metadata is parsed and the header of every image is checked, so that a broken file is reported at
+//! once. Pixels are decoded when a split is loaded. [`open`] recognizes the format of a folder. [`Dataset::procedural`] is the built-in
+//! scene, which needs no files and has exact depth.
 
 pub mod blender;
 pub mod exposure;
@@ -19,19 +19,19 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// The three parts of a dataset.
+/// Split of a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Split {
-    /// Views to learn from.
+    /// Views for training.
     Train,
-    /// Views to choose settings with.
+    /// Views for choosing settings.
     Val,
-    /// Views to report numbers on.
+    /// Views for reported results.
     Test,
 }
 
 impl Split {
-    /// All three, in the usual order.
+    /// All splits, in the usual order.
     pub const ALL: [Split; 3] = [Split::Train, Split::Val, Split::Test];
 }
 
@@ -54,40 +54,40 @@ impl std::str::FromStr for Split {
     }
 }
 
-/// One photograph and the camera that took it.
+/// Photograph with its camera.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// The file's name without folder and extension, such as "r_17".
+    /// Name of the file without folder and extension, such as "r_17".
     pub name: String,
-    /// Where it was taken from; its intrinsics have the size of `image`.
+    /// Camera. Its intrinsics have the size of `image`.
     pub camera: Camera,
-    /// 8-bit sRGB with straight alpha.
+    /// Image, 8-bit sRGB with straight alpha.
     pub image: image::RgbaImage,
-    /// Distance along the unit ray of each pixel's centre to the first surface, [height, width], infinite where there is none;
-    /// only where it is known exactly.
+    /// Distance along the unit ray of each pixel's centre to the first surface, [height, width]; infinite if there is none. `None` unless
+    /// known exactly.
     pub depth: Option<Array2<f32>>,
 }
 
 impl View {
-    /// Width and height of the image in pixels.
+    /// Returns width and height of the image in pixels.
     pub fn size(&self) -> [usize; 2] {
         [self.image.width() as usize, self.image.height() as usize]
     }
 
-    /// Color of pixel (x, y) over `background`: rgb a + background (1 - a) on sRGB values in [0, 1].
+    /// Returns the color of pixel (x, y) over `background`: rgb a + background (1 - a) on sRGB values in [0, 1].
     #[inline]
     pub fn color(&self, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
         image::color(&self.image, x, y, background)
     }
 
-    /// Alpha of pixel (x, y) in [0, 1].
+    /// Returns the alpha of pixel (x, y) in [0, 1].
     #[inline]
     pub fn alpha(&self, x: usize, y: usize) -> f32 {
         f32::from(self.image.get_pixel(x as u32, y as u32).0[3]) / 255.0
     }
 
-    /// The same with an image reduced by `k` in both directions, with a box filter, or by the largest number below that divides its sides.
-    /// There is no depth of it.
+    /// Returns the view with its image reduced by `k` along both axes with a box filter. If k does not divide both sides, the largest
+    /// smaller divisor is used. The result has no depth.
     pub fn reduced(&self, k: usize) -> Self {
         let (width, height) = self.image.dimensions();
         let divides = |k: &usize| width.is_multiple_of(*k as u32) && height.is_multiple_of(*k as u32);
@@ -96,24 +96,24 @@ impl View {
         View { name: self.name.clone(), camera, image: image::downscale(&self.image, k), depth: None }
     }
 
-    /// The whole picture over `background`, [height, width, 3] in [0, 1].
+    /// Returns the whole image over `background`, [height, width, 3] in [0, 1].
     pub fn composite(&self, background: [f32; 3]) -> Array3<f32> {
         image::composite(&self.image, background)
     }
 }
 
-/// True if some pixel of some view is transparent: then alpha says in all of them what is object and what is background.
+/// Returns true if some pixel of some view is transparent. Alpha then separates object and background in all views.
 pub fn has_alpha(views: &[View]) -> bool {
     views.iter().any(|view| view.image.pixels().any(|pixel| pixel.0[3] == 0))
 }
 
-/// How to open a folder.
+/// Options for opening a folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OpenOptions {
-    /// Reduce every image this many times; must divide width and height. 1 leaves them as they are.
+    /// Factor by which every image is reduced; must divide width and height. 1 keeps the full size.
     pub downscale: usize,
-    /// Without a validation split in the files, hold out every n-th training view (number n - 1, 2n - 1, ...) for validation;
-    /// at least 2. `None` leaves the validation split empty.
+    /// Interval at which training views are held out for validation, if the files have no validation split: every n-th view (number n - 1,
+    /// 2n - 1, ...). At least 2. `None` leaves the validation split empty.
     pub validation_every: Option<usize>,
 }
 
@@ -123,7 +123,7 @@ impl Default for OpenOptions {
     }
 }
 
-/// Views in three splits, read or rendered when asked for.
+/// Dataset of three splits, whose views are read or rendered on demand.
 #[derive(Debug, Clone)]
 pub struct Dataset {
     name: String,
@@ -133,13 +133,13 @@ pub struct Dataset {
     source: Source,
 }
 
-/// What is known of a view before its pixels are.
+/// View before its pixels are loaded.
 #[derive(Debug, Clone)]
 struct Frame {
     name: String,
-    /// With the intrinsics after the reduction.
+    /// Camera with the intrinsics after the reduction.
     camera: Camera,
-    /// Empty for a rendered view.
+    /// Path of the image; empty for a rendered view.
     path: PathBuf,
 }
 
@@ -149,10 +149,10 @@ enum Source {
     Procedural { scene: Arc<procedural::Scene>, supersample: usize },
 }
 
-/// Opens the dataset in the folder `path`. The one format so far is NeRF-synthetic ([`blender`]), recognized by its
+/// Opens the dataset in the folder `path`. The only supported format is NeRF-synthetic ([`blender`]), recognized by its
 /// transforms_train.json.
 ///
-/// Errors: bad input that names the file and the frame; a configuration error for `options` that do not fit the images.
+/// Errors if a file is invalid, naming file and frame; also if `options` do not fit the images (a configuration error).
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
     if let Some(every @ 0..=1) = options.validation_every {
         return Err(Error::config("validation_every", every, "2 or more"));
@@ -166,7 +166,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
     if !metadata.is_dir() {
         return Err(Error::input(path, "this is a file", "give the folder that contains transforms_train.json"));
     }
-    // What has that name and cannot be read is reported as such.
+    // A file of this name that cannot be read is reported as unreadable, not as missing.
     if !files::is_there(&path.join("transforms_train.json")) {
         return Err(unrecognized(path));
     }
@@ -174,45 +174,45 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
 }
 
 impl Dataset {
-    /// The built-in analytic scene with the given number of views; exact depth comes with every view.
+    /// Creates the built-in analytic scene with the given numbers of views. Every view has exact depth.
     ///
-    /// Errors: a configuration error for sizes of 0 or beyond [`image::MAX_SIDE`], for no training view and for a
-    /// supersampling of 0 or above 16.
+    /// Errors with a configuration error if a size is 0 or beyond [`image::MAX_SIDE`], if there is no training view, or if the
+    /// supersampling is 0 or above 16.
     pub fn procedural(options: ProceduralOptions) -> Result<Self> {
         procedural::dataset(options)
     }
 
-    /// Name of the scene: the folder's name, or "procedural".
+    /// Returns the name of the scene: the folder's name, or "procedural".
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// The format that was recognized, in words for people.
+    /// Returns the recognized format, as text for people.
     pub fn format(&self) -> &'static str {
         self.format
     }
 
-    /// Number of views in a split.
+    /// Returns the number of views in a split.
     pub fn count(&self, split: Split) -> usize {
         self.frames(split).len()
     }
 
-    /// Width and height of every image, after the reduction.
+    /// Returns width and height of the images, after the reduction.
     pub fn size(&self) -> (usize, usize) {
         self.size
     }
 
-    /// The cameras of a split, in the order of its views.
+    /// Returns the cameras of a split, in the order of its views.
     pub fn cameras(&self, split: Split) -> Vec<Camera> {
         self.frames(split).iter().map(|frame| frame.camera).collect()
     }
 
-    /// The names of a split's views, in their order.
+    /// Returns the names of a split's views, in order.
     pub fn view_names(&self, split: Split) -> Vec<&str> {
         self.frames(split).iter().map(|frame| frame.name.as_str()).collect()
     }
 
-    /// The analytic scene behind a procedural dataset, for exact answers about space.
+    /// Returns the analytic scene of a procedural dataset, for exact queries about its geometry.
     pub fn scene(&self) -> Option<&procedural::Scene> {
         match &self.source {
             Source::Procedural { scene, .. } => Some(scene),
@@ -220,19 +220,19 @@ impl Dataset {
         }
     }
 
-    /// Decodes (or renders) the views of a split in parallel, in the order of the files. `progress(done, total)` is called
-    /// after each view, from any thread, with `done` from 1 to `total` not necessarily in order.
+    /// Decodes or renders the views of a split in parallel. The result is in the order of the files. `progress(done, total)` is called
+    /// after each view, from any thread, with `done` from 1 to `total`, not necessarily in order.
     ///
-    /// Memory: 4 bytes a pixel, and 4 more where depth is known. Errors: the first view, in order, that cannot be read.
+    /// Memory: 4 bytes per pixel, and 4 more if depth is known. Errors if a view cannot be read; the first such view is reported.
     pub fn load(&self, split: Split, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<Vec<View>> {
         self.load_views(split, &(0..self.count(split)).collect::<Vec<_>>(), progress)
     }
 
-    /// Reads or renders some views of a split, in the order of their numbers. `progress(done, total)` is called from several threads.
+    /// Decodes or renders some views of a split, in the order of their numbers. `progress(done, total)` is called from several threads.
     ///
     /// Errors as for [`load`](Self::load).
     ///
-    /// Panics if there is no such view.
+    /// Panics if a number is out of range.
     pub fn load_views(&self, split: Split, numbers: &[usize], progress: &(dyn Fn(usize, usize) + Sync)) -> Result<Vec<View>> {
         let frames = self.frames(split);
         let done = AtomicUsize::new(0);
@@ -244,27 +244,28 @@ impl Dataset {
                 view
             })
             .collect();
-        // Collected in two steps: of several broken files it is always the first that is reported.
+        // Collect in two steps, so that of several broken files the first is always reported.
         views.into_iter().collect()
     }
 
-    /// Decodes (or renders) one view of a split, in the order of the files.
+    /// Decodes or renders one view of a split; views are numbered in the order of the files.
     ///
-    /// Panics if there are not so many. Errors: it cannot be read.
+    /// Panics if the number is out of range. Errors if the view cannot be read.
     pub fn load_view(&self, split: Split, number: usize) -> Result<View> {
         self.load_frame(&self.frames(split)[number])
     }
 
-    /// Writes all views to the folder `path` in the NeRF-synthetic format, with 16-bit depth pictures beside the test views
-    /// where depth is known (thousandths of a world unit, 0 where nothing was hit).
+    /// Writes all views to the folder `path` in the NeRF-synthetic format. If depth is known, it also writes 16-bit depth images of the
+    /// test views, in thousandths of a world unit, 0 for rays that hit nothing.
     ///
-    /// Errors: a folder that is not empty unless `overwrite`; cameras without square pixels and a centred principal point,
-    /// which the format cannot express; the disk's refusal.
+    /// Errors if the folder is not empty, unless `overwrite`; if a camera has non-square pixels or a principal point off the centre, which
+    /// the format cannot express; or if a file cannot be written.
     pub fn write_blender(&self, path: &Path, overwrite: bool) -> Result<()> {
         self.write_blender_changed(path, overwrite, &|_, _| ())
     }
 
-    /// The same with images that `change` has changed, such as [`exposure::spread`]; it gets all views of a split at a time.
+    /// Writes the dataset like [`write_blender`](Self::write_blender), with images modified by `change`, for example [`exposure::spread`].
+    /// `change` receives all views of a split.
     pub fn write_blender_changed(&self, path: &Path, overwrite: bool, change: &dyn Fn(Split, &mut [View])) -> Result<()> {
         blender::write(self, path, overwrite, change)
     }
@@ -279,7 +280,7 @@ impl Dataset {
             Source::Files { downscale } => {
                 let full = image::read(&frame.path)?;
                 if (full.width() as usize, full.height() as usize) != (self.size.0 * downscale, self.size.1 * downscale) {
-                    return Err(Error::input(&frame.path, "the image changed its size after the dataset was opened", "open it again"));
+                    return Err(Error::input(&frame.path, "the size of the image changed after the dataset was opened", "open it again"));
                 }
                 let image = if *downscale == 1 { full } else { image::downscale(&full, *downscale) };
                 Ok(View { name, camera, image, depth: None })
@@ -292,7 +293,7 @@ impl Dataset {
     }
 }
 
-/// Says what is in a folder that has no transforms_train.json, and guesses what the user meant.
+/// Returns the error for a folder without transforms_train.json. It lists the content and guesses the format.
 fn unrecognized(path: &Path) -> Error {
     let mut names: Vec<String> = match std::fs::read_dir(path) {
         Ok(entries) => entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect(),
@@ -307,15 +308,15 @@ fn unrecognized(path: &Path) -> Error {
     let has = |name: &str| names.iter().any(|found| found == name);
     let below = names.iter().find(|name| path.join(name).join("transforms_train.json").exists());
     let remedy = if let Some(scene) = below {
-        format!("give one scene, for instance {}", path.join(scene).display())
+        format!("give one scene, for example {}", path.join(scene).display())
     } else if has("transforms.json") {
-        "a dataset in a single transforms.json, as of instant-ngp and nerfstudio, is not supported yet; NeRF-synthetic folders are".into()
+        "a dataset in a single transforms.json, as for instant-ngp and nerfstudio, is not supported yet; use a NeRF-synthetic folder".into()
     } else if has("poses_bounds.npy") {
-        "LLFF captures (poses_bounds.npy) are not read yet; NeRF-synthetic folders are".into()
+        "LLFF captures (poses_bounds.npy) are not supported yet; use a NeRF-synthetic folder".into()
     } else if has("sparse") {
-        "COLMAP reconstructions (sparse/) are not read yet; NeRF-synthetic folders are".into()
+        "COLMAP reconstructions (sparse/) are not supported yet; use a NeRF-synthetic folder".into()
     } else {
-        "a NeRF-synthetic folder has transforms_train.json and the images it lists".into()
+        "use a NeRF-synthetic folder, with transforms_train.json and the images that it lists".into()
     };
     Error::input(path, format!("no transforms_train.json in this folder, {listed}"), remedy)
 }
@@ -330,6 +331,6 @@ mod tests {
             assert_eq!(split.to_string().parse::<Split>().unwrap(), split);
         }
         let error = "valid".parse::<Split>().unwrap_err();
-        assert_eq!(error.to_string(), "split: \"valid\" cannot be used; accepted: train, val, test");
+        assert_eq!(error.to_string(), "split: invalid value \"valid\"; accepted: train, val, test");
     }
 }

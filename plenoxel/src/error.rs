@@ -1,76 +1,76 @@
-//! What can go wrong between this crate and the world: files, settings, numbers.
+//! Errors of files, settings and computations.
 //!
-//! Mistakes of a programmer (shapes that do not fit) panic at the caller's line. Everything that comes from a file, a flag or
-//! the data is an [`Error`], and its message says where it happened, what was found, what is accepted and what to do.
+//! Programming mistakes, such as shapes that do not match, panic at the caller's line. Problems with a file, a flag or data are an
+//! [`Error`]. Its message says where the problem is, what is wrong, what is accepted, and what to do.
 
 use crate::text::one_line;
 use std::path::{Path, PathBuf};
 
-/// Result with this crate's [`Error`].
+/// [`Result`](std::result::Result) with this crate's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Everything a user, a disk or a diverging training run can cause. Displayed, it is one line that can be printed: see [`one_line`].
+/// Error caused by a user, the operating system or a diverging training run. Displayed, it is one line of printable text ([`one_line`]).
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A file or folder does not hold what it should.
+    /// A file or folder has invalid content.
     #[error("{}: {}; {}", shown(path), one_line(found), one_line(remedy))]
     Input {
-        /// The file or folder.
+        /// File or folder.
         path: PathBuf,
-        /// What is there, with frame index, key or line where that helps.
+        /// Problem, with the frame index, key or line where that helps.
         found: String,
-        /// What is accepted, or what to do about it.
+        /// Accepted content, or what to do.
         remedy: String,
     },
-    /// A setting (flag or configuration key) has a value that cannot be used.
-    #[error("{}: {} cannot be used; accepted: {}", one_line(key), one_line(found), one_line(accepted))]
+    /// A setting (flag or configuration key) has an invalid value.
+    #[error("{}: {}; accepted: {}", one_line(key), problem(found), one_line(accepted))]
     Config {
         /// Name of the setting as the user writes it.
         key: String,
-        /// The value given.
+        /// Given value, or a phrase that says what is wrong. A single word is displayed as `invalid value {found}`.
         found: String,
-        /// The values that would do.
+        /// Accepted values.
         accepted: String,
     },
-    /// A computation left the finite numbers.
+    /// A computation produced a number that is not finite, or another unusable result.
     #[error("{}: {}; {}", one_line(place), one_line(found), one_line(remedy))]
     Numeric {
-        /// Step, tensor or formula where it was noticed.
+        /// Step, tensor or formula that produced it.
         place: String,
-        /// The value seen.
+        /// Problem.
         found: String,
-        /// What usually helps.
+        /// Remedy that usually helps.
         remedy: String,
     },
-    /// The operating system refused to read or write.
+    /// The operating system failed to read or write.
     #[error("{}: {} while {doing}; {}", shown(path), one_line(&source.to_string()), remedy(source))]
     Io {
-        /// The file or folder.
+        /// File or folder.
         path: PathBuf,
-        /// The reason the operating system gave.
+        /// Error of the operating system.
         source: std::io::Error,
-        /// The activity, as a participle: "writing the image".
+        /// Activity, as a participle: "writing the image".
         doing: String,
     },
 }
 
 impl Error {
-    /// Bad data in `path`.
+    /// Creates an error for invalid content of `path`.
     pub fn input(path: impl Into<PathBuf>, found: impl Into<String>, remedy: impl Into<String>) -> Self {
         Error::Input { path: path.into(), found: found.into(), remedy: remedy.into() }
     }
 
-    /// A setting that cannot be used.
+    /// Creates an error for an invalid setting.
     pub fn config(key: impl Into<String>, found: impl ToString, accepted: impl Into<String>) -> Self {
         Error::Config { key: key.into(), found: found.to_string(), accepted: accepted.into() }
     }
 
-    /// A refusal of the operating system while `doing` something with `path`.
+    /// Creates an error of the operating system during `doing` with `path`.
     pub fn io(path: impl Into<PathBuf>, source: std::io::Error, doing: impl Into<String>) -> Self {
         Error::Io { path: path.into(), source, doing: doing.into() }
     }
 
-    /// Exit code of a process that ends with this error: 2 setting, 3 data, 4 numbers, 5 reading or writing.
+    /// Returns the exit code of a process that ends with this error: 2 setting, 3 data, 4 numbers, 5 reading or writing.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Config { .. } => 2,
@@ -81,12 +81,18 @@ impl Error {
     }
 }
 
-/// A path as it can be printed.
+/// Returns the problem with a setting: a value alone is introduced as invalid, a phrase is left as it is.
+fn problem(found: &str) -> String {
+    let found = one_line(found.trim_end_matches(','));
+    if found.contains(' ') { found } else { format!("invalid value {found}") }
+}
+
+/// Returns a path as printable text.
 fn shown(path: &Path) -> String {
     one_line(&path.display().to_string())
 }
 
-/// True if the process, or the system, has as many open files as it may have.
+/// Returns true if the process, or the system, has reached its limit of open files.
 fn has_too_many_files(refusal: &std::io::Error) -> bool {
     #[cfg(unix)]
     const CODES: [i32; 2] = [libc::EMFILE, libc::ENFILE];
@@ -96,21 +102,23 @@ fn has_too_many_files(refusal: &std::io::Error) -> bool {
     refusal.raw_os_error().is_some_and(|code| CODES.contains(&code))
 }
 
-/// What helps against a refusal of the operating system.
+/// Returns advice for an error of the operating system.
 fn remedy(refusal: &std::io::Error) -> &'static str {
     use std::io::ErrorKind::*;
     if has_too_many_files(refusal) {
-        return "allow more open files, for instance with `ulimit -n 4096`, or close other programs";
+        return "allow more open files, for example with `ulimit -n 4096`, or close other programs";
     }
     match refusal.kind() {
-        NotFound => "check that the path is spelled rightly",
+        NotFound => "check the spelling of the path",
         PermissionDenied => "change its permissions, or choose another path",
-        ReadOnlyFilesystem => "choose a place that may be written",
+        ReadOnlyFilesystem => "choose a path on a writable file system",
         InvalidData | UnexpectedEof => "the file is damaged: use an undamaged copy",
-        AlreadyExists | NotADirectory | IsADirectory => "choose another path: a file is where a folder should be, or the other way round",
+        AlreadyExists | NotADirectory | IsADirectory => {
+            "choose another path: a file is in the place of a folder, or a folder in the place of a file"
+        }
         OutOfMemory => "use a smaller file, or a machine with more memory",
-        StorageFull | QuotaExceeded | FileTooLarge => "make room on the disk, or choose another one",
-        InvalidFilename => "choose a shorter or plainer name",
+        StorageFull | QuotaExceeded | FileTooLarge => "free space on the disk, or choose another disk",
+        InvalidFilename => "choose a shorter name without special characters",
         _ => "check the disk, or choose another path",
     }
 }
@@ -124,16 +132,18 @@ mod tests {
         let input = Error::input("a.json", "frames is empty", "list at least one frame");
         assert_eq!((input.exit_code(), input.to_string().as_str()), (3, "a.json: frames is empty; list at least one frame"));
         let config = Error::config("downscale", 3, "1, 2, 4");
-        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: 3 cannot be used; accepted: 1, 2, 4"));
+        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: invalid value 3; accepted: 1, 2, 4"));
+        let phrase = Error::config("stages", "no stage", "at least one stage");
+        assert_eq!(phrase.to_string(), "stages: no stage; accepted: at least one stage");
         let io = Error::io("out", std::io::Error::other("disk full"), "writing");
         assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing; check the disk, or choose another path"));
         for (kind, remedy) in [
-            (std::io::ErrorKind::NotFound, "spelled rightly"),
+            (std::io::ErrorKind::NotFound, "spelling"),
             (std::io::ErrorKind::PermissionDenied, "permissions"),
-            (std::io::ErrorKind::ReadOnlyFilesystem, "may be written"),
+            (std::io::ErrorKind::ReadOnlyFilesystem, "writable"),
             (std::io::ErrorKind::InvalidData, "undamaged"),
-            (std::io::ErrorKind::NotADirectory, "the other way round"),
-            (std::io::ErrorKind::StorageFull, "make room"),
+            (std::io::ErrorKind::NotADirectory, "in the place of a folder"),
+            (std::io::ErrorKind::StorageFull, "free space"),
             (std::io::ErrorKind::InvalidFilename, "shorter"),
         ] {
             let text = Error::io("out", kind.into(), "writing").to_string();

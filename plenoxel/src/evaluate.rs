@@ -1,7 +1,7 @@
 //! Evaluation of a trained model against photographs: PSNR and SSIM of each view, and their means.
 //!
-//! One ray goes through the centre of each pixel. A rendered picture is clamped to [0, 1] and not rounded; a photograph is composited over the
-//! background in floats. [`crate::metrics`] has the formulas.
+//! One ray passes through the centre of each pixel. Rendered images are clamped to [0, 1] and not rounded. Photographs are composited over
+//! the background in floating point. See [`crate::metrics`] for the formulas.
 
 use crate::camera::{Camera, Ray};
 use crate::dataset::View;
@@ -28,32 +28,32 @@ pub fn evaluate<T: Real>(model: &(impl Model<T> + ?Sized), views: &[View], optio
     Viewer::of(model, options).compare(views, |_, _, _, _| Ok(())).unwrap_or_default()
 }
 
-/// A model, or anything else that renders rays, ready for pictures.
+/// Renderer of images, for a model or for any function that renders rays.
 pub struct Viewer<'a, T: Real> {
     show: RenderFn<'a, T>,
     background: [f32; 3],
 }
 
 impl<'a, T: Real> Viewer<'a, T> {
-    /// A viewer of a function from rays to pixels over a background, sRGB in [0, 1].
+    /// Creates a viewer from a function that renders rays over a background, sRGB in [0, 1].
     pub fn new(show: impl Fn(&[Ray]) -> Rendered<T> + Sync + 'a, background: [f32; 3]) -> Self {
         Viewer { show: Box::new(show), background }
     }
 
-    /// A viewer of a model.
+    /// Creates a viewer of a model.
     pub fn of(model: &'a (impl Model<T> + ?Sized), options: &ViewOptions) -> Self {
         Viewer { show: model.viewer(options), background: options.background }
     }
 
-    /// Renders the picture of a camera.
+    /// Renders the image of a camera.
     pub fn see(&self, camera: &Camera) -> Picture {
         picture_by(&self.show, camera)
     }
 
-    /// Renders each view and compares it with its photograph over the background. `seen(number, view, target, picture)` is called after each;
-    /// `target` is the photograph over the background, `[h, w, 3]`.
+    /// Renders each view and compares it with its photograph over the background. `seen(number, view, target, picture)` is called after
+    /// each view; `target` is the photograph over the background, `[h, w, 3]`.
     ///
-    /// Errors: those of `seen`, which end the comparison.
+    /// Errors if `seen` does; the comparison then stops.
     pub fn compare(&self, views: &[View], mut seen: impl FnMut(usize, &View, &Array3<f32>, &Picture) -> Result<()>) -> Result<Scores> {
         let mut per_view = Vec::with_capacity(views.len());
         for (i, view) in views.iter().enumerate() {
@@ -83,13 +83,13 @@ pub struct ViewScore {
     pub psnr: f64,
     /// Mean squared error over pixels and channels, values in [0, 1].
     pub mse: f64,
-    /// SSIM over the windows inside the image; `None` for images of less than 11 pixels a side.
+    /// SSIM over the windows inside the image; `None` for images smaller than 11 pixels per side.
     pub ssim: Option<f64>,
-    /// SSIM with zeros around the image, as svox2 computes it.
+    /// SSIM with zero padding around the image, as in svox2.
     pub ssim_same: f64,
 }
 
-/// Scores of several views. Their means are `None` if there are no views.
+/// Scores of several views. Means are `None` if there are no views.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Scores {
     /// Scores of each view, in the order of the views.
@@ -97,28 +97,28 @@ pub struct Scores {
 }
 
 impl Scores {
-    /// Mean PSNR in dB.
+    /// Returns the mean PSNR in dB.
     pub fn psnr(&self) -> Option<f64> {
         mean(self.per_view.iter().map(|view| Some(view.psnr)))
     }
 
-    /// PSNR in dB of the mean squared error over the views. Views with large errors count more than in the mean PSNR.
+    /// Returns the PSNR in dB of the mean squared error over all views. Views with large errors have more influence than in the mean PSNR.
     pub fn psnr_of_mean_mse(&self) -> Option<f64> {
         mean(self.per_view.iter().map(|view| Some(view.mse))).map(metrics::psnr_of)
     }
 
-    /// Mean SSIM; `None` if a view has none.
+    /// Returns the mean SSIM; `None` if a view has none.
     pub fn ssim(&self) -> Option<f64> {
         mean(self.per_view.iter().map(|view| view.ssim))
     }
 
-    /// Mean SSIM with zeros around the images.
+    /// Returns the mean SSIM with zero padding.
     pub fn ssim_same(&self) -> Option<f64> {
         mean(self.per_view.iter().map(|view| Some(view.ssim_same)))
     }
 }
 
-/// Mean PSNR in dB of the plain background against the views: a baseline.
+/// Returns the mean PSNR in dB of the plain background against the views, as a baseline.
 pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
     let (width, height) = views.first()?.image.dimensions();
     let shape = (height as usize, width as usize, 3);
@@ -126,12 +126,12 @@ pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
     constant_psnr(views, &plain, background)
 }
 
-/// Mean image of the views over a background, `[h, w, 3]`; `None` if there are no views. Panics unless all are of one size.
+/// Returns the mean image of the views over a background, `[h, w, 3]`; `None` if there are no views. Panics unless all views have one size.
 ///
-/// Memory: that of the result.
+/// Needs no memory beyond the result.
 pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
     let [width, height] = views.first()?.size();
-    assert!(views.iter().all(|view| view.size() == [width, height]), "mean_image: views of several sizes");
+    assert!(views.iter().all(|view| view.size() == [width, height]), "mean_image: the views have different sizes");
     let mut mean = vec![0.0; 3 * width * height];
     mean.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
@@ -146,7 +146,7 @@ pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
     Array3::from_shape_vec((height, width, 3), mean).ok()
 }
 
-/// Mean PSNR in dB of one picture, `[h, w, 3]`, against the views; `None` if there are no views or one has another size.
+/// Returns the mean PSNR in dB of one image, `[h, w, 3]`, against the views; `None` if there are no views or a view has another size.
 pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]) -> Option<f64> {
     mean(views.iter().map(|view| {
         let target = view.composite(background);
@@ -154,7 +154,7 @@ pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]
     }))
 }
 
-/// Mean of the values; `None` if there are no values or one is `None`.
+/// Returns the mean of the values; `None` if there are no values or one is `None`.
 fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
     let n = values.len();
     let sum: Option<f64> = values.sum();

@@ -1,7 +1,7 @@
-//! Grids as files of other programs.
+//! Export of grids to files of other programs.
 //!
-//! Positions are those of the dataset, z up, unless a format demands otherwise; colors are sRGB with 8 bits, as the photographs have them. A grid
-//! whose colors depend on the direction is looked at in one direction: each voxel against the way it faces, or all along a given one.
+//! Positions are those of the dataset, z up, unless a format requires otherwise. Colors are 8-bit sRGB, as in the photographs.
+//! View-dependent colors are evaluated in one direction: for each voxel opposite to its outward direction, or in a given direction for all.
 
 pub mod mesh;
 pub mod mesh_file;
@@ -16,26 +16,27 @@ use crate::sampling::{Jitter, Spacing};
 use autograd::{Real, no_grad};
 use glam::DVec3;
 
-/// The share of the light that a voxel absorbs where its matter counts as a surface, for meshes and .vox files. Of 0.03, 0.05, 0.1, 0.15, 0.2, 0.3 and
-/// 0.5 the one whose exports look most like test photographs: lego at 128³, views 0, 60 and 130. With 0.5 surfaces have holes, with 0.1 they wear a crust.
+/// Fraction of light that a voxel absorbs at the surface, for meshes and .vox files. It was chosen from 0.03, 0.05, 0.1, 0.15, 0.2, 0.3 and
+/// 0.5 as the one whose exports look most like test photographs (lego at 128³, views 0, 60 and 130). With 0.5 surfaces have holes, with 0.1
+/// a crust.
 pub const SURFACE_ALPHA: f64 = 0.3;
 
-/// How far in front of a point the ray begins that finds its color, in voxels.
+/// Distance in voxels between a point and the start of the ray that determines its color.
 const CLEARANCE: f64 = 1.0;
-/// Rays rendered at a time, which bounds the memory.
+/// Number of rays rendered at a time. It bounds the memory.
 const RAYS: usize = 4096;
 
-/// The directions, from the viewer into the scene, in which colors are seen: `along`, or where that is `None` each against its `outward`
-/// vector, of any length; zero where that is zero.
+/// Returns the directions, from the viewer into the scene, in which colors are evaluated: `along`, or, if it is `None`, opposite to each
+/// vector of `outward`, normalised; zero for zero vectors.
 fn directions(outward: &[DVec3], along: Option<DVec3>) -> Vec<DVec3> {
     outward.iter().map(|out| along.unwrap_or(-out.normalize_or_zero())).collect()
 }
 
-/// The 8-bit colors that a camera sees close by at `points`, looking along their unit `directions`: what a ray renders from a voxel before
-/// the point, divided by its opacity. A surface in a radiance field is several voxels thick, and the colors of single ones mean little: only
-/// their sum was fitted.
+/// Returns the 8-bit colors that a camera near `points` sees in the unit `directions`: the rendered color of a ray that starts one voxel
+/// before the point, divided by its opacity. A surface in a radiance field is several voxels thick, and only the sum of their colors was
+/// fitted, not the color of each.
 ///
-/// A point with a direction of zero has the mean color of its voxel, of which `rows` has the row in the tables.
+/// A point with direction zero gets the mean color of its voxel. `rows` has the rows of the points' voxels in the tables.
 pub(crate) fn near_colors<T: Real>(grid: &VoxelGrid<T>, points: &[DVec3], directions: &[DVec3], rows: &[u32]) -> Vec<[u8; 3]> {
     let side = grid.shape().voxel_side();
     let options = RenderOptions {
@@ -62,7 +63,7 @@ pub(crate) fn near_colors<T: Real>(grid: &VoxelGrid<T>, points: &[DVec3], direct
     colors.into_iter().map(in_bytes).collect()
 }
 
-/// An sRGB color in 8 bits, from 0 to 255.
+/// Converts an sRGB color to 8 bits, 0 to 255.
 pub(crate) fn in_bytes(rgb: [f64; 3]) -> [u8; 3] {
     rgb.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8)
 }

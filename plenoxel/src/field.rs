@@ -1,6 +1,6 @@
-//! Fields that fill space, and how they are stored.
+//! Radiance fields and their storage.
 //!
-//! [`Field`] and [`Radiance`] are defined by [`render`](crate::render), which knows no field.
+//! [`Field`] and [`Radiance`] are defined by [`render`](crate::render), which depends on no particular field.
 
 pub(crate) mod neighbours;
 pub mod sh;

@@ -1,8 +1,8 @@
-//! Just the geometry that rays and grids need: the axis-aligned box.
+//! Geometry of rays and grids: the axis-aligned box.
 
 use glam::DVec3;
 
-/// Axis-aligned box in world coordinates, its faces included.
+/// Axis-aligned box in world coordinates, including its faces.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Aabb {
     /// Corner with the smallest coordinates.
@@ -12,21 +12,21 @@ pub struct Aabb {
 }
 
 impl Aabb {
-    /// The cube from -`half_width` to `half_width` on every axis.
+    /// Returns the cube from -`half_width` to `half_width` on every axis.
     pub fn cube(half_width: f64) -> Self {
         Aabb { min: DVec3::splat(-half_width), max: DVec3::splat(half_width) }
     }
 
-    /// True for points inside or on a face.
+    /// Returns true for points inside or on a face.
     pub fn contains(&self, point: DVec3) -> bool {
         point.cmpge(self.min).all() && point.cmple(self.max).all()
     }
 
-    /// The part of the ray `origin + t direction`, t >= 0, that lies in the box: `Some((t_enter, t_exit))` with
-    /// 0 <= t_enter <= t_exit, or `None` if the ray misses it or has it behind. t is in units of the direction's length.
+    /// Returns the interval of the ray `origin + t direction`, t >= 0, inside the box: `Some((t_enter, t_exit))` with 0 <= t_enter <=
+    /// t_exit, or `None` if the ray misses the box or the box is behind it. t is in units of the direction's length.
     ///
-    /// Slab test (Kay and Kajiya 1986). A direction component that is zero never divides: such a ray is in that slab for
-    /// every t or for none.
+    /// Slab test (Kay and Kajiya 1986). A direction component of zero is not divided by: such a ray is in that slab for every t or for
+    /// none.
     pub fn intersect(&self, origin: DVec3, direction: DVec3) -> Option<(f64, f64)> {
         let (mut enter, mut exit) = (0.0_f64, f64::INFINITY);
         for axis in 0..3 {
@@ -41,7 +41,7 @@ impl Aabb {
             enter = enter.max(a.min(b));
             exit = exit.min(a.max(b));
         }
-        // A zero direction inside the box would leave the exit infinite: it is not a ray.
+        // A zero direction inside the box would leave the exit infinite; it is not a ray.
         (enter <= exit && exit.is_finite()).then_some((enter, exit))
     }
 }

@@ -1,7 +1,7 @@
-//! The generic code of this crate, compiled here for both precisions.
+//! Instances of this crate's generic code for both precisions.
 //!
-//! With little optimisation the compiler lets crates share what a dependency has already compiled of its generic code. So in the builds
-//! that the tests run in, each test links this instead of compiling a renderer and a trainer of its own. Nothing calls it.
+//! In builds with little optimisation, crates can share generic code that a dependency has already compiled. The tests' builds therefore
+//! link these instances instead of compiling a renderer and a trainer per test. Nothing calls them.
 
 use crate::checkpoint::{self, Header};
 use crate::dataset::View;
@@ -18,12 +18,12 @@ use autograd::optim::{Optimizer, Rates, Sgd};
 use autograd::{Real, grad, value_and_grad};
 use std::path::Path;
 
-/// In `f32`.
+/// Instances for `f32`.
 pub fn single(config: Config, views: &[View], options: &RenderOptions<'_>, path: &Path) -> Result<()> {
     all::<f32>(config, views, options, path)
 }
 
-/// In `f64`.
+/// Instances for `f64`.
 pub fn double(config: Config, views: &[View], options: &RenderOptions<'_>, path: &Path) -> Result<()> {
     all::<f64>(config, views, options, path)
 }

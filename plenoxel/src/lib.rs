@@ -1,27 +1,29 @@
 #![doc = include_str!("../README.md")]
 //!
-//! # The straight line
+//! # Modules
 //!
-//! | module | what it does |
+//! | module | contents |
 //! | --- | --- |
-//! | [`dataset`] | photographs with known cameras, in three splits |
+//! | [`dataset`] | images with known cameras, in a train, a validation and a test split |
 //! | [`camera`], [`geometry`] | pixel to ray; the box that rays are clipped to |
-//! | [`camera_path`] | where the camera of a film stands, by formula or from a file |
-//! | [`rays`] | training rays, made on the fly |
-//! | [`sampling`] | where a ray looks at the field |
-//! | [`field`] | what fills space: density and radiance |
-//! | [`render`] | from samples to pixels; [`render::composite`](mod@render::composite) is the specification |
+//! | [`camera_path`] | camera paths of rendered films, by formula or from a file |
+//! | [`rays`] | training rays, generated for each batch |
+//! | [`sampling`] | sample positions along rays; occupancy of space |
+//! | [`field`] | radiance fields: density and color at a point |
+//! | [`render`] | volume rendering; [`render::composite`](mod@render::composite) is the reference implementation |
 //! | [`loss`] | losses and their weighted sum |
 //! | [`train`] | batch → render → loss → gradients → optimizer, for any [`Model`](train::Model) |
-//! | [`model`] | fields with their recipes: [`model::plenoxels`] |
-//! | [`evaluate`] | a model against photographs |
+//! | [`model`] | radiance fields with their training recipes: [`model::plenoxels`] |
+//! | [`evaluate`] | PSNR and SSIM of a model on the images of a split |
 //! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |
-//! | [`checkpoint`] | a trained grid on disk |
-//! | [`run`] | a run without a screen: settings, folder, metrics, evaluation |
-//! | [`export`] | a grid as MagicaVoxel .vox, or its surface as a mesh |
+//! | [`checkpoint`] | a trained grid in a file |
+//! | [`run`] | complete runs, without printing: settings, run folder, metrics, evaluation |
+//! | [`export`] | a grid as MagicaVoxel .vox, as a mesh of its surface, or for the web viewer |
 //! | [`metrics`] | PSNR and SSIM |
-//! | [`point_cloud`], [`export`] | a trained grid as colored points; filters; files for other programs |
-//! | [`random`], [`files`], [`json`], [`text`], [`error`] | numbers by purpose, files within bounds and whole, JSON, text of others on a screen, what can go wrong |
+//! | [`point_cloud`] | a trained grid as colored points, filters, PLY files |
+//! | [`random`] | random numbers from a seed and a purpose |
+//! | [`files`], [`json`] | size-limited reads and atomic writes; JSON |
+//! | [`text`], [`error`] | untrusted text made safe to print; errors |
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
@@ -54,7 +56,7 @@ pub mod tensor_file;
 pub mod text;
 pub mod train;
 
-/// The code of the repository's front page is compiled and run with the tests.
+/// A test that compiles and runs the code of the repository's README.
 #[cfg(doctest)]
 #[doc = include_str!("../../README.md")]
 struct FrontPage;

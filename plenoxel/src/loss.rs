@@ -1,6 +1,6 @@
 //! Losses and their weighted sum.
 //!
-//! A loss is a function of a training step to a scalar tensor. The losses of this crate and a closure of your own are used in the same way:
+//! A loss is a function from a training step to a scalar tensor. Built-in losses and closures are used in the same way:
 //!
 //! ```
 //! use plenoxel::loss::mse;
@@ -11,9 +11,9 @@
 //! assert_eq!(objective.names().collect::<Vec<_>>(), ["mse", "bright"]);
 //! ```
 //!
-//! A loss may have parameters of its own, which are learned beside those of the model ([`Objective::with_param`]): the shape of
-//! [`robust`](AdaptiveRobust), the exposure of each view ([`Objective::with_exposure`]). What is compared with the photographs is the prediction: the rendered
-//! colors, unless [`Objective::predicting`] says otherwise.
+//! A loss may have parameters, which are trained together with the model ([`Objective::with_param`]): for example the shape of
+//! [`robust`](AdaptiveRobust), or the exposure of each view ([`Objective::with_exposure`]). Losses compare the prediction with the
+//! photographs. The prediction is the rendered color, unless [`Objective::predicting`] changes it.
 
 mod exposure;
 mod objective;

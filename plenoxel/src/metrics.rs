@@ -1,33 +1,33 @@
-//! Image quality: PSNR and SSIM, as the tables of radiance-field papers compute them.
+//! Image quality: PSNR and SSIM, as in the tables of radiance-field papers.
 //!
-//! Predictions are clamped to [0, 1] first and not quantised; the target is the float composite of the 8-bit picture. A table's
-//! number is the mean of the views' numbers, not the PSNR of the mean error. Sums are accumulated in f64, row by row in
-//! order, so results do not depend on the number of threads.
+//! Predictions are clamped to [0, 1] and not quantised. The target is the 8-bit image composited in floating point. The value of a table is
+//! the mean over the views, not the PSNR of the mean error. Sums are accumulated in f64, row by row in order, so results do not depend on
+//! the number of threads.
 
 use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
 
 /// Side of the Gaussian window of SSIM.
 const WINDOW: usize = 11;
-/// Columns processed together, so that the running sums stay in the first-level cache.
+/// Number of columns processed together, so that the running sums stay in the L1 cache.
 const BLOCK: usize = 64;
 
-/// Peak signal-to-noise ratio in dB: [`psnr_of`] the [`mse`].
+/// Returns the peak signal-to-noise ratio in dB, [`psnr_of`] the [`mse`].
 ///
-/// Both are [height, width, 3]; panics if the shapes differ.
+/// Both images are [height, width, 3]. Panics if the shapes differ.
 pub fn psnr(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 {
     psnr_of(mse(prediction, target))
 }
 
-/// Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]: -10 log10(mse). Infinite for 0.
+/// Returns the peak signal-to-noise ratio in dB for a mean squared error of values in [0, 1]: -10 log10(mse). Infinite for 0.
 pub fn psnr_of(mse: f64) -> f64 {
     -10.0 * mse.log10()
 }
 
-/// Mean squared error over pixels and channels, the prediction clamped to [0, 1]. NaN if the prediction contains NaN or the images are
-/// empty.
+/// Returns the mean squared error over pixels and channels, with the prediction clamped to [0, 1]. NaN if the prediction contains NaN or
+/// the images are empty.
 ///
-/// Both are [height, width, 3]; panics if the shapes differ.
+/// Both images are [height, width, 3]. Panics if the shapes differ.
 pub fn mse(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 {
     assert_eq!(prediction.shape(), target.shape(), "mse: prediction and target differ in shape");
     let row_sums: Vec<f64> = (0..target.shape()[0])
@@ -41,24 +41,24 @@ pub fn mse(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 
     row_sums.iter().sum::<f64>() / target.len() as f64
 }
 
-/// Structural similarity (Wang et al. 2004): 11 x 11 Gaussian window of sigma 1.5, k1 = 0.01, k2 = 0.03, L = 1, per channel,
-/// averaged over channels and the windows that lie fully inside the image ("valid", as tf.image.ssim, mip-NeRF and DVGO).
-/// Variances are clipped at 0 and the covariance at the geometric mean of the variances. The prediction is clamped to [0, 1].
+/// Returns the structural similarity (Wang et al. 2004): 11 x 11 Gaussian window of sigma 1.5, k1 = 0.01, k2 = 0.03, L = 1, per channel,
+/// averaged over channels and over the windows inside the image ("valid", as in tf.image.ssim, mip-NeRF and DVGO). Variances are clipped at
+/// 0, and the covariance at the geometric mean of the variances. The prediction is clamped to [0, 1].
 ///
-/// Both are [height, width, 3]; panics if the shapes differ. `None` for images smaller than 11 pixels a side.
+/// Both images are [height, width, 3]. Panics if the shapes differ. `None` for images smaller than 11 pixels per side.
 pub fn ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> Option<f64> {
     let (height, width, _) = target.dim();
     (height >= WINDOW && width >= WINDOW).then(|| mean_ssim(prediction, target, 0))
 }
 
-/// Structural similarity as svox2 computes it: like [`ssim`], but with one window per pixel, beyond the image zeros in both
-/// pictures. On bright borders it reads slightly higher. Defined for every size; NaN for empty images.
+/// Returns the structural similarity as svox2 computes it: like [`ssim`], but with one window per pixel and zero padding around both
+/// images. With bright borders it is slightly higher. Defined for every size; NaN for empty images.
 pub fn ssim_same(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 {
     mean_ssim(prediction, target, WINDOW / 2)
 }
 
-/// SSIM with `pad` rows and columns of zeros on every side. The filter is separable, so each row of windows takes a weighted
-/// sum of 11 image rows first, then of 11 neighbours in it; channels stay interleaved and a neighbour is `channels` away.
+/// Returns the SSIM with `pad` rows and columns of zeros on every side. The filter is separable: each row of windows first takes a weighted
+/// sum of 11 image rows, then of 11 neighbours within the result. Channels are interleaved, so neighbours are `channels` apart.
 fn mean_ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>, pad: usize) -> f64 {
     assert_eq!(prediction.shape(), target.shape(), "ssim: prediction and target differ in shape");
     let (height, width, channels) = target.dim();
@@ -110,7 +110,7 @@ fn mean_ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>, pad: 
     row_sums.iter().sum::<f64>() / (rows * columns) as f64
 }
 
-/// Adds weight times a, b, a², b² and ab of a stretch of one image row to the five running sums.
+/// Adds weight times a, b, a², b² and ab of a stretch of an image row to the five running sums.
 #[inline]
 fn add_moments(sums: &mut [[f64; BLOCK]; 5], weight: f64, a: &[f64], b: &[f64]) {
     // Slices cut to one length let the compiler drop the bounds checks and use vector instructions.
@@ -127,19 +127,19 @@ fn add_moments(sums: &mut [[f64; BLOCK]; 5], weight: f64, a: &[f64], b: &[f64]) 
     }
 }
 
-/// SSIM of one window from its weighted means of a, b, a², b² and ab.
+/// Returns the SSIM of one window from its weighted means of a, b, a², b² and ab.
 #[inline]
 fn similarity(a: f64, b: f64, aa: f64, bb: f64, ab: f64) -> f64 {
     const C1: f64 = 0.01 * 0.01;
     const C2: f64 = 0.03 * 0.03;
     let (variance_a, variance_b) = ((aa - a * a).max(0.0), (bb - b * b).max(0.0));
     let bound = (variance_a * variance_b).sqrt();
-    // min and max, not clamp, which panics where the bound is NaN.
+    // min and max instead of clamp, which panics if the bound is NaN.
     let covariance = (ab - a * b).min(bound).max(-bound);
     (2.0 * a * b + C1) * (2.0 * covariance + C2) / ((a * a + b * b + C1) * (variance_a + variance_b + C2))
 }
 
-/// The window's weights along one axis: exp(-x² / (2 · 1.5²)) at x = -5 ... 5, normalised to sum 1.
+/// Returns the weights of the window along one axis: exp(-x² / (2 · 1.5²)) at x = -5 ... 5, normalised to sum 1.
 fn gaussian() -> [f64; WINDOW] {
     let raw: [f64; WINDOW] = std::array::from_fn(|k| (-(k as f64 - 5.0).powi(2) / (2.0 * 1.5 * 1.5)).exp());
     let sum: f64 = raw.iter().sum();
@@ -151,7 +151,7 @@ mod tests {
     use super::*;
     use ndarray::Array3;
 
-    /// A reproducible picture with structure and noise; `phase` makes a different one.
+    /// Returns a reproducible image with structure and noise; `phase` selects different images.
     fn picture(height: usize, width: usize, phase: f32) -> Array3<f32> {
         Array3::from_shape_fn((height, width, 3), |(y, x, c)| {
             let hash = (y * 7919 + x * 104729 + c * 1299709) % 997;
@@ -159,7 +159,7 @@ mod tests {
         })
     }
 
-    /// SSIM by its definition: for every window the 121 weights, centred moments, no separability.
+    /// Computes SSIM by definition: 121 weights and centred moments for every window, without separability.
     fn brute_force(a: &Array3<f32>, b: &Array3<f32>, pad: isize) -> f64 {
         let (height, width, channels) = a.dim();
         let at = |image: &Array3<f32>, y: isize, x: isize, c: usize| {

@@ -1,4 +1,4 @@
-//! Radiance fields with their recipes, one assembled model in each file. [`Model`] is the trait that they have in common.
+//! Radiance fields with their training recipes. [`Model`] is the trait that they implement.
 //!
 #![doc = include_str!("../docs/own_field.md")]
 
@@ -13,21 +13,21 @@ use crate::train::About;
 use plenoxels::config::Config;
 use std::path::Path;
 
-/// Kinds of models that [`open`] reads.
+/// Kinds of models that [`open`] can read.
 pub const KINDS: [&str; 1] = [plenoxels::KIND];
 
-/// Kind of the model of a checkpoint.
+/// Returns the kind of model that a checkpoint holds.
 ///
-/// Errors name the file and what is wrong with it.
+/// Errors if the file cannot be read; the error names the file and the problem.
 pub fn kind(path: &Path) -> Result<String> {
     let facts = TensorFile::open(path)?.facts()?;
-    // Early checkpoints of voxel grids do not say.
+    // Early checkpoints of voxel grids have no kind.
     Ok(facts["kind"].as_str().unwrap_or(plenoxels::KIND).to_owned())
 }
 
-/// The model of a checkpoint, to be looked at, with the config of its run.
+/// Opens the model of a checkpoint for rendering, with the config of its run.
 ///
-/// Errors: the file cannot be read, or its kind is not among [`KINDS`].
+/// Errors if the file cannot be read, or if its kind is not one of [`KINDS`].
 pub fn open(path: &Path, config: &Config) -> Result<(Box<dyn Model<f32>>, About)> {
     match &kind(path)?[..] {
         plenoxels::KIND => {
@@ -35,20 +35,20 @@ pub fn open(path: &Path, config: &Config) -> Result<(Box<dyn Model<f32>>, About)
             Ok((Box::new(model), about))
         }
         other => {
-            let found = format!("a model of kind `{other}`, for which this program has no code");
-            let remedy = format!("kinds that it knows: {}; the program that trained this one can evaluate it", KINDS.join(", "));
+            let found = format!("unknown kind of model `{other}`");
+            let remedy = format!("accepted: {}; evaluate the model with the program that trained it", KINDS.join(", "));
             Err(Error::input(path, found, remedy))
         }
     }
 }
 
-/// The voxel grid of a model, for what needs one; `what` names it in the error, such as "a mesh".
+/// Returns the voxel grid of a model. `what` names the purpose in the error message, for example "a mesh".
 ///
-/// Errors: the model has none.
+/// Errors if the model has no voxel grid.
 pub fn voxel_grid<'m>(model: &'m dyn Model<f32>, path: &Path, what: &str) -> Result<&'m VoxelGrid<f32>> {
     let grid = model.content().and_then(|content| content.downcast_ref());
     grid.ok_or_else(|| {
-        let found = format!("a model of kind `{}`, which has no voxels", model.kind());
-        Error::input(path, found, format!("{what} needs a voxel grid: a run of kind `{}`", plenoxels::KIND))
+        let found = format!("a model of kind `{}` has no voxels", model.kind());
+        Error::input(path, found, format!("{what} needs a voxel grid: use a run of kind `{}`", plenoxels::KIND))
     })
 }

@@ -1,7 +1,7 @@
-//! Point clouds with colors, normals and scalar fields: what is made of a voxel grid, and what others send.
+//! Point clouds with colors, normals and scalar fields, created from a voxel grid or read from files.
 //!
-//! Coordinates are `f64`, in whatever frame they came; [`filter`] cleans a cloud as CloudCompare does, [`from_grid`] makes one of a grid,
-//! [`ply`] reads the PLY files of others and writes them.
+//! Coordinates are `f64`, in the frame of their source. [`filter`] filters a cloud like CloudCompare, [`from_grid`] creates a cloud from a
+//! grid, and [`ply`] reads and writes PLY files.
 
 pub mod filter;
 pub mod from_grid;
@@ -12,47 +12,47 @@ mod tree;
 
 use glam::DVec3;
 
-/// Points with what is known of each; every list that is there has one entry for each point.
+/// Points with optional attributes. Every list that is present has one entry per point.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointCloud {
     /// Coordinates.
     pub positions: Vec<DVec3>,
-    /// Red, green, blue.
+    /// Colors: red, green, blue.
     pub colors: Option<Vec<[u8; 3]>>,
-    /// Unit, or zero where there is none.
+    /// Normals of unit length; zero for points without a normal.
     pub normals: Option<Vec<[f32; 3]>>,
-    /// Numbers with a name.
+    /// Named scalar fields.
     pub fields: Vec<ScalarField>,
 }
 
-/// A number for each point.
+/// One number per point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScalarField {
-    /// Without the `scalar_` that CloudCompare puts in front of it in a file.
+    /// Name, without the prefix `scalar_` that CloudCompare uses in files.
     pub name: String,
-    /// One for each point; may be no number.
+    /// One value per point; may be NaN.
     pub values: Vec<f32>,
 }
 
 impl PointCloud {
-    /// The number of points.
+    /// Returns the number of points.
     pub fn len(&self) -> usize {
         self.positions.len()
     }
 
-    /// True if there is no point.
+    /// Returns true if there are no points.
     pub fn is_empty(&self) -> bool {
         self.positions.is_empty()
     }
 
-    /// The values of the field with a name.
+    /// Returns the values of the field of this name.
     pub fn field(&self, name: &str) -> Option<&[f32]> {
         self.fields.iter().find(|field| field.name == name).map(|field| &field.values[..])
     }
 
-    /// The points with some numbers, in their order.
+    /// Returns the points with the given numbers, in that order.
     ///
-    /// Panics if there is no point with one of the numbers.
+    /// Panics if a number is out of range.
     pub fn chosen(&self, numbers: &[u32]) -> Self {
         fn of<E: Copy>(list: &[E], numbers: &[u32]) -> Vec<E> {
             numbers.iter().map(|&i| list[i as usize]).collect()

@@ -1,8 +1,8 @@
-//! Random numbers as a function of what they are for: (seed, purpose, step, index), never of threads or of how many were drawn before.
-//! So a run can be cut anywhere and resumed, and any number of threads draws the same numbers.
+//! Random numbers as a function of (seed, purpose, step, index). They do not depend on threads or on earlier draws, so a run can be resumed
+//! at any step, and any number of threads draws the same numbers.
 //!
-//! The crate draws for its own [`Purpose`]s. A loss or a program of your own draws from a [`Stream`] with a name of its own, and repeats its
-//! numbers whenever a step is taken again, as after a resumed run:
+//! The crate draws for its own [`Purpose`]s. Custom losses and programs draw from a [`Stream`] with their own name. A step that is taken
+//! again, for example after resuming, draws the same numbers:
 //!
 //! ```
 //! use plenoxel::model::plenoxels::Objective;
@@ -19,7 +19,7 @@
 
 pub use autograd::random::Stream;
 
-/// What a number is drawn for; different purposes are independent.
+/// Purpose of a random number. Different purposes are independent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Purpose {
     /// Order of the training rays within an epoch.
@@ -30,32 +30,32 @@ pub enum Purpose {
     Initial = 3,
     /// Cells on which a regulariser is evaluated.
     Cells = 4,
-    /// Squares of neighbouring pixels.
+    /// Random patches of pixels.
     Patches = 5,
 }
 
-/// 64 random bits for (seed, purpose, step, index).
+/// Returns 64 random bits for (seed, purpose, step, index).
 pub fn bits(seed: u64, purpose: Purpose, step: u64, index: u64) -> u64 {
     stream(seed, purpose, step, index).bits(0)
 }
 
-/// A uniform number in [0, 1) for (seed, purpose, step, index).
+/// Returns a uniform random number in [0, 1) for (seed, purpose, step, index).
 pub fn uniform(seed: u64, purpose: Purpose, step: u64, index: u64) -> f64 {
     stream(seed, purpose, step, index).uniform(0)
 }
 
-/// The stream of which the first number is for (seed, purpose, step, index).
+/// Returns the stream whose first number is that of (seed, purpose, step, index).
 fn stream(seed: u64, purpose: Purpose, step: u64, index: u64) -> Stream {
     Stream::new(mix(mix(seed ^ (purpose as u64) << 56) ^ step) ^ mix(index))
 }
 
-/// The first output of SplitMix64 with seed x.
+/// Returns the first output of SplitMix64 with seed x.
 fn mix(x: u64) -> u64 {
     Stream::new(x).bits(0)
 }
 
-/// A permutation of 0..n that needs no memory: a four-round Feistel network on the next even number of bits, walked until it lands
-/// inside (Black and Rogaway 2002).
+/// Pseudorandom permutation of 0..n without a table: a four-round Feistel network on the next even number of bits, iterated until the
+/// result is below n (cycle walking, Black and Rogaway 2002).
 #[derive(Clone, Copy, Debug)]
 pub struct Permutation {
     n: u64,
@@ -64,15 +64,15 @@ pub struct Permutation {
 }
 
 impl Permutation {
-    /// The permutation of 0..n for (seed, purpose, epoch).
+    /// Creates the permutation of 0..n for (seed, purpose, epoch).
     pub fn new(n: u64, seed: u64, purpose: Purpose, epoch: u64) -> Self {
         let half_bits = (64 - n.saturating_sub(1).leading_zeros()).div_ceil(2).max(1);
         Permutation { n, half_bits, keys: [0, 1, 2, 3].map(|round| bits(seed, purpose, epoch, round)) }
     }
 
-    /// Where `i` goes. Panics if `i` is not below n.
+    /// Returns the image of `i`. Panics if `i` is not below n.
     pub fn at(&self, i: u64) -> u64 {
-        assert!(i < self.n, "permutation of {} asked for {i}", self.n);
+        assert!(i < self.n, "permutation: index {i} is out of range for length {}", self.n);
         let mask = (1u64 << self.half_bits) - 1;
         let mut x = i;
         loop {
@@ -114,7 +114,7 @@ mod tests {
         assert_ne!(bits(1, Purpose::Jitter, 5, 0), bits(1, Purpose::Initial, 5, 0));
     }
 
-    /// What is drawn must not change, or no run could be repeated.
+    /// Changing these numbers would make runs irreproducible.
     #[test]
     fn numbers_have_these_bits() {
         const DRAWN: u64 = 0xb0b6_95b7_8e9c_e144;

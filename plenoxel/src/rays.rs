@@ -1,4 +1,4 @@
-//! Training rays, made on the fly: a ray is a view, a pixel and a camera, so a scene costs no more memory than its 8-bit images.
+//! Training rays, generated from view, pixel and camera when needed. A scene needs only the memory of its 8-bit images.
 
 mod batch;
 mod channel;
@@ -22,31 +22,31 @@ use ndarray::Array3;
 use std::sync::Arc;
 use tiles::Tile;
 
-/// The pixels of some views, all of them or those that can see something, in an order that is shuffled anew each epoch.
+/// Training pixels of some views: all pixels, or those that can show matter. The order is shuffled in each epoch.
 #[derive(Debug)]
 pub struct RaySource {
     all_views: Arc<[View]>,
     reduction: usize,
-    /// The views reduced by `reduction`, unless that is 1.
+    /// Views reduced by `reduction`, unless it is 1.
     reduced: Option<Vec<View>>,
     background: [f32; 3],
     seed: u64,
     tiles: Vec<Tile>,
     /// `first[t]` is the number of pixels before tile t.
     first: Vec<u64>,
-    /// The tile of every [`apart`](Self::apart)-th pixel, about as many as there are tiles: one search for a random pixel would wait for memory a
-    /// dozen times.
+    /// Tile of every [`apart`](Self::apart)-th pixel; about as many entries as tiles. A binary search for a random pixel would wait for
+    /// memory about twelve times.
     guide: Vec<u32>,
-    /// Pixels of all views, as reduced now.
+    /// Number of pixels of all views, after reduction.
     pixels: u64,
     with_depth: bool,
     channels: Vec<Channel>,
 }
 
 impl RaySource {
-    /// All pixels of `views` over a background, in an order that follows from the seed.
+    /// Creates a source of all pixels of `views` over a background. The order depends on the seed.
     ///
-    /// The source owns the views: a `Vec` is moved into it, an `Arc` is shared with it, and a slice is copied, pixels and all.
+    /// The source owns the views: a `Vec` is moved, an `Arc` is shared, and a slice is copied with its pixels.
     pub fn new(views: impl Into<Arc<[View]>>, background: [f32; 3], seed: u64) -> Self {
         let mut source = RaySource {
             all_views: views.into(),
@@ -65,36 +65,36 @@ impl RaySource {
         source
     }
 
-    /// The same source, whose batches have [`RayBatch::depth`] if some view has a depth image. Of a reduced pixel it is the mean over its k × k
-    /// pixels: infinite or NaN if one of them is.
+    /// Adds [`RayBatch::depth`] to the batches, if some view has a depth image. The depth of a reduced pixel is the mean over its k × k
+    /// pixels; infinite or NaN if one of them is.
     pub fn with_depth(self) -> Self {
         RaySource { with_depth: true, ..self }
     }
 
-    /// The same source, whose batches have numbers of one's own for each pixel ([`RayBatch::channel`]): masks, weights, features.
+    /// Adds custom numbers for each pixel to the batches ([`RayBatch::channel`]): masks, weights, features.
     ///
-    /// `images` are `[height, width, c]`, one for each view at its full size, all of the same c. Of a reduced pixel a number is the mean over
-    /// its k × k pixels. NaN stays NaN.
+    /// `images` are `[height, width, c]`, one for each view at full size, all with the same c. The value of a reduced pixel is the mean
+    /// over its k × k pixels. NaN stays NaN.
     ///
-    /// Panics if images are too few or too many, of another size than their view (which is named), without channels, or of different numbers of
-    /// channels, and if there is a channel of this name already.
+    /// Panics if the number of images is not the number of views, if an image has another size than its view (the message names the view),
+    /// if the number of channels is 0 or differs between images, or if a channel of this name exists.
     #[track_caller]
     pub fn with_channel(mut self, name: impl Into<String>, images: impl Into<Arc<[Array3<f32>]>>) -> Self {
         let name = name.into();
-        assert!(self.channels.iter().all(|channel| channel.name != name), "there is a channel `{name}` already");
+        assert!(self.channels.iter().all(|channel| channel.name != name), "with_channel: channel `{name}` exists already");
         self.channels.push(Channel::new(name, images.into(), &self.all_views));
         self
     }
 
-    /// From now on all pixels of the views reduced by k with a box filter, or by the largest number below that divides a view's sides
-    /// ([`View::reduced`]); not aimed. k = 1 is for the views themselves.
+    /// Reduces the views by k with a box filter ([`View::reduced`]) and selects all their pixels. A view whose sides k does not divide is
+    /// reduced by the largest smaller divisor. k = 1 restores the views at full size.
     ///
     /// Panics if k is 0.
     #[track_caller]
     pub fn set_reduction(&mut self, k: usize) {
         assert!(k > 0, "set_reduction: images cannot be reduced by 0");
         if k != self.reduction {
-            // The old ones go before the new ones come.
+            // Release the old views before the new ones are created.
             self.reduced = None;
             self.reduced = (k > 1).then(|| parallel::map_indices(self.all_views.len(), |v| self.all_views[v].reduced(k)));
             self.reduction = k;
@@ -104,17 +104,17 @@ impl RaySource {
         self.pixels = self.len();
     }
 
-    /// By how much the views are reduced now, 1 at first.
+    /// Returns the current reduction of the views, initially 1.
     pub fn reduction(&self) -> usize {
         self.reduction
     }
 
-    /// The views at their full size.
+    /// Returns the views at full size.
     pub fn all_views(&self) -> &Arc<[View]> {
         &self.all_views
     }
 
-    /// The views whose pixels these are, as reduced now, whether rays are aimed or not.
+    /// Returns the views after reduction. Aiming does not change them.
     pub fn views(&self) -> &[View] {
         self.reduced.as_deref().unwrap_or(&self.all_views)
     }
@@ -134,33 +134,33 @@ impl RaySource {
         }
     }
 
-    /// Pixels between two entries of the guide: those of a tile in the mean.
+    /// Returns the number of pixels between two entries of the guide: the mean number of pixels per tile.
     fn apart(&self) -> u64 {
         self.len().div_ceil(self.tiles.len().max(1) as u64).max(1)
     }
 
-    /// From now on the pixels of the same views around the projections of what may hold matter. The others show the background whatever is
-    /// learned, so they say nothing, except of the mean of the errors.
+    /// Restricts the source to the pixels around the projections of cells that may hold matter. Other pixels show the background whatever
+    /// is learned; they contribute nothing but the mean of the errors.
     pub fn aim_at(&mut self, matter: &Occupancy) {
         self.set_tiles(tiles::showing(self.views(), matter));
     }
 
-    /// The share of the pixels of the views that are in the set.
+    /// Returns the fraction of the views' pixels that the source contains.
     pub fn share(&self) -> f64 {
         self.len() as f64 / self.pixels as f64
     }
 
-    /// Rays in one epoch.
+    /// Returns the number of rays in an epoch.
     pub fn len(&self) -> u64 {
         self.first[self.tiles.len()]
     }
 
-    /// True if there are no pixels.
+    /// Returns true if there are no pixels.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Rays number `from..from + n` of the endless sequence of epochs: a function of (seed, number) alone.
+    /// Returns rays `from..from + n` of the infinite sequence of epochs. The result depends only on the seed and the numbers.
     pub fn batch<T: Real>(&self, from: u64, n: usize) -> RayBatch<T> {
         if const { is_single::<T>() } { cast(self.batch_single(from, n)) } else { self.batch_in(from, n) }
     }
@@ -181,9 +181,9 @@ impl RaySource {
         })
     }
 
-    /// Rays of chosen pixels, in their order: (view, column, row) in the images as reduced now. Whether rays are aimed does not matter.
+    /// Returns the rays of chosen pixels, in the given order: (view, column, row) in the reduced images. Aiming does not restrict them.
     ///
-    /// Panics at the caller's line, naming the first pixel that is in no view.
+    /// Panics at the caller's line if a pixel is in no view; the message names the first such pixel.
     #[track_caller]
     pub fn batch_of<T: Real>(&self, pixels: &[(u32, u32, u32)]) -> RayBatch<T> {
         let views = self.views();
@@ -200,7 +200,7 @@ impl RaySource {
         })
     }
 
-    /// The rays of n pixels, given by view, column and row.
+    /// Returns the rays of n pixels, given by view, column and row.
     fn gathered<T: Real>(&self, n: usize, place: impl Fn(usize) -> (usize, usize, usize) + Sync) -> RayBatch<T> {
         let views = self.views();
         let nowhere = Ray { origin: DVec3::ZERO, direction: DVec3::ZERO, stretch: 0.0 };
@@ -230,7 +230,7 @@ impl RaySource {
         batch
     }
 
-    /// Rays of the set through every `stride`-th column and row of the views, tile after tile, `size` at a time.
+    /// Returns the rays of the source at every `stride`-th column and row of the views, tile after tile, in batches of `size`.
     pub fn lattice_of_rays(&self, stride: u32, size: usize) -> impl Iterator<Item = Vec<Ray>> + '_ {
         let along = move |from: u32, count: u32| (from.next_multiple_of(stride)..from + count).step_by(stride as usize);
         let of_tile = move |tile: &Tile| {
@@ -246,8 +246,8 @@ impl RaySource {
         })
     }
 
-    /// How many pixels apart rays may be so that 8 of them or more pass through a voxel of this side that all views have in sight, wherever
-    /// it is in a box: as the projection of the farthest would have it.
+    /// Returns the largest stride between pixels at which at least 8 rays pass through a voxel of this side that is visible in all views. The stride
+    /// is computed for a voxel at the far end of the box, where its projection is smallest.
     pub fn stride(&self, side: f64, aabb: Aabb) -> u32 {
         const RAYS: f64 = 8.0;
         let reach = 0.5 * (aabb.max - aabb.min).length();
@@ -259,7 +259,7 @@ impl RaySource {
         (apart * pixels.fold(f64::INFINITY, f64::min)).clamp(1.0, 64.0) as u32
     }
 
-    /// All rays of the set, view after view and row after row, `size` at a time.
+    /// Returns all rays of the source, view after view and row after row, in batches of `size`.
     fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
         let views = self.views();
         let ray = |index: u64| {
@@ -269,8 +269,8 @@ impl RaySource {
         (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
     }
 
-    /// All rays of the set, view after view and row after row, `size` at a time, each with the alpha of its pixel. Where no
-    /// view has a transparent pixel ([`has_alpha`]), alpha does not tell objects: it is 0 where the color is the background's then, else 1.
+    /// Returns all rays of the source, view after view and row after row, in batches of `size`, with the alphas of their pixels. If no view
+    /// has a transparent pixel ([`has_alpha`]), alpha is 0 for pixels of the background color, and 1 for the others.
     pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
         let views = self.views();
         let has_alpha = has_alpha(views);
@@ -289,7 +289,7 @@ impl RaySource {
         })
     }
 
-    /// Number of the view, column and row of one pixel of the set.
+    /// Returns view, column and row of a pixel of the source.
     fn place(&self, index: u64) -> (usize, usize, usize) {
         let guide = self.guide[(index / self.apart()) as usize] as usize;
         let t = guide + self.first[guide + 1..].iter().take_while(|&&f| f <= index).count();

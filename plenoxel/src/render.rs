@@ -1,4 +1,4 @@
-//! From rays to pixels.
+//! Volume rendering: pixels from rays.
 
 pub mod composite;
 mod field;
@@ -12,39 +12,38 @@ pub use composite::{Columns, PerSample, Rendered, composite};
 pub use field::{Field, Radiance};
 use serde::{Deserialize, Serialize};
 
-/// What computes a batch of pixels.
+/// Implementation that renders a batch of rays.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Engine {
-    /// One pass over a field that has a kernel, with a hand-written adjoint; the graph for any other field.
+    /// One fused pass with a hand-written adjoint, for fields with a kernel; the graph for other fields.
     #[default]
     Fused,
-    /// The graph of small ops: [`composite()`] on any field, with every number of every sample at hand.
+    /// Graph of small ops: [`composite()`] on any field. It keeps the values of every sample.
     Graph,
 }
 
-/// How rays become pixels.
+/// Options for rendering rays.
 #[derive(Clone, Debug)]
 pub struct RenderOptions<'a> {
-    /// The box outside of which there is nothing.
+    /// Bounding box; space outside of it is empty.
     pub aabb: Aabb,
-    /// Where samples lie.
+    /// Spacing of samples.
     pub spacing: Spacing,
-    /// Their random shift: none when evaluating.
+    /// Random shift of samples; [`Jitter::None`] for evaluation.
     pub jitter: Jitter,
-    /// Color behind the box, sRGB in [0, 1].
+    /// Background color, sRGB in [0, 1].
     pub background: [f32; 3],
-    /// Cells outside of which no sample is looked at; `None` for those that the field itself can reach.
+    /// Cells in which samples are evaluated; `None` for the cells that the field can reach.
     pub occupancy: Option<&'a Occupancy>,
-    /// What does it.
+    /// Implementation.
     pub engine: Engine,
-    /// The fused engine ends a ray where less than this share of the light comes from behind; 0 for never. What lies behind is not looked up:
-    /// all columns and all gradients are of the samples before. A color is then off by at most this times the largest difference between
-    /// colors.
+    /// Transmittance below which the fused engine ends a ray; 0 never ends it early. Samples behind are not looked up: columns and
+    /// gradients include only the samples before. The error of a color is at most this value times the largest difference between colors.
     pub stop_below: f64,
 }
 
-/// Renders a batch: dataset → rays → **samples → radiance → pixels**.
+/// Renders a batch of rays: dataset → rays → **samples → radiance → pixels**.
 pub fn render<T: Real>(field: &impl Field<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let fused = match options.engine {
         Engine::Fused => field.render_fused(rays, options),

@@ -1,7 +1,7 @@
-//! Where a ray looks at the field: the single definition of sample positions.
+//! Positions of samples along rays. This module is the only definition of sample positions.
 //!
-//! A sample stands for an interval of its ray: position at the interval's middle, `delta` its length. Samples of a batch are packed one ray
-//! after another; ray `r` owns `offsets[r]..offsets[r + 1]`, and rays that miss the box own nothing.
+//! A sample represents an interval of its ray: its position is the middle of the interval, `delta` the length. Samples of a batch are
+//! packed one ray after another; ray `r` owns `offsets[r]..offsets[r + 1]`. Rays that miss the box have no samples.
 
 mod occupancy;
 pub mod walk;
@@ -14,29 +14,29 @@ pub use occupancy::Occupancy;
 use occupancy::{Along, Look};
 use serde::{Deserialize, Serialize};
 
-/// How samples are spaced along a ray.
+/// Spacing of samples along a ray.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Spacing {
-    /// Steps of this world length from where the ray enters the box to where it leaves; the last step ends there, so the lengths add up
-    /// to the chord. Jitter shifts the steps by a fraction of one.
+    /// Steps of this world length from the entry of the ray into the box to its exit. The last step ends at the exit, so the lengths sum to
+    /// the chord. Jitter shifts the steps by a fraction of a step.
     Step(f64),
-    /// The source paper's: `samples` points equally spaced over t ∈ [0, far], t measured along the direction whose camera z is −1 (so
-    /// its world length is `stretch · t`); those inside the box count. Jitter shifts all of them by a fraction of one.
+    /// Spacing of the source paper: `samples` points evenly spaced over t ∈ [0, far], where t is measured along the direction whose camera
+    /// z is −1 (its world length is `stretch · t`). Points inside the box are used. Jitter shifts all points by a fraction of the spacing.
     Points {
-        /// Points on the whole ray, box or not.
+        /// Number of points on the whole ray, inside or outside of the box.
         samples: usize,
-        /// Largest t, in multiples of the un-normalised direction.
+        /// Largest t, in multiples of the direction that is not normalised.
         far: f64,
     },
 }
 
-/// The random shift of each ray's samples; evaluation has none.
+/// Random shift of each ray's samples. Evaluation uses none.
 #[derive(Clone, Copy, Debug)]
 pub enum Jitter {
-    /// Samples where the spacing puts them.
+    /// No shift.
     None,
-    /// One uniform fraction of a step for each ray, a function of (seed, step, place in the batch).
+    /// One uniform random fraction of a step per ray. It depends only on seed, step and position in the batch.
     PerRay {
         /// Seed of the run.
         seed: u64,
@@ -54,34 +54,34 @@ impl Jitter {
     }
 }
 
-/// Packed samples of n rays, m in all.
+/// Packed samples of n rays, m in total.
 #[derive(Debug, Clone)]
 pub struct Samples<T: Real> {
-    /// `[m]` distance of the sample from the ray's origin, world length.
+    /// Distance of the sample from the ray's origin, `[m]`, world length.
     pub t: Tensor<T>,
-    /// `[m]` length of the interval it stands for, world length.
+    /// Length of the sample's interval, `[m]`, world length.
     pub delta: Tensor<T>,
-    /// `[m, 3]` position, world.
+    /// Position, `[m, 3]`, world frame.
     pub positions: Tensor<T>,
-    /// `[n, 3]` unit direction of each ray.
+    /// Unit direction of each ray, `[n, 3]`.
     pub directions: Tensor<T>,
-    /// n + 1 entries from 0 to m.
+    /// Offsets of the rays' samples: n + 1 entries from 0 to m.
     pub offsets: Indices,
 }
 
 impl<T: Real> Samples<T> {
-    /// The number of samples.
+    /// Returns the number of samples.
     pub fn len(&self) -> usize {
         self.t.len()
     }
 
-    /// True if no ray hits the box.
+    /// Returns true if there are no samples.
     pub fn is_empty(&self) -> bool {
         self.t.is_empty()
     }
 }
 
-/// The intervals `k -> (middle, length)` of one ray, as far as they lie in the box.
+/// Intervals `k -> (middle, length)` of one ray inside the box.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct March {
     pub(crate) count: usize,
@@ -93,7 +93,7 @@ pub(crate) struct March {
     points: bool,
 }
 
-/// The samples of one ray: everything about their positions is here.
+/// Computes the intervals of one ray: the only place that defines sample positions.
 pub(crate) fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> March {
     let none = March { count: 0, near: 0.0, far: 0.0, start: 0.0, step: 1.0, points: false };
     let Some((near, far)) = aabb.intersect(ray.origin, ray.direction) else { return none };
@@ -102,7 +102,7 @@ pub(crate) fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> Ma
             if far <= near {
                 return none;
             }
-            // Boundaries inside the chord: near + (k + jitter) step, the first at k = 1 unless jitter makes room for k = 0.
+            // Interval boundaries inside the chord: near + (k + jitter) step, from k = 1 on, or from k = 0 with jitter.
             let start = near + if jitter > 0.0 { jitter * step } else { step };
             let inner = if start < far { ((far - start) / step).ceil() as usize } else { 0 };
             March { count: inner + 1, near, far, start, step, points: false }
@@ -118,7 +118,7 @@ pub(crate) fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> Ma
 }
 
 impl March {
-    /// Middle and length of interval k.
+    /// Returns middle and length of interval k.
     #[inline(always)]
     pub(crate) fn interval(&self, k: usize) -> (f64, f64) {
         if self.points {
@@ -129,7 +129,7 @@ impl March {
         (0.5 * (begin + end), end - begin)
     }
 
-    /// The same if it is neither the first nor the last.
+    /// Returns middle and length of interval k, which must be neither the first nor the last.
     #[inline(always)]
     fn inner_interval(&self, k: usize) -> (f64, f64) {
         if self.points {
@@ -139,13 +139,13 @@ impl March {
         (0.5 * (begin + end), end - begin)
     }
 
-    /// Where interval k begins if it is not the first.
+    /// Returns the start of interval k, which must not be the first.
     #[inline(always)]
     fn boundary(&self, k: usize) -> f64 {
         self.start + (f64::from(k as u32) - 1.0) * self.step
     }
 
-    /// The intervals from number `first` on.
+    /// Returns the intervals from `first` on.
     #[inline(always)]
     fn intervals<const N: usize>(&self, first: usize) -> [(f64, f64); N] {
         let mut found: [(f64, f64); N] = std::array::from_fn(|i| self.inner_interval(first + i));
@@ -157,25 +157,25 @@ impl March {
         found
     }
 
-    /// The intervals whose middle lies in an occupied cell.
+    /// Returns the intervals whose middle lies in an occupied cell.
     #[inline]
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
         Occupied { march: *self, along: cells.along(ray), next: 0, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
 }
 
-/// Intervals that are looked at together.
+/// Number of intervals that are tested together.
 const LOOKS: usize = 16;
 
-/// `(middle, length)` of those intervals of a march that lie in occupied cells. Runs of empty bricks are passed in one stride; the intervals are
-/// those of [`March::interval`] all the same.
+/// Iterator over `(middle, length)` of the intervals of a march in occupied cells. Empty bricks are skipped at once; the intervals are the
+/// same as those of [`March::interval`].
 #[derive(Clone, Debug)]
 pub(crate) struct Occupied<'a> {
     march: March,
     along: Along<'a>,
-    /// The next interval to be looked at.
+    /// Next interval to test.
     next: usize,
-    /// What was found the last time: `count` intervals, of which some are taken.
+    /// Result of the last test: `count` intervals, of which `taken` were returned.
     found: [(f64, f64); LOOKS],
     taken: usize,
     count: usize,
@@ -198,14 +198,14 @@ impl Iterator for Occupied<'_> {
 }
 
 impl Occupied<'_> {
-    /// Finds the next intervals, if there are any in the next bricks.
+    /// Tests the next intervals, or skips empty bricks.
     fn look(&mut self) {
         let march = &self.march;
-        // Where the last look found something there is more to be expected.
+        // If the last test found occupied intervals, more are likely to follow.
         let lost = self.count == 0;
         (self.taken, self.count) = (0, 0);
         if lost && let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
-            // The last k whose middle does not lie beyond the exit, but for rounding; it is looked at again.
+            // Last k whose middle is not beyond the exit, up to rounding. It is tested again.
             let half = if march.points { 0.0 } else { 0.5 };
             let last = ((exit - march.start) / march.step + half) as usize;
             self.next = (self.next + 1).max(last);
@@ -217,7 +217,7 @@ impl Occupied<'_> {
 }
 
 dispatched! {
-/// Those of the [`LOOKS`] intervals from number `first` on that are occupied. Returns how many.
+/// Finds the occupied intervals among the [`LOOKS`] intervals from `first` on. Returns their number.
 fn occupied_of(march: &March, along: &Along<'_>, first: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
     let all: [(f64, f64); LOOKS] = march.intervals(first);
     let occupied = along.occupied(&all.map(|(middle, _)| middle));
@@ -232,8 +232,7 @@ fn occupied_of(march: &March, along: &Along<'_>, first: usize, found: &mut [(f64
 }
 }
 
-/// Packed samples of a batch of rays through a box. With `occupancy`, samples in empty cells are left out; the others stay where they
-/// are.
+/// Samples a batch of rays through a box. With `occupancy`, samples in empty cells are left out; the positions of the others do not change.
 pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitter, occupancy: Option<&Occupancy>) -> Samples<T> {
     const RUN: usize = 128;
     let marches: Vec<(Vec<March>, Vec<u32>)> = parallel::map_chunks(rays.len(), RUN, |range| {

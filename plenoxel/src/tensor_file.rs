@@ -1,7 +1,8 @@
-//! Named tensors in a `safetensors` file. They are made, written and read one at a time, so that a file may be as large as the memory.
+//! Named tensors in a `safetensors` file. Tensors are created, written and read one at a time, so that a file may be as large as the
+//! memory.
 //!
-//! The metadata have one entry, `plenoxel`: a JSON object. (It is one entry because several would be written in a random order, and equal models
-//! are to be equal files.)
+//! The metadata have one entry, `plenoxel`, a JSON object. Several entries would be written in random order, and equal models should give
+//! identical files.
 
 use crate::error::{Error, Result};
 use crate::files;
@@ -20,12 +21,12 @@ use std::path::{Path, PathBuf};
 
 /// Key of the metadata.
 const KEY: &str = "plenoxel";
-/// The longest header that is read: of a hundred thousand tensors. The format allows ten times as much.
+/// Length of the longest header that is read, enough for a hundred thousand tensors. The format allows ten times as much.
 const LONGEST: u64 = 10_000_000;
-/// What helps against a damaged file.
+/// Advice for a damaged file.
 pub(crate) const RETRAIN: &str = "train again, or use an undamaged copy";
 
-/// A tensor to write.
+/// Tensor to write.
 pub(crate) struct Entry<'a> {
     pub name: String,
     dtype: Dtype,
@@ -34,7 +35,7 @@ pub(crate) struct Entry<'a> {
 }
 
 impl<'a> Entry<'a> {
-    /// A tensor whose bytes, little-endian, `bytes` makes when it is written.
+    /// Creates an entry. `bytes` returns the little-endian bytes when the tensor is written.
     pub fn new(name: impl Into<String>, dtype: Dtype, shape: Vec<usize>, bytes: impl Fn() -> Vec<u8> + 'a) -> Self {
         Entry { name: name.into(), dtype, shape, bytes: Box::new(bytes) }
     }
@@ -58,10 +59,10 @@ impl View for &Entry<'_> {
     }
 }
 
-/// Writes tensors and a header, whole or not at all.
+/// Writes tensors and a header atomically.
 pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>]) -> Result<()> {
     let header = serde_json::to_string(header).map_err(|e| {
-        let found = format!("the header cannot be put together ({e})");
+        let found = format!("the header cannot be written as JSON ({e})");
         Error::input(path, found, "this is a defect of the program")
     })?;
     let views = entries.iter().map(|entry| (&entry.name, entry));
@@ -69,7 +70,7 @@ pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>])
     let folder = path.parent().unwrap_or(Path::new(""));
     files::check_room(folder, bytes as u64, bytes as u64).map_err(|e| Error::io(path, e, "writing the file"))?;
     files::atomically(path, |temporary| {
-        // The library makes files that nobody else may read.
+        // The library creates files with restricted permissions; use the default permissions instead.
         let permissions = File::create(temporary)?.metadata()?.permissions();
         safetensors::serialize_to_file(views, Some(HashMap::from([(KEY.to_owned(), header)])), temporary).map_err(|e| match e {
             safetensors::SafeTensorError::IoError(e) => e,
@@ -79,7 +80,7 @@ pub(crate) fn write(path: &Path, header: &impl Serialize, entries: &[Entry<'_>])
     })
 }
 
-/// Tensors and facts on their way into a file, as [`Model::write`](crate::train::Model::write) adds them.
+/// Tensors and facts to be written to a file, collected by [`Model::write`](crate::train::Model::write).
 pub struct TensorWriter<'a> {
     dtype: Dtype,
     facts: Map<String, Value>,
@@ -87,12 +88,12 @@ pub struct TensorWriter<'a> {
 }
 
 impl<'a> TensorWriter<'a> {
-    /// A file of numbers in the precision of `T`.
+    /// Creates a writer of numbers in the precision of `T`.
     pub(crate) fn of<T: Real>() -> Self {
         TensorWriter { dtype: dtype_of::<T>(), facts: Map::new(), entries: Vec::new() }
     }
 
-    /// A file of numbers in `f32`, whatever is written.
+    /// Creates a writer that converts all numbers to `f32`.
     pub(crate) fn single() -> Self {
         TensorWriter { dtype: Dtype::F32, facts: Map::new(), entries: Vec::new() }
     }
@@ -117,44 +118,48 @@ impl<'a> TensorWriter<'a> {
         self.entries.push(Entry::new(name, dtype, shape.to_vec(), move || bytes_of(values, dtype)));
     }
 
-    /// Adds a tensor that the file holds on to until it is written.
+    /// Adds a tensor that the writer owns.
     pub fn owned<T: Real>(&mut self, name: impl Into<String>, tensor: Tensor<T>) {
         let dtype = self.dtype;
         self.entries.push(Entry::new(name, dtype, tensor.shape().to_vec(), move || bytes_of(tensor.data(), dtype)));
     }
 
-    /// Adds a list of words of 64 bits.
+    /// Adds a list of 64-bit words.
     pub fn words(&mut self, name: impl Into<String>, words: &'a [u64]) {
         let bytes = || words.iter().flat_map(|word| word.to_le_bytes()).collect();
         self.entries.push(Entry::new(name, Dtype::U64, vec![words.len()], bytes));
     }
 
-    /// Writes the file, whole or not at all.
+    /// Writes the file atomically.
     pub(crate) fn write(&self, path: &Path) -> Result<()> {
         write(path, &self.facts, &self.entries)
     }
 }
 
-/// A source of bytes that can be read at any place.
+/// Seekable source of bytes.
 trait Source: Read + Seek {}
 impl<R: Read + Seek> Source for R {}
 
-/// A file whose tensors can be read.
+/// File of tensors, opened for reading.
 pub struct TensorFile<'a> {
     path: PathBuf,
     source: Box<dyn Source + 'a>,
     metadata: Metadata,
-    /// Where the tensors begin.
+    /// Offset of the tensors in the file.
     begin: u64,
 }
 
 impl<'a> TensorFile<'a> {
-    /// Opens a file. Errors: it cannot be read, is no plain file, or is not a whole file of this program.
+    /// Opens a file.
+    ///
+    /// Errors if it cannot be read, is not a regular file, or is not a complete file of this program.
     pub fn open(path: &Path) -> Result<Self> {
         Self::new(path, files::open(path, files::TENSORS)?)
     }
 
-    /// Opens a source, which `path` names in messages. Errors: it cannot be read, or is not a whole file of this program.
+    /// Opens a source that `path` names in error messages.
+    ///
+    /// Errors if it cannot be read, or is not a complete file of this program.
     pub(crate) fn new(path: &Path, mut source: impl Read + Seek + 'a) -> Result<Self> {
         let refused = |e| refused(path, e);
         let size = source.seek(SeekFrom::End(0)).map_err(refused)?;
@@ -166,70 +171,70 @@ impl<'a> TensorFile<'a> {
         let metadata: Metadata = serde_json::from_slice(&text).map_err(|e| damaged(path, &e))?;
         let (begin, expected) = (length.saturating_add(8), metadata.data_len() as u64);
         if size.checked_sub(begin) != Some(expected) {
-            return Err(damaged(path, &format!("{size} bytes, where {} are announced", begin.saturating_add(expected))));
+            return Err(damaged(path, &format!("it has {size} bytes, its header announces {}", begin.saturating_add(expected))));
         }
         Ok(TensorFile { path: path.to_owned(), source: Box::new(source), metadata, begin })
     }
 
-    /// Path of the file, for messages.
+    /// Returns the path of the file, for error messages.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The JSON object in the file's metadata.
+    /// Returns the JSON object in the file's metadata.
     pub fn facts(&self) -> Result<Value> {
         let Some(text) = self.metadata.metadata().as_ref().and_then(|m| m.get(KEY)) else {
-            let found = format!("a safetensors file without `{KEY}` in its metadata");
-            return Err(Error::input(&self.path, found, "give a checkpoint that this program wrote"));
+            let found = format!("a safetensors file without the key `{KEY}` in its metadata");
+            return Err(Error::input(&self.path, found, "use a checkpoint that this program wrote"));
         };
         serde_json::from_str(text).map_err(|e| self.unreadable(&e))
     }
 
-    /// A fact that was added with [`TensorWriter::fact`].
+    /// Returns a fact that was added with [`TensorWriter::fact`].
     ///
-    /// Errors if it is missing or of another type.
+    /// Errors if it is missing or has another type.
     pub fn fact<V: DeserializeOwned>(&self, name: &str) -> Result<V> {
         serde_json::from_value(self.facts()?[name].take()).map_err(|e| self.unreadable(&format!("{name}: {e}")))
     }
 
-    /// An error that says why the header cannot be read.
+    /// Returns the error for a header that cannot be read.
     pub(crate) fn unreadable(&self, e: &dyn std::fmt::Display) -> Error {
         Error::input(&self.path, format!("the header cannot be read ({e})"), RETRAIN)
     }
 
-    /// An error about the contents of the file.
+    /// Returns an error for invalid content of the file.
     pub fn damaged(&self, found: impl Into<String>) -> Error {
         Error::input(&self.path, found, RETRAIN)
     }
 
-    /// Names and shapes of the tensors, by name.
+    /// Returns names and shapes of the tensors, sorted by name.
     pub fn tensors(&self) -> Vec<(String, Vec<usize>)> {
         let mut all: Vec<_> = self.metadata.tensors().into_iter().map(|(name, info)| (name, info.shape.clone())).collect();
         all.sort();
         all
     }
 
-    /// True if there is a tensor of this name.
+    /// Returns true if there is a tensor of this name.
     pub fn contains(&self, name: &str) -> bool {
         self.info(name).is_some()
     }
 
-    /// Type, shape and place of a tensor, if it is there.
+    /// Returns type, shape and offsets of a tensor, if it exists.
     pub(crate) fn info(&self, name: &str) -> Option<&TensorInfo> {
         self.metadata.info(name)
     }
 
-    /// The bytes of a tensor of this type and shape.
+    /// Reads the bytes of a tensor of this type and shape.
     pub(crate) fn read(&mut self, name: &str, dtype: Dtype, expected: &[usize]) -> Result<Vec<u8>> {
         let Some(info) = self.info(name) else {
             return Err(Error::input(&self.path, format!("no tensor `{name}`"), RETRAIN));
         };
         if info.dtype != dtype || info.shape != expected {
             let found = format!("tensor `{name}` is {:?} {:?}", info.dtype, info.shape);
-            return Err(Error::input(&self.path, found, format!("{dtype:?} {expected:?} is expected; {RETRAIN}")));
+            return Err(Error::input(&self.path, found, format!("accepted: {dtype:?} {expected:?}; {RETRAIN}")));
         }
         let (from, to) = info.data_offsets;
-        // As long as the file is, for its length was compared. Numbers are made of the bytes.
+        // The size is bounded by that of the file, which was checked. The factor 2 accounts for the numbers converted from the bytes.
         memory::check(&self.path, &format!("tensor `{name}`"), 2 * (to - from) as u64)?;
         let mut bytes = vec![0; to - from];
         let read = self.source.seek(SeekFrom::Start(self.begin + from as u64)).and_then(|_| self.source.read_exact(&mut bytes));
@@ -237,20 +242,20 @@ impl<'a> TensorFile<'a> {
         Ok(bytes)
     }
 
-    /// A tensor of this shape, in single or double precision.
+    /// Reads a tensor of this shape, stored in single or double precision.
     pub fn tensor<T: Real>(&mut self, name: &str, shape: &[usize]) -> Result<Tensor<T>> {
         let dtype = self.info(name).map(|info| info.dtype).filter(|dtype| [Dtype::F32, Dtype::F64].contains(dtype));
         let values = self.numbers(name, dtype.unwrap_or(dtype_of::<T>()), shape)?;
         Ok(Tensor::from_vec(values, shape))
     }
 
-    /// A list of words of 64 bits.
+    /// Reads a list of 64-bit words.
     pub fn words(&mut self, name: &str, length: usize) -> Result<Vec<u64>> {
         let bytes = self.read(name, Dtype::U64, &[length])?;
         Ok(bytes.as_chunks::<8>().0.iter().map(|b| u64::from_le_bytes(*b)).collect())
     }
 
-    /// The numbers of a tensor.
+    /// Reads the numbers of a tensor.
     pub(crate) fn numbers<T: Real>(&mut self, name: &str, dtype: Dtype, expected: &[usize]) -> Result<Vec<T>> {
         let bytes = self.read(name, dtype, expected)?;
         Ok(match dtype {
@@ -265,15 +270,15 @@ fn refused(path: &Path, e: std::io::Error) -> Error {
 }
 
 fn damaged(path: &Path, e: &dyn std::fmt::Display) -> Error {
-    Error::input(path, format!("not a whole safetensors file ({e})"), RETRAIN)
+    Error::input(path, format!("not a complete safetensors file ({e})"), RETRAIN)
 }
 
-/// The type that holds every number of T.
+/// Returns the type that stores numbers of type `T` exactly.
 pub(crate) fn dtype_of<T: Real>() -> Dtype {
     if size_of::<T>() == 8 { Dtype::F64 } else { Dtype::F32 }
 }
 
-/// Numbers as a file has them.
+/// Returns the little-endian bytes of numbers.
 pub(crate) fn bytes_of<T: Real>(values: &[T], dtype: Dtype) -> Vec<u8> {
     match dtype {
         Dtype::F64 => values.iter().flat_map(|x| x.as_f64().to_le_bytes()).collect(),

@@ -1,7 +1,7 @@
-//! Text for people: that of others, such as names of files and what files say, made fit to be printed, and times.
+//! Text for people: untrusted text, such as file names and file content, made safe to print; and times.
 
-/// The text on one line, so that it can do nothing to a terminal but to be read: control characters, line breaks, and marks that change the
-/// direction of writing are escaped as Rust writes them, `\n` and `\u{1b}`. Everything else stays as it is.
+/// Returns the text on one line without characters that control a terminal: control characters, line breaks, and marks that change the
+/// direction of writing are escaped as in Rust, `\n` and `\u{1b}`. Everything else is unchanged.
 pub fn one_line(text: &str) -> String {
     let mut line = String::with_capacity(text.len());
     for c in text.chars() {
@@ -10,7 +10,7 @@ pub fn one_line(text: &str) -> String {
     line
 }
 
-/// True for characters that move something on a screen instead of being shown.
+/// Returns true for characters that control a terminal instead of being displayed.
 pub(crate) fn is_unprintable(c: char) -> bool {
     let separator = matches!(c, '\u{2028}' | '\u{2029}');
     let direction = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');

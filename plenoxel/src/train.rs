@@ -1,6 +1,7 @@
-//! Training: batch → render → objective → gradients → optimizer, stage after stage. It knows no field: [`Model`] is the seam.
+//! Training: batch → render → objective → gradients → optimizer, stage after stage. The trainer depends on no particular field, only on
+//! [`Model`].
 //!
-//! The trainer draws, computes and reports; it never prints and never reads a clock.
+//! The trainer draws batches, computes and reports. It never prints and never reads a clock.
 
 mod model;
 mod state;
@@ -23,13 +24,13 @@ use std::sync::Arc;
 /// Settings of a run that do not depend on the model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrainOptions {
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// Color behind the scene, sRGB in [0, 1].
+    /// Background color, sRGB in [0, 1].
     pub background: [f32; 3],
-    /// Rays in a step.
+    /// Number of rays per training step.
     pub rays_per_step: usize,
-    /// Steps of the run, for models that do not plan stages of their own.
+    /// Number of steps of the run, for models that do not define stages.
     pub steps: u64,
     /// Shift the samples of each training ray by a random fraction of a step.
     pub jitter: bool,
@@ -42,51 +43,51 @@ impl Default for TrainOptions {
     }
 }
 
-/// A stage with its place in the run.
+/// Stage with its position in the run.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlannedStage {
     /// Number of the stage, from 0.
     pub index: usize,
-    /// Cells along each axis of what the model stores, if it stores a grid.
+    /// Resolution of the model's grid along each axis, if it has one.
     pub resolution: Option<usize>,
-    /// Its first step.
+    /// Number of its first step.
     pub first: u64,
-    /// Number of its steps.
+    /// Number of steps.
     pub steps: u64,
 }
 
-/// Result of one step.
+/// Result of a training step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
     /// Number of the step, from 0 over the whole run.
     pub step: u64,
-    /// Stage it belongs to, from 0.
+    /// Number of the stage, from 0.
     pub stage: usize,
-    /// True if it was the last of its stage.
+    /// True for the last step of a stage.
     pub ends_stage: bool,
-    /// The weighted sum that was minimised.
+    /// Value of the objective, before the update.
     pub loss: f64,
-    /// Each loss by itself, unweighted.
+    /// Unweighted value of each loss.
     pub losses: Vec<(String, f64)>,
-    /// −10 log₁₀ of the batch's mean squared error: of training rays, before the update. Where rays are aimed, those that were left out count
-    /// with an error of 0.
+    /// Training PSNR: −10 log₁₀ of the mean squared error of the batch, before the update. If rays are aimed, pixels that were left out
+    /// count with error 0.
     pub psnr: f64,
-    /// Rays in the batch.
+    /// Number of rays in the batch.
     pub rays: usize,
-    /// Samples they took.
+    /// Number of samples on the rays.
     pub samples: usize,
-    /// Learning rate of each parameter of the model, by its name.
+    /// Learning rate of each parameter of the model, by name.
     pub rates: Vec<(String, f64)>,
 }
 
 impl Report {
-    /// Learning rate of the parameter of this name.
+    /// Returns the learning rate of the parameter of this name.
     pub fn rate(&self, parameter: &str) -> Option<f64> {
         self.rates.iter().find(|(name, _)| name == parameter).map(|(_, rate)| *rate)
     }
 }
 
-/// A model in training.
+/// Training run of a model.
 pub struct Trainer<T: Real, M: Model<T>> {
     model: M,
     options: TrainOptions,
@@ -95,45 +96,45 @@ pub struct Trainer<T: Real, M: Model<T>> {
     objective: Objective<T, M>,
     optimizer: Box<dyn Optimizer<T>>,
     loss_optimizer: Box<dyn Optimizer<T>>,
-    /// Draws the batch of a step, where it is not the shuffled pixels.
+    /// Custom function that draws the batch of a step; `None` for shuffled pixels.
     draw: Option<Draw<T>>,
     step: u64,
 }
 
-/// A function from the rays of a run and the number of a step to the batch of the step.
+/// Function from the rays of a run and the number of a step to the batch of the step.
 type Draw<T> = Box<dyn Fn(&RaySource, u64) -> RayBatch<T> + Send + Sync>;
 
 impl<T: Real, M: Model<T>> Trainer<T, M> {
-    /// A run of a model from its beginning.
+    /// Creates a training run of a model.
     ///
-    /// Errors if there is no image to learn from, or no step to take.
+    /// Errors if there is no training view, or no step to take.
     pub fn with_model(model: M, views: impl Into<Arc<[View]>>, mut objective: Objective<T, M>, options: TrainOptions) -> Result<Self> {
         let rays = RaySource::new(views, options.background, options.seed);
         if rays.is_empty() {
-            return Err(Error::config("train views", "none", "at least one image to learn from"));
+            return Err(Error::config("train views", "no training views", "at least one image"));
         }
         let plan = plan(&model, &options, rays.len());
-        let Some(first) = plan.first() else { return Err(Error::config("stages", "no stage", "at least one")) };
+        let Some(first) = plan.first() else { return Err(Error::config("stages", "no stage", "at least one stage")) };
         let (optimizer, loss_optimizer) = (model.optimizer(first), objective.take_optimizer());
         Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, draw: None, step: 0 })
     }
 
-    /// The same run, whose batches have [`RayBatch::depth`](crate::rays::RayBatch::depth) where views have a depth image.
+    /// Adds [`RayBatch::depth`](crate::rays::RayBatch::depth) to the batches, for views with a depth image.
     pub fn with_depth(self) -> Self {
         Trainer { rays: self.rays.with_depth(), ..self }
     }
 
-    /// The same run, whose batches have numbers of your own for each pixel: `images` are `[height, width, c]`, one for each training view. A loss
-    /// reads them with [`RayBatch::channel`](crate::rays::RayBatch::channel).
+    /// Adds custom numbers for each pixel to the batches. `images` are `[height, width, c]`, one for each training view. A loss reads them
+    /// with [`RayBatch::channel`](crate::rays::RayBatch::channel).
     ///
-    /// Panics as [`RaySource::with_channel`] does.
+    /// Panics in the cases of [`RaySource::with_channel`].
     #[track_caller]
     pub fn with_channel(self, name: impl Into<String>, images: impl Into<Arc<[Array3<f32>]>>) -> Self {
         Trainer { rays: self.rays.with_channel(name, images), ..self }
     }
 
-    /// The same run with batches of your own, such as patches or chosen pixels, instead of the shuffled pixels: `draw` makes the batch of a
-    /// step, whose number counts over the whole run. A function of the number alone keeps runs repeatable.
+    /// Replaces the shuffled pixels by custom batches, such as patches or chosen pixels. `draw` returns the batch of a step; steps are
+    /// numbered over the whole run. Runs are reproducible if the batch depends only on the number.
     ///
     /// ```
     /// # use plenoxel::{model::plenoxels::Trainer, train::Model};
@@ -145,79 +146,79 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         Trainer { draw: Some(Box::new(draw)), ..self }
     }
 
-    /// The same run with a model that `change` makes of its own, for which stages are planned anew.
+    /// Replaces the model by `change(model)` and plans the stages again.
     ///
     /// Panics if steps have been taken.
     #[track_caller]
     pub fn map_model(mut self, change: impl FnOnce(M) -> M) -> Self {
-        assert_eq!(self.step, 0, "a run starts once");
+        assert_eq!(self.step, 0, "map_model: the run has already taken steps");
         self.model = change(self.model);
         self.plan = plan(&self.model, &self.options, self.rays.len());
         self.optimizer = self.model.optimizer(&self.plan[0]);
         self
     }
 
-    /// The model as it is now.
+    /// Returns the current model.
     pub fn model(&self) -> &M {
         &self.model
     }
 
-    /// The trained model.
+    /// Returns the model, consuming the trainer.
     pub fn into_model(self) -> M {
         self.model
     }
 
-    /// The model of a checkpoint that this trainer's run wrote at its end ([`Model::load`]), and facts about it.
+    /// Loads the checkpoint that this trainer's run wrote at its end ([`Model::load`]). Returns the model and the facts about it.
     ///
-    /// Errors name the file and what is wrong with it.
+    /// Errors if the file cannot be read; the error names the file and the problem.
     pub fn into_model_of(mut self, path: &Path) -> Result<(M, About)> {
         let about = self.model.load(path)?;
         Ok((self.model, about))
     }
 
-    /// The objective, with the parameters of its losses as they are now.
+    /// Returns the objective, with the current parameters of its losses.
     pub fn objective(&self) -> &Objective<T, M> {
         &self.objective
     }
 
-    /// Settings that do not depend on the model.
+    /// Returns the settings that do not depend on the model.
     pub fn options(&self) -> &TrainOptions {
         &self.options
     }
 
-    /// The training views.
+    /// Returns the training views.
     pub fn views(&self) -> &[View] {
         self.rays.all_views()
     }
 
-    /// The stages with their steps.
+    /// Returns the stages with their steps.
     pub fn plan(&self) -> &[PlannedStage] {
         &self.plan
     }
 
-    /// Steps of the whole run.
+    /// Returns the number of steps of the whole run.
     pub fn total_steps(&self) -> u64 {
         self.plan.iter().map(|p| p.steps).sum()
     }
 
-    /// Steps taken so far.
+    /// Returns the number of steps taken so far.
     pub fn steps_taken(&self) -> u64 {
         self.step
     }
 
-    /// The stage of a step; `None` if the run is over by then.
+    /// Returns the stage of a step; `None` if the run ends before it.
     fn stage_of(&self, step: u64) -> Option<PlannedStage> {
         self.plan.iter().find(|p| step < p.first + p.steps).copied()
     }
 
-    /// Takes the next step; `None` when the run is over.
+    /// Takes the next step. Returns `None` when the run is over.
     ///
-    /// Errors if the loss or the model is no longer finite, naming the step, and those of [`Model::begin_stage`].
+    /// Errors if the loss or the model is no longer finite, naming the step; also returns the errors of [`Model::begin_stage`].
     pub fn step(&mut self) -> Result<Option<Report>> {
         let Some(stage) = self.stage_of(self.step) else { return Ok(None) };
         let in_stage = self.step - stage.first;
         if in_stage == 0 {
-            // The memory of the old optimizer is free before the model grows.
+            // Release the memory of the old optimizer before the model grows.
             self.optimizer = self.model.optimizer(&stage);
             self.model.begin_stage(&stage, &mut self.rays).map_err(|e| at_step(e, self.step))?;
         }
@@ -249,7 +250,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         self.loss_optimizer.step(&mut self.objective, &gradients, self.step);
         let ends_stage = in_stage + 1 == stage.steps;
         if ends_stage && !(self.model.is_finite() && self.objective.is_finite()) {
-            return Err(self.numeric("the model holds numbers that are not finite".to_owned()));
+            return Err(self.numeric("the model has values that are not finite".to_owned()));
         }
         let mut rates = Vec::new();
         self.model.visit(&mut |param| rates.push((param.name().to_owned(), self.optimizer.rate(param.name(), in_stage))));
@@ -264,7 +265,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     }
 }
 
-/// Stages one after another.
+/// Plans the stages of a model, one after another.
 fn plan<T: Real, M: Model<T>>(model: &M, options: &TrainOptions, rays_per_epoch: u64) -> Vec<PlannedStage> {
     let mut first = 0;
     let stages = model.stages(options, rays_per_epoch).into_iter().enumerate().map(|(index, StageLength { resolution, steps })| {
@@ -274,7 +275,7 @@ fn plan<T: Real, M: Model<T>>(model: &M, options: &TrainOptions, rays_per_epoch:
     stages.collect()
 }
 
-/// An error of numbers with the step at which it was noticed, where the model did not say.
+/// Adds the number of the step to a numeric error without a place.
 fn at_step(error: Error, step: u64) -> Error {
     match error {
         Error::Numeric { place, found, remedy } if place.is_empty() => Error::Numeric { place: format!("step {step}"), found, remedy },

@@ -1,23 +1,23 @@
-//! What can be wrong with where cameras are and look, before anything is learned from them.
+//! Plausibility checks of camera poses before training.
 
 use super::Camera;
 use crate::geometry::Aabb;
 use glam::{DMat3, DVec3};
 
-/// Rays of a view that are tried along each axis.
+/// Number of tested rays of a view along each axis.
 const TRIED: usize = 16;
 
-/// Findings about the cameras of a scene.
+/// Problems found in the cameras of a scene.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Placement {
-    /// The reason why nothing can be learned, and the likely remedy: no ray of any camera meets the box.
+    /// Reason why training is impossible, and the likely remedy: no ray of any camera hits the box.
     pub hopeless: Option<[String; 2]>,
-    /// Reasons why training is likely to fail, each with its likely cause.
+    /// Reasons why training may fail, each with its likely cause.
     pub warnings: Vec<String>,
 }
 
 impl Placement {
-    /// Looks at cameras that are to see what is inside of a box.
+    /// Checks the cameras of a scene inside a box.
     pub fn of(cameras: &[Camera], aabb: Aabb) -> Self {
         let mut found = Placement::default();
         if cameras.is_empty() {
@@ -29,13 +29,13 @@ impl Placement {
         let seen = focus.map_or(String::new(), |focus| format!("; they look at about {}", point(focus)));
         let outside = focus.is_some_and(|focus| (focus - center).abs().max_element() > extent);
         let remedy = if outside {
-            "move the scene so that its object is around the origin, or give a --half-width that reaches it"
+            "move the scene so that its object is around the origin, or set a --half-width that reaches it"
         } else {
             "check the poses: camera to world, with x right, y up and z backwards (OpenGL)"
         };
         if hits == 0 {
             let boxed = format!("the box from {} to {}", point(aabb.min), point(aabb.max));
-            let reason = format!("no ray of the {} training views meets {boxed}{seen}", cameras.len());
+            let reason = format!("no ray of the {} training views hits {boxed}{seen}", cameras.len());
             found.hopeless = Some([reason, remedy.to_owned()]);
             return found;
         }
@@ -54,7 +54,7 @@ impl Placement {
         let distance = mean.distance(center).max(extent);
         if cameras.len() > 1 && spread < 1e-3 * distance {
             found.warnings.push(format!(
-                "all {} cameras stand at one point, {}: no depth can be learned; check the translations of the poses",
+                "all {} cameras are at one point, {}: no depth can be learned; check the translations of the poses",
                 cameras.len(),
                 point(mean)
             ));
@@ -62,8 +62,8 @@ impl Placement {
         let inside = positions().filter(|p| (*p - center).abs().max_element() < extent).count();
         if 2 * inside > cameras.len() {
             found.warnings.push(format!(
-                "{inside} of {} cameras stand inside of the box: what they photograph may lie outside of it; a smaller --half-width, or poses of \
-                 another scale, put them around it",
+                "{inside} of {} cameras are inside of the box, and may photograph objects outside of it; use a smaller --half-width, or \
+                 poses of another scale, so that the cameras are around the box",
                 cameras.len()
             ));
         }
@@ -71,7 +71,7 @@ impl Placement {
     }
 }
 
-/// True if a camera sees the middle of a box, or one of some of its rays meets it.
+/// Returns true if a camera sees the centre of a box, or if one of the tested rays hits the box.
 fn meets(camera: &Camera, aabb: Aabb) -> bool {
     let at = |k: usize, n: usize| (k as f64 + 0.5) * n as f64 / TRIED as f64;
     let k = &camera.intrinsics;
@@ -85,25 +85,25 @@ fn meets(camera: &Camera, aabb: Aabb) -> bool {
     })
 }
 
-/// The point nearest to the optical axes of cameras, by least squares; `None` if the axes are nearly parallel.
+/// Returns the point nearest to the optical axes of cameras, by least squares; `None` if the axes are nearly parallel.
 fn focus(cameras: &[Camera]) -> Option<DVec3> {
     let (mut sum, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
         let k = &camera.intrinsics;
         let ray = camera.ray(0.5 * k.width as f64, 0.5 * k.height as f64);
         let d = ray.direction;
-        // I - d dᵀ takes away what is along the axis.
+        // I - d dᵀ removes the component along the axis.
         let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
         sum += across;
         right += across * ray.origin;
     }
     let mean = sum * (1.0 / cameras.len() as f64);
-    // Of parallel axes it is 0.
+    // The determinant is 0 for parallel axes.
     (mean.determinant() > 1e-4).then(|| sum.inverse() * right)
 }
 
 fn point(p: DVec3) -> String {
-    // Adding 0 makes a positive zero of a negative one.
+    // Adding 0 turns negative zero into positive zero.
     let [x, y, z] = p.to_array().map(|c| (100.0 * c).round() / 100.0 + 0.0);
     format!("({x:.2}, {y:.2}, {z:.2})")
 }

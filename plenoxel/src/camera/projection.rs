@@ -1,21 +1,21 @@
-//! How the voxels of a box project into a picture: what carving looks up, and what rays are aimed by.
+//! Projection of the voxels of a box into an image, used by carving and for aiming rays.
 
 use crate::camera::Camera;
 use crate::geometry::Aabb;
 use autograd::lattice::{BRICK, local_of};
 use glam::{DVec3, dvec3};
 
-/// How the voxels of a box project into an image.
+/// Projection of the voxels of a box into an image.
 pub struct Projection {
     /// Width and height in pixels.
     pub size: [usize; 2],
-    /// x·depth, y·depth and depth of the corner of voxel (0, 0, 0), and what a voxel adds to them along each axis.
+    /// x·depth, y·depth and depth of the first corner of voxel (0, 0, 0), and their increments per voxel along each axis.
     origin: DVec3,
     steps: [DVec3; 3],
 }
 
 impl Projection {
-    /// Of the voxels of a box into the image of a camera, of this width and height in pixels.
+    /// Creates the projection of the voxels of a box into the image of a camera with this width and height in pixels.
     pub fn of(camera: &Camera, size: [usize; 2], aabb: Aabb, voxels: [usize; 3]) -> Self {
         let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
         let origin = homogeneous(camera, aabb.min);
@@ -23,15 +23,15 @@ impl Projection {
         Projection { size, origin, steps }
     }
 
-    /// x·depth, y·depth and depth of a voxel's first corner, x and y in pixels.
+    /// Returns x·depth, y·depth and depth of a voxel's first corner; x and y in pixels.
     #[inline(always)]
     pub fn corner(&self, voxel: [usize; 3]) -> DVec3 {
         let [x, y, z] = voxel.map(|k| k as f64);
         self.origin + x * self.steps[0] + y * self.steps[1] + z * self.steps[2]
     }
 
-    /// The projections of the corners of a box of voxels, from `low` to one behind the last, if all of them are before the camera. Bit a of a
-    /// corner's number says whether it is the higher one along axis a.
+    /// Returns the projected corners of a box of voxels, from `low` to one beyond the last voxel; `None` if a corner is not in front of the
+    /// camera. Bit a of a corner's number is set for the higher corner along axis a.
     #[inline(always)]
     pub fn corners(&self, low: [usize; 3], high: [usize; 3]) -> Option<[[f64; 2]; 8]> {
         let mut corners = [[0.0; 2]; 8];
@@ -45,7 +45,7 @@ impl Projection {
         Some(corners)
     }
 
-    /// The same for each voxel of a brick, whose first is `low`: neighbours share them.
+    /// Returns the projected corners of all voxels of a brick whose first voxel is `low`. Neighbouring voxels share corners.
     #[inline(always)]
     pub fn corners_in_brick(&self, low: [usize; 3]) -> BrickCorners {
         let mut corners = [[[[0.0; 2]; BRICK + 1]; BRICK + 1]; BRICK + 1];
@@ -60,7 +60,7 @@ impl Projection {
         BrickCorners(corners)
     }
 
-    /// The pixels of the image that a rectangle touches; none if it is beside the image.
+    /// Returns the pixels of the image that a rectangle touches; empty if it is outside of the image.
     #[inline(always)]
     pub fn touched(&self, rectangle: Rectangle) -> Pixels {
         let along = |a: usize| {
@@ -72,11 +72,11 @@ impl Projection {
     }
 }
 
-/// The projections of the corners of all voxels of a brick; NaN for those that are not before the camera.
+/// Projected corners of all voxels of a brick; NaN for corners that are not in front of the camera.
 pub struct BrickCorners([[[[f64; 2]; BRICK + 1]; BRICK + 1]; BRICK + 1]);
 
 impl BrickCorners {
-    /// Those of a voxel, given by its bit, in the order of [`Projection::corners`].
+    /// Returns the corners of a voxel, given by its bit, in the order of [`Projection::corners`].
     #[inline(always)]
     pub fn of(&self, bit: usize) -> Option<[[f64; 2]; 8]> {
         let [x, y, z] = local_of(bit);
@@ -85,7 +85,7 @@ impl BrickCorners {
     }
 }
 
-/// x·depth, y·depth and depth of a point as a camera sees it, x and y in pixels: linear in the point.
+/// Returns x·depth, y·depth and depth of a point in a camera, x and y in pixels. The result is linear in the point.
 fn homogeneous(camera: &Camera, point: DVec3) -> DVec3 {
     let k = &camera.intrinsics;
     let local = camera.camera_to_world.inverse().transform_point3(point);
@@ -93,7 +93,7 @@ fn homogeneous(camera: &Camera, point: DVec3) -> DVec3 {
     dvec3(k.fx * local.x + k.cx * depth, -k.fy * local.y + k.cy * depth, depth)
 }
 
-/// A rectangle of an image, in pixel coordinates.
+/// Rectangle in an image, in pixel coordinates.
 #[derive(Clone, Copy, Debug)]
 pub struct Rectangle {
     /// Left and top.
@@ -102,7 +102,7 @@ pub struct Rectangle {
     pub high: [f64; 2],
 }
 
-/// Columns and rows of pixels, each from the first to one behind the last.
+/// Columns and rows of pixels, each from the first to one beyond the last.
 #[derive(Clone, Copy, Debug)]
 pub struct Pixels {
     pub x: (usize, usize),
@@ -110,7 +110,7 @@ pub struct Pixels {
 }
 
 impl Pixels {
-    /// Their number.
+    /// Returns the number of pixels.
     #[inline(always)]
     pub fn area(self) -> usize {
         (self.x.1 - self.x.0) * (self.y.1 - self.y.0)
@@ -118,7 +118,7 @@ impl Pixels {
 }
 
 impl Rectangle {
-    /// The smallest one around some points, and a margin.
+    /// Returns the bounding rectangle of some points, enlarged by a margin.
     #[inline(always)]
     pub fn around(points: &[[f64; 2]; 8], margin: f64) -> Self {
         let along = |a: usize, f: fn(f64, f64) -> f64| points.iter().map(|p| p[a]).reduce(f).unwrap_or(f64::NAN);

@@ -1,29 +1,29 @@
-//! instant-ngp's `base_cam.json`: keyframes in its own world, and the splines between them.
+//! instant-ngp's `base_cam.json`: keyframes in instant-ngp's world frame, interpolated by splines.
 
 use super::{CameraPath, Entries, Entry, Format, Fov, Shot};
 use crate::error::Result;
 use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
 
-/// The factor from a dataset's lengths to instant-ngp's, and what is added to coordinates (`NERF_SCALE` in its `nerf_loader.h`).
+/// Scale from the dataset's to instant-ngp's coordinates, and the offset added then (`NERF_SCALE` in its `nerf_loader.h`).
 const SCALE: f64 = 0.33;
 const OFFSET: f64 = 0.5;
 
-/// Cameras in the dataset's world.
+/// Keyframe in the dataset's world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Keyframe {
     rotation: DQuat,
     position: DVec3,
-    /// Vertical, in radians.
+    /// Vertical field of view in radians.
     fov: f64,
 }
 
-/// What a path is made of.
+/// Keyframes of a path.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Keyframes {
     keys: Vec<Keyframe>,
-    /// When each ends, increasing from above 0.
+    /// End time of each keyframe's segment, positive and increasing.
     times: Vec<f64>,
-    /// True if the first follows the last.
+    /// True if the first keyframe follows the last.
     looped: bool,
     /// Degree of the spline, 0 to 3.
     order: u8,
@@ -33,28 +33,28 @@ pub(super) fn read(file: &Entry<'_>) -> Result<CameraPath> {
     let (mut keys, mut times) = (Vec::new(), Vec::new());
     for entry in file.list("path", "keyframe")? {
         keys.push(keyframe(&entry)?);
-        times.push(entry.optional("timestamp", f64::is_finite, "it is a number")?.unwrap_or(0.0));
+        times.push(entry.optional("timestamp", f64::is_finite, "a number")?.unwrap_or(0.0));
     }
-    // As instant-ngp does, and for its older files.
+    // As in instant-ngp, also for its older files.
     if !(times[0] > 0.0 && times.is_sorted_by(|a, b| a < b)) {
         times = (1..=keys.len()).map(|k| k as f64).collect();
     }
     let looped = match file.value.get("loop") {
         None => false,
-        Some(value) => value.as_bool().ok_or_else(|| file.wrong("loop", "it is true or false"))?,
+        Some(value) => value.as_bool().ok_or_else(|| file.wrong("loop", "true or false"))?,
     };
     let order = match file.value.get("spline_order") {
         None => 3,
-        Some(value) => value.as_u64().filter(|order| *order <= 3).ok_or_else(|| file.wrong("spline_order", "it is 0, 1, 2 or 3"))?,
+        Some(value) => value.as_u64().filter(|order| *order <= 3).ok_or_else(|| file.wrong("spline_order", "0, 1, 2 or 3"))?,
     };
     let keyframes = Keyframes { keys, times, looped, order: order as u8 };
     Ok(CameraPath { format: Format::InstantNgp, size: None, fps: None, entries: Entries::Keyframes(keyframes) })
 }
 
 fn keyframe(entry: &Entry<'_>) -> Result<Keyframe> {
-    const QUATERNION: &str = "it is a quaternion x, y, z, w of 4 finite numbers, not all of them 0";
+    const QUATERNION: &str = "a quaternion x, y, z, w of 4 finite numbers, not all of them 0";
     let rotation = DVec4::from(entry.numbers::<4>("R", QUATERNION)?).try_normalize().ok_or_else(|| entry.wrong("R", QUATERNION))?;
-    let position = DVec3::from(entry.numbers::<3>("T", "it is a position of 3 finite numbers")?);
+    let position = DVec3::from(entry.numbers::<3>("T", "a position of 3 finite numbers")?);
     let camera_to_world = entry.near_enough("T", to_dataset(DMat3::from_quat(DQuat::from_vec4(rotation)), position))?;
     Ok(Keyframe {
         rotation: DQuat::from_mat3(&camera_to_world.matrix3).normalize(),
@@ -63,7 +63,8 @@ fn keyframe(entry: &Entry<'_>) -> Result<Keyframe> {
     })
 }
 
-/// A pose of instant-ngp in the dataset's world: the axes are cycled back, y and z of the camera change their sign, and position is (T − ½) / 0.33.
+/// Converts a pose from instant-ngp's to the dataset's world frame: the axes are cycled back, y and z of the camera change sign, and the
+/// position is (T − ½) / 0.33.
 fn to_dataset(rotation: DMat3, position: DVec3) -> DAffine3 {
     // (x, y, z)ngp to (z, x, y).
     let cycle = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
@@ -76,14 +77,15 @@ impl Keyframes {
         self.keys.len()
     }
 
-    /// Frames evenly spaced in time. A loop ends one frame before it began, any other path with its last frame.
+    /// Returns frames evenly spaced in time. A loop ends one frame before its start, any other path at its last keyframe.
     pub fn shots(&self, frames: usize) -> Vec<Shot> {
         let intervals = if self.looped { frames } else { frames.saturating_sub(1).max(1) };
         (0..frames).map(|i| self.at(i as f64 / intervals as f64)).collect()
     }
 
-    /// The shot at a time in [0, 1]: keyframes around it weighted by a uniform B-spline, which is smooth and passes near its keyframes
-    /// (`CameraPath::eval_camera_path` in `camera_path.h`). Of quaternions the sum is taken, each with the sign that is nearer to those before it.
+    /// Returns the shot at a time in [0, 1]: a uniform B-spline of the keyframes around it, which is smooth and passes near the keyframes
+    /// (`CameraPath::eval_camera_path` in `camera_path.h`). Quaternions are summed, each with the sign that is closer to the sum of those
+    /// before it.
     fn at(&self, time: f64) -> Shot {
         let (first, t) = self.segment(time);
         let weights = weights(self.order, t);
@@ -99,7 +101,7 @@ impl Keyframes {
         Shot { camera_to_world: DAffine3::from_rotation_translation(rotation, position), fov: Fov::Vertical(fov) }
     }
 
-    /// The keyframe before a time in [0, 1], and how much of the way to the next one is done.
+    /// Returns the keyframe before a time in [0, 1], and the fraction of the way to the next one.
     fn segment(&self, time: f64) -> (usize, f64) {
         let segments = if self.looped { self.len() } else { self.len() - 1 };
         if segments == 0 {
@@ -111,7 +113,7 @@ impl Keyframes {
         (segment, ((time - start) / (self.times[segment] - start)).clamp(0.0, 1.0))
     }
 
-    /// A keyframe by its number, also beyond the ends.
+    /// Returns a keyframe by number. Numbers beyond the ends are wrapped or clamped.
     fn key(&self, number: isize) -> &Keyframe {
         let n = self.len() as isize;
         let number = if self.looped { number.rem_euclid(n) } else { number.clamp(0, n - 1) };
@@ -119,7 +121,8 @@ impl Keyframes {
     }
 }
 
-/// What the keyframes before, at, after and next after a place weigh there: B-splines of degree 3, 2, 1, or the nearest alone. They add up to 1.
+/// Returns the weights of the keyframes before, at, after and next after a position: B-splines of degree 3, 2 and 1, or the nearest
+/// keyframe. They sum to 1.
 fn weights(order: u8, t: f64) -> [f64; 4] {
     let u = 1.0 - t;
     match order {
@@ -147,14 +150,14 @@ mod tests {
 
     #[test]
     fn a_camera_of_instant_ngp_looks_at_the_middle_of_the_scene_with_z_up() {
-        // The pose that the program starts with: 1.5 from the middle of its unit cube, on its +z, which is the dataset's +x. A half turn about x
+        // The initial pose of instant-ngp: 1.5 from the middle of its unit cube, on its +z, which is the dataset's +x. A half turn around x
         // has y down and looks along -z.
         let path = path(r#"{"path": [{"R": [1, 0, 0, 0], "T": [0.5, 0.5, 2.0], "fov": 50.625}]}"#);
         assert_eq!((path.format, path.entries()), (Format::InstantNgp, 1));
         let camera = path.shots(3)[2].camera((200, 100));
         assert!((camera.position() - DVec3::X * 1.5 / 0.33).length() < 1e-12);
         assert!((camera.ray(100.0, 50.0).direction + DVec3::X).length() < 1e-12);
-        // A point above the middle is above it in the picture, and one to the viewer's right, +y, at its right.
+        // A point above the middle is above it in the image, and a point to the viewer's right, +y, is to the right of it.
         let (x, y, _) = camera.project(DVec3::new(0.0, 0.3, 0.2)).unwrap();
         assert!(x > 100.0 && y < 50.0);
         assert!((camera.intrinsics.fy - 50.0 / (50.625_f64.to_radians() / 2.0).tan()).abs() < 1e-9);
@@ -162,7 +165,7 @@ mod tests {
 
     #[test]
     fn a_camera_that_was_saved_by_hand_looks_at_what_it_was_turned_around() {
-        // Of a published path: T plus `scale` along the line of sight is the point that the mouse turned the camera around.
+        // From a published path: T plus `scale` along the line of sight is the point around which the mouse rotated the camera.
         let path = path(
             r#"{"path": [{"R": [0.9752712845802307, 0.02367633581161499, -0.13074590265750885, 0.17660845816135406],
                 "T": [0.8360474109649658, 1.0097604990005493, 1.586057424545288], "fov": 50.625, "scale": 1.2396693229675293}]}"#,
@@ -189,7 +192,8 @@ mod tests {
         assert_eq!(x(&line(false, 1).shots(7)), [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]);
         assert_eq!(x(&line(true, 1).shots(8)), [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 1.5]);
         assert_eq!(x(&line(false, 0).shots(7)), [0.0, 1.0, 1.0, 2.0, 2.0, 3.0, 3.0]);
-        // In the middle of a straight line with even steps splines of any degree are the line; at its end keyframes repeat: (2 + 4·3 + 3)/6.
+        // In the middle of a straight line with even steps, splines of any degree are the line. At its end, keyframes repeat: (2 + 4·3 +
+        // 3)/6.
         let cubic = x(&line(false, 3).shots(4));
         assert_eq!(&cubic[1..3], [1.0, 2.0]);
         assert!((cubic[3] - 17.0 / 6.0).abs() < 1e-6);

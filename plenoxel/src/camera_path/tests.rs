@@ -1,4 +1,4 @@
-//! What is read, what is refused, and that nothing else happens for any bytes.
+//! Tests of valid and invalid camera paths, and of arbitrary bytes.
 
 use super::*;
 use crate::random::{Purpose, uniform};
@@ -16,7 +16,7 @@ fn refused(value: &Value, parts: &[&str]) {
     assert!(parts.iter().all(|part| text.contains(part)), "{parts:?} in {text}");
 }
 
-/// A camera at height z above the origin that looks down, as a matrix row by row.
+/// Returns a camera at height z above the origin that looks down, as a matrix row by row.
 fn rows(z: f64) -> [[f64; 4]; 4] {
     [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]]
 }
@@ -59,7 +59,7 @@ fn fewer_frames_are_chosen_and_more_are_found_between() {
     assert_eq!(heights(&path, 1), [2.0]);
     assert_eq!(heights(&path, 5), [2.0, 2.5, 3.0, 4.0, 5.0]);
     assert_eq!(path.shots(0).len(), 1);
-    // From looking down to looking along x, half of a right angle in the middle.
+    // From looking down to looking along x; in the middle, half of a right angle.
     let mut turned = nerfstudio();
     turned["camera_path"][1]["camera_to_world"] = json!([0, 0, -1, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]);
     turned["camera_path"].as_array_mut().unwrap().pop();
@@ -85,7 +85,7 @@ fn angles_of_view_of_a_transforms_file_are_found_wherever_they_are() {
     near(with(&|v| v["camera_angle_y"] = json!(std::f64::consts::FRAC_PI_2)), 50.0);
     near(with(&|v| [("fl_x", 250.0), ("w", 400.0), ("h", 200.0)].into_iter().for_each(|(key, n)| v[key] = json!(n))), 125.0);
     near(with(&|v| [("fl_y", 250.0), ("w", 400.0), ("h", 200.0)].into_iter().for_each(|(key, n)| v[key] = json!(n))), 125.0);
-    // A frame's own goes first.
+    // Keys of a frame have priority.
     let own = with(&|v| {
         v["camera_angle_x"] = json!(0.3);
         v["frames"][0]["fl_x"] = json!(50);
@@ -148,7 +148,7 @@ fn each_kind_of_damage_is_named_with_its_frame_and_field() {
 
 #[test]
 fn damaged_bytes_are_read_or_refused_and_what_is_read_is_finite() {
-    // Seed 1: each file 300 times with some bytes replaced, most often by digits, so that it often remains JSON.
+    // Seed 1: each file is damaged 300 times. Some bytes are replaced, mostly by digits, so that the file often stays valid JSON.
     let seed = 1;
     for (which, value) in [nerfstudio(), transforms(), instant_ngp()].iter().enumerate() {
         let text = value.to_string().into_bytes();

@@ -1,30 +1,30 @@
-//! Paths around the scene, for runs of which nothing but the box is known.
+//! Camera paths around the scene, which need no other knowledge than the box.
 
 use super::{Fov, Shot};
 use crate::camera::{Camera, Intrinsics};
 use glam::DVec3;
 use std::f64::consts::{FRAC_PI_2, TAU};
 
-/// A camera that goes around the vertical axis of the world, +z, and looks at the origin, the centre of every grid.
+/// Camera path around the vertical axis of the world, +z, looking at the origin, which is the centre of every grid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Turntable {
-    /// From the origin, world length, above 0.
+    /// Distance from the origin, world length, above 0.
     pub distance: f64,
-    /// Above the horizon, in radians, within ± 80 degrees: straight from above there is no way up in a picture.
+    /// Elevation above the horizon in radians, within ± 80 degrees. Seen from straight above, an image has no upward direction.
     pub elevation: f64,
-    /// Angle of view across the shorter side of the picture, in radians.
+    /// Field of view across the shorter side of the image, in radians.
     pub fov: f64,
 }
 
-/// The highest elevation.
+/// Largest elevation.
 const HIGHEST: f64 = 80.0 / 180.0 * std::f64::consts::PI;
-/// How far a spiral rises above its mean elevation and falls below.
+/// Amplitude of a spiral's elevation.
 const SWING: f64 = 25.0 / 180.0 * std::f64::consts::PI;
-/// How often a spiral goes around while it rises and falls once.
+/// Number of turns of a spiral while its elevation oscillates once.
 const TURNS: f64 = 2.0;
 
 impl Turntable {
-    /// As far away, as high and with as much in view as these cameras on the mean. `None` if none of them is away from the origin.
+    /// Returns a turntable with the mean distance, elevation and field of view of some cameras; `None` if all of them are at the origin.
     pub fn like(cameras: &[Camera]) -> Option<Self> {
         let away: Vec<&Camera> = cameras.iter().filter(|camera| camera.position().length() > 0.0).collect();
         let mean = |of: &dyn Fn(&Camera) -> f64| away.iter().map(|camera| of(camera)).sum::<f64>() / away.len() as f64;
@@ -36,25 +36,27 @@ impl Turntable {
         })
     }
 
-    /// From 30 degrees above, with the lens of the NeRF-synthetic scenes (50 mm on 36 mm), so far away that the ball around the cube from
-    /// −`half_width` to `half_width` that touches its faces fills the picture: half_width / sin(fov / 2).
+    /// Returns a turntable at 30 degrees elevation with the lens of the NeRF-synthetic scenes (50 mm on 36 mm). Its distance is half_width
+    /// / sin(fov / 2): the ball inside the cube from −`half_width` to `half_width` that touches its faces fills the image.
     pub fn around_box(half_width: f64) -> Self {
         let fov = 2.0 * (0.5 * 36.0 / 50.0_f64).atan();
         Turntable { distance: half_width / (0.5 * fov).sin(), elevation: 30.0_f64.to_radians(), fov }
     }
 
-    /// A full turn, counterclockwise seen from above, from −y on. It ends one frame before it began, so that it can be shown again and again.
+    /// Returns a full turn, counterclockwise seen from above, starting at −y. It ends one frame before its start, so that it can be played
+    /// in a loop.
     pub fn orbit(&self, frames: usize) -> Vec<Shot> {
         self.turn(frames, 1.0, |_| self.elevation)
     }
 
-    /// Two turns, in which the camera rises by 25 degrees, falls as far below its elevation, and comes back. It ends one frame before it began.
+    /// Returns two turns, during which the camera rises by 25 degrees, falls as far below its elevation, and comes back. It ends one frame
+    /// before its start.
     pub fn spiral(&self, frames: usize) -> Vec<Shot> {
         self.turn(frames, TURNS, |share| (self.elevation + SWING * (TAU * share).sin()).clamp(-HIGHEST, HIGHEST))
     }
 
     fn turn(&self, frames: usize, turns: f64, elevation: impl Fn(f64) -> f64) -> Vec<Shot> {
-        // The intrinsics are the shot's own affair.
+        // The shot has its own field of view, so these intrinsics are not used.
         let any = Intrinsics::from_fov_x(1, 1, self.fov);
         let shot = |i: usize| {
             let share = i as f64 / frames as f64;
@@ -85,7 +87,7 @@ mod tests {
             let (x, y, _) = camera.project(DVec3::ZERO).unwrap();
             assert!((x - 20.0).abs() < 1e-9 && (y - 15.0).abs() < 1e-9);
             assert!(camera.project(DVec3::Z * 0.1).unwrap().1 < 15.0, "up is up");
-            // The angle to the next frame is the same everywhere, from the last to the first too.
+            // The angle to the next frame is constant, also from the last to the first.
             let flat = |shot: &Shot| shot.camera_to_world.translation.truncate();
             let step = flat(shot).angle_to(flat(&shots[(i + 1) % 12]));
             assert!((step - TAU / 12.0).abs() < 1e-9, "frame {i}: {step}");

@@ -1,19 +1,19 @@
-//! Colors of an opaque grid from the photographs that show it, without gradients.
+//! Colors of an opaque grid, fitted to the photographs without gradients.
 //!
-//! Each voxel v has harmonics xᵥ and is seen from d as S(d)·xᵥ. The problem of the source paper's second extension is one small weighted
-//! least squares for each voxel by itself,
+//! Each voxel v has harmonics xᵥ and shows the color S(d)·xᵥ in direction d. The source paper's second extension is one small weighted
+//! least-squares problem for each voxel on its own,
 //!
 //! ```text
-//! min Σ wᵣᵥ |pᵣ − S(dᵣ)·xᵥ|² + λ Σ wᵣᵥ Σ_{k≥1} |xᵥₖ|²        over the rays r that see v with share wᵣᵥ,
+//! min Σ wᵣᵥ |pᵣ − S(dᵣ)·xᵥ|² + λ Σ wᵣᵥ Σ_{k≥1} |xᵥₖ|²        over the rays r that see v with weight wᵣᵥ.
 //! ```
 //!
-//! which [`fit_exactly`] solves by its normal equations: Aᵥ xᵥ = bᵥ with Aᵥ = Σ w S Sᵀ + λ (Σ w) diag(0, 1, …, 1), bᵥ = Σ w S p. With degree 0
-//! the answer is the weighted mean of the paper's first extension. But a pixel is shared by several voxels, Cᵣ = Σᵥ wᵣᵥ S(dᵣ)·xᵥ + rest, and
-//! the error that a viewer sees is that of Cᵣ. So sweeps follow: xᵥ ← xᵥ + Aᵥ⁻¹ (Σ w S (pᵣ − Cᵣ) − ridge). Since the shares of a ray add up to
-//! at most 1, the sum of the voxels' own problems is a convex bound on the sum over rays that touches it at x (Jensen), so every sweep lowers
-//! Σᵣ |pᵣ − Cᵣ|² and its ridge, as far as colors stay unclamped: no rate is to be chosen.
+//! [`fit_exactly`] solves the normal equations Aᵥ xᵥ = bᵥ with Aᵥ = Σ w S Sᵀ + λ (Σ w) diag(0, 1, …, 1), bᵥ = Σ w S p. With degree 0 the
+//! solution is the weighted mean of the paper's first extension. But several voxels share a pixel, Cᵣ = Σᵥ wᵣᵥ S(dᵣ)·xᵥ + rest, and the
+//! visible error is that of Cᵣ. Joint sweeps therefore follow: xᵥ ← xᵥ + Aᵥ⁻¹ (Σ w S (pᵣ − Cᵣ) − ridge). The weights of a ray sum to at
+//! most 1, so the sum of the voxels' own problems is a convex upper bound of the sum over rays that touches it at x (Jensen). Every sweep
+//! therefore decreases Σᵣ |pᵣ − Cᵣ|² plus its ridge while colors are not clamped, and no rate has to be chosen.
 //!
-//! [`fit_by_descent`] is the paper's own way, stochastic gradient descent, with its lost updates repaired.
+//! [`fit_by_descent`] is the paper's stochastic gradient descent, with its lost updates fixed.
 
 use super::light::{Light, Opaque, Pixel, object_pixels};
 use crate::dataset::View;
@@ -22,15 +22,15 @@ use crate::field::sh;
 use crate::random::{Permutation, Purpose};
 use autograd::{Lattice, parallel};
 
-/// What a fit looks at.
+/// Inputs of a fit.
 pub struct Seen<'a> {
-    /// The voxels.
+    /// Voxels.
     pub opaque: &'a Opaque<'a>,
-    /// Which of them have rows.
+    /// Lattice that maps voxels to rows.
     pub lattice: &'a Lattice,
-    /// The photographs.
+    /// Photographs.
     pub views: &'a [View],
-    /// Color behind the scene.
+    /// Background color, sRGB in [0, 1].
     pub background: [f32; 3],
     /// Degree of the harmonics.
     pub degree: usize,
@@ -38,17 +38,17 @@ pub struct Seen<'a> {
     pub offset: f32,
 }
 
-/// What a fit finds.
+/// Result of a fit.
 pub struct Fitted {
-    /// Harmonics of every row, all of red, then green, then blue: `[rows, 3 (degree + 1)²]`. Those of voxels that no pixel shows are 0.
+    /// Coefficients of every row, all of red, then green, then blue: `[rows, 3 (degree + 1)²]`. Those of voxels that no pixel shows are 0.
     pub table: Vec<f32>,
-    /// The share of object pixels that show no voxel.
+    /// Fraction of object pixels that show no voxel.
     pub missed: f64,
 }
 
-/// Bytes of light that a fit keeps from one pass to the next.
+/// Bytes of [`Light`] that a fit keeps from one pass to the next.
 pub const KEPT_LIGHT: usize = 1 << 28;
-/// Passes of [`fit_by_descent`] over the pixels.
+/// Number of passes of [`fit_by_descent`] over the pixels.
 pub const EPOCHS: usize = RATES.len();
 const RATES: [f32; 4] = [0.9, 0.9, 0.1, 0.1];
 
@@ -61,7 +61,7 @@ impl Seen<'_> {
         self.opaque.light(self.views, pixels, self.background, self.degree)
     }
 
-    /// Has pixels say what they show more than the voxels do.
+    /// Sets the value of each pixel to its color minus the color of the voxels.
     fn compare(&self, light: &mut Light, table: &[f32]) {
         let count = self.count();
         light.say_errors(|row, basis| {
@@ -71,11 +71,11 @@ impl Seen<'_> {
     }
 }
 
-/// The light of all object pixels, batch by batch, of which the first are kept for the next pass.
+/// Passes over the light of all object pixels in batches. The first batches are kept for the next pass.
 struct Passes<'a> {
     seen: &'a Seen<'a>,
     kept: Vec<Light>,
-    /// Bytes that are left for more.
+    /// Bytes left for further batches.
     room: usize,
 }
 
@@ -97,7 +97,7 @@ impl<'a> Passes<'a> {
     }
 }
 
-/// The solution of every voxel's own problem, then `sweeps` over all of them together. `passed(passes)` is called after each.
+/// Solves every voxel's own problem, then runs `sweeps` joint sweeps. `passed(passes)` is called after each pass.
 pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, passed: &dyn Fn(usize)) -> Fitted {
     let count = seen.count();
     let (triangle, width) = (count * (count + 1) / 2, 3 * count);
@@ -124,7 +124,7 @@ pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, passed: &dyn Fn(u
         });
     });
     let weight: Vec<f32> = sides.chunks_exact(triangle + width).map(|row| row[0] / (sh::Y0 * sh::Y0) as f32).collect();
-    // The right sides are the last numbers of each row of a table.
+    // The right sides are the last numbers of each row of `right`, which has `of` numbers per row.
     let solve = |table: &mut [f32], right: &[f32], of: usize| {
         parallel::for_each_rows(table, width, |first, chunk| {
             for (r, x) in chunk.chunks_exact_mut(width).enumerate() {
@@ -155,11 +155,11 @@ pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, passed: &dyn Fn(u
     Fitted { table, missed: pixels_missed as f64 / pixels_all as f64 }
 }
 
-/// x ← x + A⁻¹ (g − ridge x), channel by channel, without a ridge on the mean.
+/// Computes x ← x + A⁻¹ (g − ridge x) for each channel. The coefficient of degree 0 has no ridge.
 fn improve(x: &mut [f32], a: &[f32], g: &[f32], ridge: f32) {
     const MOST: usize = sh::count(sh::MAX_DEGREE);
     let count = x.len() / 3;
-    // A little for the mean too: directions that are all the same leave A singular but for rounding.
+    // A small ridge for degree 0 too: if all directions are equal, A is singular up to rounding.
     let least = 1e-6 * f64::from(a[0]);
     let mut l = [[0.0_f64; MOST]; MOST];
     let mut at = 0;
@@ -188,14 +188,15 @@ fn improve(x: &mut [f32], a: &[f32], g: &[f32], ridge: f32) {
     }
 }
 
-/// The source paper's descent: rays of object pixels in random order, 5000 to a step, at the rates 0.9, 0.9, 0.1, 0.1 of four epochs, colors
-/// smoothed after the first. Its program keeps one ray's update of all those that meet in a voxel; here a voxel moves by their mean,
+/// Fits colors with the source paper's descent: rays of object pixels in random order, 5000 per step, rates 0.9, 0.9, 0.1, 0.1 in four
+/// epochs, colors smoothed after the first. The paper's program keeps the update of only one of the rays that meet in a voxel. Here a voxel
+/// moves by their mean,
 ///
 /// ```text
 /// xᵥ ← xᵥ + 2 rate Σ w S (pᵣ − Cᵣ) / Σ w,
 /// ```
 ///
-/// the composite has its background, and rays are not jittered.
+/// Here the composite includes the background, and rays are not jittered.
 pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, passed: &dyn Fn(usize)) -> Fitted {
     const RAYS: usize = 5000;
     let (count, width) = (seen.count(), 3 * seen.count());
@@ -206,7 +207,7 @@ pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, passed: &dyn Fn(usize)) -> Fit
         row.iter_mut().step_by(count).zip(mean).for_each(|(x, mean)| *x = *mean);
     }
     let pixels: Vec<Pixel> = object_pixels(seen.views).flatten().collect();
-    // Of each voxel Σ w S (p − C), then Σ w; zero between steps.
+    // Σ w S (p − C), then Σ w, for each voxel; zero between steps.
     let mut sums = vec![0.0; seen.lattice.rows() * (width + 1)];
     for (epoch, rate) in RATES.into_iter().enumerate() {
         let order = Permutation::new(pixels.len() as u64, seed, Purpose::RayOrder, epoch as u64);
@@ -238,7 +239,7 @@ pub fn fit_by_descent(seen: &Seen<'_>, seed: u64, passed: &dyn Fn(usize)) -> Fit
     Fitted { table, missed: mean.missed }
 }
 
-/// row += w S valueᶜ for the three channels.
+/// Computes row += w S valueᶜ for the three channels.
 #[inline(always)]
 fn add_products(row: &mut [f32], count: usize, w: f32, value: [f32; 3], basis: &[f32]) {
     for (row, value) in row.chunks_exact_mut(count).zip(value) {

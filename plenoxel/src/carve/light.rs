@@ -1,5 +1,6 @@
-//! What the voxels of an opaque grid give to the pixels of photographs: wᵥ = T (1 − exp(−σ lᵥ)), l being the exact chord of the ray in the
-//! voxel and T what reaches it. Fits read it ray by ray, and add to voxels in an order that depends on the pixels alone.
+//! Weights of the voxels of an opaque grid in the pixels of photographs: wᵥ = T (1 − exp(−σ lᵥ)), where l is the exact chord of the ray in
+//! the voxel and T the transmittance before it. Fits read the weights ray by ray. They accumulate per voxel in an order that depends only
+//! on the pixels.
 
 use crate::camera::Ray;
 use crate::dataset::View;
@@ -12,38 +13,38 @@ use autograd::rows::Buckets;
 use autograd::{Lattice, Tensor, no_grad, parallel};
 use std::ops::ControlFlow;
 
-/// A ray ends in the voxel behind which less than this is left of its light, and that voxel takes what is left: two levels of an 8-bit image.
+/// Transmittance below which a ray ends: two levels of an 8-bit image. The last voxel gets the rest.
 const REST: f32 = 1.0 / 128.0;
-/// Rays that a thread takes at a time.
+/// Number of rays per task.
 const CHUNK: usize = 1024;
-/// Parts of the tables that are added to side by side.
+/// Number of parts of the tables that are updated in parallel.
 const PARTS: usize = 64;
-/// Views that are searched for object pixels at a time.
+/// Number of views that are searched for object pixels at a time.
 const VIEWS: usize = 8;
-/// Pixels whose light is in memory at a time.
+/// Number of pixels whose weights are in memory at a time.
 const BATCH: usize = 1 << 16;
 
-/// What a voxel gives to a pixel.
+/// Weight of a voxel in a pixel.
 #[derive(Clone, Copy, Debug)]
 pub struct Hit {
     /// Row of the voxel.
     pub row: u32,
-    /// The pixel's place in its chunk.
+    /// Position of the pixel in its chunk.
     pub ray: u32,
-    /// Its share of the pixel.
+    /// Weight of the voxel in the pixel.
     pub weight: f32,
 }
 
-/// A pixel of a view.
+/// Pixel of a view.
 #[derive(Clone, Copy, Debug)]
 pub struct Pixel {
     /// Number of the view.
     pub view: u32,
-    /// Number of the pixel in it, row after row.
+    /// Number of the pixel in the view, row after row.
     pub index: u32,
 }
 
-/// A grid of one density, as light sees it.
+/// Grid of voxels with one density.
 #[derive(Debug)]
 pub struct Opaque<'a> {
     lattice: &'a Lattice,
@@ -54,36 +55,36 @@ pub struct Opaque<'a> {
     density: f64,
 }
 
-/// The light of some pixels, with what each pixel has to say to the voxels that it sees: at first its color over the background.
+/// Weights of voxels in some pixels, with a value for each pixel: initially its color over the background.
 pub struct Light {
     chunks: Vec<Chunk>,
-    /// Harmonics of a pixel.
+    /// Number of harmonics per pixel.
     count: usize,
-    /// Rows of a part.
+    /// Number of rows per part.
     part: usize,
 }
 
-/// The hits of a part of the voxels.
+/// Hits of a part of the voxels.
 #[derive(Clone, Copy)]
 pub struct PartHits<'a> {
     light: &'a Light,
     part: usize,
 }
 
-/// A voxel of a part, seen by a pixel.
+/// Voxel of a part, seen by a pixel.
 pub struct SeenBy<'a> {
-    /// Row of the voxel, counted from the first of the part.
+    /// Row of the voxel, relative to the first row of the part.
     pub row: usize,
-    /// Its share of the pixel.
+    /// Weight of the voxel in the pixel.
     pub weight: f32,
-    /// What the pixel has to say.
+    /// Value of the pixel.
     pub value: [f32; 3],
-    /// Harmonics at the ray's direction.
+    /// Harmonics for the ray's direction.
     pub basis: &'a [f32],
 }
 
 impl<'a> PartHits<'a> {
-    /// In the order of the pixels.
+    /// Iterates in the order of the pixels.
     pub fn iter(self) -> impl Iterator<Item = SeenBy<'a>> {
         let PartHits { light, part } = self;
         light.chunks.iter().flat_map(move |chunk| {
@@ -100,21 +101,21 @@ impl<'a> PartHits<'a> {
     }
 }
 
-/// Consecutive pixels, and their hits: those of a part of the tables one after another.
+/// Chunk of consecutive pixels, with their hits sorted by part of the tables.
 struct Chunk {
     hits: Vec<Hit>,
     parts: Buckets,
-    /// What each pixel shows without the background behind the voxels.
+    /// Color of each pixel without the background behind the voxels.
     objects: Vec<[f32; 3]>,
     values: Vec<[f32; 3]>,
     /// `[pixels, (degree + 1)²]`
     basis: Tensor<f32>,
-    /// Pixels that see no voxel.
+    /// Number of pixels that see no voxel.
     missed: usize,
 }
 
 impl<'a> Opaque<'a> {
-    /// All voxels of a lattice with the same density, 1 / world length.
+    /// Creates a grid of all voxels of a lattice with the same density, 1 / world length.
     pub fn new(lattice: &'a Lattice, aabb: Aabb, density: f64) -> Self {
         let bricks = lattice.brick_grid();
         let first_rows = parallel::map_indices(lattice.masks().len(), |b| {
@@ -126,7 +127,7 @@ impl<'a> Opaque<'a> {
         Opaque { lattice, walk: Walk::new(aabb, lattice.nodes()).within(extent), occupancy, first_rows, density }
     }
 
-    /// Appends the voxels on a ray, from the camera on, each with the optical depth behind it as its weight, until that is opaque.
+    /// Appends the voxels along a ray from the camera on until it is opaque. The weight of each is the optical depth behind it.
     fn depths(&self, ray: &Ray, number: u32, out: &mut Vec<Hit>) {
         let masks = self.occupancy.masks();
         let opaque = -REST.ln();
@@ -144,7 +145,7 @@ impl<'a> Opaque<'a> {
         );
     }
 
-    /// The light of some pixels; `degree` is of the harmonics.
+    /// Computes the weights for some pixels. `degree` is the degree of the harmonics.
     pub fn light(&self, views: &[View], pixels: &[Pixel], background: [f32; 3], degree: usize) -> Light {
         let part = self.lattice.rows().div_ceil(PARTS).max(1);
         let chunks = parallel::map_chunks(pixels.len(), CHUNK, |range| {
@@ -169,8 +170,8 @@ impl<'a> Opaque<'a> {
     }
 }
 
-/// Turns optical depths behind voxels into their weights, e^(-depth before) - e^(-depth behind), and returns what is left of the light at the
-/// end of each ray: nothing where it is opaque, for the last voxel has taken it. The hits of ray r end at `ends[r]`.
+/// Converts optical depths behind voxels to weights, e^(-depth before) - e^(-depth behind). Returns the remaining transmittance of each
+/// ray, 0 if it is opaque, because the last voxel got the rest. The hits of ray r end at `ends[r]`.
 fn to_weights(hits: &mut [Hit], ends: &[usize]) -> Vec<f32> {
     let depths: Vec<f32> = hits.iter().map(|hit| -hit.weight).collect();
     let n = depths.len();
@@ -189,7 +190,7 @@ fn to_weights(hits: &mut [Hit], ends: &[usize]) -> Vec<f32> {
     rests.collect()
 }
 
-/// Hits by the part of the tables that they belong to, in their order within each.
+/// Sorts hits by the part of the tables that they belong to, keeping their order within each part.
 fn by_part(hits: &[Hit], part: usize) -> (Vec<Hit>, Buckets) {
     let part_of = |hit: &Hit| hit.row as usize / part;
     let mut places = Buckets::count(PARTS, hits.iter().map(part_of));
@@ -199,7 +200,8 @@ fn by_part(hits: &[Hit], part: usize) -> (Vec<Hit>, Buckets) {
 }
 
 impl Light {
-    /// Has each pixel say what it shows more than Σ w color + rest · background. `color(row, basis)` is of a voxel in the ray's direction.
+    /// Sets the value of each pixel to its color minus Σ w color + rest · background. `color(row, basis)` is the color of a voxel in the
+    /// ray's direction.
     pub fn say_errors(&mut self, color: impl Fn(usize, &[f32]) -> [f32; 3] + Sync) {
         let count = self.count;
         parallel::for_each_chunk(&mut self.chunks, 1, |_, chunks| {
@@ -214,8 +216,8 @@ impl Light {
         });
     }
 
-    /// Calls `f` with the hits of a part of the voxels, and the rows of some tables that belong to it, for all parts side by side. Tables come
-    /// with their width; hits of a voxel come in the order of the pixels.
+    /// Calls `f` in parallel with the hits of each part of the voxels and with the corresponding rows of some tables. Tables are given with
+    /// their width. Hits of a voxel are in the order of the pixels.
     pub fn for_each_part<const N: usize>(&self, tables: [(&mut Vec<f32>, usize); N], f: impl Fn(PartHits<'_>, [&mut [f32]; N]) + Sync) {
         let widths = tables.each_ref().map(|(_, width)| *width);
         let mut rows = tables.map(|(table, width)| table.chunks_mut(self.part * width));
@@ -228,18 +230,18 @@ impl Light {
         parallel::for_each_item(parts, |part, rows| f(PartHits { light: self, part }, rows));
     }
 
-    /// The number of pixels.
+    /// Returns the number of pixels.
     pub fn pixels(&self) -> usize {
         self.chunks.iter().map(|chunk| chunk.values.len()).sum()
     }
 
-    /// Bytes that it takes.
+    /// Returns the size in bytes.
     pub fn bytes(&self) -> usize {
         let of_chunk = |chunk: &Chunk| size_of_val(&*chunk.hits) + (24 + 4 * self.count) * chunk.values.len();
         self.chunks.iter().map(of_chunk).sum()
     }
 
-    /// The number of pixels that see no voxel.
+    /// Returns the number of pixels that see no voxel.
     pub fn missed(&self) -> usize {
         self.chunks.iter().map(|chunk| chunk.missed).sum()
     }
@@ -262,13 +264,13 @@ impl Pixel {
     }
 }
 
-/// Harmonics at the directions of some rays, `[rays, (degree + 1)²]`.
+/// Returns the harmonics for the directions of rays, `[rays, (degree + 1)²]`.
 fn basis(rays: &[Ray], degree: usize) -> Tensor<f32> {
     let directions = rays.iter().flat_map(|ray| ray.direction.as_vec3().to_array()).collect();
     no_grad(|| sh::basis(&Tensor::from_vec(directions, &[rays.len(), 3]), degree))
 }
 
-/// The pixels that show the object, whatever its color: view after view, row after row, a batch at a time.
+/// Returns the pixels that show the object (alpha above 0), view after view, row after row, in batches.
 pub fn object_pixels(views: &[View]) -> impl Iterator<Item = Vec<Pixel>> + '_ {
     views.chunks(VIEWS).enumerate().flat_map(|(group, views)| {
         let lists = parallel::map_indices(views.len(), |v| {

@@ -1,27 +1,28 @@
-//! The photo hull: what is left of a box of voxels when those that the photographs contradict are carved away (Kutulakos and Seitz, A Theory
-//! of Shape by Space Carving, 2000). It opens hollows that no silhouette shows, and needs no alpha.
+//! The photo hull: a box of voxels from which voxels that contradict the photographs are carved (Kutulakos and Seitz, A Theory of Shape by
+//! Space Carving, 2000). It finds hollows that no silhouette shows, and needs no alpha channel.
 //!
-//! A voxel v is *photo-consistent* if one color explains every pixel that sees it, that is, whose ray meets v before any other voxel that is
-//! left. Each round looks, tests and carves:
+//! A voxel v is *photo-consistent* if one color explains every pixel that sees it. A pixel sees v if its ray meets v before any other
+//! remaining voxel. Each round has three steps:
 //!
-//! 1. look: the exact walk of each object pixel's ray finds the first voxel left (item buffers, as in generalized voxel coloring: Culbertson,
-//!    Malzbender and Slabaugh 1999). Only the rays of voxels that went in the round before are walked again.
-//! 2. test: voxels that new pixels see are tested with all of their pixels in all views: those are inconsistent whose colors have a standard
-//!    deviation above [`PhotoConfig::noise`]. A view votes by the range of the colors of its pixels, as much as there are of them
+//! 1. look: the exact traversal of each object pixel's ray finds the first remaining voxel (item buffers, as in generalized voxel coloring:
+//!    Culbertson, Malzbender and Slabaugh 1999). Only rays whose voxel was carved in the previous round are traversed again.
+//! 2. test: voxels that new pixels see are tested with all of their pixels in all views. A voxel is inconsistent if its colors have a
+//!    standard deviation above [`PhotoConfig::noise`]. A view contributes the range of the colors of its pixels, weighted by their number
 //!    (`votes.rs`).
-//! 3. carve: voxels go that are inconsistent, and so are at least half of the visible ones among their 26 neighbours: surfaces that are
-//!    really elsewhere are wrong in patches, while the surface itself is wrong in single voxels and lines, where a texture or a silhouette
-//!    crosses them. One wrong removal would show the voxel behind it at a place where it is inconsistent too, and so on.
+//! 3. carve: a voxel is carved if it is inconsistent, and at least half of the visible voxels among its 26 neighbours are too. Surfaces
+//!    that are really elsewhere are inconsistent in patches. The true surface is inconsistent in single voxels and lines, where a texture
+//!    or a silhouette crosses them. One wrongly carved voxel would expose the voxel behind it, which is inconsistent there too, and so on.
 //!
-//! until none goes. Voxels of a round go together, so the result depends on nothing but the input. This is right because carving hides
-//! nothing: the pixels of a voxel that is left only become more, and what contradicts a voxel before others of its round are gone does so
-//! afterwards. With a test that more pixels can only make stricter, any order has the same fixed point, the photo hull: the union of all
-//! shapes in the box that are consistent, hence a superset of the true one if that is. Here the spread is a mean over pixels and patches
-//! have to agree, so the rounds are part of the definition; at their end no visible voxel is inconsistent together with its patch.
+//! Rounds end when no voxel is carved. All voxels of a round are carved together, so the result depends only on the input. Carving never
+//! hides a voxel: the pixels that see a remaining voxel only become more, so a voxel that is contradicted before others of its round are
+//! carved is contradicted afterwards. With a test that further pixels can only make stricter, any order has the same fixed point, the photo
+//! hull: the union of all consistent shapes in the box, hence a superset of the true shape if that is consistent. Here the deviation is a
+//! mean over pixels and patches must agree, so the rounds are part of the definition. At the end, no visible voxel is inconsistent together
+//! with its patch.
 //!
-//! Pixels without alpha show no voxel and do not vote: what they contradict, the visual hull has left out already. Shiny surfaces have
-//! no one color: where their shine varies by more than `noise` they are carved into. Plain walls of hollows give nothing to tell them from a
-//! lid by.
+//! Pixels with alpha 0 show no voxel and do not vote: the visual hull has already carved what they contradict. Glossy surfaces have no
+//! single color: where their color varies by more than `noise`, they are carved into. Uniformly colored walls of hollows cannot be
+//! distinguished from a closed surface.
 
 mod visible;
 mod votes;
@@ -35,28 +36,30 @@ use serde::{Deserialize, Serialize};
 use visible::FirstVoxels;
 use votes::{Votes, Witness};
 
-/// What makes a voxel photo-consistent.
+/// Settings of the test for photo-consistency.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PhotoConfig {
-    /// The largest standard deviation among the colors of a voxel, in units of sRGB values in [0, 1], the mean square of the three channels.
-    /// It stands for whatever is no Lambertian surface of one color: sensor noise, a pixel's share of other surfaces, shine. Less carves
-    /// more. Above 0.
+    /// Largest standard deviation of the colors of a voxel, for sRGB values in [0, 1]: the root of the mean square over the three channels.
+    /// It accounts for deviations from a Lambertian surface of one color: sensor noise, other surfaces in a pixel, gloss. Smaller values
+    /// carve more. Must be above 0.
     pub noise: f64,
 }
 
 impl Default for PhotoConfig {
-    /// 15 % of the range of colors. On the built-in scene (100 views of 200 x 200, 128³ voxels) half of what fills the bowl goes and 0.12 % of
-    /// the voxels that are at least half full, nearly all of its shiny ball; at 0.12 it is two thirds, and 1 %.
+    /// 15 % of the range of colors. On the built-in scene (100 views of 200 x 200, 128³ voxels) it carves half of the filling of the bowl,
+    /// and 0.12 % of the voxels that are at least half full, nearly all of them in the glossy ball. 0.12 carves two thirds of the filling,
+    /// and 1 % of these voxels.
     fn default() -> Self {
         PhotoConfig { noise: 0.15 }
     }
 }
 
-/// The voxels of `start` that are photo-consistent in all views. `start` must hold the scene: a visual hull, or the whole box where there is no alpha.
-/// `progress(round, carved, left)` is called after each round, from 1, with the number of voxels carved in it and left.
+/// Returns the voxels of `start` that are photo-consistent in all views. `start` must contain the scene: a visual hull, or the whole box if
+/// there is no alpha channel. `progress(round, carved, left)` is called after each round, from 1, with the numbers of carved and remaining
+/// voxels.
 ///
-/// Errors: a configuration error for a noise that is not above 0.
+/// Errors with a configuration error if the noise is not above 0.
 pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progress: &dyn Fn(usize, usize, usize)) -> Result<Occupancy> {
     if config.noise.is_nan() || config.noise <= 0.0 {
         return Err(Error::config("noise", config.noise, "a number above 0"));
@@ -97,16 +100,16 @@ pub fn photo_hull(views: &[View], start: &Occupancy, config: &PhotoConfig, progr
     Ok(Occupancy::from_masks(aabb, voxels, masks))
 }
 
-/// The voxels that pixels see, as masks of bricks.
+/// Voxels that pixels see, as masks of bricks.
 struct Surface {
     bricks: BrickGrid,
     visible: Vec<u64>,
-    /// Those among them that failed the test.
+    /// Visible voxels that failed the test.
     inconsistent: Vec<u64>,
 }
 
 impl Surface {
-    /// True if at least half of the visible neighbours are inconsistent.
+    /// Returns true if at least half of the visible neighbours are inconsistent.
     fn patch_agrees(&self, brick: usize, bit: usize) -> bool {
         let voxel = self.bricks.node(brick, bit);
         let (mut visible, mut inconsistent) = (0, 0);

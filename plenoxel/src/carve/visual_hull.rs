@@ -1,6 +1,7 @@
-//! The visual hull: what the silhouettes of all views leave of a box of voxels.
+//! The visual hull: the voxels of a box inside the silhouettes of all views.
 //!
-//! By footprint and by rays, background is what has alpha 0, and a reduced picture has alpha 0 only where its whole block has ([`crate::dataset::image::downscale`]).
+//! In [`by_footprint`] and [`by_rays`], background pixels have alpha 0. A pixel of a reduced image has alpha 0 only if its whole block has
+//! ([`crate::dataset::image::downscale`]).
 
 use crate::camera::projection::{Pixels, Projection, Rectangle};
 use crate::dataset::View;
@@ -12,28 +13,28 @@ use autograd::{dispatched, parallel};
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// Views whose silhouettes are in memory at a time.
+/// Number of views whose silhouettes are in memory at a time.
 const VIEWS: usize = 8;
-/// Bricks that a thread takes at a time.
+/// Number of bricks per task.
 const BRICKS: usize = 16;
 
-/// The voxels of which no view shows the whole projection, and `margin` pixels around it, inside of its image and on background. So no
-/// voxel goes that holds matter of which the margin's surroundings show something; voxels that a view does not see whole stay for others to
-/// decide.
+/// Returns the voxels that remain when a voxel is carved if some view shows its whole projection, and `margin` pixels around it, inside of
+/// the image and on background. A voxel with matter stays if the margin's pixels show some of it. A view that sees a voxel only in part
+/// does not decide on it.
 ///
-/// Bricks of 4³ voxels are tested by the rectangle around their projection, voxels by the projection itself, a convex polygon.
-/// `progress(views)` is called as views are done.
+/// Bricks of 4³ voxels are tested by the bounding rectangle of their projection, voxels by the projection itself, a convex polygon.
+/// `progress(views)` is called with the number of processed views.
 pub fn by_footprint(views: &[View], aabb: Aabb, voxels: [usize; 3], margin: f64, progress: &dyn Fn(usize)) -> Occupancy {
     by_footprint_of(views, &Occupancy::from_masks(aabb, voxels, full(voxels)), margin, progress)
 }
 
-/// The same of some of the voxels alone.
+/// Carves like [`by_footprint`], starting from the voxels `of`.
 pub fn by_footprint_of(views: &[View], of: &Occupancy, margin: f64, progress: &dyn Fn(usize)) -> Occupancy {
     by_silhouettes(views, is_object, of, margin, progress)
 }
 
-/// Of some voxels those that [`by_footprint`] leaves, with silhouettes that need no alpha: `is_object` says which pixels (x, y) of a view show
-/// the object, and is asked once for each, in parallel.
+/// Carves like [`by_footprint_of`], with silhouettes that need no alpha channel. `is_object` returns whether pixel (x, y) of a view shows
+/// the object. It is called once per pixel, in parallel.
 pub fn by_silhouettes(
     views: &[View],
     is_object: impl Fn(&View, usize, usize) -> bool + Sync,
@@ -59,20 +60,21 @@ pub fn by_silhouettes(
     Occupancy::from_masks(aabb, voxels, masks)
 }
 
-/// Bytes of the silhouettes that are in memory at a time, for so many views of so many pixels: a number in a summed-area table for each.
+/// Returns the bytes of the silhouettes that are in memory at a time, for views of `pixels` pixels each: one number of a summed-area table
+/// per pixel.
 pub(crate) fn silhouette_bytes(views: usize, pixels: usize) -> u64 {
     (views.min(VIEWS) * size_of::<u32>() * pixels) as u64
 }
 
-/// The voxels that the ray of no background pixel passes through: the source paper's rule, with every voxel on the ray instead of those
-/// around 900 points. Rays are of pixel centres, so it carves into what thin parts leave between them.
-/// `progress(views)` is called as views are done.
+/// Returns the voxels through which no ray of a background pixel passes: the source paper's rule, with every voxel on the ray instead of
+/// the voxels at 900 points. Rays pass through pixel centres, so thin parts are carved where they lie between rays. `progress(views)` is
+/// called with the number of processed views.
 pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3], progress: &dyn Fn(usize)) -> Occupancy {
-    // Voxels only ever go, so the order in which they do is all the same.
+    // Voxels are only ever removed, so the order does not matter.
     let masks: Vec<AtomicU64> = full(voxels).into_iter().map(AtomicU64::new).collect();
     let (mut done, mut group) = (0, 1);
     while done < views.len() {
-        // What is empty now stays so: the next views, as many again, leave it out or cross it in large steps.
+        // Empty voxels stay empty: the next views, as many again, skip them or cross them in large steps.
         let snapshot = || masks.iter().map(|mask| mask.load(Relaxed)).collect();
         let empty = Occupancy::from_masks(aabb, voxels, snapshot());
         let Some(extent) = empty.extent() else { break };
@@ -98,7 +100,7 @@ pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3], progress: &dyn Fn
     Occupancy::from_masks(aabb, voxels, masks.into_iter().map(AtomicU64::into_inner).collect())
 }
 
-/// True where nothing of the object is seen.
+/// Returns true for background pixels.
 pub(super) fn is_background(view: &View, x: usize, y: usize) -> bool {
     view.image.get_pixel(x as u32, y as u32).0[3] == 0
 }
@@ -107,31 +109,31 @@ fn is_object(view: &View, x: usize, y: usize) -> bool {
     !is_background(view, x, y)
 }
 
-/// Masks of all voxels.
+/// Returns masks of all voxels.
 pub(super) fn full(voxels: [usize; 3]) -> Vec<u64> {
     let bricks = BrickGrid::new(voxels);
     parallel::map_indices(bricks.len(), |brick| bricks.inside(brick))
 }
 
-/// Where a view shows the object, and how voxels project into it.
+/// Object pixels of a view, and the projection of voxels into it.
 struct Silhouette {
     projection: Projection,
-    /// Object pixels above and left of each corner of the pixels: a summed-area table (Crow 1984), width + 1 to a row.
+    /// Summed-area table (Crow 1984): the number of object pixels above and left of each pixel corner, width + 1 per row.
     sums: Vec<u32>,
 }
 
-/// Pairs of corners ([`Projection::corners`]) that an edge joins.
+/// Pairs of corners ([`Projection::corners`]) that are joined by an edge.
 const EDGES: [(usize, usize); 12] = [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)];
 
 dispatched! {
-/// Those voxels of a brick within bounds, as a mask, whose projection lies on background.
+/// Returns, as a mask, the voxels of a brick whose projection lies on background.
 fn outside(silhouette: &Silhouette, [low, high]: [[usize; 3]; 2], mask: u64, margin: f64) -> u64 {
     let projection = &silhouette.projection;
     if let Some(corners) = projection.corners(low, high) {
         let bounds = Rectangle::around(&corners, margin);
         match silhouette.object_pixels(bounds) {
             Some(0) if silhouette.holds(bounds) => return mask,
-            // Not seen, or object all over: nothing in it lies on background.
+            // The brick is not visible, or is covered by the object: no voxel lies on background.
             None => return 0,
             Some(n) if n == projection.touched(bounds).area() => return 0,
             Some(_) => {}
@@ -157,7 +159,7 @@ impl Silhouette {
         Silhouette { projection: Projection::of(&view.camera, [width, height], aabb, voxels), sums }
     }
 
-    /// True if the convex polygon around some points, and a margin around it, are inside of the image and on background.
+    /// Returns true if the convex hull of some points, and a margin around it, lies inside of the image and on background.
     #[inline(always)]
     fn is_on_background(&self, corners: &[[f64; 2]; 8], margin: f64) -> bool {
         let bounds = Rectangle::around(corners, margin);
@@ -171,7 +173,7 @@ impl Silhouette {
         }
         let (first, last) = (bounds.low[1].floor() as usize, (bounds.high[1].floor() as usize).min(self.projection.size[1] - 1));
         for row in first..=last {
-            // The part of the polygon that is in this row of pixels lies between ends of the parts of its edges that are.
+            // The polygon's part in this row of pixels lies between the ends of its edges' parts in the row.
             let (top, bottom) = (row as f64 - margin, row as f64 + 1.0 + margin);
             let (mut left, mut right) = (f64::INFINITY, f64::NEG_INFINITY);
             for (from, to) in EDGES.map(|(i, j)| (corners[i], corners[j])) {
@@ -195,13 +197,13 @@ impl Silhouette {
         true
     }
 
-    /// True if a rectangle is inside of the image.
+    /// Returns true if a rectangle lies inside of the image.
     #[inline(always)]
     fn holds(&self, rectangle: Rectangle) -> bool {
         (0..2).all(|a| rectangle.low[a] >= 0.0 && rectangle.high[a] <= self.projection.size[a] as f64)
     }
 
-    /// The number of object pixels that a rectangle touches; `None` if it is beside the image.
+    /// Returns the number of object pixels that a rectangle touches; `None` if it is outside of the image.
     #[inline(always)]
     fn object_pixels(&self, rectangle: Rectangle) -> Option<usize> {
         let pixels = self.projection.touched(rectangle);

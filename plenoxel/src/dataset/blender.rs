@@ -1,9 +1,9 @@
 //! NeRF-synthetic folders: `transforms_{train,val,test}.json` and the PNG images they list (Mildenhall et al. 2020).
 //!
-//! A file has `camera_angle_x`, the horizontal field of view in radians, and `frames`, each with a `file_path` without
-//! extension and a 4 x 4 camera-to-world `transform_matrix` with OpenGL axes; world z is up. Only listed images are views: the
-//! depth and normal pictures that lie in the test folder of the original scenes never are. Other intrinsics must say the same as
-//! `camera_angle_x` and the images; keys that are none are ignored.
+//! A file has `camera_angle_x`, the horizontal field of view in radians, and `frames`, each with a `file_path` without extension and a 4 x
+//! 4 camera-to-world `transform_matrix` with OpenGL axes; world z is up. Only listed images are views: the depth and normal images in the
+//! test folder of the original scenes are not. Further intrinsics must agree with `camera_angle_x` and with the size of the images. Other
+//! keys are ignored.
 
 mod intrinsics;
 mod write;
@@ -21,15 +21,15 @@ pub(super) use write::write;
 
 /// Largest accepted entry of RᵀR - 1. Files written in single precision stay below 1e-6; a scaled or sheared matrix does not.
 const ORTHONORMAL_WITHIN: f64 = 1e-3;
-/// Camera positions beyond this overflow when rays are cut with boxes.
+/// Largest accepted coordinate of a camera. Larger ones overflow when rays are intersected with boxes.
 const FARTHEST: f64 = 1e12;
-/// As long as any system takes paths.
+/// Longest accepted path, which is the limit of common systems.
 const LONGEST_PATH: usize = 4096;
 
-/// Opens the NeRF-synthetic folder `root`. The training file must exist and list frames; without a validation or test file those
-/// splits are empty.
+/// Opens the NeRF-synthetic folder `root`. The training file must exist and list frames. Without a validation or test file, these splits
+/// are empty.
 ///
-/// Errors: everything that is wrong with the JSON, the matrices and the images' headers, with file and frame.
+/// Errors if the JSON, a matrix or an image's header is invalid, naming file and frame.
 pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     let mut splits = [Vec::new(), Vec::new(), Vec::new()];
     let mut stated = Vec::new();
@@ -43,7 +43,7 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
         }
     }
     if splits[0].is_empty() {
-        return Err(Error::input(file_name(root, Split::Train), "frames is empty", "at least one training view is needed"));
+        return Err(Error::input(file_name(root, Split::Train), "frames is empty", "list at least one training view"));
     }
     let size = common_size(splits.iter().flatten())?;
     stated.iter().try_for_each(|(path, transforms)| transforms.intrinsics.check(path, transforms.fov_x, size))?;
@@ -70,7 +70,7 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     })
 }
 
-/// One entry of `frames`, and its image.
+/// Entry of `frames`, with its image.
 struct Listed {
     name: String,
     image: PathBuf,
@@ -78,14 +78,14 @@ struct Listed {
     camera_to_world: DAffine3,
 }
 
-/// What a transforms file says, checked.
+/// Validated content of a transforms file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Transforms {
     /// Horizontal field of view, radians.
     pub fov_x: f64,
-    /// The views: `file_path` as it is written, and the camera to world.
+    /// Views: `file_path` as written, and the camera-to-world transform.
     pub frames: Vec<(String, DAffine3)>,
-    /// What it says of the cameras beside that.
+    /// Further intrinsics of the file.
     pub intrinsics: StatedIntrinsics,
 }
 
@@ -94,9 +94,9 @@ fn file_name(root: &Path, split: Split) -> PathBuf {
 }
 
 impl Transforms {
-    /// The views with the images of the scene `root`.
+    /// Returns the views with the images of the scene `root`.
     ///
-    /// Errors: there is no such image.
+    /// Errors if an image does not exist.
     fn listed(&self, root: &Path, split: Split) -> Result<Vec<Listed>> {
         let listed = self.frames.iter().enumerate().map(|(k, (text, camera_to_world))| {
             let image = find_image(root, split, text).map_err(|tried| {
@@ -110,9 +110,9 @@ impl Transforms {
         listed.collect()
     }
 
-    /// Reads the bytes of a transforms file; `path` names it in messages.
+    /// Parses a transforms file. `path` names it in error messages.
     ///
-    /// Errors: everything that is wrong with the JSON and the matrices, with the frame.
+    /// Errors if the JSON or a matrix is invalid, naming the frame.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
         let bad = |found: String, remedy: &str| Error::input(path, found, remedy);
         let json = json::parse(path, bytes)?;
@@ -127,7 +127,7 @@ impl Transforms {
             });
         };
         let Some(fov_x) = angle.as_f64().filter(|angle| is_angle_of_view(*angle)) else {
-            return Err(bad(format!("camera_angle_x is {}", json::shown(angle)), "it is a number of radians between 0 and pi"));
+            return Err(bad(format!("camera_angle_x is {}", json::shown(angle)), "accepted: a number of radians between 0 and pi"));
         };
         let Some(frames) = json.get("frames") else {
             return Err(bad("there is no key \"frames\"".into(), "list the views, each with file_path and transform_matrix"));
@@ -151,7 +151,7 @@ impl Transforms {
             let pose = pose(matrix).map_err(|(found, remedy)| bad(format!("transform_matrix of frame {k} {found}"), remedy))?;
             if pose.translation.abs().max_element() > FARTHEST {
                 let found = format!("transform_matrix of frame {k} puts the camera at {:?}", pose.translation.to_array());
-                return Err(bad(found, "coordinates of up to 1e12 are accepted"));
+                return Err(bad(found, "accepted: coordinates of up to 1e12"));
             }
             Ok((file_path.to_owned(), pose))
         };
@@ -160,8 +160,8 @@ impl Transforms {
     }
 }
 
-/// The image a `file_path` means: relative to the scene as written, or by its last part in the split's folder; `.png` is
-/// appended unless it is there. Otherwise the places that were tried.
+/// Returns the image of a `file_path`: relative to the scene as written, or its last part in the split's folder. `.png` is appended unless
+/// present. If there is no such image, returns the paths that were tried.
 fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result<PathBuf, Vec<PathBuf>> {
     let file_path = file_path.replace('\\', "/");
     let base = file_path.rsplit('/').next().unwrap_or(&file_path);
@@ -176,14 +176,14 @@ fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result
     // An image with another extension is found too, so that the message can say that it is not a PNG.
     let as_written = root.join(file_path.trim_start_matches("./"));
     let all = || tried.iter().chain([&as_written]);
-    // What is there and no file is found last, so that the message can say what it is.
+    // Existing paths that are not files come last, so that the message can say what they are.
     let found = all().find(|path| path.is_file()).or_else(|| all().find(|path| files::is_there(path))).cloned();
     found.ok_or(tried)
 }
 
-/// Checks and converts a 4 x 4 camera-to-world matrix; an error completes the sentence "transform_matrix of frame k ...".
+/// Validates and converts a 4 x 4 camera-to-world matrix. An error completes the sentence "transform_matrix of frame k ...".
 pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'static str)> {
-    const SHAPE: &str = "it is a list of 4 rows of 4 numbers";
+    const SHAPE: &str = "accepted: a list of 4 rows of 4 numbers";
     let mut m = [[0.0; 4]; 4];
     let rows = matrix.as_array().ok_or_else(|| ("is not a list of rows".to_owned(), SHAPE))?;
     if rows.len() != 4 {
@@ -196,17 +196,16 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
         }
         for (j, value) in row.iter().enumerate() {
             let number = value.as_f64().filter(|number| number.is_finite());
-            m[i][j] =
-                number.ok_or_else(|| (format!("has {} in row {i}, column {j}", json::shown(value)), "every entry is a finite number"))?;
+            m[i][j] = number.ok_or_else(|| (format!("has {} in row {i}, column {j}", json::shown(value)), "accepted: finite numbers"))?;
         }
     }
     rigid(m)
 }
 
-/// Checks and converts the rows of a camera-to-world matrix, all of them finite; an error completes the same sentence.
+/// Validates and converts the rows of a camera-to-world matrix, which must be finite. An error completes the sentence of [`pose`].
 pub(crate) fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, &'static str)> {
     if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6) {
-        return Err((format!("has the last row {:?}", m[3]), "the last row of a rigid motion is 0 0 0 1"));
+        return Err((format!("has the last row {:?}", m[3]), "accepted: a rigid motion, whose last row is 0 0 0 1"));
     }
     let matrix = DMat4::from_cols_array_2d(&m).transpose();
     let rotation = DMat3::from_mat4(matrix);
@@ -222,7 +221,7 @@ pub(crate) fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, 
     Ok(DAffine3::from_mat4(matrix))
 }
 
-/// The size all images share.
+/// Returns the common size of all images.
 fn common_size<'a>(listed: impl Iterator<Item = &'a Listed>) -> Result<(usize, usize)> {
     let mut first: Option<(&Path, (usize, usize))> = None;
     for Listed { image: path, .. } in listed {
@@ -232,7 +231,7 @@ fn common_size<'a>(listed: impl Iterator<Item = &'a Listed>) -> Result<(usize, u
             Some((other, expected)) if expected != size => {
                 let found =
                     format!("the image has {} x {} pixels, but {} has {} x {}", size.0, size.1, other.display(), expected.0, expected.1);
-                return Err(Error::input(path, found, "all images of a scene must have one size"));
+                return Err(Error::input(path, found, "use images of one size in a scene"));
             }
             Some(_) => {}
         }

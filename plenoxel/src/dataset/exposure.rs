@@ -1,4 +1,4 @@
-//! Photographs as a camera on automatic settings would have taken them: of another brightness and white balance in every view.
+//! Simulation of automatic exposure: a different brightness and white balance in every view.
 
 use super::View;
 use crate::random::Stream;
@@ -12,10 +12,10 @@ use ::image::Rgba;
 /// g_c = exp(S z₀ + S/2 (z_c − (z₁ + z₂ + z₃) / 3)),        c = 1, 2, 3
 /// ```
 ///
-/// with S = `spread` and standard normal z₀ … z₃ ([`Stream`] of `seed` and the name "exposure", step v, index 0 to 3): brightness varies by a factor
-/// of about exp(±S), and the mean of ln g_c over the channels is S z₀. Colors are multiplied as they are stored, sRGB with straight alpha,
-/// rounded, and clamped to [0, 1]; alpha and depth stay. Where nothing is clamped, a color of one view is that of another times g / g'.
-/// With a spread of 0 nothing changes.
+/// with S = `spread` and standard normal z₀ … z₃ ([`Stream`] of `seed` and the name "exposure", step v, index 0 to 3). Brightness varies by
+/// a factor of about exp(±S); the mean of ln g_c over the channels is S z₀. Gains multiply the stored colors, sRGB with straight alpha;
+/// results are rounded and clamped to [0, 1]. Alpha and depth do not change. Colors of two views that are not clamped differ by the factor
+/// g / g'. A spread of 0 changes nothing.
 pub fn spread(views: &mut [View], spread: f64, seed: u64) {
     let stream = Stream::new(seed).named("exposure");
     for (v, view) in views.iter_mut().enumerate() {
@@ -28,7 +28,7 @@ pub fn spread(views: &mut [View], spread: f64, seed: u64) {
     }
 }
 
-/// The gain of each channel, of four standard normal numbers.
+/// Computes the gain of each channel from four standard normal numbers.
 fn gains(spread: f64, [brightness, balance @ ..]: [f64; 4]) -> [f64; 3] {
     let mean = balance.iter().sum::<f64>() / 3.0;
     balance.map(|z| (spread * brightness + spread / 2.0 * (z - mean)).exp())

@@ -1,8 +1,8 @@
-//! Pictures on disk and in memory: PNG decoding and writing, reduction by a box filter, composition over a background.
+//! Images: PNG decoding and encoding, reduction with a box filter, compositing over a background.
 //!
-//! A picture is 8-bit RGBA with *straight* alpha, as the files have it: a quarter of the memory of floats, and the background
-//! stays a choice until a color is asked for. Values are sRGB as stored; nothing here linearises, since every published number
-//! compares and composites the stored values.
+//! An image is 8-bit RGBA with *straight* alpha, as stored in files. This takes a quarter of the memory of floats, and the background can
+//! be chosen when a color is read. Values are sRGB as stored. They are not linearised, because published results compare and composite the
+//! stored values.
 
 mod rows;
 
@@ -18,14 +18,14 @@ use std::path::Path;
 pub use ::image::RgbaImage;
 pub use rows::MAX_SIDE;
 
-/// The last chunk of every PNG: length 0, name, checksum.
+/// Last chunk of every PNG: length 0, name, checksum.
 const END: [u8; 12] = *b"\0\0\0\0IEND\xae\x42\x60\x82";
 
-/// Width and height of the PNG file `path`, without decoding it: reads its first 26 bytes and its last 12.
+/// Returns width and height of the PNG file `path` without decoding it: reads its first 26 bytes and its last 12.
 ///
-/// A file that does not end as a PNG ends is decoded at once, so that one cut short is reported when a dataset is opened and
-/// not hours later; its pixels are not kept. Errors: missing, not a plain file, not a PNG, cut short, empty, larger than [`MAX_SIDE`], or of more
-/// pixels than the file can hold.
+/// A file without the end of a PNG is decoded at once, so that a truncated file is reported when the dataset is opened, not hours later;
+/// its pixels are not kept. Errors if the file is missing, not a regular file, not a PNG, truncated, empty, larger than [`MAX_SIDE`], or
+/// has more pixels than its size allows.
 pub fn size(path: &Path) -> Result<(usize, usize)> {
     let mut file = files::open(path, files::IMAGE)?;
     let (width, height) = rows::size(path, &mut file)?;
@@ -38,17 +38,17 @@ pub fn size(path: &Path) -> Result<(usize, usize)> {
     Ok((width as usize, height as usize))
 }
 
-/// Decodes the PNG file `path` (gray, RGB or palette, with or without alpha, of any bit depth) to 8-bit RGBA. 16-bit values are
-/// rounded; without alpha the picture is opaque.
+/// Decodes the PNG file `path` (gray, RGB or palette, with or without alpha, of any bit depth) to 8-bit RGBA. 16-bit values are rounded. An
+/// image without alpha is opaque.
 ///
-/// Memory: 4 bytes a pixel, whatever the bit depth. Errors: missing, not a plain file, not a PNG, cut short, damaged, larger than [`MAX_SIDE`],
-/// of more pixels than the file can hold, or of more than there is memory for.
+/// Memory: 4 bytes per pixel, for any bit depth. Errors if the file is missing, not a regular file, not a PNG, truncated, damaged, larger
+/// than [`MAX_SIDE`], has more pixels than its size allows, or does not fit into memory.
 pub fn read(path: &Path) -> Result<RgbaImage> {
     let file = files::open(path, files::IMAGE)?;
     picture(path, BufReader::new(file))
 }
 
-/// The same from the bytes of a file; `path` names it in messages.
+/// Decodes the bytes of a PNG file like [`read`]. `path` names it in error messages.
 pub fn decode(path: &Path, bytes: &[u8]) -> Result<RgbaImage> {
     picture(path, Cursor::new(bytes))
 }
@@ -59,33 +59,33 @@ fn picture(path: &Path, mut source: impl BufRead + Seek) -> Result<RgbaImage> {
     let bytes = 4 * width as usize * height as usize;
     memory::check(path, &format!("an image of {width} x {height} pixels"), bytes as u64)?;
     let mut pixels = Vec::new();
-    // Address space may be short where memory is not.
+    // Address space may be exhausted before memory is.
     pixels.try_reserve_exact(bytes).map_err(|_| Error::io(path, std::io::ErrorKind::OutOfMemory.into(), "decoding the image"))?;
     pixels.resize(bytes, 0);
     rows.read(&mut pixels)?;
-    // As many as there are: no pixel is black instead.
+    // The buffer has exactly the size of the image, so this never falls back to the default.
     Ok(RgbaImage::from_raw(width, height, pixels).unwrap_or_default())
 }
 
-/// Checks that pictures of `width` x `height` can be reduced `k` times: k must divide both, since blocks of different sizes
-/// would belong to no camera.
+/// Checks that images of `width` x `height` can be reduced by k. k must divide both sides, because blocks of different sizes do not belong
+/// to one camera.
 ///
-/// Errors: a configuration error that lists the divisors that would do.
+/// Errors with a configuration error that lists the accepted divisors.
 pub fn check_downscale(k: usize, (width, height): (usize, usize)) -> Result<()> {
     let divides = |k: usize| width.is_multiple_of(k) && height.is_multiple_of(k);
     if k > 0 && divides(k) {
         return Ok(());
     }
     let divisors: Vec<String> = (1..=width.min(height).min(MAX_SIDE as usize)).filter(|&k| divides(k)).map(|k| k.to_string()).collect();
-    let found = if k == 0 { "0".to_owned() } else { format!("{k}, which does not divide the {width} x {height} images,") };
+    let found = if k == 0 { "0".to_owned() } else { format!("{k} does not divide the {width} x {height} images") };
     Err(Error::config("downscale", found, divisors.join(", ")))
 }
 
-/// The picture reduced `k` times: each pixel averages a block of k x k.
+/// Reduces an image by k: each pixel is the mean of a block of k x k pixels.
 ///
-/// What is averaged is alpha and the color *times* alpha; straight alpha is stored again, everything rounded to nearest. So
-/// compositing the result over any background equals averaging the composited block, up to the rounding to 8 bits. Alpha is 0 only
-/// where the whole block has alpha 0, so that a silhouette loses nothing; the color there is 0. Panics unless k divides width and height ([`check_downscale`]).
+/// The means are of alpha and of color *times* alpha. The result has straight alpha, rounded to nearest. Compositing it over any background
+/// therefore equals averaging the composited block, up to rounding to 8 bits. Alpha is 0 only if the whole block has alpha 0, so that
+/// silhouettes do not shrink; the color is then 0. Panics unless k divides width and height ([`check_downscale`]).
 pub fn downscale(image: &RgbaImage, k: usize) -> RgbaImage {
     if k == 1 {
         return image.clone();
@@ -112,7 +112,7 @@ pub fn downscale(image: &RgbaImage, k: usize) -> RgbaImage {
     })
 }
 
-/// Color of pixel (x, y) over `background`: rgb a + background (1 - a) on the stored sRGB values, in [0, 1].
+/// Returns the color of pixel (x, y) over `background`: rgb a + background (1 - a) on the stored sRGB values, in [0, 1].
 #[inline]
 pub fn color(image: &RgbaImage, x: usize, y: usize, background: [f32; 3]) -> [f32; 3] {
     let [r, g, b, a] = image.get_pixel(x as u32, y as u32).0;
@@ -121,7 +121,7 @@ pub fn color(image: &RgbaImage, x: usize, y: usize, background: [f32; 3]) -> [f3
     [over(r, background[0]), over(g, background[1]), over(b, background[2])]
 }
 
-/// The whole picture over `background`: [height, width, 3] in [0, 1].
+/// Returns the whole image over `background`: [height, width, 3] in [0, 1].
 pub fn composite(image: &RgbaImage, background: [f32; 3]) -> Array3<f32> {
     let (width, height) = (image.width() as usize, image.height() as usize);
     let mut out = Array3::zeros((height, width, 3));
@@ -133,10 +133,10 @@ pub fn composite(image: &RgbaImage, background: [f32; 3]) -> Array3<f32> {
     out
 }
 
-/// Writes `rgb` [height, width, 3] as an 8-bit PNG: values are clamped to [0, 1] and rounded to nearest; NaN becomes 0. The file
-/// appears whole or not at all.
+/// Writes `rgb` [height, width, 3] as an 8-bit PNG. Values are clamped to [0, 1] and rounded to nearest; NaN becomes 0. The file is written
+/// atomically.
 ///
-/// Panics unless there are three channels. Errors: an empty picture, or the disk's refusal.
+/// Panics unless there are three channels. Errors if the image is empty or cannot be written.
 pub fn write_rgb(path: &Path, rgb: ArrayView3<'_, f32>) -> Result<()> {
     let (height, width, channels) = rgb.dim();
     assert_eq!(channels, 3, "write_rgb: expected [height, width, 3], got {:?}", rgb.shape());
@@ -144,23 +144,23 @@ pub fn write_rgb(path: &Path, rgb: ArrayView3<'_, f32>) -> Result<()> {
     encode(path, &bytes, (width, height), ExtendedColorType::Rgb8)
 }
 
-/// Writes an RGBA picture with straight alpha as PNG. The file appears whole or not at all.
+/// Writes an RGBA image with straight alpha as a PNG, atomically.
 pub fn write_rgba(path: &Path, image: &RgbaImage) -> Result<()> {
     encode(path, image.as_raw(), (image.width() as usize, image.height() as usize), ExtendedColorType::Rgba8)
 }
 
-/// Writes 16-bit gray values [height, width] as PNG. The file appears whole or not at all.
+/// Writes 16-bit gray values [height, width] as a PNG, atomically.
 pub fn write_gray16(path: &Path, values: &Array2<u16>) -> Result<()> {
-    // The encoder takes samples in the machine's byte order.
+    // The encoder expects samples in native byte order.
     let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_ne_bytes()).collect();
     encode(path, &bytes, (values.ncols(), values.nrows()), ExtendedColorType::L16)
 }
 
 fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<()> {
-    // Nothing is written that would not be read.
+    // Images that could not be read back are not written.
     if width.max(height) > MAX_SIDE as usize {
-        let found = format!("a picture of {width} x {height} pixels is not written");
-        return Err(Error::input(path, found, format!("pictures of up to {MAX_SIDE} pixels a side are")));
+        let found = format!("an image of {width} x {height} pixels is too large to write");
+        return Err(Error::input(path, found, format!("accepted: up to {MAX_SIDE} pixels per side")));
     }
     let mut png = Vec::new();
     ::image::codecs::png::PngEncoder::new(&mut png).write_image(bytes, width as u32, height as u32, color).map_err(|error| {
@@ -239,7 +239,7 @@ mod tests {
         assert!(error.to_string().contains("does not divide the 8 x 12 images"), "{error}");
         assert!(error.to_string().ends_with("accepted: 1, 2, 4"), "{error}");
         assert!(check_downscale(0, (8, 12)).is_err() && check_downscale(4, (8, 12)).is_ok());
-        // What a damaged file says of the built-in scene was tried divisor by divisor.
+        // Trying one divisor after another would never end for such sizes of a damaged file.
         assert!(check_downscale(7, (usize::MAX, usize::MAX - 1)).is_err());
     }
 
@@ -274,7 +274,7 @@ mod tests {
         let error = size(&path).unwrap_err();
         assert!(error.to_string().contains("60000 x 60000"), "{error}");
         assert_eq!((error.exit_code(), read(&path).unwrap_err().exit_code()), (3, 3));
-        // Of an acceptable size, but the file is too short for it.
+        // The size is acceptable, but the file is too short for it.
         let mut bytes = std::fs::read(&path).unwrap();
         bytes[16..24].copy_from_slice(&[0, 0, 0x40, 0, 0, 0, 0x40, 0]);
         std::fs::write(&path, bytes).unwrap();

@@ -1,8 +1,8 @@
-//! The built-in scene as a dataset: a still life with exact depth, rendered on demand; no files needed.
+//! Built-in scene as a dataset: a still life with exact depth, rendered on demand, without files.
 //!
-//! Cameras imitate the NeRF-synthetic scenes: the same field of view and distance, the upper hemisphere. Training and
-//! validation views are spread evenly over it on different spirals of golden angles; test views follow a smooth path
-//! around the scene, so that they make a film.
+//! Cameras are like those of the NeRF-synthetic scenes: same field of view, same distance, on the upper hemisphere. Training and validation
+//! views are evenly spread over the hemisphere, on different golden-angle spirals. Test views follow a smooth path around the scene, so
+//! that they form a film.
 
 mod bounds;
 mod convex;
@@ -21,12 +21,12 @@ use std::sync::Arc;
 
 pub use scene::Scene;
 
-/// Horizontal field of view in radians, that of the NeRF-synthetic scenes.
+/// Horizontal field of view in radians, as in the NeRF-synthetic scenes.
 pub const FOV_X: f64 = 0.6911112070083618;
-/// Distance of every camera from the origin, that of the NeRF-synthetic scenes.
+/// Distance of every camera from the origin, as in the NeRF-synthetic scenes.
 pub const CAMERA_DISTANCE: f64 = 4.031128874;
 
-/// Size and number of the built-in scene's pictures.
+/// Size and number of the images of the built-in scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ProceduralOptions {
     /// Image width in pixels.
@@ -86,20 +86,20 @@ pub(super) fn dataset(options: ProceduralOptions) -> Result<Dataset> {
     })
 }
 
-/// Direction `k` of `n` on the upper hemisphere by equal steps in height and golden angles in azimuth (spherical Fibonacci
-/// lattice): nearly even, from just above the horizon to nearly overhead. `turn` radians are added to every azimuth.
+/// Returns direction `k` of `n` on the upper hemisphere, by equal steps in height and golden angles in azimuth (spherical Fibonacci
+/// lattice). The directions are nearly uniform, from just above the horizon to nearly overhead. `turn` radians are added to every azimuth.
 fn hemisphere(k: usize, n: usize, turn: f64) -> DVec3 {
     const GOLDEN_ANGLE: f64 = 2.399963229728653; // pi (3 - sqrt 5)
     toward(0.02 + 0.97 * (k as f64 + 0.5) / n as f64, GOLDEN_ANGLE * k as f64 + turn)
 }
 
-/// Direction `k` of `n` on the test path: twice around while the height swings slowly between low and high.
+/// Returns direction `k` of `n` on the test path: two turns around the scene while the height changes slowly between low and high.
 fn path(k: usize, n: usize) -> DVec3 {
     let s = (k as f64 + 0.5) / n as f64;
     toward(0.5 - 0.36 * (TAU * s).cos(), 2.0 * TAU * s + 0.3)
 }
 
-/// The unit vector with the given z and azimuth.
+/// Returns the unit vector with the given z and azimuth.
 fn toward(z: f64, azimuth: f64) -> DVec3 {
     let flat = (1.0 - z * z).sqrt();
     DVec3::new(flat * azimuth.cos(), flat * azimuth.sin(), z)

@@ -1,15 +1,16 @@
-//! The surface of a grid's matter as triangles with normals and colors.
+//! Surface of a grid's matter as a triangle mesh with normals and colors.
 //!
-//! Marching cubes (Lorensen and Cline 1987) on the cells between voxel centres: wherever the density crosses the level between two neighbouring
-//! centres lies a vertex, and each cell joins its vertices to polygons. Which ones is not a printed table but derived, in `mesh/cases.rs`, from one
-//! rule for the faces of cells; two cells see their common face alike, so the surface is closed and each edge has exactly two triangles.
-//! Surface nets were rejected for that reason: where matter touches along an edge, four of their triangles meet.
+//! Marching cubes (Lorensen and Cline 1987) on the cells between voxel centres: a vertex lies where the density crosses the level between
+//! two neighbouring centres, and each cell connects its vertices to polygons. The polygons are not taken from a printed table but derived,
+//! in `mesh/cases.rs`, from one rule for the faces of cells. Two cells treat their common face alike, so the surface is closed and each
+//! edge has exactly two triangles. Surface nets were rejected for that reason: where matter touches along an edge, four of their triangles
+//! meet.
 //!
-//! Outside of the box there is nothing, so a surface that reaches it is closed on its faces. Planes of centres are taken two at a time:
-//! memory is that of the grid, the mesh, and a few arrays of resolution².
+//! Space outside of the box is empty, so a surface that reaches the box is closed on its faces. Planes of centres are processed two at a
+//! time: memory is that of the grid, the mesh, and a few arrays of resolution².
 //!
-//! What was found may then lose its small parts (`mesh/parts.rs`), its steps (`mesh/smoothing.rs`), and triangles (`mesh/decimation.rs`). It stays
-//! closed.
+//! Optional steps remove small parts (`mesh/parts.rs`), smooth the surface (`mesh/smoothing.rs`), and reduce the number of triangles
+//! (`mesh/decimation.rs`). The surface stays closed.
 
 mod cases;
 mod decimation;
@@ -23,61 +24,63 @@ use autograd::{Real, parallel};
 use cases::{CORNERS, EDGES};
 use glam::DVec3;
 
-/// A surface in the dataset's world coordinates.
+/// Triangle mesh in the dataset's world coordinates.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Mesh {
     /// World position of each vertex.
     pub positions: Vec<[f32; 3]>,
-    /// Unit normal of each vertex, out of the matter.
+    /// Unit normal of each vertex, pointing out of the matter.
     pub normals: Vec<[f32; 3]>,
     /// sRGB color of each vertex.
     pub colors: Vec<[u8; 3]>,
     /// Vertices of each triangle, counterclockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
-    /// Number of parts that were left out because they had fewer triangles than [`MeshOptions::min_part`].
+    /// Number of removed parts: those with fewer triangles than [`MeshOptions::min_part`].
     pub parts_left_out: usize,
 }
 
 impl Mesh {
-    /// The volume enclosed, world length³, by the divergence theorem: Σ a · (b × c) / 6.
+    /// Returns the enclosed volume, world length³, by the divergence theorem: Σ a · (b × c) / 6.
     pub fn volume(&self) -> f64 {
         let corner = |v: u32| DVec3::from(self.positions[v as usize].map(f64::from));
         self.triangles.iter().map(|t| t.map(corner)).map(|[a, b, c]| a.dot(b.cross(c)) / 6.0).sum()
     }
 }
 
-/// Which surface, and its colors.
+/// Options of meshes.
 #[derive(Debug, Clone, Copy)]
 pub struct MeshOptions {
-    /// The density on the surface, 1 / world length; `None` is where a voxel absorbs [`SURFACE_ALPHA`].
+    /// Density of the surface, 1 / world length; `None` for the density at which a voxel absorbs [`SURFACE_ALPHA`].
     pub level: Option<f64>,
-    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each vertex against its normal.
+    /// Unit direction from the viewer into the scene in which colors are evaluated; `None` for the direction opposite to each vertex's
+    /// normal.
     pub direction: Option<DVec3>,
-    /// The least triangles of a part that is kept; the largest part is kept always. Parts hang together by common vertices: specks are some, and
-    /// so are the walls of hollows.
+    /// Smallest number of triangles of a part. Smaller parts are removed, except the largest part. Parts are connected by common vertices;
+    /// floating specks and the walls of hollows are parts.
     pub min_part: usize,
-    /// Passes of smoothing over positions and normals. No vertex moves by more than half a voxel along each axis.
+    /// Number of smoothing passes over positions and normals. No vertex moves by more than half a voxel along each axis.
     pub smooth: usize,
-    /// Edges are collapsed until no more triangles than these are left, or until each collapse that is left would join or tear the surface.
+    /// Number of triangles to decimate to; `None` for no decimation. Edges are collapsed until the number is reached, or until every
+    /// further collapse would join or tear the surface.
     pub max_triangles: Option<usize>,
 }
 
 impl Default for MeshOptions {
-    /// The level of [`SURFACE_ALPHA`], colors against the normals, no parts of fewer than 100 triangles, and neither smoothing nor decimation.
+    /// Level of [`SURFACE_ALPHA`], colors opposite to the normals, no parts of fewer than 100 triangles, no smoothing, no decimation.
     fn default() -> Self {
         MeshOptions { level: None, direction: None, min_part: 100, smooth: 0, max_triangles: None }
     }
 }
 
-/// The surface on which the density of a grid has a level.
+/// Extracts the surface on which the density of a grid has a level.
 ///
-/// Of a trilinear grid, densities are read linearly on the lines between neighbouring centres, as they are rendered. Of a nearest grid a vertex lies
-/// halfway, on the face between two voxels; the corners are rounded off. Normals are [`VoxelGrid::outward`], interpolated. A vertex has the color that
-/// a camera sees there.
+/// In a trilinear grid, the density is interpolated linearly between neighbouring centres, as in rendering. In a nearest grid, a vertex
+/// lies halfway, on the face between two voxels, so corners are rounded off. Normals are [`VoxelGrid::outward`], interpolated. A vertex has
+/// the color that a camera sees there.
 ///
 /// The result does not depend on the number of threads.
 ///
-/// Errors: the level is not positive, or no voxel is denser.
+/// Errors if the level is not positive, or if no voxel is denser.
 pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh> {
     let shape = grid.shape();
     let level = options.level.unwrap_or_else(|| shape.density_of_alpha(SURFACE_ALPHA));
@@ -88,7 +91,7 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
     if !(level > 0.0 && level < largest) {
         let accepted = match largest > 0.0 {
             true => format!("above 0 and below {largest:.4}, the largest density of this grid"),
-            false => "none, for this grid is empty: train it longer".to_owned(),
+            false => "no level, because the grid is empty: train it longer".to_owned(),
         };
         return Err(Error::config("level", format!("{level:.4}"), accepted));
     }
@@ -112,14 +115,15 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
     })
 }
 
-/// Two neighbouring centres with the level between them: `low`, and the next one along `axis`. Coordinates run from −1, outside of the box.
+/// Edge between two neighbouring centres with the level between them: `low`, and the next centre along `axis`. Coordinates start at −1,
+/// outside of the box.
 #[derive(Debug, Clone, Copy)]
 struct Crossing {
     low: [i16; 3],
     axis: u8,
 }
 
-/// What is known of a vertex.
+/// Attributes of a vertex.
 #[derive(Clone, Copy)]
 struct Vertex {
     position: DVec3,
@@ -128,8 +132,8 @@ struct Vertex {
     row: u32,
 }
 
-/// How near a vertex may come to a centre, as a share of the voxel's side: nearer ones of several edges would be one point in `f32`, and
-/// programs that join equal points would find degenerate triangles.
+/// Smallest distance between a vertex and a centre, relative to the voxel's side. Closer vertices of several edges could be equal in `f32`,
+/// and programs that merge equal points would create degenerate triangles.
 const NEAREST: f64 = 0.01;
 
 impl Crossing {
@@ -144,35 +148,35 @@ impl Crossing {
         let inside = ends.as_flattened().iter().all(|k| (0..n).contains(k));
         let t = match grid.shape().interpolation {
             Interpolation::Trilinear if inside => ((level - a) / (b - a)).clamp(NEAREST, 1.0 - NEAREST),
-            // Voxels of a nearest grid end at their faces, as those of the border do, whose outer half has no look-up.
+            // Voxels of a nearest grid end at their faces. So do those at the border, because their outer half has no look-up.
             Interpolation::Trilinear | Interpolation::Nearest => 0.5,
         };
         let [from, to] = ends.map(|end| grid.shape().center(end));
         let [dense, thin] = if a > b { [0, 1] } else { [1, 0] };
         let slope = grid.outward(ends[0]).lerp(grid.outward(ends[1]), t);
-        // A speck of matter may have no slope: it is seen along the edge.
+        // A speck of matter may have no gradient; the direction along the edge is used instead.
         let along = grid.shape().center(ends[thin]) - grid.shape().center(ends[dense]);
         let normal = slope.try_normalize().unwrap_or_else(|| along.normalize());
-        // The dense end is above a positive level, so it is present.
+        // The density of this end is above a positive level, so its voxel is present.
         let row = grid.lattice().row(ends[dense].map(|k| k as usize)).unwrap_or_default();
         Vertex { position: from.lerp(to, t), normal, row }
     }
 }
 
-/// Vertices as the edges they lie on, and the triangles between them.
+/// Vertices, given by the edges they lie on, and triangles.
 #[derive(Default)]
 struct Surface {
     crossings: Vec<Crossing>,
     triangles: Vec<[u32; 3]>,
 }
 
-/// A plane of centres of equal x with a margin of one, row-major in y and z.
+/// Plane of centres of equal x with a margin of one, row-major in y and z.
 struct Plane {
-    /// Which centres are denser than the level.
+    /// True for centres that are denser than the level.
     dense: Vec<bool>,
-    /// For each row of centres, whether one of them is.
+    /// True for rows with a dense centre.
     rows: Vec<bool>,
-    /// The vertices on the edges that begin at each centre along x, y and z; anything where there is none.
+    /// Vertices on the edges that start at each centre along x, y and z; arbitrary for edges without a vertex.
     vertices: [Vec<u32>; 3],
 }
 
@@ -182,7 +186,7 @@ impl Plane {
         Plane { dense: vec![false; side * side], rows: vec![false; side], vertices }
     }
 
-    /// Fills it with the centres of an x from −1 to n.
+    /// Reads the plane of centres at an x from −1 to n.
     fn read<T: Real>(&mut self, grid: &VoxelGrid<T>, level: f64, x: isize) {
         let side = self.rows.len();
         parallel::for_each_chunk(&mut self.dense, side, |start, row| {
@@ -197,7 +201,7 @@ impl Plane {
     }
 }
 
-/// All vertices and triangles, x slowest.
+/// Extracts all vertices and triangles, x slowest.
 fn surface<T: Real>(grid: &VoxelGrid<T>, level: f64) -> Surface {
     let n = grid.shape().resolution as isize;
     let side = n as usize + 2;
@@ -215,7 +219,7 @@ fn surface<T: Real>(grid: &VoxelGrid<T>, level: f64) -> Surface {
 }
 
 impl Surface {
-    /// The vertices on edges from the plane at `x` to the next one, and on those inside of the latter.
+    /// Adds the vertices on edges from the plane at `x` to the next plane, and on edges inside the next plane.
     fn add_vertices(&mut self, low: &mut Plane, high: &mut Plane, x: isize) {
         let side = low.rows.len();
         for y in 0..side {
@@ -243,7 +247,7 @@ impl Surface {
         }
     }
 
-    /// The triangles in the cells between two planes.
+    /// Adds the triangles in the cells between two planes.
     fn add_triangles(&mut self, cases: &[Vec<[u8; 3]>], low: &Plane, high: &Plane) {
         let side = low.rows.len();
         let planes = [low, high];

@@ -1,4 +1,4 @@
-//! A mesh as the bytes of a file: PLY, OBJ, binary glTF or STL.
+//! Mesh files: PLY, OBJ, binary glTF and STL.
 
 use super::mesh::Mesh;
 use crate::error::{Error, Result};
@@ -7,32 +7,32 @@ use serde_json::{Value, json};
 use std::fmt::{self, Display, Write};
 use std::str::FromStr;
 
-/// The formats there are.
+/// Format of a mesh file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MeshFormat {
     /// Stanford PLY, binary little endian, z up; colors as bytes `red`, `green`, `blue`.
     Ply,
     /// Wavefront OBJ, text, z up; colors after the positions, `v x y z r g b`, in [0, 1].
     Obj,
-    /// Binary glTF 2.0. Positions are the dataset's, and the node that holds them is turned so that the dataset's z is glTF's y, which is up. The
-    /// material is unlit, for the colors have the light in them already, and colors are linear, as glTF demands.
+    /// Binary glTF 2.0. Positions are those of the dataset; the node is rotated so that the dataset's z becomes glTF's y, which is up. The
+    /// material is unlit, because the colors include the lighting. Colors are linear, as glTF requires.
     Glb,
-    /// Binary STL, z up: triangles alone, each with its own normal. The format has no colors.
+    /// Binary STL, z up: triangles with one normal each. The format has no colors.
     Stl,
 }
 
 impl MeshFormat {
-    /// All of them.
+    /// All formats.
     pub const ALL: [Self; 4] = [MeshFormat::Ply, MeshFormat::Obj, MeshFormat::Glb, MeshFormat::Stl];
 
-    /// Whether files of this format hold colors.
+    /// Returns true if files of this format contain colors.
     pub fn has_colors(self) -> bool {
         self != MeshFormat::Stl
     }
 
-    /// The bytes of a file of this format. `comment` says where the mesh is from, on one line.
+    /// Encodes a mesh in this format. `comment` is one line about the origin of the mesh.
     ///
-    /// Errors: the mesh is larger than the format allows.
+    /// Errors if the mesh is larger than the format allows.
     pub fn encode(self, mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
         match self {
             MeshFormat::Ply => Ok(ply(mesh, comment)),
@@ -44,7 +44,7 @@ impl MeshFormat {
 }
 
 impl Display for MeshFormat {
-    /// Its name, which is the ending of its files.
+    /// Formats the name, which is also the file extension.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             MeshFormat::Ply => "ply",
@@ -106,7 +106,7 @@ fn obj(mesh: &Mesh, comment: &str) -> Vec<u8> {
     file.into_bytes()
 }
 
-/// Numbers of the glTF specification: types of components, targets of buffer views.
+/// Constants of the glTF specification: component types, targets of buffer views.
 mod gltf {
     pub const UNSIGNED_SHORT: u32 = 5123;
     pub const UNSIGNED_INT: u32 = 5125;
@@ -117,7 +117,7 @@ mod gltf {
 
 fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
     let floats = |rows: &[[f32; 3]]| -> Vec<u8> { rows.as_flattened().iter().flat_map(|x| x.to_le_bytes()).collect() };
-    // Shorts, for bytes would band in the dark; with an alpha, for rows must begin at multiples of four bytes.
+    // 16-bit colors, because 8 bits would show bands in dark regions; with alpha, because rows must start at multiples of four bytes.
     let colors = mesh.colors.iter().flat_map(|rgb| rgb.map(linear).into_iter().chain([u16::MAX]).flat_map(u16::to_le_bytes)).collect();
     let count = mesh.positions.len();
     let bound = |pick: fn(f32, f32) -> f32| {
@@ -151,7 +151,7 @@ fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
-        // A quarter turn about x: (x, y, z) to (x, z, −y).
+        // A quarter turn around x: (x, y, z) to (x, z, −y).
         "nodes": [{ "mesh": 0, "rotation": [-half, 0.0, 0.0, half] }],
         "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0, "NORMAL": 1, "COLOR_0": 2 }, "indices": 3, "material": 0 }] }],
         "materials": [{
@@ -164,10 +164,11 @@ fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
     });
     let mut text = document.to_string().into_bytes();
     text.resize(text.len().next_multiple_of(4), b' ');
-    // All parts have whole words, so the binary needs no padding.
+    // All parts consist of whole words, so the binary needs no padding.
     let total = 12 + 8 + text.len() + 8 + binary.len();
     let Ok(length) = u32::try_from(total) else {
-        return Err(Error::config("format", format!("glb, for a mesh of {total} bytes,"), "ply or obj: glTF ends at 4 GiB"));
+        let found = format!("glb cannot hold a mesh of {total} bytes");
+        return Err(Error::config("format", found, "ply or obj, because glTF files end at 4 GiB"));
     };
     let word = |n: usize| (n as u32).to_le_bytes();
     let header = [b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes()].concat();
@@ -176,10 +177,10 @@ fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
 
 fn stl(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
     let Ok(count) = u32::try_from(mesh.triangles.len()) else {
-        let found = format!("stl, for a mesh of {} triangles,", mesh.triangles.len());
-        return Err(Error::config("format", found, "ply or obj: STL ends at 4294967295 triangles"));
+        let found = format!("stl cannot hold a mesh of {} triangles", mesh.triangles.len());
+        return Err(Error::config("format", found, "ply or obj, because STL files end at 4294967295 triangles"));
     };
-    // The word "solid" at the beginning would make it a text for many programs.
+    // Many programs take a file that begins with the word "solid" for text.
     let mut file = format!("binary STL, {comment}").into_bytes();
     file.resize(80, b' ');
     file.extend(count.to_le_bytes());
@@ -194,7 +195,7 @@ fn stl(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
     Ok(file)
 }
 
-/// An sRGB byte as 16 bits of linear light (IEC 61966-2-1).
+/// Converts an sRGB byte to 16 bits of linear light (IEC 61966-2-1).
 fn linear(byte: u8) -> u16 {
     let c = f64::from(byte) / 255.0;
     let linear = if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) };

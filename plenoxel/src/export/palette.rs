@@ -1,13 +1,14 @@
-//! A few colors for many: an exact palette where there is one, else boxes cut in two, refined by k-means.
+//! Color quantization: an exact palette if there are few colors, otherwise recursive cutting of boxes, refined by k-means.
 
 use autograd::parallel;
 use glam::DVec3;
 
-/// A palette of at most `most` colors, and the entry of each of `colors`, with little squared error over sRGB bytes.
+/// Returns a palette of at most `most` colors, and the entry of each of `colors`, with a small squared error over sRGB bytes.
 ///
-/// The box of colors of the largest squared error is cut in two where that helps most (Wu 1992), again and again; then entries move to the means
-/// of the colors nearest to them (Lloyd 1982). No random start: the same colors give the same palette. Equal colors share an entry, and where
-/// there are no more than `most` different ones, nothing is lost. At most 256 entries have numbers.
+/// The box of colors with the largest squared error is repeatedly cut in two where that reduces the error most (Wu 1992). Entries then move
+/// to the means of the colors nearest to them (Lloyd 1982). There is no random initialization: the same colors give the same palette. Equal
+/// colors share an entry. If there are at most `most` different colors, the palette is exact. `most` must not exceed 256, because entries
+/// are bytes.
 pub fn quantize(colors: &[[u8; 3]], most: usize) -> (Vec<[u8; 3]>, Vec<u8>) {
     let mut distinct = colors.to_vec();
     distinct.sort_unstable();
@@ -24,10 +25,10 @@ pub fn quantize(colors: &[[u8; 3]], most: usize) -> (Vec<[u8; 3]>, Vec<u8>) {
     (palette, entries)
 }
 
-/// Rounds of k-means: later ones change the error of real scenes by less than a hundredth.
+/// Number of k-means rounds. Further rounds change the error of real scenes by less than 1 %.
 const ROUNDS: usize = 8;
 
-/// The palette of different colors with their counts, and the entry of each.
+/// Returns the palette of distinct colors with counts, and the entry of each.
 fn reduce(colors: &[[u8; 3]], counts: &[u32], most: usize) -> (Vec<[u8; 3]>, Vec<u32>) {
     let points: Vec<(DVec3, f64)> =
         colors.iter().zip(counts).map(|(color, &count)| (DVec3::from(color.map(f64::from)), f64::from(count))).collect();
@@ -40,7 +41,7 @@ fn reduce(colors: &[[u8; 3]], counts: &[u32], most: usize) -> (Vec<[u8; 3]>, Vec
             sums[entry as usize].1 += weight;
         }
         for (mean, (sum, weight)) in means.iter_mut().zip(sums) {
-            // A mean that is nearest to nothing stays where it is.
+            // A mean without points does not move.
             *mean = if weight > 0.0 { sum / weight } else { *mean };
         }
         nearest = assign(&points, &means);
@@ -48,7 +49,7 @@ fn reduce(colors: &[[u8; 3]], counts: &[u32], most: usize) -> (Vec<[u8; 3]>, Vec
     (means.iter().map(|mean| mean.to_array().map(|c| c.round() as u8)).collect(), nearest)
 }
 
-/// The number of the mean nearest to each point, the first of equals.
+/// Returns the number of the nearest mean for each point; the first if several are equally near.
 fn assign(points: &[(DVec3, f64)], means: &[DVec3]) -> Vec<u32> {
     let mut nearest = vec![0; points.len()];
     parallel::for_each_chunk(&mut nearest, 1024, |first, chunk| {
@@ -65,7 +66,7 @@ fn assign(points: &[(DVec3, f64)], means: &[DVec3]) -> Vec<u32> {
     nearest
 }
 
-/// Means of `most` boxes, or of fewer if each of them has one color only.
+/// Returns the means of `most` boxes, or of fewer if each box has only one color.
 fn cut_boxes(points: &[(DVec3, f64)], most: usize) -> Vec<DVec3> {
     let mut boxes = vec![Cell::new(points.to_vec())];
     while boxes.len() < most {
@@ -79,7 +80,7 @@ fn cut_boxes(points: &[(DVec3, f64)], most: usize) -> Vec<DVec3> {
     boxes.into_iter().map(|b| b.mean).collect()
 }
 
-/// Some of the points, with their mean and the sum of their squared distances from it.
+/// Set of points, with their mean and the sum of their squared distances from it.
 struct Cell {
     points: Vec<(DVec3, f64)>,
     mean: DVec3,
@@ -94,7 +95,7 @@ impl Cell {
         Cell { points, mean, error }
     }
 
-    /// The points before and after the plane across an axis that leaves the least squared error: at least one each.
+    /// Splits the points by the plane across an axis that leaves the smallest squared error, with at least one point on each side.
     fn cut(self) -> [Self; 2] {
         let weight: f64 = self.points.iter().map(|(_, weight)| weight).sum();
         let sum = weight * self.mean;
@@ -107,7 +108,7 @@ impl Cell {
             for (i, pair) in points.windows(2).enumerate() {
                 let (point, count) = pair[0];
                 (before, left) = (before + count * point, left + count);
-                // The error falls by what the two means explain.
+                // The error decreases by what the two means explain.
                 let gain = before.length_squared() / left + (sum - before).length_squared() / (weight - left);
                 if pair[1].0[axis] > point[axis] && gain > best {
                     (best, place) = (gain, Some(i + 1));
@@ -139,7 +140,7 @@ mod tests {
     fn clusters_get_an_entry_each_and_a_rare_one_is_not_lost() {
         let noise = |i: u64, axis: u64| (7.0 * uniform(1, Purpose::Initial, axis, i)) as u8;
         let centers = [[20, 30, 40], [200, 40, 30], [240, 240, 20], [90, 160, 220]];
-        // The last cluster has one color in a thousand.
+        // One color in a thousand belongs to the last cluster.
         let of = |i: u64| if i.is_multiple_of(1000) { 3 } else { (i % 3) as usize };
         let colors: Vec<[u8; 3]> = (0..5000).map(|i| [0, 1, 2].map(|axis| centers[of(i)][axis] + noise(i, axis as u64))).collect();
         let (palette, entries) = quantize(&colors, 4);
@@ -151,7 +152,8 @@ mod tests {
 
     #[test]
     fn a_cube_of_colors_costs_at_most_half_more_than_with_the_best_palette() {
-        // 12³ colors of a regular cube with 216 = 6³ entries: two by two by two share one, which misses each by half a step of 20 along each axis.
+        // 12³ colors of a regular cube with 216 = 6³ entries: 2 x 2 x 2 colors share an entry, which differs from each by half a step of 20
+        // along each axis.
         let colors: Vec<[u8; 3]> = (0..12 * 12 * 12).map(|c| [c / 144 * 20, c / 12 % 12 * 20, c % 12 * 20].map(|v| v as u8)).collect();
         let (palette, entries) = quantize(&colors, 216);
         let error = |(color, entry): (&[u8; 3], &u8)| {

@@ -1,12 +1,12 @@
-//! Voxels for MagicaVoxel: the .vox format, version 150, with the scene graph of its extension.
+//! MagicaVoxel files: the .vox format, version 150, with the scene graph of its extension.
 //!
-//! The format's x, y and z are those of the dataset, right-handed and z up, so voxel (i, j, k) of the grid is voxel (i, j, k) of the file. A model
-//! has at most 256 voxels a side: larger grids become tiles of 256³ with the grid's coordinates modulo 256, put together by the scene graph so
-//! that the box is centred in x and y and stands on the ground. That is where MagicaVoxel puts a single model by itself, so a smaller grid
-//! needs no scene graph, which some readers do not know.
+//! The format's axes are those of the dataset, right-handed and z up: voxel (i, j, k) of the grid is voxel (i, j, k) of the file. A model
+//! has at most 256 voxels per side. Larger grids become tiles of 256³ with the grid's coordinates modulo 256, arranged by the scene graph
+//! so that the box is centred in x and y and its bottom is at z = 0. MagicaVoxel places a single model there by default, so smaller grids
+//! need no scene graph, which some readers do not support.
 //!
-//! A voxel has the index of its color, 1 to 255, as 0 would be empty; entry i − 1 of the 256 in the file belongs to index i. Source: the
-//! specification `MagicaVoxel-file-format-vox.txt` of github.com/ephtracy/voxel-model, and the extension beside it.
+//! A voxel stores the index of its color, 1 to 255; 0 means empty. Entry i − 1 of the 256 palette entries in the file belongs to index i.
+//! Source: the specification `MagicaVoxel-file-format-vox.txt` of github.com/ephtracy/voxel-model, and its extension.
 
 use super::{SURFACE_ALPHA, directions, near_colors};
 use crate::error::{Error, Result};
@@ -16,26 +16,26 @@ use crate::sampling::Occupancy;
 use autograd::{Real, parallel};
 use glam::DVec3;
 
-/// The voxels of a .vox file.
+/// Voxels of a .vox file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Vox {
-    /// Voxels along each axis of the grid.
+    /// Number of voxels along each axis of the grid.
     pub resolution: usize,
-    /// sRGB colors, at most 255.
+    /// Palette of at most 255 sRGB colors.
     pub palette: Vec<[u8; 3]>,
-    /// Voxel (i, j, k) of the grid, and the index of its color: 1 is the first of the palette.
+    /// Voxels (i, j, k) of the grid with the indices of their colors; 1 is the first color of the palette.
     pub voxels: Vec<([u16; 3], u8)>,
 }
 
-/// Which voxels, and their colors.
+/// Options of .vox files.
 #[derive(Debug, Clone, Copy)]
 pub struct VoxOptions {
-    /// Voxels are taken that absorb at least this share of the light that crosses them ([`VoxelGrid::voxels_absorbing`]).
+    /// Smallest fraction of the crossing light that an exported voxel absorbs ([`VoxelGrid::voxels_absorbing`]).
     pub min_alpha: f64,
-    /// Take those too that others hide on all six sides.
+    /// Also export voxels that are hidden by others on all six sides.
     pub solid: bool,
-    /// Unit direction from the viewer into the scene in which colors are seen; `None` looks at each voxel against [`VoxelGrid::outward`], through open
-    /// faces.
+    /// Unit direction from the viewer into the scene in which colors are evaluated; `None` for the direction opposite to
+    /// [`VoxelGrid::outward`] of each voxel, restricted to open faces.
     pub direction: Option<DVec3>,
 }
 
@@ -45,9 +45,9 @@ impl Default for VoxOptions {
     }
 }
 
-/// The voxels of a grid with a palette made from their colors alone.
+/// Returns the exported voxels of a grid, with a palette made from their colors.
 ///
-/// Errors: `min_alpha` is not in [0, 1), or no voxel absorbs as much.
+/// Errors if `min_alpha` is not in [0, 1), or if no voxel absorbs as much.
 pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     let VoxOptions { min_alpha, solid, direction } = *options;
     if !(0.0..1.0).contains(&min_alpha) {
@@ -56,10 +56,10 @@ pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     let dense = grid.voxels_absorbing(min_alpha);
     let places = places(&dense, solid);
     if places.is_empty() {
-        let found = format!("{min_alpha}, which no voxel of this grid reaches,");
-        return Err(Error::config("min_alpha", found, "a smaller share of the light; if 0 is refused, train longer"));
+        let found = format!("{min_alpha}, but no voxel of the grid absorbs as much");
+        return Err(Error::config("min_alpha", found, "a smaller fraction of the light; if 0 is refused, train longer"));
     }
-    // All of them are present: an absent voxel has no density.
+    // All exported voxels are present, because absent voxels have no density.
     let rows: Vec<u32> = places.iter().map(|voxel| grid.lattice().row(voxel.map(usize::from)).unwrap_or_default()).collect();
     let signed = |place: &[u16; 3]| place.map(|k| k as isize);
     let points: Vec<DVec3> = places.iter().map(|place| grid.shape().center(signed(place))).collect();
@@ -70,7 +70,7 @@ pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     Ok(Vox { resolution: grid.shape().resolution, palette, voxels })
 }
 
-/// The part of an outward vector that points through open faces of a voxel: where a neighbour is taken too, nothing of it is seen.
+/// Returns the part of an outward vector that points through open faces of a voxel. Faces to other exported voxels are hidden.
 fn open(outward: DVec3, voxel: [isize; 3], dense: &Occupancy) -> DVec3 {
     let taken = |voxel: [isize; 3]| {
         let inside = (0..3).all(|a| (0..dense.cells()[a] as isize).contains(&voxel[a]));
@@ -83,7 +83,7 @@ fn open(outward: DVec3, voxel: [isize; 3], dense: &Occupancy) -> DVec3 {
     }))
 }
 
-/// The voxels of an occupancy, x slowest; without those that have all six neighbours, unless `solid`.
+/// Returns the voxels of an occupancy, x slowest; unless `solid`, without voxels that have all six neighbours.
 fn places(dense: &Occupancy, solid: bool) -> Vec<[u16; 3]> {
     let n = dense.cells()[0];
     let hidden = |[i, j, k]: [usize; 3]| {
@@ -97,19 +97,19 @@ fn places(dense: &Occupancy, solid: bool) -> Vec<[u16; 3]> {
     planes.concat()
 }
 
-/// The most voxels along a side of a model: coordinates are bytes.
+/// Largest number of voxels per side of a model, because coordinates are bytes.
 const SIDE: usize = 256;
 
 impl Vox {
-    /// The file's bytes.
+    /// Returns the bytes of the file.
     ///
-    /// Errors: more voxels than the format can count.
+    /// Errors if there are more voxels than the format can store.
     pub fn to_bytes(&self) -> Result<Vec<u8>> {
-        // Chunks say their length in 31 bits, and a voxel has four bytes.
+        // The length of a chunk has 31 bits, and a voxel takes four bytes.
         const MOST: usize = (1 << 29) - (1 << 20);
         if self.voxels.len() > MOST {
-            let found = format!("a selection of {} voxels", self.voxels.len());
-            return Err(Error::config("min_alpha", found, format!("at most {MOST} voxels: a larger share, or hidden voxels left out")));
+            let found = format!("{} voxels are selected", self.voxels.len());
+            return Err(Error::config("min_alpha", found, format!("at most {MOST} voxels: a larger fraction, or hidden voxels left out")));
         }
         let tiles = self.tiles();
         let mut chunks = Vec::new();
@@ -127,7 +127,7 @@ impl Vox {
         Ok([b"VOX ".as_slice(), &integers([150]), b"MAIN", &integers([0, chunks.len() as i32]), &chunks].concat())
     }
 
-    /// The parts of at most 256 voxels a side that are not empty, x slowest.
+    /// Returns the parts of at most 256 voxels per side that are not empty, x slowest.
     fn tiles(&self) -> Vec<Tile> {
         let count = self.resolution.div_ceil(SIDE);
         let mut tiles: Vec<Tile> = (0..count * count * count)
@@ -145,7 +145,8 @@ impl Vox {
         tiles
     }
 
-    /// Node 0 is the root's place, node 1 the group of all tiles; tile m has its place in node 2 m + 2 and its shape in node 2 m + 3.
+    /// Writes the scene graph. Node 0 is the transform of the root, node 1 the group of all tiles. Tile m has its transform in node 2 m + 2
+    /// and its shape in node 2 m + 3.
     fn scene_graph(&self, tiles: &[Tile], chunks: &mut Vec<u8>) {
         const NO_ATTRIBUTES: i32 = 0;
         const RESERVED: i32 = -1;
@@ -158,7 +159,7 @@ impl Vox {
         chunk(chunks, b"nGRP", &[integers([1, NO_ATTRIBUTES, count]), children].concat());
         for (m, tile) in (0..).zip(tiles) {
             let [place, shape] = [2 * m + 2, 2 * m + 3];
-            // A model's place is that of its voxel number size / 2, rounded down.
+            // The position of a model is that of its voxel number size / 2, rounded down.
             let half = self.resolution / 2;
             let [x, y, z] = [0, 1, 2].map(|a| (tile.origin[a] + tile.size[a] / 2) as i32 - [half, half, 0][a] as i32);
             let translation = [integers([1]), string("_t"), string(&format!("{x} {y} {z}"))].concat();
@@ -168,16 +169,16 @@ impl Vox {
     }
 }
 
-/// A part of the grid.
+/// Part of the grid.
 struct Tile {
-    /// Its first voxel.
+    /// First voxel of the tile.
     origin: [usize; 3],
     size: [usize; 3],
-    /// Voxel of the tile, and index of the color.
+    /// Voxels of the tile with the indices of their colors.
     voxels: Vec<[u8; 4]>,
 }
 
-/// A chunk without children: its name, the lengths of its content and its children, and the content.
+/// Appends a chunk without children: its name, the lengths of its content and its children, and the content.
 fn chunk(chunks: &mut Vec<u8>, name: &[u8; 4], content: &[u8]) {
     chunks.extend_from_slice(name);
     chunks.extend(integers([content.len() as i32, 0]));

@@ -1,14 +1,14 @@
-//! A grid made small for a page: what a viewer in a browser needs to render it, and what that costs, for it can be turned back.
+//! Compressed grid for the viewer of a page. It can be converted back, which measures the loss of compression.
 //!
-//! Only voxels that a sample with a density above 0 can read are in it. Densities are half floats, in 1 / side of a voxel, so that the unit of the
-//! world does not matter, and rounded to 6 of their 10 bits; the mean
-//! color of each channel is one byte between the lowest and the highest in the grid, and a harmonic of degree 1 and more one byte b for (b − 128) steps,
-//! so that 0 stays 0. The largest harmonic is 127 steps, or 63 or 31 where that makes it small enough: bytes that use few of their values compress well.
+//! It contains only voxels that a sample with a density above 0 can read. Densities are half floats in units of 1 / voxel side, which makes
+//! them independent of the world's unit, rounded to 6 of their 10 bits. The coefficient of degree 0 of each channel is one byte between the
+//! smallest and the largest value in the grid. A coefficient of degree 1 or more is one byte b for (b − 128) steps, so that 0 stays 0. The
+//! largest coefficient is 127 steps, or 63 or 31 if that makes the data small enough: bytes that use few of their values compress well.
 //!
-//! The bytes, a zlib stream, hold first the voxels, then the harmonics if there are any. Each begins with its places, unless harmonics share
-//! those of the voxels: one bit for each brick of 4³, bricks in row-major order and the lowest bit first, then 64 bits for each brick that
-//! has nodes, little-endian ([`Lattice::masks`]). Values follow, of one kind at a time, nodes in the order of their places: low bytes of the
-//! densities, high bytes, red, green, blue; or harmonic 1 of red, green and blue, then harmonic 2, and so on.
+//! The bytes are a zlib stream. It contains first the voxels, then the harmonics, if any. Each begins with its places, unless the harmonics
+//! share those of the voxels: one bit per brick of 4³, bricks in row-major order and the lowest bit first; then 64 bits for each brick that
+//! has nodes, little-endian ([`Lattice::masks`]). Values follow, one kind after another, nodes in the order of their places: low bytes of
+//! the densities, high bytes, red, green, blue; or harmonic 1 of red, green and blue, then harmonic 2, and so on.
 
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use autograd::lattice::{BRICK_ROWS, bits};
@@ -19,20 +19,20 @@ use half::f16;
 use serde::Serialize;
 use std::io::{self, Write};
 
-/// Steps up to the largest harmonic, at best and at worst.
+/// Number of steps up to the largest harmonic: the most, and the fewest.
 const FINEST: u8 = 127;
 const COARSEST: u8 = 31;
 
-/// A grid in few bytes.
+/// Compressed grid.
 #[derive(Debug)]
 pub struct WebGrid {
     shape: GridShape,
     lattice: Lattice,
     harmonics_lattice: Option<Lattice>,
-    /// Times the side of a voxel.
+    /// Densities times the side of a voxel.
     density: Vec<f16>,
     means: Vec<Column>,
-    /// In the order of the bytes: red, green and blue of harmonic 1, then of harmonic 2, and so on.
+    /// Harmonics in the order of the bytes: red, green and blue of harmonic 1, then of harmonic 2, and so on.
     harmonics: Vec<Column>,
 }
 
@@ -44,37 +44,37 @@ struct Column {
     step: f32,
 }
 
-/// What the bytes mean.
+/// Header that describes the bytes.
 #[derive(Debug, Serialize)]
 pub struct WebHeader {
     resolution: usize,
     half_width: f64,
     interpolation: Interpolation,
-    /// Of the harmonics; none for plain colors.
+    /// Degree of the harmonics; `None` for RGB colors.
     degree: Option<usize>,
-    /// Added to the sum of the harmonics; 0 for plain colors.
+    /// Color of zero coefficients; 0 for RGB colors.
     offset: f64,
-    /// In the page.
+    /// Number of voxels in the page.
     pub voxels: usize,
-    /// Of the mean colors: value of byte 0, and of one step, for red, green and blue.
+    /// Mean colors: value of byte 0, and size of a step, for red, green and blue.
     zeros: Vec<f32>,
     steps: Vec<f32>,
     harmonics: Option<WebHarmonics>,
 }
 
-/// What the bytes of the harmonics mean.
+/// Description of the bytes of the harmonics.
 #[derive(Debug, Serialize)]
 struct WebHarmonics {
     resolution: usize,
-    /// Voxels along each axis that share one; 1 if they have the places of the voxels.
+    /// Reduction of the harmonics; 1 if they have the places of the voxels.
     reduction: usize,
     voxels: usize,
-    /// Of one step of a byte, for red, green and blue of harmonic 1, then of harmonic 2, and so on. Byte 128 is 0.
+    /// Size of a step, for red, green and blue of harmonic 1, then of harmonic 2, and so on. Byte 128 is 0.
     steps: Vec<f32>,
 }
 
 impl WebGrid {
-    /// The voxels of a grid that can be seen, and their harmonics in so many steps up to the largest, at most 127.
+    /// Compresses the visible voxels of a grid. `harmonic_steps` is the number of steps up to the largest harmonic, at most 127.
     pub fn new(grid: &VoxelGrid<f32>, harmonic_steps: u8) -> Self {
         let seen = grid.pruned(&grid.occupancy(0.0));
         let shape = *seen.shape();
@@ -103,10 +103,10 @@ impl WebGrid {
         WebGrid { shape, lattice, harmonics_lattice, density, means, harmonics }
     }
 
-    /// The same in at most so many bytes: harmonics in fewer steps, then harmonics for fewer voxels, up to every fourth along each axis, and
-    /// then larger voxels, until it fits. Returns the bytes too.
+    /// Compresses a grid to at most `most` bytes. Until it fits, it uses fewer steps for harmonics, then a reduction of harmonics up to 4,
+    /// then a lower resolution. Also returns the bytes.
     ///
-    /// Errors: none in practice; the bytes are written to memory.
+    /// Never errors in practice, because the bytes are written to memory.
     pub fn within(grid: &VoxelGrid<f32>, most: usize) -> io::Result<(Self, Vec<u8>)> {
         let mut coarser: Option<VoxelGrid<f32>> = None;
         let mut steps = FINEST;
@@ -119,7 +119,7 @@ impl WebGrid {
                 return Ok((small, bytes));
             }
             let has_harmonics = shape.color.channels() > 3;
-            // Fewer steps halve it at best.
+            // Fewer steps save half of the bytes at most.
             if has_harmonics && steps > COARSEST && bytes.len() < 2 * most {
                 steps /= 2;
                 continue;
@@ -132,12 +132,12 @@ impl WebGrid {
         }
     }
 
-    /// Shape of the grid that a viewer sees.
+    /// Returns the shape of the compressed grid.
     pub fn shape(&self) -> &GridShape {
         &self.shape
     }
 
-    /// What the bytes mean.
+    /// Returns the header that describes the bytes.
     pub fn header(&self) -> WebHeader {
         let (degree, offset) = match self.shape.color {
             Color::Rgb => (None, 0.0),
@@ -162,9 +162,9 @@ impl WebGrid {
         }
     }
 
-    /// The bytes, compressed.
+    /// Returns the compressed bytes.
     ///
-    /// Errors: none in practice; they are written to memory.
+    /// Never errors in practice, because they are written to memory.
     pub fn bytes(&self) -> io::Result<Vec<u8>> {
         let mut stream = ZlibEncoder::new(Vec::new(), Compression::default());
         stream.write_all(&places(&self.lattice))?;
@@ -179,12 +179,12 @@ impl WebGrid {
         stream.finish()
     }
 
-    /// The grid that a viewer sees.
+    /// Returns the grid as the viewer sees it.
     pub fn to_grid(&self) -> VoxelGrid<f32> {
         let side = self.shape.voxel_side() as f32;
         let density: Vec<f32> = self.density.iter().map(|value| value.to_f32() / side).collect();
         let [means, harmonics] = [&self.means, &self.harmonics].map(|columns| columns.iter().map(Column::values).collect::<Vec<_>>());
-        // Tables have all numbers of red first, then those of green, then those of blue.
+        // Tables store all numbers of red first, then of green, then of blue.
         let of_channel = |channel: usize| harmonics.iter().skip(channel).step_by(3);
         let mut tables = vec![table(&self.lattice, &[&density])];
         match &self.harmonics_lattice {
@@ -202,16 +202,16 @@ impl WebGrid {
 }
 
 impl Column {
-    /// Bytes between the lowest and the highest value.
+    /// Converts values to bytes between the smallest and the largest value.
     fn between(values: &[f32]) -> Self {
         let low = values.iter().copied().fold(f32::INFINITY, f32::min);
         let high = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        // Where all are the same, and where there are none, any step will do.
+        // If all values are equal, or if there are none, any step will do.
         let (zero, step) = if high > low { (low, (high - low) / 255.0) } else { (if values.is_empty() { 0.0 } else { low }, 1.0) };
         Self::with(values, zero, step)
     }
 
-    /// Bytes that have 0 in their middle, and so many steps from there to the largest value.
+    /// Converts values to bytes with 0 in the middle, and `steps` steps up to the largest value.
     fn around_zero(values: &[f32], steps: u8) -> Self {
         let largest = values.iter().fold(0.0, |largest: f32, value| largest.max(value.abs()));
         let step = if largest > 0.0 { largest / f32::from(steps) } else { 1.0 };
@@ -227,29 +227,29 @@ impl Column {
     }
 }
 
-/// A density as a half float with 6 bits behind the leading one, which is 1 % of it at most.
+/// Rounds a density to a half float with 6 bits of mantissa, an error of at most 1 %.
 fn rounded(density: f32) -> f16 {
     const DROPPED: u16 = 4;
     let limit = f32::from(f16::MAX);
     let bits = f16::from_f32(density.clamp(-limit, limit)).to_bits();
-    // Rounding up may reach the next exponent, but not that of infinity.
+    // Rounding up may reach the next exponent, but must not reach that of infinity.
     let up = (bits & 0x7fff) + (1 << (DROPPED - 1));
     let bits = if up < f16::INFINITY.to_bits() { bits & 0x8000 | up } else { bits };
     f16::from_bits(bits >> DROPPED << DROPPED)
 }
 
-/// The bricks of a lattice in row-major order: number and mask of those that have nodes.
+/// Returns the bricks of a lattice in row-major order: number and mask of those that have nodes.
 fn bricks(lattice: &Lattice) -> impl Iterator<Item = Option<(usize, u64)>> {
     let grid = lattice.brick_grid();
     (0..grid.len()).map(move |b| lattice.brick(grid.place(b)))
 }
 
-/// The rows of all nodes that are present, in the order of their places.
+/// Returns the rows of all present nodes, in the order of their places.
 fn rows(lattice: &Lattice) -> Vec<usize> {
     bricks(lattice).flatten().flat_map(|(brick, mask)| bits(mask).map(move |bit| brick * BRICK_ROWS + bit)).collect()
 }
 
-/// A table from its columns, which have a value for each node that is present.
+/// Creates a table from its columns, which have one value per present node.
 fn table(lattice: &Lattice, columns: &[&Vec<f32>]) -> Tensor<f32> {
     let width = columns.len();
     let mut values = vec![0.0; lattice.rows() * width];
@@ -261,7 +261,7 @@ fn table(lattice: &Lattice, columns: &[&Vec<f32>]) -> Tensor<f32> {
     Tensor::from_vec(values, &[lattice.rows(), width])
 }
 
-/// Which nodes there are: a bit for each brick, then the masks of those that have some.
+/// Encodes the present nodes: a bit for each brick, then the masks of bricks with nodes.
 fn places(lattice: &Lattice) -> Vec<u8> {
     let bricks: Vec<Option<(usize, u64)>> = bricks(lattice).collect();
     let byte =
@@ -276,13 +276,13 @@ mod tests {
     use flate2::read::ZlibDecoder;
     use std::io::Read;
 
-    /// A ball of random colors in an empty box.
+    /// Returns a ball of random colors in an empty box.
     fn ball(color: Color, sh_reduction: usize, half_width: f64) -> VoxelGrid<f32> {
         let shape = GridShape { resolution: 18, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction };
         let grid = VoxelGrid::random(shape, 1.0, 1.0, 7);
         let density = (0..grid.lattice().rows()).map(|row| {
             let far = grid.lattice().node(row as u32).map_or(9.0, |node| node.map(|k| (k as f32 - 8.5).powi(2)).iter().sum::<f32>().sqrt());
-            // Most of the light in a voxel of the middle, whatever the unit.
+            // In the middle a voxel absorbs most of the light, whatever the unit.
             (6.0 - far) / half_width as f32
         });
         let density = Tensor::from_vec(density.collect(), &[grid.lattice().rows(), 1]);
@@ -303,7 +303,7 @@ mod tests {
                     2 => (grid.harmonics_lattice(), back.harmonics_lattice()),
                     _ => (Some(grid.lattice()), Some(back.lattice())),
                 };
-                // Harmonics lie next to the means in one table: one byte tells them less precisely.
+                // In a common table, harmonics and coefficients of degree 0 have the tolerance of harmonics, whose bytes are less precise.
                 let tolerance = if table == 1 && reduction == 1 { 0.6 / 127.0 } else { tolerance };
                 let width = old.tensor().shape()[1];
                 let mut compared = 0;

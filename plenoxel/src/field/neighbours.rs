@@ -1,8 +1,8 @@
-//! Means over the voxels around a voxel.
+//! Means over neighbouring voxels.
 
 use autograd::{Lattice, Real, parallel};
 
-/// Each row of a table `[rows, width]` averaged with those of the present voxels around its own, as [`average`] does.
+/// Averages each row of a table `[rows, width]` with the rows of the present neighbours of its voxel, as [`average`] does.
 pub(crate) fn smoothed<T: Real>(lattice: &Lattice, table: &[T], width: usize) -> Vec<T> {
     let mut out = vec![T::zero(); table.len()];
     parallel::for_each_rows(&mut out, width, |first, chunk| {
@@ -15,8 +15,9 @@ pub(crate) fn smoothed<T: Real>(lattice: &Lattice, table: &[T], width: usize) ->
     out
 }
 
-/// The mean of the rows of a voxel and the 26 around it, as far as they are present, with the source paper's weights: 6 for the voxel itself, 1
-/// for a neighbour across a face, 1/√2 across an edge, 1/√3 across a corner. Only rows that `counts` are taken in; zero if there is none.
+/// Writes the weighted mean of the rows of a voxel and its 26 neighbours into `out`. Only present voxels whose row satisfies `counts`
+/// contribute; zero if there is none. Weights are those of the source paper: 6 for the voxel itself, 1 for a neighbour across a face, 1/√2
+/// across an edge, 1/√3 across a corner.
 pub(crate) fn average<T: Real>(lattice: &Lattice, table: &[T], voxel: [usize; 3], counts: impl Fn(&[T]) -> bool, out: &mut [T]) {
     let (nodes, width) = (lattice.nodes(), out.len());
     let weights = [6.0, 1.0, 0.5_f64.sqrt(), (1.0_f64 / 3.0).sqrt()].map(T::lit);
@@ -46,7 +47,7 @@ mod tests {
 
     #[test]
     fn neighbours_count_by_how_they_touch_and_absent_ones_do_not() {
-        // A voxel, one across a face, one across an edge, one across a corner; and one too far away.
+        // A voxel; neighbours across a face, an edge and a corner; and a voxel that is too far away.
         let present = [[1, 1, 1], [2, 1, 1], [0, 0, 1], [2, 2, 2], [1, 1, 4]];
         let lattice = Lattice::bricks_where([5; 3], |voxel| present.contains(&voxel));
         let mut table = vec![f64::NAN; lattice.rows()];

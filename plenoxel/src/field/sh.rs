@@ -1,21 +1,23 @@
-//! Real spherical harmonics, degrees 0 to 3, in svox2's order and signs (those of PlenOctrees, and of the source paper's atan2 form).
+//! Real spherical harmonics, degrees 0 to 3, in the order and with the signs of svox2 (also of PlenOctrees, and of the source paper's atan2
+//! form).
 //!
-//! Degree d has (d + 1)² functions: 1; −y, z, −x; xy, −yz, 2z² − x² − y², −xz, x² − y²; and seven of third order, each times its constant.
+//! Up to degree d there are (d + 1)² functions: 1; −y, z, −x; xy, −yz, 2z² − x² − y², −xz, x² − y²; and seven of degree 3. Each is
+//! multiplied by its normalization constant.
 
 use autograd::{Real, Tensor};
 
-/// The constant function, 1 / (2 √π).
+/// Constant function of degree 0, 1 / (2 √π).
 pub const Y0: f64 = 0.282_094_791_773_878_14;
 
-/// Number of functions up to a degree.
+/// Returns the number of functions up to a degree.
 pub const fn count(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
 
-/// The largest degree there is code for.
+/// Largest supported degree.
 pub const MAX_DEGREE: usize = 3;
 
-/// The basis at unit directions `[n, 3]`: `[n, (degree + 1)²]`. Differentiable in the directions.
+/// Evaluates the basis at unit directions `[n, 3]`. Returns `[n, (degree + 1)²]`, differentiable in the directions.
 ///
 /// Panics if the degree is above 3 or the directions are not `[n, 3]`.
 #[track_caller]

@@ -1,14 +1,17 @@
 //! Density and color in a grid of voxels, dense or sparse.
 //!
-//! Voxel (i, j, k) of n³ has its centre at (i + ½, j + ½, k + ½) · side − half. A [`Lattice`] of bricks says which row of the tables is
-//! its own, if it is present; one that is not has density and color 0 and takes no part in training. Nearest look-up takes the voxel a
-//! point lies in; trilinear look-up runs between centres, and in the outer half voxel repeats the border. Outside the box there is nothing.
-//! Values are stored raw and activated after interpolation: σ = max(0, density).
+//! Voxel (i, j, k) of n³ has its centre at (i + ½, j + ½, k + ½) · side − half width. A [`Lattice`] of bricks maps each present voxel to
+//! its row of the tables. An absent voxel has density and color 0 and is not trained. Nearest look-up reads the voxel that contains the
+//! point. Trilinear look-up interpolates between voxel centres; in the outer half voxel it repeats the border. Space outside of the box is
+//! empty. Values are stored raw and activated after interpolation: σ = max(0, density).
 //!
-//! How a color changes with the direction changes little from voxel to voxel. So harmonics of degree 1 and more may be stored for every f-th
-//! voxel along each axis only ([`GridShape::sh_reduction`]), which leaves 3 numbers of color in a voxel and is harder to overfit:
-//! c(x, d) = max(0, offset + Y₀ c₀(x) + Σ_{k≥1} Yₖ(d) cₖ(x)), where c₀ is read as density is, and cₖ the same way in a grid of ⌈n / f⌉³ voxels
-//! of side f · side with the same lowest corner. Its coordinates are (u + ½) / f − ½ of the voxel coordinates u.
+//! View-dependent color varies slowly from voxel to voxel. Harmonics of degree 1 and more may therefore be stored for every f-th voxel
+//! along each axis only ([`GridShape::sh_reduction`]). A voxel then stores 3 color numbers, and overfits less:
+//!
+//! c(x, d) = max(0, offset + Y₀ c₀(x) + Σ_{k≥1} Yₖ(d) cₖ(x)).
+//!
+//! Here c₀ is interpolated like the density, and cₖ likewise in a grid of ⌈n / f⌉³ voxels of side f · side with the same lowest corner.
+//! Voxel coordinates u have the coordinates (u + ½) / f − ½ in that grid.
 
 mod appearance;
 pub mod fused;
@@ -29,28 +32,28 @@ use layout::Layout;
 use reshape::moved;
 pub use shape::{Color, GridShape, Interpolation};
 
-/// A grid with its parameters: `density` `[rows, 1]`, `color` `[rows, color_width]` and, where harmonics are reduced, `harmonics`
-/// `[rows of larger voxels, harmonics_width]`.
+/// Voxel grid with its parameters: `density` `[rows, 1]`, `color` `[rows, color_width]` and, if harmonics are reduced, `harmonics` `[rows
+/// of larger voxels, harmonics_width]`.
 #[derive(Debug)]
 pub struct VoxelGrid<T: Real> {
     layout: Layout,
-    /// The voxels in which a sample can read a present one; `None` if that is everywhere.
+    /// Cells in which a sample can read a present voxel; `None` if all cells are.
     reach: Option<Occupancy>,
-    /// Raw density; σ = max(0, ·) after interpolation, 1 / world length.
+    /// Raw density, 1 / world length; σ = max(0, ·) after interpolation.
     pub density: Param<T>,
-    /// Colors or their harmonics; of harmonics that are reduced, the means.
+    /// RGB colors or coefficients of harmonics. If harmonics are reduced, the coefficients of degree 0.
     pub color: Param<T>,
-    /// Harmonics of degree 1 and more, where they are reduced.
+    /// Coefficients of degree 1 and more, if harmonics are reduced.
     pub harmonics: Option<Param<T>>,
 }
 
 impl<T: Real> VoxelGrid<T> {
-    /// A grid with the same density and the same color numbers everywhere.
+    /// Creates a grid with constant density and color numbers.
     pub fn uniform(shape: GridShape, density: f64, color: f64) -> Self {
         Self::filled(shape, |table, shape| Tensor::full(&shape, [density, color, color][table]))
     }
 
-    /// A grid of uniform random numbers: density in [0, `density`), colors in [0, `color`). A function of the seed.
+    /// Creates a grid of uniform random numbers, density in [0, `density`) and colors in [0, `color`). The result depends only on the seed.
     pub fn random(shape: GridShape, density: f64, color: f64, seed: u64) -> Self {
         Self::filled(shape, |table, [rows, width]| {
             let scale = [density, color, color][table];
@@ -64,33 +67,33 @@ impl<T: Real> VoxelGrid<T> {
         })
     }
 
-    /// A grid with all voxels from what `fill` makes of each table's number and shape.
+    /// Creates a grid with all voxels. `fill` receives the number and the shape of each table.
     fn filled(shape: GridShape, fill: impl Fn(usize, [usize; 2]) -> Tensor<T>) -> Self {
         let layout = Layout::new(shape, shape.full());
         let tables = layout.tables().into_iter().enumerate().map(|(table, shape)| fill(table, shape)).collect();
         Self::assembled(layout, tables)
     }
 
-    /// A grid with all voxels from its tables, whose rows are in the order of [`GridShape::full`].
+    /// Creates a grid with all voxels from its tables. Their rows are in the order of [`GridShape::full`].
     ///
-    /// Panics if they are not `[rows, 1]` and `[rows, channels]`, or if the shape's harmonics are reduced.
+    /// Panics if the tables are not `[rows, 1]` and `[rows, channels]`, or if the shape's harmonics are reduced.
     #[track_caller]
     pub fn from_tables(shape: GridShape, density: Tensor<T>, color: Tensor<T>) -> Self {
         Self::with_lattice(shape, shape.full(), density, color)
     }
 
-    /// A grid with the voxels of a lattice.
+    /// Creates a grid with the voxels of a lattice.
     ///
-    /// Panics if the lattice is of another resolution, the tables do not have its rows, or the shape's harmonics are reduced.
+    /// Panics if the lattice has another resolution, the tables have another number of rows, or the shape's harmonics are reduced.
     #[track_caller]
     pub fn with_lattice(shape: GridShape, lattice: Lattice, density: Tensor<T>, color: Tensor<T>) -> Self {
         Self::with_tables(shape, lattice, vec![density, color])
     }
 
-    /// A grid with the voxels of a lattice and all its tables: density, color and, if the shape's harmonics are reduced, these, whose rows are
-    /// those of [`GridShape::harmonics_lattice`].
+    /// Creates a grid with the voxels of a lattice from all its tables: density, color and, if harmonics are reduced, harmonics, whose rows
+    /// are those of [`GridShape::harmonics_lattice`].
     ///
-    /// Panics if the lattice is of another resolution, or the tables are not as many or not of these shapes.
+    /// Panics if the lattice has another resolution, or if the number or the shapes of the tables do not match.
     #[track_caller]
     pub fn with_tables(shape: GridShape, lattice: Lattice, tables: Vec<Tensor<T>>) -> Self {
         Self::assembled(Layout::new(shape, lattice), tables)
@@ -111,9 +114,9 @@ impl<T: Real> VoxelGrid<T> {
         VoxelGrid { layout, reach, density, color, harmonics }
     }
 
-    /// A grid with all voxels from tables in row-major order, voxel (i, j, k) being row (i·n + j)·n + k.
+    /// Creates a grid with all voxels from tables in row-major order: voxel (i, j, k) is row (i·n + j)·n + k.
     ///
-    /// Panics if they are not `[n³, 1]` and `[n³, channels]`, or if the shape's harmonics are reduced.
+    /// Panics if the tables are not `[n³, 1]` and `[n³, channels]`, or if the shape's harmonics are reduced.
     #[track_caller]
     pub fn from_row_major(shape: GridShape, density: &Tensor<T>, color: &Tensor<T>) -> Self {
         assert_eq!(density.shape(), [shape.voxels(), 1], "density table of a grid of {}³ voxels", shape.resolution);
@@ -123,23 +126,23 @@ impl<T: Real> VoxelGrid<T> {
         Self::from_tables(shape, moved(density, &row_major, &full), moved(color, &row_major, &full))
     }
 
-    /// Density and color in row-major order, with zeros for voxels that are not present: `[n³, 1]` and `[n³, color_width]`.
+    /// Returns density and color in row-major order, `[n³, 1]` and `[n³, color_width]`, with zeros for absent voxels.
     pub fn to_row_major(&self) -> [Tensor<T>; 2] {
         let row_major = Lattice::from(self.lattice().nodes());
         [&self.density, &self.color].map(|table| moved(table.tensor(), self.lattice(), &row_major))
     }
 
-    /// Shape and meaning.
+    /// Returns the shape of the grid.
     pub fn shape(&self) -> &GridShape {
         &self.layout.shape
     }
 
-    /// Which voxels are present, and their rows: what look-ups take.
+    /// Returns the lattice, which maps present voxels to rows of the tables.
     pub fn lattice(&self) -> &Lattice {
         &self.layout.lattice
     }
 
-    /// The same for the harmonics, where they are reduced.
+    /// Returns the lattice of the harmonics, if they are reduced.
     pub fn harmonics_lattice(&self) -> Option<&Lattice> {
         self.layout.harmonics.as_ref()
     }
@@ -148,23 +151,23 @@ impl<T: Real> VoxelGrid<T> {
         &self.layout
     }
 
-    /// The parameters in the order of the tables: density, color, and harmonics where they are reduced.
+    /// Returns the parameters in the order of the tables: density, color and, if harmonics are reduced, harmonics.
     pub fn params(&self) -> impl Iterator<Item = &Param<T>> {
         [&self.density, &self.color].into_iter().chain(&self.harmonics)
     }
 
-    /// The box it fills.
+    /// Returns the box of the grid.
     pub fn aabb(&self) -> Aabb {
         Aabb::cube(self.shape().half_width)
     }
 
-    /// World positions to voxel coordinates, in which centres are the integers: (p + half) / side − ½.
+    /// Converts world positions to voxel coordinates, in which voxel centres are integers: (p + half width) / side − ½.
     pub fn world_to_voxels(&self, positions: &Tensor<T>) -> Tensor<T> {
         let scale = 1.0 / self.shape().voxel_side();
         positions.affine(scale, self.shape().half_width * scale - 0.5)
     }
 
-    /// Makes optimizers keep density >= 0, and RGB colors in [0, 1] (the source paper's projection; harmonics are free).
+    /// Bounds density to >= 0, and RGB colors to [0, 1], in all optimizers (the source paper's projection). Harmonics are not bounded.
     pub fn project(&mut self) {
         self.density.set_bounds(Bounds { low: T::zero(), high: T::infinity() });
         if self.shape().color == Color::Rgb {
@@ -172,26 +175,27 @@ impl<T: Real> VoxelGrid<T> {
         }
     }
 
-    /// The cells in which a sample can have a density above 0: with trilinear look-up those between centres of voxels, with nearest the voxels.
-    /// Leaving out the samples elsewhere changes no rendered value.
+    /// Returns the cells in which a sample can have a density above 0: cells between voxel centres with trilinear look-up, voxels with
+    /// nearest look-up. Leaving out samples in other cells changes no rendered value.
     pub fn matter(&self) -> Occupancy {
         let density = self.density.tensor().data();
         self.shape().cells_reading(self.voxels_where(|row| density[row] > T::zero()))
     }
 
-    /// The cells in which a sample can have a gradient: it has none where its density is below 0.
+    /// Returns the cells in which a sample can have a gradient. A sample whose density is negative has none.
     pub fn learning(&self) -> Occupancy {
         let density = self.density.tensor().data();
         self.shape().cells_reading(self.voxels_where(|row| density[row] >= T::zero()))
     }
 
-    /// The voxels in which a sample can have a density above `threshold`: those whose own value, or with trilinear look-up a neighbour's, is.
+    /// Returns the voxels in which a sample can have a density above `threshold`: the voxel's own density or, with trilinear look-up, a
+    /// neighbour's is.
     pub fn occupancy(&self, threshold: f64) -> Occupancy {
         let (density, threshold) = (self.density.tensor().data(), T::lit(threshold));
         self.shape().reached_from(&self.voxels_where(|row| density[row] > threshold))
     }
 
-    /// The present voxels whose rows `full` names.
+    /// Returns the present voxels whose rows satisfy `full`.
     pub fn voxels_where(&self, full: impl Fn(usize) -> bool + Sync) -> Occupancy {
         let mut masks = self.lattice().masks().to_vec();
         let grid = self.lattice().brick_grid();

@@ -1,4 +1,4 @@
-//! The weighted sum of losses, and what a loss sees.
+//! The weighted sum of losses, and the data that losses read.
 
 use super::{AdaptiveRobust, beta, cauchy_sparsity, charbonnier, distortion, entropy, huber, mse, opacity_supervision};
 use crate::error::{Error, Result};
@@ -8,29 +8,29 @@ use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::single::{cast, is_single};
 use autograd::{Module, Param, Real, Tensor};
 
-/// The data of a training step that a loss may read. `M` is the type of the model; a loss that reads the model says so by this type.
+/// Data of a training step that losses read. `M` is the type of the model; losses that read the model depend on it.
 pub struct Step<'a, T: Real, M> {
     /// Number of the step, from 0 over the whole run.
     pub number: u64,
     /// Seed of the run, for losses that draw random numbers.
     pub seed: u64,
-    /// Rays, with the photographs' colors along them.
+    /// Rays, with the colors of the photographs along them.
     pub batch: &'a RayBatch<T>,
-    /// Pixels that the model shows along the rays.
+    /// Rendered pixels of the rays.
     pub rendered: &'a Rendered<T>,
     /// The model.
     pub model: &'a M,
     /// Longest side of the model's box, world length.
     pub extent: f64,
-    /// Color behind the scene, sRGB in [0, 1].
+    /// Background color, sRGB in [0, 1].
     pub background: [f32; 3],
-    /// Predicted colors of the photographs' pixels, `[n, 3]`: the rendered colors, or what [`Objective::predicting`] makes of them.
+    /// Predicted colors, `[n, 3]`: the rendered colors, or the result of [`Objective::predicting`].
     pub prediction: Tensor<T>,
     params: &'a [Param<T>],
 }
 
 impl<'a, T: Real, M> Step<'a, T, M> {
-    /// A step before any prediction. [`Objective::evaluate`] adds the parameters of the losses and the prediction.
+    /// Creates a step whose prediction is the rendered color. [`Objective::evaluate`] adds the parameters of the losses and the prediction.
     pub fn new(
         (number, seed): (u64, u64),
         batch: &'a RayBatch<T>,
@@ -41,12 +41,12 @@ impl<'a, T: Real, M> Step<'a, T, M> {
         Step { number, seed, batch, rendered, model, extent, background, prediction: rendered.rgb.clone(), params: &[] }
     }
 
-    /// The same step with another prediction.
+    /// Returns the step with another prediction.
     fn predicted(&self, prediction: Tensor<T>) -> Self {
         Step { prediction, ..*self }
     }
 
-    /// The parameter of this name that was given to [`Objective::with_param`].
+    /// Returns the parameter of this name, as added by [`Objective::with_param`].
     ///
     /// Panics if there is none.
     #[track_caller]
@@ -69,7 +69,7 @@ struct Term<T: Real, M> {
     needs_samples: bool,
 }
 
-/// A sum of named losses for a model of type `M`, with weights that may change over the run, and the parameters of the losses.
+/// Weighted sum of named losses for a model of type `M`, with the parameters of the losses. Weights may change over the run.
 ///
 /// As a [`Module`] it consists of the parameters of its losses.
 pub struct Objective<T: Real, M> {
@@ -99,19 +99,19 @@ impl<T: Real, M> Module<T> for Objective<T, M> {
 pub struct Evaluation<T: Real> {
     /// Σ weight · loss, a scalar.
     pub total: Tensor<T>,
-    /// Value of each loss that was computed, without its weight.
+    /// Unweighted value of each loss whose weight is not 0.
     pub losses: Vec<(String, f64)>,
-    /// Predicted colors `[n, 3]`, of which the training PSNR is computed.
+    /// Predicted colors `[n, 3]`, which the training PSNR is computed from.
     pub prediction: Tensor<T>,
 }
 
 impl<T: Real, M> Objective<T, M> {
-    /// An objective without losses.
+    /// Creates an objective without losses.
     pub fn new() -> Self {
         Objective { terms: Vec::new(), predict: None, params: Vec::new(), rates: Rates::new(0.0) }
     }
 
-    /// Adds a loss. `weight` is a number or a schedule over the steps of the run; where it is 0 the loss is not computed.
+    /// Adds a loss. `weight` is a number or a schedule over the steps of the run. Steps with weight 0 do not compute the loss.
     pub fn with(
         self,
         name: impl Into<String>,
@@ -121,7 +121,8 @@ impl<T: Real, M> Objective<T, M> {
         self.with_term(name.into(), weight, Box::new(loss), false)
     }
 
-    /// Adds a loss that reads [`Rendered::samples`], the values of every sample. Training then renders with the graph, which keeps them.
+    /// Adds a loss that reads [`Rendered::samples`], the values of every sample. Training then renders with the graph engine, which keeps
+    /// them.
     pub fn with_samples(
         self,
         name: impl Into<String>,
@@ -140,13 +141,13 @@ impl<T: Real, M> Objective<T, M> {
         self
     }
 
-    /// Adds a parameter that the losses read with [`Step::param`]. It is updated by Adam (β₁ = 0.9, β₂ = 0.99) with this learning rate, a number or a
-    /// schedule over the steps of the run, and is saved and resumed with the run.
+    /// Adds a parameter that losses read with [`Step::param`]. It is trained by Adam (β₁ = 0.9, β₂ = 0.99) with the learning rate `rate`, a
+    /// number or a schedule over the steps of the run. It is saved and resumed with the run.
     ///
     /// Panics if a parameter of this name exists.
     #[track_caller]
     pub fn with_param(mut self, param: Param<T>, rate: impl Schedule + 'static) -> Self {
-        assert!(self.params.iter().all(|known| known.name() != param.name()), "with_param: two parameters `{}`", param.name());
+        assert!(self.params.iter().all(|known| known.name() != param.name()), "with_param: parameter `{}` exists already", param.name());
         self.rates = self.rates.with(param.name(), rate);
         self.params.push(param);
         self
@@ -162,9 +163,9 @@ impl<T: Real, M> Objective<T, M> {
         self
     }
 
-    /// Says how the colors of the photographs' pixels are predicted, `[n, 3]`, from a step whose `prediction` is what was predicted so far, at
-    /// first the rendered colors. Photometric losses and the reported PSNR compare the prediction. Several predictions are applied in the order
-    /// in which they were given.
+    /// Sets the prediction: a function from the step to predicted colors, `[n, 3]`. The step's `prediction` is the current prediction,
+    /// initially the rendered colors. Photometric losses and the reported PSNR use the prediction. Several functions are applied in the
+    /// order in which they were added.
     pub fn predicting(mut self, predict: impl Fn(&Step<'_, T, M>) -> Tensor<T> + Send + Sync + 'static) -> Self
     where
         M: 'static,
@@ -176,12 +177,12 @@ impl<T: Real, M> Objective<T, M> {
         self
     }
 
-    /// True if a loss reads the values of every sample.
+    /// Returns true if a loss reads the values of every sample.
     pub fn needs_samples(&self) -> bool {
         self.terms.iter().any(|term| term.needs_samples)
     }
 
-    /// Adds one of the losses in [`NAMES`] by its name. `views` is the number of training views, for losses with a parameter for each view.
+    /// Adds a loss of [`NAMES`] by its name. `views` is the number of training views, for losses with a parameter per view.
     ///
     /// Errors if the name is unknown.
     pub fn with_named(self, name: &str, weight: impl Schedule + 'static, views: usize) -> Result<Self>
@@ -199,34 +200,34 @@ impl<T: Real, M> Objective<T, M> {
             "beta" => self.with(name, weight, beta),
             "distortion" => self.with(name, weight, distortion),
             "opacity" => self.with(name, weight, opacity_supervision),
-            _ => return Err(Error::config(format!("losses.{name}"), "an unknown loss", format!("one of {}", NAMES.join(", ")))),
+            _ => return Err(Error::config(format!("losses.{name}"), "unknown loss", format!("one of {}", NAMES.join(", ")))),
         })
     }
 
-    /// Names of the losses, in order.
+    /// Returns the names of the losses, in order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.terms.iter().map(|t| t.name.as_str())
     }
 
-    /// Parameters of the losses.
+    /// Returns the parameters of the losses.
     pub fn params(&self) -> &[Param<T>] {
         &self.params
     }
 
-    /// The optimizer of the parameters of the losses, with their learning rates, which it takes over.
+    /// Returns the optimizer of the parameters of the losses. It takes over their learning rates.
     pub(crate) fn take_optimizer(&mut self) -> Box<dyn Optimizer<T>> {
         let rates = std::mem::replace(&mut self.rates, Rates::new(0.0));
         if const { is_single::<T>() } { cast(adam_single(rates)) } else { Box::new(Adam::new(rates, AdamMode::Dense)) }
     }
 
-    /// Σ weight · loss at a step, with the value of each loss.
+    /// Evaluates Σ weight · loss at a step, with the value of each loss.
     ///
-    /// Panics if a loss is not a scalar, or a prediction not of the rendered colors' shape.
+    /// Panics if a loss is not a scalar, or if the prediction has another shape than the rendered colors.
     pub fn evaluate(&self, step: Step<'_, T, M>) -> Evaluation<T> {
         let mut step = Step { params: &self.params, ..step };
         if let Some(predict) = &self.predict {
             step.prediction = predict(&step);
-            assert_eq!(step.prediction.shape(), step.rendered.rgb.shape(), "predicting: one color for each ray");
+            assert_eq!(step.prediction.shape(), step.rendered.rgb.shape(), "predicting: the prediction must have one color per ray");
         }
         let mut losses = Vec::with_capacity(self.terms.len());
         let mut total: Option<Tensor<T>> = None;
@@ -253,5 +254,5 @@ fn adam_single(rates: Rates) -> Box<dyn Optimizer<f32>> {
     Box::new(Adam::new(rates, AdamMode::Dense))
 }
 
-/// Every loss that [`Objective::with_named`] knows: those that no particular model is needed for.
+/// Names of the losses that [`Objective::with_named`] adds. They do not depend on the type of the model.
 pub const NAMES: [&str; 10] = ["mse", "charbonnier", "huber", "robust", "exposure", "sparsity", "entropy", "beta", "distortion", "opacity"];

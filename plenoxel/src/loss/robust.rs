@@ -1,54 +1,54 @@
-//! The adaptive robust loss (Barron, "A General and Adaptive Robust Loss Function", CVPR 2019): one loss that learns how heavy the tails of the
+//! The adaptive robust loss (Barron, "A General and Adaptive Robust Loss Function", CVPR 2019), which learns how heavy the tails of the
 //! errors are.
 //!
 //! With residual x, shape α and scale c (eq. 1 for 0 < α < 2)
 //!
-//! ρ(x, α, c) = (2 − α)/α · (((x/c)² / (2 − α) + 1)^{α/2} − 1),
+//! ρ(x, α, c) = (2 − α)/α · (((x/c)² / (2 − α) + 1)^{α/2} − 1).
 //!
-//! which goes from the Cauchy loss (α → 0) over Charbonnier's (α = 1) to the square (α → 2). Minimised over α too, it would choose α = 0
-//! always. So the loss is the negative log-likelihood −ln p = ρ + ln c + ln Z(α) (eq. 16), in which the partition function
+//! It interpolates between the Cauchy loss (α → 0), Charbonnier's loss (α = 1) and the squared error (α → 2). Minimising ρ over α as well
+//! would always give α = 0. The loss is therefore the negative log-likelihood −ln p = ρ + ln c + ln Z(α) (eq. 16). Its partition function
 //!
 //! Z(α) = ∫ exp(−ρ(x, α, 1)) dx
 //!
-//! makes heavy tails cost something. Barron approximates ln Z by a spline; here it is computed to rounding, as a graph of small ops that
+//! adds a cost for heavy tails. Barron approximates ln Z by a spline. Here it is computed to rounding error, as a graph of small ops that
 //! is differentiable any number of times: see [`log_partition`].
 
 use super::{Objective, Step};
 use autograd::optim::Schedule;
 use autograd::{Param, Real, Tensor};
 
-/// Start and learning rate of the adaptive robust loss. Shape and scale are learned for each of the three color channels.
+/// Initial values and learning rate of the adaptive robust loss. Shape and scale are learned for each of the three color channels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdaptiveRobust {
     /// Shape α before the first step, in (0.001, 1.999).
     pub shape: f64,
-    /// Scale c before the first step, sRGB in [0, 1], above 0: about the size of the errors that are not outliers.
+    /// Scale c before the first step, sRGB in [0, 1], above 0: about the size of errors that are not outliers.
     pub scale: f64,
     /// Learning rate of both parameters.
     pub rate: f64,
 }
 
-/// The shape in the middle of its range, as Barron starts; a scale of a tenth, and a rate of a hundredth: our choice.
+/// Shape 1, the middle of its range, as in Barron. Scale 0.1 and rate 0.01 are our choice.
 impl Default for AdaptiveRobust {
     fn default() -> Self {
         AdaptiveRobust { shape: 1.0, scale: 0.1, rate: 0.01 }
     }
 }
 
-/// Range of α. Both ends are limits of the formulas and no values to compute with (Barron, appendix D).
+/// Range of α. At both ends the formulas are limits that cannot be evaluated (Barron, appendix D).
 const SHAPES: [f64; 2] = [0.001, 1.999];
 
 impl<T: Real, M: 'static> Objective<T, M> {
-    /// Adds the adaptive robust loss of the prediction: the mean over rays and channels of −ln p. Its parameters are `<name>.shape` `[3]`, of
-    /// which α = 0.001 + 1.998 sigmoid(·), and `<name>.scale` `[3]`, of which c = exp(·).
+    /// Adds the adaptive robust loss of the prediction: the mean over rays and channels of −ln p. Its parameters are `<name>.shape` `[3]`,
+    /// with α = 0.001 + 1.998 sigmoid(·), and `<name>.scale` `[3]`, with c = exp(·).
     ///
-    /// Panics if shape or scale are out of their range.
+    /// Panics if shape or scale are out of range.
     #[track_caller]
     pub fn with_adaptive_robust(self, name: &str, weight: impl Schedule + 'static, start: AdaptiveRobust) -> Self {
         let [low, high] = SHAPES;
         let share = (start.shape - low) / (high - low);
         assert!(share > 0.0 && share < 1.0, "adaptive robust loss: shape {} is not in ({low}, {high})", start.shape);
-        assert!(start.scale > 0.0 && start.scale.is_finite(), "adaptive robust loss: scale {} is not above 0", start.scale);
+        assert!(start.scale > 0.0 && start.scale.is_finite(), "adaptive robust loss: scale {} is not finite and above 0", start.scale);
         let param = |suffix: &str, value: f64| Param::from_tensor(format!("{name}.{suffix}"), Tensor::full(&[3], value));
         let objective = self.with_param(param("shape", (share / (1.0 - share)).ln()), start.rate);
         let objective = objective.with_param(param("scale", start.scale.ln()), start.rate);
@@ -61,7 +61,7 @@ impl<T: Real, M: 'static> Objective<T, M> {
     }
 }
 
-/// −ln p `[n, k]` of residuals `[n, k]`, for shapes α and logarithms of scales c `[k]`: ρ(x, α, c) + ln c + ln Z(α).
+/// Returns −ln p `[n, k]` of residuals `[n, k]`, for shapes α and logarithms of scales c `[k]`: ρ(x, α, c) + ln c + ln Z(α).
 fn negative_log_likelihood<T: Real>(residual: &Tensor<T>, alpha: &Tensor<T>, log_scale: &Tensor<T>) -> Tensor<T> {
     let two_minus = 2.0 - alpha;
     let squared = residual.square() * ((-2.0 * log_scale).exp() / &two_minus);
@@ -70,11 +70,11 @@ fn negative_log_likelihood<T: Real>(residual: &Tensor<T>, alpha: &Tensor<T>, log
     rho + (log_scale + log_partition(alpha))
 }
 
-/// ln Z(α) of each of the shapes `[k]`.
+/// Returns ln Z(α) of shapes `[k]`.
 ///
-/// With x = √(2 − α) sinh u the integrand is √(2 − α) cosh u · exp(−(2 − α)/α · (coshᵅ u − 1)), which is analytic in a strip of half width π/4
-/// around the real axis and falls at least as fast as e^{−|u|}. There the trapezoidal rule converges exponentially: with a
-/// step of 1/8 up to u = 40 its error is below 10⁻¹⁵ of the value (Trefethen and Weideman 2014).
+/// With x = √(2 − α) sinh u the integrand is √(2 − α) cosh u · exp(−(2 − α)/α · (coshᵅ u − 1)). It is analytic in a strip of half width π/4
+/// around the real axis and decreases at least as fast as e^{−|u|}. The trapezoidal rule therefore converges exponentially: with step 1/8
+/// up to u = 40 its relative error is below 10⁻¹⁵ (Trefethen and Weideman 2014).
 pub(crate) fn log_partition<T: Real>(alpha: &Tensor<T>) -> Tensor<T> {
     const STEP: f64 = 0.125;
     const NODES: usize = 320;
@@ -82,7 +82,7 @@ pub(crate) fn log_partition<T: Real>(alpha: &Tensor<T>) -> Tensor<T> {
     let node = |k: usize| k as f64 * STEP;
     let log_cosh = (0..NODES).map(|k| T::lit(node(k) + (0.5 * (1.0 + (-2.0 * node(k)).exp())).ln()));
     let log_cosh = Tensor::from_vec(log_cosh.collect(), &[1, NODES]);
-    // The integrand is even: both halves, with the node in the middle once.
+    // The integrand is even: every node but the middle one counts twice.
     let weights = (0..NODES).map(|k| T::lit(if k == 0 { STEP } else { 2.0 * STEP }));
     let weights = Tensor::from_vec(weights.collect(), &[1, NODES]);
     let (a, two_minus) = (alpha.unsqueeze(1), (2.0 - alpha).unsqueeze(1));
@@ -90,7 +90,7 @@ pub(crate) fn log_partition<T: Real>(alpha: &Tensor<T>) -> Tensor<T> {
     (exponent.exp() * weights).sum_axis(1).ln() + 0.5 * (2.0 - alpha).ln()
 }
 
-/// eˣ − 1 without cancellation near 0.
+/// Returns eˣ − 1, without cancellation near 0.
 fn exp_m1<T: Real>(x: &Tensor<T>) -> Tensor<T> {
     -(-x).one_minus_exp_neg()
 }
@@ -116,7 +116,7 @@ mod tests {
 
     #[test]
     fn the_partition_function_is_the_integral() {
-        // Midpoints of x = tan(πy/2), many of them: a plain rule for a check.
+        // Midpoint rule in y, with x = tan(πy/2) and many nodes.
         for alpha in [0.3, 0.7, 1.5, 1.9, 1.999] {
             let n = 2_000_000;
             let rho = |x: f64| (2.0 - alpha) / alpha * ((x * x / (2.0 - alpha) + 1.0f64).powf(0.5 * alpha) - 1.0);

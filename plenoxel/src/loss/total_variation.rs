@@ -1,7 +1,7 @@
-//! Isotropic total variation of a grid's rows.
+//! Isotropic total variation of a grid's values.
 //!
-//! A cell is a node with its forward neighbours along x, y and z, all four being present. Per cell and channel √(dx² + dy² + dz² + ε),
-//! averaged over cells and channels. The gradient is the exact one.
+//! A cell consists of a node and its forward neighbours along x, y and z, all present. Its variation per channel is √(dx² + dy² + dz² + ε).
+//! The total variation is the mean over cells and channels. The gradient is exact.
 
 use super::Step;
 use crate::field::voxel_grid::VoxelGrid;
@@ -10,24 +10,25 @@ use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, STRIDE, has, previous_in}
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, RowSparse, RowSums, Tensor, dispatched, parallel};
 use std::sync::Arc;
 
-/// Keeps the root smooth (source paper).
+/// Added under the root to make it smooth (source paper).
 const EPSILON: f64 = 1e-5;
 
-/// Which cells a total variation looks at.
+/// Cells that a total variation covers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Cells {
-    /// All: a dense gradient.
+    /// All cells. The gradient is dense.
     Whole,
-    /// A contiguous run of this share of the table's bricks, at a random place each step (svox2, of its rows): a row-sparse gradient.
+    /// A contiguous run of this fraction of the table's bricks, at a random position in each step (svox2 draws runs of rows). The gradient
+    /// is row-sparse.
     Share(f64),
 }
 
 impl Cells {
-    /// svox2's share.
+    /// Fraction used by svox2.
     pub const SAMPLED: Cells = Cells::Share(0.01);
 }
 
-/// Total variation of the density of a model that has a voxel grid.
+/// Returns a loss: the total variation of the density of a model with a voxel grid.
 pub fn tv_density<T: Real, M: AsRef<VoxelGrid<T>>>(cells: Cells) -> impl Fn(&Step<'_, T, M>) -> Tensor<T> + Send + Sync {
     move |step| {
         let grid = step.model.as_ref();
@@ -35,7 +36,8 @@ pub fn tv_density<T: Real, M: AsRef<VoxelGrid<T>>>(cells: Cells) -> impl Fn(&Ste
     }
 }
 
-/// Total variation of the colors or their harmonics: the mean over all their channels, each in the cells of its own table.
+/// Returns a loss: the total variation of colors or their harmonics. It is the mean over all channels, each over the cells of its own
+/// table.
 pub fn tv_color<T: Real, M: AsRef<VoxelGrid<T>>>(cells: Cells) -> impl Fn(&Step<'_, T, M>) -> Tensor<T> + Send + Sync {
     move |step| {
         let grid = step.model.as_ref();
@@ -62,33 +64,33 @@ fn tv<T: Real, M>(step: &Step<'_, T, M>, table: &Param<T>, lattice: &Lattice, ce
     }
 }
 
-/// Total variation over all cells of a table `[rows, C]` in bricks: a scalar. A grid without cells has variation 0. The gradient is dense
-/// where there is a kernel, for the widths that grids have: C = 1, 3, 4, 9, 12, 24, 27, 45, 48.
+/// Returns the total variation over all cells of a table `[rows, C]` in bricks, as a scalar. A grid without cells has variation 0. The
+/// gradient is dense for the widths with a kernel, which include those of grids: C = 1, 3, 4, 9, 12, 24, 27, 45, 48.
 ///
-/// Panics if the layout is row-major or the table does not have its rows.
+/// Panics if the layout is row-major, or if the table has another number of rows.
 #[track_caller]
 pub fn total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
     of_run(table, lattice, None)
 }
 
-/// The same over the cells of `count` bricks from number `first` on, wrapping round, with a row-sparse gradient.
+/// Returns the total variation over the cells of `count` bricks from `first` on, wrapping around. The gradient is row-sparse.
 ///
-/// Panics too if there are not so many bricks.
+/// Panics if the layout is row-major, if the table has another number of rows, or if `first` or `count` exceeds the number of bricks.
 #[track_caller]
 pub fn total_variation_of_bricks<T: Real>(table: &Tensor<T>, lattice: &Lattice, first: usize, count: usize) -> Tensor<T> {
     let all = lattice.rows() / BRICK_ROWS;
-    assert!(first < all.max(1) && count <= all.max(1), "bricks {first} and on, {count} of them, of {all}");
+    assert!(first < all.max(1) && count <= all.max(1), "total_variation_of_bricks: {count} bricks from {first} on, the table has {all}");
     of_run(table, lattice, Some((first, count.min(all))))
 }
 
-/// Over all cells, or over those of a run of bricks.
+/// Computes the total variation over all cells, or over the cells of a run of bricks.
 #[track_caller]
 fn of_run<T: Real>(table: &Tensor<T>, lattice: &Lattice, part: Option<(usize, usize)>) -> Tensor<T> {
     check(table, lattice);
     match table.shape()[1] {
         1 => with_kernel::<T, 1, 4, 16>(table, lattice, part),
         3 => with_kernel::<T, 3, 12, 48>(table, lattice, part),
-        // No grid has rows of 4; W3 of the workloads does, 5.8 ms with the kernel and 126 ms without (`benches/RESULTS.md`).
+        // No grid has rows of 4 numbers, but workload W3 does: 5.8 ms with the kernel, 126 ms without (`benches/RESULTS.md`).
         4 => with_kernel::<T, 4, 16, 64>(table, lattice, part),
         9 => with_kernel::<T, 9, 36, 144>(table, lattice, part),
         12 => with_kernel::<T, 12, 48, 192>(table, lattice, part),
@@ -103,7 +105,7 @@ fn of_run<T: Real>(table: &Tensor<T>, lattice: &Lattice, part: Option<(usize, us
     }
 }
 
-/// Through the kernel for a width of `W`; `N` is 4 W, the length of a line, and `S` 16 W, that of a slab.
+/// Computes the total variation with the kernel for width `W`. `N` = 4 W is the length of a line, `S` = 16 W the length of a slab.
 fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &Tensor<T>,
     lattice: &Lattice,
@@ -123,24 +125,24 @@ fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(
     Tensor::from_kernel(vec![value].into(), &[], &[table], kernel)
 }
 
-/// Bricks one after another, wrapping round behind the last one.
+/// Run of consecutive bricks, wrapping around after the last brick.
 #[derive(Clone, Copy, Debug)]
 struct Run {
     first: usize,
     count: usize,
-    /// Bricks of the grid.
+    /// Number of bricks in the grid.
     all: usize,
 }
 
 impl Run {
-    /// The k-th brick.
+    /// Returns the k-th brick of the run.
     #[inline(always)]
     fn brick(self, k: usize) -> usize {
         let brick = self.first + k;
         if brick < self.all { brick } else { brick - self.all }
     }
 
-    /// The place of a brick in the run, if it is in it.
+    /// Returns the position of a brick in the run, if the run contains it.
     #[inline(always)]
     fn place(self, brick: usize) -> Option<usize> {
         let k = if brick >= self.first { brick - self.first } else { brick + self.all - self.first };
@@ -152,9 +154,9 @@ impl Run {
     }
 }
 
-/// Total variation over those of `count` rows from number `first` on, wrapping round, that have a cell: a scalar, with a row-sparse gradient.
+/// Returns the total variation over the cells of `count` rows from `first` on, wrapping around, as a scalar. The gradient is row-sparse.
 ///
-/// Panics if the layout is row-major or the table does not have its rows.
+/// Panics if the layout is row-major, or if the table has another number of rows.
 #[track_caller]
 pub fn sampled_total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice, first: usize, count: usize) -> Tensor<T> {
     check(table, lattice);
@@ -180,37 +182,38 @@ pub fn sampled_total_variation<T: Real>(table: &Tensor<T>, lattice: &Lattice, fi
 
 #[track_caller]
 fn check<T: Real>(table: &Tensor<T>, lattice: &Lattice) {
-    assert!(lattice.brick_map().is_some(), "total_variation: a lattice in bricks is needed");
+    assert!(lattice.brick_map().is_some(), "total_variation: the lattice must be in bricks");
     assert!(
         table.ndim() == 2 && table.shape()[0] == lattice.rows(),
-        "total_variation: a lattice of {} rows, a table {:?}",
+        "total_variation: the lattice has {} rows, the table has shape {:?}",
         lattice.rows(),
         table.shape()
     );
 }
 
-/// The kernel behind [`total_variation`].
+/// Kernel of [`total_variation`].
 #[derive(Debug)]
 struct TotalVariation<T: Real, const W: usize, const N: usize, const S: usize> {
     lattice: Lattice,
-    /// Bricks whose cells count.
+    /// Bricks whose cells are included.
     run: Run,
-    /// True if the gradient is one of rows.
+    /// True if the gradient is row-sparse.
     sparse: bool,
-    /// Cells times channels.
+    /// Number of cells times channels.
     terms: usize,
-    /// 1 / √(…) of each cell and channel of the run, 0 where there is no cell.
+    /// 1 / √(…) of each cell and channel of the run; 0 for nodes without a cell.
     roots: Buffer<T>,
 }
 
-/// Bricks that one task works on.
+/// Number of bricks per task.
 const TASK: usize = 256;
 
-/// With q = s / √(…) for each cell and channel, s = cotangent / number of terms: the cell gets −q (dx + dy + dz), each neighbour q d.
-/// Written as a gather, a node's gradient is what its own cell and the three cells behind it give: no two tasks write the same node.
+/// With q = s / √(…) for each cell and channel, s = cotangent / number of terms, the node of a cell gets −q (dx + dy + dz), and each
+/// neighbour q d. The gradient is computed as a gather: a node collects from its own cell and from the three cells behind it, so no two
+/// tasks write the same node.
 ///
-/// A brick is four *slabs* of equal x; a slab is four *lines* of equal y; a line is four nodes along z. The loops are over slabs: one step
-/// along x is another slab, one along y shifts the lines and one along z the nodes of each line.
+/// A brick consists of four *slabs* of equal x, a slab of four *lines* of equal y, a line of four nodes along z. The loops run over slabs:
+/// a step along x moves to another slab, a step along y shifts the lines, a step along z shifts the nodes of each line.
 impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for TotalVariation<T, W, N, S> {
     fn name(&self) -> &'static str {
         "total_variation"
@@ -248,7 +251,7 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
     }
 }
 
-/// The nodes of a brick that a cell of the run reads: those with a cell, and those ahead of one.
+/// Returns the nodes of a brick that a cell of the run reads: nodes with a cell, and their forward neighbours.
 fn touched(bricks: &[Neighbours], run: Run, brick: usize) -> u64 {
     let cells = |brick: usize| run.place(brick).map_or(0, |_| bricks[brick].cells);
     let own = cells(brick);
@@ -258,11 +261,11 @@ fn touched(bricks: &[Neighbours], run: Run, brick: usize) -> u64 {
     })
 }
 
-/// The rows of some bricks with what is added to them.
+/// Rows of some bricks, with their contributions.
 #[derive(Debug)]
 struct RowsOfBricks<T: Real> {
     bricks: Members,
-    /// A bit for each row of a brick that something is added to.
+    /// One bit per row of a brick, set if the row has a contribution.
     touched: Vec<u64>,
     width: usize,
     values: Buffer<T>,
@@ -287,16 +290,16 @@ impl<T: Real> RowSums<T> for RowsOfBricks<T> {
     }
 }
 
-/// Some of the numbers below a bound: an optimizer asks of each brick whether it is one of a few.
+/// A subset of the numbers below a bound, with constant-time look-up of positions.
 #[derive(Debug)]
 struct Members {
     bits: Vec<u64>,
-    /// Members before each word of bits.
+    /// Number of members before each word of bits.
     before: Vec<u32>,
 }
 
 impl Members {
-    /// Of ascending numbers.
+    /// Creates the subset from ascending numbers.
     fn new(ascending: &[u32], bound: usize) -> Self {
         let mut bits = vec![0u64; bound.div_ceil(64)];
         ascending.iter().for_each(|&member| bits[member as usize / 64] |= 1 << (member % 64));
@@ -305,7 +308,7 @@ impl Members {
         Members { bits, before }
     }
 
-    /// How many members come before this one; `None` if it is not one.
+    /// Returns the number of members before `number`, or `None` if it is not a member.
     #[inline(always)]
     fn place(&self, number: usize) -> Option<usize> {
         let (word, bit) = (self.bits[number / 64], number % 64);
@@ -313,13 +316,14 @@ impl Members {
     }
 }
 
-/// Slab number x of a brick, if there is one.
+/// Returns slab x of a brick, if the brick exists.
 #[inline(always)]
 fn slab<T, const S: usize>(table: &[[T; S]], brick: Option<u32>, x: usize) -> Option<&[T; S]> {
     brick.map(|b| &table[b as usize * BRICK + x])
 }
 
-/// The nodes one step ahead along x, y and z of those of a slab. Where a brick is missing it is some node of the slab: no cell reads across.
+/// Returns the nodes one step ahead along x, y and z of the nodes of a slab. If a brick is missing, they are arbitrary nodes, which no cell
+/// reads.
 #[inline(always)]
 fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
@@ -342,7 +346,7 @@ fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
 }
 
 dispatched! {
-/// 1 / √(dx² + dy² + dz² + ε) of the cells of the bricks of a run from its number `first` on, 0 elsewhere; returns Σ √(…).
+/// Computes 1 / √(dx² + dy² + dz² + ε) for the cells of the run's bricks from `first` on, 0 elsewhere. Returns Σ √(…).
 fn inverse_roots<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
     bricks: &[Neighbours],
@@ -379,7 +383,7 @@ fn inverse_roots<T: Real, const W: usize, const N: usize, const S: usize>(
 }
 }
 
-/// Σ lanes, by halves: one addition after the other would take as long as all the rest.
+/// Sums lanes pairwise. Sequential addition would take as long as all other work.
 #[inline(always)]
 fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
     let mut width = S;
@@ -393,7 +397,7 @@ fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
 }
 
 dispatched! {
-/// The gradient of some bricks, from the roots of their cells and of those behind; bricks that are not in the run have none.
+/// Computes the gradient of some bricks from the roots of their cells and of the cells behind. Cells outside of the run do not contribute.
 fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
     roots: &[[T; S]],
@@ -411,7 +415,7 @@ fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
             let brick = bricks[own].behind[axis];
             slab(table, brick, x).zip(brick.and_then(|brick| roots_of(brick as usize, x)))
         };
-        // What cells give to the node ahead: q d. That of a cell in the brick is also taken from its own node.
+        // Contributions q d of cells to the node ahead. The value for a cell in the brick is also subtracted at its own node.
         let mut from_x = [T::zero(); S];
         if let Some((last, q)) = behind(0, BRICK - 1) {
             let v = &table[own * BRICK];

@@ -1,8 +1,8 @@
-//! Plenoxels: a voxel grid, learned coarse to fine, in which empty space is left out stage after stage (Fridovich-Keil et al. 2022, and
+//! Plenoxels: a voxel grid that is trained coarse to fine and pruned of empty voxels between stages (Fridovich-Keil et al. 2022, and
 //! Maruani 2022).
 //!
-//! [`config::Config`] has every setting. [`Trainer::<f32>::new(config, views)`](Trainer) is a run with the losses that the config names,
-//! `Trainer::with_objective` one with losses of your own:
+//! [`config::Config`] holds every setting. [`Trainer::<f32>::new(config, views)`](Trainer) trains with the losses that the config names.
+//! `Trainer::with_objective` trains with an objective of your own:
 //!
 //! ```
 //! use plenoxel::dataset::procedural::ProceduralOptions;
@@ -57,52 +57,52 @@ use std::any::Any;
 use std::path::Path;
 use std::sync::Arc;
 
-/// A trainer of Plenoxels.
+/// Trainer of [`Plenoxels`].
 pub type Trainer<T> = train::Trainer<T, Plenoxels<T>>;
 
-/// An objective of Plenoxels.
+/// Objective of [`Plenoxels`].
 pub type Objective<T> = loss::Objective<T, Plenoxels<T>>;
 
-/// Data of a training step of Plenoxels.
+/// Data of a training step of [`Plenoxels`].
 pub type Step<'a, T> = loss::Step<'a, T, Plenoxels<T>>;
 
-/// Kind of model that checkpoints of voxel grids carry.
+/// Kind of model in the checkpoints of voxel grids.
 pub const KIND: &str = checkpoint::KIND;
 
-/// Steps after which it is looked up anew where the grid can learn. A sample whose corners all have a density below 0 has no gradient; it comes
-/// to have one when a voxel at its edge, which it shares with others, rises.
+/// Number of steps between updates of the mask of cells that can learn. A sample whose corners all have a negative density has no gradient.
+/// It gets one when a corner that it shares with another sample rises above 0.
 const STEPS_PER_LOOK: u64 = 64;
 
-/// Pictures end a ray where less light than this comes from behind: no number of 8 bits changes by more than a fortieth of a step.
+/// Transmittance below which rays of rendered images end. No 8-bit value changes by more than a fortieth of a level.
 const STOP_BELOW: f64 = 1e-4;
 
-/// A voxel grid with the recipe of a config.
+/// A voxel grid, trained as a config describes.
 #[derive(Debug)]
 pub struct Plenoxels<T: Real> {
-    /// Fitted to the images ([`Config::fitted_to`]).
+    /// Config, fitted to the images ([`Config::fitted_to`]).
     config: Config,
-    /// Stages that are trained, those of the scout first.
+    /// Stages to train; stages of the scout come first.
     stages: Vec<Stage>,
-    /// How many of them are the scout's.
+    /// Number of stages that belong to the scout.
     scouts: usize,
     silhouettes: Option<Silhouettes>,
     grid: VoxelGrid<T>,
-    /// Where the grid could learn when last looked at: samples elsewhere are left out.
+    /// Cells that could learn at the last update. Training leaves out samples in other cells.
     learning: Option<Occupancy>,
     most_rows: usize,
 }
 
 impl<T: Real> Plenoxels<T> {
-    /// The grid that a config starts with, for these training views.
+    /// Creates the initial grid of a config for these training views.
     ///
-    /// Errors name the setting that cannot be used.
+    /// Errors if a setting is invalid, naming the setting.
     pub fn new(config: &Config, views: &Arc<[View]>) -> Result<Self> {
         Self::with_progress(config, views, Arc::default())
     }
 
-    /// As [`new`](Self::new), with a counter for the views of visual hulls that another thread may read.
+    /// Creates the initial grid as [`new`](Self::new) does. `progress` counts the views of visual hulls; another thread may read it.
     ///
-    /// Errors name the setting that cannot be used.
+    /// Errors if a setting is invalid, naming the setting.
     pub fn with_progress(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Result<Self> {
         if const { is_single::<T>() } { cast(single::new(config, views, progress)) } else { Self::start(config, views, progress) }
     }
@@ -119,7 +119,7 @@ impl<T: Real> Plenoxels<T> {
         if let Some(silhouettes) = &silhouettes {
             shape.half_width = match silhouettes.half_width(shape.half_width) {
                 Some(half_width) => half_width,
-                // A grid to start from brings its own box.
+                // An initial grid has its own box.
                 None if config.init_from.is_some() => shape.half_width,
                 None => return Err(Silhouettes::nothing_inside()),
             };
@@ -133,18 +133,18 @@ impl<T: Real> Plenoxels<T> {
         Ok(Plenoxels { config, stages, scouts, silhouettes, grid, learning: None, most_rows: usize::MAX })
     }
 
-    /// A grid that is there already, to be looked at.
+    /// Wraps an existing grid for rendering. The model has no stages to train.
     pub fn of_grid(config: &Config, grid: VoxelGrid<T>) -> Self {
         Plenoxels { config: config.clone(), stages: Vec::new(), scouts: 0, silhouettes: None, grid, learning: None, most_rows: usize::MAX }
     }
 
-    /// The same model, in which pruning must not leave more rows of tables than these, because they would not fit into memory.
+    /// Sets the largest number of table rows that pruning may leave. More rows would not fit into memory.
     pub fn with_most_rows(self, most_rows: usize) -> Self {
         Plenoxels { most_rows, ..self }
     }
 
-    /// The same recipe starting from a grid that is there already, trained or carved: its box stays, its numbers are read at the resolution of
-    /// the first stage, and stages coarser than it are left out, except the last.
+    /// Starts from an existing grid, trained or carved. The grid keeps its box and is resampled at the resolution of the first stage.
+    /// Stages that are coarser than the grid are left out, except the last.
     pub fn starting_from(self, grid: &VoxelGrid<T>) -> Self {
         if const { is_single::<T>() } { cast(single::from(cast(self), cast_ref(grid))) } else { self.from(grid) }
     }
@@ -158,8 +158,9 @@ impl<T: Real> Plenoxels<T> {
         self
     }
 
-    /// The same from a carved grid: its voxels and colors, in the smallest box around them, with the density that training starts with, so that
-    /// gradients reach what is behind a surface. No stage is left out: a carved grid says where matter may be and not how much.
+    /// Starts from a carved grid: keeps its voxels and colors, in the smallest box around them, and sets every density to the initial
+    /// density, so that gradients reach voxels behind a surface. No stage is left out: a carved grid gives the positions of possible
+    /// matter, not its density.
     pub fn starting_from_carved(mut self, grid: &VoxelGrid<T>) -> Self {
         self.scouts = 0;
         self.stages = self.config.stages.clone();
@@ -176,46 +177,46 @@ impl<T: Real> Plenoxels<T> {
         self
     }
 
-    /// The grid as it is now.
+    /// Returns the current grid.
     pub fn grid(&self) -> &VoxelGrid<T> {
         &self.grid
     }
 
-    /// The trained grid.
+    /// Returns the grid, consuming the model.
     pub fn into_grid(self) -> VoxelGrid<T> {
         self.grid
     }
 
-    /// The config, fitted to the images ([`Config::fitted_to`]).
+    /// Returns the config, fitted to the images ([`Config::fitted_to`]).
     pub fn config(&self) -> &Config {
         &self.config
     }
 
-    /// Sampling of pictures.
+    /// Returns the sampling of rendered images.
     fn sampling(&self, view: &ViewOptions) -> Sampling {
         let sampling = self.config.evaluation;
         view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()))
     }
 
-    /// Stages that are trained, fitted to the images; those of the scout come first.
+    /// Returns the stages to train, fitted to the images. Stages of the scout come first.
     pub fn stages(&self) -> &[Stage] {
         &self.stages
     }
 
-    /// Number of the stages that are the scout's.
+    /// Returns the number of stages that belong to the scout.
     pub fn scout_stages(&self) -> usize {
         self.scouts
     }
 }
 
-/// A viewer of a voxel grid: no jitter, and empty cells are skipped, which changes no pixel.
+/// Creates a viewer of a voxel grid: without jitter, and skipping empty cells, which changes no pixel.
 pub fn grid_viewer<T: Real>(grid: &VoxelGrid<T>, sampling: Sampling, engine: Engine, background: [f32; 3]) -> Viewer<'_, T> {
     Viewer::new(show(grid, sampling, engine, background), background)
 }
 
-/// The model of a run, from its checkpoint. Its config is the run's; stages are not needed to look at it.
+/// Opens the model of a checkpoint for rendering. `config` is the config of its run; its stages are not used.
 ///
-/// Errors name the file and what is wrong with it.
+/// Errors if the file cannot be read; the error names the file and the problem.
 pub fn open(path: &Path, config: &Config) -> Result<(Plenoxels<f32>, About)> {
     let (grid, header) = checkpoint::load(path)?;
     Ok((Plenoxels::of_grid(config, grid), header.into()))
@@ -226,7 +227,7 @@ fn render_grid<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptio
     if const { is_single::<T>() } { cast(single::render(cast_ref(grid), rays, options)) } else { render(grid, rays, options) }
 }
 
-/// A grid with the values that another has now: the tables are shared until training changes them.
+/// Returns a copy of a grid. The tables are shared until training changes them.
 fn copy<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
     grid.with_density(grid.density.tensor().detach())
 }
@@ -235,7 +236,7 @@ fn save<T: Real>(grid: &VoxelGrid<T>, path: &Path, about: &About) -> Result<()> 
     checkpoint::save(path, grid, &Header::new(grid, &about.scene, about.background, about.seed, about.step))
 }
 
-/// A function from rays to the pixels of a grid.
+/// Returns a function that renders rays through a grid.
 fn show<T: Real>(
     grid: &VoxelGrid<T>,
     sampling: Sampling,
@@ -246,7 +247,7 @@ fn show<T: Real>(
     move |rays| show_within(grid, &matter, sampling, engine, background, rays)
 }
 
-/// The pixels of a grid along some rays, with samples in occupied cells alone.
+/// Renders rays through a grid, with samples in occupied cells only.
 fn show_within<T: Real>(
     grid: &VoxelGrid<T>,
     matter: &Occupancy,
@@ -342,7 +343,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         figures.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
     }
 
-    /// The voxel grid, a [`VoxelGrid<T>`].
+    /// Returns the voxel grid, a [`VoxelGrid<T>`].
     fn content(&self) -> Option<&dyn Any> {
         Some(&self.grid)
     }
@@ -382,9 +383,9 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 }
 
-/// Construction from a config, and the grid.
+/// Construction from a config, and access to the grid.
 impl<T: Real> train::Trainer<T, Plenoxels<T>> {
-    /// A run from its beginning, with the losses that the config names.
+    /// Creates a run with the losses that the config names.
     pub fn new(config: Config, views: impl Into<Arc<[View]>>) -> Result<Self> {
         config.validate()?;
         let views = views.into();
@@ -392,62 +393,61 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
         Self::with_losses(config, views, objective, Arc::default())
     }
 
-    /// A run with an objective of your own. The config must name no losses but those of the default, a mean squared error: its losses would not
-    /// be used.
+    /// Creates a run with an objective of your own.
     ///
-    /// Errors if the config names others.
+    /// Errors if the config names losses other than the default (a mean squared error), because they would not be used.
     pub fn with_objective(config: Config, views: impl Into<Arc<[View]>>, objective: Objective<T>) -> Result<Self> {
         if !config.losses.is_empty() && config.losses != Config::default().losses {
             let names: Vec<&str> = config.losses.keys().map(String::as_str).collect();
-            let accepted = "no losses in the config (`losses` empty), or Trainer::new without an objective; model::plenoxels::objective(&config, views) is one to add to";
-            return Err(Error::config("losses", format!("{} beside an objective of one's own", names.join(", ")), accepted));
+            let accepted = "an empty `losses` table, or Trainer::new; model::plenoxels::objective(&config, views) returns the config's objective to extend";
+            return Err(Error::config("losses", format!("{} would be ignored beside a custom objective", names.join(", ")), accepted));
         }
         Self::with_losses(config, views.into(), objective, Arc::default())
     }
 
-    /// A run with an objective, which may have the config's losses or others, and a counter for the views of visual hulls.
+    /// Creates a run with an objective, whatever losses the config names. `progress` counts the views of visual hulls.
     pub(crate) fn with_losses(config: Config, views: Arc<[View]>, objective: Objective<T>, progress: Arc<Progress>) -> Result<Self> {
         let model = Plenoxels::with_progress(&config, &views, progress)?;
         Self::with_model(model, views, objective, config.train_options())
     }
 
-    /// The same run where pruning must not leave more rows of tables than these ([`Plenoxels::with_most_rows`]).
+    /// Sets the largest number of table rows that pruning may leave ([`Plenoxels::with_most_rows`]).
     pub fn with_most_rows(self, most_rows: usize) -> Self {
         self.map_model(|model| model.with_most_rows(most_rows))
     }
 
-    /// The same run starting from a grid that is there already ([`Plenoxels::starting_from`]).
+    /// Starts the run from an existing grid ([`Plenoxels::starting_from`]).
     ///
     /// Panics if steps have been taken.
     pub fn starting_from(self, grid: &VoxelGrid<T>) -> Self {
         self.map_model(|model| model.starting_from(grid))
     }
 
-    /// The same run starting from a carved grid ([`Plenoxels::starting_from_carved`]).
+    /// Starts the run from a carved grid ([`Plenoxels::starting_from_carved`]).
     ///
     /// Panics if steps have been taken.
     pub fn starting_from_carved(self, grid: &VoxelGrid<T>) -> Self {
         self.map_model(|model| model.starting_from_carved(grid))
     }
 
-    /// The grid as it is now.
+    /// Returns the current grid.
     pub fn grid(&self) -> &VoxelGrid<T> {
         self.model().grid()
     }
 
-    /// The trained grid.
+    /// Returns the grid, consuming the trainer.
     pub fn into_grid(self) -> VoxelGrid<T> {
         self.into_model().into_grid()
     }
 
-    /// The config, fitted to the images ([`Config::fitted_to`]).
+    /// Returns the config, fitted to the images ([`Config::fitted_to`]).
     pub fn config(&self) -> &Config {
         self.model().config()
     }
 }
 
 impl Sampling {
-    /// `samples` points over the longest line through the box, or over the ray where the sampling is the source paper's.
+    /// Returns the sampling with `samples` samples on the diagonal of the box, or on the whole ray for [`Sampling::Points`].
     pub fn with_samples(self, samples: u32, shape: &GridShape) -> Self {
         match self {
             Sampling::Points { far, .. } => Sampling::Points { samples: samples as usize, far },

@@ -1,8 +1,8 @@
-//! The filters with which people clean point clouds, as CloudCompare defines them (CCCoreLib, `CloudSamplingTools.cpp`): the same settings
-//! keep the same points, but for noise that nobody can decide: see [`NoiseError`].
+//! Point cloud filters as defined by CloudCompare (CCCoreLib, `CloudSamplingTools.cpp`). The same settings keep the same points, except for
+//! noise at the limit of rounding: see [`NoiseError`].
 //!
-//! Each filter looks at the points that the one before has left, in this order: box, value, noise, statistical outliers.
-//! CloudCompare stores coordinates in 32 bits, shifted where they are large, and so do the filters; the cloud itself keeps its own.
+//! Filters are applied in the order box, value, noise, statistical outliers, each to the points that the previous filter kept. Like
+//! CloudCompare, the filters use 32-bit coordinates, shifted if they are large. The cloud itself keeps its coordinates.
 
 use super::sums::Sums;
 use super::tree::Tree;
@@ -11,81 +11,81 @@ use crate::geometry::Aabb;
 use autograd::parallel;
 use glam::DVec3;
 
-/// Points that one task looks at.
+/// Number of points per task.
 const RUN: usize = 4096;
 
-/// What to remove; the default removes nothing.
+/// Filters to apply; the default removes nothing.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Filters {
-    /// Points outside of the box; its faces belong to it.
+    /// Removes points outside of the box. Faces belong to the box.
     pub within: Option<Aabb>,
-    /// Points whose value is not in the range.
+    /// Removes points whose value is out of range.
     pub value: Option<Range>,
-    /// Points off the surface that their neighbours make.
+    /// Removes points off the surface formed by their neighbours.
     pub noise: Option<Noise>,
-    /// Points far from others.
+    /// Removes points far from others.
     pub outliers: Option<Outliers>,
 }
 
-/// Filter by value: keeps low ≤ v ≤ high, compared in 32 bits; a value that is no number goes.
+/// Filter by value: keeps low ≤ v ≤ high, compared in 32 bits. Removes NaN.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Range {
-    /// The smallest value that stays.
+    /// Smallest value that is kept.
     pub low: f64,
-    /// The largest value that stays.
+    /// Largest value that is kept.
     pub high: f64,
 }
 
-/// Noise filter. The neighbours of a point are the others within `radius`. If there are at least three, the point stays if its distance to
-/// the plane nearest to them is at most `error`. If there are three that make no plane, A, B and C with |AB × AC|² below 2⁻²³, it goes: the
-/// bound is CloudCompare's and depends on the unit of length.
+/// Noise filter. The neighbours of a point are the other points within `radius`. A point with at least three neighbours is kept if its
+/// distance to the least-squares plane of the neighbours is at most `error`. It is removed if it has exactly three neighbours A, B and C
+/// that define no plane,
+/// |AB × AC|² below 2⁻²³. This bound is CloudCompare's and depends on the unit of length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Noise {
-    /// Distance within which points are neighbours, in the units of the coordinates.
+    /// Radius of the neighbourhood, in units of the coordinates.
     pub radius: f64,
-    /// How far from the plane a point may be.
+    /// Largest distance of a kept point from the plane.
     pub error: NoiseError,
-    /// Removes points with fewer than three neighbours; else they stay.
+    /// Removes points with fewer than three neighbours; otherwise they are kept.
     pub remove_isolated: bool,
 }
 
-/// How far from the plane of its neighbours a point may be. Distances count as equal that differ by less than the rounding of the coordinates,
-/// 8 · 2⁻²³ of the largest:
-/// on a lattice that decides about whole edges, and CloudCompare lets chance decide.
+/// Largest distance of a kept point from the plane of its neighbours. Distances that differ by less than the rounding of the coordinates, 8
+/// · 2⁻²³ of the largest coordinate, count as equal. On a lattice this decides about whole edges; in CloudCompare, rounding decides.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum NoiseError {
-    /// In the units of the coordinates.
+    /// Distance in units of the coordinates.
     Absolute(f64),
-    /// In standard deviations of the neighbours' own distances to the plane; CloudCompare's default is 1.
+    /// Multiple of the standard deviation of the neighbours' distances to the plane; CloudCompare's default is 1.
     Relative(f64),
 }
 
-/// Statistical outlier removal (SOR): d is the mean distance of a point to its nearest `neighbours` − 1 others (the point itself counts as
-/// one, as in PCL); it stays if d ≤ mean of d + `sigma` · standard deviation of d, both over all points.
+/// Statistical outlier removal (SOR). d is the mean distance of a point to its nearest `neighbours` − 1 other points (the point itself
+/// counts as one, as in PCL). A point is kept if d ≤ mean of d + `sigma` · standard deviation of d, both over all points.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outliers {
-    /// Nearest points, the point itself among them.
+    /// Number of nearest points, including the point itself.
     pub neighbours: usize,
-    /// Standard deviations above the mean.
+    /// Number of standard deviations above the mean.
     pub sigma: f64,
 }
 
-/// How many points one filter kept.
+/// Result of a filter: numbers of points.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Kept {
     /// Name of the filter.
     pub filter: &'static str,
-    /// Points before it.
+    /// Number of points before the filter.
     pub before: usize,
-    /// Points after it.
+    /// Number of points after the filter.
     pub after: usize,
 }
 
 impl Filters {
-    /// Numbers of the points that stay, ascending, and what each filter did. `values` are those that [`Filters::value`] looks at, one for
-    /// each point. Points whose coordinates are no numbers, or none of 32 bits, go first of all.
+    /// Applies the filters. Returns the numbers of the kept points, ascending, and the result of each filter. `values` are the values for
+    /// [`Filters::value`], one per point. Points whose coordinates are not finite, or too large for 32 bits, are removed first.
     ///
-    /// Errors: a value filter without values; as many neighbours asked for as there are points.
+    /// Errors if there is a value filter but no values, or if the number of neighbours is not below the number of points.
     pub fn apply(&self, positions: &[DVec3], values: Option<&[f32]>) -> Result<(Vec<u32>, Vec<Kept>)> {
         let mut left: Vec<u32> = (0..positions.len() as u32).collect();
         let mut report = Vec::new();
@@ -105,7 +105,7 @@ impl Filters {
             filter("bbox", &mut left, &|left| Ok(left.iter().map(|i| within.contains(position(i))).collect()))?;
         }
         if let Some(range) = self.value {
-            let values = values.ok_or_else(|| Error::config("min_value", "a cloud without values", "a cloud with a scalar field"))?;
+            let values = values.ok_or_else(|| Error::config("min_value", "the cloud has no values", "a cloud with a scalar field"))?;
             let (low, high) = (range.low as f32, range.high as f32);
             filter("value", &mut left, &|left| Ok(left.iter().map(|&i| (low..=high).contains(&values[i as usize])).collect()))?;
         }
@@ -119,10 +119,10 @@ impl Filters {
     }
 }
 
-/// Coordinates beyond this may have differences that 32 bits do not hold: then a point would not be near itself.
+/// Largest accepted coordinate. Differences of larger coordinates may overflow in 32 bits: a point would not be near itself.
 const LARGEST: f64 = 0.25 * f32::MAX as f64;
 
-/// The coordinates in 32 bits. As CloudCompare does it, large ones are shifted, which changes no distance but keeps its digits.
+/// Converts coordinates to 32 bits. Like in CloudCompare, large coordinates are shifted, which preserves distances and their digits.
 fn local(positions: &[DVec3], chosen: &[u32]) -> Vec<[f32; 3]> {
     const LARGE: f64 = 1e4;
     let chosen = || chosen.iter().map(|&i| positions[i as usize]);
@@ -134,7 +134,7 @@ fn local(positions: &[DVec3], chosen: &[u32]) -> Vec<[f32; 3]> {
 }
 
 impl Noise {
-    /// Which points stay.
+    /// Returns which points are kept.
     fn keep(&self, points: &[[f32; 3]]) -> Vec<bool> {
         let tree = Tree::new(points);
         let largest = points.iter().flatten().fold(0.0f32, |largest, x| largest.max(x.abs()));
@@ -144,7 +144,7 @@ impl Noise {
         let sums = Sums::new(&tree);
         of_each(&tree, |point| {
             let mut moments = sums.within(point, squared_radius);
-            // About itself, the point adds nothing but its number.
+            // Relative to itself, the point adds nothing but its count.
             moments.count -= 1;
             if moments.count < 3 {
                 return !self.remove_isolated;
@@ -161,18 +161,18 @@ impl Noise {
 }
 
 impl Outliers {
-    /// Which points stay. The means are rounded to 32 bits, and so are their squares, before they are added up in 64, as in CloudCompare.
+    /// Returns which points are kept. Means and their squares are rounded to 32 bits and then summed in 64 bits, as in CloudCompare.
     fn keep(&self, points: &[[f32; 3]]) -> Result<Vec<bool>> {
         let k = self.neighbours;
         if k < 2 || k >= points.len() {
-            let accepted = format!("2 or more, and fewer than the {} points that are left", points.len());
+            let accepted = format!("2 or more, and fewer than the {} points that the other filters kept", points.len());
             return Err(Error::config("sor_neighbours", k, accepted));
         }
         let tree = Tree::new(points);
         let distances = of_each(&tree, |point| {
             let mut nearest = vec![0.0; k];
             tree.nearest(point, &mut nearest);
-            // The first is the point itself, or one that coincides with it.
+            // The first distance is that of the point itself, or of a coincident point.
             (nearest[1..].iter().map(|d| d.sqrt()).sum::<f64>() / (k - 1) as f64) as f32
         });
         let n = points.len() as f64;
@@ -183,7 +183,7 @@ impl Outliers {
     }
 }
 
-/// `f(point)` of every point, by number. Points are taken in the order of the tree, in which neighbours share caches.
+/// Returns `f(point)` of every point, by number. Points are processed in the order of the tree, so that neighbours share caches.
 fn of_each<R: Copy + Default + Send + Sync>(tree: &Tree, f: impl Fn([f32; 3]) -> R + Sync + Send) -> Vec<R> {
     let n = tree.points.len();
     let found = parallel::map_chunks(n, RUN, |range| -> Vec<R> { tree.points[range].iter().map(|&point| f(point)).collect() });

@@ -1,7 +1,8 @@
-//! The voxels of a grid as points.
+//! Point clouds of the voxels of a grid.
 //!
-//! A point is the centre of a voxel. Its opacity is what a ray loses that crosses the voxel from face to face
-//! ([`crate::field::voxel_grid::GridShape::alpha_of_density`]); its normal is [`VoxelGrid::outward`]; its color is one of [`ColorFrom`].
+//! A point is the centre of a voxel. Its opacity is the fraction of light that a voxel absorbs from face to face
+//! ([`crate::field::voxel_grid::GridShape::alpha_of_density`]), its normal is [`VoxelGrid::outward`], and its color is given by
+//! [`ColorFrom`].
 
 use super::{PointCloud, ScalarField};
 use crate::export::{in_bytes, near_colors};
@@ -13,60 +14,61 @@ use glam::DVec3;
 /// Frame of the points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Coordinates {
-    /// That of the dataset: voxel k has its centre at (k + ½) · side − half width.
+    /// World frame of the dataset: voxel k has its centre at (k + ½) · side − half width.
     World,
-    /// Indices of voxels, 0 to n − 1.
+    /// Voxel indices, 0 to n − 1.
     Grid,
 }
 
-/// Where the one color of a voxel comes from. A plain color is the same into every direction.
+/// Source of the color of a voxel. A color without view dependence is the same in every direction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ColorFrom<'a> {
-    /// The mean color of the samples that read it, on rays whose pixels show objects, each counting by its weight. Nobody ever looked from
-    /// other directions, and harmonics are arbitrary there; and what a voxel holds alone is not what is seen of it between its neighbours.
+    /// Mean color of the samples that read the voxel, weighted by their rendering weights, on rays of pixels that show objects. Harmonics
+    /// are arbitrary in directions that no camera looks from, and the color stored in a voxel differs from its visible color between its
+    /// neighbours.
     Seen(&'a Seen),
-    /// The mean over all directions, seen or not: the constant harmonic.
+    /// Mean over all directions: the harmonic of degree 0.
     Mean,
-    /// What a ray in this unit direction, from the viewer into the scene, shows that begins a voxel before the point.
+    /// Color rendered by a ray in this unit direction, from the viewer into the scene, that starts one voxel before the point.
     Direction(DVec3),
 }
 
-/// Which voxels become points, and how.
+/// Selection of voxels, and attributes of their points.
 #[derive(Clone, Debug, PartialEq)]
 pub struct VoxelOptions<'a> {
     /// Frame of the points.
     pub coordinates: Coordinates,
     /// Source of the colors.
     pub color: ColorFrom<'a>,
-    /// The least opacity of a point ([`VoxelGrid::voxels_absorbing`]).
+    /// Smallest opacity of a point ([`VoxelGrid::voxels_absorbing`]).
     pub min_alpha: f64,
-    /// What cameras must see of a voxel; `None` takes all.
+    /// Required visibility of a voxel; `None` selects all voxels.
     pub visible: Option<Visible<'a>>,
 }
 
-/// What cameras must see of a voxel.
+/// Required visibility of a voxel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Visible<'a> {
-    /// What they see.
+    /// Visibility of the grid's voxels.
     pub seen: &'a Seen,
-    /// The least [`Seen::weight`].
+    /// Smallest [`Seen::weight`].
     pub min_weight: f64,
-    /// The least [`Seen::object`]: clouds in the background's color, that hang where they hide nothing, are near 0.
+    /// Smallest [`Seen::object`]. Fog in the background's color that hides nothing has values near 0.
     pub min_object: f64,
 }
 
 const FIELDS: [&str; 4] = ["opacity", "density", "weight", "object"];
 
-/// Names of the fields that [`points`] gives, where it is known or not known what cameras see: `opacity` (α) and `density` (σ, 1 / world
-/// length), and `weight` and `object` of [`Seen`].
+/// Returns the names of the fields of [`points`], depending on whether visibility is known: `opacity` (α) and `density` (σ, 1 / world
+/// length), and if `seen`, also `weight` and `object` of [`Seen`].
 pub fn field_names(seen: bool) -> &'static [&'static str] {
     if seen { &FIELDS } else { &FIELDS[..2] }
 }
 
-/// The voxels of a grid as points, in row-major order of voxels, x slowest, with the fields of [`field_names`]. Coordinates are rounded to
-/// `f32`, as files have them.
+/// Returns the selected voxels of a grid as points, in row-major order, x slowest, with the fields of [`field_names`]. Coordinates are
+/// rounded to `f32`, as in files.
 ///
-/// Panics if what was seen is of a grid with another layout.
+/// Panics if the visibility belongs to a grid with another layout.
 #[track_caller]
 pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> PointCloud {
     let (shape, lattice) = (grid.shape(), grid.lattice());
@@ -74,7 +76,7 @@ pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> Point
         (Some(Visible { seen, .. }), _) | (None, ColorFrom::Seen(seen)) => Some(seen),
         _ => None,
     };
-    assert!(seen.is_none_or(|seen| seen.weight.len() == lattice.rows()), "points: what was seen is of another grid");
+    assert!(seen.is_none_or(|seen| seen.weight.len() == lattice.rows()), "points: the visibility belongs to another grid");
     let n = shape.resolution;
     let dense = grid.voxels_absorbing(options.min_alpha);
     let sigma = |row: u32| grid.density.tensor().data()[row as usize].as_f64().max(0.0);
@@ -112,22 +114,22 @@ pub fn points<T: Real>(grid: &VoxelGrid<T>, options: &VoxelOptions<'_>) -> Point
     }
 }
 
-/// The unit normal of a voxel, 0 where it faces nowhere.
+/// Returns the unit normal of a voxel; zero if it has no direction.
 fn normal<T: Real>(grid: &VoxelGrid<T>, voxel: [usize; 3]) -> [f32; 3] {
-    /// Change of α from one voxel to the next that is no surface any more, as inside of opaque matter.
+    /// Change of α per voxel below which there is no surface, as inside opaque matter.
     const FLAT: f64 = 1e-7;
     let outward = grid.outward(voxel.map(|k| k as isize));
     if outward.length() > FLAT { outward.normalize().as_vec3().to_array() } else { [0.0; 3] }
 }
 
-/// Colors of some voxels by their centres and rows, 8-bit sRGB.
+/// Returns the colors of some voxels, given by centres and rows, as 8-bit sRGB.
 fn colors<T: Real>(grid: &VoxelGrid<T>, centers: &[DVec3], rows: &[u32], from: ColorFrom<'_>) -> Vec<[u8; 3]> {
     let along = |direction: DVec3| near_colors(grid, centers, &vec![direction; rows.len()], rows);
-    // A direction of zero stands for all of them.
+    // A zero direction selects the mean over all directions.
     let mean = || along(DVec3::ZERO);
     match from {
         ColorFrom::Seen(seen) => {
-            // What nobody sees has its mean color.
+            // Invisible voxels get their mean color.
             let color =
                 |(&row, mean)| if seen.weight[row as usize] > 0.0 { in_bytes(seen.color[row as usize].map(f64::from)) } else { mean };
             rows.iter().zip(mean()).map(color).collect()

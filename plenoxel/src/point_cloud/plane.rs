@@ -1,8 +1,8 @@
-//! The plane nearest to some points.
+//! Least-squares plane of points.
 
 use glam::{DMat3, DVec3};
 
-/// Count, sum and sum of squares of some points: what a plane through them needs.
+/// Count, sum and sum of squares of points, from which a plane is computed.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Moments {
     pub count: u32,
@@ -11,18 +11,18 @@ pub(super) struct Moments {
     squares: [DVec3; 2],
 }
 
-/// A plane and how well it fits.
+/// Plane, and the deviation of the points from it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Plane {
     pub center: DVec3,
-    /// Unit.
+    /// Unit normal.
     pub normal: DVec3,
-    /// Standard deviation of the points' distances to the plane, which are 0 in the mean: the root of the smallest eigenvalue.
+    /// Standard deviation of the points' distances to the plane, whose mean is 0: the root of the smallest eigenvalue.
     pub deviation: f64,
 }
 
 impl Moments {
-    /// Takes a point in. The nearer the points are to the origin, the smaller the error.
+    /// Adds a point. The error is smaller if the points are near the origin.
     pub fn add(&mut self, p: DVec3) {
         self.count += 1;
         self.sum += p;
@@ -30,7 +30,7 @@ impl Moments {
         self.squares[1] += p * DVec3::new(p.y, p.z, p.x);
     }
 
-    /// Takes points in that were added up about another origin, which lies at `offset`.
+    /// Adds the moments of points relative to another origin, which is at `offset`.
     pub fn add_all(&mut self, others: &Moments, offset: DVec3) {
         let turned = |p: DVec3| DVec3::new(p.y, p.z, p.x);
         let (n, sum) = (f64::from(others.count), others.sum);
@@ -40,9 +40,10 @@ impl Moments {
         self.squares[1] += others.squares[1] + offset * turned(sum) + turned(offset) * sum + n * offset * turned(offset);
     }
 
-    /// The plane that minimises the sum of squared distances: through the mean, its normal being the eigenvector of the covariance with the
-    /// smallest eigenvalue. `None` if there are fewer than three points, or three, A, B and C, with |AB × AC|² below ε = 2⁻²³: on a line, or
-    /// nearly so. The bound is CloudCompare's and depends on the unit of length; through four points on a line it has some plane.
+    /// Returns the plane with the smallest sum of squared distances: it contains the mean, and its normal is the eigenvector of the
+    /// covariance with the smallest eigenvalue. Returns `None` if there are fewer than three points, or exactly three, A, B and C, with |AB
+    /// × AC|² below ε = 2⁻²³, which are nearly collinear. The bound is CloudCompare's and depends on the unit of length. Four collinear
+    /// points give an arbitrary plane through their line.
     pub fn plane(&self) -> Option<Plane> {
         if self.count < 3 {
             return None;
@@ -60,7 +61,7 @@ impl Moments {
         let mut ascending = [0, 1, 2];
         ascending.sort_by(|&a, &b| values[a].total_cmp(&values[b]));
         let [smallest, middle, largest] = ascending;
-        // Of three points, |AB × AC|² = 27 λ₁ λ₂, the two eigenvalues of the covariance that are not 0.
+        // For three points, |AB × AC|² = 27 λ₁ λ₂, with the two nonzero eigenvalues of the covariance.
         if self.count == 3 && 27.0 * values[middle] * values[largest] < f64::from(f32::EPSILON) {
             return None;
         }
@@ -68,8 +69,8 @@ impl Moments {
     }
 }
 
-/// Eigenvalues and eigenvectors, in columns, of a symmetric matrix: Jacobi's rotations (Golub and Van Loan, 8.5), each of which makes one
-/// number off the diagonal 0. Every sweep squares what is left there, so that a few are enough for `f64`.
+/// Computes eigenvalues and eigenvectors (as columns) of a symmetric matrix with Jacobi rotations (Golub and Van Loan, 8.5). Each rotation
+/// makes one off-diagonal entry 0. Convergence is quadratic, so a few sweeps reach the precision of `f64`.
 fn eigen(mut a: DMat3) -> (DVec3, DMat3) {
     const SWEEPS: usize = 12;
     let mut vectors = DMat3::IDENTITY;
@@ -104,7 +105,7 @@ mod tests {
     fn eigenvectors_of_a_symmetric_matrix_are_orthonormal_and_put_it_together_again() {
         for seed in 0..200 {
             let number = |i| 2.0 * uniform(seed, Purpose::Initial, 0, i) - 1.0;
-            // Every fourth is singular.
+            // Every fourth matrix is singular.
             let half = DMat3::from_cols(
                 DVec3::new(number(0), number(1), number(2)),
                 DVec3::new(number(3), number(4), number(5)),

@@ -1,10 +1,11 @@
-//! PLY files as others write them, and the writer of our own ([`encode`]): text or binary of either byte order, with any properties in any order.
+//! PLY files: a reader for files of other programs, in text or binary form of either byte order, with any properties in any order; and a
+//! writer ([`encode`]).
 //!
-//! A [`PlyFile`] keeps the bytes, so that [`PlyFile::chosen`] can write some of the points with everything the file says of them, whatever
-//! it may be, to the last digit. Memory is bounded by the size of the file: a header that promises more than the file holds is refused before
-//! anything is allocated.
+//! A [`PlyFile`] keeps the bytes, so that [`PlyFile::chosen`] writes a subset of the points with all their properties and all digits.
+//! Memory is bounded by the size of the file: a header that announces more data than the file contains is an error before memory is
+//! allocated.
 //!
-//! (The crate `ply-rs-bw` was weighed. It refuses names such as `scalar_Coord._Z` and values such as `nan`, which CloudCompare writes.)
+//! (The crate `ply-rs-bw` is not used: it rejects names such as `scalar_Coord._Z` and values such as `nan`, which CloudCompare writes.)
 
 mod header;
 mod write;
@@ -17,10 +18,10 @@ use crate::files;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
 
-/// What CloudCompare puts in front of the name of a scalar field.
+/// Prefix of the names of scalar fields in files of CloudCompare.
 pub const SCALAR_PREFIX: &str = "scalar_";
 
-/// A PLY file in memory whose points have been found.
+/// PLY file in memory, with the positions of its points.
 #[derive(Debug)]
 pub struct PlyFile {
     path: PathBuf,
@@ -28,29 +29,29 @@ pub struct PlyFile {
     header: Header,
     /// Number of the element with the points.
     points: usize,
-    /// Numbers of its properties x, y and z.
+    /// Numbers of the properties x, y and z.
     axes: [usize; 3],
     rows: Rows,
 }
 
-/// Where the rows of the points are.
+/// Positions of the points' rows in the file.
 #[derive(Debug)]
 enum Rows {
-    /// One after the other, all of one length.
+    /// Consecutive rows of equal length.
     Fixed { start: usize, stride: usize },
-    /// Where each begins.
+    /// Start of each row.
     At(Vec<usize>),
 }
 
 impl PlyFile {
-    /// Reads what a user named, a file or a pipe, and finds the points in it: the element `vertex`, or one whose name contains `vert` or `point`.
+    /// Reads a file or a pipe, and finds the points in it: the element `vertex`, or one whose name contains `vert` or `point`.
     ///
-    /// Errors: it cannot be read, is larger than there is memory for, is no PLY file, is cut short, or has no points with x, y and z.
+    /// Errors if it cannot be read, does not fit into memory, is not a PLY file, is truncated, or has no points with x, y and z.
     pub fn open(path: &Path) -> Result<Self> {
         Self::parse(path, files::read_named(path, files::CLOUD)?)
     }
 
-    /// The same from the bytes of a file; `path` names it in messages.
+    /// Parses the bytes of a file. `path` names it in error messages.
     pub fn parse(path: &Path, bytes: Vec<u8>) -> Result<Self> {
         let header = Header::parse(path, &bytes)?;
         let lower = |element: &Element| element.name.to_lowercase();
@@ -60,13 +61,13 @@ impl PlyFile {
             let names: Vec<&str> = header.elements.iter().map(|element| &element.name[..]).collect();
             return Err(Error::input(
                 path,
-                format!("no points: its elements are [{}]", names.join(", ")),
-                "an element `vertex` is expected",
+                format!("there are no points among its elements [{}]", names.join(", ")),
+                "accepted: a file with an element `vertex`",
             ));
         };
         if u32::try_from(header.elements[points].count).is_err() {
             let found = format!("the header says {} points", header.elements[points].count);
-            return Err(Error::input(path, found, "at most 4294967295 are read"));
+            return Err(Error::input(path, found, "accepted: at most 4294967295 points"));
         }
         let mut file = PlyFile { path: path.to_owned(), bytes, header, points, axes: [0; 3], rows: Rows::At(Vec::new()) };
         let mut cursor = Cursor { bytes: &file.bytes, at: file.header.length, encoding: file.header.encoding };
@@ -79,81 +80,82 @@ impl PlyFile {
         for (number, axis) in ["x", "y", "z"].into_iter().enumerate() {
             let Some(property) = file.property(&[axis]) else {
                 let names: Vec<&str> = file.element().properties.iter().map(|p| &p.name[..]).collect();
-                let found = format!("the points have no property `{axis}`, but [{}]", names.join(", "));
-                return Err(Error::input(path, found, "properties x, y and z are expected"));
+                let found = format!("no property `{axis}` among the properties of the points, [{}]", names.join(", "));
+                return Err(Error::input(path, found, "accepted: points with the properties x, y and z"));
             };
             file.axes[number] = property;
         }
         Ok(file)
     }
 
-    /// What the file says above its data.
+    /// Returns the header of the file.
     pub fn header(&self) -> &Header {
         &self.header
     }
 
-    /// The element with the points.
+    /// Returns the element with the points.
     pub fn element(&self) -> &Element {
         &self.header.elements[self.points]
     }
 
-    /// The number of points.
+    /// Returns the number of points.
     pub fn len(&self) -> usize {
         self.element().count
     }
 
-    /// True if there is no point.
+    /// Returns true if there are no points.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The coordinates of the points.
+    /// Returns the coordinates of the points.
     ///
-    /// Errors: something in a text is no number, as in [`PlyFile::values`].
+    /// Errors if a word of a text file is not a number, as in [`PlyFile::values`].
     pub fn positions(&self) -> Result<Vec<DVec3>> {
         let [x, y, z] = self.axes;
         let [x, y, z] = [self.column(x)?, self.column(y)?, self.column(z)?];
         Ok(x.into_iter().zip(y).zip(z).map(|((x, y), z)| DVec3::new(x, y, z)).collect())
     }
 
-    /// Names of the scalar fields: every property of the points that is one number and no coordinate, normal or color, without the
-    /// `scalar_` in front of it.
+    /// Returns the names of the scalar fields: every scalar property of the points except coordinates, normals and colors, without the
+    /// prefix `scalar_`.
     pub fn field_names(&self) -> Vec<&str> {
         self.fields().map(|(_, p)| field_name(&p.name)).collect()
     }
 
-    /// The values of a scalar field, by its name with or without `scalar_`.
+    /// Returns the values of a scalar field, by its name with or without `scalar_`.
     ///
-    /// Errors: there is none with this name; something in a text is no number.
+    /// Errors if there is no such field, or if a word of a text file is not a number.
     pub fn values(&self, name: &str) -> Result<Vec<f32>> {
         let Some((property, _)) = self.fields().find(|(_, p)| p.name == name || field_name(&p.name) == name) else {
-            let found = format!("no scalar field `{name}`");
-            return Err(Error::input(&self.path, found, format!("its scalar fields are [{}]", self.field_names().join(", "))));
+            let found = format!("there is no scalar field `{name}`");
+            return Err(Error::input(&self.path, found, format!("accepted: one of [{}]", self.field_names().join(", "))));
         };
         self.in_single(property)
     }
 
-    /// Elements besides the points, such as faces: they are not written again, for they name points by number.
+    /// Returns the elements other than the points, such as faces. They are not written to filtered files, because they refer to points by
+    /// number.
     pub fn others(&self) -> impl Iterator<Item = &Element> {
         self.header.elements.iter().enumerate().filter(|(number, _)| *number != self.points).map(|(_, element)| element)
     }
 
-    /// A file with some of the points, in the encoding of this one and with all their properties, its comments and one more.
+    /// Returns a file with some of the points, in the encoding of this file, with all their properties, with its comments and one more.
     ///
-    /// Panics if there is no point with one of the numbers.
+    /// Panics if a number is out of range.
     pub fn chosen(&self, numbers: &[u32], comment: &str) -> Vec<u8> {
         let mut file = header_lines(self.header.encoding, &self.header.remarks, comment, self.element(), numbers.len()).into_bytes();
         for &number in numbers {
             let start = self.row(number as usize);
             let mut cursor = self.cursor(start);
             for property in &self.element().properties {
-                // Found once already, when the file was opened.
+                // The row was already checked when the file was opened.
                 let _ = cursor.skip(property.kind);
             }
             let row = &self.bytes[start..cursor.at];
             match self.header.encoding {
                 Encoding::Ascii => {
-                    // Programs want a line for each row, however it was broken here.
+                    // Programs expect one line per row, however the row was broken in this file.
                     let words = row.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
                     file.extend(words.collect::<Vec<_>>().join(&b' '));
                     file.push(b'\n');
@@ -164,7 +166,7 @@ impl PlyFile {
         file
     }
 
-    /// Where a row begins.
+    /// Returns the start of a row.
     fn row(&self, number: usize) -> usize {
         match &self.rows {
             Rows::Fixed { start, stride } => start + number * stride,
@@ -176,13 +178,13 @@ impl PlyFile {
         Cursor { bytes: &self.bytes, at, encoding: self.header.encoding }
     }
 
-    /// Number of the property with one of some names, in small letters, that is one number.
+    /// Returns the number of the scalar property with one of these names, in lower case.
     fn property(&self, names: &[&str]) -> Option<usize> {
         let fits = |p: &Property| matches!(p.kind, Kind::Scalar(_)) && names.contains(&&p.name.to_lowercase()[..]);
         self.element().properties.iter().position(fits)
     }
 
-    /// The scalar fields, with the numbers of their properties.
+    /// Returns the scalar fields, with the numbers of their properties.
     fn fields(&self) -> impl Iterator<Item = (usize, &Property)> {
         let known = |name: &str| COLORS.iter().chain(&NORMALS).any(|names| names.contains(&name)) || ["x", "y", "z"].contains(&name);
         let scalar = move |p: &Property| matches!(p.kind, Kind::Scalar(_)) && !known(&p.name.to_lowercase());
@@ -193,7 +195,7 @@ impl PlyFile {
         Ok(self.column(property)?.into_iter().map(|v| v as f32).collect())
     }
 
-    /// The numbers of a property, row after row.
+    /// Returns the numbers of a property, row after row.
     fn column(&self, property: usize) -> Result<Vec<f64>> {
         let properties = &self.element().properties[..=property];
         let read = |row: usize| {
@@ -208,16 +210,16 @@ impl PlyFile {
         (0..self.len()).map(|row| read(row).map_err(|fault| self.fault(self.element(), (row, fault)))).collect()
     }
 
-    /// A fault in a row of an element, as users read it.
+    /// Returns the error for a fault in a row of an element.
     fn fault(&self, element: &Element, (row, fault): (usize, Fault)) -> Error {
         let Element { name, count, .. } = element;
         match fault {
             Fault::CutShort => {
-                let found = format!("the header says {count} rows of `{name}`, and the file ends in row {row}");
+                let found = format!("the header announces {count} rows of `{name}`, but the file ends in row {row}");
                 Error::input(&self.path, found, "use an undamaged copy: this one is cut short")
             }
             Fault::NoNumber(word) => {
-                let found = format!("row {row} of `{name}` has `{word}` where a number is expected");
+                let found = format!("row {row} of `{name}` has `{word}` instead of a number");
                 Error::input(&self.path, found, "write the cloud again; rows are counted from 0")
             }
         }
@@ -227,12 +229,12 @@ impl PlyFile {
 const COLORS: [&[&str]; 3] = [&["red", "diffuse_red", "r"], &["green", "diffuse_green", "g"], &["blue", "diffuse_blue", "b"]];
 const NORMALS: [&[&str]; 3] = [&["nx", "normal_x"], &["ny", "normal_y"], &["nz", "normal_z"]];
 
-/// Name of a scalar field by that of its property.
+/// Returns the name of a scalar field from the name of its property.
 fn field_name(property: &str) -> &str {
     property.strip_prefix(SCALAR_PREFIX).unwrap_or(property)
 }
 
-/// The header of a file with one element.
+/// Returns the header of a file with one element.
 fn header_lines(encoding: Encoding, remarks: &[String], comment: &str, element: &Element, count: usize) -> String {
     let encoding = match encoding {
         Encoding::Ascii => "ascii",
@@ -251,14 +253,14 @@ fn header_lines(encoding: Encoding, remarks: &[String], comment: &str, element: 
     lines.join("\n")
 }
 
-/// What can be wrong with a row.
+/// Fault in a row.
 #[derive(Debug)]
 enum Fault {
     CutShort,
     NoNumber(String),
 }
 
-/// A place in the data.
+/// Position in the data.
 struct Cursor<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -266,7 +268,7 @@ struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    /// Goes past an element, remembering where its rows begin if asked to. The fault comes with the number of its row.
+    /// Skips an element; returns the positions of its rows if `remember` is set. A fault comes with the number of its row.
     fn find_rows(&mut self, element: &Element, remember: bool) -> std::result::Result<Option<Rows>, (usize, Fault)> {
         let left = self.bytes.len() - self.at;
         let least = element.least_size(self.encoding);
@@ -296,7 +298,7 @@ impl<'a> Cursor<'a> {
         Ok(Some(Rows::At(starts)))
     }
 
-    /// Goes past a property.
+    /// Skips a property.
     fn skip(&mut self, kind: Kind) -> std::result::Result<(), Fault> {
         match (kind, self.encoding) {
             (Kind::Scalar(_), Encoding::Ascii) => self.word().map(drop),
@@ -306,7 +308,7 @@ impl<'a> Cursor<'a> {
                 if items < 0.0 || items.fract() != 0.0 {
                     return Err(Fault::NoNumber(format!("a list of {items} items")));
                 }
-                // At most 2³², or what a text says, which saturates: the words or bytes must be there.
+                // A list has at most 2³² items in binary files, or any number in text files (saturating). The words or bytes must exist.
                 match self.encoding {
                     Encoding::Ascii => (0..items as u64).try_for_each(|_| self.word().map(drop)),
                     _ => (items as usize).checked_mul(item.size()).ok_or(Fault::CutShort).and_then(|n| self.take(n)).map(drop),
@@ -321,7 +323,7 @@ impl<'a> Cursor<'a> {
             let word = self.word()?;
             let text = String::from_utf8_lossy(word);
             return text.parse().or_else(|_| {
-                // C libraries write what is no number in many ways: -nan(ind), 1.#QNAN.
+                // C libraries write NaN in many forms: -nan(ind), 1.#QNAN.
                 let small = text.to_lowercase();
                 let not_a_number = small.contains("nan") || small.contains("#ind");
                 not_a_number.then_some(f64::NAN).ok_or_else(|| Fault::NoNumber(text.chars().take(40).collect()))
@@ -359,7 +361,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// The next word of a text.
+    /// Returns the next word of a text.
     fn word(&mut self) -> std::result::Result<&'a [u8], Fault> {
         self.skip_space();
         let rest = &self.bytes[self.at..];

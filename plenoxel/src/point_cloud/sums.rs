@@ -1,5 +1,5 @@
-//! What the points around a place add up to. Parts of the tree that lie within the radius as a whole are added as one, so that a place costs
-//! what the border of its surroundings does, and a radius that holds the whole cloud next to nothing.
+//! Sums over the points within a radius. Parts of the tree that lie entirely within the radius are added at once. A query therefore costs
+//! time in proportion to the boundary of its neighbourhood, and almost none if the radius contains the whole cloud.
 
 use super::plane::Moments;
 use super::tree::{LEAF, Point, Tree, halves, squared_distance};
@@ -7,24 +7,24 @@ use autograd::parallel;
 use glam::DVec3;
 use std::ops::Range;
 
-/// A tree that knows of each part where it is, and the moments of its points.
+/// Tree with the bounds and the moments of each part.
 pub(super) struct Sums<'a> {
     tree: &'a Tree,
-    /// The whole, its halves, theirs, and so on down to the leaves: part i is split into 2 i + 1 and 2 i + 2.
+    /// The whole tree, its halves, their halves, and so on to the leaves: part i is split into 2 i + 1 and 2 i + 2.
     parts: Vec<Part>,
 }
 
 struct Part {
-    /// The smallest and largest coordinates.
+    /// Smallest and largest coordinates.
     low: Point,
     high: Point,
-    /// The mean of its points, about which their moments are.
+    /// Mean of the points, about which the moments are computed.
     center: DVec3,
     moments: Moments,
 }
 
 impl<'a> Sums<'a> {
-    /// Those of a tree, some 20 bytes for each point.
+    /// Computes the sums of a tree, about 20 bytes per point.
     pub fn new(tree: &'a Tree) -> Self {
         let mut parts = Vec::new();
         let mut level: Vec<Range<usize>> = std::iter::once(0..tree.points.len()).collect();
@@ -35,7 +35,7 @@ impl<'a> Sums<'a> {
         Sums { tree, parts }
     }
 
-    /// Moments about `query` of the points at a squared distance of at most `squared_radius` from it, in the arithmetic of
+    /// Returns the moments about `query` of the points whose squared distance to it is at most `squared_radius`, in the arithmetic of
     /// [`squared_distance`].
     pub fn within(&self, query: Point, squared_radius: f64) -> Moments {
         let mut moments = Moments::default();
@@ -79,7 +79,7 @@ impl Part {
         Part { low, high, center, moments }
     }
 
-    /// Bounds on [`squared_distance`] of all points of the part: rounding is monotonic, so they hold to the last bit.
+    /// Returns bounds of [`squared_distance`] over all points of the part. Rounding is monotonic, so they hold exactly.
     fn squared_distances(&self, query: Point) -> [f64; 2] {
         let mut squares = [0.0; 2];
         for axis in 0..3 {

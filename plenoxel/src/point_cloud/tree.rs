@@ -1,33 +1,33 @@
-//! Nearest neighbours, in the arithmetic of CloudCompare: coordinates are `f32`, their differences are rounded to `f32`, and squares are
+//! Nearest neighbours in the arithmetic of CloudCompare: coordinates are `f32`, their differences are rounded to `f32`, and squares are
 //! added in `f64`.
 //!
-//! A balanced kd-tree, split at the middle point of the longest side: points on a lattice, of which many share a coordinate, points that
-//! coincide, and a cloud with one point far away cost no more than others. (Cells of one size would put such a cloud into one of them.)
-//! Nothing depends on the number of threads.
+//! A balanced kd-tree, split at the median point of the longest side. Lattices, where many points share a coordinate, coincident points,
+//! and clouds with a single distant point cost no more than other clouds. (Cells of equal size would put such a cloud into one cell.) The
+//! result does not depend on the number of threads.
 
 use std::ops::Range;
 
-/// Points of a leaf, at most.
+/// Largest number of points in a leaf.
 pub(super) const LEAF: usize = 12;
-/// Smaller parts are not worth a task of their own.
+/// Size below which a part gets no task of its own.
 const TASK: usize = 1 << 14;
 
-/// A point in 32 bits.
+/// Point in 32 bits.
 pub(super) type Point = [f32; 3];
 
 /// Points in the order of the tree.
 #[derive(Debug)]
 pub(super) struct Tree {
-    /// In an order in which neighbours are near each other.
+    /// Points, ordered so that neighbours are near each other.
     pub points: Vec<Point>,
-    /// Their numbers in the cloud.
+    /// Numbers of the points in the cloud.
     pub numbers: Vec<u32>,
-    /// At the middle of each part that is split: the axis.
+    /// Axis of the split, at the middle of each split part.
     axes: Vec<u8>,
 }
 
 impl Tree {
-    /// The tree of some points, all finite.
+    /// Creates the tree of some points, which must be finite.
     pub fn new(points: &[Point]) -> Self {
         let mut order: Vec<(Point, u32)> = points.iter().zip(0..).map(|(&point, number)| (point, number)).collect();
         let mut axes = vec![0; order.len()];
@@ -36,7 +36,7 @@ impl Tree {
         Tree { points, numbers, axes }
     }
 
-    /// Squared distances of the points nearest to `query`, ascending, as many as `nearest` has places; infinite where there are fewer.
+    /// Writes the squared distances of the points nearest to `query` into `nearest`, ascending; infinite if there are fewer points.
     pub fn nearest(&self, query: Point, nearest: &mut [f64]) {
         nearest.fill(f64::INFINITY);
         self.search(0..self.points.len(), query, nearest, &mut |nearest, i| {
@@ -50,7 +50,7 @@ impl Tree {
         });
     }
 
-    /// Visits the points of a part that may be nearer than the last of `bounds`, which a visit may lower; nearer halves first.
+    /// Visits the points of a part that may be nearer than the last of `bounds`, nearer halves first. A visit may lower the bounds.
     fn search(&self, part: Range<usize>, query: Point, bounds: &mut [f64], visit: &mut impl FnMut(&mut [f64], usize)) {
         if part.len() <= LEAF {
             part.for_each(|i| visit(bounds, i));
@@ -70,13 +70,13 @@ impl Tree {
     }
 }
 
-/// The halves of a part of a tree; the point between them, at the end of the first, belongs to neither.
+/// Returns the halves of a part of a tree. The point between them, at the end of the first, belongs to neither.
 pub(super) fn halves(part: Range<usize>) -> (Range<usize>, Range<usize>) {
     let middle = part.start + part.len() / 2;
     (part.start..middle, middle + 1..part.end)
 }
 
-/// CloudCompare's (CCCoreLib, `DgmOctree.cpp`).
+/// Returns the squared distance as in CloudCompare (CCCoreLib, `DgmOctree.cpp`).
 pub(super) fn squared_distance(a: Point, b: Point) -> f64 {
     (0..3).map(|axis| f64::from(a[axis] - b[axis])).map(|d| d * d).sum()
 }

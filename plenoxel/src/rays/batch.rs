@@ -1,51 +1,51 @@
-//! A batch of rays with what is known along each.
+//! A batch of rays with the data of their pixels.
 
 use crate::camera::Ray;
 use autograd::{Real, Tensor};
 
-/// Rays with what the photographs show along them.
+/// Rays with the data of their pixels in the photographs.
 ///
-/// Every list and tensor is in the order of `rays`, n of them.
+/// Every list and tensor has n entries, in the order of `rays`.
 #[derive(Debug, Clone)]
 pub struct RayBatch<T: Real> {
-    /// Origins and unit directions, world frame.
+    /// Rays with origins and unit directions, world frame.
     pub rays: Vec<Ray>,
-    /// `[n, 3]`, sRGB in [0, 1], composited over the background.
+    /// Photographed colors, `[n, 3]`, sRGB in [0, 1], composited over the background.
     pub target: Tensor<T>,
-    /// `[n]`, in [0, 1]: how much of the pixel is object, where the images have an alpha channel; 1 where they have none.
+    /// Alpha, `[n]`, in [0, 1]: the fraction of the pixel that the object covers; 1 for images without an alpha channel.
     pub alpha: Tensor<T>,
-    /// Number of each ray's view in its source, from 0: an index for tables of a row for each view.
+    /// Number of each ray's view in the source, from 0, for example as an index into a table with one row per view.
     pub view: Vec<u32>,
-    /// Column and row of each ray's pixel, from 0 at the top left, in the image of its view as reduced at the time; the ray passes through the
-    /// pixel's centre, at + ½.
+    /// Column and row of each ray's pixel in the reduced image of its view, from 0 at the top left. The ray passes through the pixel's
+    /// centre, at + ½.
     pub pixel: Vec<[u32; 2]>,
-    /// `[n]`, world length: distance along the unit ray to the first surface ([`View::depth`](crate::dataset::View::depth)), infinite where the ray
-    /// meets none, NaN for rays of views without a depth image. `None` unless it was asked for
-    /// ([`RaySource::with_depth`](crate::rays::RaySource::with_depth)) and some view has it.
+    /// Depth, `[n]`, world length: distance along the unit ray to the first surface ([`View::depth`](crate::dataset::View::depth));
+    /// infinite if the ray hits no surface, NaN if the view has no depth image. `None` unless requested with
+    /// [`RaySource::with_depth`](crate::rays::RaySource::with_depth), or if no view has a depth image.
     pub depth: Option<Tensor<T>>,
-    /// `[n, width]` by name, in the order in which the source was given them ([`RaySource::with_channel`](crate::rays::RaySource::with_channel)).
+    /// Custom channels, `[n, width]`, by name, in the order of [`RaySource::with_channel`](crate::rays::RaySource::with_channel) calls.
     pub channels: Vec<(String, Tensor<T>)>,
 }
 
 impl<T: Real> RayBatch<T> {
-    /// The number of rays.
+    /// Returns the number of rays.
     pub fn len(&self) -> usize {
         self.rays.len()
     }
 
-    /// True if there are none.
+    /// Returns true if there are no rays.
     pub fn is_empty(&self) -> bool {
         self.rays.is_empty()
     }
 
-    /// The channel of this name, `[n, width]`; `None` if the source was given none.
+    /// Returns the channel of this name, `[n, width]`; `None` if the source has no such channel.
     pub fn channel(&self, name: &str) -> Option<&Tensor<T>> {
         self.channels.iter().find(|(found, _)| found == name).map(|(_, values)| values)
     }
 
-    /// The channel of this name, `[n, width]`, for a loss that cannot do without.
+    /// Returns the channel of this name, `[n, width]`, for a loss that requires it.
     ///
-    /// Panics at the caller's line, naming the channels that there are, if the source was given none of this name.
+    /// Panics at the caller's line if the source has no such channel; the message lists the existing channels.
     #[track_caller]
     pub fn expect_channel(&self, name: &str) -> &Tensor<T> {
         let names = || self.channels.iter().map(|(name, _)| format!("`{name}`")).collect::<Vec<_>>().join(", ");

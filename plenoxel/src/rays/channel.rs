@@ -1,4 +1,4 @@
-//! Numbers beside the colors of the pixels: depth, and what a user supplies.
+//! Additional values of pixels: depth, and user-defined channels.
 
 use super::RayBatch;
 use crate::dataset::View;
@@ -6,23 +6,24 @@ use autograd::{Buffer, Real, Tensor, parallel};
 use ndarray::Array3;
 use std::sync::Arc;
 
-/// Named numbers of every pixel of the views at their full size.
+/// Named values of every pixel of the views at full size.
 #[derive(Debug, Clone)]
 pub struct Channel {
     pub name: String,
-    /// `[height, width, c]` for each view.
+    /// Images `[height, width, c]`, one per view.
     images: Arc<[Array3<f32>]>,
-    /// Numbers of a pixel: c.
+    /// Number of values per pixel, c.
     width: usize,
 }
 
 impl Channel {
-    /// Panics unless there is one image for each view, of its size, all of the same number of channels, one or more.
+    /// Creates a channel. Panics unless there is one image per view, of the view's size, and all have the same number of channels, at least
+    /// one.
     #[track_caller]
     pub fn new(name: String, images: Arc<[Array3<f32>]>, views: &[View]) -> Self {
         assert!(images.len() == views.len(), "channel `{name}`: {} images for {} views", images.len(), views.len());
         let width = images.first().map_or(1, |image| image.dim().2);
-        assert!(width > 0, "channel `{name}`: images of shape {:?} hold no numbers", images[0].dim());
+        assert!(width > 0, "channel `{name}`: images of shape {:?} have no channels", images[0].dim());
         for (v, (image, view)) in images.iter().zip(views).enumerate() {
             let (w, h) = view.image.dimensions();
             let (found, expected) = (image.dim(), (h as usize, w as usize, width));
@@ -31,21 +32,21 @@ impl Channel {
         Channel { name, images, width }
     }
 
-    /// `[n, width]`: what the pixels of a batch hold.
+    /// Returns the values of the pixels of a batch, `[n, width]`.
     pub fn at<T: Real>(&self, batch: &RayBatch<T>, block: impl Fn(usize) -> usize + Sync) -> Tensor<T> {
         let values = gathered(batch, self.width, block, |v, [x, y], c| self.images[v][[y, x, c]]);
         Tensor::from_buffer(values, &[batch.len(), self.width])
     }
 }
 
-/// `[n]`: the depth of the pixels of a batch, NaN where a view has no depth image.
+/// Returns the depth of the pixels of a batch, `[n]`; NaN if a view has no depth image.
 pub fn depth<T: Real>(batch: &RayBatch<T>, views: &[View], block: impl Fn(usize) -> usize + Sync) -> Tensor<T> {
     let at = |v: usize, [x, y]: [usize; 2], _| views[v].depth.as_ref().map_or(f32::NAN, |depth| depth[[y, x]]);
     Tensor::from_buffer(gathered(batch, 1, block, at), &[batch.len()])
 }
 
-/// Numbers of the pixels of a batch, `width` for each: of a pixel that is the mean of k × k pixels of the full image the mean of theirs, where
-/// `block` says k by the number of the view and `at` the c-th number by view and place in the full image.
+/// Gathers `width` values for each pixel of a batch. `block` returns the reduction k of a view; a reduced pixel gets the mean over its k ×
+/// k pixels. `at` returns the c-th value of a pixel of a full image.
 fn gathered<T: Real>(
     batch: &RayBatch<T>,
     width: usize,

@@ -1,20 +1,20 @@
-//! Squares of neighbouring pixels, for losses that compare a pixel with those around it.
+//! Square patches of pixels, for losses that compare a pixel with its neighbours.
 
 use super::RaySource;
 use crate::random::{Purpose, bits};
 
 impl RaySource {
-    /// Random squares of `side` × `side` pixels of the views as reduced now, as (view, column, row) for [`batch_of`](Self::batch_of): square
-    /// after square, row after row, so that colors of the batch have the shape `[count, side, side, 3]`.
+    /// Returns random patches of `side` × `side` pixels of the reduced views, as (view, column, row) for [`batch_of`](Self::batch_of). They
+    /// are listed patch after patch and row after row, so the colors of the batch can be reshaped to `[count, side, side, 3]`.
     ///
-    /// Every square that lies in a view is as likely as any other, and they may overlap; whether rays are aimed does not matter. They are a function
-    /// of the source's seed and of `step`.
+    /// Patches are uniformly distributed over all positions inside a view, and may overlap. Aiming does not restrict them. They depend only
+    /// on the seed of the source and on `step`.
     ///
-    /// Panics if `side` is 0 or larger than all views.
+    /// Panics if `side` is 0, or if no view contains a patch.
     #[track_caller]
     pub fn patches(&self, step: u64, count: usize, side: u32) -> Vec<(u32, u32, u32)> {
-        assert!(side > 0, "patches: squares of 0 x 0 pixels");
-        // Columns and rows in which a square can begin.
+        assert!(side > 0, "patches: the side is 0");
+        // Number of columns and rows at which a patch can begin.
         let places = self.views().iter().map(|view| {
             let (width, height) = view.image.dimensions();
             ((width + 1).saturating_sub(side), (height + 1).saturating_sub(side))

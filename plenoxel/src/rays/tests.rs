@@ -5,7 +5,7 @@ use crate::dataset::procedural::ProceduralOptions;
 use crate::dataset::{Dataset, Split};
 use ndarray::{Array2, array};
 
-/// A view of some pixels in a row.
+/// Returns a view of a single row of pixels.
 fn view(pixels: &[[u8; 4]]) -> View {
     let intrinsics = Intrinsics::from_fov_x(pixels.len(), 1, 0.7);
     let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, intrinsics);
@@ -30,7 +30,7 @@ fn a_view_full_of_object_is_judged_by_alpha_if_another_one_has_some() {
     let alphas =
         |views: &[View]| -> Vec<f32> { RaySource::new(views, [1.0; 3], 0).in_order_with_alpha(3).flat_map(|(_, alphas)| alphas).collect() };
     let (white, red) = ([255, 255, 255, 255], [255, 0, 0, 255]);
-    // White parts of an object that fills its picture are object.
+    // White parts of an object that fills its image belong to the object.
     let [full, other] = [view(&[white, red]), view(&[white, [0; 4], [9, 9, 9, 51]])];
     assert_eq!(alphas(&[full.clone(), other]), [1.0, 1.0, 1.0, 0.0, 0.2]);
     assert_eq!(alphas(&[full.clone(), full]), [0.0, 1.0, 0.0, 1.0]);
@@ -41,7 +41,7 @@ fn scene() -> Vec<View> {
     Dataset::procedural(options).unwrap().load(Split::Train, &|_, _| {}).unwrap()
 }
 
-/// What a batch says of its pixels.
+/// Returns view, column and row of each pixel of a batch.
 fn places(batch: &RayBatch<f64>) -> Vec<(u32, u32, u32)> {
     batch.view.iter().zip(&batch.pixel).map(|(&view, &[x, y])| (view, x, y)).collect()
 }
@@ -108,7 +108,7 @@ fn depth_is_that_of_the_pixel_and_not_a_number_where_a_view_has_none() {
 
 #[test]
 fn channels_and_depth_of_a_reduced_pixel_are_the_mean_of_its_block() {
-    // Two views of 4 x 2 and 3 x 2 pixels: reduced by 2, of which the second stays as it is.
+    // Two views of 4 x 2 and 3 x 2 pixels: a reduction by 2 leaves the second unchanged.
     let image = |width| RgbaImage::from_pixel(width, 2, [0, 0, 0, 255].into());
     let views = [4, 3].map(|width| {
         let intrinsics = Intrinsics::from_fov_x(width, 2, 0.7);
@@ -149,7 +149,7 @@ fn what_does_not_fit_is_refused_by_its_name() {
     let mask = |source: RaySource| source.with_channel("mask", vec![Array3::zeros((16, 24, 1)); 3]);
     let twice = mask(RaySource::new(scene(), [1.0; 3], 0));
     let twice = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| drop(mask(twice)))).unwrap_err();
-    assert_eq!(*twice.downcast::<String>().unwrap(), "there is a channel `mask` already");
+    assert_eq!(*twice.downcast::<String>().unwrap(), "with_channel: channel `mask` exists already");
     let missing = message(|source| {
         let source = source.with_channel("weight", vec![Array3::zeros((16, 24, 1)); 3]);
         source.batch::<f64>(0, 1).expect_channel("mask");
@@ -165,7 +165,7 @@ fn what_does_not_fit_is_refused_by_its_name() {
 
 #[test]
 fn patches_are_squares_of_a_view_anywhere_in_it_and_change_with_step_and_seed() {
-    // Of 6 x 5 and 3 x 3 pixels: 4 x 3 squares of three pixels a side in the first, one in the second.
+    // Views of 6 x 5 and 3 x 3 pixels: 4 x 3 positions of a 3 x 3 patch in the first, one in the second.
     let view = |width: usize, height: usize| {
         let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(width, height, 0.7));
         View { name: String::new(), camera, image: RgbaImage::new(width as u32, height as u32), depth: None }

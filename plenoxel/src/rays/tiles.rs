@@ -1,19 +1,19 @@
-//! Which parts of the views can show something.
+//! Tiles of the views that can show matter.
 
 use crate::camera::projection::{Projection, Rectangle};
 use crate::dataset::View;
 use crate::sampling::Occupancy;
 use autograd::parallel;
 
-/// Pixels along a side of a tile.
+/// Side of a tile in pixels.
 const SIDE: u32 = 8;
 
-/// A rectangle of pixels.
+/// Rectangle of pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tile {
     /// Number of the view.
     pub view: u32,
-    /// Its first column and row.
+    /// First column and first row.
     pub x: u32,
     pub y: u32,
     pub width: u32,
@@ -21,7 +21,7 @@ pub struct Tile {
 }
 
 impl Tile {
-    /// All of a view.
+    /// Returns a tile that covers a whole view.
     pub fn of_view(number: usize, view: &View) -> Self {
         let (width, height) = view.image.dimensions();
         Tile { view: number as u32, x: 0, y: 0, width, height }
@@ -32,7 +32,8 @@ impl Tile {
     }
 }
 
-/// The tiles that bricks of cells project into, by the rectangle around each; all tiles of a view that has a brick beside or behind its camera.
+/// Returns the tiles that intersect the bounding rectangle of a projected brick of cells. If a brick is beside or behind a camera, returns
+/// all tiles of the view.
 pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
     let (aabb, cells) = (matter.aabb(), matter.cells());
     let bricks = matter.masks().iter().enumerate().filter(|(_, mask)| **mask != 0);

@@ -1,7 +1,8 @@
-//! **The specification**: emission and absorption along a ray (Max 1995), as a graph of small ops. When in doubt, this file is right.
+//! **Reference implementation** of volume rendering: emission and absorption along a ray (Max 1995), as a graph of small ops. Other
+//! implementations must agree with this file.
 //!
-//! With optical depth τᵢ = σᵢ δᵢ per sample, transmittance before it Tᵢ = exp(−Σ_{j<i} τⱼ), weight wᵢ = Tᵢ (1 − e^{−τᵢ}) and
-//! T_N = exp(−Σ τⱼ) left for the background b:  C = Σ wᵢ cᵢ + T_N b,  depth = Σ wᵢ tᵢ,  opacity = 1 − T_N = Σ wᵢ.
+//! With optical depth τᵢ = σᵢ δᵢ of a sample, transmittance before it Tᵢ = exp(−Σ_{j<i} τⱼ), weight wᵢ = Tᵢ (1 − e^{−τᵢ}), transmittance to
+//! the background T_N = exp(−Σ τⱼ) and background b:  C = Σ wᵢ cᵢ + T_N b,  depth = Σ wᵢ tᵢ,  opacity = 1 − T_N = Σ wᵢ.
 
 use super::Radiance;
 use crate::sampling::Samples;
@@ -9,40 +10,40 @@ use autograd::{Real, Tensor};
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// Pixels of n rays, with what the losses may want.
+/// Rendered pixels of n rays, with further columns for losses.
 #[derive(Debug, Clone)]
 pub struct Rendered<T: Real> {
-    /// `[n, 3]` color over the background.
+    /// Color over the background, `[n, 3]`.
     pub rgb: Tensor<T>,
-    /// `[n]` in [0, 1]: 1 − T_N.
+    /// Opacity 1 − T_N, `[n]`, in [0, 1].
     pub opacity: Tensor<T>,
-    /// `[n]` ln T_N <= 0.
+    /// Logarithm of the transmittance ln T_N, `[n]`, <= 0.
     pub log_transmittance: Tensor<T>,
-    /// Samples behind all the pixels.
+    /// Number of samples on all rays.
     pub sample_count: usize,
     columns: Arc<dyn Columns<T>>,
 }
 
-/// The columns of rendered pixels that cost something and are computed only when a loss or a picture asks for them.
+/// Columns of rendered pixels that are computed only when a loss or an image needs them.
 ///
-/// A kernel that renders a field implements this; [`composite()`] computes them from the samples.
+/// A kernel that renders a field implements this trait. [`composite()`] computes the columns from the samples.
 pub trait Columns<T: Real>: Debug + Send + Sync {
-    /// `[n]` Σ wᵢ tᵢ, world length.
+    /// Returns the depth Σ wᵢ tᵢ, `[n]`, world length.
     fn depth(&self) -> Tensor<T>;
 
-    /// `[n]` Σ ln(1 + 2σᵢ²).
+    /// Returns the sparsity Σ ln(1 + 2σᵢ²), `[n]`.
     fn sparsity(&self) -> Tensor<T>;
 
-    /// `[n]` Σᵢⱼ wᵢ wⱼ |tᵢ − tⱼ| + ⅓ Σ wᵢ² δᵢ, world length.
+    /// Returns the distortion Σᵢⱼ wᵢ wⱼ |tᵢ − tⱼ| + ⅓ Σ wᵢ² δᵢ, `[n]`, world length.
     fn distortion(&self) -> Tensor<T>;
 
-    /// Density, color and weight of every sample, where they are kept.
+    /// Returns density, color and weight of every sample, if they are kept.
     fn samples(&self) -> Option<&PerSample<T>> {
         None
     }
 }
 
-/// Columns without a place in the graph.
+/// Columns detached from the graph.
 #[derive(Debug)]
 struct Detached<T: Real>(Arc<dyn Columns<T>>);
 
@@ -60,20 +61,20 @@ impl<T: Real> Columns<T> for Detached<T> {
     }
 }
 
-/// What is known of each of m samples.
+/// Values of m samples.
 #[derive(Debug, Clone)]
 pub struct PerSample<T: Real> {
-    /// `[m]` wᵢ = Tᵢ (1 − e^{−σᵢδᵢ}), in [0, 1].
+    /// Rendering weights wᵢ = Tᵢ (1 − e^{−σᵢδᵢ}), `[m]`, in [0, 1].
     pub weights: Tensor<T>,
     /// Density and color.
     pub radiance: Radiance<T>,
-    /// Positions, intervals, and which ray they belong to.
+    /// Positions, intervals and rays of the samples.
     pub samples: Samples<T>,
 }
 
-/// Pixels from samples. `background` is `[3]`, or `[n, 3]` for one color a ray.
+/// Composites samples to pixels. `background` is `[3]`, or `[n, 3]` for one color per ray.
 ///
-/// Panics if radiance and samples differ in number.
+/// Panics if the numbers of radiance values and samples differ.
 #[track_caller]
 pub fn composite<T: Real>(samples: Samples<T>, radiance: Radiance<T>, background: &Tensor<T>) -> Rendered<T> {
     let offsets = &samples.offsets;
@@ -89,7 +90,7 @@ pub fn composite<T: Real>(samples: Samples<T>, radiance: Radiance<T>, background
 }
 
 impl<T: Real> Rendered<T> {
-    /// Pixels from their tensors, `[n, 3]`, `[n]` and `[n]`, and what computes the other columns.
+    /// Creates pixels from `rgb` `[n, 3]`, `opacity` `[n]`, `log_transmittance` `[n]`, and an implementation of the other columns.
     pub fn new(
         rgb: Tensor<T>,
         opacity: Tensor<T>,
@@ -100,28 +101,28 @@ impl<T: Real> Rendered<T> {
         Rendered { rgb, opacity, log_transmittance, sample_count, columns: Arc::new(columns) }
     }
 
-    /// Density, color and weight of every sample, if the graph rendered this: a fused kernel does not keep them.
+    /// Returns density, color and weight of every sample, if the graph engine rendered the pixels. Fused kernels do not keep them.
     pub fn samples(&self) -> Option<&PerSample<T>> {
         self.columns.samples()
     }
 
-    /// `[n]` Σ wᵢ tᵢ, world length. It is not divided by opacity, so that it is smooth; pictures divide.
+    /// Returns the depth Σ wᵢ tᵢ, `[n]`, world length. It is not divided by the opacity, so that it is smooth; images divide it.
     pub fn depth(&self) -> Tensor<T> {
         self.columns.depth()
     }
 
-    /// `[n]` Σ ln(1 + 2σᵢ²): Cauchy sparsity (PlenOctrees, svox2).
+    /// Returns the Cauchy sparsity Σ ln(1 + 2σᵢ²), `[n]` (PlenOctrees, svox2).
     pub fn sparsity(&self) -> Tensor<T> {
         self.columns.sparsity()
     }
 
-    /// `[n]` Σᵢⱼ wᵢ wⱼ |tᵢ − tⱼ| + ⅓ Σ wᵢ² δᵢ, world length: the distortion of mip-NeRF 360 (eq. 15).
+    /// Returns the distortion of mip-NeRF 360 (eq. 15), Σᵢⱼ wᵢ wⱼ |tᵢ − tⱼ| + ⅓ Σ wᵢ² δᵢ, `[n]`, world length.
     pub fn distortion(&self) -> Tensor<T> {
         self.columns.distortion()
     }
 
-    /// The same pixels as constants, through which no gradient flows: for a loss that compares with a rendering that is not to change.
-    /// Single samples are left out.
+    /// Returns the pixels detached from the graph, so that no gradient flows through them; for losses that compare with a fixed rendering.
+    /// The values of single samples are dropped.
     pub fn detach(&self) -> Self {
         Rendered {
             rgb: self.rgb.detach(),
@@ -132,12 +133,12 @@ impl<T: Real> Rendered<T> {
         }
     }
 
-    /// The same pixels with other colors `[n, 3]`.
+    /// Returns the pixels with other colors `[n, 3]`.
     ///
-    /// Panics if the shape is another.
+    /// Panics if the shape differs.
     #[track_caller]
     pub fn with_rgb(&self, rgb: Tensor<T>) -> Self {
-        assert_eq!(rgb.shape(), self.rgb.shape(), "with_rgb: one color for each ray");
+        assert_eq!(rgb.shape(), self.rgb.shape(), "with_rgb: colors must have the shape of the rendered colors");
         Rendered { rgb, ..self.clone() }
     }
 }
@@ -151,7 +152,7 @@ impl<T: Real> Columns<T> for PerSample<T> {
         (2.0 * self.radiance.sigma.square() + 1.0).ln().segment_sum(&self.samples.offsets)
     }
 
-    /// In linear time by prefix sums Wᵢ = Σ_{j<i} wⱼ, Mᵢ = Σ_{j<i} wⱼ tⱼ as Σ 2 wᵢ (tᵢ Wᵢ − Mᵢ) + wᵢ² δᵢ / 3.
+    /// Computed in linear time with the prefix sums Wᵢ = Σ_{j<i} wⱼ and Mᵢ = Σ_{j<i} wⱼ tⱼ, as Σ 2 wᵢ (tᵢ Wᵢ − Mᵢ) + wᵢ² δᵢ / 3.
     fn distortion(&self) -> Tensor<T> {
         let PerSample { weights: w, samples: s, .. } = self;
         let before = w.segment_exclusive_sum(&s.offsets);

@@ -1,4 +1,4 @@
-//! Whole images, in chunks of rays.
+//! Rendering of whole images, in chunks of rays.
 
 use super::{Field, RenderOptions, Rendered, render};
 use crate::camera::{Camera, Ray};
@@ -8,23 +8,23 @@ use ndarray::{Array2, Array3};
 /// A rendered image.
 #[derive(Debug, Clone)]
 pub struct Picture {
-    /// `[h, w, 3]` sRGB, not clamped.
+    /// Color, `[h, w, 3]`, sRGB, not clamped.
     pub rgb: Array3<f32>,
-    /// `[h, w]` Σ wᵢ tᵢ, world length.
+    /// Depth Σ wᵢ tᵢ, `[h, w]`, world length.
     pub depth: Array2<f32>,
-    /// `[h, w]` in [0, 1].
+    /// Opacity, `[h, w]`, in [0, 1].
     pub opacity: Array2<f32>,
 }
 
-/// Rays rendered at a time: bounds the memory.
+/// Number of rays rendered at a time. It bounds the memory.
 const CHUNK: usize = 4096;
 
-/// Renders what a camera sees of a field.
+/// Renders an image of a field.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {
     picture_by(|rays| render(field, rays, options), camera)
 }
 
-/// Renders what a camera sees, by a function from rays to pixels. No gradient is recorded.
+/// Renders an image with a function from rays to pixels. No gradient is recorded.
 pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Camera) -> Picture {
     let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
     let (mut rgb, mut depth, mut opacity) = (Vec::with_capacity(3 * w * h), Vec::with_capacity(w * h), Vec::with_capacity(w * h));
@@ -36,7 +36,7 @@ pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Came
         depth.extend(rendered.depth().data().iter().map(as_f32));
         opacity.extend(rendered.opacity.data().iter().map(as_f32));
     }
-    let fits = "one number for each pixel";
+    let fits = "one value per pixel";
     Picture {
         rgb: Array3::from_shape_vec((h, w, 3), rgb).expect(fits),
         depth: Array2::from_shape_vec((h, w), depth).expect(fits),

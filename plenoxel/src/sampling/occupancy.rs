@@ -1,4 +1,4 @@
-//! Which cells of a box may hold matter, and how far it is to the next ones.
+//! Occupancy of the cells of a box, with distances to the nearest occupied cells.
 
 use crate::camera::Ray;
 use crate::geometry::Aabb;
@@ -7,22 +7,22 @@ use autograd::{Real, Tensor, no_grad, parallel};
 use glam::DVec3;
 use std::sync::Arc;
 
-/// Which cells of a box may hold matter. Cells come in bricks of 4³, a bit for each; an empty brick knows how many bricks around it are
-/// empty too. Cloning copies pointers.
+/// Set of cells of a box that may hold matter. Cells are stored in bricks of 4³, one bit per cell. Each empty brick stores its distance to
+/// the nearest brick that is not empty. Cloning copies pointers.
 #[derive(Debug, Clone)]
 pub struct Occupancy {
     aabb: Aabb,
     bricks: BrickGrid,
-    /// The cells of each brick that may hold matter.
+    /// Mask of occupied cells of each brick.
     masks: Arc<[u64]>,
-    /// For an empty brick, the Chebyshev distance in bricks to the next one that is not, at most [`FAR`]; 0 for that one.
+    /// Chebyshev distance, in bricks, to the nearest brick that is not empty, at most [`FAR`]; 0 for a brick that is not empty.
     distance: Arc<[u8]>,
 }
 
-/// The largest distance that is told apart.
+/// Largest stored distance.
 const FAR: u8 = 8;
 
-/// What a ray finds at a point.
+/// Occupancy at a point of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Look {
     Occupied,
@@ -32,19 +32,19 @@ pub(crate) enum Look {
 }
 
 impl Occupancy {
-    /// Cells in row-major order: (i, j, k) is entry (i·ny + j)·nz + k.
+    /// Creates an occupancy from cells in row-major order: (i, j, k) is entry (i·ny + j)·nz + k.
     ///
-    /// Panics if the mask does not have one entry for each cell.
+    /// Panics if the mask does not have one entry per cell.
     pub fn new(aabb: Aabb, cells: [usize; 3], mask: &[bool]) -> Self {
-        assert_eq!(mask.len(), cells.iter().product::<usize>(), "occupancy: one entry for each of {cells:?} cells");
+        assert_eq!(mask.len(), cells.iter().product::<usize>(), "occupancy: the mask must have one entry for each of {cells:?} cells");
         let full = mask.iter().enumerate().filter(|(_, full)| **full);
         let masks = BrickGrid::new(cells).masks_of(full.map(|(c, _)| cell_at(c, cells)));
         Self::from_masks(aabb, cells, masks)
     }
 
-    /// The cells of a box at whose centres a density is above a threshold, 1 / world length. `density` maps world positions `[m, 3]` to
-    /// `[m]`: that of any field, evaluated without recording a gradient. Matter that is thinner than a cell can be missed: dilate, or take
-    /// a lower threshold.
+    /// Returns the cells of a box at whose centres a density is above a threshold, 1 / world length. `density` maps world positions `[m,
+    /// 3]` to `[m]` and may be that of any field; it is evaluated without recording a gradient. Matter thinner than a cell can be missed:
+    /// dilate the result, or lower the threshold.
     pub fn where_dense<T: Real>(aabb: Aabb, cells: [usize; 3], threshold: f64, density: impl Fn(&Tensor<T>) -> Tensor<T>) -> Self {
         const AT_A_TIME: usize = 1 << 16;
         let sides = (aabb.max - aabb.min) / DVec3::from_array(cells.map(|n| n as f64));
@@ -59,44 +59,44 @@ impl Occupancy {
         Self::new(aabb, cells, &mask)
     }
 
-    /// Cells from one mask for each brick, as in [`autograd::Lattice::masks`].
+    /// Creates an occupancy from one mask per brick, as in [`autograd::Lattice::masks`].
     ///
-    /// Panics if there is not one mask for each brick.
+    /// Panics if the number of masks is not the number of bricks.
     pub fn from_masks(aabb: Aabb, cells: [usize; 3], masks: Vec<u64>) -> Self {
         let bricks = BrickGrid::new(cells);
-        assert_eq!(masks.len(), bricks.len(), "occupancy: one mask for each of {:?} bricks", bricks.count());
+        assert_eq!(masks.len(), bricks.len(), "occupancy: there must be one mask for each of {:?} bricks", bricks.count());
         let distance = distances(&masks, bricks.count()).into();
         Occupancy { aabb, bricks, masks: masks.into(), distance }
     }
 
-    /// The box.
+    /// Returns the box.
     pub fn aabb(&self) -> Aabb {
         self.aabb
     }
 
-    /// Cells along each axis.
+    /// Returns the number of cells along each axis.
     pub fn cells(&self) -> [usize; 3] {
         self.bricks.nodes()
     }
 
-    /// How the cells are divided into bricks.
+    /// Returns the division of the cells into bricks.
     pub fn bricks(&self) -> BrickGrid {
         self.bricks
     }
 
-    /// One mask for each brick ([`BrickGrid`]).
+    /// Returns one mask per brick ([`BrickGrid`]).
     pub fn masks(&self) -> &[u64] {
         &self.masks
     }
 
-    /// How many layers of bricks are empty at a brick: 0 if it is not, k if all within k − 1 of it along axes and diagonals are. At most 8 are
-    /// told apart.
+    /// Returns the number of layers of empty bricks at a brick: 0 if the brick is not empty, k if all bricks within Chebyshev distance k −
+    /// 1 are empty. At most 8.
     #[inline]
     pub fn free(&self, brick: usize) -> u8 {
         self.distance[brick]
     }
 
-    /// May a cell hold matter?
+    /// Returns true if a cell may hold matter.
     ///
     /// Panics if the cell lies outside of the box.
     pub fn contains(&self, cell: [usize; 3]) -> bool {
@@ -105,25 +105,25 @@ impl Occupancy {
         has(self.masks[brick], bit)
     }
 
-    /// The share of cells that may hold matter.
+    /// Returns the fraction of cells that may hold matter.
     pub fn fraction(&self) -> f64 {
         self.masks.iter().map(|m| f64::from(m.count_ones())).sum::<f64>() / self.cells().iter().product::<usize>() as f64
     }
 
-    /// The smallest box around the cells that may hold matter; `None` if none may.
+    /// Returns the bounding box of the cells that may hold matter; `None` if there are none.
     pub fn bounds(&self) -> Option<Aabb> {
         let side = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells().map(|n| n as f64));
-        // Rounding must not lead out of the box.
+        // Rounding must not leave the box.
         let corner = |k: [usize; 3]| (self.aabb.min + side * DVec3::from_array(k.map(|k| k as f64))).min(self.aabb.max);
         self.extent().map(|[low, high]| Aabb { min: corner(low), max: corner(high) })
     }
 
-    /// Half the side of the smallest cube around the origin that holds all cells that may hold matter; `None` if none may.
+    /// Returns half the side of the smallest cube around the origin that contains all cells that may hold matter; `None` if there are none.
     pub fn half_width(&self) -> Option<f64> {
         self.bounds().map(|bounds| bounds.max.max(-bounds.min).max_element())
     }
 
-    /// The bounds in cells: the lowest along each axis, and one above the highest.
+    /// Returns the bounds in cells: the lowest cell along each axis, and one above the highest; `None` if there are none.
     pub fn extent(&self) -> Option<[[usize; 3]; 2]> {
         let (mut low, mut high) = (self.cells(), [0; 3]);
         for (brick, &mask) in self.masks.iter().enumerate() {
@@ -136,7 +136,7 @@ impl Occupancy {
         (low[0] < high[0]).then_some([low, high])
     }
 
-    /// The cells within `radius` cells of these, along axes and diagonals.
+    /// Returns the cells within Chebyshev distance `radius` of the occupied cells.
     pub fn dilated(&self, radius: usize) -> Self {
         let mut masks = self.masks.to_vec();
         for _ in 0..radius {
@@ -148,8 +148,9 @@ impl Occupancy {
         Self::from_masks(self.aabb, self.cells(), masks)
     }
 
-    /// The cells between the centres of these: one more along each axis, in a box larger by half a cell on every side, so that cell (i, j, k)
-    /// has its corners at the centres of the cells (i − 1, j − 1, k − 1) to (i, j, k). Those with one of these cells at a corner.
+    /// Returns the occupancy of the cells between the centres of these cells. There is one more cell along each axis, in a box that is
+    /// larger by half a cell on every side; the corners of cell (i, j, k) are the centres of cells (i − 1, j − 1, k − 1) to (i, j, k). A
+    /// cell is occupied if one of its corners is the centre of an occupied cell.
     pub fn between_centres(&self) -> Self {
         let half = 0.5 * (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells().map(|n| n as f64));
         let aabb = Aabb { min: self.aabb.min - half, max: self.aabb.max + half };
@@ -165,27 +166,27 @@ impl Occupancy {
         Self::from_masks(aabb, cells, masks)
     }
 
-    /// The cells that are in both.
+    /// Returns the cells that are in both.
     ///
-    /// Panics if the other has other cells.
+    /// Panics if the numbers of cells differ.
     pub fn intersection(&self, other: &Self) -> Self {
         self.combined(other, |a, b| a & b)
     }
 
-    /// The cells that are in either.
+    /// Returns the cells that are in either.
     ///
-    /// Panics if the other has other cells.
+    /// Panics if the numbers of cells differ.
     pub fn union(&self, other: &Self) -> Self {
         self.combined(other, |a, b| a | b)
     }
 
     fn combined(&self, other: &Self, join: fn(u64, u64) -> u64) -> Self {
-        assert_eq!(self.bricks, other.bricks, "occupancy: different grids");
+        assert_eq!(self.bricks, other.bricks, "occupancy: the grids have different numbers of cells");
         let masks = self.masks.iter().zip(&*other.masks).map(|(&a, &b)| join(a, b)).collect();
         Self::from_masks(self.aabb, self.cells(), masks)
     }
 
-    /// What can be looked up along a ray.
+    /// Prepares look-ups along a ray.
     #[inline]
     pub(crate) fn along(&self, ray: &Ray) -> Along<'_> {
         let per_length = DVec3::from_array(self.cells().map(|n| n as f64)) / (self.aabb.max - self.aabb.min);
@@ -194,29 +195,29 @@ impl Occupancy {
     }
 }
 
-/// A ray through a box, its position in cells being `start + t slope`.
+/// Ray through a box. Its position in cells at distance t is `start + t slope`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Along<'a> {
     cells: &'a Occupancy,
     start: DVec3,
     slope: DVec3,
-    /// One over the slope.
+    /// Reciprocal of the slope.
     per_cell: DVec3,
 }
 
 impl Along<'_> {
-    /// What lies at a distance along the ray.
+    /// Looks up the cell at a distance along the ray.
     #[inline]
     pub(crate) fn look(&self, t: f64) -> Look {
         let Occupancy { bricks, masks, distance, .. } = self.cells;
         let cell: [usize; 3] = std::array::from_fn(|a| self.cell(a, t, bricks.nodes()[a]) as usize);
         let (brick, bit) = bricks.split(cell);
-        // The distances are a table that stays in the cache, and most of what is looked at is far from everything.
+        // The table of distances stays in the cache, and most look-ups are far from occupied cells.
         let free = distance[brick];
         if free == 0 {
             return if has(masks[brick], bit) { Look::Occupied } else { Look::Empty };
         }
-        // All bricks nearer than `free` are empty: to where the ray leaves the cube of them.
+        // All bricks nearer than `free` are empty: skip to the exit of the ray from the cube of these bricks.
         let exit = (0..3).fold(f64::INFINITY, |exit, a| {
             let (here, reach) = ((cell[a] / BRICK) as f64, f64::from(free));
             let d = self.slope[a];
@@ -226,18 +227,18 @@ impl Along<'_> {
         Look::EmptyUntil(exit)
     }
 
-    /// The cell that a distance lies in, along one axis.
+    /// Returns the cell at a distance, along one axis.
     #[inline(always)]
     fn cell(&self, axis: usize, t: f64, cells: usize) -> u32 {
         (self.start[axis] + t * self.slope[axis]).max(0.0).min((cells - 1) as f64) as u32
     }
 
-    /// Which of some distances lie in occupied cells.
+    /// Tests which distances lie in occupied cells.
     #[inline(always)]
     pub(crate) fn occupied<const N: usize>(&self, t: &[f64; N]) -> [bool; N] {
         let Occupancy { bricks, masks, .. } = self.cells;
         let (mut numbers, mut bits) = ([0; N], [0; N]);
-        // As `BrickGrid::split`, one axis after the other: such loops vectorise.
+        // Like `BrickGrid::split`, one axis after another, because such loops vectorise.
         for a in 0..3 {
             for i in 0..N {
                 let cell = self.cell(a, t[i], bricks.nodes()[a]);
@@ -250,12 +251,12 @@ impl Along<'_> {
     }
 }
 
-/// The cell with a number in row-major order.
+/// Returns the cell with a number in row-major order.
 fn cell_at(number: usize, cells: [usize; 3]) -> [usize; 3] {
     [number / (cells[1] * cells[2]), number / cells[2] % cells[1], number % cells[2]]
 }
 
-/// Every cell and the next one along an axis, and, if asked for, the one before it.
+/// Extends the cells to the next cell along an axis and, if `back`, to the previous one.
 fn dilate(masks: &[u64], bricks: BrickGrid, axis: usize, back: bool) -> Vec<u64> {
     let stride = bricks.strides()[axis];
     let mut out = vec![0; masks.len()];
@@ -273,10 +274,10 @@ fn dilate(masks: &[u64], bricks: BrickGrid, axis: usize, back: bool) -> Vec<u64>
     out
 }
 
-/// Chebyshev distance of each brick to the nearest that is not empty, [`FAR`] at most.
+/// Returns the Chebyshev distance of each brick to the nearest brick that is not empty, at most [`FAR`].
 ///
-/// min over all bricks of max |coordinate difference|, an axis after the other: along z it is a distance, along y and x it takes
-/// min over k of max(k, what was found k bricks away).
+/// The distance is min over all bricks of max |coordinate difference|. It is computed one axis after another: along z as a plain distance,
+/// along y and x as the minimum over k of max(k, distance found k bricks away).
 fn distances(masks: &[u64], count: [usize; 3]) -> Vec<u8> {
     let mut distance: Vec<u8> = masks.iter().map(|&m| if m == 0 { FAR } else { 0 }).collect();
     for line in distance.chunks_mut(count[2].max(1)) {

@@ -1,54 +1,54 @@
-//! The voxels a ray passes through, each once, in order, with the exact chord (Amanatides and Woo 1987), over bricks of 4³ voxels of which
-//! the empty ones are crossed in one step.
+//! Traversal of the voxels along a ray, each once, in order, with the exact chord (Amanatides and Woo 1987). Empty bricks of 4³ voxels are
+//! crossed in one step.
 
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use autograd::lattice::{BRICK, BrickGrid, bit_of};
 use std::ops::ControlFlow;
 
-/// A voxel on a ray.
+/// Voxel crossed by a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Crossing {
-    /// Which one.
+    /// Index of the voxel.
     pub voxel: [usize; 3],
-    /// Number of its brick, bricks in row-major order.
+    /// Number of its brick; bricks are in row-major order.
     pub brick: usize,
     /// Its bit in the brick's mask.
     pub bit: usize,
-    /// Distance along the ray at which it is entered.
+    /// Distance along the ray at which the ray enters the voxel.
     pub enter: f64,
-    /// Distance along the ray at which it is left, above `enter`.
+    /// Distance along the ray at which the ray leaves the voxel, above `enter`.
     pub leave: f64,
 }
 
-/// The voxels of a box as rays cross them.
+/// Traversal of the voxels of a box.
 #[derive(Clone, Copy, Debug)]
 pub struct Walk {
     aabb: Aabb,
     bricks: BrickGrid,
-    /// Planes before and behind which nothing is visited.
+    /// Range of voxels that are visited: the lowest, and one above the highest.
     extent: [[usize; 3]; 2],
 }
 
-/// The planes between voxels along one axis, numbered from 0 to `voxels`, as a ray meets them.
+/// Planes between voxels along one axis, numbered from 0 to `voxels`, as crossed by a ray.
 #[derive(Clone, Copy)]
 struct Planes {
     voxels: usize,
-    /// Where the ray starts, in voxels, and how many it passes in a unit of distance.
+    /// Start of the ray in voxels, and voxels per unit of distance.
     start: f64,
     pace: f64,
-    /// Distance along the ray from plane to plane: negative if it meets them in falling order.
+    /// Distance along the ray between planes; negative if the ray crosses them in decreasing order.
     spacing: f64,
-    /// The plane at distance 0, a fraction: where the ray starts, or, if it never meets a plane, one before all of them, which are then at
-    /// distances beyond any box.
+    /// Plane at distance 0, as a fraction: the start of the ray. If the ray crosses no plane, -1, which puts all planes at distances beyond
+    /// any box.
     origin: f64,
-    /// 1 if it meets them in rising order, 0 if not: what leads from a cell to the plane by which it is left.
+    /// Offset from a cell to the plane at which the ray leaves it: 1 if the ray crosses planes in increasing order, otherwise 0.
     forward: usize,
-    /// What leads from a cell to the next one, by wrapping addition.
+    /// Step from a cell to the next, by wrapping addition.
     step: usize,
 }
 
-/// A distance that no ray gets to.
+/// Distance that no ray reaches.
 const NEVER: f64 = 1e300;
 
 impl Planes {
@@ -68,13 +68,13 @@ impl Planes {
         }
     }
 
-    /// Distance along the ray at which it meets a plane.
+    /// Returns the distance along the ray at which it crosses a plane.
     #[inline(always)]
     fn at(&self, plane: usize) -> f64 {
         (plane as f64 - self.origin) * self.spacing
     }
 
-    /// Distances at which the ray enters and leaves what is between two planes.
+    /// Returns the distances at which the ray enters and leaves the space between two planes.
     fn chord(&self, low: usize, high: usize) -> (f64, f64) {
         if self.pace == 0.0 {
             let inside = self.start >= low as f64 && self.start <= high as f64;
@@ -84,13 +84,13 @@ impl Planes {
         (low.min(high), low.max(high))
     }
 
-    /// The cell among `low..high` that the ray is in just after the distance t, but for rounding.
+    /// Returns the cell among `low..high` that contains the ray just after distance t, up to rounding.
     #[inline(always)]
     fn cell(&self, t: f64, low: usize, high: usize) -> usize {
         ((self.start + t * self.pace) as usize).clamp(low, high - 1)
     }
 
-    /// Distance at which the ray leaves a brick and those within `layers` − 1 of it.
+    /// Returns the distance at which the ray leaves a brick and the bricks within `layers` − 1 of it.
     #[inline(always)]
     fn leaves_bricks(&self, brick: usize, layers: usize) -> f64 {
         let plane = if self.forward == 1 { brick + layers } else { (brick + 1).saturating_sub(layers) };
@@ -98,15 +98,15 @@ impl Planes {
     }
 }
 
-/// A place among cells, bricks or voxels, as a ray goes from one to the next.
+/// Current cell (brick or voxel) of a traversal.
 struct Front {
     place: [usize; 3],
-    /// Distance at which the ray leaves the place's layer along each axis.
+    /// Distance at which the ray leaves the cell along each axis.
     exits: [f64; 3],
 }
 
 impl Front {
-    /// Goes on to the next cell, `spacing` being the distance between planes. Without branches, for no guess at the axis is right often.
+    /// Moves to the next cell; `spacing` is the distance between planes. Branch-free, because the axis is hard to predict.
     #[inline(always)]
     fn advance(&mut self, spacing: &[f64; 3], step: &[usize; 3]) {
         let [x, y, z] = self.exits;
@@ -118,7 +118,7 @@ impl Front {
         }
     }
 
-    /// Distance at which the ray leaves the cell.
+    /// Returns the distance at which the ray leaves the cell.
     #[inline(always)]
     fn leave(&self) -> f64 {
         let [x, y, z] = self.exits;
@@ -127,21 +127,23 @@ impl Front {
 }
 
 impl Walk {
-    /// The voxels of a box.
+    /// Creates a traversal of the voxels of a box.
     pub fn new(aabb: Aabb, voxels: [usize; 3]) -> Self {
         Walk { aabb, bricks: BrickGrid::new(voxels), extent: [[0; 3], voxels] }
     }
 
-    /// Only those from one corner on and before another ([`super::Occupancy::extent`]).
+    /// Restricts the traversal to a range of voxels ([`super::Occupancy::extent`]).
     pub fn within(self, extent: [[usize; 3]; 2]) -> Self {
         Walk { extent, ..self }
     }
 
-    /// Calls `visit` for the voxels on a ray, from its origin on, until it breaks; those that the ray only touches are no voxels on it.
-    /// `free(brick)`, asked when the ray comes to a brick, by its number in row-major order, says how many layers of bricks are empty: 0 if the
-    /// brick is not, 1 if it is, k if all around it within k − 1 are too ([`super::Occupancy::free`]). Voxels of empty bricks are left out.
+    /// Calls `visit` for each voxel along a ray, from the ray's origin on, until it breaks. Voxels that the ray only touches are not
+    /// visited. Voxels of empty bricks are skipped.
     ///
-    /// Chords add up to that of the extent within rounding.
+    /// `free(brick)` is called when the ray enters a brick, with the brick's number in row-major order. It returns the number of layers of
+    /// empty bricks: 0 if the brick is not empty, k if all bricks within k − 1 of it are empty ([`super::Occupancy::free`]).
+    ///
+    /// Without empty bricks, the chords sum to that of the extent, up to rounding.
     #[inline]
     pub fn along(&self, ray: &Ray, free: impl Fn(usize) -> u8, mut visit: impl FnMut(Crossing) -> ControlFlow<()>) {
         let axis = |a: usize| Planes::new(self.bricks.nodes()[a], ray.origin[a], ray.direction[a], self.aabb.min[a], self.aabb.max[a]);
@@ -152,7 +154,7 @@ impl Walk {
             let (enter, leave) = axis.chord(low[a], high[a]);
             (t, end) = (t.max(enter), end.min(leave));
         }
-        // A ray without direction has no end.
+        // A ray with direction zero never leaves the box.
         if t >= end || end.is_infinite() {
             return;
         }
@@ -169,7 +171,7 @@ impl Walk {
             let brick = self.bricks.number(front.place);
             let layers = usize::from(free(brick));
             if layers > 1 {
-                // To where the ray leaves the cube of empty bricks.
+                // Skip to the exit of the ray from the cube of empty bricks.
                 let leaves = |a: usize| planes[a].leaves_bricks(front.place[a], layers);
                 let beyond = Front { place: front.place, exits: [leaves(0), leaves(1), leaves(2)] };
                 t = larger(t, beyond.leave());
@@ -195,7 +197,7 @@ impl Walk {
     }
 }
 
-/// The voxels of one brick, between two distances.
+/// Visits the voxels of one brick between two distances.
 #[inline(always)]
 fn cross(
     planes: &[Planes; 3],
@@ -229,12 +231,13 @@ fn cross(
     ControlFlow::Continue(())
 }
 
-/// Minimum and maximum of numbers, in one instruction each: those of the library see to what is none.
+/// Returns the minimum in one instruction. The library's version also handles NaN.
 #[inline(always)]
 fn smaller(x: f64, y: f64) -> f64 {
     if x < y { x } else { y }
 }
 
+/// Returns the maximum in one instruction. The library's version also handles NaN.
 #[inline(always)]
 fn larger(x: f64, y: f64) -> f64 {
     if x > y { x } else { y }
@@ -260,7 +263,7 @@ mod tests {
         found
     }
 
-    /// Two points on a sphere around the box, by number.
+    /// Returns a ray from a random point on a sphere around the box towards a random point near it.
     fn random_ray(seed: u64) -> (DVec3, DVec3) {
         let number = |k: u64| 2.0 * uniform(seed, Purpose::Initial, 9, k) - 1.0;
         let from = 4.0 * dvec3(number(0), number(1), number(2)).normalize();
@@ -297,7 +300,7 @@ mod tests {
         assert_eq!(straight.iter().map(|c| c.voxel).collect::<Vec<_>>(), (0..8).map(|i| [i, 5, 0]).collect::<Vec<_>>());
         let back = crossings(&walk, dvec3(0.3, 0.3, 5.0), -DVec3::Z);
         assert_eq!(back.iter().map(|c| c.voxel).collect::<Vec<_>>(), (0..8).rev().map(|k| [5, 5, k]).collect::<Vec<_>>());
-        // Between two voxels: one of them, not both; from within, the rest of the way; beside the box and away from it, none.
+        // Between two voxels the ray crosses one of them; from inside it crosses the rest; beside the box, and away from it, none.
         assert_eq!(crossings(&walk, dvec3(-3.0, 0.25, 0.1), DVec3::X).len(), 8);
         assert_eq!(crossings(&walk, dvec3(0.1, 0.1, 0.1), DVec3::Y).len(), 4);
         assert!(crossings(&walk, dvec3(-3.0, 1.1, 0.0), DVec3::X).is_empty());
@@ -321,7 +324,7 @@ mod tests {
             },
         );
         assert!(!odd.is_empty() && odd.iter().copied().eq(all.iter().copied().filter(|c| c.brick % 2 == 1)));
-        // Jumping over several layers of empty bricks changes nothing.
+        // Skipping several layers of empty bricks does not change the result.
         let occupancy = Occupancy::new(Aabb::cube(1.0), [37; 3], &(0..37 * 37 * 37).map(|v| v % 2999 == 7).collect::<Vec<_>>());
         let walk_large = Walk::new(Aabb::cube(1.0), [37; 3]);
         let near = walk_large.within(occupancy.extent().unwrap());
@@ -343,7 +346,7 @@ mod tests {
             let solid =
                 |found: &[Crossing]| -> Vec<[usize; 3]> { found.iter().filter(|c| c.leave - c.enter > 1e-9).map(|c| c.voxel).collect() };
             assert_eq!(solid(&jumps), solid(&steps), "ray {seed}");
-            // Nor does leaving out what is before and behind all matter, to matter.
+            // Restricting the traversal to the extent of the matter does not change the crossed matter.
             let matter = |found: &[Crossing]| solid(found).into_iter().filter(|&voxel| occupancy.contains(voxel)).collect::<Vec<_>>();
             assert_eq!(matter(&along(&near, &|brick| occupancy.free(brick))), matter(&jumps), "ray {seed}");
         }

@@ -1,4 +1,4 @@
-//! The seam between a trainer and what it trains.
+//! Interface between the trainer and a model.
 
 use super::{About, PlannedStage, TrainOptions};
 use crate::camera::Ray;
@@ -40,63 +40,66 @@ impl Progress {
     }
 }
 
-/// A radiance field with a recipe: how it is rendered, how its parameters are learned, and what happens to it at which step.
+/// A radiance field with a training recipe: how it is rendered, how its parameters are optimized, and how it changes during training.
 ///
-/// A field of your own needs [`kind`](Model::kind), [`aabb`](Model::aabb), [`render`](Model::render) and [`optimizer`](Model::optimizer);
-/// `plenoxel/examples/custom_field.rs` is a complete one. Everything else has a default that fits a field whose parameters keep their
-/// shapes. [`Trainer`](super::Trainer) trains any model; [`evaluate`](crate::evaluate::evaluate) compares it with photographs.
+/// A field of your own must implement [`kind`](Model::kind), [`aabb`](Model::aabb), [`render`](Model::render) and
+/// [`optimizer`](Model::optimizer); `plenoxel/examples/custom_field.rs` is a complete example. All other methods have defaults for fields
+/// whose parameters keep their shapes. [`Trainer`](super::Trainer) trains any model; [`evaluate`](crate::evaluate::evaluate) compares it
+/// with photographs.
 pub trait Model<T: Real>: Module<T> + Send + Sync {
-    /// Name of this kind of model, which checkpoints carry.
+    /// Returns the name of this kind of model, which checkpoints store.
     fn kind(&self) -> &'static str;
 
-    /// The box outside of which there is nothing, world coordinates.
+    /// Returns the bounding box of the model in world coordinates. Space outside of it is empty.
     fn aabb(&self) -> Aabb;
 
-    /// Pixels of rays. While a step is recorded, gradients flow from them to the parameters.
+    /// Renders rays. While a step is recorded, gradients flow from the result to the parameters.
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T>;
 
-    /// A fresh optimizer, made at the beginning of each stage. Its schedules count from the first step of the stage.
+    /// Creates the optimizer of a stage. It is called at the beginning of each stage; schedules count from the stage's first step.
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>>;
 
-    /// A function that renders pictures of the model as it is now: without jitter, and with whatever can be prepared once for many rays. It is
-    /// called without recording gradients.
+    /// Returns a function that renders images of the current model, without jitter. It may precompute data for many rays. It is called
+    /// without recording gradients.
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
         let pass = Pass { background: view.background, jitter: Jitter::None, keep_samples: false, stage: None };
         Box::new(move |rays| self.render(rays, &pass))
     }
 
-    /// Stages of training, in order, where an epoch has `rays_per_epoch` rays: by default a single one of [`TrainOptions::steps`].
+    /// Returns the stages of training, in order, for epochs of `rays_per_epoch` rays. Default: a single stage of [`TrainOptions::steps`]
+    /// steps.
     fn stages(&self, options: &TrainOptions, rays_per_epoch: u64) -> Vec<StageLength> {
         let _ = rays_per_epoch;
         vec![StageLength { resolution: None, steps: options.steps }]
     }
 
-    /// Changes the model at the beginning of a stage: resampling, pruning. It may reduce the images and choose the rays of the stage.
+    /// Changes the model at the beginning of a stage, for example by resampling or pruning. It may reduce the images and restrict the rays
+    /// of the stage.
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {
         let _ = (stage, rays);
         Ok(())
     }
 
-    /// Progress of [`begin_stage`](Model::begin_stage), for a model whose stages may take long to begin: another thread reads it meanwhile. By default there is none.
+    /// Returns the progress of [`begin_stage`](Model::begin_stage), which another thread reads, for a model whose stages may take long to begin. The default is `None`.
     fn progress(&self) -> Option<Arc<Progress>> {
         None
     }
 
-    /// Changes the model before a step, whose number counts from the beginning of the stage.
+    /// Changes the model before a step. `in_stage` counts from the beginning of the stage.
     fn begin_step(&mut self, in_stage: u64) -> Result<()> {
         let _ = in_stage;
         Ok(())
     }
 
-    /// Figures about the model that progress, metrics and reports show, by name: by default the number of its parameters.
+    /// Returns named figures about the model, for progress, metrics and reports. Default: the number of its parameters.
     fn facts(&self) -> Vec<(&'static str, f64)> {
         let mut count = 0;
         self.visit(&mut |param| count += param.tensor().len());
         vec![("parameters", count as f64)]
     }
 
-    /// Facts about the trained model, rendered like this, for the final figures of a run (`result.json`): by default its kind and its
-    /// [`facts`](Model::facts), under `model`.
+    /// Returns facts about the trained model, rendered with `view`, for the final figures of a run (`result.json`). Default: an entry
+    /// `model` with its kind and its [`facts`](Model::facts).
     fn figures(&self, view: &ViewOptions) -> Map<String, Value> {
         let _ = view;
         let facts = self.facts().into_iter().map(|(name, value)| (name.to_owned(), json!(value)));
@@ -104,35 +107,35 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         [("model".to_owned(), Value::Object(model))].into_iter().collect()
     }
 
-    /// The part of the model that code for one representation can use, by its type: a voxel grid, say, which exports and the page's viewer ask
-    /// for. By default there is none.
+    /// Returns the representation of the model, for code that needs a certain type. Exports and the viewer of the report need a voxel grid,
+    /// for example. Default: none.
     fn content(&self) -> Option<&dyn Any> {
         None
     }
 
-    /// A function that renders pictures of the model as it is now, whatever becomes of the model afterwards; `None` if the model does not
-    /// support it. A run needs it to compare the models of earlier stages with test views.
+    /// Returns a function that renders images of the current model and stays valid when the model changes; `None` if not supported. A run
+    /// uses it to compare the models of earlier stages with test views.
     fn frozen(&self, view: &ViewOptions) -> Option<RenderFn<'static, T>> {
         let _ = view;
         None
     }
 
-    /// Settings that must be the same for a saved run to go on.
+    /// Returns the settings that must match when a saved run is resumed.
     fn settings(&self) -> Value {
         Value::Null
     }
 
-    /// Adds everything that [`read`](Model::read) needs: by default the parameters by their names.
+    /// Writes everything that [`read`](Model::read) needs. Default: the parameters by name.
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {
         self.visit(&mut |param| {
-            // The visitor lends each parameter for a moment; their values are shared.
+            // The visitor borrows each parameter only briefly, so the values are shared.
             file.owned(param.name(), param.tensor().detach());
         });
     }
 
-    /// Takes over what [`write`](Model::write) wrote; `stage` is the number of the last step's stage.
+    /// Restores the state that [`write`](Model::write) wrote. `stage` is the number of the last step's stage.
     ///
-    /// Errors if the file does not hold a model of this shape.
+    /// Errors if the state does not fit this model.
     fn read(&mut self, file: &mut TensorFile<'_>, stage: usize) -> Result<()> {
         let _ = stage;
         let mut done = Ok(());
@@ -144,12 +147,12 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         done
     }
 
-    /// Brings the rays of a resumed run to where [`begin_stage`](Model::begin_stage) had brought them.
+    /// Restores the rays of a resumed run to the state after [`begin_stage`](Model::begin_stage).
     fn resume(&mut self, stage: &PlannedStage, rays: &mut RaySource) {
         let _ = (stage, rays);
     }
 
-    /// Writes a checkpoint of the trained model, in `f32`, whole or not at all.
+    /// Writes a checkpoint of the trained model, in `f32`. The file is written atomically.
     fn save(&self, path: &Path, about: &About) -> Result<()> {
         let mut file = TensorWriter::single();
         file.fact("format", CHECKPOINT_FORMAT);
@@ -160,9 +163,9 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         file.write(path)
     }
 
-    /// Takes over the parameters of a checkpoint that [`save`](Model::save) wrote.
+    /// Loads the parameters of a checkpoint that [`save`](Model::save) wrote.
     ///
-    /// Errors name the file, and what is wrong with it: another kind, other parameters, damage.
+    /// Errors if the file is damaged, or has another kind of model or other parameters; the error names the file and the problem.
     fn load(&mut self, path: &Path) -> Result<About> {
         let mut file = TensorFile::open(path)?;
         check_kind(&file, self.kind())?;
@@ -171,48 +174,48 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     }
 }
 
-/// A function from rays to the pixels of a model.
+/// Function from rays to the rendered pixels of a model.
 pub type RenderFn<'a, T> = Box<dyn Fn(&[Ray]) -> Rendered<T> + Sync + 'a>;
 
-/// Version of the format of checkpoints that [`Model::save`] writes by default.
+/// Format version of the checkpoints that [`Model::save`] writes by default.
 pub const CHECKPOINT_FORMAT: &str = "plenoxel model 1";
 
-/// Refuses a file of another kind of model.
+/// Errors if the file holds another kind of model.
 pub(super) fn check_kind(file: &TensorFile<'_>, kind: &str) -> Result<()> {
     let facts = file.facts()?;
     match facts["kind"].as_str() {
         Some(found) if found == kind => Ok(()),
         found => {
-            let found = format!("a model of kind `{}`", found.unwrap_or("none"));
-            Err(crate::error::Error::input(file.path(), found, format!("a model of kind `{kind}` is expected")))
+            let found = format!("the file holds a model of kind `{}`", found.unwrap_or("none"));
+            Err(crate::error::Error::input(file.path(), found, format!("use a model of kind `{kind}`")))
         }
     }
 }
 
-/// How a model renders a batch of rays.
+/// Options for rendering a batch of rays.
 #[derive(Clone, Debug)]
 pub struct Pass {
-    /// Color behind the scene, sRGB in [0, 1].
+    /// Background color, sRGB in [0, 1].
     pub background: [f32; 3],
     /// Random shift of the samples of each ray.
     pub jitter: Jitter,
-    /// True if [`Rendered::samples`] will be asked for, which only the graph of small ops keeps.
+    /// True if [`Rendered::samples`] will be read. Only the graph of small ops keeps the samples.
     pub keep_samples: bool,
-    /// Number of the stage of training; `None` for pictures.
+    /// Number of the training stage; `None` when rendering images.
     pub stage: Option<usize>,
 }
 
-/// How pictures of a model are rendered.
+/// Options for rendering images of a model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewOptions {
-    /// Color behind the scene, sRGB in [0, 1].
+    /// Background color, sRGB in [0, 1].
     pub background: [f32; 3],
-    /// Samples on the longest ray through the box; `None` for the model's own choice.
+    /// Number of samples on the longest ray through the box; `None` for the model's default.
     pub samples: Option<u32>,
 }
 
 impl ViewOptions {
-    /// Over this background, with the model's own choice of samples.
+    /// Returns options with this background and the model's default sampling.
     pub fn over(background: [f32; 3]) -> Self {
         ViewOptions { background, samples: None }
     }
@@ -221,8 +224,8 @@ impl ViewOptions {
 /// Length of a stage.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StageLength {
-    /// Cells along each axis of what the model stores in this stage, if it stores a grid.
+    /// Resolution of the model's grid along each axis during this stage, if it has one.
     pub resolution: Option<usize>,
-    /// Steps.
+    /// Number of steps.
     pub steps: u64,
 }

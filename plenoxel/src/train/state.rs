@@ -1,9 +1,9 @@
-//! A run on disk, from which it goes on as if it had never stopped.
+//! Saved state of a run, from which it resumes with bit-identical results.
 //!
-//! A `safetensors` file. Its metadata say of which kind the model is, with which settings and which views it is trained, and how many steps were taken.
-//! Its tensors are those that [`Model::write`] adds; of each parameter what the optimizer remembers, `<name>.optimizer.0` and on; and the
-//! parameters of the losses with theirs, `loss.<name>` and `loss.<name>.optimizer.0`. Numbers are in the run's precision. Random numbers are a
-//! function of seed, step and ray, so that nothing of them is kept.
+//! The state is a `safetensors` file. Its metadata hold the kind of the model, the settings, a hash of the training views, and the number
+//! of steps taken. Its tensors are those that [`Model::write`] adds; the optimizer state of each parameter, `<name>.optimizer.0` and so on;
+//! and the parameters of the losses with their optimizer state, `loss.<name>` and `loss.<name>.optimizer.0`. Numbers have the precision of
+//! the run. Random numbers depend only on seed, step and ray, so no generator state is saved.
 
 use super::model::check_kind;
 use super::{Model, TrainOptions, Trainer, plan};
@@ -20,55 +20,56 @@ use std::path::Path;
 /// Version of the format.
 const FORMAT: &str = "plenoxel training 2";
 
-/// Facts about a trained model that every kind of checkpoint has.
+/// Facts about a trained model that every kind of checkpoint stores.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct About {
     /// Name of the scene.
     pub scene: String,
-    /// Color behind the scene that it was trained with, sRGB in [0, 1].
+    /// Background color of training, sRGB in [0, 1].
     pub background: [f32; 3],
     /// Seed of the run.
     pub seed: u64,
-    /// Steps taken.
+    /// Number of steps taken.
     pub step: u64,
 }
 
-/// Reads the facts about a trained model from its checkpoint, of whatever kind it is.
+/// Reads the facts about a trained model from its checkpoint, for any kind of model.
 ///
-/// Errors name the file and what is wrong with it.
+/// Errors if the file cannot be read; the error names the file and the problem.
 pub fn about(path: &Path) -> Result<About> {
     let file = TensorFile::open(path)?;
     let mut facts = file.facts()?;
-    // Checkpoints of voxel grids have them among the others.
+    // Checkpoints of voxel grids store them at the top level.
     let about = if facts["about"].is_object() { facts["about"].take() } else { facts };
     serde_json::from_value(about).map_err(|e| file.unreadable(&e))
 }
 
-/// Facts about a run beside those of its model.
+/// Metadata of a run, in addition to the facts of its model.
 #[derive(Debug, Serialize, Deserialize)]
 struct State {
     about: About,
     options: TrainOptions,
     settings: Value,
-    /// Bytes of a number.
+    /// Bytes per number.
     precision: usize,
-    /// A hash of cameras and pixels of the training views.
+    /// Hash of cameras and pixels of the training views.
     views: String,
     /// Number of the stage of the last step.
     stage: usize,
-    /// Of each parameter of the model the number of its updates, where the optimizer remembers something.
+    /// Number of updates of each parameter of the model; `None` if the optimizer has no state for it.
     updates: Vec<Option<u64>>,
-    /// The same of the losses.
+    /// Number of updates of each parameter of the losses.
     loss_updates: Vec<Option<u64>>,
 }
 
 impl<T: Real, M: Model<T>> Trainer<T, M> {
-    /// Facts for a checkpoint of the model as it is now.
+    /// Returns facts for a checkpoint of the current model.
     pub fn about(&self, scene: &str) -> About {
         About { scene: scene.to_owned(), background: self.options.background, seed: self.options.seed, step: self.step }
     }
 
-    /// Writes everything that the run needs to go on, except its views, whole or not at all; `scene` is the dataset's name.
+    /// Writes everything that is needed to resume the run, except its views. The file is written atomically. `scene` is the name of the
+    /// dataset.
     ///
     /// Panics if no step has been taken.
     pub fn save(&self, path: &Path, scene: &str) -> Result<()> {
@@ -94,27 +95,28 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         file.write(path)
     }
 
-    /// The run whose state the file holds, to go on from there: the steps that follow have the bits they would have had.
+    /// Resumes the run that was saved to a file. The following steps are bit-identical to those of the uninterrupted run.
     ///
-    /// Errors name the file and what is wrong with it: cut short, another program's, a later version's; of other settings or views.
+    /// Errors if the file is damaged, has another format or a later version, or belongs to other settings or views; the error names the
+    /// file and the problem.
     ///
     /// Panics if steps have been taken.
     pub fn resumed(self, path: &Path) -> Result<Self> {
         self.resumed_with(TensorFile::open(path)?)
     }
 
-    /// The same from any source, a file or bytes; `path` names it in messages.
+    /// Resumes a run from any source, such as a file or bytes. `path` names it in error messages.
     pub fn resumed_from(self, path: &Path, source: impl Read + Seek) -> Result<Self> {
         self.resumed_with(TensorFile::new(path, source)?)
     }
 
     fn resumed_with(mut self, mut file: TensorFile<'_>) -> Result<Self> {
-        assert_eq!(self.step, 0, "a run starts once");
+        assert_eq!(self.step, 0, "resumed: the run has already taken steps");
         let state = read(&file)?;
         check_kind(&file, self.model.kind())?;
         let other = |what: &str| {
-            let found = format!("the state of a run with other {what}");
-            Err(Error::input(file.path(), found, "go on with the settings and the data that the run began with, or train again"))
+            let found = format!("the saved run has other {what}");
+            Err(Error::input(file.path(), found, "resume with the settings and the data that the run began with, or train again"))
         };
         if state.options != self.options || state.settings != self.model.settings() {
             return other("settings");
@@ -127,10 +129,10 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         }
         self.model.read(&mut file, state.stage)?;
         self.plan = plan(&self.model, &self.options, self.rays.len());
-        // The first step is not taken yet, and the file is of later.
+        // A saved run has taken at least one step, and its last step belongs to the saved stage.
         let last = state.about.step.checked_sub(1);
         let current = last.and_then(|last| self.stage_of(last)).filter(|stage| stage.index == state.stage);
-        let current = current.ok_or_else(|| file.damaged("a step that the plan does not have"))?;
+        let current = current.ok_or_else(|| file.damaged("the step does not match the plan"))?;
         self.optimizer = self.model.optimizer(&current);
         read_memory(&self.model, "", &mut *self.optimizer, &state.updates, &mut file, state.about.step)?;
         let mut done = Ok(());
@@ -143,7 +145,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         done?;
         read_memory(&self.objective, "loss.", &mut *self.loss_optimizer, &state.loss_updates, &mut file, state.about.step)?;
         if !(self.model.is_finite() && self.objective.is_finite()) {
-            return Err(file.damaged("numbers that are not finite"));
+            return Err(file.damaged("it has values that are not finite"));
         }
         self.step = state.about.step;
         self.model.resume(&current, &mut self.rays);
@@ -151,7 +153,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     }
 }
 
-/// Adds what an optimizer remembers of each parameter, and returns how many updates each had.
+/// Writes the optimizer state of each parameter. Returns the number of updates of each.
 fn write_memory<'a, T: Real>(
     module: &impl Module<T>,
     prefix: &str,
@@ -169,7 +171,7 @@ fn write_memory<'a, T: Real>(
     all
 }
 
-/// Has an optimizer recall what was written of each parameter.
+/// Restores the optimizer state of each parameter.
 fn read_memory<T: Real>(
     module: &impl Module<T>,
     prefix: &str,
@@ -180,10 +182,10 @@ fn read_memory<T: Real>(
 ) -> Result<()> {
     let mut updates = updates.iter();
     let mut recall = |param: &Param<T>| -> Result<()> {
-        let Some(updates) = updates.next() else { return Err(file.damaged("a memory of other parameters")) };
+        let Some(updates) = updates.next() else { return Err(file.damaged("the optimizer state is of other parameters")) };
         let Some(updates) = *updates else { return Ok(()) };
         if updates > steps {
-            return Err(file.damaged("more updates than steps"));
+            return Err(file.damaged("a parameter has more updates than steps"));
         }
         let mut arrays: Vec<Buffer<T>> = Vec::new();
         while file.contains(&of_optimizer(prefix, param, arrays.len())) {
@@ -192,7 +194,7 @@ fn read_memory<T: Real>(
         }
         match optimizer.recall(param, updates, arrays) {
             true => Ok(()),
-            false => Err(file.damaged("the memory of another optimizer")),
+            false => Err(file.damaged("the state is of another optimizer")),
         }
     };
     let mut done = Ok(());
@@ -204,28 +206,28 @@ fn read_memory<T: Real>(
     done?;
     match updates.next() {
         None => Ok(()),
-        Some(_) => Err(file.damaged("a memory of other parameters")),
+        Some(_) => Err(file.damaged("the optimizer state is of other parameters")),
     }
 }
 
-/// Facts of a file, after its version.
+/// Reads the metadata of a file and checks its version.
 fn read(file: &TensorFile<'_>) -> Result<State> {
     let facts = file.facts()?;
     let format = facts["format"].as_str().unwrap_or("none");
     if format != FORMAT {
         let remedy =
-            format!("this program goes on from `{FORMAT}`; use the version that wrote the file, or `--init-from` for a trained grid");
+            format!("accepted: `{FORMAT}`; use the program version that wrote the file, or `--init-from` to start from a trained grid");
         return Err(Error::input(file.path(), format!("format `{format}`"), remedy));
     }
     file.fact("run")
 }
 
-/// Name of an array that an optimizer remembers of a parameter.
+/// Returns the name of an array of optimizer state.
 fn of_optimizer<T: Real>(prefix: &str, param: &Param<T>, i: usize) -> String {
     format!("{prefix}{}.optimizer.{i}", param.name())
 }
 
-/// A hash of cameras and pixels: FNV-1a of each view, and of these.
+/// Returns a hash of cameras and pixels: the FNV-1a hash of the hashes of the views.
 fn fingerprint(views: &[View]) -> String {
     const BASIS: u64 = 0xcbf2_9ce4_8422_2325;
     let more = |hash: u64, word: u64| (hash ^ word).wrapping_mul(0x0000_0100_0000_01b3);

@@ -5,12 +5,13 @@ use crate::dataset::image::RgbaImage;
 use crate::geometry::Aabb;
 use glam::{DVec3, dvec3};
 
-/// Half the side of the cube that all tests look at, in a box of half width 1.
+/// Half the side of the cube in all tests, in a box of half width 1.
 const HALF: f64 = 0.75;
-/// Half the side and the depth of the pit in its top. Its walls, like the cube's, lie between voxels of a box of 24³: none is half full.
+/// Half the side, and the depth, of the pit in the top of the cube. The walls of pit and cube lie between voxels of a box of 24³: no voxel
+/// is half full.
 const PIT: [f64; 2] = [1.0 / 3.0, 0.75];
 
-/// The point of the cube that a ray meets first; with or without a pit.
+/// Returns the first point of the cube on a ray, with or without a pit.
 fn meets(ray: &Ray, pit: bool) -> Option<DVec3> {
     let in_cube = |p: DVec3| p.abs().max_element() <= HALF;
     let in_pit = |p: DVec3| pit && p.truncate().abs().max_element() < PIT[0] && p.z > HALF - PIT[1];
@@ -20,18 +21,18 @@ fn meets(ray: &Ray, pit: bool) -> Option<DVec3> {
     along.map(|t| ray.origin + t * ray.direction).find(|p| in_cube(*p) && !in_pit(*p))
 }
 
-/// A color for each place, changing over half a unit: no shape but the right one explains it.
+/// Returns a color for each position that changes over half a unit, so that only the correct shape explains it.
 fn paint(p: DVec3) -> [f64; 3] {
     let wave = |w: DVec3| 0.5 + 0.5 * (8.0 * w.dot(p)).sin();
     [wave(dvec3(1.0, 0.3, 0.6)), wave(dvec3(-0.4, 1.0, 0.5)), wave(dvec3(0.3, -0.6, 1.0))]
 }
 
-/// What is far away in a direction.
+/// Returns the color of distant surroundings in a direction.
 fn surroundings(d: DVec3) -> [f64; 3] {
     paint(3.0 * d)
 }
 
-/// Views from all round, of the bare cube or over the surroundings, without alpha then.
+/// Returns views from all directions: of the cube alone, or, if `opaque`, in front of surroundings and without transparency.
 fn views(count: usize, pit: bool, opaque: bool) -> Vec<View> {
     let intrinsics = Intrinsics::from_fov_x(56, 56, 0.7);
     let view = |k: usize| {
@@ -57,7 +58,7 @@ fn hull(views: &[View], start: &Occupancy, noise: f64) -> Occupancy {
     photo_hull(views, start, &PhotoConfig { noise }, &|_, _, _| ()).unwrap()
 }
 
-/// How many voxels of a region, told by their middles, are in a hull, and of how many.
+/// Counts the voxels of a region, selected by their centres: those in a hull, and all.
 fn count(hull: &Occupancy, region: impl Fn(DVec3) -> bool) -> (usize, usize) {
     let n = hull.cells()[0];
     let voxels = (0..n.pow(3)).map(|v| [v / (n * n), v / n % n, v % n]);
@@ -65,12 +66,12 @@ fn count(hull: &Occupancy, region: impl Fn(DVec3) -> bool) -> (usize, usize) {
     of_region.fold((0, 0), |(left, all), voxel| (left + usize::from(hull.contains(voxel)), all + 1))
 }
 
-/// The voxels of the pit, but for the layer at its walls.
+/// Returns true for voxels of the pit, except the layer at its walls.
 fn pit(p: DVec3) -> bool {
     p.truncate().abs().max_element() < PIT[0] - 0.1 && p.z > HALF - PIT[1] + 0.1 && p.z < HALF
 }
 
-/// The voxels of the cube with its pit.
+/// Returns true for voxels of the cube with its pit.
 fn matter(p: DVec3) -> bool {
     p.abs().max_element() < HALF && !(p.truncate().abs().max_element() < PIT[0] && p.z > HALF - PIT[1])
 }

@@ -1,4 +1,4 @@
-//! Which voxel each pixel sees: item buffers (Weghorst, Hooper and Greenberg 1984).
+//! First voxel that each pixel sees: item buffers (Weghorst, Hooper and Greenberg 1984).
 
 use crate::dataset::View;
 use crate::geometry::Aabb;
@@ -10,15 +10,15 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// The ray meets no voxel, or its pixel is background.
 const NOTHING: u32 = u32::MAX;
-/// The ray has not been walked yet.
+/// The ray has not been traversed yet.
 const UNKNOWN: u32 = u32::MAX - 1;
 
-/// The number of a voxel in an item buffer.
+/// Returns the number of a voxel in an item buffer.
 pub fn number(brick: usize, bit: usize) -> u32 {
     (brick * BRICK_ROWS + bit) as u32
 }
 
-/// The first voxel on the ray of the center of each pixel, four bytes each.
+/// First voxel on the ray through the centre of each pixel, four bytes per pixel.
 pub struct FirstVoxels<'a> {
     views: &'a [View],
     walk: Walk,
@@ -27,21 +27,20 @@ pub struct FirstVoxels<'a> {
 }
 
 impl<'a> FirstVoxels<'a> {
-    /// Nothing is known of any ray yet.
+    /// Creates item buffers in which all object pixels are unknown.
     ///
-    /// Panics if there are more voxels than numbers: some 1600³.
+    /// Panics if there are more voxels than numbers, about 1600³.
     pub fn new(views: &'a [View], aabb: Aabb, voxels: [usize; 3]) -> Self {
         assert!(
             BrickGrid::new(voxels).len() * BRICK_ROWS < UNKNOWN as usize,
-            "photo hull: {voxels:?} voxels are more than 32 bits can number"
+            "photo hull: {voxels:?} voxels cannot be numbered with 32 bits"
         );
         let of_alpha = |&alpha: &u8| if alpha == 0 { NOTHING } else { UNKNOWN };
         let numbers = views.iter().map(|view| view.image.as_raw().iter().skip(3).step_by(4).map(of_alpha).collect()).collect();
         FirstVoxels { views, walk: Walk::new(aabb, voxels), numbers }
     }
 
-    /// Walks the rays whose voxel is not among those of the masks any more. The voxels that pixels see which did not see them before, as
-    /// masks.
+    /// Traverses the rays whose voxel is no longer in the masks. Returns the voxels that these rays see now, as masks.
     pub fn update(&mut self, masks: &[u64]) -> Vec<u64> {
         let fresh: Vec<AtomicU64> = masks.iter().map(|_| AtomicU64::new(0)).collect();
         let rows = self.numbers.iter_mut().zip(self.views).flat_map(|(numbers, view)| {
@@ -74,7 +73,7 @@ impl<'a> FirstVoxels<'a> {
         fresh.into_iter().map(AtomicU64::into_inner).collect()
     }
 
-    /// Numbers of the first voxels of a view's pixels, row after row; a number that no voxel has where there is none.
+    /// Returns the numbers of the first voxels of a view's pixels, row after row. Pixels without a voxel have a number that no voxel has.
     pub fn of_view(&self, view: usize) -> &[u32] {
         &self.numbers[view]
     }

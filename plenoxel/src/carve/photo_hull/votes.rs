@@ -1,4 +1,4 @@
-//! What the views have to say about a voxel, and how far they disagree.
+//! Colors of a voxel in the views, and their deviation.
 
 use crate::camera::projection::{Pixels, Projection, Rectangle};
 use crate::dataset::View;
@@ -6,31 +6,31 @@ use crate::dataset::image::RgbaImage;
 use crate::geometry::Aabb;
 use glam::DVec3;
 
-/// Projections onto the ranges by which the common color is found.
+/// Number of projection steps for finding the common color.
 const ITERATIONS: usize = 12;
 
-/// A view that says what it shows of voxels.
+/// View that votes on voxels.
 pub struct Witness {
     projection: Projection,
     /// Side of a voxel in pixels, times depth.
     scale: f64,
 }
 
-/// The colors of a voxel in a view.
+/// Colors of a voxel in a view.
 #[derive(Clone, Copy, Debug)]
 pub struct Vote {
-    /// Least and largest value of each channel among the pixels that see the voxel, in [0, 1].
+    /// Smallest and largest value of each channel over the pixels that see the voxel, in [0, 1].
     range: [[f32; 2]; 3],
-    /// How many they are.
+    /// Number of these pixels.
     pixels: u32,
 }
 
-/// The colors of a voxel in the views that see it.
+/// Votes of the views that see a voxel.
 #[derive(Default)]
 pub struct Votes(Vec<Vote>);
 
 impl Witness {
-    /// Of the voxels of a box.
+    /// Creates the witness of a view for the voxels of a box.
     pub fn of(view: &View, aabb: Aabb, voxels: [usize; 3]) -> Self {
         let side = (aabb.max - aabb.min) / DVec3::from_array(voxels.map(|n| n as f64));
         Witness {
@@ -39,11 +39,12 @@ impl Witness {
         }
     }
 
-    /// What the pixels say of which a voxel, given by place and by number, is the first; `None` if there are none.
+    /// Returns the vote of the pixels whose first voxel is the given one, which is identified by position and number; `None` if there are
+    /// no such pixels.
     ///
-    /// A pixel that is wider than a voxel shows its surroundings too. So where a voxel is w < 1 pixels wide, the range reaches 1 − w of the
-    /// way to the pixels around, but not beyond the middle between them. Without this, the smeared edge of a texture is as wide as a patch
-    /// of such voxels and contradicts all of it.
+    /// A pixel that is wider than a voxel also shows the voxel's surroundings. If a voxel is w < 1 pixels wide, the range therefore extends
+    /// by 1 − w of the difference to the neighbouring pixels, but at most half of it. Otherwise the blurred edge of a texture, which is as
+    /// wide as a patch of such voxels, would contradict the whole patch.
     pub fn vote(&self, image: &RgbaImage, first: &[u32], voxel: [usize; 3], number: u32) -> Option<Vote> {
         let corners = self.projection.corners(voxel, voxel.map(|k| k + 1))?;
         let Pixels { x: columns, y: rows } = self.projection.touched(Rectangle::around(&corners, 0.0));
@@ -61,7 +62,7 @@ impl Witness {
 }
 
 impl Vote {
-    /// Adds a pixel's color, and those `reach` of the way to the object pixels around it.
+    /// Adds a pixel's color, and the colors at fraction `reach` of the way to the object pixels around it.
     fn add(&mut self, image: &RgbaImage, x: usize, y: usize, reach: f32) {
         let color = |x: usize, y: usize| {
             let [r, g, b, alpha] = image.get_pixel(x as u32, y as u32).0;
@@ -83,25 +84,25 @@ impl Vote {
 }
 
 impl Votes {
-    /// Forgets all of them.
+    /// Removes all votes.
     pub fn clear(&mut self) {
         self.0.clear();
     }
 
-    /// Adds a view's, if there is one.
+    /// Adds the vote of a view, if there is one.
     pub fn extend(&mut self, vote: Option<Vote>) {
         self.0.extend(vote);
     }
 
-    /// The standard deviation of the colors around the one that explains them best, in [0, 1]; 0 for less than two views. With K views, nₖ
-    /// pixels and the box Rₖ of colors of each,
+    /// Returns the standard deviation of the colors from the color that explains them best, in [0, 1]; 0 for fewer than two views. With K
+    /// views, nₖ pixels and the box Rₖ of colors of each,
     ///
     /// ```text
-    /// s² = K / (K − 1) · min_c Σₖ nₖ |c − nearest point of Rₖ to c|² / (3 Σₖ nₖ):
+    /// s² = K / (K − 1) · min_c Σₖ nₖ |c − nearest point of Rₖ to c|² / (3 Σₖ nₖ).
     /// ```
     ///
-    /// a view that sees several colors on a voxel says that any of those between is right, so a texture that is finer than voxels contradicts
-    /// nothing; and one that sees little of it, past others, says little. c ← mean of the nearest points lowers the sum in every iteration.
+    /// A view that sees several colors on a voxel accepts any color between them, so textures finer than voxels contradict nothing. A view
+    /// that sees little of the voxel has little weight. The iteration c ← mean of the nearest points decreases the sum in every step.
     pub fn spread(&self) -> f64 {
         let (votes, views) = (&self.0, self.0.len());
         if views < 2 {

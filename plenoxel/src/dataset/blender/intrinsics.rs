@@ -1,44 +1,44 @@
-//! Intrinsics that a transforms file states beside `camera_angle_x`. The loader's cameras are pinholes with square pixels and the principal point in
-//! the middle: keys that say the same may stand, and all others are refused by name.
+//! Intrinsics that a transforms file states in addition to `camera_angle_x`. Cameras are pinholes with square pixels and a centred
+//! principal point: keys that agree with this are accepted, all others are errors that name the key.
 
 use crate::error::{Error, Result};
 use crate::json;
 use serde_json::Value;
 use std::path::Path;
 
-/// Lens distortion, which is none where they are 0.
+/// Keys of lens distortion; 0 means no distortion.
 const DISTORTION: [&str; 13] =
     ["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "ftheta_p0", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4"];
-/// Lenses that are no pinholes, if they are true.
+/// Keys that, if true, state a lens other than a pinhole.
 const LENSES: [&str; 2] = ["is_fisheye", "latlong"];
-/// Models of COLMAP and of nerfstudio that are pinholes where there is no distortion.
+/// Camera models of COLMAP and nerfstudio that are pinholes if there is no distortion.
 const PINHOLES: [&str; 5] = ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
-/// What can be compared with `camera_angle_x` once the size of the images is known.
+/// Keys that are compared with `camera_angle_x` when the size of the images is known.
 const COMPARED: [&str; 10] = ["camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "fl_x", "fl_y", "cx", "cy", "w", "h"];
-/// Pixels that something at the edge of an image may move if one number is used and not the other: files have rounded ones.
+/// Tolerance in pixels: the shift of a point at the edge of an image between the two values. Files contain rounded numbers.
 const WITHIN: f64 = 0.05;
 
-/// Numbers of a transforms file that must follow from its `camera_angle_x` and the size of the images.
+/// Intrinsics of a transforms file that must follow from its `camera_angle_x` and the size of the images.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StatedIntrinsics(Vec<Stated>);
 
 #[derive(Clone, Debug, PartialEq)]
 struct Stated {
     key: &'static str,
-    /// Of all frames, if none is named.
+    /// Number of the frame; `None` for a key of the whole file.
     frame: Option<usize>,
     value: f64,
 }
 
-/// A key, with the frame that it is of.
+/// Returns the key, with its frame.
 fn place(key: &str, frame: Option<usize>) -> String {
     frame.map_or(key.to_owned(), |frame| format!("{key} of frame {frame}"))
 }
 
 impl StatedIntrinsics {
-    /// Adds what a frame says, or the whole file.
+    /// Adds the intrinsics of a frame, or of the whole file.
     ///
-    /// Errors: a distortion, a lens or a camera model that is no pinhole; a value that is no number.
+    /// Errors if they state a distortion, a lens or a camera model other than a pinhole, or if a value is not a number.
     pub(super) fn add(&mut self, path: &Path, entry: &Value, frame: Option<usize>) -> Result<()> {
         let stated = |key: &str| entry.get(key).filter(|value| !value.is_null());
         let refused = |key: &str, value: &Value, remedy: &str| {
@@ -51,30 +51,30 @@ impl StatedIntrinsics {
         }
         for (key, value) in LENSES.into_iter().filter_map(|key| Some((key, stated(key)?))) {
             if value.as_bool() != Some(false) {
-                return refused(key, value, "pinhole cameras are supported");
+                return refused(key, value, "accepted: pinhole cameras");
             }
         }
         if let Some(model) = stated("camera_model")
             && !model.as_str().is_some_and(|model| PINHOLES.contains(&model))
         {
-            return refused("camera_model", model, "pinhole cameras are supported, such as PINHOLE, or OPENCV without distortion");
+            return refused("camera_model", model, "accepted: pinhole cameras, such as PINHOLE, or OPENCV without distortion");
         }
         for (key, value) in COMPARED.into_iter().filter_map(|key| Some((key, stated(key)?))) {
-            let Some(value) = value.as_f64() else { return refused(key, value, "it is a number") };
+            let Some(value) = value.as_f64() else { return refused(key, value, "accepted: a number") };
             self.0.push(Stated { key, frame, value });
         }
         Ok(())
     }
 
-    /// Compares all of it with the horizontal angle of view, radians, and with the width and height of the images, pixels.
+    /// Compares all intrinsics with the horizontal field of view, radians, and with width and height of the images, pixels.
     ///
-    /// Errors: the first that says something else.
+    /// Errors at the first value that does not agree.
     pub fn check(&self, path: &Path, fov_x: f64, (width, height): (usize, usize)) -> Result<()> {
         let (w, h) = (width as f64, height as f64);
         let focal = 0.5 * w / (0.5 * fov_x).tan();
         let fov_y = 2.0 * (0.5 * h / focal).atan();
         for Stated { key, frame, value } in &self.0 {
-            // How far a focal length moves what is seen at the edge.
+            // Shift of a point at the edge of the image if the focal length changes.
             let zoom = |side: f64, other: f64| (0.5 * side * (other / focal - 1.0)).abs();
             let angle = |side: f64, radians: f64| zoom(side, 0.5 * side / (0.5 * radians).tan());
             let (expected, moved) = match *key {

@@ -1,4 +1,4 @@
-//! Writing a dataset as a NeRF-synthetic folder.
+//! Writes a dataset as a NeRF-synthetic folder.
 
 use super::file_name;
 use crate::camera::Intrinsics;
@@ -15,14 +15,14 @@ use std::path::Path;
 pub fn write(dataset: &Dataset, root: &Path, overwrite: bool, change: &dyn Fn(Split, &mut [View])) -> Result<()> {
     let occupied = root.exists() && !std::fs::read_dir(root).is_ok_and(|mut entries| entries.next().is_none());
     if occupied && !overwrite {
-        return Err(Error::input(root, "this is not an empty folder", "choose a new folder or allow overwriting"));
+        return Err(Error::input(root, "the folder is not empty", "choose a new folder, or allow overwriting"));
     }
     for split in Split::ALL {
         let cameras = dataset.cameras(split);
         if let Some(odd) = cameras.iter().position(|camera| !expressible(&camera.intrinsics) || camera.intrinsics != cameras[0].intrinsics)
         {
-            let found = format!("{split} view {odd} has intrinsics the NeRF-synthetic format cannot express");
-            return Err(Error::input(root, found, "only one camera with square pixels and a centred principal point can be written"));
+            let found = format!("{split} view {odd} has intrinsics that the NeRF-synthetic format cannot express");
+            return Err(Error::input(root, found, "accepted: one camera with square pixels and a centred principal point"));
         }
         files::create_dir(&root.join(split.to_string()))?;
         let mut views = dataset.load(split, &|_, _| ())?;
@@ -38,7 +38,7 @@ pub fn write(dataset: &Dataset, root: &Path, overwrite: bool, change: &dyn Fn(Sp
             })
             .collect();
         written.into_iter().collect::<Result<()>>()?;
-        // The index comes last: a folder with it has all the images it lists.
+        // The JSON file is written last: a folder that contains it has all the images it lists.
         if let Some(first) = cameras.first() {
             let frames: Vec<Value> = views
                 .iter()
@@ -62,7 +62,7 @@ pub(super) fn rows(pose: &DAffine3) -> [[f64; 4]; 4] {
     [row(r.x_axis, t.x), row(r.y_axis, t.y), row(r.z_axis, t.z), [0.0, 0.0, 0.0, 1.0]]
 }
 
-/// Distances in thousandths of a world unit, 0 where nothing was hit.
+/// Converts distances to thousandths of a world unit; 0 for rays that hit nothing.
 fn millimetres(depth: &Array2<f32>) -> Array2<u16> {
     depth.mapv(|t| if t.is_finite() { (t * 1000.0).round() as u16 } else { 0 })
 }

@@ -1,22 +1,22 @@
-//! PNG images decoded row by row to 8-bit RGBA: memory is taken for what is kept, and for a row.
+//! PNG decoding to 8-bit RGBA, row by row. Memory is needed for the result and one row only.
 
 use crate::error::{Error, Result};
 use png::{BitDepth, ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Reader, Transformations};
 use std::io::{BufRead, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// Largest width or height that is accepted, in pixels. A header may claim anything; this bounds what it can make us allocate.
+/// Largest accepted width or height in pixels. It bounds the memory that a header can request.
 pub const MAX_SIDE: u32 = 16384;
 
 const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
-/// Bytes up to the bit depth and the color type.
+/// Number of bytes up to the bit depth and the color type.
 const HEAD: usize = 26;
-/// Deflate makes at most so many bytes of one: 258 of two bits.
+/// Largest expansion of Deflate: 258 bytes from two bits.
 const MOST_INFLATION: u64 = 1032;
-/// Memory for what a file says beside its pixels.
+/// Memory limit for metadata of a file.
 const MOST_BESIDE: usize = 16 << 20;
 
-/// Width and height by the first bytes of a file, where `source` then stands again.
+/// Reads width and height from the first bytes of a file. `source` is rewound to the start.
 pub(super) fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32, u32)> {
     let mut head = Vec::with_capacity(HEAD);
     let read = source.seek(SeekFrom::End(0)).and_then(|length| {
@@ -36,18 +36,18 @@ pub(super) fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32,
     let (width, height) = (number(16), number(20));
     let refused = |remedy: String| Err(Error::input(path, format!("the header says {width} x {height} pixels"), remedy));
     if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
-        return refused(format!("images of 1 to {MAX_SIDE} pixels a side are accepted"));
+        return refused(format!("accepted: images of 1 to {MAX_SIDE} pixels per side"));
     }
-    // Gray and palettes, RGB, gray with alpha, RGBA.
+    // Gray and palette, RGB, gray with alpha, RGBA.
     let channels = [1, 0, 3, 1, 2, 0, 4].get(usize::from(head[25])).copied().unwrap_or(0);
     let row = (u64::from(width) * channels * u64::from(head[24])).div_ceil(8);
     if row * u64::from(height) > MOST_INFLATION * length {
-        return refused(format!("a file of {length} bytes cannot hold so many: copy or download it again"));
+        return refused(format!("a file of {length} bytes cannot hold as many: copy or download it again"));
     }
     Ok((width, height))
 }
 
-/// A PNG image whose rows can be read.
+/// PNG image that is read row by row.
 pub(super) struct Rows<'p, R: BufRead + Seek> {
     path: &'p Path,
     reader: Reader<R>,
@@ -55,22 +55,23 @@ pub(super) struct Rows<'p, R: BufRead + Seek> {
 }
 
 impl<'p, R: BufRead + Seek> Rows<'p, R> {
-    /// Reads what stands before the pixels; `path` names the file in messages.
+    /// Reads everything before the pixels. `path` names the file in error messages.
     pub fn new(path: &'p Path, source: R) -> Result<Self> {
         let mut decoder = Decoder::new_with_limits(source, Limits { bytes: MOST_BESIDE });
         decoder.set_ignore_text_chunk(true);
         decoder.set_ignore_iccp_chunk(true);
-        // Palettes and fewer than 8 bits become 8 bits, a transparent color becomes alpha.
+        // Expand palettes and depths below 8 bits to 8 bits, and a transparent color to alpha.
         decoder.set_transformations(Transformations::EXPAND);
         let reader = decoder.read_info().map_err(|e| refused(path, e))?;
-        // Our decoder makes a panic of it at the first row (png 0.18.1, its issue 694).
+        // The decoder panics at the first row of such an image (png 0.18.1, issue 694).
         if reader.info().palette.as_ref().is_some_and(|colors| !colors.len().is_multiple_of(3)) {
             return Err(Error::input(path, "the palette ends within a color", "write it again as PNG"));
         }
         Ok(Rows { path, reader, row: Vec::new() })
     }
 
-    /// The next row, 4 bytes a pixel, and where it belongs; of an interlaced image rows have only some of the pixels. `None` at the end.
+    /// Returns the next row, 4 bytes per pixel, and its position. Rows of an interlaced image contain only some of the pixels. `None` at
+    /// the end.
     fn next(&mut self) -> Result<Option<(&[u8], InterlaceInfo)>> {
         let (color, depth) = self.reader.output_color_type();
         let Some(row) = self.reader.next_interlaced_row().map_err(|e| refused(self.path, e))? else { return Ok(None) };
@@ -82,7 +83,7 @@ impl<'p, R: BufRead + Seek> Rows<'p, R> {
         Ok(Some((&self.row, *row.interlace())))
     }
 
-    /// Decodes the image into `pixels`, 4 bytes for each.
+    /// Decodes the image into `pixels`, 4 bytes per pixel.
     pub fn read(mut self, pixels: &mut [u8]) -> Result<()> {
         let stride = 4 * self.reader.info().width as usize;
         let mut y = 0;
@@ -98,14 +99,14 @@ impl<'p, R: BufRead + Seek> Rows<'p, R> {
         Ok(())
     }
 
-    /// Decodes the image and keeps nothing of it.
+    /// Decodes the image without keeping its pixels.
     pub fn check(mut self) -> Result<()> {
         while self.next()?.is_some() {}
         Ok(())
     }
 }
 
-/// Appends pixels of any color as RGBA; without alpha they are opaque.
+/// Appends pixels of any color type as RGBA. Pixels without alpha are opaque.
 fn to_rgba<S: Copy>(color: ColorType, samples: &[S], byte: impl Fn(S) -> u8, rgba: &mut Vec<u8>) {
     match color {
         ColorType::Grayscale | ColorType::Indexed => {
@@ -120,7 +121,7 @@ fn to_rgba<S: Copy>(color: ColorType, samples: &[S], byte: impl Fn(S) -> u8, rgb
     }
 }
 
-/// 16 bits to 8: value / 257, rounded to nearest.
+/// Converts 16 bits to 8: value / 257, rounded to nearest.
 fn rounded(value: u16) -> u8 {
     ((u32::from(value) + 128) / 257) as u8
 }
@@ -130,7 +131,7 @@ fn refused(path: &Path, error: DecodingError) -> Error {
         DecodingError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => cut_short(path),
         DecodingError::IoError(source) => Error::io(path, source, "reading the image"),
         DecodingError::LimitsExceeded => {
-            Error::input(path, "what the file says beside its pixels takes too much memory", "write it again as PNG, without metadata")
+            Error::input(path, "the metadata in the file takes too much memory", "write it again as PNG, without metadata")
         }
         other => Error::input(path, format!("the image cannot be decoded ({other})"), "write it again as PNG"),
     }

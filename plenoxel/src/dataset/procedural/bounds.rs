@@ -1,26 +1,25 @@
-//! Balls around the objects, tested all at once: which objects a ray can meet, and how much sky they hide.
+//! Bounding balls of the objects, tested together: which objects a ray may hit, and how much sky they hide.
 
 use super::convex::Ball;
 use super::still_life::Object;
 use glam::DVec3;
 
-/// At most this many objects, so that their bounds fill whole vector registers and a set of them is a `u32`.
+/// Largest number of objects, for which the bounds fill whole vector registers and a set of objects is a `u32`.
 pub const MOST: usize = 16;
 
-/// A ball around each object, by coordinate, in single precision and a little larger than it need be. Lanes without an object
-/// have a radius of minus infinity.
+/// Bounding ball of each object, stored by coordinate in single precision, slightly enlarged. Unused lanes have radius minus infinity.
 #[derive(Debug, Clone)]
 pub struct Bounds {
     x: [f32; MOST],
     y: [f32; MOST],
     z: [f32; MOST],
     radius: [f32; MOST],
-    /// Radius squared of the ball that darkens its neighbours, 0 for thin things.
+    /// Squared radius of the ball that darkens neighbours; 0 for thin objects.
     shade: [f32; MOST],
 }
 
 impl Bounds {
-    /// The bounds of up to [`MOST`] objects.
+    /// Creates the bounds of up to [`MOST`] objects.
     pub fn new(objects: &[Object]) -> Self {
         let (none, nothing) = ([0.0; MOST], [f32::NEG_INFINITY; MOST]);
         let mut bounds = Bounds { x: none, y: none, z: none, radius: nothing, shade: none };
@@ -33,7 +32,7 @@ impl Bounds {
         bounds
     }
 
-    /// The objects whose balls the ray comes near: within `spread` times the distance, as a cone of rays does.
+    /// Returns the objects whose balls intersect a cone around the ray, whose radius is `spread` times the distance.
     #[inline]
     pub fn near(&self, origin: DVec3, direction: DVec3, spread: f32) -> u32 {
         let ([ox, oy, oz], [dx, dy, dz]) = (origin.as_vec3().to_array(), direction.as_vec3().to_array());
@@ -41,7 +40,7 @@ impl Bounds {
         for (k, hit) in hit.iter_mut().enumerate() {
             let (x, y, z) = (self.x[k] - ox, self.y[k] - oy, self.z[k] - oz);
             let along = x * dx + y * dy + z * dz;
-            // The cross product, not the difference of two squares, which single precision could not afford.
+            // Uses the cross product: the difference of two squares would be too inaccurate in single precision.
             let (u, v, w) = (y * dz - z * dy, z * dx - x * dz, x * dy - y * dx);
             let reach = self.radius[k] + spread * (along.abs() + self.radius[k]);
             *hit = u32::from((along > -self.radius[k]) & (u * u + v * v + w * w <= reach * reach) & (reach > 0.0));
@@ -49,8 +48,8 @@ impl Bounds {
         hit.iter().enumerate().fold(0, |bits, (k, hit)| bits | hit << k)
     }
 
-    /// The share of the sky that the objects but `own`, taken as balls, leave open to the point `p` with normal `n`: each
-    /// takes the form factor r² cos / d² of a ball.
+    /// Returns the fraction of the sky that is visible from the point `p` with normal `n`. Objects other than `own` are balls that each
+    /// hide the form factor r² cos / d².
     #[inline]
     pub fn open_sky(&self, p: DVec3, n: DVec3, own: usize) -> f64 {
         let ([px, py, pz], [nx, ny, nz]) = (p.as_vec3().to_array(), n.as_vec3().to_array());

@@ -1,40 +1,40 @@
-//! Convex solids with exact ray intersections. A ray is inside a convex solid in one interval, so that is all a shape has to
-//! know; the normal is asked for only where it is needed.
+//! Convex solids with exact ray intersections. A ray intersects a convex solid in one interval, which is all that a shape computes; the
+//! normal is computed on demand.
 
 use glam::DVec3;
 
-/// A ball in space, used as a bound.
+/// Ball, used as a bounding volume.
 #[derive(Debug, Clone, Copy)]
 pub struct Ball {
-    /// Its centre.
+    /// Centre.
     pub center: DVec3,
-    /// Its radius.
+    /// Radius.
     pub radius: f64,
 }
 
-/// A convex solid.
+/// Convex solid.
 #[derive(Debug, Clone, Copy)]
 pub enum Convex {
-    /// A sphere with its inside.
+    /// Solid sphere.
     Sphere { center: DVec3, radius: f64 },
-    /// A box with the given orthonormal `axes`.
+    /// Box with the given orthonormal `axes`.
     Block { center: DVec3, half: DVec3, axes: [DVec3; 3] },
-    /// A cylinder with flat ends, `half` long to either side of its middle along the unit `axis`.
+    /// Cylinder with flat ends. It extends `half` to either side of its centre along the unit `axis`.
     Cylinder { center: DVec3, axis: DVec3, half: f64, radius: f64 },
-    /// The same with round ends beyond the flat ones.
+    /// Cylinder with hemispherical ends beyond the flat ends.
     Capsule { center: DVec3, axis: DVec3, half: f64, radius: f64 },
-    /// An upright cone from the disc of `radius` about `base` to the tip `height` above it.
+    /// Upright cone from the disc of `radius` around `base` to the tip `height` above it.
     Cone { base: DVec3, radius: f64, height: f64 },
-    /// Everything below a horizontal plane.
+    /// Half-space below a horizontal plane.
     Below { z: f64 },
 }
 
-/// The interval in which a ray is inside a convex solid.
+/// Interval of a ray inside a convex solid.
 #[derive(Clone, Copy)]
 pub struct Span {
-    /// Distance along the ray where it goes in.
+    /// Distance along the ray at the entry.
     pub enter: f64,
-    /// Distance along the ray where it comes out.
+    /// Distance along the ray at the exit.
     pub exit: f64,
 }
 
@@ -48,7 +48,7 @@ impl Span {
         (both.enter < both.exit).then_some(both)
     }
 
-    /// The smallest interval with both: the union, where pieces of one convex solid overlap.
+    /// Returns the smallest interval that contains both. It is the union if the pieces form one convex solid.
     #[inline]
     pub fn hull(a: Option<Span>, b: Option<Span>) -> Option<Span> {
         let (Some(a), Some(b)) = (a, b) else {
@@ -57,7 +57,7 @@ impl Span {
         Some(Span { enter: a.enter.min(b.enter), exit: a.exit.max(b.exit) })
     }
 
-    /// Where a coordinate that starts at `o` and changes by `d` per unit of the ray is between -half and half.
+    /// Returns the interval in which a coordinate that starts at `o` and changes by `d` per unit of the ray is between -half and half.
     #[inline]
     pub fn slab(o: f64, d: f64, half: f64) -> Option<Span> {
         if d.abs() < 1e-300 {
@@ -67,7 +67,7 @@ impl Span {
         Some(Span { enter: a.min(b), exit: a.max(b) })
     }
 
-    /// Between the roots of a t² + 2 b t + c, for a > 0.
+    /// Returns the interval between the roots of a t² + 2 b t + c, for a > 0.
     #[inline]
     pub fn between_roots(a: f64, b: f64, c: f64) -> Option<Span> {
         let root = b * b - a * c;
@@ -78,13 +78,13 @@ impl Span {
         Some(Span { enter: (-b - root) / a, exit: (-b + root) / a })
     }
 
-    /// The ray's interval in a ball about the origin of `o`.
+    /// Returns the ray's interval in a ball around the origin of `o`.
     #[inline]
     pub fn ball(o: DVec3, d: DVec3, radius: f64) -> Option<Span> {
         Span::between_roots(1.0, o.dot(d), o.length_squared() - radius * radius)
     }
 
-    /// The ray's interval in the infinite cylinder about the line through the origin of `o` along the unit `axis`.
+    /// Returns the ray's interval in the infinite cylinder around the line through the origin of `o` along the unit `axis`.
     #[inline]
     pub fn tube(o: DVec3, d: DVec3, axis: DVec3, radius: f64) -> Option<Span> {
         let (along_o, along_d) = (axis.dot(o), axis.dot(d));
@@ -98,23 +98,23 @@ impl Span {
 }
 
 impl Convex {
-    /// A box turned by `yaw` radians about the vertical.
+    /// Creates a box rotated by `yaw` radians around the vertical.
     pub fn block(center: DVec3, half: DVec3, yaw: f64) -> Self {
         let (sin, cos) = yaw.sin_cos();
         Convex::Block { center, half, axes: [DVec3::new(cos, sin, 0.0), DVec3::new(-sin, cos, 0.0), DVec3::Z] }
     }
 
-    /// A cylinder with flat ends at `a` and `b`.
+    /// Creates a cylinder with flat ends at `a` and `b`.
     pub fn cylinder(a: DVec3, b: DVec3, radius: f64) -> Self {
         Convex::Cylinder { center: a.midpoint(b), axis: (b - a).normalize(), half: 0.5 * a.distance(b), radius }
     }
 
-    /// All points within `radius` of the segment from `a` to `b`.
+    /// Creates the solid of all points within `radius` of the segment from `a` to `b`.
     pub fn capsule(a: DVec3, b: DVec3, radius: f64) -> Self {
         Convex::Capsule { center: a.midpoint(b), axis: (b - a).normalize(), half: 0.5 * a.distance(b), radius }
     }
 
-    /// The interval in which the ray is inside.
+    /// Returns the interval in which the ray is inside.
     pub fn span(&self, origin: DVec3, d: DVec3) -> Option<Span> {
         match *self {
             Convex::Sphere { center, radius } => Span::ball(origin - center, d, radius),
@@ -132,7 +132,7 @@ impl Convex {
             }
             Convex::Capsule { center, axis, half, radius } => {
                 let o = origin - center;
-                // A ray that misses the infinite tube misses everything in it.
+                // A ray that misses the infinite cylinder misses the capsule.
                 let tube = Span::tube(o, d, axis, radius)?;
                 let sides = Span::slab(axis.dot(o), axis.dot(d), half).and_then(|slab| slab.overlap(tube));
                 let caps = Span::hull(Span::ball(o - axis * half, d, radius), Span::ball(o + axis * half, d, radius));
@@ -150,7 +150,7 @@ impl Convex {
         }
     }
 
-    /// Outward unit normal at a point of the surface; on an edge, that of either face.
+    /// Returns the outward unit normal at a point of the surface; on an edge, the normal of either face.
     pub fn normal(&self, p: DVec3) -> DVec3 {
         match *self {
             Convex::Sphere { center, .. } => (p - center).normalize(),
@@ -176,7 +176,7 @@ impl Convex {
         }
     }
 
-    /// Signed distance, negative inside: exact but for the places outside of a block, cone or cylinder that are nearest to an edge,
+    /// Returns the signed distance, negative inside. It is exact, except outside of a block, cone or cylinder at points nearest to an edge,
     /// where it is a lower bound.
     pub fn distance(&self, p: DVec3) -> f64 {
         match *self {
@@ -202,14 +202,14 @@ impl Convex {
         }
     }
 
-    /// A ball that contains the solid, unless it is unbounded.
+    /// Returns a ball that contains the solid; `None` if it is unbounded.
     pub fn bound(&self) -> Option<Ball> {
         Some(match *self {
             Convex::Sphere { center, radius } => Ball { center, radius },
             Convex::Block { center, half, .. } => Ball { center, radius: half.length() },
             Convex::Cylinder { center, half, radius, .. } => Ball { center, radius: radius.hypot(half) },
             Convex::Capsule { center, half, radius, .. } => Ball { center, radius: radius + half },
-            // The ball through the tip and the rim, or the rim's own for a flat cone.
+            // The ball through tip and rim, or around the rim for a flat cone.
             Convex::Cone { base, radius, height } => {
                 let up = (0.5 * (height * height - radius * radius) / height).max(0.0);
                 Ball { center: base + DVec3::Z * up, radius: (height - up).max(radius.hypot(up)) }
@@ -219,8 +219,8 @@ impl Convex {
     }
 }
 
-/// The ray's interval in a cone hanging from its tip at the origin of `o`: h² (x² + y²) <= r² z², -h <= z <= 0. Of the double
-/// cone only the lower nappe counts.
+/// Returns the ray's interval in a cone below its tip at the origin of `o`: h² (x² + y²) <= r² z², -h <= z <= 0. Only the lower nappe of
+/// the double cone is solid.
 fn cone_span(o: DVec3, d: DVec3, radius: f64, height: f64) -> Option<Span> {
     let slab = Span::slab(o.z + 0.5 * height, d.z, 0.5 * height)?;
     let k = (radius / height).powi(2);

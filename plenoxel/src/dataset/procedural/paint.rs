@@ -1,35 +1,34 @@
-//! The colors of surfaces and of the sky.
+//! Colors of surfaces and of the sky.
 
 use glam::{DVec3, dvec3};
 use std::f64::consts::{PI, TAU};
 
-/// Albedo (linear) in two colors, and how strongly the surface mirrors.
+/// Paint of a surface: two linear albedos in a pattern, and gloss.
 #[derive(Debug, Clone, Copy)]
 pub struct Paint {
-    /// Where the second color goes.
+    /// Pattern of the second color.
     pub pattern: Pattern,
     /// Linear albedo.
     pub colors: [DVec3; 2],
-    /// 0 for matt paint, 1 for the strongest highlights and reflections.
+    /// Gloss, from 0 for matt paint to 1 for the strongest highlights and reflections.
     pub gloss: f64,
 }
 
-/// Where the second color goes.
+/// Pattern of the second color.
 #[derive(Debug, Clone, Copy)]
 pub enum Pattern {
-    /// Nowhere.
+    /// No second color.
     Plain,
-    /// Cells of `side` along axes turned about the vertical through `center`, of which `across` is the first; an infinite side
-    /// makes stripes.
+    /// Cells of `side` along axes rotated around the vertical through `center`; `across` is the first axis. An infinite side makes stripes.
     Checker { center: DVec3, across: DVec3, side: DVec3 },
-    /// Stripes that go `turns` times around the vertical through `center` and `rise` times per unit of height.
+    /// Stripes around the vertical through `center`: `turns` per revolution and `rise` per unit of height.
     Spiral { center: DVec3, turns: f64, rise: f64 },
     /// Meridians and parallels of a globe.
     Globe { center: DVec3, meridians: f64, belts: f64 },
 }
 
 impl Pattern {
-    /// True where a point has the second color.
+    /// Returns true if a point has the second color.
     pub fn second(&self, p: DVec3) -> bool {
         let azimuth = |o: DVec3| o.y.atan2(o.x) / TAU;
         let cell = match *self {
@@ -51,7 +50,7 @@ impl Pattern {
     }
 }
 
-/// The sky seen in a mirror that reflects into a direction of the given height (cosine to the vertical).
+/// Returns the color of the sky reflected in a direction of the given height (cosine to the vertical).
 pub fn sky_color(height: f64) -> DVec3 {
     let (ground, horizon, zenith) = (dvec3(0.10, 0.06, 0.04), dvec3(0.95, 0.85, 0.72), dvec3(0.22, 0.45, 0.95));
     if height < 0.15 {

@@ -1,9 +1,9 @@
-//! The still life: its objects, its light and the picture a camera takes of it.
+//! The still life: objects, light and rendering.
 //!
-//! Chosen to exercise what voxel fields find easy and hard: stripes and checkers near the voxel size, dark and bright paint,
-//! rods and hoops about as thin as a pixel, hollows that no silhouette shows (a bowl, dimples in a block), and glossy
-//! spheres whose color changes with the direction of view, smoothly enough for spherical harmonics of degree 2. World z is
-//! up; everything lies within 1.3 of the origin. Light is the same in every picture and is not part of the scene's geometry.
+//! It contains details that are easy and hard for voxel fields: stripes and checkers near the size of a voxel, dark and bright paint, rods
+//! and rings about one pixel thick, hollows that no silhouette shows (a bowl, dimples in a block), and glossy spheres whose view-dependent
+//! color is smooth enough for spherical harmonics of degree 2. World z is up. All objects lie within 1.3 of the origin. The light is the
+//! same in every image and is not part of the geometry.
 
 use super::bounds::Bounds;
 use super::paint::sky_color;
@@ -15,19 +15,19 @@ use glam::{DVec3, dvec3};
 use ndarray::Array2;
 use rayon::prelude::*;
 
-/// Distance by which a shadow ray starts off its surface.
+/// Offset of a shadow ray from its surface.
 const OFFSET: f64 = 1e-6;
 
-/// An analytic scene: solids with paint, seen under a fixed light.
+/// Analytic scene: painted solids under a fixed light.
 #[derive(Debug, Clone)]
 pub struct Scene {
     objects: Vec<Object>,
     bounds: Bounds,
-    /// The objects (as bits) that can shade others. The table cannot: it is convex and lies below everything.
+    /// Bit set of the objects that can shade others. The table cannot: it is convex and below everything else.
     casters: u32,
 }
 
-/// What a ray met: surface and object.
+/// Surface point hit by a ray, and its object.
 #[derive(Debug, Clone, Copy)]
 struct Surface {
     hit: Hit,
@@ -35,44 +35,44 @@ struct Surface {
 }
 
 impl Scene {
-    /// The built-in still life.
+    /// Creates the built-in still life.
     pub fn still_life() -> Self {
         let objects = objects();
         let casters = objects.iter().enumerate().filter(|(_, object)| object.casts).fold(0, |bits, (k, _)| bits | 1 << k);
         Scene { bounds: Bounds::new(&objects), casters, objects }
     }
 
-    /// Signed distance from `point` to the nearest surface, negative inside solid matter. The sign is exact; outside, the value
+    /// Returns the signed distance from `point` to the nearest surface, negative inside solid matter. The sign is exact. Outside, the value
     /// never exceeds the true distance.
     pub fn distance(&self, point: DVec3) -> f64 {
         self.objects.iter().map(|object| object.solid.distance(point)).fold(f64::INFINITY, f64::min)
     }
 
-    /// True inside solid matter.
+    /// Returns true inside solid matter.
     pub fn occupied(&self, point: DVec3) -> bool {
         self.distance(point) < 0.0
     }
 
-    /// True in what was cut out of a solid and is empty: in the bowl, and in the dimples of the block.
+    /// Returns true in a hole of a solid: in the bowl, and in the dimples of the block.
     pub fn in_hollow(&self, point: DVec3) -> bool {
         !self.occupied(point) && self.objects.iter().any(|object| object.solid.in_hollow(point))
     }
 
-    /// Distance along the unit ray to the first surface, infinite where there is none.
+    /// Returns the distance along the unit ray to the first surface; infinite if there is none.
     pub fn depth(&self, ray: &Ray) -> f64 {
         self.first(ray.origin, ray.direction, u32::MAX).map_or(f64::INFINITY, |surface| surface.hit.t)
     }
 
-    /// Color in [0, 1] (as stored in an image) where the ray first meets a surface, or `None` where it meets none. It depends on
-    /// the direction for glossy surfaces.
+    /// Returns the color in [0, 1] (as stored in an image) of the first surface along the ray; `None` if there is none. The color of glossy
+    /// surfaces depends on the direction.
     pub fn color(&self, ray: &Ray) -> Option<[f64; 3]> {
         self.first(ray.origin, ray.direction, u32::MAX).map(|surface| self.shade(&surface, ray.origin, ray.direction).to_array())
     }
 
-    /// The picture `camera` takes, with `supersample` x `supersample` rays per pixel, and the exact depth along the ray of each
-    /// pixel's centre, [height, width], infinite where it meets nothing.
+    /// Renders the image of `camera` with `supersample` x `supersample` rays per pixel, and the exact depth along the ray of each pixel's
+    /// centre, [height, width], infinite if it hits nothing.
     ///
-    /// Alpha is the share of rays that hit; color is the mean over those, so that alpha is straight.
+    /// Alpha is the fraction of rays that hit a surface. Color is the mean over these rays, so alpha is straight.
     pub fn render(&self, camera: &Camera, supersample: usize) -> (RgbaImage, Array2<f32>) {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let mut pixels = vec![0_u8; 4 * width * height];
@@ -91,7 +91,7 @@ impl Scene {
                 pixels[4 * i..4 * i + 4].copy_from_slice(&self.pixel(camera, i, j, supersample, candidates));
             }
         });
-        // Both buffers have the sizes the constructors ask for, so neither refuses.
+        // Both buffers have the required sizes, so these calls never fall back to the default.
         let depth = Array2::from_shape_vec((height, width), depth).unwrap_or_default();
         (RgbaImage::from_raw(width as u32, height as u32, pixels).unwrap_or_default(), depth)
     }
@@ -114,16 +114,16 @@ impl Scene {
         [r, g, b, alpha]
     }
 
-    /// The objects (as bits) whose bounds come within the pixel's cone of rays. Deciding this once per pixel instead of once per
-    /// ray makes the empty pixels nearly free.
+    /// Returns the bit set of objects whose bounds intersect the pixel's cone of rays. It is computed once per pixel, which makes empty
+    /// pixels nearly free.
     fn candidates(&self, camera: &Camera, i: usize, j: usize) -> u32 {
         let ray = camera.ray(i as f64 + 0.5, j as f64 + 0.5);
-        // Half a pixel's diagonal and a little more.
+        // Slightly more than half the diagonal of a pixel.
         let spread = 0.75 / camera.intrinsics.fx.min(camera.intrinsics.fy);
         self.bounds.near(ray.origin, ray.direction, spread as f32)
     }
 
-    /// The first surface along the ray among the candidate objects.
+    /// Returns the first surface along the ray among the candidate objects.
     fn first(&self, origin: DVec3, direction: DVec3, candidates: u32) -> Option<Surface> {
         let mut nearest: Option<Surface> = None;
         let near = candidates & self.bounds.near(origin, direction, 0.0);
@@ -137,7 +137,7 @@ impl Scene {
         nearest
     }
 
-    /// True if anything lies between `point`, on an object facing the light, and the key light.
+    /// Returns true if an object lies between the key light and `point`, on an object facing the light.
     fn shadowed(&self, point: DVec3, light: DVec3, own: usize) -> bool {
         // A convex solid cannot shade its own lit side.
         let others = if self.objects[own].solid.convex() { !(1 << own) } else { u32::MAX };
@@ -145,7 +145,7 @@ impl Scene {
         members(near, &self.objects).any(|(_, object)| object.solid.first_hit(point, light).is_some())
     }
 
-    /// Lambert under a key light with shadows, a fill light and a sky darkened by neighbours; on glossy paint, broad
+    /// Shades a surface: Lambert shading under a shadowed key light, a fill light and a sky darkened by neighbours. Glossy paint adds wide
     /// Blinn-Phong highlights and a soft reflection of the sky that grows towards grazing angles (Schlick 1994).
     fn shade(&self, surface: &Surface, origin: DVec3, direction: DVec3) -> DVec3 {
         let key = dvec3(0.5, -0.42, 0.76).normalize();
@@ -169,12 +169,12 @@ impl Scene {
             let shine = lit * highlight(key, 16) * dvec3(0.85, 0.80, 0.72) + highlight(fill, 12) * dvec3(0.10, 0.13, 0.20);
             color = color * (1.0 - paint.gloss * fresnel) + paint.gloss * (fresnel * sky * mirrored + shine);
         }
-        // A square root stands for the display's gamma: a picture stores values as the eye wants them.
+        // The square root approximates the display's gamma, because images store sRGB values.
         color.clamp(DVec3::ZERO, DVec3::ONE).map(f64::sqrt)
     }
 }
 
-/// The objects whose bits are set, with their numbers.
+/// Returns the objects whose bits are set, with their numbers.
 fn members(mut bits: u32, objects: &[Object]) -> impl Iterator<Item = (usize, &Object)> {
     std::iter::from_fn(move || {
         let k = bits.trailing_zeros() as usize;

@@ -1,11 +1,10 @@
-//! What can be made of convex pieces: their common part, less what holes cut away. Intersections are the overlap of intervals,
-//! and a hole is an interval to jump over. Only the torus is not convex; it is sphere-traced inside a tight bound and
-//! finished by Newton's method.
+//! Solids composed of convex pieces: an intersection of pieces, minus holes. Intersections are overlaps of intervals; a hole is an interval
+//! to skip. The torus is the only other solid: it is sphere-traced inside a tight bound and refined by Newton's method.
 
 use super::convex::{Ball, Convex, Span};
 use glam::DVec3;
 
-/// Where a ray first meets a surface.
+/// First intersection of a ray with a surface.
 #[derive(Debug, Clone, Copy)]
 pub struct Hit {
     /// Distance along the unit ray.
@@ -16,17 +15,17 @@ pub struct Hit {
     pub carved: bool,
 }
 
-/// A solid of the scene.
+/// Solid of the scene.
 #[derive(Debug, Clone)]
 pub enum Solid {
-    /// What all of `body` share, without what any of `holes` covers.
+    /// Intersection of all pieces of `body`, minus the union of `holes`.
     Carved { body: Vec<Convex>, holes: Vec<Convex> },
-    /// A ring of tube radius `tube` about the circle of `radius` around the unit `axis`.
+    /// Torus with tube radius `tube` around the circle of `radius` around the unit `axis`.
     Torus { center: DVec3, axis: DVec3, radius: f64, tube: f64 },
 }
 
 impl Solid {
-    /// Where the ray from `origin` along the unit `direction` first meets the surface from outside, at t > 0.
+    /// Returns the first point at t > 0 where the ray from `origin` along the unit `direction` enters the surface from outside.
     pub fn first_hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
         match self {
             Solid::Carved { body, holes } => {
@@ -43,7 +42,7 @@ impl Solid {
                     return None;
                 }
                 let mut t = inside.enter;
-                // Jump over each hole that covers the present point, until none does.
+                // Skip each hole that contains the current point, until no hole does.
                 let covering = |t: f64| {
                     let spans = holes.iter().filter_map(|hole| Some((hole, hole.span(origin, direction)?)));
                     spans.into_iter().find(|(_, span)| span.enter <= t && t < span.exit)
@@ -62,7 +61,7 @@ impl Solid {
         }
     }
 
-    /// Signed distance, negative inside. Its sign is exact; outside it never exceeds the true distance.
+    /// Returns the signed distance, negative inside. The sign is exact. Outside, the value never exceeds the true distance.
     pub fn distance(&self, p: DVec3) -> f64 {
         match self {
             Solid::Carved { body, holes } => {
@@ -73,7 +72,7 @@ impl Solid {
         }
     }
 
-    /// True in a hole, within the body that it was cut out of.
+    /// Returns true in a hole, inside the body that it was cut out of.
     pub fn in_hollow(&self, p: DVec3) -> bool {
         match self {
             Solid::Carved { body, holes } => {
@@ -84,12 +83,12 @@ impl Solid {
         }
     }
 
-    /// True if no ray can leave the solid and meet it again.
+    /// Returns true if no ray can leave the solid and enter it again.
     pub fn convex(&self) -> bool {
         matches!(self, Solid::Carved { holes, .. } if holes.is_empty())
     }
 
-    /// A ball that contains the solid.
+    /// Returns a ball that contains the solid.
     pub fn bound(&self) -> Ball {
         match self {
             Solid::Carved { body, .. } => {
@@ -101,7 +100,7 @@ impl Solid {
     }
 }
 
-/// Signed distance to a torus about the origin, exact, and the direction in which it grows.
+/// Returns the exact signed distance to a torus around the origin, and its gradient.
 fn torus_distance(p: DVec3, axis: DVec3, radius: f64, tube: f64) -> (f64, DVec3) {
     let flat = p - axis * axis.dot(p);
     let from_circle = p - flat.normalize_or_zero() * radius;
@@ -110,7 +109,7 @@ fn torus_distance(p: DVec3, axis: DVec3, radius: f64, tube: f64) -> (f64, DVec3)
 }
 
 fn torus_hit(o: DVec3, d: DVec3, axis: DVec3, radius: f64, tube: f64) -> Option<Hit> {
-    // The ring fits between two planes, inside one cylinder and outside another: most rays are settled here.
+    // The ring lies between two planes, inside one cylinder and outside another. Most rays are decided here.
     let planes = Span::slab(axis.dot(o), axis.dot(d), tube)?;
     let bound = Span::tube(o, d, axis, radius + tube)?.overlap(planes)?;
     let mut t = bound.enter.max(0.0);
@@ -123,8 +122,8 @@ fn torus_hit(o: DVec3, d: DVec3, axis: DVec3, radius: f64, tube: f64) -> Option<
     if torus_distance(o + t * d, axis, radius, tube).0 < 0.0 {
         return None;
     }
-    // Sphere tracing (Hart 1996) approaches but never passes the surface. It is slow only along grazing rays, and those it
-    // gives up pass within a millionth of the ring.
+    // Sphere tracing (Hart 1996) approaches the surface but never passes it. It is slow only for grazing rays; rays that it gives up on
+    // pass within a millionth of the ring.
     for _ in 0..256 {
         let (distance, gradient) = torus_distance(o + t * d, axis, radius, tube);
         if distance < 1e-6 {
@@ -135,7 +134,7 @@ fn torus_hit(o: DVec3, d: DVec3, axis: DVec3, radius: f64, tube: f64) -> Option<
                 let normal = torus_distance(o + t * d, axis, radius, tube).1;
                 return (t > 0.0).then_some(Hit { t, normal, carved: false });
             }
-            // Leaving, or gliding past: a step that keeps the ray moving.
+            // The ray leaves or grazes the surface: a small step keeps it moving.
             t += 1e-5;
         }
         t += distance.max(0.0);
@@ -172,7 +171,7 @@ mod tests {
         ]
     }
 
-    /// Evenly spread unit vectors (golden angle).
+    /// Returns evenly spread unit vectors (golden angle).
     fn directions(count: usize) -> impl Iterator<Item = DVec3> {
         (0..count).map(move |k| {
             let z = 1.0 - 2.0 * (k as f64 + 0.5) / count as f64;
@@ -181,7 +180,7 @@ mod tests {
         })
     }
 
-    /// Closed forms and distance functions are written independently of each other, so their agreement says both are right.
+    /// Closed forms and distance functions are written independently, so their agreement verifies both.
     #[test]
     fn first_hits_are_where_sphere_tracing_arrives() {
         for (which, solid) in solids().iter().enumerate() {
@@ -224,12 +223,12 @@ mod tests {
         }
     }
 
-    /// True if the ray stays within 2e-4 of the surface or outside: rounding may then decide either way.
+    /// Returns true if the ray stays outside or within 2e-4 of the surface: rounding may then decide either way.
     fn grazing(solid: &Solid, origin: DVec3, direction: DVec3) -> bool {
         (0..6000).all(|k| solid.distance(origin + k as f64 * 1e-3 * direction) > -2e-4)
     }
 
-    /// True close to an edge, where a step along the normal may cross another face.
+    /// Returns true near an edge, where a step along the normal may cross another face.
     fn edge(solid: &Solid, p: DVec3) -> bool {
         let h = 1e-4;
         let gradient =

@@ -1,4 +1,4 @@
-//! The things on the table: where they stand and how they are painted.
+//! Objects of the still life: positions and paints.
 
 use super::convex::Convex;
 use super::paint::{Paint, Pattern};
@@ -8,25 +8,25 @@ use std::f64::consts::PI;
 
 /// Height of the table's top.
 pub const TABLE: f64 = -0.45;
-/// A solid with its paint.
+/// Solid with its paint.
 #[derive(Debug, Clone)]
 pub struct Object {
-    /// Its shape.
+    /// Shape.
     pub solid: Solid,
-    /// Paint of its outside.
+    /// Paint of the outside.
     pub skin: Paint,
-    /// Paint of the holes' walls, which are always matt.
+    /// Paint of the holes' walls, always matt.
     pub lining: Paint,
-    /// Fraction of the light of the sky that the walls of its holes still see. Inside a sphere every point of the wall sees
-    /// the opening under the same form factor: the opening's share of the sphere.
+    /// Fraction of the sky's light that reaches the walls of the holes. Inside a sphere the opening has the same form factor from every
+    /// point of the wall: the opening's share of the sphere.
     pub openness: f64,
-    /// Radius of the ball that stands for the object when others are darkened by it; 0 for thin things.
+    /// Radius of the ball that represents the object when it darkens others; 0 for thin objects.
     pub shade: f64,
-    /// False if it lies in nobody's light.
+    /// False if the object never shades others.
     pub casts: bool,
 }
 
-/// The list of things on the table.
+/// Returns the objects of the still life.
 pub fn objects() -> Vec<Object> {
     let matt = |pattern, first: [f64; 3], second: [f64; 3]| Paint { pattern, colors: [first.into(), second.into()], gloss: 0.0 };
     let plain = |color: [f64; 3], gloss| Paint { pattern: Pattern::Plain, colors: [color.into(); 2], gloss };
@@ -113,7 +113,7 @@ pub fn objects() -> Vec<Object> {
         leg(-0.11, -0.15),
         ring(globe, dvec3(0.25, -0.2, 1.0), 0.30, 0.023, brass),
         ring(globe, dvec3(1.0, 0.3, 0.15), 0.255, 0.023, brass),
-        // A candle, a ring lying about, two marbles.
+        // A candle, a ring on the table, two marbles.
         whole(
             Convex::cylinder(up(0.04, -0.84, 0.0), up(0.04, -0.84, 0.48), 0.12),
             matt(Pattern::Spiral { center: up(0.04, -0.84, 0.02), turns: 0.0, rise: 7.5 }, [0.02, 0.02, 0.025], [0.93, 0.66, 0.04]),

@@ -1,12 +1,11 @@
-//! How the surface runs through a cell, for each of the 256 ways in which its corners can be dense or thin.
+//! Polygons of the surface in a cell, for each of the 256 combinations of dense and thin corners.
 //!
-//! The vertices are on those of its twelve edges whose ends differ. On each face, going round counterclockwise as seen from outside of the cell,
-//! every run of dense corners is cut off by a segment from the edge where it begins to the edge where it ends. Where two dense corners lie
-//! across from each other they are thus separated; the cell on the other side of the face does the same, going the other way round. Each vertex
-//! begins a segment on one of its two faces and ends one on the other: the segments are closed loops, counterclockwise as seen from the thin
-//! side.
+//! Vertices are on the edges whose ends differ. On each face, seen from outside of the cell in counterclockwise order, every run of dense
+//! corners is cut off by a segment from the edge where the run begins to the edge where it ends. Two diagonally opposite dense corners are
+//! therefore separated. The cell on the other side of the face does the same, in the opposite order. Each vertex starts a segment on one of
+//! its two faces and ends one on the other: the segments form closed loops, counterclockwise seen from the thin side.
 
-/// Corners of a cell, x slowest: corner c is bit c of a case.
+/// Corners of a cell, x slowest. Corner c is bit c of a case.
 pub(super) const CORNERS: [[usize; 3]; 8] = [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]];
 
 /// Edges of a cell: the corner where each begins, and its axis.
@@ -25,12 +24,12 @@ pub(super) const EDGES: [([usize; 3], usize); 12] = [
     ([1, 1, 0], 2),
 ];
 
-/// For each case, triangles of edges.
+/// Returns the triangles of each case, as triples of edges.
 pub(super) fn triangles() -> Vec<Vec<[u8; 3]>> {
     (0..256).map(|case| loops(case).iter().flat_map(|edges| filled(edges)).collect()).collect()
 }
 
-/// The closed loops of edges of a case.
+/// Returns the closed loops of edges of a case.
 fn loops(case: usize) -> Vec<Vec<u8>> {
     let dense = |corner: [usize; 3]| case >> (corner[0] * 4 + corner[1] * 2 + corner[2]) & 1 == 1;
     let mut next = [None; 12];
@@ -41,7 +40,7 @@ fn loops(case: usize) -> Vec<Vec<u8>> {
             if dense(corner(0)) || !dense(corner(1)) {
                 continue;
             }
-            // A run begins between corner 0 and corner 1, and ends before the first thin one.
+            // A run begins between corners 0 and 1, and ends before the first thin corner.
             let end = (2..=4).find(|&i| !dense(corner(i))).unwrap_or(4);
             next[usize::from(between(corner(0), corner(1)))] = Some(between(corner(end - 1), corner(end)));
         }
@@ -60,7 +59,7 @@ fn loops(case: usize) -> Vec<Vec<u8>> {
     loops
 }
 
-/// The corners of a face, counterclockwise as seen from outside of the cell.
+/// Returns the corners of a face, counterclockwise seen from outside of the cell.
 fn face(axis: usize, side: usize) -> [[usize; 3]; 4] {
     let mut round = [[0, 0], [1, 0], [1, 1], [0, 1]].map(|[u, v]| {
         let mut corner = [side; 3];
@@ -74,7 +73,7 @@ fn face(axis: usize, side: usize) -> [[usize; 3]; 4] {
     round
 }
 
-/// The edge between two neighbouring corners.
+/// Returns the edge between two neighbouring corners.
 fn between(a: [usize; 3], b: [usize; 3]) -> u8 {
     let is = |&(corner, axis): &([usize; 3], usize)| {
         let mut end = corner;
@@ -84,19 +83,19 @@ fn between(a: [usize; 3], b: [usize; 3]) -> u8 {
     EDGES.iter().position(is).map_or(0, |edge| edge as u8)
 }
 
-/// True if two edges lie on a common face.
+/// Returns true if two edges lie on a common face.
 fn share_a_face(a: u8, b: u8) -> bool {
     let [(a, along_a), (b, along_b)] = [a, b].map(|edge| EDGES[usize::from(edge)]);
     (0..3).any(|axis| axis != along_a && axis != along_b && a[axis] == b[axis])
 }
 
-/// A loop filled with triangles none of whose new edges lies on a face of the cell, where the cell beyond could have the same edge.
+/// Triangulates a loop without diagonals on a face of the cell, because the neighbouring cell could have the same edge.
 fn filled(edges: &[u8]) -> Vec<[u8; 3]> {
     let n = edges.len();
     if n == 3 {
         return vec![[edges[0], edges[1], edges[2]]];
     }
-    // Cut off a corner, and fill the rest.
+    // Cut off a corner, and triangulate the rest.
     let cut = |i: usize| {
         let [before, here, after] = [i, i + 1, i + 2].map(|i| edges[i % n]);
         if share_a_face(before, after) {
@@ -145,7 +144,7 @@ mod tests {
 
     #[test]
     fn one_dense_corner_is_cut_off_counterclockwise() {
-        // Corner (0, 0, 0): from the edge along x to that along y to that along z.
+        // Corner (0, 0, 0): from the edge along x to the edge along y to the edge along z.
         let triangle = triangles()[1][0];
         let start = triangle.iter().position(|&edge| edge == 0).unwrap();
         assert_eq!([0, 1, 2].map(|i| EDGES[usize::from(triangle[(start + i) % 3])].1), [0, 1, 2]);

@@ -1,7 +1,7 @@
-//! Decimation: edges are collapsed in the order of their quadric errors (Garland and Heckbert 1997), by the crate `alum`.
+//! Decimation: edges are collapsed in the order of their quadric errors (Garland and Heckbert 1997), with the crate `alum`.
 //!
-//! Quadrics are probabilistic (Trettner and Kobbelt 2020): planes have a variance, so that vertices of flat places have one best position too.
-//! A collapse that would join or tear the surface is not made.
+//! Quadrics are probabilistic (Trettner and Kobbelt 2020): planes have a variance, so that vertices in flat regions have a unique best
+//! position too. Collapses that would join or tear the surface are not made.
 
 use super::Vertex;
 use crate::error::{Error, Result};
@@ -9,24 +9,24 @@ use alum::decimate::quadric::{QuadricDecimater, QuadricType};
 use alum::{Handle, HasDecimation, HasIterators, HasTopology, PolyMeshF64};
 use glam::DVec3;
 
-/// The same surface with no more than `most` triangles, or the fewest that it can be brought to. Parts that shrink to two triangles, back to back,
-/// are gone. A vertex that stays keeps its row and its normal.
+/// Reduces a surface to at most `most` triangles, or to the fewest that can be reached. Parts that shrink to two triangles, back to back,
+/// are removed. Remaining vertices keep their rows and normals.
 ///
-/// Errors: nothing is left.
+/// Errors if nothing remains.
 pub fn decimate(vertices: Vec<Vertex>, triangles: Vec<[u32; 3]>, most: usize) -> Result<(Vec<Vertex>, Vec<[u32; 3]>)> {
     if triangles.len() <= most {
         return Ok((vertices, triangles));
     }
     let (positions, mut left) = collapsed(&vertices, &triangles, most).map_err(|e| {
-        let found = format!("{most}, for a surface that cannot be decimated ({e:?}),");
-        Error::config("max_triangles", found, "none: leave it away")
+        let found = format!("{most}, but the surface cannot be decimated ({e:?})");
+        Error::config("max_triangles", found, "no limit: leave the option out")
     })?;
-    // Each edge has two triangles, so two with the same vertices are a part of their own.
+    // Each edge has two triangles, so two triangles with the same vertices form a part.
     left.sort_unstable_by_key(sorted);
     let left: Vec<[u32; 3]> = left.chunk_by(|a, b| sorted(a) == sorted(b)).filter(|same| same.len() == 1).map(|single| single[0]).collect();
     if left.is_empty() {
-        let found = format!("{most}, which leaves nothing of this surface: its parts are too many,");
-        return Err(Error::config("max_triangles", found, "more; or a larger --min-part, which leaves small parts out"));
+        let found = format!("{most} leaves no triangle of this surface, because it has too many parts");
+        return Err(Error::config("max_triangles", found, "a larger number; or a larger --min-part, which removes small parts"));
     }
     let mut numbers = vec![u32::MAX; vertices.len()];
     let mut kept = Vec::new();
@@ -44,7 +44,7 @@ pub fn decimate(vertices: Vec<Vertex>, triangles: Vec<[u32; 3]>, most: usize) ->
     Ok((kept, triangles))
 }
 
-/// The position of each vertex after the collapses, of those too that are gone, and the triangles that are left.
+/// Returns the position of each vertex after the collapses, including removed vertices, and the remaining triangles.
 fn collapsed(vertices: &[Vertex], triangles: &[[u32; 3]], most: usize) -> std::result::Result<(Vec<DVec3>, Vec<[u32; 3]>), alum::Error> {
     let mut mesh = PolyMeshF64::with_capacity(vertices.len(), 3 * triangles.len() / 2, triangles.len());
     for vertex in vertices {
@@ -61,7 +61,7 @@ fn collapsed(vertices: &[Vertex], triangles: &[[u32; 3]], most: usize) -> std::r
     Ok((positions, mesh.triangulated_vertices(&status).map(|corners| corners.map(|v| v.index())).collect()))
 }
 
-/// The vertices of a triangle in ascending order.
+/// Returns the vertices of a triangle in ascending order.
 fn sorted(triangle: &[u32; 3]) -> [u32; 3] {
     let mut sorted = *triangle;
     sorted.sort_unstable();

@@ -1,22 +1,22 @@
-//! Parts of a surface: triangles that hang together by common vertices.
+//! Parts of a surface: triangles connected by common vertices.
 
 use super::Surface;
 
 impl Surface {
-    /// Takes away the parts of fewer than `least` triangles, but never the largest part. Returns how many parts it took.
+    /// Removes the parts of fewer than `least` triangles, except the largest part. Returns the number of removed parts.
     pub fn leave_out_parts_below(&mut self, least: usize) -> usize {
         let mut parts = Parts::new(self.crossings.len());
         for &[a, b, c] in &self.triangles {
             parts.join(a, b);
             parts.join(b, c);
         }
-        // The triangles of each part at the vertex that names it; every part has some.
+        // Number of triangles of each part, stored at the vertex that names the part. Every part has some.
         let mut count = vec![0; self.crossings.len()];
         self.triangles.iter().for_each(|triangle| count[parts.name(triangle[0]) as usize] += 1);
         let least = least.min(count.iter().copied().max().unwrap_or(0));
         let left_out = count.iter().filter(|&&triangles| triangles > 0 && triangles < least).count();
         let mut left = Surface::default();
-        // The new number of each vertex that stays; each has a triangle.
+        // New number of each remaining vertex. Each has a triangle.
         let mut numbers = vec![0; self.crossings.len()];
         for (v, &crossing) in self.crossings.iter().enumerate() {
             if count[parts.name(v as u32) as usize] >= least {
@@ -31,7 +31,7 @@ impl Surface {
     }
 }
 
-/// Disjoint sets of vertices (Tarjan 1975), each named by its smallest vertex: a vertex points at another one of its set, or at itself.
+/// Disjoint sets of vertices (Tarjan 1975), each named by its smallest vertex. A vertex points to another vertex of its set, or to itself.
 struct Parts(Vec<u32>);
 
 impl Parts {
@@ -39,7 +39,7 @@ impl Parts {
         Parts((0..vertices as u32).collect())
     }
 
-    /// The name of the set of a vertex. Ways that were gone are halved.
+    /// Returns the name of the set of a vertex, with path halving.
     fn name(&mut self, mut v: u32) -> u32 {
         while self.0[v as usize] != v {
             let next = self.0[v as usize];

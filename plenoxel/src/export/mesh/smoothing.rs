@@ -1,15 +1,16 @@
-//! Smoothing (Taubin 1995): passes that move each vertex towards the mean of its neighbours, and back by a little more, which keeps the volume.
+//! Smoothing (Taubin 1995): each pass moves every vertex towards the mean of its neighbours, and then slightly farther back, which
+//! preserves the volume.
 
 use super::Vertex;
 use glam::DVec3;
 
-/// The share of the way to the mean of the neighbours that a vertex goes, and the one that it goes back: waves longer than the pass band
-/// 1 / λ + 1 / μ = 0.1 stay.
+/// Steps of a pass: the fraction of the distance to the neighbours' mean that a vertex moves, and then moves back. Waves longer than the
+/// pass band 1 / λ + 1 / μ = 0.1 are preserved.
 const SHARES: [f64; 2] = [0.5, -0.526];
 
-/// Smooths positions and normals in so many passes, each there and back. A vertex stays within `reach` of where it was, along each axis.
+/// Smooths positions and normals in `passes` passes. A vertex stays within `reach` of its original position along each axis.
 ///
-/// The surface is closed: each neighbour of a vertex follows it in one of the triangles around it.
+/// The surface is closed: each neighbour of a vertex follows it in exactly one of the triangles around it.
 pub fn smooth(vertices: &mut [Vertex], triangles: &[[u32; 3]], passes: usize, reach: f64) {
     let first: Vec<DVec3> = vertices.iter().map(|vertex| vertex.position).collect();
     let mut around = vec![[DVec3::ZERO; 2]; vertices.len()];

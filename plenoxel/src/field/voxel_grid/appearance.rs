@@ -1,34 +1,34 @@
-//! What a voxel is by itself, without rays: how much matter, which way it faces, its color from there. What exports are made of.
+//! Properties of single voxels for exports: absorbed light, surface normal, color.
 
 use super::{Color, GridShape, VoxelGrid};
 use crate::sampling::Occupancy;
 use autograd::{Buffer, Indices, Real, Tensor, no_grad, parallel};
 use glam::DVec3;
 
-/// Rows whose colors are computed at a time, which bounds the memory for their harmonics.
+/// Number of rows whose colors are computed at a time. It bounds the memory for their harmonics.
 const RUN: usize = 1 << 16;
 
 impl<T: Real> VoxelGrid<T> {
-    /// The voxels that absorb at least the share `min_alpha` of the light that crosses them ([`super::GridShape::alpha_of_density`]), and
-    /// have density.
+    /// Returns the voxels with a density above 0 that absorb at least the fraction `min_alpha` of the light
+    /// ([`super::GridShape::alpha_of_density`]).
     pub fn voxels_absorbing(&self, min_alpha: f64) -> Occupancy {
         let density = self.density.tensor().data();
         self.voxels_where(|row| density[row] > T::zero() && self.shape().alpha_of_density(density[row].as_f64()) >= min_alpha)
     }
 
-    /// Raw density of a voxel, 1 / world length: 0 for one that is not present or lies outside of the grid.
+    /// Returns the raw density of a voxel, 1 / world length; 0 if it is absent or outside of the grid.
     pub fn density_at(&self, voxel: [isize; 3]) -> f64 {
         let inside = voxel.iter().all(|k| (0..self.shape().resolution as isize).contains(k));
         let row = inside.then(|| self.lattice().row(voxel.map(|k| k as usize))).flatten();
         row.map_or(0.0, |row| self.density.tensor().data()[row as usize].as_f64())
     }
 
-    /// Which way a voxel faces, out of the surface: −∇α of the share α of the light that voxels absorb ([`super::GridShape::alpha_of_density`]),
-    /// change per voxel, not normalised. Central differences along each axis, smoothed by 1, 2, 1 along both others: Sobel's operator in space.
-    /// Zero where the neighbours say nothing, as inside of solid matter.
+    /// Returns the outward direction of the surface at a voxel, not normalised: −∇α per voxel, where α is the fraction of light that a
+    /// voxel absorbs ([`super::GridShape::alpha_of_density`]). The gradient is a 3D Sobel operator: central differences along each axis,
+    /// smoothed by 1, 2, 1 along the other two. Zero if the neighbours are symmetric, for example inside solid matter.
     ///
-    /// Of α and not of density: both fall in the same direction, but a density of 10⁴ beside one of 10³, both opaque, does not turn it. And
-    /// smoothed, since surfaces of opaque voxels are stairs.
+    /// α is used instead of the density because the density of opaque voxels varies: a density of 10⁴ beside 10³ would turn the normal,
+    /// although both are opaque. Smoothing is needed because surfaces of opaque voxels are stair-shaped.
     pub fn outward(&self, voxel: [isize; 3]) -> DVec3 {
         const STRIDES: [usize; 3] = [9, 3, 1];
         const SMOOTH: [f64; 3] = [1.0, 2.0, 1.0];
@@ -43,12 +43,12 @@ impl<T: Real> VoxelGrid<T> {
                 .map(|(i, j)| SMOOTH[i] * SMOOTH[j] * (alpha[i * a + j * b] - alpha[i * a + j * b + 2 * along]))
                 .sum()
         };
-        // Two voxels apart, and weights that add up to 16.
+        // The difference spans two voxels, and the weights add up to 16.
         DVec3::from([0, 1, 2].map(fall)) / 32.0
     }
 
-    /// The same matter with its unit normals in place of colors, [`VoxelGrid::outward`] of each voxel: what is rendered of it over black is
-    /// Σ wᵢ nᵢ, the mean normal of what a ray sees times its opacity. Zero where the neighbours say nothing.
+    /// Returns the grid with the unit normal of each voxel ([`VoxelGrid::outward`]) in place of its color. Rendered over black, a pixel is
+    /// Σ wᵢ nᵢ: the mean normal along the ray times its opacity. Voxels without a direction have normal zero.
     pub fn normals(&self) -> Self {
         let rows = self.lattice().rows();
         let normal = |row: usize| self.lattice().node(row as u32).map_or(DVec3::ZERO, |voxel| self.outward(voxel.map(|k| k as isize)));
@@ -62,13 +62,13 @@ impl<T: Real> VoxelGrid<T> {
         Self::with_lattice(shape, self.lattice().clone(), self.density.tensor().detach(), Tensor::from_buffer(normals, &[rows, 3]))
     }
 
-    /// Colors of rows of the tables, each seen along its unit direction from the viewer into the scene: what [`super::Color::activate`] gives for a
-    /// sample at the centre of the voxel. A direction of zero gives the mean over all directions (before the maximum with 0), for no harmonic but
-    /// the first has a mean. sRGB as the photographs have it, not clamped.
+    /// Returns the colors of rows of the tables, each seen along a unit direction from the viewer into the scene. The color is that of
+    /// [`super::Color::activate`] for a sample at the centre of the voxel. A zero direction gives the mean over all directions (before the
+    /// maximum with 0), because all harmonics but the first have mean zero. Colors are sRGB, not clamped.
     ///
-    /// Panics if there is not one direction for each row, or a row is not in the tables.
+    /// Panics if the numbers of rows and directions differ, or if a row is not in the tables.
     pub fn colors_of(&self, rows: &[u32], directions: &[DVec3]) -> Vec<[f64; 3]> {
-        assert_eq!(rows.len(), directions.len(), "colors_of: one direction for each row");
+        assert_eq!(rows.len(), directions.len(), "colors_of: the number of directions must be the number of rows");
         let runs = rows.chunks(RUN).zip(directions.chunks(RUN));
         let colors = runs.flat_map(|(rows, directions)| {
             let m = rows.len();
@@ -82,7 +82,8 @@ impl<T: Real> VoxelGrid<T> {
         colors.collect()
     }
 
-    /// All numbers of the colors at the centres of the voxels of rows, `[rows, channels]`, something for rows of no voxel. A constant.
+    /// Returns all color numbers at the voxel centres of rows, `[rows, channels]`, without gradient. Rows without a voxel get arbitrary
+    /// values.
     pub(super) fn numbers_of(&self, rows: &[u32]) -> Tensor<T> {
         let color = self.color.tensor().detach().gather_rows(&Indices::from(rows.to_vec()));
         let Some(harmonics) = &self.harmonics else { return color };
@@ -101,7 +102,7 @@ mod tests {
     use crate::render::{Engine, RenderOptions, render};
     use crate::sampling::{Jitter, Samples, Spacing};
 
-    /// Harmonics are for every second voxel where there are any.
+    /// Returns the shape with harmonics reduced by 2, if it has any.
     fn reduced(color: Color) -> GridShape {
         GridShape { sh_reduction: 2, ..shape(color) }.normalised()
     }
@@ -146,7 +147,7 @@ mod tests {
 
     #[test]
     fn a_ball_of_opaque_voxels_faces_away_from_its_center_whatever_densities_it_holds() {
-        // Densities from e² to e⁸ at random, and sides of 1/16: half of the voxels absorb nearly all light.
+        // Random densities from e² to e⁸ with voxels of side 1/16: half of the voxels absorb nearly all light.
         let shape = GridShape { resolution: 32, ..shape(Color::Rgb) };
         let voxels: Vec<[isize; 3]> = (0..32 * 32 * 32).map(|v| [v / 1024, v / 32 % 32, v % 32]).collect();
         let inside = |voxel: &[isize; 3]| shape.center(*voxel).length() < 0.8;
@@ -155,7 +156,7 @@ mod tests {
         let grid = VoxelGrid::<f64>::from_row_major(shape, &density, &Tensor::zeros(&[32 * 32 * 32, 3]));
         let border =
             |voxel: &&[isize; 3]| inside(voxel) && [0, 1, 2].iter().any(|&a| !inside(&[0, 1, 2].map(|b| voxel[b] + isize::from(a == b))));
-        // What is rendered of its normals over black is what a ray along -x sees: +x.
+        // The normals rendered over black, seen by a ray along -x, point to +x.
         let normals = grid.normals();
         let ray = Ray { origin: DVec3::new(2.0, 0.02, -0.03), direction: DVec3::NEG_X, stretch: 1.0 };
         let options = RenderOptions {
@@ -173,7 +174,8 @@ mod tests {
         let angles: Vec<f64> =
             voxels.iter().filter(border).map(|&voxel| grid.outward(voxel).angle_between(shape.center(voxel)).to_degrees()).collect();
         let mean = angles.iter().sum::<f64>() / angles.len() as f64;
-        // As it is, 10 degrees; smoothed differences of densities are 37 degrees off, differences across faces alone of shares 26, of densities 54.
+        // Measured mean: 10 degrees. With smoothed differences of densities: 37; with differences across faces only, of alpha: 26, of
+        // densities: 54.
         assert!(angles.len() > 500 && mean < 12.0, "{mean} degrees off");
     }
 
@@ -183,7 +185,7 @@ mod tests {
         let density = Tensor::from_vec((0..64).map(|v| if v / 16 < 2 { 3.0 } else { 0.0 }).collect(), &[64, 1]);
         let grid = VoxelGrid::<f64>::from_row_major(shape, &density, &Tensor::zeros(&[64, 3]));
         let alpha = 1.0 - (-3.0f64 * 0.5).exp();
-        // α before, 0 after, two voxels apart.
+        // α before the voxel, 0 behind it, two voxels apart.
         assert!(grid.outward([1, 2, 2]).abs_diff_eq(DVec3::X * alpha / 2.0, 1e-15));
         assert!(grid.outward([0, 2, 2]).abs_diff_eq(DVec3::X * -alpha / 2.0, 1e-15), "there is nothing outside of the box");
         assert!((shape.alpha_of_density(3.0) - alpha).abs() < 1e-12 && shape.alpha_of_density(-3.0) == 0.0);

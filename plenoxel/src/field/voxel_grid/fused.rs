@@ -1,17 +1,18 @@
-//! The pixels of [`composite()`] in one pass over a voxel grid, and its adjoint by hand.
+//! Fused kernel: the pixels of [`composite()`] in one pass over a voxel grid, with a hand-written adjoint.
 //!
-//! *Forward.* Rays are taken in blocks of fixed size. For each block: where the samples lie, what density is there, what weight that gives
-//! each of them, and the colors of those that have one. If gradients will be asked for, a few numbers of each sample are kept.
+//! *Forward.* Rays are processed in blocks of fixed size. Each block computes the positions of its samples, their densities, their weights,
+//! and the colors of samples that can have a weight. If gradients are recorded, a few numbers per sample are kept.
 //!
-//! *Adjoint.* Each block computes dL/dσ and dL/dc of its samples, ray by ray from the back, and sorts them by the rows of the tables they
-//! were read from. Nothing is added up yet: the optimizer asks for one range of rows after the other ([`RowSums`]), and
-//! the blocks give what they have in the order of the rays. So a step never writes a gradient table, no two threads write to the
-//! same place, and the sums have the same bits for any number of threads.
+//! *Adjoint.* Each block computes dL/dσ and dL/dc of its samples, ray by ray from back to front, and sorts them by the table rows that they
+//! read. The contributions are not summed yet. The optimizer requests one range of rows after another ([`RowSums`]), and the blocks add
+//! their contributions in the order of the rays. A step therefore writes no gradient table, no two threads write to the same location, and
+//! the sums are bit-identical for any number of threads.
 //!
-//! *Memory.* Of a batch of more than [`CHUNK`] rays nothing is kept: its adjoint marches again, one chunk after the other, and adds up the rows
-//! that a chunk touched before it goes on to the next. So a step takes what a chunk takes, and the touched rows.
+//! *Memory.* A batch of more than [`CHUNK`] rays keeps no samples. Its adjoint marches the rays again, one chunk after another, and sums
+//! the rows of a chunk before it starts the next. A step therefore needs the memory of one chunk, and of the touched rows.
 
-/// Runs an expression with the layout of a grid's tables as a `NodeMap`: one compiled for grids with all voxels, one for sparse grids.
+/// Evaluates an expression with the layout of a grid's tables as a `NodeMap`. It is compiled once for dense grids and once for sparse
+/// grids.
 macro_rules! with_bricks {
     ($lattice:expr, $map:ident => $body:expr) => {
         match ($lattice.full_brick_map(), $lattice.brick_map()) {
@@ -41,19 +42,19 @@ use forward::{Block, Scene};
 pub use seen::{Seen, largest_weights, seen};
 use std::sync::Arc;
 
-/// Rays that one task renders, and whose gradients it sorts: some ten thousand samples.
+/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples.
 const BLOCK: usize = 256;
 
-/// Rays whose samples are kept, or marched again, at a time: what bounds the memory of a step. A usual batch is an eighth of it.
+/// Number of rays whose samples are kept, or marched again, at a time. It bounds the memory of a step. A usual batch is an eighth of it.
 pub const CHUNK: usize = 128 * BLOCK;
 
-/// A bucket is this power of two of rows: 64 bricks, a cube of 16³ voxels where all of them are present.
+/// Binary logarithm of the rows in a bucket: 64 bricks, in a dense grid a cube of 16³ voxels.
 const BUCKET_SHIFT: u32 = 12;
 
-/// Columns of the kernel's output.
+/// Number of columns of the kernel's output.
 const COLUMNS: usize = 7;
 
-/// Where the columns are: rgb in 0..3.
+/// Indices of the columns; rgb has 0..3.
 mod column {
     pub const DEPTH: usize = 3;
     pub const OPACITY: usize = 4;
@@ -61,32 +62,32 @@ mod column {
     pub const DISTORTION: usize = 6;
 }
 
-/// What all blocks of a batch share.
+/// Data shared by all blocks of a batch.
 #[derive(Debug)]
 struct Batch<T: Real> {
     layout: Layout,
     background: [T; 3],
     /// `[n, 3]`
     directions: Tensor<T>,
-    /// `[n, (degree + 1)²]`: the harmonics of each ray's direction; `[n, 0]` for RGB.
+    /// Harmonics of each ray's direction, `[n, (degree + 1)²]`; `[n, 0]` for RGB.
     basis: Tensor<T>,
 }
 
-/// A rendered batch, and what its adjoint needs.
+/// Rendered batch, with the data that its adjoint needs.
 #[derive(Debug)]
 struct State<T: Real> {
     batch: Batch<T>,
     kept: Kept<T>,
 }
 
-/// The samples themselves, or, where they are too many or no gradient is recorded, the rays.
+/// Samples of a batch, or its rays if there are too many samples or no gradient is recorded.
 #[derive(Debug)]
 enum Kept<T: Real> {
     Samples(Vec<Block<T>>),
     Rays(Box<Rays>),
 }
 
-/// What it takes to find the samples again.
+/// Data to march the rays of a batch again.
 #[derive(Debug)]
 struct Rays {
     rays: Vec<Ray>,
@@ -94,13 +95,13 @@ struct Rays {
     cells: Option<Occupancy>,
 }
 
-/// What the other columns of the pixels are computed from.
+/// Rendered columns beyond the color of the pixels.
 #[derive(Debug)]
 struct Columns<T: Real> {
     /// `[n, COLUMNS]`
     pixels: Tensor<T>,
     state: Arc<State<T>>,
-    /// Those of the grid.
+    /// Tables of the grid.
     tables: Vec<Tensor<T>>,
 }
 
@@ -138,7 +139,8 @@ impl<T: Real> Batch<T> {
         Batch { layout: grid.layout().clone(), background, directions, basis }
     }
 
-    /// Harmonics of a channel in a row of the color table; 0 if its three numbers are colors, or means whose harmonics are reduced.
+    /// Returns the number of harmonics per channel in a row of the color table; 0 if a row holds an RGB color, or the coefficients of
+    /// degree 0 of reduced harmonics.
     fn harmonics(&self) -> usize {
         let shape = &self.layout.shape;
         if shape.color == Color::Rgb || shape.is_reduced() { 0 } else { shape.color_width() / 3 }
@@ -150,7 +152,7 @@ impl<T: Real> Batch<T> {
 }
 
 impl<T: Real> Scene<'_, T> {
-    /// The blocks of the rays from number `first` on, one ray for each [`COLUMNS`] of `pixels`.
+    /// Renders rays from `first` on, one for each [`COLUMNS`] entries of `pixels`. Returns their blocks.
     fn render_all(&self, first: usize, pixels: &mut [T], keep: bool) -> Vec<Block<T>> {
         if keep && self.worth_sorting() {
             return self.render_sorted(first, pixels);
@@ -191,7 +193,7 @@ pub(super) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
     )
 }
 
-/// Which columns a kernel computed.
+/// Columns that a kernel computes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Output {
     /// `[n, COLUMNS]`
@@ -200,7 +202,7 @@ enum Output {
     Sparsity,
 }
 
-/// A function of the tables of a grid.
+/// Kernel that maps the tables of a grid to columns.
 #[derive(Debug)]
 struct Fused<T: Real> {
     state: Arc<State<T>>,
@@ -254,7 +256,7 @@ impl<T: Real> Kernel<T> for Fused<T> {
 }
 
 impl<T: Real> State<T> {
-    /// Calls `f` with the samples of one chunk of rays after the other, in the order of the rays.
+    /// Calls `f` with the samples of each chunk of rays, in the order of the rays.
     fn for_each_chunk(&self, tables: &[Tensor<T>], mut f: impl FnMut(&[Block<T>])) {
         match &self.kept {
             Kept::Samples(blocks) => f(blocks),
@@ -269,7 +271,7 @@ impl<T: Real> State<T> {
         }
     }
 
-    /// The same pixels as a graph of small ops.
+    /// Computes the same pixels as a graph of small ops.
     fn composite(&self, tables: &[Tensor<T>]) -> Rendered<T> {
         let batch = &self.batch;
         let mut offsets = vec![0u32];
@@ -278,7 +280,7 @@ impl<T: Real> State<T> {
             for block in blocks {
                 let [x, y, z] = &block.at;
                 for own in block.rays() {
-                    // What has no density takes no part: empty space, and all that lies behind where a ray has stopped.
+                    // Samples without density are left out: they include empty space and everything behind the stop of a ray.
                     for i in own.filter(|&i| block.density[i] >= T::zero()) {
                         columns.iter_mut().zip([x, y, z, &block.t, &block.delta]).for_each(|(to, from)| to.push(from[i]));
                     }
@@ -293,7 +295,7 @@ impl<T: Real> State<T> {
         let [density, color] = [0, 1].map(|table: usize| batch.layout.look_up(&tables[table], &voxels));
         let color = batch.layout.whole_colors(color, tables.get(2), &voxels);
         let radiance = batch.layout.shape.color.activate(&density, &color, &batch.directions, &offsets);
-        // The world is not needed any more.
+        // Positions in world coordinates are not needed any more.
         let samples = Samples { t, delta, positions: voxels, directions: batch.directions.clone(), offsets };
         composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))
     }

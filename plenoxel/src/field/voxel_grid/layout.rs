@@ -1,26 +1,27 @@
-//! Which rows of the tables belong to which voxels, and how numbers are read there.
+//! Mapping from voxels to rows of the tables, and look-up of values.
 
 use super::shape::{GridShape, Interpolation};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
 use autograd::{Lattice, Real, Tensor};
 
-/// A shape with the rows that its voxels have. Cloning copies pointers.
+/// Shape of a grid, with the rows of its voxels. Cloning copies pointers.
 #[derive(Clone, Debug)]
 pub(crate) struct Layout {
-    /// Shape and meaning, normalised.
+    /// Shape, normalised.
     pub shape: GridShape,
     /// Rows of density and color.
     pub lattice: Lattice,
-    /// Rows of the harmonics, where they are reduced.
+    /// Rows of the harmonics, if they are reduced.
     pub harmonics: Option<Lattice>,
 }
 
 impl Layout {
-    /// Harmonics are present in the larger voxels that hold a present voxel and, with trilinear look-up, in those around them: wherever a
-    /// sample that reads a present voxel can read them, and at most one voxel further.
+    /// Creates the layout of the voxels of a lattice. Harmonics are present in the larger voxels that contain a present voxel and, with
+    /// trilinear look-up, in their neighbours. A sample that reads a present voxel therefore finds its harmonics, with a margin of at most
+    /// one larger voxel.
     ///
-    /// Panics if the lattice is of another resolution.
+    /// Panics if the lattice has another resolution.
     #[track_caller]
     pub fn new(shape: GridShape, lattice: Lattice) -> Self {
         assert_eq!(lattice.nodes(), [shape.resolution; 3], "lattice of a grid of {}³ voxels", shape.resolution);
@@ -35,20 +36,20 @@ impl Layout {
         Layout { shape, lattice, harmonics }
     }
 
-    /// Shapes of the tables: density, color and, where they are reduced, harmonics.
+    /// Returns the shapes of the tables: density, color and, if they are reduced, harmonics.
     pub fn tables(&self) -> Vec<[usize; 2]> {
         let rows = self.lattice.rows();
         let harmonics = self.harmonics.iter().map(|lattice| [lattice.rows(), self.shape.harmonics_width()]);
         [[rows, 1], [rows, self.shape.color_width()]].into_iter().chain(harmonics).collect()
     }
 
-    /// Density or color at voxel coordinates `[m, 3]`, as stored: `[m, width]`.
+    /// Looks up density or color at voxel coordinates `[m, 3]`. Returns raw values `[m, width]`.
     pub fn look_up<T: Real>(&self, table: &Tensor<T>, voxels: &Tensor<T>) -> Tensor<T> {
         self.shape.interpolation.look_up(table, voxels, &self.lattice)
     }
 
-    /// All numbers of the colors at voxel coordinates `[m, 3]`, `[m, channels]`, from what the color table has for them: as it is, or with the
-    /// harmonics put behind the mean of each channel.
+    /// Returns all color numbers at voxel coordinates `[m, 3]`, `[m, channels]`. `color` is the look-up in the color table; reduced
+    /// harmonics are appended to each channel.
     pub fn whole_colors<T: Real>(&self, color: Tensor<T>, harmonics: Option<&Tensor<T>>, voxels: &Tensor<T>) -> Tensor<T> {
         let (Some(table), Some(lattice)) = (harmonics, &self.harmonics) else { return color };
         let [scale, shift] = self.shape.to_harmonics();
@@ -59,12 +60,12 @@ impl Layout {
     }
 }
 
-/// The voxels of the harmonics that hold a voxel of a lattice.
+/// Returns the lattice of the larger voxels that contain a voxel of `lattice`.
 pub(super) fn holding(shape: &GridShape, lattice: &Lattice) -> Lattice {
     Lattice::bricks_where([shape.harmonics_resolution(); 3], |place| held(shape, place).any(|voxel| lattice.row(voxel).is_some()))
 }
 
-/// The voxels of a grid that a voxel of the harmonics holds.
+/// Returns the voxels of a grid inside a voxel of the harmonics.
 pub(super) fn held(shape: &GridShape, place: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
     let (n, f) = (shape.resolution, shape.sh_reduction);
     let [x, y, z] = place.map(|k| k * f..((k + 1) * f).min(n));
@@ -74,7 +75,7 @@ pub(super) fn held(shape: &GridShape, place: [usize; 3]) -> impl Iterator<Item =
     })
 }
 
-/// A lattice with a layer of nodes around those that are present.
+/// Returns a lattice extended by a layer of nodes around the present nodes.
 pub(super) fn dilated(lattice: &Lattice) -> Lattice {
     let present = Occupancy::from_masks(Aabb::cube(1.0), lattice.nodes(), lattice.masks().to_vec());
     Lattice::from_masks(lattice.nodes(), present.dilated(1).masks().to_vec())

@@ -1,5 +1,5 @@
-//! The same field with another meaning of colors: other harmonics, or harmonics for larger or smaller voxels. Parameters get new identities,
-//! so an optimizer starts afresh.
+//! Conversion of colors: between RGB and harmonics, and between reductions of harmonics. Converted parameters have new identities, so
+//! optimizer state is not carried over.
 
 use super::layout::{Layout, held, holding};
 use super::reshape::spread;
@@ -8,10 +8,10 @@ use crate::field::sh;
 use autograd::{Buffer, Real, Tensor, parallel};
 
 impl<T: Real> VoxelGrid<T> {
-    /// The same grid with colors of another kind, as far reduced as before. Harmonics that are left out are lost; colors that become harmonics
-    /// look the same from everywhere; harmonics that become colors are seen as the mean over all directions.
+    /// Returns the grid with another color representation and the same reduction of harmonics. Coefficients beyond the new degree are
+    /// dropped. RGB colors become harmonics without view dependence. Harmonics become RGB colors by their mean over all directions.
     pub fn with_color(&self, color: Color) -> Self {
-        // Offset and factor of the mean.
+        // Offset and factor of the coefficient of degree 0.
         let kind = |color: Color| match color {
             Color::Rgb => (0.0, 1.0),
             Color::Sh { offset, .. } => (offset, sh::Y0),
@@ -36,9 +36,12 @@ impl<T: Real> VoxelGrid<T> {
         }
     }
 
-    /// The same grid with harmonics of degree 1 and more for every so many voxels along each axis; 1 for all in every voxel. A smaller voxel has
-    /// what is read at its centre; a larger one the mean Σ αᵥ cᵥ / Σ αᵥ of the voxels v in it, αᵥ being the share of light that they absorb
-    /// ([`GridShape::alpha_of_density`]), a plain mean if none absorbs any, or that of the larger ones around it if it holds none.
+    /// Returns the grid with harmonics of degree 1 and more stored for every `reduction`-th voxel along each axis; 1 stores all
+    /// coefficients in every voxel.
+    ///
+    /// A smaller voxel gets the interpolated value at its centre. A larger voxel gets the mean Σ αᵥ cᵥ / Σ αᵥ of the voxels v inside it,
+    /// where αᵥ is the fraction of light that a voxel absorbs ([`GridShape::alpha_of_density`]); a plain mean if no voxel absorbs light;
+    /// and the mean of its neighbours if it contains no voxel.
     pub fn with_reduction(&self, reduction: usize) -> Self {
         let shape = GridShape { sh_reduction: reduction, ..*self.shape() }.normalised();
         if shape == *self.shape() {
@@ -48,9 +51,9 @@ impl<T: Real> VoxelGrid<T> {
         if shape.is_reduced() { whole.reduced(shape) } else { whole }
     }
 
-    /// The same grid with all coefficients in every voxel.
+    /// Returns the grid with all coefficients in every voxel.
     fn with_all_numbers(&self) -> Self {
-        /// Rows that are read at a time, which bounds the memory for their positions.
+        /// Number of rows read at a time. It bounds the memory for their positions.
         const RUN: usize = 1 << 16;
         let rows: Vec<u32> = (0..self.lattice().rows() as u32).collect();
         let width = self.shape().color.channels();
@@ -63,7 +66,7 @@ impl<T: Real> VoxelGrid<T> {
         Self::with_lattice(shape, self.lattice().clone(), self.density.tensor().detach(), color)
     }
 
-    /// The same grid in a reduced shape, of one with all coefficients in every voxel.
+    /// Returns the grid in a reduced shape. All coefficients must be stored in every voxel before.
     fn reduced(&self, shape: GridShape) -> Self {
         let layout = Layout::new(shape, self.lattice().clone());
         let (width, all, density) = (shape.harmonics_width(), self.color.tensor().data(), self.density.tensor().data());
@@ -93,7 +96,7 @@ impl<T: Real> VoxelGrid<T> {
     }
 }
 
-/// A table with so many numbers a row, a third for each channel: those that come first, and zeros behind them.
+/// Resizes the rows of a table to `width` numbers, a third per channel. Leading numbers are kept, missing numbers are 0.
 fn resized<T: Real>(table: &Tensor<T>, width: usize) -> Buffer<T> {
     let (old, old_width) = (table.data(), table.shape()[1]);
     let same = width.min(old_width) / 3;
@@ -115,7 +118,7 @@ mod tests {
     fn a_larger_voxel_has_the_harmonics_of_what_absorbs_light_in_it() {
         let color = Color::Sh { degree: 1, offset: 0.5 };
         let shape = GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
-        // In the first of 2³ larger voxels two of eight absorb light, one of them twice the share; in the others none does.
+        // In the first of 2³ larger voxels, two of eight voxels absorb light, one of them twice as much. In the others none does.
         let density = |v: usize| match v {
             0 => shape.density_of_alpha(0.4),
             1 => shape.density_of_alpha(0.8),
@@ -130,7 +133,7 @@ mod tests {
         let read = |place: [usize; 3]| &table.tensor().data()[9 * lattice.row(place).unwrap() as usize..][..9];
         for (i, k) in [1, 2, 3, 5, 6, 7, 9, 10, 11].into_iter().enumerate() {
             assert!((read([0, 0, 0])[i] - (number(0, k) + 2.0 * number(1, k)) / 3.0).abs() < 1e-12);
-            // Voxels 42, 43, 46, 47 and those 16 further.
+            // Voxels 42, 43, 46, 47, and the same plus 16.
             assert!((read([1, 1, 1])[i] - number(0, k) - 12.0 * 52.5).abs() < 1e-12);
         }
     }

@@ -1,7 +1,7 @@
-//! The same field in another grid: another resolution, other voxels, another look-up. Parameters get new identities, so an optimizer
-//! starts afresh.
+//! Conversion of the grid: resolution, present voxels, look-up. Converted parameters have new identities, so optimizer state is not carried
+//! over.
 //!
-//! Harmonics that are reduced come along: where the new grid has them and the old one had none, they are the mean of those around.
+//! Reduced harmonics are converted too. Where the new grid has harmonics and the old grid had none, they are the mean of their neighbours.
 
 use super::layout::{Layout, dilated};
 use super::{Color, GridShape, Interpolation, VoxelGrid};
@@ -13,21 +13,22 @@ use autograd::{Buffer, Lattice, Real, Tensor, no_grad, parallel};
 use std::ops::Range;
 
 impl<T: Real> VoxelGrid<T> {
-    /// The same field at another resolution: the old field read at the new centres, with the look-up that renders it. So a nearest grid
-    /// of twice the resolution shows exactly what the old one showed; a trilinear one does inside the old cells, and is smoother within a
-    /// quarter of an old voxel of the planes through old centres.
-    /// A new voxel is present if it reads one that is.
+    /// Resamples the field at another resolution: evaluates the old field at the new voxel centres, with the look-up that renders it. A
+    /// voxel is present if it reads a present voxel.
+    ///
+    /// With nearest look-up, doubling the resolution preserves the field exactly. With trilinear look-up, it preserves the field inside the
+    /// old cells, and smooths it within a quarter of an old voxel around the planes through old centres.
     pub fn resample(&self, resolution: usize) -> Self {
         self.resample_in(resolution, self.shape().half_width)
     }
 
-    /// The same in a smaller cube around the origin: what lies outside of it is lost.
+    /// Resamples the field at a resolution in a smaller cube around the origin. Matter outside of the cube is lost.
     ///
-    /// Panics if the cube is not smaller.
+    /// Panics if the cube is larger than the old one.
     #[track_caller]
     pub fn resample_in(&self, resolution: usize, half_width: f64) -> Self {
         let old = self.shape();
-        assert!(half_width > 0.0 && half_width <= old.half_width, "half width {half_width} of a grid of half width {}", old.half_width);
+        assert!(half_width > 0.0 && half_width <= old.half_width, "half width {half_width} for a grid of half width {}", old.half_width);
         let shape = GridShape { resolution, half_width, ..*old };
         let center = center_of(old, &shape, 1);
         let lattice = match &self.reach {
@@ -44,7 +45,7 @@ impl<T: Real> VoxelGrid<T> {
                         low..(low + 2).min(last + 1)
                     }
                 };
-                // The old bricks that a new one reads.
+                // Old bricks that a new brick reads.
                 let bricks = |k: usize| {
                     let last = (k * BRICK + BRICK - 1).min(resolution - 1);
                     corners(k * BRICK).start / BRICK..corners(last).end.div_ceil(BRICK)
@@ -59,13 +60,14 @@ impl<T: Real> VoxelGrid<T> {
         self.read_at(shape, lattice)
     }
 
-    /// The same with the resolution, the cube and the voxels of another grid, among those that [`VoxelGrid::resample_in`] gives.
+    /// Resamples the field with the resolution, the cube and the voxels of another grid. The voxels must be among those of
+    /// [`VoxelGrid::resample_in`].
     pub fn resample_as(&self, other: &Self) -> Self {
         let GridShape { resolution, half_width, .. } = *other.shape();
         self.read_at(GridShape { resolution, half_width, ..*self.shape() }, other.lattice().clone())
     }
 
-    /// The old field at the centres of other voxels.
+    /// Evaluates the field at the centres of the voxels of `lattice`.
     fn read_at(&self, shape: GridShape, lattice: Lattice) -> Self {
         let old = self.shape();
         let layout = Layout::new(shape, lattice);
@@ -73,7 +75,7 @@ impl<T: Real> VoxelGrid<T> {
             let center = center_of(old, &shape, sides);
             let width = table.shape()[1];
             let mut values = Buffer::stale(to.rows() * width);
-            // A run of rows at a time bounds the memory for positions.
+            // Processing a run of rows at a time bounds the memory for positions.
             const RUN: usize = 1 << 16;
             for (run, part) in values.chunks_mut(RUN * width).enumerate() {
                 let rows = part.len() / width;
@@ -91,7 +93,7 @@ impl<T: Real> VoxelGrid<T> {
         };
         let whole = [&self.density, &self.color].map(|table| read(table.tensor(), self.lattice(), &layout.lattice, 1));
         let mut tables = Vec::from(whole);
-        // Some centres of the harmonics' voxels lie beyond the old ones.
+        // Some centres of the new harmonics lie beyond the old present voxels.
         if let (Some(table), Some(from), Some(to)) = (&self.harmonics, self.harmonics_lattice(), &layout.harmonics) {
             let wider = dilated(from);
             tables.push(read(&spread(table.tensor(), from, &wider), &wider, to, old.sh_reduction));
@@ -99,18 +101,18 @@ impl<T: Real> VoxelGrid<T> {
         Self::assembled(layout, tables)
     }
 
-    /// The same grid without the voxels outside of `kept`.
+    /// Returns the grid without the voxels outside of `kept`.
     ///
-    /// Panics if `kept` has other cells than this grid has voxels.
+    /// Panics if the cells of `kept` are not the voxels of this grid.
     pub fn pruned(&self, kept: &Occupancy) -> Self {
-        assert_eq!(kept.cells(), self.lattice().nodes(), "pruned: occupancy of another grid");
+        assert_eq!(kept.cells(), self.lattice().nodes(), "pruned: the occupancy has another resolution than the grid");
         let masks = kept.masks().iter().zip(self.lattice().masks()).map(|(kept, present)| kept & present).collect();
         self.in_lattice(Lattice::from_masks(self.lattice().nodes(), masks))
     }
 
-    /// The same grid with a layer of voxels around those that are present: without density, and of the mean color of the voxels that they
-    /// touch. So trilinear look-up at the border reads colors of the object and not of nothing. Voxels whose color numbers are all 0, as those
-    /// that no pixel shows to carving, have no say where others have.
+    /// Adds a layer of voxels around the present voxels, with density 0 and the mean color of the voxels that they touch. Trilinear look-up
+    /// at the border then reads colors of the object. Voxels whose color numbers are all 0, such as carved voxels that no pixel shows, do
+    /// not contribute to the mean.
     pub fn grown(&self) -> Self {
         let lattice = dilated(self.lattice());
         let density = moved(self.density.tensor(), self.lattice(), &lattice);
@@ -118,32 +120,33 @@ impl<T: Real> VoxelGrid<T> {
         self.with_voxels(*self.shape(), lattice, density, color)
     }
 
-    /// The same numbers, looked up another way.
+    /// Returns the grid with the same values and another look-up.
     pub fn with_interpolation(&self, interpolation: Interpolation) -> Self {
         let shape = GridShape { interpolation, ..*self.shape() };
         self.with_voxels(shape, self.lattice().clone(), self.density.tensor().detach(), self.color.tensor().detach())
     }
 
-    /// The same grid with other densities, `[rows, 1]`. The other tables are shared until somebody changes them.
+    /// Returns the grid with other densities, `[rows, 1]`. The other tables are shared until they are changed.
     pub fn with_density(&self, density: Tensor<T>) -> Self {
         let tables = [density].into_iter().chain(self.params().skip(1).map(|table| table.tensor().detach())).collect();
         Self::assembled(self.layout().clone(), tables)
     }
 
-    /// The same densities, and no colors.
+    /// Returns the grid with the same densities and RGB colors of 0.
     pub fn outline(&self) -> Self {
         let shape = GridShape { color: Color::Rgb, ..*self.shape() };
         let tables = vec![self.density.tensor().detach(), Tensor::zeros(&[self.lattice().rows(), 3])];
         Self::with_tables(shape, self.lattice().clone(), tables)
     }
 
-    /// The same grid with some of its voxels.
+    /// Returns the grid with a subset of its voxels.
     fn in_lattice(&self, lattice: Lattice) -> Self {
         let [density, color] = [&self.density, &self.color].map(|table| moved(table.tensor(), self.lattice(), &lattice));
         self.with_voxels(*self.shape(), lattice, density, color)
     }
 
-    /// A grid of the same resolution and kind of colors with other voxels, or another look-up, and the harmonics of this one.
+    /// Returns a grid with other voxels or another look-up, and the harmonics of this grid. Resolution and color representation are
+    /// unchanged.
     fn with_voxels(&self, shape: GridShape, lattice: Lattice, density: Tensor<T>, color: Tensor<T>) -> Self {
         let layout = Layout::new(shape, lattice);
         let mut tables = vec![density, color];
@@ -154,19 +157,20 @@ impl<T: Real> VoxelGrid<T> {
     }
 }
 
-/// True if something is found at a place of a box.
+/// Returns true if `found` holds for a place in a box.
 fn any_of([i, j, k]: [Range<usize>; 3], found: impl Fn([usize; 3]) -> bool) -> bool {
     i.into_iter().any(|a| j.clone().any(|b| k.clone().any(|c| found([a, b, c]))))
 }
 
-/// Where the centre of voxel k along an axis of a grid lies in an old grid, both with voxels `sides` times as wide.
+/// Returns the position of the centre of voxel k along an axis in coordinates of the old grid. Both grids have voxels `sides` times as
+/// wide.
 fn center_of(old: &GridShape, new: &GridShape, sides: usize) -> impl Fn(usize) -> f64 + use<> {
     let ratio = new.voxel_side() / old.voxel_side();
     let beyond = (old.half_width - new.half_width) / (old.voxel_side() * sides as f64);
     move |k| (k as f64 + 0.5) * ratio - 0.5 + beyond
 }
 
-/// A table in another layout of the same grid, with zeros where the old one has no node.
+/// Moves a table to another lattice of the same grid, with zeros for nodes that the old lattice lacks.
 pub(super) fn moved<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) -> Tensor<T> {
     let width = table.shape()[1];
     let mut values = Buffer::stale(to.rows() * width);
@@ -181,8 +185,8 @@ pub(super) fn moved<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) ->
     Tensor::from_buffer(values, &[to.rows(), width])
 }
 
-/// A table in another layout of the same grid, with the mean of the rows around where the old one has no node. Rows of zeros, which nobody
-/// gave numbers, have no say where others have.
+/// Moves a table to another lattice of the same grid. Nodes that the old lattice lacks get the mean of their neighbours; rows of zeros,
+/// which were never set, do not contribute.
 pub(super) fn spread<T: Real>(table: &Tensor<T>, from: &Lattice, to: &Lattice) -> Tensor<T> {
     let width = table.shape()[1];
     let mut values = Buffer::copy_of(moved(table, from, to).data());
@@ -203,7 +207,7 @@ mod tests {
     #[test]
     fn the_layer_around_has_the_colors_of_what_it_touches_but_not_of_what_nobody_saw() {
         let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
-        // Side by side two voxels with colors and one that no pixel showed; far from them another such.
+        // Two adjacent voxels with colors and one that no pixel shows; and another such voxel far away.
         let present = [[1, 1, 1], [1, 1, 2], [1, 1, 3], [6, 6, 6]];
         let lattice = Lattice::bricks_where([8; 3], |voxel| present.contains(&voxel));
         let mut color = vec![0.0; 3 * lattice.rows()];
@@ -220,10 +224,10 @@ mod tests {
         };
         assert_eq!(grown.density_at([2, 1, 1]), 0.0);
         assert_eq!(color_at([1, 1, 0]), [0.2, 0.4, 0.6]);
-        // It touches the second across an edge, and the third across a face.
+        // The voxel touches the second voxel across an edge, and the third across a face.
         let near = color_at([2, 1, 3]);
         assert!((near[0] - 0.8).abs() < 1e-12 && near[1..] == [0.0; 2], "{near:?}");
-        // Nothing better is near; and what was there stays.
+        // Voxels without colored neighbours stay black, and existing voxels are unchanged.
         assert_eq!((color_at([1, 1, 4]), color_at([6, 6, 7]), color_at([1, 1, 3])), ([0.0; 3], [0.0; 3], [0.0; 3]));
     }
 }

@@ -1,4 +1,4 @@
-//! Shape and meaning of a grid, without its numbers.
+//! Shape of a grid and meaning of its values, without the values.
 
 use super::layout::Layout;
 use crate::field::{Radiance, sh};
@@ -8,18 +8,18 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
 
-/// How values between voxel centres are found.
+/// Interpolation between voxel centres.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Interpolation {
-    /// The voxel the point lies in.
+    /// Value of the voxel that contains the point.
     Nearest,
-    /// The eight voxel centres around the point.
+    /// Trilinear interpolation of the eight voxel centres around the point.
     Trilinear,
 }
 
 impl Interpolation {
-    /// The values `[m, width]` of a table `[rows, width]` at positions `[m, 3]`, in voxels whose centres are the integers.
+    /// Looks up a table `[rows, width]` at positions `[m, 3]`, in coordinates in which voxel centres are integers. Returns `[m, width]`.
     pub fn look_up<T: Real>(self, table: &Tensor<T>, voxels: &Tensor<T>, lattice: &Lattice) -> Tensor<T> {
         match self {
             Interpolation::Nearest => table.nearest(voxels, lattice),
@@ -28,22 +28,22 @@ impl Interpolation {
     }
 }
 
-/// What the numbers of a color mean.
+/// Color representation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Color {
-    /// Red, green and blue, the same from everywhere.
+    /// Red, green and blue, independent of the view direction.
     Rgb,
-    /// Spherical harmonics, all coefficients of red, then green, then blue: c = max(0, offset + Σ Yₖ(d) cₖ).
+    /// Spherical harmonics: c = max(0, offset + Σ Yₖ(d) cₖ). A row holds all coefficients of red, then green, then blue.
     Sh {
-        /// 0 to 3.
+        /// Degree, 0 to 3.
         degree: usize,
-        /// The color of zero coefficients: 0.5 in svox2, 0 in the source paper.
+        /// Color of zero coefficients: 0.5 in svox2, 0 in the source paper.
         offset: f64,
     },
 }
 
 impl Color {
-    /// Numbers of a color: of a row of the color table, unless harmonics have a table of their own.
+    /// Returns the count of numbers per color. A row of the color table has as many, unless harmonics are reduced.
     pub fn channels(self) -> usize {
         match self {
             Color::Rgb => 3,
@@ -51,8 +51,8 @@ impl Color {
         }
     }
 
-    /// Density and color of samples from the numbers looked up for them, `[m, 1]` and `[m, channels]`; `directions` are `[n, 3]`, and ray
-    /// r owns the samples `offsets[r]..offsets[r + 1]`.
+    /// Computes density and color of samples from interpolated values, `[m, 1]` and `[m, channels]`. `directions` is `[n, 3]`; ray r owns
+    /// the samples `offsets[r]..offsets[r + 1]`.
     pub fn activate<T: Real>(self, density: &Tensor<T>, color: &Tensor<T>, directions: &Tensor<T>, offsets: &Indices) -> Radiance<T> {
         let m = density.shape()[0];
         let sigma = density.reshape(&[m]).relu();
@@ -60,7 +60,8 @@ impl Color {
         Radiance { sigma, rgb }
     }
 
-    /// Colors `[m, 3]` of color numbers `[m, channels]`; `basis` gives the harmonics of a degree at the direction of each, `[m, count]`.
+    /// Computes colors `[m, 3]` from color numbers `[m, channels]`. `basis` returns the harmonics of a degree for each direction, `[m,
+    /// count]`.
     pub(super) fn shade<T: Real>(self, color: &Tensor<T>, basis: impl FnOnce(usize) -> Tensor<T>) -> Tensor<T> {
         let m = color.shape()[0];
         match self {
@@ -74,107 +75,110 @@ impl Color {
     }
 }
 
-/// Shape and meaning of a grid.
+/// Shape of a grid, and meaning of its values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GridShape {
-    /// Voxels along each axis.
+    /// Number of voxels along each axis.
     pub resolution: usize,
-    /// Half the side of the cube it fills, world length.
+    /// Half the side of the grid's cube, world length.
     pub half_width: f64,
-    /// Look-up between centres.
+    /// Interpolation between voxel centres.
     pub interpolation: Interpolation,
-    /// Meaning of colors.
+    /// Color representation.
     pub color: Color,
-    /// Harmonics of degree 1 and more are stored for every so many voxels along each axis, in a table of their own; 1 for all coefficients in
-    /// the color table. Colors that have no such harmonics cannot be reduced: there it means nothing, and the shape of a grid has 1.
+    /// Reduction of harmonics: coefficients of degree 1 and more are stored for every n-th voxel along each axis, in a separate table. 1
+    /// stores all coefficients in the color table. A normalised shape without such coefficients has 1.
     pub sh_reduction: usize,
 }
 
 impl GridShape {
-    /// Half widths whose voxels can be computed with in 32 bits, whatever the resolution.
+    /// Half widths for which voxels can be computed in 32 bits at any resolution.
     pub const HALF_WIDTHS: RangeInclusive<f64> = 1e-9..=1e9;
 
-    /// The same shape with a reduction that means something.
+    /// Returns the shape with `sh_reduction` 1 if there are no harmonics to reduce.
     pub fn normalised(self) -> Self {
         GridShape { sh_reduction: if self.is_reduced() { self.sh_reduction } else { 1 }, ..self }
     }
 
-    /// True if harmonics of degree 1 and more have a table of their own, for larger voxels.
+    /// Returns true if harmonics of degree 1 and more are stored in a separate table, for larger voxels.
     pub fn is_reduced(&self) -> bool {
         self.sh_reduction > 1 && self.color.channels() > 3
     }
 
-    /// Numbers in a row of the color table: all of a color, or its mean alone where harmonics are reduced.
+    /// Returns the width of the color table: all color numbers, or the coefficients of degree 0 only if harmonics are reduced.
     pub fn color_width(&self) -> usize {
         if self.is_reduced() { 3 } else { self.color.channels() }
     }
 
-    /// Numbers in a row of the table of harmonics, all those of red, then green, then blue; 0 where there is no such table.
+    /// Returns the width of the table of harmonics, whose rows hold red, then green, then blue; 0 if there is no such table.
     pub fn harmonics_width(&self) -> usize {
         self.color.channels() - self.color_width()
     }
 
-    /// Voxels of the harmonics along each axis: ⌈resolution / reduction⌉. The first begins where the grid does, the last may reach beyond it.
+    /// Returns the number of voxels of the harmonics along each axis: ⌈resolution / reduction⌉. The first begins at the grid's corner, the
+    /// last may extend beyond the grid.
     pub fn harmonics_resolution(&self) -> usize {
         self.resolution.div_ceil(self.sh_reduction)
     }
 
-    /// Factor a and shift b from voxel coordinates u to those of the harmonics, (u + ½) / reduction − ½ = a u + b.
+    /// Returns scale a and shift b from voxel coordinates u to coordinates of the harmonics, (u + ½) / reduction − ½ = a u + b.
     pub fn to_harmonics(&self) -> [f64; 2] {
         let scale = 1.0 / self.sh_reduction as f64;
         [scale, 0.5 * scale - 0.5]
     }
 
-    /// The number of voxels.
+    /// Returns the number of voxels.
     pub fn voxels(&self) -> usize {
         self.resolution.pow(3)
     }
 
-    /// Side of a voxel, world length.
+    /// Returns the side of a voxel, world length.
     pub fn voxel_side(&self) -> f64 {
         2.0 * self.half_width / self.resolution as f64
     }
 
-    /// The share α of the light that a voxel of a raw density σ, 1 / world length, absorbs when it crosses it along an axis:
-    /// 1 − exp(−max(0, σ) side), in [0, 1].
+    /// Returns the fraction α of light that a voxel of raw density σ, 1 / world length, absorbs along an axis: 1 − exp(−max(0, σ) side), in
+    /// [0, 1].
     pub fn alpha_of_density(&self, density: f64) -> f64 {
         -(-density.max(0.0) * self.voxel_side()).exp_m1()
     }
 
-    /// The density at which a voxel absorbs the share `alpha` of the light: −ln(1 − α) / side, 1 / world length.
+    /// Returns the density, 1 / world length, of a voxel that absorbs the fraction `alpha` of the light: −ln(1 − α) / side.
     pub fn density_of_alpha(&self, alpha: f64) -> f64 {
         -(-alpha).ln_1p() / self.voxel_side()
     }
 
-    /// World position of a voxel's centre. One outside of the grid has its place too.
+    /// Returns the world position of a voxel's centre. The voxel may lie outside of the grid.
     pub fn center(&self, voxel: [isize; 3]) -> DVec3 {
         DVec3::from(voxel.map(|k| (k as f64 + 0.5) * self.voxel_side() - self.half_width))
     }
 
-    /// The layout with all voxels present.
+    /// Returns the lattice with all voxels present.
     pub fn full(&self) -> Lattice {
         Lattice::bricks([self.resolution; 3])
     }
 
-    /// The rows of the harmonics of a grid with the voxels of a lattice; `None` if they are not reduced.
+    /// Returns the lattice of the harmonics for the voxels of a lattice; `None` if they are not reduced.
     ///
-    /// Panics if the lattice is of another resolution.
+    /// Panics if the lattice has another resolution.
     #[track_caller]
     pub fn harmonics_lattice(&self, lattice: &Lattice) -> Option<Lattice> {
         Layout::new(*self, lattice.clone()).harmonics
     }
 
-    /// Shapes of the tables of a grid with the voxels of a lattice: density, color and, where they are reduced, harmonics.
+    /// Returns the shapes of the tables for the voxels of a lattice: density, color and, if they are reduced, harmonics.
     pub fn tables(&self, lattice: &Lattice) -> Vec<[usize; 2]> {
         Layout::new(*self, lattice.clone()).tables()
     }
 
-    /// The voxels in which a sample can read one of `voxels`: the same with nearest look-up, their neighbours too with trilinear.
+    /// Returns the voxels in which a sample can read one of `voxels`: with nearest look-up `voxels`, with trilinear look-up also their
+    /// neighbours.
     pub fn reached_from(&self, voxels: &Occupancy) -> Occupancy {
         voxels.dilated(usize::from(self.interpolation == Interpolation::Trilinear))
     }
 
-    /// The cells in which a sample reads one of `voxels`: the same with nearest look-up, those between centres with trilinear.
+    /// Returns the cells in which a sample reads one of `voxels`: with nearest look-up `voxels`, with trilinear look-up the cells between
+    /// centres.
     pub fn cells_reading(&self, voxels: Occupancy) -> Occupancy {
         match self.interpolation {
             Interpolation::Nearest => voxels,
@@ -182,13 +186,13 @@ impl GridShape {
         }
     }
 
-    /// Bytes of a voxel in all tables, in `f32`, with its share of the harmonics where they are reduced.
+    /// Returns the bytes per voxel in all tables, in `f32`, including its share of reduced harmonics.
     pub fn voxel_bytes(&self) -> usize {
         let shared = (self.harmonics_width() * size_of::<f32>()).div_ceil(self.sh_reduction.pow(3));
         (1 + self.color_width()) * size_of::<f32>() + shared
     }
 
-    /// Bytes of all tables in `f32`, all voxels being present.
+    /// Returns the bytes of all tables in `f32`, with all voxels present.
     pub fn bytes(&self) -> usize {
         let harmonics = self.harmonics_resolution().pow(3) * self.harmonics_width();
         (self.voxels() * (1 + self.color_width()) + harmonics) * size_of::<f32>()

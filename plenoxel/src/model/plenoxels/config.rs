@@ -1,6 +1,6 @@
-//! Every setting of a run: its meaning, its unit, and where its default comes from.
+//! All settings of a run: their meanings, their units, and the sources of their defaults.
 //!
-//! The same struct is the file `config.toml` of a run, a preset, and what flags change.
+//! [`Config`] is the content of a run's `config.toml` and of a preset. Command-line flags change it.
 
 use super::objective::{LEARNED_LOSSES, LOSSES};
 use crate::camera::Camera;
@@ -17,102 +17,107 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// The most stages of a run.
+/// Largest number of stages of a run.
 const MOST_STAGES: usize = 100;
 
-/// A run, completely: the same config and the same data give the same bits.
+/// Complete settings of a run. The same config and the same data give bit-identical results.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// Images are reduced by this factor, with a box filter.
+    /// Factor by which images are reduced, with a box filter.
     pub downscale: usize,
-    /// Where a dataset has no validation file, every n-th training view is held out for validation; 0 holds out none.
+    /// Interval at which training views are held out for validation, if the dataset has no validation split: every n-th view. 0 holds out
+    /// none.
     pub validation_every: usize,
-    /// Color behind the scene, sRGB in [0, 1]. White is what published figures use.
+    /// Background color, sRGB in [0, 1]. Published figures use white.
     pub background: [f32; 3],
-    /// Half the side of the cube in which the scene lies, in the dataset's units.
+    /// Half the side of the cube that contains the scene, in units of the dataset.
     pub half_width: f64,
-    /// Look-up between voxel centres.
+    /// Interpolation between voxel centres.
     pub interpolation: Interpolation,
-    /// Meaning of a voxel's color.
+    /// Color representation of a voxel.
     pub color: ColorKind,
-    /// Degree of the harmonics, 0 to 3, where `color = "sh"`.
+    /// Degree of the spherical harmonics, 0 to 3. Used if `color = "sh"`.
     pub sh_degree: usize,
-    /// Harmonics of degree 1 and more are stored for every so many voxels along each axis, the mean color for each; 1 for all coefficients in
-    /// every voxel. Where there are no such harmonics it means nothing, and carving finds all coefficients for each voxel.
+    /// Side of the blocks of voxels that share harmonics of degree 1 and more. The coefficient of degree 0 is stored for each voxel. 1
+    /// stores all coefficients for each voxel. It has no effect without such harmonics. Carving ignores it and fits all coefficients for
+    /// each voxel.
     #[serde(default = "one")]
     pub sh_reduction: usize,
     /// Color of zero coefficients: 0.5 in svox2, 0 in the source paper.
     pub sh_offset: f64,
-    /// What computes the pixels.
+    /// Renderer that computes the pixels.
     pub engine: Engine,
-    /// Training rays end where less than this share of the light comes from behind; 0 for never. (The graph never does.)
+    /// Transmittance below which training rays end; 0 never ends them early. The engine `graph` ignores it.
     pub stop_below: f64,
-    /// Rays in a step.
+    /// Number of rays per training step.
     pub rays_per_step: usize,
-    /// Draw no rays that see nothing but empty space: only those of pixels around the projections of what is left of the grid. Where a stage
-    /// begins without empty space, all are drawn. Needs no alpha.
+    /// Draw training rays only from pixels on or around the projection of the remaining voxels, because other rays cross empty space only.
+    /// A stage that begins without empty space draws from all pixels. Needs no alpha channel.
     #[serde(default)]
     pub aim: bool,
     /// Shift the samples of each training ray by a random fraction of a step.
     pub jitter: bool,
     /// Clamp densities to >= 0 and RGB colors to [0, 1] after each step.
     pub project: bool,
-    /// Stages have no more voxels than would be this many pixels wide in a cube of the configured half width, seen from as far as the mean camera is;
-    /// 0 for no such bound. Silhouettes and a scout shrink the cube afterwards, and with it the voxels. See [`Config::fitted_to`].
+    /// Smallest width of a voxel in pixels; 0 for no bound. It limits the resolution of the stages. The width is computed for a cube of the
+    /// configured half width at the mean distance of the cameras. Silhouettes and a scout shrink the cube later, and its voxels with it.
+    /// See [`Config::fitted_to`].
     #[serde(default)]
     pub pixels_per_voxel: f64,
-    /// From this stage on (counted from 0), voxels that at the stage's start have, with all their neighbours, a density of at most
-    /// `prune_below` are taken out of the grid: they are empty from then on, and are not looked at.
+    /// First stage that begins with pruning, counted from 0. Pruning removes a voxel if its density, and the density of all its neighbours,
+    /// is at most `prune_below`. Removed voxels stay empty and are not sampled.
     pub prune_from_stage: Option<usize>,
-    /// Density, 1 / world length, at which a voxel counts as empty when pruning.
+    /// Density below which pruning treats a voxel as empty, in 1 / world length.
     pub prune_below: f64,
-    /// When pruning, voxels go too that no training ray sees: those whose largest weight, and that of all voxels within two, is below this
-    /// share of a pixel. Of the pixels as many are looked along as make eight rays through every voxel. 0 for none; svox2: 0.256 / voxels a side.
+    /// Also prune voxels whose largest rendering weight over the training rays is below this; 0 disables it. A voxel stays if a voxel at
+    /// most two away has a larger weight. The rays are a subset of the training pixels with at least eight rays per voxel. svox2 uses 0.256 /
+    /// resolution.
     pub prune_unseen_below: f64,
-    /// A short run before the first stage, where no silhouettes and no other run say which voxels exist: those of its grid that are worth
-    /// keeping do, and those of the visual hull of their silhouettes; the cube becomes as small as the first allow, again at each finer stage
-    /// that prunes, and training starts from `initial`. Needs no alpha.
+    /// Short run before the first stage that finds the voxels of the grid. It is used if neither silhouettes nor an initial run determine
+    /// them. It keeps its voxels that are worth keeping, and the visual hull of their silhouettes. The cube shrinks to the kept voxels, and
+    /// again at each finer stage that prunes. Training then starts from `initial`. Needs no alpha channel.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scout: Option<Scout>,
-    /// Folder of the run whose grid training starts from.
+    /// Folder of the run whose grid initializes training.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init_from: Option<PathBuf>,
-    /// What silhouettes may decide where images have alpha.
+    /// Use of silhouettes, if images have an alpha channel.
     #[serde(default)]
     pub hull: Hull,
     /// Values before the first step.
     pub initial: Initial,
-    /// How gradients change the grid.
+    /// Optimizer and its parameters.
     pub optimizer: OptimizerConfig,
-    /// Weight of each loss: a number, `{ weight, until }` for one that ends, or `{ from, to, steps }` for an exponential change over the run.
+    /// Weight of each loss: a number, `{ weight, until }` for a loss that ends, or `{ from, to, steps }` for a weight that changes
+    /// exponentially.
     pub losses: BTreeMap<String, Weight>,
-    /// Learning rates of losses that have parameters (`robust`, `exposure`), by the name of the loss, where they differ from the loss's own.
+    /// Learning rates of losses with parameters (`robust`, `exposure`), by name of the loss. They replace the loss's own rates.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub loss_rates: BTreeMap<String, f64>,
-    /// Coarse to fine.
+    /// Training stages, coarse to fine.
     pub stages: Vec<Stage>,
-    /// Where samples lie when images are rendered for pictures and figures.
+    /// Sampling of rendered images and of evaluation.
     pub evaluation: Sampling,
-    /// How to carve, where a run does.
+    /// Settings of carving.
     #[serde(default)]
     pub carve: CarveConfig,
 }
 
-/// What silhouettes may decide in training.
+/// Use of silhouettes in training.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Hull {
-    /// Where images have alpha: the size of the cube, and which voxels exist.
+    /// Silhouettes determine the size of the cube and which voxels exist, if images have an alpha channel.
     Auto,
-    /// Nothing: alpha is for compositing over the background only.
+    /// Silhouettes are not used. Alpha is used for compositing over the background only.
     #[default]
     Off,
 }
 
-/// Meaning of a voxel's color.
+/// Color representation of a voxel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ColorKind {
@@ -122,73 +127,73 @@ pub enum ColorKind {
     Sh,
 }
 
-/// Values before the first step.
+/// Values of the grid before the first step.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Initial {
     /// Density, 1 / world length.
     pub density: f64,
-    /// Every color number.
+    /// Value of every color channel or coefficient.
     pub color: f64,
-    /// Draw uniformly from [0, value) instead.
+    /// Draw each number uniformly from [0, value) instead.
     pub random: bool,
 }
 
-/// How gradients change the grid. Rates are of the stages.
+/// Optimizer and its parameters. Learning rates belong to the stages.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
 pub enum OptimizerConfig {
-    /// θ ← θ − rate · g
+    /// Stochastic gradient descent: θ ← θ − rate · g.
     Sgd,
-    /// Momentum of this decay.
+    /// Stochastic gradient descent with momentum.
     Momentum {
-        /// Share of the velocity that stays.
+        /// Factor by which the velocity is multiplied in each step.
         decay: f64,
     },
-    /// svox2's.
+    /// RMSProp as in svox2.
     RmsProp {
-        /// Decay of the mean square.
+        /// Decay of the running mean of squared gradients.
         beta: f64,
-        /// Added to its root.
+        /// Term added to the root of the mean square.
         epsilon: f64,
     },
-    /// Adam on touched rows only.
+    /// Adam that updates only rows with a gradient.
     LazyAdam {
-        /// Decay of the mean.
+        /// Decay of the running mean of gradients.
         beta1: f64,
-        /// Decay of the mean square.
+        /// Decay of the running mean of squared gradients.
         beta2: f64,
-        /// Added to its root.
+        /// Term added to the root of the mean square.
         epsilon: f64,
     },
 }
 
-/// A weight of a loss over the steps of the run.
+/// Weight of a loss over the steps of the run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, deny_unknown_fields)]
 pub enum Weight {
-    /// The same all the time.
+    /// Constant weight.
     Constant(f64),
-    /// The same up to a step, and nothing from then on.
+    /// Constant weight up to a step, and 0 from then on.
     Until {
-        /// Before `until`.
+        /// Weight before step `until`.
         weight: f64,
-        /// The first step without it.
+        /// First step without the loss.
         until: u64,
     },
-    /// Log-linear from one to the other over so many steps, then constant.
+    /// Weight that changes log-linearly from `from` to `to`, then stays constant.
     Exponential {
-        /// At step 0.
+        /// Weight at step 0.
         from: f64,
-        /// From `steps` on.
+        /// Weight from step `steps` on.
         to: f64,
-        /// Length of the change.
+        /// Number of steps of the change.
         steps: u64,
     },
 }
 
 impl Weight {
-    /// The weight at a step.
+    /// Returns the weight at a step.
     pub fn at(&self, step: u64) -> f64 {
         match *self {
             Weight::Constant(weight) => weight,
@@ -204,51 +209,54 @@ impl Schedule for Weight {
     }
 }
 
-/// A resolution, and how long it is trained.
+/// Training stage: a resolution, its length and its rates.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Stage {
-    /// Voxels along each axis.
+    /// Number of voxels along each axis.
     pub resolution: usize,
-    /// Length in epochs over all training pixels; exactly one of `epochs` and `steps` is given.
+    /// Length in epochs over all training pixels. A stage has exactly one of `epochs` and `steps`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub epochs: Option<f64>,
-    /// Length in steps.
+    /// Length in training steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub steps: Option<u64>,
-    /// Where samples lie.
+    /// Sampling along training rays.
     pub sampling: Sampling,
-    /// Images are reduced by this factor while the stage lasts, or by the largest below it that divides their sides: one ray then says what
-    /// many pixels show, which is all that large voxels can tell. An epoch is of the images as they were.
+    /// Factor by which images are reduced during the stage, with a box filter; the largest factor up to this that divides both sides is
+    /// used. One ray then covers many pixels, which is enough for large voxels. The length of an epoch counts the pixels of the original
+    /// images.
     #[serde(default = "one")]
     pub image_reduction: usize,
-    /// Learning rate of the density, at the stage's start.
+    /// Learning rate of the density at the start of the stage.
     pub density_rate: f64,
-    /// Learning rate of the colors, at the stage's start.
+    /// Learning rate of the colors at the start of the stage.
     pub color_rate: f64,
-    /// Learning rate of harmonics that are reduced, at the stage's start; without it `color_rate`.
+    /// Learning rate of reduced harmonics at the start of the stage. Defaults to `color_rate`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub harmonics_rate: Option<f64>,
-    /// Steps over which the density's rate rises from a hundredth of itself, along a quarter of a sine (svox2's delay); 0 for none.
+    /// Number of steps over which the learning rate of the density rises from 1% to its full value, along a quarter of a sine (svox2's
+    /// delay). 0 disables the warm-up.
     #[serde(default)]
     pub density_warm_up: u64,
-    /// All rates fall exponentially to this share of themselves at the stage's end; 1 keeps them.
+    /// Factor that all learning rates reach at the end of the stage, by exponential decay. 1 keeps them constant.
     #[serde(default = "one")]
     pub rate_decay: f64,
-    /// The same for the rates of colors and harmonics, if they fall otherwise.
+    /// Factor that the learning rates of colors and harmonics reach at the end of the stage. Defaults to `rate_decay`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub color_decay: Option<f64>,
 }
 
-/// How to find out where matter is.
+/// Settings of the scout, a short run that finds where matter is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scout {
-    /// Density before the first step, 1 / world length: thin enough that light gets through the cube.
+    /// Density before the first step, 1 / world length. It must be low enough that light passes through the cube.
     pub density: f64,
-    /// What is worth keeping after each stage: as in pruning, with the config's `prune_below` and this.
+    /// Threshold of rendering weight for keeping a voxel after each stage. It replaces the config's `prune_unseen_below`; `prune_below`
+    /// applies too.
     pub prune_unseen_below: f64,
-    /// What is trained, coarse to fine, each from `density` again in what the one before left.
+    /// Stages, coarse to fine. Each starts from `density` again, on the voxels that the previous stage kept.
     pub stages: Vec<Stage>,
 }
 
@@ -256,18 +264,18 @@ fn one<N: From<u8>>() -> N {
     N::from(1)
 }
 
-/// Where samples lie along a ray.
+/// Positions of samples along a ray.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, deny_unknown_fields)]
 pub enum Sampling {
-    /// Steps of this many voxel sides through the box.
+    /// Steps of constant length through the box.
     Step {
-        /// In voxel sides.
+        /// Length of a step, in voxel sides.
         step: f64,
     },
-    /// The source paper's: so many points over t ∈ [0, far] along the direction whose camera z is −1.
+    /// Sampling of the source paper: points evenly spaced over t ∈ [0, far], along the direction whose camera z is −1.
     Points {
-        /// On the whole ray, in the box or not.
+        /// Number of points on the whole ray, inside or outside of the box.
         samples: usize,
         /// Largest t.
         far: f64,
@@ -275,7 +283,7 @@ pub enum Sampling {
 }
 
 impl Sampling {
-    /// The most samples that a ray can take through a grid.
+    /// Returns the largest number of samples that a ray can take through a grid.
     fn most(self, resolution: usize) -> f64 {
         match self {
             Sampling::Step { step } => 3f64.sqrt() * resolution as f64 / step + 2.0,
@@ -283,7 +291,7 @@ impl Sampling {
         }
     }
 
-    /// The spacing for voxels of a side.
+    /// Returns the spacing for a voxel side in world units.
     pub fn spacing(self, voxel_side: f64) -> Spacing {
         match self {
             Sampling::Step { step } => Spacing::Step(step * voxel_side),
@@ -293,8 +301,8 @@ impl Sampling {
 }
 
 impl Stage {
-    /// So many steps at a resolution, and all else as plain as it can be: samples half a voxel apart (svox2), whole images, the density's rate 1
-    /// and that of colors 0.03 to the end.
+    /// Returns a plain stage of `steps` steps at a resolution: samples half a voxel apart (svox2), images of full size, and constant
+    /// learning rates, 1 for the density and 0.03 for colors.
     pub fn new(resolution: usize, steps: u64) -> Self {
         Stage {
             resolution,
@@ -311,26 +319,26 @@ impl Stage {
         }
     }
 
-    /// The same with at most `finest` voxels a side, but 2 at least, and a rate of the density that is less by as much.
+    /// Limits the resolution to `finest`, but at least 2. The learning rate of the density is reduced by the same factor.
     pub fn at_most(self, finest: usize) -> Self {
         let resolution = self.resolution.min(finest.max(2));
         let density_rate = self.density_rate * resolution as f64 / self.resolution as f64;
         Stage { resolution, density_rate, ..self }
     }
 
-    /// The same with at most `finest` voxels a side, and images that are reduced by as little.
+    /// Limits the resolution to `finest`, and the reduction of images to `finest / resolution`.
     fn fitted(self, finest: f64) -> Self {
         let stage = self.at_most(finest as usize);
         let image_reduction = stage.image_reduction.min((finest / stage.resolution as f64) as usize).max(1);
         Stage { image_reduction, ..stage }
     }
 
-    /// The share of their first rates that colors and harmonics end with.
+    /// Returns the factor that the learning rates of colors and harmonics reach at the end of the stage.
     pub fn color_decay(&self) -> f64 {
         self.color_decay.unwrap_or(self.rate_decay)
     }
 
-    /// Steps of this stage when an epoch has `rays` rays.
+    /// Returns the number of steps of this stage if an epoch has `rays` rays.
     pub fn step_count(&self, rays: u64, rays_per_step: usize) -> u64 {
         match (self.steps, self.epochs) {
             (Some(steps), _) => steps,
@@ -340,7 +348,7 @@ impl Stage {
     }
 }
 
-/// A recipe for small scenes of about unit size, photographed from all sides over white: what presets and files change.
+/// Settings for small scenes of about unit size, photographed from all sides over white. Presets and files change them.
 impl Default for Config {
     fn default() -> Self {
         Config {
@@ -348,11 +356,11 @@ impl Default for Config {
             downscale: 1,
             validation_every: 20,
             background: [1.0; 3],
-            // World units: svox2 and nerfstudio on NeRF-synthetic scenes.
+            // World units: svox2 and nerfstudio use this on NeRF-synthetic scenes.
             half_width: 1.5,
             interpolation: Interpolation::Trilinear,
             color: ColorKind::Sh,
-            // svox2: degree 2, and zero coefficients are gray.
+            // svox2 uses degree 2, and zero coefficients are gray.
             sh_degree: 2,
             sh_reduction: 1,
             sh_offset: 0.5,
@@ -369,14 +377,14 @@ impl Default for Config {
             scout: None,
             init_from: None,
             hull: Hull::Off,
-            // svox2's start: thin gray fog.
+            // Thin gray fog, as in svox2.
             initial: Initial { density: 0.1, color: 0.0, random: false },
-            // Gradients of a mean over 4096 rays are small: the usual 1e-8 would damp them.
+            // Gradients of a mean over 4096 rays are small. The usual epsilon of 1e-8 would damp them.
             optimizer: OptimizerConfig::LazyAdam { beta1: 0.9, beta2: 0.99, epsilon: 1e-12 },
             losses: BTreeMap::from([("mse".to_owned(), Weight::Constant(1.0))]),
             loss_rates: BTreeMap::new(),
-            // Ours, a first guess and not tuned: densities move by about one unit a step, so that a voxel is opaque or
-            // empty within a few dozen steps, colors by 0.03; the last stage settles.
+            // Our choice, not tuned. Densities change by about one unit per step, so that a voxel becomes opaque or empty within a few
+            // dozen steps. Colors change by about 0.03 per step. The rates of the last stage decay so that it settles.
             stages: vec![
                 Stage::new(16, 200),
                 Stage::new(32, 200),
@@ -390,7 +398,7 @@ impl Default for Config {
 }
 
 impl Config {
-    /// The grid of a stage.
+    /// Returns the shape of the grid at a resolution.
     pub fn grid_shape(&self, resolution: usize) -> GridShape {
         let color = match self.color {
             ColorKind::Rgb => Color::Rgb,
@@ -400,25 +408,27 @@ impl Config {
         GridShape { resolution, half_width, interpolation, color, sh_reduction }.normalised()
     }
 
-    /// What a carving run with these settings carves, and how.
+    /// Returns the options of carving with these settings.
     pub fn carve_options(&self) -> CarveOptions {
         let Config { half_width, background, seed, carve, .. } = *self;
         CarveOptions { half_width, color: self.grid_shape(carve.resolution).color, background, seed, config: carve }
     }
 
-    /// The same with stages that images of some cameras have pixels for. Small images say nothing of small voxels, which would learn what
-    /// single views show and no other.
+    /// Returns a config whose stages fit the images of some cameras. In voxels smaller than a pixel, small images leave the colors
+    /// undetermined, and the grid would overfit single views.
     ///
-    /// A pixel of a camera is p = d / f wide, for its distance d from the middle of the cube, or the cube's half width w if that is more, and
-    /// its focal length f in pixels. The finest grid has n = 2 w / (`pixels_per_voxel` p) voxels a side, p in the mean of all cameras and w as
-    /// configured. Stages that are finer get that many, and a rate of the density that is less by as much. Images are reduced by no more than k where a stage has n / k voxels a side, so that what is true of voxels
-    /// and pixels is true of theirs.
+    /// A pixel of a camera is p = max(d, w) / f wide, where d is the camera's distance from the middle of the cube, w the half width of the
+    /// cube and f the focal length in pixels. The finest grid has n = 2 w / (`pixels_per_voxel` p) voxels per axis, with p averaged over
+    /// all cameras and w as configured. Finer stages get n voxels per axis, and the learning rate of their density is reduced by the same
+    /// factor.
+    ///
+    /// The reduction of images in a stage is at most n / resolution. The bound therefore holds for reduced pixels too.
     pub fn fitted_to<'c>(&self, cameras: impl IntoIterator<Item = &'c Camera>) -> Self {
         let pixel = |camera: &Camera| camera.position().length().max(self.half_width) / camera.intrinsics.fx.min(camera.intrinsics.fy);
         let (sum, count) = cameras.into_iter().map(pixel).fold((0.0, 0.0), |(sum, count), pixel| (sum + pixel, count + 1.0));
         let finest = 2.0 * self.half_width / (self.pixels_per_voxel * sum / count);
         let mut fitted = self.clone();
-        // Without cameras, or a bound, it is no number, or infinite.
+        // Without cameras or without a bound it is NaN or infinite.
         if finest.is_finite() {
             let of_scout = fitted.scout.iter_mut().flat_map(|scout| &mut scout.stages);
             fitted.stages.iter_mut().chain(of_scout).for_each(|stage| *stage = stage.fitted(finest));
@@ -426,7 +436,7 @@ impl Config {
         fitted
     }
 
-    /// How a grid is rendered with samples at these places.
+    /// Returns the options for rendering a grid with a given sampling.
     pub(super) fn render_options<T: Real>(&self, grid: &VoxelGrid<T>, sampling: Sampling, jitter: Jitter) -> RenderOptions<'static> {
         RenderOptions {
             aabb: grid.aabb(),
@@ -439,26 +449,26 @@ impl Config {
         }
     }
 
-    /// Values before the first step, of the scout or of the training itself.
+    /// Returns the values before the first step of the scout, or of the training itself.
     pub(super) fn initial_of(&self, scout: bool) -> Initial {
         let density = self.scout.as_ref().filter(|_| scout).map_or(self.initial.density, |scout| scout.density);
         Initial { density, ..self.initial }
     }
 
-    /// Settings of the trainer, which do not depend on the model.
+    /// Returns the settings of the trainer, which do not depend on the model.
     pub fn train_options(&self) -> TrainOptions {
         let Config { seed, background, rays_per_step, jitter, .. } = *self;
         TrainOptions { seed, background, rays_per_step, jitter, ..TrainOptions::default() }
     }
 
-    /// Checks that there is something to train.
+    /// Errors if the config has no stage to train.
     pub fn check_stages(&self) -> Result<()> {
-        check(!self.stages.is_empty(), "stages", "no stage", "at least one")
+        check(!self.stages.is_empty(), "stages", "no stage", "at least one stage")
     }
 
-    /// Checks every value; an error names the key as the file spells it.
+    /// Checks every value. An error names the key as it is spelled in the file.
     pub fn validate(&self) -> Result<()> {
-        // What single precision can square and add up.
+        // Limits for which squares and sums stay finite in single precision.
         let density = |key: &str, value: f64| check((0.0..=1e12).contains(&value), key, value, "0 to 1e12");
         let color = |key: &str, value: f64| check((-1e6..=1e6).contains(&value), key, value, "-1e6 to 1e6");
         let decay = |key: &str, value: f64| check((0.0..1.0).contains(&value), key, value, "a number in [0, 1)");
@@ -468,7 +478,7 @@ impl Config {
         check(
             self.background.iter().all(|c| (0.0..=1.0).contains(c)),
             "background",
-            format!("{:?}", self.background),
+            format!("invalid value {:?}", self.background),
             "three numbers in [0, 1]",
         )?;
         let half_widths = "a number above 0, from 1e-9 to 1e9";
@@ -482,7 +492,7 @@ impl Config {
         density("prune_below", self.prune_below)?;
         check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;
         let nowhere = self.init_from.as_ref().is_some_and(|path| path.as_os_str().is_empty());
-        check(!nowhere, "init_from", "\"\"", "the folder of a run")?;
+        check(!nowhere, "init_from", "an empty path", "the folder of a run")?;
         density("initial.density", self.initial.density)?;
         color("initial.color", self.initial.color)?;
         match self.optimizer {
@@ -499,7 +509,7 @@ impl Config {
             }
         }
         for (name, weight) in &self.losses {
-            check(LOSSES.contains(&name.as_str()), &format!("losses.{name}"), "an unknown loss", &format!("one of {}", LOSSES.join(", ")))?;
+            check(LOSSES.contains(&name.as_str()), &format!("losses.{name}"), "unknown loss", &format!("one of {}", LOSSES.join(", ")))?;
             let key = |part: &str| format!("losses.{name}{part}");
             let fits = |part: &str, weight: f64| check((0.0..=1e12).contains(&weight), &key(part), weight, "0 to 1e12");
             let changes = |part: &str, weight: f64| check((1e-30..=1e12).contains(&weight), &key(part), weight, "1e-30 to 1e12");
@@ -518,8 +528,8 @@ impl Config {
             let key = format!("loss_rates.{name}");
             let learned: Vec<&str> = LEARNED_LOSSES.into_iter().filter(|loss| self.losses.contains_key(*loss)).collect();
             let accepted =
-                if learned.is_empty() { "a rate for one of the losses robust and exposure".to_owned() } else { learned.join(", ") };
-            check(learned.contains(&name.as_str()), &key, "a rate for a loss that has no parameters here", &accepted)?;
+                if learned.is_empty() { "no rates unless the loss robust or exposure is used".to_owned() } else { learned.join(", ") };
+            check(learned.contains(&name.as_str()), &key, "no loss of this name has parameters", &accepted)?;
             check((1e-12..=1e6).contains(rate), &key, rate, "1e-12 to 1e6")?;
         }
         if let Some(scout) = &self.scout {
@@ -527,20 +537,20 @@ impl Config {
             density("scout.density", scout.density)?;
             let least = scout.prune_unseen_below;
             check((0.0..=1.0).contains(&least), "scout.prune_unseen_below", least, "a number in [0, 1]")?;
-            check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one, or no scout")?;
+            check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one stage, or no scout")?;
         }
         let longest = self.stages.len().max(self.scout.as_ref().map_or(0, |scout| scout.stages.len()));
-        check(longest <= MOST_STAGES, "stages", longest, "at most 100")?;
+        check(longest <= MOST_STAGES, "stages", format!("{longest} stages"), "at most 100")?;
         let stages = self.stages.iter().enumerate().map(|(i, stage)| (format!("stages[{i}]"), stage));
         let of_scout = self.scout.iter().flat_map(|scout| scout.stages.iter().enumerate());
         for (place, stage) in stages.chain(of_scout.map(|(i, stage)| (format!("scout.stages[{i}]"), stage))) {
             let key = |name: &str| format!("{place}.{name}");
-            check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels a side")?;
+            check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels per axis")?;
             match (stage.epochs, stage.steps) {
                 (Some(epochs), None) => check(epochs > 0.0 && epochs <= 1e6, &key("epochs"), epochs, "above 0 to 1e6")?,
                 (None, Some(steps)) => check((1..=1_000_000_000).contains(&steps), &key("steps"), steps, "1 to 1e9")?,
-                (Some(_), Some(_)) => check(false, &key("steps"), "`epochs` beside `steps`", "one of them")?,
-                (None, None) => check(false, &key("steps"), "neither `epochs` nor `steps`", "one of them")?,
+                (Some(_), Some(_)) => check(false, &key("steps"), "both `epochs` and `steps` are set", "one of them")?,
+                (None, None) => check(false, &key("steps"), "neither `epochs` nor `steps` is set", "one of them")?,
             }
             sampling(&key("sampling"), stage.sampling)?;
             let harmonics_rate = stage.harmonics_rate.unwrap_or(stage.color_rate);
@@ -552,20 +562,20 @@ impl Config {
             for (name, decay) in [("rate_decay", stage.rate_decay), ("color_decay", stage.color_decay())] {
                 check((1e-6..=1e6).contains(&decay), &key(name), decay, "1e-6 to 1e6")?;
             }
-            // Samples of a batch are counted in 32 bits.
+            // The kernels index samples of a batch with 32 bits.
             let samples = stage.sampling.most(stage.resolution) * self.rays_per_step as f64;
             check(
                 samples < f64::from(u32::MAX),
                 &key("sampling"),
-                format!("up to {samples:.0} samples in a step"),
-                "below 4294967295: longer steps, or a smaller rays_per_step",
+                format!("up to {samples:.0} samples per step"),
+                "fewer than 4294967295: longer steps, or a smaller rays_per_step",
             )?;
         }
         sampling("evaluation", self.evaluation)?;
         let CarveConfig { resolution, margin, depth, photo, ridge, sweeps, .. } = self.carve;
         let noise = photo.map_or(1.0, |photo| photo.noise);
         check((1e-6..=1.0).contains(&noise), "carve.photo.noise", noise, "1e-6 to 1")?;
-        check((2..=1024).contains(&resolution), "carve.resolution", resolution, "2 to 1024 voxels a side")?;
+        check((2..=1024).contains(&resolution), "carve.resolution", resolution, "2 to 1024 voxels per axis")?;
         check((0.0..=1e3).contains(&margin), "carve.margin", margin, "0 to 1000 pixels")?;
         check((1e-3..=1e3).contains(&depth), "carve.depth", depth, "0.001 to 1000")?;
         check((0.0..=1e6).contains(&ridge), "carve.ridge", ridge, "0 to 1e6")?;
@@ -588,7 +598,7 @@ fn check(fits: bool, key: &str, found: impl ToString, accepted: &str) -> Result<
         return Ok(());
     }
     let found = found.to_string();
-    // 1e300 would be written with all its zeros.
+    // A number such as 1e300 would otherwise be printed with all its zeros.
     let short = if found.len() > 20 { found.parse().ok().map(|number: f64| format!("{number:e}")) } else { None };
     Err(Error::config(key, short.unwrap_or(found), accepted))
 }

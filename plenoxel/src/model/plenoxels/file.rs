@@ -1,6 +1,7 @@
-//! The state of a grid in training, in the precision of the run: tables `density`, `color` and `harmonics` `[rows, width]` in the order of its
-//! lattice, whose `masks` of bricks say which voxels are present ([`autograd::Lattice::masks`]); and `learning`, where samples were looked up when last
-//! looked at, as masks of bricks.
+//! State of a grid in training, in the precision of the run.
+//!
+//! Entries: the tables `density`, `color` and `harmonics` `[rows, width]`, in the order of the lattice; `masks`, brick masks of the present
+//! voxels ([`autograd::Lattice::masks`]); and `learning`, brick masks of the cells that were sampled at the last update.
 
 use super::Plenoxels;
 use crate::checkpoint::Header;
@@ -13,20 +14,20 @@ use autograd::{Lattice, Real};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-/// Facts about a grid in training.
+/// Header of a grid in training.
 #[derive(Debug, Serialize, Deserialize)]
 struct Facts {
     /// Shape and conventions of the grid.
     grid: Header,
-    /// Stages of the plan: fewer than there are if the run started from a finer grid.
+    /// Number of stages in the plan. Smaller than the config's number of stages if the run started from a finer grid.
     stages: usize,
-    /// How many of them are the scout's.
+    /// Number of stages that belong to the scout.
     scouts: usize,
-    /// Box and cells of `learning`.
+    /// Box and resolution of `learning`.
     learning: Option<Cells>,
 }
 
-/// Where the bricks of an [`Occupancy`] are.
+/// Box and resolution of an [`Occupancy`].
 #[derive(Debug, Serialize, Deserialize)]
 struct Cells {
     min: DVec3,
@@ -34,7 +35,7 @@ struct Cells {
     cells: [usize; 3],
 }
 
-/// Adds what [`read`] needs.
+/// Writes everything that [`read`] needs.
 pub fn write<'a, T: Real>(model: &'a Plenoxels<T>, file: &mut TensorWriter<'a>) {
     let grid = &model.grid;
     let facts = Facts {
@@ -53,29 +54,29 @@ pub fn write<'a, T: Real>(model: &'a Plenoxels<T>, file: &mut TensorWriter<'a>) 
     }
 }
 
-/// Takes over what [`write`] wrote during a stage of this number.
+/// Restores a model from the entries that [`write`] wrote during stage `stage`.
 pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage: usize) -> Result<()> {
     let facts: Facts = file.fact("grid")?;
     let config = &model.config;
     if facts.scouts != 0 && facts.scouts != config.scout.as_ref().map_or(0, |scout| scout.stages.len()) {
-        return Err(file.damaged("a scout of impossible stages"));
+        return Err(file.damaged("the number of scout stages does not match the config"));
     }
     let scout = config.scout.iter().filter(|_| facts.scouts > 0).flat_map(|scout| &scout.stages);
     let stages: Vec<_> = scout.chain(&config.stages).copied().collect();
     let left_out =
         stages.len().checked_sub(facts.stages).filter(|left_out| *left_out < stages.len() && (facts.scouts == 0 || *left_out == 0));
-    let stages = stages[left_out.ok_or_else(|| file.damaged("a plan of impossible stages"))?..].to_vec();
-    let current = stages.get(stage).ok_or_else(|| file.damaged("a stage that the plan does not have"))?;
+    let stages = stages[left_out.ok_or_else(|| file.damaged("the number of stages does not match the config"))?..].to_vec();
+    let current = stages.get(stage).ok_or_else(|| file.damaged("the current stage is not in the plan"))?;
     let shape = facts.grid.shape();
     let configured = GridShape { half_width: shape.half_width, ..config.grid_shape(current.resolution) };
     if shape != configured || !GridShape::HALF_WIDTHS.contains(&shape.half_width) {
-        return Err(file.damaged("a grid that is not of its stage"));
+        return Err(file.damaged("the shape of the grid does not match its stage"));
     }
     let n = [shape.resolution; 3];
     let masks = masks(file, "masks", n)?.filter(|masks| masks.iter().any(|mask| *mask != 0));
-    let lattice = Lattice::from_masks(n, masks.ok_or_else(|| file.damaged("voxels outside of the grid, or none"))?);
+    let lattice = Lattice::from_masks(n, masks.ok_or_else(|| file.damaged("the grid has no voxels, or voxels outside of its box"))?);
     let shapes = shape.tables(&lattice);
-    // The old grid goes first.
+    // Release the old grid first, to save memory.
     model.grid = VoxelGrid::uniform(GridShape { resolution: 1, ..shape }, 0.0, 0.0);
     let tables = ["density", "color", "harmonics"].iter().zip(&shapes).map(|(name, shape)| file.tensor(name, shape));
     model.grid = VoxelGrid::with_tables(shape, lattice, tables.collect::<Result<_>>()?);
@@ -85,14 +86,14 @@ pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage:
     model.learning = match facts.learning {
         None => None,
         Some(Cells { min, max, cells }) => {
-            // The grid's cube, or up to a voxel more on each side.
+            // The box is the grid's cube, or extends it by up to one voxel on each side.
             let sides = shape.half_width..=2.0 * shape.half_width;
             let around = (0..3).all(|a| sides.contains(&-min[a]) && sides.contains(&max[a]));
             let masks = match cells.iter().all(|n| (1..=shape.resolution + 1).contains(n)) && around {
                 true => self::masks(file, "learning", cells)?,
                 false => None,
             };
-            let masks = masks.ok_or_else(|| file.damaged("samples outside of the grid"))?;
+            let masks = masks.ok_or_else(|| file.damaged("the mask `learning` has cells outside of the grid"))?;
             Some(Occupancy::from_masks(Aabb { min, max }, cells, masks))
         }
     };
@@ -100,7 +101,7 @@ pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage:
     Ok(())
 }
 
-/// Masks of bricks of so many cells; `None` if one has a cell outside of these.
+/// Reads brick masks of `cells`. Returns `None` if a mask has a bit outside of `cells`.
 fn masks(file: &mut TensorFile<'_>, name: &str, cells: [usize; 3]) -> Result<Option<Vec<u64>>> {
     let whole = Lattice::bricks(cells);
     let masks = file.words(name, whole.masks().len())?;

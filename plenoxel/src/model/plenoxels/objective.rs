@@ -1,4 +1,4 @@
-//! Losses of a voxel grid by their names, and the objective that a config describes.
+//! Losses of a voxel grid by name, and the objective that a config describes.
 
 use super::config::Config;
 use super::{Objective, single};
@@ -9,10 +9,10 @@ use autograd::Real;
 use autograd::optim::Schedule;
 use autograd::single::{cast, is_single};
 
-/// Losses that read the voxel grid.
+/// Names of the losses that read the voxel grid.
 const OF_GRID: [&str; 4] = ["tv_density", "tv_color", "tv_density_sampled", "tv_color_sampled"];
 
-/// Every loss that a config may name: those of any model ([`loss::NAMES`]), and those that read the voxel grid.
+/// Names of all losses that a config may use: the losses of any model ([`loss::NAMES`]) and the losses that read the voxel grid.
 pub const LOSSES: [&str; loss::NAMES.len() + OF_GRID.len()] = {
     let mut all = [""; loss::NAMES.len() + OF_GRID.len()];
     let mut i = 0;
@@ -23,10 +23,10 @@ pub const LOSSES: [&str; loss::NAMES.len() + OF_GRID.len()] = {
     all
 };
 
-/// Losses with parameters, whose learning rate a config may set.
+/// Names of the losses with parameters, whose learning rate a config may set.
 pub const LEARNED_LOSSES: [&str; 2] = ["robust", EXPOSURE];
 
-/// An objective with one more loss, by its name in [`LOSSES`], for a model that has a voxel grid; `views` is the number of training views.
+/// Adds a loss by its name in [`LOSSES`] to an objective of a model with a voxel grid. `views` is the number of training views.
 ///
 /// Errors if the name is unknown.
 pub fn with_loss<T: Real, M: AsRef<VoxelGrid<T>> + 'static>(
@@ -41,11 +41,11 @@ pub fn with_loss<T: Real, M: AsRef<VoxelGrid<T>> + 'static>(
         "tv_density_sampled" => objective.with(name, weight, tv_density(Cells::SAMPLED)),
         "tv_color_sampled" => objective.with(name, weight, tv_color(Cells::SAMPLED)),
         _ if loss::NAMES.contains(&name) => objective.with_named(name, weight, views)?,
-        _ => return Err(Error::config(format!("losses.{name}"), "an unknown loss", format!("one of {}", LOSSES.join(", ")))),
+        _ => return Err(Error::config(format!("losses.{name}"), "unknown loss", format!("one of {}", LOSSES.join(", ")))),
     })
 }
 
-/// The objective that a config describes, for a number of training views.
+/// Creates the objective that a config describes. `views` is the number of training views.
 pub fn objective<T: Real>(config: &Config, views: usize) -> Result<Objective<T>> {
     if const { is_single::<T>() } { single::objective(config, views).map(cast) } else { of_config(config, views) }
 }

@@ -1,10 +1,10 @@
-//! How a stage learns: its optimizer and its learning rates.
+//! Optimizers and learning rates of stages.
 
 use super::config::{Config, OptimizerConfig, Stage};
 use autograd::Real;
 use autograd::optim::{Adam, AdamMode, Exponential, Momentum, Optimizer, Rates, RmsProp, Schedule, Sgd, WarmUp};
 
-/// A fresh optimizer for a stage.
+/// Creates the optimizer of a stage.
 pub fn optimizer<T: Real>(config: &Config, stage: &Stage, steps: u64) -> Box<dyn Optimizer<T>> {
     let Stage { color_rate: of_color, harmonics_rate, .. } = *stage;
     let of_harmonics = harmonics_rate.unwrap_or(of_color);
@@ -22,15 +22,15 @@ pub fn optimizer<T: Real>(config: &Config, stage: &Stage, steps: u64) -> Box<dyn
     }
 }
 
-/// Learning rate of the density over the steps of a stage.
+/// Returns the learning rate of the density over the steps of a stage.
 fn density_rate(stage: &Stage, steps: u64) -> Box<dyn Schedule> {
-    // svox2's.
+    // Initial factor of the warm-up in svox2.
     const FIRST: f64 = 0.01;
     let whole = rate(stage.density_rate, stage.rate_decay, steps);
     if stage.density_warm_up == 0 { whole } else { Box::new(WarmUp::new(whole, FIRST, stage.density_warm_up)) }
 }
 
-/// Learning rate of colors or harmonics that begins with `start`.
+/// Returns the learning rate of colors or harmonics over the steps of a stage. `start` is the rate of the first step.
 fn color_rate(stage: &Stage, start: f64, steps: u64) -> Box<dyn Schedule> {
     rate(start, stage.color_decay(), steps)
 }
@@ -63,7 +63,7 @@ mod tests {
             let change = first.steps.unwrap();
             let (stage, at) = if step < change { (first, step) } else { (second, step - change) };
             let steps = stage.steps.unwrap();
-            // A unit of length is 2/3 of one there.
+            // svox2 shrinks the world by 2/3, so its unit of length is 1.5 here.
             let found = [1.5 * density_rate(stage, steps).at(at), color_rate(stage, stage.color_rate, steps).at(at)];
             for (found, published) in found.into_iter().zip([density, color]) {
                 assert!((found / published - 1.0).abs() < 0.005, "step {step}: {found}, published {published}");

@@ -1,4 +1,5 @@
-//! The instances in `f32` that this crate compiles, so that crates with losses of their own need not ([`autograd::single`]).
+//! Instances for `f32` that are compiled in this crate, so that crates with losses of their own do not compile them again
+//! ([`autograd::single`]).
 
 use super::config::{Config, Stage};
 use super::objective::of_config;

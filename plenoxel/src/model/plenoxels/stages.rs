@@ -1,4 +1,4 @@
-//! Changes of the grid between stages: it is resampled at a finer resolution, and empty space is left out.
+//! Changes of the grid between stages: resampling at a finer resolution, and pruning of empty voxels.
 
 use super::config::{Scout, Stage};
 use super::start::Silhouettes;
@@ -12,17 +12,17 @@ use crate::render::RenderOptions;
 use crate::sampling::{Jitter, Occupancy};
 use autograd::{Real, release_free_buffers};
 
-/// Rays that are rendered at a time to find out which voxels are seen: it bounds the memory.
+/// Number of rays rendered at a time when finding visible voxels. It bounds the memory.
 const RAYS_PER_BATCH: usize = 1 << 15;
 
 impl<T: Real> Plenoxels<T> {
-    /// Begins a stage.
+    /// Prepares the grid and the rays for a stage.
     pub(super) fn begin(&mut self, index: usize, rays: &mut RaySource) -> Result<()> {
         let stage = self.stages[index];
         if let Some(scout) = self.config.scout.as_ref().filter(|_| (1..=self.scouts).contains(&index)) {
             self.grid = self.after_scout(scout, index, rays)?;
         }
-        // Which voxels there will be is found out by densities alone: with all their colors, those that go at once may not fit into memory.
+        // The densities alone determine which voxels will exist. With all colors, voxels that are pruned at once might not fit into memory.
         release_free_buffers();
         let changes = stage.resolution != self.grid.shape().resolution;
         let mut outline = self.grid.outline();
@@ -55,7 +55,7 @@ impl<T: Real> Plenoxels<T> {
         Ok(())
     }
 
-    /// The grid that a stage of the scout leaves to the next stage.
+    /// Returns the grid of stage `index` that follows a stage of the scout.
     fn after_scout(&self, scout: &Scout, index: usize, rays: &RaySource) -> Result<VoxelGrid<T>> {
         let kept = self.worth_keeping(&self.grid, &self.stages[index - 1], Some(scout), rays)?;
         let initial = self.config.initial_of(index < self.scouts);
@@ -63,8 +63,9 @@ impl<T: Real> Plenoxels<T> {
         Ok(start::scouted(&self.grid, &kept, rays.views(), self.config.carve.margin, resolution, &initial))
     }
 
-    /// An outline at the resolution of a stage. After a scout, whose cube was as coarse as its voxels, it loses what is not worth keeping
-    /// first, and the cube shrinks to the rest: the coarse voxels tell as much in a fraction of the time.
+    /// Returns an outline at the resolution of a stage. After a scout, the cube is only as tight as the scout's large voxels allow. The
+    /// outline is therefore pruned before it is resampled, and the cube shrinks to the kept voxels. At the coarse resolution this takes a
+    /// fraction of the time.
     fn refined(&self, outline: VoxelGrid<T>, index: usize, rays: &RaySource) -> Result<VoxelGrid<T>> {
         let resolution = self.stages[index].resolution;
         if self.scouts == 0 || !self.prunes(index) {
@@ -75,24 +76,25 @@ impl<T: Real> Plenoxels<T> {
         Ok(outline.pruned(&kept).resample_in(resolution, half_width))
     }
 
-    /// Errors if pruning leaves more than memory has room for.
+    /// Errors if pruning leaves more rows than fit into memory.
     fn check_rows(&self, outline: &VoxelGrid<T>) -> Result<()> {
         let (rows, resolution, most) = (outline.lattice().rows(), outline.shape().resolution, self.most_rows);
         if rows <= most {
             return Ok(());
         }
-        let found = format!("{rows} voxels that would be left at {resolution}³, where memory has room for {most}");
-        Err(Error::config("prune_unseen_below", found, "a larger share of a pixel; or fewer voxels a side in the last stages"))
+        let found = format!("pruning would leave {rows} voxels at {resolution}³, memory has room for {most}");
+        Err(Error::config("prune_unseen_below", found, "a larger value, or a lower resolution in the last stages"))
     }
 
-    /// Leaves the rays out that pass what is left of the grid, if the config says so.
+    /// Restricts training rays to the remaining voxels, if the config sets `aim`.
     pub(super) fn aim(&self, reach: Option<&Occupancy>, rays: &mut RaySource) {
         if let Some(reach) = reach.filter(|_| self.config.aim) {
             rays.aim_at(reach);
         }
     }
 
-    /// The first stage that begins by pruning, if one does: the config counts those too that a start from a grid has left out.
+    /// Returns the first stage that begins with pruning, if any. The index refers to [`Plenoxels::stages`]: it accounts for the scout's
+    /// stages and for stages that were left out because training starts from a grid.
     pub fn prunes_from(&self) -> Option<usize> {
         let left_out = self.config.stages.len() + self.scouts - self.stages.len();
         self.config.prune_from_stage.map(|first| self.scouts + first.saturating_sub(left_out))
@@ -102,9 +104,10 @@ impl<T: Real> Plenoxels<T> {
         self.prunes_from().is_some_and(|first| index >= first)
     }
 
-    /// The voxels that pruning leaves, or that a scout does: those that hold matter and, if the config asks for it, that a training ray sees.
+    /// Returns the voxels that pruning or a scout keeps: voxels that hold matter and, if the config sets a threshold, are visible in a
+    /// training ray.
     ///
-    /// Errors if they are none.
+    /// Errors if no voxel is kept.
     fn worth_keeping(&self, grid: &VoxelGrid<T>, stage: &Stage, scout: Option<&Scout>, rays: &RaySource) -> Result<Occupancy> {
         let (below, least) = (self.config.prune_below, scout.map_or(self.config.prune_unseen_below, |scout| scout.prune_unseen_below));
         let full = grid.occupancy(below);
@@ -116,15 +119,16 @@ impl<T: Real> Plenoxels<T> {
             Some(_) => format!("set prune_below lower than {below}, or scout.prune_unseen_below lower than {least}"),
             None => format!("set prune_below lower than {below}, prune_unseen_below lower than {least}, or prune_from_stage later"),
         };
-        // The trainer says at which step.
-        Err(Error::Numeric { place: String::new(), found: "pruning would leave nothing".to_owned(), remedy })
+        // The trainer adds the number of the step.
+        Err(Error::Numeric { place: String::new(), found: "pruning would remove every voxel".to_owned(), remedy })
     }
 
-    /// The voxels that weigh at least so much in a pixel, and those around.
+    /// Returns the voxels whose largest weight in a pixel is at least `least`, dilated by a margin.
     fn seen(&self, grid: &VoxelGrid<T>, stage: &Stage, least: f64, rays: &RaySource) -> Occupancy {
-        // svox2's: its weights are of the samples around a voxel, and what lies behind a surface must stay for the surface to move.
+        // As in svox2: its weights are attributed to the samples around a voxel, and voxels behind a surface must stay so that the surface
+        // can move.
         const MARGIN: usize = 2;
-        // Where less light is left, no sample weighs as much.
+        // No sample weighs more than the transmittance before it.
         let stop_below = self.config.stop_below.max(least);
         let options = RenderOptions { stop_below, ..self.config.render_options(grid, stage.sampling, Jitter::None) };
         let stride = rays.stride(grid.shape().voxel_side(), grid.aabb());
@@ -157,7 +161,7 @@ mod tests {
         Config { scout, prune_from_stage, prune_unseen_below: 0.1, hull: Hull::Off, stages, ..Config::default() }
     }
 
-    /// The grid with which a stage begins if the one before learned matter of a density at these distances from the origin.
+    /// Returns the initial grid of a stage if the previous stage learned `density` at these distances from the origin.
     fn after(config: Config, stage: usize, matter: Range<f64>, density: f64) -> Result<VoxelGrid<f64>> {
         let views = views();
         let trainer = Trainer::<f64>::new(config, &views[..]).unwrap();
@@ -205,7 +209,7 @@ mod tests {
 
     #[test]
     fn thin_matter_is_nothing_to_a_scout_and_something_to_pruning_which_say_what_to_lower() {
-        // A sample of it weighs about a fifth of a pixel.
+        // A sample weighs about a fifth of a pixel.
         let refusal = |result: Result<VoxelGrid<f64>>| result.err().map(|e| e.to_string()).unwrap_or_default();
         let said = refusal(after(config(Some(24), None), 1, 0.0..0.4, 4.0));
         assert!(said.contains("scout.prune_unseen_below lower than 0.5") && !said.contains("prune_from_stage"), "{said}");

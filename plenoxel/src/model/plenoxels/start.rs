@@ -1,4 +1,4 @@
-//! What training may know before its first step: silhouettes, and a grid that was there before.
+//! Initial knowledge of training: silhouettes, and an existing grid.
 
 use super::config::{Config, Hull, Initial};
 use crate::carve::visual_hull;
@@ -14,10 +14,10 @@ use autograd::{Real, Tensor};
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
-/// Voxels along each axis of the hull that the cube is fitted to.
+/// Resolution of the visual hull that the cube is fitted to.
 const COARSE: usize = 64;
 
-/// Silhouettes of the training views, where the config lets them decide and the images have alpha.
+/// Silhouettes of the training views, for configs that use them and images with an alpha channel.
 #[derive(Debug)]
 pub struct Silhouettes {
     views: Arc<[View]>,
@@ -27,27 +27,27 @@ pub struct Silhouettes {
 }
 
 impl Silhouettes {
-    /// `None` if the config does not let them decide, or there are none.
+    /// Returns `None` if the config does not use silhouettes, or if the images have no alpha channel.
     pub fn new(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Option<Self> {
         let margin = config.carve.margin;
         (config.hull == Hull::Auto && has_alpha(views)).then(|| Silhouettes { views: views.clone(), margin, progress })
     }
 
-    /// The half width of the smallest cube around the origin that holds all that the silhouettes leave of the cube of `half_width`; `None` if they
-    /// leave nothing.
+    /// Returns the half width of the smallest cube around the origin that contains the visual hull inside the cube of `half_width`. Returns
+    /// `None` if the hull is empty.
     pub fn half_width(&self, half_width: f64) -> Option<f64> {
         let cube = Aabb::cube(half_width);
         let hull = |done: &dyn Fn(usize)| visual_hull::by_footprint(&self.views, cube, [COARSE; 3], self.margin, done);
         self.progress.of(self.views.len(), hull).half_width()
     }
 
-    /// The error if no voxel lies within the silhouettes of all views.
+    /// Returns the error for an empty visual hull.
     pub fn nothing_inside() -> Error {
-        let found = "\"auto\", where no voxel of the box lies within the silhouettes of all views,";
-        Error::config("hull", found, "\"off\"; or a half_width whose box holds the object; or another run to start from")
+        let found = "\"auto\", but no voxel of the box lies within the silhouettes of all views";
+        Error::config("hull", found, "\"off\"; or a half_width whose box contains the object; or another run to start from")
     }
 
-    /// The voxels of a grid that a sample inside of the silhouettes can read.
+    /// Returns the voxels of a grid that a sample inside the silhouettes can read.
     pub fn voxels<T: Real>(&self, grid: &VoxelGrid<T>) -> Occupancy {
         let shape = grid.shape();
         let near = shape.reached_from(&grid.voxels_where(|_| true));
@@ -56,9 +56,9 @@ impl Silhouettes {
     }
 }
 
-/// What a scout leaves to the stage after it: a grid at another resolution, as training starts, in the cube around what is worth keeping, with
-/// those voxels that read one of its visual hull. What of the hull lies outside of the cube is lost. `margin` is that of
-/// [`visual_hull::by_footprint`], in pixels of these views.
+/// Returns the initial grid of the stage after a scout. It has the given resolution and the values of `initial`, fills the smallest cube
+/// around the kept voxels, and contains the voxels that a sample in their visual hull reads. Parts of the hull outside of the cube are
+/// lost. `margin` is the margin of [`visual_hull::by_footprint`], in pixels of these views.
 pub fn scouted<T: Real>(
     grid: &VoxelGrid<T>,
     kept: &Occupancy,
@@ -74,9 +74,11 @@ pub fn scouted<T: Real>(
     whole.pruned(&near.voxels_where(|_| true))
 }
 
-/// Some voxels, and those among others that the visual hull of their silhouettes has: what they hide, and what no view rules out.
+/// Returns `matter` and the voxels of `among` in the visual hull of its silhouettes: voxels that it hides, and voxels that no view rules
+/// out.
 ///
-/// What few rays get to, such as the ground under a machine, is fog or nothing to a scout; where no voxels are, nothing can be learned.
+/// A scout leaves fog, or nothing, where few rays pass, for example the ground under a machine. Without voxels nothing could be learned
+/// there.
 fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -> Occupancy {
     let Some(extent) = matter.extent() else { return matter.clone() };
     let walk = Walk::new(matter.aabb(), matter.cells()).within(extent);
@@ -93,15 +95,15 @@ fn hull_of(matter: &Occupancy, among: &Occupancy, views: &[View], margin: f64) -
         );
         found
     };
-    // A ray may pass by the thinnest.
+    // Rays may miss the thinnest voxels, so `matter` is added.
     visual_hull::by_silhouettes(views, shows_matter, among, margin, &|_| ()).union(matter)
 }
 
-/// A carved grid whose voxels that no pixel shows have a color, the same for each channel, instead of zeros. As black as that their colors would be
-/// clamped, and have no gradient, if training finds that they are seen after all.
+/// Replaces the zero colors of a carved grid, of voxels that no pixel shows, by `color` in each channel. Zero colors would be clamped and
+/// have no gradient if training finds that the voxels are visible.
 pub fn with_unseen_colors<T: Real>(grid: &VoxelGrid<T>, color: f64) -> VoxelGrid<T> {
     if grid.shape().color != Color::Rgb {
-        // Coefficients of 0 are the color of the offset.
+        // Zero coefficients mean the color of the offset.
         return grid.with_density(grid.density.tensor().detach());
     }
     let mut colors = grid.color.tensor().data().to_vec();
@@ -111,16 +113,16 @@ pub fn with_unseen_colors<T: Real>(grid: &VoxelGrid<T>, color: f64) -> VoxelGrid
     VoxelGrid::with_tables(*grid.shape(), grid.lattice().clone(), tables)
 }
 
-/// A grid as training with a shape can start from it: resampled if the resolution is another, and with a layer of empty voxels around where
-/// trilinear look-up will read them. The box stays that of the grid.
+/// Prepares a grid for training with a shape: resamples it if the resolution differs, and adds a layer of empty voxels that trilinear
+/// interpolation will read. The grid keeps its box.
 pub fn adapted<T: Real>(grid: &VoxelGrid<T>, shape: &GridShape) -> VoxelGrid<T> {
     let same = grid.shape().resolution == shape.resolution;
     let resampled = (!same).then(|| grid.resample(shape.resolution));
     let grid = resampled.as_ref().unwrap_or(grid);
-    // Before colors change: zeros are then those of voxels that nobody saw.
+    // Grow before colors change: zeros still mark voxels that no pixel shows.
     let grown = (shape.interpolation == Interpolation::Trilinear).then(|| grid.grown());
     let grid = grown.as_ref().unwrap_or(grid);
-    // Harmonics last, so that they are averaged over what training will see.
+    // Reduce harmonics last, so that they are averaged over the voxels that training will use.
     grid.with_color(shape.color).with_interpolation(shape.interpolation).with_reduction(shape.sh_reduction)
 }
 
@@ -148,7 +150,7 @@ mod tests {
             assert!(r >= 0.65 || hull.contains(place), "{place:?} is in the ball of radius 0.65, at {r}");
             assert!(r <= 0.95 || !hull.contains(place), "{place:?} is beside it, at {r}");
         }
-        // Matter so thin that rays of all pixels pass it by is matter all the same, and nothing hides nothing.
+        // Matter that rays of all pixels miss is kept, and empty matter has an empty hull.
         let coarse: Vec<View> = views.iter().map(|view| view.reduced(32)).collect();
         let mut one = vec![false; cells.pow(3)];
         assert_eq!(hull_of(&of(&one), &all, &views, 0.5).fraction(), 0.0);

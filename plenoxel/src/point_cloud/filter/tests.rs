@@ -5,12 +5,12 @@ fn number(seed: u64, i: usize) -> f64 {
     uniform(seed, Purpose::Initial, 7, i as u64)
 }
 
-/// Points as files have them: 32 bits.
+/// Rounds a point to 32 bits, as in files.
 fn rounded(p: DVec3) -> DVec3 {
     p.as_vec3().as_dvec3()
 }
 
-/// Random points near a bent surface, some of them twice, and a few far away.
+/// Returns random points near a curved surface, some of them twice, and a few far away.
 fn scattered(n: usize, seed: u64) -> Vec<DVec3> {
     let point = |i: usize| {
         let [u, v, w] = [0, 1, 2].map(|a| number(seed, 3 * i + a));
@@ -22,7 +22,7 @@ fn scattered(n: usize, seed: u64) -> Vec<DVec3> {
     (0..n).map(|i| rounded(point(if i % 40 == 39 { i - 1 } else { i }))).collect()
 }
 
-/// A ball of voxels with holes, in the world coordinates of a grid.
+/// Returns a ball of voxels with holes, in world coordinates of a grid.
 fn lattice(seed: u64) -> Vec<DVec3> {
     let (n, side) = (11, 0.0234375 * 1.1);
     let voxels = (0..n * n * n).map(|v| DVec3::new((v / (n * n)) as f64, (v / n % n) as f64, (v % n) as f64));
@@ -34,7 +34,7 @@ fn kept(points: &[DVec3], filters: &Filters) -> Vec<u32> {
     filters.apply(points, None).unwrap().0
 }
 
-/// The definition, with all distances: a list of every distance, sorted, without the point itself.
+/// Computes outliers by definition, from the sorted list of all distances without the point itself.
 fn outliers_by_definition(points: &[DVec3], k: usize, sigma: f64) -> Vec<u32> {
     let mut means = Vec::new();
     for (i, p) in points.iter().enumerate() {
@@ -50,8 +50,8 @@ fn outliers_by_definition(points: &[DVec3], k: usize, sigma: f64) -> Vec<u32> {
     (0..points.len() as u32).filter(|&i| f64::from(means[i as usize]) <= limit).collect()
 }
 
-/// The smallest eigenvalue of a symmetric matrix in closed form (Smith 1961), and an eigenvector as the largest cross product of two rows of
-/// the matrix without it.
+/// Returns the smallest eigenvalue of a symmetric matrix in closed form (Smith 1961), and an eigenvector: the largest cross product of two
+/// rows of the matrix minus the eigenvalue.
 fn smallest_eigen(a: glam::DMat3) -> (f64, DVec3) {
     let q = (a.x_axis.x + a.y_axis.y + a.z_axis.z) / 3.0;
     let b = a - glam::DMat3::from_diagonal(DVec3::splat(q));
@@ -64,8 +64,8 @@ fn smallest_eigen(a: glam::DMat3) -> (f64, DVec3) {
     (value, vector.normalize())
 }
 
-/// The definition, with all points and the deviations measured one by one: how far beyond the limit each point is; infinite for isolated
-/// ones, and 1 for those whose three neighbours make no plane.
+/// Computes noise by definition, from all points and each deviation: the distance of each point beyond the limit. Infinite for isolated
+/// points, 1 for points whose three neighbours define no plane.
 fn noise_by_definition(points: &[DVec3], radius: f64, error: NoiseError) -> Vec<f64> {
     let one = |i: usize| {
         let near = |q: &DVec3| f64::from((q.as_vec3() - points[i].as_vec3()).length()) <= radius;
@@ -112,7 +112,7 @@ fn noise_is_that_of_the_definition() {
         // Few neighbours, many, nearly all, all: the cloud is 14 across.
         for radius in [0.05, 0.12, 0.5, 5.0, 20.0] {
             let beyond = noise_by_definition(&points, radius, error);
-            // On the limit but for rounding: the filter keeps these, and allows for 8 ε of the largest coordinate, which is 8.
+            // On the limit up to rounding: the filter keeps these. It allows for 8 ε of the largest coordinate, which is 8.
             let undecided = |b: f64| b > -1e-7 && b < 1e-5;
             assert!(beyond.iter().filter(|b| b.abs() > 1e-7 && undecided(**b)).count() <= 3, "{radius} {error:?}");
             for remove_isolated in [false, true] {
@@ -130,7 +130,7 @@ fn noise_is_that_of_the_definition() {
 
 #[test]
 fn a_radius_that_holds_the_whole_cloud_is_not_asked_of_each_pair() {
-    // 10¹⁰ pairs, which would take minutes.
+    // Comparing 10¹⁰ pairs would take minutes.
     let points = scattered(100_000, 12);
     let noise = |radius| Noise { radius, error: NoiseError::Relative(1.0), remove_isolated: true };
     let [all, more] = [20.0, 1e9].map(|radius| kept(&points, &Filters { noise: Some(noise(radius)), ..Filters::default() }));
@@ -139,9 +139,9 @@ fn a_radius_that_holds_the_whole_cloud_is_not_asked_of_each_pair() {
 
 #[test]
 fn of_a_solid_cube_of_voxels_the_noise_filter_takes_the_corners() {
-    // With a radius of 1.28 sides the neighbours are those across a face. Inside, on faces and on edges the point is as near to their plane
-    // as they are: on an edge, with neighbours ±x, +y, +z, their plane has the normal (0, 1, 1) / √2 and the distances ±1 / (2 √2) from the
-    // mean, and so has the point: equal but for rounding. At a corner the three neighbours lie in a plane, 1 / √3 away.
+    // With a radius of 1.28 sides, the neighbours are those across a face. Inside, on faces and on edges the point is as close to their
+    // plane as they are. On an edge with neighbours ±x, +y, +z the plane has the normal (0, 1, 1) / √2, and the distances from the mean are
+    // ±1 / (2 √2), also for the point: equal up to rounding. At a corner the three neighbours lie in a plane at distance 1 / √3.
     for (side, origin) in [(1.0, 0.0), (0.0234375, -1.47), (0.1, 3.3)] {
         let voxels = (0..64).map(|v| DVec3::new(f64::from(v / 16), f64::from(v / 4 % 4), f64::from(v % 4)));
         let points: Vec<DVec3> = voxels.map(|p| rounded((p + 0.5) * side + origin)).collect();
@@ -170,7 +170,7 @@ fn filters_are_applied_one_after_the_other_and_say_what_they_did() {
     assert!((report[0].before, report[0].after) == (400, 398) && report[4].after == got.len());
     assert!(report.windows(2).all(|pair| pair[0].after == pair[1].before && pair[1].after < pair[1].before), "{report:?}");
 
-    // The same by hand.
+    // The same filters, applied one by one.
     let chosen = |left: &[u32]| left.iter().map(|&i| points[i as usize]).collect::<Vec<_>>();
     let within = |i: &u32| points[*i as usize].y <= 0.9 && points[*i as usize].x <= 1.0 && points[*i as usize].max_element() <= 2.0;
     let first: Vec<u32> = (0..400).filter(|i| points[*i as usize].is_finite() && within(i) && values[*i as usize] >= 0.25).collect();
@@ -183,7 +183,7 @@ fn filters_are_applied_one_after_the_other_and_say_what_they_did() {
 
 #[test]
 fn points_far_from_the_origin_are_filtered_like_those_near_it() {
-    // Whole multiples of 2⁻¹⁰: exact in 32 bits near the origin, and in 64 anywhere.
+    // Multiples of 2⁻¹⁰ are exact in 32 bits near the origin, and in 64 bits anywhere.
     let near: Vec<DVec3> = scattered(500, 8).iter().map(|p| (p * 1024.0).round() / 1024.0).collect();
     let far: Vec<DVec3> = near.iter().map(|p| p + DVec3::new(431_000.0, 5_412_000.0, 300.0)).collect();
     let outliers = Filters { outliers: Some(Outliers { neighbours: 6, sigma: 1.0 }), ..Filters::default() };
@@ -226,7 +226,7 @@ fn settings_that_fit_no_point_are_refused() {
 
 #[test]
 fn points_that_32_bits_do_not_hold_go_and_do_no_harm() {
-    // Noise once counted the neighbours of such a point, without itself, and there were -1.
+    // Regression test: the noise filter counted -1 neighbours of such a point.
     let mut points = scattered(50, 3);
     points.extend([DVec3::new(1e39, 0.0, 0.0), DVec3::new(0.0, -1e308, 0.0), DVec3::new(3e38, 0.0, -3e38), DVec3::splat(f64::INFINITY)]);
     let noise = Noise { radius: 0.75, error: NoiseError::Relative(1.0), remove_isolated: false };

@@ -15,7 +15,7 @@ const SHAPE: GridShape = GridShape {
     sh_reduction: 1,
 };
 
-/// A grid with the densities and coefficients that functions of a voxel name.
+/// Creates a grid from functions of density and coefficients.
 fn grid(shape: GridShape, density: impl Fn([usize; 3]) -> f64, color: impl Fn([usize; 3], usize) -> f64) -> VoxelGrid<f64> {
     let n = shape.resolution;
     let voxels: Vec<[usize; 3]> = (0..n * n * n).map(|v| [v / (n * n), v / n % n, v % n]).collect();
@@ -29,7 +29,7 @@ fn options() -> VoxelOptions<'static> {
     VoxelOptions { coordinates: Coordinates::World, color: ColorFrom::Mean, min_alpha: 0.0, visible: None }
 }
 
-/// Parallel rays along −z over the whole front, or along +z over the whole back, one through the middle of each column of voxels.
+/// Returns parallel rays along −z over the whole front, or along +z over the whole back, one through the centre of each column of voxels.
 fn rays(sign: f64) -> Vec<Ray> {
     let at = |k: usize| (k as f64 + 0.5) * 0.5 - 2.0;
     let ray = |i: usize| Ray { origin: DVec3::new(at(i / 8), at(i % 8), -4.0 * sign), direction: DVec3::Z * sign, stretch: 1.0 };
@@ -70,7 +70,7 @@ fn points_are_the_centers_of_dense_voxels_with_opacity_and_density() {
     assert_eq!(cloud.field("weight"), None);
     // ½ + Y₀ c for c = 0, 1, 2, whatever the other coefficients: 0.5, 0.782, 1.06.
     assert_eq!(cloud.colors, Some(vec![[128, 199, 255]; 2]));
-    // Into +z the second coefficient counts, 0.4886 z, and the others do not: 0.5 + 9 · 0.4886 is more than white.
+    // Along +z only the second coefficient has an effect, 0.4886 z: 0.5 + 9 · 0.4886 is above white.
     let toward = points(&grid, &VoxelOptions { color: ColorFrom::Direction(DVec3::Z), ..options() });
     assert_eq!(toward.colors.unwrap()[0], [255, 255, 255]);
     let away = points(&grid, &VoxelOptions { color: ColorFrom::Direction(-DVec3::Z), ..options() });
@@ -82,7 +82,7 @@ fn points_are_the_centers_of_dense_voxels_with_opacity_and_density() {
 
 #[test]
 fn a_color_along_a_direction_is_what_a_ray_shows_and_not_what_a_voxel_holds_alone() {
-    // A thin black voxel before an opaque white one: ½ ± Y₀ · 1.7725.
+    // A thin black voxel in front of an opaque white one: ½ ± Y₀ · 1.7725.
     let density = |v: [usize; 3]| match v {
         [1, 2, 3] => 0.1,
         [1, 2, 4] => 1000.0,
@@ -91,7 +91,7 @@ fn a_color_along_a_direction_is_what_a_ray_shows_and_not_what_a_voxel_holds_alon
     let grid = grid(SHAPE, density, |[.., z], c| if c % 4 > 0 { 0.0 } else { (z as f64 - 3.5) * 2.0 * 1.772_453_85 });
     let color = |color| points(&grid, &VoxelOptions { color, ..options() }).colors.unwrap()[0];
     assert_eq!(color(ColorFrom::Mean), [0; 3]);
-    // The black one lets e^(-0.1 · 0.5) = 0.951 through; from the other side the white one hides it.
+    // The black voxel transmits e^(-0.1 · 0.5) = 0.951. From the other side the white voxel hides it.
     assert_eq!(color(ColorFrom::Direction(DVec3::Z)), [243; 3]);
     assert_eq!(color(ColorFrom::Direction(-DVec3::Z)), [255; 3]);
 }
@@ -108,7 +108,7 @@ fn normals_point_out_of_matter() {
     let coordinates = VoxelOptions { coordinates: Coordinates::Grid, ..options() };
     let half = points(&solid(&|v| v.y <= 3.0), &coordinates);
     assert!(normal_at(&half, DVec3::new(4.0, 3.0, 4.0)).abs_diff_eq(DVec3::Y, 1e-6));
-    // Nothing changes inside, and beyond the grid there is nothing.
+    // Inside nothing changes, and outside of the grid space is empty.
     assert_eq!(normal_at(&half, DVec3::new(4.0, 1.0, 4.0)), DVec3::ZERO);
     assert!(normal_at(&half, DVec3::new(4.0, 0.0, 4.0)).abs_diff_eq(-DVec3::Y, 1e-6));
     let slope = points(&solid(&|v| v.x + v.z <= 7.0), &coordinates);
@@ -137,7 +137,8 @@ fn colors_are_those_that_cameras_see_and_voxels_that_nobody_sees_are_left_out() 
         assert!(cloud.colors.unwrap().iter().all(|c| *c == [252, 128, 128]));
         assert!(cloud.fields.iter().any(|f| f.name == "weight" && f.values.iter().all(|w| *w > 0.99)));
 
-        // From both sides each layer is seen from one; where photographs show the background nothing is an object, whatever its weight.
+        // From both sides, each layer is visible from one side. Voxels in front of background pixels are not objects, whatever their
+        // weight.
         let both = seen(&slab, [(rays(1.0), vec![1.0; 64]), (rays(-1.0), vec![0.0; 64])], &look(&slab));
         let of = |min_object: f64| Some(Visible { seen: &both, min_weight: 0.0, min_object });
         assert_eq!(points(&slab, &VoxelOptions { visible: of(0.5), ..options() }).len(), 64, "{interpolation:?}");
@@ -148,7 +149,7 @@ fn colors_are_those_that_cameras_see_and_voxels_that_nobody_sees_are_left_out() 
 #[test]
 fn reduced_harmonics_are_seen_as_whole_ones_are() {
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
-        // Means of all kinds, harmonics that are the same everywhere.
+        // Arbitrary means, constant harmonics.
         let whole = grid(
             SHAPE.with(interpolation),
             |[x, y, z]| ((x * 7 + y * 3 + z * 5) % 11) as f64 * 0.3,

@@ -1,16 +1,16 @@
-//! The header of a PLY file: what the bytes after it mean.
+//! Header of a PLY file: the layout of the data.
 
 use crate::error::{Error, Result};
 use std::path::Path;
 
-/// How numbers are written.
+/// Encoding of numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Encoding {
-    /// As text, separated by white space.
+    /// Text, separated by white space.
     Ascii,
-    /// Least byte first.
+    /// Binary, least significant byte first.
     LittleEndian,
-    /// Greatest byte first.
+    /// Binary, most significant byte first.
     BigEndian,
 }
 
@@ -35,7 +35,7 @@ pub enum Number {
     F64,
 }
 
-/// Every type with the names it has in files, the usual one first.
+/// All types with their names in files, the usual name first.
 const NUMBERS: [(Number, [&str; 2]); 8] = [
     (Number::I8, ["char", "int8"]),
     (Number::U8, ["uchar", "uint8"]),
@@ -52,12 +52,12 @@ impl Number {
         NUMBERS.iter().find(|(_, names)| names.contains(&name)).map(|(number, _)| *number)
     }
 
-    /// Its usual name.
+    /// Returns the usual name of the type.
     pub fn name(self) -> &'static str {
         NUMBERS.iter().find(|(number, _)| *number == self).map_or("float", |(_, names)| names[0])
     }
 
-    /// Bytes of one.
+    /// Returns the size in bytes.
     pub fn size(self) -> usize {
         match self {
             Number::I8 | Number::U8 => 1,
@@ -68,37 +68,37 @@ impl Number {
     }
 }
 
-/// What a property is.
+/// Kind of a property.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// One number.
+    /// Single number.
     Scalar(Number),
-    /// A number of items, and the items.
+    /// List: the type of its length, and the type of its items.
     List(Number, Number),
 }
 
-/// A column of an element.
+/// Property of an element: a column.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Property {
-    /// As the file has it.
+    /// Name, as in the file.
     pub name: String,
-    /// What it is.
+    /// Kind of the property.
     pub kind: Kind,
 }
 
-/// A table of the file.
+/// Element of the file: a table.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Element {
-    /// As the file has it.
+    /// Name, as in the file.
     pub name: String,
-    /// Its rows.
+    /// Number of rows.
     pub count: usize,
-    /// Its columns.
+    /// Columns.
     pub properties: Vec<Property>,
 }
 
 impl Element {
-    /// Bytes of a binary row; `None` if lists make rows differ.
+    /// Returns the bytes of a binary row; `None` if lists make the lengths of rows differ.
     pub fn stride(&self) -> Option<usize> {
         self.properties
             .iter()
@@ -109,7 +109,7 @@ impl Element {
             .sum()
     }
 
-    /// The fewest bytes that a row can take: each number of a text is a digit and a space.
+    /// Returns the smallest possible size of a row in bytes. A number in a text takes at least a digit and a space.
     pub fn least_size(&self, encoding: Encoding) -> usize {
         let binary = |p: &Property| match p.kind {
             Kind::Scalar(number) | Kind::List(number, _) => number.size(),
@@ -121,28 +121,28 @@ impl Element {
     }
 }
 
-/// All that stands above the data.
+/// Header of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Header {
-    /// How the data are written.
+    /// Encoding of the data.
     pub encoding: Encoding,
-    /// Lines that begin with `comment` or `obj_info`, in their order.
+    /// Lines that begin with `comment` or `obj_info`, in order.
     pub remarks: Vec<String>,
-    /// Tables, in the order of the data.
+    /// Elements, in the order of the data.
     pub elements: Vec<Element>,
-    /// Where the data begin.
+    /// Offset of the data in the file.
     pub length: usize,
 }
 
 impl Header {
-    /// Reads the lines from `ply` to `end_header`.
+    /// Parses the lines from `ply` to `end_header`.
     ///
-    /// Errors name the line: not a PLY file, cut short, an unknown format or type.
+    /// Errors if the file is not a PLY file, is truncated, or has an unknown format or type; the error names the line.
     pub fn parse(path: &Path, file: &[u8]) -> Result<Self> {
         let write_again = "write the cloud again as PLY 1.0";
         if !file.starts_with(b"ply") {
             let start: String = String::from_utf8_lossy(&file[..file.len().min(16)]).escape_debug().collect();
-            return Err(Error::input(path, format!("no PLY file: it begins with `{start}`"), "give a file that begins with `ply`"));
+            return Err(Error::input(path, format!("no PLY file: it begins with `{start}`"), "use a file that begins with `ply`"));
         }
         let (mut encoding, mut remarks, mut elements) = (None, Vec::new(), Vec::<Element>::new());
         let mut at = 0;
@@ -160,7 +160,7 @@ impl Header {
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words[..] {
                 ["ply"] if number == 1 => {}
-                _ if number == 1 => return bad("the first line must be `ply` alone"),
+                _ if number == 1 => return bad("accepted: `ply` as the first line"),
                 [] => {}
                 ["comment" | "obj_info", ..] => remarks.push(line.to_owned()),
                 ["format", name, _version] => {
@@ -168,12 +168,12 @@ impl Header {
                         "ascii" => Encoding::Ascii,
                         "binary_little_endian" => Encoding::LittleEndian,
                         "binary_big_endian" => Encoding::BigEndian,
-                        _ => return bad("ascii, binary_little_endian and binary_big_endian are read"),
+                        _ => return bad("accepted: ascii, binary_little_endian, binary_big_endian"),
                     });
                 }
                 ["element", name, count] => match count.parse() {
                     Ok(count) => elements.push(Element { name: name.to_owned(), count, properties: Vec::new() }),
-                    Err(_) => return bad("`element NAME COUNT` is expected, the count being a whole number"),
+                    Err(_) => return bad("accepted: `element NAME COUNT`, where COUNT is a whole number"),
                 },
                 ["property", ref kind @ .., name] => {
                     let kind = match *kind {
@@ -186,14 +186,14 @@ impl Header {
                     };
                     let Some(kind) = kind else {
                         return bad(
-                            "`property TYPE NAME` or `property list TYPE TYPE NAME` is expected; types: char, uchar, short, ushort, int, uint, float, double",
+                            "accepted: `property TYPE NAME` or `property list TYPE TYPE NAME`; types: char, uchar, short, ushort, int, uint, float, double",
                         );
                     };
-                    let Some(element) = elements.last_mut() else { return bad("a property must stand below an element") };
+                    let Some(element) = elements.last_mut() else { return bad("a property must be below an element") };
                     element.properties.push(Property { name: name.to_owned(), kind });
                 }
                 ["end_header"] => break,
-                _ => return bad("format, comment, obj_info, element, property and end_header are known"),
+                _ => return bad("accepted: format, comment, obj_info, element, property, end_header"),
             }
         }
         let encoding = encoding.ok_or_else(|| Error::input(path, "the header has no line `format`", write_again))?;

@@ -20,7 +20,7 @@ fn cloud() -> PointCloud {
     }
 }
 
-/// All that a file says of its points, colors being whole numbers up to 255.
+/// Reads everything about the points, with colors as whole numbers up to 255.
 fn read_cloud(file: &PlyFile) -> Result<PointCloud> {
     let three = |names: [&[&str]; 3]| -> Result<Option<Vec<[f64; 3]>>> {
         let [Some(a), Some(b), Some(c)] = names.map(|names| file.property(names)) else { return Ok(None) };
@@ -38,7 +38,7 @@ fn read_cloud(file: &PlyFile) -> Result<PointCloud> {
     })
 }
 
-/// Equal, where two values that are no number are equal too.
+/// Compares clouds; NaN equals NaN.
 fn same(a: &PointCloud, b: &PointCloud) -> bool {
     let fields = |c: &PointCloud| {
         c.fields.iter().map(|f| (f.name.clone(), f.values.iter().map(|v| v.to_bits()).collect())).collect::<Vec<(_, Vec<_>)>>()
@@ -46,7 +46,7 @@ fn same(a: &PointCloud, b: &PointCloud) -> bool {
     a.positions == b.positions && a.colors == b.colors && a.normals == b.normals && fields(a) == fields(b)
 }
 
-/// The cloud of other programs: two elements, lists, odd properties and names, in all encodings.
+/// Returns a file as other programs write it: several elements, lists, unusual properties and names, in all encodings.
 fn foreign(encoding: Encoding) -> Vec<u8> {
     let name = match encoding {
         Encoding::Ascii => "ascii",
@@ -108,7 +108,7 @@ fn what_is_written_is_read_again_to_the_last_bit() {
     assert!(quality.name == "quality" && quality.values == cloud.fields[0].values);
     assert!(same(&again, &cloud), "{again:?}");
 
-    // A coordinate that is no `float` makes all of them `double`.
+    // A coordinate that is not a `float` makes all of them `double`.
     cloud.positions[3].x = 1e6 + 0.1;
     let file = read(&cloud);
     assert_eq!(file.element().properties[0].kind, Kind::Scalar(Number::F64));
@@ -138,7 +138,7 @@ fn clouds_of_others_are_read_in_every_encoding_and_keep_everything_when_some_poi
         assert_eq!((chosen.others().count(), chosen.len()), (0, 2));
         let some = read_cloud(&chosen).unwrap();
         assert!(same(&some, &cloud.chosen(&[2, 0])), "{encoding:?}");
-        // The list of the last point, too.
+        // The list of the last point is kept too.
         let last = |file: &PlyFile| parse(&file.chosen(&[file.len() as u32 - 1], "one")).unwrap().chosen(&[0], "");
         assert_eq!(last(&parse(&file.chosen(&[0, 2], "one")).unwrap()).len(), last(&file).len() + "comment one\n".len());
     }
@@ -175,7 +175,7 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
             assert!(error.contains("cut short") || error.contains("at most 4294967295"), "{error}");
         }
     }
-    // Lists that promise more than there is, and an element without properties, which takes no bytes.
+    // Lists that announce more than the file contains, and an element without properties, which takes no bytes.
     refused(
         &format!(
             "ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty list uint double w\n{xyz}end_header\n\u{7f}\u{7f}\u{7f}\u{7f}1234567890123456"

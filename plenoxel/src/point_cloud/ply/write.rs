@@ -1,13 +1,14 @@
-//! Point clouds as PLY, with the names that CloudCompare, MeshLab and Open3D know.
+//! PLY writer, with property names that CloudCompare, MeshLab and Open3D recognize.
 //!
-//! Binary, least byte first; `x`, `y`, `z`; `nx`, `ny`, `nz`; `red`, `green`, `blue` from 0 to 255; `scalar_<name>` for each scalar field,
-//! which CloudCompare takes as such; and `quality`, the first field once more, which MeshLab takes (CloudCompare without a window leaves
-//! it out). No property is a list: CloudCompare does not read those of points.
+//! The file is binary, little-endian. Properties: `x`, `y`, `z`; `nx`, `ny`, `nz`; `red`, `green`, `blue` from 0 to 255; `scalar_<name>`
+//! for each scalar field, which CloudCompare reads as scalar fields; and `quality`, a copy of the first field, which MeshLab reads
+//! (CloudCompare's command line ignores it). No property is a list, because CloudCompare does not read lists of points.
 
 use super::{Element, Encoding, Kind, Number, Property, SCALAR_PREFIX, header_lines};
 use crate::point_cloud::PointCloud;
 
-/// The bytes of the file, with comments in its header, a line each. Coordinates are `float`, or `double` if some are not a `float`; spaces in names become `_`.
+/// Encodes a cloud as a file. `comments` become comment lines of the header. Coordinates are `float`, or `double` if some cannot be
+/// represented as `float`. Spaces in names become `_`.
 pub fn encode(cloud: &PointCloud, comments: &[String]) -> Vec<u8> {
     let exact = |p: &glam::DVec3| p.as_vec3().as_dvec3() == *p || !p.is_finite();
     let coordinate = if cloud.positions.iter().all(exact) { Number::F32 } else { Number::F64 };

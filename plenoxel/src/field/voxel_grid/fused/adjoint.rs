@@ -1,6 +1,6 @@
-//! From cotangents of pixels to gradients of rows.
+//! Gradients of table rows from cotangents of pixels.
 //!
-//! With Gᵢ = ∂L/∂wᵢ and G_b = ∂L/∂T_N, and for any loss on the columns,
+//! With Gᵢ = ∂L/∂wᵢ and G_b = ∂L/∂T_N, for any loss on the columns:
 //!
 //! ∂L/∂σᵢ = δᵢ (Gᵢ Tᵢ₊₁ − Σ_{j>i} wⱼ Gⱼ − T_N G_b − ∂L/∂ln T_N) + ∂L/∂sparsity · 4σᵢ / (1 + 2σᵢ²),   ∂L/∂cᵢ = wᵢ ∂L/∂rgb.
 //!
@@ -16,26 +16,27 @@ use autograd::{Buffer, Real, RowSums, Tensor, dispatched, parallel};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// What every sample of a batch adds to the tables, sorted by bucket within each block.
+/// Contributions of every sample of a batch to the tables, sorted by bucket within each block.
 #[derive(Debug)]
 pub(super) struct Sums<T: Real> {
-    /// Harmonics of a channel in a row of the color table, as [`Batch::harmonics`] counts them.
+    /// Number of harmonics per channel in a row of the color table ([`Batch::harmonics`]).
     count: usize,
     /// `[n, (degree + 1)²]`
     basis: Tensor<T>,
     blocks: Vec<Records<T>>,
 }
 
-/// The records of one block: a sample has one in every bucket that it reads.
+/// Records of one block. A sample has one record in each bucket that it reads.
 #[derive(Debug)]
 struct Records<T: Real> {
     buckets: Buckets,
     at: At<T>,
     /// ∂L/∂density
     density: Buffer<T>,
-    /// ∂L/∂rgb of the sample, before the harmonics of its ray: three numbers a record. Where a row has none, what it adds to the row.
+    /// ∂L/∂rgb of the sample, before multiplication with the harmonics of its ray: three numbers per record. If rows have no harmonics, the
+    /// contribution to the row.
     color: Buffer<T>,
-    /// Number of the ray; empty where rows have no harmonics.
+    /// Number of the ray; empty if rows have no harmonics.
     ray: Buffer<u32>,
 }
 
@@ -46,7 +47,7 @@ enum At<T: Real> {
 }
 
 impl<T: Real> Sums<T> {
-    /// From the cotangent of what a kernel computed.
+    /// Computes the records from the cotangent of the kernel's output.
     pub fn new(batch: &Batch<T>, blocks: &[Block<T>], cotangent: &Tensor<T>, output: Output) -> Self {
         let buckets = batch.layout.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
         let blocks = parallel::map_indices(blocks.len(), |b| {
@@ -61,7 +62,7 @@ impl<T: Real> Sums<T> {
         self.blocks.iter().all(|records| records.buckets.range(bucket).is_empty())
     }
 
-    /// Calls `f(records, range)` for the records of a bucket, block after block.
+    /// Calls `f(records, range)` for the records of a bucket, in the order of the blocks.
     fn for_each(&self, bucket: usize, mut f: impl FnMut(&Records<T>, Range<usize>)) {
         for records in &self.blocks {
             let range = records.buckets.range(bucket);
@@ -75,7 +76,7 @@ impl<T: Real> Sums<T> {
 /// ∂L/∂σ and ∂L/∂c of each sample of a block.
 struct Gradients<T: Real> {
     sigma: Buffer<T>,
-    /// `[rays, 3]`: what ∂L/∂cᵢ is wᵢ times.
+    /// ∂L/∂rgb of each ray, `[rays, 3]`; ∂L/∂cᵢ is wᵢ times this.
     rgb: Vec<[T; 3]>,
 }
 
@@ -99,7 +100,7 @@ impl<T: Real> Gradients<T> {
         Gradients { sigma, rgb: pixels[..rays].iter().map(|g| [g[0], g[1], g[2]]).collect() }
     }
 
-    /// Sorts what the samples whose density is not negative have by the buckets they read.
+    /// Sorts the gradients of samples with non-negative density by the buckets that they read.
     fn sorted(&self, batch: &Batch<T>, block: &Block<T>, buckets: usize) -> Records<T> {
         match batch.layout.shape.interpolation {
             Interpolation::Nearest => {
@@ -122,8 +123,8 @@ impl<T: Real> Gradients<T> {
         }
     }
 
-    /// Counts the records of each bucket, and then puts every record in its place, in the order of the samples. `buckets_of(i)` are those
-    /// that sample i reads, the first [`NONE`] ending them; `put(place, i)` puts where the sample lies.
+    /// Counts the records of each bucket, then writes every record to its place, in the order of the samples. `buckets_of(i)` are the
+    /// buckets that sample i reads, terminated by [`NONE`]. `put(place, i)` writes the rows of sample i to `place`.
     #[inline(always)]
     fn records<const K: usize>(
         &self,
@@ -169,11 +170,12 @@ impl<T: Real> Gradients<T> {
     }
 }
 
-/// No bucket: that of the row `u32::MAX`, which no table reaches.
+/// Marker for no bucket: the bucket of row `u32::MAX`, which no table reaches.
 const NONE: u32 = u32::MAX >> BUCKET_SHIFT;
 
 dispatched! {
-/// The different buckets that the corners of each sample lie in, [`NONE`] after the last. Returns how many more there are than samples.
+/// Finds the distinct buckets of the corners of each sample, terminated by [`NONE`]. Returns the number of buckets minus the number of
+/// samples.
 fn touch_buckets<T: Real>(corners: &Corners<T>, touched: &mut [[u32; 8]]) -> usize {
     let mut more = 0;
     for (i, touched) in touched.iter_mut().enumerate() {
@@ -181,7 +183,7 @@ fn touch_buckets<T: Real>(corners: &Corners<T>, touched: &mut [[u32; 8]]) -> usi
         *touched = [NONE; 8];
         touched[0] = all[0];
         if all != [all[0]; 8] {
-            // As `rows::buckets_of`, from the buckets that are there: rows and weights of the corners are not computed again.
+            // Like `rows::buckets_of`, but from the corners found before, without computing rows and weights again.
             let mut found = 1;
             for b in all {
                 if !touched[..found].contains(&b) {
@@ -196,7 +198,7 @@ fn touch_buckets<T: Real>(corners: &Corners<T>, touched: &mut [[u32; 8]]) -> usi
 }
 }
 
-/// ∂L/∂σ along one ray, from the back.
+/// Computes ∂L/∂σ along one ray, from back to front.
 #[inline(always)]
 fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: Range<usize>, g: &[T; COLUMNS], sigma: &mut [T]) {
     let Some(last) = own.clone().next_back() else { return };
@@ -205,7 +207,7 @@ fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: Range<usize>, 
     let mut behind = block.after[last] * g_background + g[column::LOG_TRANSMITTANCE];
     let (rgb, _) = block.color.as_chunks::<3>();
     let clamped = batch.layout.shape.color != Color::Rgb;
-    // Sums over all samples, and over those behind, of w and of w t.
+    // Sums of w and of w t, over all samples and over the samples behind the current one.
     let (mut all, mut all_t) = (T::zero(), T::zero());
     if g_distortion != T::zero() {
         for i in own.clone() {
@@ -230,11 +232,11 @@ fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: Range<usize>, 
     }
 }
 
-/// Rows of the density table.
+/// Contributions to the density table.
 #[derive(Debug)]
 pub(super) struct DensitySums<T: Real>(pub Arc<Sums<T>>);
 
-/// Rows of the color table.
+/// Contributions to the color table.
 #[derive(Debug)]
 pub(super) struct ColorSums<T: Real>(pub Arc<Sums<T>>);
 
@@ -321,7 +323,7 @@ fn add_rows<T: Real, const W: usize>(rows: &[u32], values: &[T], sums: &mut [T],
 }
 
 dispatched! {
-/// Adds weighted values to those of the eight rows around each sample that lie in the bucket.
+/// Adds weighted values to the corner rows of each sample that lie in the bucket.
 fn add_corners<T: Real, const W: usize>(
     bucket: usize,
     corners: &Corners<T>,

@@ -1,4 +1,4 @@
-//! From rays to pixels, a block of rays at a time.
+//! Pixels of rays, one block of rays at a time.
 
 use super::lookup::{self, Corners, Directions, Group};
 use super::places::{Places, RUN};
@@ -10,20 +10,20 @@ use crate::sampling::{Occupancy, march};
 use autograd::lattice::NodeMap;
 use autograd::{Buffer, Real, Tensor, parallel};
 
-/// The samples of some rays, as far as the adjoint needs them. Arrays have one entry for each sample unless said otherwise.
+/// Samples of a block of rays, with the data that the adjoint needs. Arrays have one entry per sample unless stated otherwise.
 #[derive(Debug)]
 pub(super) struct Block<T: Real> {
-    /// Number of its first ray.
+    /// Number of the first ray.
     pub first: usize,
-    /// Samples that were looked at, those without density too, which are not kept.
+    /// Number of evaluated samples, including samples without density, which are not kept.
     pub looked_at: usize,
     /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
-    /// As looked up: σ is this where it is not negative.
+    /// Density as looked up; σ = max(0, density).
     pub density: Buffer<T>,
-    /// Voxel coordinates; like all that follow, empty if no gradient will be asked for.
+    /// Voxel coordinates. This and all following fields are empty if no gradient is recorded.
     pub at: [Buffer<T>; 3],
-    /// The row that nearest look-up reads; empty with trilinear.
+    /// Row that nearest look-up reads; empty with trilinear look-up.
     pub rows: Buffer<u32>,
     pub t: Buffer<T>,
     pub delta: Buffer<T>,
@@ -31,7 +31,7 @@ pub(super) struct Block<T: Real> {
     pub weight: Buffer<T>,
     /// Tᵢ₊₁
     pub after: Buffer<T>,
-    /// Three numbers a sample, before harmonics are clamped at 0.
+    /// Color, three numbers per sample; before the clamping of harmonics at 0.
     pub color: Buffer<T>,
 }
 
@@ -40,19 +40,19 @@ impl<T: Real> Block<T> {
         self.offsets[self.offsets.len() - 1] as usize
     }
 
-    /// The samples of each ray.
+    /// Returns the samples of each ray.
     pub fn rays(&self) -> impl DoubleEndedIterator<Item = std::ops::Range<usize>> + '_ {
         self.offsets.windows(2).map(|o| o[0] as usize..o[1] as usize)
     }
 
-    /// True for a sample that could be seen if it were dense.
+    /// Returns a predicate that is true for samples that would be visible if they were dense.
     #[inline(always)]
     pub fn seen(&self) -> impl Fn(usize) -> bool {
         let (density, after, weight) = (&self.density[..], &self.after[..], &self.weight[..]);
         |i| density[i] >= T::zero() && (after[i] > T::zero() || weight[i] > T::zero())
     }
 
-    /// Σ ln(1 + 2σᵢ²) of each ray.
+    /// Returns Σ ln(1 + 2σᵢ²) of each ray.
     pub fn sparsity(&self) -> impl Iterator<Item = T> + '_ {
         self.rays().map(|own| {
             let of = |&d: &T| {
@@ -64,18 +64,18 @@ impl<T: Real> Block<T> {
     }
 }
 
-/// What rendering a batch reads.
+/// Inputs of rendering a batch.
 pub(super) struct Scene<'a, T: Real> {
     pub batch: &'a Batch<T>,
     pub rays: &'a [Ray],
     pub options: &'a RenderOptions<'a>,
     pub cells: Option<&'a Occupancy>,
-    /// Density, color, and harmonics where they are reduced.
+    /// Density, color and, if harmonics are reduced, harmonics.
     pub tables: [&'a [T]; 3],
 }
 
 impl<'a, T: Real> Scene<'a, T> {
-    /// Of a grid's tables.
+    /// Creates a scene from the tables of a grid.
     pub fn new(
         batch: &'a Batch<T>,
         rays: &'a [Ray],
@@ -88,7 +88,7 @@ impl<'a, T: Real> Scene<'a, T> {
         scene
     }
 
-    /// Renders the rays from number `first` on, one for each [`COLUMNS`] of `pixels`.
+    /// Renders rays from `first` on, one for each [`COLUMNS`] entries of `pixels`.
     pub fn render(&self, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
         let (mut block, found) = self.weights(first, pixels.len() / COLUMNS);
         block.color = Buffer::stale(3 * block.len());
@@ -100,7 +100,7 @@ impl<'a, T: Real> Scene<'a, T> {
         block
     }
 
-    /// The samples of `count` rays from number `first` on, all but their colors; with trilinear look-up also the rows that they read.
+    /// Computes the samples of `count` rays from `first` on, without colors. With trilinear look-up, also returns the rows that they read.
     pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         with_bricks!(self.batch.layout.lattice, map => self.weights_with(map, first, count))
     }
@@ -118,7 +118,7 @@ impl<'a, T: Real> Scene<'a, T> {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
             let mut places = Places::new(march, ray, self.cells, &self.batch.layout.shape);
             let mut left = T::one();
-            // What lies behind the stop is never looked up: of a run in which it comes, the rest is dropped.
+            // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
             while left >= stop {
                 if end + RUN > block.t.len() {
                     let room = block.make_room(trilinear);
@@ -139,7 +139,7 @@ impl<'a, T: Real> Scene<'a, T> {
                     None => {
                         let rows = &mut block.rows[run.clone()];
                         lookup::nearest_rows(at, map, rows);
-                        // What is not present is nothing, and no gradient makes it something.
+                        // Absent voxels have density -1: no light, and no gradient.
                         for (density, &row) in density.iter_mut().zip(&*rows) {
                             *density = self.tables[0].get(row as usize).copied().unwrap_or(-T::one());
                         }
@@ -157,7 +157,7 @@ impl<'a, T: Real> Scene<'a, T> {
                         break;
                     }
                     block.looked_at += 1;
-                    // A sample of no density takes no part, and no gradient changes it.
+                    // A sample with negative density absorbs nothing, and no gradient changes it.
                     if block.density[i] < T::zero() {
                         continue;
                     }
@@ -182,7 +182,7 @@ impl<'a, T: Real> Scene<'a, T> {
         (block, found)
     }
 
-    /// The color of every sample that could be seen if it were dense; zeros for the others.
+    /// Computes the color of every sample that would be visible if it were dense, and zero for the others.
     fn colors(&self, block: &mut Block<T>, found: Option<&Corners<T>>) {
         let mut color = std::mem::replace(&mut block.color, Buffer::stale(0));
         let out = color.as_chunks_mut::<3>().0;
@@ -202,14 +202,14 @@ impl<'a, T: Real> Scene<'a, T> {
         block.color = color;
     }
 
-    /// What the harmonics in a row of the color table need of the rays from number `first` on; `None` if it has none.
+    /// Returns the harmonics of rays from `first` on; `None` if rows of the color table hold no harmonics.
     pub fn directions(&self, first: usize) -> Option<Directions<'_, T>> {
         let Color::Sh { offset, .. } = self.batch.layout.shape.color else { return None };
         let count = self.batch.harmonics();
         (count > 0).then(|| Directions { basis: &self.batch.basis.data()[first * count..], count, offset: T::lit(offset) })
     }
 
-    /// Pixels from weights and colors.
+    /// Computes pixels from weights and colors.
     pub fn sum(&self, block: &Block<T>, pixels: &mut [T]) {
         let background = self.batch.background;
         let (rgb, _) = block.color.as_chunks::<3>();
@@ -255,13 +255,13 @@ impl<T: Real> Block<T> {
         }
     }
 
-    /// What is there for each sample but its row and color.
+    /// Returns the columns of each sample, except row and color.
     fn columns(&mut self) -> [&mut Buffer<T>; 8] {
         let [x, y, z] = &mut self.at;
         [x, y, z, &mut self.t, &mut self.delta, &mut self.density, &mut self.weight, &mut self.after]
     }
 
-    /// Makes room for more samples, so many that it is seldom asked for, and says how many there are room for.
+    /// Doubles the capacity for samples. Returns the new capacity.
     fn make_room(&mut self, trilinear: bool) -> usize {
         let size = (2 * self.t.len()).max(32 * BLOCK);
         self.columns().into_iter().for_each(|column| column.grow(size));
@@ -271,7 +271,7 @@ impl<T: Real> Block<T> {
         size
     }
 
-    /// Positions, middle and length of the samples from number `end` on.
+    /// Returns positions, middles and lengths of the run of samples from `end` on.
     fn places(&mut self, end: usize) -> [&mut [T; RUN]; 5] {
         let [x, y, z, t, delta, ..] = self.columns();
         [x, y, z, t, delta].map(|column| column[end..].first_chunk_mut().expect("there is room for a run"))

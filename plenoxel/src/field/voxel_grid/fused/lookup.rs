@@ -5,31 +5,31 @@ use autograd::ops::trilinear::{corners_of_many, nearest_node};
 use autograd::{Buffer, Real, dispatched, parallel};
 use std::slice::from_mut;
 
-/// How many samples ahead rows are asked for.
+/// Number of samples between the prefetch of a row and its use.
 pub(super) const AHEAD: usize = 8;
 
-/// Asks for the memory of those rows that are in a table.
+/// Prefetches the rows that are in a table.
 #[inline(always)]
 pub(super) fn ask_for<E>(table: &[E], rows: &[u32]) {
     rows.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch);
 }
 
-/// The eight rows around each of some samples, and their weights.
+/// Rows and weights of the eight corners around each sample.
 #[derive(Debug)]
 pub(super) struct Corners<T: Real> {
-    /// Eight numbers a sample.
+    /// Eight entries per sample.
     rows: Buffer<u32>,
     weights: Buffer<T>,
 }
 
-/// Those of samples that are looked up together, corner by corner.
+/// Corners of a group of samples that are looked up together, stored corner by corner.
 pub(super) struct Group<T> {
     rows: [[u32; TOGETHER]; 8],
     weights: [[T; TOGETHER]; 8],
 }
 
 dispatched! {
-/// The row of the voxel that each position lies in; `u32::MAX` if it is not present.
+/// Finds the row of the voxel that contains each position; `u32::MAX` if the voxel is absent.
 pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mut [u32]) {
     let [x, y, z] = at.map(|a| &a[..rows.len()]);
     for (i, row) in rows.iter_mut().enumerate() {
@@ -42,25 +42,25 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 }
 
 impl<T: Real> Group<T> {
-    /// Room for some.
+    /// Creates an empty group.
     pub fn none() -> Self {
         Group { rows: [[0; TOGETHER]; 8], weights: [[T::zero(); TOGETHER]; 8] }
     }
 
-    /// Finds those of at most [`TOGETHER`] positions.
+    /// Finds the corners of at most [`TOGETHER`] positions.
     #[inline(always)]
     pub fn find(&mut self, at: [&[T]; 3], map: impl NodeMap) {
         corners_of_many(at, map, from_mut(&mut self.rows), from_mut(&mut self.weights));
     }
 
-    /// What a table of one column is at each position.
+    /// Interpolates a table of one column at each position.
     pub fn density(&self, table: &[T], values: &mut [T]) {
         interpolate(table, &self.rows, &self.weights, values);
     }
 }
 
 impl<T: Real> Corners<T> {
-    /// Those of `count` positions.
+    /// Finds the corners of `count` positions.
     pub fn find(at: [&[T]; 3], map: impl NodeMap, count: usize) -> Self {
         let (mut corners, mut group) = (Corners::none(), Group::none());
         corners.make_room(count);
@@ -72,32 +72,32 @@ impl<T: Real> Corners<T> {
         corners
     }
 
-    /// Of no samples.
+    /// Creates corners of no samples.
     pub fn none() -> Self {
         Corners { rows: Buffer::stale(0), weights: Buffer::stale(0) }
     }
 
-    /// Makes room for `count` samples.
+    /// Reserves memory for `count` samples.
     pub fn make_room(&mut self, count: usize) {
         self.rows.grow(8 * count);
         self.weights.grow(8 * count);
     }
 
-    /// Sets those of samples from number `first` on to some of a group. Panics if there is no room.
+    /// Copies corners of some samples of a group to the samples from `first` on. Panics if the capacity is too small.
     pub fn put(&mut self, first: usize, from: impl ExactSizeIterator<Item = usize> + Clone, group: &Group<T>) {
         let own = first..first + from.len();
         transpose(&group.rows, from.clone(), &mut self.rows.as_chunks_mut().0[own.clone()]);
         transpose(&group.weights, from, &mut self.weights.as_chunks_mut().0[own]);
     }
 
-    /// Sets those of a sample. Panics if there is no room.
+    /// Sets the corners of a sample. Panics if the capacity is too small.
     #[inline(always)]
     pub fn set(&mut self, i: usize, (rows, weights): ([u32; 8], [T; 8])) {
         self.rows.as_chunks_mut().0[i] = rows;
         self.weights.as_chunks_mut().0[i] = weights;
     }
 
-    /// Rows and weights of a sample.
+    /// Returns rows and weights of a sample.
     #[inline(always)]
     pub fn of(&self, i: usize) -> ([u32; 8], [T; 8]) {
         (self.rows.as_chunks().0[i], self.weights.as_chunks().0[i])
@@ -105,7 +105,7 @@ impl<T: Real> Corners<T> {
 }
 
 dispatched! {
-/// The corners of some samples of a group, one after the other.
+/// Copies the corners of some samples of a group, one sample after another.
 fn transpose<N: Copy>(group: &[[N; TOGETHER]; 8], from: impl Iterator<Item = usize>, to: &mut [[N; 8]]) {
     for (to, i) in to.iter_mut().zip(from) {
         for c in 0..8 {
@@ -129,7 +129,7 @@ fn interpolate<T: Real>(table: &[T], rows: &[[u32; TOGETHER]; 8], weights: &[[T;
 }
 
 dispatched! {
-/// What the interval of each sample absorbs, 1 − exp(−σ δ), and what it lets through; σ = max(0, density).
+/// Computes the absorbed fraction 1 − exp(−σ δ) and the transmitted fraction of the interval of each sample; σ = max(0, density).
 pub(super) fn absorptions<T: Real, const FUSED: bool>(density: &[T], delta: &[T], alpha: &mut [T], through: &mut [T]) {
     for (((a, e), &s), &d) in alpha.iter_mut().zip(through).zip(density).zip(delta) {
         (*a, *e) = (s.max(T::zero()) * d).absorb::<FUSED>();
@@ -138,7 +138,7 @@ pub(super) fn absorptions<T: Real, const FUSED: bool>(density: &[T], delta: &[T]
 }
 
 dispatched! {
-/// Σⱼ wⱼ rowⱼ of a table of three columns for the samples that are seen, zeros for the others.
+/// Computes Σⱼ wⱼ rowⱼ of a table of three columns for the visible samples, and zeros for the others.
 pub(super) fn plain<T: Real, const K: usize>(
     table: &[T],
     look: impl Fn(usize) -> ([u32; K], [T; K]),
@@ -164,17 +164,17 @@ pub(super) fn plain<T: Real, const K: usize>(
 }
 }
 
-/// What harmonics need to become colors.
+/// View directions of rays, as values of the harmonics.
 #[derive(Clone, Copy)]
 pub(super) struct Directions<'a, T> {
-    /// `count` numbers for each ray.
+    /// `count` numbers per ray.
     pub basis: &'a [T],
     pub count: usize,
-    /// The color of zero coefficients.
+    /// Color of zero coefficients.
     pub offset: T,
 }
 
-/// Runs an expression with the width of the table and the number of harmonics, and with whether to multiply and add in one rounding.
+/// Evaluates an expression with the width of the table, the number of harmonics, and whether multiply-add is fused.
 macro_rules! with_degree {
     ($count:expr, $w:ident, $n:ident, $fused:ident => $body:expr) => {{
         macro_rules! run {
@@ -199,8 +199,8 @@ macro_rules! with_degree {
     }};
 }
 
-/// offset + Σₖ Yₖ Σⱼ wⱼ rowⱼₖ in red, green and blue, for the samples that are seen, zeros for the others. Ray r of `directions` owns the
-/// samples `offsets[r]..offsets[r + 1]`.
+/// Computes the colors offset + Σₖ Yₖ Σⱼ wⱼ rowⱼₖ of the visible samples, and zeros for the others. Ray r of `directions` owns the samples
+/// `offsets[r]..offsets[r + 1]`.
 pub(super) fn harmonics<T: Real, const K: usize>(
     table: &[T],
     offsets: &[u32],
@@ -212,7 +212,8 @@ pub(super) fn harmonics<T: Real, const K: usize>(
     with_degree!(directions.count, W, N, FUSED => of_rays::<T, K, W, N, FUSED>(table, offsets, directions, look, seen, out));
 }
 
-/// The same for a list of samples with trilinear look-up, `rays` being theirs; `out` has one color for each.
+/// Computes the colors of [`harmonics`] for a list of samples with trilinear look-up. `rays` has the ray of each sample; `out` gets one
+/// color per sample.
 pub(super) fn harmonics_of<T: Real>(
     table: &[T],
     at: [&[T]; 3],
@@ -226,7 +227,7 @@ pub(super) fn harmonics_of<T: Real>(
 }
 
 dispatched! {
-/// `W` is the width of the table, `N` the number of harmonics.
+/// Implements [`harmonics`] for tables of width `W` with `N` harmonics.
 fn of_rays<T: Real, const K: usize, const W: usize, const N: usize, const FUSED: bool>(
     table: &[T],
     offsets: &[u32],
@@ -235,7 +236,7 @@ fn of_rays<T: Real, const K: usize, const W: usize, const N: usize, const FUSED:
     seen: impl Fn(usize) -> bool,
     out: &mut [[T; 3]],
 ) {
-    // Coefficients of some samples in memory, and then their colors: the two need different vectors.
+    // Interpolate the coefficients of several samples first, then compute their colors: the two loops use vectors of different lengths.
     let mut sums = [[T::zero(); W]; TOGETHER];
     let table = table.as_chunks::<W>().0;
     for (own, basis) in offsets.windows(2).zip(directions.basis.as_chunks::<N>().0) {
@@ -285,7 +286,7 @@ fn of_samples<T: Real, M: NodeMap, const W: usize, const N: usize, const FUSED: 
 }
 }
 
-/// offset + Σₖ basisₖ coefficientₖ in red, green and blue.
+/// Returns offset + Σₖ basisₖ coefficientₖ in red, green and blue.
 #[inline(always)]
 fn color<T: Real, const W: usize, const N: usize, const FUSED: bool>(coefficients: &[T; W], basis: &[T; N], offset: T) -> [T; 3] {
     std::array::from_fn(|c| {
@@ -297,7 +298,7 @@ fn color<T: Real, const W: usize, const N: usize, const FUSED: bool>(coefficient
     })
 }
 
-/// Σ weightₖ rowₖ, in whole vectors where a row has one.
+/// Computes Σ weightₖ rowₖ, in whole vectors if a row is long enough.
 #[inline(always)]
 pub(super) fn weigh_all<T: Real, const K: usize, const W: usize, const FUSED: bool>(rows: [&[T; W]; K], weights: [T; K], sum: &mut [T; W]) {
     if W >= 16 {
@@ -307,7 +308,7 @@ pub(super) fn weigh_all<T: Real, const K: usize, const W: usize, const FUSED: bo
     }
 }
 
-/// Σ weightₖ rowₖ, `L` columns at a time; the last ones overlap those before, so that all are whole vectors.
+/// Computes Σ weightₖ rowₖ, `L` columns at a time. The last part overlaps the one before, so that all parts are whole vectors.
 #[inline(always)]
 fn weigh<T: Real, const K: usize, const W: usize, const L: usize, const FUSED: bool>(
     rows: [&[T; W]; K],

@@ -1,4 +1,4 @@
-//! Where the samples of a ray lie, a run of them at a time: a ray that ends early asks for no more.
+//! Positions of the samples of a ray, in runs, so that a ray that ends early computes no further positions.
 
 use crate::camera::Ray;
 use crate::field::voxel_grid::GridShape;
@@ -6,18 +6,18 @@ use crate::sampling::{March, Occupancy, Occupied};
 use autograd::lattice::TOGETHER;
 use autograd::{Real, dispatched};
 
-/// Samples that are looked up together.
+/// Number of samples that are looked up together.
 pub(super) const RUN: usize = TOGETHER;
 
-/// The samples of one ray that are still to come.
+/// Remaining samples of one ray.
 pub(super) struct Places<'a, T> {
     ray: &'a Ray,
-    /// Voxel coordinates are the world's times the first number, plus the second.
+    /// Scale and shift from world to voxel coordinates.
     to_voxels: [T; 2],
-    /// The march, and how many of its intervals have been given.
+    /// March along the ray, and the number of its intervals taken so far.
     march: March,
     next: usize,
-    /// Where cells are known that hold nothing, the intervals in the others instead.
+    /// Intervals in occupied cells, if an occupancy is known.
     occupied: Option<Occupied<'a>>,
 }
 
@@ -28,7 +28,7 @@ impl<'a, T: Real> Places<'a, T> {
         Places { ray, to_voxels, march, next: 0, occupied: cells.map(|cells| march.occupied(ray, cells)) }
     }
 
-    /// Voxel coordinates, middles and lengths of the next samples, as many as there are and [`RUN`] at most. Returns how many; 0 at the end.
+    /// Writes voxel coordinates, middles and lengths of the next samples, at most [`RUN`]. Returns their number; 0 at the end.
     pub fn next_run(&mut self, out: [&mut [T; RUN]; 5]) -> usize {
         let mut intervals = [(0.0, 0.0); RUN];
         let mut count = 0;

@@ -1,8 +1,8 @@
-//! Harmonics that are stored for larger voxels than the means of colors.
+//! Reduced harmonics: coefficients of degree 1 and more that are stored for larger voxels.
 //!
-//! rgb = offset + Y₀ Σⱼ wⱼ meanⱼ + Σₖ Yₖ Σᵢ vᵢ rowᵢₖ. Samples that follow each other on a ray mostly read the same rows of harmonics: in the
-//! adjoint, what the samples of such a run add to the color of each row is summed first, Σ v ∂L/∂rgb, and then each row gets it times Yₖ,
-//! bucket by bucket like everything else.
+//! rgb = offset + Y₀ Σⱼ wⱼ meanⱼ + Σₖ Yₖ Σᵢ vᵢ rowᵢₖ. Consecutive samples of a ray mostly read the same rows of harmonics. The adjoint
+//! first sums the contributions v ∂L/∂rgb of such a run for each row, and then adds the sum times Yₖ to the row, bucket by bucket as for
+//! the other tables.
 
 use super::forward::{Block, Scene};
 use super::lookup::{AHEAD, Corners, ask_for, nearest_rows, weigh_all};
@@ -13,23 +13,23 @@ use autograd::rows::{Buckets, buckets_of};
 use autograd::{Buffer, Lattice, Real, RowSums, Tensor, dispatched, parallel};
 use std::sync::Arc;
 
-/// A bucket is this power of two of rows: 8 bricks. The table is small, and many tasks are to share it.
+/// Binary logarithm of the rows in a bucket: 8 bricks. The table is small, and smaller buckets give enough tasks.
 const BUCKET_SHIFT: u32 = 9;
 
-/// How many runs ahead one is asked for: they are larger than a row.
+/// Number of runs between the prefetch of a run and its use. Runs are larger than rows.
 const RUNS_AHEAD: usize = 4;
 
-/// Red, green and blue, and a zero that makes a vector of them.
+/// Red, green, blue, and a zero that pads them to a vector.
 type Rgb0<T> = [T; 4];
 
-/// The rows of harmonics that each sample reads, `K` of them.
+/// Rows of harmonics that each sample reads, `K` of them.
 trait Look<T: Real, const K: usize>: Sized {
     fn find(at: [&[T]; 3], lattice: &Lattice, count: usize) -> Self;
-    /// Rows and weights of a sample.
+    /// Returns rows and weights of a sample.
     fn of(&self, i: usize) -> ([u32; K], [T; K]);
 }
 
-/// One row for each sample; one beyond the table where there is none.
+/// One row per sample; beyond the table if the voxel is absent.
 struct Nearest(Buffer<u32>);
 
 impl<T: Real> Look<T, 1> for Nearest {
@@ -56,7 +56,7 @@ impl<T: Real> Look<T, 8> for Corners<T> {
     }
 }
 
-/// What the samples of a block read.
+/// Finds the rows that the samples of a block read.
 fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lattice, block: &Block<T>) -> L {
     let [scale, shift] = batch.layout.shape.to_harmonics().map(T::lit);
     let at = block.at.each_ref().map(|at| {
@@ -67,10 +67,10 @@ fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lat
     L::find(at.each_ref().map(|at| &at[..]), lattice, block.len())
 }
 
-/// What gives rows and weights of a sample; rows may repeat, with no weight.
+/// Function from a sample to its rows and weights. Rows may repeat with weight zero.
 pub(super) type Reads<T> = Box<dyn Fn(usize) -> ([u32; 8], [T; 8])>;
 
-/// The rows of harmonics that samples of a block read, where harmonics are reduced.
+/// Returns the rows of harmonics that samples of a block read, if harmonics are reduced.
 pub(super) fn reads<T: Real>(batch: &Batch<T>, block: &Block<T>) -> Option<Reads<T>> {
     let lattice = batch.layout.harmonics.as_ref()?;
     Some(match batch.layout.shape.interpolation {
@@ -86,7 +86,7 @@ pub(super) fn reads<T: Real>(batch: &Batch<T>, block: &Block<T>) -> Option<Reads
 }
 
 impl<T: Real> Scene<'_, T> {
-    /// Makes colors of the means of the samples that are seen.
+    /// Adds harmonics to the coefficients of degree 0 of the visible samples, which makes them colors.
     pub fn add_harmonics(&self, lattice: &Lattice, block: &Block<T>, out: &mut [[T; 3]]) {
         match self.batch.layout.shape.interpolation {
             Interpolation::Nearest => self.add_found::<Nearest, 1>(lattice, block, out),
@@ -109,7 +109,7 @@ impl<T: Real> Scene<'_, T> {
 }
 
 dispatched! {
-/// `basis` has `N` + 1 numbers for each ray, a row of the table `W` = 3 `N`. A row that is not in the table is zeros.
+/// Adds harmonics to `out`. `basis` has `N` + 1 numbers per ray, a row of the table has `W` = 3 `N`. Rows beyond the table are zero.
 fn add_to_means<T: Real, const K: usize, const W: usize, const N: usize>(
     table: &[T],
     offsets: &[u32],
@@ -124,7 +124,7 @@ fn add_to_means<T: Real, const K: usize, const W: usize, const N: usize>(
     for (own, basis) in offsets.windows(2).zip(basis.chunks_exact(N + 1)) {
         for i in (own[0] as usize..own[1] as usize).filter(|&i| seen(i)) {
             if i + AHEAD < out.len() {
-                // Of samples that follow each other, most read the rows of the one before.
+                // Consecutive samples mostly read the same rows.
                 let [before, later] = [i + AHEAD - 1, i + AHEAD].map(|i| look(i).0);
                 if later != before {
                     ask_for(table, &later);
@@ -144,7 +144,7 @@ fn add_to_means<T: Real, const K: usize, const W: usize, const N: usize>(
 }
 }
 
-/// What the samples of a batch add to the rows of harmonics, from the cotangent of the pixels.
+/// Returns the contributions of the samples of a batch to the rows of harmonics, from the cotangent of the pixels.
 pub(super) fn sums<T: Real>(batch: &Batch<T>, lattice: &Lattice, blocks: &[Block<T>], cotangent: &Tensor<T>) -> Arc<dyn RowSums<T>> {
     match batch.layout.shape.interpolation {
         Interpolation::Nearest => Arc::new(HarmonicsSums::new::<Nearest>(batch, lattice, blocks, cotangent)),
@@ -152,7 +152,7 @@ pub(super) fn sums<T: Real>(batch: &Batch<T>, lattice: &Lattice, blocks: &[Block
     }
 }
 
-/// Rows of the table of harmonics, of which a sample reads `K`.
+/// Contributions to the table of harmonics. A sample reads `K` rows.
 #[derive(Debug)]
 struct HarmonicsSums<T: Real, const K: usize> {
     /// `[n, (degree + 1)²]`
@@ -160,7 +160,7 @@ struct HarmonicsSums<T: Real, const K: usize> {
     blocks: Vec<Runs<T, K>>,
 }
 
-/// The runs of samples of one block that read the same rows, and their numbers by the buckets of these rows.
+/// Runs of samples of one block, and their numbers sorted by the buckets of their rows.
 #[derive(Debug)]
 struct Runs<T: Real, const K: usize> {
     runs: Vec<Run<T, K>>,
@@ -168,17 +168,17 @@ struct Runs<T: Real, const K: usize> {
     numbers: Buffer<u32>,
 }
 
-/// Samples of a ray that read the same rows.
+/// Consecutive samples of a ray that read the same rows.
 #[derive(Debug)]
 struct Run<T: Real, const K: usize> {
     ray: u32,
     rows: [u32; K],
-    /// Σ v ∂L/∂rgb over the samples for each row, v being its weight.
+    /// Σ v ∂L/∂rgb over the samples for each row, where v is the weight of the row.
     sums: [Rgb0<T>; K],
 }
 
 impl<T: Real, const K: usize> Run<T, K> {
-    /// The buckets of its rows, each once.
+    /// Returns the distinct buckets of the rows.
     fn buckets(&self, count: usize) -> impl Iterator<Item = usize> {
         buckets_of(self.rows, BUCKET_SHIFT).filter(move |&bucket| bucket < count)
     }
@@ -246,7 +246,8 @@ impl<T: Real, const K: usize> RowSums<T> for HarmonicsSums<T, K> {
 }
 
 dispatched! {
-/// Adds what runs have, in the order of the rays, to their rows in the bucket; `basis` has `N` + 1 numbers for each ray, a row 3 `N`.
+/// Adds the contributions of runs to their rows in the bucket, in the order of the rays. `basis` has `N` + 1 numbers per ray, a row has 3
+/// `N`.
 fn add_runs<T: Real, const K: usize, const N: usize>(
     bucket: usize,
     runs: &Runs<T, K>,

@@ -1,4 +1,4 @@
-//! What rays see of each voxel: the largest weight, and the color.
+//! Visibility of voxels: largest rendering weight and mean color over rays.
 
 use super::{BLOCK, Batch, reduced};
 use crate::camera::Ray;
@@ -8,20 +8,22 @@ use autograd::{Real, Tensor, parallel};
 use std::cell::LazyCell;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
-/// What photographs show of each row of a grid's tables. Each sample on a ray counts by its weight w, times the share that the row has in it;
-/// a is the alpha of the ray's pixel, how much of an object it shows. Numbers are 0 where no ray comes.
+/// Visibility and observed color of each row of a grid's tables.
+///
+/// Each sample on a ray counts with its rendering weight w times the interpolation weight of the row in the sample. a is the alpha of the
+/// ray's pixel, the fraction of the pixel that an object covers. Values are 0 for rows that no ray reads.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Seen {
-    /// The largest w a: how much of a pixel's object the row is ever part of.
+    /// Largest w a: the largest share that the row has in the object of any pixel.
     pub weight: Vec<f32>,
-    /// Σ w a / Σ w: 1 for what stands in front of objects, 0 for what stands only where photographs show the background.
+    /// Σ w a / Σ w: 1 for voxels in front of objects, 0 for voxels that are seen only in front of background pixels.
     pub object: Vec<f32>,
-    /// Σ w a c / Σ w a, c being the color that the sample shows to the ray.
+    /// Σ w a c / Σ w a, where c is the color of the sample seen along the ray.
     pub color: Vec<[f32; 3]>,
 }
 
-/// For each row of the tables the largest weight wᵢ = Tᵢ (1 − exp(−σᵢδᵢ)) of the samples that read it, on any of the rays: how much of a
-/// pixel its voxel is ever part of, 0 where no ray comes. Rays come in batches to bound the memory; svox2 prunes by it (`grid_weight_render`).
+/// Returns the largest rendering weight wᵢ = Tᵢ (1 − exp(−σᵢδᵢ)) over the samples that read each row of the tables, on any of the rays; 0
+/// for rows that no ray reads. Rays come in batches to bound the memory. svox2 prunes by this value (`grid_weight_render`).
 pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = Vec<Ray>>, options: &RenderOptions<'_>) -> Vec<f32> {
     let largest = Largest::new(grid.lattice().rows());
     for rays in batches {
@@ -30,16 +32,17 @@ pub fn largest_weights<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<
     largest.into_weights()
 }
 
-/// What rays with the alphas of their pixels see. Samples with a weight below 1 / 1024, a quarter of a step of 8 bits, are not counted. Sums
-/// are of whole multiples of 2⁻²⁴ and so do not depend on their order: the result has the same bits for any number of threads.
+/// Returns what rays see of each row. `batches` contain rays and the alphas of their pixels. Samples with a weight below 1 / 1024, a
+/// quarter of an 8-bit level, are not counted. Sums are integer multiples of 2⁻²⁴ and do not depend on their order: the result is
+/// bit-identical for any number of threads.
 pub fn seen<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = (Vec<Ray>, Vec<f32>)>, options: &RenderOptions<'_>) -> Seen {
     const LEAST: f64 = 1.0 / 1024.0;
     const ONE: f64 = (1u64 << 24) as f64;
-    /// A color is at most 1 on a screen. This only keeps sums over 2³¹ samples within 64 bits.
+    /// Largest color value that is counted. Displayed colors are at most 1; the bound keeps sums over 2³¹ samples within 64 bits.
     const BRIGHTEST: f64 = 256.0;
     let rows = grid.lattice().rows();
     let largest = Largest::new(rows);
-    // Of w, of w a, and of w a c.
+    // Sums of w, of w a, and of w a c.
     let sums: Vec<[AtomicU64; 5]> = (0..rows).map(|_| Default::default()).collect();
     let add = |sum: &AtomicU64, amount: f64| sum.fetch_add((amount * ONE + 0.5) as u64, Relaxed);
     for (rays, alphas) in batches {
@@ -68,7 +71,7 @@ pub fn seen<T: Real>(grid: &VoxelGrid<T>, batches: impl IntoIterator<Item = (Vec
     }
 }
 
-/// The largest weight of each row so far. Numbers that are not negative are in the order of their bits, and a maximum does not depend on the
+/// Largest weight of each row so far. Non-negative floating-point numbers are ordered like their bits, and a maximum does not depend on the
 /// order of its terms.
 struct Largest(Vec<AtomicU32>);
 
@@ -90,34 +93,34 @@ impl Largest {
     }
 }
 
-/// A sample on a ray, and what it reads of the tables.
+/// Sample on a ray, with the table rows that it reads.
 struct Sample<'a, T> {
-    /// Number of its ray.
+    /// Number of the ray.
     ray: usize,
     weight: T,
-    /// Of density and color.
+    /// Rows of density and color.
     own: Reads<'a, T>,
-    /// Rows of harmonics that are reduced with their shares, which are found when they are asked for.
+    /// Rows of reduced harmonics with their weights, found on demand.
     reduced: &'a dyn Fn() -> Option<([u32; 8], [T; 8])>,
-    /// The harmonics of the ray's direction that belong to them.
+    /// Values of the reduced harmonics for the ray's direction.
     beyond: &'a [T],
 }
 
-/// Rows of a table with their shares.
+/// Rows of a table with their interpolation weights.
 struct Reads<'a, T> {
     rows: &'a [u32],
     shares: &'a [T],
-    /// What the numbers of a channel in a row are multiplied by: harmonics of the ray's direction; empty for plain colors.
+    /// Values of the harmonics for the ray's direction that the coefficients in a row are multiplied by; empty for plain colors.
     basis: &'a [T],
 }
 
 impl<T: Real> Reads<'_, T> {
-    /// Rows with their shares, those that have one.
+    /// Returns the rows with a weight above 0.
     fn iter(&self) -> impl Iterator<Item = (u32, T)> + '_ {
         self.rows.iter().copied().zip(self.shares.iter().copied()).filter(|(_, share)| *share > T::zero())
     }
 
-    /// What a table shows of these rows.
+    /// Returns the interpolated color of a table.
     fn color(&self, table: &Tensor<T>) -> [T; 3] {
         let (table, channels) = (table.data(), table.shape()[1]);
         let mut sum = [T::zero(); 3];
@@ -136,7 +139,7 @@ impl<T: Real> Reads<'_, T> {
 }
 
 impl<T: Real> Sample<'_, T> {
-    /// What it shows to its ray.
+    /// Returns the color of the sample seen along its ray.
     fn color(&self, grid: &VoxelGrid<T>) -> [f64; 3] {
         let mut sum = self.own.color(grid.color.tensor());
         if let (Some((rows, shares)), Some(table)) = ((self.reduced)(), &grid.harmonics) {
@@ -150,13 +153,13 @@ impl<T: Real> Sample<'_, T> {
 
 /// Calls `f` for every sample with a weight above `least`.
 fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>, least: f64, f: impl Fn(Sample<'_, T>) + Sync) {
-    // Where less light is left, no sample weighs as much.
+    // No sample weighs more than the transmittance before it.
     let options = &RenderOptions { stop_below: options.stop_below.max(least), ..options.clone() };
     let least = T::lit(least);
     let batch = Batch::new(grid, rays, options);
     let scene = batch.scene(grid, rays, options);
     let count = batch.basis.shape()[1];
-    // Harmonics in a row of the color table; those behind them are reduced.
+    // Number of harmonics in a row of the color table; the following harmonics are reduced.
     let here = batch.harmonics().max(1).min(count);
     parallel::map_chunks(rays.len(), BLOCK, |range| {
         let (block, corners) = scene.weights(range.start, range.len());

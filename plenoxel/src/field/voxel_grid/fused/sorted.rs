@@ -1,7 +1,7 @@
-//! The colors of a batch, read in the order of the table's rows.
+//! Colors of a batch, read in the order of the table's rows.
 //!
-//! The rays of a training batch have nothing to do with each other: taken ray by ray, nearly every sample waits for its rows to come from
-//! memory. Sorted by the buckets that they lie in, samples of other rays find the rows of a bucket in the cache.
+//! The rays of a training batch are unrelated: taken ray by ray, nearly every sample waits for its rows to arrive from memory. Sorted by
+//! bucket, samples of different rays find the rows of a bucket in the cache.
 
 use super::forward::{Block, Scene};
 use super::lookup::{self, Corners};
@@ -10,17 +10,19 @@ use crate::field::voxel_grid::Interpolation;
 use autograd::rows::Buckets;
 use autograd::{Buffer, Real, parallel};
 
-/// Tasks, each with a range of buckets: some for every thread, so that a dense corner of the scene holds up no one.
+/// Number of tasks, each with a range of buckets. There are several per thread, so that a dense part of the scene does not delay the
+/// others.
 const TASKS: usize = 64;
 
-/// Bytes of a color table from which sorting pays: a smaller one stays in the caches as it is. Builds that the tests run in sort sooner.
+/// Size of a color table, in bytes, from which sorting is faster; a smaller table stays in the caches. Debug builds sort earlier, for
+/// tests.
 const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
 
-/// The samples of a block that need a color, by the bucket of their lowest corner.
+/// Samples of a block that need a color, sorted by the bucket of their lowest corner.
 struct Order {
     buckets: Buckets,
     samples: Buffer<u32>,
-    /// Number of the ray of each of them.
+    /// Number of the ray of each sample.
     rays: Buffer<u32>,
 }
 
@@ -41,13 +43,15 @@ impl Order {
 }
 
 impl<T: Real> Scene<'_, T> {
-    /// True if the colors of a training batch are worth sorting: eight rows of harmonics for each sample, from a table beyond the caches.
+    /// Returns true if sorting makes the colors of a training batch faster: each sample reads eight rows of harmonics from a table larger
+    /// than the caches.
     pub fn worth_sorting(&self) -> bool {
         let shape = &self.batch.layout.shape;
         self.batch.harmonics() > 0 && shape.interpolation == Interpolation::Trilinear && size_of_val(self.tables[1]) >= LARGE
     }
 
-    /// The blocks of the rays from number `first` on, one ray for each [`COLUMNS`] of `pixels`, with all that the adjoint needs.
+    /// Renders rays from `first` on, one for each [`COLUMNS`] entries of `pixels`. Returns their blocks with everything that the adjoint
+    /// needs.
     pub fn render_sorted(&self, first: usize, pixels: &mut [T]) -> Vec<Block<T>> {
         let buckets = self.batch.layout.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
         let count = pixels.len() / COLUMNS;
@@ -70,7 +74,7 @@ impl<T: Real> Scene<'_, T> {
         })
     }
 
-    /// The colors of the samples of each order.
+    /// Computes the colors of the samples of each order.
     fn colors_in_order(&self, blocks: &[Block<T>], orders: &[Order], buckets: usize) -> Vec<Buffer<T>> {
         let directions = self.directions(0).expect("only harmonics are worth sorting");
         let per_task = buckets.div_ceil(TASKS).max(1);
