@@ -3,6 +3,7 @@
 #![doc = include_str!("../docs/own_field.md")]
 
 pub mod plenoxels;
+pub mod tensorf;
 
 pub use crate::train::Model;
 

@@ -1,0 +1,38 @@
+//! TensoRF on a scene, with a run folder: `cargo run --release -p plenoxel --example tensorf -- [DATA]`. Without DATA it learns the built-in scene.
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::error::Result;
+use plenoxel::loss::{Objective, mse};
+use plenoxel::model::plenoxels;
+use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
+use plenoxel::run::data::DataSource;
+use plenoxel::run::training::{Event, Outcome, RunSettings, train_model};
+use plenoxel::train::{TrainOptions, Trainer};
+
+/// A tenth of the authors' cells and steps, for two cores.
+fn config() -> Config {
+    let stages = [(48, 400), (64, 400), (96, 700)].map(|(resolution, steps)| Stage { resolution, steps }).to_vec();
+    Config { half_width: 1.4, hidden: 64, step: 1.0, color_above: 1e-3, network_rate: 3e-3, stages, ..Config::default() }
+}
+
+fn main() -> Result<()> {
+    let scene = ProceduralOptions { width: 100, height: 100, train: 60, val: 0, test: 10, supersample: 2 };
+    let data = std::env::args_os().nth(1).map_or_else(|| DataSource::built_in(&scene), |data| DataSource::folder(data.as_ref()));
+    let settings = RunSettings::new(plenoxels::config::Config::default(), data);
+    let outcome = train_model(
+        &settings,
+        |run, _, views| {
+            let options = TrainOptions { rays_per_step: 1024, ..run.train_options() };
+            let objective = Objective::new().with("mse", 1.0, mse).with("density_l1", 4e-5, density_l1);
+            Trainer::with_model(Tensorf::new(config())?, views, objective, options)
+        },
+        &mut |event| match event {
+            Event::Note(text) => eprintln!("{text}"),
+            Event::Step { report, .. } if report.step % 100 == 0 => eprintln!("step {}: {:.2} dB", report.step, report.psnr),
+            _ => {}
+        },
+    )?;
+    if let Outcome::Done(summary) = outcome {
+        println!("{}", summary.figures.sentence());
+    }
+    Ok(())
+}

@@ -1,0 +1,139 @@
+//! The factored field: its gradients, its upsampling, training and resuming.
+
+use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
+use glam::DVec3;
+use plenoxel::camera::Ray;
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::evaluate::evaluate;
+use plenoxel::loss::{Objective, mse};
+use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
+use plenoxel::render::Field;
+use plenoxel::sampling::Jitter;
+use plenoxel::train::{Model, Pass, PlannedStage, TrainOptions, Trainer, ViewOptions};
+
+const PASS: Pass = Pass { background: [1.0; 3], jitter: Jitter::None, keep_samples: false, stage: None };
+
+fn tiny(stages: &[(usize, u64)]) -> Config {
+    Config {
+        half_width: 1.4,
+        density_components: 4,
+        appearance_components: 6,
+        features: 8,
+        hidden: 8,
+        step: 1.0,
+        stages: stages.iter().map(|&(resolution, steps)| Stage { resolution, steps }).collect(),
+        ..Config::default()
+    }
+}
+
+/// A model whose density is neither fog nor nothing, so that all numbers matter.
+fn dense<T: Real>(stages: &[(usize, u64)]) -> Tensorf<T> {
+    let mut model = Tensorf::<T>::new(tiny(stages)).expect("valid settings");
+    let random = Stream::new(3);
+    model.visit_mut(&mut |param: &mut Param<T>| {
+        if param.name().starts_with("density") {
+            let values = random.named(param.name()).uniform_tensor(param.shape(), 0.5, 2.2);
+            *param = Param::from_tensor(param.name(), values);
+        }
+    });
+    model
+}
+
+fn rays(count: usize) -> Vec<Ray> {
+    let random = Stream::new(5);
+    let at = |name: &str| random.named(name).uniform_tensor::<f64>(&[count, 3], -0.8, 0.8);
+    let (from, to) = (at("from"), at("to"));
+    let point = |tensor: &Tensor<f64>, i: usize| DVec3::from_slice(&tensor.data()[3 * i..][..3]);
+    (0..count)
+        .map(|i| {
+            let origin = point(&from, i) + DVec3::new(0.0, 0.0, 4.0);
+            Ray { origin, direction: (point(&to, i) - origin).normalize(), stretch: 1.0 }
+        })
+        .collect()
+}
+
+#[test]
+fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders() {
+    let model = dense::<f64>(&[(4, 1)]);
+    // Few rays and hidden units, none of which is at the kink of its ReLU.
+    let rays = rays(2);
+    let mut inputs = Vec::new();
+    model.visit(&mut |param| inputs.push(param.tensor().to_array()));
+    let pixels = |x: &[Tensor<f64>]| {
+        let mut model = dense::<f64>(&[(4, 1)]);
+        let mut next = x.iter();
+        model.visit_mut(&mut |param: &mut Param<f64>| {
+            let tensor = next.next().expect("a tensor for each parameter").clone();
+            if tensor.is_tracked() { param.bind(tensor) } else { param.replace(tensor) }
+        });
+        model.render(&rays, &PASS).rgb
+    };
+    gradcheck(pixels, inputs);
+}
+
+#[test]
+fn a_finer_grid_of_the_same_nodes_is_the_same_field() {
+    let mut model = dense::<f64>(&[(4, 1), (7, 1)]);
+    let random = Stream::new(9);
+    let positions = random.named("positions").uniform_tensor(&[40, 3], -1.4, 1.4);
+    let before = model.density(&positions);
+    // Three cells become six: a node on each old one, and one in the middle, where linear functions are what they were.
+    let mut source = plenoxel::rays::RaySource::new(views().0, [1.0; 3], 1);
+    let stage = PlannedStage { index: 1, resolution: Some(7), steps: 1, first: 1 };
+    model.begin_stage(&stage, &mut source).expect("a stage");
+    let after = model.density(&positions);
+    for (a, b) in before.data().iter().zip(after.data()) {
+        assert!((a - b).abs() < 1e-9 * a.max(1.0), "{a} {b}");
+    }
+    assert!(no_grad(|| model.render(&rays(3), &PASS)).sample_count > 0);
+}
+
+fn views() -> (Vec<View>, Vec<View>) {
+    let options = ProceduralOptions { width: 32, height: 32, train: 24, val: 0, test: 4, supersample: 2 };
+    let scene = Dataset::procedural(options).expect("the built-in scene");
+    let load = |split| scene.load(split, &|_, _| {}).expect("its views");
+    (load(Split::Train), load(Split::Test))
+}
+
+fn trainer(views: &[View]) -> Trainer<f32, Tensorf<f32>> {
+    let config = Config { factor_rate: 0.05, network_rate: 5e-3, ..tiny(&[(16, 150), (24, 150)]) };
+    let options = TrainOptions { rays_per_step: 256, ..TrainOptions::default() };
+    let objective = Objective::new().with("mse", 1.0, mse).with("density_l1", 8e-5, density_l1);
+    Trainer::with_model(Tensorf::new(config).expect("valid settings"), views, objective, options).expect("a trainer")
+}
+
+#[test]
+fn a_scene_is_learned_and_a_resumed_run_has_the_same_bits() {
+    let (train, test) = views();
+    let mut whole = trainer(&train);
+    (0..200).for_each(|_| drop(whole.step().expect("a step")));
+    let file = std::env::temp_dir().join(format!("tensorf-{}.safetensors", std::process::id()));
+    whole.save(&file, "scene").expect("saved");
+    let mut resumed = trainer(&train).resumed(&file).expect("resumed");
+    while let Some(report) = whole.step().expect("a step") {
+        assert_eq!(resumed.step().expect("a step").as_ref(), Some(&report));
+    }
+    std::fs::remove_file(file).expect("removed");
+    let psnr = |model: &Tensorf<f32>| evaluate(model, &test, &ViewOptions::over([1.0; 3])).psnr().expect("a figure");
+    let untrained = psnr(trainer(&train).model());
+    let trained = psnr(whole.model());
+    assert!(trained > untrained + 8.0, "{untrained} to {trained}");
+}
+
+#[test]
+fn settings_without_meaning_are_refused_by_their_key() {
+    let wrong: [(&str, fn(&mut Config)); 5] = [
+        ("half_width", |config| config.half_width = f64::NAN),
+        ("density_components", |config| config.density_components = 0),
+        ("step", |config| config.step = 0.0),
+        ("stages", |config| config.stages.clear()),
+        ("stages[0].resolution", |config| config.stages[0].resolution = 1),
+    ];
+    for (key, change) in wrong {
+        let mut config = tiny(&[(4, 1)]);
+        change(&mut config);
+        let error = Tensorf::<f32>::new(config).expect_err(key);
+        assert!(error.exit_code() == 2 && error.to_string().starts_with(key), "{error}");
+    }
+}
