@@ -56,6 +56,10 @@ pub struct Config {
     pub rays_per_step: usize,
     /// Draw training rays only from pixels on or around the projection of the remaining voxels, because other rays cross empty space only.
     /// A stage that begins without empty space draws from all pixels. Needs no alpha channel.
+    ///
+    /// A loss of rays is the mean over the drawn rays. Against a loss of the grid, such as total variation, it therefore counts more than a mean over all pixels
+    /// would, by 1 / (share of the pixels that are drawn). Measured on lego, preset `fast`, held-out training views, seeds 42 and 43: 32.17 and 32.13 dB with
+    /// `tv_color_sampled` = 1e-2; 32.03 and 31.87 dB with 2.5 times that weight; 32.13 and 32.05 dB with 0.4 times.
     #[serde(default)]
     pub aim: bool,
     /// Shift the samples of each training ray by a random fraction of a step.
