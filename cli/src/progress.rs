@@ -199,7 +199,7 @@ impl<'c, 'a> Meter<'c, 'a> {
     fn new(console: &'c Console<'a>, total: u64) -> Self {
         let bar = console.bars.then(|| {
             let style = ProgressStyle::with_template("{bar:7} {percent:>3}%  {msg}").unwrap_or_else(|_| ProgressStyle::default_bar());
-            ProgressBar::new(total).with_style(style)
+            ProgressBar::with_draw_target(Some(total), terminal::bar_target()).with_style(style)
         });
         lock(&console.bar).clone_from(&bar);
         let shown = Mutex::new(Instant::now());

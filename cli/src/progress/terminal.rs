@@ -1,5 +1,10 @@
 //! Lines that fit a terminal.
 
+use indicatif::ProgressDrawTarget;
+#[cfg(unix)]
+use indicatif::TermLike;
+#[cfg(unix)]
+use std::io::{self, Write};
 use std::path::Path;
 
 /// Columns at the end of a bar's line that stay free: for `^C`, which a terminal writes where the cursor is. If that made the line longer than the terminal is wide,
@@ -11,6 +16,68 @@ const USUAL: usize = 80;
 /// Returns the number of columns of the terminal.
 pub fn columns() -> usize {
     terminal_size::terminal_size().map_or(USUAL, |(width, _)| usize::from(width.0).max(20))
+}
+
+/// Returns where bars are drawn: on stderr, in lines that leave [`FREE`] columns.
+#[cfg(unix)]
+pub fn bar_target() -> ProgressDrawTarget {
+    ProgressDrawTarget::term_like(Box::new(Narrow))
+}
+
+#[cfg(not(unix))]
+pub fn bar_target() -> ProgressDrawTarget {
+    ProgressDrawTarget::stderr()
+}
+
+/// The terminal behind stderr, described as narrower than it is, because a bar's line is filled up with spaces.
+#[cfg(unix)]
+#[derive(Debug)]
+struct Narrow;
+
+#[cfg(unix)]
+impl Narrow {
+    fn control(count: usize, code: char) -> io::Result<()> {
+        if count == 0 { Ok(()) } else { write!(io::stderr(), "\x1b[{count}{code}") }
+    }
+}
+
+#[cfg(unix)]
+impl TermLike for Narrow {
+    fn width(&self) -> u16 {
+        columns().saturating_sub(FREE).try_into().unwrap_or(u16::MAX)
+    }
+
+    fn move_cursor_up(&self, n: usize) -> io::Result<()> {
+        Self::control(n, 'A')
+    }
+
+    fn move_cursor_down(&self, n: usize) -> io::Result<()> {
+        Self::control(n, 'B')
+    }
+
+    fn move_cursor_right(&self, n: usize) -> io::Result<()> {
+        Self::control(n, 'C')
+    }
+
+    fn move_cursor_left(&self, n: usize) -> io::Result<()> {
+        Self::control(n, 'D')
+    }
+
+    fn write_line(&self, line: &str) -> io::Result<()> {
+        writeln!(io::stderr(), "{line}")
+    }
+
+    fn write_str(&self, text: &str) -> io::Result<()> {
+        write!(io::stderr(), "{text}")
+    }
+
+    fn clear_line(&self) -> io::Result<()> {
+        write!(io::stderr(), "\r\x1b[2K")
+    }
+
+    fn flush(&self) -> io::Result<()> {
+        io::stderr().flush()
+    }
 }
 
 /// Returns the start of a line beside a bar that takes `taken` columns, as much as fits.
