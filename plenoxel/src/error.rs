@@ -3,17 +3,17 @@
 //! Mistakes of a programmer (shapes that do not fit) panic at the caller's line. Everything that comes from a file, a flag or
 //! the data is an [`Error`], and its message says where it happened, what was found, what is accepted and what to do.
 
-use crate::text::one_line;
+use crate::text::{brief, one_line};
 use std::path::{Path, PathBuf};
 
 /// Result with this crate's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Everything a user, a disk or a diverging training run can cause. Displayed, it is one line that can be printed: see [`one_line`].
+/// Everything a user, a disk or a diverging training run can cause. Displayed, it is one line that can be printed, of bounded length: see [`brief`].
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file or folder does not hold what it should.
-    #[error("{}: {}; {}", shown(path), one_line(found), one_line(remedy))]
+    #[error("{}: {}; {}", shown(path), brief(found), brief(remedy))]
     Input {
         /// The file or folder.
         path: PathBuf,
@@ -23,7 +23,7 @@ pub enum Error {
         remedy: String,
     },
     /// A setting (flag or configuration key) has a value that cannot be used.
-    #[error("{}: {} cannot be used; accepted: {}", one_line(key), one_line(found), one_line(accepted))]
+    #[error("{}: {} cannot be used; accepted: {}", brief(key), brief(found), brief(accepted))]
     Config {
         /// Name of the setting as the user writes it.
         key: String,
@@ -33,7 +33,7 @@ pub enum Error {
         accepted: String,
     },
     /// A computation left the finite numbers.
-    #[error("{}: {}; {}", one_line(place), one_line(found), one_line(remedy))]
+    #[error("{}: {}; {}", brief(place), brief(found), brief(remedy))]
     Numeric {
         /// Step, tensor or formula where it was noticed.
         place: String,
@@ -43,7 +43,7 @@ pub enum Error {
         remedy: String,
     },
     /// The operating system refused to read or write.
-    #[error("{}: {} while {doing}; {}", shown(path), one_line(&source.to_string()), remedy(source))]
+    #[error("{}: {} while {doing}; {}", shown(path), brief(&source.to_string()), remedy(source))]
     Io {
         /// The file or folder.
         path: PathBuf,
@@ -145,6 +145,8 @@ mod tests {
         }
         let foreign = Error::input("a\x1b[1mb", "the key \"x\ny\"", "a\u{9b}");
         assert_eq!(foreign.to_string(), "a\\u{1b}[1mb: the key \"x\\ny\"; a\\u{9b}");
+        let long = Error::config("engine", "a".repeat(900_000), "b").to_string();
+        assert!(long.starts_with("engine: aaa") && long.ends_with("aaa cannot be used; accepted: b") && long.len() < 250, "{long}");
         let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
         assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }
