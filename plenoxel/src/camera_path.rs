@@ -27,7 +27,7 @@ mod turntable;
 use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::dataset::image::MAX_SIDE;
 use crate::error::{Error, Result};
-use crate::json;
+use crate::json::{self, Kept};
 use glam::{DAffine3, DQuat, DVec3};
 use instant_ngp::Keyframes;
 use serde_json::Value;
@@ -36,6 +36,34 @@ pub use turntable::Turntable;
 
 /// The most frames of a path: an hour of film.
 pub const MOST_FRAMES: usize = 100_000;
+/// What is kept of a file: a list that is longer than a path may be is not read to its end.
+const KEPT: Kept = Kept { keys: |key| KEYS.contains(&key), entries: MOST_FRAMES, share: 75 };
+/// The keys that one of the readers looks at.
+const KEYS: [&str; 23] = [
+    "path",
+    "loop",
+    "spline_order",
+    "R",
+    "T",
+    "fov",
+    "timestamp",
+    "camera_path",
+    "camera_type",
+    "camera_to_world",
+    "render_width",
+    "render_height",
+    "fps",
+    "frames",
+    "transform_matrix",
+    "w",
+    "h",
+    "x_fov",
+    "y_fov",
+    "fl_x",
+    "fl_y",
+    "camera_angle_x",
+    "camera_angle_y",
+];
 /// The farthest that a camera may stand from the origin, world length.
 const FARTHEST: f64 = 1e6;
 
@@ -143,7 +171,7 @@ impl CameraPath {
     ///
     /// Errors: everything that is wrong with it, with frame and field.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
-        let root = json::parse(path, bytes)?;
+        let root = json::parse(path, bytes, &KEPT)?;
         let file = Entry { path, value: &root, place: String::new() };
         // A file of nerfstudio has keyframes beside its frames, and one of instant-ngp may have anything.
         for (key, read) in
@@ -231,8 +259,8 @@ impl<'a> Entry<'a> {
     /// The entries of a list: some, and not too many. `name` is what one of them is called.
     fn list(&self, field: &str, name: &'static str) -> Result<impl ExactSizeIterator<Item = Entry<'a>>> {
         let list = self.value.get(field).and_then(Value::as_array).ok_or_else(|| self.wrong(field, "it is a list"))?;
-        if list.is_empty() || list.len() > MOST_FRAMES {
-            let found = format!("`{field}` has {} entries", list.len());
+        if list.is_empty() {
+            let found = format!("`{field}` has 0 entries");
             return Err(Error::input(self.path, found, format!("paths of 1 to {MOST_FRAMES} are read")));
         }
         let path = self.path;

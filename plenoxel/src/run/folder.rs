@@ -42,6 +42,8 @@ const REPORT: &str = "report.html";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
+/// All that figures say, those of the run and those of an evaluation at a time.
+const FIGURES: json::Kept = json::Kept { keys: |_| true, entries: usize::MAX, share: 45 };
 /// Endings of what `export` writes.
 const EXPORTED: [&str; 5] = ["vox", "ply", "obj", "glb", "stl"];
 
@@ -188,7 +190,7 @@ impl RunFolder {
         if !files::is_there(&record) {
             return Err(Error::input(path, format!("there is no {RECORD} in this folder"), remedy));
         }
-        let mut record = RunRecord::parse(&record, &files::read(&record, files::RECORD)?)?;
+        let mut record = RunRecord::parse(&record, &files::read(&record, files::RUN)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
         if config.stages.is_empty() && !record.is_of_own_model() {
             record.kind = RunKind::Carved;
@@ -318,7 +320,7 @@ impl RunFolder {
         if !files::is_there(&path) {
             return Ok(None);
         }
-        Ok(json::parse(&path, &files::read(&path, files::RECORD)?).ok())
+        json::parse_if_whole(&path, &files::read(&path, files::RECORD)?, &FIGURES)
     }
 
     /// Writes the chart of the loss, an SVG.
