@@ -82,6 +82,21 @@ pub struct Kept {
 }
 
 impl Filters {
+    /// About the most bytes of memory that [`Filters::apply`] takes for each point, beside coordinates and values.
+    pub(super) fn memory(&self) -> u64 {
+        // The numbers of those that are left, and whether each stays.
+        const LEFT: u64 = 5;
+        // Local coordinates, points and numbers in the order of the tree, its axes, and what it is made from: the first two once more.
+        const TREE: u64 = 12 + 16 + 1 + 16;
+        // Local coordinates, the tree, its sums with the ranges they are of, and what was found.
+        const NOISE: u64 = 12 + 17 + 31 + 2;
+        LEFT + match self {
+            Filters { noise: Some(_), .. } => NOISE,
+            Filters { outliers: Some(_), .. } => TREE,
+            _ => 0,
+        }
+    }
+
     /// Numbers of the points that stay, ascending, and what each filter did. `values` are those that [`Filters::value`] looks at, one for
     /// each point. Points whose coordinates are no numbers, or none of 32 bits, go first of all.
     ///

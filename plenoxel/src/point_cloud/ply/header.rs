@@ -1,6 +1,8 @@
 //! The header of a PLY file: what the bytes after it mean.
 
 use crate::error::{Error, Result};
+use crate::memory;
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// How numbers are written.
@@ -55,6 +57,35 @@ impl Number {
     /// Its usual name.
     pub fn name(self) -> &'static str {
         NUMBERS.iter().find(|(number, _)| *number == self).map_or("float", |(_, names)| names[0])
+    }
+
+    /// What a text may say in its place, in words.
+    pub(super) fn accepted(self) -> String {
+        match self.range() {
+            Some([low, high]) => format!("a whole number from {low} to {high}"),
+            None => "a number".to_owned(),
+        }
+    }
+
+    /// The smallest and the largest, of whole numbers.
+    fn range(self) -> Option<[i64; 2]> {
+        let bits = 8 * self.size() as u32;
+        match self {
+            Number::I8 | Number::I16 | Number::I32 => Some([-(1 << (bits - 1)), (1 << (bits - 1)) - 1]),
+            Number::U8 | Number::U16 | Number::U32 => Some([0, (1 << bits) - 1]),
+            Number::F32 | Number::F64 => None,
+        }
+    }
+
+    /// The number that a text says, if it is one of this type. Of fractions it may be none, in the spelling of any C library: -nan(ind), 1.#QNAN.
+    pub(super) fn parse(self, text: &str) -> Option<f64> {
+        match self.range() {
+            Some([low, high]) => text.parse().ok().filter(|value| (low..=high).contains(value)).map(|value| value as f64),
+            None => text.parse().ok().or_else(|| {
+                let small = text.to_lowercase();
+                (small.contains("nan") || small.contains("#ind")).then_some(f64::NAN)
+            }),
+        }
     }
 
     /// Bytes of one.
@@ -121,6 +152,9 @@ impl Element {
     }
 }
 
+/// The most bytes of a header, in which there may be thousands of comments and properties.
+const MOST: usize = 1 << 20;
+
 /// All that stands above the data.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Header {
@@ -137,7 +171,7 @@ pub struct Header {
 impl Header {
     /// Reads the lines from `ply` to `end_header`.
     ///
-    /// Errors name the line: not a PLY file, cut short, an unknown format or type.
+    /// Errors name the line: not a PLY file, cut short, an unknown format or type, a name that comes twice. A header of more than a megabyte is none.
     pub fn parse(path: &Path, file: &[u8]) -> Result<Self> {
         let write_again = "write the cloud again as PLY 1.0";
         if !file.starts_with(b"ply") {
@@ -145,9 +179,16 @@ impl Header {
             return Err(Error::input(path, format!("no PLY file: it begins with `{start}`"), "give a file that begins with `ply`"));
         }
         let (mut encoding, mut remarks, mut elements) = (None, Vec::new(), Vec::<Element>::new());
+        // Of elements, and of the properties of the last.
+        let (mut tables, mut columns) = (BTreeSet::new(), BTreeSet::new());
+        let head = &file[..file.len().min(MOST)];
         let mut at = 0;
         for number in 1.. {
-            let Some(end) = file[at..].iter().position(|&b| b == b'\n').map(|length| at + length) else {
+            let Some(end) = head[at..].iter().position(|&b| b == b'\n').map(|length| at + length) else {
+                if head.len() < file.len() {
+                    let found = format!("the header is longer than the {} that it may have", memory::bytes(MOST as u64));
+                    return Err(Error::input(path, found, "leave out comments and properties that are not needed"));
+                }
                 return Err(Error::input(path, "the header has no `end_header`", "use an undamaged copy: this one is cut short"));
             };
             let line = String::from_utf8_lossy(&file[at..end]);
@@ -163,7 +204,8 @@ impl Header {
                 _ if number == 1 => return bad("the first line must be `ply` alone"),
                 [] => {}
                 ["comment" | "obj_info", ..] => remarks.push(line.to_owned()),
-                ["format", name, _version] => {
+                ["format", ..] if encoding.is_some() => return bad("the format is said once"),
+                ["format", name, "1.0"] => {
                     encoding = Some(match name {
                         "ascii" => Encoding::Ascii,
                         "binary_little_endian" => Encoding::LittleEndian,
@@ -171,8 +213,13 @@ impl Header {
                         _ => return bad("ascii, binary_little_endian and binary_big_endian are read"),
                     });
                 }
+                ["format", ..] => return bad("`format ENCODING 1.0` is read"),
                 ["element", name, count] => match count.parse() {
-                    Ok(count) => elements.push(Element { name: name.to_owned(), count, properties: Vec::new() }),
+                    Ok(_) if !tables.insert(name.to_owned()) => return bad("each element has a name of its own"),
+                    Ok(count) => {
+                        columns.clear();
+                        elements.push(Element { name: name.to_owned(), count, properties: Vec::new() });
+                    }
                     Err(_) => return bad("`element NAME COUNT` is expected, the count being a whole number"),
                 },
                 ["property", ref kind @ .., name] => {
@@ -190,6 +237,9 @@ impl Header {
                         );
                     };
                     let Some(element) = elements.last_mut() else { return bad("a property must stand below an element") };
+                    if !columns.insert(name.to_owned()) {
+                        return bad("each property of an element has a name of its own");
+                    }
                     element.properties.push(Property { name: name.to_owned(), kind });
                 }
                 ["end_header"] => break,
