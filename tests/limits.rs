@@ -55,7 +55,7 @@ fn points_are_counted_by_the_header() {
     limited(20, &bbox).refused(3, &["sparse.ply: to filter 500000 points"]);
     limited(28, &sor).refused(3, &["sparse.ply: to filter 500000 points"]);
     limited(28, &bbox).done();
-    limited(46, &sor).done();
+    limited(47, &sor).done();
 }
 
 #[test]
@@ -86,6 +86,17 @@ fn json_takes_memory_for_what_is_used_of_it() {
     }
     cameras(&format!("{{\"camera_angle_x\": 0.69, \"frames\": [{}{{}}]}}", "{},".repeat(10_000)));
     limited(20, &info).refused(3, &["frame 0 has no key"]);
+}
+
+#[test]
+fn settings_with_long_names_take_no_more_than_others() {
+    let _alone = alone();
+    let folder = Folder::new("limit-settings");
+    let config = folder.path("long.toml");
+    fs::write(&config, format!("{} = [{}{{}}]\n", "k".repeat(100_000), "{},".repeat(2000))).unwrap();
+    let refused = limited(60, &["train", "--config", &config, "--out", &folder.path("run")]);
+    refused.refused(2, &["long.toml", "the unknown key `kkk"]);
+    assert!(refused.err.len() < 2000, "{}", refused.err);
 }
 
 #[test]
