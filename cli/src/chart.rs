@@ -38,7 +38,7 @@ pub struct Chart {
 }
 
 /// A curve, and a pale band around it.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct Curve {
     /// What it shows.
     pub name: String,

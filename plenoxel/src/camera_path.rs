@@ -30,7 +30,7 @@ mod turntable;
 use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::dataset::image::MAX_SIDE;
 use crate::error::{Error, Result};
-use crate::json;
+use crate::json::{self, Kept};
 use glam::{DAffine3, DQuat, DVec3};
 use instant_ngp::Keyframes;
 use serde_json::Value;
@@ -39,6 +39,34 @@ pub use turntable::Turntable;
 
 /// Largest number of frames of a path: an hour of film.
 pub const MOST_FRAMES: usize = 100_000;
+/// Content of a file that is kept. A list that is longer than a path may be is not read to its end.
+const KEPT: Kept = Kept { keys: |key| KEYS.contains(&key), entries: MOST_FRAMES, share: 75 };
+/// Keys that one of the readers uses.
+const KEYS: [&str; 23] = [
+    "path",
+    "loop",
+    "spline_order",
+    "R",
+    "T",
+    "fov",
+    "timestamp",
+    "camera_path",
+    "camera_type",
+    "camera_to_world",
+    "render_width",
+    "render_height",
+    "fps",
+    "frames",
+    "transform_matrix",
+    "w",
+    "h",
+    "x_fov",
+    "y_fov",
+    "fl_x",
+    "fl_y",
+    "camera_angle_x",
+    "camera_angle_y",
+];
 /// Largest distance of a camera from the origin along an axis, world length.
 const FARTHEST: f64 = 1e6;
 
@@ -147,7 +175,7 @@ impl CameraPath {
     ///
     /// Errors if the content is invalid, naming frame and field.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
-        let root = json::parse(path, bytes)?;
+        let root = json::parse(path, bytes, &KEPT)?;
         let file = Entry { path, value: &root, place: String::new() };
         // A file of nerfstudio contains keyframes in addition to its frames, and a file of instant-ngp may contain anything.
         for (key, read) in
@@ -235,8 +263,8 @@ impl<'a> Entry<'a> {
     /// Reads the entries of a list of 1 to [`MOST_FRAMES`]. `name` is the name of an entry.
     fn list(&self, field: &str, name: &'static str) -> Result<impl ExactSizeIterator<Item = Entry<'a>>> {
         let list = self.value.get(field).and_then(Value::as_array).ok_or_else(|| self.wrong(field, "a list"))?;
-        if list.is_empty() || list.len() > MOST_FRAMES {
-            let found = format!("`{field}` has {} entries", list.len());
+        if list.is_empty() {
+            let found = format!("`{field}` has 0 entries");
             return Err(Error::input(self.path, found, format!("accepted: 1 to {MOST_FRAMES}")));
         }
         let path = self.path;

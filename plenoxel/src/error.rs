@@ -3,17 +3,17 @@
 //! Programming mistakes, such as shapes that do not match, panic at the caller's line. Problems with a file, a flag or data are an
 //! [`Error`]. Its message says where the problem is, what is wrong, what is accepted, and what to do.
 
-use crate::text::one_line;
+use crate::text::{brief, one_line};
 use std::path::{Path, PathBuf};
 
 /// [`Result`](std::result::Result) with this crate's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Error caused by a user, the operating system or a diverging training run. Displayed, it is one line of printable text ([`one_line`]).
+/// Error caused by a user, the operating system or a diverging training run. Displayed, it is one line of printable text of bounded length ([`brief`]).
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file or folder has invalid content.
-    #[error("{}: {}; {}", shown(path), one_line(found), one_line(remedy))]
+    #[error("{}: {}; {}", shown(path), brief(found), brief(remedy))]
     Input {
         /// File or folder.
         path: PathBuf,
@@ -23,7 +23,7 @@ pub enum Error {
         remedy: String,
     },
     /// A setting (flag or configuration key) has an invalid value.
-    #[error("{}: {}; accepted: {}", one_line(key), problem(found), one_line(accepted))]
+    #[error("{}: {}; accepted: {}", brief(key), problem(found), brief(accepted))]
     Config {
         /// Name of the setting as the user writes it.
         key: String,
@@ -33,7 +33,7 @@ pub enum Error {
         accepted: String,
     },
     /// A computation produced a number that is not finite, or another unusable result.
-    #[error("{}: {}; {}", one_line(place), one_line(found), one_line(remedy))]
+    #[error("{}: {}; {}", brief(place), brief(found), brief(remedy))]
     Numeric {
         /// Step, tensor or formula that produced it.
         place: String,
@@ -43,7 +43,7 @@ pub enum Error {
         remedy: String,
     },
     /// The operating system failed to read or write.
-    #[error("{}: {} while {doing}; {}", shown(path), one_line(&source.to_string()), remedy(source))]
+    #[error("{}: {} while {doing}; {}", shown(path), brief(&source.to_string()), remedy(source))]
     Io {
         /// File or folder.
         path: PathBuf,
@@ -155,6 +155,8 @@ mod tests {
         }
         let foreign = Error::input("a\x1b[1mb", "the key \"x\ny\"", "a\u{9b}");
         assert_eq!(foreign.to_string(), "a\\u{1b}[1mb: the key \"x\\ny\"; a\\u{9b}");
+        let long = Error::config("engine", "a".repeat(900_000), "b").to_string();
+        assert!(long.starts_with("engine: aaa") && long.ends_with("aaa cannot be used; accepted: b") && long.len() < 250, "{long}");
         let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
         assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }

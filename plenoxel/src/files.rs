@@ -5,7 +5,7 @@
 
 mod read;
 
-pub use read::{CAMERA_PATH, CAMERAS, CLOUD, IMAGE, Kind, METRICS, RECORD, SETTINGS, TENSORS, is_there, open, read, read_named, text};
+pub use read::{CAMERA_PATH, CAMERAS, CLOUD, IMAGE, Kind, METRICS, RECORD, RUN, SETTINGS, TENSORS, is_there, open, read, read_named, text};
 
 mod lock;
 mod room;

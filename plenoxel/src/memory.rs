@@ -58,8 +58,17 @@ pub(crate) fn check(path: &Path, what: &str, needed: u64) -> Result<()> {
 /// The error of [`check`].
 pub(crate) fn refusal(path: &Path, what: &str, needed: u64, allowance: &Allowance) -> Error {
     let found = format!("{what} takes about {} of memory, where {allowance}", bytes(needed));
+    Error::input(path, found, remedy(allowance))
+}
+
+/// The error that what a file says was not read to its end, because it takes more memory than there is; `what` is the file in words.
+pub(crate) fn refusal_of_content(path: &Path, what: &str, allowance: &Allowance) -> Error {
+    Error::input(path, format!("what is said in {what} takes too much memory, where {allowance}"), remedy(allowance))
+}
+
+fn remedy(allowance: &Allowance) -> String {
     let more = if allowance.is_limit { "or a higher --max-memory" } else { "or a machine with more" };
-    Error::input(path, found, format!("use a smaller one, {more}"))
+    format!("use a smaller one, {more}")
 }
 
 /// Bytes with a unit of powers of 1000, at two or three digits: `2.3 GB`, `99 kB`.

@@ -1,5 +1,7 @@
 //! Text for people: untrusted text, such as file names and file content, made safe to print; and times.
 
+use std::borrow::Cow;
+
 /// Returns the text on one line without characters that control a terminal: control characters, line breaks, and marks that change the
 /// direction of writing are escaped as in Rust, `\n` and `\u{1b}`. Everything else is unchanged.
 pub fn one_line(text: &str) -> String {
@@ -8,6 +10,61 @@ pub fn one_line(text: &str) -> String {
         if is_unprintable(c) { line.extend(c.escape_default()) } else { line.push(c) }
     }
     line
+}
+
+/// Returns a part of a message on [`one_line`] and with bounded length. The middle of words longer than 200 characters and of texts longer than 1200 characters is
+/// replaced by …; numbers with many zeros are written with an exponent.
+pub fn brief(text: &str) -> String {
+    const WORD: usize = 200;
+    const ALL: usize = 1200;
+    let mut words = String::new();
+    for word in text.split_inclusive(char::is_whitespace) {
+        words += &shortened(&with_exponents(word), WORD);
+    }
+    one_line(&shortened(&words, ALL))
+}
+
+/// Formats a number with the fewest digits that read back as the same number, with an exponent if it is very large or small.
+pub fn number(value: f64) -> String {
+    let text = format!("{value:?}");
+    text.strip_suffix(".0").unwrap_or(&text).to_owned()
+}
+
+/// Returns the beginning and the end of a text of more than `most` characters.
+fn shortened(text: &str, most: usize) -> Cow<'_, str> {
+    // No character has more bytes than 4.
+    if text.len() <= most || text.chars().nth(most).is_none() {
+        return text.into();
+    }
+    let begin = text.char_indices().nth(most / 2).map_or(text.len(), |(end, _)| end);
+    let end = text.char_indices().rev().nth(most - most / 2 - 1).map_or(0, |(start, _)| start);
+    format!("{}…{}", &text[..begin], &text[end..]).into()
+}
+
+/// Returns the word with very long numbers in their shortest form, if Rust formatted them. Other digits are unchanged.
+fn with_exponents(word: &str) -> Cow<'_, str> {
+    const DIGITS: usize = 24;
+    // Length of the longest number.
+    const MOST: usize = 1100;
+    let is_part = |c: char| c.is_ascii_digit() || c == '.';
+    if word.len() <= DIGITS {
+        return word.into();
+    }
+    let mut text = String::new();
+    let mut rest = word;
+    while let Some(start) = rest.find(is_part) {
+        let (before, from) = rest.split_at(start);
+        let (digits, after) = from.split_at(from.find(|c| !is_part(c)).unwrap_or(from.len()));
+        let value = Some(digits).filter(|digits| (DIGITS..MOST).contains(&digits.len())).and_then(|digits| digits.parse::<f64>().ok());
+        text += before;
+        match value.filter(|value| value.to_string() == digits) {
+            Some(value) => text += &number(value),
+            None => text += digits,
+        }
+        rest = after;
+    }
+    text += rest;
+    text.into()
 }
 
 /// Returns true for characters that control a terminal instead of being displayed.
@@ -33,6 +90,28 @@ mod tests {
     #[test]
     fn times_read_well() {
         assert_eq!([3.4, 59.6, 3725.0].map(clock), ["0:03", "1:00", "1:02:05"]);
+    }
+
+    #[test]
+    fn what_is_long_loses_its_middle_and_the_rest_stays() {
+        let text = brief(&format!("engine: \"{}b\" cannot be used", "a".repeat(900_000)));
+        assert!(text.starts_with("engine: \"aaa") && text.ends_with("aaab\" cannot be used") && text.chars().count() < 240, "{text}");
+        let names = brief(&format!("[{}]; the end", vec!["name"; 100_000].join(", ")));
+        assert!(names.contains('…') && names.ends_with("the end") && names.chars().count() == 1201, "{names}");
+        let umlauts = brief(&"ä".repeat(201));
+        assert_eq!(umlauts, format!("{0}…{0}", "ä".repeat(100)));
+        for text in [&"ä".repeat(200), "a sentence\nof some words,  or none", &vec!["word"; 200].join(" ")] {
+            assert_eq!(brief(text), one_line(text));
+        }
+        assert_eq!(brief(&"\u{1b}".repeat(300)).chars().count(), 1201);
+    }
+
+    #[test]
+    fn numbers_are_as_short_as_they_can_be() {
+        assert_eq!([1e300, 800.0, 0.1, -2.5, 5e-324, 1e15].map(number), ["1e300", "800", "0.1", "-2.5", "5e-324", "1000000000000000"]);
+        assert_eq!(brief(&format!("fl_x is {}, or [{},{}]", 1e300, -1e25, 5e-324)), "fl_x is 1e300, or [-1e25,5e-324]");
+        let others = "1234567890123456789012345678901234567890 0.30000000000000004";
+        assert_eq!(brief(others), others);
     }
 
     #[test]

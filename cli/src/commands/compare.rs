@@ -6,7 +6,8 @@ use super::table::Figures;
 use super::table::markdown::as_text;
 use crate::html::{self, escaped};
 use crate::progress::{Console, is_stdout, thousands};
-use crate::report::{SCRIPT, STYLE, curves};
+use crate::report::curves::{self, RunCurves};
+use crate::report::{SCRIPT, STYLE};
 use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::model::plenoxels::config::Config;
@@ -47,15 +48,18 @@ struct Run {
     config: Config,
     record: RunRecord,
     figures: Figures,
-    metrics: String,
+    curves: RunCurves,
 }
 
 impl Run {
     fn read(path: &Path) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
         let figures = Figures::of(&folder, &config)?.unwrap_or_default();
+        let name = path.display().to_string();
+        // Of one run at a time: its curves are a small part of it.
         let metrics = metrics::read(&folder.metrics())?;
-        Ok(Run { name: path.display().to_string(), folder, config, record, figures, metrics })
+        let curves = RunCurves::of(&name, &metrics::lines(&metrics).map(|(_, line)| line).collect::<Vec<_>>());
+        Ok(Run { name, folder, config, record, figures, curves })
     }
 
     /// What the table says of it.
@@ -85,10 +89,9 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
     let facts: Vec<_> = runs.iter().map(Run::facts).collect();
     let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();
     let cells: Vec<Vec<&str>> = facts.iter().map(|facts| facts.iter().map(|(_, value)| value.as_str()).collect()).collect();
-    let curves = runs.iter().map(|run| (run.name.clone(), metrics::lines(&run.metrics).map(|(_, line)| line).collect()));
     let parts = [
         format!("<section>{}</section>", table(&heads, &cells)),
-        curves::side_by_side(&curves.collect::<Vec<_>>()),
+        curves::side_by_side(runs.iter().map(|run| &run.curves)),
         pictures::section(&runs)?,
         settings(&runs),
         format!("<script>\n{SCRIPT}</script>\n"),

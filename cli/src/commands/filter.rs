@@ -7,6 +7,7 @@ use clap::{Args, ValueHint};
 use plenoxel::error::{Error, Result};
 use plenoxel::point_cloud::filter::Filters;
 use plenoxel::point_cloud::ply::{Kind, PlyFile};
+use plenoxel::text::brief;
 use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
@@ -19,6 +20,9 @@ Filters are CloudCompare's and are applied in this order: bbox, value, noise, SO
 the same points; noise may keep others where the plane of the neighbours is not unique, or a point lies just as far from it \
 as is allowed: such points stay here, and CloudCompare's rounding decides. Points between voxels are often such. The new file has the encoding of the old one, and of each point that stays all properties to the last digit; \
 faces and other elements are left out, for they name points by number.";
+
+/// Elements besides the points that are named.
+const OTHERS: usize = 10;
 
 /// Clean a point cloud with CloudCompare's filters
 #[derive(Debug, Args)]
@@ -49,15 +53,21 @@ pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
             "at least one of --bbox, --min-value, --max-value, --noise-radius, --sor-neighbours, --sor-sigma",
         ));
     }
+    file.check_memory(&filters)?;
     let lists = file.element().properties.iter().filter(|p| matches!(p.kind, Kind::List(..))).count();
-    console.note(&format!("{}: {} points, fields [{}], {lists} lists", args.cloud.display(), file.len(), file.field_names().join(", ")));
+    let fields = brief(&file.field_names().join(", "));
+    console.note(&format!("{}: {} points, fields [{fields}], {lists} lists", args.cloud.display(), file.len()));
     if filters.noise.is_some() {
         let unit =
             side.map_or("the units of the file".to_owned(), |side| format!("the units of the file, in which a voxel's side is {side}"));
         console.note(&format!("noise radius: {} in {unit}", filters.noise.map_or(0.0, |noise| noise.radius)));
     }
-    for element in file.others().filter(|element| element.count > 0) {
-        console.note(&format!("left out: {} rows of `{}`, which may name points by number", element.count, element.name));
+    let others = || file.others().filter(|element| element.count > 0);
+    for element in others().take(OTHERS) {
+        console.note(&format!("left out: {} rows of `{}`, which may name points by number", element.count, brief(&element.name)));
+    }
+    if let more @ 1.. = others().skip(OTHERS).count() {
+        console.note(&format!("left out: {more} more elements"));
     }
     let field = args.filters.value_field(&file.field_names())?;
     let values = field.as_deref().map(|name| file.values(name)).transpose()?;

@@ -31,23 +31,42 @@ pub fn section(lines: &[Line<'_>], config: &Config) -> String {
     })
 }
 
+/// What each of several runs has a curve of.
+type OfEach = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
+const OF_EACH: [OfEach; 4] = [
+    ("Loss", "loss", |line| Some(line.loss)),
+    ("PSNR of training rays", DECIBELS, |line| Some(line.psnr)),
+    ("PSNR of validation views", DECIBELS, |line| line.validation_psnr),
+    ("Voxels", "number", |line| line.figure("voxels").filter(|n| *n > 0.0)),
+];
+
+/// The curves of one run among several, without the lines that they were drawn from.
+#[derive(Debug)]
+pub struct RunCurves {
+    /// By axis: how far the run goes, and its curves.
+    over: [(f64, [Curve; OF_EACH.len()]); AXES.len()],
+    is_empty: bool,
+}
+
+impl RunCurves {
+    /// The curves of a run with a name.
+    pub fn of(name: &str, lines: &[Line<'_>]) -> Self {
+        let over = AXES.map(|(_, _, at)| (lines.last().map_or(0.0, at), OF_EACH.map(|(_, _, value)| curve(name, lines, at, &value))));
+        RunCurves { over, is_empty: lines.is_empty() }
+    }
+}
+
 /// The curves of several runs in the same charts, or nothing if none of them was trained.
-pub fn side_by_side(runs: &[(String, Vec<Line<'_>>)]) -> String {
-    type OfEach = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
-    const SHOWN: [OfEach; 4] = [
-        ("Loss", "loss", |line| Some(line.loss)),
-        ("PSNR of training rays", DECIBELS, |line| Some(line.psnr)),
-        ("PSNR of validation views", DECIBELS, |line| line.validation_psnr),
-        ("Voxels", "number", |line| line.figure("voxels").filter(|n| *n > 0.0)),
-    ];
-    if runs.iter().all(|(_, lines)| lines.is_empty()) {
+pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> String {
+    if runs.clone().all(|run| run.is_empty) {
         return String::new();
     }
-    over_both(|(_, across, at)| {
-        let end = runs.iter().filter_map(|(_, lines)| lines.last()).map(at).fold(0.0, f64::max);
-        let charts = SHOWN.into_iter().filter_map(|(title, up, value)| {
+    over_both(|(name, across, _)| {
+        let axis = AXES.iter().position(|axis| axis.0 == name).unwrap_or(0);
+        let end = runs.clone().map(|run| run.over[axis].0).fold(0.0, f64::max);
+        let charts = OF_EACH.into_iter().enumerate().filter_map(|(number, (title, up, _))| {
             // A run without such figures keeps its color for the other charts.
-            let curves: Vec<Curve> = runs.iter().map(|(name, lines)| curve(name, lines, at, &value)).collect();
+            let curves: Vec<Curve> = runs.clone().map(|run| run.over[axis].1[number].clone()).collect();
             let known = curves.iter().any(|curve| !curve.lines.is_empty());
             let chart =
                 || Chart { title: title.to_owned(), across: (across.to_owned(), end), up: up.to_owned(), parts: Vec::new(), curves };

@@ -12,9 +12,10 @@ use super::{Dataset, Frame, OpenOptions, Source, Split, image};
 use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::error::{Error, Result};
 use crate::files;
-use crate::json;
+use crate::json::{self, Kept};
 use glam::{DAffine3, DMat3, DMat4};
 pub use intrinsics::StatedIntrinsics;
+use intrinsics::is_known;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 pub(super) use write::write;
@@ -23,6 +24,9 @@ pub(super) use write::write;
 const ORTHONORMAL_WITHIN: f64 = 1e-3;
 /// Largest accepted coordinate of a camera. Larger ones overflow when rays are intersected with boxes.
 const FARTHEST: f64 = 1e12;
+/// Content of a file that is kept. The list of views is made from it and needs memory too.
+const KEPT: Kept = Kept { keys: |key| is_known(key) || KEYS.contains(&key), entries: usize::MAX, share: 75 };
+const KEYS: [&str; 3] = ["frames", "file_path", "transform_matrix"];
 /// Longest accepted path, which is the limit of common systems.
 const LONGEST_PATH: usize = 4096;
 
@@ -115,7 +119,7 @@ impl Transforms {
     /// Errors if the JSON or a matrix is invalid, naming the frame.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
         let bad = |found: String, remedy: &str| Error::input(path, found, remedy);
-        let json = json::parse(path, bytes)?;
+        let json = json::parse(path, bytes, &KEPT)?;
         let Some(angle) = json.get("camera_angle_x") else {
             let found = "there is no key \"camera_angle_x\"";
             return Err(match json.get("fl_x") {

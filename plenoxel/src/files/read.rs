@@ -21,25 +21,29 @@ pub struct Kind {
     pub memory: u64,
 }
 
-/// The cameras of a dataset: a hundred thousand views with 600 bytes each. A number of few digits becomes a value of 32 bytes.
-pub const CAMERAS: Kind = Kind { name: "a JSON file of cameras", most: 64 << 20, memory: 16 };
+/// The cameras of a dataset: a hundred thousand views with 600 bytes each. The memory is that of the text in UTF-16 and in UTF-8; values are counted
+/// while they are read.
+pub const CAMERAS: Kind = Kind { name: "a JSON file of cameras", most: 64 << 20, memory: 3 };
 
-/// The cameras of a film: 50 000 frames of nerfstudio.
-pub const CAMERA_PATH: Kind = Kind { name: "a JSON file of cameras", most: 32 << 20, memory: 16 };
+/// The cameras of a film: 50 000 frames of nerfstudio. Memory as above.
+pub const CAMERA_PATH: Kind = Kind { name: "a JSON file of cameras", most: 32 << 20, memory: 3 };
 
 /// Settings, and the description of a sweep: a hundred times the longest preset.
 pub const SETTINGS: Kind = Kind { name: "a TOML file", most: 1 << 20, memory: 16 };
 
-/// What a run notes of itself: `run.json`, and figures with a line for each of ten thousand test views.
-pub const RECORD: Kind = Kind { name: "a JSON file that a run wrote", most: 16 << 20, memory: 16 };
+/// Figures that a run notes, with a line for each of ten thousand test views. Memory as above.
+pub const RECORD: Kind = Kind { name: "a JSON file that a run wrote", most: 16 << 20, memory: 3 };
 
-/// `metrics.jsonl`: hundreds of thousands of lines, where a run has thousands.
-pub const METRICS: Kind = Kind { name: "the metrics of a run", most: 256 << 20, memory: 2 };
+/// `run.json`: a few facts. One that says which of several kinds it is has its values kept until that is known.
+pub const RUN: Kind = Kind { name: "a JSON file that a run wrote", most: 1 << 20, memory: 64 };
+
+/// `metrics.jsonl`: hundreds of thousands of lines, where a run has thousands. Its reader counts what they become.
+pub const METRICS: Kind = Kind { name: "the metrics of a run", most: 256 << 20, memory: 1 };
 
 /// An image: the largest that is accepted, of 16384² pixels of 8 bytes and not compressed, and as much beside it.
 pub const IMAGE: Kind = Kind { name: "a PNG image", most: 4 << 30, memory: 0 };
 
-/// A point cloud: as many points as 32 bits count, of 16 bytes each.
+/// A point cloud: as many points as 32 bits count, of 16 bytes each. What is made of it is counted by its header.
 pub const CLOUD: Kind = Kind { name: "a PLY file", most: 64 << 30, memory: 1 };
 
 /// Tensors: a grid of 1024³ voxels with 27 harmonics, what an optimizer remembers of it, and the same in double precision.
@@ -142,9 +146,12 @@ pub fn text<'b>(path: &Path, bytes: &'b [u8]) -> Result<Cow<'b, str>> {
 
 fn utf16(path: &Path, bytes: &[u8], unit: fn([u8; 2]) -> u16) -> Result<Cow<'static, str>> {
     let (units, rest) = bytes.as_chunks::<2>();
-    let text: std::result::Result<String, _> = char::decode_utf16(units.iter().map(|bytes| unit(*bytes))).collect();
-    match text {
-        Ok(text) if rest.is_empty() => Ok(Cow::Owned(text)),
+    let letters = || char::decode_utf16(units.iter().map(|bytes| unit(*bytes)));
+    // A text that grows as it is read would take twice as much.
+    let mut text = String::with_capacity(letters().map(|letter| letter.map_or(0, char::len_utf8)).sum());
+    let read = letters().try_for_each(|letter| letter.map(|letter| text.push(letter)));
+    match read {
+        Ok(()) if rest.is_empty() => Ok(Cow::Owned(text)),
         _ => Err(Error::input(path, "the byte order mark says UTF-16, but the rest is not", "save it as UTF-8")),
     }
 }

@@ -82,6 +82,21 @@ pub struct Kept {
 }
 
 impl Filters {
+    /// Returns an upper estimate of the memory of [`Filters::apply`], bytes per point, without coordinates and values.
+    pub(super) fn memory(&self) -> u64 {
+        // Numbers of the remaining points, and a flag for each.
+        const LEFT: u64 = 5;
+        // Local coordinates; points and numbers in the order of the tree; axes of the tree; and its input, the first two once more.
+        const TREE: u64 = 12 + 16 + 1 + 16;
+        // Local coordinates, the tree, its sums with their ranges, and the result.
+        const NOISE: u64 = 12 + 17 + 31 + 2;
+        LEFT + match self {
+            Filters { noise: Some(_), .. } => NOISE,
+            Filters { outliers: Some(_), .. } => TREE,
+            _ => 0,
+        }
+    }
+
     /// Applies the filters. Returns the numbers of the kept points, ascending, and the result of each filter. `values` are the values for
     /// [`Filters::value`], one per point. Points whose coordinates are not finite, or too large for 32 bits, are removed first.
     ///

@@ -3,7 +3,7 @@
 //!
 //! A [`PlyFile`] keeps the bytes, so that [`PlyFile::chosen`] writes a subset of the points with all their properties and all digits.
 //! Memory is bounded by the size of the file: a header that announces more data than the file contains is an error before memory is
-//! allocated.
+//! allocated. An ASCII file has one row per line, as the format specifies, and no data behind the last row.
 //!
 //! (The crate `ply-rs-bw` is not used: it rejects names such as `scalar_Coord._Z` and values such as `nan`, which CloudCompare writes.)
 
@@ -13,8 +13,10 @@ mod write;
 pub use header::{Element, Encoding, Header, Kind, Number, Property};
 pub use write::encode;
 
+use super::filter::Filters;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::memory;
 use glam::DVec3;
 use std::path::{Path, PathBuf};
 
@@ -46,7 +48,8 @@ enum Rows {
 impl PlyFile {
     /// Reads a file or a pipe, and finds the points in it: the element `vertex`, or one whose name contains `vert` or `point`.
     ///
-    /// Errors if it cannot be read, does not fit into memory, is not a PLY file, is truncated, or has no points with x, y and z.
+    /// Errors if it cannot be read, does not fit into memory, is not a PLY file, is truncated or has data behind its last row, has a value that is not of
+    /// its type, or has no points with x, y and z.
     pub fn open(path: &Path) -> Result<Self> {
         Self::parse(path, files::read_named(path, files::CLOUD)?)
     }
@@ -70,13 +73,6 @@ impl PlyFile {
             return Err(Error::input(path, found, "accepted: at most 4294967295 points"));
         }
         let mut file = PlyFile { path: path.to_owned(), bytes, header, points, axes: [0; 3], rows: Rows::At(Vec::new()) };
-        let mut cursor = Cursor { bytes: &file.bytes, at: file.header.length, encoding: file.header.encoding };
-        let mut rows = None;
-        for (number, element) in file.header.elements.iter().enumerate() {
-            let found = cursor.find_rows(element, number == points).map_err(|fault| file.fault(element, fault))?;
-            rows = rows.or(found.filter(|_| number == points));
-        }
-        file.rows = rows.unwrap_or(Rows::At(Vec::new()));
         for (number, axis) in ["x", "y", "z"].into_iter().enumerate() {
             let Some(property) = file.property(&[axis]) else {
                 let names: Vec<&str> = file.element().properties.iter().map(|p| &p.name[..]).collect();
@@ -85,6 +81,33 @@ impl PlyFile {
             };
             file.axes[number] = property;
         }
+        let mut cursor = file.cursor(file.header.length);
+        let mut rows = Rows::At(Vec::new());
+        for (number, element) in file.header.elements.iter().enumerate() {
+            let is_points = number == points;
+            cursor.check_length(element).map_err(|fault| file.fault(element, fault))?;
+            if is_points {
+                let needed = file.held(cursor.is_even(element));
+                memory::check(path, &format!("to read {} points", element.count), needed)?;
+            }
+            let found = cursor.find_rows(element, is_points).map_err(|fault| file.fault(element, fault))?;
+            if is_points {
+                rows = found;
+            }
+        }
+        cursor.skip_space();
+        let rest = file.bytes.len() - cursor.at;
+        if rest > 0 {
+            let found = match cursor.encoding {
+                Encoding::Ascii => {
+                    let line = 1 + file.bytes[..cursor.at].iter().filter(|byte| **byte == b'\n').count();
+                    format!("line {line} stands behind the last row that the header speaks of")
+                }
+                _ => format!("{rest} bytes stand behind the last row that the header speaks of"),
+            };
+            return Err(Error::input(path, found, "write the cloud again: its header and its data are not of each other"));
+        }
+        file.rows = rows;
         Ok(file)
     }
 
@@ -108,13 +131,30 @@ impl PlyFile {
         self.len() == 0
     }
 
+    /// Checks that there is memory to filter the points and to write the remaining ones.
+    ///
+    /// Errors if there is not. No memory is allocated before.
+    pub fn check_memory(&self, filters: &Filters) -> Result<()> {
+        let points = self.len() as u64;
+        let values = if filters.value.is_some() { size_of::<f32>() as u64 } else { 0 };
+        let filtering = size_of::<DVec3>() as u64 + filters.memory();
+        let writing = size_of::<u32>() as u64 * points + self.bytes.len() as u64;
+        let held = self.held(matches!(self.rows, Rows::Fixed { .. })) + values * points;
+        memory::check(&self.path, &format!("to filter {points} points"), held + writing.max(filtering * points))
+    }
+
+    /// Returns the memory that the points take, bytes: the file, and the position of each row unless all rows have the same length.
+    fn held(&self, is_even: bool) -> u64 {
+        let place = if is_even { 0 } else { size_of::<usize>() };
+        (self.bytes.len() + place * self.len()) as u64
+    }
+
     /// Returns the coordinates of the points.
     ///
     /// Errors if a word of a text file is not a number, as in [`PlyFile::values`].
     pub fn positions(&self) -> Result<Vec<DVec3>> {
         let [x, y, z] = self.axes;
-        let [x, y, z] = [self.column(x)?, self.column(y)?, self.column(z)?];
-        Ok(x.into_iter().zip(y).zip(z).map(|((x, y), z)| DVec3::new(x, y, z)).collect())
+        self.each(|row| Ok(DVec3::new(self.value(row, x)?, self.value(row, y)?, self.value(row, z)?)))
     }
 
     /// Returns the names of the scalar fields: every scalar property of the points except coordinates, normals and colors, without the
@@ -145,29 +185,33 @@ impl PlyFile {
     /// Panics if a number is out of range.
     pub fn chosen(&self, numbers: &[u32], comment: &str) -> Vec<u8> {
         let mut file = header_lines(self.header.encoding, &self.header.remarks, comment, self.element(), numbers.len()).into_bytes();
+        let end: &[u8] = if self.header.encoding == Encoding::Ascii { b"\n" } else { b"" };
+        // A buffer that grows would take twice as much.
+        file.reserve_exact(numbers.iter().map(|&number| self.row(number as usize).len() + end.len()).sum());
         for &number in numbers {
-            let start = self.row(number as usize);
-            let mut cursor = self.cursor(start);
-            for property in &self.element().properties {
-                // The row was already checked when the file was opened.
-                let _ = cursor.skip(property.kind);
-            }
-            let row = &self.bytes[start..cursor.at];
-            match self.header.encoding {
-                Encoding::Ascii => {
-                    // Programs expect one line per row, however the row was broken in this file.
-                    let words = row.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
-                    file.extend(words.collect::<Vec<_>>().join(&b' '));
-                    file.push(b'\n');
-                }
-                _ => file.extend_from_slice(row),
-            }
+            file.extend_from_slice(self.row(number as usize));
+            file.extend_from_slice(end);
         }
         file
     }
 
+    /// Returns the bytes of a row, without its line break.
+    fn row(&self, number: usize) -> &[u8] {
+        let start = self.start(number);
+        let mut cursor = self.cursor(start);
+        match (&self.rows, self.header.encoding) {
+            (Rows::Fixed { stride, .. }, _) => &self.bytes[start..start + stride],
+            (Rows::At(_), Encoding::Ascii) => self.bytes[start..cursor.line_end()].trim_ascii(),
+            (Rows::At(_), _) => {
+                // The row was already checked when the file was opened.
+                let _ = self.element().properties.iter().try_for_each(|p| cursor.skip(p.kind));
+                &self.bytes[start..cursor.at]
+            }
+        }
+    }
+
     /// Returns the start of a row.
-    fn row(&self, number: usize) -> usize {
+    fn start(&self, number: usize) -> usize {
         match &self.rows {
             Rows::Fixed { start, stride } => start + number * stride,
             Rows::At(starts) => starts[number],
@@ -192,22 +236,27 @@ impl PlyFile {
     }
 
     fn in_single(&self, property: usize) -> Result<Vec<f32>> {
-        Ok(self.column(property)?.into_iter().map(|v| v as f32).collect())
+        self.each(|row| self.value(row, property).map(|v| v as f32))
     }
 
-    /// Returns the numbers of a property, row after row.
-    fn column(&self, property: usize) -> Result<Vec<f64>> {
+    /// Calls `read` for each row and collects the results.
+    fn each<T>(&self, read: impl Fn(usize) -> std::result::Result<T, Fault>) -> Result<Vec<T>> {
+        let mut all = Vec::with_capacity(self.len());
+        for row in 0..self.len() {
+            all.push(read(row).map_err(|fault| self.fault(self.element(), (row, fault)))?);
+        }
+        Ok(all)
+    }
+
+    /// Returns the value of a property in a row.
+    fn value(&self, row: usize, property: usize) -> std::result::Result<f64, Fault> {
+        let mut cursor = self.cursor(self.start(row));
         let properties = &self.element().properties[..=property];
-        let read = |row: usize| {
-            let mut cursor = self.cursor(self.row(row));
-            let before = &properties[..property];
-            before.iter().try_for_each(|p| cursor.skip(p.kind))?;
-            match properties[property].kind {
-                Kind::Scalar(number) => cursor.number(number),
-                Kind::List(..) => Err(Fault::NoNumber("a list".to_owned())),
-            }
-        };
-        (0..self.len()).map(|row| read(row).map_err(|fault| self.fault(self.element(), (row, fault)))).collect()
+        properties[..property].iter().try_for_each(|p| cursor.pass(p.kind))?;
+        match properties[property].kind {
+            Kind::Scalar(number) => cursor.number(number),
+            Kind::List(..) => Err(Fault::NoNumber { found: "a list".to_owned(), expected: Number::F64 }),
+        }
     }
 
     /// Returns the error for a fault in a row of an element.
@@ -218,9 +267,13 @@ impl PlyFile {
                 let found = format!("the header announces {count} rows of `{name}`, but the file ends in row {row}");
                 Error::input(&self.path, found, "use an undamaged copy: this one is cut short")
             }
-            Fault::NoNumber(word) => {
-                let found = format!("row {row} of `{name}` has `{word}` instead of a number");
+            Fault::NoNumber { found, expected } => {
+                let found = format!("row {row} of `{name}` has `{found}` where {} is expected", expected.accepted());
                 Error::input(&self.path, found, "write the cloud again; rows are counted from 0")
+            }
+            Fault::Line(how) => {
+                let found = format!("the line of row {row} of `{name}` has {how} numbers than the header speaks of");
+                Error::input(&self.path, found, "each row is a line of its own; rows are counted from 0")
             }
         }
     }
@@ -257,7 +310,12 @@ fn header_lines(encoding: Encoding, remarks: &[String], comment: &str, element: 
 #[derive(Debug)]
 enum Fault {
     CutShort,
-    NoNumber(String),
+    NoNumber {
+        found: String,
+        expected: Number,
+    },
+    /// A line has "fewer" or "more" numbers than a row.
+    Line(&'static str),
 }
 
 /// Position in the data.
@@ -268,52 +326,105 @@ struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    /// Skips an element; returns the positions of its rows if `remember` is set. A fault comes with the number of its row.
-    fn find_rows(&mut self, element: &Element, remember: bool) -> std::result::Result<Option<Rows>, (usize, Fault)> {
+    /// Checks that the rest of the file can contain as many rows as the element has.
+    fn check_length(&self, element: &Element) -> std::result::Result<(), (usize, Fault)> {
         let left = self.bytes.len() - self.at;
-        let least = element.least_size(self.encoding);
-        // The last number of a text needs no space after it.
-        if element.count.checked_mul(least).is_none_or(|all| all > left + 1) {
-            return Err((left / least.max(1), Fault::CutShort));
+        let (least, room) = match self.encoding {
+            // The last number of a text needs no space after it.
+            Encoding::Ascii => (element.least_size(self.encoding), left + 1),
+            _ => (element.least_size(self.encoding), left),
+        };
+        match element.count.checked_mul(least) {
+            Some(all) if all <= room => Ok(()),
+            _ => Err((left / least.max(1), Fault::CutShort)),
         }
-        if let (Some(stride), true) = (element.stride(), self.encoding != Encoding::Ascii) {
-            if element.count * stride > left {
-                return Err((left / stride.max(1), Fault::CutShort));
-            }
+    }
+
+    /// True if all rows of an element have one length.
+    fn is_even(&self, element: &Element) -> bool {
+        self.encoding != Encoding::Ascii && element.stride().is_some()
+    }
+
+    /// Goes past an element, of which there [may be](Self::check_length) so many rows, remembering where they begin if asked to. The fault comes with
+    /// the number of its row.
+    fn find_rows(&mut self, element: &Element, remember: bool) -> std::result::Result<Rows, (usize, Fault)> {
+        if let (Some(stride), true) = (element.stride(), self.is_even(element)) {
             let start = self.at;
             self.at += element.count * stride;
-            return Ok(Some(Rows::Fixed { start, stride }));
+            return Ok(Rows::Fixed { start, stride });
         }
+        let mut starts = Vec::with_capacity(if remember { element.count } else { 0 });
         if element.properties.is_empty() {
-            return Ok(None);
+            return Ok(Rows::At(starts));
         }
-        let mut starts = Vec::new();
         for row in 0..element.count {
-            self.skip_space();
             if remember {
                 starts.push(self.at);
             }
-            element.properties.iter().try_for_each(|p| self.skip(p.kind)).map_err(|fault| (row, fault))?;
+            let passed = match self.encoding {
+                Encoding::Ascii => self.line(element),
+                _ => element.properties.iter().try_for_each(|p| self.skip(p.kind)),
+            };
+            passed.map_err(|fault| (row, fault))?;
         }
-        Ok(Some(Rows::At(starts)))
+        Ok(Rows::At(starts))
     }
 
-    /// Skips a property.
+    /// Skips a line, which is a row.
+    fn line(&mut self, element: &Element) -> std::result::Result<(), Fault> {
+        let end = self.line_end();
+        let mut line = Cursor { bytes: &self.bytes[..end], ..*self };
+        let read = element.properties.iter().try_for_each(|p| line.skip(p.kind));
+        line.skip_space();
+        self.at = self.bytes.len().min(end + 1);
+        match read {
+            Err(Fault::CutShort) if end < self.bytes.len() => Err(Fault::Line("fewer")),
+            Ok(()) if line.at < end => Err(Fault::Line("more")),
+            other => other,
+        }
+    }
+
+    /// Returns the end of the line, before its line break.
+    fn line_end(&self) -> usize {
+        let rest = &self.bytes[self.at..];
+        self.at + rest.iter().position(|byte| *byte == b'\n').unwrap_or(rest.len())
+    }
+
+    /// Skips a property and checks its numbers.
     fn skip(&mut self, kind: Kind) -> std::result::Result<(), Fault> {
+        match (kind, self.encoding) {
+            (Kind::Scalar(number), Encoding::Ascii) => self.number(number).map(drop),
+            (Kind::List(count, item), Encoding::Ascii) => {
+                // The words must be there, however many a text says.
+                (0..self.items(count)?).try_for_each(|_| self.number(item).map(drop))
+            }
+            (kind, _) => self.pass(kind),
+        }
+    }
+
+    /// Goes past a property that has been checked, or whose bytes mean some number in any case.
+    fn pass(&mut self, kind: Kind) -> std::result::Result<(), Fault> {
         match (kind, self.encoding) {
             (Kind::Scalar(_), Encoding::Ascii) => self.word().map(drop),
             (Kind::Scalar(number), _) => self.take(number.size()).map(drop),
             (Kind::List(count, item), _) => {
-                let items = self.number(count)?;
-                if items < 0.0 || items.fract() != 0.0 {
-                    return Err(Fault::NoNumber(format!("a list of {items} items")));
-                }
-                // A list has at most 2³² items in binary files, or any number in text files (saturating). The words or bytes must exist.
+                let items = self.items(count)?;
                 match self.encoding {
-                    Encoding::Ascii => (0..items as u64).try_for_each(|_| self.word().map(drop)),
+                    Encoding::Ascii => (0..items).try_for_each(|_| self.word().map(drop)),
                     _ => (items as usize).checked_mul(item.size()).ok_or(Fault::CutShort).and_then(|n| self.take(n)).map(drop),
                 }
             }
+        }
+    }
+
+    /// Reads how many items a list has.
+    fn items(&mut self, count: Number) -> std::result::Result<u64, Fault> {
+        let items = self.number(count)?;
+        // Of a type of whole numbers.
+        if items < 0.0 {
+            Err(Fault::NoNumber { found: format!("a list of {items} items"), expected: Number::U32 })
+        } else {
+            Ok(items as u64)
         }
     }
 
@@ -321,13 +432,9 @@ impl<'a> Cursor<'a> {
     fn number(&mut self, number: Number) -> std::result::Result<f64, Fault> {
         if self.encoding == Encoding::Ascii {
             let word = self.word()?;
-            let text = String::from_utf8_lossy(word);
-            return text.parse().or_else(|_| {
-                // C libraries write NaN in many forms: -nan(ind), 1.#QNAN.
-                let small = text.to_lowercase();
-                let not_a_number = small.contains("nan") || small.contains("#ind");
-                not_a_number.then_some(f64::NAN).ok_or_else(|| Fault::NoNumber(text.chars().take(40).collect()))
-            });
+            let value = std::str::from_utf8(word).ok().and_then(|text| number.parse(text));
+            let found = || String::from_utf8_lossy(&word[..word.len().min(40)]).into_owned();
+            return value.ok_or_else(|| Fault::NoNumber { found: found(), expected: number });
         }
         let mut bytes = [0; 8];
         let size = number.size();

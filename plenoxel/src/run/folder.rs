@@ -44,6 +44,8 @@ const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
 /// The files of a run, those that matter least last.
 const FILES: [&str; 11] = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
+/// Content of figures that is kept: all of it. The figures of the run and of an evaluation are in memory at the same time.
+const FIGURES: json::Kept = json::Kept { keys: |_| true, entries: usize::MAX, share: 45 };
 /// Endings of what `export` writes.
 const EXPORTED: [&str; 5] = ["vox", "ply", "obj", "glb", "stl"];
 
@@ -223,7 +225,7 @@ impl RunFolder {
         if !files::is_there(&record) {
             return Err(Error::input(path, format!("there is no {RECORD} in this folder"), remedy));
         }
-        let mut record = RunRecord::parse(&record, &files::read(&record, files::RECORD)?)?;
+        let mut record = RunRecord::parse(&record, &files::read(&record, files::RUN)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
         if config.stages.is_empty() && !record.is_of_own_model() {
             record.kind = RunKind::Carved;
@@ -357,7 +359,7 @@ impl RunFolder {
         if !files::is_there(&path) {
             return Ok(None);
         }
-        Ok(json::parse(&path, &files::read(&path, files::RECORD)?).ok())
+        json::parse_if_whole(&path, &files::read(&path, files::RECORD)?, &FIGURES)
     }
 
     /// Writes the chart of the loss, an SVG.

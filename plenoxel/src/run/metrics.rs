@@ -5,6 +5,7 @@ use super::tensorboard::EventFile;
 use crate::error::{Error, Result};
 use crate::files;
 use crate::json;
+use crate::memory;
 use crate::train::{PlannedStage, Report};
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
@@ -189,12 +190,43 @@ struct Sums {
 
 /// Reads the text of a file; it is empty if there is no file.
 ///
-/// Errors: it cannot be read, is no plain file, or is larger than the metrics of a run may be.
+/// Errors: it cannot be read, is no plain file, or is larger than the metrics of a run may be; there is not enough memory for its [`lines`].
 pub fn read(path: &Path) -> Result<String> {
     if !files::is_there(path) {
         return Ok(String::new());
     }
-    Ok(String::from_utf8_lossy(&files::read(path, files::METRICS)?).into_owned())
+    let bytes = files::read(path, files::METRICS)?;
+    let what = format!("to read {} of metrics", memory::bytes(bytes.len() as u64));
+    memory::check(path, &what, parsed_bytes(&bytes))?;
+    // What is no text is copied, and may be three times as long then.
+    String::from_utf8(bytes).or_else(|damaged| {
+        let bytes = damaged.as_bytes();
+        memory::check(path, &what, 4 * bytes.len() as u64 + parsed_bytes(bytes))?;
+        Ok(String::from_utf8_lossy(bytes).into_owned())
+    })
+}
+
+/// About the most memory that a text and all of its [`lines`] take.
+fn parsed_bytes(text: &[u8]) -> u64 {
+    /// A line in a list that grows, and both of its maps with up to 11 entries.
+    const LINE: u64 = 2 * size_of::<Line<'_>>() as u64 + 850;
+    /// The fewest keys of a line; the names of some others, and a place in a map for each beyond these.
+    const OWN: u64 = 9;
+    const FEW: u64 = 20;
+    const NAME: u64 = 40;
+    const ENTRY: u64 = 130;
+    /// An entry while its line is read.
+    const READING: u64 = 260;
+    let (mut kept, mut longest) = (text.len() as u64, 0);
+    for line in text.split(|byte| *byte == b'\n') {
+        let entries = 1 + line.iter().filter(|byte| **byte == b',').count() as u64;
+        longest = entries.max(longest);
+        if entries < OWN {
+            continue;
+        }
+        kept += LINE + NAME * entries.saturating_sub(OWN).min(FEW) + ENTRY * entries.saturating_sub(OWN + FEW);
+    }
+    kept + READING * longest
 }
 
 /// The lines about training, each as text and parsed. Lines that are cut short, and those about other things, are left out.
@@ -320,5 +352,33 @@ impl MetricsFile {
     /// The last and the best validation PSNR.
     pub fn validation(&self) -> (Option<f64>, Option<Best>) {
         (self.known.validation_psnr, self.known.best)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(losses: &str, figures: &str) -> String {
+        format!(
+            r#"{{"step":7,"stage":0,"resolution":16,"ends_stage":false,"loss":0.25,"losses":{{{losses}}},"psnr":12.5,"rays":9,"samples":99,{figures}"seconds":1.5}}"#
+        )
+    }
+
+    #[test]
+    fn the_memory_of_parsed_lines_is_not_less_than_their_parts_have() {
+        let figures = r#""voxels":7,"density_rate":1.0,"color_rate":0.03,"#;
+        let text = line(r#""mse":0.2,"tv":0.1"#, figures) + "\n";
+        let one = parsed_bytes(text.repeat(2).as_bytes()) - parsed_bytes(text.as_bytes()) - text.len() as u64;
+        // A node of each map, and the names of three figures.
+        let least = (size_of::<Line<'_>>() + 11 * (24 + 8) + 11 * (24 + 16) + 3 * 32) as u64;
+        assert!((least..2 * least).contains(&one), "{one} for {least}");
+        let many = parsed_bytes(text.repeat(1000).as_bytes());
+        assert!(many >= 1000 * (least + text.len() as u64) && lines(&text.repeat(3)).count() == 3, "{many}");
+        // Thousands in a line, half of the nodes' places empty.
+        let names = (0..3000).map(|i| format!("\"l{i}\":1")).collect::<Vec<_>>().join(",");
+        assert!(parsed_bytes(line(&names, "").as_bytes()) >= 3000 * 64);
+        let names = (0..3000).map(|i| format!("\"l{i}\":1,")).collect::<String>();
+        assert!(parsed_bytes(line("", &names).as_bytes()) >= 3000 * (32 + 80 + 128));
     }
 }

@@ -15,6 +15,8 @@ use toml::{Table, Value};
 const BUILT_IN: &str = "procedural";
 /// Bytes of the name of a scene or a method: file systems have 255 for a folder that is called after both.
 const LONGEST_NAME: usize = 100;
+/// Largest number of runs of a sweep: each has a folder, a process, and a line in the table.
+const MOST_RUNS: usize = 10_000;
 const COMMANDS: [&str; 2] = ["train", "carve"];
 
 /// All runs, scene by scene.
@@ -87,6 +89,13 @@ impl Plan {
         })?;
         let mut plan = Plan { scenes: names(&scenes), methods: names(&methods), published: sweep.published, jobs: Vec::new() };
         plan.check_published(place)?;
+        let chosen = |scene: &Entry| scene.table.get("methods").and_then(Value::as_array).map_or(methods.len(), Vec::len);
+        let runs: usize = scenes.iter().map(chosen).sum();
+        if runs > MOST_RUNS {
+            let found = format!("{runs} runs, of {} scenes with {} methods", scenes.len(), methods.len());
+            let accepted = format!("up to {MOST_RUNS} runs; make several sweeps of it, or name the methods of a scene in its `methods`");
+            return Err(Error::config(place("scenes"), found, accepted));
+        }
         for scene in &scenes {
             let chosen = chosen_methods(scene, &plan.methods, place)?;
             for method in methods.iter().filter(|method| chosen.contains(&method.name)) {

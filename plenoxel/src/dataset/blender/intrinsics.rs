@@ -3,6 +3,7 @@
 
 use crate::error::{Error, Result};
 use crate::json;
+use crate::text::number;
 use serde_json::Value;
 use std::path::Path;
 
@@ -15,6 +16,8 @@ const LENSES: [&str; 2] = ["is_fisheye", "latlong"];
 const PINHOLES: [&str; 5] = ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
 /// Keys that are compared with `camera_angle_x` when the size of the images is known.
 const COMPARED: [&str; 10] = ["camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "fl_x", "fl_y", "cx", "cy", "w", "h"];
+/// Key of the name of the camera model.
+const MODEL: &str = "camera_model";
 /// Tolerance in pixels: the shift of a point at the edge of an image between the two values. Files contain rounded numbers.
 const WITHIN: f64 = 0.05;
 
@@ -28,6 +31,11 @@ struct Stated {
     /// Number of the frame; `None` for a key of the whole file.
     frame: Option<usize>,
     value: f64,
+}
+
+/// Returns true for the keys that [`StatedIntrinsics::add`] looks at.
+pub(super) fn is_known(key: &str) -> bool {
+    [&DISTORTION[..], &LENSES, &COMPARED, &[MODEL]].iter().any(|keys| keys.contains(&key))
 }
 
 /// Returns the key, with its frame.
@@ -54,10 +62,10 @@ impl StatedIntrinsics {
                 return refused(key, value, "accepted: pinhole cameras");
             }
         }
-        if let Some(model) = stated("camera_model")
+        if let Some(model) = stated(MODEL)
             && !model.as_str().is_some_and(|model| PINHOLES.contains(&model))
         {
-            return refused("camera_model", model, "accepted: pinhole cameras, such as PINHOLE, or OPENCV without distortion");
+            return refused(MODEL, model, "accepted: pinhole cameras, such as PINHOLE, or OPENCV without distortion");
         }
         for (key, value) in COMPARED.into_iter().filter_map(|key| Some((key, stated(key)?))) {
             let Some(value) = value.as_f64() else { return refused(key, value, "accepted: a number") };
@@ -90,7 +98,8 @@ impl StatedIntrinsics {
                 _ => (h, (value - h).abs()),
             };
             if moved.is_nan() || moved > WITHIN {
-                let found = format!("{} is {value}", place(key, *frame));
+                let found = format!("{} is {}", place(key, *frame), number(*value));
+                let (expected, fov_x) = (number(expected), number(fov_x));
                 let remedy = format!(
                     "{expected} is expected with camera_angle_x {fov_x} and images of {width} x {height} pixels: the principal point must be in the \
                      middle, pixels square, and the angle the same in all frames"
@@ -119,6 +128,7 @@ mod tests {
             "fl_x": 1111.1111, "fl_y": 1111.1111, "cx": 400, "cy": 300.0, "w": 800, "h": 600, "camera_angle_x": 0.69111, "camera_angle_y": 0.527451,
             "x_fov": 39.5978, "y_fov": null, "k1": 0, "k2": 0.0, "p1": 0, "camera_model": "OPENCV", "is_fisheye": false, "aabb_scale": 16
         });
+        assert!(same.as_object().unwrap().keys().all(|key| is_known(key) != (key == "aabb_scale")));
         check(same).unwrap();
         for (key, value) in [
             ("fl_x", json!(1112)),
@@ -138,10 +148,12 @@ mod tests {
             ("fl_x", json!("1111")),
             ("is_fisheye", json!(true)),
             ("camera_model", json!("OPENCV_FISHEYE")),
+            ("fl_x", json!(1e300)),
         ] {
             let error = check(json!({ key: value })).unwrap_err();
             assert_eq!(error.exit_code(), 3);
             assert!(error.to_string().starts_with(&format!("t.json: {key} of frame 3 is ")), "{error}");
+            assert!(value != 1e300 || error.to_string().contains("is 1e300; 1111.1110311937682 is expected"), "{error}");
         }
     }
 }

@@ -1,6 +1,8 @@
 //! Header of a PLY file: the layout of the data.
 
 use crate::error::{Error, Result};
+use crate::memory;
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Encoding of numbers.
@@ -55,6 +57,35 @@ impl Number {
     /// Returns the usual name of the type.
     pub fn name(self) -> &'static str {
         NUMBERS.iter().find(|(number, _)| *number == self).map_or("float", |(_, names)| names[0])
+    }
+
+    /// Returns the accepted text of an ASCII file, in words.
+    pub(super) fn accepted(self) -> String {
+        match self.range() {
+            Some([low, high]) => format!("a whole number from {low} to {high}"),
+            None => "a number".to_owned(),
+        }
+    }
+
+    /// Returns the smallest and the largest value of an integer type.
+    fn range(self) -> Option<[i64; 2]> {
+        let bits = 8 * self.size() as u32;
+        match self {
+            Number::I8 | Number::I16 | Number::I32 => Some([-(1 << (bits - 1)), (1 << (bits - 1)) - 1]),
+            Number::U8 | Number::U16 | Number::U32 => Some([0, (1 << bits) - 1]),
+            Number::F32 | Number::F64 => None,
+        }
+    }
+
+    /// Parses a number of this type. Floating-point types accept NaN in the spelling of any C library: -nan(ind), 1.#QNAN.
+    pub(super) fn parse(self, text: &str) -> Option<f64> {
+        match self.range() {
+            Some([low, high]) => text.parse().ok().filter(|value| (low..=high).contains(value)).map(|value| value as f64),
+            None => text.parse().ok().or_else(|| {
+                let small = text.to_lowercase();
+                (small.contains("nan") || small.contains("#ind")).then_some(f64::NAN)
+            }),
+        }
     }
 
     /// Returns the size in bytes.
@@ -121,6 +152,9 @@ impl Element {
     }
 }
 
+/// Largest size of a header, bytes: room for thousands of comments and properties.
+const MOST: usize = 1 << 20;
+
 /// Header of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Header {
@@ -137,7 +171,8 @@ pub struct Header {
 impl Header {
     /// Parses the lines from `ply` to `end_header`.
     ///
-    /// Errors if the file is not a PLY file, is truncated, or has an unknown format or type; the error names the line.
+    /// Errors if the file is not a PLY file, is truncated, has an unknown format or type or a repeated name, or has a header of more than a megabyte; the error names
+    /// the line.
     pub fn parse(path: &Path, file: &[u8]) -> Result<Self> {
         let write_again = "write the cloud again as PLY 1.0";
         if !file.starts_with(b"ply") {
@@ -145,9 +180,16 @@ impl Header {
             return Err(Error::input(path, format!("no PLY file: it begins with `{start}`"), "use a file that begins with `ply`"));
         }
         let (mut encoding, mut remarks, mut elements) = (None, Vec::new(), Vec::<Element>::new());
+        // Of elements, and of the properties of the last.
+        let (mut tables, mut columns) = (BTreeSet::new(), BTreeSet::new());
+        let head = &file[..file.len().min(MOST)];
         let mut at = 0;
         for number in 1.. {
-            let Some(end) = file[at..].iter().position(|&b| b == b'\n').map(|length| at + length) else {
+            let Some(end) = head[at..].iter().position(|&b| b == b'\n').map(|length| at + length) else {
+                if head.len() < file.len() {
+                    let found = format!("the header is longer than the {} that it may have", memory::bytes(MOST as u64));
+                    return Err(Error::input(path, found, "leave out comments and properties that are not needed"));
+                }
                 return Err(Error::input(path, "the header has no `end_header`", "use an undamaged copy: this one is cut short"));
             };
             let line = String::from_utf8_lossy(&file[at..end]);
@@ -163,7 +205,8 @@ impl Header {
                 _ if number == 1 => return bad("accepted: `ply` as the first line"),
                 [] => {}
                 ["comment" | "obj_info", ..] => remarks.push(line.to_owned()),
-                ["format", name, _version] => {
+                ["format", ..] if encoding.is_some() => return bad("the format is said once"),
+                ["format", name, "1.0"] => {
                     encoding = Some(match name {
                         "ascii" => Encoding::Ascii,
                         "binary_little_endian" => Encoding::LittleEndian,
@@ -171,8 +214,13 @@ impl Header {
                         _ => return bad("accepted: ascii, binary_little_endian, binary_big_endian"),
                     });
                 }
+                ["format", ..] => return bad("`format ENCODING 1.0` is read"),
                 ["element", name, count] => match count.parse() {
-                    Ok(count) => elements.push(Element { name: name.to_owned(), count, properties: Vec::new() }),
+                    Ok(_) if !tables.insert(name.to_owned()) => return bad("each element has a name of its own"),
+                    Ok(count) => {
+                        columns.clear();
+                        elements.push(Element { name: name.to_owned(), count, properties: Vec::new() });
+                    }
                     Err(_) => return bad("accepted: `element NAME COUNT`, where COUNT is a whole number"),
                 },
                 ["property", ref kind @ .., name] => {
@@ -190,6 +238,9 @@ impl Header {
                         );
                     };
                     let Some(element) = elements.last_mut() else { return bad("a property must be below an element") };
+                    if !columns.insert(name.to_owned()) {
+                        return bad("each property of an element has a name of its own");
+                    }
                     element.properties.push(Property { name: name.to_owned(), kind });
                 }
                 ["end_header"] => break,

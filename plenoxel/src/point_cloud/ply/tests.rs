@@ -24,8 +24,7 @@ fn cloud() -> PointCloud {
 fn read_cloud(file: &PlyFile) -> Result<PointCloud> {
     let three = |names: [&[&str]; 3]| -> Result<Option<Vec<[f64; 3]>>> {
         let [Some(a), Some(b), Some(c)] = names.map(|names| file.property(names)) else { return Ok(None) };
-        let [a, b, c] = [file.column(a)?, file.column(b)?, file.column(c)?];
-        Ok(Some(a.into_iter().zip(b).zip(c).map(|((a, b), c)| [a, b, c]).collect()))
+        file.each(|row| Ok([file.value(row, a)?, file.value(row, b)?, file.value(row, c)?])).map(Some)
     };
     let colors = three(COLORS)?.map(|colors| colors.into_iter().map(|c| c.map(|c| c as u8)).collect());
     let normals = three(NORMALS)?.map(|normals| normals.into_iter().map(|n| n.map(|n| n as f32)).collect());
@@ -61,6 +60,12 @@ fn foreign(encoding: Encoding) -> Vec<u8> {
     );
     let mut file = header.into_bytes();
     let mut put = |value: f64, number: Number| {
+        // Each row of a text is a line.
+        if value.is_infinite() {
+            return if encoding == Encoding::Ascii {
+                file.push(b'\n')
+            };
+        }
         let mut bytes = match number {
             _ if encoding == Encoding::Ascii => format!("{value} ").into_bytes(),
             Number::U8 => vec![value as u8],
@@ -74,7 +79,8 @@ fn foreign(encoding: Encoding) -> Vec<u8> {
         }
         file.extend(bytes);
     };
-    [(2.0, Number::U8), (0.5, Number::F32), (1.5, Number::F32), (-7.0, Number::I32)].into_iter().for_each(|(v, n)| put(v, n));
+    const END: (f64, Number) = (f64::INFINITY, Number::U8);
+    [(2.0, Number::U8), (0.5, Number::F32), (1.5, Number::F32), (-7.0, Number::I32), END].into_iter().for_each(|(v, n)| put(v, n));
     for i in 0..3u8 {
         let f = f64::from(i);
         put(4_500_000.125 + f, Number::F64);
@@ -85,9 +91,10 @@ fn foreign(encoding: Encoding) -> Vec<u8> {
         [f, 128.0, 255.0].into_iter().for_each(|c| put(c, Number::U8));
         put(if i == 1 { f64::NAN } else { 0.25 * f }, Number::F32);
         put(-300.0 + f, Number::I16);
+        put(END.0, END.1);
     }
     put(3.0, Number::U8);
-    [0.0, 1.0, 2.0].into_iter().for_each(|v| put(v, Number::I32));
+    [0.0, 1.0, 2.0, END.0].into_iter().for_each(|v| put(v, Number::I32));
     file
 }
 
@@ -167,7 +174,7 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
     refused(&ascii("element vertex 1\nvertices 3\nend_header\n"), &["line 4", "vertices 3"]);
     refused(&ascii("element face 0\nend_header\n"), &["no points", "[face]"]);
     refused(&ascii("element vertex 0\nproperty float x\nproperty list int int y\nend_header\n"), &["no property `y`", "[x, y]"]);
-    refused(&ascii(&format!("element vertex 2\n{xyz}end_header\n1 2 3\n4 5\n")), &["2 rows of `vertex`", "ends in row 1", "cut short"]);
+    refused(&ascii(&format!("element vertex 2\n{xyz}end_header\n1 2 3\n4 5")), &["2 rows of `vertex`", "ends in row 1", "cut short"]);
     for count in ["4000000000", "18446744073709551615", "5000000000"] {
         for format in ["ascii", "binary_little_endian"] {
             let text = format!("ply\nformat {format} 1.0\nelement vertex {count}\n{xyz}end_header\n1 2 3\n");
@@ -182,21 +189,98 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
         ),
         &["cut short"],
     );
-    refused(&ascii(&format!("element vertex 1\nproperty list int int w\n{xyz}end_header\n1e30 1 2 3 4\n")), &["cut short"]);
+    refused(
+        &ascii(&format!("element vertex 1\nproperty list int int w\n{xyz}end_header\n1e30 1 2 3 4\n")),
+        &["row 0 of `vertex` has `1e30` where a whole number from -2147483648 to 2147483647 is expected"],
+    );
+    refused(&ascii(&format!("element vertex 1\nproperty list uint int w\n{xyz}end_header\n4000000000 1 2 3 4\n")), &["fewer numbers"]);
     refused(&ascii(&format!("element vertex 1\nproperty list int int w\n{xyz}end_header\n-1 1 2 3 4\n")), &["list of -1 items"]);
     let nothing = ascii(&format!("element empty 4000000000\nelement vertex 1\n{xyz}end_header\n1 2 3\n"));
     assert_eq!(parse(nothing.as_bytes()).unwrap().positions().unwrap(), [DVec3::new(1.0, 2.0, 3.0)]);
     let words = ascii(&format!("element vertex 2\n{xyz}end_header\n1 2 3\n4 five 6\n"));
-    let error = parse(words.as_bytes()).unwrap().positions().unwrap_err();
-    assert!(error.exit_code() == 3 && error.to_string().contains("row 1 of `vertex` has `five`"), "{error}");
+    refused(&words, &["row 1 of `vertex` has `five` where a number is expected"]);
+}
+
+#[test]
+fn what_the_format_does_not_allow_is_not_read_as_something_else() {
+    let refused = |bytes: &[u8], part: &str| {
+        let error = parse(bytes).unwrap_err();
+        assert!(error.exit_code() == 3 && error.to_string().contains(part), "{part} in {error}");
+    };
+    let xyz = "property float x\nproperty float y\nproperty float z\n";
+    let ascii = |more: &str, rows: &str| format!("ply\nformat ascii 1.0\nelement vertex 2\n{xyz}{more}end_header\n{rows}").into_bytes();
+    // A row is a line.
+    refused(&ascii("", "1 2 3 4 5 6\n7 8 9\n"), "the line of row 0 of `vertex` has more numbers");
+    refused(&ascii("", "1 2\n3\n4 5 6\n"), "the line of row 0 of `vertex` has fewer numbers");
+    refused(&ascii("", "1 2 3\n\n4 5 6\n"), "the line of row 1 of `vertex` has fewer numbers");
+    refused(&ascii("property list uchar int w\n", "1 2 3 0\n4 5 6 2 7 8 9\n"), "the line of row 1 of `vertex` has more numbers");
+    // Nothing stands behind the last.
+    refused(&ascii("", "1 2 3\n4 5 6\n7 8 9\n"), "line 10 stands behind the last row");
+    for end in ["", "\n", " \r\n\n \n"] {
+        assert_eq!(parse(&ascii("", &format!("1 2 3\r\n\t4 5 6{end}"))).unwrap().positions().unwrap()[1], DVec3::new(4.0, 5.0, 6.0));
+    }
+    let binary = |rest: usize| {
+        let mut file = format!("ply\nformat binary_little_endian 1.0\nelement vertex 2\n{xyz}end_header\n").into_bytes();
+        file.extend(vec![0; 24 + rest]);
+        file
+    };
+    refused(&binary(5), "5 bytes stand behind the last row");
+    assert_eq!(parse(&binary(0)).unwrap().len(), 2);
+    // Numbers are of their type.
+    for (number, word, fits) in [
+        ("uchar", "300", false),
+        ("uchar", "-1", false),
+        ("uchar", "255", true),
+        ("uchar", "1.0", false),
+        ("char", "-128", true),
+        ("char", "128", false),
+        ("ushort", "65536", false),
+        ("int", "-2147483648", true),
+        ("uint", "4294967296", false),
+        ("float", "1.#QNAN", true),
+        ("float", "-nan(ind)", true),
+        ("int", "nan", false),
+        ("double", "1,5", false),
+    ] {
+        let file = ascii(&format!("property {number} a\n"), &format!("1 2 3 0\n4 5 6 {word}\n"));
+        match fits {
+            true => assert!(parse(&file).unwrap().values("a").unwrap().len() == 2, "{number} {word}"),
+            false => refused(&file, &format!("row 1 of `vertex` has `{word}` where a")),
+        }
+    }
+    // Headers of other versions, and names that are not clear.
+    let header = |text: &str| format!("ply\n{text}\nend_header\n").into_bytes();
+    refused(&header("format ascii 2.0"), "line 2 of the header is `format ascii 2.0`; `format ENCODING 1.0` is read");
+    refused(&header("format ascii 1.0\nformat ascii 1.0"), "line 3");
+    refused(&ascii("property uchar x\n", ""), "line 7 of the header is `property uchar x`; each property of an element has a name");
+    refused(&ascii("element vertex 1\n", ""), "line 7 of the header is `element vertex 1`; each element has a name");
+    assert_eq!(parse(&ascii("element face 1\nproperty uchar x\n", "1 2 3\n4 5 6\n7\n")).unwrap().len(), 2);
+}
+
+#[test]
+fn headers_have_an_end() {
+    for line in ["comment hello\n", "obj_info x\n", "element e 0\n", "property char a\n", "x"] {
+        let text = format!("ply\nformat ascii 1.0\n{}", line.repeat((1 << 20) / line.len() + 1));
+        let error = parse(text.as_bytes()).unwrap_err().to_string();
+        // Or at the first line that says the same again.
+        assert!(
+            error.len() < 300 && (error.contains("longer than the 1 MB") || error.contains("line 4") || error.contains("line 3")),
+            "{error}"
+        );
+    }
+    let names: String = (0..100_000).map(|i| format!("element {i} 0\n")).collect();
+    let error = parse(format!("ply\nformat ascii 1.0\n{}end_header\n", &names[..names[..1_000_000].rfind("element").unwrap()]).as_bytes())
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("no points: its elements are [0, 1, 2") && error.contains('…') && error.len() < 1500, "{error}");
 }
 
 #[test]
 fn a_file_cut_short_anywhere_is_refused() {
     for encoding in ENCODINGS {
         let whole = foreign(encoding);
-        // The last number of a text may lose digits and still be one; here it has one digit, and a space after it.
-        let end = if encoding == Encoding::Ascii { whole.len() - 1 } else { whole.len() };
+        // The last number of a text may lose digits and still be one; here it has one digit, and a space and a line break after it.
+        let end = if encoding == Encoding::Ascii { whole.len() - 2 } else { whole.len() };
         for length in 0..end {
             let error = parse(&whole[..length]).unwrap_err();
             assert!(error.exit_code() == 3 && error.to_string().contains("cloud.ply"), "{encoding:?} cut to {length}: {error}");

@@ -110,13 +110,19 @@ pub fn write(path: &Path, config: &Config, remark: &str) -> Result<()> {
     files::write_atomically(path, to_toml(config, remark)?.as_bytes())
 }
 
-/// Calls `f` with the path and the offset in the text of every key.
+/// No key of ours has a path of so many letters; those that have would take that much again for every key below.
+const LONGEST: usize = 500;
+
+/// Calls `f` with the path and the offset in the text of every key whose path is not too long.
 fn spans(path: &str, table: &DeTable<'_>, f: &mut dyn FnMut(String, usize)) {
     for (key, value) in table.iter() {
         let inner = match path {
             "" => key.get_ref().to_string(),
             path => format!("{path}.{}", key.get_ref()),
         };
+        if inner.len() > LONGEST {
+            continue;
+        }
         f(inner.clone(), key.span().start);
         match value.get_ref() {
             DeValue::Table(table) => spans(&inner, table, f),

@@ -1,0 +1,163 @@
+//! JSON as a tree, of which some keys are kept and the memory is counted while it grows: an empty object of three letters can take 32 bytes, and one with
+//! a key 700.
+
+use super::Kept;
+use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde_json::{Map, Number, Value};
+use std::cell::Cell;
+use std::fmt;
+
+/// Bytes of a value where it stands.
+const VALUE: u64 = size_of::<Value>() as u64;
+/// What the allocator adds to a piece of memory.
+const PIECE: u64 = 16;
+/// The keys of an object that its first node of a tree has room for, and what the node takes.
+const NODE_KEYS: usize = 11;
+const NODE: u64 = NODE_KEYS as u64 * (size_of::<String>() as u64 + VALUE) + 16 + PIECE;
+
+/// The memory that is left, and what has run out.
+pub(super) struct Room<'k> {
+    kept: &'k Kept,
+    left: Cell<u64>,
+    exceeded: Cell<bool>,
+    long: Cell<bool>,
+}
+
+impl<'k> Room<'k> {
+    pub fn new(kept: &'k Kept, left: u64) -> Self {
+        Room { kept, left: Cell::new(left), exceeded: Cell::new(false), long: Cell::new(false) }
+    }
+
+    /// True if the value takes more memory than there was.
+    pub fn is_exceeded(&self) -> bool {
+        self.exceeded.get()
+    }
+
+    /// True if a list had too many entries.
+    pub fn is_long(&self) -> bool {
+        self.long.get()
+    }
+
+    pub fn read<'de, D: Deserializer<'de>>(&self, reader: D) -> Result<Value, D::Error> {
+        reader.deserialize_any(Tree(self))
+    }
+
+    fn take<E: Error>(&self, bytes: u64) -> Result<(), E> {
+        match self.left.get().checked_sub(bytes) {
+            Some(left) => {
+                self.left.set(left);
+                Ok(())
+            }
+            None => {
+                self.exceeded.set(true);
+                Err(E::custom("no memory is left"))
+            }
+        }
+    }
+}
+
+/// Reads a value.
+#[derive(Clone, Copy)]
+struct Tree<'r>(&'r Room<'r>);
+
+impl<'de> DeserializeSeed<'de> for Tree<'_> {
+    type Value = Value;
+
+    fn deserialize<D: Deserializer<'de>>(self, reader: D) -> Result<Value, D::Error> {
+        reader.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Tree<'_> {
+    type Value = Value;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a value of JSON")
+    }
+
+    fn visit_unit<E: Error>(self) -> Result<Value, E> {
+        Ok(Value::Null)
+    }
+
+    fn visit_bool<E: Error>(self, value: bool) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_i64<E: Error>(self, value: i64) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_u64<E: Error>(self, value: u64) -> Result<Value, E> {
+        Ok(value.into())
+    }
+
+    fn visit_f64<E: Error>(self, value: f64) -> Result<Value, E> {
+        Ok(Number::from_f64(value).map_or(Value::Null, Value::Number))
+    }
+
+    fn visit_str<E: Error>(self, text: &str) -> Result<Value, E> {
+        self.0.take(text.len() as u64 + PIECE)?;
+        Ok(text.into())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut entries: A) -> Result<Value, A::Error> {
+        let mut list = Vec::new();
+        while let Some(value) = entries.next_element_seed(self)? {
+            if list.len() == self.0.kept.entries {
+                self.0.long.set(true);
+                return Err(A::Error::custom("a long list"));
+            }
+            // A list has places for four entries, and for twice as many where it is full.
+            let places = match list.len() {
+                0 => 4 * VALUE + PIECE,
+                1..4 => 0,
+                _ => 2 * VALUE,
+            };
+            self.0.take(places)?;
+            list.push(value);
+        }
+        Ok(list.into())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut entries: A) -> Result<Value, A::Error> {
+        let mut object = Map::new();
+        while let Some(key) = entries.next_key_seed(Key(self.0))? {
+            let Some(key) = key else {
+                entries.next_value::<IgnoredAny>()?;
+                continue;
+            };
+            // Nodes are half full at least.
+            let node = match object.len() {
+                0 => NODE,
+                1..NODE_KEYS => 0,
+                _ => 2 * NODE / NODE_KEYS as u64,
+            };
+            self.0.take(node + key.len() as u64 + PIECE)?;
+            object.insert(key, entries.next_value_seed(self)?);
+        }
+        Ok(object.into())
+    }
+}
+
+/// Reads the name of a key, if it is kept.
+struct Key<'r>(&'r Room<'r>);
+
+impl<'de> DeserializeSeed<'de> for Key<'_> {
+    type Value = Option<String>;
+
+    fn deserialize<D: Deserializer<'de>>(self, reader: D) -> Result<Self::Value, D::Error> {
+        reader.deserialize_str(self)
+    }
+}
+
+impl Visitor<'_> for Key<'_> {
+    type Value = Option<String>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("the name of a key")
+    }
+
+    fn visit_str<E: Error>(self, name: &str) -> Result<Self::Value, E> {
+        Ok((self.0.kept.keys)(name).then(|| name.to_owned()))
+    }
+}
