@@ -137,11 +137,20 @@ pub fn composite(image: &RgbaImage, background: [f32; 3]) -> Array3<f32> {
 /// appears whole or not at all.
 ///
 /// Panics unless there are three channels. Errors: an empty picture, or the disk's refusal.
+#[track_caller]
 pub fn write_rgb(path: &Path, rgb: ArrayView3<'_, f32>) -> Result<()> {
+    files::write_atomically(path, &rgb_as_png(path, rgb)?)
+}
+
+/// The bytes of the PNG file that [`write_rgb`] writes; `path` is for error messages.
+///
+/// Panics unless there are three channels. Errors: an empty picture, or one that is too large.
+#[track_caller]
+pub fn rgb_as_png(path: &Path, rgb: ArrayView3<'_, f32>) -> Result<Vec<u8>> {
     let (height, width, channels) = rgb.dim();
-    assert_eq!(channels, 3, "write_rgb: expected [height, width, 3], got {:?}", rgb.shape());
+    assert_eq!(channels, 3, "a picture must be [height, width, 3], got {:?}", rgb.shape());
     let bytes: Vec<u8> = rgb.iter().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    encode(path, &bytes, (width, height), ExtendedColorType::Rgb8)
+    encoded(path, &bytes, (width, height), ExtendedColorType::Rgb8)
 }
 
 /// Writes an RGBA picture with straight alpha as PNG. The file appears whole or not at all.
@@ -156,7 +165,11 @@ pub fn write_gray16(path: &Path, values: &Array2<u16>) -> Result<()> {
     encode(path, &bytes, (values.ncols(), values.nrows()), ExtendedColorType::L16)
 }
 
-fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<()> {
+fn encode(path: &Path, bytes: &[u8], size: (usize, usize), color: ExtendedColorType) -> Result<()> {
+    files::write_atomically(path, &encoded(path, bytes, size, color)?)
+}
+
+fn encoded(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<Vec<u8>> {
     // Nothing is written that would not be read.
     if width.max(height) > MAX_SIDE as usize {
         let found = format!("a picture of {width} x {height} pixels is not written");
@@ -166,7 +179,7 @@ fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: Ext
     ::image::codecs::png::PngEncoder::new(&mut png).write_image(bytes, width as u32, height as u32, color).map_err(|error| {
         Error::input(path, format!("a {width} x {height} image cannot be encoded ({error})"), "choose a usual image size")
     })?;
-    files::write_atomically(path, &png)
+    Ok(png)
 }
 
 #[cfg(test)]
