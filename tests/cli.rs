@@ -44,6 +44,8 @@ fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
     let run = folder.path("run");
     let whole = train(&run, &["--no-report"]).json();
     let grid = fs::read(folder.path("run/checkpoint.safetensors")).unwrap();
+    let strip = |run: &str| fs::read(folder.path(&format!("{run}/images/stages.png"))).unwrap();
+    let before = strip("run");
     fs::remove_file(folder.path("run/result.json")).unwrap();
     let again = plenoxel(&["train", "--resume", &run]).json();
     assert_eq!((&again["psnr"], &again["steps"], &again["rays"]), (&whole["psnr"], &whole["steps"], &whole["rays"]));
@@ -52,16 +54,27 @@ fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
         (2, true)
     );
     assert!(fs::exists(folder.path("run/report.html")).unwrap());
+    assert!(strip("run") == before, "the start and both stages are still in the strip");
     plenoxel(&["train", "--resume", &run]).refused(3, &["this run has ended"]);
 
     // One that began with a grid left the coarser stage out.
     let finer = folder.path("finer");
     let stages = |result: &Value| result["stages"].as_array().unwrap().iter().map(|stage| stage["resolution"].clone()).collect::<Vec<_>>();
     let whole = train(&finer, &["--no-report", "--init-from", &run]).json();
+    let before = strip("finer");
+    let picture = |name: &str| image::read(Path::new(&folder.path(name))).unwrap();
+    let apart = |a: &str, b: &str| {
+        let differences = picture(a).iter().zip(picture(b).iter()).map(|(a, b)| f64::from(a.abs_diff(*b))).collect::<Vec<_>>();
+        differences.iter().sum::<f64>() / differences.len() as f64
+    };
+    // It begins where the other run ended, and that one began with fog.
+    assert!(apart("finer/images/stage_0_12.png", "run/images/stage_2_12.png") < 1.0);
+    assert!(apart("run/images/stage_0_8.png", "run/images/stage_2_12.png") > 10.0);
     fs::remove_file(folder.path("finer/result.json")).unwrap();
     let again = plenoxel(&["train", "--resume", &finer, "--no-report"]).json();
     assert_eq!((stages(&again), &again["steps"]), (vec![Value::from(12)], &whole["steps"]));
     assert_eq!(stages(&whole), [12]);
+    assert!(strip("finer") == before, "the start and the stage are still in the strip");
 
     // One that was carved was not trained.
     let carved = folder.path("carved");
@@ -148,12 +161,20 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
         .sum();
     assert!((sum - metrics[0]["loss"].as_f64().unwrap()).abs() < 1e-6 && metrics[9]["psnr"].is_f64());
     assert_eq!(metrics[10]["final"], result);
-    let pictures =
-        ["preview.png", "stage_1_8.png", "stage_2_12.png", "stages.png", "test_000_r_0.png", "test_001_r_1.png", "test_002_r_2.png"];
+    let pictures = [
+        "preview.png",
+        "stage_0_8.png",
+        "stage_1_8.png",
+        "stage_2_12.png",
+        "stages.png",
+        "test_000_r_0.png",
+        "test_001_r_1.png",
+        "test_002_r_2.png",
+    ];
     assert_eq!(names(&format!("{run}/images")), pictures);
-    // Two stages and the target, and four panels, of 24 pixels with gaps of 2.
+    // The start, two stages and the target, and four panels, of 24 pixels with gaps of 2.
     let size = |name: &str| image::size(Path::new(&format!("{run}/images/{name}"))).unwrap();
-    assert_eq!((size("stages.png"), size("test_000_r_0.png")), ((3 * 24 + 2 * 2, 24), (4 * 24 + 3 * 2, 24)));
+    assert_eq!((size("stages.png"), size("test_000_r_0.png")), ((4 * 24 + 3 * 2, 24), (4 * 24 + 3 * 2, 24)));
     assert_eq!(size("preview.png"), (2 * 24 + 2, 24));
     assert!(fs::read_to_string(format!("{run}/loss.svg")).unwrap().contains("12³"));
     assert!(trained.err.contains("memory: about ") && trained.err.contains("stage 2/2 (12³)  step 10/10"), "{}", trained.err);
@@ -232,7 +253,7 @@ fn without_test_views_training_ends_well_and_has_no_figures() {
     let result = train(&folder.path("built-in"), &["--scene-views", "4,0,0"]).json();
     assert!(result["psnr"].is_null() && result["views"] == 0 && result["stages"][0]["psnr"].is_null(), "{result}");
     let pictures = names(&folder.path("built-in/images"));
-    assert_eq!(pictures, ["preview.png", "stage_1_8.png", "stage_2_12.png", "stages.png"]);
+    assert_eq!(pictures, ["preview.png", "stage_0_8.png", "stage_1_8.png", "stage_2_12.png", "stages.png"]);
     let data = scene(&folder);
     fs::remove_file(format!("{data}/transforms_test.json")).unwrap();
     let result = train_on(&data, &folder.path("run"), &["--set", "validation_every=3"]).json();

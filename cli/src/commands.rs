@@ -7,6 +7,7 @@ pub mod completions;
 pub mod evaluate;
 pub mod export;
 pub mod filter;
+pub mod harmonics;
 pub mod info;
 pub mod man;
 mod new_run;

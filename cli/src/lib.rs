@@ -17,7 +17,7 @@ mod progress;
 mod report;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{carve, compare, completions, evaluate, export, filter, info, man, presets, render, scene, sweep, train};
+use commands::{carve, compare, completions, evaluate, export, filter, harmonics, info, man, presets, render, scene, sweep, train};
 use plenoxel::error::Error;
 use plenoxel::run::{machine, memory};
 use progress::{Console, LogFormat};
@@ -40,6 +40,7 @@ Examples:
   plenoxel export mesh runs/lego-1           its surface, for other programs
   plenoxel presets                           settings to start from, and how long they take
   plenoxel compare runs/a runs/b             figures, curves and pictures side by side
+  plenoxel harmonics                         a picture of the functions that colors are made of
   plenoxel sweep scenes.toml                 every scene with every method, and the table of what came of it
 
 Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
@@ -66,6 +67,7 @@ enum Command {
     Export(export::ExportArgs),
     Filter(filter::FilterArgs),
     Info(info::InfoArgs),
+    Harmonics(harmonics::HarmonicsArgs),
     Scene(scene::SceneArgs),
     Presets(presets::PresetsArgs),
     Completions(completions::CompletionsArgs),
@@ -132,6 +134,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Export(args) => export::run(args, &console),
             Command::Filter(args) => filter::run(args, &console),
             Command::Info(args) => info::run(args, &console),
+            Command::Harmonics(args) => harmonics::run(args, &console),
             Command::Scene(args) => scene::run(args, &console),
             Command::Presets(args) => presets::run(args, &console),
             Command::Completions(args) => completions::run(args, &console),

@@ -17,15 +17,19 @@ const PANEL: [&str; 4] = ["target", "render", "error", "depth"];
 /// The stages of the run side by side, or what was carved.
 pub fn stages(folder: &RunFolder, result: &Value) -> Result<String> {
     let what = [
-        ("stages.png", "Stages", "One view at the end of each stage, and its photograph."),
+        ("stages.png", "Stages", "One view before the first step and at the end of each stage, and its photograph."),
         ("carved.png", "Carved", "What some cameras see."),
     ];
     let Some((name, title, caption)) = what.into_iter().find(|(name, ..)| folder.image(name).exists()) else { return Ok(String::new()) };
-    let stages = result["stages"]
-        .as_array()
-        .into_iter()
-        .flatten()
-        .map(|stage| stage["resolution"].as_u64().map_or_else(|| "stage".to_owned(), |resolution| format!("{resolution}³")));
+    let resolutions = result["stages"].as_array().into_iter().flatten().map(|stage| stage["resolution"].as_u64().map(|n| n as usize));
+    let numbered = resolutions.clone().take(1).chain(resolutions).enumerate();
+    // A view that was not drawn is not in the strip: a run of an earlier version has none of the start.
+    let drawn = numbered.filter(|&(number, resolution)| folder.image(&RunFolder::stage_name(number, resolution)).exists());
+    let stages = drawn.map(|(number, resolution)| match (number, resolution) {
+        (0, _) => "start".to_owned(),
+        (_, Some(resolution)) => format!("{resolution}³"),
+        (_, None) => "stage".to_owned(),
+    });
     // The photograph is of the first test view.
     let photograph = result["views"].as_u64().filter(|views| *views > 0).map(|_| "photograph".to_owned());
     let labels: Vec<String> = if name == "stages.png" { stages.chain(photograph).collect() } else { Vec::new() };

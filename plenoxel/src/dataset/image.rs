@@ -137,11 +137,20 @@ pub fn composite(image: &RgbaImage, background: [f32; 3]) -> Array3<f32> {
 /// atomically.
 ///
 /// Panics unless there are three channels. Errors if the image is empty or cannot be written.
+#[track_caller]
 pub fn write_rgb(path: &Path, rgb: ArrayView3<'_, f32>) -> Result<()> {
+    files::write_atomically(path, &rgb_as_png(path, rgb)?)
+}
+
+/// The bytes of the PNG file that [`write_rgb`] writes; `path` is for error messages.
+///
+/// Panics unless there are three channels. Errors: an empty picture, or one that is too large.
+#[track_caller]
+pub fn rgb_as_png(path: &Path, rgb: ArrayView3<'_, f32>) -> Result<Vec<u8>> {
     let (height, width, channels) = rgb.dim();
-    assert_eq!(channels, 3, "write_rgb: expected [height, width, 3], got {:?}", rgb.shape());
+    assert_eq!(channels, 3, "a picture must be [height, width, 3], got {:?}", rgb.shape());
     let bytes: Vec<u8> = rgb.iter().map(|value| (value.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    encode(path, &bytes, (width, height), ExtendedColorType::Rgb8)
+    encoded(path, &bytes, (width, height), ExtendedColorType::Rgb8)
 }
 
 /// Writes an RGBA image with straight alpha as a PNG, atomically.
@@ -156,7 +165,11 @@ pub fn write_gray16(path: &Path, values: &Array2<u16>) -> Result<()> {
     encode(path, &bytes, (values.ncols(), values.nrows()), ExtendedColorType::L16)
 }
 
-fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<()> {
+fn encode(path: &Path, bytes: &[u8], size: (usize, usize), color: ExtendedColorType) -> Result<()> {
+    files::write_atomically(path, &encoded(path, bytes, size, color)?)
+}
+
+fn encoded(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: ExtendedColorType) -> Result<Vec<u8>> {
     // Images that could not be read back are not written.
     if width.max(height) > MAX_SIDE as usize {
         let found = format!("an image of {width} x {height} pixels is too large to write");
@@ -166,7 +179,7 @@ fn encode(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: Ext
     ::image::codecs::png::PngEncoder::new(&mut png).write_image(bytes, width as u32, height as u32, color).map_err(|error| {
         Error::input(path, format!("a {width} x {height} image cannot be encoded ({error})"), "choose a usual image size")
     })?;
-    files::write_atomically(path, &png)
+    Ok(png)
 }
 
 #[cfg(test)]

@@ -4,7 +4,8 @@
 //! Up to degree d there are (d + 1)² functions: 1; −y, z, −x; xy, −yz, 2z² − x² − y², −xz, x² − y²; and seven of degree 3. Each is
 //! multiplied by its normalization constant.
 
-use autograd::{Real, Tensor};
+use autograd::{Real, Tensor, no_grad};
+use ndarray::{Array2, ArrayView2};
 
 /// Constant function of degree 0, 1 / (2 √π).
 pub const Y0: f64 = 0.282_094_791_773_878_14;
@@ -52,6 +53,17 @@ pub fn basis<T: Real>(directions: &Tensor<T>, degree: usize) -> Tensor<T> {
         }
     }
     Tensor::stack(&columns.iter().collect::<Vec<_>>(), 1)
+}
+
+/// The basis on arrays: unit directions `[n, 3]` to `[n, (degree + 1)²]`.
+///
+/// Panics as [`basis`] does.
+#[track_caller]
+pub fn values<T: Real>(directions: ArrayView2<'_, T>, degree: usize) -> Array2<T> {
+    let (rows, columns) = (directions.nrows(), count(degree));
+    let directions = Tensor::from_vec(directions.iter().copied().collect(), &[rows, directions.ncols()]);
+    let values = no_grad(|| basis(&directions, degree));
+    Array2::from_shape_fn((rows, columns), |(row, column)| values.data()[row * columns + column])
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The pictures of a run: one view at the end of each stage, and panels of test views.
+//! The pictures of a run: one view before the first step and at the end of each stage, and panels of test views.
 
 use crate::images::{self, DepthRange, Rgb};
 use plenoxel::camera::Camera;
@@ -24,6 +24,7 @@ pub struct Pictures {
     /// Test views that get a panel.
     panels: Vec<usize>,
     views: usize,
+    /// The view before the first step and after each stage.
     stages: Vec<Rgb>,
 }
 
@@ -44,33 +45,43 @@ impl Pictures {
         })
     }
 
-    /// The same with the pictures of stages that had ended when the run was interrupted, if they were wanted then too; one that cannot be read is
-    /// left out.
+    /// The same with the pictures that were drawn before the run was interrupted, if they were wanted then too; one that cannot be read is left out.
     pub fn after(mut self, past: &History, plan: &[PlannedStage]) -> Self {
-        for stage in past.stages.iter().filter_map(|&(index, _)| plan.get(index)) {
-            if self.camera.is_some()
-                && let Ok(picture) = image::read(&self.stage_path(stage))
-            {
+        if past.losses.is_empty() || self.camera.is_none() {
+            return self;
+        }
+        let first = plan.first().map(|stage| (0, stage));
+        let ended = past.stages.iter().filter_map(|&(index, _)| Some((index + 1, plan.get(index)?)));
+        for (number, stage) in first.into_iter().chain(ended) {
+            if let Ok(picture) = image::read(&self.stage_path(number, stage)) {
                 self.stages.push(image::composite(&picture, self.background));
             }
         }
         self
     }
 
+    /// The model that `see` renders has not taken a step yet.
+    pub fn initial(&mut self, stage: &PlannedStage, see: &dyn Fn(&Camera) -> Picture) -> Result<()> {
+        self.draw(0, stage, see)
+    }
+
     /// A stage has ended with a model that `see` renders.
     pub fn stage(&mut self, stage: &PlannedStage, see: &dyn Fn(&Camera) -> Picture) -> Result<()> {
+        self.draw(stage.index + 1, stage, see)
+    }
+
+    fn draw(&mut self, number: usize, stage: &PlannedStage, see: &dyn Fn(&Camera) -> Picture) -> Result<()> {
         let Some(camera) = &self.camera else {
             return Ok(());
         };
         let picture = see(camera).rgb;
-        images::write(&self.stage_path(stage), &picture)?;
+        images::write(&self.stage_path(number, stage), &picture)?;
         self.stages.push(picture);
         Ok(())
     }
 
-    fn stage_path(&self, stage: &PlannedStage) -> PathBuf {
-        let resolution = stage.resolution.map_or(String::new(), |n| format!("_{n}"));
-        self.folder.image(&format!("stage_{}{resolution}.png", stage.index + 1))
+    fn stage_path(&self, number: usize, stage: &PlannedStage) -> PathBuf {
+        self.folder.image(&RunFolder::stage_name(number, stage.resolution))
     }
 
     /// A test view was rendered with the final model, whose box has a half width.
@@ -82,7 +93,7 @@ impl Pictures {
         images::write(&self.folder.image(&RunFolder::panel_name(number, &view.name)), &images::panel(target, picture, range))
     }
 
-    /// The stages side by side, and the photograph they are to become.
+    /// The start and the stages side by side, and the photograph they are to become.
     pub fn strip(&self, first_test: Option<&View>, background: [f32; 3]) -> Result<()> {
         if self.stages.is_empty() {
             return Ok(());

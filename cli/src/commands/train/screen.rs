@@ -75,6 +75,11 @@ impl<'c, 'a> Screen<'c, 'a> {
                 self.folder = Some(run.folder.clone());
                 self.interrupt = Some(Watch::begin());
             }
+            Event::Initial { stage, see } => {
+                if let Some(pictures) = &mut self.pictures {
+                    console.drawn(pictures.initial(&stage, see));
+                }
+            }
             Event::Step { report, observation } => {
                 if let Some(progress) = &mut self.progress {
                     progress.step(report, observation);

@@ -51,6 +51,13 @@ pub enum Event<'a> {
         /// What a resumed run did before.
         history: &'a History,
     },
+    /// The model before its first step and before the first stage prunes it; a resumed run does not tell this again.
+    Initial {
+        /// The first stage.
+        stage: PlannedStage,
+        /// Renders a camera's picture of the model.
+        see: &'a dyn Fn(&Camera) -> Picture,
+    },
     /// A step was taken.
     Step {
         /// Figures of the step.

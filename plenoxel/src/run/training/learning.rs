@@ -77,6 +77,9 @@ impl Job<'_> {
         let mut preview = preview.begin(first(Split::Test).or(first(Split::Train)).filter(|_| options.pictures));
         let run = Underway { folder, config, dataset };
         on(Event::Started { run, plan: &plan, test_views: self.test_views().len(), history: &past });
+        if let Some(&stage) = plan.first().filter(|_| trainer.steps_taken() == 0) {
+            on(Event::Initial { stage, see: &|camera: &Camera| Viewer::of(trainer.model(), &options_of_view).see(camera) });
+        }
         let mut losses = past.losses;
         let mut facts = trainer.model().facts();
         let mut saved = Instant::now();
