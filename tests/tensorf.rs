@@ -123,7 +123,8 @@ fn a_scene_is_learned_and_a_resumed_run_has_the_same_bits() {
 
 #[test]
 fn settings_without_meaning_are_refused_by_their_key() {
-    let wrong: [(&str, fn(&mut Config)); 5] = [
+    type Change = fn(&mut Config);
+    let wrong: [(&str, Change); 5] = [
         ("half_width", |config| config.half_width = f64::NAN),
         ("density_components", |config| config.density_components = 0),
         ("step", |config| config.step = 0.0),
