@@ -83,7 +83,7 @@ impl Error {
 
 /// Returns the problem with a setting: a value alone is introduced as invalid, a phrase is left as it is.
 fn problem(found: &str) -> String {
-    let found = one_line(found.trim_end_matches(','));
+    let found = brief(found.trim_end_matches(','));
     if found.contains(' ') { found } else { format!("invalid value {found}") }
 }
 
@@ -156,7 +156,7 @@ mod tests {
         let foreign = Error::input("a\x1b[1mb", "the key \"x\ny\"", "a\u{9b}");
         assert_eq!(foreign.to_string(), "a\\u{1b}[1mb: the key \"x\\ny\"; a\\u{9b}");
         let long = Error::config("engine", "a".repeat(900_000), "b").to_string();
-        assert!(long.starts_with("engine: aaa") && long.ends_with("aaa cannot be used; accepted: b") && long.len() < 250, "{long}");
+        assert!(long.starts_with("engine: invalid value aaa") && long.ends_with("aaa; accepted: b") && long.len() < 250, "{long}");
         let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
         assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }

@@ -272,7 +272,7 @@ fn headers_have_an_end() {
     let error = parse(format!("ply\nformat ascii 1.0\n{}end_header\n", &names[..names[..1_000_000].rfind("element").unwrap()]).as_bytes())
         .unwrap_err()
         .to_string();
-    assert!(error.contains("no points: its elements are [0, 1, 2") && error.contains('…') && error.len() < 1500, "{error}");
+    assert!(error.contains("no points among its elements [0, 1, 2") && error.contains('…') && error.len() < 1500, "{error}");
 }
 
 #[test]
