@@ -83,7 +83,9 @@ impl Exported {
         let folder = if self.best { folder.with_best()? } else { folder };
         let path = folder.existing_checkpoint()?;
         let (header, voxels) = checkpoint::header(&path)?;
-        let estimate = Estimate::of_export(&header.shape(), voxels);
+        // Measured: places, rows and colors of voxels; triangles, normals and colors of a mesh before it is reduced.
+        let bytes_per_voxel = if format == "vox" { 100 } else { 190 };
+        let estimate = Estimate::of_export(&header.shape(), voxels, bytes_per_voxel);
         console.note(&estimate.describe());
         estimate.check()?;
         let (grid, header) = checkpoint::load(&path)?;

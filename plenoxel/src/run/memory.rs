@@ -204,15 +204,14 @@ impl Estimate {
         Estimate { images, grid, optimizer: 0, step, expected: false, key: key.to_owned(), advice }
     }
 
-    /// Reading a trained grid of so many voxels, and making something of them: at most all of them.
-    pub fn of_export(shape: &GridShape, voxels: usize) -> Self {
+    /// Estimates reading a trained grid of so many voxels and making a file of them, which takes `bytes_per_voxel` for each.
+    pub fn of_export(shape: &GridShape, voxels: usize, bytes_per_voxel: u64) -> Self {
         Estimate {
             images: 0,
             // The file and the tables read from it.
             grid: 2 * (voxels * shape.voxel_bytes()) as u64,
             optimizer: 0,
-            // Places, rows, normals and colors.
-            step: 100 * voxels as u64,
+            step: bytes_per_voxel * voxels as u64,
             expected: false,
             key: "RUN".to_owned(),
             advice: "a machine with more",
