@@ -2,7 +2,7 @@
 # Short runs of every preset with one binary, and a digest of the tensors of each final checkpoint: two builds that train the same bits print the
 # same lines. About five minutes on two cores.
 #
-#     benches/digests.sh target/release/plenoxel /tmp/new data/nerf_synthetic/lego
+#     benches/digests.sh target/release/plenoxel OUT data/nerf_synthetic/lego
 #
 # Without a third argument the runs on lego are left out. Needs Python 3 for the digests.
 set -euo pipefail

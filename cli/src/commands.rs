@@ -34,7 +34,7 @@ pub fn check_replaceable(out: &Path, runs: &[&RunFolder], data: Option<&Path>) -
     if !of_run && !of_data {
         return Ok(());
     }
-    let found = format!("{}, which belongs to the {} that is read,", out.display(), if of_run { "run" } else { "dataset" });
+    let found = format!("{} belongs to the {} that is read", out.display(), if of_run { "run" } else { "dataset" });
     Err(Error::config("--out", found, "the name of another file"))
 }
 
@@ -43,7 +43,7 @@ fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
     if dataset.count(split) > 0 {
         return Ok(());
     }
-    let found = format!("{split}, which has no views in {},", dataset.name());
+    let found = format!("{split} has no views in {}", dataset.name());
     let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
     let others: Vec<String> = others.map(|split| split.to_string()).collect();
     Err(Error::config("--split", found, others.join(", ")))

@@ -109,7 +109,7 @@ impl<'a> Console<'a> {
         }
     }
 
-    /// How a page that was written is named, for a browser to open it: on a terminal by an address that can be clicked, elsewhere by its path.
+    /// Returns the name of a page for a message: on a terminal an address that a click opens in the browser, elsewhere its path.
     pub fn address(&self, page: &Path) -> String {
         if self.terminal { terminal::file_address(page) } else { page.display().to_string() }
     }

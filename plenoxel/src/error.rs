@@ -83,7 +83,7 @@ impl Error {
 
 /// Returns the problem with a setting: a value alone is introduced as invalid, a phrase is left as it is.
 fn problem(found: &str) -> String {
-    let found = brief(found.trim_end_matches(','));
+    let found = brief(found);
     if found.contains(' ') { found } else { format!("invalid value {found}") }
 }
 

@@ -7,7 +7,7 @@
 use crate::error::{Error, Result};
 use crate::files;
 use crate::memory;
-use autograd::{Real, Tensor};
+use autograd::{Lattice, Real, Tensor};
 pub(crate) use safetensors::tensor::{Dtype, TensorInfo};
 use safetensors::tensor::{Metadata, View};
 use serde::Serialize;
@@ -247,6 +247,16 @@ impl<'a> TensorFile<'a> {
         let dtype = self.info(name).map(|info| info.dtype).filter(|dtype| [Dtype::F32, Dtype::F64].contains(dtype));
         let values = self.numbers(name, dtype.unwrap_or(dtype_of::<T>()), shape)?;
         Ok(Tensor::from_vec(values, shape))
+    }
+
+    /// Reads the brick masks of `cells`, as in [`autograd::Lattice::masks`]. Returns `None` if a mask has a bit outside of `cells`.
+    ///
+    /// Errors as for [`words`](Self::words).
+    pub fn brick_masks(&mut self, name: &str, cells: [usize; 3]) -> Result<Option<Vec<u64>>> {
+        let whole = Lattice::bricks(cells);
+        let masks = self.words(name, whole.masks().len())?;
+        let inside = masks.iter().zip(whole.masks()).all(|(mask, whole)| mask & !whole == 0);
+        Ok(inside.then_some(masks))
     }
 
     /// Reads a list of 64-bit words.

@@ -6,7 +6,7 @@
 mod model;
 mod state;
 
-pub use model::{CHECKPOINT_FORMAT, Model, Pass, Progress, RenderFn, StageLength, ViewOptions};
+pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, StageProgress, ViewOptions};
 pub use state::{About, about};
 
 use crate::dataset::View;

@@ -2,7 +2,7 @@
 //!
 //! An ordinary store first reads the cache line that it writes to. An op whose result does not fit into the cache is limited by memory bandwidth, and these
 //! reads are a large part of its traffic. With streaming stores, gathering a million random rows of 112 bytes takes 0.88 of the time, and filling 64 MB takes
-//! 0.8 of the time (`gather28` and `sum_16M` in `benches/RESULTS.md`). Elementwise ops from one large array to another do not become faster. Small results and
+//! 0.8 of the time (`gather28` and `sum_16M` in `benches/history/2026-11-21.md`). Elementwise ops from one large array to another do not become faster. Small results and
 //! other machines use an ordinary copy, which is safe code; the tests compare both.
 
 #![allow(unsafe_code)]

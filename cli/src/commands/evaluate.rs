@@ -7,7 +7,6 @@ use clap::{Args, ValueHint};
 use plenoxel::error::Result;
 use plenoxel::evaluate::{ViewScore, Viewer};
 use plenoxel::json;
-use plenoxel::run::data::DataSource;
 use plenoxel::run::figures::Figures;
 use plenoxel::run::memory::{self, Estimate};
 use serde::Serialize;
@@ -52,11 +51,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let found = args.run.find()?;
     let trained = found.folder.result()?.unwrap_or(Value::Null);
     let dataset = args.run.views(&found)?;
-    let data = match &found.source {
-        DataSource::Folder { path } => Some(path.as_path()),
-        DataSource::BuiltIn { .. } => None,
-    };
-    args.out.iter().try_for_each(|out| super::check_replaceable(out, &[&found.folder], data))?;
+    args.out.iter().try_for_each(|out| super::check_replaceable(out, &[&found.folder], found.source.path()))?;
     let Loaded { model, about, view } = args.run.load(&found, console, |sampling, shape, voxels| {
         Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
     })?;

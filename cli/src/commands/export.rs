@@ -73,18 +73,16 @@ struct Opened {
 }
 
 impl Exported {
-    /// The run with its grid, once memory is known to suffice, and the name of the file to be fit for its format.
-    fn open(&self, console: &Console<'_>, format: &str) -> Result<Opened> {
+    /// The run with its grid, once memory is known to suffice for it and for `bytes_per_voxel`, and the name of the file to be fit for its format.
+    fn open(&self, console: &Console<'_>, format: &str, bytes_per_voxel: u64) -> Result<Opened> {
         if let Some(out) = self.out.as_deref().filter(|out| !is_stdout(out) && ending(out).as_deref() != Some(format)) {
-            let found = format!("{}, for a file of the format {format},", out.display());
+            let found = format!("{} does not name a file of the format {format}", out.display());
             return Err(Error::config("--out", found, format!("a name that ends in .{format}")));
         }
         let (folder, config, record) = RunFolder::open(&self.run)?;
         let folder = if self.best { folder.with_best()? } else { folder };
         let path = folder.existing_checkpoint()?;
         let (header, voxels) = checkpoint::header(&path)?;
-        // Measured: places, rows and colors of voxels; triangles, normals and colors of a mesh before it is reduced.
-        let bytes_per_voxel = if format == "vox" { 100 } else { 190 };
         let estimate = Estimate::of_export(&header.shape(), voxels, bytes_per_voxel);
         console.note(&estimate.describe());
         estimate.check()?;

@@ -144,7 +144,7 @@ fn choose(dataset: &Dataset, split: Split, asked: &[String]) -> Result<Vec<usize
         let number = text.parse().ok().filter(|number| *number < names.len());
         let number = number.or_else(|| names.iter().position(|name| name == text));
         number.ok_or_else(|| {
-            let found = format!("`{text}`, which is no {split} view,");
+            let found = format!("there is no {split} view `{text}`");
             let last = names.len() - 1;
             let accepted = format!("0 to {last}, or a name from {} to {}", names[0], names[last]);
             Error::config("--view", found, accepted)

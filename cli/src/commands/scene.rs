@@ -93,12 +93,12 @@ pub fn run(args: &SceneArgs, console: &Console<'_>) -> Result<()> {
         ..ProceduralOptions::default()
     })?;
     if args.dir.exists() && !args.dir.is_dir() {
-        let found = format!("{}, which is a file,", args.dir.display());
+        let found = format!("{} is a file", args.dir.display());
         return Err(Error::config("DIR", found, "a folder"));
     }
     let occupied = std::fs::read_dir(&args.dir).is_ok_and(|mut entries| entries.next().is_some());
     if occupied && !args.force {
-        let found = format!("{}, which is not empty,", args.dir.display());
+        let found = format!("{} is not empty", args.dir.display());
         return Err(Error::config("DIR", found, "a new folder; or --force"));
     }
     let estimate = Estimate::of_images(&dataset);

@@ -6,7 +6,7 @@ mod job;
 mod plan;
 
 use super::table::{Cell, Failure, Row, RunTable};
-use super::train::interrupt::{EXIT_CODE, Watch};
+use crate::interrupt::{EXIT_CODE, Watch};
 use crate::progress::Console;
 use child::Program;
 use clap::builder::PossibleValuesParser;
@@ -102,7 +102,7 @@ fn check_place(out: &Path) -> Result<()> {
     if is_empty || ((holds(LOCK) || holds("table.csv")) && !holds("run.json")) {
         return Ok(());
     }
-    let found = format!("{}, which holds something that is not a sweep,", out.display());
+    let found = format!("{} is not empty, and not the folder of a sweep", out.display());
     Err(Error::config("--out", found, "a new folder, or that of a sweep"))
 }
 
@@ -229,7 +229,7 @@ fn said(job: &Job) -> String {
 fn check(job: &Job, state: &State) -> Result<()> {
     match state {
         State::Different(how) => {
-            let found = format!("{}, where there is another run ({how}),", job.folder.display());
+            let found = format!("{} has a run with other settings ({how})", job.folder.display());
             Err(Error::config("--out", found, "a folder of its own for each sweep; or --force, which overwrites such runs"))
         }
         _ => Ok(()),

@@ -1,11 +1,11 @@
 //! `plenoxel train`: from photographs to a run folder.
 
 mod flags;
-pub mod interrupt;
 mod pictures;
 mod screen;
 
 use super::report;
+use crate::interrupt;
 use crate::progress::Console;
 pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
 use plenoxel::error::Result;

@@ -16,7 +16,7 @@ const AXES: [Axis; 2] =
 /// The curves of a run, or nothing if there was no training.
 pub fn section(lines: &[Line<'_>], config: &Config) -> String {
     let Some(last) = lines.last().filter(|_| !config.stages.is_empty()) else { return String::new() };
-    over_both(|(_, across, at)| {
+    over_both(|_, (_, across, at)| {
         let charts = charts(lines, config).into_iter().map(|(title, up, values)| {
             let curves = values.into_iter().map(|(name, value)| curve(&name, lines, at, &*value)).filter(|curve| !curve.lines.is_empty());
             Chart {
@@ -31,7 +31,7 @@ pub fn section(lines: &[Line<'_>], config: &Config) -> String {
     })
 }
 
-/// What each of several runs has a curve of.
+/// Quantities of which each of several runs has a curve: title, unit, and value of a line of the metrics.
 type OfEach = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
 const OF_EACH: [OfEach; 4] = [
     ("Loss", "loss", |line| Some(line.loss)),
@@ -61,8 +61,7 @@ pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> St
     if runs.clone().all(|run| run.is_empty) {
         return String::new();
     }
-    over_both(|(name, across, _)| {
-        let axis = AXES.iter().position(|axis| axis.0 == name).unwrap_or(0);
+    over_both(|axis, (_, across, _)| {
         let end = runs.clone().map(|run| run.over[axis].0).fold(0.0, f64::max);
         let charts = OF_EACH.into_iter().enumerate().filter_map(|(number, (title, up, _))| {
             // A run without such figures keeps its color for the other charts.
@@ -77,15 +76,15 @@ pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> St
 }
 
 /// A section with charts over steps, and the same over seconds, of which the reader sees one.
-fn over_both(charts: impl Fn(Axis) -> Vec<Chart>) -> String {
+fn over_both(charts: impl Fn(usize, Axis) -> Vec<Chart>) -> String {
     let mut page = String::from("<section><h2>Curves</h2>\n");
     for (i, (name, ..)) in AXES.iter().enumerate() {
         let checked = if i == 0 { " checked" } else { "" };
         page +=
             &format!("<input type=\"radio\" name=\"axis\" id=\"over-{name}\"{checked}><label for=\"over-{name}\">over {name}</label>\n");
     }
-    for axis in AXES {
-        let charts: String = charts(axis).iter().map(Chart::svg).collect();
+    for (i, axis) in AXES.into_iter().enumerate() {
+        let charts: String = charts(i, axis).iter().map(Chart::svg).collect();
         page += &format!("<div class=\"charts\" data-over=\"{}\">{charts}</div>\n", axis.0);
     }
     page + "</section>"

@@ -58,7 +58,7 @@ impl FolderLock {
 
 /// The error if another process holds the lock of a folder.
 fn refusal(folder: &Path, file: &mut File, key: &str) -> Error {
-    let found = format!("{}, which {} is writing,", folder.display(), holder(file));
+    let found = format!("{} is being written by {}", folder.display(), holder(file));
     Error::config(key, found, "another folder, or this one when that process has ended")
 }
 

@@ -25,13 +25,14 @@ fn refuse(bytes: u64, free: Option<u64>, largest: u64, limit: Option<u64>) -> Re
     Ok(())
 }
 
-/// Refuses to begin if this process may not open a few more files: `file` and what is written at the end of a run.
+/// Checks that this process may open a few more files, as a save at the end of a run does.
 ///
 /// Errors: those of the system, if there are too many open files.
-pub fn check_handles(file: &Path) -> Result<()> {
-    // Images are read by every thread; a save has a file and its folder.
+pub fn check_handles() -> Result<()> {
     const NEEDED: usize = 16;
-    (0..NEEDED).map(|_| std::fs::File::open(file)).collect::<Result<Vec<_>>>().map(drop)
+    // A file that can be opened.
+    let Ok(program) = std::env::current_exe() else { return Ok(()) };
+    (0..NEEDED).map(|_| std::fs::File::open(&program)).collect::<Result<Vec<_>>>().map(drop)
 }
 
 /// Bytes of the largest file that this process may write, if there is such a limit.
@@ -56,7 +57,7 @@ mod tests {
         assert_eq!((full.kind(), full.to_string().as_str()), (ErrorKind::StorageFull, "30.0 MB are needed and 2.5 MB are free"));
         let limited = refuse(30, None, 20_000_000, Some(1_000_000)).unwrap_err();
         assert!(limited.kind() == ErrorKind::FileTooLarge && limited.to_string().contains("ulimit -f"), "{limited}");
-        assert!(check_room(&std::env::temp_dir(), 1, 1).is_ok());
+        assert!(check_room(&std::env::temp_dir(), 1, 1).is_ok() && check_handles().is_ok());
         let full = check_room(&std::env::temp_dir().join("not/there/yet"), u64::MAX, 1).unwrap_err();
         assert_eq!(full.kind(), ErrorKind::StorageFull);
     }

@@ -7,15 +7,15 @@ use serde_json::{Map, Number, Value};
 use std::cell::Cell;
 use std::fmt;
 
-/// Bytes of a value where it stands.
+/// Size of a value in its container, bytes.
 const VALUE: u64 = size_of::<Value>() as u64;
-/// What the allocator adds to a piece of memory.
+/// Overhead of the allocator for a piece of memory, bytes.
 const PIECE: u64 = 16;
-/// The keys of an object that its first node of a tree has room for, and what the node takes.
+/// Number of keys in the first tree node of an object, and the size of the node in bytes.
 const NODE_KEYS: usize = 11;
 const NODE: u64 = NODE_KEYS as u64 * (size_of::<String>() as u64 + VALUE) + 16 + PIECE;
 
-/// The memory that is left, and what has run out.
+/// Memory that is left while a file is read, and the limit that was exceeded.
 pub(super) struct Room<'k> {
     kept: &'k Kept,
     left: Cell<u64>,

@@ -90,7 +90,7 @@ fn of_run<T: Real>(table: &Tensor<T>, lattice: &Lattice, part: Option<(usize, us
     match table.shape()[1] {
         1 => with_kernel::<T, 1, 4, 16>(table, lattice, part),
         3 => with_kernel::<T, 3, 12, 48>(table, lattice, part),
-        // No grid has rows of 4 numbers, but workload W3 does: 5.8 ms with the kernel, 126 ms without (`benches/RESULTS.md`).
+        // No grid has rows of 4 numbers, but workload W3 does: 5.8 ms with the kernel, 126 ms without (`benches/history/2026-11-24.md`).
         4 => with_kernel::<T, 4, 16, 64>(table, lattice, part),
         9 => with_kernel::<T, 9, 36, 144>(table, lattice, part),
         12 => with_kernel::<T, 12, 48, 192>(table, lattice, part),

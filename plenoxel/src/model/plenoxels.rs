@@ -46,7 +46,7 @@ use crate::rays::RaySource;
 use crate::render::{Engine, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{self, About, Model, Pass, PlannedStage, Progress, RenderFn, StageLength, TrainOptions, ViewOptions};
+use crate::train::{self, About, Model, Pass, PlannedStage, RenderFn, StageLength, StageProgress, TrainOptions, ViewOptions};
 use autograd::optim::Optimizer;
 use autograd::single::{cast, cast_mut, cast_ref, is_single};
 use autograd::{Module, Param, Real, Tensor};
@@ -103,11 +103,11 @@ impl<T: Real> Plenoxels<T> {
     /// Creates the initial grid as [`new`](Self::new) does. `progress` counts the views of visual hulls; another thread may read it.
     ///
     /// Errors if a setting is invalid, naming the setting.
-    pub fn with_progress(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Result<Self> {
+    pub fn with_progress(config: &Config, views: &Arc<[View]>, progress: Arc<StageProgress>) -> Result<Self> {
         if const { is_single::<T>() } { cast(single::new(config, views, progress)) } else { Self::start(config, views, progress) }
     }
 
-    fn start(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Result<Self> {
+    fn start(config: &Config, views: &Arc<[View]>, progress: Arc<StageProgress>) -> Result<Self> {
         config.validate()?;
         let config = config.fitted_to(views.iter().map(|view| &view.camera));
         config.check_stages()?;
@@ -317,7 +317,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         if const { is_single::<T>() } { single::begin(cast_mut(self), stage.index, rays) } else { self.begin(stage.index, rays) }
     }
 
-    fn progress(&self) -> Option<Arc<Progress>> {
+    fn progress(&self) -> Option<Arc<StageProgress>> {
         self.silhouettes.as_ref().map(|silhouettes| silhouettes.progress.clone())
     }
 
@@ -406,7 +406,7 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
     }
 
     /// Creates a run with an objective, whatever losses the config names. `progress` counts the views of visual hulls.
-    pub(crate) fn with_losses(config: Config, views: Arc<[View]>, objective: Objective<T>, progress: Arc<Progress>) -> Result<Self> {
+    pub(crate) fn with_losses(config: Config, views: Arc<[View]>, objective: Objective<T>, progress: Arc<StageProgress>) -> Result<Self> {
         let model = Plenoxels::with_progress(&config, &views, progress)?;
         Self::with_model(model, views, objective, config.train_options())
     }

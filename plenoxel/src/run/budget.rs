@@ -1,7 +1,7 @@
 //! A plan of time: the lengths of the stages for training of a given duration, found once before the first step.
 //!
 //! Steps that are thrown away, up to twenty seconds of them, say how fast this machine is. What stages cost against each other is taken from
-//! runs on lego of NeRF-synthetic at 800 x 800 (`benches/RESULTS.md`): it differs between scenes by a quarter or so, and so does the time that a
+//! runs on lego of NeRF-synthetic at 800 x 800 (`benches/history`): it differs between scenes by a quarter or so, and so does the time that a
 //! run takes. The plan is in steps and part of the run's settings, so that they repeat the run bit by bit wherever it is run again.
 
 use crate::dataset::View;
@@ -198,7 +198,7 @@ mod tests {
         assert!((mean - 1.0).abs() < 0.02, "{mean}");
     }
 
-    /// Seconds of the k-th step of `fast` at 128 voxels a side, as they were recorded on lego (`benches/RESULTS.md`).
+    /// Seconds of the k-th step of `fast` at 128 voxels a side, as they were recorded on lego (`benches/history`).
     fn recorded(k: u64) -> f64 {
         const STEPS: [(f64, f64); 5] = [(10.0, 0.026), (40.0, 0.022), (120.0, 0.019), (400.0, 0.016), (1000.0, 0.014)];
         let k = (k as f64).clamp(STEPS[0].0, STEPS[4].0);

@@ -53,6 +53,14 @@ impl DataSource {
         DataSource::Folder { path: absolute.unwrap_or_else(|_| path.to_owned()) }
     }
 
+    /// Returns the folder with the views; `None` for the built-in scene.
+    pub fn path(&self) -> Option<&Path> {
+        match self {
+            DataSource::Folder { path } => Some(path),
+            DataSource::BuiltIn { .. } => None,
+        }
+    }
+
     /// The folder, or without one the built-in scene as it is by default.
     pub fn of(folder: Option<&Path>) -> Self {
         folder.map_or_else(|| DataSource::built_in(&ProceduralOptions::default()), DataSource::folder)

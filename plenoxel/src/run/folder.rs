@@ -42,8 +42,8 @@ const REPORT: &str = "report.html";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
-/// The files of a run, those that matter least last.
-const FILES: [&str; 11] = [CHECKPOINT, BEST, STATE, RESULT, EVALUATION, METRICS, LOSS, REPORT, CONFIG, RECORD, README];
+/// Files of a run, in the order in which they are removed: an interruption loses the least valuable ones. The record is the last, because it marks the folder of a run.
+const FILES: [&str; 11] = [README, LOSS, REPORT, METRICS, EVALUATION, RESULT, STATE, BEST, CHECKPOINT, CONFIG, RECORD];
 /// Content of figures that is kept: all of it. The figures of the run and of an evaluation are in memory at the same time.
 const FIGURES: json::Kept = json::Kept { keys: |_| true, entries: usize::MAX, share: 45 };
 /// Endings of what `export` writes.
@@ -65,7 +65,7 @@ impl NewFolder {
     pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
         if let Some(path) = out {
             if let Some(file) = path.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir()) {
-                let found = format!("{}, where {} is a file,", path.display(), file.display());
+                let found = format!("{} cannot be a folder, because {} is a file", path.display(), file.display());
                 return Err(Error::config("--out", found, "a folder"));
             }
             FolderLock::share(path, LOCK, "--out")?;
@@ -98,17 +98,17 @@ fn check_vacant(path: &Path, overwrite: bool) -> Result<()> {
     let folder = RunFolder::at(path);
     let occupied = !folder.is_empty();
     if occupied && !overwrite && !folder.has_saved_nothing() {
-        let found = format!("{}, which is not empty,", path.display());
+        let found = format!("{} is not empty", path.display());
         return Err(Error::config("--out", found, "a new folder; or --force, which overwrites the run in it"));
     }
     if occupied && !path.join(RECORD).exists() {
-        let found = format!("{}, which holds something that is not a run,", path.display());
+        let found = format!("{} is not empty, and not the folder of a run", path.display());
         return Err(Error::config("--out", found, "a new folder, or that of a run, which --force overwrites"));
     }
     // Found out before the first file is removed.
     match FILES.iter().find(|name| path.join(name).is_dir()) {
         Some(name) => {
-            let found = format!("{}, in which {name} is a folder,", path.display());
+            let found = format!("{name} in {} is a folder", path.display());
             Err(Error::config("--out", found, "the folder of a run; or a new one"))
         }
         None => Ok(()),
@@ -121,8 +121,8 @@ impl RunFolder {
         RunFolder { path: path.to_owned(), grid: CHECKPOINT, lock: None }
     }
 
-    /// The same folder, locked: no other process trains or carves into it before this value and its clones are dropped. `key` is the flag or argument that
-    /// names the folder, for messages.
+    /// Locks the folder: no other process trains or carves into it before this value and its clones are dropped. `key` is the flag or argument that names the
+    /// folder, for messages.
     ///
     /// Errors: another process is writing it.
     pub fn locked(self, key: &str) -> Result<Self> {
@@ -130,7 +130,7 @@ impl RunFolder {
         Ok(RunFolder { lock: Some(Arc::new(lock)), ..self })
     }
 
-    /// The same folder, shared with others that add to a finished run: no process trains or carves into it before this value and its clones are dropped.
+    /// Shares the folder with others that add to a finished run: no process trains or carves into it before this value and its clones are dropped.
     ///
     /// Errors: another process is training or carving into it.
     pub fn shared(self, key: &str) -> Result<Self> {
@@ -145,8 +145,8 @@ impl RunFolder {
         if self.lock.as_ref().is_none_or(|lock| lock.is_of(&self.path, LOCK)) {
             return Ok(());
         }
-        let found = "this folder, or run.lock in it, was moved, deleted or replaced while the run was writing it";
-        Err(Error::io(&self.path, std::io::Error::new(std::io::ErrorKind::NotFound, found), "writing the run"))
+        let found = std::io::Error::other("the folder, or its run.lock, was moved, deleted or replaced");
+        Err(Error::io(&self.path, found, "the run was writing it"))
     }
 
     /// True if there is nothing in the folder but a lock and temporary files, or no such folder.
@@ -203,8 +203,6 @@ impl RunFolder {
         };
         settings::write(&self.path.join(CONFIG), config, &about)?;
         self.write_json(RECORD, record)?;
-        let config = self.path.join(CONFIG);
-        files::check_handles(&config).map_err(|e| Error::io(&config, e, "opening as many files as a run needs"))?;
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
     }
 

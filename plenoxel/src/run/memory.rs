@@ -247,7 +247,7 @@ impl Estimate {
             part("grid", self.grid),
             part("optimizer", self.optimizer),
             part("step", self.step),
-            if self.expected { ", for a scene of usual surfaces" } else { "" },
+            if self.expected { ", for a typical scene" } else { "" },
         )
     }
 
@@ -256,7 +256,7 @@ impl Estimate {
     pub fn check(&self) -> Result<()> {
         match memory::allowance() {
             Some(allowance) if self.total() > allowance.bytes => {
-                let found = format!("what would need about {} of memory, where {allowance},", bytes(self.total()));
+                let found = format!("the command needs about {} of memory, but {allowance}", bytes(self.total()));
                 // A limit may be too low for anything.
                 let advice = format!("{}{}", self.advice, if allowance.is_limit { "; or a higher --max-memory" } else { "" });
                 Err(Error::config(&self.key, found, advice))

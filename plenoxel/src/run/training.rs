@@ -41,7 +41,7 @@ use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::{Objective, Trainer, objective};
 use crate::run::figures::Figures;
 use crate::text::clock;
-use crate::train::{self, Model, PlannedStage, Progress, ViewOptions};
+use crate::train::{self, Model, PlannedStage, StageProgress, ViewOptions};
 use learning::Learned;
 use preview::Preview;
 use serde::Serialize;
@@ -178,7 +178,7 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     }
     let objective = objective(&run.config, run.views.len())?;
     let NewRun { config, views, clocks, .. } = &mut run;
-    let progress = Arc::new(Progress::default());
+    let progress = Arc::new(StageProgress::default());
     let start = || {
         let trainer = Trainer::with_losses(config.clone(), views.clone(), objective, progress.clone())?.with_most_rows(most_rows);
         Ok(initial.iter().fold(trainer, if carved { Trainer::starting_from_carved } else { Trainer::starting_from }))
@@ -242,7 +242,7 @@ impl<'s> NewRun<'s> {
         if let (Some(from), Some(to)) = (&config.init_from, &settings.out)
             && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
         {
-            return Err(Error::config("--init-from", format!("{}, which is --out too,", from.display()), "another folder to write"));
+            return Err(Error::config("--init-from", format!("{} is --out too", from.display()), "another folder to write"));
         }
         let mut clocks = Clocks::default();
         let dataset = clocks.load.time(|| settings.data.open(&config))?;
@@ -338,7 +338,7 @@ fn resume_plenoxels(
     let most_rows = estimate.most_rows(&run.config).unwrap_or(usize::MAX);
     run.read(on)?;
     let objective = objective(&run.config, run.views.len())?;
-    let progress = Arc::new(Progress::default());
+    let progress = Arc::new(StageProgress::default());
     let start = || Trainer::with_losses(run.config.clone(), run.views.clone(), objective, progress.clone());
     let trainer = watched(&progress, on, start)?.with_most_rows(most_rows);
     run.learn(trainer, on)
@@ -455,7 +455,7 @@ fn load(dataset: &Dataset, split: Split, numbers: &[usize], source: &DataSource,
 }
 
 /// Runs a computation and tells of its progress.
-fn watched<R>(progress: &Progress, on: &mut Listener<'_>, compute: impl FnOnce() -> R) -> R {
+fn watched<R>(progress: &StageProgress, on: &mut Listener<'_>, compute: impl FnOnce() -> R) -> R {
     const FIRST: Duration = Duration::from_secs(1);
     const NEXT: Duration = Duration::from_millis(100);
     let (end, ended) = mpsc::channel::<()>();
@@ -498,6 +498,7 @@ fn check_disk(folder: &Path, saved: u64, on: &mut Listener<'_>) -> Result<()> {
     const REST: u64 = 4_000_000;
     let needed = |saved: u64| files::check_room(folder, 3 * saved + REST, saved);
     needed(saved / 4).map_err(|e| Error::io(folder, e, "checking the room for the run"))?;
+    files::check_handles().map_err(|e| Error::io(folder, e, "opening as many files as a run needs"))?;
     if let Err(e) = needed(saved) {
         on(Event::note(format!("the disk may be too small: {e}, if the run takes as much as is expected")));
     }
@@ -667,7 +668,7 @@ mod tests {
 
     #[test]
     fn a_long_computation_tells_of_its_progress_and_a_short_one_does_not() {
-        let progress = Progress::default();
+        let progress = StageProgress::default();
         let mut told = Vec::new();
         let mut listen = |event: Event<'_>| {
             if let Event::Carving { done, total } = event {

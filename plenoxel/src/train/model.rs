@@ -16,14 +16,14 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// Progress of a long computation, counted in items, that another thread may read while it goes on.
+/// Progress of a long computation in [`Model::begin_stage`], counted in items, that another thread may read while it goes on.
 #[derive(Debug, Default)]
-pub struct Progress {
+pub struct StageProgress {
     done: AtomicUsize,
     total: AtomicUsize,
 }
 
-impl Progress {
+impl StageProgress {
     /// Runs a computation over `total` items, which calls the function it is given with the number of items that are done.
     pub fn of<R>(&self, total: usize, compute: impl FnOnce(&dyn Fn(usize)) -> R) -> R {
         self.done.store(0, Relaxed);
@@ -81,7 +81,7 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     }
 
     /// Returns the progress of [`begin_stage`](Model::begin_stage), which another thread reads, for a model whose stages may take long to begin. The default is `None`.
-    fn progress(&self) -> Option<Arc<Progress>> {
+    fn progress(&self) -> Option<Arc<StageProgress>> {
         None
     }
 

@@ -21,6 +21,9 @@ use plenoxel::run::memory::Estimate;
 use plenoxel::sampling::Jitter;
 use std::path::PathBuf;
 
+/// Memory for each voxel: positions, rows, normals and colors.
+const BYTES_PER_VOXEL: u64 = 100;
+
 const EXAMPLES: &str = "\
 Examples:
   plenoxel export ply runs/lego                                what the training cameras see, into runs/lego/exports/cloud.ply
@@ -93,7 +96,7 @@ fn share(text: &str) -> std::result::Result<f64, String> {
 
 /// Exports the voxels of a run.
 pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
-    let Opened { folder, mut config, record, header, grid } = args.exported.open(console, "ply")?;
+    let Opened { folder, mut config, record, header, grid } = args.exported.open(console, "ply", BYTES_PER_VOXEL)?;
     config.downscale = args.downscale.unwrap_or(config.downscale);
     let side = header.shape().voxel_side();
     let coordinates = match args.coords {

@@ -7,6 +7,9 @@ use clap::Args;
 use plenoxel::error::Result;
 use plenoxel::export::vox::{VoxOptions, vox};
 
+/// Memory for each voxel: positions, rows and colors.
+const BYTES_PER_VOXEL: u64 = 100;
+
 const EXAMPLES: &str = "\
 Examples:
   plenoxel export vox runs/lego
@@ -35,7 +38,7 @@ pub struct VoxArgs {
 
 /// Writes the voxels of a run.
 pub fn run(args: &VoxArgs, console: &Console<'_>) -> Result<()> {
-    let Opened { folder, grid, .. } = args.exported.open(console, "vox")?;
+    let Opened { folder, grid, .. } = args.exported.open(console, "vox", BYTES_PER_VOXEL)?;
     let options = VoxOptions { min_alpha: args.min_alpha, solid: args.solid, direction: args.colors.direction() };
     let model = vox(&grid, &options).map_err(as_flag)?;
     let file = args.exported.write(&folder, "grid.vox", &model.to_bytes().map_err(as_flag)?, console)?;

@@ -130,7 +130,7 @@ impl Lobes {
         colors
     }
 
-    /// How far within the surface of each function places are, along the line to the origin and below 0 outside, `[place, function]`.
+    /// Returns the signed distance of places to the surface of each function along the line to the origin, positive inside, `[place, function]`.
     fn inside(&self, points: &[DVec3]) -> Array2<f64> {
         let mut values = self.values(points);
         for (mut row, point) in values.axis_iter_mut(Axis(0)).zip(points) {
@@ -146,7 +146,8 @@ impl Lobes {
         sh::values(directions.view(), self.degree)
     }
 
-    /// Half cells for a value of 1. The squares of the functions of a degree add up to (2l + 1) / 4π in every direction; where z is, that of m = 0 is all.
+    /// Returns the length of a value of 1, in units of half a cell. The squares of the functions of degree l add up to (2l + 1) / 4π in every direction, and in direction z
+    /// only m = 0 is not 0, so this is the largest square.
     fn scale(&self) -> f64 {
         LONGEST / ((2 * self.degree + 1) as f64 / (4.0 * std::f64::consts::PI)).sqrt()
     }
@@ -183,7 +184,7 @@ mod tests {
         Paper,
     }
 
-    /// What a pixel shows.
+    /// Returns the content of a pixel.
     fn seen(picture: &Rgb, [row, column]: [usize; 2]) -> Seen {
         let [red, green, blue] = [0, 1, 2].map(|c| picture[[row, column, c]]);
         match (red - blue).abs() < 0.02 && green > 0.9 {

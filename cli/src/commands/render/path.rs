@@ -103,7 +103,7 @@ fn views(run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Optio
 
 fn read(path: &Path) -> Result<CameraPath> {
     if !files::is_there(path) {
-        return Err(Error::config("--path", format!("{}, which is no file,", path.display()), "orbit, spiral, or a JSON file of cameras"));
+        return Err(Error::config("--path", format!("{} is not a file", path.display()), "orbit, spiral, or a JSON file of cameras"));
     }
     CameraPath::parse(path, &files::read_named(path, files::CAMERA_PATH)?)
 }

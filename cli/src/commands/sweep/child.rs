@@ -1,6 +1,6 @@
 //! A run as a process of its own: it may crash, or be killed for want of memory, and the sweep goes on; and its peak memory is its own.
 
-use crate::commands::train::interrupt::Watch;
+use crate::interrupt::Watch;
 use plenoxel::error::{Error, Result};
 use plenoxel::files::FolderLock;
 use std::ffi::OsString;

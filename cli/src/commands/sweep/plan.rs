@@ -110,7 +110,7 @@ impl Plan {
         for (index, published) in self.published.iter().enumerate() {
             let mut named = [&published.psnr, &published.ssim, &published.seconds].into_iter().flat_map(|figures| figures.keys());
             if !named.any(|scene| self.scenes.contains(scene)) {
-                let found = format!("`{}`, which has no figure of a scene of this sweep,", published.name);
+                let found = format!("`{}` has no figure of a scene of this sweep", published.name);
                 let accepted = format!("such as psnr = {{ {} = 30.0 }}", self.scenes.join(" = 30.0, "));
                 return Err(Error::config(place(&format!("published[{index}]")), found, accepted));
             }
@@ -150,7 +150,7 @@ fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default
         if !taken.insert(name.clone()) {
             return Err(Error::config(
                 place(&path),
-                format!("`{name}`, which comes twice,"),
+                format!("the name `{name}` occurs twice"),
                 "a name of its own: name = \"…\" in the file",
             ));
         }

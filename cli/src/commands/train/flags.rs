@@ -214,11 +214,7 @@ impl TrainArgs {
         let color = match (self.color.as_deref(), self.sh_degree) {
             (None, Some(_)) => Some(Value::String("sh".to_owned())),
             (Some("rgb"), Some(degree)) => {
-                return Err(Error::config(
-                    "--sh-degree",
-                    format!("{degree} beside --color rgb, which has no harmonics,"),
-                    "one of the two",
-                ));
+                return Err(Error::config("--sh-degree", format!("{degree} with --color rgb, which has no harmonics"), "one of the two"));
             }
             _ => text(&self.color),
         };

@@ -45,7 +45,7 @@ impl Pictures {
         })
     }
 
-    /// The same with the pictures that were drawn before the run was interrupted, if they were wanted then too; one that cannot be read is left out.
+    /// Adds the pictures that were drawn before the run was interrupted, if they were wanted then too; one that cannot be read is left out.
     pub fn after(mut self, past: &History, plan: &[PlannedStage]) -> Self {
         if past.losses.is_empty() || self.camera.is_none() {
             return self;

@@ -1,11 +1,11 @@
 //! What is shown of a run while it trains: lines and bars, the curve of the loss, pictures, and the page at the end.
 
-use super::interrupt::{self, Watch};
 use super::pictures::Pictures;
 use super::say;
 use crate::commands::new_run::{announce, loading};
 use crate::curves::loss_svg;
 use crate::images;
+use crate::interrupt::{self, Watch};
 use crate::progress::{Console, Count, Training};
 use crate::report::Report;
 use plenoxel::error::Result;

@@ -73,7 +73,7 @@ pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage:
         return Err(file.damaged("the shape of the grid does not match its stage"));
     }
     let n = [shape.resolution; 3];
-    let masks = masks(file, "masks", n)?.filter(|masks| masks.iter().any(|mask| *mask != 0));
+    let masks = file.brick_masks("masks", n)?.filter(|masks| masks.iter().any(|mask| *mask != 0));
     let lattice = Lattice::from_masks(n, masks.ok_or_else(|| file.damaged("the grid has no voxels, or voxels outside of its box"))?);
     let shapes = shape.tables(&lattice);
     // Release the old grid first, to save memory.
@@ -90,7 +90,7 @@ pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage:
             let sides = shape.half_width..=2.0 * shape.half_width;
             let around = (0..3).all(|a| sides.contains(&-min[a]) && sides.contains(&max[a]));
             let masks = match cells.iter().all(|n| (1..=shape.resolution + 1).contains(n)) && around {
-                true => self::masks(file, "learning", cells)?,
+                true => file.brick_masks("learning", cells)?,
                 false => None,
             };
             let masks = masks.ok_or_else(|| file.damaged("the mask `learning` has cells outside of the grid"))?;
@@ -99,12 +99,4 @@ pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage:
     };
     (model.stages, model.scouts) = (stages, facts.scouts);
     Ok(())
-}
-
-/// Reads brick masks of `cells`. Returns `None` if a mask has a bit outside of `cells`.
-fn masks(file: &mut TensorFile<'_>, name: &str, cells: [usize; 3]) -> Result<Option<Vec<u64>>> {
-    let whole = Lattice::bricks(cells);
-    let masks = file.words(name, whole.masks().len())?;
-    let inside = masks.iter().zip(whole.masks()).all(|(mask, whole)| mask & !whole == 0);
-    Ok(inside.then_some(masks))
 }

@@ -13,13 +13,13 @@ use crate::rays::RaySource;
 use crate::render::{self, RenderOptions, Rendered};
 use crate::sampling::Occupancy;
 use crate::tensor_file::TensorFile;
-use crate::train::{About, Progress};
+use crate::train::{About, StageProgress};
 use autograd::optim::Optimizer;
 use std::path::Path;
 use std::sync::Arc;
 
 #[inline(never)]
-pub fn new(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Result<Plenoxels<f32>> {
+pub fn new(config: &Config, views: &Arc<[View]>, progress: Arc<StageProgress>) -> Result<Plenoxels<f32>> {
     Plenoxels::start(config, views, progress)
 }
 

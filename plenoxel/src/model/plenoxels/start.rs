@@ -8,7 +8,7 @@ use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
 use crate::sampling::walk::Walk;
-use crate::train::Progress;
+use crate::train::StageProgress;
 use autograd::lattice::has;
 use autograd::{Real, Tensor};
 use std::ops::ControlFlow;
@@ -23,12 +23,12 @@ pub struct Silhouettes {
     views: Arc<[View]>,
     margin: f64,
     /// Counts views while a visual hull is computed.
-    pub progress: Arc<Progress>,
+    pub progress: Arc<StageProgress>,
 }
 
 impl Silhouettes {
     /// Returns `None` if the config does not use silhouettes, or if the images have no alpha channel.
-    pub fn new(config: &Config, views: &Arc<[View]>, progress: Arc<Progress>) -> Option<Self> {
+    pub fn new(config: &Config, views: &Arc<[View]>, progress: Arc<StageProgress>) -> Option<Self> {
         let margin = config.carve.margin;
         (config.hull == Hull::Auto && has_alpha(views)).then(|| Silhouettes { views: views.clone(), margin, progress })
     }

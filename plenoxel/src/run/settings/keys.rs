@@ -132,7 +132,7 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
             let found = format!("the key `{key}` below the list `{pattern}`");
             return Err(Error::config(place, found, format!("{pattern}[0] or {pattern}[*] with --set, [[{pattern}]] in a file")));
         }
-        let found = format!("the key `{key}` below `{pattern}`, which is no table,");
+        let found = format!("the key `{key}` below `{pattern}`, which is not a table");
         return Err(Error::config(place, found, format!("a value for `{pattern}`")));
     };
     if known.contains(&key) {

@@ -57,7 +57,7 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
         if !inner.is_table() && !inner.is_array() {
             *inner = Value::Table(Table::new());
         }
-        let found = format!("`{segment}`, which is a list,");
+        let found = format!("`{segment}` is a list");
         return match inner.as_table_mut() {
             Some(inner) => set(inner, rest, value, place),
             None => Err(Error::config(place, found, format!("an index, as in {segment}[0].{rest}, or {segment}[*].{rest}"))),

@@ -86,7 +86,7 @@ impl Job<'_> {
         let (mut mean_squared_error, mut taken) = (0.0, false);
         let last_psnr = loop {
             let begins = plan.iter().any(|stage| stage.first == trainer.steps_taken());
-            let progress = trainer.model().progress().filter(|_| begins);
+            let progress = if begins { trainer.model().progress() } else { None };
             let mut step = || trainer.step();
             let report = match clocks.train.time(|| match &progress {
                 Some(progress) => watched(progress, on, step),

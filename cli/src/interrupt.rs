@@ -13,7 +13,7 @@ const SAME_WISH: Duration = Duration::from_secs(1);
 
 static WATCHED: AtomicBool = AtomicBool::new(false);
 static REQUESTED: Mutex<Option<Instant>> = Mutex::new(None);
-/// What is said when the process is interrupted and nobody watches.
+/// Message for an interruption that ends the process at once.
 static LAST_WORDS: Mutex<String> = Mutex::new(String::new());
 
 /// Has interruptions end the process with [`EXIT_CODE`] and a clean line on a terminal. Where the system does not let it, they end the process as ever.
@@ -22,7 +22,7 @@ pub fn install() {
     LISTENING.call_once(listen);
 }
 
-/// What is said on stderr if the process is interrupted from now on, while nobody watches.
+/// Sets the message on stderr for an interruption that ends the process at once.
 pub fn on_exit(words: String) {
     *LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner) = words;
 }
