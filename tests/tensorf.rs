@@ -7,8 +7,9 @@ use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::evaluate::evaluate;
 use plenoxel::loss::{Objective, mse};
+use plenoxel::field::factored::Directions;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
-use plenoxel::render::Field;
+use plenoxel::render::{Engine, Field, Rendered};
 use plenoxel::sampling::Jitter;
 use plenoxel::train::{Model, Pass, PlannedStage, TrainOptions, Trainer, ViewOptions};
 
@@ -22,7 +23,11 @@ fn tiny(stages: &[(usize, u64)]) -> Config {
         features: 8,
         hidden: 8,
         step: 1.0,
-        stages: stages.iter().map(|&(resolution, steps)| Stage { resolution, steps }).collect(),
+        feature_octaves: 1,
+        group: 0.0,
+        stop_below: 0.0,
+        stop_below_in_pictures: 0.0,
+        stages: stages.iter().map(|&(resolution, steps)| Stage { resolution, steps, rays: 256 }).collect(),
         ..Config::default()
     }
 }
@@ -72,17 +77,71 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
     gradcheck(pixels, inputs);
 }
 
+/// A model that the kernel computes.
+fn wide(config: Config) -> Tensorf<f64> {
+    let mut model = Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }).expect("valid settings");
+    let random = Stream::new(11);
+    model.visit_mut(&mut |param: &mut Param<f64>| {
+        if param.name().starts_with("density") {
+            let values = random.named(param.name()).uniform_tensor(param.shape(), 0.2, 0.75);
+            *param = Param::from_tensor(param.name(), values);
+        }
+    });
+    model
+}
+
+/// A number that depends on every column.
+fn all_columns(rendered: &Rendered<f64>) -> Tensor<f64> {
+    let random = Stream::new(8);
+    let weights = |name: &str, shape: &[usize]| random.named(name).uniform_tensor::<f64>(shape, -1.0, 1.0);
+    let mut sum = (&rendered.rgb * weights("rgb", rendered.rgb.shape())).sum();
+    let columns = [
+        ("depth", rendered.depth()),
+        ("opacity", rendered.opacity.clone()),
+        ("transmittance", rendered.log_transmittance.clone()),
+        ("distortion", rendered.distortion()),
+        ("sparsity", rendered.sparsity() * 1e-2),
+    ];
+    for (name, column) in columns {
+        sum = sum + (&column * weights(name, column.shape())).sum();
+    }
+    sum
+}
+
+#[test]
+fn the_kernel_agrees_with_the_graph_in_values_and_gradients() {
+    for (octaves, directions) in [(0, Directions::Harmonics(3)), (2, Directions::Frequency(2))] {
+        let mut model = wide(Config { feature_octaves: octaves, directions, ..tiny(&[(9, 1)]) });
+        let rays = rays(70);
+        let mut results = Vec::new();
+        for engine in [Engine::Graph, Engine::Fused] {
+            model.engine = engine;
+            let (value, gradients) = autograd::value_and_grad(|| all_columns(&model.render(&rays, &PASS)));
+            let mut of_params = Vec::new();
+            model.visit(&mut |param| of_params.push((param.name().to_owned(), gradients.array(param.tensor()))));
+            results.push((value, of_params));
+        }
+        let ((want, graph), (got, fused)) = (&results[0], &results[1]);
+        assert!((want - got).abs() < 1e-9 * want.abs(), "{want} {got}");
+        for ((name, want), (_, got)) in graph.iter().zip(fused) {
+            let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
+            let off = want.iter().zip(got).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
+            assert!(off < 1e-9 * scale, "{name}: {off:e} of {scale:e}");
+        }
+    }
+}
+
 #[test]
 fn a_finer_grid_of_the_same_nodes_is_the_same_field() {
     let mut model = dense::<f64>(&[(4, 1), (7, 1)]);
     let random = Stream::new(9);
     let positions = random.named("positions").uniform_tensor(&[40, 3], -1.4, 1.4);
-    let before = model.density(&positions);
+    let before = model.field().density(&positions);
     // Three cells become six: a node on each old one, and one in the middle, where linear functions are what they were.
     let mut source = plenoxel::rays::RaySource::new(views().0, [1.0; 3], 1);
-    let stage = PlannedStage { index: 1, resolution: Some(7), steps: 1, first: 1 };
+    let stage = PlannedStage { index: 1, resolution: Some(7), steps: 1, first: 1, first_ray: 256, rays_per_step: 256 };
     model.begin_stage(&stage, &mut source).expect("a stage");
-    let after = model.density(&positions);
+    let after = model.field().density(&positions);
     for (a, b) in before.data().iter().zip(after.data()) {
         assert!((a - b).abs() < 1e-9 * a.max(1.0), "{a} {b}");
     }

@@ -52,6 +52,7 @@ pub use lattice::Lattice;
 #[doc(hidden)]
 pub use multiversion; // `dispatched!` expands to this path in other crates.
 pub use op::{Cotangent, GradSink, Keep, Kernel, KernelCall, Op, Vjp};
+pub use ops::linalg::{Matrix, multiply};
 pub use ops::lookup::add_rows;
 pub use param::{Bounds, Module, Param};
 pub use pool::{Buffer, Pooled, release_free_buffers};

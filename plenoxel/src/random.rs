@@ -32,6 +32,8 @@ pub enum Purpose {
     Cells = 4,
     /// Random patches of pixels.
     Patches = 5,
+    /// Samples at which the color network of a factored field is evaluated.
+    Shade = 6,
 }
 
 /// Returns 64 random bits for (seed, purpose, step, index).

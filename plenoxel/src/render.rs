@@ -1,5 +1,6 @@
 //! Volume rendering: pixels from rays.
 
+pub(crate) mod along;
 pub mod composite;
 mod field;
 pub mod picture;

@@ -54,6 +54,10 @@ pub struct PlannedStage {
     pub first: u64,
     /// Number of steps.
     pub steps: u64,
+    /// Number of rays of the steps before the first.
+    pub first_ray: u64,
+    /// Number of rays per step.
+    pub rays_per_step: usize,
 }
 
 /// Result of a training step.
@@ -223,10 +227,10 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             self.model.begin_stage(&stage, &mut self.rays).map_err(|e| at_step(e, self.step))?;
         }
         self.model.begin_step(in_stage)?;
-        let TrainOptions { seed, background, rays_per_step, jitter, .. } = self.options;
+        let TrainOptions { seed, background, jitter, .. } = self.options;
         let batch = match &self.draw {
             Some(draw) => draw(&self.rays, self.step),
-            None => self.rays.batch::<T>(self.step * rays_per_step as u64, rays_per_step),
+            None => self.rays.batch::<T>(stage.first_ray + in_stage * stage.rays_per_step as u64, stage.rays_per_step),
         };
         let jitter = if jitter { Jitter::PerRay { seed, step: self.step } } else { Jitter::None };
         let pass = Pass { background, jitter, keep_samples: self.objective.needs_samples(), stage: Some(stage.index) };
@@ -267,12 +271,15 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
 
 /// Plans the stages of a model, one after another.
 fn plan<T: Real, M: Model<T>>(model: &M, options: &TrainOptions, rays_per_epoch: u64) -> Vec<PlannedStage> {
-    let mut first = 0;
-    let stages = model.stages(options, rays_per_epoch).into_iter().enumerate().map(|(index, StageLength { resolution, steps })| {
+    let (mut first, mut first_ray) = (0, 0);
+    let plan = |(index, StageLength { resolution, steps, rays_per_step })| {
+        let rays_per_step = rays_per_step.unwrap_or(options.rays_per_step);
+        let stage = PlannedStage { index, resolution, first, steps, first_ray, rays_per_step };
         first += steps;
-        PlannedStage { index, resolution, first: first - steps, steps }
-    });
-    stages.collect()
+        first_ray += steps * rays_per_step as u64;
+        stage
+    };
+    model.stages(options, rays_per_epoch).into_iter().enumerate().map(plan).collect()
 }
 
 /// Adds the number of the step to a numeric error without a place.

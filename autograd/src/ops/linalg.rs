@@ -1,6 +1,6 @@
 //! The batched matrix product, computed by the `gemm` crate.
 //!
-//! The crate takes pointers, which requires one unsafe call, in `multiply_block`. The tests compare it with a safe triple loop. This module distributes the
+//! The crate takes pointers, which requires one unsafe call, in `multiply`. The tests compare it with a safe triple loop. This module distributes the
 //! work over threads itself, in blocks of a fixed size, so the bits do not depend on the number of threads.
 #![allow(unsafe_code)]
 
@@ -70,15 +70,15 @@ fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b
     };
     let mut out = Buffer::stale(count * m * n);
     if count == 1 {
-        let (x, y) = (Matrix::new(&a.data()[matrix(a, 0)], m, k, transpose_a), Matrix::new(&b.data()[matrix(b, 0)], k, n, transpose_b));
+        let (x, y) = (Matrix::stored(&a.data()[matrix(a, 0)], m, k, transpose_a), Matrix::stored(&b.data()[matrix(b, 0)], k, n, transpose_b));
         multiply_blocked(x, y, &mut out);
     } else {
         // Many small products: each task computes as many as fill a chunk.
         parallel::for_each_rows(&mut out, m * n, |first, chunk| {
             for (i, c) in chunk.chunks_exact_mut((m * n).max(1)).enumerate() {
-                let x = Matrix::new(&a.data()[matrix(a, first + i)], m, k, transpose_a);
-                let y = Matrix::new(&b.data()[matrix(b, first + i)], k, n, transpose_b);
-                multiply_block(x, y, c);
+                let x = Matrix::stored(&a.data()[matrix(a, first + i)], m, k, transpose_a);
+                let y = Matrix::stored(&b.data()[matrix(b, first + i)], k, n, transpose_b);
+                multiply(x, y, c);
             }
         });
     }
@@ -87,9 +87,10 @@ fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b
     Tensor::from_op(out, &shape, &[a, b], Matmul { transpose_a, transpose_b })
 }
 
-/// A view of a matrix in a slice. Entry (r, c) is at index r · row + c · col.
-#[derive(Clone, Copy)]
-struct Matrix<'a, T> {
+/// A view of a matrix in a slice.
+#[derive(Clone, Copy, Debug)]
+pub struct Matrix<'a, T> {
+    /// Entry (r, c) is at index r · `row` + c · `col`.
     data: &'a [T],
     rows: usize,
     cols: usize,
@@ -98,8 +99,24 @@ struct Matrix<'a, T> {
 }
 
 impl<'a, T> Matrix<'a, T> {
-    /// Returns a view of a `rows` × `cols` matrix that is stored in row-major order or, if `transposed`, in column-major order.
-    fn new(data: &'a [T], rows: usize, cols: usize, transposed: bool) -> Self {
+    /// Returns a view of a `rows` × `cols` matrix that is stored in row-major order.
+    ///
+    /// Panics if the slice has another length.
+    #[track_caller]
+    pub fn new(data: &'a [T], rows: usize, cols: usize) -> Self {
+        Self::stored(data, rows, cols, false)
+    }
+
+    /// Returns a view of a `rows` × `cols` matrix whose transpose is stored in row-major order.
+    ///
+    /// Panics if the slice has another length.
+    #[track_caller]
+    pub fn transposed(data: &'a [T], rows: usize, cols: usize) -> Self {
+        Self::stored(data, rows, cols, true)
+    }
+
+    #[track_caller]
+    fn stored(data: &'a [T], rows: usize, cols: usize, transposed: bool) -> Self {
         assert_eq!(data.len(), rows * cols, "matmul: a matrix of {rows} × {cols}");
         let (row, col) = if transposed { (1, rows) } else { (cols, 1) };
         Matrix { data, rows, cols, row, col }
@@ -121,8 +138,11 @@ impl<'a, T> Matrix<'a, T> {
     }
 }
 
-/// Computes out = a · b on this thread.
-fn multiply_block<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
+/// Computes out = a · b on this thread, for kernels. `out` is in row-major order.
+///
+/// Panics if the sizes do not fit.
+#[track_caller]
+pub fn multiply<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
     let (m, k, n) = (a.rows, a.cols, b.cols);
     assert!(b.rows == k && out.len() == m * n && a.reach() <= a.data.len() && b.reach() <= b.data.len());
     if m == 0 || n == 0 || k == 0 {
@@ -165,7 +185,7 @@ fn multiply_blocked<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) 
     if k > 4 * m.max(n) && k > DEEP {
         let parts = parallel::map_chunks(k, DEEP, |range| {
             let mut part = Buffer::<T>::stale(m * n);
-            multiply_block(a.cols(range.clone()), b.rows(range), &mut part);
+            multiply(a.cols(range.clone()), b.rows(range), &mut part);
             part
         });
         out.fill(T::zero());
@@ -175,7 +195,7 @@ fn multiply_blocked<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) 
     } else {
         parallel::for_each_chunk(out, ROWS * n.max(1), |start, rows| {
             let first = start / n;
-            multiply_block(a.rows(first..first + rows.len() / n), b, rows);
+            multiply(a.rows(first..first + rows.len() / n), b, rows);
         });
     }
 }

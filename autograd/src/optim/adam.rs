@@ -32,17 +32,26 @@ pub(super) struct AdamRule {
     beta1: f64,
     beta2: f64,
     epsilon: f64,
+    /// Weights of the L1 penalty, by the name of the parameter.
+    l1: Vec<(String, f64)>,
 }
 
 impl<T: Real> Adam<T> {
     /// Creates an optimizer with the given learning rates, β₁ = 0.9, β₂ = 0.99 (the value of Instant-NGP; the Adam paper has 0.999) and ε = 1e-8.
     pub fn new(rates: impl Into<Rates>, mode: AdamMode) -> Self {
-        Adam(Elementwise::new(AdamRule { mode, beta1: 0.9, beta2: 0.99, epsilon: 1e-8 }, rates))
+        Adam(Elementwise::new(AdamRule { mode, beta1: 0.9, beta2: 0.99, epsilon: 1e-8, l1: Vec::new() }, rates))
     }
 
     /// Sets the decay rates β₁ and β₂ of the moments.
     pub fn betas(mut self, beta1: f64, beta2: f64) -> Self {
         (self.0.rule.beta1, self.0.rule.beta2) = (beta1, beta2);
+        self
+    }
+
+    /// Adds λ sign(θ) to the gradient of the parameters with the given names: the gradient of the penalty λ Σ |θ|. It costs no pass over the parameter. In
+    /// lazy mode, only touched rows are penalised.
+    pub fn l1(mut self, weights: Vec<(String, f64)>) -> Self {
+        self.0.rule.l1 = weights;
         self
     }
 
@@ -54,17 +63,23 @@ impl<T: Real> Adam<T> {
 }
 
 impl<T: Real> Rule<T, 3> for AdamRule {
-    fn at(&self, rate: f64, updates: u64) -> impl Fn([T; 3], T) -> [T; 3] + Sync {
+    fn at(&self, rate: f64, updates: u64, l1: f64) -> impl Fn([T; 3], T) -> [T; 3] + Sync {
         let (b1, b2, epsilon) = (T::lit(self.beta1), T::lit(self.beta2), T::lit(self.epsilon));
         let (r1, r2) = (T::lit(1.0 - self.beta1), T::lit(1.0 - self.beta2));
         let left = |beta: f64| 1.0 - beta.powf(updates as f64);
         let rate = T::lit(rate / left(self.beta1));
         let scale = T::lit(1.0 / left(self.beta2).sqrt());
+        let l1 = T::lit(l1);
         move |[theta, m, v], g| {
+            let g = g + if theta == T::zero() { T::zero() } else { l1.copysign(theta) };
             let m = b1 * m + r1 * g;
             let v = b2 * v + r2 * g * g;
             [theta - rate * m / (v.sqrt() * scale + epsilon), m, v]
         }
+    }
+
+    fn l1(&self, name: &str) -> f64 {
+        self.l1.iter().find(|(of, _)| of == name).map_or(0.0, |(_, weight)| *weight)
     }
 
     fn visits_all_rows(&self) -> bool {

@@ -11,8 +11,13 @@ use std::collections::HashMap;
 /// The update rule of one element, which has `N` numbers: the value θ and then its `N` − 1 state values.
 pub(super) trait Rule<T: Real, const N: usize>: Send {
     /// Returns the function from `[θ, …]` and the gradient g to the new `[θ, …]`, for a parameter with the given learning rate. `updates` is the number of
-    /// updates of the parameter, including the current one.
-    fn at(&self, rate: f64, updates: u64) -> impl Fn([T; N], T) -> [T; N] + Sync;
+    /// updates of the parameter, including the current one; `l1` is the weight of its penalty.
+    fn at(&self, rate: f64, updates: u64, l1: f64) -> impl Fn([T; N], T) -> [T; N] + Sync;
+
+    /// Returns the weight of the L1 penalty of a parameter.
+    fn l1(&self, _: &str) -> f64 {
+        0.0
+    }
 
     /// Returns true if rows that a row-sparse gradient does not contain are also updated, with a gradient of 0.
     fn visits_all_rows(&self) -> bool {
@@ -37,7 +42,7 @@ impl<R, T: Real, const N: usize> Elementwise<R, T, N> {
 impl<R: Rule<T, N>, T: Real, const N: usize> Optimizer<T> for Elementwise<R, T, N> {
     fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
         self.memory.visit(module, grads, N - 1, |param, grad, state, updates| {
-            let rule = self.rule.at(self.rates.at(param.name(), step), updates);
+            let rule = self.rule.at(self.rates.at(param.name(), step), updates, self.rule.l1(param.name()));
             update(param, state, grad, self.rule.visits_all_rows(), rule);
         });
     }

@@ -41,7 +41,7 @@ impl<T: Real> RmsProp<T> {
 }
 
 impl<T: Real> Rule<T, 2> for RmsPropRule {
-    fn at(&self, rate: f64, _: u64) -> impl Fn([T; 2], T) -> [T; 2] + Sync {
+    fn at(&self, rate: f64, _: u64, _: f64) -> impl Fn([T; 2], T) -> [T; 2] + Sync {
         let (rate, epsilon) = (T::lit(rate), T::lit(self.epsilon));
         let (beta, rest) = (T::lit(self.beta), T::lit(1.0 - self.beta));
         move |[theta, v], g| {

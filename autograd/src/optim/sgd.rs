@@ -63,7 +63,7 @@ impl<T: Real> Momentum<T> {
 }
 
 impl<T: Real> Rule<T, 2> for MomentumRule {
-    fn at(&self, rate: f64, _: u64) -> impl Fn([T; 2], T) -> [T; 2] + Sync {
+    fn at(&self, rate: f64, _: u64, _: f64) -> impl Fn([T; 2], T) -> [T; 2] + Sync {
         let (rate, mu) = (T::lit(rate), T::lit(self.momentum));
         move |[theta, m], g| {
             let m = mu * m + g;

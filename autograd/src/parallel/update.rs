@@ -48,8 +48,10 @@ fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
             match width {
                 1 => update_touched::<T, N, 1, _>(x, width, sums, touched, f),
                 3 => update_touched::<T, N, 3, _>(x, width, sums, touched, f),
+                16 => update_touched::<T, N, 16, _>(x, width, sums, touched, f),
                 24 => update_touched::<T, N, 24, _>(x, width, sums, touched, f),
                 27 => update_touched::<T, N, 27, _>(x, width, sums, touched, f),
+                48 => update_touched::<T, N, 48, _>(x, width, sums, touched, f),
                 _ => update_touched::<T, N, 0, _>(x, width, sums, touched, f),
             }
         });

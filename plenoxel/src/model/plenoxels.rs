@@ -309,6 +309,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         let length = |stage: &Stage| StageLength {
             resolution: Some(stage.resolution),
             steps: stage.step_count(rays_per_epoch, options.rays_per_step),
+            rays_per_step: None,
         };
         self.stages.iter().map(length).collect()
     }

@@ -1,47 +1,41 @@
-//! TensoRF (Chen et al. 2022), the vector-matrix decomposition VM with a small color network: density and appearance are sums of products of planes and lines.
+//! TensoRF (Chen et al. 2022): a [factored field](crate::field::factored) with a small color network, trained from coarse to fine.
 //!
-//! With p in [−1, 1]³ the position in the box, and for each axis a the plane of the other two axes (b, c):
-//!
-//! * density feature s = Σₐ Σᵣ Pₐᵣ(p_b, p_c) Lₐᵣ(pₐ), density σ = 25 softplus(s − 10);
-//! * appearance feature f = B · concatₐᵣ(P'ₐᵣ(p_b, p_c) L'ₐᵣ(pₐ));
-//! * color = sigmoid(MLP(f, d, sin and cos of 2ᵏ f, sin and cos of 2ᵏ d)), d the unit direction of the ray, k < [`octaves`](Config::octaves).
-//!
-//! Planes are bilinear and lines linear, with corners aligned: the outermost nodes lie on the faces of the box. Colors are computed only for samples whose weight
-//! on their pixel is above [`color_above`](Config::color_above). Everything is a graph of small ops, so that every loss has a gradient with respect to every
-//! parameter; there is no fused kernel yet.
-//!
-//! The numbers of the default are those of the authors' `configs/lego.txt`, `opt.py` and `models/tensoRF.py`, but for the cells that are sampled: here they are found anew at
-//! the beginning of every stage but the first, above an opacity of 0.01 of one step; the authors find them at steps 2000 and 4000, above 0.08 without the factor 25, and
-//! shrink the box.
+//! The numbers of [`Config::authors`] are those of the authors' `configs/lego.txt`, `opt.py` and `models/tensoRF.py`, but for the cells that
+//! are sampled: here they are found anew at the beginning of every stage but the first; the authors find them at steps 2000 and 4000, above
+//! 0.08 without the factor 25, and shrink the box.
 
 use crate::camera::Ray;
+use crate::carve::visual_hull;
+use crate::dataset::{View, has_alpha};
 use crate::error::{Error, Result};
+use crate::field::factored::{Directions, Factored, Grouping, Shape};
 use crate::geometry::Aabb;
 use crate::loss::Step;
 use crate::rays::RaySource;
-use crate::render::{Field, Radiance, Rendered, composite};
-use crate::sampling::{Occupancy, Samples, Spacing, sample};
+use crate::render::{Engine, Field, RenderOptions, Rendered, render};
+use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{Model, Pass, PlannedStage, StageLength, TrainOptions};
-use autograd::nn::{Activation, Init, Linear, Mlp};
-use autograd::optim::{Adam, AdamMode, Exponential, Optimizer, Rates};
-use autograd::{Indices, Module, Param, Real, Tensor, impl_module, no_grad, random::Stream};
+use crate::train::{Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
+use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
+use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 /// Kind of this model in checkpoints.
 pub const KIND: &str = "tensorf";
 
-/// Nodes along each axis, and training steps, of a stage.
+/// A stage of training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Stage {
-    /// Nodes of a plane along each axis, and of a line.
+    /// Nodes along each axis if the box is a cube. Another box has as many cells, with about equal sides.
     pub resolution: usize,
     /// Steps.
     pub steps: u64,
+    /// Rays per step.
+    pub rays: usize,
 }
 
-/// Settings of the model. The default is the authors' VM-192 for synthetic scenes.
+/// Settings of the model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Config {
     /// Half the side of the box around the origin, world length.
@@ -54,47 +48,104 @@ pub struct Config {
     pub features: usize,
     /// Width of the two hidden layers of the color network.
     pub hidden: usize,
-    /// Octaves of the positional encodings of feature and direction.
-    pub octaves: usize,
+    /// Octaves of the positional encoding of the appearance feature.
+    pub feature_octaves: usize,
+    /// Encoding of directions.
+    pub directions: Directions,
     /// Distance between samples, in cells.
     pub step: f64,
-    /// Least weight of a sample whose color is computed.
+    /// Weight that completes a group of samples with one color ([`Grouping`]), in training; 0 for a color per sample.
+    pub group: f64,
+    /// The same in pictures.
+    pub group_in_pictures: f64,
+    /// Groups of samples whose weight is not above this have no color.
     pub color_above: f64,
+    /// Transmittance below which a training ray ends.
+    pub stop_below: f64,
+    /// Transmittance below which a ray of a picture ends.
+    pub stop_below_in_pictures: f64,
     /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.
     pub occupied_above: f64,
-    /// Learning rate of planes and lines at the beginning of each stage; it falls to a tenth over the run.
+    /// True to sample only cells in the visual hull of the training views' alpha channels, if they have them.
+    pub hull: bool,
+    /// Number of steps for which the density is opaque and constant; 0 to begin with the authors' random density.
+    pub opaque_steps: u64,
+    /// Learning rate of planes and lines.
     pub factor_rate: f64,
-    /// Learning rate of the matrix B and the network; it falls likewise.
+    /// Learning rate of the matrix B and the network.
     pub network_rate: f64,
+    /// Share of the learning rates that is left at the end of the run; they fall exponentially.
+    pub last_rate: f64,
+    /// Weight of the L1 norm of the density factors, Σ over planes and lines of the mean absolute value, in the first stage.
+    pub density_l1: f64,
+    /// The same in the other stages.
+    pub density_l1_later: f64,
+    /// Treatment of rows of planes without a gradient by Adam: true visits only rows with a gradient.
+    pub lazy: bool,
     /// Stages, with increasing resolution.
     pub stages: Vec<Stage>,
     /// Seed of the initial parameters.
     pub seed: u64,
 }
 
+/// The recipe for two cores.
 impl Default for Config {
     fn default() -> Self {
-        // From 128 to 300 in five steps of equal ratio.
-        let stages = [(128, 2000), (152, 1000), (180, 1000), (213, 1500), (253, 1500), (300, 23_000)];
+        let stages = [(64, 600, 512), (90, 600, 1024), (128, 800, 2048), (180, 1000, 3072), (256, 2000, 4096)];
         Config {
             half_width: 1.5,
             density_components: 16,
             appearance_components: 48,
-            features: 27,
-            hidden: 128,
-            octaves: 2,
-            step: 0.5,
-            color_above: 1e-4,
+            features: 32,
+            hidden: 64,
+            feature_octaves: 0,
+            directions: Directions::Harmonics(3),
+            step: 1.0,
+            group: 0.1,
+            group_in_pictures: 0.02,
+            color_above: 1e-3,
+            stop_below: 3e-3,
+            stop_below_in_pictures: 3e-4,
             occupied_above: 0.01,
+            hull: true,
+            opaque_steps: 50,
             factor_rate: 0.02,
-            network_rate: 1e-3,
-            stages: stages.map(|(resolution, steps)| Stage { resolution, steps }).to_vec(),
+            network_rate: 3e-3,
+            last_rate: 0.1,
+            density_l1: 8e-5,
+            density_l1_later: 4e-5,
+            lazy: true,
+            stages: stages.map(|(resolution, steps, rays)| Stage { resolution, steps, rays }).to_vec(),
             seed: 42,
         }
     }
 }
 
 impl Config {
+    /// Returns the authors' VM-192 for synthetic scenes.
+    pub fn authors() -> Self {
+        // From 128 to 300 in five steps of equal ratio.
+        let stages = [(128, 2000), (152, 1000), (180, 1000), (213, 1500), (253, 1500), (300, 23_000)];
+        Config {
+            features: 27,
+            hidden: 128,
+            feature_octaves: 2,
+            directions: Directions::Frequency(2),
+            step: 0.5,
+            group: 0.0,
+            group_in_pictures: 0.0,
+            color_above: 1e-4,
+            stop_below: 0.0,
+            stop_below_in_pictures: 0.0,
+            hull: false,
+            opaque_steps: 0,
+            network_rate: 1e-3,
+            lazy: false,
+            stages: stages.map(|(resolution, steps)| Stage { resolution, steps, rays: 4096 }).to_vec(),
+            ..Config::default()
+        }
+    }
+
     /// Checks the settings.
     ///
     /// Errors name the setting that is invalid.
@@ -112,81 +163,54 @@ impl Config {
         ] {
             check((1..=1024).contains(&width), key, width as f64, "1 to 1024")?;
         }
-        check(self.octaves <= 16, "octaves", self.octaves as f64, "0 to 16")?;
+        check(self.feature_octaves <= 16, "feature_octaves", self.feature_octaves as f64, "0 to 16")?;
+        let (most, octaves_or_degree) = match self.directions {
+            Directions::Frequency(octaves) => (16, octaves),
+            Directions::Harmonics(degree) => (3, degree),
+        };
+        check(octaves_or_degree <= most, "directions", octaves_or_degree as f64, "up to 16 octaves, or harmonics up to degree 3")?;
         check(self.step > 0.0 && self.step.is_finite(), "step", self.step, "a number of cells above 0")?;
-        for (key, share) in [("color_above", self.color_above), ("occupied_above", self.occupied_above)] {
+        for (key, share) in [
+            ("group", self.group),
+            ("group_in_pictures", self.group_in_pictures),
+            ("color_above", self.color_above),
+            ("stop_below", self.stop_below),
+            ("stop_below_in_pictures", self.stop_below_in_pictures),
+            ("occupied_above", self.occupied_above),
+        ] {
             check((0.0..1.0).contains(&share), key, share, "a number in [0, 1)")?;
         }
-        for (key, rate) in [("factor_rate", self.factor_rate), ("network_rate", self.network_rate)] {
-            check((0.0..=1.0).contains(&rate), key, rate, "a number in [0, 1]")?;
+        for (key, rate) in [("factor_rate", self.factor_rate), ("network_rate", self.network_rate), ("last_rate", self.last_rate)] {
+            check(rate > 0.0 && rate <= 1.0, key, rate, "a number in (0, 1]")?;
+        }
+        for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
+            check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
         }
         if self.stages.is_empty() {
             return Err(Error::config("stages", "no stage", "at least one"));
         }
         for (i, stage) in self.stages.iter().enumerate() {
             let key = format!("stages[{i}].resolution");
-            check((2..=4096).contains(&stage.resolution), &key, stage.resolution as f64, "2 to 4096")?;
+            check((2..=MOST_NODES).contains(&stage.resolution), &key, stage.resolution as f64, "2 to 4096")?;
             check(stage.steps > 0, &format!("stages[{i}].steps"), 0.0, "at least 1")?;
+            check((1..=1 << 20).contains(&stage.rays), &format!("stages[{i}].rays"), stage.rays as f64, "1 to 1048576")?;
         }
         Ok(())
     }
-}
 
-/// One of the two decompositions: for each axis a plane of the other two axes, `[n², R]` with the later axis fastest, and a line `[n, R]`.
-#[derive(Debug)]
-struct Factors<T: Real> {
-    planes: Vec<Param<T>>,
-    lines: Vec<Param<T>>,
-}
-
-impl_module!(Factors { planes, lines });
-
-const AXES: [&str; 3] = ["x", "y", "z"];
-
-impl<T: Real> Factors<T> {
-    /// Creates factors of 0.1 · N(0, 1).
-    fn new(name: &str, resolution: usize, components: usize, random: &Stream) -> Self {
-        let param = |kind: &str, axis: &str, rows: usize| {
-            let name = format!("{name}.{kind}.{axis}");
-            let values = random.named(&name).normal_tensor(&[rows, components], 0.0, 0.1);
-            Param::from_tensor(name, values)
-        };
-        Factors {
-            planes: AXES.map(|axis| param("plane", axis, resolution * resolution)).into(),
-            lines: AXES.map(|axis| param("line", axis, resolution)).into(),
+    fn shape(&self) -> Shape {
+        Shape {
+            density_components: self.density_components,
+            appearance_components: self.appearance_components,
+            features: self.features,
+            hidden: self.hidden,
+            feature_octaves: self.feature_octaves,
+            directions: self.directions,
         }
     }
 
-    /// Returns the number of nodes along each axis.
-    fn resolution(&self) -> usize {
-        self.lines[0].shape()[0]
-    }
-
-    /// Returns the products plane · line of each axis at positions `[m, 3]` in units of cells: three tensors `[m, R]`.
-    fn products(&self, cells: &Tensor<T>) -> [Tensor<T>; 3] {
-        let n = self.resolution();
-        let column = |axis: usize| cells.narrow(1, axis, 1);
-        let zero = Tensor::zeros(&[cells.shape()[0], 1]);
-        [0, 1, 2].map(|axis| {
-            let [b, c] = [[1, 2], [0, 2], [0, 1]][axis];
-            let plane = self.planes[axis].tensor().trilinear(&Tensor::concat(&[&column(b), &column(c), &zero], 1), [n, n, 1]);
-            let line = self.lines[axis].tensor().trilinear(&Tensor::concat(&[&column(axis), &zero, &zero], 1), [n, 1, 1]);
-            plane * line
-        })
-    }
-
-    /// Resamples planes and lines, with corners aligned.
-    fn resample(&mut self, resolution: usize) {
-        let n = self.resolution();
-        let at = |k: usize| T::lit(k as f64 * (n - 1) as f64 / (resolution - 1) as f64);
-        let of_line: Vec<T> = (0..resolution).flat_map(|i| [at(i), T::zero(), T::zero()]).collect();
-        let of_plane = (0..resolution * resolution).flat_map(|i| [at(i / resolution), at(i % resolution), T::zero()]).collect();
-        let (of_line, of_plane) = (Tensor::from_vec(of_line, &[resolution, 3]), Tensor::from_vec(of_plane, &[resolution * resolution, 3]));
-        let resampled = |param: &Param<T>, at: &Tensor<T>, nodes: [usize; 3]| {
-            Param::from_tensor(param.name(), no_grad(|| param.tensor().trilinear(at, nodes)))
-        };
-        self.planes = self.planes.iter().map(|plane| resampled(plane, &of_plane, [n, n, 1])).collect();
-        self.lines = self.lines.iter().map(|line| resampled(line, &of_line, [n, 1, 1])).collect();
+    fn total_steps(&self) -> u64 {
+        self.stages.iter().map(|stage| stage.steps).sum()
     }
 }
 
@@ -194,29 +218,47 @@ impl<T: Real> Factors<T> {
 #[derive(Debug)]
 pub struct Tensorf<T: Real> {
     config: Config,
-    density: Factors<T>,
-    appearance: Factors<T>,
-    basis: Linear<T>,
-    color: Mlp<T>,
-    /// Cells that are sampled; all of them until a stage has been trained.
-    occupied: Option<Occupancy>,
+    field: Factored<T>,
+    /// Implementation of rendering.
+    pub engine: Engine,
 }
 
 impl<T: Real> Module<T> for Tensorf<T> {
     fn visit(&self, f: &mut dyn FnMut(&Param<T>)) {
-        self.density.visit(f);
-        self.appearance.visit(f);
-        f(&self.basis.weight);
-        self.color.visit(f);
+        self.field.visit(f);
     }
 
     fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<T>)) {
-        self.density.visit_mut(f);
-        self.appearance.visit_mut(f);
-        f(&mut self.basis.weight);
-        self.color.visit_mut(f);
+        self.field.visit_mut(f);
     }
 }
+
+/// Cells that are sampled, as a checkpoint stores them beside their masks.
+#[derive(Serialize, Deserialize)]
+struct Cells {
+    #[serde(rename = "box")]
+    aabb: [[f64; 3]; 2],
+    cells: [usize; 3],
+}
+
+fn corners(aabb: Aabb) -> [[f64; 3]; 2] {
+    [aabb.min.to_array(), aabb.max.to_array()]
+}
+
+/// Returns the box with these corners, unless it has no volume.
+fn valid_box([min, max]: [[f64; 3]; 2]) -> Option<Aabb> {
+    let valid = (0..3).all(|a| min[a] < max[a] && min[a].is_finite() && max[a].is_finite());
+    valid.then(|| Aabb { min: min.into(), max: max.into() })
+}
+
+/// Most nodes along an axis of a cube.
+const MOST_NODES: usize = 4096;
+/// Cells of the visual hull along each axis.
+const HULL: usize = 128;
+/// Pixels around the silhouettes that belong to the hull.
+const HULL_MARGIN: f64 = 1.0;
+/// Most cells of an occupancy along each axis.
+const MOST_CELLS: usize = 256;
 
 impl<T: Real> Tensorf<T> {
     /// Creates the model at the resolution of the first stage.
@@ -224,21 +266,14 @@ impl<T: Real> Tensorf<T> {
     /// Errors name the setting that is invalid.
     pub fn new(config: Config) -> Result<Self> {
         config.validate()?;
-        let (random, n) = (Stream::new(config.seed), config.stages[0].resolution);
-        let encoded = (config.features + 3) * (1 + 2 * config.octaves);
-        let mut color = Mlp::new("color", &[encoded, config.hidden, config.hidden, 3], Activation::Relu, &random);
-        if let Some(last) = color.layers.last_mut() {
-            last.initialize(Init::default(), Init::Zeros, &random);
+        let random = Stream::new(config.seed);
+        let mut field = Factored::new(config.shape(), Aabb::cube(config.half_width), [config.stages[0].resolution; 3], &random);
+        if config.opaque_steps > 0 {
+            field.make_opaque();
         }
-        Ok(Tensorf {
-            density: Factors::new("density", n, config.density_components, &random),
-            appearance: Factors::new("appearance", n, config.appearance_components, &random),
-            // A matrix without bias.
-            basis: Linear::new("basis", 3 * config.appearance_components, config.features, &random),
-            color,
-            occupied: None,
-            config,
-        })
+        field.grouping = Grouping { weight: config.group, above: config.color_above };
+        field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
+        Ok(Tensorf { config, field, engine: Engine::Fused })
     }
 
     /// Returns the settings of the model.
@@ -246,70 +281,69 @@ impl<T: Real> Tensorf<T> {
         &self.config
     }
 
-    /// Returns the side of a cell, world length.
-    fn cell(&self) -> f64 {
-        2.0 * self.config.half_width / (self.density.resolution() - 1) as f64
-    }
-
-    /// Returns positions `[m, 3]` in units of cells.
-    fn cells(&self, positions: &Tensor<T>) -> Tensor<T> {
-        (positions + self.config.half_width) * (1.0 / self.cell())
-    }
-
-    /// Returns the colors at positions `[m, 3]`, seen along unit directions `[m, 3]`: `[m, 3]`.
-    fn colors(&self, positions: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
-        let products = self.appearance.products(&self.cells(positions));
-        let features = Tensor::concat(&products.each_ref(), 1).matmul(self.basis.weight.tensor());
-        let input = Tensor::concat(&[&features, directions], 1);
-        let waves = (0..self.config.octaves).map(|k| &input * f64::from(1 << k)).flat_map(|x| [x.sin(), x.cos()]);
-        let encoded: Vec<Tensor<T>> = [input.clone()].into_iter().chain(waves).collect();
-        self.color.forward(&Tensor::concat(&encoded.iter().collect::<Vec<_>>(), 1)).sigmoid()
-    }
-
-    /// Resamples all factors, if their resolution is another.
-    fn resample(&mut self, resolution: usize) {
-        if resolution != self.density.resolution() {
-            self.density.resample(resolution);
-            self.appearance.resample(resolution);
-        }
+    /// Returns the field.
+    pub fn field(&self) -> &Factored<T> {
+        &self.field
     }
 
     /// Returns the cells whose opacity, or that of a neighbour, is above [`occupied_above`](Config::occupied_above).
     fn occupied(&self) -> Occupancy {
         // An opacity 1 − exp(−σ · step) above a threshold is a density above another.
-        let threshold = -(-self.config.occupied_above).ln_1p() / (self.config.step * self.cell());
-        let cells = [(self.density.resolution() - 1).min(MOST_CELLS); 3];
-        Occupancy::where_dense(self.aabb(), cells, threshold, |positions| self.density(positions)).dilated(1)
+        let threshold = -(-self.config.occupied_above).ln_1p() / (self.config.step * self.field.cell());
+        let cells = self.field.nodes().map(|n| (n - 1).min(MOST_CELLS));
+        let density = |positions: &Tensor<T>| self.field.density(positions);
+        match &self.field.occupied {
+            // Outside of the cells that were sampled, the density has its initial value.
+            Some(sampled) => {
+                let sampled = sampled.resampled(self.aabb(), cells);
+                sampled.dense(threshold, density).dilated(1).intersection(&sampled)
+            }
+            None => Occupancy::where_dense(self.aabb(), cells, threshold, density).dilated(1),
+        }
+    }
+
+    fn hull(&self, views: &[View]) -> Option<Occupancy> {
+        let hull = || visual_hull::by_footprint(views, self.aabb(), [HULL; 3], HULL_MARGIN, &|_| {}).dilated(1);
+        (self.config.hull && has_alpha(views)).then(hull)
+    }
+
+    fn render_with(&self, rays: &[Ray], background: [f32; 3], jitter: Jitter, engine: Engine) -> Rendered<T> {
+        let config = &self.config;
+        let training = matches!(jitter, Jitter::PerRay { .. });
+        let options = RenderOptions {
+            aabb: self.aabb(),
+            spacing: Spacing::Step(config.step * self.field.cell()),
+            jitter,
+            background,
+            occupancy: None,
+            engine,
+            stop_below: if training { config.stop_below } else { config.stop_below_in_pictures },
+        };
+        render(&self.field, rays, &options)
     }
 }
 
-/// Most cells of an occupancy along each axis.
-const MOST_CELLS: usize = 128;
-/// The authors' `density_shift` and `distance_scale`.
-const SHIFT: f64 = -10.0;
-const SCALE: f64 = 25.0;
+/// Returns the numbers of nodes of a box with about as many cells as a cube of `resolution` nodes along each axis, with about equal sides.
+fn nodes_of(aabb: Aabb, resolution: usize) -> [usize; 3] {
+    let extent = aabb.max - aabb.min;
+    let side = (extent.x * extent.y * extent.z).cbrt() / (resolution - 1) as f64;
+    (extent / side).to_array().map(|cells| cells.round().max(1.0) as usize + 1)
+}
 
-impl<T: Real> Field<T> for Tensorf<T> {
-    fn density(&self, positions: &Tensor<T>) -> Tensor<T> {
-        let [x, y, z] = self.density.products(&self.cells(positions)).map(|product| product.sum_axis(1));
-        (x + y + z + SHIFT).softplus() * SCALE
-    }
+/// Learning rate that falls exponentially over a run of `total` steps, of which `first` came before; 0 for the first `frozen` steps of the run.
+#[derive(Debug)]
+struct Falling {
+    rate: f64,
+    last: f64,
+    first: u64,
+    total: u64,
+    frozen: u64,
+}
 
-    fn radiance(&self, samples: &Samples<T>) -> Radiance<T> {
-        let sigma = self.density(&samples.positions);
-        let weights = no_grad(|| {
-            let tau = &sigma.detach() * &samples.delta;
-            (-tau.segment_exclusive_sum(&samples.offsets)).exp() * tau.one_minus_exp_neg()
-        });
-        let seen = weights.data().iter().enumerate().filter(|(_, weight)| weight.as_f64() > self.config.color_above);
-        let seen = Indices::from(seen.map(|(i, _)| i as u32).collect::<Vec<_>>());
-        let directions = samples.directions.segment_repeat(&samples.offsets);
-        let rgb = self.colors(&samples.positions.gather_rows(&seen), &directions.gather_rows(&seen));
-        Radiance { sigma, rgb: rgb.scatter_rows(&seen, samples.len()) }
-    }
-
-    fn reach(&self) -> Option<&Occupancy> {
-        self.occupied.as_ref()
+impl Schedule for Falling {
+    fn at(&self, step: u64) -> f64 {
+        let step = self.first + step;
+        if step < self.frozen { 0.0 } else { self.rate * self.last.powf(step as f64 / self.total as f64) }
     }
 }
 
@@ -319,41 +353,65 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 
     fn aabb(&self) -> Aabb {
-        Aabb::cube(self.config.half_width)
+        self.field.aabb()
     }
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {
-        let spacing = Spacing::Step(self.config.step * self.cell());
-        let samples = sample(rays, &self.aabb(), spacing, pass.jitter, self.reach());
-        let background = Tensor::from_vec(pass.background.map(|c| T::lit(f64::from(c))).to_vec(), &[3]);
-        let radiance = self.radiance(&samples);
-        composite(samples, radiance, &background)
+        let engine = if pass.keep_samples { Engine::Graph } else { self.engine };
+        self.render_with(rays, pass.background, pass.jitter, engine)
+    }
+
+    fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
+        let background = view.background;
+        Box::new(move |rays| self.render_with(rays, background, Jitter::None, self.engine))
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
         let config = &self.config;
-        let total: u64 = config.stages.iter().map(|stage| stage.steps).sum();
-        // The authors restart the rates at each upsampling, and let them fall to a tenth over as many steps as the whole run has.
-        let falling = |rate: f64| Exponential::new(rate, 0.1 * rate, total.max(stage.steps));
-        let network = self.color.param_names().into_iter().chain([self.basis.weight.name().to_owned()]);
-        let rates = network.fold(Rates::new(falling(config.factor_rate)), |rates, name| rates.with(name, falling(config.network_rate)));
-        Box::new(Adam::new(rates, AdamMode::Dense).betas(0.9, 0.99))
+        let falling = |rate: f64, frozen: u64| Falling { rate, last: config.last_rate, first: stage.first, total: config.total_steps(), frozen };
+        let mut rates = Rates::new(falling(config.factor_rate, 0));
+        for name in self.field.network_names() {
+            rates = rates.with(name, falling(config.network_rate, 0));
+        }
+        let mut l1 = Vec::new();
+        self.field.density_factors().visit(&mut |param| {
+            let weight = if stage.index == 0 { config.density_l1 } else { config.density_l1_later };
+            l1.push((param.name().to_owned(), weight / param.tensor().len() as f64));
+        });
+        for (name, _) in &l1 {
+            rates = rates.with(name.clone(), falling(config.factor_rate, config.opaque_steps));
+        }
+        let mode = if config.lazy { AdamMode::Lazy } else { AdamMode::Dense };
+        Box::new(Adam::new(rates, mode).betas(0.9, 0.99).epsilon(1e-12).l1(l1))
     }
 
     fn stages(&self, _: &TrainOptions, _: u64) -> Vec<StageLength> {
-        self.config.stages.iter().map(|stage| StageLength { resolution: Some(stage.resolution), steps: stage.steps }).collect()
+        let length = |stage: &Stage| StageLength { resolution: Some(stage.resolution), steps: stage.steps, rays_per_step: Some(stage.rays) };
+        self.config.stages.iter().map(length).collect()
     }
 
-    fn begin_stage(&mut self, stage: &PlannedStage, _: &mut RaySource) -> Result<()> {
-        if stage.index > 0 {
+    fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {
+        if stage.index == 0 {
+            self.field.occupied = self.hull(rays.all_views());
+        } else {
             let occupied = self.occupied();
             if occupied.fraction() == 0.0 {
                 return Err(Error::config("occupied_above", "no cell is this opaque", "a smaller opacity"));
             }
-            self.occupied = Some(occupied);
+            self.field.occupied = Some(occupied);
         }
-        self.resample(self.config.stages[stage.index].resolution);
+        if let Some(occupied) = &self.field.occupied {
+            rays.aim_at(occupied);
+        }
+        let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
+        self.field.resample(aabb, nodes_of(aabb, self.config.stages[stage.index].resolution));
         Ok(())
+    }
+
+    fn resume(&mut self, _: &PlannedStage, rays: &mut RaySource) {
+        if let Some(occupied) = &self.field.occupied {
+            rays.aim_at(occupied);
+        }
     }
 
     fn settings(&self) -> Value {
@@ -361,32 +419,34 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {
-        file.fact("resolution", self.density.resolution());
-        file.fact("cells", self.occupied.as_ref().map(Occupancy::cells));
-        if let Some(occupied) = &self.occupied {
+        file.fact("box", corners(self.aabb()));
+        file.fact("nodes", self.field.nodes());
+        file.fact("occupied", self.field.occupied.as_ref().map(|cells| Cells { aabb: corners(cells.aabb()), cells: cells.cells() }));
+        if let Some(occupied) = &self.field.occupied {
             file.words("occupied", occupied.masks());
         }
         self.visit(&mut |param| file.owned(param.name(), param.tensor().detach()));
     }
 
     fn read(&mut self, file: &mut TensorFile<'_>, _: usize) -> Result<()> {
-        let resolution: usize = file.fact("resolution")?;
-        if !self.config.stages.iter().any(|stage| stage.resolution == resolution) {
-            return Err(file.damaged("the resolution is not one of the stages"));
+        let (aabb, nodes): ([[f64; 3]; 2], [usize; 3]) = (file.fact("box")?, file.fact("nodes")?);
+        let aabb = valid_box(aabb).ok_or_else(|| file.damaged("the box has no volume"))?;
+        if nodes.iter().any(|n| !(2..=4 * MOST_NODES).contains(n)) {
+            return Err(file.damaged("the number of nodes is not one of this model"));
         }
-        let cells: Option<[usize; 3]> = file.fact("cells")?;
-        if cells.is_some_and(|cells| cells.iter().any(|n| !(1..=MOST_CELLS).contains(n))) {
-            return Err(file.damaged("the number of cells is not one of this model"));
-        }
-        self.occupied = match cells {
+        self.field.occupied = match file.fact::<Option<Cells>>("occupied")? {
             None => None,
-            Some(cells) => {
+            Some(Cells { aabb, cells }) => {
+                let aabb = valid_box(aabb).ok_or_else(|| file.damaged("the box of the occupied cells has no volume"))?;
+                if cells.iter().any(|n| !(1..=MOST_CELLS).contains(n)) {
+                    return Err(file.damaged("the number of cells is not one of this model"));
+                }
                 let masks = file.brick_masks("occupied", cells)?;
                 let masks = masks.ok_or_else(|| file.damaged("the mask `occupied` has cells outside of the box"))?;
-                Some(Occupancy::from_masks(self.aabb(), cells, masks))
+                Some(Occupancy::from_masks(aabb, cells, masks))
             }
         };
-        self.resample(resolution);
+        self.field.resample(aabb, nodes);
         let mut done = Ok(());
         self.visit_mut(&mut |param| {
             if done.is_ok() {
@@ -397,10 +457,10 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 }
 
-/// Returns the L1 norm of the density factors: Σ over planes and lines of the mean absolute value. The authors' weight is 8e-5 in the first stage and 4e-5 after it.
+/// Returns the L1 norm of the density factors: Σ over planes and lines of the mean absolute value.
 pub fn density_l1<T: Real>(step: &Step<'_, T, Tensorf<T>>) -> Tensor<T> {
     let mut sum: Option<Tensor<T>> = None;
-    step.model.density.visit(&mut |param| {
+    step.model.field.density_factors().visit(&mut |param| {
         let mean = param.tensor().abs().mean();
         sum = Some(sum.take().map_or_else(|| mean.clone(), |sum| sum + &mean));
     });

@@ -46,17 +46,46 @@ impl Occupancy {
     /// 3]` to `[m]` and may be that of any field; it is evaluated without recording a gradient. Matter thinner than a cell can be missed:
     /// dilate the result, or lower the threshold.
     pub fn where_dense<T: Real>(aabb: Aabb, cells: [usize; 3], threshold: f64, density: impl Fn(&Tensor<T>) -> Tensor<T>) -> Self {
-        const AT_A_TIME: usize = 1 << 16;
-        let sides = (aabb.max - aabb.min) / DVec3::from_array(cells.map(|n| n as f64));
-        let center = |c: usize| (aabb.min + sides * DVec3::from_array(cell_at(c, cells).map(|k| k as f64 + 0.5))).to_array().map(T::lit);
-        let total = cells.iter().product::<usize>();
-        let mut mask = Vec::with_capacity(total);
-        for start in (0..total).step_by(AT_A_TIME) {
-            let end = (start + AT_A_TIME).min(total);
-            let positions = Tensor::from_vec((start..end).flat_map(center).collect(), &[end - start, 3]);
-            mask.extend(no_grad(|| density(&positions)).data().iter().map(|d| d.as_f64() > threshold));
+        let all: Vec<u64> = (0..BrickGrid::new(cells).len()).map(|brick| BrickGrid::new(cells).inside(brick)).collect();
+        Self::from_masks(aabb, cells, all).dense(threshold, density)
+    }
+
+    /// Returns the occupied cells at whose centres a density is above a threshold, as [`Occupancy::where_dense`].
+    pub fn dense<T: Real>(&self, threshold: f64, density: impl Fn(&Tensor<T>) -> Tensor<T>) -> Self {
+        const BRICKS: usize = 1 << 12;
+        let mut masks = self.masks.to_vec();
+        for (first, masks) in (0..).step_by(BRICKS).zip(masks.chunks_mut(BRICKS)) {
+            let cells = || masks.iter().zip(first..).flat_map(|(&mask, brick)| bits(mask).map(move |bit| (brick, bit)));
+            let positions: Vec<T> = cells().flat_map(|(brick, bit)| self.center(self.bricks.node(brick, bit)).to_array().map(T::lit)).collect();
+            let positions = Tensor::from_vec(positions, &[cells().count(), 3]);
+            let density = no_grad(|| density(&positions));
+            let thin: Vec<_> = cells().zip(density.data()).filter(|(_, d)| d.as_f64() <= threshold).map(|(cell, _)| cell).collect();
+            thin.into_iter().for_each(|(brick, bit)| masks[brick - first] &= !(1 << bit));
         }
-        Self::new(aabb, cells, &mask)
+        Self::from_masks(self.aabb, self.cells(), masks)
+    }
+
+    /// Returns the center of a cell.
+    fn center(&self, cell: [usize; 3]) -> DVec3 {
+        let sides = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells().map(|n| n as f64));
+        self.aabb.min + sides * (DVec3::from_array(cell.map(|k| k as f64)) + 0.5)
+    }
+
+    /// Returns the cells of another division of space, whose centres lie in occupied cells.
+    pub fn resampled(&self, aabb: Aabb, cells: [usize; 3]) -> Self {
+        let all = Occupancy { aabb, bricks: BrickGrid::new(cells), masks: [].into(), distance: [].into() };
+        let masks = parallel::map_indices(all.bricks.len(), |brick| {
+            let full = bits(all.bricks.inside(brick)).filter(|&bit| self.contains_point(all.center(all.bricks.node(brick, bit))));
+            full.fold(0, |mask, bit| mask | 1 << bit)
+        });
+        Self::from_masks(aabb, cells, masks)
+    }
+
+    /// Returns true if a point lies in an occupied cell.
+    pub fn contains_point(&self, at: DVec3) -> bool {
+        let cell = (at - self.aabb.min) / (self.aabb.max - self.aabb.min) * DVec3::from_array(self.cells().map(|n| n as f64));
+        let inside = (0..3).all(|a| cell[a] >= 0.0 && cell[a] < self.cells()[a] as f64);
+        inside && self.contains(cell.to_array().map(|k| k as usize))
     }
 
     /// Creates an occupancy from one mask per brick, as in [`autograd::Lattice::masks`].

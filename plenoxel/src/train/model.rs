@@ -70,7 +70,7 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     /// steps.
     fn stages(&self, options: &TrainOptions, rays_per_epoch: u64) -> Vec<StageLength> {
         let _ = rays_per_epoch;
-        vec![StageLength { resolution: None, steps: options.steps }]
+        vec![StageLength { resolution: None, steps: options.steps, rays_per_step: None }]
     }
 
     /// Changes the model at the beginning of a stage, for example by resampling or pruning. It may reduce the images and restrict the rays
@@ -228,4 +228,6 @@ pub struct StageLength {
     pub resolution: Option<usize>,
     /// Number of steps.
     pub steps: u64,
+    /// Number of rays per step; `None` for [`TrainOptions::rays_per_step`].
+    pub rays_per_step: Option<usize>,
 }

@@ -1,0 +1,211 @@
+//! Fused kernel: the pixels of [`composite()`] in one pass over a factored field, with a hand-written adjoint.
+//!
+//! *Forward.* Rays are processed in blocks. Each block computes the densities of its samples and their weights, forms groups
+//! ([`Grouping`](super::Grouping)), and evaluates the color network at one member of each group, for all groups of the block together.
+//!
+//! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
+//! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
+//! another ([`RowSums`]), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
+//! the sums are bit-identical for any number of threads.
+
+mod adjoint;
+mod forward;
+mod lookup;
+mod network;
+
+use super::{Factored, Grouping, Shape};
+use crate::camera::Ray;
+use crate::render::along::{COLUMNS, column};
+use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
+use crate::sampling::{Jitter, Samples};
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Module, Param, Real, RowSparse, Tensor, parallel};
+use forward::{Block, Scene};
+use std::sync::Arc;
+
+/// Returns true if the kernel computes fields of these sizes.
+pub fn supports(shape: &Shape) -> bool {
+    [shape.density_components, shape.appearance_components].iter().all(|count| count % lookup::LANES == 0)
+}
+
+/// Returns the number of rays in a block, which depends on the size of the batch only.
+fn block_of(rays: usize) -> usize {
+    rays.div_ceil(48).clamp(16, 256)
+}
+
+/// Data of a batch that its blocks share.
+#[derive(Debug)]
+struct Batch<T: Real> {
+    shape: Shape,
+    nodes: [usize; 3],
+    background: [T; 3],
+    /// `[n, 3]`
+    directions: Tensor<T>,
+    /// Encoded directions, `[n, e]`.
+    encoded: Tensor<T>,
+    grouping: Grouping,
+    jitter: Jitter,
+}
+
+/// Rendered batch, with the data that its adjoint needs.
+#[derive(Debug)]
+struct State<T: Real> {
+    batch: Batch<T>,
+    /// Empty if no gradient is recorded.
+    blocks: Vec<Block<T>>,
+}
+
+/// Rendered columns beyond the color of the pixels.
+#[derive(Debug)]
+struct Columns<T: Real> {
+    /// `[n, COLUMNS]`
+    pixels: Tensor<T>,
+    /// Σ ln(1 + 2σᵢ²) of each ray.
+    sparsity: Tensor<T>,
+}
+
+impl<T: Real> render::Columns<T> for Columns<T> {
+    fn depth(&self) -> Tensor<T> {
+        self.pixels.index_axis(1, column::DEPTH)
+    }
+
+    fn distortion(&self) -> Tensor<T> {
+        self.pixels.index_axis(1, column::DISTORTION)
+    }
+
+    fn sparsity(&self) -> Tensor<T> {
+        self.sparsity.clone()
+    }
+}
+
+/// Renders a batch of rays through a field.
+pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    let n = rays.len();
+    let mut tables: Vec<&Tensor<T>> = Vec::new();
+    let params = Params::of(field);
+    tables.extend(params.0.iter());
+    let keep = tables.iter().any(|table| table.is_tracked()) && autograd::is_recording();
+    let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[n, 3]);
+    let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
+    let background = options.background.map(|c| T::lit(f64::from(c)));
+    let jitter = options.jitter;
+    let grouping = if matches!(jitter, Jitter::None) { field.grouping_in_pictures } else { field.grouping };
+    let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, jitter };
+    let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params.0);
+    let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
+    let size = block_of(n);
+    let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();
+    let blocks = parallel::map_items(parts, |b, (pixels, sparsity)| {
+        let block = scene.render(b * size, pixels, sparsity);
+        let count = block.len();
+        (count, keep.then_some(block))
+    });
+    let sample_count = blocks.iter().map(|(count, _)| count).sum();
+    let state = Arc::new(State { batch, blocks: blocks.into_iter().filter_map(|(_, block)| block).collect() });
+    let kernel = |output| Fused { state: state.clone(), output };
+    let pixels = Tensor::from_kernel(pixels, &[n, COLUMNS], &tables, kernel(Output::Pixels));
+    let sparsity = Tensor::from_kernel(sparsity, &[n], &tables, kernel(Output::Sparsity));
+    Rendered::new(
+        pixels.narrow(1, 0, 3),
+        pixels.index_axis(1, column::OPACITY),
+        pixels.index_axis(1, column::LOG_TRANSMITTANCE),
+        sample_count,
+        Columns { pixels, sparsity },
+    )
+}
+
+/// Parameters of a field, in their order.
+struct Params<T: Real>(Vec<Tensor<T>>);
+
+impl<T: Real> Params<T> {
+    fn of(field: &Factored<T>) -> Self {
+        let mut tables = Vec::new();
+        field.visit(&mut |param: &Param<T>| tables.push(param.tensor().clone()));
+        Params(tables)
+    }
+}
+
+/// Columns that a kernel computes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Output {
+    /// `[n, COLUMNS]`
+    Pixels,
+    /// `[n]`
+    Sparsity,
+}
+
+/// Kernel that maps the parameters of a field to columns.
+#[derive(Debug)]
+struct Fused<T: Real> {
+    state: Arc<State<T>>,
+    output: Output,
+}
+
+impl<T: Real> Kernel<T> for Fused<T> {
+    fn name(&self) -> &'static str {
+        "render_factored"
+    }
+
+    fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
+        let rendered = self.state.composite(inputs);
+        if self.output == Output::Sparsity {
+            return rendered.sparsity();
+        }
+        let column = |x: Tensor<T>| x.unsqueeze(1);
+        let columns = [
+            rendered.rgb.clone(),
+            column(rendered.depth()),
+            column(rendered.opacity.clone()),
+            column(rendered.log_transmittance.clone()),
+            column(rendered.distortion()),
+        ];
+        Tensor::concat(&columns.iter().collect::<Vec<_>>(), 1)
+    }
+
+    fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
+        let count = adjoint::PLANES_AND_LINES + 1 + 2 * 3;
+        let tables: Vec<Tensor<T>> = (0..count).map(|input| call.input(input)).collect();
+        let adjoint::Cotangents { planes, dense } = adjoint::cotangents(&self.state, &tables, call.cotangent(), self.output);
+        for (input, sums) in planes {
+            out.rows(input, RowSparse::deferred(tables[input].shape(), sums));
+        }
+        for (input, values) in dense {
+            out.dense(input, values);
+        }
+    }
+}
+
+impl<T: Real> State<T> {
+    /// Computes the same pixels as a graph of small ops.
+    fn composite(&self, tables: &[Tensor<T>]) -> Rendered<T> {
+        let batch = &self.batch;
+        let (mut offsets, mut rays) = (vec![0u32], Vec::new());
+        let mut columns: [Vec<T>; 5] = Default::default();
+        // Numbers of the shaded samples, and for each sample with a color its number and that of its shaded sample.
+        let (mut shaded, mut colored, mut group) = (Vec::new(), Vec::new(), Vec::new());
+        for block in &self.blocks {
+            let first = columns[0].len() as u32;
+            let [x, y, z] = block.at();
+            for (to, from) in columns.iter_mut().zip([x, y, z, block.t(), block.delta()]) {
+                to.extend_from_slice(from);
+            }
+            offsets.extend(block.offsets[1..].iter().map(|offset| first + offset));
+            for (i, &of) in block.group.iter().enumerate().filter(|(_, of)| **of != forward::NONE) {
+                colored.push(first + i as u32);
+                group.push(shaded.len() as u32 + of);
+            }
+            shaded.extend(block.shaded.iter().map(|sample| first + sample));
+            rays.extend(block.rays_of_shaded.iter().copied());
+        }
+        let offsets = Indices::from(offsets);
+        let m = columns[0].len();
+        let [x, y, z, t, delta] = columns.map(|values| Tensor::from_vec(values, &[m]));
+        let cells = Tensor::stack(&[&x, &y, &z], 1);
+        let directions = batch.encoded.gather_rows(&Indices::from(rays));
+        let colors = super::colors(tables, batch.shape.feature_octaves, &cells.gather_rows(&Indices::from(shaded)), &directions);
+        let rgb = colors.gather_rows(&Indices::from(group)).scatter_rows(&Indices::from(colored), m);
+        let radiance = Radiance { sigma: super::density(tables, &cells), rgb };
+        // Positions in world coordinates are not needed any more.
+        let samples = Samples { t, delta, positions: cells, directions: batch.directions.clone(), offsets };
+        composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))
+    }
+}

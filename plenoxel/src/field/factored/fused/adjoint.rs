@@ -1,0 +1,230 @@
+//! Cotangents of the parameters from cotangents of pixels.
+
+use super::forward::{Block, NONE, Tables};
+use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, RUN, add_to_lines, first_rows};
+use super::network::NetworkCotangents;
+use super::super::PLANE_OF;
+use super::{Output, State};
+use crate::render::along::{COLUMNS, sparsity_slope};
+use autograd::rows::{Buckets, buckets_of};
+use autograd::{Buffer, Real, RowSums, Tensor, parallel};
+use std::sync::Arc;
+
+/// Number of tables of planes and lines, which come before those of the network.
+pub const PLANES_AND_LINES: usize = 12;
+
+/// Cotangents by the number of the input.
+pub struct Cotangents<T: Real> {
+    pub planes: Vec<(usize, Arc<dyn RowSums<T>>)>,
+    pub dense: Vec<(usize, Buffer<T>)>,
+}
+
+/// Cotangents of one block.
+#[derive(Debug)]
+struct Part<T: Real> {
+    /// ∂L/∂s of each sample.
+    density: Buffer<T>,
+    /// Cotangents of the products of each shaded sample, `[shaded, 3 R]`.
+    products: Buffer<T>,
+    /// Samples, sorted by the rows of each plane that they read.
+    density_rows: [Sorted; 3],
+    /// Shaded samples, likewise.
+    product_rows: [Sorted; 3],
+}
+
+/// Samples sorted by the bucket of rows that they read.
+#[derive(Debug)]
+struct Sorted {
+    buckets: Buckets,
+    samples: Buffer<u32>,
+}
+
+impl Sorted {
+    fn new<T: Real>(axis: usize, at: [&[T]; 3], nodes: [usize; 3], shift: u32, live: impl Fn(usize) -> bool) -> Self {
+        let mut rows = Buffer::stale(at[0].len());
+        first_rows(axis, at, nodes, &mut rows);
+        let (buckets, stride) = (plane_size(axis, nodes).div_ceil(1 << shift), nodes[PLANE_OF[axis][1]] as u32);
+        let of = |i: usize| buckets_of([rows[i], rows[i] + 1, rows[i] + stride, rows[i] + stride + 1], shift);
+        let mut places = Buckets::count(buckets, (0..rows.len()).filter(|&i| live(i)).flat_map(of));
+        let mut samples = Buffer::stale(places.total());
+        for i in (0..rows.len()).filter(|&i| live(i)) {
+            of(i).for_each(|bucket| samples[places.take(bucket)] = i as u32);
+        }
+        Sorted { buckets: places.filled(), samples }
+    }
+}
+
+/// Returns the base-2 logarithm of the rows in a bucket: about a thirty-second of a plane, and not more than fits into a core's cache.
+fn bucket_shift(axis: usize, nodes: [usize; 3], width: usize) -> u32 {
+    const FLOATS: usize = 1 << 15;
+    let rows = (plane_size(axis, nodes) / 32).min(FLOATS / width).max(64);
+    rows.ilog2()
+}
+
+/// Returns the number of nodes of the plane that belongs to the line of an axis.
+fn plane_size(axis: usize, nodes: [usize; 3]) -> usize {
+    PLANE_OF[axis].map(|a| nodes[a]).iter().product()
+}
+
+/// Contributions of all samples of a batch to one plane.
+#[derive(Debug)]
+struct PlaneSums<T: Real> {
+    state: Arc<State<T>>,
+    parts: Arc<Vec<Part<T>>>,
+    /// Parameters of the field, in their order.
+    tables: Arc<Vec<Tensor<T>>>,
+    axis: usize,
+    of_density: bool,
+}
+
+impl<T: Real> PlaneSums<T> {
+    fn width(&self) -> usize {
+        let shape = &self.state.batch.shape;
+        if self.of_density { shape.density_components } else { shape.appearance_components }
+    }
+
+    fn sorted<'a>(&self, part: &'a Part<T>) -> &'a Sorted {
+        &(if self.of_density { &part.density_rows } else { &part.product_rows })[self.axis]
+    }
+}
+
+impl<T: Real> RowSums<T> for PlaneSums<T> {
+    fn bucket_shift(&self) -> u32 {
+        bucket_shift(self.axis, self.state.batch.nodes, self.width())
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.parts.iter().all(|part| self.sorted(part).buckets.range(bucket).is_empty())
+    }
+
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        let tables = Tables::new(&self.state.batch, &self.tables);
+        let pairs = if self.of_density { tables.density } else { tables.appearance };
+        for (part, block) in self.parts.iter().zip(&self.state.blocks) {
+            let sorted = self.sorted(part);
+            let which = &sorted.samples[sorted.buckets.range(bucket)];
+            let (at, g) = match self.of_density {
+                true => (block.at(), OfProducts::Shared(&part.density)),
+                false => (block.shaded_at.each_ref().map(|at| &at[..]), OfProducts::Each(&part.products)),
+            };
+            let bucket = BucketSums { first: bucket << self.bucket_shift(), sums, touched };
+            if parallel::fused() {
+                lookup::add_to_plane::<T, true>(pairs, self.axis, at, which, g, bucket);
+            } else {
+                lookup::add_to_plane::<T, false>(pairs, self.axis, at, which, g, bucket);
+            }
+        }
+    }
+}
+
+/// Computes the cotangents of the parameters `tables`.
+pub fn cotangents<T: Real>(state: &Arc<State<T>>, tables: &[Tensor<T>], cotangent: &Tensor<T>, output: Output) -> Cotangents<T> {
+    let of = Tables::new(&state.batch, tables);
+    let parts = parallel::map_indices(state.blocks.len(), |b| part(state, &state.blocks[b], &of, cotangent, output));
+    let nodes = state.batch.nodes;
+    let (mut own, mut dense) = (Vec::new(), Vec::new());
+    for (part, of_block) in parts {
+        own.push(part);
+        dense.push(of_block);
+    }
+    let sums = sum_in_order(dense);
+    let mut dense = Vec::new();
+    let mut sums = sums.into_iter();
+    for first in [3, 9] {
+        let all = sums.next().unwrap_or_default();
+        let width = all.len() / nodes.iter().sum::<usize>().max(1);
+        let mut rest = &all[..];
+        for axis in 0..3 {
+            let (own, others) = rest.split_at(nodes[axis] * width);
+            dense.push((first + axis, Buffer::copy_of(own)));
+            rest = others;
+        }
+    }
+    dense.extend((PLANES_AND_LINES..).zip(sums));
+    let (parts, tables) = (Arc::new(own), Arc::new(tables.to_vec()));
+    let planes = [(0, true), (6, false)].into_iter().flat_map(|(first, of_density)| (0..3).map(move |axis| (first + axis, axis, of_density)));
+    let planes = planes.map(|(input, axis, of_density)| {
+        let sums = PlaneSums { state: state.clone(), parts: parts.clone(), tables: tables.clone(), axis, of_density };
+        (input, Arc::new(sums) as Arc<dyn RowSums<T>>)
+    });
+    Cotangents { planes: planes.collect(), dense }
+}
+
+/// Sums the arrays of the blocks, in the order of the blocks.
+fn sum_in_order<T: Real>(blocks: Vec<Vec<Buffer<T>>>) -> Vec<Buffer<T>> {
+    let Some(first) = blocks.first() else { return Vec::new() };
+    let sum = |k: usize| {
+        let mut total = Buffer::zeros(first[k].len());
+        parallel::for_each_chunk(&mut total, 4096, |start, total| {
+            for block in &blocks {
+                let own = &block[k][start..start + total.len()];
+                total.iter_mut().zip(own).for_each(|(sum, &x)| *sum += x);
+            }
+        });
+        total
+    };
+    (0..first.len()).map(sum).collect()
+}
+
+/// Computes the cotangents of one block: those of its samples; and those of the lines of density and appearance, the matrix and the layers.
+fn part<T: Real>(
+    state: &State<T>,
+    block: &Block<T>,
+    tables: &Tables<'_, T>,
+    cotangent: &Tensor<T>,
+    output: Output,
+) -> (Part<T>, Vec<Buffer<T>>) {
+    let batch = &state.batch;
+    let mut density = Buffer::stale(block.len());
+    let mut rgb = Buffer::zeros(3 * block.shaded.len());
+    match output {
+        Output::Sparsity => {
+            for (own, &g) in block.rays().zip(&cotangent.data()[block.first..]) {
+                own.for_each(|i| density[i] = g * sparsity_slope(block.sigma()[i]));
+            }
+        }
+        Output::Pixels => {
+            let (along, color) = (block.along(), block.color());
+            let of_shaded = rgb.as_chunks_mut::<3>().0;
+            for (own, g) in block.rays().zip(&cotangent.data().as_chunks::<COLUMNS>().0[block.first..]) {
+                along.sigma_adjoint(own.clone(), batch.background, g, &color, &mut density);
+                for i in own.filter(|&i| block.group[i] != NONE) {
+                    let of = &mut of_shaded[block.group[i] as usize];
+                    (0..3).for_each(|c| of[c] += along.weight[i] * g[c]);
+                }
+            }
+        }
+    }
+    density.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
+    let (products, network): (Buffer<T>, NetworkCotangents<T>) = tables.network.adjoint(&block.activations, rgb);
+    let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
+    let lines = [
+        lines(tables.density, block.at(), OfProducts::Shared(&density)),
+        lines(tables.appearance, shaded_at, OfProducts::Each(&products)),
+    ];
+    let shift = |axis: usize, pairs: Pairs<'_, T>| bucket_shift(axis, batch.nodes, pairs.width);
+    let live = |i: usize| density[i] != T::zero();
+    let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, block.at(), batch.nodes, shift(axis, tables.density), live));
+    let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, shaded_at, batch.nodes, shift(axis, tables.appearance), |_| true));
+    (Part { density, products, density_rows, product_rows }, lines.into_iter().chain(network).collect())
+}
+
+/// Returns the cotangents of three lines, one after another.
+fn lines<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: OfProducts<'_, T>) -> Buffer<T> {
+    let mut sums = Buffer::zeros(pairs.nodes.iter().sum::<usize>() * pairs.width);
+    let count = at[0].len();
+    for first in (0..count).step_by(RUN) {
+        let range = first..count.min(first + RUN);
+        let at = at.map(|at| &at[range.clone()]);
+        let g = match g {
+            OfProducts::Shared(g) => OfProducts::Shared(&g[range.clone()]),
+            OfProducts::Each(g) => OfProducts::Each(&g[3 * pairs.width * range.start..3 * pairs.width * range.end]),
+        };
+        if parallel::fused() {
+            add_to_lines::<T, true>(pairs, at, g, &mut sums);
+        } else {
+            add_to_lines::<T, false>(pairs, at, g, &mut sums);
+        }
+    }
+    sums
+}

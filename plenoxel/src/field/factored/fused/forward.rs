@@ -1,0 +1,314 @@
+//! Pixels of rays, one block of rays at a time.
+
+use super::Batch;
+use super::lookup::{self, Pairs, RUN};
+use super::network::{Activations, Network};
+use crate::camera::Ray;
+use crate::random::{Purpose, uniform};
+use crate::render::RenderOptions;
+use crate::render::along::{self, Along, COLUMNS};
+use crate::sampling::{Jitter, Occupancy, march};
+use autograd::{Buffer, Real, Tensor, parallel};
+use glam::DVec3;
+use std::ops::Range;
+
+/// Marker for a sample without a color.
+pub const NONE: u32 = u32::MAX;
+
+/// Columns of a sample.
+mod of_sample {
+    pub const T: usize = 3;
+    pub const DELTA: usize = 4;
+    pub const SIGMA: usize = 5;
+    pub const SLOPE: usize = 6;
+    pub const WEIGHT: usize = 7;
+    pub const AFTER: usize = 8;
+    /// Number of columns; positions are the first three.
+    pub const COUNT: usize = 9;
+}
+
+/// Samples of a block of rays.
+#[derive(Debug)]
+pub struct Block<T: Real> {
+    /// Number of the first ray.
+    pub first: usize,
+    /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
+    pub offsets: Vec<u32>,
+    columns: [Buffer<T>; of_sample::COUNT],
+    /// Shaded sample whose color each sample has, or [`NONE`].
+    pub group: Buffer<u32>,
+    /// Samples at which the color network is evaluated.
+    pub shaded: Vec<u32>,
+    /// Number of the ray of each shaded sample.
+    pub rays_of_shaded: Vec<u32>,
+    /// Positions of the shaded samples.
+    pub shaded_at: [Buffer<T>; 3],
+    /// Values of the color network.
+    pub activations: Activations<T>,
+}
+
+impl<T: Real> Block<T> {
+    /// Returns the number of samples.
+    pub fn len(&self) -> usize {
+        self.offsets[self.offsets.len() - 1] as usize
+    }
+
+    /// Returns the samples of each ray.
+    pub fn rays(&self) -> impl Iterator<Item = Range<usize>> + '_ {
+        self.offsets.windows(2).map(|o| o[0] as usize..o[1] as usize)
+    }
+
+    /// Returns the positions of the samples, in units of cells.
+    pub fn at(&self) -> [&[T]; 3] {
+        [0, 1, 2].map(|axis| &self.columns[axis][..self.len()])
+    }
+
+    /// Returns the distance of each sample from the origin of its ray.
+    pub fn t(&self) -> &[T] {
+        &self.columns[of_sample::T][..self.len()]
+    }
+
+    /// Returns the length of each interval.
+    pub fn delta(&self) -> &[T] {
+        &self.columns[of_sample::DELTA][..self.len()]
+    }
+
+    /// Returns the density σ of each sample.
+    pub fn sigma(&self) -> &[T] {
+        &self.columns[of_sample::SIGMA][..self.len()]
+    }
+
+    /// Returns dσ/ds of each sample.
+    pub fn slope(&self) -> &[T] {
+        &self.columns[of_sample::SLOPE][..self.len()]
+    }
+
+    fn weight(&self) -> &[T] {
+        &self.columns[of_sample::WEIGHT][..self.len()]
+    }
+
+    /// Returns the samples as rendering sees them.
+    pub fn along(&self) -> Along<'_, T> {
+        Along { t: self.t(), delta: self.delta(), weight: self.weight(), after: &self.columns[of_sample::AFTER][..self.len()] }
+    }
+
+    /// Returns the color of a sample.
+    #[inline(always)]
+    pub fn color(&self) -> impl Fn(usize) -> [T; 3] + '_ {
+        let colors = self.activations.rgb.as_chunks::<3>().0;
+        |i| colors.get(self.group[i] as usize).copied().unwrap_or([T::zero(); 3])
+    }
+}
+
+/// Inputs of rendering a batch.
+pub struct Scene<'a, T: Real> {
+    batch: &'a Batch<T>,
+    rays: &'a [Ray],
+    options: &'a RenderOptions<'a>,
+    cells: Option<&'a Occupancy>,
+    tables: Tables<'a, T>,
+}
+
+/// Parameters of a field.
+pub struct Tables<'a, T> {
+    pub density: Pairs<'a, T>,
+    pub appearance: Pairs<'a, T>,
+    pub network: Network<'a, T>,
+}
+
+impl<'a, T: Real> Tables<'a, T> {
+    pub fn new(batch: &Batch<T>, tables: &'a [Tensor<T>]) -> Self {
+        let pairs = |first: usize, width: usize| Pairs {
+            planes: [0, 1, 2].map(|axis| tables[first + axis].data()),
+            lines: [0, 1, 2].map(|axis| tables[first + 3 + axis].data()),
+            nodes: batch.nodes,
+            width,
+        };
+        Tables {
+            density: pairs(0, batch.shape.density_components),
+            appearance: pairs(6, batch.shape.appearance_components),
+            network: Network::new(&batch.shape, &tables[12..]),
+        }
+    }
+}
+
+impl<'a, T: Real> Scene<'a, T> {
+    pub fn new(
+        batch: &'a Batch<T>,
+        rays: &'a [Ray],
+        options: &'a RenderOptions<'a>,
+        cells: Option<&'a Occupancy>,
+        tables: &'a [Tensor<T>],
+    ) -> Self {
+        Scene { batch, rays, options, cells, tables: Tables::new(batch, tables) }
+    }
+
+    /// Renders rays from `first` on, one for each entry of `sparsity`.
+    pub fn render(&self, first: usize, pixels: &mut [T], sparsity: &mut [T]) -> Block<T> {
+        let mut block = self.samples(first, sparsity.len());
+        self.form_groups(&mut block);
+        self.shade(&mut block);
+        let (along, color, sigma) = (block.along(), block.color(), block.sigma());
+        for ((own, pixel), sparsity) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0).zip(sparsity) {
+            *pixel = along.pixel(own.clone(), self.batch.background, |i| sigma[i], &color);
+            *sparsity = sigma[own].iter().map(|&sigma| along::sparsity(sigma)).sum();
+        }
+        drop(color);
+        block
+    }
+
+    /// Computes densities and weights of the samples of `count` rays from `first` on.
+    fn samples(&self, first: usize, count: usize) -> Block<T> {
+        let RenderOptions { aabb, spacing, jitter, stop_below, .. } = self.options;
+        let stop = T::lit(*stop_below);
+        let mut columns: [Buffer<T>; of_sample::COUNT] = std::array::from_fn(|_| Buffer::stale(0));
+        let mut offsets = vec![0];
+        let mut end = 0;
+        let most = DVec3::from_array(self.batch.nodes.map(|n| n as f64 - 1.0));
+        let per_length = most / (aabb.max - aabb.min);
+        for (r, ray) in self.rays[first..first + count].iter().enumerate() {
+            let march = march(ray, aabb, *spacing, jitter.of(first + r));
+            let mut intervals = match self.cells {
+                Some(cells) => Intervals::Occupied(march.occupied(ray, cells)),
+                None => Intervals::All((0..march.count).map(move |k| march.interval(k))),
+            };
+            let (start, slope) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
+            let mut left = T::one();
+            while left >= stop {
+                if end + RUN > columns[0].len() {
+                    let room = (2 * columns[0].len()).max(32 * count);
+                    columns.iter_mut().for_each(|column| column.grow(room));
+                }
+                let mut own = 0;
+                while own < RUN
+                    && let Some((t, delta)) = intervals.next()
+                {
+                    let place = (start + t * slope).clamp(DVec3::ZERO, most);
+                    let values = [place.x, place.y, place.z, t, delta];
+                    columns.iter_mut().zip(values).for_each(|(column, value)| column[end + own] = T::lit(value));
+                    own += 1;
+                }
+                if own == 0 {
+                    break;
+                }
+                let [x, y, z, _, delta, sigma, slope, weight, after] = columns.each_mut().map(|column| &mut column[end..end + own]);
+                if parallel::fused() {
+                    lookup::density::<T, true>(self.tables.density, [x, y, z], sigma, slope);
+                } else {
+                    lookup::density::<T, false>(self.tables.density, [x, y, z], sigma, slope);
+                }
+                if parallel::fused() {
+                    lookup::absorb::<T, true>(sigma, delta, weight, after);
+                } else {
+                    lookup::absorb::<T, false>(sigma, delta, weight, after);
+                }
+                let mut used = 0;
+                while used < own && left >= stop {
+                    weight[used] *= left;
+                    left *= after[used];
+                    after[used] = left;
+                    used += 1;
+                }
+                end += used;
+            }
+            offsets.push(end as u32);
+        }
+        columns.iter_mut().for_each(|column| column.truncate(end));
+        Block {
+            first,
+            offsets,
+            columns,
+            group: Buffer::stale(end),
+            shaded: Vec::new(),
+            rays_of_shaded: Vec::new(),
+            shaded_at: std::array::from_fn(|_| Buffer::stale(0)),
+            activations: Activations::default(),
+        }
+    }
+
+    /// Forms the groups of each ray and chooses the shaded samples.
+    fn form_groups(&self, block: &mut Block<T>) {
+        let (limit, above) = (T::lit(self.batch.grouping.weight), T::lit(self.batch.grouping.above));
+        let mut group = std::mem::replace(&mut block.group, Buffer::stale(0));
+        let (mut shaded, mut rays) = (Vec::new(), Vec::new());
+        let weight = block.weight();
+        for (r, own) in block.rays().enumerate() {
+            let mut draws = Draws { jitter: self.batch.jitter, ray: block.first + r, drawn: 0 };
+            let (mut begin, mut sum) = (own.start, T::zero());
+            for i in own.clone() {
+                sum += weight[i];
+                if sum < limit && i + 1 < own.end {
+                    continue;
+                }
+                let members = begin..i + 1;
+                let number = if sum > above {
+                    let mut rest = T::lit(draws.next()) * sum;
+                    let chosen = members.clone().find(|&k| {
+                        rest -= weight[k];
+                        rest < T::zero()
+                    });
+                    shaded.push(chosen.unwrap_or(i) as u32);
+                    rays.push((block.first + r) as u32);
+                    shaded.len() as u32 - 1
+                } else {
+                    NONE
+                };
+                group[members].fill(number);
+                (begin, sum) = (i + 1, T::zero());
+            }
+        }
+        block.shaded_at = block.at().map(|at| shaded.iter().map(|&i| at[i as usize]).collect::<Vec<_>>().into());
+        (block.group, block.shaded, block.rays_of_shaded) = (group, shaded, rays);
+    }
+
+    /// Evaluates the color network.
+    fn shade(&self, block: &mut Block<T>) {
+        let pairs = self.tables.appearance;
+        let mut products = Buffer::stale(block.shaded.len() * 3 * pairs.width);
+        for (run, products) in products.chunks_mut(RUN * 3 * pairs.width).enumerate() {
+            let range = run * RUN..run * RUN + products.len() / (3 * pairs.width);
+            let at = block.shaded_at.each_ref().map(|at| &at[range.clone()]);
+            if parallel::fused() {
+                lookup::products::<T, true>(pairs, at, products);
+            } else {
+                lookup::products::<T, false>(pairs, at, products);
+            }
+        }
+        let (encoded, width) = (self.batch.encoded.data(), self.batch.encoded.shape()[1]);
+        let direction = |i: usize| &encoded[block.rays_of_shaded[i] as usize * width..][..width];
+        block.activations = self.tables.network.forward(products, direction);
+    }
+}
+
+/// Intervals of a ray.
+enum Intervals<'a, I> {
+    Occupied(crate::sampling::Occupied<'a>),
+    All(I),
+}
+
+impl<I: Iterator<Item = (f64, f64)>> Intervals<'_, I> {
+    #[inline(always)]
+    fn next(&mut self) -> Option<(f64, f64)> {
+        match self {
+            Intervals::Occupied(intervals) => intervals.next(),
+            Intervals::All(intervals) => intervals.next(),
+        }
+    }
+}
+
+/// Random numbers of a ray.
+struct Draws {
+    jitter: Jitter,
+    ray: usize,
+    drawn: u64,
+}
+
+impl Draws {
+    fn next(&mut self) -> f64 {
+        self.drawn += 1;
+        match self.jitter {
+            Jitter::None => 0.5,
+            Jitter::PerRay { seed, step } => uniform(seed, Purpose::Shade, step, (self.ray as u64) << 16 | self.drawn),
+        }
+    }
+}

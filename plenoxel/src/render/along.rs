@@ -1,0 +1,118 @@
+//! Pixels from samples, and gradients of samples from cotangents of pixels, along one ray: the part that fused kernels have in common.
+//!
+//! With Gᵢ = ∂L/∂wᵢ and G_b = ∂L/∂T_N, for any loss on the columns:
+//!
+//! ∂L/∂σᵢ = δᵢ (Gᵢ Tᵢ₊₁ − Σ_{j>i} wⱼ Gⱼ − T_N G_b − ∂L/∂ln T_N),   ∂L/∂cᵢ = wᵢ ∂L/∂rgb.
+//!
+//! Gᵢ = cᵢ · ∂L/∂rgb + tᵢ ∂L/∂depth + ∂L/∂distortion · (2 Σⱼ wⱼ |tᵢ − tⱼ| + ⅔ wᵢ δᵢ),   G_b = background · ∂L/∂rgb − ∂L/∂opacity.
+
+use autograd::Real;
+use std::ops::Range;
+
+/// Number of columns of a pixel.
+pub const COLUMNS: usize = 7;
+
+/// Indices of the columns; rgb has 0..3.
+pub mod column {
+    pub const DEPTH: usize = 3;
+    pub const OPACITY: usize = 4;
+    pub const LOG_TRANSMITTANCE: usize = 5;
+    pub const DISTORTION: usize = 6;
+}
+
+/// Samples of some rays, one entry per sample.
+#[derive(Clone, Copy)]
+pub struct Along<'a, T> {
+    /// Distance from the origin of the ray.
+    pub t: &'a [T],
+    /// Length of the interval.
+    pub delta: &'a [T],
+    /// wᵢ = Tᵢ (1 − exp(−σᵢδᵢ))
+    pub weight: &'a [T],
+    /// Tᵢ₊₁
+    pub after: &'a [T],
+}
+
+impl<T: Real> Along<'_, T> {
+    /// Computes the columns of the pixel of a ray with samples `own`. `sigma(i)` is σᵢ, `color(i)` is cᵢ.
+    #[inline(always)]
+    pub fn pixel(
+        &self,
+        own: Range<usize>,
+        background: [T; 3],
+        sigma: impl Fn(usize) -> T,
+        color: impl Fn(usize) -> [T; 3],
+    ) -> [T; COLUMNS] {
+        let (mut rgb, mut depth, mut opacity, mut optical_depth, mut distortion, mut moment) =
+            ([T::zero(); 3], T::zero(), T::zero(), T::zero(), T::zero(), T::zero());
+        let left = if own.is_empty() { T::one() } else { self.after[own.end - 1] };
+        for i in own {
+            let (w, t, delta) = (self.weight[i], self.t[i], self.delta[i]);
+            let c = color(i);
+            (0..3).for_each(|a| rgb[a] += w * c[a]);
+            distortion += w * (T::lit(2.0) * (t * opacity - moment) + w * delta * T::lit(1.0 / 3.0));
+            depth += w * t;
+            moment = depth;
+            opacity += w;
+            optical_depth += sigma(i) * delta;
+        }
+        let mut pixel = [T::zero(); COLUMNS];
+        (0..3).for_each(|c| pixel[c] = rgb[c] + left * background[c]);
+        pixel[column::DEPTH] = depth;
+        pixel[column::OPACITY] = opacity;
+        pixel[column::LOG_TRANSMITTANCE] = -optical_depth;
+        pixel[column::DISTORTION] = distortion;
+        pixel
+    }
+
+    /// Computes ∂L/∂σᵢ of the samples `own` of a ray, from back to front, from the cotangent g of its pixel.
+    #[inline(always)]
+    pub fn sigma_adjoint(
+        &self,
+        own: Range<usize>,
+        background: [T; 3],
+        g: &[T; COLUMNS],
+        color: impl Fn(usize) -> [T; 3],
+        sigma: &mut [T],
+    ) {
+        let Some(last) = own.clone().next_back() else { return };
+        let (g_depth, g_distortion) = (g[column::DEPTH], g[column::DISTORTION]);
+        let g_background = (0..3).map(|c| background[c] * g[c]).sum::<T>() - g[column::OPACITY];
+        let mut behind = self.after[last] * g_background + g[column::LOG_TRANSMITTANCE];
+        // Sums of w and of w t, over all samples and over the samples behind the current one.
+        let (mut all, mut all_t) = (T::zero(), T::zero());
+        if g_distortion != T::zero() {
+            for i in own.clone() {
+                all += self.weight[i];
+                all_t += self.weight[i] * self.t[i];
+            }
+        }
+        let (mut back, mut back_t) = (T::zero(), T::zero());
+        for i in own.rev() {
+            let (w, t, delta) = (self.weight[i], self.t[i], self.delta[i]);
+            let c = color(i);
+            let mut own = c[0] * g[0] + c[1] * g[1] + c[2] * g[2] + t * g_depth;
+            if g_distortion != T::zero() {
+                let (front, front_t) = (all - back - w, all_t - back_t - w * t);
+                let spread = t * front - front_t + back_t - t * back;
+                own += g_distortion * (T::lit(2.0) * spread + T::lit(2.0 / 3.0) * w * delta);
+                back += w;
+                back_t += w * t;
+            }
+            sigma[i] = delta * (own * self.after[i] - behind);
+            behind += w * own;
+        }
+    }
+}
+
+/// Returns ln(1 + 2σ²), the Cauchy sparsity of a sample.
+#[inline(always)]
+pub fn sparsity<T: Real>(sigma: T) -> T {
+    (T::one() + T::lit(2.0) * sigma * sigma).ln()
+}
+
+/// Returns the derivative of [`sparsity`].
+#[inline(always)]
+pub fn sparsity_slope<T: Real>(sigma: T) -> T {
+    T::lit(4.0) * sigma / (T::one() + T::lit(2.0) * sigma * sigma)
+}
