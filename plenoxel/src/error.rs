@@ -1,7 +1,7 @@
-//! What can go wrong between this crate and the world: files, settings, numbers.
+//! Errors in files, settings and numbers.
 //!
-//! Mistakes of a programmer (shapes that do not fit) panic at the caller's line. Everything that comes from a file, a flag or
-//! the data is an [`Error`], and its message says where it happened, what was found, what is accepted and what to do.
+//! Programming errors, such as mismatched shapes, panic at the caller's line. Everything that depends on a file, a flag or the data is an
+//! [`Error`]. Its message names the place, says what is wrong, and then what is accepted or what to do.
 
 use crate::text::one_line;
 use std::path::{Path, PathBuf};
@@ -9,40 +9,40 @@ use std::path::{Path, PathBuf};
 /// Result with this crate's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Everything a user, a disk or a diverging training run can cause. Displayed, it is one line that can be printed: see [`one_line`].
+/// An error caused by the user, the disk or a diverging training run. It is displayed as one line that is safe to print: see [`one_line`].
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A file or folder does not hold what it should.
+    /// A file or folder with unusable contents.
     #[error("{}: {}; {}", shown(path), one_line(found), one_line(remedy))]
     Input {
         /// The file or folder.
         path: PathBuf,
-        /// What is there, with frame index, key or line where that helps.
+        /// The problem, with frame index, key or line where that helps.
         found: String,
-        /// What is accepted, or what to do about it.
+        /// The accepted contents, or the remedy.
         remedy: String,
     },
-    /// A setting (flag or configuration key) has a value that cannot be used.
-    #[error("{}: {} cannot be used; accepted: {}", one_line(key), one_line(found), one_line(accepted))]
+    /// An unusable setting (flag or configuration key).
+    #[error("{}: {}; {}", one_line(key), one_line(found), one_line(accepted))]
     Config {
         /// Name of the setting as the user writes it.
         key: String,
-        /// The value given.
+        /// The problem, such as "invalid value 3".
         found: String,
-        /// The values that would do.
+        /// The accepted values, such as "expected 1, 2, 4", or the remedy.
         accepted: String,
     },
-    /// A computation left the finite numbers.
+    /// A computation with a result that is not finite.
     #[error("{}: {}; {}", one_line(place), one_line(found), one_line(remedy))]
     Numeric {
-        /// Step, tensor or formula where it was noticed.
+        /// Step, tensor or formula at which it was detected.
         place: String,
-        /// The value seen.
+        /// The problem.
         found: String,
-        /// What usually helps.
+        /// The usual remedy.
         remedy: String,
     },
-    /// The operating system refused to read or write.
+    /// A read or write that the operating system refused.
     #[error("{}: {} while {doing}; {}", shown(path), one_line(&source.to_string()), remedy(source))]
     Io {
         /// The file or folder.
@@ -55,22 +55,35 @@ pub enum Error {
 }
 
 impl Error {
-    /// Bad data in `path`.
+    /// An error for the contents of `path`: the problem, and the remedy.
     pub fn input(path: impl Into<PathBuf>, found: impl Into<String>, remedy: impl Into<String>) -> Self {
         Error::Input { path: path.into(), found: found.into(), remedy: remedy.into() }
     }
 
-    /// A setting that cannot be used.
-    pub fn config(key: impl Into<String>, found: impl ToString, accepted: impl Into<String>) -> Self {
-        Error::Config { key: key.into(), found: found.to_string(), accepted: accepted.into() }
+    /// An error for a setting with an invalid value, displayed as `key: invalid value VALUE; expected EXPECTED`.
+    pub fn config(key: impl Into<String>, value: impl ToString, expected: impl Into<String>) -> Self {
+        Self::usage(key, format!("invalid value {}", value.to_string()), format!("expected {}", expected.into()))
     }
 
-    /// A refusal of the operating system while `doing` something with `path`.
+    /// An error for a setting that cannot be used for another reason than its value, displayed as `key: PROBLEM; REMEDY`.
+    pub fn usage(key: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Error::Config { key: key.into(), found: problem.into(), accepted: remedy.into() }
+    }
+
+    /// The error with another name for its setting. Errors of other kinds are returned unchanged.
+    pub fn with_key(self, rename: impl FnOnce(&str) -> String) -> Self {
+        match self {
+            Error::Config { key, found, accepted } => Error::Config { key: rename(&key), found, accepted },
+            other => other,
+        }
+    }
+
+    /// An error that the operating system returned while `doing` something with `path`.
     pub fn io(path: impl Into<PathBuf>, source: std::io::Error, doing: impl Into<String>) -> Self {
         Error::Io { path: path.into(), source, doing: doing.into() }
     }
 
-    /// Exit code of a process that ends with this error: 2 setting, 3 data, 4 numbers, 5 reading or writing.
+    /// Exit code of a process that ends with this error: 2 for settings, 3 for bad input, 4 for numbers that are not finite, 5 for reading or writing.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Config { .. } => 2,
@@ -81,12 +94,12 @@ impl Error {
     }
 }
 
-/// A path as it can be printed.
+/// A path on one line.
 fn shown(path: &Path) -> String {
     one_line(&path.display().to_string())
 }
 
-/// True if the process, or the system, has as many open files as it may have.
+/// True if the process or the system has reached its limit of open files.
 fn has_too_many_files(refusal: &std::io::Error) -> bool {
     #[cfg(unix)]
     const CODES: [i32; 2] = [libc::EMFILE, libc::ENFILE];
@@ -96,21 +109,21 @@ fn has_too_many_files(refusal: &std::io::Error) -> bool {
     refusal.raw_os_error().is_some_and(|code| CODES.contains(&code))
 }
 
-/// What helps against a refusal of the operating system.
+/// The remedy for an error of the operating system.
 fn remedy(refusal: &std::io::Error) -> &'static str {
     use std::io::ErrorKind::*;
     if has_too_many_files(refusal) {
         return "allow more open files, for instance with `ulimit -n 4096`, or close other programs";
     }
     match refusal.kind() {
-        NotFound => "check that the path is spelled rightly",
+        NotFound => "check the spelling of the path",
         PermissionDenied => "change its permissions, or choose another path",
-        ReadOnlyFilesystem => "choose a place that may be written",
+        ReadOnlyFilesystem => "choose a path on a writable file system",
         InvalidData | UnexpectedEof => "the file is damaged: use an undamaged copy",
-        AlreadyExists | NotADirectory | IsADirectory => "choose another path: a file is where a folder should be, or the other way round",
+        AlreadyExists | NotADirectory | IsADirectory => "choose another path: there is a file in place of a folder, or a folder in place of a file",
         OutOfMemory => "use a smaller file, or a machine with more memory",
-        StorageFull | QuotaExceeded | FileTooLarge => "make room on the disk, or choose another one",
-        InvalidFilename => "choose a shorter or plainer name",
+        StorageFull | QuotaExceeded | FileTooLarge => "free disk space, or choose another disk",
+        InvalidFilename => "choose a shorter name, or one without special characters",
         _ => "check the disk, or choose another path",
     }
 }
@@ -124,16 +137,18 @@ mod tests {
         let input = Error::input("a.json", "frames is empty", "list at least one frame");
         assert_eq!((input.exit_code(), input.to_string().as_str()), (3, "a.json: frames is empty; list at least one frame"));
         let config = Error::config("downscale", 3, "1, 2, 4");
-        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: 3 cannot be used; accepted: 1, 2, 4"));
+        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: invalid value 3; expected 1, 2, 4"));
+        let missing = Error::usage("stages", "there is no stage", "add one").with_key(|key| format!("a.toml: {key}"));
+        assert_eq!((missing.exit_code(), missing.to_string().as_str()), (2, "a.toml: stages: there is no stage; add one"));
         let io = Error::io("out", std::io::Error::other("disk full"), "writing");
         assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing; check the disk, or choose another path"));
         for (kind, remedy) in [
-            (std::io::ErrorKind::NotFound, "spelled rightly"),
+            (std::io::ErrorKind::NotFound, "spelling"),
             (std::io::ErrorKind::PermissionDenied, "permissions"),
-            (std::io::ErrorKind::ReadOnlyFilesystem, "may be written"),
+            (std::io::ErrorKind::ReadOnlyFilesystem, "writable"),
             (std::io::ErrorKind::InvalidData, "undamaged"),
-            (std::io::ErrorKind::NotADirectory, "the other way round"),
-            (std::io::ErrorKind::StorageFull, "make room"),
+            (std::io::ErrorKind::NotADirectory, "in place of"),
+            (std::io::ErrorKind::StorageFull, "free disk space"),
             (std::io::ErrorKind::InvalidFilename, "shorter"),
         ] {
             let text = Error::io("out", kind.into(), "writing").to_string();

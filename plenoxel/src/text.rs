@@ -1,7 +1,7 @@
-//! Text for people: that of others, such as names of files and what files say, made fit to be printed, and times.
+//! Text for terminals: untrusted text escaped to one line, and durations.
 
-/// The text on one line, so that it can do nothing to a terminal but to be read: control characters, line breaks, and marks that change the
-/// direction of writing are escaped as Rust writes them, `\n` and `\u{1b}`. Everything else stays as it is.
+/// Escapes untrusted text, such as a file name, so that it is one line and cannot control a terminal. Control characters, line breaks and
+/// bidirectional formatting characters become Rust escapes such as `\n` and `\u{1b}`. All other characters are unchanged.
 pub fn one_line(text: &str) -> String {
     let mut line = String::with_capacity(text.len());
     for c in text.chars() {
@@ -10,14 +10,14 @@ pub fn one_line(text: &str) -> String {
     line
 }
 
-/// True for characters that move something on a screen instead of being shown.
+/// True for characters that a terminal or a text renderer interprets instead of displaying.
 pub(crate) fn is_unprintable(c: char) -> bool {
     let separator = matches!(c, '\u{2028}' | '\u{2029}');
     let direction = matches!(c, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     c.is_control() || separator || direction
 }
 
-/// Formats a time as minutes and seconds, with hours where there are any: `1:02:05`.
+/// Formats a duration in seconds as `m:ss`, or as `h:mm:ss` from one hour on, such as `1:02:05`.
 pub fn clock(seconds: f64) -> String {
     let s = seconds.max(0.0).round() as u64;
     match s / 3600 {

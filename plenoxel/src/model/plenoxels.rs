@@ -400,7 +400,7 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
         if !config.losses.is_empty() && config.losses != Config::default().losses {
             let names: Vec<&str> = config.losses.keys().map(String::as_str).collect();
             let accepted = "no losses in the config (`losses` empty), or Trainer::new without an objective; model::plenoxels::objective(&config, views) is one to add to";
-            return Err(Error::config("losses", format!("{} beside an objective of one's own", names.join(", ")), accepted));
+            return Err(Error::usage("losses", format!("a custom objective does not use the losses of the config: {}", names.join(", ")), accepted));
         }
         Self::with_losses(config, views.into(), objective, Arc::default())
     }

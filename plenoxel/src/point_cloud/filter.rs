@@ -105,7 +105,7 @@ impl Filters {
             filter("bbox", &mut left, &|left| Ok(left.iter().map(|i| within.contains(position(i))).collect()))?;
         }
         if let Some(range) = self.value {
-            let values = values.ok_or_else(|| Error::config("min_value", "a cloud without values", "a cloud with a scalar field"))?;
+            let values = values.ok_or_else(|| Error::usage("min_value", "the cloud has no values", "use a cloud with a scalar field"))?;
             let (low, high) = (range.low as f32, range.high as f32);
             filter("value", &mut left, &|left| Ok(left.iter().map(|&i| (low..=high).contains(&values[i as usize])).collect()))?;
         }
