@@ -160,25 +160,28 @@ impl<'a> Carving<'a> {
         // No image shows the voxel that its camera stands in, so it would stay and hide everything.
         if let Some(view) = views.iter().find(|view| aabb.contains(view.camera.position())) {
             let nearest = views.iter().map(|view| view.camera.position().abs().max_element()).fold(f64::INFINITY, f64::min);
-            let found = format!("{half_width}, a box in which the camera of {} stands,", view.name);
-            return Err(Error::config("half_width", found, format!("a box around the object alone, below {nearest:.3}")));
+            let found = format!("the camera of {} is inside the box of half width {half_width}", view.name);
+            return Err(Error::usage("half_width", found, format!("use a box around the object only, below {nearest:.3}")));
         }
         let mut hull = match rule {
             Rule::Footprint => visual_hull::by_footprint(views, aabb, voxels, margin, &|views| progress(Progress::Views(views))),
             Rule::Rays => visual_hull::by_rays(views, aabb, voxels, &|views| progress(Progress::Views(views))),
         };
         if hull.fraction() == 0.0 {
-            let found = format!("{half_width}, of which the silhouettes leave nothing,");
-            return Err(Error::config("half_width", found, "a box around the object"));
+            let found = format!("the silhouettes leave no voxel of the box of half width {half_width}");
+            return Err(Error::usage("half_width", found, "use a box that contains the object"));
         }
         if let Some(photo) = &photo {
             hull = photo_hull::photo_hull(views, &hull, photo, &|round, carved, left| progress(Progress::Round { round, carved, left }))?;
         }
         match hull.fraction() {
-            0.0 => Err(Error::config("carve.photo.noise", photo.map_or(0.0, |photo| photo.noise), "more, for nothing is left")),
+            0.0 => {
+                let found = format!("no voxel is left with {}", photo.map_or(0.0, |photo| photo.noise));
+                Err(Error::usage("carve.photo.noise", found, "increase it"))
+            }
             1.0 => {
-                let found = format!("{resolution}, of which no image shows one voxel whole on background,");
-                Err(Error::config("carve.resolution", found, "more voxels along an axis, a larger half_width, or a smaller carve.margin"))
+                let found = format!("at {resolution}, no image shows a whole voxel on background, so nothing is carved");
+                Err(Error::usage("carve.resolution", found, "use more voxels per side, a larger half_width, or a smaller carve.margin"))
             }
             _ => Ok(Carving { views, options: *options, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }

@@ -330,6 +330,6 @@ mod tests {
             assert_eq!(split.to_string().parse::<Split>().unwrap(), split);
         }
         let error = "valid".parse::<Split>().unwrap_err();
-        assert_eq!(error.to_string(), "split: \"valid\" cannot be used; accepted: train, val, test");
+        assert_eq!(error.to_string(), "split: invalid value \"valid\"; expected train, val, test");
     }
 }

@@ -77,8 +77,8 @@ pub fn check_downscale(k: usize, (width, height): (usize, usize)) -> Result<()> 
         return Ok(());
     }
     let divisors: Vec<String> = (1..=width.min(height).min(MAX_SIDE as usize)).filter(|&k| divides(k)).map(|k| k.to_string()).collect();
-    let found = if k == 0 { "0".to_owned() } else { format!("{k}, which does not divide the {width} x {height} images,") };
-    Err(Error::config("downscale", found, divisors.join(", ")))
+    let found = if k == 0 { "invalid value 0".to_owned() } else { format!("{k} does not divide the image size {width} x {height}") };
+    Err(Error::usage("downscale", found, format!("expected {}", divisors.join(", "))))
 }
 
 /// The picture reduced `k` times: each pixel averages a block of k x k.

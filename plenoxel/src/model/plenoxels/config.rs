@@ -453,7 +453,7 @@ impl Config {
 
     /// Checks that there is something to train.
     pub fn check_stages(&self) -> Result<()> {
-        check(!self.stages.is_empty(), "stages", "no stage", "at least one")
+        demand(!self.stages.is_empty(), "stages", "there is no stage", "set at least one")
     }
 
     /// Checks every value; an error names the key as the file spells it.
@@ -499,7 +499,7 @@ impl Config {
             }
         }
         for (name, weight) in &self.losses {
-            check(LOSSES.contains(&name.as_str()), &format!("losses.{name}"), "an unknown loss", &format!("one of {}", LOSSES.join(", ")))?;
+            demand(LOSSES.contains(&name.as_str()), &format!("losses.{name}"), "unknown loss", &format!("expected one of {}", LOSSES.join(", ")))?;
             let key = |part: &str| format!("losses.{name}{part}");
             let fits = |part: &str, weight: f64| check((0.0..=1e12).contains(&weight), &key(part), weight, "0 to 1e12");
             let changes = |part: &str, weight: f64| check((1e-30..=1e12).contains(&weight), &key(part), weight, "1e-30 to 1e12");
@@ -517,9 +517,11 @@ impl Config {
         for (name, rate) in &self.loss_rates {
             let key = format!("loss_rates.{name}");
             let learned: Vec<&str> = LEARNED_LOSSES.into_iter().filter(|loss| self.losses.contains_key(*loss)).collect();
-            let accepted =
-                if learned.is_empty() { "a rate for one of the losses robust and exposure".to_owned() } else { learned.join(", ") };
-            check(learned.contains(&name.as_str()), &key, "a rate for a loss that has no parameters here", &accepted)?;
+            let remedy = match learned.is_empty() {
+                true => "remove it: only the losses robust and exposure have parameters".to_owned(),
+                false => format!("expected a rate for {}", learned.join(", ")),
+            };
+            demand(learned.contains(&name.as_str()), &key, "this loss has no parameters here", &remedy)?;
             check((1e-12..=1e6).contains(rate), &key, rate, "1e-12 to 1e6")?;
         }
         if let Some(scout) = &self.scout {
@@ -527,7 +529,7 @@ impl Config {
             density("scout.density", scout.density)?;
             let least = scout.prune_unseen_below;
             check((0.0..=1.0).contains(&least), "scout.prune_unseen_below", least, "a number in [0, 1]")?;
-            check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one, or no scout")?;
+            demand(!scout.stages.is_empty(), "scout.stages", "there is no stage", "set at least one, or remove the scout")?;
         }
         let longest = self.stages.len().max(self.scout.as_ref().map_or(0, |scout| scout.stages.len()));
         check(longest <= MOST_STAGES, "stages", longest, "at most 100")?;
@@ -539,8 +541,8 @@ impl Config {
             match (stage.epochs, stage.steps) {
                 (Some(epochs), None) => check(epochs > 0.0 && epochs <= 1e6, &key("epochs"), epochs, "above 0 to 1e6")?,
                 (None, Some(steps)) => check((1..=1_000_000_000).contains(&steps), &key("steps"), steps, "1 to 1e9")?,
-                (Some(_), Some(_)) => check(false, &key("steps"), "`epochs` beside `steps`", "one of them")?,
-                (None, None) => check(false, &key("steps"), "neither `epochs` nor `steps`", "one of them")?,
+                (Some(_), Some(_)) => demand(false, &key("steps"), "both `epochs` and `steps` are set", "set one of them")?,
+                (None, None) => demand(false, &key("steps"), "neither `epochs` nor `steps` is set", "set one of them")?,
             }
             sampling(&key("sampling"), stage.sampling)?;
             let harmonics_rate = stage.harmonics_rate.unwrap_or(stage.color_rate);
@@ -554,11 +556,11 @@ impl Config {
             }
             // Samples of a batch are counted in 32 bits.
             let samples = stage.sampling.most(stage.resolution) * self.rays_per_step as f64;
-            check(
+            demand(
                 samples < f64::from(u32::MAX),
                 &key("sampling"),
-                format!("up to {samples:.0} samples in a step"),
-                "below 4294967295: longer steps, or a smaller rays_per_step",
+                &format!("a training step has up to {samples:.0} samples, which is more than 4294967294"),
+                "use a larger sampling step, or a smaller rays_per_step",
             )?;
         }
         sampling("evaluation", self.evaluation)?;
@@ -581,6 +583,11 @@ fn sampling(key: &str, sampling: Sampling) -> Result<()> {
             check((1e-6..=1e6).contains(&far), &format!("{key}.far"), far, "1e-6 to 1e6")
         }
     }
+}
+
+/// Checks a condition other than the range of a value.
+fn demand(holds: bool, key: &str, problem: &str, remedy: &str) -> Result<()> {
+    if holds { Ok(()) } else { Err(Error::usage(key, problem, remedy)) }
 }
 
 fn check(fits: bool, key: &str, found: impl ToString, accepted: &str) -> Result<()> {

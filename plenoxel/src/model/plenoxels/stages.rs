@@ -81,8 +81,8 @@ impl<T: Real> Plenoxels<T> {
         if rows <= most {
             return Ok(());
         }
-        let found = format!("{rows} voxels that would be left at {resolution}³, where memory has room for {most}");
-        Err(Error::config("prune_unseen_below", found, "a larger share of a pixel; or fewer voxels a side in the last stages"))
+        let found = format!("{rows} voxels are left at {resolution}³, but the available memory holds {most}");
+        Err(Error::usage("prune_unseen_below", found, "increase it, or use fewer voxels per side in the last stages"))
     }
 
     /// Leaves the rays out that pass what is left of the grid, if the config says so.

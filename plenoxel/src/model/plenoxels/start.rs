@@ -43,8 +43,8 @@ impl Silhouettes {
 
     /// The error if no voxel lies within the silhouettes of all views.
     pub fn nothing_inside() -> Error {
-        let found = "\"auto\", where no voxel of the box lies within the silhouettes of all views,";
-        Error::config("hull", found, "\"off\"; or a half_width whose box holds the object; or another run to start from")
+        let found = "no voxel of the box lies within the silhouettes of all views";
+        Error::usage("hull", found, "set it to \"off\", set a half_width whose box contains the object, or start from another run")
     }
 
     /// The voxels of a grid that a sample inside of the silhouettes can read.
