@@ -217,7 +217,7 @@ fn a_run_remembers_its_data_until_the_data_moves() {
     let trained = train_on(&data, &run, &[]).json();
     assert_eq!(plenoxel(&["evaluate", &run]).json()["psnr"], trained["psnr"]);
     fs::rename(&data, &moved).unwrap();
-    plenoxel(&["evaluate", &run]).refused(3, &[&data, "not there any more", "--data"]);
+    plenoxel(&["evaluate", &run]).refused(3, &[&data, "no longer exists", "--data"]);
     plenoxel(&["render", &run]).refused(3, &["--data"]);
     assert_eq!(plenoxel(&["evaluate", &run, "--data", &moved]).json()["psnr"], trained["psnr"]);
     plenoxel(&["evaluate", &run, "--data", &moved, "--split", "val"]).refused(2, &["--split", "val", "no views", "train, test"]);
@@ -437,7 +437,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
     with_file("seed = 3\n[initial]\ndensitty = 1\n").refused(2, &["my.toml, line 3", "`densitty`", "nearest known key is `density`"]);
     with_file("seed = 3\nhalf_width = 0\n").refused(2, &["half_width", "my.toml, line 2", "above 0"]);
     with_file("seed = \n").refused(3, &["my.toml", "line 1", "not TOML"]);
-    train(&run, &["--config", &folder.path("none.toml")]).refused(3, &["none.toml", "no such file"]);
+    train(&run, &["--config", &folder.path("none.toml")]).refused(3, &["none.toml", "does not exist"]);
     train(&run, &["--config", &folder.path("")]).refused(3, &["this is a folder"]);
     // What a file leaves open the preset fills in, and a flag goes before both.
     let run_config = || fs::read_to_string(format!("{run}/config.toml")).unwrap();
@@ -501,7 +501,7 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
     }
     export(&["ply", &none, "--out", "cloud.obj"]).refused(2, &["--out", "cloud.obj", ".ply"]);
     export(&["vox", &none]).refused(3, &["none", "there is no such run"]);
-    export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "spelled rightly"]);
+    export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "spelling"]);
 }
 
 #[test]
@@ -717,7 +717,7 @@ fn some_test_views_or_none_are_compared_and_the_figures_say_so() {
     assert_eq!(panels, 3);
 
     let answer = command::train("4,0,5", &none, &["--no-evaluate"]);
-    assert!(answer.out.contains("not compared with the 5 test views"), "{}", answer.out);
+    assert!(answer.out.contains("not evaluated on the 5 test views"), "{}", answer.out);
     assert!(answer.json()["psnr"].is_null());
     let evaluated = plenoxel(&["evaluate", &none]).json();
     let compared = plenoxel(&["compare", &none, &some, "--out", &folder.path("page.html")]).done();

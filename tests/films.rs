@@ -116,7 +116,7 @@ fn a_path_becomes_frames_in_every_format_and_a_film() {
     assert_eq!(names(&format!("{renders}/orbit")), ["frame_0000.png", "frame_0001.png"]);
     assert!(names(&renders).iter().all(|name| ["orbit", "orbit.gif", "orbit.mp4"].contains(&name.as_str())), "{:?}", names(&renders));
     assert_eq!(image::size(Path::new(&format!("{renders}/orbit/frame_0001.png"))).unwrap(), (9, 8));
-    plenoxel(&["render", &run, "--path", "spiral", "--data", &data]).refused(3, &["not there any more"]);
+    plenoxel(&["render", &run, "--path", "spiral", "--data", &data]).refused(3, &["no longer exists"]);
     plenoxel(&["render", &run]).refused(3, &["--data"]);
 }
 

@@ -62,7 +62,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     fs::rename(&data, &moved).unwrap();
     fs::remove_file(&cloud).unwrap();
     plenoxel(&["export", "ply", &run])
-        .refused(3, &[&data, "not there any more", "--data DIR", "--min-weight 0 --min-object 0 --color mean"]);
+        .refused(3, &[&data, "no longer exists", "--data DIR", "--min-weight 0 --min-object 0 --color mean"]);
     assert!(!Path::new(&cloud).exists(), "half an export");
     plenoxel(&["export", "ply", &run, "--min-weight", "0", "--min-object", "0", "--color", "mean"]).done();
     plenoxel(&["export", "ply", &run, "--data", &moved]).done();
@@ -132,10 +132,10 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     assert_eq!((noise.code, points(&clean)), (0, 6));
 
     fs::write(&cloud, &text.as_bytes()[..text.len() - 12]).unwrap();
-    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "cut short"]);
+    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "truncated"]);
     fs::write(&cloud, text.replace("0.5 0 0", "0,5 0 0")).unwrap();
     refused(&["--sor-sigma", "1"], 3, &["scan.ply", "row 0", "0,5"]);
     fs::write(&cloud, "solid cube").unwrap();
-    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "no PLY file", "solid cube"]);
-    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(3, &["missing.ply", "no such file"]);
+    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "not a PLY file", "solid cube"]);
+    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(3, &["missing.ply", "does not exist"]);
 }

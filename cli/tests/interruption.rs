@@ -84,7 +84,7 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
     }
     let output = child.wait_with_output().expect("it ends");
     assert_eq!(output.status.code(), Some(130), "{}", text(&output));
-    assert!(text(&output).contains("saved; go on with: plenoxel train --resume"), "{}", text(&output));
+    assert!(text(&output).contains("saved; resume with: plenoxel train --resume"), "{}", text(&output));
     assert!(Path::new(&cut).join("training.safetensors").exists() && !Path::new(&cut).join("checkpoint.safetensors").exists());
 
     for lines in [150, 210, 300] {
@@ -135,7 +135,7 @@ fn a_terminal_that_is_closed_stops_a_run_as_ctrl_c_does() {
     let output = child.wait_with_output().expect("it ends");
     assert_eq!(output.status.code(), Some(130), "{}", text(&output));
     assert!(
-        text(&output).contains("go on with: plenoxel train --resume") && run.join("training.safetensors").exists(),
+        text(&output).contains("resume with: plenoxel train --resume") && run.join("training.safetensors").exists(),
         "{}",
         text(&output)
     );

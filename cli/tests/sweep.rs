@@ -90,7 +90,7 @@ fn an_interrupted_sweep_has_its_run_saved_and_goes_on_with_it() {
     let output = child.wait_with_output().expect("it ends");
     let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert_eq!(output.status.code(), Some(130), "{err}");
-    assert!(err.contains("the same command again goes on") && !err.contains("2/2") && out.contains("| procedural | – | – |"), "{err}{out}");
+    assert!(err.contains("repeat the command to resume") && !err.contains("2/2") && out.contains("| procedural | – | – |"), "{err}{out}");
     assert!(root.join("sweeps/plan/procedural/long/training.safetensors").exists());
 
     let (code, out, err) = plenoxel(&root, &["sweep", "plan.toml"]);
@@ -148,7 +148,7 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     fs::write(root.join("plan.toml"), FILE.replace("downscale = 5", "downscale = 2").replace("steps=6", "steps=7")).expect("the file");
     let (code, _, err) = sweep(&[]);
     assert_eq!(code, Some(2), "{err}");
-    assert!(err.contains("swept/few/fine, where there is another run (stages[0].steps is 6 and not 7), cannot be used"), "{err}");
+    assert!(err.contains("swept/few/fine is a run with other settings (stages[0].steps is 6, not 7); choose another folder"), "{err}");
     fs::write(
         root.join("plan.toml"),
         FILE.replace(", \"odd\"]", "]")

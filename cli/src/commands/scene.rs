@@ -61,8 +61,8 @@ pub struct SceneArgs {
     #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test, value_parser = whole::<usize>(0, MOST_VIEWS))]
     test: usize,
 
-    /// Spread S of the exposure of training views, 0 to 2. The sRGB values of each view are multiplied by exp(S z) and each channel by exp(S/2 z),
-    /// with standard normal random numbers z. Validation and test views are not changed [default: 0]
+    /// Spread S of random exposures of the training views, 0 to 2. The sRGB values of a view are multiplied by exp(S z) for its brightness, and each
+    /// channel by about exp(S/2 z) for its white balance, with standard normal z. Validation and test views are not changed [default: 0]
     #[arg(long, value_name = "S", help_heading = "Scene", value_parser = spread)]
     exposure_spread: Option<f64>,
 

@@ -60,13 +60,13 @@ impl PlyFile {
             let names: Vec<&str> = header.elements.iter().map(|element| &element.name[..]).collect();
             return Err(Error::input(
                 path,
-                format!("no points: its elements are [{}]", names.join(", ")),
-                "an element `vertex` is expected",
+                format!("the file has no points: its elements are [{}]", names.join(", ")),
+                "expected an element `vertex`",
             ));
         };
         if u32::try_from(header.elements[points].count).is_err() {
             let found = format!("the header says {} points", header.elements[points].count);
-            return Err(Error::input(path, found, "at most 4294967295 are read"));
+            return Err(Error::input(path, found, "at most 4294967295 are supported"));
         }
         let mut file = PlyFile { path: path.to_owned(), bytes, header, points, axes: [0; 3], rows: Rows::At(Vec::new()) };
         let mut cursor = Cursor { bytes: &file.bytes, at: file.header.length, encoding: file.header.encoding };
@@ -80,7 +80,7 @@ impl PlyFile {
             let Some(property) = file.property(&[axis]) else {
                 let names: Vec<&str> = file.element().properties.iter().map(|p| &p.name[..]).collect();
                 let found = format!("the points have no property `{axis}`, but [{}]", names.join(", "));
-                return Err(Error::input(path, found, "properties x, y and z are expected"));
+                return Err(Error::input(path, found, "expected the properties x, y and z"));
             };
             file.axes[number] = property;
         }
@@ -127,7 +127,7 @@ impl PlyFile {
     /// Errors: there is none with this name; something in a text is no number.
     pub fn values(&self, name: &str) -> Result<Vec<f32>> {
         let Some((property, _)) = self.fields().find(|(_, p)| p.name == name || field_name(&p.name) == name) else {
-            let found = format!("no scalar field `{name}`");
+            let found = format!("the cloud has no scalar field `{name}`");
             return Err(Error::input(&self.path, found, format!("its scalar fields are [{}]", self.field_names().join(", "))));
         };
         self.in_single(property)
@@ -214,7 +214,7 @@ impl PlyFile {
         match fault {
             Fault::CutShort => {
                 let found = format!("the header says {count} rows of `{name}`, and the file ends in row {row}");
-                Error::input(&self.path, found, "use an undamaged copy: this one is cut short")
+                Error::input(&self.path, found, "the file is truncated: use an undamaged copy")
             }
             Fault::NoNumber(word) => {
                 let found = format!("row {row} of `{name}` has `{word}` where a number is expected");

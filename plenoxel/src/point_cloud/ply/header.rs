@@ -142,13 +142,17 @@ impl Header {
         let write_again = "write the cloud again as PLY 1.0";
         if !file.starts_with(b"ply") {
             let start: String = String::from_utf8_lossy(&file[..file.len().min(16)]).escape_debug().collect();
-            return Err(Error::input(path, format!("no PLY file: it begins with `{start}`"), "give a file that begins with `ply`"));
+            let found = match start.is_empty() {
+                true => "this is not a PLY file: it is empty".to_owned(),
+                false => format!("this is not a PLY file: it begins with `{start}`, not with `ply`"),
+            };
+            return Err(Error::input(path, found, "give a PLY file"));
         }
         let (mut encoding, mut remarks, mut elements) = (None, Vec::new(), Vec::<Element>::new());
         let mut at = 0;
         for number in 1.. {
             let Some(end) = file[at..].iter().position(|&b| b == b'\n').map(|length| at + length) else {
-                return Err(Error::input(path, "the header has no `end_header`", "use an undamaged copy: this one is cut short"));
+                return Err(Error::input(path, "the header has no `end_header`", "the file is truncated: use an undamaged copy"));
             };
             let line = String::from_utf8_lossy(&file[at..end]);
             let line = line.trim();

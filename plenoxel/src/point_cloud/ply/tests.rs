@@ -153,10 +153,10 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
     };
     let ascii = |rest: &str| format!("ply\nformat ascii 1.0\n{rest}");
     let xyz = "property float x\nproperty float y\nproperty float z\n";
-    refused("", &["no PLY file", "begins with ``"]);
-    refused("\u{89}PNG\r\n", &["no PLY file", "PNG"]);
+    refused("", &["not a PLY file", "it is empty"]);
+    refused("\u{89}PNG\r\n", &["not a PLY file", "PNG"]);
     refused("plyx\nend_header\n", &["line 1", "plyx"]);
-    refused("ply\nformat ascii 1.0\nelement vertex 3\n", &["no `end_header`", "cut short"]);
+    refused("ply\nformat ascii 1.0\nelement vertex 3\n", &["no `end_header`", "truncated"]);
     refused("ply\nelement vertex 0\nend_header\n", &["no line `format`"]);
     refused("ply\nformat binary 1.0\nend_header\n", &["line 2", "binary_little_endian"]);
     refused(&ascii("element vertex -3\nend_header\n"), &["line 3", "whole number"]);
@@ -167,12 +167,12 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
     refused(&ascii("element vertex 1\nvertices 3\nend_header\n"), &["line 4", "vertices 3"]);
     refused(&ascii("element face 0\nend_header\n"), &["no points", "[face]"]);
     refused(&ascii("element vertex 0\nproperty float x\nproperty list int int y\nend_header\n"), &["no property `y`", "[x, y]"]);
-    refused(&ascii(&format!("element vertex 2\n{xyz}end_header\n1 2 3\n4 5\n")), &["2 rows of `vertex`", "ends in row 1", "cut short"]);
+    refused(&ascii(&format!("element vertex 2\n{xyz}end_header\n1 2 3\n4 5\n")), &["2 rows of `vertex`", "ends in row 1", "truncated"]);
     for count in ["4000000000", "18446744073709551615", "5000000000"] {
         for format in ["ascii", "binary_little_endian"] {
             let text = format!("ply\nformat {format} 1.0\nelement vertex {count}\n{xyz}end_header\n1 2 3\n");
             let error = parse(text.as_bytes()).unwrap_err().to_string();
-            assert!(error.contains("cut short") || error.contains("at most 4294967295"), "{error}");
+            assert!(error.contains("truncated") || error.contains("at most 4294967295"), "{error}");
         }
     }
     // Lists that promise more than there is, and an element without properties, which takes no bytes.
@@ -180,9 +180,9 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
         &format!(
             "ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty list uint double w\n{xyz}end_header\n\u{7f}\u{7f}\u{7f}\u{7f}1234567890123456"
         ),
-        &["cut short"],
+        &["truncated"],
     );
-    refused(&ascii(&format!("element vertex 1\nproperty list int int w\n{xyz}end_header\n1e30 1 2 3 4\n")), &["cut short"]);
+    refused(&ascii(&format!("element vertex 1\nproperty list int int w\n{xyz}end_header\n1e30 1 2 3 4\n")), &["truncated"]);
     refused(&ascii(&format!("element vertex 1\nproperty list int int w\n{xyz}end_header\n-1 1 2 3 4\n")), &["list of -1 items"]);
     let nothing = ascii(&format!("element empty 4000000000\nelement vertex 1\n{xyz}end_header\n1 2 3\n"));
     assert_eq!(parse(nothing.as_bytes()).unwrap().positions().unwrap(), [DVec3::new(1.0, 2.0, 3.0)]);
