@@ -52,7 +52,7 @@ fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
         (2, true)
     );
     assert!(fs::exists(folder.path("run/report.html")).unwrap());
-    plenoxel(&["train", "--resume", &run]).refused(3, &["this run has ended"]);
+    plenoxel(&["train", "--resume", &run]).refused(3, &["this run is finished"]);
 
     // One that began with a grid left the coarser stage out.
     let finer = folder.path("finer");
@@ -411,7 +411,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
     refused(&["--downscale", "5"], &["downscale", "5", "24 x 24", "1, 2, 3, 4, 6, 8, 12, 24"]);
     refused(&["--set", "stages[1].resolution=1024", "--sh-degree", "3"], &["stages[1].resolution", "GB of memory", "fewer voxels"]);
     refused(&["--half-width", "-1"], &["half_width (--half-width)", "above 0"]);
-    refused(&["--set", "stages[0].rezolution=4"], &["--set stages[0].rezolution", "nearest known key is `resolution`"]);
+    refused(&["--set", "stages[0].rezolution=4"], &["--set stages[0].rezolution", "did you mean `resolution`?"]);
     refused(&["--set", "stages[4].resolution=4"], &["stages[0] to stages[1]"]);
     refused(&["--set", "losses.tv=1"], &["unknown key `tv`"]);
     refused(&["--set", "jitter=perhaps"], &["--set jitter", "boolean"]);
@@ -434,9 +434,9 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
         fs::write(&config, text).unwrap();
         train(&run, &["--config", &config])
     };
-    with_file("seed = 3\n[initial]\ndensitty = 1\n").refused(2, &["my.toml, line 3", "`densitty`", "nearest known key is `density`"]);
+    with_file("seed = 3\n[initial]\ndensitty = 1\n").refused(2, &["my.toml, line 3", "`densitty`", "did you mean `density`?"]);
     with_file("seed = 3\nhalf_width = 0\n").refused(2, &["half_width", "my.toml, line 2", "above 0"]);
-    with_file("seed = \n").refused(3, &["my.toml", "line 1", "not TOML"]);
+    with_file("seed = \n").refused(3, &["my.toml", "line 1", "not valid TOML"]);
     train(&run, &["--config", &folder.path("none.toml")]).refused(3, &["none.toml", "does not exist"]);
     train(&run, &["--config", &folder.path("")]).refused(3, &["this is a folder"]);
     // What a file leaves open the preset fills in, and a flag goes before both.
@@ -508,7 +508,7 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
 fn a_damaged_run_is_refused() {
     let folder = Folder::new("damaged");
     let run = folder.path("run");
-    plenoxel(&["evaluate", &run]).refused(3, &["there is no such run"]);
+    plenoxel(&["evaluate", &run]).refused(3, &["this run folder does not exist"]);
     plenoxel(&["info", &run]).refused(3, &["run"]);
     plenoxel(&["render", &folder.path("")]).refused(3, &["no run.json"]);
     assert_eq!(train(&run, &["--no-images", "--quiet"]).code, 0);
@@ -552,7 +552,7 @@ fn a_file_of_a_run_that_never_ends_is_refused_by_its_name() {
         fs::rename(&kept, &path).unwrap();
     }
     fs::remove_file(format!("{run}/run.json")).unwrap();
-    plenoxel(&["evaluate", &run]).refused(3, &["there is no run.json in this folder"]);
+    plenoxel(&["evaluate", &run]).refused(3, &["it has no run.json"]);
 }
 
 #[cfg(unix)]

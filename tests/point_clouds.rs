@@ -61,8 +61,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     let moved = folder.path("moved");
     fs::rename(&data, &moved).unwrap();
     fs::remove_file(&cloud).unwrap();
-    plenoxel(&["export", "ply", &run])
-        .refused(3, &[&data, "no longer exists", "--data DIR", "--min-weight 0 --min-object 0 --color mean"]);
+    plenoxel(&["export", "ply", &run]).refused(3, &[&data, "no longer exists", "--data DIR", "--min-weight 0 --min-object 0 --color mean"]);
     assert!(!Path::new(&cloud).exists(), "half an export");
     plenoxel(&["export", "ply", &run, "--min-weight", "0", "--min-object", "0", "--color", "mean"]).done();
     plenoxel(&["export", "ply", &run, "--data", &moved]).done();
@@ -71,7 +70,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "no such run"]);
     plenoxel(&["export", "ply", &run, "--data", &moved, "-o", &folder.path("no/where.ply")]).refused(5, &["no/where.ply"]);
     let none = ["export", "ply", &run, "--data", &moved, "--min-value", "1e9"];
-    plenoxel(&none).refused(2, &["leaves no point", "value 0", "a lower minimum"]);
+    plenoxel(&none).refused(2, &["no point is left", "value 0", "a lower minimum"]);
     for (flag, value, part) in [
         ("--color", "blue", "seen, mean, or a direction"),
         ("--color", "0,0,0", "direction"),
@@ -108,7 +107,11 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     text += "400 0 0 0 0.95 10\n3 0 1 2\n";
     fs::write(&cloud, &text).unwrap();
     let filtered = plenoxel(&["filter", &cloud, "--out", &clean, "--sor-neighbours", "3", "--sor-sigma", "1"]);
-    assert!(filtered.err.contains("left out: 1 rows of `face`") && filtered.err.contains("[height, time], 1 lists"), "{}", filtered.err);
+    assert!(
+        filtered.err.contains("left out 1 row of element `face`") && filtered.err.contains("scalar fields: height, time; 1 list"),
+        "{}",
+        filtered.err
+    );
     assert!(filtered.done().contains("wrote 10 points"));
     let lines: Vec<String> = fs::read_to_string(&clean).unwrap().lines().map(str::to_owned).collect();
     assert_eq!(lines[lines.len() - 2..], ["8.5 0 0 2 8 7 0.8 8", "9.5 0 0 2 9 7 0.9 9"]);

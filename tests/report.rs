@@ -138,12 +138,12 @@ fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     let page = fs::read_to_string(page).unwrap();
     check_alone(&page);
     // The seed is all that differs.
-    assert!(page.contains("1 that differ") && page.contains("<td>seed</td><td>1</td><td>2</td>"));
+    assert!(page.contains("1 setting differs") && page.contains("<td>seed</td><td>1</td><td>2</td>"));
     // Of two views the photograph, and the picture and the error of each run; loss, both kinds of PSNR and voxels over two axes.
     assert_eq!((page.matches("data:image/jpeg;base64,").count(), page.matches("<svg").count()), (10, 8));
-    plenoxel(&["compare", &folder.path("none")]).refused(3, &["there is no such run"]);
+    plenoxel(&["compare", &folder.path("none")]).refused(3, &["this run folder does not exist"]);
     fs::write(folder.path("second/result.json"), "figures").unwrap();
     plenoxel(&["compare", &first, &second]).refused(3, &["second", "no figures that can be read", "--resume"]);
     plenoxel(&["report", &second]).done();
-    assert!(fs::read_to_string(folder.path("second/report.html")).unwrap().contains("no figures that can be read"));
+    assert!(fs::read_to_string(folder.path("second/report.html")).unwrap().contains("no valid results"));
 }

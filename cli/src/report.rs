@@ -55,7 +55,8 @@ impl Report<'_> {
         let scripts = format!("<script>\n{}</script>\n{}", SCRIPT, scene.as_ref().map_or_else(String::new, scene::Scene::scripts));
         let page = html::page(&title, STYLE, &(parts.join("\n") + &scripts));
         self.folder.write_report(&page)?;
-        let note = scene.map_or_else(|| "it has no interactive viewer, because the model is not a voxel grid".to_owned(), |scene| scene.note());
+        let note =
+            scene.map_or_else(|| "it has no interactive viewer, because the model is not a voxel grid".to_owned(), |scene| scene.note());
         console.note(&format!("report.html has {}; {note}", bytes(page.len() as u64)));
         Ok(format!("report: {}", console.address(&self.folder.report())))
     }
@@ -100,9 +101,7 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
             report.config.background
         ),
         _ if result.is_null() => "There are no valid results: `plenoxel train --resume` computes them again.".to_owned(),
-        _ => {
-            "The run was not evaluated on test views. Run `plenoxel evaluate`, then `plenoxel report` to regenerate this page.".to_owned()
-        }
+        _ => "The run was not evaluated on test views. Run `plenoxel evaluate`, then `plenoxel report` to regenerate this page.".to_owned(),
     };
     format!(
         "<div class=\"facts\">{}</div>\n<p>{}, {}. {what}</p>",

@@ -95,7 +95,7 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
         child.wait().expect("it ends");
     }
     let output = plenoxel(&["--resume", &cut, "--no-images"]).output().expect("it runs");
-    assert!(output.status.success() && text(&output).contains("going on after step"), "{}", text(&output));
+    assert!(output.status.success() && text(&output).contains("resumed after step"), "{}", text(&output));
     let found = result(Path::new(&cut));
     assert!(found.0 == want.0, "another grid");
     assert_eq!(found.1.last(), want.1.last());
@@ -109,7 +109,7 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
 
     // It has ended, and a folder without a run has nothing to go on with; what a run was told when it began is not told again.
     for (arguments, code, reason) in [
-        (&["--resume", &cut][..], 3, "this run has ended"),
+        (&["--resume", &cut][..], 3, "this run is finished"),
         (&["--resume", &path("nowhere")], 3, "there is no such run"),
         (&["--resume", &cut, "--seed", "1"], 2, "cannot be used with"),
     ] {

@@ -94,7 +94,7 @@ fn an_interrupted_sweep_has_its_run_saved_and_goes_on_with_it() {
     assert!(root.join("sweeps/plan/procedural/long/training.safetensors").exists());
 
     let (code, out, err) = plenoxel(&root, &["sweep", "plan.toml"]);
-    assert!(code == Some(2) && err.contains("1/2 procedural long: going on\n"), "{err}");
+    assert!(code == Some(2) && err.contains("1/2 procedural long: resuming\n"), "{err}");
     assert!(out.contains("| procedural | **") && out.contains("| failed (2) |"), "{out}");
     fs::remove_dir_all(root).expect("it is removed");
 }
@@ -137,8 +137,8 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
         (modified("swept/few/coarse/result.json"), fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it"));
     fs::remove_file(root.join("swept/few/fine/result.json")).expect("it is removed");
     let (code, again, err) = sweep(&[]);
-    assert_eq!((code, err.matches("finished already: PSNR ").count()), (Some(2), 4), "{err}");
-    assert!(err.contains("2/7 few fine: going on") && err.contains("3/7 few odd: begins"), "{err}");
+    assert_eq!((code, err.matches("already finished: PSNR ").count()), (Some(2), 4), "{err}");
+    assert!(err.contains("2/7 few fine: resuming") && err.contains("3/7 few odd: starting"), "{err}");
     assert_eq!(modified("swept/few/coarse/result.json"), before);
     assert!(fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it") == grid);
     let psnr = |text: &str| text.lines().find_map(|line| line.strip_prefix("| few | ")?.split(" · ").next().map(str::to_owned));
@@ -158,6 +158,6 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     let (code, _, err) = sweep(&["--quiet"]);
     assert_eq!((code, err.as_str()), (Some(0), ""));
     let (code, _, err) = sweep(&[]);
-    assert_eq!((code, err.matches("finished already").count()), (Some(0), 6), "{err}");
+    assert_eq!((code, err.matches("already finished").count()), (Some(0), 6), "{err}");
     fs::remove_dir_all(root).expect("it is removed");
 }

@@ -120,7 +120,9 @@ fn remedy(refusal: &std::io::Error) -> &'static str {
         PermissionDenied => "change its permissions, or choose another path",
         ReadOnlyFilesystem => "choose a path on a writable file system",
         InvalidData | UnexpectedEof => "the file is damaged: use an undamaged copy",
-        AlreadyExists | NotADirectory | IsADirectory => "choose another path: there is a file in place of a folder, or a folder in place of a file",
+        AlreadyExists | NotADirectory | IsADirectory => {
+            "choose another path: there is a file in place of a folder, or a folder in place of a file"
+        }
         OutOfMemory => "use a smaller file, or a machine with more memory",
         StorageFull | QuotaExceeded | FileTooLarge => "free disk space, or choose another disk",
         InvalidFilename => "choose a shorter name, or one without special characters",

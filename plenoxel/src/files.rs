@@ -37,7 +37,9 @@ pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>)
 /// Errors: [`Error::Io`] if it cannot be created, for example because a file has that name.
 pub fn create_dir(path: &Path) -> Result<()> {
     fs::create_dir_all(path).map_err(|source| match path.ancestors().find(|path| path.is_symlink() && !path.exists()) {
-        Some(link) => Error::input(link, "this symbolic link is broken: its target does not exist", "remove the link, or choose another folder"),
+        Some(link) => {
+            Error::input(link, "this symbolic link is broken: its target does not exist", "remove the link, or choose another folder")
+        }
         None => Error::io(path, source, "creating the folder"),
     })
 }

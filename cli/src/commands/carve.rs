@@ -165,7 +165,9 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let count = console.count("carving, view", views.len());
     let progress = |progress| match progress {
         Progress::Views(done) => count.at(done, views.len()),
-        Progress::Round { round, carved, left } => console.note(&format!("photo hull, round {round}: carved {carved} voxels, {left} are left")),
+        Progress::Round { round, carved, left } => {
+            console.note(&format!("photo hull, round {round}: carved {carved} voxels, {left} are left"))
+        }
     };
     let carving = hull_clock.time(|| Carving::new(&views, &config.carve_options(), &progress))?;
     drop(count);

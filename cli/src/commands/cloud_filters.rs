@@ -154,9 +154,5 @@ pub fn check_not_empty(left: usize, report: &str) -> Result<()> {
     if left > 0 {
         return Ok(());
     }
-    Err(Error::usage(
-        "filters",
-        format!("no point is left ({report})"),
-        "use a larger box, a lower minimum, or a larger radius or sigma",
-    ))
+    Err(Error::usage("filters", format!("no point is left ({report})"), "use a larger box, a lower minimum, or a larger radius or sigma"))
 }

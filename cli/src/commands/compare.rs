@@ -114,7 +114,8 @@ fn settings(runs: &[Run]) -> String {
     }
     let heads: Vec<&str> = ["setting"].into_iter().chain(runs.iter().map(|run| run.name.as_str())).collect();
     let table = table(&heads, &rows);
-    format!("<section><h2>Settings</h2>\n<details open><summary>{} settings differ</summary>{table}</details></section>", rows.len())
+    let what = if rows.len() == 1 { "setting differs" } else { "settings differ" };
+    format!("<section><h2>Settings</h2>\n<details open><summary>{} {what}</summary>{table}</details></section>", rows.len())
 }
 
 /// Formats a table as HTML.

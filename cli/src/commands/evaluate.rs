@@ -110,9 +110,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     // A carved run and one trained with --no-evaluate have no test scores. An unfinished run has none either, but is not compared.
     if args.run.is_as_trained() && same_scene && trained.is_object() && !trained["psnr"].is_number() {
         folder.shared("RUN")?.write_evaluation(&evaluation)?;
-        console.note(
-            "the scores were written to evaluation.json in the run folder; `plenoxel compare` and `plenoxel report` show them",
-        );
+        console.note("the scores were written to evaluation.json in the run folder; `plenoxel compare` and `plenoxel report` show them");
     }
     Ok(())
 }

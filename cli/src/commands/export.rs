@@ -106,8 +106,7 @@ fn ending(path: &Path) -> Option<String> {
 }
 
 /// Help of `--min-alpha`.
-const MIN_ALPHA: &str =
-    "Minimum alpha of a voxel, 1 - exp(-density * side); voxels without density are never kept";
+const MIN_ALPHA: &str = "Minimum alpha of a voxel, 1 - exp(-density * side); voxels without density are never kept";
 
 /// Parses a minimum alpha, which is below 1.
 fn min_alpha(text: &str) -> std::result::Result<f64, String> {

@@ -54,15 +54,18 @@ pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
     let counted = |count: usize, what: &str| format!("{count} {what}{}", if count == 1 { "" } else { "s" });
     let mut facts = vec![counted(file.len(), "point")];
     facts.extend(Some(file.field_names().join(", ")).filter(|names| !names.is_empty()).map(|names| format!("scalar fields: {names}")));
-    facts.extend(Some(lists).filter(|lists| *lists > 0).map(|lists| counted(lists, "list property").replace("propertys", "properties")));
+    facts.extend(Some(lists).filter(|lists| *lists > 0).map(|lists| counted(lists, "list")));
     console.note(&format!("{}: {}", args.cloud.display(), facts.join("; ")));
     if filters.noise.is_some() {
-        let unit =
-            side.map_or("units of the file".to_owned(), |side| format!("units of the file, in which the side of a voxel is {side}"));
+        let unit = side.map_or("units of the file".to_owned(), |side| format!("units of the file, in which the side of a voxel is {side}"));
         console.note(&format!("noise radius: {} in {unit}", filters.noise.map_or(0.0, |noise| noise.radius)));
     }
     for element in file.others().filter(|element| element.count > 0) {
-        console.note(&format!("left out {} rows of `{}`, which may refer to points by index", element.count, element.name));
+        console.note(&format!(
+            "left out {} of element `{}`, which may refer to points by index",
+            counted(element.count, "row"),
+            element.name
+        ));
     }
     let field = args.filters.value_field(&file.field_names())?;
     let values = field.as_deref().map(|name| file.values(name)).transpose()?;

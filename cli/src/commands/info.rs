@@ -202,7 +202,10 @@ fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
         let fov = k.fov_x().to_degrees();
         lines.push((
             "cameras",
-            format!("focal length {:.2} pixels (horizontal field of view {fov:.1}°), distance from the origin {nearest:.3} to {farthest:.3}", k.fx),
+            format!(
+                "focal length {:.2} pixels (horizontal field of view {fov:.1}°), distance from the origin {nearest:.3} to {farthest:.3}",
+                k.fx
+            ),
         ));
     }
     lines

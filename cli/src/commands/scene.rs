@@ -97,7 +97,11 @@ pub fn run(args: &SceneArgs, console: &Console<'_>) -> Result<()> {
     }
     let occupied = std::fs::read_dir(&args.dir).is_ok_and(|mut entries| entries.next().is_some());
     if occupied && !args.force {
-        return Err(Error::usage("DIR", format!("{} is not empty", args.dir.display()), "choose a new folder, or write into it with --force"));
+        return Err(Error::usage(
+            "DIR",
+            format!("{} is not empty", args.dir.display()),
+            "choose a new folder, or write into it with --force",
+        ));
     }
     let estimate = Estimate::of_images(&dataset);
     console.note(&estimate.describe());

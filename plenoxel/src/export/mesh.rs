@@ -87,9 +87,11 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
     let largest = largest.into_iter().fold(0.0, f64::max);
     if !(level > 0.0 && level < largest) {
         return Err(match largest > 0.0 {
-            true => {
-                Error::config("level", format!("{level:.4}"), format!("a number above 0 and below {largest:.4}, the largest density of this grid"))
-            }
+            true => Error::config(
+                "level",
+                format!("{level:.4}"),
+                format!("a number above 0 and below {largest:.4}, the largest density of this grid"),
+            ),
             false => Error::usage("level", "this grid is empty, so it has no surface", "train it longer"),
         });
     }

@@ -52,7 +52,11 @@ struct Speed {
 /// Errors: the run starts from another run; the time is too short for the stages; those of [`Trainer::step`].
 pub fn on_time(config: Config, views: &Arc<[View]>, seconds: f64) -> Result<Config> {
     if config.init_from.is_some() {
-        return Err(Error::usage("--time", "a run that starts from another run cannot be planned by time", "leave out --time or --init-from"));
+        return Err(Error::usage(
+            "--time",
+            "a run that starts from another run cannot be planned by time",
+            "leave out --time or --init-from",
+        ));
     }
     let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();

@@ -242,8 +242,7 @@ impl RunFolder {
         let best = RunFolder { grid: BEST, ..self };
         if !files::is_there(&best.checkpoint()) {
             let found = format!("this run folder has no {BEST}");
-            let remedy =
-                "leave out --best: the last grid was the best, there was no earlier checkpoint, or there are no validation views";
+            let remedy = "leave out --best: the last grid was the best, there was no earlier checkpoint, or there are no validation views";
             return Err(Error::input(&best.path, found, remedy));
         }
         Ok(best)
@@ -467,8 +466,7 @@ impl RunFolder {
 
     fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
         let path = self.path.join(name);
-        let text =
-            serde_json::to_string_pretty(value).map_err(|e| Error::input(&path, e.to_string(), "this is a bug in the program"))?;
+        let text = serde_json::to_string_pretty(value).map_err(|e| Error::input(&path, e.to_string(), "this is a bug in the program"))?;
         files::write_atomically(&path, (text + "\n").as_bytes())
     }
 }

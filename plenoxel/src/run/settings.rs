@@ -33,7 +33,8 @@ impl Layers {
     /// A stack with the defaults only.
     pub fn defaults() -> Result<Self> {
         let mut layers = Layers::default();
-        let text = toml::to_string(&Config::default()).map_err(|e| Error::usage("the defaults", e.to_string(), "this is a bug in the program"))?;
+        let text =
+            toml::to_string(&Config::default()).map_err(|e| Error::usage("the defaults", e.to_string(), "this is a bug in the program"))?;
         layers.text(&text, &|_| "the defaults".to_owned())?;
         Ok(layers)
     }
@@ -47,7 +48,9 @@ impl Layers {
 
     /// Adds a TOML text on top. `place(path)` names the place of a key in messages.
     fn text(&mut self, text: &str, place: &dyn Fn(&str) -> String) -> Result<()> {
-        let layer: Table = text.parse().map_err(|e: toml::de::Error| Error::usage(place(""), format!("invalid TOML: {}", e.message()), "fix the syntax"))?;
+        let layer: Table = text
+            .parse()
+            .map_err(|e: toml::de::Error| Error::usage(place(""), format!("invalid TOML: {}", e.message()), "fix the syntax"))?;
         keys::check_table(&layer, place)?;
         leaves("", &Value::Table(layer.clone()), &mut |path, _| {
             self.places.push((path.to_owned(), place(path)));

@@ -242,7 +242,11 @@ impl<'s> NewRun<'s> {
         if let (Some(from), Some(to)) = (&config.init_from, &settings.out)
             && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
         {
-            return Err(Error::usage("--init-from", format!("{} is also the folder of --out", from.display()), "choose another folder for --out"));
+            return Err(Error::usage(
+                "--init-from",
+                format!("{} is also the folder of --out", from.display()),
+                "choose another folder for --out",
+            ));
         }
         let mut clocks = Clocks::default();
         let dataset = clocks.load.time(|| settings.data.open(&config))?;

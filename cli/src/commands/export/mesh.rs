@@ -84,7 +84,11 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
     let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes, console)?;
     console.wrote(
         &file,
-        &format!("wrote {vertices} vertices and {triangles} triangles with an enclosed volume of {:.4} to {}", surface.volume(), file.display()),
+        &format!(
+            "wrote {vertices} vertices and {triangles} triangles with an enclosed volume of {:.4} to {}",
+            surface.volume(),
+            file.display()
+        ),
     )
 }
 

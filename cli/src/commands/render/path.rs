@@ -103,7 +103,11 @@ fn views(run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Optio
 
 fn read(path: &Path) -> Result<CameraPath> {
     if !files::is_there(path) {
-        return Err(Error::usage("--path", format!("the file {} does not exist", path.display()), "expected orbit, spiral, or a JSON file of cameras"));
+        return Err(Error::usage(
+            "--path",
+            format!("the file {} does not exist", path.display()),
+            "expected orbit, spiral, or a JSON file of cameras",
+        ));
     }
     CameraPath::parse(path, &files::read_named(path, files::CAMERA_PATH)?)
 }
@@ -141,5 +145,8 @@ fn frame_size(text: &str) -> std::result::Result<(usize, usize), String> {
 }
 
 fn rate(text: &str) -> std::result::Result<f64, String> {
-    text.parse().ok().filter(|fps| (0.1..=1000.0).contains(fps)).ok_or_else(|| "expected a number of frames per second from 0.1 to 1000".to_owned())
+    text.parse()
+        .ok()
+        .filter(|fps| (0.1..=1000.0).contains(fps))
+        .ok_or_else(|| "expected a number of frames per second from 0.1 to 1000".to_owned())
 }

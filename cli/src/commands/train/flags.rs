@@ -258,7 +258,9 @@ fn duration(text: &str) -> std::result::Result<f64, String> {
         _ => None,
     };
     let seconds = unit.and_then(|unit| Some(number.parse::<f64>().ok()? * unit));
-    seconds.filter(|s| *s > 0.0 && *s <= 1e6).ok_or_else(|| "expected a duration above 0 and up to 1e6 seconds, such as 90s, 5m or 1h".to_owned())
+    seconds
+        .filter(|s| *s > 0.0 && *s <= 1e6)
+        .ok_or_else(|| "expected a duration above 0 and up to 1e6 seconds, such as 90s, 5m or 1h".to_owned())
 }
 
 /// Parses a duration, or `off` to infinity.

@@ -102,7 +102,9 @@ impl<'c, 'a> Screen<'c, 'a> {
                 (self.progress, self.interrupt) = (None, None);
                 if let Some(folder) = &self.folder {
                     let again = format!("plenoxel train --resume {}", folder.path().display());
-                    interrupt::on_exit(format!("interrupted; the trained model is saved; write its final figures and report with: {again}"));
+                    interrupt::on_exit(format!(
+                        "interrupted; the trained model is saved; write its final figures and report with: {again}"
+                    ));
                 }
             }
             Event::Evaluating { done, total } => {

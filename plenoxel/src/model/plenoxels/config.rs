@@ -499,7 +499,12 @@ impl Config {
             }
         }
         for (name, weight) in &self.losses {
-            demand(LOSSES.contains(&name.as_str()), &format!("losses.{name}"), "unknown loss", &format!("expected one of {}", LOSSES.join(", ")))?;
+            demand(
+                LOSSES.contains(&name.as_str()),
+                &format!("losses.{name}"),
+                "unknown loss",
+                &format!("expected one of {}", LOSSES.join(", ")),
+            )?;
             let key = |part: &str| format!("losses.{name}{part}");
             let fits = |part: &str, weight: f64| check((0.0..=1e12).contains(&weight), &key(part), weight, "0 to 1e12");
             let changes = |part: &str, weight: f64| check((1e-30..=1e12).contains(&weight), &key(part), weight, "1e-30 to 1e12");

@@ -65,7 +65,11 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
     };
     let length = table.get(name).and_then(Value::as_array).map_or(0, Vec::len);
     let none = |found: String| match length {
-        0 => Error::usage(place, format!("{found} has an index, but `{name}` is not a list with entries"), format!("set `{name}` without an index")),
+        0 => Error::usage(
+            place,
+            format!("{found} has an index, but `{name}` is not a list with entries"),
+            format!("set `{name}` without an index"),
+        ),
         n => Error::usage(place, format!("{found} is out of range"), format!("expected {name}[0] to {name}[{}], or {name}[*]", n - 1)),
     };
     let index = index.trim_end_matches(']');
@@ -85,7 +89,11 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
             (Some(rest), Value::Table(inner), value) => set(inner, rest, value, place)?,
             (None, entry, Some(value)) => *entry = value.clone(),
             _ => {
-                return Err(Error::usage(place, format!("`{path}` has no such key, or no value"), format!("set a key of a table, or a value for {name}[{index}]")));
+                return Err(Error::usage(
+                    place,
+                    format!("`{path}` has no such key, or no value"),
+                    format!("set a key of a table, or a value for {name}[{index}]"),
+                ));
             }
         }
     }

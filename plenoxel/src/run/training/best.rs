@@ -38,7 +38,9 @@ impl<'a> BestModel<'a> {
                 on(Event::note(format!("{found}: {shown}")));
             }
             (Some(best), None) => {
-                on(Event::note(format!("the validation PSNR of the last model was not measured; the best checkpoint has {best:.2} dB: {shown}")));
+                on(Event::note(format!(
+                    "the validation PSNR of the last model was not measured; the best checkpoint has {best:.2} dB: {shown}"
+                )));
             }
             _ => {
                 if let Err(e) = self.folder.remove_best() {

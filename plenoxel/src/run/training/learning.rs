@@ -151,10 +151,9 @@ impl Job<'_> {
         let model = trainer.into_model();
         if let Err(e) = folder.save(&model, &about) {
             let kept = match rescued(folder.path(), &model, &about) {
-                Some(place) => format!(
-                    "the trained model was saved as {}; move it to checkpoint.safetensors in the run folder",
-                    place.display()
-                ),
+                Some(place) => {
+                    format!("the trained model was saved as {}; move it to checkpoint.safetensors in the run folder", place.display())
+                }
                 None => "the trained model was not saved".to_owned(),
             };
             let again = match folder.existing_state() {
