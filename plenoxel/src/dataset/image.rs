@@ -236,8 +236,8 @@ mod tests {
     fn a_reduction_that_does_not_divide_lists_those_that_do() {
         let error = check_downscale(3, (8, 12)).unwrap_err();
         assert_eq!(error.exit_code(), 2);
-        assert!(error.to_string().contains("does not divide the 8 x 12 images"), "{error}");
-        assert!(error.to_string().ends_with("accepted: 1, 2, 4"), "{error}");
+        assert!(error.to_string().contains("does not divide the image size 8 x 12"), "{error}");
+        assert!(error.to_string().ends_with("expected 1, 2, 4"), "{error}");
         assert!(check_downscale(0, (8, 12)).is_err() && check_downscale(4, (8, 12)).is_ok());
         // What a damaged file says of the built-in scene was tried divisor by divisor.
         assert!(check_downscale(7, (usize::MAX, usize::MAX - 1)).is_err());
