@@ -67,7 +67,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     plenoxel(&["export", "ply", &run, "--data", &moved]).done();
     assert_eq!(points(&cloud), file.len());
 
-    plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "no such run"]);
+    plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "this run folder does not exist"]);
     plenoxel(&["export", "ply", &run, "--data", &moved, "-o", &folder.path("no/where.ply")]).refused(5, &["no/where.ply"]);
     let none = ["export", "ply", &run, "--data", &moved, "--min-value", "1e9"];
     plenoxel(&none).refused(2, &["no point is left", "value 0", "a lower minimum"]);
@@ -126,11 +126,11 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     refused(&["--max-value", "0.5"], 2, &["error: --max-value", "several scalar fields", "height, time"]);
     refused(&["--min-value", "0.5", "--value-field", "depth"], 2, &["--value-field", "depth", "height, time"]);
     refused(&["--noise-radius", "2", "--units", "voxel"], 2, &["--units", "voxel_side", "world"]);
-    refused(&["--sor-neighbours", "11"], 2, &["error: --sor-neighbours: 11 cannot", "fewer than the 11 points"]);
+    refused(&["--sor-neighbours", "11"], 2, &["error: --sor-neighbours: invalid value 11", "fewer than the 11 points"]);
     plenoxel(&["filter", &cloud, "-o", &clean, "--min-value", "0.5", "--value-field", "scalar_time", "--max-value", "6"]).done();
     assert_eq!(points(&clean), 6);
     let noise = plenoxel(&["filter", &cloud, "-o", &clean, "--noise-radius", "2.5", "--remove-isolated"]);
-    assert!(noise.err.contains("the units of the file"), "{}", noise.err);
+    assert!(noise.err.contains("units of the file"), "{}", noise.err);
     // Of the neighbours in a row three lie on a line, and four have a plane through it.
     assert_eq!((noise.code, points(&clean)), (0, 6));
 

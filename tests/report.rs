@@ -83,7 +83,7 @@ fn a_carved_run_has_a_page_too() {
     plenoxel(&["carve", "--resolution", "16", "--downscale", "8", "--out", &run]).done();
     let page = fs::read_to_string(folder.path("run/report.html")).unwrap();
     check_alone(&page);
-    assert!(page.contains("carving the hull") && page.contains("<h2>Carved</h2>") && !page.contains("<h2>Curves</h2>"));
+    assert!(page.contains("carving the hull") && page.contains("<h2>Carved grid</h2>") && !page.contains("<h2>Curves</h2>"));
     assert_eq!(settings_of(&page)["grid"]["interpolation"], "nearest");
 }
 
@@ -114,7 +114,7 @@ fn an_evaluated_carved_run_has_figures_in_the_comparison_and_the_report() {
     assert_ne!(row(&carved)[6], "–", "the time is that of carving");
     plenoxel(&["report", &carved]).done();
     let page = fs::read_to_string(folder.path("carved/report.html")).unwrap();
-    assert!(page.contains(&format!("<b>{psnr:.2} dB</b>")) && page.contains("figures of all 2 test views"));
+    assert!(page.contains(&format!("<b>{psnr:.2} dB</b>")) && page.contains("scores of all 2 test views"));
 
     // A trained run has its figures, and keeps them.
     plenoxel(&["evaluate", &trained]).json();

@@ -172,7 +172,7 @@ fn a_run_that_was_killed_before_its_page_gets_it_when_it_is_resumed() {
     let resumed = folder.run(&["train", "--resume", "run"]);
     assert!(code(&resumed) == 0 && page.exists(), "{}", err(&resumed));
     let ended = folder.run(&["train", "--resume", "run"]);
-    assert!(code(&ended) == 3 && err(&ended).contains("ended"), "{}", err(&ended));
+    assert!(code(&ended) == 3 && err(&ended).contains("is finished"), "{}", err(&ended));
 }
 
 #[test]

@@ -110,7 +110,7 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
     // It has ended, and a folder without a run has nothing to go on with; what a run was told when it began is not told again.
     for (arguments, code, reason) in [
         (&["--resume", &cut][..], 3, "this run is finished"),
-        (&["--resume", &path("nowhere")], 3, "there is no such run"),
+        (&["--resume", &path("nowhere")], 3, "this run folder does not exist"),
         (&["--resume", &cut, "--seed", "1"], 2, "cannot be used with"),
     ] {
         let output = plenoxel(arguments).output().expect("it runs");
@@ -153,7 +153,7 @@ fn a_run_whose_folder_is_moved_and_replaced_keeps_its_model_and_touches_nothing(
     let output = child.wait_with_output().expect("it ends");
     let said = text(&output);
     assert_eq!(output.status.code(), Some(5), "{said}");
-    assert!(said.contains("moved, deleted or replaced") && said.contains("the trained model is saved elsewhere"), "{said}");
+    assert!(said.contains("moved, deleted or replaced") && said.contains("the trained model was saved as"), "{said}");
     assert_eq!(fs::read_dir(&run).expect("a folder").count(), 0);
     let kept: Vec<_> = fs::read_dir(&root).expect("a folder").flatten().filter(|file| file.path().is_file()).collect();
     assert!(kept.len() == 1 && kept[0].file_name().to_string_lossy().ends_with(".safetensors"), "{kept:?}");

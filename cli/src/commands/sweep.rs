@@ -242,10 +242,10 @@ fn describe(job: &Job, state: &State, console: &Console<'_>) -> Result<()> {
     let what = match (state, job.cell()) {
         (State::Finished, _) => format!("finished: {}", said(job)),
         (State::Different(how), _) => format!("blocked by a run with other settings: {how}"),
-        (State::Unevaluated, _) => "to be evaluated".to_owned(),
-        (State::Interrupted, _) => "to be resumed".to_owned(),
-        (_, Cell::Failed(failure)) => format!("to be retried, failed with exit code {}: {}", failure.code, failure.error),
-        (State::New | State::CutShort, _) => "to be run".to_owned(),
+        (State::Unevaluated, _) => "to evaluate".to_owned(),
+        (State::Interrupted, _) => "to resume".to_owned(),
+        (_, Cell::Failed(failure)) => format!("to retry, failed with exit code {}: {}", failure.code, failure.error),
+        (State::New | State::CutShort, _) => "to run".to_owned(),
     };
     console.result(&format!("{} {}: {what}", job.scene, job.method))?;
     let arguments = job.command_line(state);

@@ -147,7 +147,7 @@ impl RunFolder {
         if self.lock.as_ref().is_none_or(|lock| lock.is_of(&self.path, LOCK)) {
             return Ok(());
         }
-        let found = "this folder, or run.lock in it, was moved, deleted or replaced during the run";
+        let found = "this folder, or run.lock in it, was moved, deleted or replaced";
         Err(Error::io(&self.path, std::io::Error::new(std::io::ErrorKind::NotFound, found), "writing the run"))
     }
 

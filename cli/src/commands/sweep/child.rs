@@ -24,7 +24,7 @@ pub struct Program {
     pub lock: FolderLock,
 }
 
-/// How a process ended.
+/// Result of a child process.
 pub struct Ended {
     /// Exit code; 128 plus the number of the signal if a signal ended the process, as in shells.
     pub code: u8,
