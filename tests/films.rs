@@ -180,7 +180,7 @@ fn cameras_of_other_programs_are_recognised_and_damaged_ones_refused() {
     for (flag, value, accepted) in [
         ("--frames", "0", "1 to 100000"),
         ("--frames", "100001", "1 to 100000"),
-        ("--size", "99999", "up to 16384"),
+        ("--size", "99999", "at most 16384"),
         ("--size", "0", "320x240"),
         ("--fps", "0", "0.1 to 1000"),
         ("--channels", "heat", "normal"),
