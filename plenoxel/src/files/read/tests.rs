@@ -36,7 +36,7 @@ fn a_file_is_read_up_to_the_size_of_its_kind() {
     let path = folder.write("a", &[7; 100]);
     assert_eq!((read(&path, SMALL).unwrap(), read_named(&path, SMALL).unwrap()), (vec![7; 100], vec![7; 100]));
     let path = folder.write("b", &[7; 101]);
-    refused(open(&path, SMALL), 3, "larger than the 0 kB that a small file may have; a small file is expected");
+    refused(open(&path, SMALL), 3, "too large: a small file may have at most 0 kB; expected a small file");
     refused(read(&path, SMALL), 3, "too large");
     refused(read_named(&path, SMALL), 3, "too large");
     let greedy = Kind { memory: u64::MAX / 101, most: 101, ..SMALL };
