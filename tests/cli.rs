@@ -414,7 +414,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
     refused(&["--set", "stages[0].rezolution=4"], &["--set stages[0].rezolution", "did you mean `resolution`?"]);
     refused(&["--set", "stages[4].resolution=4"], &["stages[0] to stages[1]"]);
     refused(&["--set", "losses.tv=1"], &["unknown key `tv`"]);
-    refused(&["--set", "jitter=perhaps"], &["--set jitter", "boolean"]);
+    refused(&["--set", "jitter=perhaps"], &["--set jitter", "true or false"]);
     refused(&["--threads", "0"], &["--threads", "1 to 1024"]);
     refused(&["--threads", "5000"], &["--threads"]);
     refused(&["--sh-degree", "4"], &["--sh-degree", "from 0 to 3"]);

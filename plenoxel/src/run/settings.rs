@@ -197,27 +197,37 @@ fn refusal(key: String, complaint: &str) -> Error {
         return Error::usage(key, "invalid value", "expected a number, { weight = …, until = step } or { from = …, to = …, steps = … }");
     }
     if let Some(missing) = complaint.strip_prefix("missing field ") {
-        return Error::usage(key, format!("the key {missing} is missing"), "set it: it has no default");
+        return Error::usage(key, format!("the key {missing} is missing"), "set it, because it has no default");
     }
     let Some((found, accepted)) = complaint.split_once(", expected ") else {
         return Error::usage(key, complaint, "correct the value");
     };
     let found = ["invalid type: ", "invalid value: "].iter().fold(found, |found, start| found.trim_start_matches(start));
-    let found = if found == "unit variant" { "of another type" } else { found };
-    let accepted = match accepted {
+    // The words of serde for its own types.
+    let expected = match accepted {
         "f64" | "f32" => "a number",
         "u64" | "usize" => "a whole number of at least 0",
-        "a boolean" => "a boolean: true or false",
+        "a boolean" => "true or false",
         "a sequence" => "a list",
-        "string only" => "a string",
-        "path string" => "a path",
+        "string only" | "a string" => "a string",
+        "path string" => "a path in quotes",
+        "an array of length 3" => "a list of three numbers",
+        "internally tagged enum OptimizerConfig" => "a table such as { kind = \"sgd\" }",
         table if table.starts_with("struct ") || table == "a map" => "a table",
         other => other,
     };
-    match found.split_once(" `") {
-        // serde names the kinds of values and variants that it does not know.
-        Some(("unknown variant", name)) => Error::usage(key, format!("unknown value `{name}"), format!("expected {accepted}")),
-        _ => Error::config(key, found, accepted),
+    let value = ["string ", "integer ", "floating point ", "boolean "].iter().find_map(|kind| found.strip_prefix(kind));
+    match (found, value) {
+        (_, Some(value)) => Error::config(key, value.trim_matches('`'), expected),
+        ("map", _) => Error::config(key, "of type table", expected),
+        ("sequence", _) => Error::config(key, "of type list", expected),
+        ("unit variant" | "newtype variant" | "struct variant" | "tuple variant", _) => {
+            Error::usage(key, "invalid type", format!("expected {expected}"))
+        }
+        _ => match found.strip_prefix("unknown variant ") {
+            Some(name) => Error::usage(key, format!("unknown value {name}"), format!("expected {expected}")),
+            None => Error::config(key, found, expected),
+        },
     }
 }
 

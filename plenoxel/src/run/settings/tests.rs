@@ -135,14 +135,14 @@ fn a_refused_value_names_the_place_where_it_was_written() {
     let message = refusal(&["stages[*].density_rate=-1"]);
     assert!(message.starts_with("stages[0].density_rate (--set stages[*].density_rate): invalid value -1"), "{message}");
     let message = refusal(&["half_width=wide"]);
-    assert!(message.starts_with("--set half_width") && message.contains("invalid value string \"wide\"; expected a number"), "{message}");
+    assert!(message.starts_with("--set half_width") && message.contains("invalid value \"wide\"; expected a number"), "{message}");
     let message = refusal(&["evaluation={samples=5}"]);
     assert!(message.starts_with("--set evaluation") && message.contains("far ="), "{message}");
     let message = refusal(&["losses.mse=often"]);
     assert!(message.contains("a number, { weight = ") && message.contains("{ from = "), "{message}");
     // An entry of a list is named by its number.
     let message = refusal(&["stages[2].color_rate=fast", "stages[3].color_rate=0.1"]);
-    assert!(message.starts_with("--set stages[2].color_rate: invalid value string \"fast\"; expected a number"), "{message}");
+    assert!(message.starts_with("--set stages[2].color_rate: invalid value \"fast\"; expected a number"), "{message}");
     let message = refusal(&["optimizer.kind=momentum"]);
     assert!(message.contains("the key `decay` is missing") && message.contains("--set optimizer.kind"), "{message}");
     assert!(refusal(&["stages"]).contains("key=value"));
