@@ -1,19 +1,19 @@
-//! Loss, PSNR, resolution and rates of a run, or of several, over steps and over seconds.
+//! Curves of loss, PSNR, resolution and learning rates of one or several runs, over steps and over seconds.
 
 use crate::chart::{Chart, Curve, DECIBELS};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::metrics::Line;
 use std::collections::BTreeSet;
 
-/// Points of a curve that are told apart.
+/// Maximum number of points per curve.
 const POINTS: usize = 500;
 
-/// What curves are drawn over: its name, what it says below the axis, and where a line of the metrics is on it.
+/// A horizontal axis: its name, its label, and the position of a line of the metrics.
 type Axis = (&'static str, &'static str, fn(&Line<'_>) -> f64);
 const AXES: [Axis; 2] =
     [("steps", "training step", |line| line.step as f64 + 1.0), ("seconds", "seconds of training", |line| line.seconds)];
 
-/// The curves of a run, or nothing if there was no training.
+/// The curves of a run; empty without training.
 pub fn section(lines: &[Line<'_>], config: &Config) -> String {
     let Some(last) = lines.last().filter(|_| !config.stages.is_empty()) else { return String::new() };
     over_both(|_, (_, across, at)| {
@@ -90,7 +90,7 @@ fn over_both(charts: impl Fn(usize, Axis) -> Vec<Chart>) -> String {
     page + "</section>"
 }
 
-/// A number of a line, where it has it.
+/// A function from a line to a value, if the line has it.
 type Value<'a> = Box<dyn Fn(&Line<'_>) -> Option<f64> + 'a>;
 
 /// Title, vertical axis and curves of a chart.
@@ -99,18 +99,18 @@ type Shown<'a> = (&'static str, &'static str, Vec<(String, Value<'a>)>);
 fn charts<'a>(lines: &[Line<'_>], config: &'a Config) -> Vec<Shown<'a>> {
     let whole: Vec<(String, Value<'a>)> = vec![("loss".to_owned(), Box::new(|line| Some(line.loss)))];
     let names: BTreeSet<String> = lines.iter().flat_map(|line| line.losses.keys().map(|name| name.to_string())).collect();
-    // As it counts in the sum. A loss that the settings do not know was added by a program, with a weight that is not known.
+    // Weighted, as in the sum. A loss that is not in the settings was added by a program, with an unknown weight.
     let each = names.into_iter().map(|name| {
         let (key, weight) = (name.clone(), config.losses.get(&name));
-        let shown = if weight.is_some() { name } else { format!("{name}, without its weight") };
+        let shown = if weight.is_some() { name } else { format!("{name} (unweighted)") };
         let counted = move |line: &Line<'_>| Some(line.losses.get(key.as_str())? * weight.map_or(1.0, |weight| weight.at(line.step)));
         (shown, Box::new(counted) as Value<'a>)
     });
-    // One loss is the whole.
+    // A single loss is equal to the sum.
     let each: Vec<_> = each.collect();
     let losses = if each.len() > 1 { whole.into_iter().chain(each).collect() } else { whole };
     vec![
-        ("Loss, and its parts with their weights", "loss", losses),
+        ("Loss and its weighted parts", "loss", losses),
         (
             "PSNR",
             DECIBELS,
@@ -123,7 +123,7 @@ fn charts<'a>(lines: &[Line<'_>], config: &'a Config) -> Vec<Shown<'a>> {
             "Size of the grid",
             "number",
             vec![
-                ("voxels a side".to_owned(), Box::new(|line| line.resolution.map(|n| n as f64))),
+                ("voxels per side".to_owned(), Box::new(|line| line.resolution.map(|n| n as f64))),
                 ("voxels".to_owned(), Box::new(|line| line.figure("voxels").filter(|n| *n > 0.0))),
             ],
         ),
@@ -142,7 +142,7 @@ fn rates(lines: &[Line<'_>]) -> Vec<(String, Value<'static>)> {
     parameters.into_iter().map(curve).collect()
 }
 
-/// A curve with a break between stages.
+/// A curve with breaks between stages.
 fn curve(name: &str, lines: &[Line<'_>], at: fn(&Line<'_>) -> f64, value: &dyn Fn(&Line<'_>) -> Option<f64>) -> Curve {
     let each = lines.len().div_ceil(POINTS).max(1);
     let mean = |values: &mut dyn Iterator<Item = f64>| {
@@ -157,7 +157,7 @@ fn curve(name: &str, lines: &[Line<'_>], at: fn(&Line<'_>) -> f64, value: &dyn F
     Curve { name: name.to_owned(), lines: stages.filter(|points| !points.is_empty()).collect(), band: Vec::new() }
 }
 
-/// Where stages begin.
+/// The start of each stage, with its label.
 fn parts(lines: &[Line<'_>], at: fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
     let mut begin = 0.0;
     let parts = lines.chunk_by(|a, b| a.stage == b.stage).map(|stage| {
@@ -192,7 +192,7 @@ mod tests {
         let both = |a, b| vec![Some(a), Some(b)];
         assert_eq!(
             shown,
-            [("loss", both(0.6, 0.6)), ("mine, without its weight", both(2.0, 2.0)), ("mse", both(0.5, 0.5)), ("sparsity", both(0.1, 0.0)),]
+            [("loss", both(0.6, 0.6)), ("mine (unweighted)", both(2.0, 2.0)), ("mse", both(0.5, 0.5)), ("sparsity", both(0.1, 0.0)),]
         );
     }
 }

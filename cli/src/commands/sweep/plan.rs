@@ -110,9 +110,9 @@ impl Plan {
         for (index, published) in self.published.iter().enumerate() {
             let mut named = [&published.psnr, &published.ssim, &published.seconds].into_iter().flat_map(|figures| figures.keys());
             if !named.any(|scene| self.scenes.contains(scene)) {
-                let found = format!("`{}` has no figure of a scene of this sweep", published.name);
-                let accepted = format!("such as psnr = {{ {} = 30.0 }}", self.scenes.join(" = 30.0, "));
-                return Err(Error::config(place(&format!("published[{index}]")), found, accepted));
+                let found = format!("`{}` has no results for the scenes of this sweep", published.name);
+                let remedy = format!("add some, such as psnr = {{ {} = 30.0 }}", self.scenes.join(" = 30.0, "));
+                return Err(Error::usage(place(&format!("published[{index}]")), found, remedy));
             }
         }
         Ok(())
@@ -131,7 +131,7 @@ fn folder_of(table: &Table) -> Option<&str> {
 /// Entries under the names they give themselves, or `default` does; they become folders.
 fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default: impl Fn(&Table) -> String) -> Result<Vec<Entry>> {
     if tables.is_empty() {
-        return Err(Error::config(place(list), format!("no {list}"), format!("at least one entry [[{list}]]")));
+        return Err(Error::usage(place(list), format!("there are no {list}"), format!("add at least one entry [[{list}]]")));
     }
     let plain = |c: char| c.is_alphanumeric() || matches!(c, '-' | '_');
     let (mut entries, mut taken) = (Vec::new(), BTreeSet::new());
@@ -144,14 +144,14 @@ fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default
         };
         if name.is_empty() || name.len() > LONGEST_NAME || !name.chars().all(plain) {
             let place = place(&format!("{path}.name"));
-            let accepted = format!("a name of at most {LONGEST_NAME} letters, digits, - and _, for it becomes a folder");
-            return Err(Error::config(place, format!("the name `{name}`"), accepted));
+            let accepted = format!("a name of at most {LONGEST_NAME} letters, digits, - and _, because it becomes a folder name");
+            return Err(Error::usage(place, format!("invalid name `{name}`"), format!("expected {accepted}")));
         }
         if !taken.insert(name.clone()) {
-            return Err(Error::config(
+            return Err(Error::usage(
                 place(&path),
-                format!("the name `{name}` occurs twice"),
-                "a name of its own: name = \"…\" in the file",
+                format!("the name `{name}` is used twice"),
+                "give each entry a different name: name = \"…\" in the file",
             ));
         }
         entries.push(Entry { name, path, table });
@@ -224,10 +224,7 @@ fn asked(call: &Call, place: &str) -> Result<Asked> {
         Ok(_) => Err(Error::config("command", call.command, COMMANDS.join(" or "))),
         Err(answer) => return Err(flags::refusal(&answer, call.command, place)),
     };
-    asked.map_err(|e| match e {
-        Error::Config { key, found, accepted } => Error::config(format!("{place}: {key}"), found, accepted),
-        other => other,
-    })
+    asked.map_err(|e| e.with_key(|key| format!("{place}: {key}")))
 }
 
 #[cfg(test)]

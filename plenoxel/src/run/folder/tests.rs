@@ -38,7 +38,7 @@ fn an_occupied_folder_is_refused_unless_forced_and_other_files_survive() {
     // What cannot be removed is found out before anything is.
     std::fs::create_dir(path.join(RESULT)).unwrap();
     let refused = NewFolder::choose(Some(&path), "x", true).unwrap_err();
-    assert!(refused.to_string().contains("in which result.json is a folder") && path.join(CHECKPOINT).exists(), "{refused}");
+    assert!(refused.to_string().contains("its result.json is a folder") && path.join(CHECKPOINT).exists(), "{refused}");
     std::fs::remove_dir(path.join(RESULT)).unwrap();
     let folder = RunFolder::at(&path);
     assert!(folder.owns(&path.join(CHECKPOINT)) && folder.owns(&path.join("images/old.png")));

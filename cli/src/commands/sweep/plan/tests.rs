@@ -67,9 +67,9 @@ fn every_scene_meets_every_method_unless_it_chooses() {
 fn mistakes_are_named_with_their_place_and_what_would_do() {
     let good = "[[scenes]]\n[[methods]]\npreset = \"fast\"\n";
     for (name, text, code, parts) in [
-        ("toml", "scenes = = 1", 3, &["line 1 is not TOML"][..]),
-        ("top", &format!("scnes = 1\n{good}"), 2, &["line 1: the unknown key `scnes`", "nearest known key is `scenes`"]),
-        ("none", "scenes = []\nmethods = []", 2, &["no scenes", "[[scenes]]"]),
+        ("toml", "scenes = = 1", 3, &["line 1 is not valid TOML"][..]),
+        ("top", &format!("scnes = 1\n{good}"), 2, &["line 1: unknown key `scnes`", "did you mean `scenes`?"]),
+        ("none", "scenes = []\nmethods = []", 2, &["there are no scenes", "[[scenes]]"]),
         ("lists", "scenes = 3\nmethods = []", 3, &["line 1", "expected a sequence"]),
         ("scene", "[[scenes]]\ndownscal = 4\n[[methods]]\n", 2, &["line 2", "unknown key `downscal`", "`downscale`"]),
         ("method", &format!("{good}prezet = \"fast\""), 2, &["line 4", "unknown key `prezet`", "`preset`"]),
@@ -81,15 +81,15 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
             &["line 2, `procedural` with `fats`", "`fats` for --preset", "fast, quality"],
         ),
         ("value", &format!("{good}downscale = \"half\""), 2, &["`half` for --downscale", "a whole number from 1 to 64"]),
-        ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: the unknown key", "`half_width`"]),
+        ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: unknown key", "`half_width`"]),
         ("range", &format!("{good}set = [\"half_width=-1\"]"), 2, &["`procedural` with `fast`: --set half_width: invalid value -1"]),
-        ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "as the flag takes it"]),
+        ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "expected a value of the flag"]),
         ("flag", "[[scenes]]\nscene_size = 32\n[[methods]]\ncommand = \"carve\"", 2, &["line 2", "which is of `carve`", "`scene_size`"]),
-        ("both", "[[scenes]]\ndata = \"a\"\nscene_size = 32\n[[methods]]", 2, &["--scene-size <SIZE> together with [DATA]"]),
+        ("both", "[[scenes]]\ndata = \"a\"\nscene_size = 32\n[[methods]]", 2, &["--scene-size <SIZE> conflicts with [DATA]"]),
         ("data", "[[scenes]]\ndata = 3\n[[methods]]", 2, &["line 2", "invalid value 3", "a folder in quotes"]),
         ("command", "[[scenes]]\n[[methods]]\ncommand = \"render\"", 2, &["line 3", "\"train\" or \"carve\""]),
         ("names", "[[scenes]]\nname = \"a/b\"\n[[methods]]", 2, &["line 2", "`a/b`", "letters, digits"]),
-        ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "`procedural`, which comes twice"]),
+        ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "the name `procedural` is used twice"]),
         ("chosen", "[[scenes]]\nmethods = [\"fat\"]\n[[methods]]\npreset = \"fast\"", 2, &["line 2", "unknown method `fat`", "`fast`"]),
         (
             "published",
@@ -130,13 +130,13 @@ fn flags_alone_make_the_same_plan() {
     assert_eq!((&plan.jobs[1].call.data, &plan.jobs[2].call.data), (&Some("data/lego".into()), &None));
     assert!(plan.jobs.iter().all(|job| job.asked.config.seed == 3));
     let twice = Plan::from_flags(&strings(&["a/lego", "b/lego"]), &strings(&["fast"]), &[], Path::new("o")).unwrap_err();
-    assert!(twice.to_string().starts_with("--scene: `lego`, which comes twice"), "{twice}");
+    assert!(twice.to_string().starts_with("--scene: the name `lego` is used twice"), "{twice}");
 }
 
 #[test]
 fn the_example_of_the_help_is_a_plan() {
-    let example = super::super::EXAMPLES.lines().skip_while(|line| *line != "relative to the file:").skip(1);
-    let text: Vec<&str> = example.take_while(|line| !line.starts_with("Runs are")).collect();
+    let example = super::super::EXAMPLES.lines().skip_while(|line| *line != "relative to the file. Example:").skip(1);
+    let text: Vec<&str> = example.take_while(|line| !line.starts_with("Run folders are")).collect();
     let plan = read("example", &text.join("\n")).unwrap();
     assert_eq!(plan.methods, ["fast", "paper-tv", "hull"]);
     assert_eq!(plan.jobs.len(), 4);
