@@ -346,7 +346,7 @@ fn broken_images_are_found_on_opening_and_named() {
     // The last 12 bytes only say that the file ends; without them every pixel is still there.
     for length in [20, 40, png.len() - 13] {
         fs::write(&path, &png[..length]).unwrap();
-        folder.refused(3, &["r_1.png", "cut short"]);
+        folder.refused(3, &["r_1.png", "truncated"]);
     }
     fs::write(&path, b"\xff\xd8\xff\xe0 JFIF and so on, long enough").unwrap();
     folder.refused(3, &["r_1.png", "JPEG", "PNG"]);

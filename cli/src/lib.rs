@@ -78,11 +78,11 @@ enum Command {
 #[derive(Debug, Args)]
 struct Machine {
     /// Number of threads; results do not depend on it [default: all cores]
-    #[arg(long, global = true, value_name = "N", help_heading = "Machine", value_parser = commands::whole::<usize>(1, machine::MOST_THREADS as u64))]
+    #[arg(long, global = true, value_name = "N", help_heading = "Machine", value_parser = commands::whole::<usize>(1, machine::MOST_THREADS as u64), allow_negative_numbers = true)]
     threads: Option<usize>,
 
     /// Memory limit, such as 8GB or 500MiB; a command that needs more is refused before it starts [default: the free memory]
-    #[arg(long, global = true, value_name = "SIZE", help_heading = "Machine", value_parser = commands::memory_size)]
+    #[arg(long, global = true, value_name = "SIZE", help_heading = "Machine", value_parser = commands::memory_size, allow_hyphen_values = true)]
     max_memory: Option<u64>,
 
     /// Print errors and results only
@@ -171,7 +171,7 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::{Command, CommandFactory};
+    use clap::{Command, CommandFactory, ValueHint};
     use plenoxel::model::plenoxels::config::Config;
     use plenoxel::run::settings::{CARVE, PRESETS};
 
@@ -201,6 +201,20 @@ mod tests {
             for argument in command.get_arguments() {
                 let text = argument.get_help().unwrap_or_default().to_string();
                 assert!(text.len() > 5 && !text.ends_with('.'), "{name}: {argument}: {text}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_negative_number_is_a_value_that_the_flag_itself_refuses() {
+        const TEXTS: [&str; 6] = ["KEY=VALUE", "DATA", "NAME", "FORMAT", "FORMATS", "orbit|spiral|FILE"];
+        for command in all() {
+            for flag in
+                command.get_opts().filter(|flag| flag.get_value_hint() == ValueHint::Unknown && flag.get_possible_values().is_empty())
+            {
+                let name = flag.get_value_names().unwrap_or_default().concat();
+                let takes = flag.is_allow_negative_numbers_set() || flag.is_allow_hyphen_values_set() || flag.is_require_equals_set();
+                assert!(takes || TEXTS.contains(&name.as_str()), "{}: {flag}", command.get_name());
             }
         }
     }

@@ -39,7 +39,7 @@ impl Report<'_> {
     pub fn write(&self, console: &Console<'_>) -> Result<String> {
         let result = self.folder.figures()?.unwrap_or(Value::Null);
         let metrics = metrics::read(&self.folder.metrics())?;
-        let lines: Vec<_> = metrics::lines(&metrics).map(|(_, line)| line).collect();
+        let lines = curves::lines(self.folder, &metrics, console);
         let scene = scene::Scene::of(self)?;
         let title = format!("{} – {}", self.folder.path().file_name().unwrap_or_default().to_string_lossy(), self.record.scene);
         let parts = [

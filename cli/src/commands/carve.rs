@@ -69,23 +69,23 @@ pub struct CarveArgs {
     set: Vec<String>,
 
     /// Downscale the images by this factor, which must divide their width and height [default: 1]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION))]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION), allow_negative_numbers = true)]
     downscale: Option<i64>,
 
     /// Background color: white, black, or three numbers r,g,b in [0, 1] [default: white]
-    #[arg(long, help_heading = "Scene", value_parser = super::background)]
+    #[arg(long, help_heading = "Scene", value_parser = super::background, allow_hyphen_values = true)]
     background: Option<[f64; 3]>,
 
     /// Half the side of the cube that contains the scene, in units of the dataset [default: 1.5]
-    #[arg(long, value_name = "LENGTH", help_heading = "Scene", allow_negative_numbers = true)]
+    #[arg(long, value_name = "LENGTH", help_heading = "Scene", value_parser = super::number(f64::NEG_INFINITY), allow_negative_numbers = true)]
     half_width: Option<f64>,
 
     /// Voxels per side of the box [default: 256]
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(2, 1024))]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(2, 1024), allow_negative_numbers = true)]
     resolution: Option<i64>,
 
     /// Degree of spherical harmonics for view-dependent color, 0 to 3 [default: one constant color per voxel]
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3), allow_negative_numbers = true)]
     sh_degree: Option<i64>,
 
     /// Carving rule: footprint removes a voxel if some view shows all of it on background; rays removes it if the ray of some background

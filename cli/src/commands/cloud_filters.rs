@@ -33,15 +33,15 @@ pub struct CloudFilters {
 
     /// Noise filter: radius for the neighbors of a point. Points too far from the plane of their neighbors are removed. Distances between voxels are
     /// 1, 1.41, 1.73, 2 ... voxel sides; choose a radius between these
-    #[arg(long, value_name = "R", value_parser = number(f64::MIN_POSITIVE))]
+    #[arg(long, value_name = "R", value_parser = number(f64::MIN_POSITIVE), allow_negative_numbers = true)]
     noise_radius: Option<f64>,
 
     /// Noise filter: maximum distance from the plane, as a length
-    #[arg(long, value_name = "D", value_parser = number(0.0), requires = "noise_radius", conflicts_with = "noise_relative")]
+    #[arg(long, value_name = "D", value_parser = number(0.0), requires = "noise_radius", conflicts_with = "noise_relative", allow_negative_numbers = true)]
     noise_error: Option<f64>,
 
     /// Noise filter: maximum distance from the plane, in standard deviations of the neighbors' distances [default: 1]
-    #[arg(long, value_name = "N", value_parser = number(0.0), requires = "noise_radius")]
+    #[arg(long, value_name = "N", value_parser = number(0.0), requires = "noise_radius", allow_negative_numbers = true)]
     noise_relative: Option<f64>,
 
     /// Noise filter: also remove points with fewer than three neighbors
@@ -50,7 +50,7 @@ pub struct CloudFilters {
 
     /// Statistical outlier removal (SOR): number of nearest points for the mean distance, including the point itself
     /// [default: 6 with --sor-sigma]
-    #[arg(long, value_name = "K", value_parser = whole::<usize>(2, 1000))]
+    #[arg(long, value_name = "K", value_parser = whole::<usize>(2, 1000), allow_negative_numbers = true)]
     sor_neighbours: Option<usize>,
 
     /// Statistical outlier removal: maximum mean distance of a point, in standard deviations above the mean over all points
@@ -139,14 +139,19 @@ impl CloudFilters {
 fn bounds(text: &str) -> std::result::Result<Aabb, String> {
     let [a, b, c, d, e, f] = numbers::<6>(text)?;
     let (min, max) = (DVec3::new(a, b, c), DVec3::new(d, e, f));
-    let accepted = "expected XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX with no minimum above its maximum";
-    if min.cmple(max).all() { Ok(Aabb { min, max }) } else { Err(accepted.to_owned()) }
+    let expected = "expected XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX with no minimum above its maximum";
+    if min.cmple(max).all() { Ok(Aabb { min, max }) } else { Err(expected.to_owned()) }
+}
+
+/// Formats a number of points.
+pub fn points(count: usize) -> String {
+    format!("{count} point{}", if count == 1 { "" } else { "s" })
 }
 
 /// Summarizes the filters: the numbers of points before, and after each filter, such as "5000 points, value 4000, sor 3900".
 pub fn describe(before: usize, report: &[Kept]) -> String {
     let steps: String = report.iter().map(|kept| format!(", {} {}", kept.filter, kept.after)).collect();
-    format!("{before} points{steps}")
+    format!("{}{steps}", points(before))
 }
 
 /// Checks that some points are left.

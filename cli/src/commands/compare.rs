@@ -52,13 +52,13 @@ struct Run {
 }
 
 impl Run {
-    fn read(path: &Path) -> Result<Self> {
+    fn read(path: &Path, console: &Console<'_>) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
         let figures = Figures::of(&folder, &config)?.unwrap_or_default();
         let name = path.display().to_string();
-        // Of one run at a time: its curves are a small part of it.
+        // The metrics of one run at a time: the curves take much less memory.
         let metrics = metrics::read(&folder.metrics())?;
-        let curves = RunCurves::of(&name, &metrics::lines(&metrics).map(|(_, line)| line).collect::<Vec<_>>());
+        let curves = RunCurves::of(&name, &curves::lines(&folder, &metrics, console));
         Ok(Run { name, folder, config, record, figures, curves })
     }
 
@@ -84,7 +84,7 @@ impl Run {
 
 /// Compares runs.
 pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
-    let runs: Vec<Run> = args.runs.iter().map(|path| Run::read(path)).collect::<Result<_>>()?;
+    let runs: Vec<Run> = args.runs.iter().map(|path| Run::read(path, console)).collect::<Result<_>>()?;
     super::check_replaceable(&args.out, &runs.iter().map(|run| &run.folder).collect::<Vec<_>>(), None)?;
     let facts: Vec<_> = runs.iter().map(Run::facts).collect();
     let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();

@@ -1,7 +1,7 @@
 //! `plenoxel filter`: CloudCompare's filters for any point cloud.
 
 use super::as_flag;
-use super::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
+use super::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe, points};
 use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::error::{Error, Result};
@@ -58,7 +58,9 @@ pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
     let lists = file.element().properties.iter().filter(|p| matches!(p.kind, Kind::List(..))).count();
     let counted = |count: usize, what: &str| format!("{count} {what}{}", if count == 1 { "" } else { "s" });
     let mut facts = vec![counted(file.len(), "point")];
-    facts.extend(Some(file.field_names().join(", ")).filter(|names| !names.is_empty()).map(|names| format!("scalar fields: {}", brief(&names))));
+    facts.extend(
+        Some(file.field_names().join(", ")).filter(|names| !names.is_empty()).map(|names| format!("scalar fields: {}", brief(&names))),
+    );
     facts.extend(Some(lists).filter(|lists| *lists > 0).map(|lists| counted(lists, "list")));
     console.note(&format!("{}: {}", args.cloud.display(), facts.join("; ")));
     if filters.noise.is_some() {
@@ -79,5 +81,5 @@ pub fn run(args: &FilterArgs, console: &Console<'_>) -> Result<()> {
     let report = describe(file.len(), &report);
     check_not_empty(left.len(), &report)?;
     console.write_file(&args.out, &file.chosen(&left, &format!("filtered by {}: {report}", crate::PROGRAM)))?;
-    console.wrote(&args.out, &format!("wrote {} points to {} ({report})", left.len(), args.out.display()))
+    console.wrote(&args.out, &format!("wrote {} to {} ({report})", points(left.len()), args.out.display()))
 }

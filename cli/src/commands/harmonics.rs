@@ -27,11 +27,11 @@ scale. z points up, x to the lower left and y to the right. Order and signs are 
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct HarmonicsArgs {
     /// Draw all functions up to this degree, 0 to 3
-    #[arg(long, value_name = "N", default_value_t = sh::MAX_DEGREE, value_parser = whole::<usize>(0, sh::MAX_DEGREE as u64))]
+    #[arg(long, value_name = "N", default_value_t = sh::MAX_DEGREE, value_parser = whole::<usize>(0, sh::MAX_DEGREE as u64), allow_negative_numbers = true)]
     degree: usize,
 
     /// Width and height of the cell of a function in pixels, 16 to 1024
-    #[arg(long, value_name = "N", default_value_t = 200, value_parser = whole::<usize>(16, 1024))]
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = whole::<usize>(16, 1024), allow_negative_numbers = true)]
     size: usize,
 
     /// Picture to write, replacing what is there; - for stdout

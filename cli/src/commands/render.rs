@@ -43,7 +43,7 @@ pub struct RenderArgs {
     run: TrainedRun,
 
     /// Render only this view, given by index from 0 or by name; may be repeated
-    #[arg(long, value_name = "N|NAME", help_heading = "Scene", conflicts_with = "path")]
+    #[arg(long, value_name = "N|NAME", help_heading = "Scene", conflicts_with = "path", allow_negative_numbers = true)]
     view: Vec<String>,
 
     #[command(flatten)]

@@ -42,32 +42,32 @@ pub struct SceneArgs {
     size: Option<(usize, usize)>,
 
     /// Image width in pixels
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().width, value_parser = whole::<usize>(1, MOST_PIXELS))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().width, value_parser = whole::<usize>(1, MOST_PIXELS), allow_negative_numbers = true)]
     width: usize,
 
     /// Image height in pixels
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().height, value_parser = whole::<usize>(1, MOST_PIXELS))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().height, value_parser = whole::<usize>(1, MOST_PIXELS), allow_negative_numbers = true)]
     height: usize,
 
     /// Number of training views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().train, value_parser = whole::<usize>(1, MOST_VIEWS))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().train, value_parser = whole::<usize>(1, MOST_VIEWS), allow_negative_numbers = true)]
     train: usize,
 
     /// Number of validation views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().val, value_parser = whole::<usize>(0, MOST_VIEWS))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().val, value_parser = whole::<usize>(0, MOST_VIEWS), allow_negative_numbers = true)]
     val: usize,
 
     /// Number of test views
-    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test, value_parser = whole::<usize>(0, MOST_VIEWS))]
+    #[arg(long, value_name = "N", help_heading = "Scene", default_value_t = ProceduralOptions::default().test, value_parser = whole::<usize>(0, MOST_VIEWS), allow_negative_numbers = true)]
     test: usize,
 
     /// Spread S of random exposures of the training views, 0 to 2. The sRGB values of a view are multiplied by exp(S z) for its brightness, and each
     /// channel by about exp(S/2 z) for its white balance, with standard normal z. Validation and test views are not changed [default: 0]
-    #[arg(long, value_name = "S", help_heading = "Scene", value_parser = spread)]
+    #[arg(long, value_name = "S", help_heading = "Scene", value_parser = spread, allow_negative_numbers = true)]
     exposure_spread: Option<f64>,
 
     /// Seed of the random exposures
-    #[arg(long, value_name = "SEED", help_heading = "Scene", default_value_t = 42, requires = "exposure_spread")]
+    #[arg(long, value_name = "SEED", help_heading = "Scene", default_value_t = 42, requires = "exposure_spread", value_parser = whole::<u64>(0, u64::MAX), allow_negative_numbers = true)]
     seed: u64,
 
     /// Write into a folder that is not empty

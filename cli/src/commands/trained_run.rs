@@ -34,11 +34,11 @@ pub struct TrainedRun {
     pub split: Split,
 
     /// Downscale the images by this factor [default: that of the training]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::whole::<usize>(1, super::MOST_REDUCTION))]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::whole::<usize>(1, super::MOST_REDUCTION), allow_negative_numbers = true)]
     pub downscale: Option<usize>,
 
     /// Number of samples on the longest ray through the box (preset paper: on every ray) [default: the `evaluation` setting of the run]
-    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = super::whole::<u32>(2, 100_000))]
+    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = super::whole::<u32>(2, 100_000), allow_negative_numbers = true)]
     pub samples: Option<u32>,
 }
 

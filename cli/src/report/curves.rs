@@ -1,8 +1,10 @@
 //! Curves of loss, PSNR, resolution and learning rates of one or several runs, over steps and over seconds.
 
 use crate::chart::{Chart, Curve, DECIBELS};
+use crate::progress::Console;
 use plenoxel::model::plenoxels::config::Config;
-use plenoxel::run::metrics::Line;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::metrics::{self, Line};
 use std::collections::BTreeSet;
 
 /// Maximum number of points per curve.
@@ -12,6 +14,16 @@ const POINTS: usize = 500;
 type Axis = (&'static str, &'static str, fn(&Line<'_>) -> f64);
 const AXES: [Axis; 2] =
     [("steps", "training step", |line| line.step as f64 + 1.0), ("seconds", "seconds of training", |line| line.seconds)];
+
+/// Parses the metrics of a run. Warns of unreadable lines.
+pub fn lines<'t>(folder: &RunFolder, metrics: &'t str, console: &Console<'_>) -> Vec<Line<'t>> {
+    let (lines, unreadable) = metrics::of_steps(metrics);
+    if unreadable > 0 {
+        let (path, s) = (folder.metrics(), if unreadable == 1 { "" } else { "s" });
+        console.note(&format!("warning: {}: {unreadable} unreadable line{s} left out of the curves", path.display()));
+    }
+    lines
+}
 
 /// The curves of a run; empty without training.
 pub fn section(lines: &[Line<'_>], config: &Config) -> String {
@@ -40,23 +52,23 @@ const OF_EACH: [OfEach; 4] = [
     ("Voxels", "number", |line| line.figure("voxels").filter(|n| *n > 0.0)),
 ];
 
-/// The curves of one run among several, without the lines that they were drawn from.
+/// The curves of one run among several, without the lines of the metrics.
 #[derive(Debug)]
 pub struct RunCurves {
-    /// By axis: how far the run goes, and its curves.
+    /// For each axis: the end of the run, and its curves.
     over: [(f64, [Curve; OF_EACH.len()]); AXES.len()],
     is_empty: bool,
 }
 
 impl RunCurves {
-    /// The curves of a run with a name.
+    /// Computes the curves of a run with this name.
     pub fn of(name: &str, lines: &[Line<'_>]) -> Self {
         let over = AXES.map(|(_, _, at)| (lines.last().map_or(0.0, at), OF_EACH.map(|(_, _, value)| curve(name, lines, at, &value))));
         RunCurves { over, is_empty: lines.is_empty() }
     }
 }
 
-/// The curves of several runs in the same charts, or nothing if none of them was trained.
+/// The curves of several runs in the same charts; empty if none of them was trained.
 pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> String {
     if runs.clone().all(|run| run.is_empty) {
         return String::new();
@@ -64,7 +76,7 @@ pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> St
     over_both(|axis, (_, across, _)| {
         let end = runs.clone().map(|run| run.over[axis].0).fold(0.0, f64::max);
         let charts = OF_EACH.into_iter().enumerate().filter_map(|(number, (title, up, _))| {
-            // A run without such figures keeps its color for the other charts.
+            // A run without these values keeps its color in the other charts.
             let curves: Vec<Curve> = runs.clone().map(|run| run.over[axis].1[number].clone()).collect();
             let known = curves.iter().any(|curve| !curve.lines.is_empty());
             let chart =
@@ -75,7 +87,7 @@ pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> St
     })
 }
 
-/// A section with charts over steps, and the same over seconds, of which the reader sees one.
+/// A section with charts over steps and over seconds; the reader selects one.
 fn over_both(charts: impl Fn(usize, Axis) -> Vec<Chart>) -> String {
     let mut page = String::from("<section><h2>Curves</h2>\n");
     for (i, (name, ..)) in AXES.iter().enumerate() {
@@ -172,7 +184,6 @@ fn parts(lines: &[Line<'_>], at: fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
 mod tests {
     use super::*;
     use plenoxel::model::plenoxels::config::Weight;
-    use plenoxel::run::metrics;
 
     #[test]
     fn parts_of_the_loss_are_shown_as_they_count_in_it() {
@@ -185,7 +196,7 @@ mod tests {
             )
         };
         let text = [4, 5].map(line).join("\n");
-        let lines: Vec<Line<'_>> = metrics::lines(&text).map(|(_, line)| line).collect();
+        let (lines, _) = metrics::of_steps(&text);
         let (_, _, values) = charts(&lines, &config).swap_remove(0);
         let shown: Vec<(&str, Vec<Option<f64>>)> =
             values.iter().map(|(name, value)| (name.as_str(), lines.iter().map(&**value).collect())).collect();

@@ -7,6 +7,7 @@ use crate::files;
 use crate::json;
 use crate::memory;
 use crate::train::{PlannedStage, Report};
+use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -190,15 +191,15 @@ struct Sums {
 
 /// Reads the text of a metrics file; it is empty if the file does not exist.
 ///
-/// Errors: the file cannot be read, is not a regular file, or is too large; there is not enough memory for its [`lines`].
+/// Errors: the file cannot be read, is not a regular file, or is too large; there is not enough memory for its lines.
 pub fn read(path: &Path) -> Result<String> {
     if !files::is_there(path) {
         return Ok(String::new());
     }
     let bytes = files::read(path, files::METRICS)?;
-    let what = format!("to read {} of metrics", memory::bytes(bytes.len() as u64));
+    let what = format!("reading {} of metrics", memory::bytes(bytes.len() as u64));
     memory::check(path, &what, parsed_bytes(&bytes))?;
-    // What is no text is copied, and may be three times as long then.
+    // Text that is not UTF-8 is copied, and may become three times as long.
     String::from_utf8(bytes).or_else(|damaged| {
         let bytes = damaged.as_bytes();
         memory::check(path, &what, 4 * bytes.len() as u64 + parsed_bytes(bytes))?;
@@ -206,16 +207,16 @@ pub fn read(path: &Path) -> Result<String> {
     })
 }
 
-/// About the most memory that a text and all of its [`lines`] take.
+/// Upper estimate of the memory of a text and its parsed lines, in bytes.
 fn parsed_bytes(text: &[u8]) -> u64 {
-    /// A line in a list that grows, and both of its maps with up to 11 entries.
+    /// A line in a growing list, and both of its maps with up to 11 entries.
     const LINE: u64 = 2 * size_of::<Line<'_>>() as u64 + 850;
-    /// The fewest keys of a line; the names of some others, and a place in a map for each beyond these.
+    /// Required keys of a line. The names of the next FEW keys take NAME each; further keys take a place in a map too.
     const OWN: u64 = 9;
     const FEW: u64 = 20;
     const NAME: u64 = 40;
     const ENTRY: u64 = 130;
-    /// An entry while its line is read.
+    /// An entry while its line is parsed.
     const READING: u64 = 260;
     let (mut kept, mut longest) = (text.len() as u64, 0);
     for line in text.split(|byte| *byte == b'\n') {
@@ -227,6 +228,24 @@ fn parsed_bytes(text: &[u8]) -> u64 {
         kept += LINE + NAME * entries.saturating_sub(OWN).min(FEW) + ENTRY * entries.saturating_sub(OWN + FEW);
     }
     kept + READING * longest
+}
+
+/// Parses the lines of training steps. Returns them with the number of unreadable lines, such as a truncated line.
+pub fn of_steps(text: &str) -> (Vec<Line<'_>>, usize) {
+    /// Any other line, such as the final figures.
+    #[derive(Deserialize)]
+    struct Other {
+        #[serde(default)]
+        step: Option<IgnoredAny>,
+    }
+    let mut unreadable = 0;
+    let line = |text| {
+        let line = serde_json::from_str(text).ok();
+        let is_other = || serde_json::from_str::<Other>(text).is_ok_and(|other| other.step.is_none());
+        unreadable += usize::from(line.is_none() && !is_other());
+        line
+    };
+    (text.lines().filter_map(line).collect(), unreadable)
 }
 
 /// Parses the lines of training steps; returns each with its text. Truncated lines and other lines are skipped.
@@ -363,6 +382,14 @@ mod tests {
         format!(
             r#"{{"step":7,"stage":0,"resolution":16,"ends_stage":false,"loss":0.25,"losses":{{{losses}}},"psnr":12.5,"rays":9,"samples":99,{figures}"seconds":1.5}}"#
         )
+    }
+
+    #[test]
+    fn a_truncated_or_damaged_line_is_counted_and_other_lines_are_not() {
+        let good = line(r#""mse":0.2"#, "");
+        let text = format!("{good}\n{{\"step\":8,\n{{\"step\":\"8\"}}\n7\n{{\"final\":{{\"psnr\":1}}}}\n{good}\n{}", &good[..20]);
+        let (lines, unreadable) = of_steps(&text);
+        assert_eq!((lines.len(), unreadable), (2, 4));
     }
 
     #[test]

@@ -85,8 +85,8 @@ impl Layers {
             text => Some(match format!("value = {text}").parse::<Table>() {
                 Ok(mut table) => table.remove("value").unwrap_or_else(|| Value::String(text.to_owned())),
                 Err(_) if is_whole_number(text) => {
-                    let accepted = format!("a whole number from {} to {}", i64::MIN, i64::MAX);
-                    return Err(Error::config(format!("--set {path}"), text, accepted));
+                    let expected = format!("a whole number from {} to {}", i64::MIN, i64::MAX);
+                    return Err(Error::config(format!("--set {path}"), text, expected));
                 }
                 Err(_) => Value::String(text.to_owned()),
             }),
@@ -104,9 +104,12 @@ impl Layers {
             Some(place) => format!("{key} ({place})"),
             None => key.to_owned(),
         };
-        let config: Config = serde_path_to_error::deserialize(Value::Table(self.table)).map_err(|e| {
-            let key = e.path().to_string();
-            refusal(placed(&key), e.inner().message())
+        let config: Config = serde_path_to_error::deserialize(Value::Table(self.table.clone())).map_err(|e| {
+            let (path, complaint) = (e.path().to_string(), e.inner().message());
+            // A table in place of a name such as "auto" is reported at the key inside it.
+            let key =
+                path.rsplit_once('.').filter(|_| complaint.starts_with("expected table, found")).map_or(&path[..], |(outer, _)| outer);
+            refusal(placed(key), value_at(&self.table, key), complaint)
         })?;
         config.validate().map_err(|e| e.with_key(placed))?;
         Ok(config)
@@ -188,46 +191,42 @@ fn place_of<'a>(places: &'a [(String, String)], key: &str) -> Option<&'a str> {
     last.map(|(_, place)| place.as_str())
 }
 
-/// The error for the setting `key`, from the message of a failed conversion.
-fn refusal(key: String, complaint: &str) -> Error {
-    if complaint.contains("enum Sampling") {
-        return Error::usage(key, "invalid value", "expected { step = voxel sides } or { samples = points, far = largest t }");
-    }
-    if complaint.contains("enum Weight") {
-        return Error::usage(key, "invalid value", "expected a number, { weight = …, until = step } or { from = …, to = …, steps = … }");
-    }
+/// The value at a path such as `stages[0].sampling`.
+fn value_at<'v>(table: &'v Table, path: &str) -> Option<&'v Value> {
+    let mut segments = path.split(['.', '[']).map(|segment| segment.trim_end_matches(']'));
+    let first = table.get(segments.next()?)?;
+    segments.try_fold(first, |value, segment| match value {
+        Value::Array(entries) => entries.get(segment.parse::<usize>().ok()?),
+        value => value.get(segment),
+    })
+}
+
+/// The error for the setting `key` with a value, from the message of a failed conversion.
+fn refusal(key: String, value: Option<&Value>, complaint: &str) -> Error {
     if let Some(missing) = complaint.strip_prefix("missing field ") {
         return Error::usage(key, format!("the key {missing} is missing"), "set it, because it has no default");
     }
-    let Some((found, accepted)) = complaint.split_once(", expected ") else {
-        return Error::usage(key, complaint, "correct the value");
+    let expected = match complaint.split_once(", expected ").map_or(complaint, |(_, expected)| expected) {
+        sampling if sampling.contains("enum Sampling") => "{ step = voxel sides } or { samples = points, far = largest t }".to_owned(),
+        weight if weight.contains("enum Weight") => "a number, { weight = …, until = step } or { from = …, to = …, steps = … }".to_owned(),
+        // The words of serde for its own types, and of the parser for a table in place of a name.
+        "f64" | "f32" => "a number".to_owned(),
+        "u64" | "usize" => "a whole number of at least 0".to_owned(),
+        "a boolean" => "true or false".to_owned(),
+        "a sequence" => "a list".to_owned(),
+        "path string" => "a path in quotes".to_owned(),
+        "an array of length 3" => "a list of three numbers".to_owned(),
+        "internally tagged enum OptimizerConfig" => "a table such as { kind = \"sgd\" }".to_owned(),
+        "string only" | "variant identifier" => "a string".to_owned(),
+        table if table.starts_with("struct ") || table == "a map" => "a table".to_owned(),
+        text if text == complaint => "a string".to_owned(),
+        other => other.replace('`', ""),
     };
-    let found = ["invalid type: ", "invalid value: "].iter().fold(found, |found, start| found.trim_start_matches(start));
-    // The words of serde for its own types.
-    let expected = match accepted {
-        "f64" | "f32" => "a number",
-        "u64" | "usize" => "a whole number of at least 0",
-        "a boolean" => "true or false",
-        "a sequence" => "a list",
-        "string only" | "a string" => "a string",
-        "path string" => "a path in quotes",
-        "an array of length 3" => "a list of three numbers",
-        "internally tagged enum OptimizerConfig" => "a table such as { kind = \"sgd\" }",
-        table if table.starts_with("struct ") || table == "a map" => "a table",
-        other => other,
-    };
-    let value = ["string ", "integer ", "floating point ", "boolean "].iter().find_map(|kind| found.strip_prefix(kind));
-    match (found, value) {
-        (_, Some(value)) => Error::config(key, value.trim_matches('`'), expected),
-        ("map", _) => Error::config(key, "of type table", expected),
-        ("sequence", _) => Error::config(key, "of type list", expected),
-        ("unit variant" | "newtype variant" | "struct variant" | "tuple variant", _) => {
-            Error::usage(key, "invalid type", format!("expected {expected}"))
-        }
-        _ => match found.strip_prefix("unknown variant ") {
-            Some(name) => Error::usage(key, format!("unknown value {name}"), format!("expected {expected}")),
-            None => Error::config(key, found, expected),
-        },
+    let name = complaint.strip_prefix("unknown variant `").and_then(|rest| rest.split('`').next());
+    match (name, value) {
+        (Some(name), _) => Error::config(key, format!("\"{name}\""), expected),
+        (None, Some(value)) => Error::config(key, value, expected),
+        (None, None) => Error::usage(key, "invalid value", format!("expected {expected}")),
     }
 }
 

@@ -38,28 +38,28 @@ pub struct MeshArgs {
     format: Option<MeshFormat>,
 
     /// Density of the isosurface, 1 / world length [default: the density at which a voxel has an alpha of 0.3]
-    #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE))]
+    #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE), allow_negative_numbers = true)]
     level: Option<f64>,
 
     /// Minimum number of triangles of a separate part; smaller parts, such as specks of fog and hidden cavities, are removed. 0 keeps all
     /// parts; the largest part is always kept
-    #[arg(long, value_name = "TRIANGLES", help_heading = "Surface", default_value_t = MeshOptions::default().min_part, value_parser = whole::<usize>(0, u64::from(u32::MAX)))]
+    #[arg(long, value_name = "TRIANGLES", help_heading = "Surface", default_value_t = MeshOptions::default().min_part, value_parser = whole::<usize>(0, u64::from(u32::MAX)), allow_negative_numbers = true)]
     min_part: usize,
 
     /// Number of smoothing passes, which remove voxel steps; no vertex moves by more than half a voxel along each axis
-    #[arg(long, value_name = "PASSES", help_heading = "Surface", default_value_t = MeshOptions::default().smooth, value_parser = whole::<usize>(0, 100))]
+    #[arg(long, value_name = "PASSES", help_heading = "Surface", default_value_t = MeshOptions::default().smooth, value_parser = whole::<usize>(0, 100), allow_negative_numbers = true)]
     smooth: usize,
 
     /// Decimate the mesh to at most this number of triangles, by edge collapses in the order of the error they cause
-    #[arg(long, value_name = "N", help_heading = "Surface", value_parser = whole::<usize>(4, u64::from(u32::MAX)))]
+    #[arg(long, value_name = "N", help_heading = "Surface", value_parser = whole::<usize>(4, u64::from(u32::MAX)), allow_negative_numbers = true)]
     max_triangles: Option<usize>,
 }
 
 /// Writes the surface of a run.
 pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
-    let named = args.exported.out.as_deref().and_then(ending).map(|ending| format(&ending).map_err(|accepted| (ending, accepted)));
+    let named = args.exported.out.as_deref().and_then(ending).map(|ending| format(&ending).map_err(|expected| (ending, expected)));
     let format = match (args.format, named) {
-        (None, Some(Err((ending, accepted)))) => return Err(Error::usage("--out", format!("unknown file extension .{ending}"), accepted)),
+        (None, Some(Err((ending, expected)))) => return Err(Error::usage("--out", format!("unknown file extension .{ending}"), expected)),
         (None, Some(Ok(named))) => named,
         (given, _) => given.unwrap_or(MeshFormat::Ply),
     };

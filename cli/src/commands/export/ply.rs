@@ -1,7 +1,7 @@
 //! `plenoxel export ply`: exports the voxels of a run as a colored point cloud.
 
 use super::{ColorChoice, Exported, MIN_ALPHA, Opened, color, min_alpha};
-use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
+use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe, points};
 use crate::commands::new_run::load;
 use crate::commands::{MOST_REDUCTION, as_flag, check_split, whole};
 use crate::progress::Console;
@@ -52,16 +52,16 @@ pub struct PlyArgs {
           value_parser = color(&[("seen", ColorChoice::Seen), ("mean", ColorChoice::Mean)]))]
     color: ColorChoice,
 
-    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = LEAST_ALPHA, value_parser = min_alpha)]
+    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = LEAST_ALPHA, value_parser = min_alpha, allow_negative_numbers = true)]
     min_alpha: f64,
 
     /// Minimum of the largest rendering weight of a voxel in the pixels of the training views; 0 also keeps invisible voxels
-    #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = LEAST_WEIGHT, value_parser = share)]
+    #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = LEAST_WEIGHT, value_parser = share, allow_negative_numbers = true)]
     min_weight: f64,
 
     /// Minimum share of a voxel's pixels in the training views that show the object; floaters in the background color have 0. Objects are
     /// identified by alpha, or by their color if no image has transparent pixels
-    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = LEAST_OBJECT, value_parser = share)]
+    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = LEAST_OBJECT, value_parser = share, allow_negative_numbers = true)]
     min_object: f64,
 
     /// Dataset folder, if it has moved [default: that of the training]
@@ -69,7 +69,7 @@ pub struct PlyArgs {
     data: Option<PathBuf>,
 
     /// Downscale the training images by this factor [default: that of the training]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<usize>(1, MOST_REDUCTION))]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<usize>(1, MOST_REDUCTION), allow_negative_numbers = true)]
     downscale: Option<usize>,
 
     #[command(flatten)]
@@ -142,7 +142,7 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         report.clone(),
     ];
     let file = args.exported.write(&folder, "cloud.ply", &encode(&cloud.chosen(&left), &comments), console)?;
-    console.wrote(&file, &format!("wrote {} points to {} ({report})", left.len(), file.display()))
+    console.wrote(&file, &format!("wrote {} to {} ({report})", points(left.len()), file.display()))
 }
 
 /// Visibility and color of the voxels in the training views.

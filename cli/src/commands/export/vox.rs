@@ -28,7 +28,7 @@ pub struct VoxArgs {
     #[command(flatten)]
     colors: SurfaceColors,
 
-    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = VoxOptions::default().min_alpha, value_parser = min_alpha)]
+    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = VoxOptions::default().min_alpha, value_parser = min_alpha, allow_negative_numbers = true)]
     min_alpha: f64,
 
     /// Also export voxels that are hidden on all six sides

@@ -36,15 +36,15 @@ pub struct PathArgs {
     pub path: Option<PathChoice>,
 
     /// Number of frames [default: that of the file, or 120]
-    #[arg(long, value_name = "N", help_heading = "Path", requires = "path", value_parser = whole::<usize>(1, MOST_FRAMES as u64))]
+    #[arg(long, value_name = "N", help_heading = "Path", requires = "path", value_parser = whole::<usize>(1, MOST_FRAMES as u64), allow_negative_numbers = true)]
     frames: Option<usize>,
 
     /// Size of the frames in pixels, SIDE or WIDTHxHEIGHT [default: that of the file, that of the views, or 400]
-    #[arg(long, value_name = "SIZE", help_heading = "Path", requires = "path", value_parser = frame_size)]
+    #[arg(long, value_name = "SIZE", help_heading = "Path", requires = "path", value_parser = frame_size, allow_hyphen_values = true)]
     size: Option<(usize, usize)>,
 
     /// Frames per second of the MP4 and the GIF, which shows at most 50 [default: that of the file, or 30]
-    #[arg(long, value_name = "RATE", help_heading = "Path", requires = "path", value_parser = rate)]
+    #[arg(long, value_name = "RATE", help_heading = "Path", requires = "path", value_parser = rate, allow_negative_numbers = true)]
     fps: Option<f64>,
 }
 

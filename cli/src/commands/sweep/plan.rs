@@ -92,9 +92,9 @@ impl Plan {
         let chosen = |scene: &Entry| scene.table.get("methods").and_then(Value::as_array).map_or(methods.len(), Vec::len);
         let runs: usize = scenes.iter().map(chosen).sum();
         if runs > MOST_RUNS {
-            let found = format!("{runs} runs, of {} scenes with {} methods", scenes.len(), methods.len());
-            let accepted = format!("up to {MOST_RUNS} runs; make several sweeps of it, or name the methods of a scene in its `methods`");
-            return Err(Error::config(place("scenes"), found, accepted));
+            let found =
+                format!("{} scenes with {} methods make {runs} runs, but a sweep has at most {MOST_RUNS}", scenes.len(), methods.len());
+            return Err(Error::usage(place("scenes"), found, "make several sweeps, or select the `methods` of each scene"));
         }
         for scene in &scenes {
             let chosen = chosen_methods(scene, &plan.methods, place)?;
@@ -144,8 +144,8 @@ fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default
         };
         if name.is_empty() || name.len() > LONGEST_NAME || !name.chars().all(plain) {
             let place = place(&format!("{path}.name"));
-            let accepted = format!("a name of at most {LONGEST_NAME} letters, digits, - and _, because it becomes a folder name");
-            return Err(Error::usage(place, format!("invalid name `{name}`"), format!("expected {accepted}")));
+            let expected = format!("expected a name of at most {LONGEST_NAME} letters, digits, - and _, because it becomes a folder name");
+            return Err(Error::usage(place, format!("invalid name `{name}`"), expected));
         }
         if !taken.insert(name.clone()) {
             return Err(Error::usage(

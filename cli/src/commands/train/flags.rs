@@ -1,6 +1,6 @@
 //! The flags of `train`, and the configuration resolved from them.
 
-use crate::commands::{MOST_REDUCTION, background, whole};
+use crate::commands::{MOST_REDUCTION, background, number, whole};
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
@@ -69,16 +69,16 @@ pub struct TrainArgs {
 
     /// Checkpoint interval, such as 30s or 10m. A checkpoint is also saved on Ctrl-C and SIGTERM. The checkpoint with the best validation
     /// PSNR is kept as best.safetensors if it is better than the final grid
-    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration, default_value = "5m")]
+    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration, default_value = "5m", allow_hyphen_values = true)]
     pub checkpoint_every: f64,
 
     /// Preview interval, such as 10s, or off. A preview renders images/preview.png and measures the PSNR of a few validation views. Previews do
     /// not affect the training and take less than 5 % of the time, or one second in short runs
-    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration_or_off, default_value = "10s")]
+    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration_or_off, default_value = "10s", allow_hyphen_values = true)]
     pub preview_every: f64,
 
     /// Evaluate the trained grid on N evenly spaced test views instead of all of them
-    #[arg(long, value_name = "N", help_heading = "Output", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "no_evaluate")]
+    #[arg(long, value_name = "N", help_heading = "Output", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "no_evaluate", allow_negative_numbers = true)]
     pub test_views: Option<usize>,
 
     /// Do not evaluate the trained grid on the test views; `plenoxel evaluate` can do it later
@@ -119,15 +119,15 @@ pub struct TrainArgs {
     seed: Option<i64>,
 
     /// Downscale the images by this factor, which must divide their width and height [default: 1; preset paper: 8]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION))]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION), allow_negative_numbers = true)]
     downscale: Option<i64>,
 
     /// Background color: white, black, or three numbers r,g,b in [0, 1] [default: white]
-    #[arg(long, help_heading = "Scene", value_parser = background)]
+    #[arg(long, help_heading = "Scene", value_parser = background, allow_hyphen_values = true)]
     background: Option<[f64; 3]>,
 
     /// Half the side of the cube that contains the scene, in units of the dataset [default: 1.5; presets demo and paper: 1.4]
-    #[arg(long, value_name = "LENGTH", help_heading = "Scene", allow_negative_numbers = true)]
+    #[arg(long, value_name = "LENGTH", help_heading = "Scene", value_parser = number(f64::NEG_INFINITY), allow_negative_numbers = true)]
     half_width: Option<f64>,
 
     /// Image size of the built-in scene in pixels, SIDE or WIDTHxHEIGHT [default: 200]
@@ -135,7 +135,7 @@ pub struct TrainArgs {
     scene_size: Option<(usize, usize)>,
 
     /// Numbers of training, validation and test views of the built-in scene [default: 100,10,25]
-    #[arg(long, value_name = "TRAIN,VAL,TEST", help_heading = "Scene", value_parser = three_counts, conflicts_with = "data")]
+    #[arg(long, value_name = "TRAIN,VAL,TEST", help_heading = "Scene", value_parser = three_counts, conflicts_with = "data", allow_hyphen_values = true)]
     scene_views: Option<[usize; 3]>,
 
     /// Interpolation between voxel centers [default: trilinear; preset paper: nearest]
@@ -147,12 +147,12 @@ pub struct TrainArgs {
     color: Option<String>,
 
     /// Degree of the spherical harmonics, 0 to 3; implies --color sh [default: 2]
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3), allow_negative_numbers = true)]
     sh_degree: Option<i64>,
 
     /// Store view-dependent color (harmonics of degree 1 and higher) on an N times coarser grid, which saves memory and time
     /// [default: 4; presets quality: 3, demo, plenoxels and paper: 1]
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64))]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64), allow_negative_numbers = true)]
     sh_reduction: Option<i64>,
 
     /// Start from the grid of this run. With a trained grid, the box is that of the grid, and coarser stages are skipped. With a carved grid, the
@@ -265,7 +265,7 @@ fn duration(text: &str) -> std::result::Result<f64, String> {
 
 /// Parses a duration, or `off` to infinity.
 fn duration_or_off(text: &str) -> std::result::Result<f64, String> {
-    if text == "off" { Ok(f64::INFINITY) } else { duration(text).map_err(|accepted| format!("{accepted}, or off")) }
+    if text == "off" { Ok(f64::INFINITY) } else { duration(text).map_err(|expected| format!("{expected}, or off")) }
 }
 
 /// Parses an image size, `SIDE` or `WIDTHxHEIGHT`.

@@ -167,11 +167,11 @@ fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
 
 /// The error for an unknown name. It suggests the known name of the most similar spelling, or lists all known names if none is similar.
 pub fn unknown_name(what: &str, name: &str, known: &[&str], place: &str) -> Error {
-    let accepted = match nearest(name, known) {
+    let remedy = match nearest(name, known) {
         Some(known) => format!("did you mean `{known}`?"),
         None => format!("expected one of {}", known.join(", ")),
     };
-    Error::usage(place, format!("unknown {what} `{name}`"), accepted)
+    Error::usage(place, format!("unknown {what} `{name}`"), remedy)
 }
 
 #[cfg(test)]
