@@ -143,7 +143,7 @@ fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     assert_eq!((page.matches("data:image/jpeg;base64,").count(), page.matches("<svg").count()), (10, 8));
     plenoxel(&["compare", &folder.path("none")]).refused(3, &["this run folder does not exist"]);
     fs::write(folder.path("second/result.json"), "figures").unwrap();
-    plenoxel(&["compare", &first, &second]).refused(3, &["second", "no figures that can be read", "--resume"]);
+    plenoxel(&["compare", &first, &second]).refused(3, &["second", "result.json of this run is missing or damaged", "--resume"]);
     plenoxel(&["report", &second]).done();
     assert!(fs::read_to_string(folder.path("second/report.html")).unwrap().contains("no valid results"));
 }

@@ -222,7 +222,7 @@ mod tests {
         let scale = Scale::of([0.004, 0.11].into_iter(), false);
         let labels: Vec<String> = scale.ticks().into_iter().map(|(_, label)| label).collect();
         assert_eq!(labels, ["0.005", "0.01", "0.02", "0.05", "0.1"]);
-        // Nothing is lost of a curve that begins at 0, and one that all but vanishes does not press the others together.
+        // A curve that begins at 0 is shown completely, and a curve near 0 does not compress the others.
         let scale = Scale::of([0.0, 1e-12, 0.01, 1.0].into_iter(), false);
         assert!(scale.logarithmic && scale.low > 5e-5 && scale.y(0.0) == HEIGHT - BOTTOM && scale.y(0.01) < scale.y(1e-12));
         assert!(!Scale::of([5.0, 33.0].into_iter(), true).logarithmic && !Scale::of([-1.0, 33.0].into_iter(), false).logarithmic);

@@ -40,7 +40,7 @@ Examples:
   plenoxel export mesh runs/lego-1           export the surface as a mesh
   plenoxel presets                           list presets and their training times
   plenoxel compare runs/a runs/b             compare results, curves and pictures of runs
-  plenoxel harmonics                         draw the spherical harmonics that make up colors
+  plenoxel harmonics                         draw the spherical harmonics, the basis of view-dependent color
   plenoxel sweep scenes.toml                 run every scene with every method and print the results
 
 Progress is printed to stderr, results to stdout. Exit codes: 0 success, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \

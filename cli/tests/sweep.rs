@@ -112,7 +112,7 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     assert_eq!((code, out.matches(": to run").count()), (Some(0), 7), "{out}{err}");
     assert!(out.contains("few fine: to run\n    plenoxel train --set=rays_per_step=200 ") && !root.join("swept").exists(), "{out}");
 
-    // The first to fail has a setting that cannot be used.
+    // The first run to fail has an invalid setting.
     let (code, out, err) = sweep(&[]);
     assert_eq!(code, Some(2), "{err}");
     assert!(err.contains("3/7 few odd: failed with exit code 2: downscale: 5") && err.contains("2 of 7 runs failed"), "{err}");

@@ -22,7 +22,7 @@ maximum distance: they are kept here, while in CloudCompare rounding decides. Po
 encoding of the input, and all properties of the kept points unchanged. Faces and other elements are left out, because they refer to points by \
 index.";
 
-/// Elements besides the points that are named.
+/// Largest number of left out elements to name.
 const OTHERS: usize = 10;
 
 /// Clean a point cloud with CloudCompare's filters

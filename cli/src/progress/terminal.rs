@@ -18,7 +18,7 @@ pub fn columns() -> usize {
     terminal_size::terminal_size().map_or(USUAL, |(width, _)| usize::from(width.0).max(20))
 }
 
-/// Returns where bars are drawn: on stderr, in lines that leave [`FREE`] columns.
+/// Returns the draw target of progress bars: stderr, without the last [`FREE`] columns.
 #[cfg(unix)]
 pub fn bar_target() -> ProgressDrawTarget {
     ProgressDrawTarget::term_like(Box::new(Narrow))
@@ -29,7 +29,7 @@ pub fn bar_target() -> ProgressDrawTarget {
     ProgressDrawTarget::stderr()
 }
 
-/// The terminal behind stderr, described as narrower than it is, because a bar's line is filled up with spaces.
+/// The terminal of stderr, with a reduced width, because a bar pads its line with spaces.
 #[cfg(unix)]
 #[derive(Debug)]
 struct Narrow;
@@ -80,7 +80,7 @@ impl TermLike for Narrow {
     }
 }
 
-/// Returns the start of a line beside a bar that takes `taken` columns, as much as fits.
+/// Truncates a line to the space beside a bar of `taken` columns.
 pub fn fitted(line: &str, taken: usize, columns: usize) -> String {
     line.chars().take(columns.saturating_sub(taken + FREE)).collect()
 }

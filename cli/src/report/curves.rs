@@ -43,7 +43,7 @@ pub fn section(lines: &[Line<'_>], config: &Config) -> String {
     })
 }
 
-/// Quantities of which each of several runs has a curve: title, unit, and value of a line of the metrics.
+/// Charts with one curve per run: title, unit, and value of a line of the metrics.
 type OfEach = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
 const OF_EACH: [OfEach; 4] = [
     ("Loss", "loss", |line| Some(line.loss)),

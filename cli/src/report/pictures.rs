@@ -23,7 +23,7 @@ pub fn stages(folder: &RunFolder, result: &Value) -> Result<String> {
     let Some((name, title, caption)) = what.into_iter().find(|(name, ..)| folder.image(name).exists()) else { return Ok(String::new()) };
     let resolutions = result["stages"].as_array().into_iter().flatten().map(|stage| stage["resolution"].as_u64().map(|n| n as usize));
     let numbered = resolutions.clone().take(1).chain(resolutions).enumerate();
-    // A view that was not drawn is not in the strip: a run of an earlier version has none of the start.
+    // Only pictures that exist are in the strip: runs of earlier versions have none of the start.
     let drawn = numbered.filter(|&(number, resolution)| folder.image(&RunFolder::stage_name(number, resolution)).exists());
     let stages = drawn.map(|(number, resolution)| match (number, resolution) {
         (0, _) => "start".to_owned(),

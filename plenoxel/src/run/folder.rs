@@ -430,8 +430,8 @@ impl RunFolder {
         format!("test_{number:03}_{view}.png")
     }
 
-    /// File name of the picture of a view at the end of a stage, which is counted from 1; number 0 is the view before the first step. The resolution
-    /// is that of the grid, if the model has one.
+    /// File name of the picture at the end of stage `number`, counted from 1; 0 is the picture before the first step. `resolution` is that of the
+    /// grid, if the model has one.
     pub fn stage_name(number: usize, resolution: Option<usize>) -> String {
         let resolution = resolution.map_or(String::new(), |n| format!("_{n}"));
         format!("stage_{number}{resolution}.png")

@@ -89,7 +89,7 @@ fn record(bytes: &[u8]) -> Vec<u8> {
     [&length[..], &checksum(&length), bytes, &checksum(bytes)].concat()
 }
 
-/// CRC-32C, rotated and shifted by a constant, because a checksum of bytes that hold checksums is a weak one.
+/// The masked CRC-32C of TFRecord files: rotated, and shifted by a constant, because a checksum of bytes that contain checksums is weak.
 fn checksum(bytes: &[u8]) -> [u8; 4] {
     crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
 }
@@ -109,7 +109,7 @@ mod field {
     pub const IMAGE: u64 = 4;
 }
 
-/// A protocol buffer, field by field: before each comes its number and, in three bits, how it is written.
+/// Writer of a protocol buffer: each field follows a tag with its number and, in three bits, its wire type.
 #[derive(Default)]
 struct Message(Vec<u8>);
 

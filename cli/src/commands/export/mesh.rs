@@ -8,7 +8,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::export::mesh::{MeshOptions, mesh};
 use plenoxel::export::mesh_file::MeshFormat;
 
-/// Memory for each voxel: triangles, normals and colors of a surface before it is reduced. Measured on lego.
+/// Memory per voxel in bytes: triangles, normals and colors of a surface before decimation. Measured on lego.
 const BYTES_PER_VOXEL: u64 = 190;
 
 const EXAMPLES: &str = "\

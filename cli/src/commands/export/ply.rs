@@ -21,7 +21,7 @@ use plenoxel::run::memory::Estimate;
 use plenoxel::sampling::Jitter;
 use std::path::PathBuf;
 
-/// Memory for each voxel: positions, rows, normals and colors.
+/// Memory per voxel in bytes: positions, rows, normals and colors.
 const BYTES_PER_VOXEL: u64 = 100;
 
 const EXAMPLES: &str = "\

@@ -7,7 +7,7 @@ use clap::Args;
 use plenoxel::error::Result;
 use plenoxel::export::vox::{VoxOptions, vox};
 
-/// Memory for each voxel: positions, rows and colors.
+/// Memory per voxel in bytes: positions, rows and colors.
 const BYTES_PER_VOXEL: u64 = 100;
 
 const EXAMPLES: &str = "\

@@ -39,8 +39,7 @@ pub fn flags(command: &str, name: &str, value: &Value, base: &Path, place: &str)
     let flag = argument.get_long().unwrap_or_default();
     let is_path = matches!(argument.get_value_hint(), ValueHint::DirPath | ValueHint::FilePath | ValueHint::AnyPath);
     let valued = |value: &Value| {
-        let text =
-            text(value).ok_or_else(|| Error::usage(place, format!("invalid value `{name} = {value}`"), "expected a value of the flag"))?;
+        let text = text(value).ok_or_else(|| Error::config(place, value, format!("a value of --{flag}")))?;
         let text = if is_path { base.join(text).to_string_lossy().into_owned() } else { text };
         Ok(format!("--{flag}={text}"))
     };

@@ -9,7 +9,7 @@ fn presets() -> impl Iterator<Item = &'static str> {
     PRESETS.iter().chain([&CARVE]).map(|preset| preset.name)
 }
 
-/// What no preset has, so that there is a value for every key.
+/// Settings that no preset has, so that every key has a value.
 const RARE: [&str; 11] = [
     "prune_from_stage = 1",
     "init_from = \"run\"",
@@ -24,7 +24,7 @@ const RARE: [&str; 11] = [
     "losses.sparsity = { from = 1e-3, to = 1e-4, steps = 5 }",
 ];
 
-/// The complete configuration of each preset, and one with what none of them has, as layers to which more can be set.
+/// The complete configuration of each preset, and one with the remaining keys, as layers.
 fn complete() -> Vec<Layers> {
     let rare = |name| {
         let mut layers = preset(name);
@@ -284,7 +284,7 @@ fn text_of(config: &Config) -> String {
     to_toml(config, "").unwrap()
 }
 
-/// What a key takes beside numbers like the one it has.
+/// True for values of another type that a key also accepts.
 fn is_another_form(path: &str, text: &str) -> bool {
     let flags = ["aim", "jitter", "project", "initial.random"];
     text == "true" && flags.contains(&path) || path == "stages" && text == "[]" || path == "init_from" && text != "\"\""

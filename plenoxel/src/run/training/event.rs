@@ -51,11 +51,11 @@ pub enum Event<'a> {
         /// The history of a resumed run.
         history: &'a History,
     },
-    /// The model before its first step and before the first stage prunes it; a resumed run does not tell this again.
+    /// The model before its first step, before the first stage prunes it. A resumed run does not emit this event again.
     Initial {
         /// The first stage.
         stage: PlannedStage,
-        /// Renders a camera's picture of the model.
+        /// Renders the model from a camera.
         see: &'a dyn Fn(&Camera) -> Picture,
     },
     /// A step was taken.

@@ -51,7 +51,7 @@ fn every_scene_meets_every_method_unless_it_chooses() {
         let arguments: Vec<OsString> = job.call.arguments(&["--out".into()]);
         arguments.into_iter().map(|a| a.into_string().unwrap()).collect()
     };
-    // What is particular comes after what is general, and counts.
+    // Specific settings follow general ones, and override them.
     let data = std::env::temp_dir().join("data/my.lego").to_string_lossy().into_owned();
     let sets = ["--set=seed=1", "--set=rays_per_step=77"];
     let fast = ["--downscale=4", "--no-images", "--preset=fast", "--set=rays_per_step=99", "--set=seed=5", "--out", "--", &data];
@@ -83,12 +83,12 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
         ("value", &format!("{good}downscale = \"half\""), 2, &["`half` for --downscale", "a whole number from 1 to 64"]),
         ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: unknown key", "`half_width`"]),
         ("range", &format!("{good}set = [\"half_width=-1\"]"), 2, &["`procedural` with `fast`: --set half_width: invalid value -1"]),
-        ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "expected a value of the flag"]),
+        ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "invalid value { x = 1 }; expected a value of --downscale"]),
         ("flag", "[[scenes]]\nscene_size = 32\n[[methods]]\ncommand = \"carve\"", 2, &["line 2", "which is of `carve`", "`scene_size`"]),
         ("both", "[[scenes]]\ndata = \"a\"\nscene_size = 32\n[[methods]]", 2, &["--scene-size <SIZE> conflicts with [DATA]"]),
         ("data", "[[scenes]]\ndata = 3\n[[methods]]", 2, &["line 2", "invalid value 3", "a folder in quotes"]),
         ("command", "[[scenes]]\n[[methods]]\ncommand = \"render\"", 2, &["line 3", "\"train\" or \"carve\""]),
-        ("names", "[[scenes]]\nname = \"a/b\"\n[[methods]]", 2, &["line 2", "`a/b`", "letters, digits"]),
+        ("names", "[[scenes]]\nname = \"a/b\"\n[[methods]]", 2, &["line 2", "\"a/b\"", "letters, digits"]),
         ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "the name `procedural` is used twice"]),
         ("chosen", "[[scenes]]\nmethods = [\"fat\"]\n[[methods]]\npreset = \"fast\"", 2, &["line 2", "unknown method `fat`", "`fast`"]),
         (
@@ -97,7 +97,7 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
             2,
             &["line 4", "psnr = { procedural"],
         ),
-        ("source", &format!("{good}[[published]]\nname = \"x\""), 3, &["line 4", "missing field `source`"]),
+        ("source", &format!("{good}[[published]]\nname = \"x\""), 3, &["line 4", "the key `source` is missing"]),
         ("figure", &format!("{good}[[published]]\npsn = 1"), 2, &["line 5", "unknown key `psn`", "`psnr`"]),
     ] {
         let error = read(name, text).unwrap_err();
@@ -108,7 +108,7 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
 }
 
 #[test]
-fn more_runs_than_anyone_waits_for_are_refused_before_they_are_thought_out() {
+fn too_many_runs_are_refused_before_they_are_planned() {
     let entries = |list: &str, n: usize| (0..n).map(|i| format!("[[{list}]]\nname = \"{list}{i}\"\n")).collect::<String>();
     let error = read("many", &(entries("scenes", 3000) + &entries("methods", 3000))).unwrap_err();
     let message = error.to_string();
