@@ -431,7 +431,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
     };
     refused(&["--downscale", "5"], &["downscale", "5", "24 x 24", "1, 2, 3, 4, 6, 8, 12, 24"]);
     refused(&["--set", "stages[1].resolution=1024", "--sh-degree", "3"], &["stages[1].resolution", "GB of memory", "fewer voxels"]);
-    refused(&["--half-width", "-1"], &["half_width (--half-width)", "above 0"]);
+    refused(&["--half-width", "-1"], &["half_width (--half-width)", "from 1e-9"]);
     refused(&["--set", "stages[0].rezolution=4"], &["--set stages[0].rezolution", "did you mean `resolution`?"]);
     refused(&["--set", "stages[4].resolution=4"], &["stages[0] to stages[1]"]);
     refused(&["--set", "losses.tv=1"], &["unknown key `tv`"]);
@@ -456,7 +456,7 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
         train(&run, &["--config", &config])
     };
     with_file("seed = 3\n[initial]\ndensitty = 1\n").refused(2, &["my.toml, line 3", "`densitty`", "did you mean `density`?"]);
-    with_file("seed = 3\nhalf_width = 0\n").refused(2, &["half_width", "my.toml, line 2", "above 0"]);
+    with_file("seed = 3\nhalf_width = 0\n").refused(2, &["half_width", "my.toml, line 2", "from 1e-9"]);
     with_file("seed = \n").refused(3, &["my.toml", "line 1", "not valid TOML"]);
     train(&run, &["--config", &folder.path("none.toml")]).refused(3, &["none.toml", "does not exist"]);
     train(&run, &["--config", &folder.path("")]).refused(3, &["this is a folder"]);
@@ -518,7 +518,7 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
     }
     export(&["mesh", &none, "--level", "0"]).refused(2, &["--level", "above 0"]);
     for (what, alpha) in [("vox", "1"), ("vox", "2"), ("ply", "1"), ("ply", "nan")] {
-        export(&[what, &none, "--min-alpha", alpha]).refused(2, &["--min-alpha", "from 0 to below 1"]);
+        export(&[what, &none, "--min-alpha", alpha]).refused(2, &["--min-alpha", "in [0, 1)"]);
     }
     export(&["ply", &none, "--out", "cloud.obj"]).refused(2, &["--out", "cloud.obj", ".ply"]);
     export(&["vox", &none]).refused(3, &["none", "this run folder does not exist"]);

@@ -74,7 +74,7 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     for (flag, value, part) in [
         ("--color", "blue", "seen, mean, or a direction"),
         ("--color", "0,0,0", "direction"),
-        ("--min-alpha", "1.5", "from 0 to below 1"),
+        ("--min-alpha", "1.5", "in [0, 1)"),
         ("--min-weight", "1.5", "from 0 to 1"),
         ("--coords", "camera", "world"),
         ("--noise-radius", "0", "--noise-radius"),

@@ -144,6 +144,10 @@ fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     plenoxel(&["compare", &folder.path("none")]).refused(3, &["this run folder does not exist"]);
     fs::write(folder.path("second/result.json"), "figures").unwrap();
     plenoxel(&["compare", &first, &second]).refused(3, &["second", "result.json of this run is missing or damaged", "--resume"]);
-    plenoxel(&["report", &second]).done();
+    let metrics = folder.path("second/metrics.jsonl");
+    fs::write(&metrics, fs::read_to_string(&metrics).unwrap() + "{\"step\":").unwrap();
+    let report = plenoxel(&["report", &second]);
+    assert!(report.err.contains(&format!("warning: {metrics}: 1 unreadable line left out of the curves")), "{}", report.err);
+    report.done();
     assert!(fs::read_to_string(folder.path("second/report.html")).unwrap().contains("no valid results"));
 }

@@ -110,7 +110,7 @@ const MIN_ALPHA: &str = "Minimum alpha of a voxel, 1 - exp(-density * side); vox
 
 /// Parses a minimum alpha, which is below 1.
 fn min_alpha(text: &str) -> std::result::Result<f64, String> {
-    text.parse().ok().filter(|share| (0.0..1.0).contains(share)).ok_or_else(|| "expected a number from 0 to below 1".to_owned())
+    text.parse().ok().filter(|share| (0.0..1.0).contains(share)).ok_or_else(|| "expected a number in [0, 1)".to_owned())
 }
 
 /// Choice of a constant color for a view-dependent one.

@@ -92,9 +92,12 @@ impl Scene {
             bytes(self.bytes.len() as u64)
         );
         match &self.cost {
-            Some(Cost { views, whole, small, between }) => format!(
-                "{what}; its PSNR on {views} test views is {small:.2} dB, that of the trained grid {whole:.2} dB; the PSNR between both is {between:.1} dB"
-            ),
+            Some(Cost { views, whole, small, between }) => {
+                let s = if *views == 1 { "" } else { "s" };
+                format!(
+                    "{what}; its PSNR on {views} test view{s} is {small:.2} dB, that of the trained grid {whole:.2} dB; the PSNR between both is {between:.1} dB"
+                )
+            }
             None => what,
         }
     }

@@ -51,7 +51,7 @@ impl Default for VoxOptions {
 pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     let VoxOptions { min_alpha, solid, direction } = *options;
     if !(0.0..1.0).contains(&min_alpha) {
-        return Err(Error::config("min_alpha", min_alpha, "a number from 0 to below 1"));
+        return Err(Error::config("min_alpha", min_alpha, "a number in [0, 1)"));
     }
     let dense = grid.voxels_absorbing(min_alpha);
     let places = places(&dense, solid);

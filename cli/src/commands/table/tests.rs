@@ -51,7 +51,12 @@ fn markdown_has_a_cell_for_each_run_and_means_of_whole_columns_only() {
 ";
     let (table, notes) = text.split_at(expected.len());
     assert_eq!(table, expected);
-    assert!(notes.contains("- lego: fast, 3 views of 100 × 100 over white; slow, 3 views of 50 × 50 over white; these cannot"), "{notes}");
+    assert!(
+        notes.contains(
+            "- lego: fast, 3 views of 100 × 100 over white; slow, 3 views of 50 × 50 over white; these results are not comparable."
+        ),
+        "{notes}"
+    );
     assert!(notes.contains("- ship: 3 views of 100 × 100 over white.\n"), "{notes}");
     assert!(notes.contains("- ship, slow: failed with exit code 4: loss is \\<NaN\\> \\| \"here\"\n"), "{notes}");
     assert!(notes.contains("- Others: published, not measured here: their table\n"), "{notes}");

@@ -169,7 +169,7 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
     refused(&ascii("element vertex -3\nend_header\n"), &["line 3", "whole number"]);
     refused(&ascii("element vertex 99999999999999999999999\nend_header\n"), &["line 3"]);
     refused(&ascii("property float x\nend_header\n"), &["line 3", "an element before"]);
-    refused(&ascii("element vertex 1\nproperty half x\nend_header\n"), &["line 4", "property half x", "types: char"]);
+    refused(&ascii("element vertex 1\nproperty half x\nend_header\n"), &["line 4", "property half x", "the types char"]);
     refused(&ascii("element vertex 1\nproperty list float int x\nend_header\n"), &["line 4"]);
     refused(&ascii("element vertex 1\nvertices 3\nend_header\n"), &["line 4", "vertices 3"]);
     refused(&ascii("element face 0\nend_header\n"), &["no points", "[face]"]);
@@ -272,7 +272,7 @@ fn headers_have_an_end() {
     let error = parse(format!("ply\nformat ascii 1.0\n{}end_header\n", &names[..names[..1_000_000].rfind("element").unwrap()]).as_bytes())
         .unwrap_err()
         .to_string();
-    assert!(error.contains("no points among its elements [0, 1, 2") && error.contains('…') && error.len() < 1500, "{error}");
+    assert!(error.contains("no points: its elements are [0, 1, 2") && error.contains('…') && error.len() < 1500, "{error}");
 }
 
 #[test]

@@ -112,8 +112,8 @@ fn too_many_runs_are_refused_before_they_are_planned() {
     let entries = |list: &str, n: usize| (0..n).map(|i| format!("[[{list}]]\nname = \"{list}{i}\"\n")).collect::<String>();
     let error = read("many", &(entries("scenes", 3000) + &entries("methods", 3000))).unwrap_err();
     let message = error.to_string();
-    assert!(error.exit_code() == 2 && message.contains("9000000 runs, of 3000 scenes with 3000 methods"), "{message}");
-    assert!(message.contains("line 1: ") && message.contains("up to 10000 runs"), "{message}");
+    assert!(error.exit_code() == 2 && message.contains("3000 scenes with 3000 methods make 9000000 runs"), "{message}");
+    assert!(message.contains("line 1: ") && message.contains("at most 10000;"), "{message}");
     // Each scene with few of many methods.
     let few = entries("scenes", 3).replace("]]\n", "]]\nmethods = [\"methods7\"]\n") + &entries("methods", 4000);
     assert_eq!(read("few", &few).unwrap().jobs.len(), 3);
