@@ -400,7 +400,7 @@ fn images_and_boxes_that_cannot_be_carved_are_refused_with_the_reason() {
     assert!(refused(&with_alpha(0), &config(8, None)).contains("transparent all over"));
     let mut far = config(8, None);
     far.half_width = 1000.0;
-    assert!(refused(&views, &far).contains("the camera of r_0 is inside of the box"), "{}", refused(&views, &far));
+    assert!(refused(&views, &far).contains("the camera of r_0 is inside the box"), "{}", refused(&views, &far));
     assert_eq!(Carving::new(&with_alpha(0), &far.carve_options(), &|_| {}).unwrap_err().exit_code(), 3);
     let mut wide = config(8, None);
     wide.carve.margin = 100.0;

@@ -112,7 +112,7 @@ fn a_damaged_or_foreign_file_is_named_with_what_is_wrong() {
     assert!(text.contains("plenoxel 1"));
     let later: Vec<u8> = replace(&whole, b"plenoxel 1", b"plenoxel 9");
     assert!(message(&later).contains("format `plenoxel 9`"));
-    assert!(message(&replace(&whole, br#"\"resolution\":5"#, br#"\"resolution\":7"#)).contains("accepted"));
+    assert!(message(&replace(&whole, br#"\"resolution\":5"#, br#"\"resolution\":7"#)).contains("expected"));
     let foreign = safetensors_without_metadata();
     assert!(message(&foreign).contains("without the key `plenoxel`"));
     assert_eq!(checkpoint::load::<f32>(&dir.join("missing")).expect_err("there is none").exit_code(), 3);

@@ -55,7 +55,7 @@ fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
     );
     assert!(fs::exists(folder.path("run/report.html")).unwrap());
     assert!(strip("run") == before, "the start and both stages are still in the strip");
-    plenoxel(&["train", "--resume", &run]).refused(3, &["this run has ended"]);
+    plenoxel(&["train", "--resume", &run]).refused(3, &["this run is finished"]);
 
     // One that began with a grid left the coarser stage out.
     let finer = folder.path("finer");
@@ -80,7 +80,7 @@ fn a_run_that_was_killed_before_its_figures_gets_them_by_resuming() {
     let carved = folder.path("carved");
     plenoxel(&["carve", &scene(&folder), "--resolution", "8", "--no-report", "--out", &carved]).done();
     fs::remove_file(folder.path("carved/result.json")).unwrap();
-    plenoxel(&["train", "--resume", &carved]).refused(3, &["this run was carved", "--init-from"]);
+    plenoxel(&["train", "--resume", &carved]).refused(3, &["a carved run cannot be resumed", "--init-from"]);
     assert!(!plenoxel(&["info", &carved]).done().contains("--resume"));
 }
 
@@ -91,7 +91,7 @@ fn a_grid_that_validation_views_liked_better_than_the_last_is_kept() {
     // What the first stage learned, the second spoils.
     let spoil = ["--set", "stages[0].steps=40", "--set", "stages[1].density_rate=500.0", "--set", "stages[1].color_rate=5.0"];
     let answer = train(&run, &[&spoil[..], &["--checkpoint-every", "0.000001s", "--no-report", "--no-images"]].concat());
-    assert!(answer.err.contains("an earlier checkpoint shows validation views better"), "{}", answer.err);
+    assert!(answer.err.contains("an earlier checkpoint has a better validation PSNR"), "{}", answer.err);
     let result = answer.json();
     let best = &result["best_validation"];
     let [last, kept] = [&[][..], &["--best"]].map(|flag| plenoxel(&[&["evaluate", run.as_str(), "--split", "val"], flag].concat()).json());
@@ -106,7 +106,7 @@ fn a_grid_that_validation_views_liked_better_than_the_last_is_kept() {
     let good = folder.path("good");
     train(&good, &["--checkpoint-every", "0.000001s", "--no-report", "--no-images"]).done();
     assert!(!fs::exists(folder.path("good/best.safetensors")).unwrap());
-    plenoxel(&["evaluate", &good, "--best"]).refused(3, &["best.safetensors", "leave --best away"]);
+    plenoxel(&["evaluate", &good, "--best"]).refused(3, &["best.safetensors", "leave out --best"]);
 }
 
 #[test]
@@ -238,10 +238,10 @@ fn a_run_remembers_its_data_until_the_data_moves() {
     let trained = train_on(&data, &run, &[]).json();
     assert_eq!(plenoxel(&["evaluate", &run]).json()["psnr"], trained["psnr"]);
     fs::rename(&data, &moved).unwrap();
-    plenoxel(&["evaluate", &run]).refused(3, &[&data, "not there any more", "--data"]);
+    plenoxel(&["evaluate", &run]).refused(3, &[&data, "no longer exists", "--data"]);
     plenoxel(&["render", &run]).refused(3, &["--data"]);
     assert_eq!(plenoxel(&["evaluate", &run, "--data", &moved]).json()["psnr"], trained["psnr"]);
-    plenoxel(&["evaluate", &run, "--data", &moved, "--split", "val"]).refused(2, &["--split", "val", "no views", "train, test"]);
+    plenoxel(&["evaluate", &run, "--data", &moved, "--split", "val"]).refused(2, &["--split", "val", "has no val views", "train or test"]);
     plenoxel(&["render", &run, "--data", &moved, "--view", "r_9"]).refused(2, &["--view", "r_9", "r_0 to r_1"]);
     plenoxel(&["evaluate", &run, "--data", &moved, "--downscale", "3"]).refused(2, &["downscale", "3", "1, 2, 4"]);
 }
@@ -284,7 +284,7 @@ fn a_run_is_overwritten_only_when_forced_and_leaves_nothing_of_the_old_one() {
     assert_eq!(plenoxel(&["scene", &data, "--size", "8", "--train", "1", "--val", "0", "--test", "0", "--force"]).code, 0);
     assert!(plenoxel(&["info", &data]).out.contains("1 train, 0 val, 0 test"));
     fs::write(folder.path("file"), "x").unwrap();
-    plenoxel(&["scene", &folder.path("file")]).refused(2, &["which is a file"]);
+    plenoxel(&["scene", &folder.path("file")]).refused(2, &["is a file"]);
     train(&folder.path("file"), &["--force"]).refused(2, &["is a file"]);
     // A folder cannot be made below a file.
     train(&folder.path("file/run"), &["--quiet"]).refused(2, &["file/run", "is a file"]);
@@ -368,7 +368,7 @@ fn who_watches_sees_the_same_figures_everywhere_and_changes_nothing() {
     let refused = plenoxel(&["evaluate", &folder.path("nowhere"), "--log-format", "json"]);
     let error: Value = serde_json::from_str(&refused.err).unwrap();
     assert_eq!((refused.code, &error["event"], &error["exit_code"]), (3, &"error".into(), &3.into()));
-    assert!(error["message"].as_str().unwrap().contains("there is no such run"), "{error}");
+    assert!(error["message"].as_str().unwrap().contains("this run folder does not exist"), "{error}");
     plenoxel(&["train", "--preview-every", "sometimes"]).refused(2, &["--preview-every", "or off"]);
 }
 
@@ -396,7 +396,7 @@ fn each_broken_dataset_is_refused_with_the_place_and_the_remedy() {
         fs::write(&path, whole).unwrap();
     };
     let png = fs::read(format!("{data}/train/r_1.png")).unwrap();
-    broken("train/r_1.png", png[..png.len() / 2].to_vec(), &["cut short"]);
+    broken("train/r_1.png", png[..png.len() / 2].to_vec(), &["truncated"]);
     broken("train/r_1.png", b"\xff\xd8\xff\xe0 a photograph".to_vec(), &["JPEG", "convert it to PNG"]);
     broken("train/r_1.png", Vec::new(), &["empty"]);
     let other = folder.path("other");
@@ -431,15 +431,15 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
     };
     refused(&["--downscale", "5"], &["downscale", "5", "24 x 24", "1, 2, 3, 4, 6, 8, 12, 24"]);
     refused(&["--set", "stages[1].resolution=1024", "--sh-degree", "3"], &["stages[1].resolution", "GB of memory", "fewer voxels"]);
-    refused(&["--half-width", "-1"], &["half_width (--half-width)", "above 0"]);
-    refused(&["--set", "stages[0].rezolution=4"], &["--set stages[0].rezolution", "nearest known key is `resolution`"]);
+    refused(&["--half-width", "-1"], &["half_width (--half-width)", "from 1e-9"]);
+    refused(&["--set", "stages[0].rezolution=4"], &["--set stages[0].rezolution", "did you mean `resolution`?"]);
     refused(&["--set", "stages[4].resolution=4"], &["stages[0] to stages[1]"]);
     refused(&["--set", "losses.tv=1"], &["unknown key `tv`"]);
-    refused(&["--set", "jitter=perhaps"], &["--set jitter", "boolean"]);
+    refused(&["--set", "jitter=perhaps"], &["--set jitter", "true or false"]);
     refused(&["--threads", "0"], &["--threads", "1 to 1024"]);
     refused(&["--threads", "5000"], &["--threads"]);
     refused(&["--sh-degree", "4"], &["--sh-degree", "from 0 to 3"]);
-    refused(&["--color", "rgb", "--sh-degree", "1"], &["--sh-degree", "--color rgb", "one of the two"]);
+    refused(&["--color", "rgb", "--sh-degree", "1"], &["--sh-degree", "--color rgb", "leave out one of the two"]);
     refused(&["--background", "gray"], &["--background", "white, black"]);
     refused(&["--preset", "best"], &["--preset", "demo", "paper"]);
     refused(&["--engine", "magic"], &["--engine", "graph"]);
@@ -455,10 +455,10 @@ fn settings_that_cannot_be_used_are_refused_before_anything_is_written() {
         fs::write(&config, text).unwrap();
         train(&run, &["--config", &config])
     };
-    with_file("seed = 3\n[initial]\ndensitty = 1\n").refused(2, &["my.toml, line 3", "`densitty`", "nearest known key is `density`"]);
-    with_file("seed = 3\nhalf_width = 0\n").refused(2, &["half_width", "my.toml, line 2", "above 0"]);
-    with_file("seed = \n").refused(3, &["my.toml", "line 1", "not TOML"]);
-    train(&run, &["--config", &folder.path("none.toml")]).refused(3, &["none.toml", "no such file"]);
+    with_file("seed = 3\n[initial]\ndensitty = 1\n").refused(2, &["my.toml, line 3", "`densitty`", "did you mean `density`?"]);
+    with_file("seed = 3\nhalf_width = 0\n").refused(2, &["half_width", "my.toml, line 2", "from 1e-9"]);
+    with_file("seed = \n").refused(3, &["my.toml", "line 1", "not valid TOML"]);
+    train(&run, &["--config", &folder.path("none.toml")]).refused(3, &["none.toml", "does not exist"]);
     train(&run, &["--config", &folder.path("")]).refused(3, &["this is a folder"]);
     // What a file leaves open the preset fills in, and a flag goes before both.
     let run_config = || fs::read_to_string(format!("{run}/config.toml")).unwrap();
@@ -484,8 +484,8 @@ fn numbers_that_are_not_finite_end_the_run_and_leave_the_metrics_but_no_checkpoi
         left.contains(&"loss.svg".to_owned()) && !left.iter().any(|name| name.contains("checkpoint") || name.contains("result")),
         "{left:?}"
     );
-    plenoxel(&["evaluate", &run]).refused(3, &["no checkpoint.safetensors", "did not end"]);
-    assert!(plenoxel(&["info", &run]).out.contains("the run did not end"));
+    plenoxel(&["evaluate", &run]).refused(3, &["no checkpoint.safetensors", "not finished"]);
+    assert!(plenoxel(&["info", &run]).out.contains("the run is not finished"));
 }
 
 #[test]
@@ -518,30 +518,30 @@ fn a_run_is_exported_to_its_folder_or_to_a_file() {
     }
     export(&["mesh", &none, "--level", "0"]).refused(2, &["--level", "above 0"]);
     for (what, alpha) in [("vox", "1"), ("vox", "2"), ("ply", "1"), ("ply", "nan")] {
-        export(&[what, &none, "--min-alpha", alpha]).refused(2, &["--min-alpha", "from 0 on, and below 1"]);
+        export(&[what, &none, "--min-alpha", alpha]).refused(2, &["--min-alpha", "in [0, 1)"]);
     }
     export(&["ply", &none, "--out", "cloud.obj"]).refused(2, &["--out", "cloud.obj", ".ply"]);
-    export(&["vox", &none]).refused(3, &["none", "there is no such run"]);
-    export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "check the spelling"]);
+    export(&["vox", &none]).refused(3, &["none", "this run folder does not exist"]);
+    export(&["vox", &run, "--min-alpha", "0", "--out", &folder.path("none/a.vox")]).refused(5, &["a.vox", "spelling"]);
 }
 
 #[test]
 fn a_damaged_run_is_refused() {
     let folder = Folder::new("damaged");
     let run = folder.path("run");
-    plenoxel(&["evaluate", &run]).refused(3, &["there is no such run"]);
+    plenoxel(&["evaluate", &run]).refused(3, &["this run folder does not exist"]);
     plenoxel(&["info", &run]).refused(3, &["run"]);
     plenoxel(&["render", &folder.path("")]).refused(3, &["no run.json"]);
     assert_eq!(train(&run, &["--no-images", "--quiet"]).code, 0);
     let checkpoint = format!("{run}/checkpoint.safetensors");
-    plenoxel(&["evaluate", &checkpoint]).refused(3, &["not the folder of a run"]);
+    plenoxel(&["evaluate", &checkpoint]).refused(3, &["not a run folder"]);
     let whole = fs::read(&checkpoint).unwrap();
     fs::write(&checkpoint, &whole[..whole.len() - 9]).unwrap();
     plenoxel(&["evaluate", &run]).refused(3, &["checkpoint.safetensors"]);
     plenoxel(&["info", &checkpoint]).refused(3, &["checkpoint.safetensors"]);
     fs::write(&checkpoint, whole).unwrap();
     fs::write(format!("{run}/run.json"), "{}").unwrap();
-    plenoxel(&["evaluate", &run]).refused(3, &["run.json", "does not describe a run"]);
+    plenoxel(&["evaluate", &run]).refused(3, &["run.json", "not a valid record of a run"]);
 }
 
 /// A run whose files are replaced one by one.
@@ -573,7 +573,7 @@ fn a_file_of_a_run_that_never_ends_is_refused_by_its_name() {
         fs::rename(&kept, &path).unwrap();
     }
     fs::remove_file(format!("{run}/run.json")).unwrap();
-    plenoxel(&["evaluate", &run]).refused(3, &["there is no run.json in this folder"]);
+    plenoxel(&["evaluate", &run]).refused(3, &["it has no run.json"]);
 }
 
 #[cfg(unix)]
@@ -711,10 +711,10 @@ fn carving_refuses_what_it_cannot_carve_and_writes_nothing() {
     plenoxel(&["carve", &data, "--out", &out, "--set", "carve.rezolution=8"]).refused(2, &["`rezolution`", "`resolution`"]);
     plenoxel(&["carve", &data, "--out", &out, "--set", "carve.depth=-1"]).refused(2, &["carve.depth", "0.001 to 1000"]);
     plenoxel(&["carve", &data, "--out", &out, "--half-width", "1e9", "--resolution", "8"])
-        .refused(2, &["half_width", "a box around the object alone, below"]);
+        .refused(2, &["half_width", "a box around the object only, below"]);
     plenoxel(&["carve", &data, "--out", &out, "--photo-consistency=1e-9"]).refused(2, &["carve.photo.noise", "1e-6 to 1"]);
     plenoxel(&["train", &data, "--out", &out, "--set", "stages=[]"]).refused(2, &["stages", "at least one"]);
-    plenoxel(&["train", &data, "--out", &out, "--init-from", &folder.path("none")]).refused(3, &["there is no such run"]);
+    plenoxel(&["train", &data, "--out", &out, "--init-from", &folder.path("none")]).refused(3, &["this run folder does not exist"]);
     for view in 0..3 {
         let path = PathBuf::from(format!("{data}/train/r_{view}.png"));
         let mut picture = image::read(&path).unwrap();
@@ -731,14 +731,14 @@ fn some_test_views_or_none_are_compared_and_the_figures_say_so() {
     let folder = Folder::new("some-views");
     let [some, none] = ["some", "none"].map(|name| folder.path(name));
     let answer = command::train("4,0,5", &some, &["--test-views", "3"]);
-    assert!(answer.out.contains("means over 3 test views of 24 x 24, evenly spaced among 5"), "{}", answer.out);
+    assert!(answer.out.contains("means over 3 test views of 24 x 24, evenly spaced among all 5"), "{}", answer.out);
     let result = answer.json();
     assert_eq!((result["views"].as_u64(), result["per_view"].as_array().map(Vec::len)), (Some(3), Some(3)));
     let panels = names(&format!("{some}/images")).into_iter().filter(|name| name.starts_with("test_")).count();
     assert_eq!(panels, 3);
 
     let answer = command::train("4,0,5", &none, &["--no-evaluate"]);
-    assert!(answer.out.contains("not compared with the 5 test views"), "{}", answer.out);
+    assert!(answer.out.contains("not evaluated on the 5 test views"), "{}", answer.out);
     assert!(answer.json()["psnr"].is_null());
     let evaluated = plenoxel(&["evaluate", &none]).json();
     let compared = plenoxel(&["compare", &none, &some, "--out", &folder.path("page.html")]).done();

@@ -170,7 +170,7 @@ fn downscaling_reduces_images_and_intrinsics_alike() {
     assert_eq!(small.load(Split::Train, &|_, _| ()).unwrap()[1].image.dimensions(), (2, 2));
     for downscale in [0, 3] {
         let options = OpenOptions { downscale, ..OpenOptions::default() };
-        refused(dataset::open(&folder.0, &options), 2, &["downscale", &downscale.to_string(), "accepted: 1, 2, 4"]);
+        refused(dataset::open(&folder.0, &options), 2, &["downscale", &downscale.to_string(), "expected 1, 2, 4"]);
     }
 }
 
@@ -221,7 +221,7 @@ fn what_may_never_end_is_refused_wherever_a_file_is_expected() {
         folder.refused(3, &[name, "this is a pipe, not a plain file"]);
         fs::remove_file(&path).unwrap();
         symlink("nowhere", &path).unwrap();
-        folder.refused(3, &[name, "a link to a file that is not there"]);
+        folder.refused(3, &[name, "link is broken"]);
     }
 }
 
@@ -269,9 +269,9 @@ fn cameras_are_read_from_every_unicode_encoding_that_marks_itself() {
     fs::write(folder.path(name), &utf16).unwrap();
     assert_eq!(folder.open().unwrap().count(Split::Train), 4);
     fs::write(folder.path(name), &utf16[..utf16.len() - 1]).unwrap();
-    folder.refused(3, &[name, "UTF-16", "save it as UTF-8"]);
+    folder.refused(3, &[name, "UTF-16", "save the file as UTF-8"]);
     fs::write(folder.path(name), text.replace("train/r_0", "train/r\u{e9}").chars().map(|c| c as u8).collect::<Vec<_>>()).unwrap();
-    folder.refused(3, &[name, "line 4 is no text in UTF-8"]);
+    folder.refused(3, &[name, "line 4 is not valid UTF-8"]);
 }
 
 #[test]
@@ -346,7 +346,7 @@ fn broken_images_are_found_on_opening_and_named() {
     // The last 12 bytes only say that the file ends; without them every pixel is still there.
     for length in [20, 40, png.len() - 13] {
         fs::write(&path, &png[..length]).unwrap();
-        folder.refused(3, &["r_1.png", "cut short"]);
+        folder.refused(3, &["r_1.png", "truncated"]);
     }
     fs::write(&path, b"\xff\xd8\xff\xe0 JFIF and so on, long enough").unwrap();
     folder.refused(3, &["r_1.png", "JPEG", "PNG"]);

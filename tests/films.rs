@@ -112,11 +112,11 @@ fn a_path_becomes_frames_in_every_format_and_a_film() {
     // Without its views a run is still turned around, and an earlier film of the name is gone.
     fs::remove_dir_all(&data).unwrap();
     let answer = plenoxel(&["render", &run, "--path", "orbit", "--frames", "2", "--size", "9x8"]);
-    assert!(answer.code == 0 && answer.err.contains("follows from the box"), "{}", answer.err);
+    assert!(answer.code == 0 && answer.err.contains("computed from the box"), "{}", answer.err);
     assert_eq!(names(&format!("{renders}/orbit")), ["frame_0000.png", "frame_0001.png"]);
     assert!(names(&renders).iter().all(|name| ["orbit", "orbit.gif", "orbit.mp4"].contains(&name.as_str())), "{:?}", names(&renders));
     assert_eq!(image::size(Path::new(&format!("{renders}/orbit/frame_0001.png"))).unwrap(), (9, 8));
-    plenoxel(&["render", &run, "--path", "spiral", "--data", &data]).refused(3, &["not there any more"]);
+    plenoxel(&["render", &run, "--path", "spiral", "--data", &data]).refused(3, &["no longer exists"]);
     plenoxel(&["render", &run]).refused(3, &["--data"]);
 }
 
@@ -169,8 +169,8 @@ fn cameras_of_other_programs_are_recognised_and_damaged_ones_refused() {
     assert_eq!(frame("base_cam/frame_0000.png"), (10, 10));
 
     let refused = |path: &str, code: u8, parts: &[&str]| plenoxel(&["render", &run, "--path", path]).refused(code, parts);
-    refused("orbti", 2, &["--path", "orbti", "no file", "orbit, spiral"]);
-    refused(&data, 3, &["scene", "this is a folder", "a JSON file of cameras is expected"]);
+    refused("orbti", 2, &["--path", "orbti", "does not exist", "orbit, spiral"]);
+    refused(&data, 3, &["scene", "this is a folder", "expected a JSON file of cameras"]);
     refused(&write("empty.json", &json!({})), 3, &["empty.json", "none of the keys"]);
     refused(
         &write("broken.json", &json!({"path": [{"R": [0, 0, 0, 0], "T": [0, 0, 0], "fov": 9}]})),
@@ -180,7 +180,7 @@ fn cameras_of_other_programs_are_recognised_and_damaged_ones_refused() {
     for (flag, value, accepted) in [
         ("--frames", "0", "1 to 100000"),
         ("--frames", "100001", "1 to 100000"),
-        ("--size", "99999", "up to 16384"),
+        ("--size", "99999", "at most 16384"),
         ("--size", "0", "320x240"),
         ("--fps", "0", "0.1 to 1000"),
         ("--channels", "heat", "normal"),

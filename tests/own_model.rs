@@ -102,7 +102,7 @@ fn commands_say_what_they_cannot_do_with_a_kind_that_they_do_not_know() {
     for command in [&["evaluate"][..], &["render"], &["export", "vox"], &["export", "mesh"], &["export", "ply"]] {
         plenoxel(&[command, &[&run[..]]].concat()).refused(3, &["checkpoint.safetensors", "`position mlp`"]);
     }
-    plenoxel(&["train", "--resume", &run]).refused(3, &[&run, "ended"]);
+    plenoxel(&["train", "--resume", &run]).refused(3, &[&run, "this run is finished"]);
     plenoxel(&["train", "--preset=demo", "--scene-size=24", "--init-from", &run, "--out", &folder.path("next")])
         .refused(3, &["`position mlp`"]);
     plenoxel(&["compare", &run, &run, "--out", &folder.path("compared.html")]).done();

@@ -61,21 +61,20 @@ fn a_run_becomes_points_in_the_coordinates_of_its_data_that_filters_thin_out() {
     let moved = folder.path("moved");
     fs::rename(&data, &moved).unwrap();
     fs::remove_file(&cloud).unwrap();
-    plenoxel(&["export", "ply", &run])
-        .refused(3, &[&data, "not there any more", "--data DIR", "--min-weight 0 --min-object 0 --color mean"]);
+    plenoxel(&["export", "ply", &run]).refused(3, &[&data, "no longer exists", "--data DIR", "--min-weight 0 --min-object 0 --color mean"]);
     assert!(!Path::new(&cloud).exists(), "half an export");
     plenoxel(&["export", "ply", &run, "--min-weight", "0", "--min-object", "0", "--color", "mean"]).done();
     plenoxel(&["export", "ply", &run, "--data", &moved]).done();
     assert_eq!(points(&cloud), file.len());
 
-    plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "no such run"]);
+    plenoxel(&["export", "ply", &folder.path("missing")]).refused(3, &["missing", "this run folder does not exist"]);
     plenoxel(&["export", "ply", &run, "--data", &moved, "-o", &folder.path("no/where.ply")]).refused(5, &["no/where.ply"]);
     let none = ["export", "ply", &run, "--data", &moved, "--min-value", "1e9"];
-    plenoxel(&none).refused(2, &["leaves no point", "value 0", "a lower minimum"]);
+    plenoxel(&none).refused(2, &["no point is left", "value 0", "a lower minimum"]);
     for (flag, value, part) in [
         ("--color", "blue", "seen, mean, or a direction"),
         ("--color", "0,0,0", "direction"),
-        ("--min-alpha", "1.5", "from 0 on, and below 1"),
+        ("--min-alpha", "1.5", "in [0, 1)"),
         ("--min-weight", "1.5", "from 0 to 1"),
         ("--coords", "camera", "world"),
         ("--noise-radius", "0", "--noise-radius"),
@@ -108,7 +107,11 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     text += "400 0 0 0 0.95 10\n3 0 1 2\n";
     fs::write(&cloud, &text).unwrap();
     let filtered = plenoxel(&["filter", &cloud, "--out", &clean, "--sor-neighbours", "3", "--sor-sigma", "1"]);
-    assert!(filtered.err.contains("left out: 1 rows of `face`") && filtered.err.contains("[height, time], 1 lists"), "{}", filtered.err);
+    assert!(
+        filtered.err.contains("left out 1 row of element `face`") && filtered.err.contains("scalar fields: height, time; 1 list"),
+        "{}",
+        filtered.err
+    );
     assert!(filtered.done().contains("wrote 10 points"));
     let lines: Vec<String> = fs::read_to_string(&clean).unwrap().lines().map(str::to_owned).collect();
     assert_eq!(lines[lines.len() - 2..], ["8.5 0 0 2 8 7 0.8 8", "9.5 0 0 2 9 7 0.9 9"]);
@@ -127,15 +130,15 @@ fn a_cloud_of_another_program_is_cleaned_and_keeps_its_properties() {
     plenoxel(&["filter", &cloud, "-o", &clean, "--min-value", "0.5", "--value-field", "scalar_time", "--max-value", "6"]).done();
     assert_eq!(points(&clean), 6);
     let noise = plenoxel(&["filter", &cloud, "-o", &clean, "--noise-radius", "2.5", "--remove-isolated"]);
-    assert!(noise.err.contains("the units of the file"), "{}", noise.err);
+    assert!(noise.err.contains("units of the file"), "{}", noise.err);
     // Of the neighbours in a row three lie on a line, and four have a plane through it.
     assert_eq!((noise.code, points(&clean)), (0, 6));
 
     fs::write(&cloud, &text.as_bytes()[..text.len() - 12]).unwrap();
-    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "cut short"]);
+    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "truncated"]);
     fs::write(&cloud, text.replace("0.5 0 0", "0,5 0 0")).unwrap();
     refused(&["--sor-sigma", "1"], 3, &["scan.ply", "row 0", "0,5"]);
     fs::write(&cloud, "solid cube").unwrap();
-    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "no PLY file", "solid cube"]);
-    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(3, &["missing.ply", "no such file"]);
+    refused(&["--sor-sigma", "1"], 3, &["scan.ply", "not a PLY file", "solid cube"]);
+    plenoxel(&["filter", &folder.path("missing.ply"), "-o", &clean, "--sor-sigma", "1"]).refused(3, &["missing.ply", "does not exist"]);
 }

@@ -83,7 +83,7 @@ fn a_carved_run_has_a_page_too() {
     plenoxel(&["carve", "--resolution", "16", "--downscale", "8", "--out", &run]).done();
     let page = fs::read_to_string(folder.path("run/report.html")).unwrap();
     check_alone(&page);
-    assert!(page.contains("carving the hull") && page.contains("<h2>Carved</h2>") && !page.contains("<h2>Curves</h2>"));
+    assert!(page.contains("carving the hull") && page.contains("<h2>Carved grid</h2>") && !page.contains("<h2>Curves</h2>"));
     assert_eq!(settings_of(&page)["grid"]["interpolation"], "nearest");
 }
 
@@ -114,7 +114,7 @@ fn an_evaluated_carved_run_has_figures_in_the_comparison_and_the_report() {
     assert_ne!(row(&carved)[6], "–", "the time is that of carving");
     plenoxel(&["report", &carved]).done();
     let page = fs::read_to_string(folder.path("carved/report.html")).unwrap();
-    assert!(page.contains(&format!("<b>{psnr:.2} dB</b>")) && page.contains("figures of all 2 test views"));
+    assert!(page.contains(&format!("<b>{psnr:.2} dB</b>")) && page.contains("scores of all 2 test views"));
 
     // A trained run has its figures, and keeps them.
     plenoxel(&["evaluate", &trained]).json();
@@ -138,12 +138,16 @@ fn runs_are_compared_by_figures_settings_curves_and_pictures() {
     let page = fs::read_to_string(page).unwrap();
     check_alone(&page);
     // The seed is all that differs.
-    assert!(page.contains("1 that differ") && page.contains("<td>seed</td><td>1</td><td>2</td>"));
+    assert!(page.contains("1 setting differs") && page.contains("<td>seed</td><td>1</td><td>2</td>"));
     // Of two views the photograph, and the picture and the error of each run; loss, both kinds of PSNR and voxels over two axes.
     assert_eq!((page.matches("data:image/jpeg;base64,").count(), page.matches("<svg").count()), (10, 8));
-    plenoxel(&["compare", &folder.path("none")]).refused(3, &["there is no such run"]);
+    plenoxel(&["compare", &folder.path("none")]).refused(3, &["this run folder does not exist"]);
     fs::write(folder.path("second/result.json"), "figures").unwrap();
-    plenoxel(&["compare", &first, &second]).refused(3, &["second", "no figures that can be read", "--resume"]);
-    plenoxel(&["report", &second]).done();
-    assert!(fs::read_to_string(folder.path("second/report.html")).unwrap().contains("no figures that can be read"));
+    plenoxel(&["compare", &first, &second]).refused(3, &["second", "result.json of this run is missing or damaged", "--resume"]);
+    let metrics = folder.path("second/metrics.jsonl");
+    fs::write(&metrics, fs::read_to_string(&metrics).unwrap() + "{\"step\":").unwrap();
+    let report = plenoxel(&["report", &second]);
+    assert!(report.err.contains(&format!("warning: {metrics}: 1 unreadable line left out of the curves")), "{}", report.err);
+    report.done();
+    assert!(fs::read_to_string(folder.path("second/report.html")).unwrap().contains("no valid results"));
 }

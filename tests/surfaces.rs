@@ -362,7 +362,7 @@ fn selections_that_hold_nothing_are_refused_with_what_would_do() {
         let error = mesh(&thin, &MeshOptions { level, ..MeshOptions::default() }).unwrap_err();
         assert!(error.exit_code() == 2 && error.to_string().contains(part), "{error}");
     }
-    for (min_alpha, part) in [(0.5, "smaller"), (1.0, "below 1"), (-0.1, "0 or more"), (f64::NAN, "0 or more")] {
+    for (min_alpha, part) in [(0.5, "smaller"), (1.0, "in [0, 1)"), (-0.1, "in [0, 1)"), (f64::NAN, "in [0, 1)")] {
         let error = vox(&thin, &VoxOptions { min_alpha, ..VoxOptions::default() }).unwrap_err();
         assert!(error.exit_code() == 2 && error.to_string().contains(part), "{error}");
     }

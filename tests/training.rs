@@ -244,7 +244,7 @@ fn losses_of_a_config_beside_an_objective_are_refused() {
         |losses: &[&str]| Trainer::<f32>::with_objective(with(losses), views(Split::Train), Objective::new().with("m", 1.0, mse)).err();
     assert!(refused(&[]).is_none() && refused(&["mse"]).is_none());
     let text = refused(&["mse", "tv_color"]).expect("it is refused").to_string();
-    assert!(text.starts_with("losses: mse, tv_color would be ignored beside a custom objective"), "{text}");
+    assert!(text.starts_with("losses: a custom objective does not use the losses of the config: mse, tv_color"), "{text}");
 }
 
 #[test]

@@ -1,55 +1,54 @@
-//! A picture of curves as an SVG: values over steps or seconds, stages side by side, on a logarithmic scale where the values are positive and
-//! far apart.
+//! Line charts as SVG: values over steps or seconds, divided into stages. The scale is logarithmic for positive values over a wide range.
 
 use crate::html::escaped;
 use std::fmt::Write;
 
-/// Small, so that text is large enough where a page shows it in the width of a phone.
+/// Small, so that the text is readable at the width of a phone.
 const WIDTH: f64 = 600.0;
 const HEIGHT: f64 = 380.0;
-/// Of a line of the legend, which is below where there are several curves.
+/// Height of a line of the legend.
 const LEGEND: f64 = 20.0;
 const LEFT: f64 = 88.0;
 const RIGHT: f64 = 24.0;
 const TOP: f64 = 64.0;
 const BOTTOM: f64 = 56.0;
-/// Parts of the horizontal axis that are narrower than this have no room for their names.
+/// Minimum width of a part of the horizontal axis with a name.
 const NARROWEST: f64 = 40.0;
 
 const INK: &str = "#222";
 const FAINT: &str = "#e4e4e4";
 const MARK: &str = "#888";
-/// Colors of curves, in their order.
+/// Colors of the curves, in order.
 const CURVES: [&str; 6] = ["#1f5fa8", "#c8501e", "#3a8a3a", "#7a4fa0", "#a07a20", "#3a8f8f"];
 
-/// What is to be drawn.
+/// A chart.
 #[derive(Debug, Default)]
 pub struct Chart {
-    /// Above it.
+    /// Title above the chart.
     pub title: String,
-    /// What the horizontal axis counts, and how far it goes from 0 on.
+    /// Label of the horizontal axis, and its end; it begins at 0.
     pub across: (String, f64),
-    /// What the vertical axis measures.
+    /// Label of the vertical axis.
     pub up: String,
-    /// Parts of the horizontal axis: beginning and name.
+    /// Parts of the horizontal axis: start and name.
     pub parts: Vec<(f64, String)>,
-    /// The curves. Names are told where there are several.
+    /// The curves. Several curves have a legend.
     pub curves: Vec<Curve>,
 }
 
 /// A curve, and a pale band around it.
 #[derive(Debug, Clone, Default)]
 pub struct Curve {
-    /// What it shows.
+    /// Name in the legend.
     pub name: String,
-    /// Its points; a line goes from one to the next of a list.
+    /// Polylines, each a list of points.
     pub lines: Vec<Vec<(f64, f64)>>,
-    /// Points with the lowest and the highest value there.
+    /// Points of the band, with the lowest and the highest value.
     pub band: Vec<(f64, f64, f64)>,
 }
 
 impl Chart {
-    /// The picture.
+    /// Formats the chart as SVG.
     pub fn svg(&self) -> String {
         let (across, end) = (&self.across.0, self.across.1.max(f64::MIN_POSITIVE));
         let x = |place: f64| LEFT + place / end * (WIDTH - LEFT - RIGHT);
@@ -120,10 +119,10 @@ impl Chart {
 
 /// The unit of values that are logarithms.
 pub const DECIBELS: &str = "dB";
-/// The longest logarithmic scale, as a factor: what is smaller lies on its lower end.
+/// Maximum range of a logarithmic scale, as a factor; smaller values are drawn at its lower end.
 const LONGEST: f64 = 1e4;
 
-/// From values to heights: logarithmic where none of them is negative and those above 0 differ by more than a factor of five, unless they are logarithms.
+/// Vertical scale. It is logarithmic if no value is negative, the positive values differ by more than a factor of five, and the values are not in decibels.
 struct Scale {
     logarithmic: bool,
     low: f64,
@@ -156,7 +155,7 @@ impl Scale {
         bottom - place.clamp(0.0, 1.0) * (bottom - TOP)
     }
 
-    /// Values worth a line, with their labels: 1, 2, 5 in every decade, powers of ten alone where there are many.
+    /// Values of the grid lines, with labels: 1, 2 and 5 in every decade, or only powers of ten over many decades.
     fn ticks(&self) -> Vec<(f64, String)> {
         if !self.logarithmic {
             return linear_ticks(self.low, self.high, 6);
@@ -188,7 +187,7 @@ fn label(value: f64) -> String {
     }
 }
 
-/// At most `most` + 1 round numbers between two bounds, with as many decimals as tell them apart.
+/// Returns at most `most` + 1 round numbers between two bounds, with labels of the necessary decimals.
 fn linear_ticks(low: f64, high: f64, most: usize) -> Vec<(f64, String)> {
     let rough = (high - low) / most as f64;
     let power = 10f64.powf(rough.log10().floor());
@@ -223,7 +222,7 @@ mod tests {
         let scale = Scale::of([0.004, 0.11].into_iter(), false);
         let labels: Vec<String> = scale.ticks().into_iter().map(|(_, label)| label).collect();
         assert_eq!(labels, ["0.005", "0.01", "0.02", "0.05", "0.1"]);
-        // Nothing is lost of a curve that begins at 0, and one that all but vanishes does not press the others together.
+        // A curve that begins at 0 is shown completely, and a curve near 0 does not compress the others.
         let scale = Scale::of([0.0, 1e-12, 0.01, 1.0].into_iter(), false);
         assert!(scale.logarithmic && scale.low > 5e-5 && scale.y(0.0) == HEIGHT - BOTTOM && scale.y(0.01) < scale.y(1e-12));
         assert!(!Scale::of([5.0, 33.0].into_iter(), true).logarithmic && !Scale::of([-1.0, 33.0].into_iter(), false).logarithmic);

@@ -1,4 +1,4 @@
-//! One file for each command: its arguments, and what it does.
+//! The commands: a module for each, with its arguments and its implementation.
 
 pub mod carve;
 mod cloud_filters;
@@ -25,7 +25,7 @@ use plenoxel::error::Error;
 use plenoxel::run::folder::RunFolder;
 use std::path::Path;
 
-/// Refuses to write `out` over a file of one of the runs, or of the dataset in the folder `data`, that a command reads.
+/// Checks that the output file `out` is not a file of one of the `runs` or of the dataset folder `data` that a command reads.
 pub fn check_replaceable(out: &Path, runs: &[&RunFolder], data: Option<&Path>) -> Result<(), Error> {
     let of_run = runs.iter().any(|run| run.owns(out));
     let of_data = data.is_some_and(|data| {
@@ -35,42 +35,39 @@ pub fn check_replaceable(out: &Path, runs: &[&RunFolder], data: Option<&Path>) -
         return Ok(());
     }
     let found = format!("{} belongs to the {} that is read", out.display(), if of_run { "run" } else { "dataset" });
-    Err(Error::config("--out", found, "the name of another file"))
+    Err(Error::usage("--out", found, "choose another file"))
 }
 
-/// Refuses a split without views.
+/// Checks that a split has views.
 fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
     if dataset.count(split) > 0 {
         return Ok(());
     }
-    let found = format!("{split} has no views in {}", dataset.name());
+    let found = format!("{} has no {split} views", dataset.name());
     let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
     let others: Vec<String> = others.map(|split| split.to_string()).collect();
-    Err(Error::config("--split", found, others.join(", ")))
+    Err(Error::usage("--split", found, format!("choose {}", others.join(" or "))))
 }
 
-/// A setting of the library under the name that its flag has.
+/// The error with the name of the flag for its setting.
 pub fn as_flag(error: Error) -> Error {
-    match error {
-        Error::Config { key, found, accepted } => Error::config(format!("--{}", key.replace('_', "-")), found, accepted),
-        other => other,
-    }
+    error.with_key(|key| format!("--{}", key.replace('_', "-")))
 }
 
-/// A split as the command line takes it.
+/// Parses a split.
 fn split(text: &str) -> Result<Split, String> {
-    text.parse().map_err(|_| "train, val or test".to_owned())
+    text.parse().map_err(|_| "expected train, val or test".to_owned())
 }
 
-/// A whole number within bounds, as the command line takes it.
+/// Parses a whole number from `least` to `most`.
 pub fn whole<N: TryFrom<u64>>(least: u64, most: u64) -> impl Fn(&str) -> Result<N, String> + Clone {
     move |text| {
         let number = text.parse().ok().filter(|n| (least..=most).contains(n));
-        number.and_then(|n| N::try_from(n).ok()).ok_or_else(|| format!("a whole number from {least} to {most}"))
+        number.and_then(|n| N::try_from(n).ok()).ok_or_else(|| format!("expected a whole number from {least} to {most}"))
     }
 }
 
-/// An amount of memory as the command line takes it: a number of bytes, or of units of 1000 or 1024.
+/// Parses an amount of memory: a number of bytes, or a number with a decimal or binary unit.
 pub fn memory_size(text: &str) -> Result<u64, String> {
     let unit = text.trim_start_matches(|c: char| c.is_ascii_digit() || c == '.');
     let bytes_of_unit = match unit.trim().to_ascii_lowercase().as_str() {
@@ -83,10 +80,10 @@ pub fn memory_size(text: &str) -> Result<u64, String> {
     };
     let number: f64 = text[..text.len() - unit.len()].parse().unwrap_or(f64::NAN);
     let bytes = number * bytes_of_unit;
-    if bytes >= 1.0 { Ok(bytes as u64) } else { Err("an amount of memory, such as 8GB, 8GiB or 500MB".to_owned()) }
+    if bytes >= 1.0 { Ok(bytes as u64) } else { Err("expected an amount of memory such as 8GB, 8GiB or 500MB".to_owned()) }
 }
 
-/// A color as the command line takes it: a name, or three numbers.
+/// Parses a color: a name, or three numbers.
 fn background(text: &str) -> Result<[f64; 3], String> {
     match text {
         "white" => return Ok([1.0; 3]),
@@ -94,10 +91,10 @@ fn background(text: &str) -> Result<[f64; 3], String> {
         _ => {}
     }
     let color = numbers(text).ok().filter(|color: &[f64; 3]| color.iter().all(|c| (0.0..=1.0).contains(c)));
-    color.ok_or_else(|| "white, black, or three numbers in [0, 1] such as 0.2,0.5,1".to_owned())
+    color.ok_or_else(|| "expected white, black, or three numbers in [0, 1] such as 0.2,0.5,1".to_owned())
 }
 
-/// A color as [`background`] reads it.
+/// Formats a color for [`background`].
 fn background_name(color: [f32; 3]) -> String {
     match color {
         [1.0, 1.0, 1.0] => "white".to_owned(),
@@ -106,23 +103,23 @@ fn background_name(color: [f32; 3]) -> String {
     }
 }
 
-/// A number of at least `least`, as the command line takes it.
+/// Parses a number of at least `least`.
 fn number(least: f64) -> impl Fn(&str) -> Result<f64, String> + Clone {
     move |text| match text.parse::<f64>() {
         Ok(number) if number.is_finite() && number >= least => Ok(number),
-        _ if least == f64::NEG_INFINITY => Err("a number".to_owned()),
-        _ if least == f64::MIN_POSITIVE => Err("a number above 0".to_owned()),
-        _ => Err(format!("a number of at least {least}")),
+        _ if least == f64::NEG_INFINITY => Err("expected a number".to_owned()),
+        _ if least == f64::MIN_POSITIVE => Err("expected a number above 0".to_owned()),
+        _ => Err(format!("expected a number of at least {least}")),
     }
 }
 
-/// Numbers with commas between them, as the command line takes them.
+/// Parses N numbers separated by commas.
 fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|n| n.trim().parse().ok().filter(|n: &f64| n.is_finite())).collect();
-    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| format!("{N} numbers with commas between them"))
+    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| format!("expected {N} numbers separated by commas"))
 }
 
-/// By how much images may be reduced.
+/// Maximum factor of image reduction.
 const MOST_REDUCTION: u64 = 64;
 
 #[cfg(test)]

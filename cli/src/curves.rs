@@ -1,17 +1,17 @@
-//! The loss over the steps of a run, after figure 4 of the source paper: stages side by side, on a logarithmic scale.
+//! The loss curve of a run, like figure 4 of the source paper, with stages side by side and a logarithmic scale.
 //!
-//! The pale band reaches from the lowest to the highest loss among the steps that share a column; the line is a mean over about 2 % of
-//! the run, never across the end of a stage, so that the jump after a subdivision stays visible.
+//! The pale band shows the minimum and the maximum loss of the steps in a column. The line is a moving average over about 2 % of the run, separate for
+//! each stage, so that the jump at the start of a stage remains visible.
 
 use crate::chart::{Chart, Curve};
 use plenoxel::train::PlannedStage;
 
-/// Points of the curve: one for each pixel across would be more than an eye can tell apart.
+/// Number of points of the curve.
 const COLUMNS: usize = 400;
-/// Points to either side that smooth one: 1 % of the run.
+/// Number of points on either side for smoothing: 1 % of the run.
 const REACH: usize = COLUMNS / 100;
 
-/// The picture of `losses`, one for each step from 0 on, as SVG. `stages` may reach beyond them, if a run ended early.
+/// Draws `losses`, one for each step from 0 on, as SVG. `stages` may have more steps, if the run ended early.
 pub fn loss_svg(losses: &[f64], stages: &[PlannedStage], title: &str) -> String {
     let steps = stages.last().map_or(0, |stage| stage.first + stage.steps).max(losses.len() as u64).max(1);
     let columns = columns(losses, stages);
@@ -27,7 +27,7 @@ pub fn loss_svg(losses: &[f64], stages: &[PlannedStage], title: &str) -> String 
     chart.svg()
 }
 
-/// The steps that share a point of the curve.
+/// The steps of a point of the curve.
 struct Column {
     step: f64,
     stage: usize,
@@ -60,7 +60,7 @@ fn columns(losses: &[f64], stages: &[PlannedStage]) -> Vec<Column> {
     columns
 }
 
-/// Replaces each mean by that of its neighbourhood, which shrinks towards the ends so that it stays centred.
+/// Smooths the means with a centered window, which becomes smaller towards the ends.
 fn smooth(columns: &mut [Column]) {
     let means: Vec<f64> = columns.iter().map(|c| c.smooth).collect();
     for (i, column) in columns.iter_mut().enumerate() {

@@ -1,6 +1,6 @@
-//! What HTML pages share: text made harmless, pictures that travel with the page, and the frame with its style sheet.
+//! HTML pages: escaping, embedded pictures, and the page template with its style sheet.
 //!
-//! A page is one file that reads nothing else, so that it can be kept, moved and sent.
+//! A page is a single file without external resources, so it can be moved and sent.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -8,7 +8,7 @@ use image::DynamicImage;
 use image::codecs::jpeg::JpegEncoder;
 use plenoxel::dataset::image::RgbaImage;
 
-/// Looks of all pages; they follow the reader's choice of light or dark.
+/// Style sheet of all pages, with the light or dark color scheme of the reader.
 const STYLE: &str = "\
 :root { color-scheme: light dark; }
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 80rem; padding: 0 1rem; }
@@ -20,7 +20,7 @@ img { display: block; max-width: 100%; border-radius: 4px; }
 .scroll { overflow-x: auto; }
 ";
 
-/// Text as it may stand in an element or in a quoted attribute.
+/// Escapes text for an element or a quoted attribute.
 pub fn escaped(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
@@ -36,17 +36,17 @@ pub fn escaped(text: &str) -> String {
     safe
 }
 
-/// JPEG quality of pictures within a page; the files beside it are whole.
+/// JPEG quality of embedded pictures.
 const QUALITY: u8 = 88;
 
-/// An opaque picture within the page, reduced to at most this width and height in pixels.
+/// Embeds an opaque picture, downscaled to at most this width and height in pixels.
 pub fn picture(picture: &RgbaImage, [width, height]: [u32; 2], description: &str) -> String {
     let large = picture.width() > width || picture.height() > height;
     let whole = DynamicImage::from(picture.clone());
     let rgb = if large { whole.thumbnail(width, height) } else { whole }.into_rgb8();
     let (width, height, description) = (rgb.width(), rgb.height(), escaped(description));
     let mut jpeg = Vec::new();
-    // Only pictures of more than 65535 pixels a side are refused.
+    // JPEG fails only for pictures of more than 65535 pixels per side.
     match JpegEncoder::new_with_quality(&mut jpeg, QUALITY).encode_image(&rgb) {
         Ok(()) => format!(
             "<img width=\"{width}\" height=\"{height}\" alt=\"{description}\" src=\"data:image/jpeg;base64,{}\">",
@@ -56,7 +56,7 @@ pub fn picture(picture: &RgbaImage, [width, height]: [u32; 2], description: &str
     }
 }
 
-/// A whole page: a title as text, styles of its own, and the HTML below its heading.
+/// Formats a page from its title as text, its style sheet, and the HTML below its heading.
 pub fn page(title: &str, style: &str, body: &str) -> String {
     let title = escaped(title);
     format!(

@@ -1,4 +1,4 @@
-//! Pictures of results: panels target | render | error | depth, strips, and the color maps behind them.
+//! Pictures of results: panels of target, render, error and depth; strips; and their color maps.
 
 use image::imageops::crop_imm;
 use ndarray::{Array2, Array3, Axis, Slice, concatenate};
@@ -8,36 +8,36 @@ use plenoxel::error::Result;
 use plenoxel::render::picture::Picture;
 use std::path::Path;
 
-/// The error that gets the brightest color: the absolute difference, averaged over channels.
+/// Error with the brightest color: the absolute difference, averaged over channels.
 pub const ERROR_SCALE: f32 = 0.25;
 
 /// A picture with values in [0, 1], `[h, w, 3]`.
 pub type Rgb = Array3<f32>;
 
-/// Distances that share the color map of depth.
+/// Range of distances for the color map of depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DepthRange {
-    /// Gets the red end.
+    /// Distance shown in red.
     pub near: f64,
-    /// Gets the blue end.
+    /// Distance shown in blue.
     pub far: f64,
 }
 
 impl DepthRange {
-    /// The range for a camera: the ball that touches the faces of the box from inside. Cameras at one distance share it.
+    /// The range for a camera: the largest ball inside the box. Cameras at the same distance have the same range.
     pub fn of(camera: &Camera, half_width: f64) -> Self {
         let distance = camera.position().length();
         DepthRange { near: (distance - half_width).max(0.0), far: distance + half_width }
     }
 }
 
-/// Target, render, error and depth side by side.
+/// Draws target, render, error and depth side by side.
 pub fn panel(target: &Rgb, picture: &Picture, range: DepthRange) -> Rgb {
     let error = error_map(target, picture);
     strip(&[target, &picture.rgb, &error, &depth_map(picture, range)])
 }
 
-/// Pictures of one height side by side, with thin gaps.
+/// Draws pictures of the same height side by side, with thin gaps.
 pub fn strip(pictures: &[&Rgb]) -> Rgb {
     let Some(first) = pictures.first() else {
         return Rgb::zeros((0, 0, 3));
@@ -51,15 +51,15 @@ pub fn strip(pictures: &[&Rgb]) -> Rgb {
     concatenate(Axis(1), &parts).unwrap_or_else(|_| (*first).clone())
 }
 
-/// Pixels between pictures of a strip of this height.
+/// Gap between the pictures of a strip of this height, in pixels.
 fn gap(height: usize) -> usize {
     (height / 50).max(2)
 }
 
-/// A picture of a strip, counted from 0, if all of them are of one size: in a panel 0 is the target, 1 the render and 2 the error. `None` if the
-/// strip has no such picture.
+/// Cuts a picture out of a strip of pictures of one size. In a panel, 0 is the target, 1 the render and 2 the error. `None` if the strip has no such
+/// picture.
 pub fn part(strip: &RgbaImage, number: usize, (width, height): (usize, usize)) -> Option<RgbaImage> {
-    // A file may say anything of its size.
+    // The size is read from a file, and may be any number.
     if height != strip.height() as usize || width > strip.width() as usize {
         return None;
     }
@@ -67,7 +67,7 @@ pub fn part(strip: &RgbaImage, number: usize, (width, height): (usize, usize)) -
     (x + width <= strip.width() as usize).then(|| crop_imm(strip, x as u32, 0, width as u32, height as u32).to_image())
 }
 
-/// Mean absolute error over channels, black at 0 through red to pale yellow at [`ERROR_SCALE`] and above.
+/// Mean absolute error over channels: black is 0, pale yellow is [`ERROR_SCALE`] or more.
 pub fn error_map(target: &Rgb, picture: &Picture) -> Rgb {
     let (h, w, _) = target.dim();
     colored(h, w, |y, x| {
@@ -76,7 +76,7 @@ pub fn error_map(target: &Rgb, picture: &Picture) -> Rgb {
     })
 }
 
-/// Distance to what is seen, Σ wᵢ tᵢ / opacity, red where near and blue where far, over white where nothing is seen.
+/// Mean distance along the ray, Σ wᵢ tᵢ / opacity: red is near, blue is far, white is empty.
 pub fn depth_map(picture: &Picture, range: DepthRange) -> Rgb {
     let (h, w) = picture.depth.dim();
     colored(h, w, |y, x| {
@@ -97,7 +97,7 @@ pub fn opacity_map(picture: &Picture) -> Rgb {
     colored(h, w, |y, x| [opacity[[y, x]]; 3])
 }
 
-/// Unit normals `[h, w, 3]` of a picture that shows normals over black; zero where there is none.
+/// Unit normals `[h, w, 3]` from a picture of normals over black; zero where empty.
 pub fn unit_normals(picture: &Picture) -> Rgb {
     let mut normals = picture.rgb.clone();
     for mut normal in normals.lanes_mut(Axis(2)) {
@@ -107,7 +107,7 @@ pub fn unit_normals(picture: &Picture) -> Rgb {
     normals
 }
 
-/// Normals with x, y, z from -1 to 1 as red, green, blue from 0 to 1, over white where nothing is seen.
+/// Normals as colors: x, y, z from -1 to 1 are red, green, blue from 0 to 1; white is empty.
 pub fn normal_map(picture: &Picture) -> Rgb {
     let normals = unit_normals(picture);
     let (h, w, _) = normals.dim();
@@ -136,14 +136,14 @@ fn colored(h: usize, w: usize, color: impl Fn(usize, usize) -> [f32; 3]) -> Rgb 
 /// Coefficients of a polynomial of degree 6 for red, green and blue, the constant first.
 type Map = [[f32; 3]; 7];
 
-/// A color map at `x`, which is brought into [0, 1].
+/// Evaluates a color map at `x`, clamped to [0, 1].
 fn color(map: &Map, x: f32) -> [f32; 3] {
     let x = if x.is_finite() { x.clamp(0.0, 1.0) } else { 1.0 };
     let value = |c: usize| map.iter().rev().fold(0.0, |sum, k| sum * x + k[c]);
     [0, 1, 2].map(|c| value(c).clamp(0.0, 1.0))
 }
 
-/// Google's turbo in Mikhailov's polynomial fit: the many hues tell small differences of distance apart, dark blue to dark red.
+/// Google's turbo in Mikhailov's polynomial fit, from dark blue to dark red. Its many hues make small differences of distance visible.
 const TURBO: Map = [
     [0.135_721_38, 0.091_402_61, 0.106_673_3],
     [4.615_392_6, 2.194_188_4, 12.641_946],
@@ -154,7 +154,7 @@ const TURBO: Map = [
     [0.0; 3],
 ];
 
-/// matplotlib's inferno in Zucker's polynomial fit: evenly brighter from black on.
+/// matplotlib's inferno in Zucker's polynomial fit, with uniformly increasing brightness from black.
 const INFERNO: Map = [
     [0.000_218_940_37, 0.001_651_004_6, -0.019_480_899],
     [0.106_513_42, 0.563_956_44, 3.932_712_3],
@@ -170,7 +170,7 @@ mod tests {
     use super::*;
 
     fn near(a: [f32; 3], b: [f32; 3]) -> bool {
-        // The fit of inferno is good to about 1 %.
+        // The error of the fit is about 1 %.
         a.iter().zip(b).all(|(a, b)| (a - b).abs() < 0.02)
     }
 
@@ -200,7 +200,7 @@ mod tests {
         let pixel = |x: usize| [0, 1, 2].map(|c| map[[0, x, c]]);
         assert_eq!(pixel(0), [1.0; 3]);
         assert!(near(pixel(1), color(&TURBO, 1.0)));
-        // Half seen at 2.75 / 0.5 = 5.5: half the color of the far end, half white.
+        // Opacity 0.5 at the distance 2.75 / 0.5 = 5.5: half the color of the far end, half white.
         assert!(near(pixel(2), color(&TURBO, 0.0).map(|c| 0.5 * c + 0.5)));
     }
 

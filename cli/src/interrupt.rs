@@ -1,14 +1,15 @@
-//! Ctrl-C, SIGTERM and SIGHUP, which a terminal sends when it is closed: the first time while a run trains, or a sweep has runs made, it is asked to save and stop; else the process ends.
+//! Handling of Ctrl-C, SIGTERM and SIGHUP (sent when a terminal is closed). The first signal asks a training run or a sweep to save and stop. Otherwise,
+//! signals end the process.
 
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
 use std::sync::{Mutex, Once, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Exit code of a process that was interrupted.
+/// Exit code of an interrupted process.
 pub const EXIT_CODE: u8 = 130;
 
-/// Who stops a process often tells it twice, as its parent and as its group: what comes so soon after the first is the same wish.
+/// Time during which further signals count as the first one: a process often receives a signal twice, directly and through its process group.
 const SAME_WISH: Duration = Duration::from_secs(1);
 
 static WATCHED: AtomicBool = AtomicBool::new(false);
@@ -16,7 +17,8 @@ static REQUESTED: Mutex<Option<Instant>> = Mutex::new(None);
 /// Message for an interruption that ends the process at once.
 static LAST_WORDS: Mutex<String> = Mutex::new(String::new());
 
-/// Has interruptions end the process with [`EXIT_CODE`] and a clean line on a terminal. Where the system does not let it, they end the process as ever.
+/// Installs the signal handler: interruptions end the process with [`EXIT_CODE`] and a message. If it cannot be installed, they end the process as
+/// usual.
 pub fn install() {
     static LISTENING: Once = Once::new();
     LISTENING.call_once(listen);
@@ -27,11 +29,11 @@ pub fn on_exit(words: String) {
     *LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner) = words;
 }
 
-/// While it lives, an interruption is something to ask for.
+/// A guard during which the first interruption is only recorded.
 pub struct Watch(());
 
 impl Watch {
-    /// Begins to watch. Where the system does not let it, an interruption ends the process as ever.
+    /// Starts recording interruptions. If no handler can be installed, they end the process as usual.
     pub fn begin() -> Self {
         install();
         *wished() = None;
@@ -39,13 +41,13 @@ impl Watch {
         Watch(())
     }
 
-    /// True if somebody asked.
+    /// True if an interruption was recorded.
     pub fn requested(&self) -> bool {
         requested()
     }
 }
 
-/// True if somebody asked since the last watch began.
+/// True if an interruption was recorded since the last [`Watch::begin`].
 pub fn requested() -> bool {
     wished().is_some()
 }
@@ -60,21 +62,21 @@ fn wished() -> std::sync::MutexGuard<'static, Option<Instant>> {
     REQUESTED.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Somebody wants the process to stop.
+/// Handles an interruption.
 fn wish() {
     let first = *wished().get_or_insert_with(Instant::now);
     if !WATCHED.load(SeqCst) || first.elapsed() > SAME_WISH {
         let words = LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner);
         let mut err = std::io::stderr();
-        // The bar goes, and with it what the terminal wrote behind it. Nobody can be told that stderr cannot be written.
+        // Clears the progress bar with the `^C` of the terminal. A failure to print cannot be reported.
         let clear = if err.is_terminal() { "\r\x1b[2K" } else { "" };
         drop(writeln!(err, "{clear}error: {}", if words.is_empty() { "interrupted" } else { &words }));
         std::process::exit(EXIT_CODE.into());
     }
 }
 
-/// Has a thread listen, for as long as the process lives, to what it does not ignore: shells have what runs in the background ignore Ctrl-C, and `nohup` has a
-/// program ignore SIGHUP.
+/// Starts a thread that handles signals, except those that the process ignores: shells make background processes ignore Ctrl-C, and `nohup` makes
+/// programs ignore SIGHUP.
 #[cfg(unix)]
 fn listen() {
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};

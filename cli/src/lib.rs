@@ -1,9 +1,8 @@
-//! The command line of plenoxel as a library: [`run`] takes arguments and two streams and returns an exit code, so that a test can call
-//! it like any function.
+//! The command line of plenoxel as a library: [`run`] takes arguments and two streams and returns an exit code, so that tests can call it
+//! directly.
 //!
-//! Exit codes: 0 done, 2 usage or a setting that cannot be used, 3 bad input, 4 numbers that are not finite, 5 reading or writing,
-//! 130 interrupted: what was trained is saved. A sweep ends with the code of the
-//! first of its runs that failed.
+//! Exit codes: 0 success, 2 usage or an invalid setting, 3 bad input, 4 numbers that are not finite, 5 reading or writing, 130 interrupted with
+//! the training saved. A sweep ends with the exit code of its first failed run.
 #![forbid(unsafe_code)]
 
 mod chart;
@@ -25,29 +24,29 @@ use progress::{Console, LogFormat};
 use std::ffi::OsString;
 use std::io::Write;
 
-/// Name and version, as runs record it.
+/// Program name and version, recorded by runs.
 const PROGRAM: &str = concat!("plenoxel ", env!("CARGO_PKG_VERSION"));
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel train                             learn the built-in scene; needs no files
-  plenoxel train data/lego --preset paper    learn a NeRF-synthetic scene as the source paper does
-  plenoxel carve data/lego                   an opaque colored grid from silhouettes
-  plenoxel evaluate runs/lego-1              PSNR and SSIM on its test views
-  plenoxel render runs/lego-1 --view 0       a picture of it
-  plenoxel render runs/lego-1 --path orbit   a film of it
-  plenoxel report runs/lego-1                its page again, to look around in
-  plenoxel export ply runs/lego-1            its voxels as a colored point cloud
-  plenoxel export mesh runs/lego-1           its surface, for other programs
-  plenoxel presets                           settings to start from, and how long they take
-  plenoxel compare runs/a runs/b             figures, curves and pictures side by side
-  plenoxel harmonics                         a picture of the functions that colors are made of
-  plenoxel sweep scenes.toml                 every scene with every method, and the table of what came of it
+  plenoxel train                             train the built-in scene; needs no files
+  plenoxel train data/lego --preset paper    train a NeRF-synthetic scene as in the source paper
+  plenoxel carve data/lego                   carve an opaque colored grid from silhouettes
+  plenoxel evaluate runs/lego-1              compute PSNR and SSIM on the test views
+  plenoxel render runs/lego-1 --view 0       render a test view
+  plenoxel render runs/lego-1 --path orbit   render a video along a camera path
+  plenoxel report runs/lego-1                regenerate report.html, with an interactive viewer
+  plenoxel export ply runs/lego-1            export the voxels as a colored point cloud
+  plenoxel export mesh runs/lego-1           export the surface as a mesh
+  plenoxel presets                           list presets and their training times
+  plenoxel compare runs/a runs/b             compare results, curves and pictures of runs
+  plenoxel harmonics                         draw the spherical harmonics, the basis of view-dependent color
+  plenoxel sweep scenes.toml                 run every scene with every method and print the results
 
-Progress goes to stderr, results to stdout. Exit codes: 0 done, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
-130 interrupted (what was trained is saved).";
+Progress is printed to stderr, results to stdout. Exit codes: 0 success, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
+130 interrupted (the training is saved).";
 
-/// Voxel radiance fields from photographs with known cameras
+/// Train voxel radiance fields from photographs with known cameras
 #[derive(Debug, Parser)]
 #[command(name = "plenoxel", version, after_help = EXAMPLES, max_term_width = 110, arg_required_else_help = true)]
 struct Cli {
@@ -78,44 +77,44 @@ enum Command {
 
 #[derive(Debug, Args)]
 struct Machine {
-    /// Threads to compute with; results do not depend on it [default: all cores]
-    #[arg(long, global = true, value_name = "N", help_heading = "Machine", value_parser = commands::whole::<usize>(1, machine::MOST_THREADS as u64))]
+    /// Number of threads; results do not depend on it [default: all cores]
+    #[arg(long, global = true, value_name = "N", help_heading = "Machine", value_parser = commands::whole::<usize>(1, machine::MOST_THREADS as u64), allow_negative_numbers = true)]
     threads: Option<usize>,
 
-    /// Refuse what would need more memory than this, such as 8GB or 500MiB [default: what is free]
-    #[arg(long, global = true, value_name = "SIZE", help_heading = "Machine", value_parser = commands::memory_size)]
+    /// Memory limit, such as 8GB or 500MiB; a command that needs more is refused before it starts [default: the free memory]
+    #[arg(long, global = true, value_name = "SIZE", help_heading = "Machine", value_parser = commands::memory_size, allow_hyphen_values = true)]
     max_memory: Option<u64>,
 
     /// Print errors and results only
     #[arg(long, short, global = true, help_heading = "Machine")]
     quiet: bool,
 
-    /// What to write to stderr: lines for people, or a JSON object on each line for programs; stdout stays as it is
+    /// Format of messages on stderr: plain text, or one JSON object per line; it does not affect stdout
     #[arg(long, global = true, value_name = "FORMAT", help_heading = "Machine", value_enum, default_value_t = LogFormat::Plain)]
     log_format: LogFormat,
 }
 
 impl Machine {
-    /// The flags with which another process would use the machine in the same way.
+    /// The command-line flags for these settings, for child processes.
     fn flags(&self) -> Vec<String> {
         let threads = self.threads.map(|n| format!("--threads={n}"));
         threads.into_iter().chain(self.max_memory.map(|bytes| format!("--max-memory={bytes}"))).collect()
     }
 }
 
-/// Where a command prints.
+/// Output streams of a command.
 pub struct Streams<'a> {
     /// Results.
     pub out: &'a mut (dyn Write + Send),
-    /// Progress and errors.
+    /// Progress, notes and errors.
     pub err: &'a mut (dyn Write + Send),
-    /// True if the process's stderr is a terminal: progress is then drawn there as a bar.
+    /// True if stderr is a terminal; progress is then drawn as a bar.
     pub terminal: bool,
-    /// True if its stdout is one: lines for programs are left out there.
+    /// True if stdout is a terminal; the JSON line for programs is then not printed.
     pub read_by_people: bool,
 }
 
-/// Runs a command line, the program's name first, and returns the exit code.
+/// Runs a command line, which begins with the program name, and returns the exit code.
 pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams: Streams<'_>) -> u8 {
     let cli = match Cli::try_parse_from(args) {
         Ok(cli) => cli,
@@ -153,10 +152,10 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     }
 }
 
-/// Help and version go to stdout with exit code 0, complaints to stderr with 2.
+/// Prints help and version to stdout with exit code 0, errors of arguments to stderr with exit code 2.
 fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
     let text = answer.render();
-    // A stream that is closed cannot be told so.
+    // A failure to print cannot be reported.
     if answer.use_stderr() {
         let written = match streams.terminal {
             true => write!(streams.err, "{}", text.ansi()),
@@ -172,11 +171,11 @@ fn answer_to_arguments(answer: &clap::Error, streams: Streams<'_>) -> u8 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::{Command, CommandFactory};
+    use clap::{Command, CommandFactory, ValueHint};
     use plenoxel::model::plenoxels::config::Config;
     use plenoxel::run::settings::{CARVE, PRESETS};
 
-    /// A command with those below it, and the words that call it.
+    /// A command and its subcommands.
     fn commands(command: &Command) -> Vec<Command> {
         let below = command.get_subcommands().flat_map(commands);
         std::iter::once(command.clone()).chain(below).collect()
@@ -202,6 +201,20 @@ mod tests {
             for argument in command.get_arguments() {
                 let text = argument.get_help().unwrap_or_default().to_string();
                 assert!(text.len() > 5 && !text.ends_with('.'), "{name}: {argument}: {text}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_negative_number_is_a_value_that_the_flag_itself_refuses() {
+        const TEXTS: [&str; 7] = ["KEY=VALUE", "DATA", "SPLIT", "NAME", "FORMAT", "FORMATS", "orbit|spiral|FILE"];
+        for command in all() {
+            for flag in
+                command.get_opts().filter(|flag| flag.get_value_hint() == ValueHint::Unknown && flag.get_possible_values().is_empty())
+            {
+                let name = flag.get_value_names().unwrap_or_default().concat();
+                let takes = flag.is_allow_negative_numbers_set() || flag.is_allow_hyphen_values_set() || flag.is_require_equals_set();
+                assert!(takes || TEXTS.contains(&name.as_str()), "{}: {flag}", command.get_name());
             }
         }
     }
@@ -243,7 +256,7 @@ mod tests {
     #[test]
     fn the_examples_of_all_helps_are_understood() {
         let helps = all().into_iter().map(|command| command.get_after_help().unwrap_or_default().to_string());
-        // What an example does stands behind two spaces.
+        // The description of an example follows two spaces.
         let example = |line: &str| Some(line.strip_prefix("  plenoxel ")?.split("  ").next()?.split(['>', '|']).next()?.to_owned());
         let examples = helps.flat_map(|help| help.lines().filter_map(example).collect::<Vec<_>>());
         let lines: Vec<String> = examples.collect();

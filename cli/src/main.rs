@@ -1,4 +1,4 @@
-//! The `plenoxel` program: everything is in the library, where tests can call it.
+//! The `plenoxel` program. Its implementation is in the library, so that tests can call it.
 #![forbid(unsafe_code)]
 
 use std::io::IsTerminal;
@@ -12,10 +12,10 @@ fn main() -> ExitCode {
     ExitCode::from(plenoxel_cli::run(std::env::args_os(), streams))
 }
 
-/// Has a file that grows beyond `ulimit -f` be an error of the write, and not the end of the process.
+/// Ignores the signal for files beyond `ulimit -f`, so that the write returns an error instead.
 #[cfg(unix)]
 fn refuse_large_files_by_error() {
-    // The flag is not read: that there is a handler is what counts.
+    // Nothing reads the flag; installing a handler is enough.
     drop(signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Default::default()));
 }
 

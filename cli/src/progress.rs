@@ -1,7 +1,7 @@
-//! The only printing: progress and notes to stderr, results to stdout.
+//! Output of the program: progress and notes to stderr, results to stdout.
 //!
-//! On a terminal progress is a bar; elsewhere, in a log file say, it is a plain line every few seconds and at the end of each stage. With
-//! `--log-format json` each line on stderr is one JSON object, for programs.
+//! On a terminal, progress is a bar. In a file or pipe, it is a line every few seconds and at the end of each stage. With `--log-format json`, each
+//! line on stderr is a JSON object.
 
 mod terminal;
 mod training;
@@ -20,27 +20,27 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 pub use training::Training;
 
-/// Time between lines.
+/// Interval of progress lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
-/// Time between changes of a bar: as often as an eye can follow.
+/// Interval of updates of a bar.
 const BAR_EVERY: Duration = Duration::from_millis(100);
 
-/// Columns of a bar and its percentage.
+/// Width of a bar with its percentage, in columns.
 const BAR_COLUMNS: usize = 14;
 
-/// What is written to stderr.
+/// Format of messages on stderr.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
-    /// Lines for people; on a terminal, bars.
+    /// Plain text; on a terminal, with progress bars.
     Plain,
-    /// A JSON object on each line.
+    /// One JSON object per line.
     Json,
 }
 
-/// Where everything is printed; usable from several threads.
+/// The console, for use from several threads.
 pub struct Console<'a> {
     streams: Mutex<Streams<'a>>,
-    /// The bar on the screen, if there is one: other lines must not be written through it.
+    /// The visible progress bar, which is suspended while other lines are printed.
     bar: Mutex<Option<ProgressBar>>,
     bars: bool,
     /// True if stderr is a terminal.
@@ -50,40 +50,40 @@ pub struct Console<'a> {
 }
 
 impl<'a> Console<'a> {
-    /// A console on two streams. `quiet` leaves only errors and results.
+    /// Creates a console on two streams. With `quiet`, it prints errors and results only.
     pub fn new(streams: Streams<'a>, format: LogFormat, quiet: bool) -> Self {
         let bars = streams.terminal && format == LogFormat::Plain && !quiet;
         let terminal = streams.terminal;
         Console { streams: Mutex::new(streams), bar: Mutex::new(None), bars, terminal, format, quiet }
     }
 
-    /// A line of results on stdout, in which nothing does anything to a terminal.
+    /// Prints a line of results to stdout, with control characters escaped.
     pub fn result(&self, line: &str) -> Result<()> {
         let line = one_line(line);
         let read_by_people = lock(&self.streams).read_by_people;
         if read_by_people { self.text(&terminal::wrapped(&line, terminal::columns())) } else { self.text(&line) }
     }
 
-    /// Lines of results on stdout as they are: they were made here, and [`one_line`] was asked about what came from elsewhere. A reader that has
-    /// gone away is no failure: the results are in files too.
+    /// Prints lines of results to stdout unchanged. Untrusted text in them must be escaped with [`one_line`]. A closed stdout is no error, because the
+    /// results are also in files.
     pub fn text(&self, text: &str) -> Result<()> {
         let out = &mut lock(&self.streams).out;
         match writeln!(out, "{text}").and_then(|()| out.flush()) {
-            Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Error::io("stdout", e, "printing the result")),
+            Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Error::io("stdout", e, "printing the results")),
             _ => Ok(()),
         }
     }
 
-    /// Writes a file that the user named; `-` and `/dev/stdout` are stdout.
+    /// Writes a file given on the command line; `-` and `/dev/stdout` are stdout.
     pub fn write_file(&self, path: &Path, bytes: &[u8]) -> Result<()> {
         if !is_stdout(path) {
             return files::write_atomically(path, bytes);
         }
         let out = &mut lock(&self.streams).out;
-        out.write_all(bytes).and_then(|()| out.flush()).map_err(|e| Error::io("stdout", e, "writing the result"))
+        out.write_all(bytes).and_then(|()| out.flush()).map_err(|e| Error::io("stdout", e, "writing the file"))
     }
 
-    /// Says what was written to a file: on stdout, or on stderr if stdout is the file.
+    /// Prints a message about a written file: to stdout, or to stderr if stdout is the file.
     pub fn wrote(&self, path: &Path, text: &str) -> Result<()> {
         if is_stdout(path) {
             self.note(text);
@@ -92,13 +92,13 @@ impl<'a> Console<'a> {
         self.result(text)
     }
 
-    /// The same as a JSON object, for programs; nothing where people read it.
+    /// Prints the results as a JSON object for programs, unless stdout is a terminal.
     pub fn record(&self, value: &impl Serialize) -> Result<()> {
         let read_by_people = lock(&self.streams).read_by_people;
         if read_by_people { Ok(()) } else { self.result(&json::line(value)?) }
     }
 
-    /// A line of information on stderr.
+    /// Prints a note to stderr.
     pub fn note(&self, text: &str) {
         #[derive(Serialize)]
         struct Note<'t> {
@@ -109,12 +109,12 @@ impl<'a> Console<'a> {
         }
     }
 
-    /// Returns the name of a page for a message: on a terminal an address that a click opens in the browser, elsewhere its path.
+    /// The name of a written page: a `file://` address on a terminal, which can be clicked, and its path elsewhere.
     pub fn address(&self, page: &Path) -> String {
         if self.terminal { terminal::file_address(page) } else { page.display().to_string() }
     }
 
-    /// A line on stderr about why the command ends with an exit code.
+    /// Prints an error to stderr.
     pub fn error(&self, text: &str, exit_code: u8) {
         #[derive(Serialize)]
         struct Failure<'t> {
@@ -124,7 +124,7 @@ impl<'a> Console<'a> {
         self.log("error", &Failure { message: text, exit_code }, || format!("error: {text}"));
     }
 
-    /// A line on stderr: what happened with its figures, or the same for people.
+    /// Prints an event to stderr, as JSON with its fields or as plain text.
     fn log(&self, event: &str, fields: &impl Serialize, plain: impl FnOnce() -> String) {
         #[derive(Serialize)]
         struct Line<'t, F> {
@@ -144,7 +144,7 @@ impl<'a> Console<'a> {
 
     fn write(&self, text: &str) {
         let bar = lock(&self.bar).clone();
-        // Nobody can be told that stderr cannot be written.
+        // A failure to print cannot be reported.
         let write = || drop(writeln!(lock(&self.streams).err, "{text}"));
         match bar {
             Some(bar) => bar.suspend(write),
@@ -152,23 +152,23 @@ impl<'a> Console<'a> {
         }
     }
 
-    /// What came of drawing: a picture that cannot be written is no reason to lose what was learned.
+    /// Returns the result of drawing a picture. An error becomes a note, so that the run continues.
     pub fn drawn<R>(&self, done: Result<R>) -> Option<R> {
-        done.map_err(|e| self.note(&format!("no picture: {e}"))).ok()
+        done.map_err(|e| self.note(&format!("a picture was not written: {e}"))).ok()
     }
 
-    /// Progress of something that is counted, such as images read.
+    /// Progress of a countable task, such as reading images.
     pub fn count(&self, what: &str, total: usize) -> Count<'_, 'a> {
         Count { meter: Meter::new(self, total as u64), what: what.to_owned() }
     }
 
-    /// Progress of a number of things that other processes do, who tell of it in lines.
+    /// Progress of child processes, reported as lines of text.
     pub fn relay(&self, total: usize) -> Relay<'_, 'a> {
         Relay { meter: Meter::new(self, total as u64), total }
     }
 }
 
-/// True for a name of stdout.
+/// True if the path is a name of stdout.
 pub fn is_stdout(path: &Path) -> bool {
     ["-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"].iter().any(|name| path == Path::new(name))
 }
@@ -177,18 +177,18 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// How far something is: its fields are what programs read.
+/// A state of progress; its fields are those of the JSON object.
 trait Standing: Serialize {
-    /// The same on a line for people.
+    /// Formats the state as a line of text.
     fn line(&self) -> String;
 
-    /// The same beside a bar, the most important first, for a narrow terminal shows no more.
+    /// Formats the state for display beside a bar, the most important part first, because narrow terminals truncate it.
     fn beside_bar(&self) -> String {
         self.line()
     }
 }
 
-/// A bar or its lines.
+/// A progress bar or progress lines.
 struct Meter<'c, 'a> {
     console: &'c Console<'a>,
     bar: Option<ProgressBar>,
@@ -206,7 +206,7 @@ impl<'c, 'a> Meter<'c, 'a> {
         Meter { console, bar, shown }
     }
 
-    /// Shows how far it is, if it is time to or it must be; what must be shown stays as a line above the bar.
+    /// Shows the state if an update is due. If `must` is true, it is always shown, as a permanent line.
     fn show<S: Standing>(&self, (position, total): (u64, u64), must: bool, standing: impl FnOnce() -> S) {
         if self.console.quiet {
             return;
@@ -238,36 +238,36 @@ impl Drop for Meter<'_, '_> {
     }
 }
 
-/// Progress of something that is counted.
+/// Progress of a countable task.
 pub struct Count<'c, 'a> {
     meter: Meter<'c, 'a>,
     what: String,
 }
 
 impl Count<'_, '_> {
-    /// So many are done.
+    /// Reports that `done` of `total` items are done.
     pub fn at(&self, done: usize, total: usize) {
-        // People see that it is over; programs are told.
+        // Only programs need a message at the end.
         let must = done == total && self.meter.console.format == LogFormat::Json;
         self.meter.show((done as u64, total as u64), must, || Counted { what: &self.what, done, total });
     }
 }
 
-/// Progress of what other processes do.
+/// Progress of child processes.
 pub struct Relay<'c, 'a> {
     meter: Meter<'c, 'a>,
     total: usize,
 }
 
 impl Relay<'_, '_> {
-    /// So many things are done, and the one that is being done says this of itself.
+    /// Reports that `done` processes have ended, and a line of the current one.
     pub fn say(&self, done: usize, line: impl FnOnce() -> String) {
         let total = self.total;
         self.meter.show((done as u64, total as u64), false, || Relayed { done, total, message: line() });
     }
 }
 
-/// So many of how many, and how far the next one is.
+/// Number of ended processes, and a line of the current one.
 #[derive(Serialize)]
 struct Relayed {
     done: usize,
@@ -281,7 +281,7 @@ impl Standing for Relayed {
     }
 }
 
-/// So many of how many.
+/// Number of done items.
 #[derive(Serialize)]
 struct Counted<'w> {
     what: &'w str,
@@ -295,7 +295,7 @@ impl Standing for Counted<'_> {
     }
 }
 
-/// A number with three digits and k or M, and a space before the unit.
+/// Formats a number with about three digits, followed by a space and the prefix k or M.
 fn metric(x: f64) -> String {
     match x {
         x if x >= 1e6 => format!("{:.2} M", x / 1e6),
@@ -304,7 +304,7 @@ fn metric(x: f64) -> String {
     }
 }
 
-/// A number with spaces between its thousands.
+/// Formats a number with narrow spaces between groups of three digits.
 pub fn thousands(n: u64) -> String {
     let digits = n.to_string();
     let first = digits.len() % 3;

@@ -1,6 +1,6 @@
-//! `report.html`: what came of a run, on one page that needs no other file, no server and no network.
+//! `report.html`: the results of a run on a single page that needs no other file, no server and no network.
 //!
-//! It is made from what is in the run folder, and from the model; so it can be made again later.
+//! It is built from the run folder and the model, so it can be regenerated at any time.
 
 pub mod curves;
 pub mod pictures;
@@ -19,27 +19,27 @@ use plenoxel::text::clock;
 use serde_json::Value;
 use std::fmt::Write;
 
-/// Looks of a report, and of other pages with curves and pictures.
+/// Style sheet of reports and of other pages with curves and pictures.
 pub const STYLE: &str = include_str!("report/style.css");
-/// What makes pictures grow and change their order.
+/// Script that enlarges and sorts pictures.
 pub const SCRIPT: &str = include_str!("report/page.js");
 
-/// What a report is about.
+/// The contents of a report.
 pub struct Report<'a> {
     pub folder: &'a RunFolder,
     pub config: &'a Config,
     pub record: &'a RunRecord,
     pub dataset: &'a Dataset,
-    /// The trained model; `None` if this program has no code for its kind.
+    /// The trained model; `None` for a custom model.
     pub model: Option<&'a dyn Model<f32>>,
 }
 
 impl Report<'_> {
-    /// Writes the page. Returns what is to be said about it.
+    /// Writes the page. Returns a message with its path.
     pub fn write(&self, console: &Console<'_>) -> Result<String> {
         let result = self.folder.figures()?.unwrap_or(Value::Null);
         let metrics = metrics::read(&self.folder.metrics())?;
-        let lines: Vec<_> = metrics::lines(&metrics).map(|(_, line)| line).collect();
+        let lines = curves::lines(self.folder, &metrics, console);
         let scene = scene::Scene::of(self)?;
         let title = format!("{} – {}", self.folder.path().file_name().unwrap_or_default().to_string_lossy(), self.record.scene);
         let parts = [
@@ -55,25 +55,26 @@ impl Report<'_> {
         let scripts = format!("<script>\n{}</script>\n{}", SCRIPT, scene.as_ref().map_or_else(String::new, scene::Scene::scripts));
         let page = html::page(&title, STYLE, &(parts.join("\n") + &scripts));
         self.folder.write_report(&page)?;
-        let note = scene.map_or_else(|| "there are no voxels to look around in".to_owned(), |scene| scene.note());
-        console.note(&format!("page of {}: {note}", bytes(page.len() as u64)));
+        let note =
+            scene.map_or_else(|| "it has no interactive viewer, because the model is not a voxel grid".to_owned(), |scene| scene.note());
+        console.note(&format!("report.html has {}; {note}", bytes(page.len() as u64)));
         Ok(format!("report: {}", console.address(&self.folder.report())))
     }
 
-    /// Every setting, as the run folder has them.
+    /// The section with all settings.
     fn settings(&self) -> Result<String> {
         let text = self.folder.settings()?;
         let again = self.record.kind.command();
         let data = escaped(&self.record.data.arguments());
         Ok(format!(
-            "<section><h2>Settings</h2>\n<p>They repeat the run: <code>plenoxel {again}{data} --config config.toml</code></p>\n\
+            "<section><h2>Settings</h2>\n<p>This command repeats the run: <code>plenoxel {again}{data} --config config.toml</code></p>\n\
              <details><summary>config.toml</summary><pre>{}</pre></details></section>",
             escaped(&text)
         ))
     }
 }
 
-/// The figures that people look for first.
+/// The main results.
 fn facts(report: &Report<'_>, result: &Value) -> String {
     let number = |key: &str, digits: usize, unit: &str| result[key].as_f64().map(|x| format!("{x:.digits$}{unit}"));
     let views = result["views"].as_u64().unwrap_or(0);
@@ -86,8 +87,8 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
         ("grid", result["resolution"].as_u64().map(|resolution| format!("{resolution}³"))),
     ];
     let baselines = [
-        ("background alone", number("baseline_background_psnr", 2, " dB")),
-        ("mean training image", number("baseline_mean_image_psnr", 2, " dB")),
+        ("PSNR of the background", number("baseline_background_psnr", 2, " dB")),
+        ("PSNR of the mean training image", number("baseline_mean_image_psnr", 2, " dB")),
     ];
     let facts = facts
         .into_iter()
@@ -96,13 +97,11 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
         .filter_map(|(name, value)| Some(format!("<div><b>{}</b><span>{name}</span></div>", value?)));
     let what = match (views, result["width"].as_u64(), result["height"].as_u64()) {
         (1.., Some(width), Some(height)) => format!(
-            "PSNR and SSIM are means over {views} test views of {width} x {height} on a background of {:?}, predictions clamped to [0, 1].",
+            "PSNR and SSIM are means over {views} test views of {width} x {height} pixels, on the background {:?}, with predictions clamped to [0, 1].",
             report.config.background
         ),
-        _ if result.is_null() => "There are no figures that can be read: `plenoxel train --resume` writes them again.".to_owned(),
-        _ => {
-            "It was not compared with test views. `plenoxel evaluate` does that; then `plenoxel report` writes this page again.".to_owned()
-        }
+        _ if result.is_null() => "There are no valid results: `plenoxel train --resume` computes them again.".to_owned(),
+        _ => "The run was not evaluated on test views. Run `plenoxel evaluate`, then `plenoxel report` to regenerate this page.".to_owned(),
     };
     format!(
         "<div class=\"facts\">{}</div>\n<p>{}, {}. {what}</p>",
@@ -112,13 +111,13 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
     ) + &warnings(result)
 }
 
-/// Reasons to doubt the result.
+/// Warnings about the results.
 fn warnings(result: &Value) -> String {
     let warnings = result["warnings"].as_array().into_iter().flatten().filter_map(Value::as_str);
     warnings.map(|warning| format!("\n<p class=\"warning\"><b>Warning:</b> {}</p>", escaped(warning))).collect()
 }
 
-/// What each stage came to.
+/// The table of stages.
 fn stages(result: &Value) -> String {
     let Some(stages) = result["stages"].as_array().filter(|stages| !stages.is_empty()) else { return String::new() };
     let mut rows = String::new();
@@ -129,12 +128,12 @@ fn stages(result: &Value) -> String {
         let _ = write!(rows, "<tr><td>{resolution}</td><td>{}</td><td>{seconds}</td><td>{psnr}</td></tr>", stage["steps"]);
     }
     format!(
-        "<section><table><thead><tr><th>stage</th><th>steps</th><th>ended after</th><th>test PSNR</th></tr></thead>\
+        "<section><table><thead><tr><th>stage</th><th>steps</th><th>training time at its end</th><th>test PSNR</th></tr></thead>\
          <tbody>{rows}</tbody></table></section>"
     )
 }
 
-/// Time, memory and machine.
+/// The table of time, memory and machine.
 fn costs(report: &Report<'_>, result: &Value) -> String {
     let time = |key: &str| result[key].as_f64().map(clock);
     let count = |key: &str| result[key].as_u64().map(thousands);
@@ -143,12 +142,12 @@ fn costs(report: &Report<'_>, result: &Value) -> String {
         ("reading images", time("seconds_load")),
         ("training", time("seconds").filter(|_| !report.record.is_carved())),
         ("carving the hull", time("seconds_hull")),
-        ("coloring it", time("seconds_color")),
-        ("rendering and comparing test views", time("seconds_evaluate")),
-        ("largest memory of the process", result["peak_memory_bytes"].as_u64().map(bytes)),
+        ("fitting colors", time("seconds_color")),
+        ("evaluating test views", time("seconds_evaluate")),
+        ("peak memory", result["peak_memory_bytes"].as_u64().map(bytes)),
         ("steps", count("steps")),
         ("rays", count("rays")),
-        ("samples a ray", per_ray),
+        ("samples per ray", per_ray),
         ("threads", Some(report.record.threads.to_string())),
         ("vector instructions", Some(report.record.instruction_set.clone())),
         ("program", Some(report.record.program.clone())),

@@ -28,7 +28,7 @@ fn there_may_be_an_ffmpeg_or_none_and_one_that_fails_is_quoted() {
     };
     let (gif, mp4) = (run.join("renders/orbit.gif"), run.join("renders/orbit.mp4"));
     let (code, told) = render();
-    assert!(code == Some(0) && told.contains("no ffmpeg") && gif.exists() && !mp4.exists(), "{told}");
+    assert!(code == Some(0) && told.contains("ffmpeg is not in PATH") && gif.exists() && !mp4.exists(), "{told}");
 
     let ffmpeg = |script: &str| {
         let path = bin.join("ffmpeg");

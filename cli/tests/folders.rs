@@ -87,7 +87,7 @@ fn runs_that_start_at_the_same_moment_lose_nothing() {
         codes.sort_unstable();
         assert_eq!(codes, [0, 2], "{} {}", err(&ended[0]), err(&ended[1]));
         let refused = err(ended.iter().find(|output| code(output) == 2).expect("one was refused"));
-        assert!(refused.contains("is writing") || refused.contains("not empty"), "{refused}");
+        assert!(refused.contains("is being written by") || refused.contains("not empty"), "{refused}");
         assert_eq!(refused.matches("error: ").count(), 1, "{refused}");
         seed_of(&folder.0.join(format!("same-{pair}")));
     }
@@ -126,7 +126,7 @@ fn a_full_disk_is_found_before_the_first_step() {
         format!("ulimit -f 8; exec {program} {} --set 'stages[*].resolution=64' --out run", TINY.map(|a| format!("'{a}'")).join(" "));
     let refused = Command::new("sh").current_dir(&folder.0).args(["-c", &line]).output().expect("a shell");
     assert_eq!(refused.status.code(), Some(5), "{}", err(&refused));
-    assert!(err(&refused).contains("ulimit -f") && err(&refused).contains("free space"), "{}", err(&refused));
+    assert!(err(&refused).contains("ulimit -f") && err(&refused).contains("free disk space"), "{}", err(&refused));
     assert!(!folder.0.join("run/metrics.jsonl").exists());
     // A file that cannot be written in full is an error too, and not the end of the process.
     let line = format!("ulimit -f 1; exec {program} completions bash > completions");
@@ -172,7 +172,7 @@ fn a_run_that_was_killed_before_its_page_gets_it_when_it_is_resumed() {
     let resumed = folder.run(&["train", "--resume", "run"]);
     assert!(code(&resumed) == 0 && page.exists(), "{}", err(&resumed));
     let ended = folder.run(&["train", "--resume", "run"]);
-    assert!(code(&ended) == 3 && err(&ended).contains("ended"), "{}", err(&ended));
+    assert!(code(&ended) == 3 && err(&ended).contains("is finished"), "{}", err(&ended));
 }
 
 #[test]

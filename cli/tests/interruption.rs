@@ -84,7 +84,7 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
     }
     let output = child.wait_with_output().expect("it ends");
     assert_eq!(output.status.code(), Some(130), "{}", text(&output));
-    assert!(text(&output).contains("saved; go on with: plenoxel train --resume"), "{}", text(&output));
+    assert!(text(&output).contains("saved; resume with: plenoxel train --resume"), "{}", text(&output));
     assert!(Path::new(&cut).join("training.safetensors").exists() && !Path::new(&cut).join("checkpoint.safetensors").exists());
 
     for lines in [150, 210, 300] {
@@ -95,7 +95,7 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
         child.wait().expect("it ends");
     }
     let output = plenoxel(&["--resume", &cut, "--no-images"]).output().expect("it runs");
-    assert!(output.status.success() && text(&output).contains("going on after step"), "{}", text(&output));
+    assert!(output.status.success() && text(&output).contains("resumed after step"), "{}", text(&output));
     let found = result(Path::new(&cut));
     assert!(found.0 == want.0, "another grid");
     assert_eq!(found.1.last(), want.1.last());
@@ -109,8 +109,8 @@ fn a_run_that_is_interrupted_and_killed_goes_on_bit_by_bit() {
 
     // It has ended, and a folder without a run has nothing to go on with; what a run was told when it began is not told again.
     for (arguments, code, reason) in [
-        (&["--resume", &cut][..], 3, "this run has ended"),
-        (&["--resume", &path("nowhere")], 3, "there is no such run"),
+        (&["--resume", &cut][..], 3, "this run is finished"),
+        (&["--resume", &path("nowhere")], 3, "this run folder does not exist"),
         (&["--resume", &cut, "--seed", "1"], 2, "cannot be used with"),
     ] {
         let output = plenoxel(arguments).output().expect("it runs");
@@ -135,7 +135,7 @@ fn a_terminal_that_is_closed_stops_a_run_as_ctrl_c_does() {
     let output = child.wait_with_output().expect("it ends");
     assert_eq!(output.status.code(), Some(130), "{}", text(&output));
     assert!(
-        text(&output).contains("go on with: plenoxel train --resume") && run.join("training.safetensors").exists(),
+        text(&output).contains("resume with: plenoxel train --resume") && run.join("training.safetensors").exists(),
         "{}",
         text(&output)
     );
@@ -153,7 +153,7 @@ fn a_run_whose_folder_is_moved_and_replaced_keeps_its_model_and_touches_nothing(
     let output = child.wait_with_output().expect("it ends");
     let said = text(&output);
     assert_eq!(output.status.code(), Some(5), "{said}");
-    assert!(said.contains("moved, deleted or replaced") && said.contains("the trained model is saved elsewhere"), "{said}");
+    assert!(said.contains("moved, deleted or replaced") && said.contains("the trained model was saved as"), "{said}");
     assert_eq!(fs::read_dir(&run).expect("a folder").count(), 0);
     let kept: Vec<_> = fs::read_dir(&root).expect("a folder").flatten().filter(|file| file.path().is_file()).collect();
     assert!(kept.len() == 1 && kept[0].file_name().to_string_lossy().ends_with(".safetensors"), "{kept:?}");

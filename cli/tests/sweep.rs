@@ -90,11 +90,11 @@ fn an_interrupted_sweep_has_its_run_saved_and_goes_on_with_it() {
     let output = child.wait_with_output().expect("it ends");
     let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert_eq!(output.status.code(), Some(130), "{err}");
-    assert!(err.contains("the same command again goes on") && !err.contains("2/2") && out.contains("| procedural | – | – |"), "{err}{out}");
+    assert!(err.contains("repeat the command to resume") && !err.contains("2/2") && out.contains("| procedural | – | – |"), "{err}{out}");
     assert!(root.join("sweeps/plan/procedural/long/training.safetensors").exists());
 
     let (code, out, err) = plenoxel(&root, &["sweep", "plan.toml"]);
-    assert!(code == Some(2) && err.contains("1/2 procedural long: going on\n"), "{err}");
+    assert!(code == Some(2) && err.contains("1/2 procedural long: resuming\n"), "{err}");
     assert!(out.contains("| procedural | **") && out.contains("| failed (2) |"), "{out}");
     fs::remove_dir_all(root).expect("it is removed");
 }
@@ -112,7 +112,7 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     assert_eq!((code, out.matches(": to run").count()), (Some(0), 7), "{out}{err}");
     assert!(out.contains("few fine: to run\n    plenoxel train --set=rays_per_step=200 ") && !root.join("swept").exists(), "{out}");
 
-    // The first to fail has a setting that cannot be used.
+    // The first run to fail has an invalid setting.
     let (code, out, err) = sweep(&[]);
     assert_eq!(code, Some(2), "{err}");
     assert!(err.contains("3/7 few odd: failed with exit code 2: downscale: 5") && err.contains("2 of 7 runs failed"), "{err}");
@@ -137,8 +137,8 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
         (modified("swept/few/coarse/result.json"), fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it"));
     fs::remove_file(root.join("swept/few/fine/result.json")).expect("it is removed");
     let (code, again, err) = sweep(&[]);
-    assert_eq!((code, err.matches("finished already: PSNR ").count()), (Some(2), 4), "{err}");
-    assert!(err.contains("2/7 few fine: going on") && err.contains("3/7 few odd: begins"), "{err}");
+    assert_eq!((code, err.matches("already finished: PSNR ").count()), (Some(2), 4), "{err}");
+    assert!(err.contains("2/7 few fine: resuming") && err.contains("3/7 few odd: starting"), "{err}");
     assert_eq!(modified("swept/few/coarse/result.json"), before);
     assert!(fs::read(root.join("swept/few/fine/checkpoint.safetensors")).expect("it") == grid);
     let psnr = |text: &str| text.lines().find_map(|line| line.strip_prefix("| few | ")?.split(" · ").next().map(str::to_owned));
@@ -148,7 +148,7 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     fs::write(root.join("plan.toml"), FILE.replace("downscale = 5", "downscale = 2").replace("steps=6", "steps=7")).expect("the file");
     let (code, _, err) = sweep(&[]);
     assert_eq!(code, Some(2), "{err}");
-    assert!(err.contains("swept/few/fine, where there is another run (stages[0].steps is 6 and not 7); accepted: "), "{err}");
+    assert!(err.contains("swept/few/fine is a run with other settings (stages[0].steps is 6, not 7); choose another folder"), "{err}");
     fs::write(
         root.join("plan.toml"),
         FILE.replace(", \"odd\"]", "]")
@@ -158,6 +158,6 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     let (code, _, err) = sweep(&["--quiet"]);
     assert_eq!((code, err.as_str()), (Some(0), ""));
     let (code, _, err) = sweep(&[]);
-    assert_eq!((code, err.matches("finished already").count()), (Some(0), 6), "{err}");
+    assert_eq!((code, err.matches("already finished").count()), (Some(0), 6), "{err}");
     fs::remove_dir_all(root).expect("it is removed");
 }

@@ -185,7 +185,7 @@ impl CameraPath {
                 return read(&file);
             }
         }
-        let remedy = "accepted: one of `path` (instant-ngp), `camera_path` (nerfstudio) and `frames` (transforms.json)";
+        let remedy = "expected one of `path` (instant-ngp), `camera_path` (nerfstudio) and `frames` (transforms.json)";
         Err(Error::input(path, "it has none of the keys of a camera path", remedy))
     }
 
@@ -234,30 +234,30 @@ struct Entry<'a> {
 
 impl<'a> Entry<'a> {
     /// Returns the error for an invalid field.
-    fn wrong(&self, field: &str, accepted: &str) -> Error {
+    fn wrong(&self, field: &str, expected: &str) -> Error {
         let found = match self.value.get(field) {
             None => format!("there is no `{field}`{}", self.place),
             Some(value) => format!("`{field}`{} is {}", self.place, json::shown(value)),
         };
-        Error::input(self.path, found, format!("accepted: {accepted}"))
+        Error::input(self.path, found, format!("expected {expected}"))
     }
 
     /// Reads a number that satisfies a predicate.
-    fn number(&self, field: &str, accepts: impl Fn(f64) -> bool, accepted: &str) -> Result<f64> {
+    fn number(&self, field: &str, accepts: impl Fn(f64) -> bool, expected: &str) -> Result<f64> {
         let number = self.value.get(field).and_then(Value::as_f64).filter(|number| accepts(*number));
-        number.ok_or_else(|| self.wrong(field, accepted))
+        number.ok_or_else(|| self.wrong(field, expected))
     }
 
     /// Reads an optional number that satisfies a predicate.
-    fn optional(&self, field: &str, accepts: impl Fn(f64) -> bool, accepted: &str) -> Result<Option<f64>> {
-        self.value.get(field).map(|_| self.number(field, accepts, accepted)).transpose()
+    fn optional(&self, field: &str, accepts: impl Fn(f64) -> bool, expected: &str) -> Result<Option<f64>> {
+        self.value.get(field).map(|_| self.number(field, accepts, expected)).transpose()
     }
 
     /// Reads N finite numbers.
-    fn numbers<const N: usize>(&self, field: &str, accepted: &str) -> Result<[f64; N]> {
+    fn numbers<const N: usize>(&self, field: &str, expected: &str) -> Result<[f64; N]> {
         let list = self.value.get(field).and_then(Value::as_array).filter(|list| list.len() == N);
         let numbers: Option<Vec<f64>> = list.and_then(|list| list.iter().map(|n| n.as_f64().filter(|n| n.is_finite())).collect());
-        numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| self.wrong(field, accepted))
+        numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| self.wrong(field, expected))
     }
 
     /// Reads the entries of a list of 1 to [`MOST_FRAMES`]. `name` is the name of an entry.
@@ -265,7 +265,7 @@ impl<'a> Entry<'a> {
         let list = self.value.get(field).and_then(Value::as_array).ok_or_else(|| self.wrong(field, "a list"))?;
         if list.is_empty() {
             let found = format!("`{field}` has 0 entries");
-            return Err(Error::input(self.path, found, format!("accepted: 1 to {MOST_FRAMES}")));
+            return Err(Error::input(self.path, found, format!("expected 1 to {MOST_FRAMES}")));
         }
         let path = self.path;
         Ok(list.iter().enumerate().map(move |(k, value)| Entry { path, value, place: format!(" of {name} {k}") }))
@@ -273,15 +273,15 @@ impl<'a> Entry<'a> {
 
     /// Reads a field of view given in degrees. Returns radians.
     fn fov(&self) -> Result<f64> {
-        let accepted = "an angle in degrees, above 0 and below 180";
-        self.number("fov", |degrees| is_angle_of_view(degrees.to_radians()), accepted).map(f64::to_radians)
+        let expected = "an angle in degrees, above 0 and below 180";
+        self.number("fov", |degrees| is_angle_of_view(degrees.to_radians()), expected).map(f64::to_radians)
     }
 
     /// Reads width and height in pixels, if both are given.
     fn size(&self, width: &str, height: &str) -> Result<Option<(usize, usize)>> {
         let pixels = |n: f64| (1.0..=f64::from(MAX_SIDE)).contains(&n);
-        let accepted = format!("a number of pixels from 1 to {MAX_SIDE}");
-        let [width, height] = [width, height].map(|field| self.optional(field, pixels, &accepted));
+        let expected = format!("a number of pixels from 1 to {MAX_SIDE}");
+        let [width, height] = [width, height].map(|field| self.optional(field, pixels, &expected));
         Ok(width?.zip(height?).map(|(width, height)| (width as usize, height as usize)))
     }
 

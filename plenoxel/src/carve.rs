@@ -163,16 +163,16 @@ impl<'a> Carving<'a> {
         // No image shows the voxel that contains its camera: the voxel would not be carved, and would hide everything.
         if let Some(view) = views.iter().find(|view| aabb.contains(view.camera.position())) {
             let nearest = views.iter().map(|view| view.camera.position().abs().max_element()).fold(f64::INFINITY, f64::min);
-            let found = format!("{half_width} is too large, the camera of {} is inside of the box", view.name);
-            return Err(Error::config("half_width", found, format!("a box around the object alone, below {nearest:.3}")));
+            let found = format!("the camera of {} is inside the box of half width {half_width}", view.name);
+            return Err(Error::usage("half_width", found, format!("use a box around the object only, below {nearest:.3}")));
         }
         let mut hull = match rule {
             Rule::Footprint => visual_hull::by_footprint(views, aabb, voxels, margin, &|views| progress(Progress::Views(views))),
             Rule::Rays => visual_hull::by_rays(views, aabb, voxels, &|views| progress(Progress::Views(views))),
         };
         if hull.fraction() == 0.0 {
-            let found = format!("{half_width}, but the silhouettes leave no voxel of the box");
-            return Err(Error::config("half_width", found, "a box around the object"));
+            let found = format!("the silhouettes leave no voxel of the box of half width {half_width}");
+            return Err(Error::usage("half_width", found, "use a box that contains the object"));
         }
         if let Some(photo) = &photo {
             hull = photo_hull::photo_hull(views, &hull, photo, &|round, carved, left| progress(Progress::Round { round, carved, left }))?;
@@ -180,11 +180,11 @@ impl<'a> Carving<'a> {
         match hull.fraction() {
             0.0 => {
                 let noise = photo.map_or(0.0, |photo| photo.noise);
-                Err(Error::config("carve.photo.noise", format!("{noise} leaves no voxel"), "a larger value"))
+                Err(Error::usage("carve.photo.noise", format!("photo carving with a noise of {noise} removes every voxel"), "increase it"))
             }
             1.0 => {
-                let found = format!("{resolution}, but no image shows a whole voxel on background");
-                Err(Error::config("carve.resolution", found, "more voxels per axis, a larger half_width, or a smaller carve.margin"))
+                let found = format!("at {resolution} voxels per axis, no image shows a whole voxel as background, so nothing is carved");
+                Err(Error::usage("carve.resolution", found, "use more voxels per axis, a larger half_width, or a smaller carve.margin"))
             }
             _ => Ok(Carving { views, options: *options, lattice: Lattice::from_masks(voxels, hull.masks().to_vec()) }),
         }

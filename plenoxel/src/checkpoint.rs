@@ -220,7 +220,7 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
         return Err(Error::input(
             path,
             format!("format `{format}`"),
-            format!("accepted: `{FORMAT}`, `{SPARSE_FORMAT}` and `{REDUCED_FORMAT}`; use the program version that wrote the file"),
+            format!("expected `{FORMAT}`, `{SPARSE_FORMAT}` and `{REDUCED_FORMAT}`; use the program version that wrote the file"),
         ));
     }
     let format = format.to_owned();
@@ -230,7 +230,7 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
         return Err(Error::input(
             path,
             "the grid is not in the frame of its dataset",
-            "accepted: grids whose scene_transform is the identity",
+            "expected a grid whose scene_transform is the identity",
         ));
     }
     let reduced = (1..=1024).contains(&header.sh_reduction) && header.shape().is_reduced() == (format == REDUCED_FORMAT);
@@ -254,7 +254,7 @@ pub fn read<T: Real>(path: &Path, source: impl Read + Seek) -> Result<(VoxelGrid
     let shape = header.shape();
     let n = header.resolution;
     // A few voxels may be spread over many bricks.
-    memory::check(path, &format!("a grid of {n}³ voxels"), BRICK_BYTES * BrickGrid::new([n; 3]).len() as u64)?;
+    memory::check(path, &format!("reading a grid of {n}³ voxels"), BRICK_BYTES * BrickGrid::new([n; 3]).len() as u64)?;
     fn table<T: Real>(file: &mut TensorFile<'_>, name: &str, width: usize, expected: &[usize]) -> Result<Tensor<T>> {
         let values = file.numbers(name, Dtype::F32, expected)?;
         let rows = values.len() / width;

@@ -331,6 +331,6 @@ mod tests {
             assert_eq!(split.to_string().parse::<Split>().unwrap(), split);
         }
         let error = "valid".parse::<Split>().unwrap_err();
-        assert_eq!(error.to_string(), "split: invalid value \"valid\"; accepted: train, val, test");
+        assert_eq!(error.to_string(), "split: invalid value \"valid\"; expected train, val, test");
     }
 }

@@ -1,7 +1,11 @@
 //! Errors of files, settings and computations.
 //!
 //! Programming mistakes, such as shapes that do not match, panic at the caller's line. Problems with a file, a flag or data are an
-//! [`Error`]. Its message says where the problem is, what is wrong, what is accepted, and what to do.
+//! [`Error`]. Its message says where the problem is, what is wrong, and then what is accepted or what to do:
+//!
+//! - `key: invalid value VALUE; expected EXPECTED` for the value of a setting ([`Error::config`]),
+//! - `key: PROBLEM; REMEDY` for any other problem with a setting ([`Error::usage`]),
+//! - `path: PROBLEM; REMEDY` for the content of a file ([`Error::input`]).
 
 use crate::text::{brief, one_line};
 use std::path::{Path, PathBuf};
@@ -22,15 +26,15 @@ pub enum Error {
         /// Accepted content, or what to do.
         remedy: String,
     },
-    /// A setting (flag or configuration key) has an invalid value.
-    #[error("{}: {}; accepted: {}", brief(key), problem(found), brief(accepted))]
+    /// A setting (flag or configuration key) cannot be used as it is given.
+    #[error("{}: {}; {}", brief(key), brief(problem), brief(remedy))]
     Config {
         /// Name of the setting as the user writes it.
         key: String,
-        /// Given value, or a phrase that says what is wrong. A single word is displayed as `invalid value {found}`.
-        found: String,
-        /// Accepted values.
-        accepted: String,
+        /// Problem, such as "invalid value 3".
+        problem: String,
+        /// Accepted values, such as "expected 1, 2 or 4", or what to do.
+        remedy: String,
     },
     /// A computation produced a number that is not finite, or another unusable result.
     #[error("{}: {}; {}", brief(place), brief(found), brief(remedy))]
@@ -60,9 +64,22 @@ impl Error {
         Error::Input { path: path.into(), found: found.into(), remedy: remedy.into() }
     }
 
-    /// Creates an error for an invalid setting.
-    pub fn config(key: impl Into<String>, found: impl ToString, accepted: impl Into<String>) -> Self {
-        Error::Config { key: key.into(), found: found.to_string(), accepted: accepted.into() }
+    /// Creates an error for a setting with an invalid value, displayed as `key: invalid value VALUE; expected EXPECTED`.
+    pub fn config(key: impl Into<String>, value: impl ToString, expected: impl Into<String>) -> Self {
+        Self::usage(key, format!("invalid value {}", value.to_string()), format!("expected {}", expected.into()))
+    }
+
+    /// Creates an error for another problem with a setting than its value, displayed as `key: PROBLEM; REMEDY`.
+    pub fn usage(key: impl Into<String>, problem: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Error::Config { key: key.into(), problem: problem.into(), remedy: remedy.into() }
+    }
+
+    /// Returns the error with another name of its setting. Errors of other kinds are unchanged.
+    pub fn with_key(self, rename: impl FnOnce(&str) -> String) -> Self {
+        match self {
+            Error::Config { key, problem, remedy } => Error::Config { key: rename(&key), problem, remedy },
+            other => other,
+        }
     }
 
     /// Creates an error of the operating system during `doing` with `path`.
@@ -79,12 +96,6 @@ impl Error {
             Error::Io { .. } => 5,
         }
     }
-}
-
-/// Returns the problem with a setting: a value alone is introduced as invalid, a phrase is left as it is.
-fn problem(found: &str) -> String {
-    let found = brief(found);
-    if found.contains(' ') { found } else { format!("invalid value {found}") }
 }
 
 /// Returns a path as printable text.
@@ -114,10 +125,10 @@ fn remedy(refusal: &std::io::Error) -> &'static str {
         ReadOnlyFilesystem => "choose a path on a writable file system",
         InvalidData | UnexpectedEof => "the file is damaged: use an undamaged copy",
         AlreadyExists | NotADirectory | IsADirectory => {
-            "choose another path: a file is in the place of a folder, or a folder in the place of a file"
+            "choose another path: there is a file in place of a folder, or a folder in place of a file"
         }
         OutOfMemory => "use a smaller file, or a machine with more memory",
-        StorageFull | QuotaExceeded | FileTooLarge => "free space on the disk, or choose another disk",
+        StorageFull | QuotaExceeded | FileTooLarge => "free disk space, or choose another disk",
         InvalidFilename => "choose a shorter name without special characters",
         _ => "check the disk, or choose another path",
     }
@@ -132,9 +143,9 @@ mod tests {
         let input = Error::input("a.json", "frames is empty", "list at least one frame");
         assert_eq!((input.exit_code(), input.to_string().as_str()), (3, "a.json: frames is empty; list at least one frame"));
         let config = Error::config("downscale", 3, "1, 2, 4");
-        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: invalid value 3; accepted: 1, 2, 4"));
-        let phrase = Error::config("stages", "no stage", "at least one stage");
-        assert_eq!(phrase.to_string(), "stages: no stage; accepted: at least one stage");
+        assert_eq!((config.exit_code(), config.to_string().as_str()), (2, "downscale: invalid value 3; expected 1, 2, 4"));
+        let missing = Error::usage("stages", "there is no stage", "add one").with_key(|key| format!("a.toml: {key}"));
+        assert_eq!((missing.exit_code(), missing.to_string().as_str()), (2, "a.toml: stages: there is no stage; add one"));
         let io = Error::io("out", std::io::Error::other("disk full"), "writing");
         assert_eq!((io.exit_code(), io.to_string().as_str()), (5, "out: disk full while writing; check the disk, or choose another path"));
         for (kind, remedy) in [
@@ -142,8 +153,8 @@ mod tests {
             (std::io::ErrorKind::PermissionDenied, "permissions"),
             (std::io::ErrorKind::ReadOnlyFilesystem, "writable"),
             (std::io::ErrorKind::InvalidData, "undamaged"),
-            (std::io::ErrorKind::NotADirectory, "in the place of a folder"),
-            (std::io::ErrorKind::StorageFull, "free space"),
+            (std::io::ErrorKind::NotADirectory, "in place of a folder"),
+            (std::io::ErrorKind::StorageFull, "free disk space"),
             (std::io::ErrorKind::InvalidFilename, "shorter"),
         ] {
             let text = Error::io("out", kind.into(), "writing").to_string();
@@ -156,7 +167,7 @@ mod tests {
         let foreign = Error::input("a\x1b[1mb", "the key \"x\ny\"", "a\u{9b}");
         assert_eq!(foreign.to_string(), "a\\u{1b}[1mb: the key \"x\\ny\"; a\\u{9b}");
         let long = Error::config("engine", "a".repeat(900_000), "b").to_string();
-        assert!(long.starts_with("engine: invalid value aaa") && long.ends_with("aaa; accepted: b") && long.len() < 250, "{long}");
+        assert!(long.starts_with("engine: invalid value aaa") && long.ends_with("aaa; expected b") && long.len() < 250, "{long}");
         let numeric = Error::Numeric { place: "step 7".into(), found: "loss is NaN".into(), remedy: "lower the learning rate".into() };
         assert_eq!((numeric.exit_code(), numeric.to_string().as_str()), (4, "step 7: loss is NaN; lower the learning rate"));
     }

@@ -1,7 +1,7 @@
-//! Files are read within bounds, and appear whole or not at all.
+//! Bounded reads and atomic writes of files.
 //!
-//! Everything this crate reads goes through [`open`], [`read`] or [`read_named`]. Everything it writes goes through [`write_atomically`], so that
-//! an interrupted run, a full disk or a power cut leaves either the old file or the new one, never half of one.
+//! This crate reads files through [`open`], [`read`] and [`read_named`] only. It writes them through [`write_atomically`]: after an interrupted
+//! run, a full disk or a power cut, a file has either its old contents or its new ones, never a part of them.
 
 mod read;
 
@@ -17,27 +17,29 @@ use crate::error::{Error, Result};
 use std::fs;
 use std::path::Path;
 
-/// Writes `bytes` to `path`, replacing what is there: a temporary file in the same folder is written, synced to disk and
-/// renamed. Other processes see the old content or the new, and nothing is left behind on failure.
+/// Writes `bytes` to `path` and replaces an existing file: writes a temporary file in the same folder, syncs it to disk and
+/// renames it. Other processes see either the old contents or the new ones. A failure leaves no temporary file.
 ///
-/// Errors: [`Error::Io`] if the folder is missing or refuses the file.
+/// Errors: [`Error::Io`] if the folder does not exist or cannot be written.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     atomically(path, |temporary| fs::write(temporary, bytes))
 }
 
-/// The same with a file that `write` makes, under the name it is given.
+/// Replaces the file `path` like [`write_atomically`]; `write` writes the temporary file whose path it receives.
 ///
-/// Errors: the same, and those of `write`.
+/// Errors: those of [`write_atomically`], and those of `write`.
 pub fn atomically(path: &Path, write: impl FnOnce(&Path) -> std::io::Result<()>) -> Result<()> {
     autograd::files::atomically(path, write).map_err(|source| Error::io(path, source, "writing the file"))
 }
 
-/// Creates the folder `path` and the folders above it; one that exists already is fine.
+/// Creates the folder `path` and its parents; existing folders are no error.
 ///
-/// Errors: [`Error::Io`] if it cannot be created, for instance because a file has that name.
+/// Errors: [`Error::Io`] if it cannot be created, for example because a file has that name.
 pub fn create_dir(path: &Path) -> Result<()> {
     fs::create_dir_all(path).map_err(|source| match path.ancestors().find(|path| path.is_symlink() && !path.exists()) {
-        Some(link) => Error::input(link, "this is a link to something that does not exist", "remove the link, or choose another folder"),
+        Some(link) => {
+            Error::input(link, "this symbolic link is broken: its target does not exist", "remove the link, or choose another folder")
+        }
         None => Error::io(path, source, "creating the folder"),
     })
 }

@@ -63,10 +63,10 @@ fn attempt(path: &Path, bytes: &[u8], kept: &Kept, allowance: Option<Allowance>)
         }
         let place = format!("line {}, column {}", error.line(), error.column());
         let (found, remedy) = if error.is_eof() {
-            (format!("the JSON ends early, at {place}"), "the file is cut short: copy or download it again")
+            (format!("the JSON ends early, at {place}"), "the file is truncated: copy or download it again")
         } else if room.is_long() {
-            let found = format!("at {place} is a list of more than {} entries", kept.entries);
-            return too_large(Error::input(path, found, format!("lists of up to {} are read", kept.entries)));
+            let found = format!("the list at {place} has more than {} entries", kept.entries);
+            return too_large(Error::input(path, found, "split it, because longer lists are not supported"));
         } else {
             (format!("this is not valid JSON: {error}"), "correct the file at this position; numbers must be finite")
         };
@@ -136,10 +136,7 @@ mod tests {
     fn memory_is_counted_while_a_file_is_read_and_only_for_what_is_kept() {
         let junk = format!(r#"{{"zz": [{}[]], "b": 7}}"#, r#"{"a":[]},"#.repeat(500));
         let message = read(&junk, &ALL, 300_000).unwrap_err();
-        assert!(
-            message.contains("t.json: what is said in 5 kB of JSON takes too much memory, where --max-memory allows 305 kB"),
-            "{message}"
-        );
+        assert!(message.contains("t.json: the content of 5 kB of JSON needs too much memory: --max-memory allows 305 kB"), "{message}");
         assert!(read(&junk, &ALL, 600_000).is_ok());
         assert_eq!(read(&junk, &Kept { keys: |key| key == "b", ..ALL }, 1000), Ok(json!({"b": 7})));
         for text in ["[[],[],[],[],[]]".to_owned(), format!("[{}0]", "0,".repeat(900)), format!("\"{}\"", "a".repeat(900))] {
@@ -152,7 +149,7 @@ mod tests {
         let long = format!("{{\"b\": [{}", "0,".repeat(1001));
         assert_eq!(
             read(&long, &ALL, 1 << 30).unwrap_err(),
-            "t.json: at line 1, column 2009 is a list of more than 1000 entries; lists of up to 1000 are read"
+            "t.json: the list at line 1, column 2009 has more than 1000 entries; split it, because longer lists are not supported"
         );
         assert!(read(&format!("[{}0]", "0,".repeat(999)), &ALL, 1 << 30).is_ok());
     }

@@ -1,23 +1,23 @@
-//! The memory that there is: what the system has free, the limit that the user set, and what this process has.
+//! Memory: the available amount, the limit set by the user, and the amount that this process uses.
 
 use crate::error::{Error, Result};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use sysinfo::{MemoryRefreshKind, ProcessRefreshKind, ProcessesToUpdate, System};
 
-/// Bytes that a command may take in all, if the user set them; 0 if not.
+/// Limit set by the user for the memory of a command, in bytes; 0 without a limit.
 static LIMIT: AtomicU64 = AtomicU64::new(0);
 
 /// The largest resident memory that [`now`] has returned.
 static PEAK: AtomicU64 = AtomicU64::new(0);
 
-/// Limits the memory that later commands of this process may take; `None` lifts the limit.
+/// Limits the memory that later commands of this process may use, in bytes; `None` removes the limit.
 pub fn limit(bytes: Option<u64>) {
     LIMIT.store(bytes.unwrap_or(0), Relaxed);
 }
 
-/// Bytes of memory that can be taken now: the free memory or the limit, whichever is less. `None` where there is no limit and the system does
-/// not say how much is free.
+/// Memory available now, in bytes: the free memory or the limit, whichever is smaller. `None` without a limit on systems that do not report
+/// free memory.
 pub fn available() -> Option<u64> {
     match LIMIT.load(Relaxed) {
         0 => free(),
@@ -25,29 +25,29 @@ pub fn available() -> Option<u64> {
     }
 }
 
-/// How much memory can be taken, and whose word that is: displayed, "--max-memory allows 500 MB" or "there is room for 2.3 GB".
+/// Available memory and its reason, displayed as "--max-memory allows 500 MB" or "2.3 GB are available".
 pub(crate) struct Allowance {
-    /// As [`available`] has them.
+    /// The bytes returned by [`available`].
     pub bytes: u64,
-    /// True if the user's limit is less than what is free.
+    /// True if the user's limit is smaller than the free memory.
     pub is_limit: bool,
 }
 
 impl std::fmt::Display for Allowance {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let why = if self.is_limit { "--max-memory allows" } else { "there is room for" };
-        write!(f, "{why} {}", bytes(self.bytes))
+        let bytes = bytes(self.bytes);
+        if self.is_limit { write!(f, "--max-memory allows {bytes}") } else { write!(f, "{bytes} are available") }
     }
 }
 
-/// How much memory can be taken now; `None` where nobody says.
+/// The memory available now; `None` if it is unknown.
 pub(crate) fn allowance() -> Option<Allowance> {
     available().map(|bytes| Allowance { bytes, is_limit: LIMIT.load(Relaxed) == bytes })
 }
 
-/// Checks that `needed` bytes of memory can be taken to do `what` with the file `path`.
+/// Checks that `needed` bytes of memory are available for `what`, an operation on the file `path`.
 ///
-/// Errors: bad input, for the file is too large to be used here.
+/// Errors: bad input, because the file is too large for the available memory.
 pub(crate) fn check(path: &Path, what: &str, needed: u64) -> Result<()> {
     match allowance() {
         Some(allowance) if needed > allowance.bytes => Err(refusal(path, what, needed, &allowance)),
@@ -57,21 +57,22 @@ pub(crate) fn check(path: &Path, what: &str, needed: u64) -> Result<()> {
 
 /// The error of [`check`].
 pub(crate) fn refusal(path: &Path, what: &str, needed: u64, allowance: &Allowance) -> Error {
-    let found = format!("{what} takes about {} of memory, where {allowance}", bytes(needed));
+    let found = format!("{what} needs about {} of memory, but {allowance}", bytes(needed));
     Error::input(path, found, remedy(allowance))
 }
 
-/// The error that what a file says was not read to its end, because it takes more memory than there is; `what` is the file in words.
+/// The error for content that needs more memory than is available and thus was not read to the end; `what` names the kind of file.
 pub(crate) fn refusal_of_content(path: &Path, what: &str, allowance: &Allowance) -> Error {
-    Error::input(path, format!("what is said in {what} takes too much memory, where {allowance}"), remedy(allowance))
+    Error::input(path, format!("the content of {what} needs too much memory: {allowance}"), remedy(allowance))
 }
 
+/// What to do about a file that is too large.
 fn remedy(allowance: &Allowance) -> String {
-    let more = if allowance.is_limit { "or a higher --max-memory" } else { "or a machine with more" };
-    format!("use a smaller one, {more}")
+    let more = if allowance.is_limit { "or a higher --max-memory" } else { "or a machine with more memory" };
+    format!("use a smaller file, {more}")
 }
 
-/// Bytes with a unit of powers of 1000, at two or three digits: `2.3 GB`, `99 kB`.
+/// Formats bytes with two or three digits and a decimal unit, such as `2.3 GB` or `99 kB`.
 pub fn bytes(n: u64) -> String {
     match n as f64 {
         n if n >= 1e10 => format!("{:.0} GB", n / 1e9),
@@ -81,14 +82,14 @@ pub fn bytes(n: u64) -> String {
     }
 }
 
-/// Memory that the system counts as available, on Linux within the limits of the control group and of the process.
+/// Memory that the system reports as available; on Linux within the limits of the control group and of the process.
 fn free() -> Option<u64> {
     let mut system = System::new().ok()?;
     system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
     let free = Some(system.available_memory()).filter(|free| *free > 0)?;
     let number = |path: &str| -> Option<u64> { std::fs::read_to_string(path).ok()?.trim().parse().ok() };
     let limit = number("/sys/fs/cgroup/memory.max");
-    // What the group has of files in memory goes when memory is needed.
+    // The page cache of the group is reclaimed when memory is needed.
     let files = std::fs::read_to_string("/sys/fs/cgroup/memory.stat").map_or(0, |text| cached(&text));
     let used = number("/sys/fs/cgroup/memory.current").unwrap_or(0).saturating_sub(files);
     let free = limit.map_or(free, |limit| free.min(limit.saturating_sub(used)));
@@ -96,30 +97,30 @@ fn free() -> Option<u64> {
     Some(address_space(&limits).map_or(free, |limit| free.min(limit.saturating_sub(taken()))))
 }
 
-/// Bytes of files in memory, by the kernel's table of a control group.
+/// Bytes of the page cache, from the `memory.stat` of a control group.
 fn cached(stat: &str) -> u64 {
     let number = |line: &str| line.strip_prefix("active_file ").or(line.strip_prefix("inactive_file "))?.trim().parse::<u64>().ok();
     stat.lines().filter_map(number).sum()
 }
 
-/// Bytes of addresses this process may have (`ulimit -v`), by the kernel's table of limits.
+/// Limit of the address space of this process (`ulimit -v`) in bytes, from `/proc/self/limits`.
 fn address_space(limits: &str) -> Option<u64> {
     limits.lines().find_map(|line| line.strip_prefix("Max address space"))?.split_whitespace().next()?.parse().ok()
 }
 
-/// Bytes of addresses that it has.
+/// Size of the address space of this process, in bytes.
 fn taken() -> u64 {
     of_process("VmSize:").unwrap_or(0)
 }
 
-/// Returns the largest resident memory of this process so far, in bytes: as Linux has it, elsewhere the largest that [`now`] has returned. `None` where the
-/// system does not say.
+/// Returns the peak resident memory of this process, in bytes. On systems other than Linux it is the largest value that [`now`] has returned.
+/// `None` if the system does not report it.
 pub fn peak() -> Option<u64> {
     let now = now();
     of_process("VmHWM:").or_else(|| now.map(|_| PEAK.load(Relaxed)))
 }
 
-/// Returns the resident memory of this process now, in bytes; `None` where the system does not say.
+/// Returns the current resident memory of this process, in bytes; `None` if the system does not report it.
 pub fn now() -> Option<u64> {
     let process = sysinfo::get_current_pid().ok()?;
     let mut system = System::new().ok()?;

@@ -37,7 +37,7 @@ pub fn open(path: &Path, config: &Config) -> Result<(Box<dyn Model<f32>>, About)
         }
         other => {
             let found = format!("unknown kind of model `{other}`");
-            let remedy = format!("accepted: {}; evaluate the model with the program that trained it", KINDS.join(", "));
+            let remedy = format!("expected {}; evaluate the model with the program that trained it", KINDS.join(", "));
             Err(Error::input(path, found, remedy))
         }
     }

@@ -1,15 +1,15 @@
-//! A run without a screen: its settings and its folder, what it needs of the machine, and its figures. Nothing here prints.
+//! Training runs: settings, data, memory, run folders and metrics. Nothing in this module prints.
 //!
 //! | module | contents |
 //! | --- | --- |
 //! | [`settings`] | defaults < preset < file < assignments, resolved to a configuration |
-//! | [`data`] | the source of the views, as a run records it |
-//! | [`memory`], [`machine`] | an estimate of the memory before it is taken; threads, vector instructions, the time |
-//! | [`budget`] | a plan of time: lengths of the stages for training of a given duration |
+//! | [`data`] | the source of the views, recorded by a run |
+//! | [`memory`], [`machine`] | memory estimates; threads, vector instructions and the time |
+//! | [`budget`] | time budgets: lengths of the stages for training of a given duration |
 //! | [`folder`] | the files of a run, by name |
-//! | [`metrics`], [`tensorboard`] | the figures of each step, on lines of JSON and as TensorBoard reads them |
-//! | [`training`] | the run itself, in events |
-//! | [`figures`] | mean scores with their definitions |
+//! | [`metrics`], [`tensorboard`] | the metrics of training, as JSON lines and as TensorBoard events |
+//! | [`training`] | the run itself, reported as events |
+//! | [`figures`] | mean test scores with their definitions |
 //!
 //! Modules here may read the clock and the system; [`train`](crate::train) may not.
 
@@ -24,10 +24,10 @@ pub mod settings;
 pub mod tensorboard;
 pub mod training;
 
-/// Program and version, as runs record it.
+/// Program name and version, recorded by runs.
 pub const PROGRAM: &str = concat!("plenoxel ", env!("CARGO_PKG_VERSION"));
 
-/// Numbers of at most `most` of `n` things, evenly spaced, the first and the last among them.
+/// Returns at most `most` indices below `n`, evenly spaced, including the first and the last.
 pub fn evenly_spaced(n: usize, most: usize) -> Vec<usize> {
     match n {
         n if n <= most => (0..n).collect(),

@@ -231,11 +231,11 @@ impl<'a> TensorFile<'a> {
         };
         if info.dtype != dtype || info.shape != expected {
             let found = format!("tensor `{name}` is {:?} {:?}", info.dtype, info.shape);
-            return Err(Error::input(&self.path, found, format!("accepted: {dtype:?} {expected:?}; {RETRAIN}")));
+            return Err(Error::input(&self.path, found, format!("expected {dtype:?} {expected:?}; {RETRAIN}")));
         }
         let (from, to) = info.data_offsets;
         // The size is bounded by that of the file, which was checked. The factor 2 accounts for the numbers converted from the bytes.
-        memory::check(&self.path, &format!("tensor `{name}`"), 2 * (to - from) as u64)?;
+        memory::check(&self.path, &format!("reading the tensor `{name}`"), 2 * (to - from) as u64)?;
         let mut bytes = vec![0; to - from];
         let read = self.source.seek(SeekFrom::Start(self.begin + from as u64)).and_then(|_| self.source.read_exact(&mut bytes));
         read.map_err(|e| refused(&self.path, e))?;

@@ -115,10 +115,10 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     pub fn with_model(model: M, views: impl Into<Arc<[View]>>, mut objective: Objective<T, M>, options: TrainOptions) -> Result<Self> {
         let rays = RaySource::new(views, options.background, options.seed);
         if rays.is_empty() {
-            return Err(Error::config("train views", "no training views", "at least one image"));
+            return Err(Error::usage("views", "there are no training views", "give at least one image"));
         }
         let plan = plan(&model, &options, rays.len());
-        let Some(first) = plan.first() else { return Err(Error::config("stages", "no stage", "at least one stage")) };
+        let Some(first) = plan.first() else { return Err(Error::usage("stages", "there is no stage", "set at least one")) };
         let (optimizer, loss_optimizer) = (model.optimizer(first), objective.take_optimizer());
         Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, draw: None, step: 0 })
     }

@@ -1,4 +1,4 @@
-//! `plenoxel carve`: from silhouettes and colors to an opaque colored grid, without training.
+//! `plenoxel carve`: carves an opaque colored grid from silhouettes and colors, without training.
 
 use super::new_run::{announce, load};
 use super::{MOST_REDUCTION, whole};
@@ -27,29 +27,28 @@ use toml::Value;
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel carve data/lego                                 the visual hull with mean colors, 256 voxels a side
-  plenoxel carve data/lego --sh-degree 2 --resolution 128  with harmonics of the direction of view
-  plenoxel carve data/lego --carve rays --downscale 4      the source paper's rule, at 200 x 200
-  plenoxel carve data/lego --photo-consistency             hollows too, where colors contradict
-  plenoxel train data/lego --init-from runs/lego-1         training goes on from what was carved
+  plenoxel carve data/lego                                 the visual hull with mean colors, 256 voxels per side
+  plenoxel carve data/lego --sh-degree 2 --resolution 128  with view-dependent color (spherical harmonics)
+  plenoxel carve data/lego --carve rays --downscale 4      with the rule of the source paper, at 200 x 200
+  plenoxel carve data/lego --photo-consistency             also carve concave parts, by inconsistent colors
+  plenoxel train data/lego --init-from runs/lego-1         train the carved grid
 
-The result is a run like a trained one: evaluate, render, export and info take it. Settings are layered as for train; --set \
-reaches those below carve. The last line on stdout is one JSON object, \
-where it is no terminal.";
+The result is a run folder for evaluate, render, export and info. Settings are layered as for train; for --set, those of carving begin \
+with `carve.`. If stdout is not a terminal, its last line is a JSON object with the results.";
 
-/// Carve an opaque colored grid, without training, from the silhouettes of images with alpha or from colors that contradict
+/// Carve an opaque colored grid, without training, from the silhouettes of images with alpha or by photo-consistency
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct CarveArgs {
-    /// Folder of a dataset in the NeRF-synthetic format; without it, the built-in scene
+    /// Dataset folder in the NeRF-synthetic format [default: the built-in scene]
     #[arg(value_hint = ValueHint::DirPath)]
     data: Option<PathBuf>,
 
-    /// Folder to write [default: runs/<scene>-<n>, the first free n]
+    /// Run folder to write [default: runs/<scene>-<n> with the first free n]
     #[arg(long, short, help_heading = "Output", value_hint = ValueHint::DirPath)]
     out: Option<PathBuf>,
 
-    /// Overwrite the run in the folder
+    /// Overwrite an existing run in the folder
     #[arg(long, help_heading = "Output")]
     force: bool,
 
@@ -61,7 +60,7 @@ pub struct CarveArgs {
     #[arg(long, help_heading = "Output")]
     no_report: bool,
 
-    /// TOML file of settings; a complete one, such as the config.toml of a run, replaces all others
+    /// TOML file of settings that override the preset; a complete file, such as the config.toml of a run, replaces the preset
     #[arg(long, value_name = "FILE", help_heading = "Settings", value_hint = ValueHint::FilePath)]
     config: Option<PathBuf>,
 
@@ -69,48 +68,48 @@ pub struct CarveArgs {
     #[arg(long, value_name = "KEY=VALUE", help_heading = "Settings")]
     set: Vec<String>,
 
-    /// Reduce the images by this factor, which must divide their width and height
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION))]
+    /// Downscale the images by this factor, which must divide their width and height [default: 1]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION), allow_negative_numbers = true)]
     downscale: Option<i64>,
 
-    /// Color behind the scene: white, black, or three numbers r,g,b in [0, 1] [default: white]
-    #[arg(long, help_heading = "Scene", value_parser = super::background)]
+    /// Background color: white, black, or three numbers r,g,b in [0, 1] [default: white]
+    #[arg(long, help_heading = "Scene", value_parser = super::background, allow_hyphen_values = true)]
     background: Option<[f64; 3]>,
 
-    /// Half the side of the cube in which the scene lies, in the dataset's units [default: 1.5]
-    #[arg(long, value_name = "LENGTH", help_heading = "Scene", allow_negative_numbers = true)]
+    /// Half the side of the cube that contains the scene, in units of the dataset [default: 1.5]
+    #[arg(long, value_name = "LENGTH", help_heading = "Scene", value_parser = super::number(f64::NEG_INFINITY), allow_negative_numbers = true)]
     half_width: Option<f64>,
 
-    /// Voxels along each axis [default: 256]
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(2, 1024))]
+    /// Voxels per side of the box [default: 256]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(2, 1024), allow_negative_numbers = true)]
     resolution: Option<i64>,
 
-    /// Harmonics of the direction of view up to this degree, 0 to 3, instead of one color a voxel
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
+    /// Degree of spherical harmonics for view-dependent color, 0 to 3 [default: one constant color per voxel]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3), allow_negative_numbers = true)]
     sh_degree: Option<i64>,
 
-    /// What makes a voxel go: footprint, a view that shows all of it on background, or rays, the ray of a background pixel through it (the
-    /// source paper's) [default: footprint]
+    /// Carving rule: footprint removes a voxel if some view shows all of it on background; rays removes it if the ray of some background
+    /// pixel passes through it, as in the source paper [default: footprint]
     #[arg(long, value_name = "RULE", help_heading = "Carving", value_parser = ["footprint", "rays"])]
     carve: Option<String>,
 
-    /// Carve on, away voxels of which the photographs show colors that differ by more than this standard deviation, of sRGB values in [0, 1]
-    /// (0.15 if no number is given). Needs no alpha, but surroundings that show through: against one plain color everywhere nothing contradicts
+    /// Also carve voxels with inconsistent colors: remove those whose colors in the photographs differ by more than this standard deviation, of sRGB
+    /// values in [0, 1] (0.15 if no number is given). Needs no alpha channel, but a varied background: with one plain color, no voxel is inconsistent
     #[arg(long, value_name = "NOISE", help_heading = "Carving", value_parser = super::number(0.0), num_args = 0..=1, require_equals = true)]
     photo_consistency: Option<Option<f64>>,
 
-    /// How colors are found: exact, by least squares, or sgd, the source paper's descent [default: exact]
+    /// Fit of the colors: exact (least squares), or sgd (gradient descent, as in the source paper) [default: exact]
     #[arg(long, help_heading = "Carving", value_parser = ["exact", "sgd"])]
     fit: Option<String>,
 }
 
 impl CarveArgs {
-    /// Where the views come from.
+    /// Source of the views.
     pub fn source(&self) -> DataSource {
         DataSource::of(self.data.as_deref())
     }
 
-    /// The configuration, and the preset it started from.
+    /// Resolves the configuration. Returns it with the name of its preset.
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
         settings::layered(None, CARVE.name, self.config.as_deref(), |layers| self.flags(layers))
     }
@@ -138,10 +137,10 @@ impl CarveArgs {
     }
 }
 
-/// Voxels along an axis from which the hull takes so long that one would rather know before whether its colors fit in memory.
+/// Number of voxels per side above which the memory of the colors is estimated before the hull, because the hull takes long.
 const LARGE: usize = 256;
 
-/// Carves a scene and leaves a run folder.
+/// Carves a scene and writes a run folder.
 pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let source = args.source();
     let (config, preset) = args.config()?;
@@ -158,7 +157,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let views = load_clock.time(|| load(console, &dataset, Split::Train, &source))?;
 
     let mut hull_clock = Stopwatch::default();
-    // A coarse hull is too large. If not even half of what it says would fit, that is said before the work is done.
+    // A coarse hull overestimates the number of voxels. If not even half of them fit into memory, the command fails early.
     if config.carve.resolution > LARGE {
         let expected = hull_clock.time(|| carve::voxels_expected(&views, &config.carve_options())).unwrap_or(0.0);
         Estimate::of_carving(&config, &dataset, (0.5 * expected) as usize, !args.no_report).check()?;
@@ -166,7 +165,9 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let count = console.count("carving, view", views.len());
     let progress = |progress| match progress {
         Progress::Views(done) => count.at(done, views.len()),
-        Progress::Round { round, carved, left } => console.note(&format!("photo hull, round {round}: {carved} voxels carved, {left} left")),
+        Progress::Round { round, carved, left } => {
+            console.note(&format!("photo hull, round {round}: carved {carved} voxels, {left} are left"))
+        }
     };
     let carving = hull_clock.time(|| Carving::new(&views, &config.carve_options(), &progress))?;
     drop(count);
@@ -175,14 +176,14 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     console.note(&format!("carved {n}³ voxels in {:.2} s: {left} are left, {share:.1} %", hull_clock.seconds()));
     if share > 50.0 {
         console.note(
-            "most of the box is left: the photographs contradict little of it; more views, alpha, or a smaller --half-width would help",
+            "most of the box is left because the photographs rule out little of it; use more views, images with alpha, or a smaller --half-width",
         );
     }
     let estimate = Estimate::of_carving(&config, &dataset, carving.rows(), !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
 
-    // Nothing is written, and nothing overwritten, before all that could be wrong with the input has been found.
+    // Nothing is written or overwritten before all checks of the input.
     let folder = folder.create()?;
     let record = RunRecord::new(RunKind::Carved, &dataset, preset, &source);
     folder.describe(&config, &record)?;
@@ -197,7 +198,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     drop(count);
     if colored.missed > 0.0 && has_alpha(&views) {
         console.note(&format!(
-            "{:.2} % of the object pixels show no voxel: parts thinner than a pixel, or beyond the box (--half-width)",
+            "{:.2} % of the object pixels show no voxel: those parts are thinner than a pixel or outside the box (--half-width)",
             100.0 * colored.missed
         ));
     }
@@ -210,7 +211,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     if !args.no_images
         && let Some(views) = console.drawn(draw(&folder, &config, &dataset, &model))
     {
-        console.note(&format!("pictures of {views} views in images/carved.png"));
+        console.note(&format!("wrote pictures of {views} views to images/carved.png"));
     }
     let summary = Summary {
         seconds: hull_clock.seconds() + color_clock.seconds(),
@@ -229,12 +230,12 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     folder.write_result(&summary)?;
     let Summary { seconds, seconds_hull, seconds_color, .. } = summary;
     console.result(&format!(
-        "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; `plenoxel evaluate` compares it with test views"
+        "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; evaluate it on test views with `plenoxel evaluate`"
     ))?;
     if config.carve.rule == Rule::Footprint {
         console.note(
-            "the footprint rule keeps every voxel that some pixel may see in part: the start for --init-from; --carve rays carves closer to the silhouettes \
-             and compares better with test views (lego: 23.7 dB instead of 19.1)",
+            "the footprint rule keeps every voxel that any pixel may show, as a start for --init-from; --carve rays carves closer to the silhouettes and has \
+             a better test PSNR (lego: 23.7 dB instead of 19.1 dB)",
         );
     }
     console.result(&format!("run folder: {}", folder.path().display()))?;
@@ -246,7 +247,7 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     Ok(())
 }
 
-/// Writes pictures of the model from some cameras, side by side, and returns how many.
+/// Renders the model from some cameras, writes the pictures side by side, and returns their number.
 fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, model: &Plenoxels<f32>) -> Result<usize> {
     const MOST: usize = 4;
     let split = if dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
@@ -259,7 +260,7 @@ fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, model: &Plenoxel
     Ok(pictures.len())
 }
 
-/// Final figures. `seconds` are of carving and coloring, without reading images.
+/// Final figures. `seconds` is the time of carving and coloring, without reading images.
 #[derive(Debug, Serialize)]
 struct Summary {
     seconds: f64,

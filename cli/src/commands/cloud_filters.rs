@@ -1,4 +1,4 @@
-//! The flags of CloudCompare's filters, which `export ply` and `filter` share.
+//! The flags of CloudCompare's filters, for `export ply` and `filter`.
 
 use super::{number, numbers, whole};
 use clap::{ArgGroup, Args, ValueEnum};
@@ -7,59 +7,59 @@ use plenoxel::error::{Error, Result};
 use plenoxel::geometry::Aabb;
 use plenoxel::point_cloud::filter::{Filters, Kept, Noise, NoiseError, Outliers, Range};
 
-/// CloudCompare's own defaults.
+/// Defaults of CloudCompare.
 const NEIGHBOURS: usize = 6;
 const SIGMA: f64 = 1.0;
 
-/// What to remove from a cloud, in this order: box, value, noise, outliers.
+/// Filters of a point cloud, in the order of their application: box, value, noise, outliers.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Filters", group = ArgGroup::new("values").args(["min_value", "max_value"]).multiple(true))]
 pub struct CloudFilters {
-    /// Keep points in the box XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX, in the coordinates of the file written
+    /// Keep points in the box XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX, in coordinates of the output file
     #[arg(long, value_name = "BOX", value_parser = bounds, allow_hyphen_values = true)]
     bbox: Option<Aabb>,
 
-    /// Keep points whose value is at least this
+    /// Minimum value of a point in the scalar field of --value-field
     #[arg(long, value_name = "V", value_parser = number(f64::NEG_INFINITY), allow_hyphen_values = true)]
     min_value: Option<f64>,
 
-    /// Keep points whose value is at most this
+    /// Maximum value of a point in the scalar field of --value-field
     #[arg(long, value_name = "V", value_parser = number(f64::NEG_INFINITY), allow_hyphen_values = true)]
     max_value: Option<f64>,
 
-    /// Scalar field that --min-value and --max-value look at [default: density or sigma, or the only one]
+    /// Scalar field for --min-value and --max-value [default: density or sigma, or the only field]
     #[arg(long, value_name = "NAME", requires = "values")]
     value_field: Option<String>,
 
-    /// Noise filter: remove points off the plane of their neighbours within this distance. Between voxels distances are 1, 1.41, 1.73,
-    /// 2 ... sides: choose one between those
-    #[arg(long, value_name = "R", value_parser = number(f64::MIN_POSITIVE))]
+    /// Noise filter: radius for the neighbors of a point. Points too far from the plane of their neighbors are removed. Distances between voxels are
+    /// 1, 1.41, 1.73, 2 ... voxel sides; choose a radius between these
+    #[arg(long, value_name = "R", value_parser = number(f64::MIN_POSITIVE), allow_negative_numbers = true)]
     noise_radius: Option<f64>,
 
-    /// Noise filter: the distance from the plane that is allowed, as a length
-    #[arg(long, value_name = "D", value_parser = number(0.0), requires = "noise_radius", conflicts_with = "noise_relative")]
+    /// Noise filter: maximum distance from the plane, as a length
+    #[arg(long, value_name = "D", value_parser = number(0.0), requires = "noise_radius", conflicts_with = "noise_relative", allow_negative_numbers = true)]
     noise_error: Option<f64>,
 
-    /// Noise filter: the distance from the plane that is allowed, in standard deviations of the neighbours' distances [default: 1]
-    #[arg(long, value_name = "N", value_parser = number(0.0), requires = "noise_radius")]
+    /// Noise filter: maximum distance from the plane, in standard deviations of the neighbors' distances [default: 1]
+    #[arg(long, value_name = "N", value_parser = number(0.0), requires = "noise_radius", allow_negative_numbers = true)]
     noise_relative: Option<f64>,
 
-    /// Noise filter: remove points with fewer than three neighbours too
+    /// Noise filter: also remove points with fewer than three neighbors
     #[arg(long, requires = "noise_radius")]
     remove_isolated: bool,
 
-    /// Statistical outlier removal (SOR): compare the mean distance to this many nearest points, the point itself being one of them
-    /// [default: 6, if there is --sor-sigma]
-    #[arg(long, value_name = "K", value_parser = whole::<usize>(2, 1000))]
+    /// Statistical outlier removal (SOR): number of nearest points for the mean distance, including the point itself
+    /// [default: 6 with --sor-sigma]
+    #[arg(long, value_name = "K", value_parser = whole::<usize>(2, 1000), allow_negative_numbers = true)]
     sor_neighbours: Option<usize>,
 
-    /// Statistical outlier removal: remove points whose mean distance is more than this many standard deviations above the mean of all
-    /// [default: 1, if there is --sor-neighbours]
+    /// Statistical outlier removal: maximum mean distance of a point, in standard deviations above the mean over all points
+    /// [default: 1 with --sor-neighbours]
     #[arg(long, value_name = "N", value_parser = number(f64::NEG_INFINITY), allow_hyphen_values = true)]
     sor_sigma: Option<f64>,
 
-    /// What --noise-radius and --noise-error are measured in: sides of a voxel, or the world's unit of length [default: voxel; world for a
-    /// file that does not name the side of its voxels]
+    /// Unit of --noise-radius and --noise-error: the side of a voxel, or the world unit [default: voxel; world for a file without a
+    /// voxel_side comment]
     #[arg(long)]
     units: Option<Units>,
 }
@@ -71,26 +71,26 @@ pub enum Units {
     World,
 }
 
-/// One unit of length in the coordinates of a cloud.
+/// Units of length in the coordinates of a cloud.
 #[derive(Clone, Copy, Debug)]
 pub struct UnitLengths {
     /// The side of a voxel, if there are voxels.
     pub voxel: Option<f64>,
-    /// The world's unit.
+    /// The world unit.
     pub world: f64,
 }
 
 impl CloudFilters {
-    /// The filters for a cloud.
+    /// Returns the filters for a cloud.
     ///
-    /// Errors: lengths in voxels, where nobody knows how large they are.
+    /// Errors: the lengths are in voxels, but the size of a voxel is unknown.
     pub fn filters(&self, lengths: UnitLengths) -> Result<Filters> {
         let unit = match (self.units, lengths.voxel) {
             (Some(Units::World), _) | (None, None) => lengths.world,
             (_, Some(side)) => side,
             (Some(Units::Voxel), None) => {
-                let found = "voxel, for a file that does not name the side of its voxels in a line `comment voxel_side`,";
-                return Err(Error::config("--units", found, "world"));
+                let found = "the file has no line `comment voxel_side`, so the side of its voxels is unknown";
+                return Err(Error::usage("--units", found, "use world"));
             }
         };
         let value = self
@@ -109,9 +109,9 @@ impl CloudFilters {
         Ok(Filters { within: self.bbox, value, noise, outliers })
     }
 
-    /// The scalar field to look at, out of those that a cloud has; `None` if no filter looks at values.
+    /// Chooses the scalar field of the value filter from the fields of a cloud; `None` without a value filter.
     ///
-    /// Errors: the cloud has none, or several, or not the one that was asked for.
+    /// Errors: the cloud has no fields, several fields, or not the requested one.
     pub fn value_field(&self, names: &[&str]) -> Result<Option<String>> {
         if !self.looks_at_values() {
             return Ok(None);
@@ -120,13 +120,13 @@ impl CloudFilters {
         let list = names.join(", ");
         let flag = if self.min_value.is_some() { "--min-value" } else { "--max-value" };
         match (&self.value_field, names) {
-            (_, []) => Err(Error::config(flag, "a cloud without scalar fields", "a cloud with one")),
+            (_, []) => Err(Error::usage(flag, "the cloud has no scalar fields", "leave it out, or use a cloud with a scalar field")),
             (Some(name), _) => known(name).map(Some).ok_or_else(|| Error::config("--value-field", format!("`{name}`"), list)),
             (None, [only]) => Ok(Some((*only).to_owned())),
             (None, _) => known("density")
                 .or_else(|| known("sigma"))
                 .map(Some)
-                .ok_or_else(|| Error::config(flag, "a cloud with several scalar fields", format!("--value-field with one of {list}"))),
+                .ok_or_else(|| Error::usage(flag, "the cloud has several scalar fields", format!("choose one with --value-field: {list}"))),
         }
     }
 
@@ -135,28 +135,29 @@ impl CloudFilters {
     }
 }
 
-/// A box as the command line takes it.
+/// Parses a box.
 fn bounds(text: &str) -> std::result::Result<Aabb, String> {
     let [a, b, c, d, e, f] = numbers::<6>(text)?;
     let (min, max) = (DVec3::new(a, b, c), DVec3::new(d, e, f));
-    let accepted = "XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX with no minimum above its maximum";
-    if min.cmple(max).all() { Ok(Aabb { min, max }) } else { Err(accepted.to_owned()) }
+    let expected = "expected XMIN,YMIN,ZMIN,XMAX,YMAX,ZMAX with no minimum above its maximum";
+    if min.cmple(max).all() { Ok(Aabb { min, max }) } else { Err(expected.to_owned()) }
 }
 
-/// What filters did, in words: "5000 points, value 4000, sor 3900".
+/// Formats a number of points.
+pub fn points(count: usize) -> String {
+    format!("{count} point{}", if count == 1 { "" } else { "s" })
+}
+
+/// Summarizes the filters: the numbers of points before, and after each filter, such as "5000 points, value 4000, sor 3900".
 pub fn describe(before: usize, report: &[Kept]) -> String {
     let steps: String = report.iter().map(|kept| format!(", {} {}", kept.filter, kept.after)).collect();
-    format!("{before} points{steps}")
+    format!("{}{steps}", points(before))
 }
 
-/// Refuses to write a cloud without points.
+/// Checks that some points are left.
 pub fn check_not_empty(left: usize, report: &str) -> Result<()> {
     if left > 0 {
         return Ok(());
     }
-    Err(Error::config(
-        "filters",
-        format!("what leaves no point ({report})"),
-        "settings that keep some: a wider box, a lower minimum, a larger radius or sigma",
-    ))
+    Err(Error::usage("filters", format!("no point is left ({report})"), "use a larger box, a lower minimum, or a larger radius or sigma"))
 }

@@ -1,4 +1,4 @@
-//! `plenoxel compare`: runs side by side, as a table and as a page with curves and pictures.
+//! `plenoxel compare`: compares runs in a table and in a page with curves and pictures.
 
 mod pictures;
 
@@ -21,28 +21,28 @@ use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel compare runs/lego-1 runs/lego-2         prints a table, writes compare.html
+  plenoxel compare runs/lego-1 runs/lego-2         print a table and write compare.html
   plenoxel compare runs/lego-* --out lego.html
 
-The page has the table, curves over steps and over seconds, the test views of which every run has a picture (what each rendered, and how far \
-it is from the photograph), and the settings that differ. Runs may be of different scenes; then there are no pictures.";
+The page has the table, curves over steps and over seconds, the test views that all runs have rendered (rendering and error of each run), and \
+the settings that differ. Runs of different scenes are compared without pictures.";
 
-/// Compare runs: a table, and a page with curves and pictures side by side
+/// Compare runs in a table, and in a page with curves and pictures side by side
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct CompareArgs {
-    /// Folders of runs
+    /// Run folders to compare
     #[arg(required = true, value_name = "RUN", value_hint = ValueHint::DirPath)]
     runs: Vec<PathBuf>,
 
-    /// Page to write, replacing what is there
+    /// HTML page to write, replacing an existing file
     #[arg(long, short, value_name = "FILE", help_heading = "Output", default_value = "compare.html", value_hint = ValueHint::FilePath)]
     out: PathBuf,
 }
 
-/// A run among others.
+/// A run to compare.
 struct Run {
-    /// As the command line has it, which tells runs of one name in several folders apart.
+    /// Path as given on the command line, which distinguishes runs of the same name.
     name: String,
     folder: RunFolder,
     config: Config,
@@ -52,17 +52,17 @@ struct Run {
 }
 
 impl Run {
-    fn read(path: &Path) -> Result<Self> {
+    fn read(path: &Path, console: &Console<'_>) -> Result<Self> {
         let (folder, config, record) = RunFolder::open(path)?;
         let figures = Figures::of(&folder, &config)?.unwrap_or_default();
         let name = path.display().to_string();
-        // Of one run at a time: its curves are a small part of it.
+        // The metrics of one run at a time: the curves take much less memory.
         let metrics = metrics::read(&folder.metrics())?;
-        let curves = RunCurves::of(&name, &metrics::lines(&metrics).map(|(_, line)| line).collect::<Vec<_>>());
+        let curves = RunCurves::of(&name, &curves::lines(&folder, &metrics, console));
         Ok(Run { name, folder, config, record, figures, curves })
     }
 
-    /// What the table says of it.
+    /// The cells of the table.
     fn facts(&self) -> [(&'static str, String); 11] {
         let Figures { psnr, ssim, views, seconds, voxels, resolution, rays, peak_memory_bytes, .. } = self.figures;
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "–".to_owned());
@@ -84,7 +84,7 @@ impl Run {
 
 /// Compares runs.
 pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
-    let runs: Vec<Run> = args.runs.iter().map(|path| Run::read(path)).collect::<Result<_>>()?;
+    let runs: Vec<Run> = args.runs.iter().map(|path| Run::read(path, console)).collect::<Result<_>>()?;
     super::check_replaceable(&args.out, &runs.iter().map(|run| &run.folder).collect::<Vec<_>>(), None)?;
     let facts: Vec<_> = runs.iter().map(Run::facts).collect();
     let heads: Vec<&str> = facts.iter().take(1).flatten().map(|(name, _)| *name).collect();
@@ -104,7 +104,7 @@ pub fn run(args: &CompareArgs, console: &Console<'_>) -> Result<()> {
     console.wrote(&args.out, &format!("wrote {}", args.out.display()))
 }
 
-/// The settings that are not the same in all runs.
+/// The section with the settings that differ.
 fn settings(runs: &[Run]) -> String {
     let values: Vec<BTreeMap<String, String>> = runs.iter().map(|run| settings::values(&run.config)).collect();
     let keys: BTreeSet<&String> = values.iter().flat_map(BTreeMap::keys).collect();
@@ -113,14 +113,15 @@ fn settings(runs: &[Run]) -> String {
         .map(|key| [key.as_str()].into_iter().chain(values.iter().map(|of| of.get(key).map_or("–", String::as_str))).collect())
         .collect();
     if rows.is_empty() {
-        return "<section><h2>Settings</h2><p>All settings are the same.</p></section>".to_owned();
+        return "<section><h2>Settings</h2><p>All settings are equal.</p></section>".to_owned();
     }
     let heads: Vec<&str> = ["setting"].into_iter().chain(runs.iter().map(|run| run.name.as_str())).collect();
     let table = table(&heads, &rows);
-    format!("<section><h2>Settings</h2>\n<details open><summary>{} that differ</summary>{table}</details></section>", rows.len())
+    let what = if rows.len() == 1 { "setting differs" } else { "settings differ" };
+    format!("<section><h2>Settings</h2>\n<details open><summary>{} {what}</summary>{table}</details></section>", rows.len())
 }
 
-/// A table for the page.
+/// Formats a table as HTML.
 fn table(heads: &[&str], rows: &[Vec<&str>]) -> String {
     let line = |tag: &str, cells: &[&str]| {
         let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
@@ -130,7 +131,7 @@ fn table(heads: &[&str], rows: &[Vec<&str>]) -> String {
     format!("<div class=\"scroll\"><table>\n{}{rows}</table></div>", line("th", heads))
 }
 
-/// The same for a terminal, as Markdown.
+/// Formats a table as aligned Markdown, for a terminal.
 fn aligned(heads: &[&str], rows: &[Vec<&str>]) -> String {
     let rows: Vec<Vec<String>> = rows.iter().map(|row| row.iter().map(|cell| as_text(cell)).collect()).collect();
     let rows: Vec<Vec<&str>> = rows.iter().map(|row| row.iter().map(String::as_str).collect()).collect();

@@ -1,4 +1,4 @@
-//! `plenoxel completions`: what a shell needs to complete command lines, from the definitions that parse them.
+//! `plenoxel completions`: shell completions, generated from the definitions of the command line.
 
 use crate::Cli;
 use crate::progress::Console;
@@ -11,17 +11,17 @@ Examples:
   plenoxel completions bash > ~/.local/share/bash-completion/completions/plenoxel
   plenoxel completions zsh > ~/.zfunc/_plenoxel      with ~/.zfunc in fpath before compinit
   plenoxel completions fish > ~/.config/fish/completions/plenoxel.fish
-  source <(plenoxel completions bash)                for this session alone";
+  source <(plenoxel completions bash)                for this session only";
 
-/// Print completions for a shell
+/// Print the completion script of a shell
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct CompletionsArgs {
-    /// The shell
+    /// Shell for which the script is printed
     shell: Shell,
 }
 
-/// Prints a script for a shell.
+/// Prints the completion script.
 pub fn run(args: &CompletionsArgs, console: &Console<'_>) -> Result<()> {
     let mut command = Cli::command();
     let name = command.get_name().to_owned();

@@ -1,4 +1,4 @@
-//! `plenoxel evaluate`: figures of a trained run on the views of a split.
+//! `plenoxel evaluate`: PSNR and SSIM of a run on the views of a split.
 
 use super::new_run::load;
 use super::trained_run::{Found, Loaded, TrainedRun};
@@ -16,31 +16,31 @@ use std::time::Instant;
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel evaluate runs/lego                      at the resolution it was trained at
-  plenoxel evaluate runs/lego --downscale 1        at full resolution
+  plenoxel evaluate runs/lego                      at the image size of the training
+  plenoxel evaluate runs/lego --downscale 1        at the full image size
   plenoxel evaluate runs/lego --split val --json
   plenoxel evaluate runs/lego --out lego.json
 
-The figures of a carved run on its test views are kept in its folder, as evaluation.json.
+The test scores of a carved run are also written to evaluation.json in its folder.
 
---samples N places N samples on the longest line through the box, and as densely on shorter ones. Runs of the paper preset \
-count samples from the camera to its far limit instead.
+--samples N places N samples on the longest ray through the box, and samples of the same spacing on shorter rays. In runs of the paper preset, \
+every ray has N samples between the camera and the far limit.
 
-PSNR and SSIM are means over views. The last line on stdout, where it is no terminal, is one JSON object, which says how each figure is computed: what is \
-clamped, rounded and padded, over which background, at which size. LPIPS is not computed.";
+PSNR and SSIM are means over views. If stdout is not a terminal, its last line is a JSON object with the scores and their definitions: clamping, \
+rounding, padding, background and image size. LPIPS is not computed.";
 
-/// Compute PSNR and SSIM of a trained run on the views of a split
+/// Compute PSNR and SSIM of a run on the views of a split
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct EvaluateArgs {
     #[command(flatten)]
     run: TrainedRun,
 
-    /// Print the JSON object alone
+    /// Print only the JSON object
     #[arg(long, help_heading = "Output")]
     json: bool,
 
-    /// Write the JSON object to this file too, replacing what is there
+    /// Also write the JSON object to this file, replacing an existing file
     #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
 }
@@ -58,10 +58,10 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let Found { folder, config, preset, source } = found;
     let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
-    // A folder may have another name by now: no error.
+    // No error, because a folder may have been renamed.
     let same_scene = about.scene == dataset.name();
     if !same_scene {
-        console.note(&format!("the run is of another scene: {}, not {}", about.scene, dataset.name()));
+        console.note(&format!("the run was trained on another scene: {}, not {}", about.scene, dataset.name()));
     }
 
     let start = Instant::now();
@@ -82,7 +82,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         }
         console.result(&figures.sentence())?;
     }
-    // An earlier grid took less.
+    // The time and rays of the best grid are not known.
     let of_last = |key: &str| if args.run.best { None } else { trained.get(key) };
     let evaluation = Evaluation {
         figures,
@@ -98,22 +98,19 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         per_view: scores.per_view,
     };
     let line = json::line(&evaluation)?;
-    // Printed first, so that a file that cannot be written takes nothing with it.
+    // Printed first, so that the scores are not lost if the file cannot be written.
     if json { console.result(&line) } else { console.record(&evaluation) }?;
     let file = args.out.iter().filter(|file| !is_stdout(file));
     file.into_iter().try_for_each(|file| console.write_file(file, (line.clone() + "\n").as_bytes()))?;
-    // A carved run has no figures of its own, nor has one that was trained with --no-evaluate. One that did not end well has none either, and is no run
-    // to compare.
+    // A carved run and one trained with --no-evaluate have no test scores. An unfinished run has none either, but is not compared.
     if args.run.is_as_trained() && same_scene && trained.is_object() && !trained["psnr"].is_number() {
         folder.shared("RUN")?.write_evaluation(&evaluation)?;
-        console.note(
-            "kept in the run's folder: `plenoxel compare` shows these figures, and so does `plenoxel report`, which writes the page again",
-        );
+        console.note("the scores were written to evaluation.json in the run folder; `plenoxel compare` and `plenoxel report` show them");
     }
     Ok(())
 }
 
-/// What `evaluate` prints last. `seconds` is the training time that the run remembers.
+/// The JSON object of `evaluate`. `seconds` is the training time recorded by the run.
 #[derive(Debug, Serialize)]
 struct Evaluation {
     #[serde(flatten)]

@@ -1,4 +1,4 @@
-//! `plenoxel export`: a trained run as files of other programs.
+//! `plenoxel export`: exports the grid of a run to files for other programs.
 
 mod mesh;
 mod ply;
@@ -18,12 +18,12 @@ use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel export ply runs/lego       a colored point cloud: CloudCompare, MeshLab
-  plenoxel export vox runs/lego       MagicaVoxel
-  plenoxel export mesh runs/lego      a surface: Blender, and what reads PLY, OBJ, GLB or STL
-  plenoxel export ply --help          the settings of one";
+  plenoxel export ply runs/lego       a colored point cloud, for CloudCompare or MeshLab
+  plenoxel export vox runs/lego       voxels, for MagicaVoxel
+  plenoxel export mesh runs/lego      a surface mesh, for Blender and other readers of PLY, OBJ, GLB or STL
+  plenoxel export ply --help          the flags of a format";
 
-/// Write a trained run as files of other programs
+/// Export the grid of a run as a point cloud, voxels or a mesh
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, arg_required_else_help = true)]
 pub struct ExportArgs {
@@ -47,23 +47,23 @@ pub fn run(args: &ExportArgs, console: &Console<'_>) -> Result<()> {
     }
 }
 
-/// Which run, and where to.
+/// The run to export, and the file to write.
 #[derive(Debug, Args)]
 struct Exported {
-    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
+    /// Run folder written by `plenoxel train` or `plenoxel carve`
     #[arg(value_hint = ValueHint::DirPath)]
     run: PathBuf,
 
-    /// The grid that validation views liked best of those that were saved, where it is another than the last
+    /// Use best.safetensors, the checkpoint with the best validation PSNR, instead of the final grid
     #[arg(long)]
     best: bool,
 
-    /// File to write, replacing what is there; - for stdout [default: in RUN/exports]
+    /// File to write, replacing an existing file; - for stdout [default: a file in RUN/exports]
     #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
 }
 
-/// A run as it was found.
+/// An opened run.
 struct Opened {
     folder: RunFolder,
     config: Config,
@@ -73,11 +73,13 @@ struct Opened {
 }
 
 impl Exported {
-    /// The run with its grid, once memory is known to suffice for it and for `bytes_per_voxel`, and the name of the file to be fit for its format.
+    /// Opens the run and reads its grid, once there is enough memory for it and for `bytes_per_voxel`.
+    ///
+    /// Errors: the output file has the wrong extension; the run cannot be read; there is not enough memory.
     fn open(&self, console: &Console<'_>, format: &str, bytes_per_voxel: u64) -> Result<Opened> {
         if let Some(out) = self.out.as_deref().filter(|out| !is_stdout(out) && ending(out).as_deref() != Some(format)) {
-            let found = format!("{} does not name a file of the format {format}", out.display());
-            return Err(Error::config("--out", found, format!("a name that ends in .{format}")));
+            let found = format!("{} does not end in .{format}", out.display());
+            return Err(Error::usage("--out", found, format!("choose a name that ends in .{format}")));
         }
         let (folder, config, record) = RunFolder::open(&self.run)?;
         let folder = if self.best { folder.with_best()? } else { folder };
@@ -90,7 +92,7 @@ impl Exported {
         Ok(Opened { folder, config, record, header, grid })
     }
 
-    /// Writes the file that was asked for, or else one of a name in the run's folder, and says which.
+    /// Writes the requested file, or the file `name` in the exports of the run. Returns its path.
     fn write(&self, folder: &RunFolder, name: &str, bytes: &[u8], console: &Console<'_>) -> Result<PathBuf> {
         let file = self.out.clone().map_or_else(|| folder.create_export(name), Ok)?;
         console.write_file(&file, bytes)?;
@@ -98,34 +100,33 @@ impl Exported {
     }
 }
 
-/// What stands behind the last dot of a file's name, in small letters.
+/// The file extension, in lower case.
 fn ending(path: &Path) -> Option<String> {
     path.extension().map(|ending| ending.to_string_lossy().to_ascii_lowercase())
 }
 
-/// What `--min-alpha` means, whatever is exported.
-const MIN_ALPHA: &str =
-    "Keep voxels that absorb at least this share of the light that crosses them, 1 - exp(-density * side); none without density";
+/// Help of `--min-alpha`.
+const MIN_ALPHA: &str = "Minimum alpha of a voxel, 1 - exp(-density * side); voxels without density are never kept";
 
-/// A least share of the light as the command line takes it: no voxel absorbs all of it.
+/// Parses a minimum alpha, which is below 1.
 fn min_alpha(text: &str) -> std::result::Result<f64, String> {
-    text.parse().ok().filter(|share| (0.0..1.0).contains(share)).ok_or_else(|| "a number from 0 on, and below 1".to_owned())
+    text.parse().ok().filter(|share| (0.0..1.0).contains(share)).ok_or_else(|| "expected a number in [0, 1)".to_owned())
 }
 
-/// The one color of a place, where it depends on the direction.
+/// Choice of a constant color for a view-dependent one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum ColorChoice {
-    /// What training cameras see of it.
+    /// The mean color in the training views.
     Seen,
     /// The mean over all directions.
     Mean,
-    /// As seen straight on, against the normal of the surface.
+    /// The color seen against the normal of the surface.
     Facing,
-    /// As seen along a unit direction, from the viewer into the scene.
+    /// The color seen along a unit direction, from the viewer into the scene.
     Along(DVec3),
 }
 
-/// A choice as the command line takes it: one of some words, or a direction.
+/// Parses a choice: one of `words`, or a direction.
 fn color(words: &'static [(&'static str, ColorChoice)]) -> impl Fn(&str) -> std::result::Result<ColorChoice, String> + Clone {
     move |text| {
         if let Some((_, choice)) = words.iter().find(|(word, _)| *word == text) {
@@ -135,22 +136,22 @@ fn color(words: &'static [(&'static str, ColorChoice)]) -> impl Fn(&str) -> std:
         let words = || words.iter().map(|(word, _)| format!("{word}, ")).collect::<String>();
         direction
             .map(ColorChoice::Along)
-            .ok_or_else(|| format!("{}or a direction of three numbers such as 0,0,-1, not all of them 0", words()))
+            .ok_or_else(|| format!("expected {}or a direction of three numbers such as 0,0,-1, not all 0", words()))
     }
 }
 
-/// From where the colors of a surface are seen.
+/// The flags for the colors of a surface.
 #[derive(Debug, Args)]
 struct SurfaceColors {
-    /// The one color of a place, where it depends on the direction: as seen straight on, against the surface's normal, or what a ray in
-    /// the direction X,Y,Z, from the viewer into the scene, shows there
+    /// View direction for view-dependent color: facing, against the surface normal, or one direction X,Y,Z for all points, from the viewer
+    /// into the scene
     #[arg(long, value_name = "facing|X,Y,Z", help_heading = "Colors", default_value = "facing", allow_hyphen_values = true,
           value_parser = color(&[("facing", ColorChoice::Facing)]))]
     color: ColorChoice,
 }
 
 impl SurfaceColors {
-    /// The direction, if it is one for all.
+    /// The direction, if it is the same for all points.
     fn direction(&self) -> Option<DVec3> {
         if let ColorChoice::Along(direction) = self.color { Some(direction) } else { None }
     }

@@ -1,4 +1,4 @@
-//! `plenoxel info`: what a run, a checkpoint or a dataset is, and what machine this is.
+//! `plenoxel info`: describes a run, a checkpoint or a dataset, and the machine.
 
 use crate::progress::Console;
 use clap::{Args, ValueHint};
@@ -21,21 +21,21 @@ use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel info                                    this machine
-  plenoxel info data/lego                          a dataset
-  plenoxel info runs/lego                          a run
-  plenoxel info runs/lego/checkpoint.safetensors   a trained grid";
+  plenoxel info                                    describe this machine
+  plenoxel info data/lego                          describe a dataset
+  plenoxel info runs/lego                          describe a run
+  plenoxel info runs/lego/checkpoint.safetensors   describe a trained grid";
 
-/// Say what a run, a checkpoint or a dataset is: format, sizes, conventions, memory
+/// Describe a run, a checkpoint or a dataset: format, sizes, conventions and memory
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct InfoArgs {
-    /// Run folder, checkpoint, or folder of a dataset; without it, the machine alone
+    /// Run folder, checkpoint or dataset folder [default: describe the machine only]
     #[arg(value_hint = ValueHint::AnyPath)]
     path: Option<PathBuf>,
 }
 
-/// Describes what is at a path.
+/// Prints the description of a path.
 pub fn run(args: &InfoArgs, console: &Console<'_>) -> Result<()> {
     if let Some(path) = &args.path {
         let lines = describe(path)?;
@@ -69,20 +69,20 @@ fn describe(path: &Path) -> Result<Lines> {
         return of_run(path);
     }
     if !files::is_there(path) {
-        return Err(Error::input(path, "there is nothing", "give the folder of a run or of a dataset, or a checkpoint"));
+        return Err(Error::input(path, "this path does not exist", "give a run folder, a dataset folder or a checkpoint"));
     }
     let opened = dataset::open(path, &OpenOptions::default());
     opened.map(|dataset| of_dataset(path, &dataset)).map_err(|e| match e {
-        // About the folder, and not about a file in it.
+        // An error about the folder, not about a file in it.
         Error::Input { path: about, found, remedy } if about == path && path.is_dir() => {
-            let found = format!("neither a run (no run.json) nor a dataset: {found}");
+            let found = format!("this is neither a run folder (it has no run.json) nor a dataset ({found})");
             Error::input(about, found, remedy)
         }
         other => other,
     })
 }
 
-/// The facts of a checkpoint whose model this program has no code for: its kind and its parameters; `None` for a voxel grid.
+/// Describes the checkpoint of a custom model: its kind and its parameters. Returns `None` for a voxel grid.
 fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
     let kind = model::kind(path)?;
     if model::KINDS.contains(&&kind[..]) {
@@ -91,7 +91,7 @@ fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
     let file = TensorFile::open(path)?;
     let mut lines = vec![
         ("checkpoint", path.display().to_string()),
-        ("kind", format!("{kind}: a model of another program, which can render and evaluate it")),
+        ("kind", format!("{kind}: a custom model; the program that trained it can render and evaluate it")),
     ];
     lines.extend(file.tensors().into_iter().map(|(name, shape)| ("parameter", format!("{name} {shape:?}"))));
     Ok(Some(lines))
@@ -103,21 +103,21 @@ fn of_run(path: &Path) -> Result<Lines> {
     let mut lines = vec![
         ("run", path.display().to_string()),
         ("scene", format!("{}, {}", record.scene, record.format)),
-        ("made by", format!("{} with {}", record.program, record.instruction_set)),
+        ("created by", format!("{} with {}", record.program, record.instruction_set)),
         ("preset", record.preset.unwrap_or_else(|| "none".to_owned())),
     ];
     let data = match &record.data {
-        DataSource::Folder { path } if !path.exists() => format!("{}, not there any more", path.display()),
+        DataSource::Folder { path } if !path.exists() => format!("{}, which no longer exists", path.display()),
         source => source.to_string(),
     };
     lines.push(("data", data));
     let result = folder.result()?;
-    // Small images have smaller grids than they were asked for.
+    // For small images, grids are smaller than configured.
     let trained: Option<Vec<u64>> =
         result.as_ref().and_then(|result| result["stages"].as_array()?.iter().map(|stage| stage["resolution"].as_u64()).collect());
     let stages = trained.unwrap_or_else(|| config.stages.iter().map(|stage| stage.resolution as u64).collect());
     let stages: Vec<String> = stages.iter().map(|resolution| format!("{resolution}³")).collect();
-    lines.push(("stages", if carved { "none: it was carved".to_owned() } else { stages.join(", ") }));
+    lines.push(("stages", if carved { "none: the grid was carved".to_owned() } else { stages.join(", ") }));
     if folder.checkpoint().exists() {
         match of_other_kind(&folder.checkpoint())? {
             Some(other) => lines.extend(other),
@@ -127,10 +127,10 @@ fn of_run(path: &Path) -> Result<Lines> {
             }
         }
     } else {
-        lines.push(("grid", "none: the run did not end".to_owned()));
+        lines.push(("grid", "none: the run is not finished".to_owned()));
     }
     if !carved && folder.existing_state().is_ok() {
-        lines.push(("go on with", format!("plenoxel train --resume {}", path.display())));
+        lines.push(("resume with", format!("plenoxel train --resume {}", path.display())));
     }
     if let Some(result) = result {
         let number = |key: &str| result[key].as_f64();
@@ -143,7 +143,7 @@ fn of_run(path: &Path) -> Result<Lines> {
 }
 
 fn steps(count: u64) -> String {
-    if count == 0 { "not: carved".to_owned() } else { format!("{count} steps") }
+    if count == 0 { "no: carved".to_owned() } else { format!("{count} steps") }
 }
 
 fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
@@ -153,7 +153,7 @@ fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
         None => "RGB".to_owned(),
         Some(degree) => {
             let means = if shape.is_reduced() {
-                format!(", all but the means for every {} voxels along an axis", shape.sh_reduction)
+                format!(", degree 1 and higher on a {} times coarser grid", shape.sh_reduction)
             } else {
                 String::new()
             };
@@ -202,7 +202,10 @@ fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
         let fov = k.fov_x().to_degrees();
         lines.push((
             "cameras",
-            format!("focal length {:.2} pixels ({fov:.1}° across), {nearest:.3} to {farthest:.3} from the origin", k.fx),
+            format!(
+                "focal length {:.2} pixels (horizontal field of view {fov:.1}°), distance from the origin {nearest:.3} to {farthest:.3}",
+                k.fx
+            ),
         ));
     }
     lines

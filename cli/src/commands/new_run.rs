@@ -1,4 +1,4 @@
-//! What a new run begins with, whether it trains or carves.
+//! The start of a new run, for `train` and `carve`.
 
 use super::background_name;
 use crate::progress::Console;
@@ -8,7 +8,7 @@ use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::machine;
 
-/// Says that a split is read or rendered.
+/// Describes the loading of a split.
 pub fn loading(split: Split, source: &DataSource) -> String {
     match source {
         DataSource::Folder { .. } => format!("reading {split} images"),
@@ -16,13 +16,13 @@ pub fn loading(split: Split, source: &DataSource) -> String {
     }
 }
 
-/// Reads or renders a split.
+/// Loads the views of a split, with progress.
 pub fn load(console: &Console<'_>, dataset: &Dataset, split: Split, source: &DataSource) -> Result<Vec<View>> {
     let count = console.count(&loading(split, source), dataset.count(split));
     dataset.load(split, &|done, total| count.at(done, total))
 }
 
-/// Says what the scene and the machine are.
+/// Prints the scene and the machine.
 pub fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
     let (width, height) = dataset.size();
     let [train, val, test] = Split::ALL.map(|split| dataset.count(split));

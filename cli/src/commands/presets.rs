@@ -1,4 +1,4 @@
-//! `plenoxel presets`: which there are, what one says, and what it amounts to.
+//! `plenoxel presets`: lists and prints presets.
 
 use crate::progress::Console;
 use clap::Args;
@@ -9,22 +9,22 @@ use plenoxel::run::settings::{self, CARVE, PRESETS};
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel presets                               all of them, in a line each
-  plenoxel presets fast                          what it changes, and why
-  plenoxel presets fast --resolved > mine.toml   every setting, to be edited
-  plenoxel train data/lego --config mine.toml
+  plenoxel presets                               list all presets
+  plenoxel presets fast                          print the settings of a preset, with comments
+  plenoxel presets fast --resolved > mine.toml   write all settings to a file, for editing
+  plenoxel train data/lego --config mine.toml    train with the edited settings
 
-Times are of training on two cores, and say at what size of the images.";
+Times are training times on two cores, for the given image size.";
 
 /// List the presets, or print one
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct PresetsArgs {
-    /// Print this one, with its comments: what it changes of the defaults
+    /// Preset to print: its differences from the defaults, with comments
     #[arg(value_parser = PossibleValuesParser::new(PRESETS.iter().chain([&CARVE]).map(|preset| preset.name)))]
     name: Option<String>,
 
-    /// Print the complete configuration that it amounts to, which --config takes
+    /// Print the complete configuration of the preset, as a file for --config
     #[arg(long, requires = "name")]
     resolved: bool,
 }
@@ -35,7 +35,7 @@ pub fn run(args: &PresetsArgs, console: &Console<'_>) -> Result<()> {
         None => list(console),
         Some(name) if args.resolved => {
             let (config, command) = (Config::preset(name)?, if *name == CARVE.name { "carve" } else { "train" });
-            let remark = format!("Preset {name} of {}.\nplenoxel {command} DATA --config THIS_FILE", crate::PROGRAM);
+            let remark = format!("Preset {name} of {}. Use it with:\nplenoxel {command} DATA --config THIS_FILE", crate::PROGRAM);
             console.text(settings::to_toml(&config, &remark)?.trim_end())
         }
         Some(name) => console.text(settings::preset(name)?.text.trim_end()),
@@ -43,7 +43,7 @@ pub fn run(args: &PresetsArgs, console: &Console<'_>) -> Result<()> {
 }
 
 fn list(console: &Console<'_>) -> Result<()> {
-    console.result(&row(["preset", "time on two cores", "alpha decides", "for"]))?;
+    console.result(&row(["preset", "time on two cores", "alpha gives", "purpose"]))?;
     PRESETS.iter().chain([&CARVE]).try_for_each(|preset| {
         let alpha = alpha_decides(&Config::preset(preset.name)?);
         console.result(&row([preset.name, preset.time, alpha, preset.purpose]))
@@ -54,7 +54,7 @@ fn row([name, time, alpha, purpose]: [&str; 4]) -> String {
     format!("{name:11}{time:29}{alpha:17}{purpose}")
 }
 
-/// What a configuration takes from images that have alpha, beside what they show over a background.
+/// Use of the alpha channel of images, besides compositing.
 fn alpha_decides(config: &Config) -> &'static str {
     match (config.stages.is_empty(), config.hull) {
         (true, _) => "the shape",

@@ -1,4 +1,4 @@
-//! `plenoxel render`: pictures of a trained run, from the cameras of its views or along a path.
+//! `plenoxel render`: renders a run from the cameras of its views or along a camera path.
 
 mod channels;
 mod float_files;
@@ -21,39 +21,39 @@ use std::time::Instant;
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel render runs/lego                        all test views
-  plenoxel render runs/lego --view 0 --view r_17   two of them, by number and by name
+  plenoxel render runs/lego                        render all test views
+  plenoxel render runs/lego --view 0 --view r_17   render two views, by index and by name
   plenoxel render runs/lego --split train --downscale 4
-  plenoxel render runs/lego --path orbit           a turntable: 120 frames, a GIF, an MP4 if there is ffmpeg
+  plenoxel render runs/lego --path orbit           render a turntable: 120 frames, a GIF, and an MP4 if ffmpeg is installed
   plenoxel render runs/lego --path base_cam.json --size 1280x720 --fps 60
   plenoxel render runs/lego --path spiral --channels color,depth,normal --format png,exr
 
-Views become RUN/renders/<split>_<number>_<name>.png, with the colors over the run's background, and the same with _depth (red near,
-blue far, white empty), _normal (x, y, z of the world as red, green, blue; white empty) and _opacity. Frames become
-RUN/renders/<path>/frame_0000.png and so on; their PNG files are joined to RUN/renders/<path>.gif and .mp4, which replace earlier ones.
+Views are written to RUN/renders/<split>_<index>_<name>.png, with the background of the run. Other channels have a suffix: _depth (red is near,
+blue is far, white is empty), _normal (world x, y, z as red, green, blue; white is empty) and _opacity. Frames of a path are written to
+RUN/renders/<path>/frame_0000.png and so on. The PNG frames are combined to RUN/renders/<path>.gif and .mp4; earlier files are replaced.
 
-EXR and NPY files have 32-bit floats: depth is the distance along the ray in the dataset's units (NaN where nothing is seen), normals are
-unit vectors in the world (0 where nothing is seen), opacity is from 0 to 1. Color is linear light in EXR, sRGB in NPY, not clamped.";
+EXR and NPY files have 32-bit floats. Depth is the distance along the ray in units of the dataset (NaN where empty). Normals are unit vectors in
+world coordinates (0 where empty). Opacity is from 0 to 1. Color is linear light in EXR and sRGB in NPY, not clamped.";
 
-/// Render a trained run from its views, or along a camera path as a film
+/// Render a run from its views, or as a video along a camera path
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct RenderArgs {
     #[command(flatten)]
     run: TrainedRun,
 
-    /// Render this view only, by number from 0 or by name; may be repeated
-    #[arg(long, value_name = "N|NAME", help_heading = "Scene", conflicts_with = "path")]
+    /// Render only this view, given by index from 0 or by name; may be repeated
+    #[arg(long, value_name = "N|NAME", help_heading = "Scene", conflicts_with = "path", allow_negative_numbers = true)]
     view: Vec<String>,
 
     #[command(flatten)]
     path: PathArgs,
 
-    /// Kinds of pictures, with commas between them [default: all for views, color for paths]
+    /// Channels to render, separated by commas [default: all for views, color for paths]
     #[arg(long, value_enum, value_name = "KINDS", value_delimiter = ',', help_heading = "Output")]
     channels: Vec<Channel>,
 
-    /// File formats of single pictures, with commas between them
+    /// File formats of the pictures, separated by commas
     #[arg(long, value_enum, value_name = "FORMATS", value_delimiter = ',', default_value = "png", help_heading = "Output")]
     format: Vec<FileFormat>,
 }
@@ -97,8 +97,8 @@ fn film(args: &RenderArgs, path: &PathChoice, console: &Console<'_>) -> Result<(
     Ok(())
 }
 
-/// Renders what each camera sees to files whose names begin with a path, and says how many there were. `prepare` makes the folder for them, once it
-/// is known that they can be rendered.
+/// Renders each camera to files whose names begin with its path, and returns the number of cameras. `prepare` creates the folder, after all
+/// checks.
 fn render(
     args: &RenderArgs,
     found: &Found,
@@ -114,7 +114,7 @@ fn render(
         .run
         .load(found, console, |sampling, shape, voxels| Estimate::of_pictures(&found.config, sampling, shape, voxels, pixels, normals))?;
     prepare()?;
-    let grid = || voxel_grid(&*model, found.folder.path(), "a picture of normals");
+    let grid = || voxel_grid(&*model, found.folder.path(), "rendering normals");
     let normals = normals.then(|| Ok(Plenoxels::of_grid(&found.config, grid()?.normals()))).transpose()?;
     let pictures = Pictures::new(&*model, normals.as_ref(), &view, &channels, &args.format);
     let count = console.count("rendering", shots.len());
@@ -124,17 +124,17 @@ fn render(
         count.at(done + 1, shots.len());
     }
     drop(count);
-    console.note(&format!("{:.2} seconds for each camera", start.elapsed().as_secs_f64() / shots.len().max(1) as f64));
+    console.note(&format!("{:.2} seconds per camera", start.elapsed().as_secs_f64() / shots.len().max(1) as f64));
     Ok(shots.len())
 }
 
-/// The kinds of pictures that were asked for, each once.
+/// The requested channels, without duplicates.
 fn channels(args: &RenderArgs, default: &[Channel]) -> Vec<Channel> {
     let asked = if args.channels.is_empty() { default } else { &args.channels };
     Channel::ALL.into_iter().filter(|channel| asked.contains(channel)).collect()
 }
 
-/// Numbers of the views that were asked for: all of the split unless some are named.
+/// Indices of the requested views; all views of the split by default.
 fn choose(dataset: &Dataset, split: Split, asked: &[String]) -> Result<Vec<usize>> {
     let names = dataset.view_names(split);
     if asked.is_empty() {
@@ -144,10 +144,9 @@ fn choose(dataset: &Dataset, split: Split, asked: &[String]) -> Result<Vec<usize
         let number = text.parse().ok().filter(|number| *number < names.len());
         let number = number.or_else(|| names.iter().position(|name| name == text));
         number.ok_or_else(|| {
-            let found = format!("there is no {split} view `{text}`");
             let last = names.len() - 1;
-            let accepted = format!("0 to {last}, or a name from {} to {}", names[0], names[last]);
-            Error::config("--view", found, accepted)
+            let expected = format!("expected an index from 0 to {last}, or a name from {} to {}", names[0], names[last]);
+            Error::usage("--view", format!("there is no {split} view `{text}`"), expected)
         })
     };
     asked.iter().map(find).collect()

@@ -1,4 +1,4 @@
-//! `plenoxel report`: the page about a run, made again.
+//! `plenoxel report`: regenerates report.html of a run.
 
 use crate::progress::Console;
 use crate::report::Report;
@@ -13,31 +13,32 @@ use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel report runs/lego                        writes runs/lego/report.html
+  plenoxel report runs/lego                        write runs/lego/report.html
   plenoxel report runs/lego --data elsewhere/lego
 
-`train` and `carve` write it too. It needs no other file and no network: settings, curves, pictures, figures, and the grid itself to look
-around in, with colors and densities of 8 and 16 bits; from 30 MB on it is made coarser, and the page says what that costs.";
+`train` and `carve` also write this page. It is a single file that needs no network. It has the settings, curves, pictures and results, and an
+interactive viewer of the grid. The grid of the viewer is quantized to 8 and 16 bits, and resampled if it exceeds 30 MB. The page states the
+PSNR of both grids.";
 
-/// Write the page about a run again, with pictures, curves and an interactive view
+/// Regenerate report.html of a run, with pictures, curves and an interactive viewer
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct ReportArgs {
-    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
+    /// Run folder written by `plenoxel train` or `plenoxel carve`
     #[arg(value_hint = ValueHint::DirPath)]
     run: PathBuf,
 
-    /// Where the dataset is now [default: where it was when training]
+    /// Dataset folder, if it has moved [default: that of the training]
     #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
     data: Option<PathBuf>,
 }
 
-/// Writes the page.
+/// Writes the report.
 pub fn run(args: &ReportArgs, console: &Console<'_>) -> Result<()> {
     write(&args.run, args.data.as_deref().map(DataSource::folder), console)
 }
 
-/// Writes the page about the run in a folder; `data` is the source of its views now, if it is not where it was.
+/// Writes the report of a run; `data` is the new source of its views if they have moved.
 pub fn write(run: &Path, data: Option<DataSource>, console: &Console<'_>) -> Result<()> {
     let (folder, config, record) = RunFolder::open(run)?;
     let folder = folder.shared("RUN")?;
@@ -52,7 +53,7 @@ pub fn write(run: &Path, data: Option<DataSource>, console: &Console<'_>) -> Res
         estimate.check()?;
         Some(model::open(&path, &config)?.0)
     } else {
-        console.note(&format!("the model is of kind `{}`: the page has no interactive view of it", record.model));
+        console.note(&format!("the report has no interactive viewer, because the model is of kind `{}`", record.model));
         None
     };
     let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: model.as_deref() };

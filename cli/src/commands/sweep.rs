@@ -1,4 +1,4 @@
-//! `plenoxel sweep`: a list of scenes with a list of methods, and the table of what came of it.
+//! `plenoxel sweep`: runs a list of scenes with a list of methods, and writes a table of the results.
 
 mod child;
 mod flags;
@@ -22,21 +22,21 @@ use std::path::{Path, PathBuf};
 const EXAMPLES: &str = "\
 Examples:
   plenoxel sweep --scene data/lego --scene procedural --preset fast --preset paper --out sweeps/first
-  plenoxel sweep nerf.toml                   into sweeps/nerf; the same again goes on with the rest
-  plenoxel sweep nerf.toml --dry-run
+  plenoxel sweep nerf.toml                   run the sweep in sweeps/nerf, or resume it
+  plenoxel sweep nerf.toml --dry-run         list the runs and their states
 
-A file of scenes and methods, every scene with every method. Keys are flags of train (or carve):
-downscale = 4 for --downscale 4. Those of a method count more than those of a scene. Paths are
-relative to the file:
+The TOML file lists scenes and methods. Every scene is run with every method. Keys are flags of train
+or carve: downscale = 4 means --downscale 4. Keys of a method override those of a scene. Paths are
+relative to the file. Example:
 
   [[scenes]]
-  data = \"../data/lego\"                      # its name is lego, unless name = \"...\" says another
+  data = \"../data/lego\"                      # the name is lego, or that of the key `name`
   downscale = 4
 
   [[scenes]]
-  name = \"small\"                             # without data: the built-in scene
+  name = \"small\"                             # the built-in scene, because there is no `data`
   scene_size = 100
-  methods = [\"fast\"]                         # not all of them
+  methods = [\"fast\"]                         # only these methods
 
   [[methods]]
   preset = \"fast\"
@@ -50,24 +50,25 @@ relative to the file:
   name = \"hull\"
   command = \"carve\"
 
-  [[published]]                              # a column of figures that are not measured here
+  [[published]]                              # a column with published results
   name = \"Plenoxels\"
   source = \"Fridovich-Keil et al. 2022, at 800 x 800\"
-  psnr = { lego = 34.10 }                    # ssim and seconds likewise
+  psnr = { lego = 34.10 }                    # also: ssim, seconds
 
-Runs are in OUT/SCENE/METHOD, what they said beside them in METHOD.log. The table is table.md (on
-stdout too), table.csv with all figures, and table.html with pictures. After Ctrl-C the same command
-goes on; what failed it tries again. The exit code is that of the first run that failed, or 0.";
+Run folders are OUT/SCENE/METHOD, with the log next to them in METHOD.log. The table is written to
+table.md (and stdout), table.csv with all results, and table.html with pictures. SIGINT and SIGTERM
+are forwarded to the current run, which saves its state. Repeat the command to resume the sweep and
+to retry failed runs. The exit code is that of the first failed run, or 0.";
 
-/// Run a list of scenes with a list of methods, whatever of it is not finished, and print the table scene x method
+/// Run every scene of a list with every method, skip finished runs, and print a table of the results
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct SweepArgs {
-    /// TOML file with scenes and methods, as below; or say them with --scene and --preset
+    /// TOML file with scenes and methods, described below; alternatively, use --scene and --preset
     #[arg(value_hint = ValueHint::FilePath, required_unless_present = "scene", conflicts_with_all = ["scene", "preset"])]
     file: Option<PathBuf>,
 
-    /// Folder of a dataset, or procedural, the built-in scene; may be repeated
+    /// Dataset folder, or `procedural` for the built-in scene; may be repeated
     #[arg(long, value_name = "DATA", requires_all = ["preset", "out"])]
     scene: Vec<String>,
 
@@ -75,38 +76,38 @@ pub struct SweepArgs {
     #[arg(long, requires = "scene", value_parser = PossibleValuesParser::new(PRESETS.map(|preset| preset.name)))]
     preset: Vec<String>,
 
-    /// Folder to write [default: sweeps/<name of the file>]
+    /// Sweep folder to write [default: sweeps/<name of the file>]
     #[arg(long, short, help_heading = "Output", value_hint = ValueHint::DirPath)]
     out: Option<PathBuf>,
 
-    /// Overwrite runs in it that have other settings than are asked for now
+    /// Overwrite existing runs with other settings
     #[arg(long, help_heading = "Output")]
     force: bool,
 
-    /// Say what would run and what is finished, and do nothing
+    /// List the runs with their states and commands, without running them
     #[arg(long, help_heading = "Output")]
     dry_run: bool,
 
-    /// Set any key of the configuration, for all runs; may be repeated
+    /// Set any key of the configuration of all runs; may be repeated
     #[arg(long, value_name = "KEY=VALUE", help_heading = "Settings")]
     set: Vec<String>,
 }
 
-/// File that is locked while a sweep is made; a folder that has it is that of a sweep.
+/// Lock file of a sweep folder, by which it is recognized.
 const LOCK: &str = "sweep.lock";
 
-/// Refuses a folder that holds something else: a run, a dataset.
+/// Checks that a folder is empty or a sweep folder.
 fn check_place(out: &Path) -> Result<()> {
     let holds = |name: &str| out.join(name).exists();
     let is_empty = std::fs::read_dir(out).map_or(true, |mut entries| entries.next().is_none());
     if is_empty || ((holds(LOCK) || holds("table.csv")) && !holds("run.json")) {
         return Ok(());
     }
-    let found = format!("{} is not empty, and not the folder of a sweep", out.display());
-    Err(Error::config("--out", found, "a new folder, or that of a sweep"))
+    let found = format!("{} is not empty and not a sweep folder", out.display());
+    Err(Error::usage("--out", found, "choose a new folder or a sweep folder"))
 }
 
-/// Makes the runs that are not finished, and the table of all. `machine` are flags that each run is to have. Returns the exit code.
+/// Makes the unfinished runs, and writes the table. `machine` are additional flags for each run. Returns the exit code.
 pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Result<u8> {
     let named = args.file.as_deref().and_then(Path::file_stem).unwrap_or_default();
     let out = args.out.clone().unwrap_or_else(|| Path::new("sweeps").join(named));
@@ -124,7 +125,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     check_place(&out)?;
     files::create_dir(&out)?;
     let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: FolderLock::acquire(&out, LOCK, "--out")? };
-    // A child is asked too, and saves; the sweep waits for it.
+    // Signals are forwarded to the child, which saves its state. The sweep waits for it.
     let watch = Watch::begin();
     let (mut failed, mut interrupted) = (Vec::new(), false);
     for (index, job) in plan.jobs.iter().enumerate() {
@@ -143,19 +144,19 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     console.text(table(&plan, &out).write(&out)?.trim_end())?;
     console.note(&format!("table: {}", out.join("table.html").display()));
     if interrupted {
-        console.error("interrupted; the same command again goes on with what is not finished", EXIT_CODE);
+        console.error("interrupted; repeat the command to resume the sweep", EXIT_CODE);
         return Ok(EXIT_CODE);
     }
     let Some((first, failure)) = failed.first() else { return Ok(0) };
     let (count, of, log) = (failed.len(), plan.jobs.len(), first.log());
     console.error(
-        &format!("{count} of {of} runs failed, the first as {} tells; the same command again tries once more", log.display()),
+        &format!("{count} of {of} runs failed, see {} for the first one; repeat the command to retry them", log.display()),
         failure.code,
     );
     Ok(failure.code)
 }
 
-/// One run among all.
+/// The context of a run in a sweep.
 struct Sweep<'a, 'c> {
     program: &'a Program,
     watch: &'a Watch,
@@ -165,12 +166,12 @@ struct Sweep<'a, 'c> {
 }
 
 impl Sweep<'_, '_> {
-    /// Does what is missing of a run, and returns how it failed, if it did.
+    /// Completes a run. Returns its failure, if it failed.
     fn finish(&self, job: &Job) -> Result<Option<Failure>> {
         job.forget()?;
         let state = job.state();
         if state == State::Finished {
-            self.note(job, &format!("finished already: {}", said(job)));
+            self.note(job, &format!("already finished: {}", said(job)));
             return Ok(None);
         }
         job.folder.parent().map_or(Ok(()), files::create_dir)?;
@@ -178,13 +179,13 @@ impl Sweep<'_, '_> {
             job.remove_log()?;
         }
         if let Some(arguments) = job.command_line(&state) {
-            self.note(job, if state == State::Interrupted { "going on" } else { "begins" });
+            self.note(job, if state == State::Interrupted { "resuming" } else { "starting" });
             if let Err(failure) = self.process(job, &arguments)? {
                 return Ok(Some(failure));
             }
         }
         if job.state() == State::Unevaluated {
-            // The command keeps its figures in the folder.
+            // The command writes the scores to the run folder.
             if let Err(failure) = self.process(job, &job.evaluation())? {
                 return Ok(Some(failure));
             }
@@ -193,7 +194,7 @@ impl Sweep<'_, '_> {
         Ok(None)
     }
 
-    /// Has the program called, and returns what it said on stdout, or how it failed.
+    /// Runs the program, and returns its output on stdout, or its failure.
     fn process(&self, job: &Job, arguments: &[OsString]) -> Result<std::result::Result<String, Failure>> {
         let progress = self.console.relay(self.of);
         let ended = self.program.run(arguments, &job.log(), self.watch, |line| progress.say(self.index, || self.line(job, line)))?;
@@ -217,33 +218,33 @@ impl Sweep<'_, '_> {
     }
 }
 
-/// What came of a run, in few words.
+/// A short summary of the results of a run.
 fn said(job: &Job) -> String {
     match job.cell() {
         Cell::Measured(measured) => measured.sentence(),
-        Cell::Failed(_) | Cell::Missing => "no figures".to_owned(),
+        Cell::Failed(_) | Cell::Missing => "no results".to_owned(),
     }
 }
 
-/// Refuses to go on where a run with other settings is in the way.
+/// Checks that the folder of a run has no run with other settings.
 fn check(job: &Job, state: &State) -> Result<()> {
     match state {
         State::Different(how) => {
-            let found = format!("{} has a run with other settings ({how})", job.folder.display());
-            Err(Error::config("--out", found, "a folder of its own for each sweep; or --force, which overwrites such runs"))
+            let found = format!("{} is a run with other settings ({how})", job.folder.display());
+            Err(Error::usage("--out", found, "choose another folder for this sweep, or overwrite the run with --force"))
         }
         _ => Ok(()),
     }
 }
 
-/// Says what would be done about a run, and with which command.
+/// Prints the state of a run, and the command that completes it.
 fn describe(job: &Job, state: &State, console: &Console<'_>) -> Result<()> {
     let what = match (state, job.cell()) {
         (State::Finished, _) => format!("finished: {}", said(job)),
-        (State::Different(how), _) => format!("in the way is another run: {how}"),
+        (State::Different(how), _) => format!("blocked by a run with other settings: {how}"),
         (State::Unevaluated, _) => "to evaluate".to_owned(),
-        (State::Interrupted, _) => "to go on with".to_owned(),
-        (_, Cell::Failed(failure)) => format!("to run again, it failed with exit code {}: {}", failure.code, failure.error),
+        (State::Interrupted, _) => "to resume".to_owned(),
+        (_, Cell::Failed(failure)) => format!("to retry, failed with exit code {}: {}", failure.code, failure.error),
         (State::New | State::CutShort, _) => "to run".to_owned(),
     };
     console.result(&format!("{} {}: {what}", job.scene, job.method))?;
@@ -251,7 +252,7 @@ fn describe(job: &Job, state: &State, console: &Console<'_>) -> Result<()> {
     arguments.iter().try_for_each(|arguments| console.result(&format!("    {}", child::command_line(arguments))))
 }
 
-/// The table of what there is now.
+/// The table of the current results.
 fn table(plan: &Plan, out: &Path) -> RunTable {
     let cell = |scene: &String, method: &String| {
         let job = plan.jobs.iter().find(|job| job.scene == *scene && job.method == *method);

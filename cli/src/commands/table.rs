@@ -1,4 +1,4 @@
-//! The table of a comparison, scenes x methods, with what each run came to: as Markdown, CSV and an HTML page.
+//! The table of the results of a sweep, scenes x methods, as Markdown, CSV and an HTML page.
 
 mod csv;
 mod figures;
@@ -13,54 +13,54 @@ use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Runs side by side.
+/// Results of runs, by scene and method.
 #[derive(Debug)]
 pub struct RunTable {
-    /// What is compared.
+    /// Heading of the table.
     pub title: String,
-    /// The columns.
+    /// Names of the columns.
     pub methods: Vec<String>,
-    /// One for each scene, with as many cells as there are methods.
+    /// One row per scene, with one cell per method.
     pub rows: Vec<Row>,
-    /// More columns, of figures that others have published.
+    /// Columns with published results.
     pub published: Vec<Published>,
 }
 
-/// What all methods make of a scene.
+/// Results of all methods for a scene.
 #[derive(Debug)]
 pub struct Row {
     pub scene: String,
     pub cells: Vec<Cell>,
 }
 
-/// What a method made of a scene.
+/// Result of a method for a scene.
 #[derive(Debug)]
 pub enum Cell {
     Measured(Box<Measured>),
     Failed(Failure),
-    /// It was not asked for, or there is nothing of it yet.
+    /// The run is not part of the sweep, or has not ended.
     Missing,
 }
 
-/// Figures from elsewhere, by scene.
+/// Published results, by scene.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Published {
-    /// Whose they are.
+    /// Name of the method.
     pub name: String,
-    /// Where they are published, and what was measured.
+    /// Publication, and what was measured.
     pub source: String,
-    /// In dB.
+    /// PSNR in dB.
     #[serde(default)]
     pub psnr: BTreeMap<String, f64>,
     #[serde(default)]
     pub ssim: BTreeMap<String, f64>,
-    /// Of training.
+    /// Seconds of training.
     #[serde(default)]
     pub seconds: BTreeMap<String, f64>,
 }
 
 impl Published {
-    /// Its figures of a scene.
+    /// The results for a scene.
     fn scores(&self, scene: &str) -> Scores {
         let of = |figures: &BTreeMap<String, f64>| figures.get(scene).copied();
         Scores { psnr: of(&self.psnr), ssim: of(&self.ssim), seconds: of(&self.seconds) }
@@ -77,7 +77,7 @@ impl RunTable {
         Ok(markdown)
     }
 
-    /// The mean of a column over all scenes; of a figure that one of them lacks there is none.
+    /// The mean of a column over all scenes. A figure that is missing for a scene has no mean.
     fn mean(&self, method: usize) -> Scores {
         Scores::mean(self.rows.iter().map(|row| row.cells.get(method).map(Cell::scores).unwrap_or_default()))
     }
@@ -86,10 +86,12 @@ impl RunTable {
         Scores::mean(self.rows.iter().map(|row| published.scores(&row.scene)))
     }
 
-    /// What one has to know to read the figures, a sentence each.
+    /// Notes below the table.
     fn notes(&self) -> Vec<String> {
-        let mut notes =
-            vec!["PSNR in dB on test views, SSIM, and seconds of training; means are over all scenes, where none is missing.".to_owned()];
+        let mut notes = vec![
+            "PSNR in dB on test views, SSIM, and seconds of training; means are over all scenes, and are left out if a scene is missing."
+                .to_owned(),
+        ];
         for row in &self.rows {
             notes.extend(self.views_of(row));
         }
@@ -102,7 +104,7 @@ impl RunTable {
         notes
     }
 
-    /// What a scene was measured on, method by method where they differ.
+    /// The test views of a scene; for each method, if they differ.
     fn views_of(&self, row: &Row) -> Option<String> {
         let first = row.cells.iter().find_map(Cell::measured)?;
         if row.is_comparable() {
@@ -110,12 +112,12 @@ impl RunTable {
         }
         let measured = self.methods.iter().zip(&row.cells).filter_map(|(method, cell)| Some((method, cell.measured()?)));
         let each: Vec<String> = measured.map(|(method, measured)| format!("{method}, {}", measured.views())).collect();
-        Some(format!("{}: {}; these cannot be compared with each other.", row.scene, each.join("; ")))
+        Some(format!("{}: {}; these results are not comparable.", row.scene, each.join("; ")))
     }
 }
 
 impl Row {
-    /// True if all of it was measured on views of the same number, size and background.
+    /// True if all methods were evaluated on the same number of views, of the same size and with the same background.
     fn is_comparable(&self) -> bool {
         let mut views = self.cells.iter().filter_map(Cell::measured).map(Measured::views);
         let first = views.next();
@@ -136,7 +138,7 @@ impl Cell {
     }
 }
 
-/// A figure of the table: PSNR, SSIM, seconds, or a line where there is none.
+/// Formats a figure; a dash if it is missing.
 fn said(value: Option<f64>, say: impl Fn(f64) -> String) -> String {
     value.map_or("–".to_owned(), say)
 }
@@ -145,7 +147,7 @@ fn decibels(psnr: Option<f64>) -> String {
     said(psnr, |psnr| format!("{psnr:.2}"))
 }
 
-/// SSIM and the time, after the PSNR.
+/// Formats SSIM and time, which follow the PSNR.
 fn beside(scores: &Scores) -> String {
     let seconds = |s: f64| if s < 9.95 { format!("{s:.1} s") } else { format!("{s:.0} s") };
     format!("{} · {}", said(scores.ssim, |ssim| format!("{ssim:.3}")), said(scores.seconds, seconds))

@@ -1,4 +1,4 @@
-//! `plenoxel train`: from photographs to a run folder.
+//! `plenoxel train`: trains a scene and writes a run folder.
 
 mod flags;
 mod pictures;
@@ -15,12 +15,12 @@ use plenoxel::text::clock;
 use screen::Screen;
 use std::path::Path;
 
-/// Learns a scene and leaves a run folder. Returns the exit code: 0, or another if it was interrupted.
+/// Trains a scene and writes a run folder. Returns the exit code: 0, or 130 if it was interrupted.
 pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let mut screen = Screen::new(console, !args.no_images, !args.no_report);
     let outcome = match &args.resume {
         Some(path) if lacks_page(path) && !args.no_report => {
-            console.note("this run has its figures; only the page is missing");
+            console.note("this run is finished; writing its missing report.html");
             return report::write(path, args.moved_to(), console).map(|()| 0);
         }
         Some(path) => {
@@ -49,8 +49,8 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         Outcome::Stopped { steps, total, folder } => {
             let again = format!("plenoxel train --resume {}", folder.path().display());
             let text = match steps < total {
-                true => format!("interrupted after step {steps} of {total}, saved; go on with: {again}"),
-                false => format!("interrupted after the last step; its figures: {again}"),
+                true => format!("interrupted after step {steps} of {total}; the training is saved; resume with: {again}"),
+                false => format!("interrupted after the last step; compute the final figures with: {again}"),
             };
             console.error(&text, interrupt::EXIT_CODE);
             Ok(interrupt::EXIT_CODE)
@@ -58,7 +58,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     }
 }
 
-/// True for a run that was killed between its figures and its page.
+/// True for a run that was killed after its final figures and before its report.
 fn lacks_page(path: &Path) -> bool {
     let folder = RunFolder::at(path);
     folder.result().is_ok_and(|result| result.is_some())
@@ -79,14 +79,14 @@ fn options(args: &TrainArgs, stage_psnr: bool) -> RunOptions {
     }
 }
 
-/// Prints the figures of a run that has ended.
+/// Prints the final figures of a run.
 fn say(console: &Console<'_>, summary: &Summary, note: Option<&str>) -> Result<()> {
     if let Some(note) = note {
         console.note(note);
     }
     let decibels = |x: Option<f64>| x.map_or("none".to_owned(), |x| format!("{x:.2} dB"));
     console.note(&format!(
-        "trained {} steps in {}; background alone {}, mean training image {}",
+        "trained {} steps in {}; baselines: background {}, mean training image {}",
         summary.steps,
         clock(summary.seconds),
         decibels(summary.baseline_background_psnr),

@@ -1,4 +1,4 @@
-//! A trained run and the views to look at it from: what `evaluate` and `render` begin with.
+//! A finished run and its views, for `evaluate` and `render`.
 
 use crate::progress::Console;
 use clap::{Args, ValueHint};
@@ -14,35 +14,35 @@ use plenoxel::run::memory::Estimate;
 use plenoxel::train::{About, ViewOptions};
 use std::path::PathBuf;
 
-/// Which run, and how to look at it.
+/// The run, its views, and the sampling.
 #[derive(Debug, Args)]
 pub struct TrainedRun {
-    /// Run folder that `plenoxel train` or `plenoxel carve` wrote
+    /// Run folder written by `plenoxel train` or `plenoxel carve`
     #[arg(value_hint = ValueHint::DirPath)]
     pub run: PathBuf,
 
-    /// The grid that validation views liked best of those that were saved, where it is another than the last
+    /// Use best.safetensors, the checkpoint with the best validation PSNR, instead of the final grid
     #[arg(long)]
     pub best: bool,
 
-    /// Where the dataset is now [default: where it was when training]
+    /// Dataset folder, if it has moved [default: that of the training]
     #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
     pub data: Option<PathBuf>,
 
-    /// Views to look from: train, val or test
+    /// Split of the views: train, val or test
     #[arg(long, help_heading = "Scene", default_value_t = Split::Test, value_parser = super::split)]
     pub split: Split,
 
-    /// Reduce the images by this factor [default: as in training]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::whole::<usize>(1, super::MOST_REDUCTION))]
+    /// Downscale the images by this factor [default: that of the training]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::whole::<usize>(1, super::MOST_REDUCTION), allow_negative_numbers = true)]
     pub downscale: Option<usize>,
 
-    /// Samples on the longest ray through the box (preset paper: on every ray) [default: as the run's `evaluation` setting says]
-    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = super::whole::<u32>(2, 100_000))]
+    /// Number of samples on the longest ray through the box (preset paper: on every ray) [default: the `evaluation` setting of the run]
+    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = super::whole::<u32>(2, 100_000), allow_negative_numbers = true)]
     pub samples: Option<u32>,
 }
 
-/// What a run says of itself. Its views may be gone.
+/// An opened run. Its dataset may no longer exist.
 pub struct Found {
     pub folder: RunFolder,
     pub config: Config,
@@ -50,7 +50,7 @@ pub struct Found {
     pub source: DataSource,
 }
 
-/// Its model, and how to render it.
+/// The model of a run, and its render options.
 pub struct Loaded {
     pub model: Box<dyn Model<f32>>,
     pub about: About,
@@ -58,7 +58,7 @@ pub struct Loaded {
 }
 
 impl TrainedRun {
-    /// Finds it.
+    /// Opens the run folder.
     pub fn find(&self) -> Result<Found> {
         let (folder, mut config, record) = RunFolder::open(&self.run)?;
         let folder = if self.best { folder.with_best()? } else { folder };
@@ -67,19 +67,23 @@ impl TrainedRun {
         Ok(Found { folder, config, preset: record.preset, source })
     }
 
-    /// Whether it is looked at as figures of a run are defined: its last grid, on whole test views, sampled as its settings say.
+    /// True for the evaluation that defines the scores of a run: its final grid, on the test views at full size, sampled as configured.
     pub fn is_as_trained(&self) -> bool {
         !self.best && self.split == Split::Test && self.downscale.is_none() && self.samples.is_none()
     }
 
-    /// Opens its views, of which some must be of the split.
+    /// Opens the dataset.
+    ///
+    /// Errors: it has no views of the split.
     pub fn views(&self, found: &Found) -> Result<Dataset> {
         let dataset = found.source.reopen(&found.config)?;
         super::check_split(&dataset, self.split)?;
         Ok(dataset)
     }
 
-    /// Reads its model, once memory is known to suffice: what `estimate` says of sampling, shape and number of voxels.
+    /// Reads the model. `estimate` computes the memory from the sampling, the shape and the number of voxels.
+    ///
+    /// Errors: there is not enough memory; the model cannot be read.
     pub fn load(
         &self,
         found: &Found,
@@ -95,14 +99,14 @@ impl TrainedRun {
         estimate.check()?;
         let (model, about) = model::open(&path, &found.config)?;
         if about.background != found.config.background {
-            console.note("warning: config.toml has another background than the model was trained with: figures and pictures are over that of config.toml");
+            console.note("warning: the background of config.toml differs from that of the training; that of config.toml is used");
         }
         Ok(Loaded { model, about, view: ViewOptions { background: found.config.background, samples: self.samples } })
     }
 }
 
 impl Found {
-    /// Half the side of the box of its model, world length.
+    /// Half the side of the box of the model, in world units.
     pub fn half_width(&self) -> Result<f64> {
         let (header, _) = checkpoint::header(&self.folder.existing_checkpoint()?)?;
         Ok(header.shape().half_width)

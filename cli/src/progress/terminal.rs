@@ -1,4 +1,4 @@
-//! Lines that fit a terminal.
+//! Line wrapping for terminals.
 
 use indicatif::ProgressDrawTarget;
 #[cfg(unix)]
@@ -7,10 +7,10 @@ use indicatif::TermLike;
 use std::io::{self, Write};
 use std::path::Path;
 
-/// Columns at the end of a bar's line that stay free: for `^C`, which a terminal writes where the cursor is. If that made the line longer than the terminal is wide,
-/// the bar could not be cleared.
+/// Free columns at the end of the line of a bar, for the `^C` that a terminal prints at the cursor. A line longer than the terminal could not be
+/// cleared.
 const FREE: usize = 4;
-/// Columns of a terminal that does not tell.
+/// Default number of columns.
 const USUAL: usize = 80;
 
 /// Returns the number of columns of the terminal.
@@ -18,7 +18,7 @@ pub fn columns() -> usize {
     terminal_size::terminal_size().map_or(USUAL, |(width, _)| usize::from(width.0).max(20))
 }
 
-/// Returns where bars are drawn: on stderr, in lines that leave [`FREE`] columns.
+/// Returns the draw target of progress bars: stderr, without the last [`FREE`] columns.
 #[cfg(unix)]
 pub fn bar_target() -> ProgressDrawTarget {
     ProgressDrawTarget::term_like(Box::new(Narrow))
@@ -29,7 +29,7 @@ pub fn bar_target() -> ProgressDrawTarget {
     ProgressDrawTarget::stderr()
 }
 
-/// The terminal behind stderr, described as narrower than it is, because a bar's line is filled up with spaces.
+/// The terminal of stderr, with a reduced width, because a bar pads its line with spaces.
 #[cfg(unix)]
 #[derive(Debug)]
 struct Narrow;
@@ -80,13 +80,13 @@ impl TermLike for Narrow {
     }
 }
 
-/// Returns the start of a line beside a bar that takes `taken` columns, as much as fits.
+/// Truncates a line to the space beside a bar of `taken` columns.
 pub fn fitted(line: &str, taken: usize, columns: usize) -> String {
     line.chars().take(columns.saturating_sub(taken + FREE)).collect()
 }
 
-/// Breaks a line at spaces so that it fits the columns; the next lines are indented. Numbers stay together with the words on both sides of them, which may be
-/// their units, unless there are two spaces between. A word that is longer than a line stays whole: it may be a path to be copied.
+/// Wraps a line at spaces and indents the following lines. Numbers are kept together with their neighboring words, which may be units, unless two spaces
+/// separate them. A word longer than a line is not broken, because it may be a path.
 pub fn wrapped(line: &str, columns: usize) -> String {
     const BOUND: &str = "\u{a0}";
     let mut words: Vec<String> = Vec::new();
@@ -100,7 +100,7 @@ pub fn wrapped(line: &str, columns: usize) -> String {
             }
             bound = word.ends_with([',', ';', ':']);
         }
-        // The second space of two, which goes where a line is broken.
+        // The second of two spaces, which is dropped at a line break.
         if let Some(last) = words.last_mut() {
             last.push(' ');
         }
@@ -114,7 +114,7 @@ pub fn wrapped(line: &str, columns: usize) -> String {
     textwrap::fill(words.join(" ").trim_end(), options).replace(BOUND, " ")
 }
 
-/// Returns the address of a file for a browser, which many terminals open at a click.
+/// Returns the `file://` address of a file, which many terminals open at a click.
 pub fn file_address(path: &Path) -> String {
     let absolute = path.canonicalize().or_else(|_| std::path::absolute(path)).unwrap_or_else(|_| path.to_owned());
     let text = absolute.to_string_lossy().replace('\\', "/");

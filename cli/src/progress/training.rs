@@ -1,4 +1,4 @@
-//! Progress of a training run: a bar for each stage, or lines.
+//! Progress of a training run: a bar for each stage, or lines of text.
 
 use super::{Console, Counted, Meter, Standing, metric};
 use plenoxel::run::budget::step_cost;
@@ -9,11 +9,11 @@ use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// Time to evaluate one pixel of a test view (image reading, rendering, PSNR, SSIM), relative to the time of one training ray of the last stage. Measured: 0.17 on the
+/// Time to evaluate one pixel of a test view (reading, rendering, PSNR, SSIM), relative to one training ray of the last stage. Measured: 0.17 on the
 /// built-in scene, 0.20 and 0.23 on lego.
 const EVALUATION_RAY: f64 = 0.2;
 
-/// A mean that forgets: each value moves it by `share` of the way, the first ones by more, so that it starts without a bias.
+/// An exponential moving average with smoothing factor `share`. The first values have larger weights, so that it is unbiased.
 #[derive(Debug, Clone, Copy)]
 struct Smoothed {
     share: f64,
@@ -36,7 +36,7 @@ impl Smoothed {
 pub struct Training<'c, 'a> {
     meter: Meter<'c, 'a>,
     plan: Vec<PlannedStage>,
-    /// Rays of the evaluation that follows.
+    /// Number of rays of the final evaluation.
     rays_to_evaluate: f64,
     total: u64,
     mse: Smoothed,
@@ -48,7 +48,7 @@ pub struct Training<'c, 'a> {
 }
 
 impl<'a> Console<'a> {
-    /// Progress of a training run that has taken so many seconds, and whose model is compared with so many pixels at the end.
+    /// Progress of a training run. `rays_to_evaluate` is the number of pixels of the final evaluation, `seconds` the training time of a resumed run.
     pub fn training(&self, plan: &[PlannedStage], rays_to_evaluate: f64, seconds: f64) -> Training<'_, 'a> {
         let total = plan.iter().map(|p| p.steps).sum();
         Training {
@@ -67,12 +67,12 @@ impl<'a> Console<'a> {
 }
 
 impl Training<'_, '_> {
-    /// Shows the progress of something that is counted between two steps.
+    /// Shows the progress of a countable task between two steps.
     pub fn count(&self, what: &str, done: usize, total: usize) {
         self.meter.show((done as u64, total as u64), false, || Counted { what, done, total });
     }
 
-    /// A step was taken.
+    /// Shows a step.
     pub fn step(&mut self, report: &Report, seen: &Observation) {
         let took = seen.seconds - self.seconds;
         self.seconds = seen.seconds;
@@ -81,7 +81,7 @@ impl Training<'_, '_> {
         self.loss.add(report.loss);
         let stage = self.plan[report.stage];
         if report.step == stage.first {
-            // The first step of a stage also makes its grid: it says nothing about the next ones.
+            // The first step of a stage includes the creation of its grid, so its duration is not representative.
             (self.step_seconds, self.samples) = (Smoothed::new(0.05), Smoothed::new(0.05));
         } else {
             self.step_seconds.add(took);
@@ -113,9 +113,8 @@ impl Training<'_, '_> {
         }
     }
 
-    /// Seconds until the run has its figures, or `None` while no step of this stage but the first, which also builds the grid, has been timed. This stage is
-    /// counted at its own pace, a later one at the pace that [`step_cost`] expects of its resolution, and a pixel of a test view as `EVALUATION_RAY` training rays
-    /// of the last stage.
+    /// Estimates the remaining seconds of the run, including the final evaluation; `None` during the first two steps of a stage. The current stage is
+    /// estimated with its measured pace, later stages with [`step_cost`], and a pixel of a test view as `EVALUATION_RAY` training rays of the last stage.
     fn remaining(&self, report: &Report) -> Option<f64> {
         let now = &self.plan[report.stage];
         let step = Some(self.step_seconds.value).filter(|_| self.step_seconds.count > 0.0)?;
@@ -127,8 +126,8 @@ impl Training<'_, '_> {
     }
 }
 
-/// How far training is. Stages count from 1, steps are those that have been taken; losses, rates and the PSNR of training rays are smoothed, that of validation views
-/// is the last there was.
+/// Progress of training. Stages count from 1, and `step` is the number of steps taken. Losses, rates and the PSNR of training rays are smoothed; the
+/// validation PSNR is the last measured one.
 #[derive(Debug, Clone, Serialize)]
 struct Now {
     what: &'static str,
@@ -146,7 +145,7 @@ struct Now {
     /// Facts about the model by name.
     #[serde(flatten)]
     facts: BTreeMap<String, serde_json::Number>,
-    /// The most important of them.
+    /// The most important fact.
     #[serde(skip)]
     size: Option<(&'static str, f64)>,
     memory_bytes: Option<u64>,
@@ -167,7 +166,7 @@ impl Now {
         }
     }
 
-    /// Rays a second, voxels and memory, as far as they are known.
+    /// Formats rays per second, voxels and memory, as far as they are known.
     fn sizes(&self) -> String {
         let pace = self.rays_per_second.map(|rays| format!("  {}rays/s", metric(rays)));
         let memory = self.memory_bytes.map(|n| format!("  {}", bytes(n)));

@@ -1,19 +1,31 @@
-//! Loss, PSNR, resolution and rates of a run, or of several, over steps and over seconds.
+//! Curves of loss, PSNR, resolution and learning rates of one or several runs, over steps and over seconds.
 
 use crate::chart::{Chart, Curve, DECIBELS};
+use crate::progress::Console;
 use plenoxel::model::plenoxels::config::Config;
-use plenoxel::run::metrics::Line;
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::metrics::{self, Line};
 use std::collections::BTreeSet;
 
-/// Points of a curve that are told apart.
+/// Maximum number of points per curve.
 const POINTS: usize = 500;
 
-/// What curves are drawn over: its name, what it says below the axis, and where a line of the metrics is on it.
+/// A horizontal axis: its name, its label, and the position of a line of the metrics.
 type Axis = (&'static str, &'static str, fn(&Line<'_>) -> f64);
 const AXES: [Axis; 2] =
     [("steps", "training step", |line| line.step as f64 + 1.0), ("seconds", "seconds of training", |line| line.seconds)];
 
-/// The curves of a run, or nothing if there was no training.
+/// Parses the metrics of a run. Warns of unreadable lines.
+pub fn lines<'t>(folder: &RunFolder, metrics: &'t str, console: &Console<'_>) -> Vec<Line<'t>> {
+    let (lines, unreadable) = metrics::of_steps(metrics);
+    if unreadable > 0 {
+        let (path, s) = (folder.metrics(), if unreadable == 1 { "" } else { "s" });
+        console.note(&format!("warning: {}: {unreadable} unreadable line{s} left out of the curves", path.display()));
+    }
+    lines
+}
+
+/// The curves of a run; empty without training.
 pub fn section(lines: &[Line<'_>], config: &Config) -> String {
     let Some(last) = lines.last().filter(|_| !config.stages.is_empty()) else { return String::new() };
     over_both(|_, (_, across, at)| {
@@ -31,7 +43,7 @@ pub fn section(lines: &[Line<'_>], config: &Config) -> String {
     })
 }
 
-/// Quantities of which each of several runs has a curve: title, unit, and value of a line of the metrics.
+/// Charts with one curve per run: title, unit, and value of a line of the metrics.
 type OfEach = (&'static str, &'static str, fn(&Line<'_>) -> Option<f64>);
 const OF_EACH: [OfEach; 4] = [
     ("Loss", "loss", |line| Some(line.loss)),
@@ -40,23 +52,23 @@ const OF_EACH: [OfEach; 4] = [
     ("Voxels", "number", |line| line.figure("voxels").filter(|n| *n > 0.0)),
 ];
 
-/// The curves of one run among several, without the lines that they were drawn from.
+/// The curves of one run among several, without the lines of the metrics.
 #[derive(Debug)]
 pub struct RunCurves {
-    /// By axis: how far the run goes, and its curves.
+    /// For each axis: the end of the run, and its curves.
     over: [(f64, [Curve; OF_EACH.len()]); AXES.len()],
     is_empty: bool,
 }
 
 impl RunCurves {
-    /// The curves of a run with a name.
+    /// Computes the curves of a run with this name.
     pub fn of(name: &str, lines: &[Line<'_>]) -> Self {
         let over = AXES.map(|(_, _, at)| (lines.last().map_or(0.0, at), OF_EACH.map(|(_, _, value)| curve(name, lines, at, &value))));
         RunCurves { over, is_empty: lines.is_empty() }
     }
 }
 
-/// The curves of several runs in the same charts, or nothing if none of them was trained.
+/// The curves of several runs in the same charts; empty if none of them was trained.
 pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> String {
     if runs.clone().all(|run| run.is_empty) {
         return String::new();
@@ -64,7 +76,7 @@ pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> St
     over_both(|axis, (_, across, _)| {
         let end = runs.clone().map(|run| run.over[axis].0).fold(0.0, f64::max);
         let charts = OF_EACH.into_iter().enumerate().filter_map(|(number, (title, up, _))| {
-            // A run without such figures keeps its color for the other charts.
+            // A run without these values keeps its color in the other charts.
             let curves: Vec<Curve> = runs.clone().map(|run| run.over[axis].1[number].clone()).collect();
             let known = curves.iter().any(|curve| !curve.lines.is_empty());
             let chart =
@@ -75,7 +87,7 @@ pub fn side_by_side<'r>(runs: impl Iterator<Item = &'r RunCurves> + Clone) -> St
     })
 }
 
-/// A section with charts over steps, and the same over seconds, of which the reader sees one.
+/// A section with charts over steps and over seconds; the reader selects one.
 fn over_both(charts: impl Fn(usize, Axis) -> Vec<Chart>) -> String {
     let mut page = String::from("<section><h2>Curves</h2>\n");
     for (i, (name, ..)) in AXES.iter().enumerate() {
@@ -90,7 +102,7 @@ fn over_both(charts: impl Fn(usize, Axis) -> Vec<Chart>) -> String {
     page + "</section>"
 }
 
-/// A number of a line, where it has it.
+/// A function from a line to a value, if the line has it.
 type Value<'a> = Box<dyn Fn(&Line<'_>) -> Option<f64> + 'a>;
 
 /// Title, vertical axis and curves of a chart.
@@ -99,18 +111,18 @@ type Shown<'a> = (&'static str, &'static str, Vec<(String, Value<'a>)>);
 fn charts<'a>(lines: &[Line<'_>], config: &'a Config) -> Vec<Shown<'a>> {
     let whole: Vec<(String, Value<'a>)> = vec![("loss".to_owned(), Box::new(|line| Some(line.loss)))];
     let names: BTreeSet<String> = lines.iter().flat_map(|line| line.losses.keys().map(|name| name.to_string())).collect();
-    // As it counts in the sum. A loss that the settings do not know was added by a program, with a weight that is not known.
+    // Weighted, as in the sum. A loss that is not in the settings was added by a program, with an unknown weight.
     let each = names.into_iter().map(|name| {
         let (key, weight) = (name.clone(), config.losses.get(&name));
-        let shown = if weight.is_some() { name } else { format!("{name}, without its weight") };
+        let shown = if weight.is_some() { name } else { format!("{name} (unweighted)") };
         let counted = move |line: &Line<'_>| Some(line.losses.get(key.as_str())? * weight.map_or(1.0, |weight| weight.at(line.step)));
         (shown, Box::new(counted) as Value<'a>)
     });
-    // One loss is the whole.
+    // A single loss is equal to the sum.
     let each: Vec<_> = each.collect();
     let losses = if each.len() > 1 { whole.into_iter().chain(each).collect() } else { whole };
     vec![
-        ("Loss, and its parts with their weights", "loss", losses),
+        ("Loss and its weighted parts", "loss", losses),
         (
             "PSNR",
             DECIBELS,
@@ -123,7 +135,7 @@ fn charts<'a>(lines: &[Line<'_>], config: &'a Config) -> Vec<Shown<'a>> {
             "Size of the grid",
             "number",
             vec![
-                ("voxels a side".to_owned(), Box::new(|line| line.resolution.map(|n| n as f64))),
+                ("voxels per side".to_owned(), Box::new(|line| line.resolution.map(|n| n as f64))),
                 ("voxels".to_owned(), Box::new(|line| line.figure("voxels").filter(|n| *n > 0.0))),
             ],
         ),
@@ -142,7 +154,7 @@ fn rates(lines: &[Line<'_>]) -> Vec<(String, Value<'static>)> {
     parameters.into_iter().map(curve).collect()
 }
 
-/// A curve with a break between stages.
+/// A curve with breaks between stages.
 fn curve(name: &str, lines: &[Line<'_>], at: fn(&Line<'_>) -> f64, value: &dyn Fn(&Line<'_>) -> Option<f64>) -> Curve {
     let each = lines.len().div_ceil(POINTS).max(1);
     let mean = |values: &mut dyn Iterator<Item = f64>| {
@@ -157,7 +169,7 @@ fn curve(name: &str, lines: &[Line<'_>], at: fn(&Line<'_>) -> f64, value: &dyn F
     Curve { name: name.to_owned(), lines: stages.filter(|points| !points.is_empty()).collect(), band: Vec::new() }
 }
 
-/// Where stages begin.
+/// The start of each stage, with its label.
 fn parts(lines: &[Line<'_>], at: fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
     let mut begin = 0.0;
     let parts = lines.chunk_by(|a, b| a.stage == b.stage).map(|stage| {
@@ -172,7 +184,6 @@ fn parts(lines: &[Line<'_>], at: fn(&Line<'_>) -> f64) -> Vec<(f64, String)> {
 mod tests {
     use super::*;
     use plenoxel::model::plenoxels::config::Weight;
-    use plenoxel::run::metrics;
 
     #[test]
     fn parts_of_the_loss_are_shown_as_they_count_in_it() {
@@ -185,14 +196,14 @@ mod tests {
             )
         };
         let text = [4, 5].map(line).join("\n");
-        let lines: Vec<Line<'_>> = metrics::lines(&text).map(|(_, line)| line).collect();
+        let (lines, _) = metrics::of_steps(&text);
         let (_, _, values) = charts(&lines, &config).swap_remove(0);
         let shown: Vec<(&str, Vec<Option<f64>>)> =
             values.iter().map(|(name, value)| (name.as_str(), lines.iter().map(&**value).collect())).collect();
         let both = |a, b| vec![Some(a), Some(b)];
         assert_eq!(
             shown,
-            [("loss", both(0.6, 0.6)), ("mine, without its weight", both(2.0, 2.0)), ("mse", both(0.5, 0.5)), ("sparsity", both(0.1, 0.0)),]
+            [("loss", both(0.6, 0.6)), ("mine (unweighted)", both(2.0, 2.0)), ("mse", both(0.5, 0.5)), ("sparsity", both(0.1, 0.0)),]
         );
     }
 }

@@ -1,4 +1,4 @@
-//! The pictures of a run in its report: stages, and test views with their figures.
+//! The pictures of a report: stages, and test views with their scores.
 
 use crate::html::{escaped, picture};
 use plenoxel::dataset::image as files;
@@ -8,22 +8,22 @@ use serde_json::Value;
 use std::fmt::Write;
 use std::path::Path;
 
-/// Pictures are at most so wide and so high, in pixels: the files beside the report are whole.
+/// Maximum width and height of pictures in a report, in pixels. The files in the run folder have the full size.
 pub const LARGEST: [u32; 2] = [4000, 400];
 
-/// What the pictures of a panel show, from left to right.
+/// The parts of a panel, from left to right.
 const PANEL: [&str; 4] = ["target", "render", "error", "depth"];
 
-/// The stages of the run side by side, or what was carved.
+/// The section with the stages side by side, or with the carved grid.
 pub fn stages(folder: &RunFolder, result: &Value) -> Result<String> {
     let what = [
-        ("stages.png", "Stages", "One view before the first step and at the end of each stage, and its photograph."),
-        ("carved.png", "Carved", "What some cameras see."),
+        ("stages.png", "Stages", "One view before the first step and at the end of each stage, and the photograph."),
+        ("carved.png", "Carved grid", "The carved grid from some cameras."),
     ];
     let Some((name, title, caption)) = what.into_iter().find(|(name, ..)| folder.image(name).exists()) else { return Ok(String::new()) };
     let resolutions = result["stages"].as_array().into_iter().flatten().map(|stage| stage["resolution"].as_u64().map(|n| n as usize));
     let numbered = resolutions.clone().take(1).chain(resolutions).enumerate();
-    // A view that was not drawn is not in the strip: a run of an earlier version has none of the start.
+    // Only pictures that exist are in the strip: runs of earlier versions have none of the start.
     let drawn = numbered.filter(|&(number, resolution)| folder.image(&RunFolder::stage_name(number, resolution)).exists());
     let stages = drawn.map(|(number, resolution)| match (number, resolution) {
         (0, _) => "start".to_owned(),
@@ -44,13 +44,13 @@ fn strip(picture: &str, labels: &[impl AsRef<str>], caption: &str, more: &str) -
     format!("<figure{more}><div class=\"strip\">{picture}{labels}</div><figcaption>{caption}</figcaption></figure>\n")
 }
 
-/// Test views as target | render | error | depth, each with its figures, and the figures of those without a picture.
+/// The section with the test views as target | render | error | depth, and a table with the scores of all test views.
 pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
     let Some(views) = result["per_view"].as_array().filter(|views| !views.is_empty()) else { return Ok(String::new()) };
     let (mut figures, mut rows) = (String::new(), String::new());
     for (number, view) in views.iter().enumerate() {
         let name = view["name"].as_str().unwrap_or_default();
-        // JSON has no number for that of equal pictures.
+        // JSON has no infinity, the PSNR of equal pictures.
         let psnr = view["psnr"].as_f64();
         let (order, psnr) = (psnr.map_or("Infinity".to_owned(), |x| x.to_string()), psnr.map_or("∞".to_owned(), |x| format!("{x:.2}")));
         let ssim = view["ssim"].as_f64().map_or("–".to_owned(), |ssim| format!("{ssim:.4}"));
@@ -63,23 +63,23 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
             figures += &strip(&picture, &PANEL, &caption, &format!(" data-psnr=\"{order}\""));
         }
     }
-    let order = "<label>order <select id=\"order\"><option value=\"\">as they are</option><option value=\"1\">worst first</option>\
+    let order = "<label>order <select id=\"order\"><option value=\"\">as listed</option><option value=\"1\">worst first</option>\
                  <option value=\"-1\">best first</option></select></label>";
     let pictures = match figures.is_empty() {
         true => String::new(),
         false => format!(
-            "<p>Error is the absolute difference averaged over channels, black at 0, pale yellow at 0.25 and above. \
-             Depth is red where near and blue where far. {order}</p>\n<div id=\"panels\">\n{figures}</div>\n"
+            "<p>Error is the absolute difference averaged over channels: black is 0, pale yellow is 0.25 or more. \
+             In depth, red is near and blue is far. {order}</p>\n<div id=\"panels\">\n{figures}</div>\n"
         ),
     };
     Ok(format!(
-        "<section><h2>Test views</h2>\n{pictures}<details><summary>figures of all {} test views</summary><table><thead><tr><th></th><th>view</th>\
+        "<section><h2>Test views</h2>\n{pictures}<details><summary>scores of all {} test views</summary><table><thead><tr><th></th><th>view</th>\
          <th>PSNR, dB</th><th>SSIM</th></tr></thead><tbody>{rows}</tbody></table></details></section>",
         views.len()
     ))
 }
 
-/// A picture of a file as part of the page.
+/// Embeds a picture file in the page.
 fn embedded(path: &Path, what: &str) -> Result<String> {
     Ok(picture(&files::read(path)?, LARGEST, what))
 }

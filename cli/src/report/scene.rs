@@ -1,4 +1,4 @@
-//! The grid in the page, for its viewer: how it is embedded, and what that costs.
+//! The embedded grid of a report, for its viewer, and the loss of quality by its compression.
 
 use super::Report;
 use crate::html::escaped;
@@ -16,14 +16,14 @@ use plenoxel::run::evenly_spaced;
 use plenoxel::run::memory::bytes;
 use serde_json::{Value, json};
 
-/// The most bytes of a grid in a page, before base64 makes four of three: 30 MB after it.
+/// Maximum size of the embedded grid in bytes, which becomes 30 MB in base64.
 const MOST_BYTES: usize = 22_500_000;
-/// Test views on which its cost is measured.
+/// Number of test views for the PSNR of the embedded grid.
 const COMPARED: usize = 3;
-/// Views to begin from.
+/// Maximum number of start views.
 const VIEWS: usize = 25;
 
-/// A grid in a page.
+/// The embedded grid.
 pub struct Scene {
     small: WebGrid,
     bytes: Vec<u8>,
@@ -33,19 +33,19 @@ pub struct Scene {
     size: [usize; 2],
 }
 
-/// What is lost by quantising, and by resampling if that was necessary: means over a few test views, in dB.
+/// Loss of quality by quantization and, if necessary, resampling: mean PSNR over a few test views, in dB.
 struct Cost {
     views: usize,
-    /// The whole grid's picture against the photograph.
+    /// PSNR of the trained grid.
     whole: f64,
-    /// The small grid's.
+    /// PSNR of the embedded grid.
     small: f64,
-    /// The small grid's picture against the whole one's.
+    /// PSNR of the embedded grid relative to the trained grid.
     between: f64,
 }
 
 impl Scene {
-    /// The voxel grid of a report, made small; `None` if its model has none.
+    /// Compresses the voxel grid of a report; `None` if its model has none.
     pub fn of(report: &Report<'_>) -> Result<Option<Self>> {
         let Some(grid) = report.model.and_then(|model| model.content()?.downcast_ref()) else { return Ok(None) };
         let packed = WebGrid::within(grid, MOST_BYTES);
@@ -65,41 +65,46 @@ impl Scene {
         Ok(Some(Scene { small, bytes, settings, cost, size }))
     }
 
-    /// The viewer.
+    /// The HTML of the viewer.
     pub fn figure(&self) -> String {
         let [width, height] = self.size;
         format!(
-            "<section><h2>Look around</h2>\n<figure id=\"viewer\"><canvas tabindex=\"0\" style=\"--shape: calc({height} / {width})\" \
-             aria-label=\"interactive view of the trained grid\"></canvas>\n<figcaption>Drag to turn, wheel or pinch to zoom, shift and drag or two \
-             fingers to move; arrow keys, + and −. <label>begin at <select></select></label> <button type=\"button\" \
+            "<section><h2>Interactive viewer</h2>\n<figure id=\"viewer\"><canvas tabindex=\"0\" style=\"--shape: calc({height} / {width})\" \
+             aria-label=\"interactive view of the trained grid\"></canvas>\n<figcaption>Rotate: drag, or arrow keys. Zoom: wheel, pinch, or + and −. \
+             Move: shift and drag, or two fingers. <label>Start view: <select></select></label> <button type=\"button\" \
              id=\"fill\">full screen</button> <button type=\"button\" id=\"save\">save picture</button><br>\n\
              <output></output><br>{}</figcaption></figure></section>",
             escaped(&self.note())
         )
     }
 
-    /// What is in the page, and what it costs.
+    /// Describes the embedded grid and its loss of quality.
     pub fn note(&self) -> String {
         let (shape, header) = (self.small.shape(), self.small.header());
-        let reduction =
-            if shape.sh_reduction > 1 { format!(", harmonics for each {} voxels", shape.sh_reduction.pow(3)) } else { String::new() };
+        let reduction = match shape.sh_reduction {
+            1 => String::new(),
+            k => format!(", with view-dependent color on a {k} times coarser grid"),
+        };
         let what = format!(
-            "the page holds {} voxels of {}³{reduction} in {}",
+            "the viewer has a compressed grid of {} voxels at {}³{reduction}, in {}",
             thousands(header.voxels as u64),
             shape.resolution,
             bytes(self.bytes.len() as u64)
         );
         match &self.cost {
-            Some(Cost { views, whole, small, between }) => format!(
-                "{what}, which show {views} test views with {small:.2} dB, the grid itself with {whole:.2} dB ({between:.1} dB between the two)"
-            ),
+            Some(Cost { views, whole, small, between }) => {
+                let s = if *views == 1 { "" } else { "s" };
+                format!(
+                    "{what}; its PSNR on {views} test view{s} is {small:.2} dB, that of the trained grid {whole:.2} dB; the PSNR between both is {between:.1} dB"
+                )
+            }
             None => what,
         }
     }
 
-    /// What makes the viewer work.
+    /// The data and the script of the viewer.
     pub fn scripts(&self) -> String {
-        // A name of a view may hold anything, but no end of the script.
+        // The name of a view may contain `</script>`.
         let settings = self.settings.to_string().replace('<', "\\u003c");
         format!(
             "<script type=\"application/json\" id=\"scene\">{settings}</script>\n<script type=\"text/plain\" id=\"grid\">{}</script>\n\
@@ -111,7 +116,7 @@ impl Scene {
 }
 
 impl Cost {
-    /// Renders a few test views with both grids.
+    /// Measures the loss on a few test views.
     fn of(report: &Report<'_>, grid: &VoxelGrid<f32>, small: &WebGrid) -> Result<Option<Self>> {
         let chosen = evenly_spaced(report.dataset.count(Split::Test), COMPARED);
         let background = report.config.background;
@@ -134,7 +139,7 @@ impl Cost {
     }
 }
 
-/// A camera as the viewer takes it: its right, up and backward axes and its position, and the lens in pixels.
+/// A camera for the viewer: right, up and backward axes, position, and intrinsics in pixels.
 fn view(name: &str, camera: &Camera) -> Value {
     let k = &camera.intrinsics;
     json!({

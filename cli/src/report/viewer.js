@@ -1,8 +1,8 @@
-// The viewer: the trained grid, ray by ray, in a fragment shader.
+// The viewer: ray casting of the trained grid in a fragment shader.
 //
-// It takes the samples that the program takes (`plenoxel/src/sampling.rs`): intervals of one length from where a ray enters the box, colors and
-// densities read at their middles, alpha = 1 - exp(-density length). Voxels lie in an atlas of bricks of 4^3 cells, which have 5^3 corners,
-// so that the hardware interpolates; a table of links says where a brick is, or how far the next one must be.
+// It uses the samples of the program (`plenoxel/src/sampling.rs`): intervals of equal length from the entry of a ray into the box, colors and
+// densities at their midpoints, alpha = 1 - exp(-density length). Voxels are stored in an atlas of bricks of 4^3 cells, which have 5^3 corners,
+// so that the hardware interpolates. A table of links has the place of each brick, or for an empty brick the distance to the nearest one.
 'use strict';
 
 const BRICK = 4, CORNERS = BRICK + 1;
@@ -52,7 +52,7 @@ function buildAtlas(places, counts, most, slabs = 1) {
   const deepest = Math.floor(most / CORNERS / slabs);
   const across = Math.max(1, Math.ceil(Math.cbrt(bricks.length)), Math.ceil(Math.sqrt(bricks.length / deepest)));
   const deep = Math.max(1, Math.ceil(bricks.length / across ** 2));
-  if (CORNERS * across > most) throw new Error('this grid is too large for the textures of this browser');
+  if (CORNERS * across > most) throw new Error('the grid is too large for the textures of this browser');
   const size = [CORNERS * across, CORNERS * across, CORNERS * deep];
   markDistances(links, side);
   for (let b = 0; b < links.length; b++) if (!(links[b] & DISTANCE)) {
@@ -238,7 +238,7 @@ void main() {
 // How many pixels of a picture of this size show one pixel of a camera, if all that the camera sees is to be in it.
 const fitted = (camera, width, height) => Math.min(width / camera.width, height / camera.height);
 
-// What a scene looks like from anywhere.
+// A renderer for a scene.
 class Renderer {
   constructor(canvas, scene, bytes) {
     const gl = canvas.getContext('webgl2', { antialias: false, alpha: false, preserveDrawingBuffer: true });
@@ -360,7 +360,7 @@ class Renderer {
   }
 }
 
-// A camera that hands and mice move: around a pivot on its line of sight, to and from it, and beside it.
+// An orbit camera: it rotates around a pivot on its line of sight, zooms and pans.
 class Orbit {
   constructor(view) { this.from(view); }
 
@@ -374,7 +374,7 @@ class Orbit {
 
   axis(k) { return this.rotation.slice(3 * k, 3 * k + 3); }
 
-  // Turns the scene as a hand would: by so many radians to the right, and down, but not over the poles.
+  // Rotates the scene by angles in radians to the right and down, but not over the poles.
   turn(right, down) {
     const height = Math.asin(Math.max(-1, Math.min(1, this.axis(2)[2])));
     if (Math.abs(height + down) > 1.55 && Math.abs(height + down) > Math.abs(height)) down = 0;
@@ -409,23 +409,23 @@ function rotated(v, [x, y, z], angle) {
   ];
 }
 
-// The viewer on the page: while something moves, as many pixels as FRAME milliseconds allow; at rest all of them, in bands of BAND milliseconds.
+// The viewer on the page. While the camera moves, the resolution is reduced to FRAME milliseconds per frame. At rest, the full resolution is drawn in bands of BAND milliseconds.
 const FRAME = 60, BAND = 150;
 class Viewer {
   constructor(figure, scene, bytes) {
     this.canvas = figure.querySelector('canvas');
     this.status = figure.querySelector('output');
     this.renderer = new Renderer(this.canvas, scene, bytes);
-    // A machine that sleeps, or has too much to draw, takes textures away.
-    this.canvas.addEventListener('webglcontextlost', e => { e.preventDefault(); this.status.textContent = 'the browser took the picture away; waiting for it'; });
+    // Textures are lost when the machine sleeps or is overloaded.
+    this.canvas.addEventListener('webglcontextlost', e => { e.preventDefault(); this.status.textContent = 'The browser released the graphics memory; waiting to restore the view.'; });
     this.canvas.addEventListener('webglcontextrestored', () => {
       try {
         this.renderer = new Renderer(this.canvas, scene, bytes);
         this.moved();
-      } catch (error) { this.status.textContent = `The picture cannot be shown again: ${error.message}`; }
+      } catch (error) { this.status.textContent = `The view cannot be restored: ${error.message}`; }
     });
     this.camera = new Orbit(scene.views[0]);
-    // Pixels of a frame, and of a band: what was taken for the last ones tells how many.
+    // Pixels of a frame and of a band, adapted to the measured times.
     this.pixels = { frame: 10000, band: 10000 };
     this.moving = { last: 0, scale: 1 };
     this.still = 0;
@@ -467,7 +467,7 @@ class Viewer {
     fill.addEventListener('click', () => { canvas.requestFullscreen().then(() => canvas.focus(), error => { this.status.textContent = error.message; }); });
   }
 
-  // Something has moved: to be drawn at the next frame.
+  // Schedules a redraw after the camera has moved.
   moved() {
     this.still = -1;
     if (!this.waiting) { this.waiting = true; requestAnimationFrame(() => this.frame()); }
@@ -501,17 +501,17 @@ class Viewer {
       if (to < height) requestAnimationFrame(() => this.frame());
     }
     const percent = Math.round(100 * this.moving.scale);
-    this.status.textContent = `moving: ${this.moving.last.toFixed(0)} ms a frame at ${percent} % of the width; ` +
-      (this.still < height ? 'sharpening' : `at rest: ${this.stillTime.toFixed(0)} ms for ${width} x ${height}`);
+    this.status.textContent = `moving: ${this.moving.last.toFixed(0)} ms per frame at ${percent} % resolution; ` +
+      (this.still < height ? 'refining' : `still: ${this.stillTime.toFixed(0)} ms for ${width} x ${height} pixels`);
   }
 
-  // So many pixels took so long: the next will be as many as should take the time they have. Never so few that nothing is seen.
+  // Adapts the number of pixels to the time they may take, with a lower limit.
   learn(what, time, goal, drawn) {
     const better = drawn * Math.max(0.5, Math.min(1.5, goal / time));
     this.pixels[what] = Math.max(better, 2500);
   }
 
-  // Saves what the camera sees, in the size of the photographs.
+  // Saves the current view as a PNG file, in the size of the photographs.
   save() {
     if (this.renderer.gl.isContextLost()) return;
     const picture = this.renderer.picture(this.camera), canvas = document.createElement('canvas'), link = document.createElement('a');
@@ -523,12 +523,12 @@ class Viewer {
   }
 }
 
-// What is above can be tested where there is no page.
+// The code above can be tested without a page.
 if (typeof document !== 'undefined') (async () => {
   const figure = document.getElementById('viewer');
   try {
     const scene = JSON.parse(document.getElementById('scene').textContent);
-    if (!scene.views.length) throw new Error('there is no view to begin from');
+    if (!scene.views.length) throw new Error('there is no start view');
     window.viewer = new Viewer(figure, scene, await unpack(document.getElementById('grid').textContent.trim()));
   } catch (error) {
     figure.querySelector('output').textContent = `The viewer cannot be shown: ${error.message}`;

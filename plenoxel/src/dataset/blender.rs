@@ -131,7 +131,7 @@ impl Transforms {
             });
         };
         let Some(fov_x) = angle.as_f64().filter(|angle| is_angle_of_view(*angle)) else {
-            return Err(bad(format!("camera_angle_x is {}", json::shown(angle)), "accepted: a number of radians between 0 and pi"));
+            return Err(bad(format!("camera_angle_x is {}", json::shown(angle)), "expected a number of radians between 0 and pi"));
         };
         let Some(frames) = json.get("frames") else {
             return Err(bad("there is no key \"frames\"".into(), "list the views, each with file_path and transform_matrix"));
@@ -155,7 +155,7 @@ impl Transforms {
             let pose = pose(matrix).map_err(|(found, remedy)| bad(format!("transform_matrix of frame {k} {found}"), remedy))?;
             if pose.translation.abs().max_element() > FARTHEST {
                 let found = format!("transform_matrix of frame {k} puts the camera at {:?}", pose.translation.to_array());
-                return Err(bad(found, "accepted: coordinates of up to 1e12"));
+                return Err(bad(found, "expected coordinates of up to 1e12"));
             }
             Ok((file_path.to_owned(), pose))
         };
@@ -187,7 +187,7 @@ fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result
 
 /// Validates and converts a 4 x 4 camera-to-world matrix. An error completes the sentence "transform_matrix of frame k ...".
 pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'static str)> {
-    const SHAPE: &str = "accepted: a list of 4 rows of 4 numbers";
+    const SHAPE: &str = "expected a list of 4 rows of 4 numbers";
     let mut m = [[0.0; 4]; 4];
     let rows = matrix.as_array().ok_or_else(|| ("is not a list of rows".to_owned(), SHAPE))?;
     if rows.len() != 4 {
@@ -200,7 +200,7 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
         }
         for (j, value) in row.iter().enumerate() {
             let number = value.as_f64().filter(|number| number.is_finite());
-            m[i][j] = number.ok_or_else(|| (format!("has {} in row {i}, column {j}", json::shown(value)), "accepted: finite numbers"))?;
+            m[i][j] = number.ok_or_else(|| (format!("has {} in row {i}, column {j}", json::shown(value)), "expected finite numbers"))?;
         }
     }
     rigid(m)
@@ -209,7 +209,7 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
 /// Validates and converts the rows of a camera-to-world matrix, which must be finite. An error completes the sentence of [`pose`].
 pub(crate) fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, &'static str)> {
     if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6) {
-        return Err((format!("has the last row {:?}", m[3]), "accepted: a rigid motion, whose last row is 0 0 0 1"));
+        return Err((format!("has the last row {:?}", m[3]), "expected a rigid motion, whose last row is 0 0 0 1"));
     }
     let matrix = DMat4::from_cols_array_2d(&m).transpose();
     let rotation = DMat3::from_mat4(matrix);

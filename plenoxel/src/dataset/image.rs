@@ -57,7 +57,7 @@ fn picture(path: &Path, mut source: impl BufRead + Seek) -> Result<RgbaImage> {
     let (width, height) = rows::size(path, &mut source)?;
     let rows = Rows::new(path, source)?;
     let bytes = 4 * width as usize * height as usize;
-    memory::check(path, &format!("an image of {width} x {height} pixels"), bytes as u64)?;
+    memory::check(path, &format!("reading an image of {width} x {height} pixels"), bytes as u64)?;
     let mut pixels = Vec::new();
     // Address space may be exhausted before memory is.
     pixels.try_reserve_exact(bytes).map_err(|_| Error::io(path, std::io::ErrorKind::OutOfMemory.into(), "decoding the image"))?;
@@ -77,8 +77,8 @@ pub fn check_downscale(k: usize, (width, height): (usize, usize)) -> Result<()> 
         return Ok(());
     }
     let divisors: Vec<String> = (1..=width.min(height).min(MAX_SIDE as usize)).filter(|&k| divides(k)).map(|k| k.to_string()).collect();
-    let found = if k == 0 { "0".to_owned() } else { format!("{k} does not divide the {width} x {height} images") };
-    Err(Error::config("downscale", found, divisors.join(", ")))
+    let found = if k == 0 { "invalid value 0".to_owned() } else { format!("{k} does not divide the image size {width} x {height}") };
+    Err(Error::usage("downscale", found, format!("expected {}", divisors.join(", "))))
 }
 
 /// Reduces an image by k: each pixel is the mean of a block of k x k pixels.
@@ -173,7 +173,7 @@ fn encoded(path: &Path, bytes: &[u8], (width, height): (usize, usize), color: Ex
     // Images that could not be read back are not written.
     if width.max(height) > MAX_SIDE as usize {
         let found = format!("an image of {width} x {height} pixels is too large to write");
-        return Err(Error::input(path, found, format!("accepted: up to {MAX_SIDE} pixels per side")));
+        return Err(Error::input(path, found, format!("expected at most {MAX_SIDE} pixels per side")));
     }
     let mut png = Vec::new();
     ::image::codecs::png::PngEncoder::new(&mut png).write_image(bytes, width as u32, height as u32, color).map_err(|error| {
@@ -249,8 +249,8 @@ mod tests {
     fn a_reduction_that_does_not_divide_lists_those_that_do() {
         let error = check_downscale(3, (8, 12)).unwrap_err();
         assert_eq!(error.exit_code(), 2);
-        assert!(error.to_string().contains("does not divide the 8 x 12 images"), "{error}");
-        assert!(error.to_string().ends_with("accepted: 1, 2, 4"), "{error}");
+        assert!(error.to_string().contains("does not divide the image size 8 x 12"), "{error}");
+        assert!(error.to_string().ends_with("expected 1, 2, 4"), "{error}");
         assert!(check_downscale(0, (8, 12)).is_err() && check_downscale(4, (8, 12)).is_ok());
         // Trying one divisor after another would never end for such sizes of a damaged file.
         assert!(check_downscale(7, (usize::MAX, usize::MAX - 1)).is_err());

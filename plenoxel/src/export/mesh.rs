@@ -89,11 +89,14 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
     });
     let largest = largest.into_iter().fold(0.0, f64::max);
     if !(level > 0.0 && level < largest) {
-        let accepted = match largest > 0.0 {
-            true => format!("above 0 and below {largest:.4}, the largest density of this grid"),
-            false => "no level, because the grid is empty: train it longer".to_owned(),
-        };
-        return Err(Error::config("level", format!("{level:.4}"), accepted));
+        return Err(match largest > 0.0 {
+            true => Error::config(
+                "level",
+                format!("{level:.4}"),
+                format!("a number above 0 and below {largest:.4}, the largest density of this grid"),
+            ),
+            false => Error::usage("level", "this grid is empty, so it has no surface", "train it longer"),
+        });
     }
     let mut surface = surface(grid, level);
     let parts_left_out = surface.leave_out_parts_below(options.min_part);

@@ -167,8 +167,7 @@ fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
     // All parts consist of whole words, so the binary needs no padding.
     let total = 12 + 8 + text.len() + 8 + binary.len();
     let Ok(length) = u32::try_from(total) else {
-        let found = format!("glb cannot hold a mesh of {total} bytes");
-        return Err(Error::config("format", found, "ply or obj, because glTF files end at 4 GiB"));
+        return Err(Error::usage("format", format!("the mesh has {total} bytes, but glb files may have at most 4 GiB"), "use ply or obj"));
     };
     let word = |n: usize| (n as u32).to_le_bytes();
     let header = [b"glTF".as_slice(), &2u32.to_le_bytes(), &length.to_le_bytes()].concat();
@@ -177,8 +176,8 @@ fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
 
 fn stl(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
     let Ok(count) = u32::try_from(mesh.triangles.len()) else {
-        let found = format!("stl cannot hold a mesh of {} triangles", mesh.triangles.len());
-        return Err(Error::config("format", found, "ply or obj, because STL files end at 4294967295 triangles"));
+        let found = format!("the mesh has {} triangles, but stl files may have at most 4294967295", mesh.triangles.len());
+        return Err(Error::usage("format", found, "use ply or obj"));
     };
     // Many programs take a file that begins with the word "solid" for text.
     let mut file = format!("binary STL, {comment}").into_bytes();

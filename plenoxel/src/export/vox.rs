@@ -51,13 +51,13 @@ impl Default for VoxOptions {
 pub fn vox<T: Real>(grid: &VoxelGrid<T>, options: &VoxOptions) -> Result<Vox> {
     let VoxOptions { min_alpha, solid, direction } = *options;
     if !(0.0..1.0).contains(&min_alpha) {
-        return Err(Error::config("min_alpha", min_alpha, "0 or more, and below 1"));
+        return Err(Error::config("min_alpha", min_alpha, "a number in [0, 1)"));
     }
     let dense = grid.voxels_absorbing(min_alpha);
     let places = places(&dense, solid);
     if places.is_empty() {
-        let found = format!("{min_alpha}, but no voxel of the grid absorbs as much");
-        return Err(Error::config("min_alpha", found, "a smaller fraction of the light; if 0 is refused, train longer"));
+        let found = format!("no voxel of this grid has an alpha of {min_alpha} or more");
+        return Err(Error::usage("min_alpha", found, "use a smaller value; if 0 fails too, train longer"));
     }
     // All exported voxels are present, because absent voxels have no density.
     let rows: Vec<u32> = places.iter().map(|voxel| grid.lattice().row(voxel.map(usize::from)).unwrap_or_default()).collect();
@@ -108,8 +108,8 @@ impl Vox {
         // The length of a chunk has 31 bits, and a voxel takes four bytes.
         const MOST: usize = (1 << 29) - (1 << 20);
         if self.voxels.len() > MOST {
-            let found = format!("{} voxels are selected", self.voxels.len());
-            return Err(Error::config("min_alpha", found, format!("at most {MOST} voxels: a larger fraction, or hidden voxels left out")));
+            let found = format!("{} voxels are selected, but a .vox file may have at most {MOST}", self.voxels.len());
+            return Err(Error::usage("min_alpha", found, "use a larger value, or leave out hidden voxels"));
         }
         let tiles = self.tiles();
         let mut chunks = Vec::new();

@@ -1,4 +1,4 @@
-//! One writer for each folder.
+//! Folder locks: one writer at a time.
 
 use crate::error::{Error, Result};
 use same_file::Handle;
@@ -6,8 +6,8 @@ use std::fs::{File, TryLockError};
 use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-/// An advisory lock on a folder, held until it is dropped or its process ends: an exclusive lock of the system on a file in the folder. The file
-/// names the process that holds the lock and stays when the lock is released, so that no two processes can lock different files of one name.
+/// An advisory lock on a folder: an exclusive system lock on a file in the folder. It is held until it is dropped or its process ends. The file
+/// names the process that holds the lock. It remains after the lock is released, so that two processes never lock different files of one name.
 #[derive(Debug)]
 pub struct FolderLock {
     file: File,
@@ -16,8 +16,8 @@ pub struct FolderLock {
 impl FolderLock {
     /// Locks a folder that exists, by its file `name`. `key` is the flag or argument that names the folder, for messages.
     ///
-    /// Errors: another process, or another part of this one, holds the lock; the file cannot be created. Where a file system has no locks, the folder
-    /// counts as locked by this process alone.
+    /// Errors: another process, or another part of this one, holds the lock; the file cannot be created. On file systems without locks, this
+    /// process always gets the lock.
     pub fn acquire(folder: &Path, name: &str, key: &str) -> Result<Self> {
         let path = folder.join(name);
         let opened = File::options().read(true).write(true).create(true).truncate(false).open(&path);
@@ -30,12 +30,12 @@ impl FolderLock {
         Ok(FolderLock { file })
     }
 
-    /// Shares a folder with others that share it, so that nobody [acquires](Self::acquire) it meanwhile; returns `None` if nobody ever did. Nothing is
-    /// written.
+    /// Takes a shared lock on a folder, which keeps others from [acquiring](Self::acquire) it. Returns `None` if the folder has no lock file.
+    /// Writes nothing.
     ///
     /// Errors: another process holds the lock.
     pub fn share(folder: &Path, name: &str, key: &str) -> Result<Option<Self>> {
-        // One that cannot be opened is not ours to respect: whatever is written next says why.
+        // A lock file that cannot be opened is ignored: the next write will report the reason.
         let Ok(mut file) = File::open(folder.join(name)) else { return Ok(None) };
         match file.try_lock_shared() {
             Err(TryLockError::WouldBlock) => Err(refusal(folder, &mut file, key)),
@@ -43,10 +43,10 @@ impl FolderLock {
         }
     }
 
-    /// True if the locked file is still the file of that name in the folder: neither was moved, deleted or replaced.
+    /// True if the locked file still has that name in the folder, so that neither was moved, deleted or replaced.
     pub fn is_of(&self, folder: &Path, name: &str) -> bool {
         let own = self.file.try_clone().and_then(Handle::from_file);
-        // Where the system cannot tell, nothing is wrong.
+        // Systems that cannot compare files report no change.
         own.is_ok_and(|own| Handle::from_path(folder.join(name)).map_or_else(|e| e.kind() != ErrorKind::NotFound, |there| own == there))
     }
 
@@ -56,22 +56,23 @@ impl FolderLock {
     }
 }
 
-/// The error if another process holds the lock of a folder.
+/// The error for a folder whose lock is held by another process.
 fn refusal(folder: &Path, file: &mut File, key: &str) -> Error {
     let found = format!("{} is being written by {}", folder.display(), holder(file));
-    Error::config(key, found, "another folder, or this one when that process has ended")
+    Error::usage(key, found, "choose another folder, or wait until that process has ended")
 }
 
-/// The process that a lock file names; it may have left the lock to a process that it started.
+/// The process named by a lock file. A child process may have inherited the lock.
 fn holder(file: &mut File) -> String {
     let mut text = String::new();
     let read = file.seek(SeekFrom::Start(0)).and_then(|_| file.take(64).read_to_string(&mut text));
     let number = read.ok().and_then(|_| text.trim().strip_prefix("process ")?.parse::<u32>().ok());
-    number.map_or_else(|| "another process".to_owned(), |number| format!("process {number} or one that it started"))
+    number.map_or_else(|| "another process".to_owned(), |number| format!("process {number} or one of its child processes"))
 }
 
-/// True for a temporary file of [`atomically`](super::atomically) whose process has ended, and for one of the safetensors library, `.tmp` and six
-/// characters, which only the process that holds the lock of a run writes: so ask only while you hold it.
+/// True for a temporary file that no process is writing: one of [`atomically`](super::atomically) whose process has ended, or one of the
+/// safetensors library, named `.tmp` and six characters. Only the process with the lock of a run writes the latter, so call this only while
+/// holding the lock.
 pub fn is_abandoned(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     if name.starts_with(".tmp") {
@@ -84,7 +85,7 @@ pub fn is_abandoned(path: &Path) -> bool {
     if processes.join("self").exists() {
         return !processes.join(process).exists();
     }
-    // Without a list of processes: a file that is being written has just been changed.
+    // Without /proc: a file that is being written was modified recently.
     const LONG: std::time::Duration = std::time::Duration::from_secs(60);
     path.metadata().and_then(|facts| facts.modified()).is_ok_and(|time| time.elapsed().is_ok_and(|age| age > LONG))
 }

@@ -1,5 +1,5 @@
-//! JSON as a tree, of which some keys are kept and the memory is counted while it grows: an empty object of three letters can take 32 bytes, and one with
-//! a key 700.
+//! JSON trees that keep selected keys and count their memory while they are parsed: an empty object of three bytes may take 32 bytes of memory, and an
+//! object with one key 700.
 
 use super::Kept;
 use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
@@ -15,7 +15,7 @@ const PIECE: u64 = 16;
 const NODE_KEYS: usize = 11;
 const NODE: u64 = NODE_KEYS as u64 * (size_of::<String>() as u64 + VALUE) + 16 + PIECE;
 
-/// Memory that is left while a file is read, and the limit that was exceeded.
+/// Memory left for the content of a file, and the limits that were exceeded.
 pub(super) struct Room<'k> {
     kept: &'k Kept,
     left: Cell<u64>,
@@ -28,7 +28,7 @@ impl<'k> Room<'k> {
         Room { kept, left: Cell::new(left), exceeded: Cell::new(false), long: Cell::new(false) }
     }
 
-    /// True if the value takes more memory than there was.
+    /// True if the value needs more memory than was left.
     pub fn is_exceeded(&self) -> bool {
         self.exceeded.get()
     }
@@ -50,13 +50,13 @@ impl<'k> Room<'k> {
             }
             None => {
                 self.exceeded.set(true);
-                Err(E::custom("no memory is left"))
+                Err(E::custom("not enough memory"))
             }
         }
     }
 }
 
-/// Reads a value.
+/// Parser of a value.
 #[derive(Clone, Copy)]
 struct Tree<'r>(&'r Room<'r>);
 
@@ -105,9 +105,9 @@ impl<'de> Visitor<'de> for Tree<'_> {
         while let Some(value) = entries.next_element_seed(self)? {
             if list.len() == self.0.kept.entries {
                 self.0.long.set(true);
-                return Err(A::Error::custom("a long list"));
+                return Err(A::Error::custom("too many entries in a list"));
             }
-            // A list has places for four entries, and for twice as many where it is full.
+            // A list has a capacity of four entries, which is doubled when it is full.
             let places = match list.len() {
                 0 => 4 * VALUE + PIECE,
                 1..4 => 0,
@@ -126,7 +126,7 @@ impl<'de> Visitor<'de> for Tree<'_> {
                 entries.next_value::<IgnoredAny>()?;
                 continue;
             };
-            // Nodes are half full at least.
+            // Nodes are at least half full.
             let node = match object.len() {
                 0 => NODE,
                 1..NODE_KEYS => 0,
@@ -139,7 +139,7 @@ impl<'de> Visitor<'de> for Tree<'_> {
     }
 }
 
-/// Reads the name of a key, if it is kept.
+/// Parser of the name of a key, if the key is kept.
 struct Key<'r>(&'r Room<'r>);
 
 impl<'de> DeserializeSeed<'de> for Key<'_> {

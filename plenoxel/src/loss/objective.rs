@@ -200,7 +200,7 @@ impl<T: Real, M> Objective<T, M> {
             "beta" => self.with(name, weight, beta),
             "distortion" => self.with(name, weight, distortion),
             "opacity" => self.with(name, weight, opacity_supervision),
-            _ => return Err(Error::config(format!("losses.{name}"), "unknown loss", format!("one of {}", NAMES.join(", ")))),
+            _ => return Err(Error::usage(format!("losses.{name}"), "unknown loss", format!("expected one of {}", NAMES.join(", ")))),
         })
     }
 

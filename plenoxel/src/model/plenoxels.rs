@@ -400,8 +400,9 @@ impl<T: Real> train::Trainer<T, Plenoxels<T>> {
     pub fn with_objective(config: Config, views: impl Into<Arc<[View]>>, objective: Objective<T>) -> Result<Self> {
         if !config.losses.is_empty() && config.losses != Config::default().losses {
             let names: Vec<&str> = config.losses.keys().map(String::as_str).collect();
-            let accepted = "an empty `losses` table, or Trainer::new; model::plenoxels::objective(&config, views) returns the config's objective to extend";
-            return Err(Error::config("losses", format!("{} would be ignored beside a custom objective", names.join(", ")), accepted));
+            let remedy = "leave `losses` empty, or use Trainer::new; model::plenoxels::objective(&config, views) builds an objective with these losses";
+            let found = format!("a custom objective does not use the losses of the config: {}", names.join(", "));
+            return Err(Error::usage("losses", found, remedy));
         }
         Self::with_losses(config, views.into(), objective, Arc::default())
     }

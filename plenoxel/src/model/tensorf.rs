@@ -150,9 +150,9 @@ impl Config {
     ///
     /// Errors name the setting that is invalid.
     pub fn validate(&self) -> Result<()> {
-        let check = |valid: bool, key: &str, found: f64, accepted: &str| match valid {
+        let check = |valid: bool, key: &str, value: f64, expected: &str| match valid {
             true => Ok(()),
-            false => Err(Error::config(key, found.to_string(), accepted)),
+            false => Err(Error::config(key, value, expected)),
         };
         check(self.half_width > 0.0 && self.half_width.is_finite(), "half_width", self.half_width, "a length above 0")?;
         for (key, width) in [
@@ -187,7 +187,7 @@ impl Config {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
         }
         if self.stages.is_empty() {
-            return Err(Error::config("stages", "no stage", "at least one"));
+            return Err(Error::usage("stages", "there is no stage", "set at least one"));
         }
         for (i, stage) in self.stages.iter().enumerate() {
             let key = format!("stages[{i}].resolution");
@@ -396,7 +396,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
         } else {
             let occupied = self.occupied();
             if occupied.fraction() == 0.0 {
-                return Err(Error::config("occupied_above", "no cell is this opaque", "a smaller opacity"));
+                return Err(Error::usage("occupied_above", "no cell is this opaque", "use a smaller opacity"));
             }
             self.field.occupied = Some(occupied);
         }

@@ -120,7 +120,7 @@ impl Filters {
             filter("bbox", &mut left, &|left| Ok(left.iter().map(|i| within.contains(position(i))).collect()))?;
         }
         if let Some(range) = self.value {
-            let values = values.ok_or_else(|| Error::config("min_value", "the cloud has no values", "a cloud with a scalar field"))?;
+            let values = values.ok_or_else(|| Error::usage("min_value", "the cloud has no values", "use a cloud with a scalar field"))?;
             let (low, high) = (range.low as f32, range.high as f32);
             filter("value", &mut left, &|left| Ok(left.iter().map(|&i| (low..=high).contains(&values[i as usize])).collect()))?;
         }
@@ -180,8 +180,8 @@ impl Outliers {
     fn keep(&self, points: &[[f32; 3]]) -> Result<Vec<bool>> {
         let k = self.neighbours;
         if k < 2 || k >= points.len() {
-            let accepted = format!("2 or more, and fewer than the {} points that the other filters kept", points.len());
-            return Err(Error::config("sor_neighbours", k, accepted));
+            let expected = format!("2 or more, and fewer than the {} points that the other filters kept", points.len());
+            return Err(Error::config("sor_neighbours", k, expected));
         }
         let tree = Tree::new(points);
         let distances = of_each(&tree, |point| {

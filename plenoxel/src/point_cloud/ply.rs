@@ -64,20 +64,20 @@ impl PlyFile {
             let names: Vec<&str> = header.elements.iter().map(|element| &element.name[..]).collect();
             return Err(Error::input(
                 path,
-                format!("there are no points among its elements [{}]", names.join(", ")),
-                "accepted: a file with an element `vertex`",
+                format!("the file has no points: its elements are [{}]", names.join(", ")),
+                "expected an element `vertex`",
             ));
         };
         if u32::try_from(header.elements[points].count).is_err() {
             let found = format!("the header says {} points", header.elements[points].count);
-            return Err(Error::input(path, found, "accepted: at most 4294967295 points"));
+            return Err(Error::input(path, found, "at most 4294967295 are supported"));
         }
         let mut file = PlyFile { path: path.to_owned(), bytes, header, points, axes: [0; 3], rows: Rows::At(Vec::new()) };
         for (number, axis) in ["x", "y", "z"].into_iter().enumerate() {
             let Some(property) = file.property(&[axis]) else {
                 let names: Vec<&str> = file.element().properties.iter().map(|p| &p.name[..]).collect();
-                let found = format!("no property `{axis}` among the properties of the points, [{}]", names.join(", "));
-                return Err(Error::input(path, found, "accepted: points with the properties x, y and z"));
+                let found = format!("the points have no property `{axis}`, but [{}]", names.join(", "));
+                return Err(Error::input(path, found, "expected the properties x, y and z"));
             };
             file.axes[number] = property;
         }
@@ -88,7 +88,7 @@ impl PlyFile {
             cursor.check_length(element).map_err(|fault| file.fault(element, fault))?;
             if is_points {
                 let needed = file.held(cursor.is_even(element));
-                memory::check(path, &format!("to read {} points", element.count), needed)?;
+                memory::check(path, &format!("reading {} points", element.count), needed)?;
             }
             let found = cursor.find_rows(element, is_points).map_err(|fault| file.fault(element, fault))?;
             if is_points {
@@ -101,11 +101,11 @@ impl PlyFile {
             let found = match cursor.encoding {
                 Encoding::Ascii => {
                     let line = 1 + file.bytes[..cursor.at].iter().filter(|byte| **byte == b'\n').count();
-                    format!("line {line} stands behind the last row that the header speaks of")
+                    format!("line {line} follows the last row that the header announces")
                 }
-                _ => format!("{rest} bytes stand behind the last row that the header speaks of"),
+                _ => format!("{rest} bytes follow the last row that the header announces"),
             };
-            return Err(Error::input(path, found, "write the cloud again: its header and its data are not of each other"));
+            return Err(Error::input(path, found, "write the cloud again: its header does not match its data"));
         }
         file.rows = rows;
         Ok(file)
@@ -140,7 +140,7 @@ impl PlyFile {
         let filtering = size_of::<DVec3>() as u64 + filters.memory();
         let writing = size_of::<u32>() as u64 * points + self.bytes.len() as u64;
         let held = self.held(matches!(self.rows, Rows::Fixed { .. })) + values * points;
-        memory::check(&self.path, &format!("to filter {points} points"), held + writing.max(filtering * points))
+        memory::check(&self.path, &format!("filtering {points} points"), held + writing.max(filtering * points))
     }
 
     /// Returns the memory that the points take, bytes: the file, and the position of each row unless all rows have the same length.
@@ -168,8 +168,8 @@ impl PlyFile {
     /// Errors if there is no such field, or if a word of a text file is not a number.
     pub fn values(&self, name: &str) -> Result<Vec<f32>> {
         let Some((property, _)) = self.fields().find(|(_, p)| p.name == name || field_name(&p.name) == name) else {
-            let found = format!("there is no scalar field `{name}`");
-            return Err(Error::input(&self.path, found, format!("accepted: one of [{}]", self.field_names().join(", "))));
+            let found = format!("the cloud has no scalar field `{name}`");
+            return Err(Error::input(&self.path, found, format!("its scalar fields are [{}]", self.field_names().join(", "))));
         };
         self.in_single(property)
     }
@@ -265,15 +265,15 @@ impl PlyFile {
         match fault {
             Fault::CutShort => {
                 let found = format!("the header announces {count} rows of `{name}`, but the file ends in row {row}");
-                Error::input(&self.path, found, "use an undamaged copy: this one is cut short")
+                Error::input(&self.path, found, "the file is truncated: use an undamaged copy")
             }
             Fault::NoNumber { found, expected } => {
-                let found = format!("row {row} of `{name}` has `{found}` where {} is expected", expected.accepted());
+                let found = format!("row {row} of `{name}` has `{found}` where {} is expected", expected.expected());
                 Error::input(&self.path, found, "write the cloud again; rows are counted from 0")
             }
             Fault::Line(how) => {
-                let found = format!("the line of row {row} of `{name}` has {how} numbers than the header speaks of");
-                Error::input(&self.path, found, "each row is a line of its own; rows are counted from 0")
+                let found = format!("the line of row {row} of `{name}` has {how} numbers than the header announces");
+                Error::input(&self.path, found, "expected one line per row; rows are counted from 0")
             }
         }
     }

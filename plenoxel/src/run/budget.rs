@@ -1,8 +1,8 @@
-//! A plan of time: the lengths of the stages for training of a given duration, found once before the first step.
+//! Time budget: the lengths of the stages for training of a given duration, computed once before the first step.
 //!
-//! Steps that are thrown away, up to twenty seconds of them, say how fast this machine is. What stages cost against each other is taken from
-//! runs on lego of NeRF-synthetic at 800 x 800 (`benches/history`): it differs between scenes by a quarter or so, and so does the time that a
-//! run takes. The plan is in steps and part of the run's settings, so that they repeat the run bit by bit wherever it is run again.
+//! The speed of the machine is measured with up to twenty seconds of discarded steps. The relative cost of the stages is taken from runs on
+//! lego of NeRF-synthetic at 800 x 800 (`benches/history`). It varies between scenes by about a quarter, and so does the actual duration. The
+//! plan is a number of steps for each stage and is part of the settings of the run, which thus repeat the run bit by bit on any machine.
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
@@ -11,46 +11,52 @@ use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// The fog that a grid starts as clears: the k-th step of the first stage takes 1 + a ln(b / k) of what its steps take in the mean, and after
-/// some thousands so much of it. In 17 runs on lego 150 steps and more say 0.83 to 1.12 of what is true, 0.92 to 1.05 where the stage has 2000.
+/// Cost of the k-th step of the first stage relative to the mean step, 1 + a ln(b / k), and its lower bound after some thousand steps: the cost
+/// falls as the initial fog clears. Extrapolated from 150 steps or more in 17 runs on lego, it gave 0.83 to 1.12 of the true duration, and 0.92 to
+/// 1.05 for stages of 2000 steps.
 const CLEARING: (f64, f64) = (0.147, 780.0);
 const CLEARED: f64 = 0.8;
-/// A step at k times the resolution takes k to this power times as long, 128 to 448 voxels a side. In the mean it is the 0.73rd on a machine
-/// without AVX-512 and the 0.93rd on one with it, where memory is more of the whole: rather a little early than late.
+/// Exponent of the duration of a step as a function of the resolution, for 128 to 448 voxels per side. The measured mean is 0.73 on a machine
+/// without AVX-512 and 0.93 on one with it, where memory access dominates. The larger value makes runs end early rather than late.
 const GROWTH: f64 = 0.9;
-/// To begin a stage of 256 voxels a side takes as long as this many rays at 128, and more with the square of the resolution: the grid is
-/// resampled, and its voxels are looked at.
+/// Cost of the start of a stage at 256 voxels per side, as a number of training rays at 128. It grows with the square of the resolution: the grid
+/// is resampled and pruned.
 const RAYS_TO_BEGIN: f64 = 2.2e6;
-/// The share of it where the resolution stays: voxels are looked at only.
+/// Share of that cost if the resolution does not change: the grid is pruned only.
 const ONLY_LOOKED_AT: f64 = 0.5;
-/// The share of the time that goes into finding out how fast the machine is, and the seconds that are enough; a few steps it always takes.
-/// With 3 seconds two plans for eleven minutes, made half an hour apart, differed by half in steps that then took equally long.
+/// Duration of the speed measurement: its share of the planned time, and its maximum in seconds. It takes at least a few steps. With 3 seconds,
+/// two plans for eleven minutes, made half an hour apart, differed by half in their number of steps.
 const CALIBRATION: (f64, f64) = (0.03, 20.0);
-/// Stages of less than this share of their steps are coarser, by so much: then more rays and a sooner begin are worth more than voxels. On lego
-/// `fast` has in 29 seconds at 256 voxels a side, these few steps included, what it has at 320 in 30 without them.
+/// Share of the configured steps below which the finest stages become coarser, and the factor of their resolution: in short runs, more steps
+/// improve the result more than more voxels. On lego, `fast` reaches in 29 seconds at 256 voxels per side, measurement included, the PSNR that
+/// it reaches at 320 in 30 seconds without the measurement.
 const COARSER: (f64, f64) = (0.6, 0.8);
 
-/// How fast the machine is, and what is gone by now.
+/// Measured speed of the machine, and the time used so far.
 struct Speed {
-    /// Voxels a side of the grid that was measured.
+    /// Voxels per side of the measured grid.
     resolution: usize,
-    /// Seconds for a step of the first stage, in the mean.
+    /// Mean duration of a step of the first stage, in seconds.
     step: f64,
-    /// Seconds before the first step: what can be known beforehand is.
+    /// Seconds before the first step.
     begin: f64,
-    /// Seconds it took to find out.
+    /// Duration of the measurement, in seconds.
     spent: f64,
 }
 
-/// Settings whose stages are as long as fits into `seconds` of training on this machine, the time of this measurement included. All that is
-/// counted in steps is scaled: stages, warm-ups, schedules of losses. Where the time is short, the finest stages are coarser.
+/// Scales the stages so that training takes `seconds` on this machine, including the measurement made here. Everything counted in steps is
+/// scaled: stages, warm-ups and loss schedules. If the time is short, the finest stages also become coarser.
 ///
-/// The result depends on the speed of the machine. It is in steps, so that a run with it repeats to the bit.
+/// The result depends on the speed of the machine. It is a number of steps, so a run with these settings repeats bit by bit.
 ///
-/// Errors: the run starts from another; the time is too short for the stages; and those of [`Trainer::step`].
+/// Errors: the run starts from another run; the time is too short for the stages; those of [`Trainer::step`].
 pub fn on_time(config: Config, views: &Arc<[View]>, seconds: f64) -> Result<Config> {
     if config.init_from.is_some() {
-        return Err(Error::config("--time", "a run that starts from another", "--time without --init-from, or stages with steps"));
+        return Err(Error::usage(
+            "--time",
+            "a run that starts from another run cannot be planned by time",
+            "leave out --time or --init-from",
+        ));
     }
     let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
@@ -59,7 +65,7 @@ pub fn on_time(config: Config, views: &Arc<[View]>, seconds: f64) -> Result<Conf
     planned(config, &steps, seconds, &speed)
 }
 
-/// The plan for a machine of this speed; `steps` are of the stages as they were asked for.
+/// The plan for a machine of this speed; `steps` are the configured numbers of steps.
 fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result<Config> {
     let factor = |config: &Config| factor(&config.stages, steps, config.rays_per_step, seconds, speed);
     let (config, factor) = match factor(&config) {
@@ -87,12 +93,12 @@ fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result
     Ok(Config { stages, losses: losses.collect(), ..config })
 }
 
-/// `asked` with all that a plan of time changes taken from `found`: lengths of stages, their resolutions with the rates of the density, image
-/// reductions, and weights of losses. It equals `found` if `found` is a plan for `asked`.
+/// Returns `asked` with everything that a time budget changes taken from `found`: lengths of stages, resolutions with density rates, image
+/// reductions and loss weights. The result equals `found` if `found` is a plan for `asked`.
 pub fn planned_like(asked: Config, found: &Config) -> Config {
     let like = |(asked, found): (Stage, &Stage)| {
         let planned = asked.at_most(found.resolution);
-        // It may have been brought there in two strides.
+        // It may have been scaled twice, with rounding.
         let same = (planned.density_rate / found.density_rate - 1.0).abs() < 1e-9;
         Stage {
             steps: found.steps,
@@ -111,18 +117,18 @@ pub fn planned_like(asked: Config, found: &Config) -> Config {
         (Some(asked), Some(found)) => Some(Scout { stages: stages(asked.stages, &found.stages), ..asked }),
         (asked, _) => asked,
     };
-    // Weights may change after a number of steps.
+    // Schedules of weights are counted in steps.
     Config { stages: stages(asked.stages, &found.stages), scout, losses: found.losses.clone(), ..asked }
 }
 
-/// The same with the finest stages a share of what they are.
+/// Reduces the resolution of the finest stages.
 fn coarser(config: Config) -> Config {
     let finest = config.stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
     let stages = config.stages.iter().map(|stage| stage.at_most((COARSER.1 * finest as f64) as usize)).collect();
     Config { stages, ..config }
 }
 
-/// Takes steps like those of the first stage, for a share of the `seconds` that are planned.
+/// Measures the speed with steps of the first stage, for a share of the planned `seconds`.
 fn measure(config: &Config, views: &Arc<[View]>, seconds: f64) -> Result<Speed> {
     let start = Instant::now();
     let endless = Stage { steps: Some(1 << 20), epochs: None, ..config.stages[0] };
@@ -137,8 +143,8 @@ fn measure(config: &Config, views: &Arc<[View]>, seconds: f64) -> Result<Speed> 
     })
 }
 
-/// The speed of a machine that took `begin` seconds before the first step of a stage, and takes as many for each next one as `step` says, which is
-/// asked for a share of the `seconds` that are planned.
+/// Measures the speed of a machine that took `begin` seconds before the first step. `step` takes a step and returns its duration; it is called for a
+/// share of the planned `seconds`.
 fn speed(resolution: usize, begin: f64, seconds: f64, mut step: impl FnMut() -> Result<f64>) -> Result<Speed> {
     let enough = (CALIBRATION.0 * seconds).min(CALIBRATION.1);
     let (mut count, mut steps, mut taken) = (0, 0.0, 0.0);
@@ -150,20 +156,20 @@ fn speed(resolution: usize, begin: f64, seconds: f64, mut step: impl FnMut() -> 
     Ok(Speed { resolution, step: taken / steps, begin, spent: begin + taken })
 }
 
-/// Expected seconds of a step at a resolution, in units of one at a single voxel.
+/// Expected duration of a step at a resolution, relative to a grid of a single voxel.
 pub fn step_cost(resolution: usize) -> f64 {
     (resolution as f64).powf(GROWTH)
 }
 
-/// How many steps of the mean the k-th of the first stage is.
+/// Cost of the k-th step of the first stage, relative to the mean step.
 fn in_fog(k: u32) -> f64 {
     let (slope, usual) = CLEARING;
     (1.0 + slope * (usual / f64::from(k)).ln()).max(CLEARED)
 }
 
-/// By how much all stages have to be longer for the time to be full.
+/// Factor for the lengths of all stages with which training takes the planned time.
 fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed) -> Result<f64> {
-    // Seconds for a step at a resolution.
+    // Duration of a step at a resolution, in seconds.
     let step = |resolution: usize| speed.step * step_cost(resolution) / step_cost(speed.resolution);
     let begin = |stages: &[Stage]| {
         let share = if stages[0].resolution == stages[1].resolution { ONLY_LOOKED_AT } else { 1.0 };
@@ -171,15 +177,14 @@ fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, s
     };
     let fixed = speed.spent + speed.begin + stages.windows(2).map(begin).sum::<f64>();
     let cost = stages.iter().zip(steps).map(|(stage, &steps)| steps as f64 * step(stage.resolution)).sum::<f64>();
-    // With fewer steps a stage does not get to where the next one can begin.
+    // With fewer steps, a stage does not converge enough for the next one.
     const LEAST: f64 = 0.1;
     if seconds < fixed + LEAST * cost {
-        // Ten seconds more or less are what a machine with neighbours may differ by.
+        // Rounded up to ten seconds: durations vary by that much on a shared machine.
         let least = 10.0 * ((fixed + LEAST * cost) / 10.0).ceil();
         let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
-        let coarser = if finest > 64 { "; or coarser ones, as in --set stages[*].resolution=64" } else { "" };
-        let accepted = format!("{least}s or more, which these stages need here{coarser}");
-        return Err(Error::config("--time", format!("{seconds}s"), accepted));
+        let coarser = if finest > 64 { ", or coarser stages such as --set stages[*].resolution=64" } else { "" };
+        return Err(Error::usage("--time", format!("{seconds}s is too short for these stages"), format!("use {least}s or more{coarser}")));
     }
     Ok((seconds - fixed) / cost)
 }

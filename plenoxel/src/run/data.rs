@@ -1,4 +1,4 @@
-//! Where views come from: a folder, or the built-in scene; written down in a run so that it can be evaluated later.
+//! The source of the views of a run: a dataset folder or the built-in scene. A run records it so that it can be evaluated later.
 
 use crate::camera::placement::Placement;
 use crate::dataset::procedural::ProceduralOptions;
@@ -10,13 +10,13 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-/// Where views come from.
+/// Source of views.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "kind")]
 pub enum DataSource {
-    /// A folder on disk.
+    /// A dataset folder.
     Folder {
-        /// Absolute, so that a run can be evaluated from anywhere.
+        /// Absolute path, so that the run can be evaluated from any directory.
         path: PathBuf,
     },
     /// The procedural scene.
@@ -46,9 +46,9 @@ impl fmt::Display for DataSource {
 }
 
 impl DataSource {
-    /// A folder as given on the command line.
+    /// A dataset folder given on the command line.
     pub fn folder(path: &Path) -> Self {
-        // A folder that does not exist keeps its name for the error that opening it will give.
+        // A folder that does not exist keeps its name, for the error when it is opened.
         let absolute = path.canonicalize().or_else(|_| std::path::absolute(path));
         DataSource::Folder { path: absolute.unwrap_or_else(|_| path.to_owned()) }
     }
@@ -61,7 +61,7 @@ impl DataSource {
         }
     }
 
-    /// The folder, or without one the built-in scene as it is by default.
+    /// The dataset folder, or the built-in scene with its defaults if `None`.
     pub fn of(folder: Option<&Path>) -> Self {
         folder.map_or_else(|| DataSource::built_in(&ProceduralOptions::default()), DataSource::folder)
     }
@@ -71,12 +71,12 @@ impl DataSource {
         DataSource::BuiltIn { width: options.width, height: options.height, train: options.train, val: options.val, test: options.test }
     }
 
-    /// The arguments that name it on a command line, each with a space before.
+    /// The command-line arguments for this source, each preceded by a space.
     pub fn arguments(&self) -> String {
         let plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c);
         match self {
             DataSource::Folder { path } if path.to_str().is_some_and(|path| path.chars().all(plain)) => format!(" {}", path.display()),
-            // Quoted, and nothing in it that a remark in a file may not hold.
+            // Quoted and escaped, so that it fits into a comment of a file.
             DataSource::Folder { path } => format!(" {path:?}"),
             built_in if *built_in == DataSource::of(None) => String::new(),
             DataSource::BuiltIn { width, height, train, val, test } => {
@@ -85,9 +85,9 @@ impl DataSource {
         }
     }
 
-    /// What is likely to go wrong with training views whose cameras stand and look like these, as sentences for people.
+    /// Checks the poses of the training cameras against the box `aabb`, in world coordinates. Returns warnings as sentences.
     ///
-    /// Errors: nothing can be learned from them in this box, world coordinates.
+    /// Errors: nothing can be learned from these cameras in this box.
     pub fn check_cameras(&self, dataset: &Dataset, aabb: Aabb) -> Result<Vec<String>> {
         let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), aabb);
         match hopeless {
@@ -96,15 +96,15 @@ impl DataSource {
         }
     }
 
-    /// Opens the views with the reduction and the validation split of a configuration. The built-in scene is rendered at the reduced
-    /// size right away.
+    /// Opens the dataset with the image reduction and the validation split of a configuration. The built-in scene is rendered directly at the
+    /// reduced size.
     pub fn open(&self, config: &Config) -> Result<Dataset> {
         let downscale = config.downscale;
         match self {
             DataSource::Folder { path } => {
                 if path.to_str().is_none() {
-                    let found = "the name of this folder is not UTF-8, so that a run could not record it";
-                    return Err(Error::input(path, found, "rename it, or give a link to it whose name is"));
+                    let found = "the name of this folder is not UTF-8, so a run cannot record it";
+                    return Err(Error::input(path, found, "rename it, or use a symbolic link with a UTF-8 name"));
                 }
                 let validation_every = match config.validation_every {
                     0 => None,
@@ -127,11 +127,11 @@ impl DataSource {
         }
     }
 
-    /// Opens the views a run remembers; a folder that has gone is reported with the flag that says where it is now.
+    /// Opens the dataset that a run recorded. If the folder no longer exists, the error names the flag for its new path.
     pub fn reopen(&self, config: &Config) -> Result<Dataset> {
         match self {
             DataSource::Folder { path } if !path.exists() => {
-                Err(Error::input(path, "the dataset this run learned from is not there any more", "say where it is now with --data DIR"))
+                Err(Error::input(path, "the dataset of this run no longer exists", "give its new path with --data DIR"))
             }
             _ => self.open(config),
         }

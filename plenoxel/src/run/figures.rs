@@ -1,4 +1,4 @@
-//! Final figures of a run against the views of a split, with the resolution, the background and the definitions they depend on.
+//! Mean scores of a run on the views of a split, with the resolution, the background and the definitions on which they depend.
 
 use crate::dataset::{Dataset, Split};
 use crate::evaluate::Scores;
@@ -7,7 +7,7 @@ use crate::train::{Model, ViewOptions};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-/// Mean scores over the views of a split, the images and the model they are of, and their definitions.
+/// Mean scores over the views of a split, with facts about the images and the model, and the definition of each score.
 #[derive(Debug, Serialize)]
 pub struct Figures {
     psnr: Option<f64>,
@@ -24,7 +24,7 @@ pub struct Figures {
     width: usize,
     height: usize,
     background: [f32; 3],
-    /// Facts about the model, among them how it is sampled.
+    /// Facts about the model, including its sampling.
     #[serde(flatten)]
     model: Map<String, Value>,
     image: ImageFacts,
@@ -55,7 +55,7 @@ struct Counts {
     test: usize,
 }
 
-/// Definitions of the figures, for readers of the file.
+/// Definitions of the scores, for readers of the file.
 #[derive(Debug, Serialize)]
 struct Definitions {
     prediction: &'static str,
@@ -69,21 +69,21 @@ struct Definitions {
 }
 
 const LPIPS: NotComputed =
-    NotComputed { computed: false, why: "it takes the weights of a trained network, which this program does not have" };
+    NotComputed { computed: false, why: "it needs the weights of a trained network, which this program does not have" };
 
 const DEFINITIONS: Definitions = Definitions {
     prediction: "one ray through each pixel's centre, clamped to [0, 1], not rounded to 8 bits",
-    target: "the 8-bit image with its alpha, composited over the background in floats, not rounded again",
+    target: "the 8-bit image, composited over the background with its alpha in floats, not rounded again",
     color_space: "sRGB values as stored, not linearized",
     mse: "mean of the squared error over the pixels and the three channels of a view",
-    psnr: "dB; -10 log10(mse) of each view, then the mean over views",
-    psnr_of_mean_mse: "dB; -10 log10 of the mean of the views' mse, as instant-ngp reports it",
+    psnr: "dB; -10 log10(mse) of each view, averaged over views",
+    psnr_of_mean_mse: "dB; -10 log10 of the mse averaged over views, as instant-ngp reports it",
     ssim: "Gaussian window of 11 x 11 pixels, sigma 1.5, k1 0.01, k2 0.03, of each channel; mean over the windows inside the image (valid), channels and views",
-    ssim_same: "the same with a window at each pixel and zeros around the image (same), as svox2",
+    ssim_same: "ssim with a window at each pixel and zero padding (same), as in svox2",
 };
 
 impl Figures {
-    /// The figures of a model against the views of a split, rendered like `view`.
+    /// The scores of a model on the views of a split, rendered with the options `view`.
     pub fn new(scores: &Scores, split: Split, dataset: &Dataset, config: &Config, model: &dyn Model<f32>, view: &ViewOptions) -> Self {
         let (width, height) = dataset.size();
         let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
@@ -106,18 +106,18 @@ impl Figures {
         }
     }
 
-    /// The figures as one sentence.
+    /// The scores in one sentence.
     pub fn sentence(&self) -> String {
         let Figures { psnr, ssim, split, views, of, width, height, .. } = self;
         let Some(psnr) = psnr else {
             return match of {
-                0 => format!("no {split} views to evaluate on"),
-                _ => format!("not compared with the {of} {split} views"),
+                0 => format!("not evaluated: there are no {split} views"),
+                _ => format!("not evaluated on the {of} {split} views"),
             };
         };
         let ssim = ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));
-        let some = if views < of { format!(", evenly spaced among {of}") } else { String::new() };
-        let views = if *views == 1 { format!("of 1 {split} view") } else { format!("means over {views} {split} views") };
+        let some = if views < of { format!(", evenly spaced among all {of}") } else { String::new() };
+        let views = if *views == 1 { format!("on 1 {split} view") } else { format!("means over {views} {split} views") };
         format!("PSNR {psnr:.2} dB{ssim}: {views} of {width} x {height}{some}")
     }
 }

@@ -1,4 +1,4 @@
-//! The folder of a run: the name of each file in it, and when one may be overwritten.
+//! The run folder: the names of its files, its lock, and the rules for overwriting it.
 
 mod listing;
 mod record;
@@ -21,9 +21,9 @@ use std::sync::Arc;
 #[derive(Debug, Clone)]
 pub struct RunFolder {
     path: PathBuf,
-    /// File name of the model that is read and written: the last or the best.
+    /// File name of the model: the last or the best.
     grid: &'static str,
-    /// Held while the folder is written.
+    /// Lock held while the folder is written.
     lock: Option<Arc<FolderLock>>,
 }
 
@@ -42,14 +42,14 @@ const REPORT: &str = "report.html";
 const IMAGES: &str = "images";
 const RENDERS: &str = "renders";
 const EXPORTS: &str = "exports";
-/// Files of a run, in the order in which they are removed: an interruption loses the least valuable ones. The record is the last, because it marks the folder of a run.
+/// The files of a run in the order of their removal, the least important first. The record is the last, because it marks the folder as a run.
 const FILES: [&str; 11] = [README, LOSS, REPORT, METRICS, EVALUATION, RESULT, STATE, BEST, CHECKPOINT, CONFIG, RECORD];
-/// Content of figures that is kept: all of it. The figures of the run and of an evaluation are in memory at the same time.
+/// All content of figure files is kept. The figures of the run and of an evaluation are in memory at the same time.
 const FIGURES: json::Kept = json::Kept { keys: |_| true, entries: usize::MAX, share: 45 };
-/// Endings of what `export` writes.
+/// File extensions of `plenoxel export`.
 const EXPORTED: [&str; 5] = ["vox", "ply", "obj", "glb", "stl"];
 
-/// The place of a run folder that will be created.
+/// A run folder to be created.
 #[derive(Debug)]
 pub struct NewFolder {
     /// `None` for `runs/<scene>-<n>` with the first free n.
@@ -59,14 +59,17 @@ pub struct NewFolder {
 }
 
 impl NewFolder {
-    /// The place for a new run: `out`, or `runs/<scene>-<n>` with the first n that is free when the folder is created. Nothing is written yet.
+    /// Chooses the folder of a new run: `out`, or `runs/<scene>-<n>` with the first n that is free at [`create`](Self::create). Writes nothing.
     ///
-    /// Errors: `out` is a file; it is not empty and `overwrite` is false; it is not empty and not the folder of a run; another process is writing it.
+    /// Errors: `out` is a file; it is not empty and `overwrite` is false; it is not empty and not a run folder; another process is writing to it.
     pub fn choose(out: Option<&Path>, scene: &str, overwrite: bool) -> Result<Self> {
         if let Some(path) = out {
             if let Some(file) = path.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir()) {
-                let found = format!("{} cannot be a folder, because {} is a file", path.display(), file.display());
-                return Err(Error::config("--out", found, "a folder"));
+                let found = match file == path {
+                    true => format!("{} is a file", path.display()),
+                    false => format!("{} cannot be a folder, because {} is a file", path.display(), file.display()),
+                };
+                return Err(Error::usage("--out", found, "choose a folder"));
             }
             FolderLock::share(path, LOCK, "--out")?;
             check_vacant(path, overwrite)?;
@@ -74,15 +77,15 @@ impl NewFolder {
         Ok(NewFolder { path: out.map(Path::to_owned), scene: scene.to_owned(), overwrite })
     }
 
-    /// Bytes of the files that are overwritten: the model and the state of the run that is there.
+    /// Returns the size of the files that will be overwritten, in bytes: the model and the state of the existing run.
     pub fn overwritten(&self) -> u64 {
         let size = |name: &str| self.path.as_ref().and_then(|path| path.join(name).metadata().ok()).map_or(0, |file| file.len());
         if self.overwrite { [CHECKPOINT, BEST, STATE].map(size).iter().sum() } else { 0 }
     }
 
-    /// Creates the folder and locks it, and removes the files of a run that is overwritten. Files of other kinds stay.
+    /// Creates the folder, locks it, and removes the files of a run that is overwritten. Other files are kept.
     ///
-    /// Errors: those of [`choose`](Self::choose), which may have become true since; the folder cannot be written.
+    /// Errors: those of [`choose`](Self::choose), checked again; the folder cannot be written.
     pub fn create(self) -> Result<RunFolder> {
         let Some(path) = self.path else { return RunFolder::at(&reserve(Path::new("runs"), &self.scene)?).locked("--out") };
         files::create_dir(&path)?;
@@ -93,44 +96,45 @@ impl NewFolder {
     }
 }
 
-/// Refuses a folder that may not be written: one with files, unless it is that of a run which is overwritten.
+/// Checks that a folder may be written: it is empty, or it is a run folder to be overwritten.
 fn check_vacant(path: &Path, overwrite: bool) -> Result<()> {
     let folder = RunFolder::at(path);
     let occupied = !folder.is_empty();
     if occupied && !overwrite && !folder.has_saved_nothing() {
         let found = format!("{} is not empty", path.display());
-        return Err(Error::config("--out", found, "a new folder; or --force, which overwrites the run in it"));
+        return Err(Error::usage("--out", found, "choose a new folder, or overwrite the run in it with --force"));
     }
     if occupied && !path.join(RECORD).exists() {
-        let found = format!("{} is not empty, and not the folder of a run", path.display());
-        return Err(Error::config("--out", found, "a new folder, or that of a run, which --force overwrites"));
+        let found = format!("{} is not empty and not a run folder", path.display());
+        return Err(Error::usage("--out", found, "choose a new folder, or a run folder to overwrite with --force"));
     }
-    // Found out before the first file is removed.
+    // Checked before any file is removed.
     match FILES.iter().find(|name| path.join(name).is_dir()) {
         Some(name) => {
-            let found = format!("{name} in {} is a folder", path.display());
-            Err(Error::config("--out", found, "the folder of a run; or a new one"))
+            let found = format!("{} is not a run folder: its {name} is a folder", path.display());
+            Err(Error::usage("--out", found, "choose a run folder or a new folder"))
         }
         None => Ok(()),
     }
 }
 
 impl RunFolder {
-    /// The run folder at a path; nothing is read, and nothing needs to be there.
+    /// The run folder at a path. Reads nothing; the folder need not exist.
     pub fn at(path: &Path) -> Self {
         RunFolder { path: path.to_owned(), grid: CHECKPOINT, lock: None }
     }
 
-    /// Locks the folder: no other process trains or carves into it before this value and its clones are dropped. `key` is the flag or argument that names the
-    /// folder, for messages.
+    /// Locks the folder exclusively: no other process trains or carves into it until this value and its clones are dropped. `key` is the flag or
+    /// argument that names the folder, for messages.
     ///
-    /// Errors: another process is writing it.
+    /// Errors: another process is writing to it.
     pub fn locked(self, key: &str) -> Result<Self> {
         let lock = FolderLock::acquire(&self.path, LOCK, key)?;
         Ok(RunFolder { lock: Some(Arc::new(lock)), ..self })
     }
 
-    /// Shares the folder with others that add to a finished run: no process trains or carves into it before this value and its clones are dropped.
+    /// Locks the folder for adding files to a finished run, shared with other such processes: no process trains or carves into it until this value and
+    /// its clones are dropped.
     ///
     /// Errors: another process is training or carving into it.
     pub fn shared(self, key: &str) -> Result<Self> {
@@ -138,7 +142,7 @@ impl RunFolder {
         Ok(RunFolder { lock: lock.map(Arc::new), ..self })
     }
 
-    /// Checks that the folder is still the one that was locked: another of its name is not written.
+    /// Checks that the folder is still the locked one, so that another folder of the same name is not written.
     ///
     /// Errors: it was moved, deleted or replaced.
     pub fn check_identity(&self) -> Result<()> {
@@ -149,18 +153,18 @@ impl RunFolder {
         Err(Error::io(&self.path, found, "the run was writing it"))
     }
 
-    /// True if there is nothing in the folder but a lock and temporary files, or no such folder.
+    /// True if the folder does not exist, or contains only a lock and temporary files.
     pub fn is_empty(&self) -> bool {
         entries(&self.path).all(|path| path.ends_with(LOCK) || is_fragment(&path))
     }
 
-    /// True for a run that ended before its first step, of which nothing is lost if it is overwritten.
+    /// True for a run that ended before its first step and can be overwritten without loss.
     fn has_saved_nothing(&self) -> bool {
         let is_empty = |name: &str| self.path.join(name).metadata().map_or(true, |file| file.len() == 0);
         self.path.join(RECORD).exists() && [CHECKPOINT, BEST, STATE, RESULT, METRICS].into_iter().all(is_empty)
     }
 
-    /// True for a file that is one of the run's own: its settings, figures, metrics, models or pictures.
+    /// True for a file that belongs to the run: its settings, figures, metrics, models or pictures.
     pub fn owns(&self, file: &Path) -> bool {
         let (Ok(file), Ok(folder)) = (file.canonicalize(), self.path.canonicalize()) else { return false };
         let own = FILES.iter().any(|name| file == folder.join(name));
@@ -172,7 +176,7 @@ impl RunFolder {
         self.remove_fragments()?;
         let paths = FILES.map(|name| self.path.join(name)).into_iter().filter(|path| files::is_there(path));
         for path in paths.chain(tensorboard::present(&self.path)) {
-            std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it"))?;
+            std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing the file"))?;
         }
         let clear = |folder: &Path, endings| remove(entries(folder).filter(|path| path.is_file() && is_one_of(path, endings)));
         clear(&self.path.join(IMAGES), &["png"])?;
@@ -181,7 +185,7 @@ impl RunFolder {
             clear(&made.of_grid(EXPORTS), &EXPORTED)?;
             let renders = made.of_grid(RENDERS);
             clear(&renders, &RENDERED)?;
-            // Films have folders of their own, for their frames.
+            // Each camera path has a folder with its frames.
             for film in entries(&renders).filter(|path| path.is_dir() && !path.is_symlink()) {
                 remove(entries(&film).filter(|path| is_frame(path)))?;
             }
@@ -189,15 +193,15 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Writes `config.toml`, `run.json` and `README.md`, which are known before the first step.
+    /// Writes `config.toml`, `run.json` and `README.md`, before the first step.
     pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
         let about = match record.is_of_own_model() {
             false => {
                 let again = format!("plenoxel {}{} --config THIS_FILE", record.kind.command(), record.data.arguments());
-                format!("Settings of a run of {}. The same run again:\n{again}", record.program)
+                format!("Settings of a run of {}. This command repeats the run:\n{again}", record.program)
             }
             true => format!(
-                "Settings of a run of a model of kind `{}`, on {}. The program that made it may not use all of them.",
+                "Settings of a run with a model of kind `{}`, on {}. The program that created it may not use all of them.",
                 record.model, record.data
             ),
         };
@@ -206,22 +210,22 @@ impl RunFolder {
         files::write_atomically(&self.path.join(README), EXPLANATION.as_bytes())
     }
 
-    /// Opens the folder of a run for reading.
+    /// Opens a run folder for reading.
     ///
-    /// Errors: it is not the folder of a run.
+    /// Errors: it is not a run folder.
     pub fn open(path: &Path) -> Result<(Self, Config, RunRecord)> {
-        let remedy = "give the folder that `plenoxel train` or `plenoxel carve` wrote";
+        let remedy = "give a run folder written by `plenoxel train` or `plenoxel carve`";
         if !path.exists() {
-            return Err(Error::input(path, "there is no such run", remedy));
+            return Err(Error::input(path, "this run folder does not exist", remedy));
         }
         if !path.is_dir() {
-            let found = "this is a file, not the folder of a run";
+            let found = "this is a file, not a run folder";
             return Err(Error::input(path, found, remedy));
         }
         let folder = Self::at(path);
         let record = path.join(RECORD);
         if !files::is_there(&record) {
-            return Err(Error::input(path, format!("there is no {RECORD} in this folder"), remedy));
+            return Err(Error::input(path, format!("this is not a run folder: it has no {RECORD}"), remedy));
         }
         let mut record = RunRecord::parse(&record, &files::read(&record, files::RUN)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
@@ -231,21 +235,20 @@ impl RunFolder {
         Ok((folder, config, record))
     }
 
-    /// The same folder with the best grid, by validation PSNR, in place of the last.
+    /// Selects the best grid, by validation PSNR, instead of the last.
     ///
-    /// Errors: there is no best grid besides the last.
+    /// Errors: there is no separate best grid.
     pub fn with_best(self) -> Result<Self> {
         let best = RunFolder { grid: BEST, ..self };
         if !files::is_there(&best.checkpoint()) {
-            let found = format!("there is no {BEST} in this folder");
-            let remedy =
-                "leave --best away: the last grid was the best, or nothing was saved before it, or there were no validation views to tell";
+            let found = format!("this run folder has no {BEST}");
+            let remedy = "leave out --best: the last grid was the best, there was no earlier checkpoint, or there are no validation views";
             return Err(Error::input(&best.path, found, remedy));
         }
         Ok(best)
     }
 
-    /// The step after which the best grid so far was written, if there is one.
+    /// Returns the step after which the best grid was written, if there is one.
     pub fn best_step(&self) -> Option<u64> {
         train::about(&self.path.join(BEST)).ok().map(|about| about.step)
     }
@@ -255,7 +258,7 @@ impl RunFolder {
         model.save(&self.path.join(BEST), about)
     }
 
-    /// Removes the best grid, when the last is as good.
+    /// Removes the best grid.
     pub fn remove_best(&self) -> Result<()> {
         remove([self.path.join(BEST)].into_iter().filter(|path| path.exists()))
     }
@@ -268,33 +271,33 @@ impl RunFolder {
         model.save(&self.checkpoint(), about)
     }
 
-    /// Path of the trained model, which is there.
+    /// Returns the path of the existing trained model.
     ///
-    /// Errors: there is none, because the run did not end well.
+    /// Errors: there is none, because the run did not finish.
     pub fn existing_checkpoint(&self) -> Result<PathBuf> {
         let path = self.checkpoint();
         if !files::is_there(&path) {
-            let found = format!("there is no {CHECKPOINT} in this folder: the run did not end");
-            let best = if self.path.join(BEST).exists() { "; or --best, for the best grid that was saved" } else { "" };
+            let found = format!("the run is not finished: it has no {CHECKPOINT}");
+            let best = if self.path.join(BEST).exists() { ", or use the best grid so far with --best" } else { "" };
             return Err(Error::input(
                 &self.path,
                 found,
-                format!("resume it (`plenoxel train --resume`, if that began it), or train again{best}"),
+                format!("resume it (`plenoxel train --resume`, if `plenoxel train` started it), or train again{best}"),
             ));
         }
         Ok(path)
     }
 
-    /// The file from which training resumes; `None` if training has ended and only the final figures are missing.
+    /// Returns the path of the state from which training resumes; `None` if training has ended and only the final figures are missing.
     ///
-    /// Errors: there is none, because the run has ended or has saved nothing yet.
+    /// Errors: there is none, because the run is finished or has no checkpoint yet.
     pub fn existing_state(&self) -> Result<Option<PathBuf>> {
         let path = self.state();
         let (found, remedy) = match (files::is_there(&path), files::is_there(&self.checkpoint())) {
             (true, _) => return Ok(Some(path)),
             (false, true) if self.result()?.is_none() => return Ok(None),
-            (false, true) => ("this run has ended", "to train its grid further, use `--init-from`"),
-            (false, false) => ("this run left nothing from which to go on", "train again with its config.toml"),
+            (false, true) => ("this run is finished", "to train its grid further, use --init-from"),
+            (false, false) => ("this run ended before its first checkpoint", "train again with its config.toml"),
         };
         Err(Error::input(&self.path, found, remedy))
     }
@@ -304,7 +307,7 @@ impl RunFolder {
         remove([self.state()].into_iter().filter(|path| path.exists()))
     }
 
-    /// Removes temporary files of processes that were killed.
+    /// Removes temporary files of killed processes.
     pub fn remove_fragments(&self) -> Result<()> {
         [&self.path, &self.path.join(IMAGES)].into_iter().try_for_each(|folder| remove(entries(folder).filter(|path| is_abandoned(path))))
     }
@@ -315,32 +318,33 @@ impl RunFolder {
         self.write_json(RESULT, result)
     }
 
-    /// Reads the final figures, if there are any. Damaged ones count as none: resuming the run writes them again.
+    /// Reads the final figures, if there are any. Invalid JSON counts as none: resuming the run writes it again.
     ///
-    /// Errors: the file is there and cannot be read.
+    /// Errors: the file exists but cannot be read.
     pub fn result(&self) -> Result<Option<serde_json::Value>> {
         self.read_json(RESULT)
     }
 
-    /// Writes the figures of an evaluation, of a run whose final figures are without test views.
+    /// Writes the scores of `plenoxel evaluate`, for a run whose final figures have none.
     pub fn write_evaluation(&self, figures: &impl Serialize) -> Result<()> {
         self.write_json(EVALUATION, figures)
     }
 
-    /// Reads the figures of an evaluation, if they were written.
+    /// Reads the scores of `plenoxel evaluate`, if they were written.
     ///
-    /// Errors as for [`RunFolder::result`].
+    /// Errors: those of [`RunFolder::result`].
     pub fn evaluation(&self) -> Result<Option<serde_json::Value>> {
         self.read_json(EVALUATION)
     }
 
-    /// The final figures, with those of an evaluation where the final ones are without test views: of a carved run, or of one trained without evaluation.
+    /// Reads the final figures, completed with those of `plenoxel evaluate` if they have no test scores: for a carved run, or one trained with
+    /// `--no-evaluate`.
     ///
-    /// Errors as for [`RunFolder::result`].
+    /// Errors: those of [`RunFolder::result`].
     pub fn figures(&self) -> Result<Option<serde_json::Value>> {
         let Some(mut all) = self.result()? else { return Ok(None) };
         if let (Some(all), Some(serde_json::Value::Object(evaluation))) = (all.as_object_mut(), self.evaluation()?) {
-            // What training or carving took stays; a run of `--no-evaluate` has the keys of figures without values.
+            // The costs of training or carving are kept. A run with `--no-evaluate` has the keys of the scores without values.
             const OF_THE_RUN: [&str; 2] = ["seconds_load", "peak_memory_bytes"];
             let replaced = |key: &str| !all.get("psnr").is_some_and(serde_json::Value::is_number) && !OF_THE_RUN.contains(&key);
             let (replaced, added): (Vec<_>, Vec<_>) = evaluation.into_iter().partition(|(key, _)| replaced(key));
@@ -416,7 +420,7 @@ impl RunFolder {
         images
     }
 
-    /// Path of a picture that is rendered of the grid after the run.
+    /// Path of a picture rendered by `plenoxel render`.
     pub fn render(&self, name: &str) -> PathBuf {
         self.of_grid(RENDERS).join(name)
     }
@@ -426,8 +430,8 @@ impl RunFolder {
         format!("test_{number:03}_{view}.png")
     }
 
-    /// File name of the picture of a view at the end of a stage, which is counted from 1; number 0 is the view before the first step. The resolution
-    /// is that of the grid, if the model has one.
+    /// File name of the picture at the end of stage `number`, counted from 1; 0 is the picture before the first step. `resolution` is that of the
+    /// grid, if the model has one.
     pub fn stage_name(number: usize, resolution: Option<usize>) -> String {
         let resolution = resolution.map_or(String::new(), |n| format!("_{n}"));
         format!("stage_{number}{resolution}.png")
@@ -438,20 +442,20 @@ impl RunFolder {
         files::create_dir(&self.path.join(IMAGES))
     }
 
-    /// Path of a folder for files made of the grid; those of the best grid have a folder of their own.
+    /// Path of a folder for renders or exports; those of the best grid have a separate folder.
     fn of_grid(&self, name: &str) -> PathBuf {
         if self.grid == BEST { self.path.join(format!("{name}-best")) } else { self.path.join(name) }
     }
 
-    /// Creates the folder of pictures that are rendered after the run, and returns its path.
+    /// Creates the folder for the pictures of `plenoxel render` and returns its path.
     pub fn create_renders(&self) -> Result<PathBuf> {
         let path = self.of_grid(RENDERS);
         files::create_dir(&path)?;
         Ok(path)
     }
 
-    /// Creates the folder of the frames of a film, and returns its path. Frames of an earlier film of this name are removed, and its GIF and MP4,
-    /// whose names are the film's with one of `suffixes`.
+    /// Creates the folder for the frames of a camera path and returns its path. Removes earlier frames of the same name, and the GIF and MP4 files,
+    /// whose names are that of the path with one of `suffixes`.
     pub fn create_film(&self, name: &str, suffixes: &[&str]) -> Result<PathBuf> {
         let renders = self.create_renders()?;
         let path = renders.join(name);
@@ -462,7 +466,7 @@ impl RunFolder {
         Ok(path)
     }
 
-    /// Creates the folder of exports, and returns the path of a file in it.
+    /// Creates the folder for exports and returns the path of a file in it.
     pub fn create_export(&self, name: &str) -> Result<PathBuf> {
         let path = self.of_grid(EXPORTS);
         files::create_dir(&path)?;
@@ -471,13 +475,12 @@ impl RunFolder {
 
     fn write_json(&self, name: &str, value: &impl Serialize) -> Result<()> {
         let path = self.path.join(name);
-        let text =
-            serde_json::to_string_pretty(value).map_err(|e| Error::input(&path, e.to_string(), "this is a defect of the program"))?;
+        let text = serde_json::to_string_pretty(value).map_err(|e| Error::input(&path, e.to_string(), "this is a bug in the program"))?;
         files::write_atomically(&path, (text + "\n").as_bytes())
     }
 }
 
-/// The folder's own explanation.
+/// `README.md` of a run folder, which describes its files.
 const EXPLANATION: &str = include_str!("folder/README.md");
 
 #[cfg(test)]

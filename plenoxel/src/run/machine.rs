@@ -1,41 +1,38 @@
-//! The machine a run is on: threads, vector instructions, and the time.
+//! The machine: threads, vector instructions and the time.
 
 use crate::error::{Error, Result};
 use std::num::NonZero;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Upper bound of a number of threads that a user asks for; a larger one is taken for a typing error.
+/// Maximum number of threads that a user may request; a larger number is considered a typing error.
 pub const MOST_THREADS: usize = 1024;
 
-/// Calls `f` on a pool of `threads` threads, or of one for each core. The number of threads changes the time it takes and no result.
+/// Calls `f` on a pool of `threads` threads, or of one thread per core if `None`. Results do not depend on the number of threads.
 ///
-/// Errors: the system refuses so many threads; the setting is called `threads`.
+/// Errors: the system cannot start the threads; the message names the setting `threads`.
 pub fn with_threads<R: Send>(threads: Option<usize>, f: impl FnOnce() -> R + Send) -> Result<R> {
     let available = std::thread::available_parallelism().map_or(1, NonZero::get);
     let threads = threads.unwrap_or(available);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let pool = pool.map_err(|e| {
-        let found = format!("{threads} (the system refuses them: {e})");
-        Error::config(
-            "threads",
-            found,
-            format!("fewer than that, where {available} are usual; or higher limits of the system for threads and their memory"),
-        )
+        let found = format!("the system cannot start {threads} threads ({e})");
+        let remedy = format!("use fewer threads (the default is {available}), or raise the system's limits for threads and memory");
+        Error::usage("threads", found, remedy)
     })?;
     Ok(pool.install(f))
 }
 
-/// Number of threads of the current pool.
+/// Returns the number of threads of the current pool.
 pub fn threads() -> usize {
     rayon::current_num_threads()
 }
 
-/// Wall-clock time: seconds since 1970-01-01 UTC.
+/// Returns the wall-clock time in seconds since 1970-01-01 UTC.
 pub fn time() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
 
-/// Name of the vector instructions that the numeric loops use on this machine; they are chosen at run time.
+/// Returns the name of the vector instructions that the numeric loops use on this machine. They are detected at run time.
 pub fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {

@@ -1,4 +1,4 @@
-//! `metrics.jsonl`: the figures of a run, line by line while it trains; and the same figures for TensorBoard.
+//! Metrics of training, as lines of `metrics.jsonl` and as TensorBoard events.
 
 use super::folder::RunFolder;
 use super::tensorboard::EventFile;
@@ -7,6 +7,7 @@ use crate::files;
 use crate::json;
 use crate::memory;
 use crate::train::{PlannedStage, Report};
+use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -14,10 +15,10 @@ use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// About so many lines in a run: enough for any curve.
+/// Approximate number of lines per run.
 const LINES: u64 = 1000;
 
-/// The metrics of a run, which grow by one whole line at a time. A run that resumes cuts them back to the step at which it was saved.
+/// A writer for the metrics of a run. It appends whole lines. Resuming a run removes the lines after its last checkpoint.
 pub struct MetricsFile {
     path: PathBuf,
     file: File,
@@ -38,7 +39,7 @@ pub struct Best {
     pub psnr: f64,
 }
 
-/// The last value of each figure that is needed later.
+/// The last value of some figures.
 #[derive(Clone, Copy, Default)]
 struct Known {
     step: u64,
@@ -52,7 +53,7 @@ struct Known {
 impl Known {
     fn add(&mut self, line: &Line<'_>) {
         let seen = line.validation_psnr.map(|psnr| Best { step: line.step, psnr });
-        // Of equal ones the later: it has learned more.
+        // Of equal values, the later one counts.
         let better = seen.filter(|seen| self.best.is_none_or(|best| seen.psnr >= best.psnr));
         *self = Known {
             step: line.step,
@@ -65,12 +66,12 @@ impl Known {
     }
 }
 
-/// The figures of the steps before a run resumes, as its lines tell them.
+/// The figures of a run before it was resumed, read from its metrics.
 #[derive(Default)]
 pub struct History {
-    /// Loss of each step: the mean that its line has.
+    /// Loss of each step: the mean in its line.
     pub losses: Vec<f64>,
-    /// Each stage that has ended, and the seconds of training at its end.
+    /// Index of each finished stage, and the seconds of training at its end.
     pub stages: Vec<(usize, f64)>,
     /// Seconds of training.
     pub seconds: f64,
@@ -81,7 +82,7 @@ pub struct History {
 }
 
 impl History {
-    /// The lines of a file about the first `taken` steps, and the history they tell.
+    /// Parses the lines of the first `taken` steps. Returns their text, and their history.
     pub fn of(text: &str, taken: u64) -> (String, Self) {
         let (mut kept, mut past) = (String::new(), History::default());
         for (text, line) in lines(text).filter(|(_, line)| line.step < taken) {
@@ -101,14 +102,14 @@ impl History {
     }
 }
 
-/// A line about training. Losses and PSNR are means over the steps since the line before.
+/// A line of the metrics. Losses and PSNR are means over the steps since the previous line.
 #[derive(Serialize, Deserialize)]
 pub struct Line<'a> {
-    /// Number of the last step it is about, from 0.
+    /// Index of the last step of the line, from 0.
     pub step: u64,
     /// Stage of that step, from 0.
     pub stage: usize,
-    /// Cells along each axis of what the model stores, if it stores a grid.
+    /// Voxels along each axis, if the model is a grid.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resolution: Option<usize>,
     /// True if that step was the last of its stage.
@@ -140,7 +141,7 @@ impl Line<'_> {
         self.figures.get(name)?.as_f64()
     }
 
-    /// Its figures as TensorBoard shows them, rays a second from what was known before.
+    /// The scalars for TensorBoard. `before` has the figures of the previous line, for the rays per second.
     fn scalars(&self, before: &Known) -> Vec<(Cow<'_, str>, f64)> {
         let rays_per_second = self.rays.saturating_sub(before.rays) as f64 / (self.seconds - before.seconds);
         let each = self.losses.iter().map(|(name, value)| (format!("loss/{name}").into(), *value));
@@ -157,7 +158,7 @@ impl Line<'_> {
     }
 }
 
-/// Figures of a step that the trainer does not report.
+/// Figures of a step that are not in the trainer's report.
 #[derive(Clone, Default)]
 pub struct Observation {
     /// Facts about the model, the most important first ([`Model::facts`](crate::train::Model::facts)).
@@ -168,7 +169,7 @@ pub struct Observation {
     pub seconds: f64,
 }
 
-/// Facts about a model by name, and learning rates by the name of their parameter with `_rate` behind it. Whole numbers are written as such.
+/// Collects facts about a model by name, and learning rates by the name of their parameter with the suffix `_rate`. Whole numbers become integers.
 pub fn figures(facts: &[(&'static str, f64)], rates: &[(String, f64)]) -> BTreeMap<String, serde_json::Number> {
     let facts = facts.iter().filter_map(|&(name, value)| {
         let whole = value.fract() == 0.0 && (0.0..9e15).contains(&value);
@@ -188,17 +189,17 @@ struct Sums {
     losses: Vec<(String, f64)>,
 }
 
-/// Reads the text of a file; it is empty if there is no file.
+/// Reads the text of a metrics file; it is empty if the file does not exist.
 ///
-/// Errors: it cannot be read, is no plain file, or is larger than the metrics of a run may be; there is not enough memory for its [`lines`].
+/// Errors: the file cannot be read, is not a regular file, or is too large; there is not enough memory for its lines.
 pub fn read(path: &Path) -> Result<String> {
     if !files::is_there(path) {
         return Ok(String::new());
     }
     let bytes = files::read(path, files::METRICS)?;
-    let what = format!("to read {} of metrics", memory::bytes(bytes.len() as u64));
+    let what = format!("reading {} of metrics", memory::bytes(bytes.len() as u64));
     memory::check(path, &what, parsed_bytes(&bytes))?;
-    // What is no text is copied, and may be three times as long then.
+    // Text that is not UTF-8 is copied, and may become three times as long.
     String::from_utf8(bytes).or_else(|damaged| {
         let bytes = damaged.as_bytes();
         memory::check(path, &what, 4 * bytes.len() as u64 + parsed_bytes(bytes))?;
@@ -206,16 +207,16 @@ pub fn read(path: &Path) -> Result<String> {
     })
 }
 
-/// About the most memory that a text and all of its [`lines`] take.
+/// Upper estimate of the memory of a text and its parsed lines, in bytes.
 fn parsed_bytes(text: &[u8]) -> u64 {
-    /// A line in a list that grows, and both of its maps with up to 11 entries.
+    /// A line in a growing list, and both of its maps with up to 11 entries.
     const LINE: u64 = 2 * size_of::<Line<'_>>() as u64 + 850;
-    /// The fewest keys of a line; the names of some others, and a place in a map for each beyond these.
+    /// Required keys of a line. The names of the next FEW keys take NAME each; further keys take a place in a map too.
     const OWN: u64 = 9;
     const FEW: u64 = 20;
     const NAME: u64 = 40;
     const ENTRY: u64 = 130;
-    /// An entry while its line is read.
+    /// An entry while its line is parsed.
     const READING: u64 = 260;
     let (mut kept, mut longest) = (text.len() as u64, 0);
     for line in text.split(|byte| *byte == b'\n') {
@@ -229,15 +230,33 @@ fn parsed_bytes(text: &[u8]) -> u64 {
     kept + READING * longest
 }
 
-/// The lines about training, each as text and parsed. Lines that are cut short, and those about other things, are left out.
+/// Parses the lines of training steps. Returns them with the number of unreadable lines, such as a truncated line.
+pub fn of_steps(text: &str) -> (Vec<Line<'_>>, usize) {
+    /// Any other line, such as the final figures.
+    #[derive(Deserialize)]
+    struct Other {
+        #[serde(default)]
+        step: Option<IgnoredAny>,
+    }
+    let mut unreadable = 0;
+    let line = |text| {
+        let line = serde_json::from_str(text).ok();
+        let is_other = || serde_json::from_str::<Other>(text).is_ok_and(|other| other.step.is_none());
+        unreadable += usize::from(line.is_none() && !is_other());
+        line
+    };
+    (text.lines().filter_map(line).collect(), unreadable)
+}
+
+/// Parses the lines of training steps; returns each with its text. Truncated lines and other lines are skipped.
 pub fn lines(text: &str) -> impl Iterator<Item = (&str, Line<'_>)> {
     text.lines().filter_map(|text| Some((text, serde_json::from_str(text).ok()?)))
 }
 
 impl MetricsFile {
-    /// Creates the file of a run of `total_steps` steps.
+    /// Creates the metrics of a run of `total_steps` steps.
     ///
-    /// Errors: it cannot be created.
+    /// Errors: the file cannot be created.
     pub fn create(folder: &RunFolder, total_steps: u64) -> Result<Self> {
         Self::open(folder, total_steps, 0, Known::default())
     }
@@ -257,9 +276,9 @@ impl MetricsFile {
         })
     }
 
-    /// Opens the file of a run that resumes after `taken` steps. Lines about later steps are removed.
+    /// Opens the metrics of a run that resumes after `taken` steps. Removes the lines of later steps.
     ///
-    /// Errors: it cannot be read or written.
+    /// Errors: the file cannot be read or written.
     pub fn resume(folder: &RunFolder, total_steps: u64, taken: u64) -> Result<(Self, History)> {
         let path = folder.metrics();
         let (kept, past) = History::of(&read(&path)?, taken);
@@ -267,11 +286,11 @@ impl MetricsFile {
         Ok((Self::open(folder, total_steps, taken, past.known)?, past))
     }
 
-    /// Adds a step. A line is written every few steps, at the end of a stage, after a look at validation views, and where `must` is true.
+    /// Adds a step. A line is written every few steps, at the end of a stage, with a validation PSNR, and if `must` is true.
     ///
     /// Errors: the file cannot be written.
     pub fn step(&mut self, report: &Report, plan: &[PlannedStage], seen: &Observation, must: bool) -> Result<()> {
-        // Lines of a damaged file may have said anything.
+        // A damaged file may contain any number.
         self.rays = self.rays.saturating_add(report.rays as u64);
         self.samples = self.samples.saturating_add(report.samples as u64);
         let since = &mut self.since;
@@ -312,7 +331,7 @@ impl MetricsFile {
         self.append(&line)
     }
 
-    /// Appends the last line, with the final figures; `figures` go to TensorBoard too.
+    /// Appends the last line, with the final figures. `figures` are also written for TensorBoard.
     ///
     /// Errors: the file cannot be written.
     pub fn conclude(&mut self, line: &impl Serialize, figures: &[(&str, Option<f64>)]) -> Result<()> {
@@ -320,7 +339,7 @@ impl MetricsFile {
         self.events.scalars(self.known.step, figures.iter().filter_map(|(name, value)| Some((*name, (*value)?))))
     }
 
-    /// Adds a picture after a step for TensorBoard: the path of a PNG file, whose size in pixels is `(width, height)`.
+    /// Adds a picture for TensorBoard after a step: a PNG file of `(width, height)` pixels.
     ///
     /// Errors: the picture cannot be read, or the events cannot be written.
     pub fn picture(&mut self, step: u64, size: (usize, usize), png: &Path) -> Result<()> {
@@ -328,14 +347,14 @@ impl MetricsFile {
         self.events.image(step, "preview", size, &bytes)
     }
 
-    /// Waits until all lines are on the disk.
+    /// Syncs the lines to disk.
     ///
     /// Errors: they cannot be written.
     pub fn sync(&self) -> Result<()> {
         self.file.sync_data().map_err(|e| Error::io(&self.path, e, "writing the metrics"))
     }
 
-    /// Appends a line, which need not be about a step.
+    /// Appends any line.
     ///
     /// Errors: the file cannot be written.
     pub fn append(&mut self, line: &impl Serialize) -> Result<()> {
@@ -344,12 +363,12 @@ impl MetricsFile {
         written.map_err(|e| Error::io(&self.path, e, "writing the metrics"))
     }
 
-    /// Rays and samples since the start of training.
+    /// Returns the rays and samples since the start of training.
     pub fn counts(&self) -> (u64, u64) {
         (self.rays, self.samples)
     }
 
-    /// The last and the best validation PSNR.
+    /// Returns the last and the best validation PSNR.
     pub fn validation(&self) -> (Option<f64>, Option<Best>) {
         (self.known.validation_psnr, self.known.best)
     }
@@ -363,6 +382,14 @@ mod tests {
         format!(
             r#"{{"step":7,"stage":0,"resolution":16,"ends_stage":false,"loss":0.25,"losses":{{{losses}}},"psnr":12.5,"rays":9,"samples":99,{figures}"seconds":1.5}}"#
         )
+    }
+
+    #[test]
+    fn a_truncated_or_damaged_line_is_counted_and_other_lines_are_not() {
+        let good = line(r#""mse":0.2"#, "");
+        let text = format!("{good}\n{{\"step\":8,\n{{\"step\":\"8\"}}\n7\n{{\"final\":{{\"psnr\":1}}}}\n{good}\n{}", &good[..20]);
+        let (lines, unreadable) = of_steps(&text);
+        assert_eq!((lines.len(), unreadable), (2, 4));
     }
 
     #[test]

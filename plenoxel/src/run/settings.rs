@@ -1,9 +1,9 @@
 //! The settings of a run, resolved from layers: defaults < preset < file < assignments.
 //!
-//! Layers are merged as tables, so that a layer holds only what it changes. Each value remembers where it was written, and an error
-//! names that place: a line of a file, a preset, a flag.
+//! Layers are merged as tables, so a layer holds only the keys that it changes. Each value remembers where it was set: in a line of a file, a
+//! preset or a flag. Errors name that place.
 //!
-//! Without layers of one's own: [`Config::preset`], [`Config::from_toml`], [`Config::read`].
+//! [`Config::preset`], [`Config::from_toml`] and [`Config::read`] resolve a configuration without explicit layers.
 
 mod difference;
 mod file;
@@ -21,33 +21,36 @@ use crate::model::plenoxels::config::Config;
 use std::path::Path;
 use toml::{Table, Value};
 
-/// Settings laid over each other, of which [`Layers::resolve`] makes a [`Config`].
+/// A stack of settings, from which [`Layers::resolve`] makes a [`Config`].
 #[derive(Debug, Default, Clone)]
 pub struct Layers {
     table: Table,
-    /// Path of each value that was written, and the place where it was; later entries win.
+    /// Path of each value that was set, and the place where it was set; later entries take precedence.
     places: Vec<(String, String)>,
 }
 
 impl Layers {
-    /// The defaults alone.
+    /// A stack with the defaults only.
     pub fn defaults() -> Result<Self> {
         let mut layers = Layers::default();
-        let text = toml::to_string(&Config::default()).map_err(|e| Error::config("the defaults", e, "a defect of the program"))?;
+        let text =
+            toml::to_string(&Config::default()).map_err(|e| Error::usage("the defaults", e.to_string(), "this is a bug in the program"))?;
         layers.text(&text, &|_| "the defaults".to_owned())?;
         Ok(layers)
     }
 
-    /// Lays a preset over what is there.
+    /// Adds a preset on top.
     pub fn with_preset(mut self, name: &str) -> Result<Self> {
         let preset = presets::preset(name)?;
         self.text(preset.text, &|_| format!("preset {name}"))?;
         Ok(self)
     }
 
-    /// Lays a text over what is there. `place(path)` names the place of a key in messages.
+    /// Adds a TOML text on top. `place(path)` names the place of a key in messages.
     fn text(&mut self, text: &str, place: &dyn Fn(&str) -> String) -> Result<()> {
-        let layer: Table = text.parse().map_err(|e: toml::de::Error| Error::config(place(""), e.message(), "valid TOML"))?;
+        let layer: Table = text
+            .parse()
+            .map_err(|e: toml::de::Error| Error::usage(place(""), format!("invalid TOML: {}", e.message()), "fix the syntax"))?;
         keys::check_table(&layer, place)?;
         leaves("", &Value::Table(layer.clone()), &mut |path, _| {
             self.places.push((path.to_owned(), place(path)));
@@ -56,7 +59,7 @@ impl Layers {
         Ok(())
     }
 
-    /// Lays a file over what is there.
+    /// Adds a file on top.
     pub fn file(&mut self, file: &ConfigFile) -> Result<()> {
         self.text(file.text(), &|path| file.place(path))
     }
@@ -69,12 +72,12 @@ impl Layers {
         Ok(())
     }
 
-    /// Sets one value from an assignment as `--set` takes it, `path=value`. The value is TOML, or a bare word for a string. An empty value
-    /// removes the key.
+    /// Sets one value from an assignment `path=value`, as in `--set`. The value is TOML; a string needs no quotes. An empty value removes the
+    /// key.
     pub fn assign(&mut self, assignment: &str) -> Result<()> {
         let Some((path, text)) = assignment.split_once('=') else {
             let found = format!("`{assignment}`");
-            return Err(Error::config("--set", found, "key=value, as in --set stages[0].epochs=4"));
+            return Err(Error::config("--set", found, "key=value, such as --set stages[0].epochs=4"));
         };
         let (path, text) = (path.trim(), text.trim());
         let value = match text {
@@ -82,8 +85,8 @@ impl Layers {
             text => Some(match format!("value = {text}").parse::<Table>() {
                 Ok(mut table) => table.remove("value").unwrap_or_else(|| Value::String(text.to_owned())),
                 Err(_) if is_whole_number(text) => {
-                    let accepted = format!("a whole number from {} to {}", i64::MIN, i64::MAX);
-                    return Err(Error::config(format!("--set {path}"), text, accepted));
+                    let expected = format!("a whole number from {} to {}", i64::MIN, i64::MAX);
+                    return Err(Error::config(format!("--set {path}"), text, expected));
                 }
                 Err(_) => Value::String(text.to_owned()),
             }),
@@ -91,9 +94,9 @@ impl Layers {
         self.set(path, value, &format!("--set {path}"))
     }
 
-    /// Makes the configuration and checks it.
+    /// Builds the configuration and checks it.
     ///
-    /// Errors: a key is missing, or a value has the wrong type or is out of its range; the message names the place where it was written.
+    /// Errors: a key is missing, or a value has the wrong type or is out of range; the message names the place where it was set.
     pub fn resolve(self) -> Result<Config> {
         let places = self.places;
         let placed = |key: &str| match place_of(&places, key) {
@@ -101,23 +104,22 @@ impl Layers {
             Some(place) => format!("{key} ({place})"),
             None => key.to_owned(),
         };
-        let config: Config = serde_path_to_error::deserialize(Value::Table(self.table)).map_err(|e| {
-            let key = e.path().to_string();
-            let (found, accepted) = explain(e.inner().message());
-            Error::config(placed(&key), found, accepted)
+        let config: Config = serde_path_to_error::deserialize(Value::Table(self.table.clone())).map_err(|e| {
+            let (path, complaint) = (e.path().to_string(), e.inner().message());
+            // A table in place of a name such as "auto" is reported at the key inside it.
+            let key =
+                path.rsplit_once('.').filter(|_| complaint.starts_with("expected table, found")).map_or(&path[..], |(outer, _)| outer);
+            refusal(placed(key), value_at(&self.table, key), complaint)
         })?;
-        config.validate().map_err(|e| match e {
-            Error::Config { key, found, accepted } => Error::config(placed(&key), found, accepted),
-            other => other,
-        })?;
+        config.validate().map_err(|e| e.with_key(placed))?;
         Ok(config)
     }
 }
 
-/// The settings of a command, defaults < preset < file < `flags`, and the name of the preset under them. Without `preset` it is `default`.
-/// A complete file has no preset under it.
+/// Resolves the settings of a command, defaults < preset < file < `flags`. Returns them with the name of their preset, which is `default` if
+/// `preset` is `None`. A complete file has no preset.
 ///
-/// Errors: a preset beside a complete file, which would replace all of the preset; and those of [`Layers`].
+/// Errors: `preset` is given together with a complete file, which would override all of it; those of [`Layers`].
 pub fn layered<'a>(
     preset: Option<&'a str>,
     default: &'a str,
@@ -127,12 +129,16 @@ pub fn layered<'a>(
     let file = file.map(ConfigFile::read_named).transpose()?;
     let complete = file.as_ref().is_some_and(ConfigFile::is_complete);
     if let (Some(preset), true) = (preset, complete) {
-        return Err(Error::config("--preset", format!("{preset} beside a --config that says everything"), "one of the two"));
+        return Err(Error::usage(
+            "--preset",
+            format!("the file of --config is complete, so the preset {preset} would have no effect"),
+            "leave out --preset or --config",
+        ));
     }
     let preset = preset.or((!complete).then_some(default));
     let mut layers = match preset {
         Some(preset) => Layers::defaults()?.with_preset(preset)?,
-        // Not even the defaults: they have a loss that the file may be without.
+        // Without the defaults: they have a loss that the file may leave out.
         None => Layers::default(),
     };
     if let Some(file) = &file {
@@ -143,17 +149,18 @@ pub fn layered<'a>(
 }
 
 impl Config {
-    /// Settings from TOML text. A complete text, which has every required key, stands alone; any other is a layer over the defaults.
+    /// Parses settings from TOML text. A complete text, with every required key, is used alone; any other text is a layer over the defaults.
     /// Messages call the text "the settings".
     ///
-    /// Errors: the text is not TOML, has an unknown key, or a value that cannot be used; the message names the line.
+    /// Errors: the text is not TOML, or has an unknown key or an invalid value; the message names the line.
     pub fn from_toml(text: &str) -> Result<Self> {
         ConfigFile::parse(Path::new("the settings"), text.as_bytes())?.resolve()
     }
 
-    /// Settings from a TOML file of at most 1 MiB ([`SETTINGS`](crate::files::SETTINGS)), such as the `config.toml` of a run; as [`Config::from_toml`] otherwise.
+    /// Reads settings from a TOML file of at most 1 MiB ([`SETTINGS`](crate::files::SETTINGS)), such as the `config.toml` of a run, like
+    /// [`Config::from_toml`].
     ///
-    /// Errors: the file cannot be read, and those of [`Config::from_toml`]; the message names file and line.
+    /// Errors: the file cannot be read; those of [`Config::from_toml`]. The message names file and line.
     pub fn read(path: &Path) -> Result<Self> {
         ConfigFile::read_named(path)?.resolve()
     }
@@ -174,9 +181,9 @@ fn leaves(path: &str, value: &Value, f: &mut dyn FnMut(&str, &Value)) {
     }
 }
 
-/// Where the value at `key` was written last: `key` itself, or a part or the whole of it.
+/// The place where the value at `key` was set last: `key` itself, a key inside it, or a table that contains it.
 fn place_of<'a>(places: &'a [(String, String)], key: &str) -> Option<&'a str> {
-    // `stages[*]` on the command line stands for every entry.
+    // `stages[*]` on the command line means every entry.
     let general: String = key.split('[').map(|part| part.trim_start_matches(|c: char| c.is_ascii_digit())).collect::<Vec<_>>().join("[");
     let inside = |part: &str, whole: &str| part.strip_prefix(whole).is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']));
     let related = |path: &str| inside(path, key) || inside(key, path) || inside(path, &general) || inside(&general, path);
@@ -184,28 +191,43 @@ fn place_of<'a>(places: &'a [(String, String)], key: &str) -> Option<&'a str> {
     last.map(|(_, place)| place.as_str())
 }
 
-/// What was found and what is accepted, from the message of a failed conversion.
-fn explain(complaint: &str) -> (&str, &str) {
-    if complaint.contains("enum Sampling") {
-        return ("the value", "{ step = voxel sides } or { samples = points, far = largest t }");
+/// The value at a path such as `stages[0].sampling`.
+fn value_at<'v>(table: &'v Table, path: &str) -> Option<&'v Value> {
+    let mut segments = path.split(['.', '[']).map(|segment| segment.trim_end_matches(']'));
+    let first = table.get(segments.next()?)?;
+    segments.try_fold(first, |value, segment| match value {
+        Value::Array(entries) => entries.get(segment.parse::<usize>().ok()?),
+        value => value.get(segment),
+    })
+}
+
+/// The error for the setting `key` with a value, from the message of a failed conversion.
+fn refusal(key: String, value: Option<&Value>, complaint: &str) -> Error {
+    if let Some(missing) = complaint.strip_prefix("missing field ") {
+        return Error::usage(key, format!("the key {missing} is missing"), "set it, because it has no default");
     }
-    if complaint.contains("enum Weight") {
-        return ("the value", "a number, { weight = …, until = step } or { from = …, to = …, steps = … }");
+    let expected = match complaint.split_once(", expected ").map_or(complaint, |(_, expected)| expected) {
+        sampling if sampling.contains("enum Sampling") => "{ step = voxel sides } or { samples = points, far = largest t }".to_owned(),
+        weight if weight.contains("enum Weight") => "a number, { weight = …, until = step } or { from = …, to = …, steps = … }".to_owned(),
+        // The words of serde for its own types, and of the parser for a table in place of a name.
+        "f64" | "f32" => "a number".to_owned(),
+        "u64" | "usize" => "a whole number of at least 0".to_owned(),
+        "a boolean" => "true or false".to_owned(),
+        "a sequence" => "a list".to_owned(),
+        "path string" => "a path in quotes".to_owned(),
+        "an array of length 3" => "a list of three numbers".to_owned(),
+        "internally tagged enum OptimizerConfig" => "a table such as { kind = \"sgd\" }".to_owned(),
+        "string only" | "variant identifier" => "a string".to_owned(),
+        table if table.starts_with("struct ") || table == "a map" => "a table".to_owned(),
+        text if text == complaint => "a string".to_owned(),
+        other => other.replace('`', ""),
+    };
+    let name = complaint.strip_prefix("unknown variant `").and_then(|rest| rest.split('`').next());
+    match (name, value) {
+        (Some(name), _) => Error::config(key, format!("\"{name}\""), expected),
+        (None, Some(value)) => Error::config(key, value, expected),
+        (None, None) => Error::usage(key, "invalid value", format!("expected {expected}")),
     }
-    let Some((found, accepted)) = complaint.split_once(", expected ") else {
-        return (complaint, "a value for every key");
-    };
-    let found = ["invalid type: ", "invalid value: "].iter().fold(found, |found, start| found.trim_start_matches(start));
-    let accepted = match accepted {
-        "f64" | "f32" => "a number",
-        "u64" | "usize" => "a whole number of at least 0",
-        "a boolean" => "a boolean: true or false",
-        "a sequence" => "a list",
-        "path string" => "a path",
-        table if table.starts_with("struct ") || table == "a map" => "a table",
-        other => other,
-    };
-    (found, accepted)
 }
 
 /// True for an optional sign and digits.

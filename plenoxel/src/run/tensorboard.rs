@@ -1,8 +1,8 @@
-//! TensorBoard's event files: the figures of `metrics.jsonl` for `tensorboard --logdir runs`.
+//! TensorBoard event files: the figures of `metrics.jsonl` for `tensorboard --logdir runs`.
 //!
-//! A file is a row of records, each a length, the length's checksum, so many bytes, and their checksum; the bytes are a protocol buffer, an
-//! `Event`. Records, masked checksums and the numbers of the fields are as in TensorFlow's `record_writer.h`, `event.proto` and
-//! `summary.proto`. A last record that was cut short is left out by who reads.
+//! A file is a sequence of records. A record is a length, the checksum of the length, the data, and the checksum of the data. The data is a protocol
+//! buffer of type `Event`. Records, masked checksums and field numbers follow TensorFlow's `record_writer.h`, `event.proto` and `summary.proto`.
+//! Readers ignore a truncated last record.
 
 use super::machine;
 use crate::error::{Error, Result};
@@ -10,19 +10,19 @@ use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// What TensorBoard knows the files by; then comes the time in seconds, by which it sorts them.
+/// Prefix by which TensorBoard recognizes the files. The time in seconds follows, by which it sorts them.
 const PREFIX: &str = "events.out.tfevents.";
-/// What it expects in the first record.
+/// Contents of the first record.
 const VERSION: &str = "brain.Event:2";
 
-/// An event file that grows by one record at a time.
+/// A writer for an event file.
 pub struct EventFile {
     path: PathBuf,
     file: File,
 }
 
 impl EventFile {
-    /// A new file in the folder of a run after `taken` steps. TensorBoard drops what earlier files hold of later steps.
+    /// Creates a new file in a run folder after `taken` steps. TensorBoard drops later steps of earlier files.
     ///
     /// Errors: the file cannot be created.
     pub fn create(folder: &Path, taken: u64) -> Result<Self> {
@@ -30,17 +30,17 @@ impl EventFile {
         let number = (machine::time() as u64).max(newest.map_or(0, |newest| newest.saturating_add(1)));
         let path = folder.join(format!("{PREFIX}{number}.plenoxel"));
         let file = OpenOptions::new().append(true).create_new(true).open(&path);
-        let file = file.map_err(|e| Error::io(&path, e, "creating the events for TensorBoard"))?;
+        let file = file.map_err(|e| Error::io(&path, e, "creating the TensorBoard event file"))?;
         let mut events = EventFile { path, file };
         events.append(0, field::FILE_VERSION, VERSION.as_bytes())?;
         if taken > 0 {
-            // SessionLog { status: START }: TensorBoard drops this step and later ones, for they will be taken again.
+            // SessionLog { status: START }: TensorBoard drops this step and later ones, which will be repeated.
             events.append(taken, field::SESSION_LOG, &Message::default().varint(1, 1).0)?;
         }
         Ok(events)
     }
 
-    /// Appends numbers after a step, each with its name.
+    /// Appends named scalars after a step.
     ///
     /// Errors: the file cannot be written.
     pub fn scalars<'n>(&mut self, step: u64, values: impl IntoIterator<Item = (&'n str, f64)>) -> Result<()> {
@@ -50,7 +50,7 @@ impl EventFile {
         self.append(step, field::SUMMARY, &summary.0)
     }
 
-    /// Appends a picture after a step: the bytes of a PNG file, whose size in pixels is `(width, height)`.
+    /// Appends an image after a step: the bytes of a PNG file of `(width, height)` pixels.
     ///
     /// Errors: the file cannot be written.
     pub fn image(&mut self, step: u64, tag: &str, (width, height): (usize, usize), png: &[u8]) -> Result<()> {
@@ -64,11 +64,11 @@ impl EventFile {
     fn append(&mut self, step: u64, field: u64, content: &[u8]) -> Result<()> {
         let event = Message::default().double(field::WALL_TIME, machine::time()).varint(field::STEP, step).bytes(field, content);
         let written = self.file.write_all(&record(&event.0));
-        written.map_err(|e| Error::io(&self.path, e, "writing the events for TensorBoard"))
+        written.map_err(|e| Error::io(&self.path, e, "writing the TensorBoard event file"))
     }
 }
 
-/// The event files in a folder.
+/// Returns the event files in a folder.
 pub fn present(folder: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries.map(|entry| entry.path()).filter(|path| name(path).is_some_and(|name| name.starts_with(PREFIX)))
@@ -89,7 +89,7 @@ fn record(bytes: &[u8]) -> Vec<u8> {
     [&length[..], &checksum(&length), bytes, &checksum(bytes)].concat()
 }
 
-/// CRC-32C, rotated and shifted by a constant, because a checksum of bytes that hold checksums is a weak one.
+/// The masked CRC-32C of TFRecord files: rotated, and shifted by a constant, because a checksum of bytes that contain checksums is weak.
 fn checksum(bytes: &[u8]) -> [u8; 4] {
     crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
 }
@@ -109,7 +109,7 @@ mod field {
     pub const IMAGE: u64 = 4;
 }
 
-/// A protocol buffer, field by field: before each comes its number and, in three bits, how it is written.
+/// Writer of a protocol buffer: each field follows a tag with its number and, in three bits, its wire type.
 #[derive(Default)]
 struct Message(Vec<u8>);
 

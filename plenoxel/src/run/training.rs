@@ -1,4 +1,4 @@
-//! A training run from its settings to its figures: what `plenoxel train` does, without a screen. It speaks in [`Event`]s.
+//! A training run from its settings to its final figures, as in `plenoxel train`. Progress is reported as [`Event`]s; nothing is printed.
 //!
 //! ```no_run
 //! use plenoxel::model::plenoxels::config::Config;
@@ -53,37 +53,37 @@ use std::time::{Duration, Instant};
 
 /// Settings of a new run.
 pub struct RunSettings {
-    /// The recipe.
+    /// Configuration of the training.
     pub config: Config,
-    /// Preset under the config, for the record.
+    /// Preset of the config, for `run.json`.
     pub preset: Option<String>,
     /// Source of the views.
     pub data: DataSource,
-    /// Folder to write; `None` for `runs/<scene>-<n>` with the first free n.
+    /// Run folder; `None` for `runs/<scene>-<n>` with the first free n.
     pub out: Option<PathBuf>,
-    /// Overwrite the run in the folder.
+    /// Overwrite an existing run in the folder.
     pub force: bool,
-    /// Seconds that training is planned to take on this machine; `None` for the steps of the config.
+    /// Planned duration of training on this machine, in seconds; `None` for the steps of the config.
     pub time: Option<f64>,
-    /// Settings that do not change what is trained.
+    /// Settings that do not affect the training.
     pub options: RunOptions,
 }
 
-/// Settings of a run that do not change what is trained: a resumed run may have others.
+/// Settings of a run that do not affect the training. They may change when a run is resumed.
 pub struct RunOptions {
-    /// Seconds between two saves of the state from which a run resumes.
+    /// Checkpoint interval, in seconds.
     pub checkpoint_every: f64,
-    /// Seconds between two previews; infinite for none. They take less than a twentieth of the time.
+    /// Preview interval, in seconds; infinity for no previews. Previews take less than 5 % of the time.
     pub preview_every: f64,
-    /// True if somebody draws the pictures of [`Event::Preview`]; else validation views alone are looked at.
+    /// Render the pictures of [`Event::Preview`]; otherwise only the validation PSNR is measured.
     pub pictures: bool,
-    /// Keep the grid of each stage and compare it with the test views at the end.
+    /// Keep the grid of each stage and evaluate it on the test views at the end.
     pub stage_psnr: bool,
-    /// Test views that the final model is compared with, evenly spaced among all of them; 0 for none.
+    /// Maximum number of test views for the final evaluation, evenly spaced among all of them; 0 for no evaluation.
     pub test_views: usize,
-    /// Count the memory that the page about the run takes.
+    /// Include report.html in the memory estimate.
     pub report: bool,
-    /// Asked after each step: true saves the run and ends it.
+    /// Called after each step: `true` saves the run and stops it.
     pub stop: Box<dyn Fn() -> bool + Send + Sync>,
 }
 
@@ -102,42 +102,42 @@ impl Default for RunOptions {
 }
 
 impl RunSettings {
-    /// A run with a recipe on some views, and the default for everything else.
+    /// Settings for a run with a config on some views, and defaults for everything else.
     pub fn new(config: Config, data: DataSource) -> Self {
         RunSettings { config, preset: None, data, out: None, force: false, time: None, options: RunOptions::default() }
     }
 }
 
-/// End of a run.
+/// Outcome of a run.
 #[derive(Debug)]
 pub enum Outcome {
-    /// The run has its final figures.
+    /// The run is finished and has its final figures.
     Done(Box<Summary>),
-    /// The run was stopped and saved: it resumes from its folder.
+    /// The run was stopped and saved. It can be resumed from its folder.
     Stopped {
         /// Steps taken.
         steps: u64,
         /// Steps of the whole run.
         total: u64,
-        /// Its folder.
+        /// The run folder.
         folder: RunFolder,
     },
 }
 
-/// A listener to events; those of loading come from several threads.
+/// A listener for events. [`Event::Loading`] is sent from several threads.
 pub type Listener<'l> = dyn FnMut(Event<'_>) + Send + 'l;
 
-/// Trains Plenoxels with the losses that the config names.
+/// Trains Plenoxels with the losses of the config.
 ///
-/// Errors: settings that cannot be used, data that cannot be read, numbers that are not finite, files that cannot be written.
+/// Errors: a setting is invalid, data cannot be read, a number is not finite, or a file cannot be written.
 pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
     train_with(settings, objective, on)
 }
 
-/// Trains Plenoxels with an objective of your own, which `objective` makes of the config and the number of training views. The losses of the config
-/// are used only if `objective` adds them, as [`plenoxels::objective`](objective()) does.
+/// Trains Plenoxels with a custom objective. `objective` builds it from the config and the number of training views. The losses of the config are
+/// used only if `objective` adds them, as [`plenoxels::objective`](objective()) does.
 ///
-/// Errors as for [`train()`], and those of `objective`.
+/// Errors: those of [`train()`] and of `objective`.
 pub fn train_with(
     settings: &RunSettings,
     objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
@@ -146,7 +146,7 @@ pub fn train_with(
     train_plenoxels(settings, Box::new(objective), on)
 }
 
-/// A function from a config and the number of training views to an objective.
+/// A function that builds an objective from a config and the number of training views.
 type MakeObjective<'o> = Box<dyn FnOnce(&Config, usize) -> Result<Objective<f32>> + 'o>;
 
 /// [`train_with`], compiled once.
@@ -157,11 +157,11 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     let carved = from.as_ref().is_some_and(|(_, _, record)| record.is_carved());
     let initial = from.map(|(folder, ..)| folder.existing_checkpoint()).transpose()?;
     let known = initial.as_deref().map(checkpoint::header).transpose()?;
-    // A grid to start from brings its own box.
+    // An initial grid has its own box.
     let half_width = known.as_ref().map_or(run.config.half_width, |(header, _)| header.shape().half_width);
     run.check_cameras(Aabb::cube(half_width), on)?;
     if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != run.dataset.name()) {
-        on(Event::note(format!("the grid it starts from is of another scene: {}, not {}", header.scene, run.dataset.name())));
+        on(Event::note(format!("the initial grid is of another scene: {}, not {}", header.scene, run.dataset.name())));
     }
     let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
     let estimate = estimate(&run.config, &run.dataset, bytes as u64, &settings.options, on)?;
@@ -170,7 +170,7 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     let initial = initial.as_deref().map(checkpoint::load).transpose()?.map(|(grid, _)| grid);
     run.read(on)?;
     if let Some(seconds) = settings.time {
-        on(Event::note("finding out how fast this machine is"));
+        on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
         *config = clocks.train.time(|| budget::on_time(config.clone(), views, seconds))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
@@ -187,27 +187,27 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     drop(initial);
     let half_width = trainer.grid().shape().half_width;
     if half_width != config.half_width {
-        let chosen = if config.init_from.is_some() { "of the grid it starts from" } else { "around the silhouettes" };
+        let chosen = if config.init_from.is_some() { "from the initial grid" } else { "from the silhouettes" };
         on(Event::note(format!("box: half width {half_width:.4}, {chosen}")));
     }
     if let scouts @ 1.. = trainer.model().scout_stages() {
-        on(Event::note(format!("scout: {scouts} short stages first find out where matter is, as no silhouettes say so")));
+        on(Event::note(format!("scout: {scouts} short stages first locate the objects, because there are no silhouettes")));
     }
     run.learn(trainer, on)
 }
 
-/// Trains a model of your own. `start` makes its trainer of the config, the dataset and the training views. Of the config it may use what it likes:
-/// [`Config::train_options`] has seed, background and rays of a step; the run itself uses the background and what concerns the images. The model is
-/// saved and evaluated by its [`Model`] methods; its own settings ([`Model::settings`]) are part of its checkpoint.
+/// Trains a custom model. `start` builds its trainer from the config, the dataset and the training views. It may use any part of the config;
+/// [`Config::train_options`] has the seed, the background and the rays per step. The run itself uses the background and the image settings. The
+/// model is saved and evaluated with its [`Model`] methods. Its own settings ([`Model::settings`]) are part of its checkpoint.
 ///
-/// Errors as for [`train()`], and those of `start`.
+/// Errors: those of [`train()`] and of `start`.
 pub fn train_model<M: Model<f32>>(
     settings: &RunSettings,
     start: impl FnOnce(&Config, &Dataset, Arc<[View]>) -> Result<train::Trainer<f32, M>>,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
     if settings.time.is_some() {
-        return Err(Error::config("--time", "a model of one's own", "a number of steps: only Plenoxels are planned by time"));
+        return Err(Error::usage("--time", "a custom model cannot be planned by time", "set a number of steps"));
     }
     let mut run = NewRun::open(settings, on)?;
     run.read(on)?;
@@ -217,32 +217,36 @@ pub fn train_model<M: Model<f32>>(
     run.learn(trainer, on)
 }
 
-/// A run that begins.
+/// A new run.
 struct NewRun<'s> {
     settings: &'s RunSettings,
-    /// The recipe, with the steps that were planned.
+    /// The config, with planned steps.
     config: Config,
     dataset: Dataset,
     folder: NewFolder,
-    /// The training views, once they are read.
+    /// The training views; empty until they are read.
     views: Arc<[View]>,
     preview: Preview,
     clocks: Clocks,
-    /// Bytes that a saved state is expected to take.
+    /// Expected size of a saved state, in bytes.
     saved: u64,
-    /// What is likely to go wrong.
+    /// Warnings about the cameras.
     warnings: Vec<String>,
 }
 
 impl<'s> NewRun<'s> {
-    /// Opens the dataset, and chooses the folder. Nothing is written.
+    /// Opens the dataset and chooses the folder. Writes nothing.
     fn open(settings: &'s RunSettings, on: &mut Listener<'_>) -> Result<Self> {
         let config = settings.config.clone();
         config.validate()?;
         if let (Some(from), Some(to)) = (&config.init_from, &settings.out)
             && from.canonicalize().is_ok_and(|from| to.canonicalize().is_ok_and(|to| from == to))
         {
-            return Err(Error::config("--init-from", format!("{} is --out too", from.display()), "another folder to write"));
+            return Err(Error::usage(
+                "--init-from",
+                format!("{} is also the folder of --out", from.display()),
+                "choose another folder for --out",
+            ));
         }
         let mut clocks = Clocks::default();
         let dataset = clocks.load.time(|| settings.data.open(&config))?;
@@ -261,9 +265,9 @@ impl<'s> NewRun<'s> {
         })
     }
 
-    /// Looks for what is likely to go wrong with these cameras and a model in a box.
+    /// Checks the cameras against the box of the model and reports warnings.
     ///
-    /// Errors: no camera sees anything of the box.
+    /// Errors: no camera sees the box.
     fn check_cameras(&mut self, aabb: Aabb, on: &mut Listener<'_>) -> Result<()> {
         self.warnings = self.settings.data.check_cameras(&self.dataset, aabb)?;
         self.warnings.iter().for_each(|warning| on(Event::warning(warning)));
@@ -278,8 +282,7 @@ impl<'s> NewRun<'s> {
         Ok(())
     }
 
-    /// Writes the folder, trains and evaluates. Nothing is written, and nothing overwritten, before all that could be wrong with the input has been
-    /// found.
+    /// Creates the folder, trains and evaluates. Nothing is written or overwritten before all checks of the input.
     fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
         let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved, warnings } = self;
         let RunSettings { data, preset, time, options, .. } = settings;
@@ -300,17 +303,16 @@ impl<'s> NewRun<'s> {
     }
 }
 
-/// Resumes a stopped run from where it was last saved, with the losses that its config names; `data` is the source of the views now, if it is
-/// not where it was.
+/// Resumes a stopped run from its last checkpoint, with the losses of its config. `data` is the new source of the views if they have moved.
 ///
-/// Errors as for [`train()`], and if the run has ended or left nothing to resume from.
+/// Errors: those of [`train()`]; the run has ended or saved no checkpoint.
 pub fn resume(path: &Path, data: Option<DataSource>, options: &RunOptions, on: &mut Listener<'_>) -> Result<Outcome> {
     resume_with(path, data, options, objective, on)
 }
 
-/// Resumes a run that [`train_with`] began, with the same objective.
+/// Resumes a run started by [`train_with`], with the same objective.
 ///
-/// Errors as for [`resume`].
+/// Errors: those of [`resume`] and of `objective`.
 pub fn resume_with(
     path: &Path,
     data: Option<DataSource>,
@@ -331,8 +333,8 @@ fn resume_plenoxels(
 ) -> Result<Outcome> {
     let mut run = OldRun::open(path, data, options, on)?;
     if run.record.is_of_own_model() {
-        let found = format!("a run of a model of kind `{}`", run.record.model);
-        return Err(Error::input(path, found, "resume it with the program that began it (run::training::resume_model)"));
+        let found = format!("this run has a model of another kind, `{}`", run.record.model);
+        return Err(Error::input(path, found, "resume it with the program that started it (run::training::resume_model)"));
     }
     let estimate = estimate(&run.config, &run.dataset, 0, options, on)?;
     let most_rows = estimate.most_rows(&run.config).unwrap_or(usize::MAX);
@@ -344,9 +346,9 @@ fn resume_plenoxels(
     run.learn(trainer, on)
 }
 
-/// Resumes a run that [`train_model`] began, with the same function.
+/// Resumes a run started by [`train_model`], with the same `start`.
 ///
-/// Errors as for [`resume`], and those of `start`.
+/// Errors: those of [`resume`] and of `start`.
 pub fn resume_model<M: Model<f32>>(
     path: &Path,
     data: Option<DataSource>,
@@ -360,7 +362,7 @@ pub fn resume_model<M: Model<f32>>(
     run.learn(trainer, on)
 }
 
-/// A run that goes on.
+/// A resumed run.
 struct OldRun<'o> {
     folder: RunFolder,
     config: Config,
@@ -379,7 +381,7 @@ impl<'o> OldRun<'o> {
     fn open(path: &Path, data: Option<DataSource>, options: &'o RunOptions, on: &mut Listener<'_>) -> Result<Self> {
         let (folder, config, mut record) = RunFolder::open(path)?;
         if record.is_carved() {
-            return Err(Error::input(path, "this run was carved", "to train its grid further, use `--init-from`"));
+            return Err(Error::input(path, "a carved run cannot be resumed", "train its grid with --init-from"));
         }
         let folder = folder.locked("--resume")?;
         let state = folder.existing_state()?;
@@ -387,7 +389,7 @@ impl<'o> OldRun<'o> {
         record.data = data.unwrap_or(record.data);
         let dataset = clocks.load.time(|| record.data.open(&config))?;
         if machine::instruction_set() != record.instruction_set {
-            on(Event::note(format!("it began with {}: other bits, the same picture", record.instruction_set)));
+            on(Event::note(format!("the run was started with {}: the results differ by rounding only", record.instruction_set)));
         }
         on(Event::Opened { dataset: &dataset, config: &config });
         Ok(OldRun { folder, config, record, options, dataset, state, views: Arc::new([]), preview: Preview::default(), clocks })
@@ -401,7 +403,7 @@ impl<'o> OldRun<'o> {
         Ok(())
     }
 
-    /// Trains from the state on, with a trainer of the run before its first step, and evaluates.
+    /// Resumes training from the state with a new trainer of the run, and evaluates.
     fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
         let OldRun { folder, config, record, options, dataset, state, views, preview, mut clocks } = self;
         let trainer = match &state {
@@ -420,7 +422,7 @@ impl<'o> OldRun<'o> {
         let (metrics, past) = MetricsFile::resume(&folder, total, taken)?;
         clocks.train.0 = Duration::try_from_secs_f64(past.seconds).unwrap_or_default();
         let path = folder.path().display();
-        on(Event::note(format!("run: {path}, going on after step {taken} of {total}, {} of training", clock(past.seconds))));
+        on(Event::note(format!("run: {path}, resumed after step {taken} of {total} and {} of training", clock(past.seconds))));
         let as_it_began = !record.is_of_own_model() && config.init_from.is_none();
         let aabb = if as_it_began { Aabb::cube(config.half_width) } else { trainer.model().aabb() };
         let warnings = record.data.check_cameras(&dataset, aabb)?;
@@ -434,13 +436,13 @@ impl<'o> OldRun<'o> {
     }
 }
 
-/// The last stages, which so many steps were taken in: a run that begins with a grid leaves coarser ones out.
+/// Returns the last stages of a plan, with `steps` steps in total: a run with an initial grid skips coarser stages.
 fn ends_after(plan: &[PlannedStage], steps: u64) -> &[PlannedStage] {
     let taken = |from: &usize| plan[*from..].iter().map(|stage| stage.steps).sum::<u64>() == steps;
     &plan[(0..plan.len()).find(taken).unwrap_or(0)..]
 }
 
-/// Numbers of all views of a split.
+/// Indices of all views of a split.
 fn all(dataset: &Dataset, split: Split) -> Vec<usize> {
     (0..dataset.count(split)).collect()
 }
@@ -454,7 +456,7 @@ fn load(dataset: &Dataset, split: Split, numbers: &[usize], source: &DataSource,
     })
 }
 
-/// Runs a computation and tells of its progress.
+/// Runs a computation and reports its progress.
 fn watched<R>(progress: &StageProgress, on: &mut Listener<'_>, compute: impl FnOnce() -> R) -> R {
     const FIRST: Duration = Duration::from_secs(1);
     const NEXT: Duration = Duration::from_millis(100);
@@ -475,14 +477,14 @@ fn watched<R>(progress: &StageProgress, on: &mut Listener<'_>, compute: impl FnO
     })
 }
 
-/// Says which stages the images are large enough for, and how much memory a run will take.
+/// Reports the stages, reduced to the size of the images, and the memory estimate.
 ///
-/// Errors: there is less memory.
+/// Errors: there is not enough memory.
 fn estimate(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions, on: &mut Listener<'_>) -> Result<Estimate> {
     let fitted = config.fitted_to(&dataset.cameras(Split::Train));
     if fitted.stages != config.stages {
         let stages: Vec<String> = fitted.stages.iter().map(|stage| format!("{}³", stage.resolution)).collect();
-        on(Event::note(format!("stages as the size of the images allows (pixels_per_voxel): {}", stages.join(", "))));
+        on(Event::note(format!("stages, limited by the size of the images (pixels_per_voxel): {}", stages.join(", "))));
     }
     let estimate = Estimate::of_training(&fitted, dataset, initial, options);
     on(Event::note(estimate.describe()));
@@ -490,22 +492,22 @@ fn estimate(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptio
     Ok(estimate)
 }
 
-/// Refuses a run whose files will not fit on the disk, and says if they might not.
+/// Checks that the files of a run fit on the disk, and warns if they might not.
 ///
-/// Errors: there is less room than a run takes of whose voxels pruning leaves a quarter of what is expected.
+/// Errors: the disk is too small even if pruning leaves only a quarter of the expected voxels.
 fn check_disk(folder: &Path, saved: u64, on: &mut Listener<'_>) -> Result<()> {
-    // While a state is saved, the one before is there too; then the checkpoint, the pictures and the page.
+    // A new state is written before the previous one is removed. The checkpoint, the pictures and the page follow.
     const REST: u64 = 4_000_000;
     let needed = |saved: u64| files::check_room(folder, 3 * saved + REST, saved);
-    needed(saved / 4).map_err(|e| Error::io(folder, e, "checking the room for the run"))?;
+    needed(saved / 4).map_err(|e| Error::io(folder, e, "checking the disk space for the run"))?;
     files::check_handles().map_err(|e| Error::io(folder, e, "opening as many files as a run needs"))?;
     if let Err(e) = needed(saved) {
-        on(Event::note(format!("the disk may be too small: {e}, if the run takes as much as is expected")));
+        on(Event::note(format!("warning: the disk may be too small for this run: {e}")));
     }
     Ok(())
 }
 
-/// A run that is under way, however it began.
+/// A new or resumed run.
 struct Job<'a> {
     folder: &'a RunFolder,
     config: &'a Config,
@@ -516,16 +518,16 @@ struct Job<'a> {
     warnings: &'a [String],
 }
 
-/// A run that was stopped: steps taken, and steps of the whole run.
+/// A stopped run: steps taken, and total steps.
 struct Stopped(u64, u64);
 
 impl Job<'_> {
-    /// Numbers of the test views that the model is compared with.
+    /// Indices of the test views for the final evaluation.
     fn test_views(&self) -> Vec<usize> {
         evenly_spaced(self.dataset.count(Split::Test), self.options.test_views)
     }
 
-    /// Compares what was learned with the test views, and writes the figures.
+    /// Evaluates the model on the test views and writes the final figures.
     fn conclude<M: Model<f32>>(
         &self,
         learned: std::result::Result<Learned<M>, Stopped>,
@@ -535,7 +537,7 @@ impl Job<'_> {
         let Job { folder, config, dataset, .. } = *self;
         let mut learned = match learned {
             Ok(learned) => learned,
-            // Without the lock: who holds the outcome may resume the run.
+            // Without the lock, so that the caller can resume the run.
             Err(Stopped(steps, total)) => return Ok(Outcome::Stopped { steps, total, folder: RunFolder::at(folder.path()) }),
         };
         let test = clocks.load.time(|| load(dataset, Split::Test, &self.test_views(), &self.record.data, on))?;
@@ -582,7 +584,7 @@ impl Job<'_> {
     }
 }
 
-/// Figures of the final model, and of those of earlier stages that were kept.
+/// Scores of the final model, and of the kept models of earlier stages.
 fn compare<M: Model<f32>>(
     learned: &mut Learned<M>,
     test: &[View],
@@ -620,11 +622,11 @@ fn compare<M: Model<f32>>(
     Ok(scores)
 }
 
-/// A warning about views that are shown worse than by the mean of the training views.
+/// A warning for a PSNR below that of the mean training image.
 fn worse(split: &str, psnr: f64, mean: f64) -> String {
     format!(
-        "{split} views are shown worse, {psnr:.2} dB, than by the mean training image, {mean:.2} dB: too few steps, or poses or intrinsics that do \
-         not belong to the images"
+        "the {split} PSNR of {psnr:.2} dB is below that of the mean training image, {mean:.2} dB: there were too few steps, or the poses or \
+         intrinsics do not match the images"
     )
 }
 
@@ -635,7 +637,7 @@ struct Final<'a> {
     result: &'a Summary,
 }
 
-/// Time by what it was spent on; listeners are on none of the clocks.
+/// Durations of loading, training and evaluation. The time of listeners is not counted.
 #[derive(Debug, Default)]
 struct Clocks {
     load: Stopwatch,
@@ -643,12 +645,12 @@ struct Clocks {
     evaluate: Stopwatch,
 }
 
-/// Adds up the time of some things.
+/// A stopwatch that accumulates durations.
 #[derive(Debug, Default)]
 pub struct Stopwatch(pub Duration);
 
 impl Stopwatch {
-    /// Runs `f` on the clock.
+    /// Runs `f` and adds its duration.
     pub fn time<R>(&mut self, f: impl FnOnce() -> R) -> R {
         let start = Instant::now();
         let result = f();
@@ -656,7 +658,7 @@ impl Stopwatch {
         result
     }
 
-    /// Seconds so far.
+    /// Returns the accumulated seconds.
     pub fn seconds(&self) -> f64 {
         self.0.as_secs_f64()
     }

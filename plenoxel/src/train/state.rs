@@ -216,7 +216,7 @@ fn read(file: &TensorFile<'_>) -> Result<State> {
     let format = facts["format"].as_str().unwrap_or("none");
     if format != FORMAT {
         let remedy =
-            format!("accepted: `{FORMAT}`; use the program version that wrote the file, or `--init-from` to start from a trained grid");
+            format!("expected `{FORMAT}`; use the program version that wrote the file, or `--init-from` to start from a trained grid");
         return Err(Error::input(file.path(), format!("format `{format}`"), remedy));
     }
     file.fact("run")

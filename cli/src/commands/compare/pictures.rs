@@ -1,4 +1,4 @@
-//! What each of several runs made of the same test views.
+//! Renderings of the same test views by several runs.
 
 use super::Run;
 use crate::html::{escaped, picture};
@@ -10,15 +10,15 @@ use plenoxel::run::evenly_spaced;
 use plenoxel::run::folder::RunFolder;
 use std::path::Path;
 
-/// Views that are shown.
+/// Largest number of views.
 const MOST: usize = 8;
 
-/// Parts of a panel.
+/// Indices of the pictures in a panel.
 const TARGET: usize = 0;
 const RENDER: usize = 1;
 const ERROR: usize = 2;
 
-/// Views of which every run has a panel: the photograph, and what each run rendered with its error below. Nothing if there are none.
+/// The section with the test views for which every run has a panel: the photograph, and the rendering and error of each run. Empty without such views.
 pub fn section(runs: &[Run]) -> Result<String> {
     let views: Vec<Vec<(String, f64)>> = runs.iter().map(panels).collect::<Result<_>>()?;
     let has = |run: &Run, panel: &str| run.record.scene == runs[0].record.scene && run.folder.image(panel).exists();
@@ -40,11 +40,11 @@ pub fn section(runs: &[Run]) -> Result<String> {
         return Ok(page);
     }
     Ok(format!(
-        "<section><h2>Test views</h2>\n<p>Each run's picture, and its error below: black at 0, pale yellow at 0.25 and above.</p>\n{page}</section>"
+        "<section><h2>Test views</h2>\n<p>The rendering of each run, with its error below: black is 0, pale yellow is 0.25 or more.</p>\n{page}</section>"
     ))
 }
 
-/// File name and PSNR of the test views of a run.
+/// File names and PSNR of the test views of a run.
 fn panels(run: &Run) -> Result<Vec<(String, f64)>> {
     let result = run.folder.figures()?.unwrap_or_default();
     let views = result["per_view"].as_array().into_iter().flatten().enumerate();
@@ -52,13 +52,13 @@ fn panels(run: &Run) -> Result<Vec<(String, f64)>> {
     Ok(named.collect())
 }
 
-/// Parts of a panel, one below the other.
+/// Some pictures of a panel, one below the other.
 fn part(run: &Run, panel: &str, parts: &[usize]) -> Result<String> {
     let path = run.folder.image(panel);
     let whole = files::read(&path)?;
     let (Some(width), Some(height)) = (run.figures.width, run.figures.height) else {
-        let found = "this run has no figures that can be read in result.json";
-        return Err(Error::input(run.folder.path(), found, "`plenoxel train --resume` writes them again"));
+        let found = "result.json of this run is missing or damaged, so the size of its pictures is unknown";
+        return Err(Error::input(run.folder.path(), found, "write it again with `plenoxel train --resume`"));
     };
     let mut all = String::new();
     for &number in parts {
@@ -69,5 +69,5 @@ fn part(run: &Run, panel: &str, parts: &[usize]) -> Result<String> {
 }
 
 fn unlike(path: &Path) -> Error {
-    Error::input(path, "this picture is not as large as result.json says", "remove it, or train again")
+    Error::input(path, "the size of this picture differs from that in result.json", "remove the picture, or train again")
 }

@@ -1,4 +1,4 @@
-//! `plenoxel export mesh`: the surface of a trained run.
+//! `plenoxel export mesh`: exports the surface of a run.
 
 use super::{Exported, Opened, SurfaceColors, ending};
 use crate::commands::{as_flag, number, whole};
@@ -8,7 +8,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::export::mesh::{MeshOptions, mesh};
 use plenoxel::export::mesh_file::MeshFormat;
 
-/// Memory for each voxel: triangles, normals and colors of a surface before it is reduced. Measured on lego.
+/// Memory per voxel in bytes: triangles, normals and colors of a surface before decimation. Measured on lego.
 const BYTES_PER_VOXEL: u64 = 190;
 
 const EXAMPLES: &str = "\
@@ -17,13 +17,13 @@ Examples:
   plenoxel export mesh runs/lego --format glb
   plenoxel export mesh runs/lego --level 20 --min-part 1000 --out lego.obj
   plenoxel export mesh runs/lego --smooth 10 --max-triangles 200000
-  plenoxel export mesh runs/lego --format stl              for printers; without colors
+  plenoxel export mesh runs/lego --format stl              for 3D printing; without colors
 
-Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the dataset's coordinates, z up. GLB files turn \
-it, for glTF has y up. A higher level takes fog away, and thin parts with it. Small parts go first, then the surface is smoothed, then \
+Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the coordinates of the dataset, z up. GLB files are rotated, \
+because glTF has y up. A higher level removes fog, but also thin parts. Small parts are removed first, then the surface is smoothed, then \
 decimated.";
 
-/// Write the surface of a run as a colored mesh
+/// Export the surface of a run as a colored mesh
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct MeshArgs {
@@ -33,32 +33,33 @@ pub struct MeshArgs {
     #[command(flatten)]
     colors: SurfaceColors,
 
-    /// ply, obj, glb or stl [default: as --out ends, else ply]
+    /// File format: ply, obj, glb or stl [default: that of the file name of --out, or ply]
     #[arg(long, value_name = "FORMAT", help_heading = "Output", value_parser = format)]
     format: Option<MeshFormat>,
 
-    /// Density on the surface, 1 / world length [default: where a voxel absorbs 30 % of the light that crosses it]
-    #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE))]
+    /// Density of the isosurface, 1 / world length [default: the density at which a voxel has an alpha of 0.3]
+    #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE), allow_negative_numbers = true)]
     level: Option<f64>,
 
-    /// Leave out separate parts of fewer triangles than this, specks of fog and hollows that nobody sees; 0 keeps all. The largest part stays
-    #[arg(long, value_name = "TRIANGLES", help_heading = "Surface", default_value_t = MeshOptions::default().min_part, value_parser = whole::<usize>(0, u64::from(u32::MAX)))]
+    /// Minimum number of triangles of a separate part; smaller parts, such as specks of fog and hidden cavities, are removed. 0 keeps all
+    /// parts; the largest part is always kept
+    #[arg(long, value_name = "TRIANGLES", help_heading = "Surface", default_value_t = MeshOptions::default().min_part, value_parser = whole::<usize>(0, u64::from(u32::MAX)), allow_negative_numbers = true)]
     min_part: usize,
 
-    /// Passes of smoothing, which takes the steps of voxels away: no vertex moves by more than half a voxel along each axis
-    #[arg(long, value_name = "PASSES", help_heading = "Surface", default_value_t = MeshOptions::default().smooth, value_parser = whole::<usize>(0, 100))]
+    /// Number of smoothing passes, which remove voxel steps; no vertex moves by more than half a voxel along each axis
+    #[arg(long, value_name = "PASSES", help_heading = "Surface", default_value_t = MeshOptions::default().smooth, value_parser = whole::<usize>(0, 100), allow_negative_numbers = true)]
     smooth: usize,
 
-    /// Collapse edges until no more triangles than this are left, those first that change the surface least
-    #[arg(long, value_name = "N", help_heading = "Surface", value_parser = whole::<usize>(4, u64::from(u32::MAX)))]
+    /// Decimate the mesh to at most this number of triangles, by edge collapses in the order of the error they cause
+    #[arg(long, value_name = "N", help_heading = "Surface", value_parser = whole::<usize>(4, u64::from(u32::MAX)), allow_negative_numbers = true)]
     max_triangles: Option<usize>,
 }
 
 /// Writes the surface of a run.
 pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
-    let named = args.exported.out.as_deref().and_then(ending).map(|ending| format(&ending).map_err(|accepted| (ending, accepted)));
+    let named = args.exported.out.as_deref().and_then(ending).map(|ending| format(&ending).map_err(|expected| (ending, expected)));
     let format = match (args.format, named) {
-        (None, Some(Err((ending, accepted)))) => return Err(Error::config("--out", format!("a name that ends in .{ending}"), accepted)),
+        (None, Some(Err((ending, expected)))) => return Err(Error::usage("--out", format!("unknown file extension .{ending}"), expected)),
         (None, Some(Ok(named))) => named,
         (given, _) => given.unwrap_or(MeshFormat::Ply),
     };
@@ -73,24 +74,28 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
     let surface = mesh(&grid, &options).map_err(as_flag)?;
     if surface.parts_left_out > 0 {
         let parts = if surface.parts_left_out == 1 { "part" } else { "parts" };
-        console.note(&format!("left out {} {parts} of fewer than {} triangles (--min-part)", surface.parts_left_out, args.min_part));
+        console.note(&format!("removed {} {parts} of fewer than {} triangles (--min-part)", surface.parts_left_out, args.min_part));
     }
     let (vertices, triangles) = (surface.positions.len(), surface.triangles.len());
     if args.max_triangles.is_some_and(|most| triangles > most) {
-        console.note(&format!("{triangles} triangles are the fewest to which this surface collapses without being joined or torn"));
+        console.note(&format!("the mesh has {triangles} triangles: fewer would change the topology of the surface"));
     }
     if !format.has_colors() {
-        console.note(&format!("{format} files have no colors: ply, obj and glb do"));
+        console.note(&format!("{format} files have no colors; ply, obj and glb files do"));
     }
     let bytes = format.encode(&surface, crate::PROGRAM).map_err(as_flag)?;
     let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes, console)?;
     console.wrote(
         &file,
-        &format!("wrote {vertices} vertices and {triangles} triangles around {:.4} of volume to {}", surface.volume(), file.display()),
+        &format!(
+            "wrote {vertices} vertices and {triangles} triangles with an enclosed volume of {:.4} to {}",
+            surface.volume(),
+            file.display()
+        ),
     )
 }
 
-/// A format as the command line takes it.
+/// Parses a format.
 fn format(text: &str) -> std::result::Result<MeshFormat, String> {
-    text.parse().map_err(|_| "ply, obj, glb or stl".to_owned())
+    text.parse().map_err(|_| "expected ply, obj, glb or stl".to_owned())
 }

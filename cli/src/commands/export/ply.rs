@@ -1,7 +1,7 @@
-//! `plenoxel export ply`: the voxels of a run as a colored point cloud.
+//! `plenoxel export ply`: exports the voxels of a run as a colored point cloud.
 
 use super::{ColorChoice, Exported, MIN_ALPHA, Opened, color, min_alpha};
-use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe};
+use crate::commands::cloud_filters::{CloudFilters, UnitLengths, check_not_empty, describe, points};
 use crate::commands::new_run::load;
 use crate::commands::{MOST_REDUCTION, as_flag, check_split, whole};
 use crate::progress::Console;
@@ -21,67 +21,68 @@ use plenoxel::run::memory::Estimate;
 use plenoxel::sampling::Jitter;
 use std::path::PathBuf;
 
-/// Memory for each voxel: positions, rows, normals and colors.
+/// Memory per voxel in bytes: positions, rows, normals and colors.
 const BYTES_PER_VOXEL: u64 = 100;
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel export ply runs/lego                                what the training cameras see, into runs/lego/exports/cloud.ply
-  plenoxel export ply runs/lego --sor-sigma 2                  and without stragglers
+  plenoxel export ply runs/lego                                visible voxels, to runs/lego/exports/cloud.ply
+  plenoxel export ply runs/lego --sor-sigma 2                  also without outliers
   plenoxel export ply runs/lego --min-alpha 0 --min-weight 0 --min-object 0
   plenoxel export ply runs/lego --min-value 2 --noise-radius 1.28 --sor-neighbours 6 --sor-sigma 0.2
 
-The last is the recipe of the source paper: value, noise and SOR filter of CloudCompare, in this order; --min-value looks at \
-the density. It is meant for solid clouds, with the zeros of the line above it: a surface one voxel thin has few neighbours. Coordinates are those of the dataset unless --coords grid asks for indices of voxels.";
+The last example has the filters of the source paper: value (density), noise and SOR filter of CloudCompare, in this order. They are meant for \
+solid clouds; combine them with the zeros of the example above, because points of a surface one voxel thick have few neighbours. Coordinates \
+are those of the dataset, or voxel indices with --coords grid.";
 
-/// Write the voxels of a run as a colored point cloud
+/// Export the voxels of a run as a colored point cloud
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct PlyArgs {
     #[command(flatten)]
     exported: Exported,
 
-    /// Frame of the points: the dataset's own, or indices of voxels from 0
+    /// Coordinates of the points: those of the dataset (world), or voxel indices from 0 (grid)
     #[arg(long, help_heading = "Output", default_value = "world")]
     coords: Coords,
 
-    /// The one color of a voxel, where it depends on the direction: what training cameras see of it, the mean over all directions, or what a ray
-    /// in the direction X,Y,Z, from the viewer into the scene, shows there
+    /// View direction for view-dependent color: seen, the mean over the training views; mean, the mean over all directions; or one direction
+    /// X,Y,Z for all points, from the viewer into the scene
     #[arg(long, value_name = "seen|mean|X,Y,Z", help_heading = "Colors", default_value = "seen", allow_hyphen_values = true,
           value_parser = color(&[("seen", ColorChoice::Seen), ("mean", ColorChoice::Mean)]))]
     color: ColorChoice,
 
-    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = LEAST_ALPHA, value_parser = min_alpha)]
+    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = LEAST_ALPHA, value_parser = min_alpha, allow_negative_numbers = true)]
     min_alpha: f64,
 
-    /// Keep voxels that make at least this share of some pixel of a training view; 0 keeps those that nobody sees
-    #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = LEAST_WEIGHT, value_parser = share)]
+    /// Minimum of the largest rendering weight of a voxel in the pixels of the training views; 0 also keeps invisible voxels
+    #[arg(long, value_name = "W", help_heading = "Voxels", default_value_t = LEAST_WEIGHT, value_parser = share, allow_negative_numbers = true)]
     min_weight: f64,
 
-    /// Keep voxels of whose pixels in the training views at least this share shows an object: floating clouds in the background's color have
-    /// 0. Alpha tells objects from the background, or the color where no image is transparent anywhere
-    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = LEAST_OBJECT, value_parser = share)]
+    /// Minimum share of a voxel's pixels in the training views that show the object; floaters in the background color have 0. Objects are
+    /// identified by alpha, or by their color if no image has transparent pixels
+    #[arg(long, value_name = "S", help_heading = "Voxels", default_value_t = LEAST_OBJECT, value_parser = share, allow_negative_numbers = true)]
     min_object: f64,
 
-    /// Where the dataset is now [default: where it was when training]
+    /// Dataset folder, if it has moved [default: that of the training]
     #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
     data: Option<PathBuf>,
 
-    /// Reduce the training images by this factor [default: as in training]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<usize>(1, MOST_REDUCTION))]
+    /// Downscale the training images by this factor [default: that of the training]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<usize>(1, MOST_REDUCTION), allow_negative_numbers = true)]
     downscale: Option<usize>,
 
     #[command(flatten)]
     filters: CloudFilters,
 }
 
-/// Chosen by looking at clouds of lego, of both presets. Less alpha than in exports that choose by nothing else: here the training views choose
-/// too, and where a run ends early, as with the preset `paper`, no voxel absorbs 0.3.
+/// Chosen by inspecting clouds of lego, of both presets. The alpha is lower than in other exports, because the training views select voxels as well,
+/// and because no voxel of a short run, such as one of the preset `paper`, has an alpha of 0.3.
 const LEAST_ALPHA: f64 = 0.05;
 const LEAST_WEIGHT: f64 = 0.05;
 const LEAST_OBJECT: f64 = 0.7;
 
-/// Rays that are looked along at a time.
+/// Rays per batch.
 const RAYS_PER_BATCH: u64 = 1 << 15;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -91,7 +92,7 @@ enum Coords {
 }
 
 fn share(text: &str) -> std::result::Result<f64, String> {
-    text.parse().ok().filter(|s| (0.0..=1.0).contains(s)).ok_or_else(|| "a number from 0 to 1".to_owned())
+    text.parse().ok().filter(|s| (0.0..=1.0).contains(s)).ok_or_else(|| "expected a number from 0 to 1".to_owned())
 }
 
 /// Exports the voxels of a run.
@@ -107,7 +108,7 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         Coordinates::World => UnitLengths { voxel: Some(side), world: 1.0 },
         Coordinates::Grid => UnitLengths { voxel: Some(1.0), world: 1.0 / side },
     };
-    // Filters before the minutes that looking may take.
+    // Filters are checked before the training views are rendered, which may take minutes.
     let filters = args.filters.filters(lengths)?;
     let chooses = args.min_weight > 0.0 || args.min_object > 0.0;
     let looks = chooses || args.color == ColorChoice::Seen;
@@ -130,24 +131,24 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
 
     let (n, half) = (grid.shape().resolution, grid.shape().half_width);
     let frame = match coordinates {
-        Coordinates::World => "the dataset's own".to_owned(),
-        Coordinates::Grid => format!("indices of voxels; world = (index + 0.5) * {side} - {half}"),
+        Coordinates::World => "those of the dataset".to_owned(),
+        Coordinates::Grid => format!("voxel indices; world = (index + 0.5) * {side} - {half}"),
     };
     let comments = [
-        format!("{} voxels a side, scene {}, {} steps", n, header.scene, header.step),
+        format!("{} voxels per side, scene {}, {} steps", n, header.scene, header.step),
         format!("coordinates: {frame}"),
         format!("voxel_side {}", lengths.voxel.unwrap_or(1.0)),
-        "opacity = 1 - exp(-density * side of a voxel in the world); weight, object: what training views show of it".to_owned(),
+        "opacity = 1 - exp(-density * side of a voxel in world units); weight: largest rendering weight in the training views; object: share of its pixels that show the object".to_owned(),
         report.clone(),
     ];
     let file = args.exported.write(&folder, "cloud.ply", &encode(&cloud.chosen(&left), &comments), console)?;
-    console.wrote(&file, &format!("wrote {} points to {} ({report})", left.len(), file.display()))
+    console.wrote(&file, &format!("wrote {} to {} ({report})", points(left.len()), file.display()))
 }
 
-/// What the training cameras see of a grid.
+/// Visibility and color of the voxels in the training views.
 fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32>, console: &Console<'_>) -> Result<Seen> {
     let source = args.data.as_deref().map_or(record.data, DataSource::folder);
-    let without = "or go on without its cameras: --min-weight 0 --min-object 0 --color mean";
+    let without = "or export without the dataset: --min-weight 0 --min-object 0 --color mean";
     let dataset = source.reopen(config).map_err(|e| match e {
         Error::Input { path, found, remedy } => Error::input(path, found, format!("{remedy}, {without}")),
         other => other,
@@ -155,7 +156,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     check_split(&dataset, Split::Train)?;
     let mut estimate =
         Estimate::of_evaluation(config, config.evaluation, grid.shape(), grid.lattice().present(), Some((&dataset, Split::Train)));
-    // What is added up for each row.
+    // The sums of each row.
     estimate.grid += (grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>())) as u64;
     console.note(&estimate.describe());
     estimate.check()?;
@@ -172,7 +173,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
         stop_below: 0.0,
     };
     let total = rays.len().div_ceil(RAYS_PER_BATCH) as usize;
-    let count = console.count("looking along training rays", total);
+    let count = console.count("rendering the training rays, batch", total);
     let batches = rays.in_order_with_alpha(RAYS_PER_BATCH).enumerate().map(|(done, batch)| {
         count.at(done, total);
         batch

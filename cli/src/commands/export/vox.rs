@@ -1,4 +1,4 @@
-//! `plenoxel export vox`: a trained run for MagicaVoxel.
+//! `plenoxel export vox`: exports the voxels of a run for MagicaVoxel.
 
 use super::{Exported, MIN_ALPHA, Opened, SurfaceColors, min_alpha};
 use crate::commands::as_flag;
@@ -7,7 +7,7 @@ use clap::Args;
 use plenoxel::error::Result;
 use plenoxel::export::vox::{VoxOptions, vox};
 
-/// Memory for each voxel: positions, rows and colors.
+/// Memory per voxel in bytes: positions, rows and colors.
 const BYTES_PER_VOXEL: u64 = 100;
 
 const EXAMPLES: &str = "\
@@ -15,10 +15,10 @@ Examples:
   plenoxel export vox runs/lego
   plenoxel export vox runs/lego --min-alpha 0.5 --out lego.vox
 
-Writes RUN/exports/grid.vox. Voxel (i, j, k) of the grid is voxel (i, j, k) of the file, z up; grids of more than 256 voxels \
-a side become tiles of 256 in one scene. The palette has up to 255 colors, chosen for the voxels that are written.";
+Writes RUN/exports/grid.vox. Voxel (i, j, k) of the grid is voxel (i, j, k) of the file, z up. Grids of more than 256 voxels per side \
+are split into tiles of 256 in one scene. The palette has up to 255 colors, computed from the exported voxels.";
 
-/// Write the voxels of a run as a MagicaVoxel .vox file
+/// Export the voxels of a run as a MagicaVoxel .vox file
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct VoxArgs {
@@ -28,10 +28,10 @@ pub struct VoxArgs {
     #[command(flatten)]
     colors: SurfaceColors,
 
-    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = VoxOptions::default().min_alpha, value_parser = min_alpha)]
+    #[arg(long, value_name = "A", help_heading = "Voxels", help = MIN_ALPHA, default_value_t = VoxOptions::default().min_alpha, value_parser = min_alpha, allow_negative_numbers = true)]
     min_alpha: f64,
 
-    /// Keep voxels too that others hide on all six sides
+    /// Also export voxels that are hidden on all six sides
     #[arg(long, help_heading = "Voxels")]
     solid: bool,
 }

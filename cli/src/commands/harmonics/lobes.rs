@@ -1,4 +1,4 @@
-//! Spherical harmonics as surfaces: in each direction as far from the origin as the function is large.
+//! Spherical harmonics as surfaces, whose distance from the origin in a direction is the absolute value of the function.
 
 use super::text;
 use crate::images::Rgb;
@@ -18,24 +18,24 @@ const INK: f32 = 0.25;
 
 /// Radius of the longest lobe, in units of half a cell.
 const LONGEST: f64 = 0.92;
-/// Rays through a pixel, along each axis.
+/// Number of rays per pixel along each axis.
 const RAYS: usize = 2;
-/// Places on a ray through the middle at which the sign of the distance to the surface is looked up.
+/// Number of samples on a ray through the middle, at which the sign of the distance to the surface is evaluated.
 const PLACES: usize = 160;
-/// Distance of the places whose differences are the normal, in units of half a cell.
+/// Step of the finite differences for the normal, in units of half a cell.
 const STEP: f64 = 1e-4;
 /// Azimuth and elevation of the eye, in degrees.
 const EYE: [f64; 2] = [25.0, 22.0];
 
-/// All functions up to a degree.
+/// Picture of all functions up to a degree.
 #[derive(Debug, Clone, Copy)]
 pub struct Lobes {
     pub degree: usize,
-    /// Pixels along each side of a cell.
+    /// Side of a cell in pixels.
     pub size: usize,
 }
 
-/// Directions of the picture in the world: to the right, up, and to the eye.
+/// World directions of the picture: right, up, and towards the eye.
 struct Axes {
     right: DVec3,
     up: DVec3,
@@ -56,7 +56,7 @@ impl Axes {
 }
 
 impl Lobes {
-    /// The picture: a centred row for each degree, its functions from m = -l to m = l.
+    /// Draws the picture: one centered row per degree, with its functions from m = -l to m = l.
     pub fn picture(&self) -> Rgb {
         let size = self.size;
         let mut picture = Rgb::from_elem((size * (self.degree + 1), size * (2 * self.degree + 1), 3), PAPER);
@@ -78,11 +78,11 @@ impl Lobes {
         [l * self.size, (self.degree - l + function - l * l) * self.size]
     }
 
-    /// Cells of all functions, `[function, row, column, channel]`.
+    /// Draws the cells of all functions, `[function, row, column, channel]`.
     fn cells(&self) -> Array4<f32> {
         let functions = sh::count(self.degree);
         let mut cells = Array4::zeros((self.size, functions, self.size, 3));
-        // A row of pixels at a time, so that memory does not grow with the square of the size.
+        // One row of pixels at a time, so that memory does not grow with the square of the size.
         let mut rows: Vec<_> = cells.axis_iter_mut(Axis(0)).collect();
         rows.par_iter_mut().enumerate().for_each(|(row, out)| {
             for k in 0..RAYS * RAYS {
@@ -96,14 +96,14 @@ impl Lobes {
         cells.permuted_axes([1, 0, 2, 3])
     }
 
-    /// Colors of rays at one height and several places across, `[function, place, channel]`.
+    /// Colors of the rays at one height, `[function, place, channel]`.
     fn along(&self, y: f64, across: &[f64]) -> Rgb {
         let axes = Axes::new();
         let mut rays = Vec::new();
         for (column, &x) in across.iter().enumerate() {
             let reach = (1.0 - x * x - y * y).max(0.0).sqrt();
             let count = (reach * PLACES as f64).ceil() as usize;
-            // From the eye on; an even number of steps would meet the origin, where directions end.
+            // From the eye to the back. An even number of steps would hit the origin, which has no direction.
             rays.extend((0..=2 * count).map(|k| (column, [x, y, reach * (1.0 - (k as f64 + 0.25) / (count.max(1) as f64))])));
         }
         let points: Vec<DVec3> = rays.iter().map(|(_, place)| axes.point(*place)).collect();
@@ -113,7 +113,7 @@ impl Lobes {
             let mut found = vec![None; across.len()];
             for (i, &(column, [x, y, depth])) in rays.iter().enumerate() {
                 if found[column].is_none() && inside[[i, function]] >= 0.0 {
-                    // The surface is between this place and the one before it, if that is on the same ray.
+                    // The surface is between this sample and the previous one, if that is on the same ray.
                     let before = i.checked_sub(1).filter(|before| rays[*before].0 == column);
                     let depth = before.map_or(depth, |before| {
                         let [a, b] = [inside[[before, function]], inside[[i, function]]];
@@ -130,7 +130,7 @@ impl Lobes {
         colors
     }
 
-    /// Returns the signed distance of places to the surface of each function along the line to the origin, positive inside, `[place, function]`.
+    /// Returns the signed distance of places to the surface of each function along the line to the origin, positive inside, as `[place, function]`.
     fn inside(&self, points: &[DVec3]) -> Array2<f64> {
         let mut values = self.values(points);
         for (mut row, point) in values.axis_iter_mut(Axis(0)).zip(points) {
@@ -139,20 +139,20 @@ impl Lobes {
         values
     }
 
-    /// The functions in the directions of places, `[place, function]`.
+    /// Evaluates the functions in the directions of places, `[place, function]`.
     fn values(&self, points: &[DVec3]) -> Array2<f64> {
         let directions: Vec<DVec3> = points.iter().map(|point| point.try_normalize().unwrap_or(DVec3::Z)).collect();
         let directions = Array2::from_shape_fn((points.len(), 3), |(i, axis)| directions[i][axis]);
         sh::values(directions.view(), self.degree)
     }
 
-    /// Returns the length of a value of 1, in units of half a cell. The squares of the functions of degree l add up to (2l + 1) / 4π in every direction, and in direction z
-    /// only m = 0 is not 0, so this is the largest square.
+    /// Returns the length of a value of 1, in units of half a cell. The squares of the functions of degree l sum to (2l + 1) / 4π in every direction. In
+    /// direction z only m = 0 is not 0, so this is the largest square.
     fn scale(&self) -> f64 {
         LONGEST / ((2 * self.degree + 1) as f64 / (4.0 * std::f64::consts::PI)).sqrt()
     }
 
-    /// Colors of places on the surface of a function.
+    /// Shades places on the surface of a function.
     fn shaded(&self, function: usize, hits: &[(usize, DVec3)], axes: &Axes) -> Vec<[f32; 3]> {
         let around = hits.iter().flat_map(|(_, hit)| DVec3::AXES.map(|axis| [*hit + axis * STEP, *hit - axis * STEP])).flatten();
         let distances = self.inside(&around.collect::<Vec<_>>());
@@ -194,7 +194,7 @@ mod tests {
         }
     }
 
-    /// The pixel of a function's cell in which a place is seen, in units of half a cell.
+    /// The pixel of a function's cell that shows a place, given in units of half a cell.
     fn pixel(function: usize, place: DVec3) -> [usize; 2] {
         let axes = Axes::new();
         let half = 0.5 * LOBES.size as f64;
@@ -218,7 +218,7 @@ mod tests {
         assert_eq!([at(8, 1.0, 0.0, 0.0), at(8, 0.0, 1.0, 0.0)], [Seen::Positive, Seen::Negative]);
         // z (2z² - 3x² - 3y²).
         assert_eq!([at(12, 0.0, 0.0, 1.0), at(12, 0.0, 0.0, -1.0)], [Seen::Positive, Seen::Negative]);
-        // Between the lobes of z there is nothing.
+        // The space between the lobes of z is empty.
         assert_eq!(at(2, 0.0, 1.0, 0.0), Seen::Paper);
     }
 
@@ -235,7 +235,7 @@ mod tests {
             let mirrored = pixels().filter(|&(row, column)| covered(row, column) != covered(row, n - 1 - column)).count();
             assert!(all > 60 && turned <= all / 20, "function {function}: {turned} of {all}");
             assert!(mirrored <= all / 20 || ![0, 2, 6, 12].contains(&function), "function {function}: {mirrored} of {all}");
-            // Those of -yz and -xz lean to one side.
+            // The lobes of -yz and -xz lean to one side.
             assert!(mirrored > all / 10 || ![5, 7].contains(&function), "function {function}: {mirrored} of {all}");
         }
     }

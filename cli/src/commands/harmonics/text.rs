@@ -1,11 +1,11 @@
-//! Labels of a few characters, drawn into a picture.
+//! Short labels in pictures.
 
 use ndarray::ArrayViewMut3;
 
-/// Rows of a letter; a # is a dot.
+/// Number of rows of a letter; # is a dot.
 const HEIGHT: usize = 7;
 
-/// The letters of labels such as `l=3 m=-2`, each of 5 dots in width.
+/// Letters of labels such as `l=3 m=-2`, 5 dots wide.
 const LETTERS: [(char, [&str; HEIGHT]); 8] = [
     ('0', [" ### ", "#   #", "#   #", "#   #", "#   #", "#   #", " ### "]),
     ('1', ["  #  ", " ##  ", "  #  ", "  #  ", "  #  ", "  #  ", " ### "]),
@@ -17,8 +17,8 @@ const LETTERS: [(char, [&str; HEIGHT]); 8] = [
     ('m', ["     ", "     ", "## # ", "# # #", "# # #", "# # #", "# # #"]),
 ];
 
-/// Writes a label into the upper left corner of a picture, with dots of `dot` pixels a side and a brightness. Other characters are spaces; what does not
-/// fit is cut off.
+/// Writes a label into the upper left corner of a picture, with square dots of `dot` pixels and brightness `ink`. Unknown characters become spaces. The
+/// label is clipped to the picture.
 pub fn write(picture: &mut ArrayViewMut3<'_, f32>, label: &str, dot: usize, ink: f32) {
     let margin = 2 * dot;
     for (place, letter) in label.chars().enumerate() {
@@ -46,7 +46,7 @@ mod tests {
         let mut picture = Array3::from_elem((12, 9, 3), 1.0);
         write(&mut picture.view_mut(), "1-", 1, 0.0);
         let row = |y: usize| (0..9).map(|x| if picture[[y, x, 0]] == 0.0 { '#' } else { ' ' }).collect::<String>();
-        // The second letter is cut off at the border.
+        // The second letter is clipped at the border.
         assert_eq!((row(2), row(5), row(8)), ("    #    ".to_owned(), "    #    ".to_owned(), "   ###   ".to_owned()));
         let ink = picture.iter().filter(|value| **value == 0.0).count();
         assert_eq!(ink, 3 * 10);

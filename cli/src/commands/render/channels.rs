@@ -1,4 +1,4 @@
-//! Kinds of pictures, the formats of their files, and one camera's pictures in all of them.
+//! Channels of rendered pictures and their file formats.
 
 use super::float_files;
 use crate::images::{self, DepthRange, Rgb};
@@ -14,7 +14,7 @@ use plenoxel::render::picture::Picture;
 use plenoxel::train::ViewOptions;
 use std::path::{Path, PathBuf};
 
-/// What a picture shows.
+/// A channel of a rendered picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Channel {
     Color,
@@ -26,7 +26,7 @@ pub enum Channel {
 impl Channel {
     pub const ALL: [Channel; 4] = [Channel::Color, Channel::Depth, Channel::Normal, Channel::Opacity];
 
-    /// What its files have behind their name.
+    /// Suffix of its file names.
     pub fn suffix(self) -> &'static str {
         match self {
             Channel::Color => "",
@@ -37,10 +37,10 @@ impl Channel {
     }
 }
 
-/// How a picture is stored.
+/// File format of a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum FileFormat {
-    /// 8 bits, to look at.
+    /// 8-bit, for display.
     Png,
     /// 32-bit floats, for compositing programs.
     Exr,
@@ -48,7 +48,7 @@ pub enum FileFormat {
     Npy,
 }
 
-/// What writes the pictures of a run.
+/// A writer for the pictures of a run.
 pub struct Pictures<'a> {
     color: Viewer<'a, f32>,
     normals: Option<Viewer<'a, f32>>,
@@ -58,7 +58,7 @@ pub struct Pictures<'a> {
 }
 
 impl<'a> Pictures<'a> {
-    /// Pictures of a model and of its normals, which must be there if they are among the channels.
+    /// Creates a writer for a model. `normals` is required if it is among the channels.
     pub fn new(
         model: &'a dyn Model<f32>,
         normals: Option<&'a Plenoxels<f32>>,
@@ -77,7 +77,7 @@ impl<'a> Pictures<'a> {
         }
     }
 
-    /// Writes what a camera sees to files whose names begin with `stem`.
+    /// Renders a camera to files whose names begin with `stem`.
     pub fn write(&self, camera: &Camera, stem: &Path) -> Result<()> {
         let normals = self.normals.as_ref().map(|viewer| viewer.see(camera));
         // Depth and opacity are the same in both.
@@ -109,7 +109,7 @@ fn file(stem: &Path, channel: Channel, ending: &str) -> PathBuf {
     path.into()
 }
 
-/// A picture to look at.
+/// A channel for display.
 fn shown(channel: Channel, picture: &Picture, range: DepthRange) -> Rgb {
     match channel {
         Channel::Color => picture.rgb.clone(),
@@ -119,12 +119,12 @@ fn shown(channel: Channel, picture: &Picture, range: DepthRange) -> Rgb {
     }
 }
 
-/// A picture to compute with, `[h, w, 1 or 3]`.
+/// The values of a channel, `[h, w, 1 or 3]`.
 fn values(channel: Channel, picture: &Picture) -> Array3<f32> {
     let one = |values: Array2<f32>| values.insert_axis(Axis(2));
     match channel {
         Channel::Color => picture.rgb.clone(),
-        // 0 / 0 is NaN, where nothing is seen.
+        // 0 / 0 is NaN where the picture is empty.
         Channel::Depth => one(&picture.depth / &picture.opacity),
         Channel::Normal => images::unit_normals(picture),
         Channel::Opacity => one(picture.opacity.clone()),

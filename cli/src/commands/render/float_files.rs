@@ -6,7 +6,7 @@ use plenoxel::error::Result;
 use plenoxel::files::atomically;
 use std::path::Path;
 
-/// Writes `[h, w, 3]` as channels R, G, B, anything else's first numbers as channel Y: names that every program shows.
+/// Writes `[h, w, 3]` as the channels R, G, B, and anything else as the channel Y. Programs display channels of these names.
 pub fn write_exr(path: &Path, values: ArrayView3<'_, f32>) -> Result<()> {
     let (height, width, channels) = values.dim();
     let size = (width, height);
@@ -26,13 +26,13 @@ pub fn write_exr(path: &Path, values: ArrayView3<'_, f32>) -> Result<()> {
     })
 }
 
-/// `[h, w, 3]` or, of one number a pixel, `[h, w]` in row-major order (NumPy's format 1.0). By hand, since what `ndarray-npy` needs to read
-/// such headers is more than this.
+/// Encodes `[h, w, 3]`, or `[h, w]` for one channel, in row-major order (NumPy format 1.0). Implemented here, because `ndarray-npy` has many
+/// dependencies for reading headers.
 pub fn npy(values: ArrayView3<'_, f32>) -> Vec<u8> {
     let (height, width, channels) = values.dim();
     let shape = if channels == 1 { format!("({height}, {width})") } else { format!("({height}, {width}, {channels})") };
     let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
-    // Six bytes of signature, two of version and two of length; all of it fills lines of 64 bytes, the last of them a newline.
+    // Signature (6 bytes), version (2) and length (2); the header is padded to a multiple of 64 bytes and ends in a newline.
     const BEFORE: usize = 10;
     let length = (BEFORE + header.len() + 1).next_multiple_of(64) - BEFORE;
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();

@@ -1,4 +1,4 @@
-//! The frames of a path as a GIF that repeats and, where there is `ffmpeg`, as an MP4.
+//! Videos of camera paths: a looping GIF and, if `ffmpeg` is installed, an MP4.
 
 use crate::progress::Console;
 use gif::{Encoder, Frame, Repeat};
@@ -13,22 +13,22 @@ use std::io::{self, BufWriter, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// The shortest time that viewers show a frame for, in hundredths of a second; they take less for "as you like".
+/// Shortest delay of a GIF frame, in hundredths of a second; viewers replace shorter delays by a default.
 const SHORTEST: u64 = 2;
 
-/// The PNG files of a path.
+/// The PNG frames of a camera path.
 pub struct Reel<'a> {
-    /// Where they are: `frame_0000<suffix>.png` and so on.
+    /// Folder of `frame_0000<suffix>.png` and so on.
     pub folder: &'a Path,
     pub suffix: &'a str,
-    /// How many, at least 1.
+    /// Number of frames, at least 1.
     pub frames: usize,
-    /// Frames a second.
+    /// Frames per second.
     pub fps: f64,
 }
 
 impl Reel<'_> {
-    /// Writes `<folder><suffix>.gif` and `.mp4`, and says where.
+    /// Writes `<folder><suffix>.gif` and `.mp4`, and prints their paths.
     pub fn write(&self, console: &Console<'_>) -> Result<()> {
         let gif = self.file("gif");
         self.write_gif(&gif, console)?;
@@ -40,7 +40,7 @@ impl Reel<'_> {
                 console.result(&format!("wrote {}", mp4.display()))
             }
             false => {
-                console.note(&format!("there is no ffmpeg on PATH, so {} was not written", mp4.display()));
+                console.note(&format!("{} was not written: ffmpeg is not in PATH", mp4.display()));
                 Ok(())
             }
         }
@@ -52,11 +52,11 @@ impl Reel<'_> {
         path.into()
     }
 
-    /// Each frame has a palette of its own, of the kind that .vox files have: that of the `gif` crate (NeuQuant) forgets small bright things, such
-    /// as the red lamps of lego. As many frames are read and reduced at a time as there are threads.
+    /// Writes the GIF. Each frame has its own palette, computed as for .vox files: the palettes of the `gif` crate (NeuQuant) lose small bright
+    /// details, such as the red lamps of lego. Each thread processes one frame at a time.
     fn write_gif(&self, path: &Path, console: &Console<'_>) -> Result<()> {
         let (width, height) = image::size(&self.frame(0))?;
-        let count = console.count("joining the frames to a GIF", self.frames);
+        let count = console.count("encoding the GIF, frame", self.frames);
         let numbers: Vec<usize> = (0..self.frames).collect();
         atomically(path, |temporary| {
             let file = BufWriter::new(File::create(temporary)?);
@@ -85,15 +85,15 @@ impl Reel<'_> {
         Ok(frame)
     }
 
-    /// H.264 or what else ffmpeg makes MP4 files of, with the colors of screens (BT.709) in the form that every player takes: half of the
-    /// resolution in color, so width and height are rounded up to even numbers.
+    /// Writes the MP4 with ffmpeg's default codec (usually H.264), BT.709 colors and 4:2:0 chroma subsampling, which every player supports. Width and
+    /// height are rounded up to even numbers.
     fn write_mp4(&self, path: &Path) -> Result<()> {
         let even = "scale=ceil(iw/2)*2:ceil(ih/2)*2:out_color_matrix=bt709,format=yuv420p";
         let (fps, frames, input) = (self.fps.to_string(), self.frames.to_string(), format!("frame_%04d{}.png", self.suffix));
         atomically(path, |temporary| {
             let output = std::path::absolute(temporary)?;
             let mut ffmpeg = Command::new("ffmpeg");
-            // In its folder, whose name would otherwise be taken for a pattern too.
+            // In the folder of the frames, because its name could contain pattern characters.
             ffmpeg.current_dir(self.folder).stdin(Stdio::null());
             ffmpeg.args(["-nostdin", "-loglevel", "error", "-y", "-framerate", &fps, "-start_number", "0", "-i", &input]);
             ffmpeg.args(["-frames:v", &frames, "-vf", even, "-crf", "18", "-colorspace", "bt709", "-color_primaries", "bt709"]);
@@ -113,13 +113,13 @@ impl Reel<'_> {
     }
 }
 
-/// True if there is a program of this name: any other failure will be told when it is used.
+/// True if ffmpeg is installed. Other errors are reported when it is used.
 fn has_ffmpeg() -> bool {
     let answer = Command::new("ffmpeg").arg("-version").stdin(Stdio::null()).output();
     !answer.is_err_and(|error| error.kind() == ErrorKind::NotFound)
 }
 
-/// How long a frame is shown, in hundredths of a second: whole numbers whose sums are as near to the rate as they can be.
+/// Delay of a frame in hundredths of a second, rounded so that the total duration matches the rate.
 fn delay(number: usize, fps: f64) -> u16 {
     let until = |frames: usize| (100.0 * frames as f64 / fps).round() as u64;
     (until(number + 1) - until(number)).clamp(SHORTEST, u64::from(u16::MAX)) as u16

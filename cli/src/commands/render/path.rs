@@ -1,4 +1,4 @@
-//! `--path`: the cameras of a film.
+//! `--path`: camera paths.
 
 use crate::commands::train::size;
 use crate::commands::trained_run::{Found, TrainedRun};
@@ -12,14 +12,14 @@ use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use std::path::{Path, PathBuf};
 
-/// Frames of a path that has no number of its own: the source paper's turntable.
+/// Default number of frames, that of the source paper's turntable.
 const FRAMES: usize = 120;
-/// Frames a second, unless the file says so.
+/// Default frame rate, in frames per second.
 const FPS: f64 = 30.0;
-/// Side of pictures where there are no views to go by.
+/// Default side of frames in pixels, if there are no views.
 const SIDE: usize = 400;
 
-/// Where the camera goes.
+/// Choice of a camera path.
 #[derive(Debug, Clone)]
 pub enum PathChoice {
     Orbit,
@@ -27,38 +27,38 @@ pub enum PathChoice {
     File(PathBuf),
 }
 
-/// A path, and how it becomes frames.
+/// A camera path, and the size and rate of its frames.
 #[derive(Debug, Args)]
 pub struct PathArgs {
-    /// Render a film instead: once around the scene (orbit), twice around rising and falling (spiral), or along the cameras of a JSON file:
-    /// instant-ngp's base_cam.json, nerfstudio's camera_path.json, any transforms.json
+    /// Render a video along a camera path: orbit (one turn around the scene), spiral (two turns, rising and falling), or the cameras of a JSON
+    /// file: base_cam.json of instant-ngp, camera_path.json of nerfstudio, or any transforms.json
     #[arg(long, value_name = "orbit|spiral|FILE", help_heading = "Path", value_parser = choice)]
     pub path: Option<PathChoice>,
 
-    /// Number of frames [default: 120, or those of the file]
-    #[arg(long, value_name = "N", help_heading = "Path", requires = "path", value_parser = whole::<usize>(1, MOST_FRAMES as u64))]
+    /// Number of frames [default: that of the file, or 120]
+    #[arg(long, value_name = "N", help_heading = "Path", requires = "path", value_parser = whole::<usize>(1, MOST_FRAMES as u64), allow_negative_numbers = true)]
     frames: Option<usize>,
 
-    /// Size of the frames in pixels, SIDE or WIDTHxHEIGHT [default: the file's, or that of the dataset's views, or 400]
-    #[arg(long, value_name = "SIZE", help_heading = "Path", requires = "path", value_parser = frame_size)]
+    /// Size of the frames in pixels, SIDE or WIDTHxHEIGHT [default: that of the file, that of the views, or 400]
+    #[arg(long, value_name = "SIZE", help_heading = "Path", requires = "path", value_parser = frame_size, allow_hyphen_values = true)]
     size: Option<(usize, usize)>,
 
-    /// Frames a second of the GIF (which shows no more than 50) and the MP4 [default: the file's, or 30]
-    #[arg(long, value_name = "RATE", help_heading = "Path", requires = "path", value_parser = rate)]
+    /// Frames per second of the MP4 and the GIF, which shows at most 50 [default: that of the file, or 30]
+    #[arg(long, value_name = "RATE", help_heading = "Path", requires = "path", value_parser = rate, allow_negative_numbers = true)]
     fps: Option<f64>,
 }
 
-/// What is to be rendered.
+/// The cameras of a video.
 pub struct Film {
-    /// What its files are called.
+    /// Name of its files.
     pub name: String,
     pub cameras: Vec<Camera>,
-    /// Frames a second.
+    /// Frames per second.
     pub fps: f64,
 }
 
 impl PathArgs {
-    /// The film of a path. Views are looked at for what the path leaves open, and need not be there any more.
+    /// Returns the cameras of a path. The views of the run, if they still exist, give the parameters that the path leaves open.
     pub fn film(&self, path: &PathChoice, run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Film> {
         let file = match path {
             PathChoice::File(path) => Some((path, read(path)?)),
@@ -83,19 +83,19 @@ impl PathArgs {
             (None, PathChoice::Spiral) => ("spiral".to_owned(), table()?.spiral(self.frames.unwrap_or(FRAMES))),
             (None, _) => ("orbit".to_owned(), table()?.orbit(self.frames.unwrap_or(FRAMES))),
         };
-        console.note(&format!("frames: {} of {} x {}", shots.len(), size.0, size.1));
+        console.note(&format!("frames: {} of {} x {} pixels", shots.len(), size.0, size.1));
         let fps = self.fps.or(file.as_ref().and_then(|(_, path)| path.fps)).unwrap_or(FPS);
         Ok(Film { name, cameras: shots.iter().map(|shot| shot.camera(size)).collect(), fps })
     }
 }
 
-/// The views of a run as far as they are there. Only where the user says where they are must they be.
+/// Opens the dataset of a run, if it still exists. If the user gave its folder, it must exist.
 fn views(run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Option<Dataset>> {
     match found.source.reopen(&found.config) {
         Ok(dataset) => Ok(Some(dataset)),
         Err(error) if run.data.is_some() => Err(error),
         Err(error) => {
-            console.note(&format!("no views to go by ({error}); the path follows from the box"));
+            console.note(&format!("the views of the run cannot be read ({error}); the camera path is computed from the box"));
             Ok(None)
         }
     }
@@ -103,12 +103,16 @@ fn views(run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Optio
 
 fn read(path: &Path) -> Result<CameraPath> {
     if !files::is_there(path) {
-        return Err(Error::config("--path", format!("{} is not a file", path.display()), "orbit, spiral, or a JSON file of cameras"));
+        return Err(Error::usage(
+            "--path",
+            format!("the file {} does not exist", path.display()),
+            "expected orbit, spiral, or a JSON file of cameras",
+        ));
     }
     CameraPath::parse(path, &files::read_named(path, files::CAMERA_PATH)?)
 }
 
-/// What the entries of a path are called.
+/// Name of the entries of a path.
 fn entries(path: &CameraPath) -> &'static str {
     match (path.is_interpolated(), path.entries()) {
         (true, 1) => "keyframe",
@@ -118,16 +122,16 @@ fn entries(path: &CameraPath) -> &'static str {
     }
 }
 
-/// The name of a file without its ending.
+/// The name of a file without its extension.
 fn stem(path: &Path) -> String {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    // Of a file `...json` it is `..`, which is no name for a folder.
+    // For a file `...json` it is `..`, which is not a folder name.
     if stem.trim_matches('.').is_empty() { "path".to_owned() } else { stem.into_owned() }
 }
 
 fn choice(text: &str) -> std::result::Result<PathChoice, String> {
     match text {
-        "" => Err("orbit, spiral, or a JSON file of cameras".to_owned()),
+        "" => Err("expected orbit, spiral, or a JSON file of cameras".to_owned()),
         "orbit" => Ok(PathChoice::Orbit),
         "spiral" => Ok(PathChoice::Spiral),
         file => Ok(PathChoice::File(file.into())),
@@ -137,9 +141,12 @@ fn choice(text: &str) -> std::result::Result<PathChoice, String> {
 fn frame_size(text: &str) -> std::result::Result<(usize, usize), String> {
     let (width, height) = size(text)?;
     let most = image::MAX_SIDE as usize;
-    if width.max(height) <= most { Ok((width, height)) } else { Err(format!("up to {most} pixels a side")) }
+    if width.max(height) <= most { Ok((width, height)) } else { Err(format!("expected at most {most} pixels per side")) }
 }
 
 fn rate(text: &str) -> std::result::Result<f64, String> {
-    text.parse().ok().filter(|fps| (0.1..=1000.0).contains(fps)).ok_or_else(|| "a number of frames a second from 0.1 to 1000".to_owned())
+    text.parse()
+        .ok()
+        .filter(|fps| (0.1..=1000.0).contains(fps))
+        .ok_or_else(|| "expected a number of frames per second from 0.1 to 1000".to_owned())
 }

@@ -1,4 +1,4 @@
-//! A run as a process of its own: it may crash, or be killed for want of memory, and the sweep goes on; and its peak memory is its own.
+//! Runs as child processes: the sweep continues if a run crashes or is killed for lack of memory, and the peak memory of each run is measured separately.
 
 use crate::interrupt::Watch;
 use plenoxel::error::{Error, Result};
@@ -11,30 +11,30 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
 use std::time::Duration;
 
-/// Time between looks whether the sweep was asked to stop.
+/// Interval of checks for a request to stop.
 const LISTENING: Duration = Duration::from_millis(50);
 
-/// What the processes of a sweep have in common.
+/// The program that a sweep runs.
 pub struct Program {
-    /// This program.
+    /// Path of this program.
     pub path: PathBuf,
-    /// Flags for all: threads and memory.
+    /// Flags for all runs: threads and memory.
     pub machine: Vec<String>,
-    /// The lock of the sweep, which lasts until the last who has the file open ends: a run that outlives its sweep keeps it.
+    /// The lock of the sweep. Child processes inherit it, so that a run that outlives its sweep keeps it.
     pub lock: FolderLock,
 }
 
-/// How a process ended.
+/// Result of a child process.
 pub struct Ended {
-    /// Exit code; of one that a signal ended 128 and the signal's number, as shells count.
+    /// Exit code; 128 plus the number of the signal if a signal ended the process, as in shells.
     pub code: u8,
-    /// What it said on stdout.
+    /// Its output on stdout.
     pub out: String,
-    /// What it said last, its error if it said so.
+    /// Its error message, or its last line on stderr.
     pub last: String,
 }
 
-/// This very program: on Linux even if another has taken its place on the disk since, so that one sweep is made by one program.
+/// Path of this program. On Linux it refers to the running program even if its file was replaced, so that a sweep uses a single version.
 pub fn this_program() -> Result<PathBuf> {
     let link = Path::new("/proc/self/exe");
     if link.exists() {
@@ -44,8 +44,8 @@ pub fn this_program() -> Result<PathBuf> {
 }
 
 impl Program {
-    /// Runs the program to its end. What it says on stderr goes to the end of the file `log`, and line by line to `said`. If the sweep is asked to
-    /// stop, so is the program.
+    /// Runs the program to its end. Its stderr is appended to the file `log` and passed to `said` line by line. A request to stop the sweep is forwarded
+    /// to the program.
     pub fn run(&self, arguments: &[OsString], log: &Path, watch: &Watch, mut said: impl FnMut(&str)) -> Result<Ended> {
         let writing = |e| Error::io(log, e, "writing the log");
         let starting = |e| Error::io(&self.path, e, "starting a run");
@@ -54,7 +54,7 @@ impl Program {
         let mut child = Command::new(&self.path)
             .args(&self.machine)
             .args(arguments)
-            // Nothing is read from it: it is how a process is given an open file.
+            // Not for input: the child inherits the lock as its stdin.
             .stdin(self.lock.file().try_clone().map_err(starting)?)
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
@@ -65,7 +65,7 @@ impl Program {
         let over = AtomicBool::new(false);
         let out = std::thread::scope(|scope| {
             let child = &child;
-            // However it ends.
+            // Also set when this closure panics.
             let ends = Ends(&over);
             scope.spawn(|| {
                 while !over.load(SeqCst) {
@@ -77,7 +77,7 @@ impl Program {
             });
             let out = scope.spawn(|| {
                 let mut bytes = Vec::new();
-                // What cannot be read is not there.
+                // Unreadable output is ignored.
                 drop(stdout.map(|mut stdout| stdout.read_to_end(&mut bytes)));
                 String::from_utf8_lossy(&bytes).into_owned()
             });
@@ -85,7 +85,7 @@ impl Program {
             if let Some(stderr) = stderr {
                 let mut stderr = BufReader::new(stderr);
                 while stderr.read_until(b'\n', &mut bytes).is_ok_and(|n| n > 0) {
-                    // A full disk is no reason for the run to fail, which may have its own elsewhere.
+                    // A failure to write the log does not fail the run.
                     drop(file.write_all(&bytes));
                     let text = String::from_utf8_lossy(&bytes);
                     last.hear(text.trim_end());
@@ -102,7 +102,7 @@ impl Program {
     }
 }
 
-/// Says that something is over when it is dropped.
+/// A guard that sets its flag when it is dropped.
 struct Ends<'o>(&'o AtomicBool);
 
 impl Drop for Ends<'_> {
@@ -111,7 +111,7 @@ impl Drop for Ends<'_> {
     }
 }
 
-/// What a process said last that matters.
+/// The last error and the last line of a process.
 #[derive(Default)]
 struct Last {
     line: String,
@@ -131,15 +131,15 @@ impl Last {
     fn words(self, status: ExitStatus) -> String {
         match (self.error, signal(status)) {
             (Some(error), _) => error,
-            // What a system does that runs out of memory.
-            (None, Some(9)) => format!("killed, perhaps for want of memory, after: {}", self.line),
+            // SIGKILL, sent by systems that run out of memory.
+            (None, Some(9)) => format!("killed, possibly for lack of memory, after: {}", self.line),
             (None, Some(signal)) => format!("ended by signal {signal} after: {}", self.line),
             (None, None) => self.line,
         }
     }
 }
 
-/// A call of the program as one types it into a shell.
+/// Formats a call of the program as a shell command.
 pub fn command_line(arguments: &[OsString]) -> String {
     let plain = |c: char| c.is_alphanumeric() || "-_=./,:+@%".contains(c);
     let words = arguments.iter().map(|argument| {
@@ -154,11 +154,11 @@ fn code(status: ExitStatus) -> u8 {
     code.and_then(|code| u8::try_from(code).ok()).unwrap_or(u8::MAX)
 }
 
-/// From a terminal it hears it too, at the same time.
+/// Sends SIGTERM to the child. On a terminal, the child also receives Ctrl-C itself.
 #[cfg(unix)]
 fn ask_to_stop(child: &Child) {
     let process = i32::try_from(child.id()).ok().and_then(rustix::process::Pid::from_raw);
-    // One that has ended need not be asked.
+    // The child may have ended already.
     let _ = process.map(|process| rustix::process::kill_process(process, rustix::process::Signal::TERM));
 }
 

@@ -1,5 +1,5 @@
-//! Flags of `train` and `carve` as keys of a sweep's file: `downscale = 4` is `--downscale=4`. Which there are, and what they take, is asked
-//! of the command line itself.
+//! Flags of `train` and `carve` as keys of a sweep file: `downscale = 4` means `--downscale=4`. The flags and their values are taken from the
+//! definition of the command line.
 
 use clap::error::{ContextKind, ContextValue};
 use clap::{Arg, ArgAction, CommandFactory, ValueHint};
@@ -8,27 +8,27 @@ use plenoxel::run::settings;
 use std::path::Path;
 use toml::{Table, Value};
 
-/// What a sweep decides itself.
+/// Flags that a sweep sets itself.
 const DECIDED: [&str; 3] = ["out", "force", "resume"];
 
 /// A flag with its value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Flag {
-    /// As the file spells it.
+    /// Key in the file.
     pub key: String,
-    /// As the command line has it.
+    /// Argument on the command line.
     pub text: String,
 }
 
-/// The keys that stand for flags of a command.
+/// Returns the keys for the flags of a command.
 pub fn keys(command: &str) -> Vec<String> {
     let cli = crate::Cli::command();
     let arguments = cli.find_subcommand(command).into_iter().flat_map(clap::Command::get_arguments);
     arguments.filter_map(key).filter(|key| !DECIDED.contains(&key.as_str())).collect()
 }
 
-/// The flag of a command that a key with a value stands for: none if it is switched off, several where it may be repeated. Paths are relative
-/// to `base`. `place` is where the key stands.
+/// Returns the arguments of a command for a key with a value: none for `false`, and several for a list. Paths are relative to `base`. `place` names the
+/// key in messages.
 pub fn flags(command: &str, name: &str, value: &Value, base: &Path, place: &str) -> Result<Vec<Flag>> {
     let cli = crate::Cli::command();
     let mut arguments = cli.find_subcommand(command).into_iter().flat_map(clap::Command::get_arguments);
@@ -39,7 +39,7 @@ pub fn flags(command: &str, name: &str, value: &Value, base: &Path, place: &str)
     let flag = argument.get_long().unwrap_or_default();
     let is_path = matches!(argument.get_value_hint(), ValueHint::DirPath | ValueHint::FilePath | ValueHint::AnyPath);
     let valued = |value: &Value| {
-        let text = text(value).ok_or_else(|| Error::config(place, format!("`{name} = {value}`"), "a value as the flag takes it"))?;
+        let text = text(value).ok_or_else(|| Error::config(place, value, format!("a value of --{flag}")))?;
         let text = if is_path { base.join(text).to_string_lossy().into_owned() } else { text };
         Ok(format!("--{flag}={text}"))
     };
@@ -55,7 +55,7 @@ fn key(argument: &Arg) -> Option<String> {
     argument.get_long().map(|long| long.replace('-', "_"))
 }
 
-/// A value as the command line spells it.
+/// Formats a value for the command line.
 fn text(value: &Value) -> Option<String> {
     match value {
         Value::String(text) => Some(text.clone()),
@@ -66,7 +66,7 @@ fn text(value: &Value) -> Option<String> {
     }
 }
 
-/// Refuses a table with a key that is not known. `place` says where a key of it stands.
+/// Checks the keys of a table. `place` names the place of a key in messages.
 pub fn check_keys(table: &Table, known: &[String], place: &dyn Fn(&str) -> String) -> Result<()> {
     let names: Vec<&str> = known.iter().map(String::as_str).collect();
     match table.keys().find(|key| !names.contains(&key.as_str())) {
@@ -75,7 +75,7 @@ pub fn check_keys(table: &Table, known: &[String], place: &dyn Fn(&str) -> Strin
     }
 }
 
-/// What the command line says of arguments it does not take, at a place of a file.
+/// The error for invalid arguments, at a place of a file.
 pub fn refusal(answer: &clap::Error, command: &str, place: &str) -> Error {
     let said = |kind| match answer.get(kind) {
         Some(ContextValue::String(text)) => Some(text.clone()),
@@ -84,11 +84,11 @@ pub fn refusal(answer: &clap::Error, command: &str, place: &str) -> Error {
     };
     let flag = said(ContextKind::InvalidArg).unwrap_or_else(|| "its flags".to_owned());
     let found = match (said(ContextKind::InvalidValue), said(ContextKind::PriorArg)) {
-        (Some(value), _) => format!("`{value}` for {flag}"),
-        (None, Some(other)) => format!("{flag} together with {other}"),
-        (None, None) => flag,
+        (Some(value), _) => format!("invalid value `{value}` for {flag}"),
+        (None, Some(other)) => format!("{flag} conflicts with {other}"),
+        (None, None) => format!("{flag} is invalid"),
     };
     let reason = std::error::Error::source(answer).map(ToString::to_string);
-    let accepted = reason.or_else(|| said(ContextKind::ValidValue));
-    Error::config(place, found, accepted.unwrap_or_else(|| format!("what `plenoxel {command} --help` lists")))
+    let expected = reason.or_else(|| said(ContextKind::ValidValue).map(|values| format!("expected {values}")));
+    Error::usage(place, found, expected.unwrap_or_else(|| format!("see `plenoxel {command} --help`")))
 }

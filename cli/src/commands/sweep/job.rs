@@ -1,4 +1,4 @@
-//! One run of a sweep: the command line that makes it, and how far it is.
+//! A run of a sweep: its command line and its state.
 
 use super::flags::Flag;
 use crate::commands::table::{Cell, Failure, Measured};
@@ -25,52 +25,52 @@ pub struct Job {
     pub asked: Asked,
 }
 
-/// A command line, but for where the run goes.
+/// A command line without its output folder.
 #[derive(Debug)]
 pub struct Call {
     pub command: &'static str,
     pub flags: Vec<Flag>,
-    /// The folder with the views; the built-in scene has none.
+    /// Dataset folder; `None` for the built-in scene.
     pub data: Option<PathBuf>,
 }
 
-/// What that command line amounts to.
+/// The settings of that command line.
 #[derive(Debug)]
 pub struct Asked {
     pub config: Config,
     pub source: DataSource,
-    /// Seconds that training was asked to take: then the lengths of stages are found out when it begins.
+    /// Requested seconds of training (`--time`); the lengths of the stages are then computed at the start of the run.
     pub time: Option<f64>,
 }
 
-/// How far a run is.
+/// State of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub enum State {
-    /// There is nothing of it.
+    /// Not started.
     New,
-    /// It ended before anything was saved from which it could go on.
+    /// Ended before its first checkpoint.
     CutShort,
-    /// It can go on from where it was saved.
+    /// Stopped with a checkpoint, so that it can be resumed.
     Interrupted,
-    /// It is not compared with test views yet.
+    /// Trained or carved, but not evaluated on the test views.
     Unevaluated,
     Finished,
-    /// The folder has a run with other settings: these.
+    /// The folder has a run with other settings; the text lists the differences.
     Different(String),
 }
 
 impl Call {
-    /// The command line, with more flags.
+    /// The arguments of the command line, with additional ones.
     pub fn arguments(&self, more: &[OsString]) -> Vec<OsString> {
         let flags = self.flags.iter().map(|flag| OsString::from(&flag.text));
-        // What comes after -- is no flag, whatever it looks like.
+        // An argument after -- is not a flag.
         let data = self.data.iter().flat_map(|data| ["--".into(), data.into()]);
         [self.command.into()].into_iter().chain(flags).chain(more.iter().cloned()).chain(data).collect()
     }
 }
 
 impl Job {
-    /// How far it is, by what lies in its folder.
+    /// Determines the state from the files in the folder.
     pub fn state(&self) -> State {
         if RunFolder::at(&self.folder).is_empty() {
             return State::New;
@@ -85,7 +85,7 @@ impl Job {
         }
         match (folder.result(), folder.evaluation()) {
             (Err(e), _) | (_, Err(e)) => State::Different(e.to_string()),
-            // A comparison with no test views is one too, and has no PSNR.
+            // An evaluation without test views is complete, and has no PSNR.
             (Ok(Some(result)), Ok(evaluation)) if result.get("psnr").is_some() || evaluation.is_some() => State::Finished,
             (Ok(Some(_)), _) => State::Unevaluated,
             (Ok(None), _) if !record.is_carved() && folder.existing_state().is_ok() => State::Interrupted,
@@ -93,7 +93,7 @@ impl Job {
         }
     }
 
-    /// The command line that brings it to its end from a state; none if there is nothing to do but to evaluate it.
+    /// Returns the command line that finishes the run from a state; `None` if it is finished or only has to be evaluated.
     pub fn command_line(&self, state: &State) -> Option<Vec<OsString>> {
         let folder = || self.folder.clone().into_os_string();
         let out = || ["--out".into(), folder()];
@@ -109,12 +109,12 @@ impl Job {
         }
     }
 
-    /// The command line that compares it with its test views and prints the figures.
+    /// Returns the command line that evaluates the run on its test views.
     pub fn evaluation(&self) -> Vec<OsString> {
         vec!["evaluate".into(), self.folder.clone().into_os_string(), "--json".into()]
     }
 
-    /// What it said while it was made. Names of runs have no dots, so that no run can be in the way.
+    /// Path of the log. Names of runs have no dots, so it cannot conflict with a run.
     pub fn log(&self) -> PathBuf {
         self.folder.with_extension("log")
     }
@@ -123,22 +123,22 @@ impl Job {
         self.folder.with_extension("failure.json")
     }
 
-    /// Writes down that it failed.
+    /// Records a failure.
     pub fn remember(&self, failure: &Failure) -> Result<()> {
         files::write_atomically(&self.failure_path(), (json::line(failure)? + "\n").as_bytes())
     }
 
-    /// It may have failed once: that counts no longer.
+    /// Removes the record of an earlier failure.
     pub fn forget(&self) -> Result<()> {
         remove(&self.failure_path())
     }
 
-    /// Removes what an earlier run said.
+    /// Removes the log of an earlier run.
     pub fn remove_log(&self) -> Result<()> {
         remove(&self.log())
     }
 
-    /// What came of it, so far; another run in its place is none of it.
+    /// Returns the current result. A run with other settings does not count.
     pub fn cell(&self) -> Cell {
         let failure = files::read(&self.failure_path(), files::RECORD).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok());
         match (failure, Measured::read(&self.folder)) {
@@ -150,23 +150,23 @@ impl Job {
     }
 }
 
-/// Removes a file, if it is there.
+/// Removes a file if it exists.
 fn remove(path: &Path) -> Result<()> {
     match std::fs::remove_file(path) {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path, e, "removing it")),
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(path, e, "removing the file")),
         _ => Ok(()),
     }
 }
 
 impl Asked {
-    /// Where a run is not what was asked for.
+    /// Lists the differences between a run and the requested settings.
     fn differences(&self, config: &Config, source: &DataSource, planned: Option<f64>) -> Vec<String> {
         let asked = match (self.time, planned) {
-            (Some(seconds), Some(planned)) if planned != seconds => return vec![format!("time is {planned} s and not {seconds} s")],
+            (Some(seconds), Some(planned)) if planned != seconds => return vec![format!("time is {planned} s, not {seconds} s")],
             (Some(_), _) => budget::planned_like(self.config.clone(), config),
             (None, _) => self.config.clone(),
         };
-        let data = (source != &self.source).then(|| format!("data is {source} and not {}", self.source));
+        let data = (source != &self.source).then(|| format!("data is {source}, not {}", self.source));
         data.into_iter().chain(settings::differences(config, &asked)).collect()
     }
 }

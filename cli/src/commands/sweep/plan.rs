@@ -1,4 +1,4 @@
-//! What a sweep is to do: its scenes, its methods, and the command line of each run.
+//! The plan of a sweep: its scenes, its methods, and the command line of each run.
 
 use super::flags::{self, Flag};
 use super::job::{Asked, Call, Job};
@@ -11,15 +11,15 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use toml::{Table, Value};
 
-/// The built-in scene's name where a folder could stand.
+/// Name of the built-in scene in place of a folder.
 const BUILT_IN: &str = "procedural";
-/// Bytes of the name of a scene or a method: file systems have 255 for a folder that is called after both.
+/// Largest length of the name of a scene or a method, in bytes. A folder is named after both, and file systems allow 255 bytes.
 const LONGEST_NAME: usize = 100;
-/// Largest number of runs of a sweep: each has a folder, a process, and a line in the table.
+/// Largest number of runs of a sweep. Each has a folder, a process, and a line in the table.
 const MOST_RUNS: usize = 10_000;
 const COMMANDS: [&str; 2] = ["train", "carve"];
 
-/// All runs, scene by scene.
+/// The runs of a sweep, scene by scene.
 #[derive(Debug)]
 pub struct Plan {
     pub scenes: Vec<String>,
@@ -28,10 +28,10 @@ pub struct Plan {
     pub jobs: Vec<Job>,
 }
 
-/// A file, its keys checked; flags alone come to the same.
+/// Content of a sweep file with checked keys, or the equivalent of flags.
 #[derive(Debug, Default, Deserialize)]
 struct Sweep {
-    /// For all runs; those of scenes and methods count more.
+    /// Settings of all runs; those of scenes and methods override them.
     #[serde(default)]
     set: Vec<String>,
     scenes: Vec<Table>,
@@ -40,16 +40,16 @@ struct Sweep {
     published: Vec<Published>,
 }
 
-/// A scene or a method under its name.
+/// A scene or a method, with its name.
 struct Entry {
     name: String,
-    /// Its path in the file.
+    /// Path of the entry in the file.
     path: String,
     table: Table,
 }
 
 impl Plan {
-    /// The sweep that a file describes, into `out`; `set` are settings for all runs, which count more than any other.
+    /// Plans the sweep of a file in the folder `out`. `set` has settings of all runs, which override all others.
     pub fn from_file(path: &Path, set: &[String], out: &Path) -> Result<Self> {
         let file = ConfigFile::read_named(path)?;
         let wrong = |found: String| Error::input(path, found, "see the example in `plenoxel sweep --help`");
@@ -63,13 +63,14 @@ impl Plan {
         }
         let sweep: Sweep = toml::from_str(file.text()).map_err(|e| {
             let line = e.span().map_or(0, |span| file.text()[..span.start].matches('\n').count() + 1);
-            wrong(format!("line {line}: {}", e.message()))
+            let found = e.message().strip_prefix("missing field ").map(|key| format!("the key {key} is missing"));
+            wrong(format!("line {line}: {}", found.unwrap_or_else(|| e.message().to_owned())))
         })?;
         let base = path.parent().unwrap_or(Path::new(""));
         Self::new(sweep, set, base, out, &|path| file.place(path))
     }
 
-    /// Some scenes, folders or the built-in one, with some presets.
+    /// Plans a sweep of scenes, which are folders or the built-in scene, with presets.
     pub fn from_flags(scenes: &[String], presets: &[String], set: &[String], out: &Path) -> Result<Self> {
         let tables =
             |key: &str, values: &[String]| values.iter().map(|value| Table::from_iter([(key.to_owned(), value.as_str().into())])).collect();
@@ -92,9 +93,9 @@ impl Plan {
         let chosen = |scene: &Entry| scene.table.get("methods").and_then(Value::as_array).map_or(methods.len(), Vec::len);
         let runs: usize = scenes.iter().map(chosen).sum();
         if runs > MOST_RUNS {
-            let found = format!("{runs} runs, of {} scenes with {} methods", scenes.len(), methods.len());
-            let accepted = format!("up to {MOST_RUNS} runs; make several sweeps of it, or name the methods of a scene in its `methods`");
-            return Err(Error::config(place("scenes"), found, accepted));
+            let found =
+                format!("{} scenes with {} methods make {runs} runs, but a sweep has at most {MOST_RUNS}", scenes.len(), methods.len());
+            return Err(Error::usage(place("scenes"), found, "make several sweeps, or select the `methods` of each scene"));
         }
         for scene in &scenes {
             let chosen = chosen_methods(scene, &plan.methods, place)?;
@@ -105,14 +106,14 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Refuses a column that would be empty.
+    /// Checks that no column with published results is empty.
     fn check_published(&self, place: &dyn Fn(&str) -> String) -> Result<()> {
         for (index, published) in self.published.iter().enumerate() {
             let mut named = [&published.psnr, &published.ssim, &published.seconds].into_iter().flat_map(|figures| figures.keys());
             if !named.any(|scene| self.scenes.contains(scene)) {
-                let found = format!("`{}` has no figure of a scene of this sweep", published.name);
-                let accepted = format!("such as psnr = {{ {} = 30.0 }}", self.scenes.join(" = 30.0, "));
-                return Err(Error::config(place(&format!("published[{index}]")), found, accepted));
+                let found = format!("`{}` has no results for the scenes of this sweep", published.name);
+                let remedy = format!("add some, such as psnr = {{ {} = 30.0 }}", self.scenes.join(" = 30.0, "));
+                return Err(Error::usage(place(&format!("published[{index}]")), found, remedy));
             }
         }
         Ok(())
@@ -123,15 +124,15 @@ fn names(entries: &[Entry]) -> Vec<String> {
     entries.iter().map(|entry| entry.name.clone()).collect()
 }
 
-/// The folder a scene's views are in; none for the built-in scene.
+/// Dataset folder of a scene; `None` for the built-in scene.
 fn folder_of(table: &Table) -> Option<&str> {
     table.get("data").and_then(Value::as_str).filter(|data| *data != BUILT_IN)
 }
 
-/// Entries under the names they give themselves, or `default` does; they become folders.
+/// Returns the entries with their names: the key `name`, or the result of `default`. Names become folder names.
 fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default: impl Fn(&Table) -> String) -> Result<Vec<Entry>> {
     if tables.is_empty() {
-        return Err(Error::config(place(list), format!("no {list}"), format!("at least one entry [[{list}]]")));
+        return Err(Error::usage(place(list), format!("there are no {list}"), format!("add at least one entry [[{list}]]")));
     }
     let plain = |c: char| c.is_alphanumeric() || matches!(c, '-' | '_');
     let (mut entries, mut taken) = (Vec::new(), BTreeSet::new());
@@ -144,14 +145,14 @@ fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default
         };
         if name.is_empty() || name.len() > LONGEST_NAME || !name.chars().all(plain) {
             let place = place(&format!("{path}.name"));
-            let accepted = format!("a name of at most {LONGEST_NAME} letters, digits, - and _, for it becomes a folder");
-            return Err(Error::config(place, format!("the name `{name}`"), accepted));
+            let expected = format!("a name of at most {LONGEST_NAME} letters, digits, - and _, because it becomes a folder name");
+            return Err(Error::config(place, format!("\"{name}\""), expected));
         }
         if !taken.insert(name.clone()) {
-            return Err(Error::config(
+            return Err(Error::usage(
                 place(&path),
-                format!("the name `{name}` occurs twice"),
-                "a name of its own: name = \"…\" in the file",
+                format!("the name `{name}` is used twice"),
+                "give each entry a different name: name = \"…\" in the file",
             ));
         }
         entries.push(Entry { name, path, table });
@@ -159,7 +160,7 @@ fn named(list: &str, tables: Vec<Table>, place: &dyn Fn(&str) -> String, default
     Ok(entries)
 }
 
-/// The methods that a scene is learned with: all, unless it says which.
+/// Names of the methods for a scene: its key `methods`, or all.
 fn chosen_methods(scene: &Entry, methods: &[String], place: &dyn Fn(&str) -> String) -> Result<Vec<String>> {
     let Some(value) = scene.table.get("methods") else {
         return Ok(methods.to_vec());
@@ -174,7 +175,7 @@ fn chosen_methods(scene: &Entry, methods: &[String], place: &dyn Fn(&str) -> Str
     }
 }
 
-/// The run of a scene with a method.
+/// Plans the run of a scene with a method.
 fn job(
     scene: &Entry,
     method: &Entry,
@@ -215,7 +216,7 @@ fn job(
     Ok(Job { scene: scene.name.clone(), method: method.name.clone(), folder, call, asked })
 }
 
-/// What a run's command line amounts to.
+/// Parses the command line of a run, and resolves its settings.
 fn asked(call: &Call, place: &str) -> Result<Asked> {
     let cli = crate::Cli::try_parse_from(["plenoxel".into()].into_iter().chain(call.arguments(&[])));
     let asked = match cli.map(|cli| cli.command) {
@@ -224,10 +225,7 @@ fn asked(call: &Call, place: &str) -> Result<Asked> {
         Ok(_) => Err(Error::config("command", call.command, COMMANDS.join(" or "))),
         Err(answer) => return Err(flags::refusal(&answer, call.command, place)),
     };
-    asked.map_err(|e| match e {
-        Error::Config { key, found, accepted } => Error::config(format!("{place}: {key}"), found, accepted),
-        other => other,
-    })
+    asked.map_err(|e| e.with_key(|key| format!("{place}: {key}")))
 }
 
 #[cfg(test)]

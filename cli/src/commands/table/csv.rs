@@ -1,4 +1,4 @@
-//! The table in long form as CSV: a line for each run, with all of its figures.
+//! The table in long form as CSV: one line per run, with all results.
 
 use super::figures::Figures;
 use super::{Cell, RunTable};
@@ -52,12 +52,12 @@ fn fields(scene: &str, method: &str, cell: &Cell) -> [String; 19] {
     ]
 }
 
-/// A value, or nothing where there is none.
+/// Formats a value; empty if it is missing.
 fn text_of(value: Option<impl Display>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }
 
-/// A field as RFC 4180 has it: in quotes where it would be read as something else.
+/// Formats a field as in RFC 4180: in quotes if it has special characters.
 fn quoted(field: &str) -> String {
     if field.contains([',', '"', '\n', '\r']) { format!("\"{}\"", field.replace('"', "\"\"")) } else { field.to_owned() }
 }

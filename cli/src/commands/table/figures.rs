@@ -1,4 +1,4 @@
-//! What a run came to, as its folder says.
+//! Results of a run, read from its folder.
 
 use crate::commands::background_name;
 use plenoxel::checkpoint;
@@ -8,41 +8,41 @@ use plenoxel::run::folder::RunFolder;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// A run that has ended.
+/// A finished run.
 #[derive(Debug)]
 pub struct Measured {
     pub folder: RunFolder,
     pub figures: Figures,
 }
 
-/// Its figures, as far as there are any.
+/// Results of a run; missing ones are `None`.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(default)]
 pub struct Figures {
     pub psnr: Option<f64>,
     pub ssim: Option<f64>,
     pub ssim_same: Option<f64>,
-    /// Of training or carving.
+    /// Seconds of training or carving.
     pub seconds: Option<f64>,
     pub rays: Option<u64>,
     pub steps: Option<u64>,
     pub peak_memory_bytes: Option<u64>,
-    /// Stored ones, where the grid is still there.
+    /// Stored voxels, from the checkpoint if it exists.
     pub voxels: Option<usize>,
     pub resolution: Option<usize>,
     pub background: [f32; 3],
-    /// Test views, and their size in pixels.
+    /// Number of test views, and their size in pixels.
     pub views: Option<usize>,
     pub width: Option<usize>,
     pub height: Option<usize>,
 }
 
-/// How a run failed.
+/// Failure of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Failure {
-    /// Exit code; of a process that a signal ended 128 and the signal's number.
+    /// Exit code; 128 plus the number of the signal if a signal ended the process.
     pub code: u8,
-    /// What it said last.
+    /// Last message of the run.
     pub error: String,
 }
 
@@ -55,15 +55,15 @@ pub struct Scores {
 }
 
 impl Measured {
-    /// The run in a folder; none if it has not ended.
+    /// Reads the run in a folder; `None` if it has not ended.
     ///
-    /// Errors: it is not the folder of a run.
+    /// Errors: the folder is not a run folder.
     pub fn read(path: &Path) -> Result<Option<Self>> {
         let (folder, config, _) = RunFolder::open(path)?;
         Ok(Figures::of(&folder, &config)?.map(|figures| Measured { folder, figures }))
     }
 
-    /// Its figures in few words.
+    /// A summary in one line.
     pub fn sentence(&self) -> String {
         let Figures { psnr, ssim, seconds, .. } = self.figures;
         let psnr = psnr.map_or("no test views".to_owned(), |psnr| format!("PSNR {psnr:.2} dB"));
@@ -71,7 +71,7 @@ impl Measured {
         format!("{psnr}{ssim}, {}", seconds.map_or("time unknown".to_owned(), |seconds| format!("{seconds:.1} s")))
     }
 
-    /// What its figures were measured on, in words.
+    /// A description of the test views.
     pub fn views(&self) -> String {
         let Figures { views: Some(views), width: Some(width), height: Some(height), background, .. } = &self.figures else {
             return "no test views".to_owned();
@@ -81,9 +81,9 @@ impl Measured {
 }
 
 impl Figures {
-    /// Those of a run; none if it has not ended.
+    /// Reads the results of a run; `None` if it has not ended.
     ///
-    /// Errors as for [`RunFolder::result`].
+    /// Errors: those of [`RunFolder::result`].
     pub fn of(folder: &RunFolder, config: &Config) -> Result<Option<Self>> {
         let figures = folder.figures()?.and_then(|figures| serde_json::from_value::<Figures>(figures).ok());
         let Some(figures) = figures else { return Ok(None) };
@@ -97,7 +97,7 @@ impl Figures {
 }
 
 impl Scores {
-    /// The mean of each figure that all of them have.
+    /// The mean of each figure; `None` if one of the values is missing.
     pub fn mean(all: impl Iterator<Item = Scores> + Clone) -> Scores {
         let mean = |figure: fn(Scores) -> Option<f64>| {
             let values: Vec<f64> = all.clone().map(figure).collect::<Option<_>>()?;

@@ -1,10 +1,10 @@
-//! The table as a page of its own, with a picture in each cell.
+//! The table as an HTML page with a picture in each cell.
 
 use super::thumbnail::{self, Thumbnails};
 use super::{Cell, Row, RunTable, Scores, beside, decibels};
 use crate::html::{escaped, page, picture};
 
-/// Pixels of a picture.
+/// Largest size of a picture in pixels.
 const LARGEST: [u32; 2] = [200, 200];
 
 const STYLE: &str = "\
@@ -70,7 +70,7 @@ fn highest(scores: impl Iterator<Item = Scores>) -> Option<f64> {
     psnr.iter().copied().reduce(f64::max).filter(|_| psnr.len() > 1)
 }
 
-/// The PSNR large, the others small; `best` is the highest of those beside it.
+/// Formats the results of a cell, with a large PSNR. `best` is the highest PSNR of the row.
 fn scores(scores: &Scores, best: Option<f64>) -> String {
     if *scores == Scores::default() {
         return "–".to_owned();

@@ -1,4 +1,4 @@
-//! The table as Markdown, which also reads well as it is.
+//! The table as Markdown.
 
 use super::{Cell, RunTable, Scores, beside, decibels};
 use plenoxel::text::one_line;
@@ -42,7 +42,7 @@ fn scores(scores: &Scores) -> String {
     format!("**{}** · {}", decibels(scores.psnr), beside(scores))
 }
 
-/// Text within a line of Markdown that is shown as it is: no markup, no HTML, no border of a cell, and nothing that a terminal would do.
+/// Escapes text for a line of Markdown, so that it has no markup, HTML, cell borders or characters that control a terminal.
 pub fn as_text(text: &str) -> String {
     let text = one_line(&text.split_whitespace().collect::<Vec<_>>().join(" "));
     let mut shown = String::with_capacity(text.len());

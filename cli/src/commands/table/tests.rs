@@ -16,7 +16,7 @@ fn measured(psnr: f64, seconds: f64, width: usize) -> Cell {
     Cell::Measured(Box::new(Measured { folder: RunFolder::at("a, b".as_ref()), figures }))
 }
 
-/// Two scenes, two methods of which the second fails once, and figures of somebody else for the first scene.
+/// A table of two scenes and two methods, of which one run fails, and published results for the first scene.
 fn table() -> RunTable {
     let failed = Cell::Failed(Failure { code: 4, error: "loss is <NaN> | \"here\"".to_owned() });
     RunTable {
@@ -51,7 +51,12 @@ fn markdown_has_a_cell_for_each_run_and_means_of_whole_columns_only() {
 ";
     let (table, notes) = text.split_at(expected.len());
     assert_eq!(table, expected);
-    assert!(notes.contains("- lego: fast, 3 views of 100 × 100 over white; slow, 3 views of 50 × 50 over white; these cannot"), "{notes}");
+    assert!(
+        notes.contains(
+            "- lego: fast, 3 views of 100 × 100 over white; slow, 3 views of 50 × 50 over white; these results are not comparable."
+        ),
+        "{notes}"
+    );
     assert!(notes.contains("- ship: 3 views of 100 × 100 over white.\n"), "{notes}");
     assert!(notes.contains("- ship, slow: failed with exit code 4: loss is \\<NaN\\> \\| \"here\"\n"), "{notes}");
     assert!(notes.contains("- Others: published, not measured here: their table\n"), "{notes}");
@@ -77,7 +82,7 @@ fn csv_has_a_line_for_each_run_with_a_field_for_each_head() {
     assert_eq!(lines.len(), 1 + 4);
     let commas = lines[0].matches(',').count();
     assert_eq!(lines[1], "lego,fast,finished,30,0.8,,34.25,,,,,,white,3,100,100,,,\"a, b\"");
-    // The comma in quotes is no border.
+    // The comma in quotes separates no fields.
     assert_eq!(lines[1].matches(',').count(), commas + 1);
     assert_eq!(lines[4], "ship,slow,failed,,,,,,,,,,,,,,4,\"loss is <NaN> | \"\"here\"\"\",");
     assert_eq!(lines[4].matches(',').count(), commas);
@@ -88,7 +93,7 @@ fn the_page_stands_by_itself_and_praises_only_what_can_be_compared() {
     let text = html::text(&table());
     assert!(text.contains("<title>Two &amp; two</title>") && text.contains("loss is &lt;NaN&gt; | &quot;here&quot;"), "{text}");
     assert!(text.contains(">30.00<") && text.contains("published, not measured here"), "{text}");
-    // The two of lego were measured at different sizes.
+    // The runs of lego were evaluated at different sizes.
     assert!(!text.contains("psnr best") && !text.contains("http") && !text.contains("src=\"images"), "{text}");
     let mut equal = table();
     equal.rows[0].cells[1] = measured(25.0, 3.25, 100);

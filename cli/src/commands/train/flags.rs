@@ -1,6 +1,6 @@
-//! The flags of `train`, and the configuration they amount to.
+//! The flags of `train`, and the configuration resolved from them.
 
-use crate::commands::{MOST_REDUCTION, background, whole};
+use crate::commands::{MOST_REDUCTION, background, number, whole};
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::procedural::ProceduralOptions;
@@ -13,18 +13,17 @@ use toml::Value;
 
 const EXAMPLES: &str = "\
 Examples:
-  plenoxel train                                   the built-in scene, into runs/procedural-1
-  plenoxel train data/lego --out runs/lego         a NeRF-synthetic folder
+  plenoxel train                                   train the built-in scene into runs/procedural-1
+  plenoxel train data/lego --out runs/lego         train a NeRF-synthetic scene
   plenoxel train data/lego --preset paper --tv 1e-4
   plenoxel train data/lego --downscale 4 --half-width 1.3 --set stages[*].density_rate=30
   plenoxel train data/lego --config runs/lego/config.toml --seed 7
-  plenoxel train --resume runs/lego                go on with it after Ctrl-C or a power cut
+  plenoxel train --resume runs/lego                resume after Ctrl-C or a power cut
 
-Settings are layered: defaults < preset < --config < flags. config.toml in the run folder lists all of them; --set \
-reaches each by its path there, such as stages[0].sampling.step. The last line on stdout is one JSON object, \
-where it is no terminal; result.json has it too.";
+Settings are layered: defaults < preset < --config < flags. The run folder has all of them in config.toml. --set takes their \
+paths in that file, such as stages[0].sampling.step. If stdout is not a terminal, its last line is the JSON object of result.json.";
 
-/// What a run that goes on was told when it began.
+/// Arguments that conflict with `--resume`, because they are fixed at the start of a run.
 pub const NOT_WHEN_RESUMED: [&str; 20] = [
     "out",
     "force",
@@ -48,42 +47,41 @@ pub const NOT_WHEN_RESUMED: [&str; 20] = [
     "tv",
 ];
 
-/// Learn a scene and leave a run folder with the trained grid, pictures and figures
+/// Train a scene and write a run folder with the trained grid, pictures and results
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct TrainArgs {
-    /// Folder of a dataset in the NeRF-synthetic format; without it, the built-in scene
+    /// Dataset folder in the NeRF-synthetic format [default: the built-in scene]
     #[arg(value_hint = ValueHint::DirPath)]
     data: Option<PathBuf>,
 
-    /// Folder to write [default: runs/<scene>-<n>, the first free n]
+    /// Run folder to write [default: runs/<scene>-<n> with the first free n]
     #[arg(long, short, help_heading = "Output", value_hint = ValueHint::DirPath)]
     pub out: Option<PathBuf>,
 
-    /// Overwrite the run in the folder
+    /// Overwrite an existing run in the folder
     #[arg(long, help_heading = "Output")]
     pub force: bool,
 
-    /// Go on with the run in this folder from where it was last saved, with the settings that it began with, and the data, wherever they are
-    /// now
+    /// Resume the run in this folder from its last checkpoint, with its own settings. If the dataset has moved, give its new folder as DATA
     #[arg(long, value_name = "RUN", help_heading = "Output", value_hint = ValueHint::DirPath, conflicts_with_all = NOT_WHEN_RESUMED)]
     pub resume: Option<PathBuf>,
 
-    /// Save this often what is needed to go on, such as 30s or 10m; it is saved too when the run is interrupted (Ctrl-C, SIGTERM). If an
-    /// earlier grid that was saved shows validation views better than the last, it is kept too: best.safetensors
-    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration, default_value = "5m")]
+    /// Checkpoint interval, such as 30s or 10m. A checkpoint is also saved on Ctrl-C and SIGTERM. The checkpoint with the best validation
+    /// PSNR is kept as best.safetensors if it is better than the final grid
+    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration, default_value = "5m", allow_hyphen_values = true)]
     pub checkpoint_every: f64,
 
-    /// Look at the grid this often while it trains, such as 10s, or off: images/preview.png, and the PSNR of a few validation views. What is
-    /// trained does not depend on it, and it takes less than a twentieth of the time, or a second
-    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration_or_off, default_value = "10s")]
+    /// Preview interval, such as 10s, or off. A preview renders images/preview.png and measures the PSNR of a few validation views. Previews do
+    /// not affect the training and take less than 5 % of the time, or one second in short runs
+    #[arg(long, value_name = "DURATION", help_heading = "Output", value_parser = duration_or_off, default_value = "10s", allow_hyphen_values = true)]
     pub preview_every: f64,
 
-    /// Compare the trained grid with N test views, evenly spaced, instead of all of them
-    #[arg(long, value_name = "N", help_heading = "Output", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "no_evaluate")]
+    /// Evaluate the trained grid on N evenly spaced test views instead of all of them
+    #[arg(long, value_name = "N", help_heading = "Output", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "no_evaluate", allow_negative_numbers = true)]
     pub test_views: Option<usize>,
 
-    /// Do not compare the trained grid with the test views; `plenoxel evaluate` does it later
+    /// Do not evaluate the trained grid on the test views; `plenoxel evaluate` can do it later
     #[arg(long, help_heading = "Output")]
     pub no_evaluate: bool,
 
@@ -95,83 +93,83 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     pub no_report: bool,
 
-    /// Compute the test PSNR of each earlier stage too, which doubles the evaluation [default: for the built-in scene]
+    /// Also compute the test PSNR of each earlier stage, which doubles the evaluation time [default: for the built-in scene only]
     #[arg(long, help_heading = "Output")]
     stage_psnr: bool,
 
-    /// Settings to start from; `plenoxel presets` says what each is for [default: fast; quality with --time from 180 seconds on]
+    /// Preset of the settings; `plenoxel presets` describes each [default: fast; quality with --time of 180 seconds or more]
     #[arg(long, help_heading = "Settings", value_parser = PossibleValuesParser::new(PRESETS.map(|preset| preset.name)))]
     preset: Option<String>,
 
-    /// Make all stages of the preset longer or shorter, so that training takes this long on this machine, such as 90s, 5m or 1h, and
-    /// the finest coarser if it is short; how long is found out once, and written into the settings in steps
+    /// Duration of training on this machine, such as 90s, 5m or 1h. The program measures the speed of the machine, scales the lengths of all
+    /// stages, and reduces the resolution of the finest stages if the time is short. The settings record the resulting numbers of steps
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,
 
-    /// TOML file that changes the preset; a complete one, such as the config.toml of a run, stands in its place
+    /// TOML file of settings that override the preset; a complete file, such as the config.toml of a run, replaces the preset
     #[arg(long, value_name = "FILE", help_heading = "Settings", value_hint = ValueHint::FilePath)]
     config: Option<PathBuf>,
 
-    /// Set any key of the configuration; may be repeated. Nothing after the = removes an optional key
+    /// Set any key of the configuration; may be repeated. An empty value removes an optional key
     #[arg(long, value_name = "KEY=VALUE", help_heading = "Settings")]
     set: Vec<String>,
 
-    /// Seed of everything random [default: 42]
+    /// Seed of all random numbers [default: 42]
     #[arg(long, help_heading = "Settings", value_parser = whole::<i64>(0, i64::MAX as u64), allow_negative_numbers = true)]
     seed: Option<i64>,
 
-    /// Reduce the images by this factor, which must divide their width and height [default: 1; preset paper: 8]
-    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION))]
+    /// Downscale the images by this factor, which must divide their width and height [default: 1; preset paper: 8]
+    #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION), allow_negative_numbers = true)]
     downscale: Option<i64>,
 
-    /// Color behind the scene: white, black, or three numbers r,g,b in [0, 1] [default: white]
-    #[arg(long, help_heading = "Scene", value_parser = background)]
+    /// Background color: white, black, or three numbers r,g,b in [0, 1] [default: white]
+    #[arg(long, help_heading = "Scene", value_parser = background, allow_hyphen_values = true)]
     background: Option<[f64; 3]>,
 
-    /// Half the side of the cube in which the scene lies, in the dataset's units [default: 1.5; presets demo and paper: 1.4]
-    #[arg(long, value_name = "LENGTH", help_heading = "Scene", allow_negative_numbers = true)]
+    /// Half the side of the cube that contains the scene, in units of the dataset [default: 1.5; presets demo and paper: 1.4]
+    #[arg(long, value_name = "LENGTH", help_heading = "Scene", value_parser = number(f64::NEG_INFINITY), allow_negative_numbers = true)]
     half_width: Option<f64>,
 
-    /// Size of the built-in scene's images in pixels, SIDE or WIDTHxHEIGHT [default: 200]
+    /// Image size of the built-in scene in pixels, SIDE or WIDTHxHEIGHT [default: 200]
     #[arg(long, value_name = "SIZE", help_heading = "Scene", value_parser = size, conflicts_with = "data", allow_hyphen_values = true)]
     scene_size: Option<(usize, usize)>,
 
-    /// Number of training, validation and test views of the built-in scene [default: 100,10,25]
-    #[arg(long, value_name = "TRAIN,VAL,TEST", help_heading = "Scene", value_parser = three_counts, conflicts_with = "data")]
+    /// Numbers of training, validation and test views of the built-in scene [default: 100,10,25]
+    #[arg(long, value_name = "TRAIN,VAL,TEST", help_heading = "Scene", value_parser = three_counts, conflicts_with = "data", allow_hyphen_values = true)]
     scene_views: Option<[usize; 3]>,
 
-    /// How values between voxel centres are found [default: trilinear; preset paper: nearest]
+    /// Interpolation between voxel centers [default: trilinear; preset paper: nearest]
     #[arg(long, help_heading = "Model", value_parser = ["nearest", "trilinear"])]
     interpolation: Option<String>,
 
-    /// One color a voxel, or spherical harmonics of the direction of view [default: sh; preset paper: rgb]
+    /// Color of a voxel: constant (rgb), or view-dependent with spherical harmonics (sh) [default: sh; preset paper: rgb]
     #[arg(long, help_heading = "Model", value_parser = ["rgb", "sh"])]
     color: Option<String>,
 
     /// Degree of the spherical harmonics, 0 to 3; implies --color sh [default: 2]
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3))]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(0, 3), allow_negative_numbers = true)]
     sh_degree: Option<i64>,
 
-    /// Store harmonics of degree 1 and more for every N-th voxel along each axis only, which takes less memory and time
+    /// Store view-dependent color (harmonics of degree 1 and higher) on an N times coarser grid, which saves memory and time
     /// [default: 4; presets quality: 3, demo, plenoxels and paper: 1]
-    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64))]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64), allow_negative_numbers = true)]
     sh_reduction: Option<i64>,
 
-    /// Start from the grid of this run. A trained grid keeps its box, and stages coarser than it are left out; a carved one gives the box of its
-    /// voxels, and all stages are trained
+    /// Start from the grid of this run. With a trained grid, the box is that of the grid, and coarser stages are skipped. With a carved grid, the
+    /// box is that of its voxels, and all stages are trained
     #[arg(long, value_name = "RUN", help_heading = "Training", value_hint = ValueHint::DirPath)]
     init_from: Option<PathBuf>,
 
-    /// Where images have alpha, let silhouettes decide the size of the box and which voxels exist (auto), or use alpha for compositing
-    /// only (off) [default: auto; presets paper and plenoxels: off]
+    /// Use of the alpha channel of images: auto computes the visual hull of the silhouettes for the size of the box and the initial voxels; off
+    /// uses alpha for compositing only [default: auto; presets paper and plenoxels: off]
     #[arg(long, help_heading = "Training", value_parser = ["auto", "off"])]
     hull: Option<String>,
 
-    /// What computes the pixels: fused, in one pass, or graph, the slow one to compare it with [default: fused]
+    /// Renderer for training: fused (single pass), or graph (slow reference implementation) [default: fused]
     #[arg(long, help_heading = "Training", value_parser = ["fused", "graph"])]
     engine: Option<String>,
 
-    /// Total variation of the whole grid, weighted as in the source paper: sets tv_density and tv_color to W / 2 [default: 0]
+    /// Weight of the total variation of the whole grid, as in the source paper; sets the losses tv_density and tv_color to W / 2 [default: 0]
     // The paper adds W (Σ over color channels / channels + density) / (2 n³) of sums over cells. Ours are means over cells, and
     // tv_color is one over channels too, so each gets W / 2.
     #[arg(long, value_name = "W", help_heading = "Training", value_parser = weight, allow_negative_numbers = true)]
@@ -179,7 +177,7 @@ pub struct TrainArgs {
 }
 
 impl TrainArgs {
-    /// Where the views come from.
+    /// Source of the views.
     pub fn source(&self) -> DataSource {
         if let Some(path) = &self.data {
             return DataSource::folder(path);
@@ -191,19 +189,19 @@ impl TrainArgs {
         DataSource::built_in(&ProceduralOptions { width, height, train, val, test, ..default })
     }
 
-    /// True if the grids of earlier stages are evaluated too.
+    /// True if the grids of earlier stages are evaluated as well.
     pub fn keeps_stages(&self, source: &DataSource) -> bool {
         self.stage_psnr || matches!(source, DataSource::BuiltIn { .. })
     }
 
-    /// Where the views of a run that goes on are now, if they are not where they were.
+    /// New source of the views of a resumed run, if given.
     pub fn moved_to(&self) -> Option<DataSource> {
         self.data.as_deref().map(DataSource::folder)
     }
 
-    /// The configuration, and the preset it started from.
+    /// Resolves the configuration. Returns it with the name of its preset.
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
-        // In two minutes `fast` is 0.2 dB better, in four 0.6 worse.
+        // `fast` is 0.2 dB better in two minutes, and 0.6 dB worse in four.
         let default = if self.time.is_some_and(|seconds| seconds >= 180.0) { "quality" } else { "fast" };
         settings::layered(self.preset.as_deref(), default, self.config.as_deref(), |layers| self.flags(layers))
     }
@@ -214,11 +212,15 @@ impl TrainArgs {
         let color = match (self.color.as_deref(), self.sh_degree) {
             (None, Some(_)) => Some(Value::String("sh".to_owned())),
             (Some("rgb"), Some(degree)) => {
-                return Err(Error::config("--sh-degree", format!("{degree} with --color rgb, which has no harmonics"), "one of the two"));
+                return Err(Error::usage(
+                    "--sh-degree",
+                    format!("{degree} conflicts with --color rgb, which has no harmonics"),
+                    "leave out one of the two flags",
+                ));
             }
             _ => text(&self.color),
         };
-        // Absolute, so that the settings repeat the run from anywhere.
+        // Absolute, so that the settings repeat the run from any directory.
         let init_from = self.init_from.as_deref().map(|path| path.canonicalize().unwrap_or_else(|_| path.to_owned()));
         let init_from = init_from.map(|path| Value::String(path.to_string_lossy().into_owned()));
         let background = self.background.map(|c| Value::Array(c.map(Value::Float).to_vec()));
@@ -246,7 +248,7 @@ impl TrainArgs {
     }
 }
 
-/// Seconds from `90`, `90s`, `1.5m` or `1h`.
+/// Parses a duration such as `90`, `90s`, `1.5m` or `1h` to seconds.
 fn duration(text: &str) -> std::result::Result<f64, String> {
     let number = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
     let unit = match &text[number.len()..] {
@@ -256,20 +258,22 @@ fn duration(text: &str) -> std::result::Result<f64, String> {
         _ => None,
     };
     let seconds = unit.and_then(|unit| Some(number.parse::<f64>().ok()? * unit));
-    seconds.filter(|s| *s > 0.0 && *s <= 1e6).ok_or_else(|| "a duration above 0 and up to 1e6 seconds, such as 90s, 5m or 1h".to_owned())
+    seconds
+        .filter(|s| *s > 0.0 && *s <= 1e6)
+        .ok_or_else(|| "expected a duration above 0 and up to 1e6 seconds, such as 90s, 5m or 1h".to_owned())
 }
 
-/// The same, or `off`: infinitely many.
+/// Parses a duration, or `off` to infinity.
 fn duration_or_off(text: &str) -> std::result::Result<f64, String> {
-    if text == "off" { Ok(f64::INFINITY) } else { duration(text).map_err(|accepted| format!("{accepted}; or off")) }
+    if text == "off" { Ok(f64::INFINITY) } else { duration(text).map_err(|expected| format!("{expected}, or off")) }
 }
 
-/// Width and height from `SIDE` or `WIDTHxHEIGHT`.
+/// Parses an image size, `SIDE` or `WIDTHxHEIGHT`.
 pub fn size(text: &str) -> std::result::Result<(usize, usize), String> {
     let (width, height) = text.split_once('x').unwrap_or((text, text));
     match (width.parse(), height.parse()) {
         (Ok(width), Ok(height)) if width > 0 && height > 0 => Ok((width, height)),
-        _ => Err("a number of pixels, or WIDTHxHEIGHT such as 320x240".to_owned()),
+        _ => Err("expected a number of pixels, or WIDTHxHEIGHT such as 320x240".to_owned()),
     }
 }
 
@@ -277,12 +281,12 @@ fn three_counts(text: &str) -> std::result::Result<[usize; 3], String> {
     let counts: Vec<usize> = text.split(',').map_while(|part| part.trim().parse().ok()).collect();
     let fits = counts.len() == text.split(',').count();
     let counts = counts.try_into().ok().filter(|[train, ..]: &[usize; 3]| fits && *train > 0);
-    counts.ok_or_else(|| "three numbers of views such as 100,10,25, the first of them at least 1".to_owned())
+    counts.ok_or_else(|| "expected three numbers of views such as 100,10,25, with at least 1 training view".to_owned())
 }
 
 fn weight(text: &str) -> std::result::Result<f64, String> {
     let weight = text.parse().ok();
-    weight.filter(|w: &f64| w.is_finite() && *w >= 0.0).ok_or_else(|| "a number of at least 0, such as 1e-4".to_owned())
+    weight.filter(|w: &f64| w.is_finite() && *w >= 0.0).ok_or_else(|| "expected a number of at least 0, such as 1e-4".to_owned())
 }
 
 #[cfg(test)]

@@ -12,24 +12,25 @@ use plenoxel::run::training::Underway;
 use plenoxel::train::PlannedStage;
 use std::path::PathBuf;
 
-/// Panels of more views than this fill folders and nobody's eye.
+/// Largest number of panels of test views.
 const MOST_PANELS: usize = 25;
 
 /// The pictures of a run.
 pub struct Pictures {
     folder: RunFolder,
     background: [f32; 3],
-    /// Of the first test view, or of the first training view where there is none. Its photograph is not looked at in training.
+    /// Camera of the pictures of stages: that of the first test view, or of the first training view if there are no test views. Training does not read the
+    /// photograph of a test view.
     camera: Option<Camera>,
-    /// Test views that get a panel.
+    /// Indices of the test views with a panel.
     panels: Vec<usize>,
     views: usize,
-    /// The view before the first step and after each stage.
+    /// Pictures of the view before the first step and after each stage.
     stages: Vec<Rgb>,
 }
 
 impl Pictures {
-    /// Pictures for a run that is compared with so many test views, or none at all.
+    /// Prepares the pictures of a run that is evaluated on `views` test views; draws none unless they are wanted.
     pub fn new(run: Underway<'_>, views: usize, wanted: bool) -> Result<Self> {
         let first = |split| run.dataset.cameras(split).into_iter().next();
         if wanted {
@@ -45,7 +46,7 @@ impl Pictures {
         })
     }
 
-    /// Adds the pictures that were drawn before the run was interrupted, if they were wanted then too; one that cannot be read is left out.
+    /// Adds the pictures of the stages before the run was interrupted. Missing and unreadable pictures are left out.
     pub fn after(mut self, past: &History, plan: &[PlannedStage]) -> Self {
         if past.losses.is_empty() || self.camera.is_none() {
             return self;
@@ -60,12 +61,12 @@ impl Pictures {
         self
     }
 
-    /// The model that `see` renders has not taken a step yet.
+    /// Draws the model before its first step; `see` renders it.
     pub fn initial(&mut self, stage: &PlannedStage, see: &dyn Fn(&Camera) -> Picture) -> Result<()> {
         self.draw(0, stage, see)
     }
 
-    /// A stage has ended with a model that `see` renders.
+    /// Draws the model at the end of a stage; `see` renders it.
     pub fn stage(&mut self, stage: &PlannedStage, see: &dyn Fn(&Camera) -> Picture) -> Result<()> {
         self.draw(stage.index + 1, stage, see)
     }
@@ -84,7 +85,7 @@ impl Pictures {
         self.folder.image(&RunFolder::stage_name(number, stage.resolution))
     }
 
-    /// A test view was rendered with the final model, whose box has a half width.
+    /// Writes the panel of a test view that was rendered with the final model. `half_width` is that of its box.
     pub fn panel(&self, number: usize, view: &View, target: &Rgb, picture: &Picture, half_width: f64) -> Result<()> {
         if !self.panels.contains(&number) {
             return Ok(());
@@ -93,7 +94,7 @@ impl Pictures {
         images::write(&self.folder.image(&RunFolder::panel_name(number, &view.name)), &images::panel(target, picture, range))
     }
 
-    /// The start and the stages side by side, and the photograph they are to become.
+    /// Writes the strip of the pictures before the first step and of all stages, followed by the photograph.
     pub fn strip(&self, first_test: Option<&View>, background: [f32; 3]) -> Result<()> {
         if self.stages.is_empty() {
             return Ok(());
@@ -107,6 +108,6 @@ impl Pictures {
     pub fn note(&self) -> Option<String> {
         let shown = self.panels.len();
         (shown > 0 && shown < self.views)
-            .then(|| format!("images: panels of {shown} of the {} test views, evenly spaced; all of them are in the figures", self.views))
+            .then(|| format!("wrote panels of {shown} of the {} test views, evenly spaced; the results are of all test views", self.views))
     }
 }

@@ -1,4 +1,4 @@
-//! What is shown of a run while it trains: lines and bars, the curve of the loss, pictures, and the page at the end.
+//! Output of a training run: progress, the loss curve, pictures, and the report at the end.
 
 use super::pictures::Pictures;
 use super::say;
@@ -13,24 +13,24 @@ use plenoxel::run::folder::RunFolder;
 use plenoxel::run::training::{Event, Finished};
 use plenoxel::train::PlannedStage;
 
-/// The listener to the events of a run.
+/// A listener that prints the events of a run and writes its pictures.
 pub struct Screen<'c, 'a> {
     console: &'c Console<'a>,
     draws: bool,
     reports: bool,
     count: Option<Count<'c, 'a>>,
-    /// While the run trains.
+    /// Active during training.
     interrupt: Option<Watch>,
     progress: Option<Training<'c, 'a>>,
     pictures: Option<Pictures>,
     folder: Option<RunFolder>,
     plan: Vec<PlannedStage>,
-    /// The first failure to print or to write the page.
+    /// The first error of printing or of writing the report.
     failure: Result<()>,
 }
 
 impl<'c, 'a> Screen<'c, 'a> {
-    /// A screen that draws pictures and writes a page, or does not.
+    /// Creates the listener. It writes pictures if `draws` is true, and the report if `reports` is true.
     pub fn new(console: &'c Console<'a>, draws: bool, reports: bool) -> Self {
         Screen {
             console,
@@ -46,7 +46,7 @@ impl<'c, 'a> Screen<'c, 'a> {
         }
     }
 
-    /// Shows an event. Pictures that cannot be written are no reason to lose what was learned: it is said, and the run goes on.
+    /// Handles an event. If a picture cannot be written, the run continues with a note.
     pub fn show(&mut self, event: Event<'_>) {
         let console = self.console;
         match event {
@@ -59,7 +59,7 @@ impl<'c, 'a> Screen<'c, 'a> {
                 }
             }
             Event::Carving { done, total } => {
-                const WHAT: &str = "visual hull of training views";
+                const WHAT: &str = "computing the visual hull, view";
                 match &self.progress {
                     Some(training) => training.count(WHAT, done, total),
                     None => self.count.get_or_insert_with(|| console.count(WHAT, total)).at(done, total),
@@ -107,7 +107,9 @@ impl<'c, 'a> Screen<'c, 'a> {
                 (self.progress, self.interrupt) = (None, None);
                 if let Some(folder) = &self.folder {
                     let again = format!("plenoxel train --resume {}", folder.path().display());
-                    interrupt::on_exit(format!("interrupted; the trained model is saved; its figures and its page: {again}"));
+                    interrupt::on_exit(format!(
+                        "interrupted; the trained model is saved; write its final figures and report with: {again}"
+                    ));
                 }
             }
             Event::Evaluating { done, total } => {
@@ -130,7 +132,9 @@ impl<'c, 'a> Screen<'c, 'a> {
         }
     }
 
-    /// Ends the screen. Errors: the result could not be printed, or the page not be written.
+    /// Ends the output.
+    ///
+    /// Errors: the result could not be printed, or the report could not be written.
     pub fn finish(self) -> Result<()> {
         self.failure
     }

@@ -59,16 +59,16 @@ impl StatedIntrinsics {
         }
         for (key, value) in LENSES.into_iter().filter_map(|key| Some((key, stated(key)?))) {
             if value.as_bool() != Some(false) {
-                return refused(key, value, "accepted: pinhole cameras");
+                return refused(key, value, "expected a pinhole camera");
             }
         }
         if let Some(model) = stated(MODEL)
             && !model.as_str().is_some_and(|model| PINHOLES.contains(&model))
         {
-            return refused(MODEL, model, "accepted: pinhole cameras, such as PINHOLE, or OPENCV without distortion");
+            return refused(MODEL, model, "expected a pinhole camera, such as PINHOLE, or OPENCV without distortion");
         }
         for (key, value) in COMPARED.into_iter().filter_map(|key| Some((key, stated(key)?))) {
-            let Some(value) = value.as_f64() else { return refused(key, value, "accepted: a number") };
+            let Some(value) = value.as_f64() else { return refused(key, value, "expected a number") };
             self.0.push(Stated { key, frame, value });
         }
         Ok(())

@@ -22,7 +22,7 @@ pub fn write(dataset: &Dataset, root: &Path, overwrite: bool, change: &dyn Fn(Sp
         if let Some(odd) = cameras.iter().position(|camera| !expressible(&camera.intrinsics) || camera.intrinsics != cameras[0].intrinsics)
         {
             let found = format!("{split} view {odd} has intrinsics that the NeRF-synthetic format cannot express");
-            return Err(Error::input(root, found, "accepted: one camera with square pixels and a centred principal point"));
+            return Err(Error::input(root, found, "expected one camera with square pixels and a centred principal point"));
         }
         files::create_dir(&root.join(split.to_string()))?;
         let mut views = dataset.load(split, &|_, _| ())?;

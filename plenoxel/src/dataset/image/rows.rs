@@ -36,7 +36,7 @@ pub(super) fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32,
     let (width, height) = (number(16), number(20));
     let refused = |remedy: String| Err(Error::input(path, format!("the header says {width} x {height} pixels"), remedy));
     if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
-        return refused(format!("accepted: images of 1 to {MAX_SIDE} pixels per side"));
+        return refused(format!("expected an image of 1 to {MAX_SIDE} pixels per side"));
     }
     // Gray and palette, RGB, gray with alpha, RGBA.
     let channels = [1, 0, 3, 1, 2, 0, 4].get(usize::from(head[25])).copied().unwrap_or(0);
@@ -149,5 +149,5 @@ fn not_png(path: &Path, head: &[u8]) -> Error {
 }
 
 fn cut_short(path: &Path) -> Error {
-    Error::input(path, "the PNG ends early: it is cut short", "copy or download the file again")
+    Error::input(path, "the PNG is truncated", "copy or download the file again")
 }

@@ -18,15 +18,15 @@ pub fn decimate(vertices: Vec<Vertex>, triangles: Vec<[u32; 3]>, most: usize) ->
         return Ok((vertices, triangles));
     }
     let (positions, mut left) = collapsed(&vertices, &triangles, most).map_err(|e| {
-        let found = format!("{most}, but the surface cannot be decimated ({e:?})");
-        Error::config("max_triangles", found, "no limit: leave the option out")
+        let found = format!("this surface cannot be decimated ({e:?})");
+        Error::usage("max_triangles", found, "leave it out")
     })?;
     // Each edge has two triangles, so two triangles with the same vertices form a part.
     left.sort_unstable_by_key(sorted);
     let left: Vec<[u32; 3]> = left.chunk_by(|a, b| sorted(a) == sorted(b)).filter(|same| same.len() == 1).map(|single| single[0]).collect();
     if left.is_empty() {
-        let found = format!("{most} leaves no triangle of this surface, because it has too many parts");
-        return Err(Error::config("max_triangles", found, "a larger number; or a larger --min-part, which removes small parts"));
+        let found = format!("{most} triangles are too few for the parts of this surface: nothing is left");
+        return Err(Error::usage("max_triangles", found, "increase it, or leave out small parts with a larger --min-part"));
     }
     let mut numbers = vec![u32::MAX; vertices.len()];
     let mut kept = Vec::new();

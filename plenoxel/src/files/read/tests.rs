@@ -36,19 +36,19 @@ fn a_file_is_read_up_to_the_size_of_its_kind() {
     let path = folder.write("a", &[7; 100]);
     assert_eq!((read(&path, SMALL).unwrap(), read_named(&path, SMALL).unwrap()), (vec![7; 100], vec![7; 100]));
     let path = folder.write("b", &[7; 101]);
-    refused(open(&path, SMALL), 3, "larger than the 0 kB that a small file may have; a small file is expected");
-    refused(read(&path, SMALL), 3, "larger than");
-    refused(read_named(&path, SMALL), 3, "larger than");
+    refused(open(&path, SMALL), 3, "too large: a small file may have at most 0 kB; expected a small file");
+    refused(read(&path, SMALL), 3, "too large");
+    refused(read_named(&path, SMALL), 3, "too large");
     let greedy = Kind { memory: u64::MAX / 101, most: 101, ..SMALL };
-    refused(read(&path, greedy), 3, "of memory, where");
+    refused(read(&path, greedy), 3, "of memory, but");
 }
 
 #[test]
 fn what_is_no_file_is_said_to_be_what_it_is() {
     let folder = Folder::new("kinds");
     for read in [read, read_named] {
-        refused(read(&folder.0, SMALL), 3, "this is a folder; a small file is expected there");
-        refused(read(&folder.0.join("none"), SMALL), 3, "there is no such file");
+        refused(read(&folder.0, SMALL), 3, "this is a folder; expected a small file");
+        refused(read(&folder.0.join("none"), SMALL), 3, "this file does not exist");
     }
     assert!(is_there(&folder.0) && !is_there(&folder.0.join("none")));
 }
@@ -73,9 +73,9 @@ mod unix {
         refused(open(&pipe, SMALL), 3, "this is a pipe, not a plain file");
         symlink("/dev/zero", &link).unwrap();
         refused(read(&link, SMALL), 3, "this is a device, not a plain file");
-        refused(read_named(&link, SMALL), 3, "larger than");
+        refused(read_named(&link, SMALL), 3, "too large");
         if memory::available().is_some() {
-            refused(read_named(&link, Kind { most: 1 << 60, memory: 1 << 20, ..SMALL }), 3, "of memory, where");
+            refused(read_named(&link, Kind { most: 1 << 60, memory: 1 << 20, ..SMALL }), 3, "of memory, but");
         }
         let socket = folder.0.join("socket");
         let _listener = std::os::unix::net::UnixListener::bind(&socket).unwrap();
@@ -99,7 +99,7 @@ mod unix {
         assert_eq!(read(&link, SMALL).unwrap(), b"x");
         fs::remove_file(file).unwrap();
         assert!(is_there(&link));
-        refused(read(&link, SMALL), 3, "this is a link to a file that is not there");
+        refused(read(&link, SMALL), 3, "this symbolic link is broken");
     }
 
     #[test]
@@ -127,8 +127,8 @@ fn text_is_utf_8_or_utf_16_with_a_mark() {
     let utf16 = |unit: fn(u16) -> [u8; 2]| "\u{feff}ä{}𝄞".encode_utf16().flat_map(unit).collect::<Vec<u8>>();
     for bytes in [utf16(u16::to_le_bytes), utf16(u16::to_be_bytes)] {
         assert_eq!(text(&bytes).unwrap(), "ä{}𝄞");
-        refused(text(&bytes[..bytes.len() - 1]), 3, "t.json: the byte order mark says UTF-16");
-        refused(text(&bytes[..bytes.len() - 2]), 3, "t.json: the byte order mark says UTF-16");
+        refused(text(&bytes[..bytes.len() - 1]), 3, "t.json: this file has a byte order mark of UTF-16");
+        refused(text(&bytes[..bytes.len() - 2]), 3, "t.json: this file has a byte order mark of UTF-16");
     }
-    refused(text(b"{\n\xff}"), 3, "t.json: line 2 is no text in UTF-8");
+    refused(text(b"{\n\xff}"), 3, "t.json: line 2 is not valid UTF-8");
 }

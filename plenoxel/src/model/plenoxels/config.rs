@@ -467,7 +467,7 @@ impl Config {
 
     /// Errors if the config has no stage to train.
     pub fn check_stages(&self) -> Result<()> {
-        check(!self.stages.is_empty(), "stages", "no stage", "at least one stage")
+        demand(!self.stages.is_empty(), "stages", "there is no stage", "set at least one")
     }
 
     /// Checks every value. An error names the key as it is spelled in the file.
@@ -482,10 +482,10 @@ impl Config {
         check(
             self.background.iter().all(|c| (0.0..=1.0).contains(c)),
             "background",
-            format!("invalid value {:?}", self.background),
+            format!("{:?}", self.background),
             "three numbers in [0, 1]",
         )?;
-        let half_widths = "a number above 0, from 1e-9 to 1e9";
+        let half_widths = "a number from 1e-9 to 1e9";
         check(GridShape::HALF_WIDTHS.contains(&self.half_width), "half_width", self.half_width, half_widths)?;
         check(self.sh_degree <= sh::MAX_DEGREE, "sh_degree", self.sh_degree, "0 to 3")?;
         check((1..=64).contains(&self.sh_reduction), "sh_reduction", self.sh_reduction, "1 to 64")?;
@@ -496,7 +496,7 @@ impl Config {
         density("prune_below", self.prune_below)?;
         check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;
         let nowhere = self.init_from.as_ref().is_some_and(|path| path.as_os_str().is_empty());
-        check(!nowhere, "init_from", "an empty path", "the folder of a run")?;
+        check(!nowhere, "init_from", "\"\"", "the folder of a run")?;
         density("initial.density", self.initial.density)?;
         color("initial.color", self.initial.color)?;
         match self.optimizer {
@@ -513,7 +513,12 @@ impl Config {
             }
         }
         for (name, weight) in &self.losses {
-            check(LOSSES.contains(&name.as_str()), &format!("losses.{name}"), "unknown loss", &format!("one of {}", LOSSES.join(", ")))?;
+            demand(
+                LOSSES.contains(&name.as_str()),
+                &format!("losses.{name}"),
+                "unknown loss",
+                &format!("expected one of {}", LOSSES.join(", ")),
+            )?;
             let key = |part: &str| format!("losses.{name}{part}");
             let fits = |part: &str, weight: f64| check((0.0..=1e12).contains(&weight), &key(part), weight, "0 to 1e12");
             let changes = |part: &str, weight: f64| check((1e-30..=1e12).contains(&weight), &key(part), weight, "1e-30 to 1e12");
@@ -531,30 +536,32 @@ impl Config {
         for (name, rate) in &self.loss_rates {
             let key = format!("loss_rates.{name}");
             let learned: Vec<&str> = LEARNED_LOSSES.into_iter().filter(|loss| self.losses.contains_key(*loss)).collect();
-            let accepted =
-                if learned.is_empty() { "no rates unless the loss robust or exposure is used".to_owned() } else { learned.join(", ") };
-            check(learned.contains(&name.as_str()), &key, "no loss of this name has parameters", &accepted)?;
+            let remedy = match learned.is_empty() {
+                true => "remove it: only the losses robust and exposure have parameters".to_owned(),
+                false => format!("expected a rate for {}", learned.join(", ")),
+            };
+            demand(learned.contains(&name.as_str()), &key, "this loss has no parameters here", &remedy)?;
             check((1e-12..=1e6).contains(rate), &key, rate, "1e-12 to 1e6")?;
         }
         if let Some(scout) = &self.scout {
-            check(scout.density > 0.0, "scout.density", scout.density, "above 0 to 1e12")?;
+            check(scout.density > 0.0, "scout.density", scout.density, "a number above 0, up to 1e12")?;
             density("scout.density", scout.density)?;
             let least = scout.prune_unseen_below;
             check((0.0..=1.0).contains(&least), "scout.prune_unseen_below", least, "a number in [0, 1]")?;
-            check(!scout.stages.is_empty(), "scout.stages", "no stage", "at least one stage, or no scout")?;
+            demand(!scout.stages.is_empty(), "scout.stages", "there is no stage", "set at least one, or remove the scout")?;
         }
         let longest = self.stages.len().max(self.scout.as_ref().map_or(0, |scout| scout.stages.len()));
-        check(longest <= MOST_STAGES, "stages", format!("{longest} stages"), "at most 100")?;
+        demand(longest <= MOST_STAGES, "stages", &format!("there are {longest} stages"), &format!("set at most {MOST_STAGES}"))?;
         let stages = self.stages.iter().enumerate().map(|(i, stage)| (format!("stages[{i}]"), stage));
         let of_scout = self.scout.iter().flat_map(|scout| scout.stages.iter().enumerate());
         for (place, stage) in stages.chain(of_scout.map(|(i, stage)| (format!("scout.stages[{i}]"), stage))) {
             let key = |name: &str| format!("{place}.{name}");
             check((2..=1024).contains(&stage.resolution), &key("resolution"), stage.resolution, "2 to 1024 voxels per axis")?;
             match (stage.epochs, stage.steps) {
-                (Some(epochs), None) => check(epochs > 0.0 && epochs <= 1e6, &key("epochs"), epochs, "above 0 to 1e6")?,
+                (Some(epochs), None) => check(epochs > 0.0 && epochs <= 1e6, &key("epochs"), epochs, "a number above 0, up to 1e6")?,
                 (None, Some(steps)) => check((1..=1_000_000_000).contains(&steps), &key("steps"), steps, "1 to 1e9")?,
-                (Some(_), Some(_)) => check(false, &key("steps"), "both `epochs` and `steps` are set", "one of them")?,
-                (None, None) => check(false, &key("steps"), "neither `epochs` nor `steps` is set", "one of them")?,
+                (Some(_), Some(_)) => demand(false, &key("steps"), "both `epochs` and `steps` are set", "set one of them")?,
+                (None, None) => demand(false, &key("steps"), "neither `epochs` nor `steps` is set", "set one of them")?,
             }
             sampling(&key("sampling"), stage.sampling)?;
             let harmonics_rate = stage.harmonics_rate.unwrap_or(stage.color_rate);
@@ -568,11 +575,11 @@ impl Config {
             }
             // The kernels index samples of a batch with 32 bits.
             let samples = stage.sampling.most(stage.resolution) * self.rays_per_step as f64;
-            check(
+            demand(
                 samples < f64::from(u32::MAX),
                 &key("sampling"),
-                format!("up to {samples:.0} samples per step"),
-                "fewer than 4294967295: longer steps, or a smaller rays_per_step",
+                &format!("a training step has up to {samples:.0} samples, which is more than 4294967294"),
+                "use a larger sampling step, or a smaller rays_per_step",
             )?;
         }
         sampling("evaluation", self.evaluation)?;
@@ -597,12 +604,18 @@ fn sampling(key: &str, sampling: Sampling) -> Result<()> {
     }
 }
 
-fn check(fits: bool, key: &str, found: impl ToString, accepted: &str) -> Result<()> {
+/// Checks a condition other than the range of a value.
+fn demand(holds: bool, key: &str, problem: &str, remedy: &str) -> Result<()> {
+    if holds { Ok(()) } else { Err(Error::usage(key, problem, remedy)) }
+}
+
+/// Checks the range of a value.
+fn check(fits: bool, key: &str, value: impl ToString, expected: &str) -> Result<()> {
     if fits {
         return Ok(());
     }
-    let found = found.to_string();
+    let value = value.to_string();
     // A number such as 1e300 would otherwise be printed with all its zeros.
-    let short = if found.len() > 20 { found.parse().ok().map(|number: f64| format!("{number:e}")) } else { None };
-    Err(Error::config(key, short.unwrap_or(found), accepted))
+    let short = if value.len() > 20 { value.parse().ok().map(|number: f64| format!("{number:e}")) } else { None };
+    Err(Error::config(key, short.unwrap_or(value), expected))
 }

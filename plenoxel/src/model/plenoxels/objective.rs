@@ -41,7 +41,7 @@ pub fn with_loss<T: Real, M: AsRef<VoxelGrid<T>> + 'static>(
         "tv_density_sampled" => objective.with(name, weight, tv_density(Cells::SAMPLED)),
         "tv_color_sampled" => objective.with(name, weight, tv_color(Cells::SAMPLED)),
         _ if loss::NAMES.contains(&name) => objective.with_named(name, weight, views)?,
-        _ => return Err(Error::config(format!("losses.{name}"), "unknown loss", format!("one of {}", LOSSES.join(", ")))),
+        _ => return Err(Error::usage(format!("losses.{name}"), "unknown loss", format!("expected one of {}", LOSSES.join(", ")))),
     })
 }
 
@@ -52,7 +52,7 @@ pub fn objective<T: Real>(config: &Config, views: usize) -> Result<Objective<T>>
 
 pub(super) fn of_config<T: Real>(config: &Config, views: usize) -> Result<Objective<T>> {
     if config.losses.is_empty() {
-        return Err(Error::config("losses", "no loss", "at least one, as in `mse = 1.0`"));
+        return Err(Error::usage("losses", "there is no loss", "set at least one, such as `mse = 1.0`"));
     }
     let all = config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| with_loss(objective, name, *weight, views))?;
     Ok(config.loss_rates.iter().fold(all, |objective, (loss, &rate)| {

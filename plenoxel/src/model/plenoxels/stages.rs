@@ -82,8 +82,8 @@ impl<T: Real> Plenoxels<T> {
         if rows <= most {
             return Ok(());
         }
-        let found = format!("pruning would leave {rows} voxels at {resolution}³, memory has room for {most}");
-        Err(Error::config("prune_unseen_below", found, "a larger value, or a lower resolution in the last stages"))
+        let found = format!("pruning leaves {rows} voxels at {resolution}³, but the available memory holds {most}");
+        Err(Error::usage("prune_unseen_below", found, "increase it, or reduce the resolution of the last stages"))
     }
 
     /// Restricts training rays to the remaining voxels, if the config sets `aim`.

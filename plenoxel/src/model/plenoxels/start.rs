@@ -43,8 +43,8 @@ impl Silhouettes {
 
     /// Returns the error for an empty visual hull.
     pub fn nothing_inside() -> Error {
-        let found = "\"auto\", but no voxel of the box lies within the silhouettes of all views";
-        Error::config("hull", found, "\"off\"; or a half_width whose box contains the object; or another run to start from")
+        let found = "no voxel of the box lies within the silhouettes of all views";
+        Error::usage("hull", found, "set it to \"off\", set a half_width whose box contains the object, or start from another run")
     }
 
     /// Returns the voxels of a grid that a sample inside the silhouettes can read.

@@ -59,8 +59,8 @@ impl Number {
         NUMBERS.iter().find(|(number, _)| *number == self).map_or("float", |(_, names)| names[0])
     }
 
-    /// Returns the accepted text of an ASCII file, in words.
-    pub(super) fn accepted(self) -> String {
+    /// Returns the expected text of an ASCII file, in words.
+    pub(super) fn expected(self) -> String {
         match self.range() {
             Some([low, high]) => format!("a whole number from {low} to {high}"),
             None => "a number".to_owned(),
@@ -177,7 +177,11 @@ impl Header {
         let write_again = "write the cloud again as PLY 1.0";
         if !file.starts_with(b"ply") {
             let start: String = String::from_utf8_lossy(&file[..file.len().min(16)]).escape_debug().collect();
-            return Err(Error::input(path, format!("no PLY file: it begins with `{start}`"), "use a file that begins with `ply`"));
+            let found = match start.is_empty() {
+                true => "this is not a PLY file: it is empty".to_owned(),
+                false => format!("this is not a PLY file: it begins with `{start}`, not with `ply`"),
+            };
+            return Err(Error::input(path, found, "give a PLY file"));
         }
         let (mut encoding, mut remarks, mut elements) = (None, Vec::new(), Vec::<Element>::new());
         // Of elements, and of the properties of the last.
@@ -187,41 +191,41 @@ impl Header {
         for number in 1.. {
             let Some(end) = head[at..].iter().position(|&b| b == b'\n').map(|length| at + length) else {
                 if head.len() < file.len() {
-                    let found = format!("the header is longer than the {} that it may have", memory::bytes(MOST as u64));
-                    return Err(Error::input(path, found, "leave out comments and properties that are not needed"));
+                    let found = format!("the header is longer than the limit of {}", memory::bytes(MOST as u64));
+                    return Err(Error::input(path, found, "remove comments and properties that are not needed"));
                 }
-                return Err(Error::input(path, "the header has no `end_header`", "use an undamaged copy: this one is cut short"));
+                return Err(Error::input(path, "the header has no `end_header`", "the file is truncated: use an undamaged copy"));
             };
             let line = String::from_utf8_lossy(&file[at..end]);
             let line = line.trim();
             at = end + 1;
-            let bad = |accepted: &str| {
+            let bad = |expected: &str| {
                 let shown: String = line.chars().take(80).collect();
-                Err(Error::input(path, format!("line {number} of the header is `{shown}`"), accepted))
+                Err(Error::input(path, format!("line {number} of the header is `{shown}`"), expected))
             };
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words[..] {
                 ["ply"] if number == 1 => {}
-                _ if number == 1 => return bad("accepted: `ply` as the first line"),
+                _ if number == 1 => return bad("expected `ply` as the first line"),
                 [] => {}
                 ["comment" | "obj_info", ..] => remarks.push(line.to_owned()),
-                ["format", ..] if encoding.is_some() => return bad("the format is said once"),
+                ["format", ..] if encoding.is_some() => return bad("expected one line `format`"),
                 ["format", name, "1.0"] => {
                     encoding = Some(match name {
                         "ascii" => Encoding::Ascii,
                         "binary_little_endian" => Encoding::LittleEndian,
                         "binary_big_endian" => Encoding::BigEndian,
-                        _ => return bad("accepted: ascii, binary_little_endian, binary_big_endian"),
+                        _ => return bad("expected ascii, binary_little_endian or binary_big_endian"),
                     });
                 }
-                ["format", ..] => return bad("`format ENCODING 1.0` is read"),
+                ["format", ..] => return bad("expected `format ENCODING 1.0`"),
                 ["element", name, count] => match count.parse() {
-                    Ok(_) if !tables.insert(name.to_owned()) => return bad("each element has a name of its own"),
+                    Ok(_) if !tables.insert(name.to_owned()) => return bad("expected a different name for each element"),
                     Ok(count) => {
                         columns.clear();
                         elements.push(Element { name: name.to_owned(), count, properties: Vec::new() });
                     }
-                    Err(_) => return bad("accepted: `element NAME COUNT`, where COUNT is a whole number"),
+                    Err(_) => return bad("expected `element NAME COUNT`, where COUNT is a whole number"),
                 },
                 ["property", ref kind @ .., name] => {
                     let kind = match *kind {
@@ -234,17 +238,17 @@ impl Header {
                     };
                     let Some(kind) = kind else {
                         return bad(
-                            "accepted: `property TYPE NAME` or `property list TYPE TYPE NAME`; types: char, uchar, short, ushort, int, uint, float, double",
+                            "expected `property TYPE NAME` or `property list TYPE TYPE NAME` with the types char, uchar, short, ushort, int, uint, float, double",
                         );
                     };
-                    let Some(element) = elements.last_mut() else { return bad("a property must be below an element") };
+                    let Some(element) = elements.last_mut() else { return bad("expected an element before its properties") };
                     if !columns.insert(name.to_owned()) {
-                        return bad("each property of an element has a name of its own");
+                        return bad("expected a different name for each property of an element");
                     }
                     element.properties.push(Property { name: name.to_owned(), kind });
                 }
                 ["end_header"] => break,
-                _ => return bad("accepted: format, comment, obj_info, element, property, end_header"),
+                _ => return bad("expected format, comment, obj_info, element, property or end_header"),
             }
         }
         let encoding = encoding.ok_or_else(|| Error::input(path, "the header has no line `format`", write_again))?;

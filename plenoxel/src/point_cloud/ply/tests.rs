@@ -160,26 +160,26 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
     };
     let ascii = |rest: &str| format!("ply\nformat ascii 1.0\n{rest}");
     let xyz = "property float x\nproperty float y\nproperty float z\n";
-    refused("", &["no PLY file", "begins with ``"]);
-    refused("\u{89}PNG\r\n", &["no PLY file", "PNG"]);
+    refused("", &["not a PLY file", "it is empty"]);
+    refused("\u{89}PNG\r\n", &["not a PLY file", "PNG"]);
     refused("plyx\nend_header\n", &["line 1", "plyx"]);
-    refused("ply\nformat ascii 1.0\nelement vertex 3\n", &["no `end_header`", "cut short"]);
+    refused("ply\nformat ascii 1.0\nelement vertex 3\n", &["no `end_header`", "truncated"]);
     refused("ply\nelement vertex 0\nend_header\n", &["no line `format`"]);
     refused("ply\nformat binary 1.0\nend_header\n", &["line 2", "binary_little_endian"]);
     refused(&ascii("element vertex -3\nend_header\n"), &["line 3", "whole number"]);
     refused(&ascii("element vertex 99999999999999999999999\nend_header\n"), &["line 3"]);
-    refused(&ascii("property float x\nend_header\n"), &["line 3", "below an element"]);
-    refused(&ascii("element vertex 1\nproperty half x\nend_header\n"), &["line 4", "property half x", "types: char"]);
+    refused(&ascii("property float x\nend_header\n"), &["line 3", "an element before"]);
+    refused(&ascii("element vertex 1\nproperty half x\nend_header\n"), &["line 4", "property half x", "the types char"]);
     refused(&ascii("element vertex 1\nproperty list float int x\nend_header\n"), &["line 4"]);
     refused(&ascii("element vertex 1\nvertices 3\nend_header\n"), &["line 4", "vertices 3"]);
     refused(&ascii("element face 0\nend_header\n"), &["no points", "[face]"]);
     refused(&ascii("element vertex 0\nproperty float x\nproperty list int int y\nend_header\n"), &["no property `y`", "[x, y]"]);
-    refused(&ascii(&format!("element vertex 2\n{xyz}end_header\n1 2 3\n4 5")), &["2 rows of `vertex`", "ends in row 1", "cut short"]);
+    refused(&ascii(&format!("element vertex 2\n{xyz}end_header\n1 2 3\n4 5")), &["2 rows of `vertex`", "ends in row 1", "truncated"]);
     for count in ["4000000000", "18446744073709551615", "5000000000"] {
         for format in ["ascii", "binary_little_endian"] {
             let text = format!("ply\nformat {format} 1.0\nelement vertex {count}\n{xyz}end_header\n1 2 3\n");
             let error = parse(text.as_bytes()).unwrap_err().to_string();
-            assert!(error.contains("cut short") || error.contains("at most 4294967295"), "{error}");
+            assert!(error.contains("truncated") || error.contains("at most 4294967295"), "{error}");
         }
     }
     // Lists that announce more than the file contains, and an element without properties, which takes no bytes.
@@ -187,7 +187,7 @@ fn each_broken_file_is_refused_with_the_place_and_the_remedy() {
         &format!(
             "ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty list uint double w\n{xyz}end_header\n\u{7f}\u{7f}\u{7f}\u{7f}1234567890123456"
         ),
-        &["cut short"],
+        &["truncated"],
     );
     refused(
         &ascii(&format!("element vertex 1\nproperty list int int w\n{xyz}end_header\n1e30 1 2 3 4\n")),
@@ -215,7 +215,7 @@ fn what_the_format_does_not_allow_is_not_read_as_something_else() {
     refused(&ascii("", "1 2 3\n\n4 5 6\n"), "the line of row 1 of `vertex` has fewer numbers");
     refused(&ascii("property list uchar int w\n", "1 2 3 0\n4 5 6 2 7 8 9\n"), "the line of row 1 of `vertex` has more numbers");
     // Nothing stands behind the last.
-    refused(&ascii("", "1 2 3\n4 5 6\n7 8 9\n"), "line 10 stands behind the last row");
+    refused(&ascii("", "1 2 3\n4 5 6\n7 8 9\n"), "line 10 follows the last row");
     for end in ["", "\n", " \r\n\n \n"] {
         assert_eq!(parse(&ascii("", &format!("1 2 3\r\n\t4 5 6{end}"))).unwrap().positions().unwrap()[1], DVec3::new(4.0, 5.0, 6.0));
     }
@@ -224,7 +224,7 @@ fn what_the_format_does_not_allow_is_not_read_as_something_else() {
         file.extend(vec![0; 24 + rest]);
         file
     };
-    refused(&binary(5), "5 bytes stand behind the last row");
+    refused(&binary(5), "5 bytes follow the last row");
     assert_eq!(parse(&binary(0)).unwrap().len(), 2);
     // Numbers are of their type.
     for (number, word, fits) in [
@@ -250,10 +250,10 @@ fn what_the_format_does_not_allow_is_not_read_as_something_else() {
     }
     // Headers of other versions, and names that are not clear.
     let header = |text: &str| format!("ply\n{text}\nend_header\n").into_bytes();
-    refused(&header("format ascii 2.0"), "line 2 of the header is `format ascii 2.0`; `format ENCODING 1.0` is read");
+    refused(&header("format ascii 2.0"), "line 2 of the header is `format ascii 2.0`; expected `format ENCODING 1.0`");
     refused(&header("format ascii 1.0\nformat ascii 1.0"), "line 3");
-    refused(&ascii("property uchar x\n", ""), "line 7 of the header is `property uchar x`; each property of an element has a name");
-    refused(&ascii("element vertex 1\n", ""), "line 7 of the header is `element vertex 1`; each element has a name");
+    refused(&ascii("property uchar x\n", ""), "line 7 of the header is `property uchar x`; expected a different name for each property");
+    refused(&ascii("element vertex 1\n", ""), "line 7 of the header is `element vertex 1`; expected a different name for each element");
     assert_eq!(parse(&ascii("element face 1\nproperty uchar x\n", "1 2 3\n4 5 6\n7\n")).unwrap().len(), 2);
 }
 
@@ -264,7 +264,7 @@ fn headers_have_an_end() {
         let error = parse(text.as_bytes()).unwrap_err().to_string();
         // Or at the first line that says the same again.
         assert!(
-            error.len() < 300 && (error.contains("longer than the 1 MB") || error.contains("line 4") || error.contains("line 3")),
+            error.len() < 300 && (error.contains("longer than the limit of 1 MB") || error.contains("line 4") || error.contains("line 3")),
             "{error}"
         );
     }
@@ -272,7 +272,7 @@ fn headers_have_an_end() {
     let error = parse(format!("ply\nformat ascii 1.0\n{}end_header\n", &names[..names[..1_000_000].rfind("element").unwrap()]).as_bytes())
         .unwrap_err()
         .to_string();
-    assert!(error.contains("no points among its elements [0, 1, 2") && error.contains('…') && error.len() < 1500, "{error}");
+    assert!(error.contains("no points: its elements are [0, 1, 2") && error.contains('…') && error.len() < 1500, "{error}");
 }
 
 #[test]

@@ -1,14 +1,14 @@
-//! Files in a folder: listed, told apart by their names, removed; and names that are free.
+//! Files in a run folder: listing, classification by name, removal, and free names for new folders.
 
 use crate::error::{Error, Result};
 use crate::files;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// Endings of what `render` writes.
+/// File extensions of `plenoxel render`.
 pub const RENDERED: [&str; 5] = ["png", "exr", "npy", "gif", "mp4"];
 
-/// Paths in a folder; none if it cannot be listed.
+/// Returns the paths in a folder; none if it cannot be listed.
 pub fn entries(folder: &Path) -> impl Iterator<Item = PathBuf> + use<> {
     std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
 }
@@ -17,17 +17,17 @@ fn file_name(path: &Path) -> std::borrow::Cow<'_, str> {
     path.file_name().unwrap_or_default().to_string_lossy()
 }
 
-/// True for a name that ends in a dot and one of `endings`.
+/// True if the file extension is one of `endings`.
 pub fn is_one_of(path: &Path, endings: &[&str]) -> bool {
     path.extension().is_some_and(|ending| endings.iter().any(|e| ending == *e))
 }
 
-/// True for a frame of a film.
+/// True for a frame of a video.
 pub fn is_frame(path: &Path) -> bool {
     file_name(path).starts_with("frame_") && is_one_of(path, &RENDERED)
 }
 
-/// True for a file that was being written.
+/// True for a temporary file of an interrupted write.
 pub fn is_fragment(path: &Path) -> bool {
     let name = file_name(path);
     name.starts_with(".tmp") || name.starts_with('.') && name.ends_with(".tmp")
@@ -35,11 +35,10 @@ pub fn is_fragment(path: &Path) -> bool {
 
 /// Removes files.
 pub fn remove(files: impl Iterator<Item = PathBuf>) -> Result<()> {
-    files.into_iter().try_for_each(|path| std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing it")))
+    files.into_iter().try_for_each(|path| std::fs::remove_file(&path).map_err(|e| Error::io(&path, e, "removing the file")))
 }
 
-/// Creates the folder `root/<scene>-<n>` with the first n from 1 on that nothing has: of two processes that do this at the same time, each gets a
-/// folder of its own.
+/// Creates the folder `root/<scene>-<n>` with the smallest free n from 1 on. Concurrent processes get different folders.
 pub fn reserve(root: &Path, scene: &str) -> Result<PathBuf> {
     files::create_dir(root)?;
     let plain = |c: char| {

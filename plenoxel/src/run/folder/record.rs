@@ -1,4 +1,4 @@
-//! `run.json`: the facts of a run that its settings do not hold.
+//! `run.json`: the facts about a run beyond its settings.
 
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
@@ -9,19 +9,19 @@ use crate::run::{PROGRAM, machine};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// How the grid of a run was made.
+/// Origin of the grid of a run.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RunKind {
-    /// By training.
+    /// Training.
     #[default]
     Trained,
-    /// By carving, without training.
+    /// Carving, without training.
     Carved,
 }
 
 impl RunKind {
-    /// The command that makes such a run.
+    /// The command that creates such a run.
     pub fn command(self) -> &'static str {
         match self {
             RunKind::Trained => "train",
@@ -30,31 +30,31 @@ impl RunKind {
     }
 }
 
-/// The facts of a run that its settings do not hold: program, machine, data.
+/// Facts about a run beyond its settings: program, machine and data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
-    /// How its grid was made. Runs of earlier versions do not say; [`RunFolder::open`](super::RunFolder::open) knows the carved ones by their settings,
-    /// which have no stages.
+    /// Origin of the grid. Runs of earlier versions do not record it; [`RunFolder::open`](super::RunFolder::open) recognizes carved ones by their
+    /// settings, which have no stages.
     #[serde(default)]
     pub kind: RunKind,
-    /// Kind of its model. Runs of earlier versions do not say: they are Plenoxels.
+    /// Kind of the model. Runs of earlier versions do not record it: they are Plenoxels.
     #[serde(default = "plenoxels_kind")]
     pub model: String,
-    /// Program and version that made the run.
+    /// Program and version that created the run.
     pub program: String,
-    /// Vector instructions it used: results repeat to the bit on the same ones.
+    /// Vector instructions; results repeat bit by bit with the same ones.
     pub instruction_set: String,
-    /// Number of threads it ran on. Results do not depend on it.
+    /// Number of threads. Results do not depend on it.
     pub threads: usize,
     /// Name of the scene.
     pub scene: String,
-    /// Format of the dataset, in words.
+    /// Name of the dataset format.
     pub format: String,
-    /// Preset under the settings, if there was one.
+    /// Preset of the settings, if there was one.
     pub preset: Option<String>,
     /// Source of the views.
     pub data: DataSource,
-    /// Seconds that training was planned to take, if it was planned by time.
+    /// Planned seconds of training, if it was planned by time.
     #[serde(default)]
     pub seconds_planned: Option<f64>,
 }
@@ -64,7 +64,7 @@ fn plenoxels_kind() -> String {
 }
 
 impl RunRecord {
-    /// The record of a run of Plenoxels that begins now, on this machine.
+    /// The record of a new run of Plenoxels on this machine.
     pub fn new(kind: RunKind, dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> Self {
         RunRecord {
             kind,
@@ -85,18 +85,18 @@ impl RunRecord {
         self.kind == RunKind::Carved
     }
 
-    /// True for a run of a model that this crate's own commands do not train.
+    /// True for a custom model, which the commands of this program do not train.
     pub fn is_of_own_model(&self) -> bool {
         self.model != plenoxels::KIND
     }
 
-    /// Reads the bytes of a file; `path` names it in messages.
+    /// Parses the bytes of a file; `path` names it in messages.
     ///
-    /// Errors: they are not JSON with the keys of a record.
+    /// Errors: the bytes are not JSON with the keys of a record.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
         serde_json::from_str(&files::text(path, bytes)?).map_err(|e| {
-            let found = format!("this does not describe a run ({e})");
-            Error::input(path, found, "train again, or use an undamaged copy")
+            let found = format!("this is not a valid record of a run ({e})");
+            Error::input(path, found, "use an undamaged copy, or train again")
         })
     }
 }

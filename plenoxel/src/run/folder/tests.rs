@@ -31,14 +31,14 @@ fn an_occupied_folder_is_refused_unless_forced_and_other_files_survive() {
     mine.iter().chain(&ours).for_each(|name| std::fs::write(path.join(name), "x").unwrap());
     let refused = NewFolder::choose(Some(&path), "x", false).unwrap_err();
     assert!(refused.exit_code() == 2 && refused.to_string().contains("--force"));
-    // What is not a run is not overwritten, come what may.
+    // A folder that is not a run is never overwritten.
     let refused = NewFolder::choose(Some(&path), "x", true).unwrap_err();
     assert!(refused.exit_code() == 2 && refused.to_string().contains("not a run"), "{refused}");
     std::fs::write(path.join(RECORD), "{}").unwrap();
-    // What cannot be removed is found out before anything is.
+    // Files that cannot be removed are found before any file is removed.
     std::fs::create_dir(path.join(RESULT)).unwrap();
     let refused = NewFolder::choose(Some(&path), "x", true).unwrap_err();
-    assert!(refused.to_string().contains("in which result.json is a folder") && path.join(CHECKPOINT).exists(), "{refused}");
+    assert!(refused.to_string().contains("its result.json is a folder") && path.join(CHECKPOINT).exists(), "{refused}");
     std::fs::remove_dir(path.join(RESULT)).unwrap();
     let folder = RunFolder::at(&path);
     assert!(folder.owns(&path.join(CHECKPOINT)) && folder.owns(&path.join("images/old.png")));

@@ -5,13 +5,13 @@ use crate::model::plenoxels::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use toml::Value;
 
-/// Every key whose value differs from the one asked for, as `key is x and not y`.
+/// The keys whose values differ from the requested ones, each as `key is x, not y`.
 pub fn differences(found: &Config, asked: &Config) -> Vec<String> {
     let (found, asked) = (values(found), values(asked));
     let keys: BTreeSet<&String> = found.keys().chain(asked.keys()).collect();
     let said = |value: Option<&String>| value.map_or_else(|| "unset".to_owned(), String::clone);
     let differs = keys.into_iter().filter(|key| found.get(*key) != asked.get(*key));
-    differs.map(|key| format!("{key} is {} and not {}", said(found.get(key)), said(asked.get(key)))).collect()
+    differs.map(|key| format!("{key} is {}, not {}", said(found.get(key)), said(asked.get(key)))).collect()
 }
 
 /// The value of every key as TOML, by path.
@@ -36,9 +36,9 @@ mod tests {
         asked.stages.truncate(1);
         asked.stages[0].resolution = 5;
         let said = differences(&found, &asked);
-        assert!(said.contains(&"seed is 42 and not 7".to_owned()), "{said:?}");
-        let resolution = format!("stages[0].resolution is {} and not 5", found.stages[0].resolution);
+        assert!(said.contains(&"seed is 42, not 7".to_owned()), "{said:?}");
+        let resolution = format!("stages[0].resolution is {}, not 5", found.stages[0].resolution);
         assert!(said.contains(&resolution), "{said:?}");
-        assert!(said.iter().any(|line| line.starts_with("stages[1].resolution is") && line.ends_with("and not unset")), "{said:?}");
+        assert!(said.iter().any(|line| line.starts_with("stages[1].resolution is") && line.ends_with(", not unset")), "{said:?}");
     }
 }

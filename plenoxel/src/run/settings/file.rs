@@ -18,21 +18,21 @@ pub struct ConfigFile {
 }
 
 impl ConfigFile {
-    /// Reads a plain file, such as that of a run.
+    /// Reads a regular file, such as the `config.toml` of a run.
     ///
-    /// Errors: the file cannot be read, is larger than a file of settings may be, or is not TOML; the last names the line.
+    /// Errors: the file cannot be read, is too large for a settings file, or is not TOML; the message then names the line.
     pub fn read(path: &Path) -> Result<Self> {
         Self::parse(path, &files::read(path, files::SETTINGS)?)
     }
 
-    /// The same of what a user named to be read, which may be a pipe too.
+    /// Reads a path given on the command line, which may also be a pipe, like [`ConfigFile::read`].
     pub fn read_named(path: &Path) -> Result<Self> {
         Self::parse(path, &files::read_named(path, files::SETTINGS)?)
     }
 
-    /// Reads the bytes of a file; `path` names it in messages.
+    /// Parses the bytes of a file; `path` names it in messages.
     ///
-    /// Errors, with the line: the bytes are not text in UTF-8 or UTF-16, or not TOML.
+    /// Errors: the bytes are not text in UTF-8 or UTF-16, or not TOML; the message names the line.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
         let text = files::text(path, bytes)?.into_owned();
         let ends: Vec<usize> = text.match_indices('\n').map(|(end, _)| end).collect();
@@ -44,15 +44,15 @@ impl ConfigFile {
             }),
             Err(e) => {
                 let line = e.span().map_or(1, |span| line_of(span.start));
-                let found = format!("line {line} is not TOML: {}", e.message());
-                return Err(Error::input(path, found, "correct it there"));
+                let found = format!("line {line} is not valid TOML: {}", e.message());
+                return Err(Error::input(path, found, "fix the syntax there"));
             }
         }
         let name = path.display().to_string();
         Ok(ConfigFile { name, text, lines })
     }
 
-    /// True if the file has every required key, as the resolved `config.toml` of a run: it then needs no layer under it.
+    /// True if the file has every required key, like the resolved `config.toml` of a run. It then needs no defaults.
     pub fn is_complete(&self) -> bool {
         toml::from_str::<Config>(&self.text).is_ok()
     }
@@ -62,7 +62,7 @@ impl ConfigFile {
         &self.text
     }
 
-    /// The file and the line at which a key is written, for messages.
+    /// The file name and the line of a key, for messages.
     pub fn place(&self, path: &str) -> String {
         match self.lines.get(path) {
             Some(line) => format!("{}, line {line}", self.name),
@@ -70,9 +70,9 @@ impl ConfigFile {
         }
     }
 
-    /// The settings of a complete file by itself, or of any other as a layer over the defaults.
+    /// Resolves the settings: a complete file is used alone, any other file is a layer over the defaults.
     ///
-    /// Errors as for [`Layers`].
+    /// Errors: those of [`Layers`].
     pub fn resolve(&self) -> Result<Config> {
         if self.is_complete() {
             return self.complete();
@@ -82,38 +82,38 @@ impl ConfigFile {
         layers.resolve()
     }
 
-    /// The settings of the file alone, without defaults.
+    /// Resolves the settings of the file alone, without defaults.
     ///
-    /// Errors: a required key is missing, and those of [`Layers`].
+    /// Errors: a required key is missing; those of [`Layers`].
     pub fn complete(&self) -> Result<Config> {
         let mut layers = Layers::default();
         layers.file(self)?;
-        layers.resolve().map_err(|e| match e {
-            // A key that is not there has no line.
-            Error::Config { key, found, accepted } if !key.contains(&self.name) => {
-                Error::config(format!("{}: {key}", self.name), found, accepted)
-            }
-            other => other,
-        })
+        // A missing key has no line.
+        let placed = |key: &str| match (key, key.contains(&self.name)) {
+            ("" | ".", _) => self.name.clone(),
+            (_, true) => key.to_owned(),
+            (_, false) => format!("{}: {key}", self.name),
+        };
+        layers.resolve().map_err(|e| e.with_key(placed))
     }
 }
 
-/// A complete configuration as TOML text, below a remark of one or more lines. Reading it gives the same configuration.
+/// Formats a complete configuration as TOML text, below a comment of one or more lines. Parsing it gives the same configuration.
 pub fn to_toml(config: &Config, remark: &str) -> Result<String> {
-    let text = toml::to_string(config).map_err(|e| Error::config("the settings", e, "a defect of the program"))?;
+    let text = toml::to_string(config).map_err(|e| Error::usage("the settings", e.to_string(), "this is a bug in the program"))?;
     let heading: String = remark.lines().map(|line| format!("# {line}\n")).collect();
-    Ok(format!("{heading}# Complete: no preset and no default shows through.\n\n{text}"))
+    Ok(format!("{heading}# This file is complete: it overrides every preset and default.\n\n{text}"))
 }
 
-/// Writes a complete configuration to a file, below a remark. Reading it gives the same configuration.
+/// Writes a complete configuration to a file, below a comment. Reading it gives the same configuration.
 pub fn write(path: &Path, config: &Config, remark: &str) -> Result<()> {
     files::write_atomically(path, to_toml(config, remark)?.as_bytes())
 }
 
-/// No key of ours has a path of so many letters; those that have would take that much again for every key below.
+/// Longest path of a key whose place is kept. Settings have shorter paths, and a longer path would be copied for every key below it.
 const LONGEST: usize = 500;
 
-/// Calls `f` with the path and the offset in the text of every key whose path is not too long.
+/// Calls `f` with the path of every key and its offset in the text, except keys with very long paths.
 fn spans(path: &str, table: &DeTable<'_>, f: &mut dyn FnMut(String, usize)) {
     for (key, value) in table.iter() {
         let inner = match path {

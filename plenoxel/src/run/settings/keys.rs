@@ -1,4 +1,4 @@
-//! The keys that a configuration may have, so that a misspelled one is an error that names the right one.
+//! The keys of a configuration. A misspelled key is an error that suggests the correct one.
 
 use crate::error::{Error, Result};
 use crate::model::plenoxels::{LEARNED_LOSSES, LOSSES};
@@ -75,14 +75,14 @@ const TABLES: &[(&str, &[&str])] = &[
     ("carve.photo", &["noise"]),
 ];
 
-/// Checks every key of a table and of the tables in it. `place(path)` says where a path was written.
+/// Checks every key of a table and of its nested tables. `place(path)` names the place where a path was set.
 ///
-/// Errors: the first unknown key, with where it is and the nearest known one.
+/// Errors: a key is unknown; the message names its place and similar known keys.
 pub fn check_table(table: &Table, place: &dyn Fn(&str) -> String) -> Result<()> {
     walk("", "", &Value::Table(table.clone()), place)
 }
 
-/// Checks a path such as `stages[0].sampling.step`, which `place` describes.
+/// Checks a path such as `stages[0].sampling.step`. `place` names the place where it was set.
 pub fn check_path(path: &str, place: &str) -> Result<()> {
     let mut pattern = String::new();
     for segment in path.split('.') {
@@ -119,26 +119,26 @@ fn joined(path: &str, key: &str) -> String {
 
 fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
     let fits = |table: &str| match (table.strip_suffix('*'), table == pattern) {
-        // The name is one of any, but nothing is below it.
+        // Any name, without nested tables.
         (Some(start), _) => pattern.strip_prefix(start).is_some_and(|name| !name.contains(['.', '['])),
         (None, same) => same,
     };
     let known = TABLES.iter().find(|(table, _)| fits(table));
-    // A damaged file may have one of any length, which is neither printed nor compared whole.
+    // A damaged file may have keys of any length, which are neither printed nor compared completely.
     let key = key.char_indices().nth(60).map_or(key, |(end, _)| &key[..end]);
     let is_list = TABLES.iter().any(|(table, _)| table.strip_suffix("[]") == Some(pattern));
     let Some((_, known)) = known else {
         if is_list {
-            let found = format!("the key `{key}` below the list `{pattern}`");
-            return Err(Error::config(place, found, format!("{pattern}[0] or {pattern}[*] with --set, [[{pattern}]] in a file")));
+            let found = format!("`{pattern}` is a list, so the key `{key}` needs an index");
+            return Err(Error::usage(place, found, format!("use {pattern}[0] or {pattern}[*] with --set, [[{pattern}]] in a file")));
         }
-        let found = format!("the key `{key}` below `{pattern}`, which is not a table");
-        return Err(Error::config(place, found, format!("a value for `{pattern}`")));
+        let found = format!("`{pattern}` is not a table, so it has no key `{key}`");
+        return Err(Error::usage(place, found, format!("set `{pattern}` itself")));
     };
     if known.contains(&key) {
         return Ok(());
     }
-    // One that stands elsewhere; one that is spelled alike; one that ends in the same word.
+    // Suggestions: the same key in other tables, a key of similar spelling, keys that end in the same word.
     let last_word = |key: &str| key.rsplit_once('_').map(|(_, word)| word.to_owned());
     let word = last_word(key).filter(|_| nearest(key, known).is_none());
     let places = match places(&|other| other == key) {
@@ -147,30 +147,31 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
     };
     match places.is_empty() {
         true => Err(unknown_name("key", key, known, place)),
-        false => Err(Error::config(place, format!("the key `{key}` here"), places.join(", "))),
+        false => Err(Error::usage(place, format!("unknown key `{key}`"), format!("similar keys: {}", places.join(", ")))),
     }
 }
 
-/// Where in a configuration keys may stand that are wanted.
+/// The full paths of the known keys that `wanted` selects.
 fn places(wanted: &dyn Fn(&str) -> bool) -> Vec<String> {
     let keys = TABLES.iter().flat_map(|(table, keys)| keys.iter().map(move |key| (table.replace("[]", "[*]"), *key)));
     keys.filter(|(_, key)| wanted(key)).map(|(table, key)| joined(&table, key)).collect()
 }
 
-/// The known name that is nearest in spelling, if one is near.
+/// The known name with the most similar spelling, if one is similar enough.
 fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
     let nearest = known.iter().min_by_key(|known| levenshtein(name, known));
-    nearest.filter(|known| levenshtein(name, known) <= 2 + known.len() / 4).copied()
+    // In a short word, a few changed letters make another word.
+    let most = |known: &str| (2 + known.len() / 4).min(known.len().min(name.len()).div_ceil(3));
+    nearest.filter(|known| levenshtein(name, known) <= most(known)).copied()
 }
 
-/// The refusal of a name that is not among the known ones: it says which is nearest in spelling, if one is near; a word that resembles
-/// nothing gets the whole list.
+/// The error for an unknown name. It suggests the known name of the most similar spelling, or lists all known names if none is similar.
 pub fn unknown_name(what: &str, name: &str, known: &[&str], place: &str) -> Error {
-    let accepted = match nearest(name, known) {
-        Some(known) => format!("the nearest known {what} is `{known}`"),
-        None => format!("one of {}", known.join(", ")),
+    let remedy = match nearest(name, known) {
+        Some(known) => format!("did you mean `{known}`?"),
+        None => format!("expected one of {}", known.join(", ")),
     };
-    Error::config(place, format!("the unknown {what} `{name}`"), accepted)
+    Error::usage(place, format!("unknown {what} `{name}`"), remedy)
 }
 
 #[cfg(test)]
@@ -189,17 +190,19 @@ mod tests {
     #[test]
     fn a_misspelled_path_is_answered_with_the_nearest_key() {
         let message = |path: &str| check_path(path, "--set").unwrap_err().to_string();
-        assert!(message("stages[0].rezolution").contains("the nearest known key is `resolution`"));
+        assert!(message("stages[0].rezolution").contains("did you mean `resolution`?"));
         assert!(message("losses.tv_densty").contains("`tv_density`"));
-        assert!(message("zzzzzzzzzz").contains("one of seed, downscale"));
-        assert!(message("seed.more").contains("which is no table"));
+        assert!(message("zzzzzzzzzz").contains("expected one of seed, downscale"));
+        assert!(message("seed.more").contains("`seed` is not a table"));
+        // A short word that resembles nothing gets the whole list.
+        assert!(message("foo").contains("expected one of seed, downscale"));
         assert!(message("stages.0.resolution").contains("stages[0] or stages[*]"));
         assert!(message("resolution").contains("stages[*].resolution, scout.stages[*].resolution, carve.resolution"));
-        assert!(message("stages[0].dnsty_rate").contains("the nearest known key is `density_rate`"));
+        assert!(message("stages[0].dnsty_rate").contains("did you mean `density_rate`?"));
         assert!(message("lerning_rate").contains("stages[*].density_rate, stages[*].color_rate"));
-        // However long: each part would take a table in a table.
+        // A path of any length: each part would need a nested table.
         let deep = format!("losses.mse{}", ".weight".repeat(20_000));
-        assert!(message(&deep).contains("the key `weight` below `losses.mse.weight`, which is no table"));
+        assert!(message(&deep).contains("`losses.mse.weight` is not a table, so it has no key `weight`"));
         assert!(check_path("losses.mse.from", "--set").is_ok());
         assert!(check_path("stages[*].sampling.step", "--set").is_ok());
     }

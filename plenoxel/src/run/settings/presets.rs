@@ -7,13 +7,13 @@ use crate::model::plenoxels::config::Config;
 /// A named layer of settings over the defaults.
 #[derive(Debug)]
 pub struct Preset {
-    /// Name, as `--preset` and [`Config::preset`] take it.
+    /// Name, as in `--preset` and [`Config::preset`].
     pub name: &'static str,
     /// Purpose, in a few words.
     pub purpose: &'static str,
-    /// Training time on two cores, and the image size it is for.
+    /// Training time on two cores, and the image size.
     pub time: &'static str,
-    /// The layer as TOML, with the reasons for each value in comments.
+    /// The layer as TOML; comments give the reason for each value.
     pub text: &'static str,
 }
 
@@ -21,13 +21,13 @@ pub struct Preset {
 pub const PRESETS: [Preset; 5] = [
     Preset {
         name: "fast",
-        purpose: "a good grid soon: what `train` does by itself",
+        purpose: "good quality in short time; the default of `train`",
         time: "1 to 3 min at 800 x 800",
         text: include_str!("../../../presets/fast.toml"),
     },
     Preset {
         name: "quality",
-        purpose: "the best there is",
+        purpose: "the best quality",
         time: "about 15 min at 800 x 800",
         text: include_str!("../../../presets/quality.toml"),
     },
@@ -39,13 +39,13 @@ pub const PRESETS: [Preset; 5] = [
     },
     Preset {
         name: "paper",
-        purpose: "\"Plenoxels and extension to point clouds\", bugs repaired",
+        purpose: "\"Plenoxels and extension to point clouds\", with bugs fixed",
         time: "23 s at 100 x 100",
         text: include_str!("../../../presets/paper.toml"),
     },
     Preset {
         name: "demo",
-        purpose: "coarse to fine as plainly as can be, for the built-in scene",
+        purpose: "the simplest coarse-to-fine training, for the built-in scene",
         time: "40 s at 200 x 200",
         text: include_str!("../../../presets/demo.toml"),
     },
@@ -54,12 +54,12 @@ pub const PRESETS: [Preset; 5] = [
 /// The preset for carving.
 pub const CARVE: Preset = Preset {
     name: "carve",
-    purpose: "an opaque grid, without training: for `plenoxel carve`",
+    purpose: "an opaque grid without training, for `plenoxel carve`",
     time: "20 s at 800 x 800",
     text: include_str!("../../../presets/carve.toml"),
 };
 
-/// Looks up a preset by name, [`CARVE`] included.
+/// Returns the preset of a name, which may also be [`CARVE`].
 ///
 /// Errors: no preset has this name; the message lists the names.
 pub fn preset(name: &str) -> Result<&'static Preset> {
@@ -68,7 +68,7 @@ pub fn preset(name: &str) -> Result<&'static Preset> {
 }
 
 impl Config {
-    /// The settings of a preset over the defaults, as `plenoxel train --preset NAME` resolves them without other flags.
+    /// Returns the settings of a preset over the defaults, as `plenoxel train --preset NAME` resolves them without other flags.
     ///
     /// Errors: no preset has this name; the message lists the names.
     ///

@@ -3,8 +3,8 @@
 use crate::error::{Error, Result};
 use toml::{Table, Value};
 
-/// Keys of which one excludes the others: writing the first takes away the rest. They are the two ways to place samples, the two ways to
-/// give a stage its length, and the two ways in which the weight of a loss changes.
+/// Mutually exclusive keys: setting the first removes the others. They are the two ways to place samples, the two ways to specify the length of
+/// a stage, and the two schedules of a loss weight.
 const ALTERNATIVES: [(&str, &[&str]); 9] = [
     ("step", &["samples", "far"]),
     ("samples", &["step"]),
@@ -17,8 +17,8 @@ const ALTERNATIVES: [(&str, &[&str]); 9] = [
     ("to", &["weight", "until"]),
 ];
 
-/// Lays `over` upon `base`, key by key: tables are merged, everything else, lists included, is replaced. A table with another
-/// `kind` replaces its predecessor, whose keys would mean nothing to it.
+/// Merges `over` into `base`, key by key: tables are merged, other values and lists are replaced. A table with another `kind` replaces the
+/// old table, because the keys of the old kind do not apply to it.
 pub fn merge(base: &mut Table, over: Table) {
     for (key, value) in over {
         match (base.get_mut(&key), value) {
@@ -30,9 +30,9 @@ pub fn merge(base: &mut Table, over: Table) {
     }
 }
 
-/// Sets the value at a path such as `stages[0].sampling.step`; `[*]` means every entry of a list. No value removes the key.
+/// Sets the value at a path such as `stages[0].sampling.step`; `[*]` means every entry of a list. `None` removes the key.
 ///
-/// Errors, which `place` introduces: an index that is not there, a table where a list should be or the other way round.
+/// Errors: an index is out of range; a list lacks an index, or a table has one. The message begins with `place`.
 pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) -> Result<()> {
     let (segment, rest) = match path.split_once('.') {
         Some((segment, rest)) => (segment, Some(rest)),
@@ -42,7 +42,7 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
         let Some(rest) = rest else {
             match value {
                 Some(value) => {
-                    // The other keys would mean nothing to another kind.
+                    // The other keys do not apply to another kind.
                     if segment == "kind" && table.get(segment) != Some(value) {
                         table.clear();
                     }
@@ -53,23 +53,24 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
             return Ok(());
         };
         let inner = table.entry(segment).or_insert_with(|| Value::Table(Table::new()));
-        // A number gives way to a table: `losses.tv.from` where `losses.tv` was a constant weight.
+        // A table replaces a number: `losses.tv.from` where `losses.tv` was a constant weight.
         if !inner.is_table() && !inner.is_array() {
             *inner = Value::Table(Table::new());
         }
         let found = format!("`{segment}` is a list");
         return match inner.as_table_mut() {
             Some(inner) => set(inner, rest, value, place),
-            None => Err(Error::config(place, found, format!("an index, as in {segment}[0].{rest}, or {segment}[*].{rest}"))),
+            None => Err(Error::usage(place, found, format!("add an index, as in {segment}[0].{rest} or {segment}[*].{rest}"))),
         };
     };
     let length = table.get(name).and_then(Value::as_array).map_or(0, Vec::len);
-    let none = |found: String| {
-        let accepted = match length {
-            0 => format!("a list; `{name}` is none"),
-            n => format!("{name}[0] to {name}[{}], or {name}[*]", n - 1),
-        };
-        Error::config(place, found, accepted)
+    let none = |found: String| match length {
+        0 => Error::usage(
+            place,
+            format!("{found} has an index, but `{name}` is not a list with entries"),
+            format!("set `{name}` without an index"),
+        ),
+        n => Error::usage(place, format!("{found} is out of range"), format!("expected {name}[0] to {name}[{}], or {name}[*]", n - 1)),
     };
     let index = index.trim_end_matches(']');
     let entries = match index {
@@ -88,7 +89,11 @@ pub fn set(table: &mut Table, path: &str, value: Option<&Value>, place: &str) ->
             (Some(rest), Value::Table(inner), value) => set(inner, rest, value, place)?,
             (None, entry, Some(value)) => *entry = value.clone(),
             _ => {
-                return Err(Error::config(place, format!("`{path}`"), format!("a key of a table, or a value for {name}[{index}]")));
+                return Err(Error::usage(
+                    place,
+                    format!("`{path}` has no such key, or no value"),
+                    format!("set a key of a table, or a value for {name}[{index}]"),
+                ));
             }
         }
     }
@@ -153,7 +158,7 @@ mod tests {
         assert!(message("s[2].n").contains("s[0] to s[1]"), "{}", message("s[2].n"));
         assert!(message("s[18446744073709551615].n").contains("s[0] to s[1]"));
         assert!(message("s.n").contains("s[0].n"), "{}", message("s.n"));
-        assert!(message("t[0].n").contains("`t` is none"), "{}", message("t[0].n"));
+        assert!(message("t[0].n").contains("`t` is not a list"), "{}", message("t[0].n"));
     }
 
     #[test]

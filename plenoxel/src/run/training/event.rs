@@ -1,4 +1,4 @@
-//! Events of a run, in the order in which they come.
+//! Events of a run, in the order in which they occur.
 
 use super::Summary;
 use crate::camera::Camera;
@@ -11,124 +11,124 @@ use crate::run::metrics::{History, MetricsFile, Observation};
 use crate::train::{Model, PlannedStage, Report};
 use ndarray::Array3;
 
-/// An event of a run. Listeners change nothing of what is trained.
+/// An event of a run. Listeners do not affect the training.
 pub enum Event<'a> {
-    /// A sentence for people about what happens next, or what went wrong without ending the run.
+    /// A message about the next step of the run, or about a problem that does not end it.
     Note(String),
-    /// The dataset is open.
+    /// The dataset was opened.
     Opened {
-        /// The views, not read yet.
+        /// The dataset; its images are not read yet.
         dataset: &'a Dataset,
-        /// The recipe.
+        /// The settings.
         config: &'a Config,
     },
-    /// Images are read or rendered.
+    /// Images are being read, or rendered for the built-in scene.
     Loading {
-        /// The split they belong to.
+        /// Their split.
         split: Split,
-        /// Where they come from.
+        /// Their source.
         source: &'a DataSource,
-        /// Number of images that are there.
+        /// Number of images read so far.
         done: usize,
-        /// Number of images that are read.
+        /// Number of images to read.
         total: usize,
     },
-    /// The visual hull of the silhouettes is computed, which is told if it takes longer than a second.
+    /// The visual hull is being computed. Sent only if that takes longer than a second.
     Carving {
-        /// Number of views whose silhouettes were used.
+        /// Number of views used so far.
         done: usize,
         /// Number of views to use.
         total: usize,
     },
-    /// Training begins, or goes on.
+    /// Training starts or resumes.
     Started {
         /// The run.
         run: Underway<'a>,
         /// The stages with their steps.
         plan: &'a [PlannedStage],
-        /// Number of the test views that the model is compared with at the end.
+        /// Number of test views for the final evaluation.
         test_views: usize,
-        /// What a resumed run did before.
+        /// The history of a resumed run.
         history: &'a History,
     },
-    /// The model before its first step and before the first stage prunes it; a resumed run does not tell this again.
+    /// The model before its first step, before the first stage prunes it. A resumed run does not emit this event again.
     Initial {
         /// The first stage.
         stage: PlannedStage,
-        /// Renders a camera's picture of the model.
+        /// Renders the model from a camera.
         see: &'a dyn Fn(&Camera) -> Picture,
     },
     /// A step was taken.
     Step {
         /// Figures of the step.
         report: &'a Report,
-        /// Figures of the model, of validation views if they were looked at, and of time.
+        /// Facts about the model, the validation PSNR if it was measured, and the time.
         observation: &'a Observation,
     },
-    /// The model was looked at while it trains.
+    /// A preview of the model was rendered.
     Preview {
-        /// Step after which it was.
+        /// Step after which it was rendered.
         step: u64,
-        /// True if that was the last of its stage.
+        /// True if that was the last step of its stage.
         ends_stage: bool,
-        /// The picture of the model.
+        /// The rendered picture.
         picture: &'a Array3<f32>,
         /// The photograph of the same view, if there is one.
         target: Option<&'a Array3<f32>>,
-        /// The metrics, to which a listener may add the picture as it was written.
+        /// The metrics, to which a listener may add the picture after writing it.
         metrics: &'a mut MetricsFile,
     },
-    /// A stage has ended.
+    /// A stage ended.
     StageEnded {
         /// The stage.
         stage: PlannedStage,
         /// Loss of each step so far.
         losses: &'a [f64],
-        /// Renders a camera's picture of the model as it is now.
+        /// Renders the current model from a camera.
         see: &'a dyn Fn(&Camera) -> Picture,
     },
-    /// The state from which the run resumes was saved.
+    /// A checkpoint from which the run can resume was saved.
     Saved {
         /// Steps taken.
         steps: u64,
     },
-    /// Training failed: the error follows as the result of the run.
+    /// Training failed. The run returns the error.
     Failed {
         /// Loss of each step so far.
         losses: &'a [f64],
     },
-    /// The last step was taken and the checkpoint is written, or the run was stopped and saved.
+    /// The last step was taken and the final checkpoint was written, or the run was stopped and saved.
     Trained,
-    /// Test views are compared.
+    /// Test views are being evaluated.
     Evaluating {
-        /// Number of comparisons that were made.
+        /// Number of comparisons so far.
         done: usize,
         /// Number of comparisons to make.
         total: usize,
     },
-    /// A test view was compared with the final model.
+    /// The final model was evaluated on a test view.
     Compared {
-        /// Number of the view among those that are compared.
+        /// Index of the view among the evaluated views.
         number: usize,
         /// The view.
         view: &'a View,
         /// Its photograph over the background.
         target: &'a Array3<f32>,
-        /// The picture of the model.
+        /// The rendered picture.
         picture: &'a Picture,
         /// Half the longest side of the model's box.
         half_width: f64,
     },
-    /// The run has its figures; they are written.
+    /// The final figures were written.
     Evaluated {
-        /// The figures.
+        /// The final figures.
         summary: &'a Summary,
         /// The run.
         run: Finished<'a>,
     },
 }
 
-/// A run that trains.
+/// A run during training.
 #[derive(Clone, Copy)]
 pub struct Underway<'a> {
     /// Its folder.
@@ -139,7 +139,7 @@ pub struct Underway<'a> {
     pub dataset: &'a Dataset,
 }
 
-/// A run that has ended.
+/// A finished run.
 #[derive(Clone, Copy)]
 pub struct Finished<'a> {
     /// Its folder.

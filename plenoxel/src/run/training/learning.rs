@@ -1,4 +1,4 @@
-//! The training itself: steps, previews, metrics, and the state from which a run resumes.
+//! The training loop: steps, previews, metrics and checkpoints.
 
 use super::best::BestModel;
 use super::event::Underway;
@@ -16,26 +16,27 @@ use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Training views that the mean image is compared with.
+/// Number of training views for the PSNR of the mean image.
 const VIEWS_OF_MEAN: usize = 16;
-/// Share of a step in the smoothed error of training rays.
+/// Smoothing factor of the error of training rays.
 const SMOOTHED: f64 = 0.05;
 
-/// A trained model and how it came about.
+/// A trained model with the figures of its training.
 pub struct Learned<M> {
     pub model: M,
     pub metrics: MetricsFile,
     /// Mean of the training views.
     pub mean_image: Option<Array3<f32>>,
-    /// PSNR of the training rays in the end, smoothed, and that of the mean training image; `None` if no steps were taken now.
+    /// Smoothed PSNR of the training rays at the end, and PSNR of the mean training image; `None` if no steps were taken.
     pub training_psnr: Option<[f64; 2]>,
     pub stages: Vec<StageSummary>,
-    /// Viewers of the models that stages ended with, by the number of the stage in `stages`, where they were kept.
+    /// Renderers of the models at the end of earlier stages, if kept, with their index in `stages`.
     pub kept: Vec<(usize, RenderFn<'static, f32>)>,
     pub steps: u64,
 }
 
-/// Saves a trained model that cannot be saved in its run folder where it can: beside the folder, in the current one, or among temporary files.
+/// Saves a trained model outside its run folder if that cannot be written: in the parent folder, the working directory, or the folder for
+/// temporary files. Returns the path.
 fn rescued(run: &Path, model: &impl Model<f32>, about: &About) -> Option<PathBuf> {
     let beside = run.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let name = run.file_name().unwrap_or_default().to_string_lossy();
@@ -49,14 +50,14 @@ fn rescued(run: &Path, model: &impl Model<f32>, about: &About) -> Option<PathBuf
 pub struct StageSummary {
     resolution: Option<usize>,
     steps: u64,
-    /// Seconds of training when it ended.
+    /// Seconds of training at its end.
     seconds: f64,
-    /// Mean PSNR of the test views, if the model was kept until they were read.
+    /// Mean test PSNR, if the model of the stage was kept.
     pub psnr: Option<f64>,
 }
 
 impl Job<'_> {
-    /// Trains; only the steps are on the clock for training. [`Stopped`] if the run was stopped: then everything that it needs to resume is saved.
+    /// Trains the model; only the steps count as training time. Returns [`Stopped`] if the run was stopped and its state was saved.
     pub fn learn<M: Model<f32>>(
         &self,
         mut trainer: Trainer<f32, M>,
@@ -94,7 +95,7 @@ impl Job<'_> {
             }) {
                 Ok(Some(report)) => report,
                 Ok(None) => break None,
-                // There is no checkpoint: the lines and the curve so far show how it came to this.
+                // There is no checkpoint: the metrics so far show what happened.
                 Err(e) => return Err(failed(e, &losses, &mut metrics, on)),
             };
             losses.push(report.loss);
@@ -135,8 +136,8 @@ impl Job<'_> {
                         best.saved(validation_psnr, trainer.model(), &trainer.about(dataset.name()), on);
                         on(Event::Saved { steps: report.step + 1 });
                     }
-                    // There may be room on the disk the next time.
-                    Err(e) if !stops => on(Event::note(format!("not saved: {e}"))),
+                    // The next attempt may succeed.
+                    Err(e) if !stops => on(Event::note(format!("the checkpoint was not saved: {e}"))),
                     Err(e) => return Err(e),
                 }
                 saved = Instant::now();
@@ -153,14 +154,13 @@ impl Job<'_> {
         let model = trainer.into_model();
         if let Err(e) = folder.save(&model, &about) {
             let kept = match rescued(folder.path(), &model, &about) {
-                Some(place) => format!(
-                    "the trained model is saved elsewhere, as {}; move it to checkpoint.safetensors in the run folder",
-                    place.display()
-                ),
-                None => "the trained model is not saved".to_owned(),
+                Some(place) => {
+                    format!("the trained model was saved as {}; move it to checkpoint.safetensors in the run folder", place.display())
+                }
+                None => "the trained model was not saved".to_owned(),
             };
             let again = match folder.existing_state() {
-                Ok(_) => "; `plenoxel train --resume` goes on from the last state that was saved",
+                Ok(_) => "; `plenoxel train --resume` continues from the last checkpoint",
                 Err(_) => "",
             };
             on(Event::note(format!("{kept}{again}")));
@@ -181,7 +181,7 @@ impl Job<'_> {
         Ok(Ok(Learned { model, metrics, mean_image, training_psnr, stages, kept, steps: total }))
     }
 
-    /// The result of a run that was killed between its last step and its final figures; `trainer` is one of the run before its first step.
+    /// Returns the trained model of a run that was killed between its last step and its final figures; `trainer` is a new trainer of the run.
     pub fn learned<M: Model<f32>>(
         &self,
         trainer: Trainer<f32, M>,
@@ -198,13 +198,13 @@ impl Job<'_> {
         Ok(Learned { model, metrics, mean_image, training_psnr: None, stages, kept: Vec::new(), steps: about.step })
     }
 
-    /// What test views are compared with, if there are any.
+    /// Mean training image, the baseline of the test views, if there are any.
     fn mean_image(&self, views: &[View]) -> Option<Array3<f32>> {
         if self.test_views().is_empty() { None } else { evaluate::mean_image(views, self.config.background) }
     }
 }
 
-/// Writes down that training failed, and gives the error back, or that of writing.
+/// Records in the metrics that training failed. Returns the error, or that of writing the metrics.
 fn failed(error: Error, losses: &[f64], metrics: &mut MetricsFile, on: &mut Listener<'_>) -> Error {
     on(Event::Failed { losses });
     let written = metrics.append(&json!({ "step": losses.len(), "failure": error.to_string() }));
@@ -217,7 +217,7 @@ impl StageSummary {
     }
 }
 
-/// Summaries of the stages that ended before.
+/// Summaries of the stages that ended before the run was resumed.
 fn summaries(past: &History, plan: &[PlannedStage]) -> Vec<StageSummary> {
     let ended = past.stages.iter().filter_map(|&(index, seconds)| Some((plan.get(index)?, seconds)));
     ended.map(|(planned, seconds)| StageSummary::new(planned, seconds)).collect()

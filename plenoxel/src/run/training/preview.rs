@@ -1,6 +1,6 @@
-//! A look at the model while it is trained: a small picture, and the PSNR of a few validation views by some of their pixels.
+//! Previews during training: a small picture, and the PSNR over some pixels of a few validation views.
 //!
-//! No bit of what is trained depends on it, and test views are not looked at.
+//! Previews do not affect the training. They do not use test views.
 
 use crate::camera::{Camera, Intrinsics};
 use crate::dataset::image::RgbaImage;
@@ -12,28 +12,28 @@ use crate::run::evenly_spaced;
 use ndarray::Array3;
 use std::time::Instant;
 
-/// So many validation views, evenly spaced.
+/// Number of validation views, evenly spaced.
 const VIEWS: usize = 4;
-/// Rays along their longer side, at most: their PSNR is to cost little.
+/// Maximum number of rays along the longer side of a validation view, so that its PSNR costs little.
 const SIDE: usize = 128;
-/// That of the picture's, for eyes.
+/// Maximum number of pixels along the longer side of the picture.
 const PICTURE_SIDE: usize = 256;
-/// The share of the time since training began that may be gone into looking when it is looked because time has passed or a step is saved, and when a stage ends.
+/// Maximum share of the training time for previews: for those at intervals and checkpoints, and for those at stage ends.
 const SHARES: [f64; 2] = [0.03, 0.05];
-/// Seconds that it counts for at least: the stages of short runs have their look too.
+/// Minimum training time in seconds for that share, so that the stages of short runs have previews too.
 const LEAST: f64 = 20.0;
 
-/// A preview that is made from time to time.
+/// Periodic previews.
 pub struct Preview {
     views: Vec<View>,
     pace: Pace,
     /// The first of the views, larger.
     shown: Option<View>,
-    /// Who looks where there are no validation views, if a picture is wanted.
+    /// Camera of the picture if there are no validation views; `None` if no picture is wanted.
     camera: Option<Camera>,
 }
 
-/// What was seen.
+/// Result of a preview.
 pub struct Look {
     /// Mean PSNR of the validation views over every k-th pixel of every k-th row, if there are any.
     pub psnr: Option<f64>,
@@ -41,7 +41,7 @@ pub struct Look {
     pub picture: Option<(Array3<f32>, Option<Array3<f32>>)>,
 }
 
-/// Without validation views, never.
+/// No previews.
 impl Default for Preview {
     fn default() -> Self {
         Preview { views: Vec::new(), pace: Pace::new(f64::INFINITY), shown: None, camera: None }
@@ -49,7 +49,7 @@ impl Default for Preview {
 }
 
 impl Preview {
-    /// Previews every so many seconds at most, never for infinitely many; reads the few views that are needed.
+    /// Previews at intervals of `every` seconds or more; infinity disables them. Reads the validation views that are needed.
     pub fn new(dataset: &Dataset, every: f64) -> Result<Self> {
         let chosen = match every.is_finite() {
             true => evenly_spaced(dataset.count(Split::Val), VIEWS),
@@ -65,7 +65,7 @@ impl Preview {
         Ok(Preview { views, pace: Pace::new(every), shown, camera: None })
     }
 
-    /// The same for training that begins now; with a picture if there is a camera, which looks where there are no validation views.
+    /// Starts the clock of the previews. They include a picture if `camera` is given; it is used if there are no validation views.
     pub fn begin(self, camera: Option<Camera>) -> Self {
         let camera = camera.map(|camera| {
             let Intrinsics { width, height, .. } = camera.intrinsics;
@@ -75,7 +75,7 @@ impl Preview {
         Preview { pace: Pace::new(self.pace.every), camera, ..self }
     }
 
-    /// Looks at the model, if it is time to: when a stage ends and when a step is saved whenever there is time for it.
+    /// Makes a preview if one is due: at intervals, at checkpoints and at stage ends, within the allowed share of the time.
     pub fn look<'a>(
         &mut self,
         viewer: impl FnOnce() -> Viewer<'a, f32>,
@@ -104,8 +104,8 @@ impl Preview {
     }
 }
 
-/// Every k-th pixel of every k-th row of a view, at most so many a side, with a camera that has the rays of these pixels: unlike those of a reduced
-/// image, they show what training rays show.
+/// Subsamples a view: every k-th pixel of every k-th row, at most `side` pixels per side, with a camera that has the rays of these pixels. Unlike
+/// the pixels of a downscaled image, they are pixels of the training resolution.
 fn thinned(view: &View, side: usize) -> View {
     let (width, height) = view.image.dimensions();
     let k = width.max(height).div_ceil(side as u32).min(width).min(height);
@@ -124,7 +124,7 @@ fn thinned(view: &View, side: usize) -> View {
     View { name: view.name.clone(), camera: Camera { intrinsics, ..view.camera }, image, depth: None }
 }
 
-/// A view of at most so many pixels a side, without the last columns and rows that would make no whole pixel.
+/// Downscales a view to at most `side` pixels per side, without the last columns and rows that do not fill a pixel.
 fn reduced(view: &View, side: usize) -> View {
     let (width, height) = view.image.dimensions();
     let k = width.max(height).div_ceil(side as u32).min(width).min(height);
@@ -135,13 +135,13 @@ fn reduced(view: &View, side: usize) -> View {
     View { name: view.name.clone(), camera, image, depth: None }.reduced(k as usize)
 }
 
-/// When to look: after some time, when a step is saved, or when a stage ends, and always so that little of the time goes into it.
+/// Schedule of previews: at intervals, checkpoints and stage ends, within a small share of the time.
 struct Pace {
     every: f64,
     began: Instant,
-    /// Seconds since then at which the last look was over.
+    /// End of the last preview, in seconds since `began`.
     last: f64,
-    /// Seconds of all looks, and of the last one.
+    /// Seconds of all previews, and of the last one.
     spent: f64,
     cost: f64,
 }

@@ -6,31 +6,31 @@ use crate::run::figures::Figures;
 use crate::run::metrics::Best;
 use serde::Serialize;
 
-/// Final figures, in the order in which people look for them: `result.json` of the run folder.
+/// Final figures of a run: `result.json` of its folder.
 #[derive(Debug, Serialize)]
 pub struct Summary {
     /// Mean scores over the test views, with their definitions.
     #[serde(flatten)]
     pub figures: Figures,
-    /// Mean PSNR of the plain background.
+    /// Mean test PSNR of the plain background.
     pub baseline_background_psnr: Option<f64>,
-    /// Mean PSNR of the mean training image.
+    /// Mean test PSNR of the mean training image.
     pub baseline_mean_image_psnr: Option<f64>,
     /// Seconds of training.
     pub seconds: f64,
-    /// Seconds that training was planned to take.
+    /// Planned seconds of training (`--time`).
     pub seconds_planned: Option<f64>,
     /// Seconds of reading images.
     pub seconds_load: f64,
     /// Seconds of rendering and comparing test views.
     pub seconds_evaluate: f64,
-    /// Largest amount of memory that the process had at once.
+    /// Peak memory of the process, in bytes.
     pub peak_memory_bytes: Option<u64>,
     /// Steps taken.
     pub steps: u64,
     /// Training rays.
     pub rays: u64,
-    /// Samples on them.
+    /// Samples on these rays.
     pub samples: u64,
     /// Name of the scene.
     pub scene: String,
@@ -38,9 +38,9 @@ pub struct Summary {
     pub preset: Option<String>,
     /// Folder of the run.
     pub run: String,
-    /// Mean PSNR of some pixels of validation views, when they were last looked at.
+    /// Mean PSNR over some pixels of validation views, when it was measured last.
     pub validation_psnr: Option<f64>,
-    /// The step after which it was best.
+    /// The best validation PSNR and its step.
     pub best_validation: Option<Best>,
     /// Each stage.
     pub stages: Vec<StageSummary>,

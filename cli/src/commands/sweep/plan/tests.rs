@@ -51,7 +51,7 @@ fn every_scene_meets_every_method_unless_it_chooses() {
         let arguments: Vec<OsString> = job.call.arguments(&["--out".into()]);
         arguments.into_iter().map(|a| a.into_string().unwrap()).collect()
     };
-    // What is particular comes after what is general, and counts.
+    // Specific settings follow general ones, and override them.
     let data = std::env::temp_dir().join("data/my.lego").to_string_lossy().into_owned();
     let sets = ["--set=seed=1", "--set=rays_per_step=77"];
     let fast = ["--downscale=4", "--no-images", "--preset=fast", "--set=rays_per_step=99", "--set=seed=5", "--out", "--", &data];
@@ -67,9 +67,9 @@ fn every_scene_meets_every_method_unless_it_chooses() {
 fn mistakes_are_named_with_their_place_and_what_would_do() {
     let good = "[[scenes]]\n[[methods]]\npreset = \"fast\"\n";
     for (name, text, code, parts) in [
-        ("toml", "scenes = = 1", 3, &["line 1 is not TOML"][..]),
-        ("top", &format!("scnes = 1\n{good}"), 2, &["line 1: the unknown key `scnes`", "nearest known key is `scenes`"]),
-        ("none", "scenes = []\nmethods = []", 2, &["no scenes", "[[scenes]]"]),
+        ("toml", "scenes = = 1", 3, &["line 1 is not valid TOML"][..]),
+        ("top", &format!("scnes = 1\n{good}"), 2, &["line 1: unknown key `scnes`", "did you mean `scenes`?"]),
+        ("none", "scenes = []\nmethods = []", 2, &["there are no scenes", "[[scenes]]"]),
         ("lists", "scenes = 3\nmethods = []", 3, &["line 1", "expected a sequence"]),
         ("scene", "[[scenes]]\ndownscal = 4\n[[methods]]\n", 2, &["line 2", "unknown key `downscal`", "`downscale`"]),
         ("method", &format!("{good}prezet = \"fast\""), 2, &["line 4", "unknown key `prezet`", "`preset`"]),
@@ -81,15 +81,15 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
             &["line 2, `procedural` with `fats`", "`fats` for --preset", "fast, quality"],
         ),
         ("value", &format!("{good}downscale = \"half\""), 2, &["`half` for --downscale", "a whole number from 1 to 64"]),
-        ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: the unknown key", "`half_width`"]),
+        ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: unknown key", "`half_width`"]),
         ("range", &format!("{good}set = [\"half_width=-1\"]"), 2, &["`procedural` with `fast`: --set half_width: invalid value -1"]),
-        ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "as the flag takes it"]),
+        ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "invalid value { x = 1 }; expected a value of --downscale"]),
         ("flag", "[[scenes]]\nscene_size = 32\n[[methods]]\ncommand = \"carve\"", 2, &["line 2", "which is of `carve`", "`scene_size`"]),
-        ("both", "[[scenes]]\ndata = \"a\"\nscene_size = 32\n[[methods]]", 2, &["--scene-size <SIZE> together with [DATA]"]),
+        ("both", "[[scenes]]\ndata = \"a\"\nscene_size = 32\n[[methods]]", 2, &["--scene-size <SIZE> conflicts with [DATA]"]),
         ("data", "[[scenes]]\ndata = 3\n[[methods]]", 2, &["line 2", "invalid value 3", "a folder in quotes"]),
         ("command", "[[scenes]]\n[[methods]]\ncommand = \"render\"", 2, &["line 3", "\"train\" or \"carve\""]),
-        ("names", "[[scenes]]\nname = \"a/b\"\n[[methods]]", 2, &["line 2", "`a/b`", "letters, digits"]),
-        ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "`procedural`, which comes twice"]),
+        ("names", "[[scenes]]\nname = \"a/b\"\n[[methods]]", 2, &["line 2", "\"a/b\"", "letters, digits"]),
+        ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "the name `procedural` is used twice"]),
         ("chosen", "[[scenes]]\nmethods = [\"fat\"]\n[[methods]]\npreset = \"fast\"", 2, &["line 2", "unknown method `fat`", "`fast`"]),
         (
             "published",
@@ -97,7 +97,7 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
             2,
             &["line 4", "psnr = { procedural"],
         ),
-        ("source", &format!("{good}[[published]]\nname = \"x\""), 3, &["line 4", "missing field `source`"]),
+        ("source", &format!("{good}[[published]]\nname = \"x\""), 3, &["line 4", "the key `source` is missing"]),
         ("figure", &format!("{good}[[published]]\npsn = 1"), 2, &["line 5", "unknown key `psn`", "`psnr`"]),
     ] {
         let error = read(name, text).unwrap_err();
@@ -108,12 +108,12 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
 }
 
 #[test]
-fn more_runs_than_anyone_waits_for_are_refused_before_they_are_thought_out() {
+fn too_many_runs_are_refused_before_they_are_planned() {
     let entries = |list: &str, n: usize| (0..n).map(|i| format!("[[{list}]]\nname = \"{list}{i}\"\n")).collect::<String>();
     let error = read("many", &(entries("scenes", 3000) + &entries("methods", 3000))).unwrap_err();
     let message = error.to_string();
-    assert!(error.exit_code() == 2 && message.contains("9000000 runs, of 3000 scenes with 3000 methods"), "{message}");
-    assert!(message.contains("line 1: ") && message.contains("up to 10000 runs"), "{message}");
+    assert!(error.exit_code() == 2 && message.contains("3000 scenes with 3000 methods make 9000000 runs"), "{message}");
+    assert!(message.contains("line 1: ") && message.contains("at most 10000;"), "{message}");
     // Each scene with few of many methods.
     let few = entries("scenes", 3).replace("]]\n", "]]\nmethods = [\"methods7\"]\n") + &entries("methods", 4000);
     assert_eq!(read("few", &few).unwrap().jobs.len(), 3);
@@ -130,13 +130,13 @@ fn flags_alone_make_the_same_plan() {
     assert_eq!((&plan.jobs[1].call.data, &plan.jobs[2].call.data), (&Some("data/lego".into()), &None));
     assert!(plan.jobs.iter().all(|job| job.asked.config.seed == 3));
     let twice = Plan::from_flags(&strings(&["a/lego", "b/lego"]), &strings(&["fast"]), &[], Path::new("o")).unwrap_err();
-    assert!(twice.to_string().starts_with("--scene: `lego`, which comes twice"), "{twice}");
+    assert!(twice.to_string().starts_with("--scene: the name `lego` is used twice"), "{twice}");
 }
 
 #[test]
 fn the_example_of_the_help_is_a_plan() {
-    let example = super::super::EXAMPLES.lines().skip_while(|line| *line != "relative to the file:").skip(1);
-    let text: Vec<&str> = example.take_while(|line| !line.starts_with("Runs are")).collect();
+    let example = super::super::EXAMPLES.lines().skip_while(|line| *line != "relative to the file. Example:").skip(1);
+    let text: Vec<&str> = example.take_while(|line| !line.starts_with("Run folders are")).collect();
     let plan = read("example", &text.join("\n")).unwrap();
     assert_eq!(plan.methods, ["fast", "paper-tv", "hull"]);
     assert_eq!(plan.jobs.len(), 4);
