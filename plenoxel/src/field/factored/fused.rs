@@ -29,7 +29,7 @@ pub fn supports(shape: &Shape) -> bool {
 
 /// Returns the number of rays in a block, which depends on the size of the batch only.
 fn block_of(rays: usize) -> usize {
-    rays.div_ceil(48).clamp(16, 256)
+    rays.div_ceil(16).clamp(16, 256)
 }
 
 /// Data of a batch that its blocks share.

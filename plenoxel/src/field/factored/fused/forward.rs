@@ -172,26 +172,30 @@ impl<'a, T: Real> Scene<'a, T> {
                 Some(cells) => Intervals::Occupied(march.occupied(ray, cells)),
                 None => Intervals::All((0..march.count).map(move |k| march.interval(k))),
             };
-            let (start, slope) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
+            let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
             let mut left = T::one();
             while left >= stop {
                 if end + RUN > columns[0].len() {
                     let room = (2 * columns[0].len()).max(32 * count);
                     columns.iter_mut().for_each(|column| column.grow(room));
                 }
+                let [x, y, z, t, delta, sigma, slope, weight, after] = &mut columns;
                 let mut own = 0;
                 while own < RUN
-                    && let Some((t, delta)) = intervals.next()
+                    && let Some((middle, length)) = intervals.next()
                 {
-                    let place = (start + t * slope).clamp(DVec3::ZERO, most);
-                    let values = [place.x, place.y, place.z, t, delta];
-                    columns.iter_mut().zip(values).for_each(|(column, value)| column[end + own] = T::lit(value));
+                    let place = (start + middle * along).clamp(DVec3::ZERO, most);
+                    (x[end + own], y[end + own], z[end + own]) = (T::lit(place.x), T::lit(place.y), T::lit(place.z));
+                    (t[end + own], delta[end + own]) = (T::lit(middle), T::lit(length));
                     own += 1;
                 }
                 if own == 0 {
                     break;
                 }
-                let [x, y, z, _, delta, sigma, slope, weight, after] = columns.each_mut().map(|column| &mut column[end..end + own]);
+                let run = end..end + own;
+                let (x, y, z, delta) = (&x[run.clone()], &y[run.clone()], &z[run.clone()], &delta[run.clone()]);
+                let (sigma, slope) = (&mut sigma[run.clone()], &mut slope[run.clone()]);
+                let (weight, after) = (&mut weight[run.clone()], &mut after[run]);
                 if parallel::fused() {
                     lookup::density::<T, true>(self.tables.density, [x, y, z], sigma, slope);
                 } else {
