@@ -3,15 +3,16 @@ use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::error::Result;
 use plenoxel::loss::{Objective, mse};
 use plenoxel::model::plenoxels;
-use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
+use plenoxel::model::tensorf::{Config, Stage, Tensorf};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::training::{Event, Outcome, RunSettings, train_model};
-use plenoxel::train::{TrainOptions, Trainer};
+use plenoxel::train::Trainer;
 
-/// A tenth of the authors' cells and steps, for two cores.
+/// The recipe for two cores, with small steps for small images.
 fn config() -> Config {
-    let stages = [(48, 400), (64, 400), (96, 700)].map(|(resolution, steps)| Stage { resolution, steps }).to_vec();
-    Config { half_width: 1.4, hidden: 64, step: 1.0, color_above: 1e-3, network_rate: 3e-3, stages, ..Config::default() }
+    let stages = [(48, 400, 512), (64, 400, 1024), (96, 700, 1024)];
+    let stages = stages.map(|(resolution, steps, rays)| Stage { resolution, steps, rays }).to_vec();
+    Config { half_width: 1.4, stages, ..Config::default() }
 }
 
 fn main() -> Result<()> {
@@ -21,9 +22,7 @@ fn main() -> Result<()> {
     let outcome = train_model(
         &settings,
         |run, _, views| {
-            let options = TrainOptions { rays_per_step: 1024, ..run.train_options() };
-            let objective = Objective::new().with("mse", 1.0, mse).with("density_l1", 4e-5, density_l1);
-            Trainer::with_model(Tensorf::new(config())?, views, objective, options)
+            Trainer::with_model(Tensorf::new(config())?, views, Objective::new().with("mse", 1.0, mse), run.train_options())
         },
         &mut |event| match event {
             Event::Note(text) => eprintln!("{text}"),
