@@ -8,16 +8,18 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::evaluate::evaluate;
 use plenoxel::loss::{Objective, mse};
 use plenoxel::field::factored::Directions;
+use plenoxel::geometry::Aabb;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
 use plenoxel::render::{Engine, Field, Rendered};
 use plenoxel::sampling::Jitter;
 use plenoxel::train::{Model, Pass, PlannedStage, TrainOptions, Trainer, ViewOptions};
 
+const BOX: Aabb = Aabb { min: DVec3::splat(-1.4), max: DVec3::splat(1.4) };
+
 const PASS: Pass = Pass { background: [1.0; 3], jitter: Jitter::None, keep_samples: false, stage: None };
 
 fn tiny(stages: &[(usize, u64)]) -> Config {
     Config {
-        half_width: 1.4,
         density_components: 4,
         appearance_components: 6,
         features: 8,
@@ -34,7 +36,7 @@ fn tiny(stages: &[(usize, u64)]) -> Config {
 
 /// A model whose density is neither fog nor nothing, so that all numbers matter.
 fn dense<T: Real>(stages: &[(usize, u64)]) -> Tensorf<T> {
-    let mut model = Tensorf::<T>::new(tiny(stages)).expect("valid settings");
+    let mut model = Tensorf::<T>::new(tiny(stages), BOX, 42).expect("valid settings");
     let random = Stream::new(3);
     model.visit_mut(&mut |param: &mut Param<T>| {
         if param.name().starts_with("density") {
@@ -79,7 +81,7 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
 
 /// A model that the kernel computes.
 fn wide(config: Config) -> Tensorf<f64> {
-    let mut model = Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }).expect("valid settings");
+    let mut model = Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }, BOX, 42).expect("valid settings");
     let random = Stream::new(11);
     model.visit_mut(&mut |param: &mut Param<f64>| {
         if param.name().starts_with("density") {
@@ -159,7 +161,7 @@ fn trainer(views: &[View]) -> Trainer<f32, Tensorf<f32>> {
     let config = Config { factor_rate: 0.05, network_rate: 5e-3, ..tiny(&[(16, 150), (24, 150)]) };
     let options = TrainOptions { rays_per_step: 256, ..TrainOptions::default() };
     let objective = Objective::new().with("mse", 1.0, mse).with("density_l1", 8e-5, density_l1);
-    Trainer::with_model(Tensorf::new(config).expect("valid settings"), views, objective, options).expect("a trainer")
+    Trainer::with_model(Tensorf::new(config, BOX, 42).expect("valid settings"), views, objective, options).expect("a trainer")
 }
 
 #[test]
@@ -183,8 +185,7 @@ fn a_scene_is_learned_and_a_resumed_run_has_the_same_bits() {
 #[test]
 fn settings_without_meaning_are_refused_by_their_key() {
     type Change = fn(&mut Config);
-    let wrong: [(&str, Change); 5] = [
-        ("half_width", |config| config.half_width = f64::NAN),
+    let wrong: [(&str, Change); 4] = [
         ("density_components", |config| config.density_components = 0),
         ("step", |config| config.step = 0.0),
         ("stages", |config| config.stages.clear()),
@@ -193,7 +194,7 @@ fn settings_without_meaning_are_refused_by_their_key() {
     for (key, change) in wrong {
         let mut config = tiny(&[(4, 1)]);
         change(&mut config);
-        let error = Tensorf::<f32>::new(config).expect_err(key);
+        let error = Tensorf::<f32>::new(config, BOX, 42).expect_err(key);
         assert!(error.exit_code() == 2 && error.to_string().starts_with(key), "{error}");
     }
 }

@@ -1,6 +1,7 @@
 //! TensoRF on a scene, with a run folder: `cargo run --release -p plenoxel --example tensorf -- [DATA]`. Without DATA it learns the built-in scene.
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::error::Result;
+use plenoxel::geometry::Aabb;
 use plenoxel::loss::{Objective, mse};
 use plenoxel::model::plenoxels;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf};
@@ -12,7 +13,7 @@ use plenoxel::train::Trainer;
 fn config() -> Config {
     let stages = [(48, 400, 512), (64, 400, 1024), (96, 700, 1024)];
     let stages = stages.map(|(resolution, steps, rays)| Stage { resolution, steps, rays }).to_vec();
-    Config { half_width: 1.4, stages, ..Config::default() }
+    Config { stages, ..Config::default() }
 }
 
 fn main() -> Result<()> {
@@ -22,7 +23,7 @@ fn main() -> Result<()> {
     let outcome = train_model(
         &settings,
         |run, _, views| {
-            Trainer::with_model(Tensorf::new(config())?, views, Objective::new().with("mse", 1.0, mse), run.train_options())
+            Trainer::with_model(Tensorf::new(config(), Aabb::cube(run.half_width), run.seed)?, views, Objective::new().with("mse", 1.0, mse), run.train_options())
         },
         &mut |event| match event {
             Event::Note(text) => eprintln!("{text}"),

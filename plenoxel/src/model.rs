@@ -12,10 +12,11 @@ use crate::field::voxel_grid::VoxelGrid;
 use crate::tensor_file::TensorFile;
 use crate::train::About;
 use plenoxels::config::Config;
+use tensorf::Tensorf;
 use std::path::Path;
 
 /// Kinds of models that [`open`] can read.
-pub const KINDS: [&str; 1] = [plenoxels::KIND];
+pub const KINDS: [&str; 2] = [plenoxels::KIND, tensorf::KIND];
 
 /// Returns the kind of model that a checkpoint holds.
 ///
@@ -33,6 +34,10 @@ pub fn open(path: &Path, config: &Config) -> Result<(Box<dyn Model<f32>>, About)
     match &kind(path)?[..] {
         plenoxels::KIND => {
             let (model, about) = plenoxels::open(path, config)?;
+            Ok((Box::new(model), about))
+        }
+        tensorf::KIND => {
+            let (model, about) = Tensorf::open(path)?;
             Ok((Box::new(model), about))
         }
         other => {

@@ -52,8 +52,8 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let trained = found.folder.result()?.unwrap_or(Value::Null);
     let dataset = args.run.views(&found)?;
     args.out.iter().try_for_each(|out| super::check_replaceable(out, &[&found.folder], found.source.path()))?;
-    let Loaded { model, about, view } = args.run.load(&found, console, |sampling, shape, voxels| {
-        Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
+    let Loaded { model, about, view } = args.run.load(&found, console, |sampling, stored| {
+        Estimate::of_evaluation(&found.config, sampling, stored, Some((&dataset, args.run.split)))
     })?;
     let Found { folder, config, preset, source } = found;
     let views = load(console, &dataset, args.run.split, &source)?;

@@ -9,7 +9,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files;
 use plenoxel::geometry::Aabb;
-use plenoxel::model;
+use plenoxel::model::{self, plenoxels};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
@@ -85,13 +85,17 @@ fn describe(path: &Path) -> Result<Lines> {
 /// Describes the checkpoint of a custom model: its kind and its parameters. Returns `None` for a voxel grid.
 fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
     let kind = model::kind(path)?;
-    if model::KINDS.contains(&&kind[..]) {
+    if kind == plenoxels::KIND {
         return Ok(None);
     }
+    let about = match model::KINDS.contains(&&kind[..]) {
+        true => "a factored field",
+        false => "a custom model; the program that trained it can render and evaluate it",
+    };
     let file = TensorFile::open(path)?;
     let mut lines = vec![
         ("checkpoint", path.display().to_string()),
-        ("kind", format!("{kind}: a custom model; the program that trained it can render and evaluate it")),
+        ("kind", format!("{kind}: {about}")),
     ];
     lines.extend(file.tensors().into_iter().map(|(name, shape)| ("parameter", format!("{name} {shape:?}"))));
     Ok(Some(lines))
@@ -115,7 +119,7 @@ fn of_run(path: &Path) -> Result<Lines> {
     // For small images, grids are smaller than configured.
     let trained: Option<Vec<u64>> =
         result.as_ref().and_then(|result| result["stages"].as_array()?.iter().map(|stage| stage["resolution"].as_u64()).collect());
-    let stages = trained.unwrap_or_else(|| config.stages.iter().map(|stage| stage.resolution as u64).collect());
+    let stages = trained.unwrap_or_else(|| config.resolutions().map(|resolution| resolution as u64).collect());
     let stages: Vec<String> = stages.iter().map(|resolution| format!("{resolution}³")).collect();
     lines.push(("stages", if carved { "none: the grid was carved".to_owned() } else { stages.join(", ") }));
     if folder.checkpoint().exists() {

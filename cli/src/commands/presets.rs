@@ -56,9 +56,9 @@ fn row([name, time, alpha, purpose]: [&str; 4]) -> String {
 
 /// Use of the alpha channel of images, besides compositing.
 fn alpha_decides(config: &Config) -> &'static str {
-    match (config.stages.is_empty(), config.hull) {
-        (true, _) => "the shape",
-        (false, Hull::Auto) => "box and voxels",
-        (false, Hull::Off) => "nothing",
+    match (config.trains(), config.hull) {
+        (false, _) => "the shape",
+        (true, Hull::Auto) => "box and voxels",
+        (true, Hull::Off) => "nothing",
     }
 }

@@ -112,7 +112,7 @@ fn render(
     let pixels = shots.iter().map(|(camera, _)| camera.intrinsics.width * camera.intrinsics.height).max().unwrap_or(0);
     let Loaded { model, view, .. } = args
         .run
-        .load(found, console, |sampling, shape, voxels| Estimate::of_pictures(&found.config, sampling, shape, voxels, pixels, normals))?;
+        .load(found, console, |sampling, stored| Estimate::of_pictures(&found.config, sampling, stored, pixels, normals))?;
     prepare()?;
     let grid = || voxel_grid(&*model, found.folder.path(), "rendering normals");
     let normals = normals.then(|| Ok(Plenoxels::of_grid(&found.config, grid()?.normals()))).transpose()?;

@@ -3,12 +3,11 @@
 use crate::progress::Console;
 use crate::report::Report;
 use clap::{Args, ValueHint};
-use plenoxel::checkpoint;
 use plenoxel::error::Result;
 use plenoxel::model;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
-use plenoxel::run::memory::Estimate;
+use plenoxel::run::memory::{Estimate, Stored};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -47,8 +46,7 @@ pub fn write(run: &Path, data: Option<DataSource>, console: &Console<'_>) -> Res
     let dataset = source.reopen(&config)?;
     let path = folder.existing_checkpoint()?;
     let model = if model::KINDS.contains(&&model::kind(&path)?[..]) {
-        let (header, voxels) = checkpoint::header(&path)?;
-        let estimate = Estimate::of_report(&config, &header.shape(), voxels);
+        let estimate = Estimate::of_report(&config, &Stored::read(&path)?);
         console.note(&estimate.describe());
         estimate.check()?;
         Some(model::open(&path, &config)?.0)

@@ -2,15 +2,13 @@
 
 use crate::progress::Console;
 use clap::{Args, ValueHint};
-use plenoxel::checkpoint;
 use plenoxel::dataset::{Dataset, Split};
-use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::GridShape;
+use plenoxel::error::{Error, Result};
 use plenoxel::model::plenoxels::config::{Config, Sampling};
 use plenoxel::model::{self, Model};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
-use plenoxel::run::memory::Estimate;
+use plenoxel::run::memory::{Estimate, Stored};
 use plenoxel::train::{About, ViewOptions};
 use std::path::PathBuf;
 
@@ -88,13 +86,18 @@ impl TrainedRun {
         &self,
         found: &Found,
         console: &Console<'_>,
-        estimate: impl FnOnce(Sampling, &GridShape, usize) -> Estimate,
+        estimate: impl FnOnce(Sampling, &Stored) -> Estimate,
     ) -> Result<Loaded> {
         let path = found.folder.existing_checkpoint()?;
-        let (header, voxels) = checkpoint::header(&path)?;
-        let (shape, as_trained) = (header.shape(), found.config.evaluation);
-        let sampling = self.samples.map_or(as_trained, |samples| as_trained.with_samples(samples, &shape));
-        let estimate = estimate(sampling, &shape, voxels);
+        let (stored, as_trained) = (Stored::read(&path)?, found.config.evaluation);
+        let sampling = match (self.samples, &stored) {
+            (None, _) => as_trained,
+            (Some(samples), Stored::Grid { shape, .. }) => as_trained.with_samples(samples, shape),
+            (Some(_), Stored::Factored { .. }) => {
+                return Err(Error::usage("--samples", "the samples of a factored field follow from its cells", "leave out --samples"));
+            }
+        };
+        let estimate = estimate(sampling, &stored);
         console.note(&estimate.describe());
         estimate.check()?;
         let (model, about) = model::open(&path, &found.config)?;
@@ -108,7 +111,6 @@ impl TrainedRun {
 impl Found {
     /// Half the side of the box of the model, in world units.
     pub fn half_width(&self) -> Result<f64> {
-        let (header, _) = checkpoint::header(&self.folder.existing_checkpoint()?)?;
-        Ok(header.shape().half_width)
+        Ok(Stored::read(&self.folder.existing_checkpoint()?)?.half_width())
     }
 }

@@ -27,7 +27,7 @@ pub fn lines<'t>(folder: &RunFolder, metrics: &'t str, console: &Console<'_>) ->
 
 /// The curves of a run; empty without training.
 pub fn section(lines: &[Line<'_>], config: &Config) -> String {
-    let Some(last) = lines.last().filter(|_| !config.stages.is_empty()) else { return String::new() };
+    let Some(last) = lines.last().filter(|_| config.trains()) else { return String::new() };
     over_both(|_, (_, across, at)| {
         let charts = charts(lines, config).into_iter().map(|(title, up, values)| {
             let curves = values.into_iter().map(|(name, value)| curve(&name, lines, at, &*value)).filter(|curve| !curve.lines.is_empty());

@@ -31,7 +31,7 @@ mod single;
 mod stages;
 mod start;
 
-pub use objective::{LEARNED_LOSSES, LOSSES, objective, with_loss};
+pub use objective::{LEARNED_LOSSES, LOSSES, objective, objective_of_any, with_loss};
 
 use crate::camera::Ray;
 use crate::checkpoint::{self, Header};

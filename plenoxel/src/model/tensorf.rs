@@ -15,17 +15,20 @@ use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
+use crate::model::plenoxels::config::Hull;
+use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
+use std::path::Path;
 
 /// Kind of this model in checkpoints.
 pub const KIND: &str = "tensorf";
 
 /// A stage of training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Stage {
     /// Nodes along each axis if the box is a cube. Another box has as many cells, with about equal sides.
     pub resolution: usize,
@@ -37,9 +40,8 @@ pub struct Stage {
 
 /// Settings of the model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Half the side of the box around the origin, world length.
-    pub half_width: f64,
     /// Components of each of the three plane-line pairs of the density.
     pub density_components: usize,
     /// Components of each of the three plane-line pairs of the appearance.
@@ -66,8 +68,6 @@ pub struct Config {
     pub stop_below_in_pictures: f64,
     /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.
     pub occupied_above: f64,
-    /// True to sample only cells in the visual hull of the training views' alpha channels, if they have them.
-    pub hull: bool,
     /// Number of steps for which the density is opaque and constant; 0 to begin with the authors' random density.
     pub opaque_steps: u64,
     /// Learning rate of planes and lines.
@@ -84,8 +84,6 @@ pub struct Config {
     pub lazy: bool,
     /// Stages, with increasing resolution.
     pub stages: Vec<Stage>,
-    /// Seed of the initial parameters.
-    pub seed: u64,
 }
 
 /// The recipe for two cores.
@@ -93,7 +91,6 @@ impl Default for Config {
     fn default() -> Self {
         let stages = [(64, 600, 512), (90, 600, 1024), (128, 800, 2048), (180, 1000, 3072), (256, 2000, 4096)];
         Config {
-            half_width: 1.5,
             density_components: 16,
             appearance_components: 48,
             features: 32,
@@ -107,7 +104,6 @@ impl Default for Config {
             stop_below: 3e-3,
             stop_below_in_pictures: 3e-4,
             occupied_above: 0.01,
-            hull: true,
             opaque_steps: 50,
             factor_rate: 0.02,
             network_rate: 3e-3,
@@ -116,7 +112,6 @@ impl Default for Config {
             density_l1_later: 4e-5,
             lazy: true,
             stages: stages.map(|(resolution, steps, rays)| Stage { resolution, steps, rays }).to_vec(),
-            seed: 42,
         }
     }
 }
@@ -137,7 +132,6 @@ impl Config {
             color_above: 1e-4,
             stop_below: 0.0,
             stop_below_in_pictures: 0.0,
-            hull: false,
             opaque_steps: 0,
             network_rate: 1e-3,
             lazy: false,
@@ -154,7 +148,6 @@ impl Config {
             true => Ok(()),
             false => Err(Error::config(key, value, expected)),
         };
-        check(self.half_width > 0.0 && self.half_width.is_finite(), "half_width", self.half_width, "a length above 0")?;
         for (key, width) in [
             ("density_components", self.density_components),
             ("appearance_components", self.appearance_components),
@@ -219,6 +212,7 @@ impl Config {
 pub struct Tensorf<T: Real> {
     config: Config,
     field: Factored<T>,
+    hull: Hull,
     /// Implementation of rendering.
     pub engine: Engine,
 }
@@ -261,19 +255,37 @@ const HULL_MARGIN: f64 = 1.0;
 const MOST_CELLS: usize = 256;
 
 impl<T: Real> Tensorf<T> {
-    /// Creates the model at the resolution of the first stage.
+    /// Creates the model in a box at the resolution of the first stage. `seed` determines the initial parameters.
     ///
     /// Errors name the setting that is invalid.
-    pub fn new(config: Config) -> Result<Self> {
+    pub fn new(config: Config, aabb: Aabb, seed: u64) -> Result<Self> {
         config.validate()?;
-        let random = Stream::new(config.seed);
-        let mut field = Factored::new(config.shape(), Aabb::cube(config.half_width), [config.stages[0].resolution; 3], &random);
+        let random = Stream::new(seed);
+        let mut field = Factored::new(config.shape(), aabb, nodes_of(aabb, config.stages[0].resolution), &random);
         if config.opaque_steps > 0 {
             field.make_opaque();
         }
         field.grouping = Grouping { weight: config.group, above: config.color_above };
         field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
-        Ok(Tensorf { config, field, engine: Engine::Fused })
+        Ok(Tensorf { config, field, hull: Hull::Auto, engine: Engine::Fused })
+    }
+
+    /// Sets the use of silhouettes. With [`Hull::Auto`], the default, only cells in the visual hull of the training views are sampled, if they have an alpha
+    /// channel.
+    pub fn with_hull(self, hull: Hull) -> Self {
+        Tensorf { hull, ..self }
+    }
+
+    /// Opens a trained model.
+    ///
+    /// Errors if the file is damaged or holds another kind of model; the error names the file and the problem.
+    pub fn open(path: &Path) -> Result<(Self, About)> {
+        let config: Config = TensorFile::open(path)?.fact("settings")?;
+        // Box, nodes and values are in the file.
+        let mut model = Tensorf::new(Config { stages: config.stages.iter().copied().take(1).collect(), ..config.clone() }, Aabb::cube(1.0), 0)?;
+        model.config = config;
+        let about = model.load(path)?;
+        Ok((model, about))
     }
 
     /// Returns the settings of the model.
@@ -304,7 +316,7 @@ impl<T: Real> Tensorf<T> {
 
     fn hull(&self, views: &[View]) -> Option<Occupancy> {
         let hull = || visual_hull::by_footprint(views, self.aabb(), [HULL; 3], HULL_MARGIN, &|_| {}).dilated(1);
-        (self.config.hull && has_alpha(views)).then(hull)
+        (self.hull == Hull::Auto && has_alpha(views)).then(hull)
     }
 
     fn render_with(&self, rays: &[Ray], background: [f32; 3], jitter: Jitter, engine: Engine) -> Rendered<T> {

@@ -229,7 +229,7 @@ impl RunFolder {
         }
         let mut record = RunRecord::parse(&record, &files::read(&record, files::RUN)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
-        if config.stages.is_empty() && !record.is_of_own_model() {
+        if !config.trains() && !record.is_of_own_model() {
             record.kind = RunKind::Carved;
         }
         Ok((folder, config, record))

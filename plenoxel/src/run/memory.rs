@@ -14,9 +14,13 @@ use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
 use crate::field::voxel_grid::{Color, GridShape};
+use crate::checkpoint;
 use crate::memory;
 use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
+use crate::model::{self, tensorf};
 use crate::render::Engine;
+use crate::tensor_file::TensorFile;
+use std::path::Path;
 
 /// An estimate in bytes, by purpose.
 #[derive(Debug, Clone, PartialEq)]
@@ -135,20 +139,17 @@ impl Estimate {
     }
 
     /// Estimates rendering a trained grid of `voxels` voxels, and comparing it with the views of a split if `compare` has one.
-    pub fn of_evaluation(
-        config: &Config,
-        sampling: Sampling,
-        shape: &GridShape,
-        voxels: usize,
-        compare: Option<(&Dataset, Split)>,
-    ) -> Self {
-        let samples = evaluation_samples(config, sampling, shape);
+    pub fn of_evaluation(config: &Config, sampling: Sampling, stored: &Stored, compare: Option<(&Dataset, Split)>) -> Self {
+        let rendering = match stored {
+            Stored::Grid { shape, .. } => evaluation_samples(config, sampling, shape) * evaluation_bytes_per_sample(config.engine, shape),
+            Stored::Factored { config: tensorf, .. } => EVALUATION_RAYS * factored_bytes_of_ray(tensorf, config.engine),
+        };
         Estimate {
             images: compare.map_or(0, |(dataset, split)| images(dataset, config.downscale, dataset.count(split))),
             // The file and the tables read from it.
-            grid: 2 * (voxels * shape.voxel_bytes()) as u64,
+            grid: 2 * stored.bytes(),
             optimizer: 0,
-            step: samples * evaluation_bytes_per_sample(config.engine, shape)
+            step: rendering
                 + compare.map_or(0, |(dataset, split)| comparison(dataset, split, COMPARED_BYTES)),
             expected: false,
             key: "RUN".to_owned(),
@@ -157,15 +158,16 @@ impl Estimate {
     }
 
     /// Estimates writing the report of a run whose grid has `voxels` voxels. A few views are rendered for it.
-    pub fn of_report(config: &Config, shape: &GridShape, voxels: usize) -> Self {
-        let rendering = Self::of_evaluation(config, config.evaluation, shape, voxels, None);
-        let step = rendering.step + page((voxels * shape.voxel_bytes()) as u64);
+    pub fn of_report(config: &Config, stored: &Stored) -> Self {
+        let rendering = Self::of_evaluation(config, config.evaluation, stored, None);
+        let step = rendering.step + page(stored.bytes());
         Estimate { step, advice: "use a machine with more memory", ..rendering }
     }
 
     /// Estimates rendering a trained grid of `voxels` voxels to pictures of `pixels` pixels, with or without its normals.
-    pub fn of_pictures(config: &Config, sampling: Sampling, shape: &GridShape, voxels: usize, pixels: usize, normals: bool) -> Self {
-        let rendering = Self::of_evaluation(config, sampling, shape, voxels, None);
+    pub fn of_pictures(config: &Config, sampling: Sampling, stored: &Stored, pixels: usize, normals: bool) -> Self {
+        let rendering = Self::of_evaluation(config, sampling, stored, None);
+        let voxels = if let Stored::Grid { voxels, .. } = stored { *voxels } else { 0 };
         let images = PICTURE_BYTES * pixels as u64;
         let grid = rendering.grid + if normals { (voxels * 3 * size_of::<f32>()) as u64 } else { 0 };
         let (key, advice) = match images > grid {
@@ -202,6 +204,26 @@ impl Estimate {
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
         Estimate { images, grid, optimizer: 0, step, expected: false, key: key.to_owned(), advice }
+    }
+
+    /// Estimates a training run of a factored field and its evaluation.
+    pub fn of_factored(config: &Config, tensorf: &tensorf::Config, dataset: &Dataset, options: &RunOptions) -> Self {
+        // Values and both moments of Adam, and the values of the stage before.
+        let values = tensorf.stages.iter().map(|stage| factored_bytes(tensorf, stage.resolution)).max().unwrap_or(0);
+        let rays = tensorf.stages.iter().map(|stage| stage.rays as u64).max().unwrap_or(0);
+        let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
+        let (width, height) = dataset.size();
+        let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
+        let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
+        let images = images(dataset, config.downscale, views);
+        let step = (rays.max(EVALUATION_RAYS) * factored_bytes_of_ray(tensorf, config.engine)).max(hull) + comparison;
+        let parts = [
+            (images, ("downscale", "a larger factor, so that the images fit")),
+            (step, ("tensorf.stages[*].rays", "fewer rays in a step")),
+            (3 * values, ("tensorf.stages[*].resolution", "fewer nodes a side, or fewer components")),
+        ];
+        let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
+        Estimate { images, grid: 2 * values, optimizer: 2 * values, step, expected: true, key: key.to_owned(), advice }
     }
 
     /// Estimates reading a trained grid of `voxels` voxels and exporting all of them, with `bytes_per_voxel` for the export.
@@ -270,6 +292,75 @@ impl Estimate {
 /// Bytes for report.html with a grid of `grid` bytes: the grid, its quantized copy, and the page.
 fn page(grid: u64) -> u64 {
     2 * grid + (2 * grid).min(PAGE_BYTES)
+}
+
+/// The model of a checkpoint: what determines the memory for reading and rendering it.
+pub enum Stored {
+    /// A voxel grid.
+    Grid {
+        /// Its shape.
+        shape: GridShape,
+        /// Number of its voxels.
+        voxels: usize,
+    },
+    /// A factored field.
+    Factored {
+        /// Its settings.
+        config: tensorf::Config,
+        /// Size of the file.
+        bytes: u64,
+        /// Half the longest side of its box, world length.
+        half_width: f64,
+    },
+}
+
+impl Stored {
+    /// Reads the header of a checkpoint.
+    ///
+    /// Errors: the file cannot be read; its kind is not one of [`KINDS`](model::KINDS).
+    pub fn read(path: &Path) -> Result<Self> {
+        if model::kind(path)? == tensorf::KIND {
+            let file = TensorFile::open(path)?;
+            let [min, max]: [[f64; 3]; 2] = file.fact("box")?;
+            let half_width = (0..3).map(|a| 0.5 * (max[a] - min[a])).fold(0.0, f64::max);
+            let bytes = std::fs::metadata(path).map_err(|e| Error::io(path, e, "reading"))?.len();
+            return Ok(Stored::Factored { config: file.fact("settings")?, bytes, half_width });
+        }
+        let (header, voxels) = checkpoint::header(path)?;
+        Ok(Stored::Grid { shape: header.shape(), voxels })
+    }
+
+    /// Half the longest side of the box, world length.
+    pub fn half_width(&self) -> f64 {
+        match self {
+            Stored::Grid { shape, .. } => shape.half_width,
+            Stored::Factored { half_width, .. } => *half_width,
+        }
+    }
+
+    fn bytes(&self) -> u64 {
+        match self {
+            Stored::Grid { shape, voxels } => (voxels * shape.voxel_bytes()) as u64,
+            Stored::Factored { bytes, .. } => *bytes,
+        }
+    }
+}
+
+/// Bytes of the planes of a factored field, in a box of usual proportions.
+fn factored_bytes(tensorf: &tensorf::Config, resolution: usize) -> u64 {
+    const LONG: f64 = 1.2;
+    let components = (tensorf.density_components + tensorf.appearance_components) as f64;
+    (LONG * 3.0 * (resolution * resolution) as f64 * components) as u64 * size_of::<f32>() as u64
+}
+
+/// Bytes of a ray of a factored field: of its samples, and of the samples at which the color network is evaluated.
+fn factored_bytes_of_ray(tensorf: &tensorf::Config, engine: Engine) -> u64 {
+    // Measured on lego; in the first stage, a ray has more samples with a color.
+    const SAMPLES: u64 = 24;
+    const COLORED: u64 = 6;
+    let of_sample = 120 + if engine == Engine::Graph { 400 * tensorf.density_components as u64 } else { 0 };
+    let of_color = 4 * (6 * tensorf.appearance_components + 4 * tensorf.features + 4 * tensorf.hidden) as u64;
+    SAMPLES * of_sample + COLORED * of_color
 }
 
 /// Numbers in the optimizer state for each number of the tables.

@@ -16,6 +16,7 @@
 
 mod best;
 mod event;
+mod factored;
 mod learning;
 mod preview;
 mod summary;
@@ -131,7 +132,10 @@ pub type Listener<'l> = dyn FnMut(Event<'_>) + Send + 'l;
 ///
 /// Errors: a setting is invalid, data cannot be read, a number is not finite, or a file cannot be written.
 pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
-    train_with(settings, objective, on)
+    match &settings.config.tensorf {
+        Some(tensorf) => factored::train(settings, tensorf, on),
+        None => train_with(settings, objective, on),
+    }
 }
 
 /// Trains Plenoxels with a custom objective. `objective` builds it from the config and the number of training views. The losses of the config are
@@ -307,7 +311,10 @@ impl<'s> NewRun<'s> {
 ///
 /// Errors: those of [`train()`]; the run has ended or saved no checkpoint.
 pub fn resume(path: &Path, data: Option<DataSource>, options: &RunOptions, on: &mut Listener<'_>) -> Result<Outcome> {
-    resume_with(path, data, options, objective, on)
+    match RunFolder::open(path)?.1.tensorf {
+        Some(tensorf) => factored::resume(path, &tensorf, data, options, on),
+        None => resume_with(path, data, options, objective, on),
+    }
 }
 
 /// Resumes a run started by [`train_with`], with the same objective.

@@ -17,7 +17,7 @@ use plenoxel::rays::RaySource;
 use plenoxel::render::RenderOptions;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunRecord;
-use plenoxel::run::memory::Estimate;
+use plenoxel::run::memory::{Estimate, Stored};
 use plenoxel::sampling::Jitter;
 use std::path::PathBuf;
 
@@ -154,8 +154,8 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
         other => other,
     })?;
     check_split(&dataset, Split::Train)?;
-    let mut estimate =
-        Estimate::of_evaluation(config, config.evaluation, grid.shape(), grid.lattice().present(), Some((&dataset, Split::Train)));
+    let stored = Stored::Grid { shape: *grid.shape(), voxels: grid.lattice().present() };
+    let mut estimate = Estimate::of_evaluation(config, config.evaluation, &stored, Some((&dataset, Split::Train)));
     // The sums of each row.
     estimate.grid += (grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>())) as u64;
     console.note(&estimate.describe());

@@ -6,7 +6,9 @@ use super::objective::{LEARNED_LOSSES, LOSSES};
 use crate::camera::Camera;
 use crate::carve::{CarveConfig, CarveOptions};
 use crate::error::{Error, Result};
+use crate::loss;
 use crate::field::sh;
+use crate::model::tensorf;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
@@ -108,6 +110,10 @@ pub struct Config {
     /// Settings of carving.
     #[serde(default)]
     pub carve: CarveConfig,
+    /// Settings of a factored field. If they are set, the run trains this field and no voxel grid; `stages` is then empty, and the other settings of the
+    /// grid have no effect.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tensorf: Option<tensorf::Config>,
 }
 
 /// Use of silhouettes in training.
@@ -397,6 +403,7 @@ impl Default for Config {
             ],
             evaluation: Sampling::Step { step: 0.5 },
             carve: CarveConfig::default(),
+            tensorf: None,
         }
     }
 }
@@ -465,9 +472,20 @@ impl Config {
         TrainOptions { seed, background, rays_per_step, jitter, ..TrainOptions::default() }
     }
 
+    /// Returns true if the config has a stage to train; without one it is a config for carving.
+    pub fn trains(&self) -> bool {
+        !self.stages.is_empty() || self.tensorf.is_some()
+    }
+
+    /// Returns the resolution of each stage.
+    pub fn resolutions(&self) -> impl Iterator<Item = usize> + '_ {
+        let of_field = self.tensorf.iter().flat_map(|tensorf| &tensorf.stages).map(|stage| stage.resolution);
+        self.stages.iter().map(|stage| stage.resolution).chain(of_field)
+    }
+
     /// Errors if the config has no stage to train.
     pub fn check_stages(&self) -> Result<()> {
-        demand(!self.stages.is_empty(), "stages", "there is no stage", "set at least one")
+        demand(self.trains(), "stages", "there is no stage", "set at least one")
     }
 
     /// Checks every value. An error names the key as it is spelled in the file.
@@ -583,6 +601,7 @@ impl Config {
             )?;
         }
         sampling("evaluation", self.evaluation)?;
+        self.tensorf.as_ref().map_or(Ok(()), |tensorf| self.validate_factored(tensorf))?;
         let CarveConfig { resolution, margin, depth, photo, ridge, sweeps, .. } = self.carve;
         let noise = photo.map_or(1.0, |photo| photo.noise);
         check((1e-6..=1.0).contains(&noise), "carve.photo.noise", noise, "1e-6 to 1")?;
@@ -591,6 +610,22 @@ impl Config {
         check((1e-3..=1e3).contains(&depth), "carve.depth", depth, "0.001 to 1000")?;
         check((0.0..=1e6).contains(&ridge), "carve.ridge", ridge, "0 to 1e6")?;
         check(sweeps <= 1000, "carve.sweeps", sweeps, "0 to 1000")
+    }
+}
+
+impl Config {
+    /// Checks the settings of a factored field, and that no setting of the grid contradicts them.
+    fn validate_factored(&self, tensorf: &tensorf::Config) -> Result<()> {
+        tensorf.validate().map_err(|e| e.with_key(|key| format!("tensorf.{key}")))?;
+        let of_grid = |set: bool, key: &str| match set {
+            true => Err(Error::usage(key, "this setting of a voxel grid has no effect on a factored field", "remove it, or remove `tensorf`")),
+            false => Ok(()),
+        };
+        of_grid(!self.stages.is_empty(), "stages")?;
+        of_grid(self.scout.is_some(), "scout")?;
+        of_grid(self.init_from.is_some(), "init_from")?;
+        of_grid(self.prune_from_stage.is_some(), "prune_from_stage")?;
+        self.losses.keys().try_for_each(|loss| of_grid(!loss::NAMES.contains(&&loss[..]), &format!("losses.{loss}")))
     }
 }
 

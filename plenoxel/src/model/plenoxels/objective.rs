@@ -1,6 +1,6 @@
 //! Losses of a voxel grid by name, and the objective that a config describes.
 
-use super::config::Config;
+use super::config::{Config, Weight};
 use super::{Objective, single};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
@@ -51,10 +51,24 @@ pub fn objective<T: Real>(config: &Config, views: usize) -> Result<Objective<T>>
 }
 
 pub(super) fn of_config<T: Real>(config: &Config, views: usize) -> Result<Objective<T>> {
+    named(config, |objective, name, weight| with_loss(objective, name, weight, views))
+}
+
+/// Creates the objective of a model without a voxel grid that a config describes. `views` is the number of training views.
+///
+/// Errors if a loss reads a voxel grid.
+pub fn objective_of_any<T: Real, M: 'static>(config: &Config, views: usize) -> Result<loss::Objective<T, M>> {
+    named(config, |objective, name, weight| objective.with_named(name, weight, views))
+}
+
+fn named<T: Real, M>(
+    config: &Config,
+    with: impl Fn(loss::Objective<T, M>, &str, Weight) -> Result<loss::Objective<T, M>>,
+) -> Result<loss::Objective<T, M>> {
     if config.losses.is_empty() {
         return Err(Error::usage("losses", "there is no loss", "set at least one, such as `mse = 1.0`"));
     }
-    let all = config.losses.iter().try_fold(Objective::new(), |objective, (name, weight)| with_loss(objective, name, *weight, views))?;
+    let all = config.losses.iter().try_fold(loss::Objective::new(), |objective, (name, weight)| with(objective, name, *weight))?;
     Ok(config.loss_rates.iter().fold(all, |objective, (loss, &rate)| {
         let of_loss = |name: &&str| *name == loss || name.strip_prefix(loss.as_str()).is_some_and(|rest| rest.starts_with('.'));
         let params: Vec<String> = objective.params().iter().map(|p| p.name()).filter(of_loss).map(str::to_owned).collect();

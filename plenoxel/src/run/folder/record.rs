@@ -3,7 +3,7 @@
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::model::plenoxels;
+use crate::model::{self, plenoxels};
 use crate::run::data::DataSource;
 use crate::run::{PROGRAM, machine};
 use serde::{Deserialize, Serialize};
@@ -87,7 +87,7 @@ impl RunRecord {
 
     /// True for a custom model, which the commands of this program do not train.
     pub fn is_of_own_model(&self) -> bool {
-        self.model != plenoxels::KIND
+        !model::KINDS.contains(&&self.model[..])
     }
 
     /// Parses the bytes of a file; `path` names it in messages.

@@ -18,7 +18,7 @@ pub struct Preset {
 }
 
 /// The presets for training.
-pub const PRESETS: [Preset; 5] = [
+pub const PRESETS: [Preset; 6] = [
     Preset {
         name: "fast",
         purpose: "good quality in short time; the default of `train`",
@@ -30,6 +30,12 @@ pub const PRESETS: [Preset; 5] = [
         purpose: "the best quality",
         time: "about 15 min at 800 x 800",
         text: include_str!("../../../presets/quality.toml"),
+    },
+    Preset {
+        name: "tensorf",
+        purpose: "a factored field: the best quality, without voxels to export",
+        time: "about 10 min at 800 x 800",
+        text: include_str!("../../../presets/tensorf.toml"),
     },
     Preset {
         name: "plenoxels",
