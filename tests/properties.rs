@@ -17,7 +17,7 @@ use plenoxel::evaluate;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::model::plenoxels::grid_viewer;
-use plenoxel::run::memory::Estimate;
+use plenoxel::run::memory::{Estimate, Stored};
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use proptest::test_runner::{RngSeed, TestError, TestRunner};
@@ -253,7 +253,8 @@ fn what_comparing_large_views_takes_is_estimated() {
     let views = dataset.load(Split::Test, &|_, _| ()).expect("its view");
     let config = Config::default();
     let grid = VoxelGrid::<f32>::random(config.grid_shape(8), 1.0, 0.1, 1);
-    let estimate = Estimate::of_evaluation(&config, config.evaluation, grid.shape(), 512, Some((&dataset, Split::Test)));
+    let stored = Stored::Grid { shape: *grid.shape(), voxels: 512 };
+    let estimate = Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, Split::Test)));
     let viewer = grid_viewer(&grid, config.evaluation, config.engine, config.background);
     let (scores, peak) = peak_of(|| viewer.compare(&views, |_, _, _, _| Ok(())).expect("scores"));
     assert!(scores.psnr().is_some() && peak as u64 <= estimate.step + (20 << 20), "{peak} bytes, and {} estimated", estimate.step);
