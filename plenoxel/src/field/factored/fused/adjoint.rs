@@ -134,8 +134,8 @@ pub fn cotangents<T: Real>(state: &Arc<State<T>>, tables: &[Tensor<T>], cotangen
         let all = sums.next().unwrap_or_default();
         let width = all.len() / nodes.iter().sum::<usize>().max(1);
         let mut rest = &all[..];
-        for axis in 0..3 {
-            let (own, others) = rest.split_at(nodes[axis] * width);
+        for (axis, nodes) in nodes.into_iter().enumerate() {
+            let (own, others) = rest.split_at(nodes * width);
             dense.push((first + axis, Buffer::copy_of(own)));
             rest = others;
         }

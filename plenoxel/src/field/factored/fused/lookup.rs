@@ -153,7 +153,7 @@ pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T
     let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
     let planes = pairs.planes.map(|table| table.as_chunks::<LANES>().0);
     let lines = pairs.lines.map(|table| table.as_chunks::<LANES>().0);
-    for i in 0..sigma.len() {
+    for (i, sigma) in sigma.iter_mut().enumerate() {
         let between = between(place(at, i), nodes);
         let mut sums = [T::zero(); LANES];
         for axis in 0..3 {
@@ -173,7 +173,7 @@ pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T
             }
             width /= 2;
         }
-        sigma[i] = sums[0] + T::lit(SHIFT);
+        *sigma = sums[0] + T::lit(SHIFT);
     }
     let scale = T::lit(SCALE);
     for (sigma, slope) in sigma.iter_mut().zip(slope) {
