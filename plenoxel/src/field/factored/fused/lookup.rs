@@ -259,6 +259,17 @@ impl<T: Real> Cotangents<'_, T> {
     }
 }
 
+/// The plane of an axis, whose adjoint is computed from the line along the axis.
+#[derive(Clone, Copy)]
+pub struct PlaneOf<'a, T> {
+    pub axis: usize,
+    pub line: &'a [T],
+    /// Nodes along each axis.
+    pub nodes: [usize; 3],
+    /// Components of each pair.
+    pub width: usize,
+}
+
 /// Rows of a plane in one bucket, whose sums are computed.
 pub struct BucketSums<'a, T> {
     /// First row of the bucket.
@@ -268,17 +279,17 @@ pub struct BucketSums<'a, T> {
 }
 
 dispatched! {
-/// Adds the adjoint of the plane of an axis, for the samples `which`, to the rows of one bucket. `at` are the positions of all samples.
+/// Adds the adjoint of a plane, for the samples `which`, to the rows of one bucket. `at` are the positions of all samples.
 pub fn add_to_plane<T: Real, const FUSED: bool>(
-    pairs: Pairs<'_, T>,
-    axis: usize,
+    plane: PlaneOf<'_, T>,
     at: Places<'_, T>,
     which: &[u32],
     g: Cotangents<'_, T>,
     bucket: BucketSums<'_, T>,
 ) {
-    let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
-    let line = pairs.lines[axis].as_chunks::<LANES>().0;
+    let PlaneOf { axis, nodes, .. } = plane;
+    let chunks = plane.width / LANES;
+    let line = plane.line.as_chunks::<LANES>().0;
     let sums = bucket.sums.as_chunks_mut::<LANES>().0;
     let rows = sums.len() / chunks;
     for &i in which {
