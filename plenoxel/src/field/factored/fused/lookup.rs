@@ -9,6 +9,9 @@ use autograd::{Real, dispatched, parallel};
 /// Number of components that are computed together. The number of components of a field is a multiple of it.
 pub const LANES: usize = 16;
 
+/// Number of samples between the current one and that whose cotangents are prefetched.
+const AHEAD: usize = 6;
+
 /// Number of samples that are looked up together.
 pub const RUN: usize = 16;
 
@@ -246,6 +249,14 @@ pub enum Cotangents<'a, T> {
 }
 
 impl<T: Real> Cotangents<'_, T> {
+    /// Prefetches `count` chunks of sample i from chunk `k` of `chunks` on.
+    #[inline(always)]
+    fn prefetch(&self, i: usize, k: usize, chunks: usize, count: usize) {
+        if let Cotangents::Each(g) = self {
+            parallel::prefetch(&g[(i * chunks + k) * LANES..][..count * LANES]);
+        }
+    }
+
     /// Multiplies chunk `k` of `chunks` by the cotangents of sample i.
     #[inline(always)]
     fn times(&self, i: usize, k: usize, chunks: usize, value: &mut [T; LANES]) {
@@ -292,8 +303,11 @@ pub fn add_to_plane<T: Real, const FUSED: bool>(
     let line = plane.line.as_chunks::<LANES>().0;
     let sums = bucket.sums.as_chunks_mut::<LANES>().0;
     let rows = sums.len() / chunks;
-    for &i in which {
+    for (k, &i) in which.iter().enumerate() {
         let i = i as usize;
+        if let Some(&later) = which.get(k + AHEAD) {
+            g.prefetch(later as usize, axis * chunks, 3 * chunks, chunks);
+        }
         let between = between(place(at, i), nodes);
         let (corner, along) = (Corner::new(axis, between, nodes), between[axis]);
         for row in corner.rows {
