@@ -148,7 +148,7 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     fs::write(root.join("plan.toml"), FILE.replace("downscale = 5", "downscale = 2").replace("steps=6", "steps=7")).expect("the file");
     let (code, _, err) = sweep(&[]);
     assert_eq!(code, Some(2), "{err}");
-    assert!(err.contains("swept/few/fine, where there is another run (stages[0].steps is 6 and not 7); accepted: "), "{err}");
+    assert!(err.contains("swept/few/fine has a run with other settings (stages[0].steps is 6 and not 7); accepted: "), "{err}");
     fs::write(
         root.join("plan.toml"),
         FILE.replace(", \"odd\"]", "]")

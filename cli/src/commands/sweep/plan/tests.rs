@@ -89,7 +89,7 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
         ("data", "[[scenes]]\ndata = 3\n[[methods]]", 2, &["line 2", "invalid value 3", "a folder in quotes"]),
         ("command", "[[scenes]]\n[[methods]]\ncommand = \"render\"", 2, &["line 3", "\"train\" or \"carve\""]),
         ("names", "[[scenes]]\nname = \"a/b\"\n[[methods]]", 2, &["line 2", "`a/b`", "letters, digits"]),
-        ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "`procedural`, which comes twice"]),
+        ("twice", "[[scenes]]\n[[scenes]]\n[[methods]]", 2, &["line 2", "the name `procedural` occurs twice"]),
         ("chosen", "[[scenes]]\nmethods = [\"fat\"]\n[[methods]]\npreset = \"fast\"", 2, &["line 2", "unknown method `fat`", "`fast`"]),
         (
             "published",
@@ -130,7 +130,7 @@ fn flags_alone_make_the_same_plan() {
     assert_eq!((&plan.jobs[1].call.data, &plan.jobs[2].call.data), (&Some("data/lego".into()), &None));
     assert!(plan.jobs.iter().all(|job| job.asked.config.seed == 3));
     let twice = Plan::from_flags(&strings(&["a/lego", "b/lego"]), &strings(&["fast"]), &[], Path::new("o")).unwrap_err();
-    assert!(twice.to_string().starts_with("--scene: `lego`, which comes twice"), "{twice}");
+    assert!(twice.to_string().starts_with("--scene: the name `lego` occurs twice"), "{twice}");
 }
 
 #[test]
