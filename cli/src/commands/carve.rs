@@ -1,6 +1,7 @@
 //! `plenoxel carve`: from silhouettes and colors to an opaque colored grid, without training.
 
 use super::new_run::{announce, load};
+use super::train::BuiltInScene;
 use super::{MOST_REDUCTION, whole};
 use crate::images;
 use crate::progress::Console;
@@ -81,6 +82,9 @@ pub struct CarveArgs {
     #[arg(long, value_name = "LENGTH", help_heading = "Scene", allow_negative_numbers = true)]
     half_width: Option<f64>,
 
+    #[command(flatten)]
+    built_in: BuiltInScene,
+
     /// Voxels along each axis [default: 256]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(2, 1024))]
     resolution: Option<i64>,
@@ -107,7 +111,7 @@ pub struct CarveArgs {
 impl CarveArgs {
     /// Where the views come from.
     pub fn source(&self) -> DataSource {
-        DataSource::of(self.data.as_deref())
+        self.built_in.source_or(self.data.as_deref())
     }
 
     /// The configuration, and the preset it started from.
