@@ -1,10 +1,12 @@
 //! `plenoxel evaluate`: figures of a trained run on the views of a split.
 
 use super::new_run::load;
+use super::panels::Panels;
 use super::trained_run::{Found, Loaded, TrainedRun};
 use crate::progress::{Console, is_stdout};
 use clap::{Args, ValueHint};
-use plenoxel::error::Result;
+use plenoxel::dataset::Split;
+use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::{ViewScore, Viewer};
 use plenoxel::json;
 use plenoxel::run::figures::Figures;
@@ -20,8 +22,10 @@ Examples:
   plenoxel evaluate runs/lego --downscale 1        at full resolution
   plenoxel evaluate runs/lego --split val --json
   plenoxel evaluate runs/lego --out lego.json
+  plenoxel evaluate runs/carved --downscale 8 --keep    carved at 200 x 200, compared at 100 x 100
 
-The figures of a carved run on its test views are kept in its folder, as evaluation.json.
+The figures of a carved run on its test views are kept in its folder, as evaluation.json, with pictures of up to 25 of these views; those of a run that \
+was trained with --no-evaluate are too. With another --downscale than in training or carving they are kept only if --keep says so.
 
 --samples N places N samples on the longest line through the box, and as densely on shorter ones. Runs of the paper preset \
 count samples from the camera to its far limit instead.
@@ -40,6 +44,11 @@ pub struct EvaluateArgs {
     #[arg(long, help_heading = "Output")]
     json: bool,
 
+    /// Keep the figures and pictures in the run's folder as those of its test views, at the size of --downscale: tables, pages and comparisons show
+    /// them. For carved runs, and those trained with --no-evaluate
+    #[arg(long, help_heading = "Output", conflicts_with_all = ["best", "samples"])]
+    keep: bool,
+
     /// Write the JSON object to this file too, replacing what is there
     #[arg(long, short, value_name = "FILE", help_heading = "Output", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
@@ -50,16 +59,29 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let start = Instant::now();
     let found = args.run.find()?;
     let trained = found.folder.result()?.unwrap_or(Value::Null);
+    // A carved run has no figures of its own, nor has one that was trained with --no-evaluate. One that did not end well has none either, and is no run
+    // to compare.
+    let lacks_figures = trained.is_object() && !trained["psnr"].is_number();
+    if args.keep {
+        check_keeps(args, lacks_figures)?;
+    }
     let dataset = args.run.views(&found)?;
     args.out.iter().try_for_each(|out| super::check_replaceable(out, &[&found.folder], found.source.path()))?;
     let Loaded { model, about, view } = args.run.load(&found, console, |sampling, shape, voxels| {
         Estimate::of_evaluation(&found.config, sampling, shape, voxels, Some((&dataset, args.run.split)))
     })?;
     let Found { folder, config, preset, source } = found;
+    // A folder may have another name by now: no error, unless its figures are to be kept.
+    let same_scene = about.scene == dataset.name();
+    if !same_scene && args.keep {
+        let found = format!("the views are of {}, and the run is of {}", dataset.name(), about.scene);
+        return Err(Error::config("--keep", found, "the views of the run's own scene"));
+    }
+    let keeps = (args.keep || args.run.is_as_trained()) && same_scene && lacks_figures;
+    // Nobody trains or carves into it before its pictures and figures are written.
+    let folder = if keeps { folder.shared("RUN")? } else { folder };
     let views = load(console, &dataset, args.run.split, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
-    // A folder may have another name by now: no error.
-    let same_scene = about.scene == dataset.name();
     if !same_scene {
         console.note(&format!("the run is of another scene: {}, not {}", about.scene, dataset.name()));
     }
@@ -67,11 +89,17 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let start = Instant::now();
     let viewer = Viewer::of(&*model, &view);
     let count = console.count("evaluating", views.len());
-    let scores = viewer.compare(&views, |i, _, _, _| {
+    // A run without pictures stays without.
+    let panels = Panels::new(&folder, views.len(), keeps && folder.image("").is_dir());
+    let aabb = model.aabb();
+    let half_width = 0.5 * (aabb.max - aabb.min).max_element();
+    let scores = viewer.compare(&views, |i, view, target, picture| {
+        console.drawn(panels.draw(i, view, target, picture, half_width));
         count.at(i + 1, views.len());
         Ok(())
     })?;
     drop(count);
+    panels.note().into_iter().for_each(|note| console.note(&note));
 
     let figures = Figures::new(&scores, args.run.split, &dataset, &config, &*model, &view);
     let json = args.json || args.out.as_deref().is_some_and(is_stdout);
@@ -102,13 +130,23 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     if json { console.result(&line) } else { console.record(&evaluation) }?;
     let file = args.out.iter().filter(|file| !is_stdout(file));
     file.into_iter().try_for_each(|file| console.write_file(file, (line.clone() + "\n").as_bytes()))?;
-    // A carved run has no figures of its own, nor has one that was trained with --no-evaluate. One that did not end well has none either, and is no run
-    // to compare.
-    if args.run.is_as_trained() && same_scene && trained.is_object() && !trained["psnr"].is_number() {
-        folder.shared("RUN")?.write_evaluation(&evaluation)?;
+    if keeps {
+        folder.write_evaluation(&evaluation)?;
         console.note(
             "kept in the run's folder: `plenoxel compare` shows these figures, and so does `plenoxel report`, which writes the page again",
         );
+    }
+    Ok(())
+}
+
+/// Refuses to keep figures that are not those of a run's test views, or of a run that has such figures.
+fn check_keeps(args: &EvaluateArgs, lacks_figures: bool) -> Result<()> {
+    if args.run.split != Split::Test {
+        return Err(Error::config("--keep", format!("figures of the {} views are not kept", args.run.split), "the test views"));
+    }
+    if !lacks_figures {
+        let found = "the run has figures of its test views from its training, or has not ended";
+        return Err(Error::config("--keep", found, "a carved run, or one that was trained with --no-evaluate; --out FILE for any other"));
     }
     Ok(())
 }

@@ -1,19 +1,16 @@
 //! The pictures of a run: one view before the first step and at the end of each stage, and panels of test views.
 
-use crate::images::{self, DepthRange, Rgb};
+use crate::commands::panels::Panels;
+use crate::images::{self, Rgb};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::{Split, View, image};
 use plenoxel::error::Result;
 use plenoxel::render::picture::Picture;
-use plenoxel::run::evenly_spaced;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::metrics::History;
 use plenoxel::run::training::Underway;
 use plenoxel::train::PlannedStage;
 use std::path::PathBuf;
-
-/// Panels of more views than this fill folders and nobody's eye.
-const MOST_PANELS: usize = 25;
 
 /// The pictures of a run.
 pub struct Pictures {
@@ -21,9 +18,8 @@ pub struct Pictures {
     background: [f32; 3],
     /// Of the first test view, or of the first training view where there is none. Its photograph is not looked at in training.
     camera: Option<Camera>,
-    /// Test views that get a panel.
-    panels: Vec<usize>,
-    views: usize,
+    /// Those of test views.
+    pub panels: Panels,
     /// The view before the first step and after each stage.
     stages: Vec<Rgb>,
 }
@@ -39,8 +35,7 @@ impl Pictures {
             folder: run.folder.clone(),
             background: run.config.background,
             camera: first(Split::Test).or(first(Split::Train)).filter(|_| wanted),
-            panels: if wanted { evenly_spaced(views, MOST_PANELS) } else { Vec::new() },
-            views,
+            panels: Panels::new(run.folder, views, wanted),
             stages: Vec::new(),
         })
     }
@@ -84,15 +79,6 @@ impl Pictures {
         self.folder.image(&RunFolder::stage_name(number, stage.resolution))
     }
 
-    /// A test view was rendered with the final model, whose box has a half width.
-    pub fn panel(&self, number: usize, view: &View, target: &Rgb, picture: &Picture, half_width: f64) -> Result<()> {
-        if !self.panels.contains(&number) {
-            return Ok(());
-        }
-        let range = DepthRange::of(&view.camera, half_width);
-        images::write(&self.folder.image(&RunFolder::panel_name(number, &view.name)), &images::panel(target, picture, range))
-    }
-
     /// The start and the stages side by side, and the photograph they are to become.
     pub fn strip(&self, first_test: Option<&View>, background: [f32; 3]) -> Result<()> {
         if self.stages.is_empty() {
@@ -101,12 +87,5 @@ impl Pictures {
         let target = first_test.map(|view| view.composite(background));
         let all: Vec<&Rgb> = self.stages.iter().chain(&target).collect();
         images::write(&self.folder.image("stages.png"), &images::strip(&all))
-    }
-
-    /// A note about views without a picture.
-    pub fn note(&self) -> Option<String> {
-        let shown = self.panels.len();
-        (shown > 0 && shown < self.views)
-            .then(|| format!("images: panels of {shown} of the {} test views, evenly spaced; all of them are in the figures", self.views))
     }
 }
