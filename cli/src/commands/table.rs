@@ -1,7 +1,7 @@
 //! The table of a comparison, scenes x methods, with what each run came to: as Markdown, CSV and an HTML page.
 
 mod csv;
-mod figures;
+pub mod figures;
 mod html;
 pub mod markdown;
 mod thumbnail;
@@ -10,8 +10,11 @@ pub use figures::{Failure, Figures, Measured, Scores};
 use plenoxel::error::Result;
 use plenoxel::files;
 use serde::Deserialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+
+/// Name of the row of means.
+const MEAN: &str = "mean";
 
 /// Runs side by side.
 #[derive(Debug)]
@@ -24,6 +27,8 @@ pub struct RunTable {
     pub rows: Vec<Row>,
     /// More columns, of figures that others have published.
     pub published: Vec<Published>,
+    /// Published figures of other scenes, which notes tell of.
+    pub elsewhere: Vec<Published>,
 }
 
 /// What all methods make of a scene.
@@ -60,6 +65,11 @@ pub struct Published {
 }
 
 impl Published {
+    /// The scenes that it has figures of.
+    pub fn scenes(&self) -> BTreeSet<&String> {
+        [&self.psnr, &self.ssim, &self.seconds].into_iter().flat_map(BTreeMap::keys).collect()
+    }
+
     /// Its figures of a scene.
     fn scores(&self, scene: &str) -> Scores {
         let of = |figures: &BTreeMap<String, f64>| figures.get(scene).copied();
@@ -77,19 +87,23 @@ impl RunTable {
         Ok(markdown)
     }
 
-    /// The mean of a column over all scenes; of a figure that one of them lacks there is none.
-    fn mean(&self, method: usize) -> Scores {
-        Scores::mean(self.rows.iter().map(|row| row.cells.get(method).map(Cell::scores).unwrap_or_default()))
-    }
-
-    fn published_mean(&self, published: &Published) -> Scores {
-        Scores::mean(self.rows.iter().map(|row| published.scores(&row.scene)))
+    /// The rows below the scenes, where there are several: a name, and the figures of all columns, the published ones last.
+    fn summaries(&self) -> Vec<(&'static str, Vec<Scores>, Vec<Scores>)> {
+        if self.rows.len() < 2 {
+            return Vec::new();
+        }
+        let row = |name, of: fn(&[f64]) -> f64| {
+            let measured = (0..self.methods.len()).map(|method| Scores::over(self.rows.iter().map(|row| row.scores(method)), of));
+            let published = self.published.iter().map(|p| Scores::over(self.rows.iter().map(|row| p.scores(&row.scene)), of));
+            (name, measured.collect(), published.collect())
+        };
+        vec![row(MEAN, figures::mean), row("standard deviation", figures::deviation)]
     }
 
     /// What one has to know to read the figures, a sentence each.
     fn notes(&self) -> Vec<String> {
         let mut notes =
-            vec!["PSNR in dB on test views, SSIM, and seconds of training; means are over all scenes, where none is missing.".to_owned()];
+            vec!["PSNR in dB on test views, SSIM, and seconds of training or carving; means and standard deviations are over all scenes, where none is missing.".to_owned()];
         for row in &self.rows {
             notes.extend(self.views_of(row));
         }
@@ -99,6 +113,10 @@ impl RunTable {
             }
         }
         notes.extend(self.published.iter().map(|p| format!("{}: published, not measured here: {}", p.name, p.source)));
+        notes.extend(self.elsewhere.iter().map(|p| {
+            let scenes: Vec<&str> = p.scenes().into_iter().map(String::as_str).collect();
+            format!("{}: published, not shown: of none of these scenes but of {}: {}", p.name, scenes.join(", "), p.source)
+        }));
         notes
     }
 
@@ -115,6 +133,10 @@ impl RunTable {
 }
 
 impl Row {
+    fn scores(&self, method: usize) -> Scores {
+        self.cells.get(method).map(Cell::scores).unwrap_or_default()
+    }
+
     /// True if all of it was measured on views of the same number, size and background.
     fn is_comparable(&self) -> bool {
         let mut views = self.cells.iter().filter_map(Cell::measured).map(Measured::views);

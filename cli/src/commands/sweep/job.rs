@@ -23,6 +23,8 @@ pub struct Job {
     pub folder: PathBuf,
     pub call: Call,
     pub asked: Asked,
+    /// Factor by which test images are reduced, where it is another than that of the run.
+    pub evaluate_downscale: Option<usize>,
 }
 
 /// A command line, but for where the run goes.
@@ -85,8 +87,17 @@ impl Job {
         }
         match (folder.result(), folder.evaluation()) {
             (Err(e), _) | (_, Err(e)) => State::Different(e.to_string()),
+            (Ok(Some(result)), _) if self.evaluate_downscale.is_some() && result["psnr"].is_number() => {
+                State::Different("it was compared with test views at the size of its training".to_owned())
+            }
+            (Ok(Some(result)), Ok(Some(evaluation))) if !result["psnr"].is_number() => {
+                // An evaluation of an earlier version does not tell its reduction: it is the run's.
+                let reduction = evaluation["image"]["downscale"].as_u64().map_or(config.downscale, |reduction| reduction as usize);
+                let asked = self.evaluate_downscale.unwrap_or(self.asked.config.downscale);
+                if reduction == asked { State::Finished } else { State::Unevaluated }
+            }
             // A comparison with no test views is one too, and has no PSNR.
-            (Ok(Some(result)), Ok(evaluation)) if result.get("psnr").is_some() || evaluation.is_some() => State::Finished,
+            (Ok(Some(result)), Ok(_)) if result.get("psnr").is_some() && self.evaluate_downscale.is_none() => State::Finished,
             (Ok(Some(_)), _) => State::Unevaluated,
             (Ok(None), _) if !record.is_carved() && folder.existing_state().is_ok() => State::Interrupted,
             (Ok(None), _) => State::CutShort,
@@ -111,7 +122,8 @@ impl Job {
 
     /// The command line that compares it with its test views and prints the figures.
     pub fn evaluation(&self) -> Vec<OsString> {
-        vec!["evaluate".into(), self.folder.clone().into_os_string(), "--json".into()]
+        let reduced = self.evaluate_downscale.into_iter().flat_map(|k| [format!("--downscale={k}").into(), "--keep".into()]);
+        ["evaluate".into(), self.folder.clone().into_os_string(), "--json".into()].into_iter().chain(reduced).collect()
     }
 
     /// What it said while it was made. Names of runs have no dots, so that no run can be in the way.
