@@ -143,8 +143,8 @@ impl<T: Real> Factors<T> {
             let places = Tensor::from_vec(places, &[b.len() * c.len(), 3]);
             *param = Param::from_tensor(param.name(), no_grad(|| param.tensor().trilinear(&places, [nodes[0], nodes[1], 1])));
         };
-        for axis in 0..3 {
-            resampled(&mut self.planes[axis], PLANE_OF[axis]);
+        for (axis, plane_of) in PLANE_OF.into_iter().enumerate() {
+            resampled(&mut self.planes[axis], plane_of);
             // A line is a plane whose second axis has one node.
             resampled(&mut self.lines[axis], [axis, 3]);
         }

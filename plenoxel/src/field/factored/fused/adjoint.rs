@@ -1,7 +1,7 @@
 //! Cotangents of the parameters from cotangents of pixels.
 
 use super::forward::{Block, NONE, Tables};
-use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, RUN, add_to_lines, first_rows};
+use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, RUN, add_to_lines, first_rows};
 use super::network::NetworkCotangents;
 use super::super::PLANE_OF;
 use super::{Output, State};
@@ -71,8 +71,8 @@ fn plane_size(axis: usize, nodes: [usize; 3]) -> usize {
 struct PlaneSums<T: Real> {
     state: Arc<State<T>>,
     parts: Arc<Vec<Part<T>>>,
-    /// Parameters of the field, in their order.
-    tables: Arc<Vec<Tensor<T>>>,
+    /// The line along the axis. The sums must not hold the plane itself: the optimizer could not update it in place.
+    line: Tensor<T>,
     axis: usize,
     of_density: bool,
 }
@@ -98,8 +98,7 @@ impl<T: Real> RowSums<T> for PlaneSums<T> {
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        let tables = Tables::new(&self.state.batch, &self.tables);
-        let pairs = if self.of_density { tables.density } else { tables.appearance };
+        let plane = PlaneOf { axis: self.axis, line: self.line.data(), nodes: self.state.batch.nodes, width: self.width() };
         for (part, block) in self.parts.iter().zip(&self.state.blocks) {
             let sorted = self.sorted(part);
             let which = &sorted.samples[sorted.buckets.range(bucket)];
@@ -109,9 +108,9 @@ impl<T: Real> RowSums<T> for PlaneSums<T> {
             };
             let bucket = BucketSums { first: bucket << self.bucket_shift(), sums, touched };
             if parallel::fused() {
-                lookup::add_to_plane::<T, true>(pairs, self.axis, at, which, g, bucket);
+                lookup::add_to_plane::<T, true>(plane, at, which, g, bucket);
             } else {
-                lookup::add_to_plane::<T, false>(pairs, self.axis, at, which, g, bucket);
+                lookup::add_to_plane::<T, false>(plane, at, which, g, bucket);
             }
         }
     }
@@ -134,17 +133,18 @@ pub fn cotangents<T: Real>(state: &Arc<State<T>>, tables: &[Tensor<T>], cotangen
         let all = sums.next().unwrap_or_default();
         let width = all.len() / nodes.iter().sum::<usize>().max(1);
         let mut rest = &all[..];
-        for axis in 0..3 {
-            let (own, others) = rest.split_at(nodes[axis] * width);
+        for (axis, nodes) in nodes.into_iter().enumerate() {
+            let (own, others) = rest.split_at(nodes * width);
             dense.push((first + axis, Buffer::copy_of(own)));
             rest = others;
         }
     }
     dense.extend((PLANES_AND_LINES..).zip(sums));
-    let (parts, tables) = (Arc::new(own), Arc::new(tables.to_vec()));
+    let parts = Arc::new(own);
     let planes = [(0, true), (6, false)].into_iter().flat_map(|(first, of_density)| (0..3).map(move |axis| (first + axis, axis, of_density)));
     let planes = planes.map(|(input, axis, of_density)| {
-        let sums = PlaneSums { state: state.clone(), parts: parts.clone(), tables: tables.clone(), axis, of_density };
+        let line = tables[input + 3].clone();
+        let sums = PlaneSums { state: state.clone(), parts: parts.clone(), line, axis, of_density };
         (input, Arc::new(sums) as Arc<dyn RowSums<T>>)
     });
     Cotangents { planes: planes.collect(), dense }

@@ -168,10 +168,9 @@ impl<'a, T: Real> Scene<'a, T> {
         let per_length = most / (aabb.max - aabb.min);
         for (r, ray) in self.rays[first..first + count].iter().enumerate() {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut intervals = match self.cells {
-                Some(cells) => Intervals::Occupied(march.occupied(ray, cells)),
-                None => Intervals::All((0..march.count).map(move |k| march.interval(k))),
-            };
+            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells));
+            let mut all = (0..march.count).map(move |k| march.interval(k));
+            let mut next = || occupied.as_mut().map_or_else(|| all.next(), Iterator::next);
             let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
             let mut left = T::one();
             while left >= stop {
@@ -182,7 +181,7 @@ impl<'a, T: Real> Scene<'a, T> {
                 let [x, y, z, t, delta, sigma, slope, weight, after] = &mut columns;
                 let mut own = 0;
                 while own < RUN
-                    && let Some((middle, length)) = intervals.next()
+                    && let Some((middle, length)) = next()
                 {
                     let place = (start + middle * along).clamp(DVec3::ZERO, most);
                     (x[end + own], y[end + own], z[end + own]) = (T::lit(place.x), T::lit(place.y), T::lit(place.z));
@@ -281,22 +280,6 @@ impl<'a, T: Real> Scene<'a, T> {
         let (encoded, width) = (self.batch.encoded.data(), self.batch.encoded.shape()[1]);
         let direction = |i: usize| &encoded[block.rays_of_shaded[i] as usize * width..][..width];
         block.activations = self.tables.network.forward(products, direction);
-    }
-}
-
-/// Intervals of a ray.
-enum Intervals<'a, I> {
-    Occupied(crate::sampling::Occupied<'a>),
-    All(I),
-}
-
-impl<I: Iterator<Item = (f64, f64)>> Intervals<'_, I> {
-    #[inline(always)]
-    fn next(&mut self) -> Option<(f64, f64)> {
-        match self {
-            Intervals::Occupied(intervals) => intervals.next(),
-            Intervals::All(intervals) => intervals.next(),
-        }
     }
 }
 

@@ -9,6 +9,9 @@ use autograd::{Real, dispatched, parallel};
 /// Number of components that are computed together. The number of components of a field is a multiple of it.
 pub const LANES: usize = 16;
 
+/// Number of samples between the current one and that whose cotangents are prefetched.
+const AHEAD: usize = 6;
+
 /// Number of samples that are looked up together.
 pub const RUN: usize = 16;
 
@@ -153,7 +156,7 @@ pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T
     let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
     let planes = pairs.planes.map(|table| table.as_chunks::<LANES>().0);
     let lines = pairs.lines.map(|table| table.as_chunks::<LANES>().0);
-    for i in 0..sigma.len() {
+    for (i, sigma) in sigma.iter_mut().enumerate() {
         let between = between(place(at, i), nodes);
         let mut sums = [T::zero(); LANES];
         for axis in 0..3 {
@@ -173,7 +176,7 @@ pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T
             }
             width /= 2;
         }
-        sigma[i] = sums[0] + T::lit(SHIFT);
+        *sigma = sums[0] + T::lit(SHIFT);
     }
     let scale = T::lit(SCALE);
     for (sigma, slope) in sigma.iter_mut().zip(slope) {
@@ -246,6 +249,14 @@ pub enum Cotangents<'a, T> {
 }
 
 impl<T: Real> Cotangents<'_, T> {
+    /// Prefetches `count` chunks of sample i from chunk `k` of `chunks` on.
+    #[inline(always)]
+    fn prefetch(&self, i: usize, k: usize, chunks: usize, count: usize) {
+        if let Cotangents::Each(g) = self {
+            parallel::prefetch(&g[(i * chunks + k) * LANES..][..count * LANES]);
+        }
+    }
+
     /// Multiplies chunk `k` of `chunks` by the cotangents of sample i.
     #[inline(always)]
     fn times(&self, i: usize, k: usize, chunks: usize, value: &mut [T; LANES]) {
@@ -259,6 +270,17 @@ impl<T: Real> Cotangents<'_, T> {
     }
 }
 
+/// The plane of an axis, whose adjoint is computed from the line along the axis.
+#[derive(Clone, Copy)]
+pub struct PlaneOf<'a, T> {
+    pub axis: usize,
+    pub line: &'a [T],
+    /// Nodes along each axis.
+    pub nodes: [usize; 3],
+    /// Components of each pair.
+    pub width: usize,
+}
+
 /// Rows of a plane in one bucket, whose sums are computed.
 pub struct BucketSums<'a, T> {
     /// First row of the bucket.
@@ -268,21 +290,24 @@ pub struct BucketSums<'a, T> {
 }
 
 dispatched! {
-/// Adds the adjoint of the plane of an axis, for the samples `which`, to the rows of one bucket. `at` are the positions of all samples.
+/// Adds the adjoint of a plane, for the samples `which`, to the rows of one bucket. `at` are the positions of all samples.
 pub fn add_to_plane<T: Real, const FUSED: bool>(
-    pairs: Pairs<'_, T>,
-    axis: usize,
+    plane: PlaneOf<'_, T>,
     at: Places<'_, T>,
     which: &[u32],
     g: Cotangents<'_, T>,
     bucket: BucketSums<'_, T>,
 ) {
-    let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
-    let line = pairs.lines[axis].as_chunks::<LANES>().0;
+    let PlaneOf { axis, nodes, .. } = plane;
+    let chunks = plane.width / LANES;
+    let line = plane.line.as_chunks::<LANES>().0;
     let sums = bucket.sums.as_chunks_mut::<LANES>().0;
     let rows = sums.len() / chunks;
-    for &i in which {
+    for (k, &i) in which.iter().enumerate() {
         let i = i as usize;
+        if let Some(&later) = which.get(k + AHEAD) {
+            g.prefetch(later as usize, axis * chunks, 3 * chunks, chunks);
+        }
         let between = between(place(at, i), nodes);
         let (corner, along) = (Corner::new(axis, between, nodes), between[axis]);
         for row in corner.rows {
