@@ -149,7 +149,7 @@ fn check_keep(split: Split, lacks_scores: bool) -> Result<()> {
         return Err(Error::usage(
             "--keep",
             "the run has test scores from its training, or has not ended",
-            "use --out FILE instead; --keep is for carved runs and runs trained with --no-evaluate",
+            "use --out FILE instead, because --keep is for carved runs and runs trained with --no-evaluate",
         ));
     }
     Ok(())

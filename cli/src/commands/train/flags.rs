@@ -146,7 +146,7 @@ pub struct TrainArgs {
     sh_degree: Option<i64>,
 
     /// Store view-dependent color (harmonics of degree 1 and higher) on an N times coarser grid, which saves memory and time
-    /// [default: 4; presets quality: 3, demo, plenoxels and paper: 1]
+    /// [default: 4; presets quality: 3, demo, plenoxels, paper and tensorf: 1]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64), allow_negative_numbers = true)]
     sh_reduction: Option<i64>,
 
