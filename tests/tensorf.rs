@@ -27,6 +27,7 @@ fn tiny(stages: &[(usize, u64)]) -> Config {
         step: 1.0,
         feature_octaves: 1,
         group: 0.0,
+        group_in_pictures: 0.0,
         stop_below: 0.0,
         stop_below_in_pictures: 0.0,
         stages: stages.iter().map(|&(resolution, steps)| Stage { resolution, steps, rays: 256 }).collect(),
@@ -69,11 +70,7 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
     model.visit(&mut |param| inputs.push(param.tensor().to_array()));
     let pixels = |x: &[Tensor<f64>]| {
         let mut model = dense::<f64>(&[(4, 1)]);
-        let mut next = x.iter();
-        model.visit_mut(&mut |param: &mut Param<f64>| {
-            let tensor = next.next().expect("a tensor for each parameter").clone();
-            if tensor.is_tracked() { param.bind(tensor) } else { param.replace(tensor) }
-        });
+        bind(&mut model, x);
         model.render(&rays, &PASS).rgb
     };
     gradcheck(pixels, inputs);
@@ -131,6 +128,78 @@ fn the_kernel_agrees_with_the_graph_in_values_and_gradients() {
             assert!(off < 1e-9 * scale, "{name}: {off:e} of {scale:e}");
         }
     }
+}
+
+/// Replaces the parameters of a model by tensors.
+fn bind(model: &mut Tensorf<f64>, tensors: &[Tensor<f64>]) {
+    let mut next = tensors.iter();
+    model.visit_mut(&mut |param: &mut Param<f64>| {
+        let tensor = next.next().expect("a tensor for each parameter").clone();
+        if tensor.is_tracked() { param.bind(tensor) } else { param.replace(tensor) }
+    });
+}
+
+#[test]
+fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
+    let config = Config { group: 0.9, color_above: 0.01, stop_below: 0.01, ..tiny(&[(9, 1)]) };
+    let rays = rays(40);
+    let pass = Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS };
+    let model = wide(config.clone());
+    let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render(&rays, &pass)));
+    // Gradients that can be differentiated again are computed through the reference.
+    let mut tables = Vec::new();
+    model.visit(&mut |param| tables.push(param.tensor().clone()));
+    let reference = autograd::grad(&all_columns(&model.render(&rays, &pass)), &tables.iter().collect::<Vec<_>>());
+    for (table, want) in tables.iter().zip(reference) {
+        let (want, got) = (want.to_array(), adjoint.array(table));
+        let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
+        assert!(want.iter().zip(&got).all(|(a, b)| (a - b).abs() < 1e-9 * scale));
+    }
+    // Groups are formed by weight: with a larger weight there are fewer colors, and other pixels.
+    let color = |group: f64| wide(Config { group, ..config.clone() }).render(&rays, &pass).rgb.data().to_vec();
+    assert_ne!(color(0.9), color(0.0));
+}
+
+#[test]
+fn groups_do_not_change_the_expected_color() {
+    let rays = rays(1);
+    let color = |group: f64, step: u64| {
+        let model = wide(Config { group, color_above: 0.0, ..tiny(&[(9, 1)]) });
+        let pass = Pass { jitter: Jitter::PerRay { seed: 3, step }, ..PASS };
+        model.render(&rays, &pass).rgb.data()[0]
+    };
+    const DRAWS: u64 = 4000;
+    let mean = |group: f64| (0..DRAWS).map(|step| color(group, step)).sum::<f64>() / DRAWS as f64;
+    let spread = (0..100).map(|step| (color(0.5, step) - color(0.0, step)).powi(2)).sum::<f64>().sqrt() / 10.0;
+    let off = (mean(0.5) - mean(0.0)).abs();
+    // Four standard deviations of the mean, with the seed above.
+    assert!(spread > 0.0 && off < 4.0 * spread / (DRAWS as f64).sqrt(), "{off} with a spread of {spread}");
+}
+
+#[test]
+fn training_has_the_same_bits_for_any_number_of_threads() {
+    let (train, _) = views();
+    let trained = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+        pool.install(|| {
+            let config = Config {
+                density_components: 16,
+                appearance_components: 16,
+                group: 0.1,
+                stop_below: 1e-3,
+                ..tiny(&[(16, 30), (24, 30)])
+            };
+            let objective = Objective::new().with("mse", 1.0, mse);
+            let model = Tensorf::<f32>::new(config, BOX, 42).expect("valid settings");
+            let mut trainer = Trainer::with_model(model, &train[..], objective, TrainOptions::default()).expect("a trainer");
+            while trainer.step().expect("a step").is_some() {}
+            let mut bits = Vec::new();
+            trainer.model().visit(&mut |param| bits.extend(param.tensor().data().iter().map(|x| x.to_bits())));
+            bits
+        })
+    };
+    let want = trained(1);
+    assert!([2, 3].into_iter().all(|threads| trained(threads) == want));
 }
 
 #[test]

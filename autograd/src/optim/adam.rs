@@ -32,7 +32,7 @@ pub(super) struct AdamRule {
     beta1: f64,
     beta2: f64,
     epsilon: f64,
-    /// Weights of the L1 penalty, by the name of the parameter.
+    /// Weights of the penalty mean |θ|, by the name of the parameter.
     l1: Vec<(String, f64)>,
 }
 
@@ -48,8 +48,8 @@ impl<T: Real> Adam<T> {
         self
     }
 
-    /// Adds λ sign(θ) to the gradient of the parameters with the given names: the gradient of the penalty λ Σ |θ|. It costs no pass over the parameter. In
-    /// lazy mode, only touched rows are penalised.
+    /// Adds λ sign(θ) / n to the gradient of the parameters with the given names, which have n elements: the gradient of the penalty λ mean |θ|. It costs
+    /// no pass over the parameter. In lazy mode, only touched rows are penalised.
     pub fn l1(mut self, weights: Vec<(String, f64)>) -> Self {
         self.0.rule.l1 = weights;
         self
@@ -110,6 +110,21 @@ mod tests {
         // m = 0.9 · 0.3 − 0.1 = 0.17, v = 0.999 · 0.009 + 0.001 = 0.009991; corrected by 0.19 and 0.001999.
         let step = 0.1 * (0.17 / 0.19) / (0.009_991f64 / 0.001_999).sqrt();
         assert_relative_eq!(theta.tensor().item(), 0.9 - step, max_relative = 1e-12);
+    }
+
+    #[test]
+    fn an_l1_penalty_adds_the_sign_of_the_value_to_the_gradient_of_named_parameters() {
+        let stepped = |name: &str, l1: f64, slope: f64| {
+            let mut theta = Param::new(name, arr1(&[2.0f64, -3.0, 0.0]));
+            let mut optimizer = Adam::new(0.1, AdamMode::Dense).epsilon(0.1).l1(vec![("a".to_owned(), l1)]);
+            let penalty = if slope == 0.0 { theta.tensor() * 0.0 } else { theta.tensor().abs() * (slope / 3.0) };
+            let grads = (theta.tensor() * 0.3 + penalty).sum().backward();
+            optimizer.step(&mut theta, &grads, 0);
+            theta.tensor().data().to_vec()
+        };
+        assert_eq!(stepped("a", 0.5, 0.0)[..2], stepped("a", 0.0, 0.5)[..2]);
+        assert_eq!(stepped("a", 0.5, 0.0)[2], stepped("b", 0.5, 0.0)[2]);
+        assert_eq!(stepped("b", 0.5, 0.0), stepped("b", 0.0, 0.0));
     }
 
     /// Looks up row 0, then row 1, then row 0, with a gradient of 1.

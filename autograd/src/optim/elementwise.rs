@@ -11,10 +11,10 @@ use std::collections::HashMap;
 /// The update rule of one element, which has `N` numbers: the value θ and then its `N` − 1 state values.
 pub(super) trait Rule<T: Real, const N: usize>: Send {
     /// Returns the function from `[θ, …]` and the gradient g to the new `[θ, …]`, for a parameter with the given learning rate. `updates` is the number of
-    /// updates of the parameter, including the current one; `l1` is the weight of its penalty.
+    /// updates of the parameter, including the current one; `l1` is the weight of the penalty Σ |θ|.
     fn at(&self, rate: f64, updates: u64, l1: f64) -> impl Fn([T; N], T) -> [T; N] + Sync;
 
-    /// Returns the weight of the L1 penalty of a parameter.
+    /// Returns the weight of the penalty mean |θ| of a parameter.
     fn l1(&self, _: &str) -> f64 {
         0.0
     }
@@ -42,7 +42,7 @@ impl<R, T: Real, const N: usize> Elementwise<R, T, N> {
 impl<R: Rule<T, N>, T: Real, const N: usize> Optimizer<T> for Elementwise<R, T, N> {
     fn step(&mut self, module: &mut dyn Module<T>, grads: &Gradients<T>, step: u64) {
         self.memory.visit(module, grads, N - 1, |param, grad, state, updates| {
-            let rule = self.rule.at(self.rates.at(param.name(), step), updates, self.rule.l1(param.name()));
+            let rule = self.rule.at(self.rates.at(param.name(), step), updates, self.rule.l1(param.name()) / param.tensor().len() as f64);
             update(param, state, grad, self.rule.visits_all_rows(), rule);
         });
     }

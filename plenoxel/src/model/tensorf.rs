@@ -94,11 +94,11 @@ impl Default for Config {
             density_components: 16,
             appearance_components: 48,
             features: 32,
-            hidden: 64,
+            hidden: 128,
             feature_octaves: 0,
             directions: Directions::Harmonics(3),
             step: 1.0,
-            group: 0.1,
+            group: 0.04,
             group_in_pictures: 0.02,
             color_above: 1e-3,
             stop_below: 3e-3,
@@ -106,8 +106,8 @@ impl Default for Config {
             occupied_above: 0.01,
             opaque_steps: 50,
             factor_rate: 0.02,
-            network_rate: 3e-3,
-            last_rate: 0.1,
+            network_rate: 5e-3,
+            last_rate: 0.15,
             density_l1: 8e-5,
             density_l1_later: 4e-5,
             lazy: true,
@@ -123,7 +123,6 @@ impl Config {
         let stages = [(128, 2000), (152, 1000), (180, 1000), (213, 1500), (253, 1500), (300, 23_000)];
         Config {
             features: 27,
-            hidden: 128,
             feature_octaves: 2,
             directions: Directions::Frequency(2),
             step: 0.5,
@@ -134,6 +133,7 @@ impl Config {
             stop_below_in_pictures: 0.0,
             opaque_steps: 0,
             network_rate: 1e-3,
+            last_rate: 0.1,
             lazy: false,
             stages: stages.map(|(resolution, steps)| Stage { resolution, steps, rays: 4096 }).to_vec(),
             ..Config::default()
@@ -388,7 +388,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
         let mut l1 = Vec::new();
         self.field.density_factors().visit(&mut |param| {
             let weight = if stage.index == 0 { config.density_l1 } else { config.density_l1_later };
-            l1.push((param.name().to_owned(), weight / param.tensor().len() as f64));
+            l1.push((param.name().to_owned(), weight));
         });
         for (name, _) in &l1 {
             rates = rates.with(name.clone(), falling(config.factor_rate, config.opaque_steps));

@@ -361,6 +361,21 @@ mod tests {
     }
 
     #[test]
+    fn a_finer_division_has_the_cells_whose_centres_lie_in_occupied_cells_and_density_thins_it_out() {
+        let coarse = scattered([5, 4, 6], 0.4);
+        let inner = Aabb { min: DVec3::new(-0.8, -1.0, -0.9), max: DVec3::new(0.7, 0.5, 1.0) };
+        let fine = coarse.resampled(inner, [13, 9, 11]);
+        let right = |at: &Tensor<f64>| at.index_axis(1, 0);
+        let dense = fine.dense(0.1, right);
+        for cell in (0..13 * 9 * 11).map(|c| [c / 99, c / 11 % 9, c % 11]) {
+            let at = fine.center(cell);
+            assert_eq!(fine.contains(cell), coarse.contains_point(at), "{cell:?}");
+            assert_eq!(dense.contains(cell), fine.contains(cell) && at.x > 0.1, "{cell:?}");
+        }
+        assert!(!coarse.contains_point(DVec3::new(1.01, 0.0, 0.0)) && fine.fraction() > 0.0);
+    }
+
+    #[test]
     fn bounds_stay_in_the_box_whatever_rounding_does() {
         for (half_width, n) in [(1.95, 320), (1.55, 384)] {
             let mut line = vec![false; n];

@@ -5,7 +5,7 @@
 //!
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
-//! another ([`RowSums`]), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
+//! another ([`RowSums`](autograd::RowSums)), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
 //! the sums are bit-identical for any number of threads.
 
 mod adjoint;
@@ -18,7 +18,7 @@ use crate::camera::Ray;
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Samples};
-use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Module, Param, Real, RowSparse, Tensor, parallel};
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
 use forward::{Block, Scene};
 use std::sync::Arc;
 
@@ -80,9 +80,8 @@ impl<T: Real> render::Columns<T> for Columns<T> {
 /// Renders a batch of rays through a field.
 pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let n = rays.len();
-    let mut tables: Vec<&Tensor<T>> = Vec::new();
-    let params = Params::of(field);
-    tables.extend(params.0.iter());
+    let params = field.tables();
+    let tables: Vec<&Tensor<T>> = params.iter().collect();
     let keep = tables.iter().any(|table| table.is_tracked()) && autograd::is_recording();
     let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[n, 3]);
     let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
@@ -90,7 +89,7 @@ pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOption
     let jitter = options.jitter;
     let grouping = if matches!(jitter, Jitter::None) { field.grouping_in_pictures } else { field.grouping };
     let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, jitter };
-    let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params.0);
+    let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params);
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
     let size = block_of(n);
     let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();
@@ -111,17 +110,6 @@ pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOption
         sample_count,
         Columns { pixels, sparsity },
     )
-}
-
-/// Parameters of a field, in their order.
-struct Params<T: Real>(Vec<Tensor<T>>);
-
-impl<T: Real> Params<T> {
-    fn of(field: &Factored<T>) -> Self {
-        let mut tables = Vec::new();
-        field.visit(&mut |param: &Param<T>| tables.push(param.tensor().clone()));
-        Params(tables)
-    }
 }
 
 /// Columns that a kernel computes.

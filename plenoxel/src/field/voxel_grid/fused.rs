@@ -35,6 +35,7 @@ use super::layout::Layout;
 use super::{Color, VoxelGrid};
 use crate::camera::Ray;
 use crate::field::{Field, sh};
+use crate::render::along::{COLUMNS, column};
 use crate::render::{self, RenderOptions, Rendered, composite};
 use crate::sampling::{Occupancy, Samples};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Param, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
@@ -50,17 +51,6 @@ pub const CHUNK: usize = 128 * BLOCK;
 
 /// Binary logarithm of the rows in a bucket: 64 bricks, in a dense grid a cube of 16³ voxels.
 const BUCKET_SHIFT: u32 = 12;
-
-/// Number of columns of the kernel's output.
-const COLUMNS: usize = 7;
-
-/// Indices of the columns; rgb has 0..3.
-mod column {
-    pub const DEPTH: usize = 3;
-    pub const OPACITY: usize = 4;
-    pub const LOG_TRANSMITTANCE: usize = 5;
-    pub const DISTORTION: usize = 6;
-}
 
 /// Data shared by all blocks of a batch.
 #[derive(Debug)]

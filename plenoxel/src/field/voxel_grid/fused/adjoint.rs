@@ -1,16 +1,11 @@
-//! Gradients of table rows from cotangents of pixels.
-//!
-//! With Gᵢ = ∂L/∂wᵢ and G_b = ∂L/∂T_N, for any loss on the columns:
-//!
-//! ∂L/∂σᵢ = δᵢ (Gᵢ Tᵢ₊₁ − Σ_{j>i} wⱼ Gⱼ − T_N G_b − ∂L/∂ln T_N) + ∂L/∂sparsity · 4σᵢ / (1 + 2σᵢ²),   ∂L/∂cᵢ = wᵢ ∂L/∂rgb.
-//!
-//! Gᵢ = cᵢ · ∂L/∂rgb + tᵢ ∂L/∂depth + ∂L/∂distortion · (2 Σⱼ wⱼ |tᵢ − tⱼ| + ⅔ wᵢ δᵢ),   G_b = background · ∂L/∂rgb − ∂L/∂opacity.
+//! Gradients of table rows from cotangents of pixels. [`Along`](crate::render::along::Along) has the formulas.
 
 use super::forward::Block;
 use super::lookup::Corners;
-use super::{BUCKET_SHIFT, Batch, COLUMNS, Output, column};
+use super::{BUCKET_SHIFT, Batch, COLUMNS, Output};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
+use crate::render::along;
 use autograd::rows::Buckets;
 use autograd::{Buffer, Real, RowSums, Tensor, dispatched, parallel};
 use std::ops::Range;
@@ -86,16 +81,14 @@ impl<T: Real> Gradients<T> {
         let rays = block.offsets.len() - 1;
         if output == Output::Sparsity {
             for (own, &g) in block.rays().zip(&cotangent.data()[block.first..]) {
-                for i in own {
-                    let s = block.density[i].max(T::zero());
-                    sigma[i] = g * T::lit(4.0) * s / (T::one() + T::lit(2.0) * s * s);
-                }
+                own.for_each(|i| sigma[i] = g * along::sparsity_slope(block.density[i].max(T::zero())));
             }
             return Gradients { sigma, rgb: vec![[T::zero(); 3]; rays] };
         }
         let pixels = &cotangent.data().as_chunks::<COLUMNS>().0[block.first..];
+        let (along, color) = (block.along(), block.shown(batch));
         for (own, g) in block.rays().zip(pixels) {
-            sigma_of_ray(batch, block, own, g, &mut sigma);
+            along.sigma_adjoint(own, batch.background, g, &color, &mut sigma);
         }
         Gradients { sigma, rgb: pixels[..rays].iter().map(|g| [g[0], g[1], g[2]]).collect() }
     }
@@ -196,40 +189,6 @@ fn touch_buckets<T: Real>(corners: &Corners<T>, touched: &mut [[u32; 8]]) -> usi
     }
     more
 }
-}
-
-/// Computes ∂L/∂σ along one ray, from back to front.
-#[inline(always)]
-fn sigma_of_ray<T: Real>(batch: &Batch<T>, block: &Block<T>, own: Range<usize>, g: &[T; COLUMNS], sigma: &mut [T]) {
-    let Some(last) = own.clone().next_back() else { return };
-    let (g_depth, g_distortion) = (g[column::DEPTH], g[column::DISTORTION]);
-    let g_background = (0..3).map(|c| batch.background[c] * g[c]).sum::<T>() - g[column::OPACITY];
-    let mut behind = block.after[last] * g_background + g[column::LOG_TRANSMITTANCE];
-    let (rgb, _) = block.color.as_chunks::<3>();
-    let clamped = batch.layout.shape.color != Color::Rgb;
-    // Sums of w and of w t, over all samples and over the samples behind the current one.
-    let (mut all, mut all_t) = (T::zero(), T::zero());
-    if g_distortion != T::zero() {
-        for i in own.clone() {
-            all += block.weight[i];
-            all_t += block.weight[i] * block.t[i];
-        }
-    }
-    let (mut back, mut back_t) = (T::zero(), T::zero());
-    for i in own.rev() {
-        let (w, t, delta) = (block.weight[i], block.t[i], block.delta[i]);
-        let c = if clamped { rgb[i].map(|c| c.max(T::zero())) } else { rgb[i] };
-        let mut own = c[0] * g[0] + c[1] * g[1] + c[2] * g[2] + t * g_depth;
-        if g_distortion != T::zero() {
-            let (front, front_t) = (all - back - w, all_t - back_t - w * t);
-            let spread = t * front - front_t + back_t - t * back;
-            own += g_distortion * (T::lit(2.0) * spread + T::lit(2.0 / 3.0) * w * delta);
-            back += w;
-            back_t += w * t;
-        }
-        sigma[i] = delta * (own * block.after[i] - behind);
-        behind += w * own;
-    }
 }
 
 /// Contributions to the density table.

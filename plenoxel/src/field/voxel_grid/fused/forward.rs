@@ -2,10 +2,11 @@
 
 use super::lookup::{self, Corners, Directions, Group};
 use super::places::{Places, RUN};
-use super::{BLOCK, Batch, COLUMNS, column};
+use super::{BLOCK, Batch, COLUMNS};
 use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
+use crate::render::along::{self, Along};
 use crate::sampling::{Occupancy, march};
 use autograd::lattice::NodeMap;
 use autograd::{Buffer, Real, Tensor, parallel};
@@ -52,15 +53,21 @@ impl<T: Real> Block<T> {
         |i| density[i] >= T::zero() && (after[i] > T::zero() || weight[i] > T::zero())
     }
 
+    /// Returns the samples as rendering sees them.
+    pub fn along(&self) -> Along<'_, T> {
+        Along { t: &self.t, delta: &self.delta, weight: &self.weight, after: &self.after }
+    }
+
+    /// Returns a function to the color of a sample, which is clamped at 0 if it is of harmonics.
+    #[inline(always)]
+    pub fn shown(&self, batch: &Batch<T>) -> impl Fn(usize) -> [T; 3] + '_ {
+        let (colors, clamped) = (self.color.as_chunks::<3>().0, batch.layout.shape.color != Color::Rgb);
+        move |i| if clamped { colors[i].map(|c| c.max(T::zero())) } else { colors[i] }
+    }
+
     /// Returns Σ ln(1 + 2σᵢ²) of each ray.
     pub fn sparsity(&self) -> impl Iterator<Item = T> + '_ {
-        self.rays().map(|own| {
-            let of = |&d: &T| {
-                let s = d.max(T::zero());
-                (T::one() + T::lit(2.0) * s * s).ln()
-            };
-            self.density[own].iter().map(of).sum()
-        })
+        self.rays().map(|own| self.density[own].iter().map(|&d| along::sparsity(d.max(T::zero()))).sum())
     }
 }
 
@@ -211,28 +218,9 @@ impl<'a, T: Real> Scene<'a, T> {
 
     /// Computes pixels from weights and colors.
     pub fn sum(&self, block: &Block<T>, pixels: &mut [T]) {
-        let background = self.batch.background;
-        let (rgb, _) = block.color.as_chunks::<3>();
-        let clamped = self.batch.layout.shape.color != Color::Rgb;
-        let shown = |c: T| if clamped { c.max(T::zero()) } else { c };
+        let (along, color) = (block.along(), block.shown(self.batch));
         for (own, pixel) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0) {
-            let (mut color, mut depth, mut opacity, mut optical_depth, mut distortion, mut moment) =
-                ([T::zero(); 3], T::zero(), T::zero(), T::zero(), T::zero(), T::zero());
-            let left = if own.is_empty() { T::one() } else { block.after[own.end - 1] };
-            for i in own {
-                let (w, t, delta) = (block.weight[i], block.t[i], block.delta[i]);
-                (0..3).for_each(|c| color[c] += w * shown(rgb[i][c]));
-                distortion += w * (T::lit(2.0) * (t * opacity - moment) + w * delta * T::lit(1.0 / 3.0));
-                depth += w * t;
-                moment = depth;
-                opacity += w;
-                optical_depth += block.density[i].max(T::zero()) * delta;
-            }
-            (0..3).for_each(|c| pixel[c] = color[c] + left * background[c]);
-            pixel[column::DEPTH] = depth;
-            pixel[column::OPACITY] = opacity;
-            pixel[column::LOG_TRANSMITTANCE] = -optical_depth;
-            pixel[column::DISTORTION] = distortion;
+            *pixel = along.pixel(own, self.batch.background, |i| block.density[i].max(T::zero()), &color);
         }
     }
 }
