@@ -184,6 +184,7 @@ fn a_run_is_trained_evaluated_rendered_and_described() {
     for key in ["psnr", "ssim", "ssim_same", "per_view", "seconds", "rays", "views", "width", "background", "resolution"] {
         assert_eq!(evaluated[key], result[key], "{key}");
     }
+    plenoxel(&["evaluate", &run, "--downscale", "2", "--keep"]).refused(2, &["--keep", "from its training", "--no-evaluate"]);
     let evaluated = plenoxel(&["evaluate", &run, "--split", "val", "--json", "--samples", "40"]);
     assert_eq!(evaluated.out.lines().count(), 1);
     assert_eq!((&evaluated.json()["views"], &evaluated.json()["split"]), (&1.into(), &"val".into()));
@@ -687,6 +688,23 @@ fn what_is_carved_is_a_run_that_other_commands_take_and_training_starts_from() {
     assert!(psnr > 12.0, "{psnr}");
     let told = plenoxel(&["info", &carved]).done();
     assert!(told.contains("nearest") && told.contains("degree 1"), "{told}");
+    // Its test views have panels. Scores and panels of another size are written only with --keep.
+    let panel = || image::size(Path::new(&format!("{carved}/images/test_001_r_1.png"))).unwrap();
+    let kept =
+        || serde_json::from_str::<Value>(&fs::read_to_string(format!("{carved}/evaluation.json")).unwrap()).unwrap()["width"].clone();
+    assert_eq!((panel(), kept()), ((4 * 40 + 3 * 2, 40), Value::from(40)));
+    plenoxel(&["evaluate", &carved, "--quiet", "--downscale", "2"]).done();
+    assert_eq!((panel(), kept()), ((4 * 40 + 3 * 2, 40), Value::from(40)));
+    plenoxel(&["evaluate", &carved, "--quiet", "--downscale", "2", "--keep"]).done();
+    assert_eq!((panel(), kept()), ((4 * 20 + 3 * 2, 20), Value::from(20)));
+    let compared = folder.path("carved.html");
+    plenoxel(&["compare", &carved, &carved, "--out", &compared]).done();
+    // 20 pixels, each enlarged to 20.
+    let page = fs::read_to_string(&compared).unwrap();
+    assert_eq!(page.matches("<img width=\"400\" height=\"400\" alt=\"render of").count(), 4, "two views of two runs");
+    plenoxel(&["evaluate", &carved, "--keep", "--split", "train"]).refused(2, &["--keep", "the train views", "the test views"]);
+    plenoxel(&["evaluate", &carved, "--keep", "--samples", "9"]).refused(2, &["--keep", "--samples"]);
+    plenoxel(&["evaluate", &carved, "--quiet"]).done();
     // The same settings again give the same bits.
     let again = folder.path("again");
     plenoxel(&["carve", &data, "--out", &again, "--config", &format!("{carved}/config.toml"), "--quiet"]).done();
@@ -700,6 +718,18 @@ fn what_is_carved_is_a_run_that_other_commands_take_and_training_starts_from() {
     let cold = plenoxel(&from_nothing).json()["psnr"].as_f64().unwrap();
     assert!(warm > cold + 0.5, "{warm} against {cold}");
     assert!(fs::read_to_string(format!("{trained}/config.toml")).unwrap().contains("init_from = "));
+}
+
+#[test]
+fn harmonics_are_drawn_into_a_file() {
+    let folder = Folder::new("harmonics");
+    let out = folder.path("two.png");
+    let told = plenoxel(&["harmonics", "--degree", "2", "--size", "20", "--out", &out]).done();
+    assert!(told.contains("9 functions, 100 x 60 pixels"), "{told}");
+    assert_eq!(image::size(Path::new(&out)).unwrap(), (100, 60));
+    plenoxel(&["harmonics", "--degree", "4"]).refused(2, &["--degree", "a whole number from 0 to 3"]);
+    plenoxel(&["harmonics", "--size", "5"]).refused(2, &["--size", "a whole number from 16 to 1024"]);
+    plenoxel(&["harmonics", "--size", "16", "--out", &folder.path("none/there.png")]).refused(5, &["none"]);
 }
 
 #[test]

@@ -6,9 +6,9 @@ use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::evaluate::evaluate;
-use plenoxel::loss::{Objective, mse};
 use plenoxel::field::factored::Directions;
 use plenoxel::geometry::Aabb;
+use plenoxel::loss::{Objective, mse};
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
 use plenoxel::render::{Engine, Field, Rendered};
 use plenoxel::sampling::Jitter;
@@ -78,7 +78,8 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
 
 /// A model that the kernel computes.
 fn wide(config: Config) -> Tensorf<f64> {
-    let mut model = Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }, BOX, 42).expect("valid settings");
+    let mut model =
+        Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }, BOX, 42).expect("valid settings");
     let random = Stream::new(11);
     model.visit_mut(&mut |param: &mut Param<f64>| {
         if param.name().starts_with("density") {
@@ -182,13 +183,8 @@ fn training_has_the_same_bits_for_any_number_of_threads() {
     let trained = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
-            let config = Config {
-                density_components: 16,
-                appearance_components: 16,
-                group: 0.1,
-                stop_below: 1e-3,
-                ..tiny(&[(16, 30), (24, 30)])
-            };
+            let config =
+                Config { density_components: 16, appearance_components: 16, group: 0.1, stop_below: 1e-3, ..tiny(&[(16, 30), (24, 30)]) };
             let objective = Objective::new().with("mse", 1.0, mse);
             let model = Tensorf::<f32>::new(config, BOX, 42).expect("valid settings");
             let mut trainer = Trainer::with_model(model, &train[..], objective, TrainOptions::default()).expect("a trainer");

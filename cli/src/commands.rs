@@ -11,6 +11,7 @@ pub mod harmonics;
 pub mod info;
 pub mod man;
 mod new_run;
+mod panels;
 pub mod presets;
 pub mod render;
 pub mod report;

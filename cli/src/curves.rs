@@ -75,7 +75,14 @@ mod tests {
     use super::*;
 
     fn stages() -> Vec<PlannedStage> {
-        let planned = |(i, resolution)| PlannedStage { index: i, resolution: Some(resolution), first: 50 * i as u64, steps: 50, first_ray: 0, rays_per_step: 1 };
+        let planned = |(i, resolution)| PlannedStage {
+            index: i,
+            resolution: Some(resolution),
+            first: 50 * i as u64,
+            steps: 50,
+            first_ray: 0,
+            rays_per_step: 1,
+        };
         [16, 32].into_iter().enumerate().map(planned).collect()
     }
 

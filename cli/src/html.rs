@@ -56,6 +56,16 @@ pub fn picture(picture: &RgbaImage, [width, height]: [u32; 2], description: &str
     }
 }
 
+/// Enlarges a picture by the largest whole factor for which it has at most `side` pixels per side. Pixels become squares.
+pub fn enlarged(picture: &RgbaImage, side: u32) -> RgbaImage {
+    let (width, height) = picture.dimensions();
+    let factor = side / width.max(height).max(1);
+    if factor < 2 {
+        return picture.clone();
+    }
+    image::imageops::resize(picture, width * factor, height * factor, image::imageops::FilterType::Nearest)
+}
+
 /// Formats a page from its title as text, its style sheet, and the HTML below its heading.
 pub fn page(title: &str, style: &str, body: &str) -> String {
     let title = escaped(title);
@@ -74,6 +84,14 @@ mod tests {
         assert_eq!(escaped("a<b> & \"c\" 'd'"), "a&lt;b&gt; &amp; &quot;c&quot; &#39;d&#39;");
         let page = page("<script>", "", "<p>text</p>\n");
         assert!(!page.contains("<script>") && page.contains("<p>text</p>"), "{page}");
+        let mut spots = RgbaImage::new(4, 2);
+        spots.get_pixel_mut(1, 1).0 = [9, 8, 7, 255];
+        let large = enlarged(&spots, 13);
+        assert_eq!(
+            (large.dimensions(), large.get_pixel(3, 3), large.get_pixel(5, 5)),
+            ((12, 6), spots.get_pixel(1, 1), spots.get_pixel(1, 1))
+        );
+        assert_eq!((large.get_pixel(6, 3), enlarged(&spots, 7).dimensions()), (spots.get_pixel(0, 0), (4, 2)));
         let picture = picture(&RgbaImage::new(40, 20), [10, 10], "\"x");
         assert!(picture.starts_with("<img width=\"10\" height=\"5\" alt=\"&quot;x\" src=\"data:image/jpeg;base64,/9j/"), "{picture}");
     }

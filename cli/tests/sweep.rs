@@ -38,6 +38,7 @@ downscale = 5
 name = "hull"
 command = "carve"
 resolution = 16
+evaluate_downscale = 2
 
 [[published]]
 name = "Elsewhere"
@@ -125,11 +126,13 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     assert_eq!(out, read("swept/table.md"));
     let (csv, html) = (read("swept/table.csv"), read("swept/table.html"));
     assert_eq!((csv.lines().count(), csv.matches(",finished,").count(), csv.matches(",failed,").count()), (1 + 8, 5, 2), "{csv}");
-    // Photographs of two scenes and five renders.
+    // Photographs of two scenes and five renderings, of 24 or 12 pixels, enlarged.
     assert_eq!(html.matches("data:image/jpeg;base64,").count(), 2 + 5);
+    assert_eq!((html.matches("<img width=\"192\"").count(), html.matches("Pictures: ").count()), (2 + 5, 1));
     assert!(read("swept/few/odd.log").contains("error: downscale") && read("swept/few/fine.log").starts_with("$ plenoxel train "));
     assert!(read("swept/few/fine/result.json").contains("\"psnr\""));
-    assert!(read("swept/files/hull/evaluation.json").contains("\"psnr\""));
+    let evaluation = read("swept/files/hull/evaluation.json");
+    assert!(evaluation.contains("\"psnr\"") && evaluation.contains("\"width\": 12,"), "{evaluation}");
 
     // Once more: what is finished stays as it is, what was killed before it had its figures gets them.
     let modified = |name: &str| fs::metadata(root.join(name)).and_then(|file| file.modified()).expect("its time");

@@ -23,7 +23,12 @@ fn main() -> Result<()> {
     let outcome = train_model(
         &settings,
         |run, _, views| {
-            Trainer::with_model(Tensorf::new(config(), Aabb::cube(run.half_width), run.seed)?, views, Objective::new().with("mse", 1.0, mse), run.train_options())
+            Trainer::with_model(
+                Tensorf::new(config(), Aabb::cube(run.half_width), run.seed)?,
+                views,
+                Objective::new().with("mse", 1.0, mse),
+                run.train_options(),
+            )
         },
         &mut |event| match event {
             Event::Note(text) => eprintln!("{text}"),

@@ -12,8 +12,8 @@ use crate::field::voxel_grid::VoxelGrid;
 use crate::tensor_file::TensorFile;
 use crate::train::About;
 use plenoxels::config::Config;
-use tensorf::Tensorf;
 use std::path::Path;
+use tensorf::Tensorf;
 
 /// Kinds of models that [`open`] can read.
 pub const KINDS: [&str; 2] = [plenoxels::KIND, tensorf::KIND];

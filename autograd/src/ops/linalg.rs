@@ -70,7 +70,8 @@ fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b
     };
     let mut out = Buffer::stale(count * m * n);
     if count == 1 {
-        let (x, y) = (Matrix::stored(&a.data()[matrix(a, 0)], m, k, transpose_a), Matrix::stored(&b.data()[matrix(b, 0)], k, n, transpose_b));
+        let (x, y) =
+            (Matrix::stored(&a.data()[matrix(a, 0)], m, k, transpose_a), Matrix::stored(&b.data()[matrix(b, 0)], k, n, transpose_b));
         multiply_blocked(x, y, &mut out);
     } else {
         // Many small products: each task computes as many as fill a chunk.

@@ -1,6 +1,7 @@
 //! `plenoxel carve`: carves an opaque colored grid from silhouettes and colors, without training.
 
 use super::new_run::{announce, load};
+use super::train::BuiltInScene;
 use super::{MOST_REDUCTION, whole};
 use crate::images;
 use crate::progress::Console;
@@ -80,6 +81,9 @@ pub struct CarveArgs {
     #[arg(long, value_name = "LENGTH", help_heading = "Scene", value_parser = super::number(f64::NEG_INFINITY), allow_negative_numbers = true)]
     half_width: Option<f64>,
 
+    #[command(flatten)]
+    built_in: BuiltInScene,
+
     /// Voxels per side of the box [default: 256]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(2, 1024), allow_negative_numbers = true)]
     resolution: Option<i64>,
@@ -106,7 +110,7 @@ pub struct CarveArgs {
 impl CarveArgs {
     /// Source of the views.
     pub fn source(&self) -> DataSource {
-        DataSource::of(self.data.as_deref())
+        self.built_in.source_or(self.data.as_deref())
     }
 
     /// Resolves the configuration. Returns it with the name of its preset.

@@ -9,8 +9,8 @@ use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::files;
 use plenoxel::geometry::Aabb;
-use plenoxel::model::{self, plenoxels};
 use plenoxel::model::plenoxels::config::Config;
+use plenoxel::model::{self, plenoxels};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::machine;
@@ -93,10 +93,7 @@ fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
         false => "a custom model; the program that trained it can render and evaluate it",
     };
     let file = TensorFile::open(path)?;
-    let mut lines = vec![
-        ("checkpoint", path.display().to_string()),
-        ("kind", format!("{kind}: {about}")),
-    ];
+    let mut lines = vec![("checkpoint", path.display().to_string()), ("kind", format!("{kind}: {about}"))];
     lines.extend(file.tensors().into_iter().map(|(name, shape)| ("parameter", format!("{name} {shape:?}"))));
     Ok(Some(lines))
 }

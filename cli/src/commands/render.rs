@@ -110,9 +110,8 @@ fn render(
     let channels = channels(args, default);
     let normals = channels.contains(&Channel::Normal);
     let pixels = shots.iter().map(|(camera, _)| camera.intrinsics.width * camera.intrinsics.height).max().unwrap_or(0);
-    let Loaded { model, view, .. } = args
-        .run
-        .load(found, console, |sampling, stored| Estimate::of_pictures(&found.config, sampling, stored, pixels, normals))?;
+    let Loaded { model, view, .. } =
+        args.run.load(found, console, |sampling, stored| Estimate::of_pictures(&found.config, sampling, stored, pixels, normals))?;
     prepare()?;
     let grid = || voxel_grid(&*model, found.folder.path(), "rendering normals");
     let normals = normals.then(|| Ok(Plenoxels::of_grid(&found.config, grid()?.normals()))).transpose()?;

@@ -5,12 +5,12 @@ mod flags;
 mod job;
 mod plan;
 
-use super::table::{Cell, Failure, Row, RunTable};
+use super::table::{Cell, Failure, Published, Row, RunTable};
 use crate::interrupt::{EXIT_CODE, Watch};
 use crate::progress::Console;
 use child::Program;
 use clap::builder::PossibleValuesParser;
-use clap::{Args, ValueHint};
+use clap::{ArgGroup, Args, ValueHint};
 use job::{Job, State};
 use plan::Plan;
 use plenoxel::error::{Error, Result};
@@ -24,6 +24,7 @@ Examples:
   plenoxel sweep --scene data/lego --scene procedural --preset fast --preset paper --out sweeps/first
   plenoxel sweep nerf.toml                   run the sweep in sweeps/nerf, or resume it
   plenoxel sweep nerf.toml --dry-run         list the runs and their states
+  plenoxel sweep nerf.toml --scene data/lego --scene data/chair    run its methods on other scenes
 
 The TOML file lists scenes and methods. Every scene is run with every method. Keys are flags of train
 or carve: downscale = 4 means --downscale 4. Keys of a method override those of a scene. Paths are
@@ -49,6 +50,7 @@ relative to the file. Example:
   [[methods]]
   name = \"hull\"
   command = \"carve\"
+  evaluate_downscale = 8                     # downscale factor of the evaluation
 
   [[published]]                              # a column with published results
   name = \"Plenoxels\"
@@ -62,18 +64,19 @@ to retry failed runs. The exit code is that of the first failed run, or 0.";
 
 /// Run every scene of a list with every method, skip finished runs, and print a table of the results
 #[derive(Debug, Args)]
-#[command(after_help = EXAMPLES, args_override_self = true)]
+#[command(after_help = EXAMPLES, args_override_self = true, group = ArgGroup::new("methods").required(true))]
 pub struct SweepArgs {
     /// TOML file with scenes and methods, described below; alternatively, use --scene and --preset
-    #[arg(value_hint = ValueHint::FilePath, required_unless_present = "scene", conflicts_with_all = ["scene", "preset"])]
+    #[arg(value_hint = ValueHint::FilePath, group = "methods")]
     file: Option<PathBuf>,
 
-    /// Dataset folder, or `procedural` for the built-in scene; may be repeated
-    #[arg(long, value_name = "DATA", requires_all = ["preset", "out"])]
+    /// Dataset folder, or `procedural` for the built-in scene; may be repeated. With FILE, these scenes replace those of the file, and the name of a
+    /// scene in the file selects that scene
+    #[arg(long, value_name = "DATA")]
     scene: Vec<String>,
 
     /// Train with this preset; may be repeated
-    #[arg(long, requires = "scene", value_parser = PossibleValuesParser::new(PRESETS.map(|preset| preset.name)))]
+    #[arg(long, group = "methods", requires_all = ["scene", "out"], value_parser = PossibleValuesParser::new(PRESETS.map(|preset| preset.name)))]
     preset: Vec<String>,
 
     /// Sweep folder to write [default: sweeps/<name of the file>]
@@ -112,7 +115,7 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     let named = args.file.as_deref().and_then(Path::file_stem).unwrap_or_default();
     let out = args.out.clone().unwrap_or_else(|| Path::new("sweeps").join(named));
     let plan = match &args.file {
-        Some(file) => Plan::from_file(file, &args.set, &out)?,
+        Some(file) => Plan::from_file(file, &args.scene, &args.set, &out)?,
         None => Plan::from_flags(&args.scene, &args.preset, &args.set, &out)?,
     };
     let states: Vec<State> = plan.jobs.iter().map(Job::state).collect();
@@ -258,11 +261,13 @@ fn table(plan: &Plan, out: &Path) -> RunTable {
         let job = plan.jobs.iter().find(|job| job.scene == *scene && job.method == *method);
         job.map_or(Cell::Missing, Job::cell)
     };
+    let is_shown = |published: &Published| published.scenes().iter().any(|scene| plan.scenes.contains(scene));
     let row = |scene: &String| Row { scene: scene.clone(), cells: plan.methods.iter().map(|method| cell(scene, method)).collect() };
     RunTable {
         title: format!("Sweep {}", out.file_name().unwrap_or_default().to_string_lossy()),
         methods: plan.methods.clone(),
         rows: plan.scenes.iter().map(row).collect(),
-        published: plan.published.clone(),
+        published: plan.published.iter().filter(|published| is_shown(published)).cloned().collect(),
+        elsewhere: plan.published.iter().filter(|published| !is_shown(published)).cloned().collect(),
     }
 }

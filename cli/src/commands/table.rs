@@ -1,7 +1,7 @@
 //! The table of the results of a sweep, scenes x methods, as Markdown, CSV and an HTML page.
 
 mod csv;
-mod figures;
+pub mod figures;
 mod html;
 pub mod markdown;
 mod thumbnail;
@@ -10,8 +10,11 @@ pub use figures::{Failure, Figures, Measured, Scores};
 use plenoxel::error::Result;
 use plenoxel::files;
 use serde::Deserialize;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+
+/// Name of the row of means.
+const MEAN: &str = "mean";
 
 /// Results of runs, by scene and method.
 #[derive(Debug)]
@@ -24,6 +27,8 @@ pub struct RunTable {
     pub rows: Vec<Row>,
     /// Columns with published results.
     pub published: Vec<Published>,
+    /// Published results for other scenes, which are only listed in the notes.
+    pub elsewhere: Vec<Published>,
 }
 
 /// Results of all methods for a scene.
@@ -60,6 +65,11 @@ pub struct Published {
 }
 
 impl Published {
+    /// The scenes with results.
+    pub fn scenes(&self) -> BTreeSet<&String> {
+        [&self.psnr, &self.ssim, &self.seconds].into_iter().flat_map(BTreeMap::keys).collect()
+    }
+
     /// The results for a scene.
     fn scores(&self, scene: &str) -> Scores {
         let of = |figures: &BTreeMap<String, f64>| figures.get(scene).copied();
@@ -77,19 +87,24 @@ impl RunTable {
         Ok(markdown)
     }
 
-    /// The mean of a column over all scenes. A figure that is missing for a scene has no mean.
-    fn mean(&self, method: usize) -> Scores {
-        Scores::mean(self.rows.iter().map(|row| row.cells.get(method).map(Cell::scores).unwrap_or_default()))
-    }
-
-    fn published_mean(&self, published: &Published) -> Scores {
-        Scores::mean(self.rows.iter().map(|row| published.scores(&row.scene)))
+    /// The rows below several scenes: a name, a statistic of each method, and one of each column with published results.
+    fn summaries(&self) -> Vec<(&'static str, Vec<Scores>, Vec<Scores>)> {
+        if self.rows.len() < 2 {
+            return Vec::new();
+        }
+        let row = |name, of: fn(&[f64]) -> f64| {
+            let measured = (0..self.methods.len()).map(|method| Scores::over(self.rows.iter().map(|row| row.scores(method)), of));
+            let published = self.published.iter().map(|p| Scores::over(self.rows.iter().map(|row| p.scores(&row.scene)), of));
+            (name, measured.collect(), published.collect())
+        };
+        vec![row(MEAN, figures::mean), row("standard deviation", figures::deviation)]
     }
 
     /// Notes below the table.
     fn notes(&self) -> Vec<String> {
         let mut notes = vec![
-            "PSNR in dB on test views, SSIM, and seconds of training; means are over all scenes, and are left out if a scene is missing."
+            "PSNR in dB on test views, SSIM, and seconds of training or carving; means and standard deviations are over all scenes, and are left out if \
+             a scene is missing."
                 .to_owned(),
         ];
         for row in &self.rows {
@@ -101,6 +116,10 @@ impl RunTable {
             }
         }
         notes.extend(self.published.iter().map(|p| format!("{}: published, not measured here: {}", p.name, p.source)));
+        notes.extend(self.elsewhere.iter().map(|p| {
+            let scenes: Vec<&str> = p.scenes().into_iter().map(String::as_str).collect();
+            format!("{}: published for other scenes ({}), not shown: {}", p.name, scenes.join(", "), p.source)
+        }));
         notes
     }
 
@@ -117,6 +136,11 @@ impl RunTable {
 }
 
 impl Row {
+    /// The scores of a method.
+    fn scores(&self, method: usize) -> Scores {
+        self.cells.get(method).map(Cell::scores).unwrap_or_default()
+    }
+
     /// True if all methods were evaluated on the same number of views, of the same size and with the same background.
     fn is_comparable(&self) -> bool {
         let mut views = self.cells.iter().filter_map(Cell::measured).map(Measured::views);

@@ -7,7 +7,7 @@ mod screen;
 use super::report;
 use crate::interrupt;
 use crate::progress::Console;
-pub use flags::{NOT_WHEN_RESUMED, TrainArgs, size};
+pub use flags::{BuiltInScene, NOT_WHEN_RESUMED, TrainArgs, size};
 use plenoxel::error::Result;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::training::{self, Outcome, RunOptions, RunSettings, Summary};

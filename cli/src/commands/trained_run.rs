@@ -82,12 +82,7 @@ impl TrainedRun {
     /// Reads the model. `estimate` computes the memory from the sampling, the shape and the number of voxels.
     ///
     /// Errors: there is not enough memory; the model cannot be read.
-    pub fn load(
-        &self,
-        found: &Found,
-        console: &Console<'_>,
-        estimate: impl FnOnce(Sampling, &Stored) -> Estimate,
-    ) -> Result<Loaded> {
+    pub fn load(&self, found: &Found, console: &Console<'_>, estimate: impl FnOnce(Sampling, &Stored) -> Estimate) -> Result<Loaded> {
         let path = found.folder.existing_checkpoint()?;
         let (stored, as_trained) = (Stored::read(&path)?, found.config.evaluation);
         let sampling = match (self.samples, &stored) {

@@ -11,11 +11,11 @@ use crate::error::{Error, Result};
 use crate::field::factored::{Directions, Factored, Grouping, Shape};
 use crate::geometry::Aabb;
 use crate::loss::Step;
+use crate::model::plenoxels::config::Hull;
 use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::model::plenoxels::config::Hull;
 use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
@@ -282,7 +282,8 @@ impl<T: Real> Tensorf<T> {
     pub fn open(path: &Path) -> Result<(Self, About)> {
         let config: Config = TensorFile::open(path)?.fact("settings")?;
         // Box, nodes and values are in the file.
-        let mut model = Tensorf::new(Config { stages: config.stages.iter().copied().take(1).collect(), ..config.clone() }, Aabb::cube(1.0), 0)?;
+        let mut model =
+            Tensorf::new(Config { stages: config.stages.iter().copied().take(1).collect(), ..config.clone() }, Aabb::cube(1.0), 0)?;
         model.config = config;
         let about = model.load(path)?;
         Ok((model, about))
@@ -380,7 +381,8 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
         let config = &self.config;
-        let falling = |rate: f64, frozen: u64| Falling { rate, last: config.last_rate, first: stage.first, total: config.total_steps(), frozen };
+        let falling =
+            |rate: f64, frozen: u64| Falling { rate, last: config.last_rate, first: stage.first, total: config.total_steps(), frozen };
         let mut rates = Rates::new(falling(config.factor_rate, 0));
         for name in self.field.network_names() {
             rates = rates.with(name, falling(config.network_rate, 0));
@@ -398,7 +400,8 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 
     fn stages(&self, _: &TrainOptions, _: u64) -> Vec<StageLength> {
-        let length = |stage: &Stage| StageLength { resolution: Some(stage.resolution), steps: stage.steps, rays_per_step: Some(stage.rays) };
+        let length =
+            |stage: &Stage| StageLength { resolution: Some(stage.resolution), steps: stage.steps, rays_per_step: Some(stage.rays) };
         self.config.stages.iter().map(length).collect()
     }
 

@@ -67,14 +67,7 @@ impl<T: Real> Along<'_, T> {
 
     /// Computes ∂L/∂σᵢ of the samples `own` of a ray, from back to front, from the cotangent g of its pixel.
     #[inline(always)]
-    pub fn sigma_adjoint(
-        &self,
-        own: Range<usize>,
-        background: [T; 3],
-        g: &[T; COLUMNS],
-        color: impl Fn(usize) -> [T; 3],
-        sigma: &mut [T],
-    ) {
+    pub fn sigma_adjoint(&self, own: Range<usize>, background: [T; 3], g: &[T; COLUMNS], color: impl Fn(usize) -> [T; 3], sigma: &mut [T]) {
         let Some(last) = own.clone().next_back() else { return };
         let (g_depth, g_distortion) = (g[column::DEPTH], g[column::DISTORTION]);
         let g_background = (0..3).map(|c| background[c] * g[c]).sum::<T>() - g[column::OPACITY];

@@ -10,11 +10,11 @@ use super::training::RunOptions;
 use crate::carve::Fit;
 use crate::carve::color::KEPT_LIGHT;
 use crate::carve::visual_hull::silhouette_bytes;
+use crate::checkpoint;
 use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
 use crate::field::voxel_grid::{Color, GridShape};
-use crate::checkpoint;
 use crate::memory;
 use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
 use crate::model::{self, tensorf};
@@ -149,8 +149,7 @@ impl Estimate {
             // The file and the tables read from it.
             grid: 2 * stored.bytes(),
             optimizer: 0,
-            step: rendering
-                + compare.map_or(0, |(dataset, split)| comparison(dataset, split, COMPARED_BYTES)),
+            step: rendering + compare.map_or(0, |(dataset, split)| comparison(dataset, split, COMPARED_BYTES)),
             expected: false,
             key: "RUN".to_owned(),
             advice: "use a machine with more memory, or fewer --samples",

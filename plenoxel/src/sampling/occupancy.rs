@@ -56,7 +56,8 @@ impl Occupancy {
         let mut masks = self.masks.to_vec();
         for (first, masks) in (0..).step_by(BRICKS).zip(masks.chunks_mut(BRICKS)) {
             let cells = || masks.iter().zip(first..).flat_map(|(&mask, brick)| bits(mask).map(move |bit| (brick, bit)));
-            let positions: Vec<T> = cells().flat_map(|(brick, bit)| self.center(self.bricks.node(brick, bit)).to_array().map(T::lit)).collect();
+            let positions: Vec<T> =
+                cells().flat_map(|(brick, bit)| self.center(self.bricks.node(brick, bit)).to_array().map(T::lit)).collect();
             let positions = Tensor::from_vec(positions, &[cells().count(), 3]);
             let density = no_grad(|| density(&positions));
             let thin: Vec<_> = cells().zip(density.data()).filter(|(_, d)| d.as_f64() <= threshold).map(|(cell, _)| cell).collect();

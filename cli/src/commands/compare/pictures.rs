@@ -1,7 +1,7 @@
 //! Renderings of the same test views by several runs.
 
 use super::Run;
-use crate::html::{escaped, picture};
+use crate::html::{enlarged, escaped, picture};
 use crate::images;
 use crate::report::pictures::LARGEST;
 use plenoxel::dataset::image as files;
@@ -63,7 +63,7 @@ fn part(run: &Run, panel: &str, parts: &[usize]) -> Result<String> {
     let mut all = String::new();
     for &number in parts {
         let Some(cut) = images::part(&whole, number, (width, height)) else { return Err(unlike(&path)) };
-        all += &picture(&cut, LARGEST, &format!("{} of {}", ["photograph", "render", "error"][number], run.name));
+        all += &picture(&enlarged(&cut, LARGEST[1]), LARGEST, &format!("{} of {}", ["photograph", "render", "error"][number], run.name));
     }
     Ok(all)
 }

@@ -23,6 +23,8 @@ pub struct Job {
     pub folder: PathBuf,
     pub call: Call,
     pub asked: Asked,
+    /// Downscale factor of the evaluation, if it differs from that of the run.
+    pub evaluate_downscale: Option<usize>,
 }
 
 /// A command line without its output folder.
@@ -85,8 +87,17 @@ impl Job {
         }
         match (folder.result(), folder.evaluation()) {
             (Err(e), _) | (_, Err(e)) => State::Different(e.to_string()),
+            (Ok(Some(result)), _) if self.evaluate_downscale.is_some() && result["psnr"].is_number() => {
+                State::Different("it was evaluated at the image size of its training".to_owned())
+            }
+            (Ok(Some(result)), Ok(Some(evaluation))) if !result["psnr"].is_number() => {
+                // Evaluations of earlier versions do not have the factor: it is that of the run.
+                let evaluated = evaluation["image"]["downscale"].as_u64().map_or(config.downscale, |factor| factor as usize);
+                let asked = self.evaluate_downscale.unwrap_or(self.asked.config.downscale);
+                if evaluated == asked { State::Finished } else { State::Unevaluated }
+            }
             // An evaluation without test views is complete, and has no PSNR.
-            (Ok(Some(result)), Ok(evaluation)) if result.get("psnr").is_some() || evaluation.is_some() => State::Finished,
+            (Ok(Some(result)), Ok(_)) if result.get("psnr").is_some() && self.evaluate_downscale.is_none() => State::Finished,
             (Ok(Some(_)), _) => State::Unevaluated,
             (Ok(None), _) if !record.is_carved() && folder.existing_state().is_ok() => State::Interrupted,
             (Ok(None), _) => State::CutShort,
@@ -111,7 +122,8 @@ impl Job {
 
     /// Returns the command line that evaluates the run on its test views.
     pub fn evaluation(&self) -> Vec<OsString> {
-        vec!["evaluate".into(), self.folder.clone().into_os_string(), "--json".into()]
+        let downscale = self.evaluate_downscale.into_iter().flat_map(|k| [format!("--downscale={k}").into(), "--keep".into()]);
+        ["evaluate".into(), self.folder.clone().into_os_string(), "--json".into()].into_iter().chain(downscale).collect()
     }
 
     /// Path of the log. Names of runs have no dots, so it cannot conflict with a run.

@@ -2,6 +2,7 @@
 
 use super::flags::{self, Flag};
 use super::job::{Asked, Call, Job};
+use crate::commands::MOST_REDUCTION;
 use crate::commands::table::Published;
 use clap::Parser;
 use plenoxel::error::{Error, Result};
@@ -19,6 +20,9 @@ const LONGEST_NAME: usize = 100;
 const MOST_RUNS: usize = 10_000;
 const COMMANDS: [&str; 2] = ["train", "carve"];
 
+/// Key of a method: downscale factor of its evaluation.
+const EVALUATE_DOWNSCALE: &str = "evaluate_downscale";
+
 /// The runs of a sweep, scene by scene.
 #[derive(Debug)]
 pub struct Plan {
@@ -29,7 +33,7 @@ pub struct Plan {
 }
 
 /// Content of a sweep file with checked keys, or the equivalent of flags.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Clone, Deserialize)]
 struct Sweep {
     /// Settings of all runs; those of scenes and methods override them.
     #[serde(default)]
@@ -49,8 +53,9 @@ struct Entry {
 }
 
 impl Plan {
-    /// Plans the sweep of a file in the folder `out`. `set` has settings of all runs, which override all others.
-    pub fn from_file(path: &Path, set: &[String], out: &Path) -> Result<Self> {
+    /// Plans the sweep of a file in the folder `out`. `set` has settings of all runs, which override all others. `scenes`, if not empty, replace the
+    /// scenes of the file; each is the name of a scene of the file, or a folder.
+    pub fn from_file(path: &Path, scenes: &[String], set: &[String], out: &Path) -> Result<Self> {
         let file = ConfigFile::read_named(path)?;
         let wrong = |found: String| Error::input(path, found, "see the example in `plenoxel sweep --help`");
         let root: Table = toml::from_str(file.text()).map_err(|e| wrong(e.message().to_owned()))?;
@@ -61,19 +66,29 @@ impl Plan {
             let place = |key: &str| file.place(&format!("published[{index}].{key}"));
             flags::check_keys(table, &known(&["name", "source", "psnr", "ssim", "seconds"]), &place)?;
         }
-        let sweep: Sweep = toml::from_str(file.text()).map_err(|e| {
+        let mut sweep: Sweep = toml::from_str(file.text()).map_err(|e| {
             let line = e.span().map_or(0, |span| file.text()[..span.start].matches('\n').count() + 1);
             let found = e.message().strip_prefix("missing field ").map(|key| format!("the key {key} is missing"));
             wrong(format!("line {line}: {}", found.unwrap_or_else(|| e.message().to_owned())))
         })?;
         let base = path.parent().unwrap_or(Path::new(""));
-        Self::new(sweep, set, base, out, &|path| file.place(path))
+        let plan = Self::new(sweep.clone(), set, base, out, &|path| file.place(path))?;
+        if scenes.is_empty() {
+            return Ok(plan);
+        }
+        sweep.scenes = scenes
+            .iter()
+            .map(|scene| match plan.scenes.iter().position(|name| name == scene) {
+                Some(index) => sweep.scenes[index].clone(),
+                None => with("data", &from_here(scene)),
+            })
+            .collect();
+        Self::new(sweep, set, base, out, &|path| if path.starts_with("scenes") { "--scene".into() } else { file.place(path) })
     }
 
     /// Plans a sweep of scenes, which are folders or the built-in scene, with presets.
     pub fn from_flags(scenes: &[String], presets: &[String], set: &[String], out: &Path) -> Result<Self> {
-        let tables =
-            |key: &str, values: &[String]| values.iter().map(|value| Table::from_iter([(key.to_owned(), value.as_str().into())])).collect();
+        let tables = |key: &str, values: &[String]| values.iter().map(|value| with(key, value)).collect();
         let sweep = Sweep { scenes: tables("data", scenes), methods: tables("preset", presets), ..Sweep::default() };
         Self::new(sweep, set, Path::new(""), out, &|path| if path.starts_with("scenes") { "--scene".into() } else { "--preset".into() })
     }
@@ -106,17 +121,29 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Checks that no column with published results is empty.
+    /// Checks that no published results are empty. Results for scenes that are not in the sweep are allowed.
     fn check_published(&self, place: &dyn Fn(&str) -> String) -> Result<()> {
         for (index, published) in self.published.iter().enumerate() {
-            let mut named = [&published.psnr, &published.ssim, &published.seconds].into_iter().flat_map(|figures| figures.keys());
-            if !named.any(|scene| self.scenes.contains(scene)) {
-                let found = format!("`{}` has no results for the scenes of this sweep", published.name);
+            if published.scenes().is_empty() {
+                let found = format!("`{}` has no results", published.name);
                 let remedy = format!("add some, such as psnr = {{ {} = 30.0 }}", self.scenes.join(" = 30.0, "));
                 return Err(Error::usage(place(&format!("published[{index}]")), found, remedy));
             }
         }
         Ok(())
+    }
+}
+
+/// Returns a table with one key.
+fn with(key: &str, value: &str) -> Table {
+    Table::from_iter([(key.to_owned(), value.into())])
+}
+
+/// Makes a folder of the command line absolute, because folders of a sweep file are relative to that file. The built-in scene is unchanged.
+fn from_here(data: &str) -> String {
+    match std::path::absolute(data) {
+        Ok(path) if data != BUILT_IN => path.to_string_lossy().into_owned(),
+        _ => data.to_owned(),
     }
 }
 
@@ -195,7 +222,7 @@ fn job(
     let set =
         |assignments: &[String]| assignments.iter().map(|a| Flag { key: "set".to_owned(), text: format!("--set={a}") }).collect::<Vec<_>>();
     let mut all = set(first);
-    for (entry, own) in [(scene, &["name", "data", "methods"][..]), (method, &["name", "command"])] {
+    for (entry, own) in [(scene, &["name", "data", "methods"][..]), (method, &["name", "command", EVALUATE_DOWNSCALE])] {
         let known =
             || own.iter().map(|key| (*key).to_owned()).chain(COMMANDS.iter().flat_map(|command| flags::keys(command))).collect::<Vec<_>>();
         flags::check_keys(&entry.table, &known(), &|key| place(&format!("{}.{key}", entry.path)))?;
@@ -210,10 +237,26 @@ fn job(
         Some(value) if !value.is_str() => return Err(Error::config(place(&format!("{}.data", scene.path)), value, "a folder in quotes")),
         _ => folder_of(&scene.table).map(|data| base.join(data)),
     };
-    let call = Call { command, flags: all, data };
+    let mut call = Call { command, flags: all, data };
     let asked = asked(&call, &format!("{}, `{}` with `{}`", place(&method.path), scene.name, method.name))?;
+    let evaluate_downscale = match method.table.get(EVALUATE_DOWNSCALE) {
+        None => None,
+        Some(value) => {
+            Some(reduction(value, &place(&format!("{}.{EVALUATE_DOWNSCALE}", method.path)))?).filter(|k| *k != asked.config.downscale)
+        }
+    };
+    // The evaluation at another image size follows the training.
+    let skips = evaluate_downscale.is_some() && command == COMMANDS[0] && !call.flags.iter().any(|flag| flag.key == "no_evaluate");
+    call.flags.extend(skips.then(|| Flag { key: "no_evaluate".to_owned(), text: "--no-evaluate".to_owned() }));
     let folder = out.join(&scene.name).join(&method.name);
-    Ok(Job { scene: scene.name.clone(), method: method.name.clone(), folder, call, asked })
+    Ok(Job { scene: scene.name.clone(), method: method.name.clone(), folder, call, asked, evaluate_downscale })
+}
+
+/// Parses a downscale factor.
+fn reduction(value: &Value, place: &str) -> Result<usize> {
+    let number = value.as_integer().and_then(|number| u64::try_from(number).ok()).filter(|number| (1..=MOST_REDUCTION).contains(number));
+    let number = number.ok_or_else(|| Error::config(place, value, format!("a whole number from 1 to {MOST_REDUCTION}")))?;
+    Ok(number as usize)
 }
 
 /// Parses the command line of a run, and resolves its settings.

@@ -97,12 +97,23 @@ impl Figures {
 }
 
 impl Scores {
-    /// The mean of each figure; `None` if one of the values is missing.
-    pub fn mean(all: impl Iterator<Item = Scores> + Clone) -> Scores {
-        let mean = |figure: fn(Scores) -> Option<f64>| {
+    /// A statistic of each figure; `None` if one of the values is missing.
+    pub fn over(all: impl Iterator<Item = Scores> + Clone, of: fn(&[f64]) -> f64) -> Scores {
+        let statistic = |figure: fn(Scores) -> Option<f64>| {
             let values: Vec<f64> = all.clone().map(figure).collect::<Option<_>>()?;
-            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+            (!values.is_empty()).then(|| of(&values))
         };
-        Scores { psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim), seconds: mean(|s| s.seconds) }
+        Scores { psnr: statistic(|s| s.psnr), ssim: statistic(|s| s.ssim), seconds: statistic(|s| s.seconds) }
     }
+}
+
+/// The mean of the values.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// The standard deviation of the values, with their number as the divisor, as in the source paper and in numpy.
+pub fn deviation(values: &[f64]) -> f64 {
+    let mean = mean(values);
+    (values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / values.len() as f64).sqrt()
 }

@@ -2,22 +2,31 @@
 
 use super::thumbnail::{self, Thumbnails};
 use super::{Cell, Row, RunTable, Scores, beside, decibels};
-use crate::html::{escaped, page, picture};
+use crate::html::{enlarged, escaped, page, picture};
+use plenoxel::dataset::image::RgbaImage;
 
-/// Largest size of a picture in pixels.
-const LARGEST: [u32; 2] = [200, 200];
+/// Largest size of a picture in pixels, in a table of many columns.
+const SMALL: u32 = 200;
+/// Largest size of a picture in pixels, in a table of few columns.
+const LARGE: u32 = 300;
+/// Largest number of few columns.
+const FEW: usize = 4;
 
 const STYLE: &str = "\
+body { max-width: none; margin: 2rem; }
+ul { max-width: 80rem; }
 td { vertical-align: bottom; }
-td img, th img { width: 200px; height: 200px; object-fit: contain; object-position: left bottom; margin-bottom: .4rem; }
 .psnr { font-size: 1.5rem; line-height: 1.2; font-variant-numeric: tabular-nums; }
 .best { font-weight: 700; color: light-dark(#06603a, #7fdca9); }
+.published { min-width: 8rem; }
 .published, .published .psnr { font-style: italic; }
 .failed { color: light-dark(#a01818, #ff9a8f); max-width: 200px; overflow-wrap: anywhere; }
 tr.mean > * { border-top: 2px solid #888; }
 ";
 
 pub fn text(table: &RunTable) -> String {
+    let side = if table.methods.len() + table.published.len() > FEW { SMALL } else { LARGE };
+    let show = |of: &RgbaImage, what: &str| picture(&enlarged(of, side), [side; 2], what);
     let mut body = "<div class=\"scroll\"><table>\n<tr><th>scene</th>".to_owned();
     table.methods.iter().for_each(|method| body += &format!("<th>{}</th>", escaped(method)));
     for published in &table.published {
@@ -28,12 +37,12 @@ pub fn text(table: &RunTable) -> String {
     for row in &table.rows {
         let pictures: Vec<Thumbnails> = row.cells.iter().map(|cell| cell.measured().map(thumbnail::of).unwrap_or_default()).collect();
         let target = pictures.iter().find_map(|pictures| pictures.target.as_ref());
-        let target = target.map_or(String::new(), |of| picture(of, LARGEST, &format!("photograph of {}", row.scene)));
+        let target = target.map_or(String::new(), |of| show(of, &format!("photograph of {}", row.scene)));
         body += &format!("<tr><th>{target}{}</th>", escaped(&row.scene));
         let best = highest(row.cells.iter().map(Cell::scores)).filter(|_| row.is_comparable());
         for ((method, cell), pictures) in table.methods.iter().zip(&row.cells).zip(&pictures) {
             let render = pictures.render.as_ref();
-            let render = render.map_or(String::new(), |of| picture(of, LARGEST, &format!("{} by {method}", row.scene)));
+            let render = render.map_or(String::new(), |of| show(of, &format!("{} by {method}", row.scene)));
             body += &match cell {
                 Cell::Failed(failure) => format!(
                     "<td class=\"failed\">failed with exit code {}<div class=\"small\">{}</div></td>",
@@ -48,20 +57,25 @@ pub fn text(table: &RunTable) -> String {
         }
         body += "</tr>\n";
     }
-    if table.rows.len() > 1 {
-        body += "<tr class=\"mean\"><th>mean</th>";
-        let means: Vec<Scores> = (0..table.methods.len()).map(|method| table.mean(method)).collect();
-        let best = highest(means.iter().copied()).filter(|_| table.rows.iter().all(Row::is_comparable));
-        means.iter().for_each(|mean| body += &format!("<td>{}</td>", scores(mean, best)));
-        for published in &table.published {
-            body += &format!("<td class=\"published\">{}</td>", scores(&table.published_mean(published), None));
-        }
+    for (name, measured, published) in table.summaries() {
+        let is_mean = name == super::MEAN;
+        body += &format!("<tr class=\"{}\"><th>{name}</th>", if is_mean { "mean" } else { "deviation" });
+        let best = highest(measured.iter().copied()).filter(|_| is_mean && table.rows.iter().all(Row::is_comparable));
+        measured.iter().for_each(|figures| body += &format!("<td>{}</td>", scores(figures, best)));
+        published.iter().for_each(|figures| body += &format!("<td class=\"published\">{}</td>", scores(figures, None)));
         body += "</tr>\n";
     }
+    let has_pictures = body.contains("<img ");
     body += "</table></div>\n<ul class=\"small\">\n";
+    if has_pictures {
+        body += "<li>Pictures: the photograph of the first test view, and its rendering by each method.</li>\n";
+    }
     table.notes().iter().for_each(|note| body += &format!("<li>{}</li>\n", escaped(note)));
     body += "</ul>\n";
-    page(&table.title, STYLE, &body)
+    let images = format!(
+        "td img, th img {{ width: {side}px; height: {side}px; max-width: none; object-fit: contain; object-position: left bottom; margin-bottom: .4rem; }}\n"
+    );
+    page(&table.title, &(images + STYLE), &body)
 }
 
 /// The highest PSNR, if there are several.

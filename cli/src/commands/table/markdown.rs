@@ -14,10 +14,8 @@ pub fn text(table: &RunTable) -> String {
         let published = table.published.iter().map(|p| scores(&p.scores(&row.scene)));
         text += &line([as_text(&row.scene)].into_iter().chain(measured).chain(published));
     }
-    if table.rows.len() > 1 {
-        let measured = (0..table.methods.len()).map(|method| scores(&table.mean(method)));
-        let published = table.published.iter().map(|p| scores(&table.published_mean(p)));
-        text += &line(["mean".to_owned()].into_iter().chain(measured).chain(published));
+    for (name, measured, published) in table.summaries() {
+        text += &line([name.to_owned()].into_iter().chain(measured.iter().chain(&published).map(scores)));
     }
     text += "\n";
     table.notes().iter().for_each(|note| text += &format!("- {}\n", as_text(note)));

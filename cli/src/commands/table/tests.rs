@@ -33,6 +33,13 @@ fn table() -> RunTable {
             ssim: BTreeMap::new(),
             seconds: BTreeMap::new(),
         }],
+        elsewhere: vec![Published {
+            name: "Third".to_owned(),
+            source: "a paper".to_owned(),
+            psnr: [("mic".to_owned(), 20.0)].into(),
+            ssim: BTreeMap::new(),
+            seconds: [("chair".to_owned(), 2.0)].into(),
+        }],
     }
 }
 
@@ -47,6 +54,7 @@ fn markdown_has_a_cell_for_each_run_and_means_of_whole_columns_only() {
 | lego | **30.00** · 0.800 · 34 s | **25.00** · 0.750 · 3.2 s | **34.10** · – · – |
 | ship | **20.50** · 0.705 · 100 s | failed (4) | – |
 | mean | **25.25** · 0.752 · 67 s | – | – |
+| standard deviation | **4.75** · 0.048 · 33 s | – | – |
 
 ";
     let (table, notes) = text.split_at(expected.len());
@@ -60,6 +68,7 @@ fn markdown_has_a_cell_for_each_run_and_means_of_whole_columns_only() {
     assert!(notes.contains("- ship: 3 views of 100 × 100 over white.\n"), "{notes}");
     assert!(notes.contains("- ship, slow: failed with exit code 4: loss is \\<NaN\\> \\| \"here\"\n"), "{notes}");
     assert!(notes.contains("- Others: published, not measured here: their table\n"), "{notes}");
+    assert!(notes.contains("- Third: published for other scenes (chair, mic), not shown: a paper\n"), "{notes}");
 }
 
 #[test]
@@ -72,7 +81,15 @@ fn what_others_wrote_is_no_markup_in_the_table() {
     assert!(text.contains("| \\<script\\>alert(1)\\</script\\> | **30.00**") && !text.contains("<script>"), "{text}");
     assert!(text.contains(r"| a_b \*c\* \[d\](e) \_f\_ \&lt; x\\u{1b}\[2J \| y | **20.50**"), "{text}");
     assert!(text.starts_with("# Two & two\n\n| scene | \\`m\\` | slow |"), "{text}");
-    assert_eq!(text.lines().filter(|line| line.starts_with('|')).count(), 5, "{text}");
+    assert_eq!(text.lines().filter(|line| line.starts_with('|')).count(), 6, "{text}");
+}
+
+#[test]
+fn one_scene_has_no_mean_and_no_deviation() {
+    let mut table = table();
+    table.rows.truncate(1);
+    let text = markdown::text(&table) + &html::text(&table);
+    assert!(!text.contains("| mean |") && !text.contains("<th>standard deviation</th>"), "{text}");
 }
 
 #[test]
@@ -93,6 +110,14 @@ fn the_page_stands_by_itself_and_praises_only_what_can_be_compared() {
     let text = html::text(&table());
     assert!(text.contains("<title>Two &amp; two</title>") && text.contains("loss is &lt;NaN&gt; | &quot;here&quot;"), "{text}");
     assert!(text.contains(">30.00<") && text.contains("published, not measured here"), "{text}");
+    assert!(text.contains("<th>standard deviation</th><td><div class=\"psnr\">4.75<"), "{text}");
+    // Pictures are smaller in a table of many columns. This table has no pictures.
+    let mut wide = table();
+    wide.methods.extend(["other".to_owned(), "another".to_owned()]);
+    assert!(
+        text.contains("img { width: 300px;") && html::text(&wide).contains("img { width: 200px;") && !text.contains("Pictures:"),
+        "{text}"
+    );
     // The runs of lego were evaluated at different sizes.
     assert!(!text.contains("psnr best") && !text.contains("http") && !text.contains("src=\"images"), "{text}");
     let mut equal = table();

@@ -8,7 +8,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::settings::{self, Layers, PRESETS};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use toml::Value;
 
 const EXAMPLES: &str = "\
@@ -130,13 +130,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "LENGTH", help_heading = "Scene", value_parser = number(f64::NEG_INFINITY), allow_negative_numbers = true)]
     half_width: Option<f64>,
 
-    /// Image size of the built-in scene in pixels, SIDE or WIDTHxHEIGHT [default: 200]
-    #[arg(long, value_name = "SIZE", help_heading = "Scene", value_parser = size, conflicts_with = "data", allow_hyphen_values = true)]
-    scene_size: Option<(usize, usize)>,
-
-    /// Numbers of training, validation and test views of the built-in scene [default: 100,10,25]
-    #[arg(long, value_name = "TRAIN,VAL,TEST", help_heading = "Scene", value_parser = three_counts, conflicts_with = "data", allow_hyphen_values = true)]
-    scene_views: Option<[usize; 3]>,
+    #[command(flatten)]
+    built_in: BuiltInScene,
 
     /// Interpolation between voxel centers [default: trilinear; preset paper: nearest]
     #[arg(long, help_heading = "Model", value_parser = ["nearest", "trilinear"])]
@@ -151,7 +146,7 @@ pub struct TrainArgs {
     sh_degree: Option<i64>,
 
     /// Store view-dependent color (harmonics of degree 1 and higher) on an N times coarser grid, which saves memory and time
-    /// [default: 4; presets quality: 3, demo, plenoxels and paper: 1]
+    /// [default: 4; presets quality: 3, demo, plenoxels, paper and tensorf: 1]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64), allow_negative_numbers = true)]
     sh_reduction: Option<i64>,
 
@@ -176,17 +171,36 @@ pub struct TrainArgs {
     tv: Option<f64>,
 }
 
-impl TrainArgs {
-    /// Source of the views.
-    pub fn source(&self) -> DataSource {
-        if let Some(path) = &self.data {
-            return DataSource::folder(path);
+/// Size and views of the built-in scene, for a command with an optional argument `data`.
+#[derive(Debug, Args)]
+pub struct BuiltInScene {
+    /// Image size of the built-in scene in pixels, SIDE or WIDTHxHEIGHT [default: 200]
+    #[arg(long, value_name = "SIZE", help_heading = "Scene", value_parser = size, conflicts_with = "data", allow_hyphen_values = true)]
+    scene_size: Option<(usize, usize)>,
+
+    /// Numbers of training, validation and test views of the built-in scene [default: 100,10,25]
+    #[arg(long, value_name = "TRAIN,VAL,TEST", help_heading = "Scene", value_parser = three_counts, conflicts_with = "data", allow_hyphen_values = true)]
+    scene_views: Option<[usize; 3]>,
+}
+
+impl BuiltInScene {
+    /// Source of the views: a folder, or the built-in scene.
+    pub fn source_or(&self, folder: Option<&Path>) -> DataSource {
+        if let Some(folder) = folder {
+            return DataSource::folder(folder);
         }
         let default = ProceduralOptions::default();
         let (width, height) = self.scene_size.unwrap_or((default.width, default.height));
         let views = [default.train, default.val, default.test];
         let [train, val, test] = self.scene_views.unwrap_or(views);
         DataSource::built_in(&ProceduralOptions { width, height, train, val, test, ..default })
+    }
+}
+
+impl TrainArgs {
+    /// Source of the views.
+    pub fn source(&self) -> DataSource {
+        self.built_in.source_or(self.data.as_deref())
     }
 
     /// True if the grids of earlier stages are evaluated as well.

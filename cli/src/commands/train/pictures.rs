@@ -1,19 +1,16 @@
 //! The pictures of a run: one view before the first step and at the end of each stage, and panels of test views.
 
-use crate::images::{self, DepthRange, Rgb};
+use crate::commands::panels::Panels;
+use crate::images::{self, Rgb};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::{Split, View, image};
 use plenoxel::error::Result;
 use plenoxel::render::picture::Picture;
-use plenoxel::run::evenly_spaced;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::metrics::History;
 use plenoxel::run::training::Underway;
 use plenoxel::train::PlannedStage;
 use std::path::PathBuf;
-
-/// Largest number of panels of test views.
-const MOST_PANELS: usize = 25;
 
 /// The pictures of a run.
 pub struct Pictures {
@@ -22,9 +19,8 @@ pub struct Pictures {
     /// Camera of the pictures of stages: that of the first test view, or of the first training view if there are no test views. Training does not read the
     /// photograph of a test view.
     camera: Option<Camera>,
-    /// Indices of the test views with a panel.
-    panels: Vec<usize>,
-    views: usize,
+    /// Panels of test views.
+    pub panels: Panels,
     /// Pictures of the view before the first step and after each stage.
     stages: Vec<Rgb>,
 }
@@ -40,8 +36,7 @@ impl Pictures {
             folder: run.folder.clone(),
             background: run.config.background,
             camera: first(Split::Test).or(first(Split::Train)).filter(|_| wanted),
-            panels: if wanted { evenly_spaced(views, MOST_PANELS) } else { Vec::new() },
-            views,
+            panels: Panels::new(run.folder, views, wanted),
             stages: Vec::new(),
         })
     }
@@ -85,15 +80,6 @@ impl Pictures {
         self.folder.image(&RunFolder::stage_name(number, stage.resolution))
     }
 
-    /// Writes the panel of a test view that was rendered with the final model. `half_width` is that of its box.
-    pub fn panel(&self, number: usize, view: &View, target: &Rgb, picture: &Picture, half_width: f64) -> Result<()> {
-        if !self.panels.contains(&number) {
-            return Ok(());
-        }
-        let range = DepthRange::of(&view.camera, half_width);
-        images::write(&self.folder.image(&RunFolder::panel_name(number, &view.name)), &images::panel(target, picture, range))
-    }
-
     /// Writes the strip of the pictures before the first step and of all stages, followed by the photograph.
     pub fn strip(&self, first_test: Option<&View>, background: [f32; 3]) -> Result<()> {
         if self.stages.is_empty() {
@@ -102,12 +88,5 @@ impl Pictures {
         let target = first_test.map(|view| view.composite(background));
         let all: Vec<&Rgb> = self.stages.iter().chain(&target).collect();
         images::write(&self.folder.image("stages.png"), &images::strip(&all))
-    }
-
-    /// A note about views without a picture.
-    pub fn note(&self) -> Option<String> {
-        let shown = self.panels.len();
-        (shown > 0 && shown < self.views)
-            .then(|| format!("wrote panels of {shown} of the {} test views, evenly spaced; the results are of all test views", self.views))
     }
 }

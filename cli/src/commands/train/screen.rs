@@ -117,14 +117,14 @@ impl<'c, 'a> Screen<'c, 'a> {
             }
             Event::Compared { number, view, target, picture, half_width } => {
                 if let Some(pictures) = &self.pictures {
-                    console.drawn(pictures.panel(number, view, target, picture, half_width));
+                    console.drawn(pictures.panels.draw(number, view, target, picture, half_width));
                 }
             }
             Event::Evaluated { summary, run } => {
                 self.count = None;
                 let pictures = self.pictures.as_ref();
                 pictures.map(|pictures| console.drawn(pictures.strip(run.test.first(), run.config.background)));
-                let note = pictures.and_then(Pictures::note);
+                let note = pictures.and_then(|pictures| pictures.panels.note());
                 let said = say(console, summary, note.as_deref());
                 let reported = said.and_then(|()| if self.reports { self.report(run) } else { Ok(()) });
                 self.failure = std::mem::replace(&mut self.failure, Ok(())).and(reported);

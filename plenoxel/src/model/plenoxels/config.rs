@@ -6,10 +6,10 @@ use super::objective::{LEARNED_LOSSES, LOSSES};
 use crate::camera::Camera;
 use crate::carve::{CarveConfig, CarveOptions};
 use crate::error::{Error, Result};
-use crate::loss;
 use crate::field::sh;
-use crate::model::tensorf;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::loss;
+use crate::model::tensorf;
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
 use crate::train::TrainOptions;
@@ -618,7 +618,9 @@ impl Config {
     fn validate_factored(&self, tensorf: &tensorf::Config) -> Result<()> {
         tensorf.validate().map_err(|e| e.with_key(|key| format!("tensorf.{key}")))?;
         let of_grid = |set: bool, key: &str| match set {
-            true => Err(Error::usage(key, "this setting of a voxel grid has no effect on a factored field", "remove it, or remove `tensorf`")),
+            true => {
+                Err(Error::usage(key, "this setting of a voxel grid has no effect on a factored field", "remove it, or remove `tensorf`"))
+            }
             false => Ok(()),
         };
         of_grid(!self.stages.is_empty(), "stages")?;

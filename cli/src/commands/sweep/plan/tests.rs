@@ -1,4 +1,5 @@
 use super::*;
+use crate::commands::table::figures;
 use std::ffi::OsString;
 use std::path::PathBuf;
 
@@ -6,7 +7,7 @@ use std::path::PathBuf;
 fn read(name: &str, text: &str) -> Result<Plan> {
     let path = std::env::temp_dir().join(format!("plenoxel-sweep-{}-{name}.toml", std::process::id()));
     std::fs::write(&path, text).unwrap();
-    let plan = Plan::from_file(&path, &["seed=5".to_owned()], Path::new("out"));
+    let plan = Plan::from_file(&path, &[], &["seed=5".to_owned()], Path::new("out"));
     std::fs::remove_file(path).unwrap();
     plan
 }
@@ -84,7 +85,7 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
         ("key", &format!("{good}set = [\"half_widht=1\"]"), 2, &["line 2", "--set half_widht: unknown key", "`half_width`"]),
         ("range", &format!("{good}set = [\"half_width=-1\"]"), 2, &["`procedural` with `fast`: --set half_width: invalid value -1"]),
         ("table", &format!("{good}downscale = {{ x = 1 }}"), 2, &["line 4", "invalid value { x = 1 }; expected a value of --downscale"]),
-        ("flag", "[[scenes]]\nscene_size = 32\n[[methods]]\ncommand = \"carve\"", 2, &["line 2", "which is of `carve`", "`scene_size`"]),
+        ("flag", "[[scenes]]\ntime = \"9s\"\n[[methods]]\ncommand = \"carve\"", 2, &["line 2", "which is of `carve`", "`time`"]),
         ("both", "[[scenes]]\ndata = \"a\"\nscene_size = 32\n[[methods]]", 2, &["--scene-size <SIZE> conflicts with [DATA]"]),
         ("data", "[[scenes]]\ndata = 3\n[[methods]]", 2, &["line 2", "invalid value 3", "a folder in quotes"]),
         ("command", "[[scenes]]\n[[methods]]\ncommand = \"render\"", 2, &["line 3", "\"train\" or \"carve\""]),
@@ -93,10 +94,11 @@ fn mistakes_are_named_with_their_place_and_what_would_do() {
         ("chosen", "[[scenes]]\nmethods = [\"fat\"]\n[[methods]]\npreset = \"fast\"", 2, &["line 2", "unknown method `fat`", "`fast`"]),
         (
             "published",
-            &format!("{good}[[published]]\nname = \"x\"\nsource = \"y\"\npsnr = {{ lego = 1 }}"),
+            &format!("{good}[[published]]\nname = \"x\"\nsource = \"y\"\npsnr = {{ }}"),
             2,
-            &["line 4", "psnr = { procedural"],
+            &["line 4", "`x` has no results", "psnr = { procedural"],
         ),
+        ("reduction", &format!("{good}evaluate_downscale = 0"), 2, &["line 4", "invalid value 0", "a whole number from 1 to 64"]),
         ("source", &format!("{good}[[published]]\nname = \"x\""), 3, &["line 4", "the key `source` is missing"]),
         ("figure", &format!("{good}[[published]]\npsn = 1"), 2, &["line 5", "unknown key `psn`", "`psnr`"]),
     ] {
@@ -140,4 +142,71 @@ fn the_example_of_the_help_is_a_plan() {
     let plan = read("example", &text.join("\n")).unwrap();
     assert_eq!(plan.methods, ["fast", "paper-tv", "hull"]);
     assert_eq!(plan.jobs.len(), 4);
+    assert_eq!((plan.jobs[2].asked.config.downscale, plan.jobs[2].evaluate_downscale), (4, Some(8)));
+}
+
+#[test]
+fn a_run_may_be_compared_at_another_size_than_it_was_made_at() {
+    let plan = read(
+        "size",
+        "[[scenes]]\n[[methods]]\npreset = \"fast\"\ndownscale = 2\nevaluate_downscale = 1\n\
+         [[methods]]\nname = \"hull\"\ncommand = \"carve\"\ndownscale = 4\nevaluate_downscale = 4\n\
+         [[methods]]\nname = \"other\"\ncommand = \"carve\"\nevaluate_downscale = 8",
+    )
+    .unwrap();
+    let found: Vec<_> = plan.jobs.iter().map(|job| (job.asked.config.downscale, job.evaluate_downscale)).collect();
+    assert_eq!(found, [(2, Some(1)), (4, None), (1, Some(8))]);
+    // Training skips the evaluation, which a second command makes.
+    let leaves = |job: &Job| job.call.flags.iter().any(|flag| flag.text == "--no-evaluate");
+    assert_eq!(plan.jobs.iter().map(leaves).collect::<Vec<_>>(), [true, false, false]);
+    assert_eq!(plan.jobs[2].evaluation()[2..], ["--json", "--downscale=8", "--keep"]);
+    assert_eq!(plan.jobs[1].evaluation().len(), 3);
+}
+
+/// Plans a sweep of `benches`; `scenes`, if not empty, replace those of its file.
+fn shipped(name: &str, scenes: &[&str]) -> Result<Plan> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../benches").join(name);
+    let scenes: Vec<String> = scenes.iter().map(|scene| (*scene).to_owned()).collect();
+    Plan::from_file(&path, &scenes, &[], Path::new("out"))
+}
+
+#[test]
+fn other_scenes_take_the_place_of_those_of_a_file() {
+    let plan = shipped("table1.toml", &["data/lego", "procedural"]).unwrap();
+    assert_eq!((plan.scenes, plan.jobs.len()), (vec!["lego".to_owned(), "procedural".to_owned()], 8));
+    // A folder is relative to the current directory, and a scene of the file keeps its keys.
+    let here = std::env::current_dir().unwrap();
+    assert_eq!(plan.jobs[0].call.data, Some(here.join("data/lego")));
+    assert!(plan.jobs[4].asked.source.to_string().starts_with("built in, 800 x 800"), "{}", plan.jobs[4].asked.source);
+    // `procedural` is the built-in scene, although the file does not have it.
+    let plan = shipped("ablation.toml", &["procedural"]).unwrap();
+    assert_eq!((plan.jobs.len(), &plan.jobs[0].call.data), (4, &None));
+    let twice = shipped("table1.toml", &["a/lego", "b/lego"]).unwrap_err().to_string();
+    assert!(twice.starts_with("--scene: ") && twice.contains("`lego`"), "{twice}");
+}
+
+#[test]
+fn the_sweeps_that_are_shipped_are_plans() {
+    assert_eq!(shipped("ablation.toml", &[]).unwrap().methods.len(), 4);
+    // The images have 800 x 800 pixels. Carving uses 200 x 200; training and evaluation use 100 x 100.
+    let sizes = |plan: &Plan| plan.jobs.iter().map(|job| (job.asked.config.downscale, job.evaluate_downscale)).collect::<Vec<_>>();
+    let (trained, carved) = ((8, None), (4, Some(8)));
+    let table = shipped("table1.toml", &[]).unwrap();
+    assert_eq!(
+        (table.methods.join(" "), sizes(&table)),
+        ("plain-tv plain carve-color carve-sh".to_owned(), vec![trained, trained, carved, carved])
+    );
+    let figure = shipped("figure8.toml", &[]).unwrap();
+    assert_eq!((figure.methods.join(" "), sizes(&figure)), ("grid carved carved-sh".to_owned(), vec![trained, carved, carved]));
+    for job in table.jobs.iter().chain(&figure.jobs) {
+        assert!(job.asked.source.to_string().starts_with("built in, 800 x 800"), "{}", job.asked.source);
+    }
+    // The published figures have the published means and deviations.
+    let summaries = [(22.10, 1.41), (22.10, 1.41), (21.28, 1.65), (22.90, 2.24)];
+    assert_eq!(table.published.len(), summaries.len());
+    for (published, (mean, deviation)) in table.published.iter().zip(summaries) {
+        let psnr: Vec<f64> = published.psnr.values().copied().collect();
+        let found = (figures::mean(&psnr), figures::deviation(&psnr));
+        assert!(psnr.len() == 8 && (found.0 - mean).abs() < 0.006 && (found.1 - deviation).abs() < 0.016, "{}: {found:?}", published.name);
+    }
 }

@@ -1,9 +1,9 @@
 //! Cotangents of the parameters from cotangents of pixels.
 
+use super::super::PLANE_OF;
 use super::forward::{Block, NONE, Tables};
 use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, RUN, add_to_lines, first_rows};
 use super::network::NetworkCotangents;
-use super::super::PLANE_OF;
 use super::{Output, State};
 use crate::render::along::{COLUMNS, sparsity_slope};
 use autograd::rows::{Buckets, buckets_of};
@@ -141,7 +141,8 @@ pub fn cotangents<T: Real>(state: &Arc<State<T>>, tables: &[Tensor<T>], cotangen
     }
     dense.extend((PLANES_AND_LINES..).zip(sums));
     let parts = Arc::new(own);
-    let planes = [(0, true), (6, false)].into_iter().flat_map(|(first, of_density)| (0..3).map(move |axis| (first + axis, axis, of_density)));
+    let planes =
+        [(0, true), (6, false)].into_iter().flat_map(|(first, of_density)| (0..3).map(move |axis| (first + axis, axis, of_density)));
     let planes = planes.map(|(input, axis, of_density)| {
         let line = tables[input + 3].clone();
         let sums = PlaneSums { state: state.clone(), parts: parts.clone(), line, axis, of_density };
@@ -198,10 +199,8 @@ fn part<T: Real>(
     density.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
     let (products, network): (Buffer<T>, NetworkCotangents<T>) = tables.network.adjoint(&block.activations, rgb);
     let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
-    let lines = [
-        lines(tables.density, block.at(), OfProducts::Shared(&density)),
-        lines(tables.appearance, shaded_at, OfProducts::Each(&products)),
-    ];
+    let lines =
+        [lines(tables.density, block.at(), OfProducts::Shared(&density)), lines(tables.appearance, shaded_at, OfProducts::Each(&products))];
     let shift = |axis: usize, pairs: Pairs<'_, T>| bucket_shift(axis, batch.nodes, pairs.width);
     let live = |i: usize| density[i] != T::zero();
     let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, block.at(), batch.nodes, shift(axis, tables.density), live));

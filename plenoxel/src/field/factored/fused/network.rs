@@ -72,7 +72,11 @@ impl<'a, T: Real> Network<'a, T> {
                 inputs.push(out);
             } else {
                 add_bias::<T, false>(&mut out, layer.bias);
-                if parallel::fused() { sigmoid::<T, true>(&mut out) } else { sigmoid::<T, false>(&mut out) }
+                if parallel::fused() {
+                    sigmoid::<T, true>(&mut out)
+                } else {
+                    sigmoid::<T, false>(&mut out)
+                }
                 rgb = out;
             }
         }
