@@ -29,6 +29,7 @@ mod graph;
 mod index;
 pub mod lattice;
 pub mod nn;
+mod matrix;
 mod op;
 pub mod ops;
 pub mod optim;
@@ -51,8 +52,8 @@ pub use index::Indices;
 pub use lattice::Lattice;
 #[doc(hidden)]
 pub use multiversion; // `dispatched!` expands to this path in other crates.
+pub use matrix::{Matrix, multiply};
 pub use op::{Cotangent, GradSink, Keep, Kernel, KernelCall, Op, Vjp};
-pub use ops::linalg::{Matrix, multiply};
 pub use ops::lookup::add_rows;
 pub use param::{Bounds, Module, Param};
 pub use pool::{Buffer, Pooled, release_free_buffers};

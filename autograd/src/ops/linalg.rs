@@ -1,9 +1,8 @@
-//! The batched matrix product, computed by the `gemm` crate.
+//! The batched matrix product.
 //!
-//! The crate takes pointers, which requires one unsafe call, in `multiply`. The tests compare it with a safe triple loop. This module distributes the
-//! work over threads itself, in blocks of a fixed size, so the bits do not depend on the number of threads.
-#![allow(unsafe_code)]
+//! This module distributes the work over threads in blocks of a fixed size, so the bits do not depend on the number of threads.
 
+use crate::matrix::{Matrix, multiply};
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::parallel;
 use crate::pool::Buffer;
@@ -86,95 +85,6 @@ fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b
     let mut shape = batch.to_vec();
     shape.extend([m, n]);
     Tensor::from_op(out, &shape, &[a, b], Matmul { transpose_a, transpose_b })
-}
-
-/// A view of a matrix in a slice.
-#[derive(Clone, Copy, Debug)]
-pub struct Matrix<'a, T> {
-    /// Entry (r, c) is at index r · `row` + c · `col`.
-    data: &'a [T],
-    rows: usize,
-    cols: usize,
-    row: usize,
-    col: usize,
-}
-
-impl<'a, T> Matrix<'a, T> {
-    /// Returns a view of a `rows` × `cols` matrix that is stored in row-major order.
-    ///
-    /// Panics if the slice has another length.
-    #[track_caller]
-    pub fn new(data: &'a [T], rows: usize, cols: usize) -> Self {
-        Self::stored(data, rows, cols, false)
-    }
-
-    /// Returns a view of a `rows` × `cols` matrix whose transpose is stored in row-major order.
-    ///
-    /// Panics if the slice has another length.
-    #[track_caller]
-    pub fn transposed(data: &'a [T], rows: usize, cols: usize) -> Self {
-        Self::stored(data, rows, cols, true)
-    }
-
-    #[track_caller]
-    fn stored(data: &'a [T], rows: usize, cols: usize, transposed: bool) -> Self {
-        assert_eq!(data.len(), rows * cols, "matmul: a matrix of {rows} × {cols}");
-        let (row, col) = if transposed { (1, rows) } else { (cols, 1) };
-        Matrix { data, rows, cols, row, col }
-    }
-
-    fn rows(self, range: std::ops::Range<usize>) -> Self {
-        assert!(range.end <= self.rows);
-        Matrix { data: &self.data[(range.start * self.row).min(self.data.len())..], rows: range.len(), ..self }
-    }
-
-    fn cols(self, range: std::ops::Range<usize>) -> Self {
-        assert!(range.end <= self.cols);
-        Matrix { data: &self.data[(range.start * self.col).min(self.data.len())..], cols: range.len(), ..self }
-    }
-
-    /// Returns the index of the last entry plus one, or 0 for an empty matrix.
-    fn reach(&self) -> usize {
-        if self.rows == 0 || self.cols == 0 { 0 } else { (self.rows - 1) * self.row + (self.cols - 1) * self.col + 1 }
-    }
-}
-
-/// Computes out = a · b on this thread, for kernels. `out` is in row-major order.
-///
-/// Panics if the sizes do not fit.
-#[track_caller]
-pub fn multiply<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
-    let (m, k, n) = (a.rows, a.cols, b.cols);
-    assert!(b.rows == k && out.len() == m * n && a.reach() <= a.data.len() && b.reach() <= b.data.len());
-    if m == 0 || n == 0 || k == 0 {
-        out.fill(T::zero());
-        return;
-    }
-    // SAFETY: the assertion ensures that every entry that the call reads or writes, at the given strides, lies inside the three slices. `out` is borrowed
-    // uniquely, and `T` is f32 or f64, which the library supports.
-    unsafe {
-        gemm::gemm(
-            m,
-            n,
-            k,
-            out.as_mut_ptr(),
-            1,
-            n as isize,
-            false,
-            a.data.as_ptr(),
-            a.col as isize,
-            a.row as isize,
-            b.data.as_ptr(),
-            b.col as isize,
-            b.row as isize,
-            T::zero(),
-            T::one(),
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
-        );
-    }
 }
 
 /// Computes out = a · b in parallel, in blocks of a fixed size. The blocks are rows of the result or, if the inner dimension is much longer than the
