@@ -12,7 +12,7 @@ fn plenoxel(args: &[&str]) -> Answer {
     command::plenoxel(&[args, &["--max-memory", "400MB", "--quiet"]].concat())
 }
 
-const PRESETS: [&str; 6] = ["fast", "quality", "plenoxels", "paper", "demo", "carve"];
+const PRESETS: [&str; 7] = ["fast", "quality", "tensorf", "plenoxels", "paper", "demo", "carve"];
 
 /// Assignments that keep all that a preset does and make it small: grids, steps and rays.
 fn shortened(preset: &str) -> Vec<String> {
@@ -28,6 +28,9 @@ fn shortened(preset: &str) -> Vec<String> {
     };
     let mut all = of("stages", count("[[stages]]"), 12);
     all.extend(of("scout.stages", count("[[scout.stages]]"), 25));
+    let of_field = count("[[tensorf.stages]]");
+    all.extend(of("tensorf.stages", of_field, 12));
+    all.extend((0..of_field).map(|i| format!("tensorf.stages[{i}].rays=200")));
     all.extend(["rays_per_step=200".to_owned(), "carve.resolution=20".to_owned()]);
     all
 }
@@ -65,7 +68,7 @@ fn the_settings_of_a_run_of_each_preset_repeat_it_to_the_bit() {
         let resolved = plenoxel(&["presets", preset, "--resolved"]).done();
         // What was not shortened is the preset's own.
         let own = resolved.lines().filter(|line| !line.starts_with('#'));
-        let short = ["resolution", "steps", "epochs", "rays_per_step"];
+        let short = ["resolution", "steps", "epochs", "rays_per_step", "rays"];
         for line in own.filter(|line| !short.iter().any(|key| line.starts_with(key))) {
             assert!(text.contains(line), "{preset}: {line}");
         }

@@ -28,8 +28,8 @@ mod gradients;
 mod graph;
 mod index;
 pub mod lattice;
-pub mod nn;
 mod matrix;
+pub mod nn;
 mod op;
 pub mod ops;
 pub mod optim;
@@ -50,9 +50,9 @@ pub use gradients::{Grad, Gradients};
 pub use graph::{no_grad, recording as is_recording};
 pub use index::Indices;
 pub use lattice::Lattice;
+pub use matrix::{Matrix, multiply};
 #[doc(hidden)]
 pub use multiversion; // `dispatched!` expands to this path in other crates.
-pub use matrix::{Matrix, multiply};
 pub use op::{Cotangent, GradSink, Keep, Kernel, KernelCall, Op, Vjp};
 pub use ops::lookup::add_rows;
 pub use param::{Bounds, Module, Param};
