@@ -1,7 +1,7 @@
 //! Fused kernel: the pixels of [`composite()`] in one pass over a factored field, with a hand-written adjoint.
 //!
 //! *Forward.* Rays are processed in blocks. Each block computes the densities of its samples and their weights, forms groups
-//! ([`Grouping`](super::Grouping)), and evaluates the color network at one member of each group, for all groups of the block together.
+//! ([`Grouping`]), and evaluates the color network at one member of each group, for all groups of the block together.
 //!
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
