@@ -5,10 +5,11 @@ use glam::DVec3;
 use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
-use plenoxel::evaluate::evaluate;
+use plenoxel::evaluate::{constant_psnr, evaluate, mean_image};
 use plenoxel::field::factored::Directions;
 use plenoxel::geometry::Aabb;
 use plenoxel::loss::{Objective, mse};
+use plenoxel::model::plenoxels::config::Hull;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
 use plenoxel::render::{Engine, Field, Rendered};
 use plenoxel::sampling::Jitter;
@@ -245,6 +246,21 @@ fn a_scene_is_learned_and_a_resumed_run_has_the_same_bits() {
     let untrained = psnr(trainer(&train).model());
     let trained = psnr(whole.model());
     assert!(trained > untrained + 8.0, "{untrained} to {trained}");
+}
+
+#[test]
+fn a_scene_is_learned_without_silhouettes_too() {
+    let (train, test) = views();
+    let stages = [Stage { resolution: 24, steps: 400, rays: 256 }];
+    let config = Config { density_components: 16, appearance_components: 16, stages: stages.to_vec(), ..Config::default() };
+    let model = Tensorf::<f32>::new(config, BOX, 42).expect("valid settings").with_hull(Hull::Off);
+    let objective = Objective::new().with("mse", 1.0, mse);
+    let mut trainer = Trainer::with_model(model, &train[..], objective, TrainOptions::default()).expect("a trainer");
+    while trainer.step().expect("a step").is_some() {}
+    let psnr = evaluate(trainer.model(), &test, &ViewOptions::over([1.0; 3])).psnr().expect("a figure");
+    // An opaque start would stay below.
+    let mean = mean_image(&train, [1.0; 3]).and_then(|mean| constant_psnr(&test, &mean, [1.0; 3])).expect("a figure");
+    assert!(psnr > mean + 1.0, "{psnr}, {mean} of the mean image");
 }
 
 #[test]

@@ -68,7 +68,8 @@ pub struct Config {
     pub stop_below_in_pictures: f64,
     /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.
     pub occupied_above: f64,
-    /// Number of steps for which the density is opaque and constant; 0 to begin with the authors' random density.
+    /// Number of steps for which the density is constant. If it is not 0 and there is a visual hull, the density is opaque before the first step; otherwise it is
+    /// the authors' random density.
     pub opaque_steps: u64,
     /// Learning rate of planes and lines.
     pub factor_rate: f64,
@@ -262,9 +263,6 @@ impl<T: Real> Tensorf<T> {
         config.validate()?;
         let random = Stream::new(seed);
         let mut field = Factored::new(config.shape(), aabb, nodes_of(aabb, config.stages[0].resolution), &random);
-        if config.opaque_steps > 0 {
-            field.make_opaque();
-        }
         field.grouping = Grouping { weight: config.group, above: config.color_above };
         field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
         Ok(Tensorf { config, field, hull: Hull::Auto, engine: Engine::Fused })
@@ -408,6 +406,10 @@ impl<T: Real> Model<T> for Tensorf<T> {
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {
         if stage.index == 0 {
             self.field.occupied = self.hull(rays.all_views());
+            // Without a hull, an opaque field would be the whole box, in which nothing is seen.
+            if self.field.occupied.is_some() && self.config.opaque_steps > 0 {
+                self.field.make_opaque();
+            }
         } else {
             let occupied = self.occupied();
             if occupied.fraction() == 0.0 {
