@@ -6,7 +6,7 @@ use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::evaluate::{constant_psnr, evaluate, mean_image};
-use plenoxel::field::factored::Directions;
+use plenoxel::field::encoding::Directions;
 use plenoxel::geometry::Aabb;
 use plenoxel::loss::{Objective, mse};
 use plenoxel::model::plenoxels::config::Hull;

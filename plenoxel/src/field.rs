@@ -2,6 +2,7 @@
 //!
 //! [`Field`] and [`Radiance`] are defined by [`render`](crate::render), which depends on no particular field.
 
+pub mod encoding;
 pub mod factored;
 pub(crate) mod neighbours;
 pub mod sh;

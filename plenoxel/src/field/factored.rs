@@ -11,7 +11,7 @@
 
 pub mod fused;
 
-use super::sh;
+use super::encoding::{Directions, frequency};
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::render::{Field, Radiance, RenderOptions, Rendered};
@@ -19,42 +19,6 @@ use crate::sampling::{Occupancy, Samples};
 use autograd::nn::{Activation, Init, Linear, Mlp};
 use autograd::{Indices, Module, Param, Real, Tensor, impl_module, no_grad, random::Stream};
 use glam::DVec3;
-use serde::{Deserialize, Serialize};
-
-/// Encoding of the unit direction of a ray for the color network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Directions {
-    /// The direction, and sin and cos of 2ᵏ times it for k below this number (TensoRF).
-    Frequency(usize),
-    /// Spherical harmonics up to this degree, at most 3 (Instant-NGP).
-    Harmonics(usize),
-}
-
-impl Directions {
-    /// Returns the number of values per direction.
-    pub fn width(self) -> usize {
-        match self {
-            Directions::Frequency(octaves) => 3 * (1 + 2 * octaves),
-            Directions::Harmonics(degree) => sh::count(degree),
-        }
-    }
-
-    /// Encodes unit directions `[n, 3]`.
-    fn encode<T: Real>(self, directions: &Tensor<T>) -> Tensor<T> {
-        match self {
-            Directions::Frequency(octaves) => waves(directions, octaves),
-            Directions::Harmonics(degree) => sh::basis(directions, degree),
-        }
-    }
-}
-
-/// Returns x `[n, c]` with sin and cos of 2ᵏ x for k < `octaves` appended: `[n, c (1 + 2 octaves)]`.
-fn waves<T: Real>(x: &Tensor<T>, octaves: usize) -> Tensor<T> {
-    let waves = (0..octaves).map(|k| x * f64::from(1 << k)).flat_map(|x| [x.sin(), x.cos()]);
-    let all: Vec<Tensor<T>> = [x.clone()].into_iter().chain(waves).collect();
-    Tensor::concat(&all.iter().collect::<Vec<_>>(), 1)
-}
 
 /// Sizes of a factored field, except its resolution.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -178,7 +142,7 @@ fn density<T: Real>(tables: &[Tensor<T>], cells: &Tensor<T>) -> Tensor<T> {
 fn colors<T: Real>(tables: &[Tensor<T>], feature_octaves: usize, cells: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
     let products = products(&tables[6..9], &tables[9..12], cells);
     let features = Tensor::concat(&products.each_ref(), 1).matmul(&tables[12]);
-    let mut hidden = Tensor::concat(&[&waves(&features, feature_octaves), directions], 1);
+    let mut hidden = Tensor::concat(&[&frequency(&features, feature_octaves), directions], 1);
     let layers = &tables[13..];
     for (l, layer) in layers.chunks(2).enumerate() {
         hidden = hidden.matmul(&layer[0]) + &layer[1];
