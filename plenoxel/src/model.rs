@@ -3,6 +3,7 @@
 #![doc = include_str!("../docs/own_field.md")]
 
 pub mod plenoxels;
+pub mod recipe;
 pub mod tensorf;
 
 pub use crate::train::Model;
@@ -40,11 +41,7 @@ pub fn open(path: &Path, config: &Config) -> Result<(Box<dyn Model<f32>>, About)
             let (model, about) = Tensorf::open(path)?;
             Ok((Box::new(model), about))
         }
-        other => {
-            let found = format!("unknown kind of model `{other}`");
-            let remedy = format!("expected {}; evaluate the model with the program that trained it", KINDS.join(", "));
-            Err(Error::input(path, found, remedy))
-        }
+        other => Err(recipe::unknown(other, &TensorFile::open(path)?)),
     }
 }
 

@@ -88,8 +88,9 @@ impl TrainedRun {
         let sampling = match (self.samples, &stored) {
             (None, _) => as_trained,
             (Some(samples), Stored::Grid { shape, .. }) => as_trained.with_samples(samples, shape),
-            (Some(_), Stored::Factored { .. }) => {
-                return Err(Error::usage("--samples", "the samples of a factored field follow from its cells", "leave out --samples"));
+            (Some(_), Stored::Other { recipe, .. }) => {
+                let found = format!("the settings of the model `{}` determine its samples", recipe.kind());
+                return Err(Error::usage("--samples", found, "leave out --samples"));
             }
         };
         let estimate = estimate(sampling, &stored);

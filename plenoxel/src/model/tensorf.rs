@@ -4,15 +4,20 @@
 //! are sampled: here they are found anew at the beginning of every stage but the first; the authors find them at steps 2000 and 4000, above
 //! 0.08 without the factor 25, and shrink the box.
 
+mod config;
+mod recipe;
+
+pub use config::{Config, Stage};
+
 use crate::camera::Ray;
 use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
 use crate::error::{Error, Result};
-use crate::field::encoding::Directions;
-use crate::field::factored::{Factored, Grouping, Shape};
+use crate::field::factored::{Factored, Grouping};
 use crate::geometry::Aabb;
 use crate::loss::Step;
 use crate::model::plenoxels::config::Hull;
+use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Spacing};
@@ -20,194 +25,13 @@ use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
+use config::MOST_NODES;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::Path;
 
 /// Kind of this model in checkpoints.
 pub const KIND: &str = "tensorf";
-
-/// A stage of training.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Stage {
-    /// Nodes along each axis if the box is a cube. Another box has as many cells, with about equal sides.
-    pub resolution: usize,
-    /// Steps.
-    pub steps: u64,
-    /// Rays per step.
-    pub rays: usize,
-}
-
-/// Settings of the model.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Config {
-    /// Components of each of the three plane-line pairs of the density.
-    pub density_components: usize,
-    /// Components of each of the three plane-line pairs of the appearance.
-    pub appearance_components: usize,
-    /// Length of the appearance feature.
-    pub features: usize,
-    /// Width of the two hidden layers of the color network.
-    pub hidden: usize,
-    /// Octaves of the positional encoding of the appearance feature.
-    pub feature_octaves: usize,
-    /// Encoding of directions.
-    pub directions: Directions,
-    /// Distance between samples, in cells.
-    pub step: f64,
-    /// Weight that completes a group of samples with one color ([`Grouping`]), in training; 0 for a color per sample.
-    pub group: f64,
-    /// The same in pictures.
-    pub group_in_pictures: f64,
-    /// Groups of samples whose weight is not above this have no color.
-    pub color_above: f64,
-    /// Transmittance below which a training ray ends.
-    pub stop_below: f64,
-    /// Transmittance below which a ray of a picture ends.
-    pub stop_below_in_pictures: f64,
-    /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.
-    pub occupied_above: f64,
-    /// Number of steps for which the density is constant. If it is not 0 and there is a visual hull, the density is opaque before the first step; otherwise it is
-    /// the authors' random density.
-    pub opaque_steps: u64,
-    /// Learning rate of planes and lines.
-    pub factor_rate: f64,
-    /// Learning rate of the matrix B and the network.
-    pub network_rate: f64,
-    /// Share of the learning rates that is left at the end of the run; they fall exponentially.
-    pub last_rate: f64,
-    /// Weight of the L1 norm of the density factors, Σ over planes and lines of the mean absolute value, in the first stage.
-    pub density_l1: f64,
-    /// The same in the other stages.
-    pub density_l1_later: f64,
-    /// Treatment of rows of planes without a gradient by Adam: true visits only rows with a gradient.
-    pub lazy: bool,
-    /// Stages, with increasing resolution.
-    pub stages: Vec<Stage>,
-}
-
-/// The recipe for two cores.
-impl Default for Config {
-    fn default() -> Self {
-        let stages = [(64, 600, 512), (90, 600, 1024), (128, 800, 2048), (180, 1000, 3072), (256, 2000, 4096)];
-        Config {
-            density_components: 16,
-            appearance_components: 48,
-            features: 32,
-            hidden: 128,
-            feature_octaves: 0,
-            directions: Directions::Harmonics(3),
-            step: 1.0,
-            group: 0.04,
-            group_in_pictures: 0.02,
-            color_above: 1e-3,
-            stop_below: 3e-3,
-            stop_below_in_pictures: 3e-4,
-            occupied_above: 0.01,
-            opaque_steps: 50,
-            factor_rate: 0.02,
-            network_rate: 5e-3,
-            last_rate: 0.15,
-            density_l1: 8e-5,
-            density_l1_later: 4e-5,
-            lazy: true,
-            stages: stages.map(|(resolution, steps, rays)| Stage { resolution, steps, rays }).to_vec(),
-        }
-    }
-}
-
-impl Config {
-    /// Returns the authors' VM-192 for synthetic scenes.
-    pub fn authors() -> Self {
-        // From 128 to 300 in five steps of equal ratio.
-        let stages = [(128, 2000), (152, 1000), (180, 1000), (213, 1500), (253, 1500), (300, 23_000)];
-        Config {
-            features: 27,
-            feature_octaves: 2,
-            directions: Directions::Frequency(2),
-            step: 0.5,
-            group: 0.0,
-            group_in_pictures: 0.0,
-            color_above: 1e-4,
-            stop_below: 0.0,
-            stop_below_in_pictures: 0.0,
-            opaque_steps: 0,
-            network_rate: 1e-3,
-            last_rate: 0.1,
-            lazy: false,
-            stages: stages.map(|(resolution, steps)| Stage { resolution, steps, rays: 4096 }).to_vec(),
-            ..Config::default()
-        }
-    }
-
-    /// Checks the settings.
-    ///
-    /// Errors name the setting that is invalid.
-    pub fn validate(&self) -> Result<()> {
-        let check = |valid: bool, key: &str, value: f64, expected: &str| match valid {
-            true => Ok(()),
-            false => Err(Error::config(key, value, expected)),
-        };
-        for (key, width) in [
-            ("density_components", self.density_components),
-            ("appearance_components", self.appearance_components),
-            ("features", self.features),
-            ("hidden", self.hidden),
-        ] {
-            check((1..=1024).contains(&width), key, width as f64, "1 to 1024")?;
-        }
-        check(self.feature_octaves <= 16, "feature_octaves", self.feature_octaves as f64, "0 to 16")?;
-        let (most, octaves_or_degree) = match self.directions {
-            Directions::Frequency(octaves) => (16, octaves),
-            Directions::Harmonics(degree) => (3, degree),
-        };
-        check(octaves_or_degree <= most, "directions", octaves_or_degree as f64, "up to 16 octaves, or harmonics up to degree 3")?;
-        check(self.step > 0.0 && self.step.is_finite(), "step", self.step, "a number of cells above 0")?;
-        for (key, share) in [
-            ("group", self.group),
-            ("group_in_pictures", self.group_in_pictures),
-            ("color_above", self.color_above),
-            ("stop_below", self.stop_below),
-            ("stop_below_in_pictures", self.stop_below_in_pictures),
-            ("occupied_above", self.occupied_above),
-        ] {
-            check((0.0..1.0).contains(&share), key, share, "a number in [0, 1)")?;
-        }
-        for (key, rate) in [("factor_rate", self.factor_rate), ("network_rate", self.network_rate), ("last_rate", self.last_rate)] {
-            check(rate > 0.0 && rate <= 1.0, key, rate, "a number in (0, 1]")?;
-        }
-        for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
-            check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
-        }
-        if self.stages.is_empty() {
-            return Err(Error::usage("stages", "there is no stage", "set at least one"));
-        }
-        for (i, stage) in self.stages.iter().enumerate() {
-            let key = format!("stages[{i}].resolution");
-            check((2..=MOST_NODES).contains(&stage.resolution), &key, stage.resolution as f64, "2 to 4096")?;
-            check(stage.steps > 0, &format!("stages[{i}].steps"), 0.0, "at least 1")?;
-            check((1..=1 << 20).contains(&stage.rays), &format!("stages[{i}].rays"), stage.rays as f64, "1 to 1048576")?;
-        }
-        Ok(())
-    }
-
-    fn shape(&self) -> Shape {
-        Shape {
-            density_components: self.density_components,
-            appearance_components: self.appearance_components,
-            features: self.features,
-            hidden: self.hidden,
-            feature_octaves: self.feature_octaves,
-            directions: self.directions,
-        }
-    }
-
-    fn total_steps(&self) -> u64 {
-        self.stages.iter().map(|stage| stage.steps).sum()
-    }
-}
 
 /// The model.
 #[derive(Debug)]
@@ -247,8 +71,6 @@ fn valid_box([min, max]: [[f64; 3]; 2]) -> Option<Aabb> {
     valid.then(|| Aabb { min: min.into(), max: max.into() })
 }
 
-/// Most nodes along an axis of a cube.
-const MOST_NODES: usize = 4096;
 /// Cells of the visual hull along each axis.
 const HULL: usize = 128;
 /// Pixels around the silhouettes that belong to the hull.
@@ -342,11 +164,13 @@ fn nodes_of(aabb: Aabb, resolution: usize) -> [usize; 3] {
     (extent / side).to_array().map(|cells| cells.round().max(1.0) as usize + 1)
 }
 
-/// Learning rate that falls exponentially over a run of `total` steps, of which `first` came before; 0 for the first `frozen` steps of the run.
+/// Learning rate that falls exponentially over a run of `total` steps, of which `first` came before, and in the last share `cool_down` of the run also linearly
+/// to 0; 0 for the first `frozen` steps of the run.
 #[derive(Debug)]
 struct Falling {
     rate: f64,
     last: f64,
+    cool_down: f64,
     first: u64,
     total: u64,
     frozen: u64,
@@ -355,7 +179,12 @@ struct Falling {
 impl Schedule for Falling {
     fn at(&self, step: u64) -> f64 {
         let step = self.first + step;
-        if step < self.frozen { 0.0 } else { self.rate * self.last.powf(step as f64 / self.total as f64) }
+        if step < self.frozen {
+            return 0.0;
+        }
+        let done = step as f64 / self.total as f64;
+        let left = if self.cool_down > 0.0 { ((1.0 - done) / self.cool_down).clamp(0.0, 1.0) } else { 1.0 };
+        left * self.rate * self.last.powf(done)
     }
 }
 
@@ -380,8 +209,14 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
         let config = &self.config;
-        let falling =
-            |rate: f64, frozen: u64| Falling { rate, last: config.last_rate, first: stage.first, total: config.total_steps(), frozen };
+        let falling = |rate: f64, frozen: u64| Falling {
+            rate,
+            last: config.last_rate,
+            cool_down: config.cool_down,
+            first: stage.first,
+            total: config.total_steps(),
+            frozen,
+        };
         let mut rates = Rates::new(falling(config.factor_rate, 0));
         for name in self.field.network_names() {
             rates = rates.with(name, falling(config.network_rate, 0));
@@ -399,9 +234,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 
     fn stages(&self, _: &TrainOptions, _: u64) -> Vec<StageLength> {
-        let length =
-            |stage: &Stage| StageLength { resolution: Some(stage.resolution), steps: stage.steps, rays_per_step: Some(stage.rays) };
-        self.config.stages.iter().map(length).collect()
+        Recipe::stages(&self.config)
     }
 
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {

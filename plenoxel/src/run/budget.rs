@@ -8,7 +8,7 @@ use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::model::plenoxels::Trainer;
 use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
-use crate::model::tensorf;
+use crate::model::recipe::Recipe;
 use crate::text::clock;
 use crate::train;
 use std::sync::Arc;
@@ -96,63 +96,31 @@ fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result
     Ok(Config { stages, losses: losses.collect(), ..config })
 }
 
-/// Scales the stages of a factored field so that training takes `seconds` on this machine, including the measurement made here. `begin` creates a trainer.
+/// Scales the settings of another model so that training takes `seconds` on this machine, including the measurement made here. `begin` creates a trainer.
 ///
-/// Errors: the time is too short for the stages; those of [`Trainer::step`](train::Trainer::step).
-pub fn factored_on_time<M: train::Model<f32>>(
-    config: tensorf::Config,
-    seconds: f64,
-    begin: impl FnOnce(tensorf::Config) -> Result<train::Trainer<f32, M>>,
-) -> Result<tensorf::Config> {
-    let (start, first) = (Instant::now(), config.stages[0]);
-    let endless = tensorf::Stage { steps: 1 << 20, ..first };
-    let mut trainer = begin(tensorf::Config { stages: vec![endless], ..config.clone() })?;
+/// Errors: the time is too short; those of [`Trainer::step`](train::Trainer::step).
+pub fn recipe_on_time<R: Recipe>(recipe: &R, seconds: f64, begin: impl FnOnce(&R) -> Result<train::Trainer<f32, R::Model>>) -> Result<R> {
+    let start = Instant::now();
+    let mut trainer = begin(recipe)?;
     trainer.step()?;
     let begun = start.elapsed().as_secs_f64();
     let enough = (CALIBRATION.0 * seconds).min(CALIBRATION.1);
     let (mut count, mut spent) = (0, begun);
     while count < 20 || spent - begun < enough {
-        trainer.step()?;
+        let Some(report) = trainer.step()? else { break };
         count += 1;
         spent = start.elapsed().as_secs_f64();
+        if report.ends_stage {
+            break;
+        }
     }
-    let unit = (spent - begun) / f64::from(count) / factored_cost(&first);
+    let unit = (spent - begun) / f64::from(count.max(1)) / recipe.cost_of_first_step();
     let left = seconds - spent - begun;
     if left <= 0.0 {
         let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + begun));
         return Err(Error::usage("--time", found, "give it more time"));
     }
-    Ok(tensorf::Config { stages: factored_stages(&config.stages, left / unit), ..config })
-}
-
-/// Scales stages to a total cost. In a short run, the earlier stages are shortened less than the last, and the finest stages become coarser: without geometry, and
-/// with few steps for each node, finer planes gain nothing.
-fn factored_stages(stages: &[tensorf::Stage], cost: f64) -> Vec<tensorf::Stage> {
-    let total = |stages: &[tensorf::Stage]| stages.iter().map(|stage| stage.steps as f64 * factored_cost(stage)).sum::<f64>();
-    let factor = cost / total(stages);
-    let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
-    let most = ((finest as f64 * factor.min(1.0).powf(0.13)) as usize).max(2);
-    let scaled = |stage: &tensorf::Stage| {
-        let steps = (stage.steps as f64 * factor.max(factor.sqrt().min(1.0))).round() as u64;
-        tensorf::Stage { resolution: stage.resolution.min(most), steps: steps.max(1), ..*stage }
-    };
-    let mut stages: Vec<tensorf::Stage> = stages.iter().map(scaled).collect();
-    if let Some((last, earlier)) = stages.split_last_mut() {
-        let left = cost - total(earlier);
-        // At least a third for the last stage.
-        if left < cost / 3.0 {
-            let shrink = cost / 1.5 / total(earlier);
-            earlier.iter_mut().for_each(|stage| stage.steps = ((stage.steps as f64 * shrink) as u64).max(1));
-        }
-        last.steps = ((left.max(cost / 3.0) / factored_cost(last)).round() as u64).max(1);
-    }
-    stages
-}
-
-/// Duration of a step of a factored field, in units of a ray at a resolution of 0. On lego, stages of 400 to 5000 rays at 64 to 300 nodes took 5.1 to 6.0 µs per
-/// unit on two cores of an AMD EPYC with AVX-512.
-fn factored_cost(stage: &tensorf::Stage) -> f64 {
-    (stage.rays as f64 + 150.0) * (1.0 + stage.resolution as f64 / 1500.0)
+    Ok(recipe.with_cost(left / unit))
 }
 
 /// Returns `asked` with everything that a time budget changes taken from `found`: lengths of stages, resolutions with density rates, image
@@ -255,20 +223,6 @@ fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, s
 mod tests {
     use super::*;
 
-    #[test]
-    fn stages_of_a_factored_field_cost_what_they_may_and_short_runs_are_coarser() {
-        let stages = tensorf::Config::default().stages;
-        let total = |stages: &[tensorf::Stage]| stages.iter().map(|stage| stage.steps as f64 * factored_cost(stage)).sum::<f64>();
-        let whole = total(&stages);
-        for factor in [0.03, 0.1, 0.4, 1.0, 3.0] {
-            let planned = factored_stages(&stages, factor * whole);
-            let share = total(&planned) / (factor * whole);
-            assert!((0.95..1.05).contains(&share), "{factor}: {share}");
-            let finest = |stages: &[tensorf::Stage]| stages.iter().map(|stage| stage.resolution).max();
-            assert_eq!(finest(&planned) < finest(&stages), factor < 1.0, "{factor}");
-            assert!(factor > 1.0 || planned[0].steps as f64 >= factor * stages[0].steps as f64);
-        }
-    }
     use crate::dataset::procedural::ProceduralOptions;
     use crate::dataset::{Dataset, Split};
 

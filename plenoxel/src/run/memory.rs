@@ -17,7 +17,8 @@ use crate::field::voxel_grid::fused::CHUNK;
 use crate::field::voxel_grid::{Color, GridShape};
 use crate::memory;
 use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
-use crate::model::{self, tensorf};
+use crate::model::recipe::{Memory, Recipe};
+use crate::model::{self, plenoxels, recipe};
 use crate::render::Engine;
 use crate::tensor_file::TensorFile;
 use std::path::Path;
@@ -142,7 +143,7 @@ impl Estimate {
     pub fn of_evaluation(config: &Config, sampling: Sampling, stored: &Stored, compare: Option<(&Dataset, Split)>) -> Self {
         let rendering = match stored {
             Stored::Grid { shape, .. } => evaluation_samples(config, sampling, shape) * evaluation_bytes_per_sample(config.engine, shape),
-            Stored::Factored { config: tensorf, .. } => EVALUATION_RAYS * factored_bytes_of_ray(tensorf, config.engine),
+            Stored::Other { recipe, .. } => EVALUATION_RAYS * recipe.memory(config.engine).ray,
         };
         Estimate {
             images: compare.map_or(0, |(dataset, split)| images(dataset, config.downscale, dataset.count(split))),
@@ -205,24 +206,25 @@ impl Estimate {
         Estimate { images, grid, optimizer: 0, step, expected: false, key: key.to_owned(), advice }
     }
 
-    /// Estimates a training run of a factored field and its evaluation.
-    pub fn of_factored(config: &Config, tensorf: &tensorf::Config, dataset: &Dataset, options: &RunOptions) -> Self {
-        // Values and both moments of Adam, and the values of the stage before.
-        let values = tensorf.stages.iter().map(|stage| factored_bytes(tensorf, stage.resolution)).max().unwrap_or(0);
-        let rays = tensorf.stages.iter().map(|stage| stage.rays as u64).max().unwrap_or(0);
+    /// Estimates a training run of another model than the grid, and its evaluation.
+    pub fn of_recipe(config: &Config, recipe: &dyn Recipe, dataset: &Dataset, options: &RunOptions) -> Self {
+        let Memory { parameters, ray, size, smaller } = recipe.memory(config.engine);
+        let rays = recipe.stages().iter().map(|stage| stage.rays_per_step.unwrap_or(config.rays_per_step) as u64).max().unwrap_or(0);
         let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
         let (width, height) = dataset.size();
         let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
         let images = images(dataset, config.downscale, views);
-        let step = (rays.max(EVALUATION_RAYS) * factored_bytes_of_ray(tensorf, config.engine)).max(hull) + comparison;
+        let step = (rays.max(EVALUATION_RAYS) * ray).max(hull) + comparison;
+        let own = |key: &str| format!("{}.{key}", recipe.kind());
         let parts = [
-            (images, ("downscale", "a larger factor, so that the images fit")),
-            (step, ("tensorf.stages[*].rays", "fewer rays in a step")),
-            (3 * values, ("tensorf.stages[*].resolution", "fewer nodes a side, or fewer components")),
+            (images, "downscale".to_owned(), "reduce the images by a larger factor"),
+            (step, own("stages[*].rays"), "use fewer rays in a step"),
+            (3 * parameters, own(size), smaller),
         ];
-        let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
-        Estimate { images, grid: 2 * values, optimizer: 2 * values, step, expected: true, key: key.to_owned(), advice }
+        let (_, key, advice) = parts.into_iter().max_by_key(|(bytes, ..)| *bytes).unwrap_or_default();
+        // The values of a stage and of the stage before, and both moments of Adam.
+        Estimate { images, grid: 2 * parameters, optimizer: 2 * parameters, step, expected: true, key, advice }
     }
 
     /// Estimates reading a trained grid of `voxels` voxels and exporting all of them, with `bytes_per_voxel` for the export.
@@ -302,10 +304,10 @@ pub enum Stored {
         /// Number of its voxels.
         voxels: usize,
     },
-    /// A factored field.
-    Factored {
+    /// Another model.
+    Other {
         /// Its settings.
-        config: tensorf::Config,
+        recipe: Box<dyn Recipe>,
         /// Size of the file.
         bytes: u64,
         /// Half the longest side of its box, world length.
@@ -318,12 +320,13 @@ impl Stored {
     ///
     /// Errors: the file cannot be read; its kind is not one of [`KINDS`](model::KINDS).
     pub fn read(path: &Path) -> Result<Self> {
-        if model::kind(path)? == tensorf::KIND {
+        let kind = model::kind(path)?;
+        if kind != plenoxels::KIND {
             let file = TensorFile::open(path)?;
             let [min, max]: [[f64; 3]; 2] = file.fact("box")?;
             let half_width = (0..3).map(|a| 0.5 * (max[a] - min[a])).fold(0.0, f64::max);
             let bytes = std::fs::metadata(path).map_err(|e| Error::io(path, e, "reading"))?.len();
-            return Ok(Stored::Factored { config: file.fact("settings")?, bytes, half_width });
+            return Ok(Stored::Other { recipe: recipe::read(&kind, &file)?, bytes, half_width });
         }
         let (header, voxels) = checkpoint::header(path)?;
         Ok(Stored::Grid { shape: header.shape(), voxels })
@@ -333,33 +336,16 @@ impl Stored {
     pub fn half_width(&self) -> f64 {
         match self {
             Stored::Grid { shape, .. } => shape.half_width,
-            Stored::Factored { half_width, .. } => *half_width,
+            Stored::Other { half_width, .. } => *half_width,
         }
     }
 
     fn bytes(&self) -> u64 {
         match self {
             Stored::Grid { shape, voxels } => (voxels * shape.voxel_bytes()) as u64,
-            Stored::Factored { bytes, .. } => *bytes,
+            Stored::Other { bytes, .. } => *bytes,
         }
     }
-}
-
-/// Bytes of the planes of a factored field, in a box of usual proportions.
-fn factored_bytes(tensorf: &tensorf::Config, resolution: usize) -> u64 {
-    const LONG: f64 = 1.2;
-    let components = (tensorf.density_components + tensorf.appearance_components) as f64;
-    (LONG * 3.0 * (resolution * resolution) as f64 * components) as u64 * size_of::<f32>() as u64
-}
-
-/// Bytes of a ray of a factored field: of its samples, and of the samples at which the color network is evaluated.
-fn factored_bytes_of_ray(tensorf: &tensorf::Config, engine: Engine) -> u64 {
-    // Measured on lego; in the first stage, a ray has more samples with a color.
-    const SAMPLES: u64 = 24;
-    const COLORED: u64 = 6;
-    let of_sample = 120 + if engine == Engine::Graph { 400 * tensorf.density_components as u64 } else { 0 };
-    let of_color = 4 * (6 * tensorf.appearance_components + 4 * tensorf.features + 4 * tensorf.hidden) as u64;
-    SAMPLES * of_sample + COLORED * of_color
 }
 
 /// Numbers in the optimizer state for each number of the tables.

@@ -16,8 +16,8 @@
 
 mod best;
 mod event;
-mod factored;
 mod learning;
+mod other;
 mod preview;
 mod summary;
 
@@ -133,7 +133,7 @@ pub type Listener<'l> = dyn FnMut(Event<'_>) + Send + 'l;
 /// Errors: a setting is invalid, data cannot be read, a number is not finite, or a file cannot be written.
 pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
     match &settings.config.tensorf {
-        Some(tensorf) => factored::train(settings, tensorf, on),
+        Some(tensorf) => other::train(settings, tensorf, on),
         None => train_with(settings, objective, on),
     }
 }
@@ -312,7 +312,7 @@ impl<'s> NewRun<'s> {
 /// Errors: those of [`train()`]; the run has ended or saved no checkpoint.
 pub fn resume(path: &Path, data: Option<DataSource>, options: &RunOptions, on: &mut Listener<'_>) -> Result<Outcome> {
     match RunFolder::open(path)?.1.tensorf {
-        Some(tensorf) => factored::resume(path, &tensorf, data, options, on),
+        Some(tensorf) => other::resume(path, &tensorf, data, options, on),
         None => resume_with(path, data, options, objective, on),
     }
 }

@@ -9,6 +9,7 @@ use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::loss;
+use crate::model::recipe::Recipe;
 use crate::model::tensorf;
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
@@ -474,13 +475,13 @@ impl Config {
 
     /// Returns true if the config has a stage to train; without one it is a config for carving.
     pub fn trains(&self) -> bool {
-        !self.stages.is_empty() || self.tensorf.is_some()
+        !self.stages.is_empty() || self.recipe().is_some()
     }
 
     /// Returns the resolution of each stage.
     pub fn resolutions(&self) -> impl Iterator<Item = usize> + '_ {
-        let of_field = self.tensorf.iter().flat_map(|tensorf| &tensorf.stages).map(|stage| stage.resolution);
-        self.stages.iter().map(|stage| stage.resolution).chain(of_field)
+        let of_other = self.recipe().into_iter().flat_map(|recipe| recipe.stages()).filter_map(|stage| stage.resolution);
+        self.stages.iter().map(|stage| stage.resolution).chain(of_other)
     }
 
     /// Errors if the config has no stage to train.
@@ -601,7 +602,7 @@ impl Config {
             )?;
         }
         sampling("evaluation", self.evaluation)?;
-        self.tensorf.as_ref().map_or(Ok(()), |tensorf| self.validate_factored(tensorf))?;
+        self.recipe().map_or(Ok(()), |recipe| self.validate_other(recipe))?;
         let CarveConfig { resolution, margin, depth, photo, ridge, sweeps, .. } = self.carve;
         let noise = photo.map_or(1.0, |photo| photo.noise);
         check((1e-6..=1.0).contains(&noise), "carve.photo.noise", noise, "1e-6 to 1")?;
@@ -614,13 +615,16 @@ impl Config {
 }
 
 impl Config {
-    /// Checks the settings of a factored field, and that no setting of the grid contradicts them.
-    fn validate_factored(&self, tensorf: &tensorf::Config) -> Result<()> {
-        tensorf.validate().map_err(|e| e.with_key(|key| format!("tensorf.{key}")))?;
+    /// Checks the settings of another model than the voxel grid, and that no setting of the grid contradicts them.
+    fn validate_other(&self, recipe: &dyn Recipe) -> Result<()> {
+        let kind = recipe.kind();
+        recipe.validate().map_err(|e| e.with_key(|key| format!("{kind}.{key}")))?;
         let of_grid = |set: bool, key: &str| match set {
-            true => {
-                Err(Error::usage(key, "this setting of a voxel grid has no effect on a factored field", "remove it, or remove `tensorf`"))
-            }
+            true => Err(Error::usage(
+                key,
+                format!("this setting of a voxel grid has no effect on the model `{kind}`"),
+                format!("remove it, or remove `{kind}`"),
+            )),
             false => Ok(()),
         };
         of_grid(!self.stages.is_empty(), "stages")?;

@@ -2,6 +2,9 @@
 
 use crate::error::{Error, Result};
 use crate::model::plenoxels::{LEARNED_LOSSES, LOSSES};
+use crate::model::tensorf;
+use serde::Serialize;
+use std::sync::LazyLock;
 use strsim::levenshtein;
 use toml::{Table, Value};
 
@@ -23,8 +26,8 @@ const STAGE: &[&str] = &[
 /// The two ways to place samples.
 const SAMPLING: &[&str] = &["step", "samples", "far"];
 
-/// Every table with its keys. In a path, `[]` stands for any index and `*` for any name.
-const TABLES: &[(&str, &[&str])] = &[
+/// The tables of the run and of the voxel grid with their keys. In a path, `[]` stands for any index and `*` for any name.
+const FIXED: &[(&str, &[&str])] = &[
     (
         "",
         &[
@@ -74,35 +77,20 @@ const TABLES: &[(&str, &[&str])] = &[
     ("evaluation", SAMPLING),
     ("carve", &["resolution", "rule", "margin", "depth", "photo", "fit", "ridge", "sweeps"]),
     ("carve.photo", &["noise"]),
-    (
-        "tensorf",
-        &[
-            "density_components",
-            "appearance_components",
-            "features",
-            "hidden",
-            "feature_octaves",
-            "directions",
-            "step",
-            "group",
-            "group_in_pictures",
-            "color_above",
-            "stop_below",
-            "stop_below_in_pictures",
-            "occupied_above",
-            "opaque_steps",
-            "factor_rate",
-            "network_rate",
-            "last_rate",
-            "density_l1",
-            "density_l1_later",
-            "lazy",
-            "stages",
-        ],
-    ),
     ("tensorf.directions", &["frequency", "harmonics"]),
     ("tensorf.stages[]", &["resolution", "steps", "rays"]),
 ];
+
+/// Every table with its keys: [`FIXED`], and the settings of the other models, whose keys are those of their defaults.
+static TABLES: LazyLock<Vec<(&str, Vec<String>)>> = LazyLock::new(|| {
+    let fixed = FIXED.iter().map(|(table, keys)| (*table, keys.iter().map(|key| (*key).to_owned()).collect()));
+    fixed.chain([(tensorf::KIND, keys_of(&tensorf::Config::default()))]).collect()
+});
+
+/// Returns the keys of a settings structure.
+fn keys_of(settings: &impl Serialize) -> Vec<String> {
+    Table::try_from(settings).map(|table| table.keys().cloned().collect()).unwrap_or_default()
+}
 
 /// Checks every key of a table and of its nested tables. `place(path)` names the place where a path was set.
 ///
@@ -164,25 +152,26 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
         let found = format!("`{pattern}` is not a table, so it has no key `{key}`");
         return Err(Error::usage(place, found, format!("set `{pattern}` itself")));
     };
+    let known: Vec<&str> = known.iter().map(String::as_str).collect();
     if known.contains(&key) {
         return Ok(());
     }
     // Suggestions: the same key in other tables, a key of similar spelling, keys that end in the same word.
     let last_word = |key: &str| key.rsplit_once('_').map(|(_, word)| word.to_owned());
-    let word = last_word(key).filter(|_| nearest(key, known).is_none());
+    let word = last_word(key).filter(|_| nearest(key, &known).is_none());
     let places = match places(&|other| other == key) {
         same if !same.is_empty() => same,
         _ => places(&|other| word.is_some() && last_word(other) == word),
     };
     match places.is_empty() {
-        true => Err(unknown_name("key", key, known, place)),
+        true => Err(unknown_name("key", key, &known, place)),
         false => Err(Error::usage(place, format!("unknown key `{key}`"), format!("similar keys: {}", places.join(", ")))),
     }
 }
 
 /// The full paths of the known keys that `wanted` selects.
 fn places(wanted: &dyn Fn(&str) -> bool) -> Vec<String> {
-    let keys = TABLES.iter().flat_map(|(table, keys)| keys.iter().map(move |key| (table.replace("[]", "[*]"), *key)));
+    let keys = TABLES.iter().flat_map(|(table, keys)| keys.iter().map(move |key| (table.replace("[]", "[*]"), key.as_str())));
     keys.filter(|(_, key)| wanted(key)).map(|(table, key)| joined(&table, key)).collect()
 }
 

@@ -1,4 +1,4 @@
-//! Runs that train a factored field (`tensorf` in the config).
+//! Runs that train another model than the voxel grid: one with a table of settings of its own ([`Recipe`]).
 
 use super::{Event, Listener, NewRun, OldRun, Outcome, RunOptions, RunSettings, clock};
 use crate::dataset::View;
@@ -6,7 +6,7 @@ use crate::error::Result;
 use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::objective_of_any;
-use crate::model::tensorf::{self, Tensorf};
+use crate::model::recipe::Recipe;
 use crate::run::budget;
 use crate::run::data::DataSource;
 use crate::run::memory::Estimate;
@@ -17,19 +17,17 @@ use std::sync::Arc;
 /// Creates the trainer of a run.
 ///
 /// Errors: a setting is invalid; a loss needs a voxel grid; there are no training views.
-fn trainer(config: &Config, tensorf: &tensorf::Config, views: Arc<[View]>) -> Result<Trainer<f32, Tensorf<f32>>> {
-    let mut model = Tensorf::new(tensorf.clone(), Aabb::cube(config.half_width), config.seed)?.with_hull(config.hull);
-    model.engine = config.engine;
+fn trainer<R: Recipe>(config: &Config, recipe: &R, views: Arc<[View]>) -> Result<Trainer<f32, R::Model>> {
     let objective = objective_of_any(config, views.len())?;
-    Trainer::with_model(model, views, objective, config.train_options())
+    Trainer::with_model(recipe.model(config)?, views, objective, config.train_options())
 }
 
-/// Trains a factored field.
-pub fn train(settings: &RunSettings, tensorf: &tensorf::Config, on: &mut Listener<'_>) -> Result<Outcome> {
-    let mut tensorf = tensorf.clone();
+/// Trains a model.
+pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Listener<'_>) -> Result<Outcome> {
+    let mut recipe = recipe.clone();
     let mut run = NewRun::open(settings, on)?;
     run.check_cameras(Aabb::cube(run.config.half_width), on)?;
-    let estimate = Estimate::of_factored(&run.config, &tensorf, &run.dataset, &settings.options);
+    let estimate = Estimate::of_recipe(&run.config, &recipe, &run.dataset, &settings.options);
     on(Event::note(estimate.describe()));
     estimate.check()?;
     run.saved = estimate.saved();
@@ -37,30 +35,33 @@ pub fn train(settings: &RunSettings, tensorf: &tensorf::Config, on: &mut Listene
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
-        let begin = |tensorf: tensorf::Config| trainer(config, &tensorf, views.clone());
-        tensorf = clocks.train.time(|| budget::factored_on_time(tensorf, seconds, begin))?;
-        let stages = tensorf.stages.iter().map(|stage| format!("{} at {}³", stage.steps, stage.resolution));
+        let begin = |recipe: &R| trainer(config, recipe, views.clone());
+        recipe = clocks.train.time(|| budget::recipe_on_time(&recipe, seconds, begin))?;
+        let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
+            Some(resolution) => format!("{} at {resolution}³", stage.steps),
+            None => stage.steps.to_string(),
+        });
         on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
-        config.tensorf = Some(tensorf.clone());
+        recipe.clone().set(config);
     }
     let NewRun { config, views, clocks, .. } = &mut run;
-    let trainer = clocks.train.time(|| trainer(config, &tensorf, views.clone()))?;
+    let trainer = clocks.train.time(|| trainer(config, &recipe, views.clone()))?;
     run.learn(trainer, on)
 }
 
-/// Resumes a run that trains a factored field.
-pub fn resume(
+/// Resumes a run.
+pub fn resume<R: Recipe>(
     path: &Path,
-    tensorf: &tensorf::Config,
+    recipe: &R,
     data: Option<DataSource>,
     options: &RunOptions,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
     let mut run = OldRun::open(path, data, options, on)?;
-    let estimate = Estimate::of_factored(&run.config, tensorf, &run.dataset, options);
+    let estimate = Estimate::of_recipe(&run.config, recipe, &run.dataset, options);
     on(Event::note(estimate.describe()));
     estimate.check()?;
     run.read(on)?;
-    let trainer = trainer(&run.config, tensorf, run.views.clone())?;
+    let trainer = trainer(&run.config, recipe, run.views.clone())?;
     run.learn(trainer, on)
 }

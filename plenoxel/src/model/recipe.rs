@@ -1,0 +1,87 @@
+//! Settings of the models that have a table of their own in the configuration of a run, named by their kind: `[tensorf]`, for example.
+
+use super::tensorf;
+use crate::error::{Error, Result};
+use crate::model::Model;
+use crate::model::plenoxels::config::Config;
+use crate::render::Engine;
+use crate::tensor_file::TensorFile;
+use crate::train::StageLength;
+
+/// Settings from which a run trains a model.
+pub trait Recipe: Send + Sync {
+    /// The model.
+    type Model: Model<f32> + 'static
+    where
+        Self: Sized;
+
+    /// Returns the kind of the model, which is also the key of these settings in the configuration.
+    fn kind(&self) -> &'static str;
+
+    /// Checks the settings.
+    ///
+    /// Errors name the setting that is invalid.
+    fn validate(&self) -> Result<()>;
+
+    /// Returns the stages of training.
+    fn stages(&self) -> Vec<StageLength>;
+
+    /// Returns the memory of the model.
+    fn memory(&self, engine: Engine) -> Memory;
+
+    /// Creates the model, with the box, seed, hull and engine of a configuration.
+    ///
+    /// Errors name the setting that is invalid.
+    fn model(&self, config: &Config) -> Result<Self::Model>
+    where
+        Self: Sized;
+
+    /// Returns the cost of the first step, in units of [`with_cost`](Recipe::with_cost).
+    fn cost_of_first_step(&self) -> f64;
+
+    /// Returns settings whose steps cost this much in total: the same training, longer or shorter.
+    fn with_cost(&self, cost: f64) -> Self
+    where
+        Self: Sized;
+
+    /// Puts the settings into a configuration.
+    fn set(self, config: &mut Config)
+    where
+        Self: Sized;
+}
+
+/// Memory of a model, in bytes.
+#[derive(Clone, Copy, Debug)]
+pub struct Memory {
+    /// Parameters, in the stage that has the most.
+    pub parameters: u64,
+    /// What a step keeps for a ray.
+    pub ray: u64,
+    /// Setting that determines the parameters, and how to make them fewer, for messages.
+    pub size: &'static str,
+    /// See `size`.
+    pub smaller: &'static str,
+}
+
+/// Reads the settings of a checkpoint of a kind other than the voxel grid.
+///
+/// Errors: the kind is not one of [`KINDS`](super::KINDS); the settings are damaged.
+pub fn read(kind: &str, file: &TensorFile<'_>) -> Result<Box<dyn Recipe>> {
+    match kind {
+        tensorf::KIND => Ok(Box::new(file.fact::<tensorf::Config>("settings")?)),
+        other => Err(unknown(other, file)),
+    }
+}
+
+/// The error for a kind of model that this program cannot render.
+pub(super) fn unknown(kind: &str, file: &TensorFile<'_>) -> Error {
+    let remedy = format!("expected {}; evaluate the model with the program that trained it", super::KINDS.join(", "));
+    Error::input(file.path(), format!("unknown kind of model `{kind}`"), remedy)
+}
+
+impl Config {
+    /// Returns the settings of the model to train, if it is not the voxel grid.
+    pub fn recipe(&self) -> Option<&dyn Recipe> {
+        self.tensorf.as_ref().map(|tensorf| tensorf as &dyn Recipe)
+    }
+}
