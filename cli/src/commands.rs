@@ -1,5 +1,6 @@
 //! The commands: a module for each, with its arguments and its implementation.
 
+pub mod bake;
 pub mod carve;
 mod cloud_filters;
 pub mod compare;

@@ -40,7 +40,7 @@ impl Report<'_> {
         let result = self.folder.figures()?.unwrap_or(Value::Null);
         let metrics = metrics::read(&self.folder.metrics())?;
         let lines = curves::lines(self.folder, &metrics, console);
-        let scene = scene::Scene::of(self)?;
+        let scene = scene::Scene::of(self, console)?;
         let title = format!("{} – {}", self.folder.path().file_name().unwrap_or_default().to_string_lossy(), self.record.scene);
         let parts = [
             facts(self, &result),
@@ -55,8 +55,7 @@ impl Report<'_> {
         let scripts = format!("<script>\n{}</script>\n{}", SCRIPT, scene.as_ref().map_or_else(String::new, scene::Scene::scripts));
         let page = html::page(&title, STYLE, &(parts.join("\n") + &scripts));
         self.folder.write_report(&page)?;
-        let note =
-            scene.map_or_else(|| "it has no interactive viewer, because the model is not a voxel grid".to_owned(), |scene| scene.note());
+        let note = scene.map_or_else(|| "it has no interactive viewer".to_owned(), |scene| scene.note());
         console.note(&format!("report.html has {}; {note}", bytes(page.len() as u64)));
         Ok(format!("report: {}", console.address(&self.folder.report())))
     }
@@ -64,10 +63,9 @@ impl Report<'_> {
     /// The section with all settings.
     fn settings(&self) -> Result<String> {
         let text = self.folder.settings()?;
-        let again = self.record.kind.command();
-        let data = escaped(&self.record.data.arguments());
+        let again = escaped(&self.record.command_line("config.toml"));
         Ok(format!(
-            "<section><h2>Settings</h2>\n<p>This command repeats the run: <code>plenoxel {again}{data} --config config.toml</code></p>\n\
+            "<section><h2>Settings</h2>\n<p>This command repeats the run: <code>{again}</code></p>\n\
              <details><summary>config.toml</summary><pre>{}</pre></details></section>",
             escaped(&text)
         ))
@@ -83,12 +81,13 @@ fn facts(report: &Report<'_>, result: &Value) -> String {
     let facts = [
         ("PSNR", number("psnr", 2, " dB")),
         ("SSIM", number("ssim", 4, "")),
-        (if report.record.is_carved() { "carving" } else { "training" }, result["seconds"].as_f64().map(clock)),
+        (report.record.kind.process(), result["seconds"].as_f64().map(clock)),
         ("grid", result["resolution"].as_u64().map(|resolution| format!("{resolution}³"))),
     ];
     let baselines = [
         ("PSNR of the background", number("baseline_background_psnr", 2, " dB")),
         ("PSNR of the mean training image", number("baseline_mean_image_psnr", 2, " dB")),
+        ("PSNR of the field", number("psnr_of_field", 2, " dB")),
     ];
     let facts = facts
         .into_iter()
@@ -140,7 +139,7 @@ fn costs(report: &Report<'_>, result: &Value) -> String {
     let per_ray = result["samples"].as_f64().zip(result["rays"].as_f64()).map(|(samples, rays)| format!("{:.1}", samples / rays.max(1.0)));
     let rows = [
         ("reading images", time("seconds_load")),
-        ("training", time("seconds").filter(|_| !report.record.is_carved())),
+        (report.record.kind.process(), time("seconds").filter(|_| !report.record.is_carved())),
         ("carving the hull", time("seconds_hull")),
         ("fitting colors", time("seconds_color")),
         ("evaluating test views", time("seconds_evaluate")),

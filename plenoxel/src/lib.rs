@@ -15,6 +15,7 @@
 //! | [`train`] | batch → render → loss → gradients → optimizer, for any [`Model`](train::Model) |
 //! | [`model`] | radiance fields with their training recipes: [`model::plenoxels`] |
 //! | [`evaluate`] | PSNR and SSIM of a model on the images of a split |
+//! | [`bake`] | a voxel grid with the density and the colors of a factored field |
 //! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |
 //! | [`checkpoint`] | a trained grid in a file |
 //! | [`run`] | complete runs, without printing: settings, run folder, metrics, evaluation |
@@ -27,6 +28,7 @@
 #![deny(unsafe_code)]
 #![warn(missing_docs)]
 
+pub mod bake;
 pub mod camera;
 pub mod camera_path;
 pub mod carve;

@@ -12,6 +12,7 @@ use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::model::plenoxels::config::Config;
+use plenoxel::model::{self, tensorf};
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::Estimate;
 use std::path::{Path, PathBuf};
@@ -84,6 +85,14 @@ impl Exported {
         let (folder, config, record) = RunFolder::open(&self.run)?;
         let folder = if self.best { folder.with_best()? } else { folder };
         let path = folder.existing_checkpoint()?;
+        if model::kind(&path)? == tensorf::KIND {
+            let run = self.run.display();
+            return Err(Error::input(
+                &path,
+                "a factored field has no voxels",
+                format!("run `plenoxel bake {run}` first, and export its result"),
+            ));
+        }
         let (header, voxels) = checkpoint::header(&path)?;
         let estimate = Estimate::of_export(&header.shape(), voxels, bytes_per_voxel);
         console.note(&estimate.describe());

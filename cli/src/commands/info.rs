@@ -12,7 +12,7 @@ use plenoxel::geometry::Aabb;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::model::{self, plenoxels};
 use plenoxel::run::data::DataSource;
-use plenoxel::run::folder::RunFolder;
+use plenoxel::run::folder::{RunFolder, RunKind};
 use plenoxel::run::machine;
 use plenoxel::run::memory::{self, bytes};
 use plenoxel::tensor_file::TensorFile;
@@ -100,7 +100,7 @@ fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
 
 fn of_run(path: &Path) -> Result<Lines> {
     let (folder, config, record) = RunFolder::open(path)?;
-    let carved = record.is_carved();
+    let kind = record.kind;
     let mut lines = vec![
         ("run", path.display().to_string()),
         ("scene", format!("{}, {}", record.scene, record.format)),
@@ -118,7 +118,8 @@ fn of_run(path: &Path) -> Result<Lines> {
         result.as_ref().and_then(|result| result["stages"].as_array()?.iter().map(|stage| stage["resolution"].as_u64()).collect());
     let stages = trained.unwrap_or_else(|| config.resolutions().map(|resolution| resolution as u64).collect());
     let stages: Vec<String> = stages.iter().map(|resolution| format!("{resolution}³")).collect();
-    lines.push(("stages", if carved { "none: the grid was carved".to_owned() } else { stages.join(", ") }));
+    lines.push(("stages", if kind == RunKind::Trained { stages.join(", ") } else { format!("none: the grid was {}", kind.name()) }));
+    lines.extend(record.baked.map(|baked| ("baked from", baked.run.display().to_string())));
     if folder.checkpoint().exists() {
         match of_other_kind(&folder.checkpoint())? {
             Some(other) => lines.extend(other),
@@ -130,14 +131,14 @@ fn of_run(path: &Path) -> Result<Lines> {
     } else {
         lines.push(("grid", "none: the run is not finished".to_owned()));
     }
-    if !carved && folder.existing_state().is_ok() {
+    if kind == RunKind::Trained && folder.existing_state().is_ok() {
         lines.push(("resume with", format!("plenoxel train --resume {}", path.display())));
     }
     if let Some(result) = result {
         let number = |key: &str| result[key].as_f64();
         if let (Some(psnr), Some(seconds)) = (number("psnr"), number("seconds")) {
             let ssim = number("ssim").map_or(String::new(), |ssim| format!(", SSIM {ssim:.4}"));
-            lines.push(("test", format!("PSNR {psnr:.2} dB{ssim}, trained in {}", clock(seconds))));
+            lines.push(("test", format!("PSNR {psnr:.2} dB{ssim}, {} in {}", kind.name(), clock(seconds))));
         }
     }
     Ok(lines)

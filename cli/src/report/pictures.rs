@@ -14,11 +14,12 @@ pub const LARGEST: [u32; 2] = [4000, 400];
 /// The parts of a panel, from left to right.
 const PANEL: [&str; 4] = ["target", "render", "error", "depth"];
 
-/// The section with the stages side by side, or with the carved grid.
+/// The section with the stages side by side, or with the carved or baked grid.
 pub fn stages(folder: &RunFolder, result: &Value) -> Result<String> {
     let what = [
         ("stages.png", "Stages", "One view before the first step and at the end of each stage, and the photograph."),
         ("carved.png", "Carved grid", "The carved grid from some cameras."),
+        ("baked.png", "Baked grid", "A test view."),
     ];
     let Some((name, title, caption)) = what.into_iter().find(|(name, ..)| folder.image(name).exists()) else { return Ok(String::new()) };
     let resolutions = result["stages"].as_array().into_iter().flatten().map(|stage| stage["resolution"].as_u64().map(|n| n as usize));
@@ -32,7 +33,11 @@ pub fn stages(folder: &RunFolder, result: &Value) -> Result<String> {
     });
     // The photograph is of the first test view.
     let photograph = result["views"].as_u64().filter(|views| *views > 0).map(|_| "photograph".to_owned());
-    let labels: Vec<String> = if name == "stages.png" { stages.chain(photograph).collect() } else { Vec::new() };
+    let labels: Vec<String> = match name {
+        "stages.png" => stages.chain(photograph).collect(),
+        "baked.png" => ["photograph", "field", "baked grid"].map(str::to_owned).to_vec(),
+        _ => Vec::new(),
+    };
     let picture = embedded(&folder.image(name), title)?;
     Ok(format!("<section><h2>{title}</h2>\n{}</section>", strip(&picture, &labels, caption, "")))
 }

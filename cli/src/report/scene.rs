@@ -1,19 +1,24 @@
-//! The embedded grid of a report, for its viewer, and the loss of quality by its compression.
+//! The embedded grid of a report, for its viewer, and the loss of quality by its compression. A factored field is baked into a grid first.
 
 use super::Report;
 use crate::html::escaped;
-use crate::progress::thousands;
+use crate::progress::{Console, thousands};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
+use plenoxel::bake::{BakeOptions, bake, resolution_of};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
+use plenoxel::evaluate::Viewer;
 use plenoxel::export::web::WebGrid;
+use plenoxel::field::factored::Factored;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics;
+use plenoxel::model::Model;
 use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::run::evenly_spaced;
 use plenoxel::run::memory::bytes;
+use plenoxel::train::ViewOptions;
 use serde_json::{Value, json};
 
 /// Maximum size of the embedded grid in bytes, which becomes 30 MB in base64.
@@ -23,8 +28,15 @@ const COMPARED: usize = 3;
 /// Maximum number of start views.
 const VIEWS: usize = 25;
 
+/// Most voxels along each axis of a grid that is baked for the page.
+const BAKED_VOXELS: usize = 256;
+/// Degree of its harmonics.
+const BAKED_DEGREE: usize = 2;
+
 /// The embedded grid.
 pub struct Scene {
+    /// True if the grid was baked.
+    baked: bool,
     small: WebGrid,
     bytes: Vec<u8>,
     settings: Value,
@@ -33,21 +45,31 @@ pub struct Scene {
     size: [usize; 2],
 }
 
-/// Loss of quality by quantization and, if necessary, resampling: mean PSNR over a few test views, in dB.
+/// Loss of quality by baking, quantization and, if necessary, resampling: mean PSNR over a few test views, in dB.
 struct Cost {
     views: usize,
-    /// PSNR of the trained grid.
+    /// PSNR of the trained model.
     whole: f64,
     /// PSNR of the embedded grid.
     small: f64,
-    /// PSNR of the embedded grid relative to the trained grid.
+    /// PSNR of the embedded grid relative to the trained model.
     between: f64,
 }
 
 impl Scene {
-    /// Compresses the voxel grid of a report; `None` if its model has none.
-    pub fn of(report: &Report<'_>) -> Result<Option<Self>> {
-        let Some(grid) = report.model.and_then(|model| model.content()?.downcast_ref()) else { return Ok(None) };
+    /// Compresses the voxel grid of a report, or bakes and compresses its factored field; `None` if its model has neither, or if the field
+    /// cannot be baked.
+    pub fn of(report: &Report<'_>, console: &Console<'_>) -> Result<Option<Self>> {
+        let Some((model, content)) = report.model.and_then(|model| Some((model, model.content()?))) else { return Ok(None) };
+        let baked = match content.downcast_ref().map(|field| baked(field, report, console)) {
+            Some(Ok(grid)) => Some(grid),
+            Some(Err(error)) => {
+                console.note(&format!("the field cannot be shown: {error}"));
+                return Ok(None);
+            }
+            None => None,
+        };
+        let Some(grid) = baked.as_ref().or_else(|| content.downcast_ref()) else { return Ok(None) };
         let packed = WebGrid::within(grid, MOST_BYTES);
         let (small, bytes) = packed.map_err(|e| Error::io("report.html", e, "compressing the grid"))?;
         let split = if report.dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
@@ -61,8 +83,8 @@ impl Scene {
             "background": report.config.background,
             "views": views,
         });
-        let cost = Cost::of(report, grid, &small)?;
-        Ok(Some(Scene { small, bytes, settings, cost, size }))
+        let cost = Cost::of(report, model, &small)?;
+        Ok(Some(Scene { baked: baked.is_some(), small, bytes, settings, cost, size }))
     }
 
     /// The HTML of the viewer.
@@ -70,7 +92,7 @@ impl Scene {
         let [width, height] = self.size;
         format!(
             "<section><h2>Interactive viewer</h2>\n<figure id=\"viewer\"><canvas tabindex=\"0\" style=\"--shape: calc({height} / {width})\" \
-             aria-label=\"interactive view of the trained grid\"></canvas>\n<figcaption>Rotate: drag, or arrow keys. Zoom: wheel, pinch, or + and −. \
+             aria-label=\"interactive view of the grid\"></canvas>\n<figcaption>Rotate: drag, or arrow keys. Zoom: wheel, pinch, or + and −. \
              Move: shift and drag, or two fingers. <label>Start view: <select></select></label> <button type=\"button\" \
              id=\"fill\">full screen</button> <button type=\"button\" id=\"save\">save picture</button><br>\n\
              <output></output><br>{}</figcaption></figure></section>",
@@ -86,16 +108,18 @@ impl Scene {
             k => format!(", with view-dependent color on a {k} times coarser grid"),
         };
         let what = format!(
-            "the viewer has a compressed grid of {} voxels at {}³{reduction}, in {}",
+            "the viewer has a compressed grid of {} voxels at {}³{reduction}{}, in {}",
             thousands(header.voxels as u64),
             shape.resolution,
+            if self.baked { ", baked from the factored field" } else { "" },
             bytes(self.bytes.len() as u64)
         );
         match &self.cost {
             Some(Cost { views, whole, small, between }) => {
                 let s = if *views == 1 { "" } else { "s" };
+                let trained = if self.baked { "field" } else { "trained grid" };
                 format!(
-                    "{what}; its PSNR on {views} test view{s} is {small:.2} dB, that of the trained grid {whole:.2} dB; the PSNR between both is {between:.1} dB"
+                    "{what}; its PSNR on {views} test view{s} is {small:.2} dB, that of the {trained} {whole:.2} dB; the PSNR between both is {between:.1} dB"
                 )
             }
             None => what,
@@ -117,12 +141,12 @@ impl Scene {
 
 impl Cost {
     /// Measures the loss on a few test views.
-    fn of(report: &Report<'_>, grid: &VoxelGrid<f32>, small: &WebGrid) -> Result<Option<Self>> {
+    fn of(report: &Report<'_>, model: &dyn Model<f32>, small: &WebGrid) -> Result<Option<Self>> {
         let chosen = evenly_spaced(report.dataset.count(Split::Test), COMPARED);
         let background = report.config.background;
         let small = small.to_grid();
-        let [whole, small] =
-            [grid, &small].map(|grid| grid_viewer(grid, report.config.evaluation, report.config.engine, report.config.background));
+        let whole = Viewer::of(model, &ViewOptions::over(background));
+        let small = grid_viewer(&small, report.config.evaluation, report.config.engine, background);
         let mut sums = [0.0; 3];
         for &i in &chosen {
             let view = report.dataset.load_view(Split::Test, i)?;
@@ -137,6 +161,13 @@ impl Cost {
         let [whole, small, between] = sums;
         Ok((!chosen.is_empty()).then_some(Cost { views: chosen.len(), whole, small, between }))
     }
+}
+
+/// Bakes a field for the page.
+fn baked(field: &Factored<f32>, report: &Report<'_>, console: &Console<'_>) -> Result<VoxelGrid<f32>> {
+    let options = BakeOptions { resolution: resolution_of(field).min(BAKED_VOXELS), degree: BAKED_DEGREE };
+    let count = console.count("baking for the viewer, voxel", 1);
+    bake(field, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
 }
 
 /// A camera for the viewer: right, up and backward axes, position, and intrinsics in pixels.

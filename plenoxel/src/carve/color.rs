@@ -19,6 +19,7 @@ use super::light::{Light, Opaque, Pixel, object_pixels};
 use crate::dataset::View;
 use crate::field::neighbours::smoothed;
 use crate::field::sh;
+use crate::field::sh::least_squares::improve;
 use crate::random::{Permutation, Purpose};
 use autograd::{Lattice, parallel};
 
@@ -153,39 +154,6 @@ pub fn fit_exactly(seen: &Seen<'_>, ridge: f32, sweeps: usize, passed: &dyn Fn(u
         passed(sweep + 2);
     }
     Fitted { table, missed: pixels_missed as f64 / pixels_all as f64 }
-}
-
-/// Computes x ← x + A⁻¹ (g − ridge x) for each channel. The coefficient of degree 0 has no ridge.
-fn improve(x: &mut [f32], a: &[f32], g: &[f32], ridge: f32) {
-    const MOST: usize = sh::count(sh::MAX_DEGREE);
-    let count = x.len() / 3;
-    // A small ridge for degree 0 too: if all directions are equal, A is singular up to rounding.
-    let least = 1e-6 * f64::from(a[0]);
-    let mut l = [[0.0_f64; MOST]; MOST];
-    let mut at = 0;
-    for i in 0..count {
-        for j in 0..=i {
-            let mut sum = f64::from(a[at]) - (0..j).map(|k| l[i][k] * l[j][k]).sum::<f64>();
-            at += 1;
-            if i == j {
-                sum += least + if i > 0 { f64::from(ridge) } else { 0.0 };
-                l[i][i] = sum.max(least).sqrt();
-            } else {
-                l[i][j] = sum / l[j][j];
-            }
-        }
-    }
-    for (x, g) in x.chunks_exact_mut(count).zip(g.chunks_exact(count)) {
-        let mut y = [0.0_f64; MOST];
-        for i in 0..count {
-            let pull = if i > 0 { ridge * x[i] } else { 0.0 };
-            y[i] = (f64::from(g[i] - pull) - (0..i).map(|k| l[i][k] * y[k]).sum::<f64>()) / l[i][i];
-        }
-        for i in (0..count).rev() {
-            y[i] = (y[i] - (i + 1..count).map(|k| l[k][i] * y[k]).sum::<f64>()) / l[i][i];
-            x[i] += y[i] as f32;
-        }
-    }
 }
 
 /// Fits colors with the source paper's descent: rays of object pixels in random order, 5000 per step, rates 0.9, 0.9, 0.1, 0.1 in four

@@ -128,9 +128,10 @@ fn products<T: Real>(planes: &[Tensor<T>], lines: &[Tensor<T>], cells: &Tensor<T
     })
 }
 
-/// The authors' `density_shift` and `distance_scale`.
+/// The authors' `density_shift`.
 const SHIFT: f64 = -10.0;
-const SCALE: f64 = 25.0;
+/// The authors' `distance_scale`: factor of the softplus in the density.
+pub const SCALE: f64 = 25.0;
 
 /// Returns the density at positions `[m, 3]` in units of cells, from the tables of a field in the order of its parameters.
 fn density<T: Real>(tables: &[Tensor<T>], cells: &Tensor<T>) -> Tensor<T> {
@@ -138,11 +139,15 @@ fn density<T: Real>(tables: &[Tensor<T>], cells: &Tensor<T>) -> Tensor<T> {
     (x + y + z + SHIFT).softplus() * SCALE
 }
 
-/// Returns the colors at positions `[m, 3]` in units of cells, seen along encoded directions `[m, e]`: `[m, 3]`.
-fn colors<T: Real>(tables: &[Tensor<T>], feature_octaves: usize, cells: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+/// Returns the appearance features at positions `[m, 3]` in units of cells: `[m, features]`.
+fn features<T: Real>(tables: &[Tensor<T>], cells: &Tensor<T>) -> Tensor<T> {
     let products = products(&tables[6..9], &tables[9..12], cells);
-    let features = Tensor::concat(&products.each_ref(), 1).matmul(&tables[12]);
-    let mut hidden = Tensor::concat(&[&frequency(&features, feature_octaves), directions], 1);
+    Tensor::concat(&products.each_ref(), 1).matmul(&tables[12])
+}
+
+/// Returns the colors of features `[m, features]`, seen along encoded directions `[m, e]`: `[m, 3]`.
+fn shade<T: Real>(tables: &[Tensor<T>], feature_octaves: usize, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+    let mut hidden = Tensor::concat(&[&frequency(features, feature_octaves), directions], 1);
     let layers = &tables[13..];
     for (l, layer) in layers.chunks(2).enumerate() {
         hidden = hidden.matmul(&layer[0]) + &layer[1];
@@ -151,6 +156,11 @@ fn colors<T: Real>(tables: &[Tensor<T>], feature_octaves: usize, cells: &Tensor<
         }
     }
     hidden.sigmoid()
+}
+
+/// Returns the colors at positions `[m, 3]` in units of cells, seen along encoded directions `[m, e]`: `[m, 3]`.
+fn colors<T: Real>(tables: &[Tensor<T>], feature_octaves: usize, cells: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+    shade(tables, feature_octaves, &features(tables, cells), directions)
 }
 
 /// A factored radiance field.
@@ -262,6 +272,16 @@ impl<T: Real> Factored<T> {
         self.density.resample(&at);
         self.appearance.resample(&at);
         self.aabb = aabb;
+    }
+
+    /// Returns the appearance features at world positions `[m, 3]`: `[m, features]`.
+    pub fn features(&self, positions: &Tensor<T>) -> Tensor<T> {
+        features(&self.tables(), &self.cells(positions))
+    }
+
+    /// Returns the colors of appearance features `[m, features]`, seen along unit directions `[m, 3]`: `[m, 3]`, in [0, 1].
+    pub fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+        shade(&self.tables(), self.shape.feature_octaves, features, &self.shape.directions.encode(directions))
     }
 
     /// Returns positions `[m, 3]` in units of cells.

@@ -4,6 +4,8 @@
 //! Up to degree d there are (d + 1)² functions: 1; −y, z, −x; xy, −yz, 2z² − x² − y², −xz, x² − y²; and seven of degree 3. Each is
 //! multiplied by its normalization constant.
 
+pub(crate) mod least_squares;
+
 use autograd::{Real, Tensor, no_grad};
 use ndarray::{Array2, ArrayView2};
 

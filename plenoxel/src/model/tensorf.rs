@@ -28,6 +28,7 @@ use autograd::{Module, Param, Real, Tensor, random::Stream};
 use config::MOST_NODES;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
+use std::any::Any;
 use std::path::Path;
 
 /// Kind of this model in checkpoints.
@@ -263,6 +264,11 @@ impl<T: Real> Model<T> for Tensorf<T> {
         if let Some(occupied) = &self.field.occupied {
             rays.aim_at(occupied);
         }
+    }
+
+    /// Returns the field, a [`Factored<T>`].
+    fn content(&self) -> Option<&dyn Any> {
+        Some(&self.field)
     }
 
     fn settings(&self) -> Value {

@@ -106,6 +106,11 @@ impl Figures {
         }
     }
 
+    /// The mean PSNR in dB; `None` if no view was compared.
+    pub fn psnr(&self) -> Option<f64> {
+        self.psnr
+    }
+
     /// The scores in one sentence.
     pub fn sentence(&self) -> String {
         let Figures { psnr, ssim, split, views, of, width, height, .. } = self;

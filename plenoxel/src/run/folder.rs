@@ -3,7 +3,7 @@
 mod listing;
 mod record;
 
-pub use record::{RunKind, RunRecord};
+pub use record::{Baked, RunKind, RunRecord};
 
 use super::settings::{self, ConfigFile};
 use super::tensorboard;
@@ -197,8 +197,7 @@ impl RunFolder {
     pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
         let about = match record.is_of_own_model() {
             false => {
-                let again = format!("plenoxel {}{} --config THIS_FILE", record.kind.command(), record.data.arguments());
-                format!("Settings of a run of {}. This command repeats the run:\n{again}", record.program)
+                format!("Settings of a run of {}. This command repeats the run:\n{}", record.program, record.command_line("THIS_FILE"))
             }
             true => format!(
                 "Settings of a run with a model of kind `{}`, on {}. The program that created it may not use all of them.",
@@ -229,7 +228,7 @@ impl RunFolder {
         }
         let mut record = RunRecord::parse(&record, &files::read(&record, files::RUN)?)?;
         let config = ConfigFile::read(&path.join(CONFIG))?.complete()?;
-        if !config.trains() && !record.is_of_own_model() {
+        if record.kind == RunKind::Trained && !config.trains() && !record.is_of_own_model() {
             record.kind = RunKind::Carved;
         }
         Ok((folder, config, record))

@@ -387,8 +387,9 @@ impl<'o> OldRun<'o> {
     /// Opens a run and its dataset.
     fn open(path: &Path, data: Option<DataSource>, options: &'o RunOptions, on: &mut Listener<'_>) -> Result<Self> {
         let (folder, config, mut record) = RunFolder::open(path)?;
-        if record.is_carved() {
-            return Err(Error::input(path, "a carved run cannot be resumed", "train its grid with --init-from"));
+        if record.kind != RunKind::Trained {
+            let found = format!("a {} run cannot be resumed", record.kind.name());
+            return Err(Error::input(path, found, "train its grid with --init-from"));
         }
         let folder = folder.locked("--resume")?;
         let state = folder.existing_state()?;

@@ -9,7 +9,7 @@ use plenoxel::json;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::budget;
 use plenoxel::run::data::DataSource;
-use plenoxel::run::folder::RunFolder;
+use plenoxel::run::folder::{RunFolder, RunKind};
 use plenoxel::run::settings;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -99,7 +99,7 @@ impl Job {
             // An evaluation without test views is complete, and has no PSNR.
             (Ok(Some(result)), Ok(_)) if result.get("psnr").is_some() && self.evaluate_downscale.is_none() => State::Finished,
             (Ok(Some(_)), _) => State::Unevaluated,
-            (Ok(None), _) if !record.is_carved() && folder.existing_state().is_ok() => State::Interrupted,
+            (Ok(None), _) if record.kind == RunKind::Trained && folder.existing_state().is_ok() => State::Interrupted,
             (Ok(None), _) => State::CutShort,
         }
     }

@@ -7,7 +7,7 @@ use crate::model::{self, plenoxels};
 use crate::run::data::DataSource;
 use crate::run::{PROGRAM, machine};
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Origin of the grid of a run.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,16 +18,48 @@ pub enum RunKind {
     Trained,
     /// Carving, without training.
     Carved,
+    /// Baking of a trained field.
+    Baked,
 }
 
 impl RunKind {
+    /// The name of the kind: trained, carved or baked.
+    pub fn name(self) -> &'static str {
+        match self {
+            RunKind::Trained => "trained",
+            RunKind::Carved => "carved",
+            RunKind::Baked => "baked",
+        }
+    }
+
     /// The command that creates such a run.
     pub fn command(self) -> &'static str {
         match self {
             RunKind::Trained => "train",
             RunKind::Carved => "carve",
+            RunKind::Baked => "bake",
         }
     }
+
+    /// The name of what this command does.
+    pub fn process(self) -> &'static str {
+        match self {
+            RunKind::Trained => "training",
+            RunKind::Carved => "carving",
+            RunKind::Baked => "baking",
+        }
+    }
+}
+
+/// Origin of a baked grid.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Baked {
+    /// Run folder of the field.
+    pub run: PathBuf,
+    /// Number of voxels along each axis.
+    pub resolution: usize,
+    /// Degree of the harmonics.
+    pub sh_degree: usize,
 }
 
 /// Facts about a run beyond its settings: program, machine and data.
@@ -57,6 +89,9 @@ pub struct RunRecord {
     /// Planned seconds of training, if it was planned by time.
     #[serde(default)]
     pub seconds_planned: Option<f64>,
+    /// The field that was baked, for a baked run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub baked: Option<Baked>,
 }
 
 fn plenoxels_kind() -> String {
@@ -77,6 +112,19 @@ impl RunRecord {
             preset: preset.map(str::to_owned),
             data: source.clone(),
             seconds_planned: None,
+            baked: None,
+        }
+    }
+
+    /// The command line that repeats the run; `config` is the name of its file of settings.
+    pub fn command_line(&self, config: &str) -> String {
+        let command = self.kind.command();
+        match &self.baked {
+            Some(Baked { run, resolution, sh_degree }) => {
+                let run = DataSource::folder(run).arguments();
+                format!("plenoxel {command}{run} --resolution {resolution} --sh-degree {sh_degree}")
+            }
+            None => format!("plenoxel {command}{} --config {config}", self.data.arguments()),
         }
     }
 

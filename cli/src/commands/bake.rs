@@ -1,0 +1,228 @@
+//! `plenoxel bake`: turns a factored field into a voxel grid, as a new run.
+
+use super::new_run::loading;
+use super::whole;
+use crate::images;
+use crate::progress::Console;
+use crate::report::Report;
+use clap::{Args, ValueHint};
+use ndarray::Array3;
+use plenoxel::bake::{BakeOptions, OFFSET, bake, resolution_of};
+use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::error::{Error, Result};
+use plenoxel::evaluate::{Scores, ViewScore, Viewer};
+use plenoxel::field::factored::Factored;
+use plenoxel::field::voxel_grid::Interpolation;
+use plenoxel::model::plenoxels::Plenoxels;
+use plenoxel::model::plenoxels::config::{ColorKind, Config};
+use plenoxel::model::{self, Model};
+use plenoxel::run::data::DataSource;
+use plenoxel::run::evenly_spaced;
+use plenoxel::run::figures::Figures;
+use plenoxel::run::folder::{Baked, NewFolder, RunFolder, RunKind, RunRecord};
+use plenoxel::run::memory::{self, Estimate, Stored};
+use plenoxel::run::training::Stopwatch;
+use plenoxel::train::{About, ViewOptions};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+const EXAMPLES: &str = "\
+Examples:
+  plenoxel bake runs/field                       write runs/field-baked
+  plenoxel bake runs/field --resolution 256      with fewer voxels
+  plenoxel export mesh runs/field-baked
+
+The result is a run folder for evaluate, render, export and report. A grid has smoother colors than the field: the command prints the PSNR of both \
+on up to 25 test views. If stdout is not a terminal, its last line is a JSON object with the results.";
+
+/// Most test views on which the field and the grid are compared.
+const COMPARED: usize = 25;
+
+/// Turn a factored field (preset tensorf) into a voxel grid with spherical harmonics, for exports
+#[derive(Debug, Args)]
+#[command(after_help = EXAMPLES, args_override_self = true)]
+pub struct BakeArgs {
+    /// Run folder of a factored field, written by `plenoxel train`
+    #[arg(value_hint = ValueHint::DirPath)]
+    run: PathBuf,
+
+    /// Use best.safetensors, the checkpoint with the best validation PSNR, instead of the final field
+    #[arg(long)]
+    best: bool,
+
+    /// Voxels per side of the box [default: as many as the field has cells, at most 512]
+    #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<usize>(2, 1024), allow_negative_numbers = true)]
+    resolution: Option<usize>,
+
+    /// Degree of spherical harmonics for view-dependent color, 0 to 3
+    #[arg(long, value_name = "N", help_heading = "Model", default_value_t = 2, value_parser = whole::<usize>(0, 3), allow_negative_numbers = true)]
+    sh_degree: usize,
+
+    /// Dataset folder, if it has moved [default: that of the training]
+    #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
+    data: Option<PathBuf>,
+
+    /// Run folder to write [default: RUN-baked]
+    #[arg(long, short, help_heading = "Output", value_hint = ValueHint::DirPath)]
+    out: Option<PathBuf>,
+
+    /// Overwrite an existing run in the folder
+    #[arg(long, help_heading = "Output")]
+    force: bool,
+
+    /// Write no report.html
+    #[arg(long, help_heading = "Output")]
+    no_report: bool,
+}
+
+/// Bakes a field and writes a run folder.
+pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
+    let (source, config, record) = RunFolder::open(&args.run)?;
+    let source = if args.best { source.with_best()? } else { source };
+    let path = source.existing_checkpoint()?;
+    let stored = match model::kind(&path)? {
+        kind if kind == model::tensorf::KIND => Stored::read(&path)?,
+        kind if kind == model::plenoxels::KIND => {
+            return Err(Error::input(&path, "this is a voxel grid already", "export it without `plenoxel bake`"));
+        }
+        other => return Err(Error::input(&path, format!("a model of kind `{other}` cannot be baked"), "use a run of preset tensorf")),
+    };
+    let data = args.data.as_deref().map_or(record.data, DataSource::folder);
+    let dataset = data.reopen(&config)?;
+    let out = args.out.clone().map_or_else(|| beside(&args.run), Ok)?;
+    let folder = NewFolder::choose(Some(&out), dataset.name(), args.force)?;
+    let estimate = Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, Split::Test)));
+    console.note(&estimate.describe());
+    estimate.check()?;
+    let (trained, about) = model::open(&path, &config)?;
+    let Some(field) = trained.content().and_then(|content| content.downcast_ref::<Factored<f32>>()) else {
+        return Err(Error::input(&path, "the model has no factored field", "use a run of preset tensorf"));
+    };
+
+    let options = BakeOptions { resolution: args.resolution.unwrap_or_else(|| resolution_of(field)), degree: args.sh_degree };
+    let mut clock = Stopwatch::default();
+    let count = console.count("baking, voxel", 1);
+    let cameras = dataset.cameras(Split::Train);
+    let grid = clock.time(|| bake(field, &options, &cameras, &|done, all| count.at(done, all)))?;
+    drop(count);
+    let voxels = grid.lattice().present();
+    console.note(&format!("baked {voxels} voxels at {}³ in {:.1} s", options.resolution, clock.seconds()));
+
+    let folder = folder.create()?;
+    let config = Config {
+        color: ColorKind::Sh,
+        sh_degree: options.degree,
+        sh_offset: OFFSET,
+        sh_reduction: 1,
+        interpolation: Interpolation::Trilinear,
+        stages: Vec::new(),
+        tensorf: None,
+        ..config
+    };
+    let from = source.path().canonicalize().unwrap_or_else(|_| source.path().to_owned());
+    let baked = Baked { run: from, resolution: options.resolution, sh_degree: options.degree };
+    let record = RunRecord { baked: Some(baked), ..RunRecord::new(RunKind::Baked, &dataset, record.preset.as_deref(), &data) };
+    folder.describe(&config, &record)?;
+    let model = Plenoxels::of_grid(&config, grid);
+    folder.save(&model, &About { step: about.step, seed: about.seed, scene: about.scene, background: config.background })?;
+
+    let view = ViewOptions::over(config.background);
+    let Compared { of_field, of_grid } = compare(&*trained, &model, &dataset, &data, &folder, console)?;
+    let summary = Summary {
+        figures: Figures::new(&of_grid, Split::Test, &dataset, &config, &model, &view),
+        psnr_of_field: of_field.psnr(),
+        seconds: clock.seconds(),
+        peak_memory_bytes: memory::peak(),
+        voxels,
+        scene: dataset.name().to_owned(),
+        run: folder.path().display().to_string(),
+        per_view: of_grid.per_view,
+    };
+    folder.write_result(&summary)?;
+    console.result(&summary.sentence())?;
+    console.result(&format!("run folder: {}", folder.path().display()))?;
+    console.record(&summary)?;
+    if !args.no_report {
+        let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: Some(&model) };
+        console.note(&report.write(console)?);
+    }
+    Ok(())
+}
+
+/// The folder next to a run, with `-baked` after its name.
+fn beside(run: &Path) -> Result<PathBuf> {
+    let whole = run.canonicalize().map_err(|e| Error::io(run, e, "reading the folder"))?;
+    let name = whole.file_name().map(|name| format!("{}-baked", name.to_string_lossy()));
+    let name = name.ok_or_else(|| Error::usage("--out", "the run folder has no name", "give the folder to write"))?;
+    // A relative path stays relative.
+    Ok(if run.file_name().is_some() { run.with_file_name(name) } else { whole.with_file_name(name) })
+}
+
+/// Scores on the same test views.
+struct Compared {
+    of_field: Scores,
+    of_grid: Scores,
+}
+
+/// Compares the field and the baked grid with test views, and draws the first of them.
+fn compare(
+    field: &dyn Model<f32>,
+    grid: &Plenoxels<f32>,
+    dataset: &Dataset,
+    data: &DataSource,
+    folder: &RunFolder,
+    console: &Console<'_>,
+) -> Result<Compared> {
+    let chosen = evenly_spaced(dataset.count(Split::Test), COMPARED);
+    let count = console.count(&loading(Split::Test, data), chosen.len());
+    let views = dataset.load_views(Split::Test, &chosen, &|done, all| count.at(done, all))?;
+    drop(count);
+    let view = ViewOptions::over(grid.config().background);
+    let mut strip: Vec<Array3<f32>> = Vec::new();
+    let mut scores = |model: &dyn Model<f32>, what: &str| {
+        let count = console.count(&format!("evaluating the {what}"), views.len());
+        Viewer::of(model, &view).compare(&views, |i, _: &View, target, picture| {
+            count.at(i + 1, views.len());
+            if i == 0 {
+                strip.extend(strip.is_empty().then(|| target.clone()));
+                strip.push(picture.rgb.clone());
+            }
+            Ok(())
+        })
+    };
+    let compared = Compared { of_field: scores(field, "field")?, of_grid: scores(grid, "baked grid")? };
+    if !strip.is_empty() {
+        folder.create_images()?;
+        images::write(&folder.image("baked.png"), &images::strip(&strip.iter().collect::<Vec<_>>()))?;
+    }
+    Ok(compared)
+}
+
+/// Final figures. `seconds` is the time of baking alone.
+#[derive(Debug, Serialize)]
+struct Summary {
+    #[serde(flatten)]
+    figures: Figures,
+    /// Mean PSNR of the field on the same views.
+    psnr_of_field: Option<f64>,
+    seconds: f64,
+    peak_memory_bytes: Option<u64>,
+    voxels: usize,
+    scene: String,
+    run: String,
+    per_view: Vec<ViewScore>,
+}
+
+impl Summary {
+    /// The quality in one sentence, with what baking costs.
+    fn sentence(&self) -> String {
+        let sentence = self.figures.sentence();
+        match (self.psnr_of_field, self.figures.psnr()) {
+            (Some(field), Some(grid)) => {
+                let (difference, side) = ((field - grid).abs(), if grid <= field { "below" } else { "above" });
+                format!("{sentence}; {difference:.1} dB {side} the field, which has {field:.2} dB")
+            }
+            _ => sentence,
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! `plenoxel bake`, and the page and the exports of a factored field.
+
+#[path = "support/command.rs"]
+mod command;
+
+use command::{Answer, Folder, plenoxel};
+use serde_json::Value;
+use std::fs;
+
+const STAGES: &str = "tensorf.stages=[{resolution=12, steps=40, rays=256}, {resolution=20, steps=40, rays=256}]";
+
+/// Trains a tiny factored field of the built-in scene.
+fn train(out: &str, more: &[&str]) -> Answer {
+    let tiny = [
+        "train",
+        "--preset=tensorf",
+        "--scene-size=24",
+        "--scene-views=8,1,2",
+        "--set",
+        STAGES,
+        "--set=tensorf.opaque_steps=5",
+        "--out",
+        out,
+    ];
+    plenoxel(&[&tiny[..], more].concat())
+}
+
+#[test]
+fn the_page_of_a_factored_field_shows_a_baked_grid() {
+    let folder = Folder::new("bake-page");
+    let run = folder.path("field");
+    let trained = train(&run, &["--no-images"]);
+    assert!(trained.err.contains("baked from the factored field") && trained.err.contains("that of the field"), "{}", trained.err);
+    trained.done();
+    let page = fs::read_to_string(folder.path("field/report.html")).unwrap();
+    assert!(page.contains("<figure id=\"viewer\">") && page.contains("id=\"grid\"") && page.contains("baked from the factored field"));
+    // The bits do not depend on the number of threads.
+    plenoxel(&["report", &run, "--threads=3"]).done();
+    assert!(fs::read_to_string(folder.path("field/report.html")).unwrap() == page);
+}
+
+#[test]
+fn a_baked_field_is_a_run_that_other_commands_take() {
+    let folder = Folder::new("bake");
+    let [run, baked] = ["field", "baked"].map(|name| folder.path(name));
+    train(&run, &["--no-report", "--no-images"]).done();
+    plenoxel(&["export", "mesh", &run]).refused(3, &["a factored field has no voxels", &format!("run `plenoxel bake {run}` first")]);
+    plenoxel(&["render", &run, "--channels", "normal"]).refused(3, &["run `plenoxel bake RUN` first"]);
+
+    let answer = plenoxel(&["bake", &run, "--resolution", "24", "--out", &baked]);
+    assert!(answer.out.contains("PSNR ") && answer.out.contains(" the field, which has "), "{}", answer.out);
+    let result = answer.json();
+    let number = |key: &str| result[key].as_f64().unwrap();
+    assert!((number("psnr") - number("psnr_of_field")).abs() < 3.0, "{result}");
+    assert_eq!((&result["resolution"], &result["views"]), (&Value::from(24), &Value::from(2)));
+    let evaluated = plenoxel(&["evaluate", &baked]).json();
+    assert!((evaluated["psnr"].as_f64().unwrap() - number("psnr")).abs() < 1e-9);
+
+    plenoxel(&["export", "mesh", &baked, "--level", "5"]).done();
+    plenoxel(&["export", "ply", &baked]).done();
+    plenoxel(&["export", "vox", &baked]).done();
+    plenoxel(&["render", &baked, "--view", "0", "--channels", "normal"]).done();
+    let about = plenoxel(&["info", &baked]).done();
+    assert!(about.contains("none: the grid was baked") && about.contains(&run), "{about}");
+    let page = fs::read_to_string(folder.path("baked/report.html")).unwrap();
+    assert!(page.contains("<figure id=\"viewer\">") && page.contains("<h2>Baked grid</h2>") && page.contains("PSNR of the field"));
+
+    // A grid is not baked, a baked run is not resumed, and nothing is overwritten unasked.
+    plenoxel(&["bake", &baked]).refused(3, &["this is a voxel grid already"]);
+    plenoxel(&["train", "--resume", &baked]).refused(3, &["a baked run cannot be resumed"]);
+    plenoxel(&["bake", &run, "--out", &baked]).refused(2, &["is not empty", "--force"]);
+
+    // The command in the settings repeats the run.
+    let checkpoint = || fs::read(folder.path("baked/checkpoint.safetensors")).unwrap();
+    let (before, settings) = (checkpoint(), fs::read_to_string(folder.path("baked/config.toml")).unwrap());
+    let line = settings.lines().find_map(|line| line.strip_prefix("# plenoxel ")).unwrap();
+    let words: Vec<&str> = line.split_whitespace().chain(["--out", &baked, "--force", "--no-report", "--threads=3"]).collect();
+    plenoxel(&words).done();
+    assert!(checkpoint() == before);
+}
