@@ -38,7 +38,7 @@ pub struct Config {
     pub directions: Directions,
     /// Distance between samples, in cells.
     pub step: f64,
-    /// Weight that completes a group of samples with one color ([`Grouping`]), in training; 0 for a color per sample.
+    /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::factored::Grouping)), in training; 0 for a color per sample.
     pub group: f64,
     /// The same in pictures.
     pub group_in_pictures: f64,

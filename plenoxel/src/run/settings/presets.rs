@@ -34,7 +34,7 @@ pub const PRESETS: [Preset; 6] = [
     Preset {
         name: "tensorf",
         purpose: "a factored field: the best quality; `plenoxel bake` makes voxels of it for exports",
-        time: "about 10 min at 800 x 800",
+        time: "about 11 min at 800 x 800",
         text: include_str!("../../../presets/tensorf.toml"),
     },
     Preset {
