@@ -1,10 +1,13 @@
-//! Single ops at the sizes of the scripts they are compared with: `fwd_ms` forward, `ms` forward and backward from a given cotangent.
+//! Single ops at the sizes of the scripts they are compared with: `fwd_ms` forward, `ms` forward and backward from a given cotangent. `gflop_per_s` of a network
+//! counts its matrix products; compare it with `gemm_…` of the bench `roofline`.
 //!
 //!     cargo bench --bench ops
 //!     cargo bench --bench ops -- exp gather4 --repeats 21
 
 mod support;
 
+use autograd::nn::{Activation, Mlp};
+use autograd::random::Stream;
 use autograd::{Buffer, Indices, Tensor, add_rows};
 use std::hint::black_box;
 use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat};
@@ -32,13 +35,28 @@ fn row(args: &Arguments, name: &str, inputs: &[&[usize]], f: impl Fn(&[Tensor<f3
         form = if variables.iter().any(|v| gradients.get(v).is_some_and(|g| g.as_rows().is_some())) { "rows" } else { "dense" };
         drop(black_box(gradients));
     });
-    print(name, Some(median(&forward)), &both, form);
+    print(name, Some(median(&forward)), &both, form, None);
 }
 
-fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str) {
+/// Eight layers of one width for 65 536 rows of a constant input: forward, and the adjoint of the parameters.
+fn network(args: &Arguments, width: usize) {
+    let (name, layers, rows) = (format!("mlp_8x{width}"), 8, 65_536);
+    if !args.wants(&name) {
+        return;
+    }
+    let net = Mlp::<f32>::new("net", &vec![width; layers + 1], Activation::Relu, &Stream::new(1));
+    let (x, cotangent) = (tensor(&[rows, width], 2), tensor(&[rows, width], 3));
+    let forward = repeat(args.repeats, || drop(black_box(autograd::no_grad(|| net.forward(&x)))));
+    let both = repeat(args.repeats, || drop(black_box(net.forward(&x).backward_from(&cotangent))));
+    // Forward, weights, and activations of all layers but the first.
+    let products = (3 * layers - 1) as f64 * 2.0 * (rows * width * width) as f64;
+    print(&name, Some(median(&forward)), &both, "dense", Some(products * 1e-6 / median(&both)));
+}
+
+fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str, gflop_per_s: Option<f64>) {
     let row = serde_json::json!({
         "workload": format!("op:{name}"), "fwd_ms": forward, "ms": median(both), "ms_min": both[0], "ms_max": both[both.len() - 1],
-        "n": both.len(), "gradient": form, "peak_rss_mb": peak_memory_mb(),
+        "n": both.len(), "gradient": form, "gflop_per_s": gflop_per_s, "peak_rss_mb": peak_memory_mb(),
     });
     println!("{row}");
 }
@@ -61,13 +79,16 @@ fn run() {
     row(&args, "mulsum_5000x200x3", &[&[5000, 200], &[5000, 200, 3]], |x| (x[0].unsqueeze(2) * &x[1]).sum_axis(1));
     row(&args, "matmul_1024", &[&[1024, 1024], &[1024, 1024]], |x| x[0].matmul(&x[1]));
     row(&args, "matmul_65536x32x64", &[&[65536, 32], &[32, 64]], |x| x[0].matmul(&x[1]));
+    for width in [16, 64, 128, 256] {
+        network(&args, width);
+    }
     row(&args, "sum_16M", &[&[16_000_000]], |x| x[0].sum());
     for width in [4, 28] {
         let name = format!("scatter_add{width}");
         if args.wants(&name) {
             let (mut table, values) = (Buffer::zeros(ROWS * width), numbers(PICKS * width, 9));
             let times = repeat(args.repeats, || add_rows(&mut table, width, &picks, &values));
-            print(&name, None, &times, "in place");
+            print(&name, None, &times, "in place", None);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What this machine can do at most: bandwidth of memory, and rows picked at random from tables of several sizes.
+//! What this machine can do at most: bandwidth of memory, rows picked at random from tables of several sizes, and matrix products.
 //!
 //!     cargo bench --bench roofline
 //!
@@ -6,7 +6,7 @@
 
 mod support;
 
-use autograd::{Buffer, Indices, Tensor, parallel};
+use autograd::{Buffer, Indices, Matrix, Tensor, multiply, parallel};
 use std::hint::black_box;
 use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat};
 
@@ -48,6 +48,9 @@ fn run() {
     for (side, width) in [(64, 1), (128, 1), (128, 3), (128, 27)] {
         gather(&args, side, width);
     }
+    for width in [16, 64, 128, 256] {
+        products(&args, width);
+    }
 }
 
 /// Random rows of a table, each added up where it is found: nothing is written.
@@ -68,6 +71,26 @@ fn gather(args: &Arguments, side: usize, width: usize) {
         black_box(sums);
     });
     print(&name, &times, PICKS * width * size_of::<f32>(), Some(PICKS));
+}
+
+/// Products of 256 rows with a square matrix, on all threads.
+fn products(args: &Arguments, width: usize) {
+    let name = format!("gemm_{width}");
+    if !args.wants(&name) {
+        return;
+    }
+    let (rows, blocks) = (256, 1024);
+    let (x, w) = (numbers(rows * width, 3), numbers(width * width, 4));
+    let mut out = Buffer::<f32>::zeros(blocks * rows * width);
+    let times = repeat(args.repeats, || {
+        parallel::for_each_chunk(&mut out, rows * width, |_, out| {
+            multiply(Matrix::new(&x, rows, width), Matrix::new(&w, width, width), out)
+        });
+    });
+    let ms = median(&times);
+    let flops = 2.0 * (blocks * rows * width * width) as f64;
+    let row = serde_json::json!({ "limit": name, "ms": ms, "gflop_per_s": flops * 1e-6 / ms, "threads": rayon::current_num_threads() });
+    println!("{row}");
 }
 
 fn add<const W: usize>(table: &[f32], picks: &[u32]) -> f32 {

@@ -12,7 +12,7 @@ fn plenoxel(args: &[&str]) -> Answer {
     command::plenoxel(&[args, &["--max-memory", "400MB", "--quiet"]].concat())
 }
 
-const PRESETS: [&str; 7] = ["fast", "quality", "tensorf", "plenoxels", "paper", "demo", "carve"];
+const PRESETS: [&str; 11] = ["fast", "quality", "voxels", "tensorf", "dvgo", "ngp", "nerf", "plenoxels", "paper", "demo", "carve"];
 
 /// Assignments that keep all that a preset does and make it small: grids, steps and rays.
 fn shortened(preset: &str) -> Vec<String> {
@@ -32,6 +32,17 @@ fn shortened(preset: &str) -> Vec<String> {
     all.extend(of("tensorf.stages", of_field, 12));
     all.extend((0..of_field).map(|i| format!("tensorf.stages[{i}].rays=200")));
     all.extend(["rays_per_step=200".to_owned(), "carve.resolution=20".to_owned()]);
+    let of_fine = count("[[dvgo.fine]]");
+    all.extend(of("dvgo.fine", of_fine, 12));
+    all.extend((0..of_fine).map(|i| format!("dvgo.fine[{i}].rays=200")));
+    // So few steps make little opaque.
+    let others = [
+        ("[dvgo]", &["dvgo.coarse={resolution=12, steps=40, rays=200}", "dvgo.coarse_opacity=1e-2", "dvgo.occupied_above=1e-4"][..]),
+        ("[ngp]", &["ngp.stages=[{steps=12, rays=200}]", "ngp.log2_rows=8", "ngp.cells=16", "ngp.refresh_all_until=4"]),
+        ("[nerf]", &["nerf.steps=4", "nerf.rays=50", "nerf.width=16", "nerf.decay_steps=4"]),
+    ];
+    let shorter = others.into_iter().filter(|(table, _)| count(table) > 0).flat_map(|(_, settings)| settings);
+    all.extend(shorter.map(|setting| (*setting).to_owned()));
     all
 }
 
@@ -68,13 +79,26 @@ fn the_settings_of_a_run_of_each_preset_repeat_it_to_the_bit() {
         let resolved = plenoxel(&["presets", preset, "--resolved"]).done();
         // What was not shortened is the preset's own.
         let own = resolved.lines().filter(|line| !line.starts_with('#'));
-        let short = ["resolution", "steps", "epochs", "rays_per_step", "rays"];
+        let short = [
+            "resolution",
+            "steps",
+            "epochs",
+            "rays_per_step",
+            "rays",
+            "coarse_opacity",
+            "occupied_above",
+            "log2_rows",
+            "cells",
+            "refresh_all_until",
+            "width",
+            "decay_steps",
+        ];
         for line in own.filter(|line| !short.iter().any(|key| line.starts_with(key))) {
             assert!(text.contains(line), "{preset}: {line}");
         }
     }
     // Without silhouettes these have a scout, and aim at what it found.
-    for preset in ["fast", "quality"] {
+    for preset in ["fast", "voxels"] {
         let args = ["train", "--scene-size=24", "--scene-views=6,0,1", "--preset", preset, "--hull", "off"];
         let mut settings = shortened(preset);
         // So few steps at the preset's rates would leave nothing.
@@ -93,7 +117,8 @@ fn presets_are_listed_printed_and_resolved() {
     assert_eq!(list.lines().count(), 1 + PRESETS.len(), "{list}");
     for (line, preset) in list.lines().skip(1).zip(PRESETS) {
         assert!(line.starts_with(preset) && line.len() <= 120, "{line}");
-        let file = fs::read_to_string(format!("plenoxel/presets/{preset}.toml")).unwrap();
+        let file = if preset == "tensorf" { "quality" } else { preset };
+        let file = fs::read_to_string(format!("plenoxel/presets/{file}.toml")).unwrap();
         assert_eq!(plenoxel(&["presets", preset]).done().trim_end(), file.trim_end());
         // Its own switch says what alpha decides.
         let resolved = plenoxel(&["presets", preset, "--resolved"]).done();

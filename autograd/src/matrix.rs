@@ -1,6 +1,6 @@
 //! Products of matrices in slices, computed on one thread by the `gemm` crate.
 //!
-//! The crate takes pointers, which requires one unsafe call, in [`multiply`]. The tests of the matrix product compare it with a safe triple loop.
+//! The crate takes pointers, which requires one unsafe call, in `product`. The tests of the matrix product compare it with a safe triple loop.
 #![allow(unsafe_code)]
 
 use crate::real::Real;
@@ -40,6 +40,11 @@ impl<'a, T> Matrix<'a, T> {
         Matrix { data, rows, cols, row, col }
     }
 
+    /// Returns the transpose, a view of the same numbers.
+    pub fn transpose(self) -> Self {
+        Matrix { rows: self.cols, cols: self.rows, row: self.col, col: self.row, ..self }
+    }
+
     pub(crate) fn rows(self, range: std::ops::Range<usize>) -> Self {
         assert!(range.end <= self.rows);
         Matrix { data: &self.data[(range.start * self.row).min(self.data.len())..], rows: range.len(), ..self }
@@ -61,12 +66,28 @@ impl<'a, T> Matrix<'a, T> {
 /// Panics if the sizes do not fit.
 #[track_caller]
 pub fn multiply<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
+    product(a, b, out, false);
+}
+
+/// Computes out += a · b on this thread, for kernels. `out` is in row-major order.
+///
+/// Panics if the sizes do not fit.
+#[track_caller]
+pub fn add_product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
+    product(a, b, out, true);
+}
+
+#[track_caller]
+fn product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool) {
     let (m, k, n) = (a.rows, a.cols, b.cols);
     assert!(b.rows == k && out.len() == m * n && a.reach() <= a.data.len() && b.reach() <= b.data.len());
     if m == 0 || n == 0 || k == 0 {
-        out.fill(T::zero());
+        if !add {
+            out.fill(T::zero());
+        }
         return;
     }
+    let kept = if add { T::one() } else { T::zero() };
     // SAFETY: the assertion ensures that every entry that the call reads or writes, at the given strides, lies inside the three slices. `out` is borrowed
     // uniquely, and `T` is f32 or f64, which the library supports.
     unsafe {
@@ -77,14 +98,14 @@ pub fn multiply<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
             out.as_mut_ptr(),
             1,
             n as isize,
-            false,
+            add,
             a.data.as_ptr(),
             a.col as isize,
             a.row as isize,
             b.data.as_ptr(),
             b.col as isize,
             b.row as isize,
-            T::zero(),
+            kept,
             T::one(),
             false,
             false,

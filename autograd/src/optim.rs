@@ -15,11 +15,13 @@
 mod adam;
 mod elementwise;
 mod rmsprop;
+mod scaled;
 mod schedule;
 mod sgd;
 
 pub use adam::{Adam, AdamMode};
 pub use rmsprop::RmsProp;
+pub use scaled::Scaled;
 pub use schedule::{Exponential, Piecewise, Schedule, WarmUp};
 pub use sgd::{Momentum, Sgd};
 

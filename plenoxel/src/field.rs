@@ -2,9 +2,14 @@
 //!
 //! [`Field`] and [`Radiance`] are defined by [`render`](crate::render), which depends on no particular field.
 
+pub mod dvgo;
 pub mod encoding;
 pub mod factored;
+pub mod grouping;
+pub mod hash_grid;
 pub(crate) mod neighbours;
+pub mod nerf;
+pub mod ngp;
 pub mod sh;
 pub mod voxel_grid;
 

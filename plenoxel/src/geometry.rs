@@ -17,6 +17,18 @@ impl Aabb {
         Aabb { min: DVec3::splat(-half_width), max: DVec3::splat(half_width) }
     }
 
+    /// Returns the number of grid nodes along each axis, with nodes on the faces, at which the box has about as many cells as a cube of `resolution` nodes
+    /// along each axis, with about equal sides.
+    pub fn nodes(&self, resolution: usize) -> [usize; 3] {
+        let side = self.volume().cbrt() / (resolution - 1) as f64;
+        ((self.max - self.min) / side).to_array().map(|cells| cells.round().max(1.0) as usize + 1)
+    }
+
+    /// Returns the volume.
+    pub fn volume(&self) -> f64 {
+        (self.max - self.min).element_product()
+    }
+
     /// Returns true for points inside or on a face.
     pub fn contains(&self, point: DVec3) -> bool {
         point.cmpge(self.min).all() && point.cmple(self.max).all()

@@ -26,7 +26,7 @@ mod total_variation;
 pub use exposure::EXPOSURE;
 pub use objective::{Evaluation, NAMES, Objective, Step};
 pub use opacity::{beta, entropy, opacity_supervision};
-pub use photometric::{charbonnier, huber, mse};
+pub use photometric::{charbonnier, huber, mse, random_background, sample_color};
 pub use robust::AdaptiveRobust;
 pub use sparsity::{cauchy_sparsity, distortion};
 pub use total_variation::{Cells, sampled_total_variation, total_variation, total_variation_of_bricks, tv_color, tv_density};

@@ -2,8 +2,13 @@
 //!
 #![doc = include_str!("../docs/own_field.md")]
 
+mod cells;
+pub mod dvgo;
+pub mod nerf;
+pub mod ngp;
 pub mod plenoxels;
 pub mod recipe;
+mod stage;
 pub mod tensorf;
 
 pub use crate::train::Model;
@@ -12,12 +17,15 @@ use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::tensor_file::TensorFile;
 use crate::train::About;
+use dvgo::Dvgo;
+use nerf::Nerf;
+use ngp::Ngp;
 use plenoxels::config::Config;
 use std::path::Path;
 use tensorf::Tensorf;
 
 /// Kinds of models that [`open`] can read.
-pub const KINDS: [&str; 2] = [plenoxels::KIND, tensorf::KIND];
+pub const KINDS: [&str; 5] = [plenoxels::KIND, tensorf::KIND, dvgo::KIND, nerf::KIND, ngp::KIND];
 
 /// Returns the kind of model that a checkpoint holds.
 ///
@@ -39,6 +47,18 @@ pub fn open(path: &Path, config: &Config) -> Result<(Box<dyn Model<f32>>, About)
         }
         tensorf::KIND => {
             let (model, about) = Tensorf::open(path)?;
+            Ok((Box::new(model), about))
+        }
+        dvgo::KIND => {
+            let (model, about) = Dvgo::open(path)?;
+            Ok((Box::new(model), about))
+        }
+        nerf::KIND => {
+            let (model, about) = Nerf::open(path)?;
+            Ok((Box::new(model), about))
+        }
+        ngp::KIND => {
+            let (model, about) = Ngp::open(path)?;
             Ok((Box::new(model), about))
         }
         other => Err(recipe::unknown(other, &TensorFile::open(path)?)),

@@ -34,6 +34,10 @@ pub enum Purpose {
     Patches = 5,
     /// Samples at which the color network of a factored field is evaluated.
     Shade = 6,
+    /// Samples that are drawn where an earlier pass found matter.
+    Importance = 7,
+    /// Noise of the density.
+    Noise = 8,
 }
 
 /// Returns 64 random bits for (seed, purpose, step, index).

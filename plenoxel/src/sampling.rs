@@ -3,7 +3,10 @@
 //! A sample represents an interval of its ray: its position is the middle of the interval, `delta` the length. Samples of a batch are
 //! packed one ray after another; ray `r` owns `offsets[r]..offsets[r + 1]`. Rays that miss the box have no samples.
 
+pub mod importance;
 mod occupancy;
+mod running;
+mod visible;
 pub mod walk;
 
 use crate::camera::Ray;
@@ -12,7 +15,9 @@ use crate::random::{Purpose, uniform};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 pub use occupancy::Occupancy;
 use occupancy::{Along, Look};
+pub use running::{Refresh, RunningOccupancy};
 use serde::{Deserialize, Serialize};
+pub use visible::sample_visible;
 
 /// Spacing of samples along a ray.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -234,7 +239,6 @@ fn occupied_of(march: &March, along: &Along<'_>, first: usize, found: &mut [(f64
 
 /// Samples a batch of rays through a box. With `occupancy`, samples in empty cells are left out; the positions of the others do not change.
 pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitter, occupancy: Option<&Occupancy>) -> Samples<T> {
-    const RUN: usize = 128;
     let marches: Vec<(Vec<March>, Vec<u32>)> = parallel::map_chunks(rays.len(), RUN, |range| {
         let marches: Vec<March> = range.clone().map(|r| march(&rays[r], aabb, spacing, jitter.of(r))).collect();
         let counts = marches.iter().zip(range).map(|(m, r)| match occupancy {
@@ -244,32 +248,60 @@ pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitt
         let counts = counts.collect();
         (marches, counts)
     });
+    let counts = marches.iter().flat_map(|(_, counts)| counts.iter().copied());
+    packed(rays, counts, |r, slots| {
+        let march = &marches[r / RUN].0[r % RUN];
+        match occupancy {
+            None => (0..march.count).map(|k| march.interval(k)).for_each(|(middle, length)| slots.put(middle, length)),
+            Some(cells) => march.occupied(&rays[r], cells).for_each(|(middle, length)| slots.put(middle, length)),
+        }
+    })
+}
+
+/// Number of rays whose samples are placed together.
+const RUN: usize = 128;
+
+/// Places for the samples of some rays, filled one after another.
+struct Slots<'a, T> {
+    ray: Ray,
+    t: &'a mut [T],
+    delta: &'a mut [T],
+    positions: &'a mut [T],
+    filled: usize,
+}
+
+impl<T: Real> Slots<'_, T> {
+    /// Adds a sample of the current ray, given its distance and the length of its interval.
+    #[inline]
+    fn put(&mut self, t: f64, delta: f64) {
+        let (i, p) = (self.filled, self.ray.origin + t * self.ray.direction);
+        (self.t[i], self.delta[i]) = (T::lit(t), T::lit(delta));
+        self.positions[3 * i..3 * i + 3].copy_from_slice(&[T::lit(p.x), T::lit(p.y), T::lit(p.z)]);
+        self.filled += 1;
+    }
+}
+
+/// Packs the samples of rays. `counts` are the numbers of samples of the rays, and `place(r, slots)` adds those of ray r.
+fn packed<T: Real>(rays: &[Ray], counts: impl Iterator<Item = u32>, place: impl Fn(usize, &mut Slots<'_, T>) + Sync) -> Samples<T> {
     let mut offsets = Vec::with_capacity(rays.len() + 1);
     offsets.push(0u32);
-    for count in marches.iter().flat_map(|(_, counts)| counts) {
+    for count in counts {
         offsets.push(offsets[offsets.len() - 1] + count);
     }
     let m = offsets[rays.len()] as usize;
     let (mut t, mut delta, mut positions) = (Buffer::<T>::stale(m), Buffer::<T>::stale(m), Buffer::<T>::stale(3 * m));
-    let lengths = || (0..marches.len()).map(|c| (offsets[((c + 1) * RUN).min(rays.len())] - offsets[c * RUN]) as usize);
+    let runs = rays.len().div_ceil(RUN);
+    let lengths = || (0..runs).map(|c| (offsets[((c + 1) * RUN).min(rays.len())] - offsets[c * RUN]) as usize);
     let parts: Vec<_> = parallel::split_lengths(&mut t, lengths())
         .into_iter()
         .zip(parallel::split_lengths(&mut delta, lengths()))
         .zip(parallel::split_lengths(&mut positions, lengths().map(|n| 3 * n)))
         .collect();
     parallel::for_each_item(parts, |c, ((t, delta), positions)| {
-        let mut i = 0;
-        for (ray, march) in rays[c * RUN..].iter().zip(&marches[c].0) {
-            let mut place = |middle: f64, length: f64| {
-                let p = ray.origin + middle * ray.direction;
-                (t[i], delta[i]) = (T::lit(middle), T::lit(length));
-                positions[3 * i..3 * i + 3].copy_from_slice(&[T::lit(p.x), T::lit(p.y), T::lit(p.z)]);
-                i += 1;
-            };
-            match occupancy {
-                None => (0..march.count).map(|k| march.interval(k)).for_each(|(middle, length)| place(middle, length)),
-                Some(cells) => march.occupied(ray, cells).for_each(|(middle, length)| place(middle, length)),
-            }
+        let mut slots = Slots { ray: rays[c * RUN], t, delta, positions, filled: 0 };
+        for (r, &ray) in rays.iter().enumerate().skip(c * RUN).take(RUN) {
+            slots.ray = ray;
+            place(r, &mut slots);
         }
     });
     let directions: Vec<T> = rays.iter().flat_map(|r| r.direction.to_array()).map(T::lit).collect();

@@ -6,6 +6,7 @@
 mod model;
 mod state;
 
+pub(crate) use model::read_params;
 pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, StageProgress, ViewOptions};
 pub use state::{About, about};
 
@@ -225,6 +226,8 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             // Release the memory of the old optimizer before the model grows.
             self.optimizer = self.model.optimizer(&stage);
             self.model.begin_stage(&stage, &mut self.rays).map_err(|e| at_step(e, self.step))?;
+            // It may depend on what the model has found.
+            self.optimizer = self.model.optimizer(&stage);
         }
         self.model.begin_step(in_stage)?;
         let TrainOptions { seed, background, jitter, .. } = self.options;

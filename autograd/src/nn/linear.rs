@@ -44,6 +44,12 @@ impl<T: Real> Linear<T> {
     /// Panics with the name of the parameter and the shapes if x has fewer dimensions or another last dimension.
     #[track_caller]
     pub fn forward(&self, x: &Tensor<T>) -> Tensor<T> {
+        self.check_input(x);
+        x.matmul(self.weight.tensor()) + self.bias.tensor()
+    }
+
+    #[track_caller]
+    pub(super) fn check_input(&self, x: &Tensor<T>) {
         assert!(
             x.ndim() >= 2 && x.shape().last() == Some(&self.inputs()),
             "Linear: `{}` of shape {:?} got an input of shape {:?}; expected […, {}]",
@@ -52,7 +58,6 @@ impl<T: Real> Linear<T> {
             x.shape(),
             self.inputs()
         );
-        x.matmul(self.weight.tensor()) + self.bias.tensor()
     }
 
     /// Returns the number of inputs.

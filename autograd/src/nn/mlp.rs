@@ -1,5 +1,7 @@
 //! [`Mlp`]: a multilayer perceptron.
 
+mod fused;
+
 use super::Linear;
 use crate::impl_module;
 use crate::random::Stream;
@@ -89,21 +91,38 @@ impl<T: Real> Mlp<T> {
 
     /// Returns the output, of shape `[…, last width]`, for x of shape `[…, first width]` with at least two dimensions.
     ///
+    /// Every activation but the sine is computed by a kernel, block by block of rows, and its derivatives with respect to x and to the parameters are
+    /// computed only where they are needed. At the kink of a ReLU the derivative is that of the right side.
+    ///
     /// Panics with the name of the layer and the shapes if x has fewer dimensions or another last dimension.
     #[track_caller]
     pub fn forward(&self, x: &Tensor<T>) -> Tensor<T> {
-        let mut hidden = x.clone();
-        for (i, layer) in self.layers.iter().enumerate() {
-            if i > 0 {
-                hidden = self.activation.apply(&hidden);
-            }
-            if self.skip == Some(i) {
-                hidden = Tensor::concat(&[x, &hidden], x.ndim() - 1);
-            }
-            hidden = layer.forward(&hidden);
+        if let Some(first) = self.layers.first() {
+            first.check_input(x);
         }
-        hidden
+        let graph = || layered(x, self.activation, self.skip, self.layers.iter().map(|layer| |x: &Tensor<T>| layer.forward(x)));
+        fused::forward(self, x).unwrap_or_else(graph)
     }
+}
+
+/// Applies layers to x one after another, with the activation between them; layer `skip` reads x concatenated with the activations.
+fn layered<T: Real, L: Fn(&Tensor<T>) -> Tensor<T>>(
+    x: &Tensor<T>,
+    activation: Activation,
+    skip: Option<usize>,
+    layers: impl Iterator<Item = L>,
+) -> Tensor<T> {
+    let mut hidden = x.clone();
+    for (i, layer) in layers.enumerate() {
+        if i > 0 {
+            hidden = activation.apply(&hidden);
+        }
+        if skip == Some(i) {
+            hidden = Tensor::concat(&[x, &hidden], x.ndim() - 1);
+        }
+        hidden = layer(&hidden);
+    }
+    hidden
 }
 
 #[cfg(test)]

@@ -47,7 +47,9 @@ fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
             let x = x.each_mut().map(|x| &mut x[start..][..sums.len()]);
             match width {
                 1 => update_touched::<T, N, 1, _>(x, width, sums, touched, f),
+                2 => update_touched::<T, N, 2, _>(x, width, sums, touched, f),
                 3 => update_touched::<T, N, 3, _>(x, width, sums, touched, f),
+                4 => update_touched::<T, N, 4, _>(x, width, sums, touched, f),
                 16 => update_touched::<T, N, 16, _>(x, width, sums, touched, f),
                 24 => update_touched::<T, N, 24, _>(x, width, sums, touched, f),
                 27 => update_touched::<T, N, 27, _>(x, width, sums, touched, f),

@@ -2,6 +2,7 @@
 
 use crate::table::*;
 use autograd::Tensor;
+use autograd::nn::Activation;
 use ndarray::ArrayD;
 
 /// Each row is `op, case, [inputs], function` and, for a function with kinks, a kink function that is zero at them.
@@ -32,6 +33,7 @@ pub fn all() -> Vec<Row> {
         lookup(),
         trilinear(),
         select(),
+        networks(),
         compositions(),
     ]
     .into_iter()
@@ -236,6 +238,24 @@ fn select() -> Vec<Row> {
         "masked", "same shape", [numbers(&[2, 3], 12)], |x| x[0].masked(&mask(&[2, 3])).square();
         "masked", "[2, 3] by [2, 1]", [numbers(&[2, 3], 12)], |x| x[0].masked(&mask(&[2, 1])).square();
         "where_", "same shape", [numbers(&[2, 3], 12), numbers(&[2, 3], 13)], |x| Tensor::where_(&mask(&[2, 3]), &x[0].square(), &x[1].exp());
+    }
+}
+
+/// Networks, whose kernel is not a method of a tensor.
+fn networks() -> Vec<Row> {
+    rows! {
+        "(mlp)", "softplus", [numbers(&[4, 2], 22), numbers(&[2, 3], 23), numbers(&[3], 24), numbers(&[3, 2], 25), numbers(&[2], 26)],
+            |x| network(&[2, 3, 2], Activation::Softplus, None, x);
+        "(mlp)", "tanh, a skip connection", [numbers(&[4, 2], 22), numbers(&[2, 3], 23), numbers(&[3], 24), numbers(&[5, 2], 25), numbers(&[2], 26)],
+            |x| network(&[2, 3, 2], Activation::Tanh, Some(1), x);
+        "(mlp)", "relu, two hidden layers",
+            [numbers(&[3, 2], 22), numbers(&[2, 3], 23), numbers(&[3], 24), numbers(&[5, 3], 25), numbers(&[3], 26), numbers(&[3, 1], 27), numbers(&[1], 28)],
+            |x| network(&[2, 3, 3, 1], Activation::Relu, Some(1), x).square(),
+            kinks: |x| {
+                let first = x[0].matmul(&x[1]) + &x[2];
+                let second = Tensor::concat(&[&x[0], &first.relu()], 1).matmul(&x[3]) + &x[4];
+                Tensor::concat(&[&first, &second], 1)
+            };
     }
 }
 

@@ -1,6 +1,8 @@
 //! A row of the table, and the inputs of the functions.
 
-use autograd::{Closeness, Gradcheck, Indices, Real, Tensor, grad};
+use autograd::nn::{Activation, Mlp};
+use autograd::random::Stream;
+use autograd::{Closeness, Gradcheck, Indices, Module, Real, Tensor, grad};
 use ndarray::ArrayD;
 
 pub type Function<T> = fn(&[Tensor<T>]) -> Tensor<T>;
@@ -115,4 +117,19 @@ pub fn at_integers(u: &Tensor<f64>) -> Tensor<f64> {
 /// Returns numbers that are zero half-way between the integers, where the nearest node changes.
 pub fn at_halves(u: &Tensor<f64>) -> Tensor<f64> {
     (u * std::f64::consts::PI).cos()
+}
+
+/// Returns the output of a network for the input `x[0]` and the weights and biases `x[1..]`.
+pub fn network<T: Real>(widths: &[usize], activation: Activation, skip: Option<usize>, x: &[Tensor<T>]) -> Tensor<T> {
+    let random = Stream::new(0);
+    let mut net = match skip {
+        None => Mlp::new("net", widths, activation, &random),
+        Some(skip) => Mlp::with_skip("net", widths, activation, skip, &random),
+    };
+    let mut given = x[1..].iter();
+    net.visit_mut(&mut |param| {
+        let tensor = given.next().expect("a tensor for each parameter").clone();
+        if tensor.is_tracked() { param.bind(tensor) } else { param.replace(tensor) }
+    });
+    net.forward(&x[0])
 }

@@ -89,7 +89,7 @@ fn of_other_kind(path: &Path) -> Result<Option<Lines>> {
         return Ok(None);
     }
     let about = match model::KINDS.contains(&&kind[..]) {
-        true => "a factored field",
+        true => "no voxel grid; `evaluate` and `render` read it",
         false => "a custom model; the program that trained it can render and evaluate it",
     };
     let file = TensorFile::open(path)?;

@@ -1,6 +1,7 @@
 //! Encodings of positions, directions and features for networks.
 
 use super::sh;
+use crate::error::{Error, Result};
 use autograd::{Real, Tensor};
 use serde::{Deserialize, Serialize};
 
@@ -20,6 +21,18 @@ impl Directions {
         match self {
             Directions::Frequency(octaves) => 3 * (1 + 2 * octaves),
             Directions::Harmonics(degree) => sh::count(degree),
+        }
+    }
+
+    /// Checks the number of octaves or the degree. `key` names the setting in errors.
+    pub fn validate(self, key: &str) -> Result<()> {
+        let valid = match self {
+            Directions::Frequency(octaves) => octaves <= 16,
+            Directions::Harmonics(degree) => degree <= sh::MAX_DEGREE,
+        };
+        match valid {
+            true => Ok(()),
+            false => Err(Error::config(key, format!("{self:?}"), "up to 16 octaves, or harmonics up to degree 3")),
         }
     }
 

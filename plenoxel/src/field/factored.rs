@@ -12,6 +12,7 @@
 pub mod fused;
 
 use super::encoding::{Directions, frequency};
+use super::grouping::Grouping;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::render::{Field, Radiance, RenderOptions, Rendered};
@@ -35,22 +36,6 @@ pub struct Shape {
     pub feature_octaves: usize,
     /// Encoding of directions.
     pub directions: Directions,
-}
-
-/// Which samples have their own color. Consecutive samples of a ray form a group as soon as their weights sum to `weight`; the color
-/// network is evaluated at one member, chosen at random with probability proportional to its weight, and gives its color to the group. The
-/// expected color of a pixel does not change. Without jitter, the member at half the weight is chosen.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Grouping {
-    /// Weight that completes a group; 0 for groups of one sample.
-    pub weight: f64,
-    /// Groups whose weight is not above this have no color.
-    pub above: f64,
-}
-
-impl Grouping {
-    /// Every sample has its own color.
-    pub const NONE: Grouping = Grouping { weight: 0.0, above: 0.0 };
 }
 
 /// Factors of a density or an appearance: for each axis a plane of the other two axes (b, c), `[n_b n_c, R]` with

@@ -1,6 +1,6 @@
 //! The weighted sum of losses, and the data that losses read.
 
-use super::{AdaptiveRobust, beta, cauchy_sparsity, charbonnier, distortion, entropy, huber, mse, opacity_supervision};
+use super::{AdaptiveRobust, beta, cauchy_sparsity, charbonnier, distortion, entropy, huber, mse, opacity_supervision, random_background};
 use crate::error::{Error, Result};
 use crate::rays::RayBatch;
 use crate::render::{PerSample, Rendered};
@@ -200,6 +200,7 @@ impl<T: Real, M> Objective<T, M> {
             "beta" => self.with(name, weight, beta),
             "distortion" => self.with(name, weight, distortion),
             "opacity" => self.with(name, weight, opacity_supervision),
+            "random_background" => self.with(name, weight, random_background),
             _ => return Err(Error::usage(format!("losses.{name}"), "unknown loss", format!("expected one of {}", NAMES.join(", ")))),
         })
     }
@@ -255,4 +256,5 @@ fn adam_single(rates: Rates) -> Box<dyn Optimizer<f32>> {
 }
 
 /// Names of the losses that [`Objective::with_named`] adds. They do not depend on the type of the model.
-pub const NAMES: [&str; 10] = ["mse", "charbonnier", "huber", "robust", "exposure", "sparsity", "entropy", "beta", "distortion", "opacity"];
+pub const NAMES: [&str; 11] =
+    ["mse", "charbonnier", "huber", "robust", "exposure", "sparsity", "entropy", "beta", "distortion", "opacity", "random_background"];

@@ -1,7 +1,8 @@
 //! Settings of the models that have a table of their own in the configuration of a run, named by their kind: `[tensorf]`, for example.
 
-use super::tensorf;
+use super::{dvgo, nerf, ngp, tensorf};
 use crate::error::{Error, Result};
+use crate::loss::Objective;
 use crate::model::Model;
 use crate::model::plenoxels::config::Config;
 use crate::render::Engine;
@@ -36,6 +37,14 @@ pub trait Recipe: Send + Sync {
     where
         Self: Sized;
 
+    /// Adds the losses that belong to the model to those of the configuration.
+    fn own_losses(&self, objective: Objective<f32, Self::Model>) -> Objective<f32, Self::Model>
+    where
+        Self: Sized,
+    {
+        objective
+    }
+
     /// Returns the cost of the first step, in units of [`with_cost`](Recipe::with_cost).
     fn cost_of_first_step(&self) -> f64;
 
@@ -57,6 +66,8 @@ pub struct Memory {
     pub parameters: u64,
     /// What a step keeps for a ray.
     pub ray: u64,
+    /// What a picture needs for a ray of a batch.
+    pub ray_of_picture: u64,
     /// Setting that determines the parameters, and how to make them fewer, for messages.
     pub size: &'static str,
     /// See `size`.
@@ -69,6 +80,9 @@ pub struct Memory {
 pub fn read(kind: &str, file: &TensorFile<'_>) -> Result<Box<dyn Recipe>> {
     match kind {
         tensorf::KIND => Ok(Box::new(file.fact::<tensorf::Config>("settings")?)),
+        dvgo::KIND => Ok(Box::new(file.fact::<dvgo::Config>("settings")?)),
+        nerf::KIND => Ok(Box::new(file.fact::<nerf::Config>("settings")?)),
+        ngp::KIND => Ok(Box::new(file.fact::<ngp::Config>("settings")?)),
         other => Err(unknown(other, file)),
     }
 }
@@ -82,6 +96,14 @@ pub(super) fn unknown(kind: &str, file: &TensorFile<'_>) -> Error {
 impl Config {
     /// Returns the settings of the model to train, if it is not the voxel grid.
     pub fn recipe(&self) -> Option<&dyn Recipe> {
-        self.tensorf.as_ref().map(|tensorf| tensorf as &dyn Recipe)
+        self.recipes().into_iter().flatten().next()
+    }
+
+    /// Returns the settings of each model that the configuration has. A valid configuration has at most one.
+    pub(super) fn recipes(&self) -> [Option<&dyn Recipe>; 4] {
+        fn any<R: Recipe>(recipe: Option<&R>) -> Option<&dyn Recipe> {
+            recipe.map(|recipe| recipe as &dyn Recipe)
+        }
+        [any(self.tensorf.as_ref()), any(self.dvgo.as_ref()), any(self.nerf.as_ref()), any(self.ngp.as_ref())]
     }
 }

@@ -7,15 +7,19 @@
 mod config;
 mod recipe;
 
-pub use config::{Config, Stage};
+pub use super::stage::Stage;
+pub use config::Config;
 
+use super::stage::MOST_NODES;
 use crate::camera::Ray;
 use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
 use crate::error::{Error, Result};
-use crate::field::factored::{Factored, Grouping};
+use crate::field::factored::Factored;
+use crate::field::grouping::Grouping;
 use crate::geometry::Aabb;
 use crate::loss::Step;
+use crate::model::cells;
 use crate::model::plenoxels::config::Hull;
 use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
@@ -25,8 +29,6 @@ use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
-use config::MOST_NODES;
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::any::Any;
 use std::path::Path;
@@ -54,24 +56,6 @@ impl<T: Real> Module<T> for Tensorf<T> {
     }
 }
 
-/// Cells that are sampled, as a checkpoint stores them beside their masks.
-#[derive(Serialize, Deserialize)]
-struct Cells {
-    #[serde(rename = "box")]
-    aabb: [[f64; 3]; 2],
-    cells: [usize; 3],
-}
-
-fn corners(aabb: Aabb) -> [[f64; 3]; 2] {
-    [aabb.min.to_array(), aabb.max.to_array()]
-}
-
-/// Returns the box with these corners, unless it has no volume.
-fn valid_box([min, max]: [[f64; 3]; 2]) -> Option<Aabb> {
-    let valid = (0..3).all(|a| min[a] < max[a] && min[a].is_finite() && max[a].is_finite());
-    valid.then(|| Aabb { min: min.into(), max: max.into() })
-}
-
 /// Cells of the visual hull along each axis.
 const HULL: usize = 128;
 /// Pixels around the silhouettes that belong to the hull.
@@ -86,7 +70,7 @@ impl<T: Real> Tensorf<T> {
     pub fn new(config: Config, aabb: Aabb, seed: u64) -> Result<Self> {
         config.validate()?;
         let random = Stream::new(seed);
-        let mut field = Factored::new(config.shape(), aabb, nodes_of(aabb, config.stages[0].resolution), &random);
+        let mut field = Factored::new(config.shape(), aabb, aabb.nodes(config.stages[0].resolution), &random);
         field.grouping = Grouping { weight: config.group, above: config.color_above };
         field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
         Ok(Tensorf { config, field, hull: Hull::Auto, engine: Engine::Fused })
@@ -156,13 +140,6 @@ impl<T: Real> Tensorf<T> {
         };
         render(&self.field, rays, &options)
     }
-}
-
-/// Returns the numbers of nodes of a box with about as many cells as a cube of `resolution` nodes along each axis, with about equal sides.
-fn nodes_of(aabb: Aabb, resolution: usize) -> [usize; 3] {
-    let extent = aabb.max - aabb.min;
-    let side = (extent.x * extent.y * extent.z).cbrt() / (resolution - 1) as f64;
-    (extent / side).to_array().map(|cells| cells.round().max(1.0) as usize + 1)
 }
 
 /// Learning rate that falls exponentially over a run of `total` steps, of which `first` came before, and in the last share `cool_down` of the run also linearly
@@ -256,7 +233,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
             rays.aim_at(occupied);
         }
         let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
-        self.field.resample(aabb, nodes_of(aabb, self.config.stages[stage.index].resolution));
+        self.field.resample(aabb, aabb.nodes(self.config.stages[stage.index].resolution));
         Ok(())
     }
 
@@ -276,33 +253,18 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {
-        file.fact("box", corners(self.aabb()));
+        cells::write_box(self.aabb(), file);
         file.fact("nodes", self.field.nodes());
-        file.fact("occupied", self.field.occupied.as_ref().map(|cells| Cells { aabb: corners(cells.aabb()), cells: cells.cells() }));
-        if let Some(occupied) = &self.field.occupied {
-            file.words("occupied", occupied.masks());
-        }
+        cells::write(self.field.occupied.as_ref(), file);
         self.visit(&mut |param| file.owned(param.name(), param.tensor().detach()));
     }
 
     fn read(&mut self, file: &mut TensorFile<'_>, _: usize) -> Result<()> {
-        let (aabb, nodes): ([[f64; 3]; 2], [usize; 3]) = (file.fact("box")?, file.fact("nodes")?);
-        let aabb = valid_box(aabb).ok_or_else(|| file.damaged("the box has no volume"))?;
+        let (aabb, nodes): (Aabb, [usize; 3]) = (cells::read_box(file)?, file.fact("nodes")?);
         if nodes.iter().any(|n| !(2..=4 * MOST_NODES).contains(n)) {
             return Err(file.damaged("the number of nodes is not one of this model"));
         }
-        self.field.occupied = match file.fact::<Option<Cells>>("occupied")? {
-            None => None,
-            Some(Cells { aabb, cells }) => {
-                let aabb = valid_box(aabb).ok_or_else(|| file.damaged("the box of the occupied cells has no volume"))?;
-                if cells.iter().any(|n| !(1..=MOST_CELLS).contains(n)) {
-                    return Err(file.damaged("the number of cells is not one of this model"));
-                }
-                let masks = file.brick_masks("occupied", cells)?;
-                let masks = masks.ok_or_else(|| file.damaged("the mask `occupied` has cells outside of the box"))?;
-                Some(Occupancy::from_masks(aabb, cells, masks))
-            }
-        };
+        self.field.occupied = cells::read(file)?;
         self.field.resample(aabb, nodes);
         let mut done = Ok(());
         self.visit_mut(&mut |param| {

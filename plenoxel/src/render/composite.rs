@@ -21,6 +21,8 @@ pub struct Rendered<T: Real> {
     pub log_transmittance: Tensor<T>,
     /// Number of samples on all rays.
     pub sample_count: usize,
+    /// Color of an earlier pass over the same rays, `[n, 3]`, from which the field of that pass learns; `None` for models with one pass.
+    pub coarse: Option<Tensor<T>>,
     columns: Arc<dyn Columns<T>>,
 }
 
@@ -61,6 +63,31 @@ impl<T: Real> Columns<T> for Detached<T> {
     }
 }
 
+/// Columns of joined batches.
+#[derive(Debug)]
+struct Joined<T: Real>(Vec<Rendered<T>>);
+
+impl<T: Real> Joined<T> {
+    fn column(&self, of: fn(&Rendered<T>) -> Tensor<T>) -> Tensor<T> {
+        let columns: Vec<Tensor<T>> = self.0.iter().map(of).collect();
+        Tensor::concat(&columns.iter().collect::<Vec<_>>(), 0)
+    }
+}
+
+impl<T: Real> Columns<T> for Joined<T> {
+    fn depth(&self) -> Tensor<T> {
+        self.column(Rendered::depth)
+    }
+
+    fn sparsity(&self) -> Tensor<T> {
+        self.column(Rendered::sparsity)
+    }
+
+    fn distortion(&self) -> Tensor<T> {
+        self.column(Rendered::distortion)
+    }
+}
+
 /// Values of m samples.
 #[derive(Debug, Clone)]
 pub struct PerSample<T: Real> {
@@ -98,7 +125,7 @@ impl<T: Real> Rendered<T> {
         sample_count: usize,
         columns: impl Columns<T> + 'static,
     ) -> Self {
-        Rendered { rgb, opacity, log_transmittance, sample_count, columns: Arc::new(columns) }
+        Rendered { rgb, opacity, log_transmittance, sample_count, coarse: None, columns: Arc::new(columns) }
     }
 
     /// Returns density, color and weight of every sample, if the graph engine rendered the pixels. Fused kernels do not keep them.
@@ -129,8 +156,29 @@ impl<T: Real> Rendered<T> {
             opacity: self.opacity.detach(),
             log_transmittance: self.log_transmittance.detach(),
             sample_count: self.sample_count,
+            coarse: self.coarse.as_ref().map(Tensor::detach),
             columns: Arc::new(Detached(self.columns.clone())),
         }
+    }
+
+    /// Joins the pixels of batches of rays. The values of single samples and the colors of earlier passes are dropped.
+    ///
+    /// Panics if there is no batch.
+    #[track_caller]
+    pub fn joined(parts: Vec<Self>) -> Self {
+        let joined = |column: fn(&Self) -> &Tensor<T>| Tensor::concat(&parts.iter().map(column).collect::<Vec<_>>(), 0);
+        let (rgb, opacity, log_transmittance) = (joined(|x| &x.rgb), joined(|x| &x.opacity), joined(|x| &x.log_transmittance));
+        let sample_count = parts.iter().map(|part| part.sample_count).sum();
+        Rendered::new(rgb, opacity, log_transmittance, sample_count, Joined(parts))
+    }
+
+    /// Returns the pixels with the color of an earlier pass over the same rays, `[n, 3]`.
+    ///
+    /// Panics if the shape differs.
+    #[track_caller]
+    pub fn with_coarse(self, rgb: Tensor<T>) -> Self {
+        assert_eq!(rgb.shape(), self.rgb.shape(), "with_coarse: colors must have the shape of the rendered colors");
+        Rendered { coarse: Some(rgb), ..self }
     }
 
     /// Returns the pixels with other colors `[n, 3]`.

@@ -143,7 +143,7 @@ impl Estimate {
     pub fn of_evaluation(config: &Config, sampling: Sampling, stored: &Stored, compare: Option<(&Dataset, Split)>) -> Self {
         let rendering = match stored {
             Stored::Grid { shape, .. } => evaluation_samples(config, sampling, shape) * evaluation_bytes_per_sample(config.engine, shape),
-            Stored::Other { recipe, .. } => EVALUATION_RAYS * recipe.memory(config.engine).ray,
+            Stored::Other { recipe, .. } => EVALUATION_RAYS * recipe.memory(config.engine).ray_of_picture,
         };
         Estimate {
             images: compare.map_or(0, |(dataset, split)| images(dataset, config.downscale, dataset.count(split))),
@@ -208,14 +208,14 @@ impl Estimate {
 
     /// Estimates a training run of another model than the grid, and its evaluation.
     pub fn of_recipe(config: &Config, recipe: &dyn Recipe, dataset: &Dataset, options: &RunOptions) -> Self {
-        let Memory { parameters, ray, size, smaller } = recipe.memory(config.engine);
+        let Memory { parameters, ray, ray_of_picture, size, smaller } = recipe.memory(config.engine);
         let rays = recipe.stages().iter().map(|stage| stage.rays_per_step.unwrap_or(config.rays_per_step) as u64).max().unwrap_or(0);
         let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
         let (width, height) = dataset.size();
         let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
         let images = images(dataset, config.downscale, views);
-        let step = (rays.max(EVALUATION_RAYS) * ray).max(hull) + comparison;
+        let step = (rays * ray).max(EVALUATION_RAYS * ray_of_picture).max(hull) + comparison;
         let own = |key: &str| format!("{}.{key}", recipe.kind());
         let parts = [
             (images, "downscale".to_owned(), "reduce the images by a larger factor"),
@@ -323,10 +323,11 @@ impl Stored {
         let kind = model::kind(path)?;
         if kind != plenoxels::KIND {
             let file = TensorFile::open(path)?;
+            let recipe = recipe::read(&kind, &file)?;
             let [min, max]: [[f64; 3]; 2] = file.fact("box")?;
             let half_width = (0..3).map(|a| 0.5 * (max[a] - min[a])).fold(0.0, f64::max);
             let bytes = std::fs::metadata(path).map_err(|e| Error::io(path, e, "reading"))?.len();
-            return Ok(Stored::Other { recipe: recipe::read(&kind, &file)?, bytes, half_width });
+            return Ok(Stored::Other { recipe, bytes, half_width });
         }
         let (header, voxels) = checkpoint::header(path)?;
         Ok(Stored::Grid { shape: header.shape(), voxels })

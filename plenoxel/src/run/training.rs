@@ -132,9 +132,12 @@ pub type Listener<'l> = dyn FnMut(Event<'_>) + Send + 'l;
 ///
 /// Errors: a setting is invalid, data cannot be read, a number is not finite, or a file cannot be written.
 pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
-    match &settings.config.tensorf {
-        Some(tensorf) => other::train(settings, tensorf, on),
-        None => train_with(settings, objective, on),
+    match &settings.config {
+        Config { tensorf: Some(recipe), .. } => other::train(settings, recipe, on),
+        Config { dvgo: Some(recipe), .. } => other::train(settings, recipe, on),
+        Config { nerf: Some(recipe), .. } => other::train(settings, recipe, on),
+        Config { ngp: Some(recipe), .. } => other::train(settings, recipe, on),
+        _ => train_with(settings, objective, on),
     }
 }
 
@@ -311,9 +314,12 @@ impl<'s> NewRun<'s> {
 ///
 /// Errors: those of [`train()`]; the run has ended or saved no checkpoint.
 pub fn resume(path: &Path, data: Option<DataSource>, options: &RunOptions, on: &mut Listener<'_>) -> Result<Outcome> {
-    match RunFolder::open(path)?.1.tensorf {
-        Some(tensorf) => other::resume(path, &tensorf, data, options, on),
-        None => resume_with(path, data, options, objective, on),
+    match RunFolder::open(path)?.1 {
+        Config { tensorf: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
+        Config { dvgo: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
+        Config { nerf: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
+        Config { ngp: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
+        _ => resume_with(path, data, options, objective, on),
     }
 }
 

@@ -46,8 +46,13 @@ impl Occupancy {
     /// 3]` to `[m]` and may be that of any field; it is evaluated without recording a gradient. Matter thinner than a cell can be missed:
     /// dilate the result, or lower the threshold.
     pub fn where_dense<T: Real>(aabb: Aabb, cells: [usize; 3], threshold: f64, density: impl Fn(&Tensor<T>) -> Tensor<T>) -> Self {
-        let all: Vec<u64> = (0..BrickGrid::new(cells).len()).map(|brick| BrickGrid::new(cells).inside(brick)).collect();
-        Self::from_masks(aabb, cells, all).dense(threshold, density)
+        Self::full(aabb, cells).dense(threshold, density)
+    }
+
+    /// Returns all cells of a box.
+    pub fn full(aabb: Aabb, cells: [usize; 3]) -> Self {
+        let bricks = BrickGrid::new(cells);
+        Self::from_masks(aabb, cells, (0..bricks.len()).map(|brick| bricks.inside(brick)).collect())
     }
 
     /// Returns the occupied cells at whose centres a density is above a threshold, as [`Occupancy::where_dense`].
@@ -66,10 +71,14 @@ impl Occupancy {
         Self::from_masks(self.aabb, self.cells(), masks)
     }
 
+    /// Returns the sides of a cell, world length.
+    pub(super) fn sides(&self) -> DVec3 {
+        (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells().map(|n| n as f64))
+    }
+
     /// Returns the center of a cell.
     fn center(&self, cell: [usize; 3]) -> DVec3 {
-        let sides = (self.aabb.max - self.aabb.min) / DVec3::from_array(self.cells().map(|n| n as f64));
-        self.aabb.min + sides * (DVec3::from_array(cell.map(|k| k as f64)) + 0.5)
+        self.aabb.min + self.sides() * (DVec3::from_array(cell.map(|k| k as f64)) + 0.5)
     }
 
     /// Returns the cells of another division of space, whose centres lie in occupied cells.

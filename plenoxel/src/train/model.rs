@@ -56,7 +56,8 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     /// Renders rays. While a step is recorded, gradients flow from the result to the parameters.
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T>;
 
-    /// Creates the optimizer of a stage. It is called at the beginning of each stage; schedules count from the stage's first step.
+    /// Creates the optimizer of a stage; schedules count from the stage's first step. It is called at the beginning of each stage, before and after
+    /// [`begin_stage`](Model::begin_stage), and after [`resume`](Model::resume).
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>>;
 
     /// Returns a function that renders images of the current model, without jitter. It may precompute data for many rays. It is called
@@ -138,16 +139,11 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     /// Errors if the state does not fit this model.
     fn read(&mut self, file: &mut TensorFile<'_>, stage: usize) -> Result<()> {
         let _ = stage;
-        let mut done = Ok(());
-        self.visit_mut(&mut |param| {
-            if done.is_ok() {
-                done = file.tensor(param.name(), param.shape()).map(|read| param.update(|values| values.copy_from_slice(read.data())));
-            }
-        });
-        done
+        read_params(self, file)
     }
 
-    /// Restores the rays of a resumed run to the state after [`begin_stage`](Model::begin_stage).
+    /// Restores the rays of a resumed run, and everything that [`read`](Model::read) does not restore, to the state after
+    /// [`begin_stage`](Model::begin_stage).
     fn resume(&mut self, stage: &PlannedStage, rays: &mut RaySource) {
         let _ = (stage, rays);
     }
@@ -172,6 +168,19 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         self.read(&mut file, 0)?;
         file.fact("about")
     }
+}
+
+/// Reads the values of all parameters by name.
+///
+/// Errors if the file lacks a parameter, or has it in another shape.
+pub(crate) fn read_params<T: Real, M: Module<T> + ?Sized>(module: &mut M, file: &mut TensorFile<'_>) -> Result<()> {
+    let mut done = Ok(());
+    module.visit_mut(&mut |param| {
+        if done.is_ok() {
+            done = file.tensor(param.name(), param.shape()).map(|read| param.update(|values| values.copy_from_slice(read.data())));
+        }
+    });
+    done
 }
 
 /// Function from rays to the rendered pixels of a model.

@@ -133,6 +133,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         let last = state.about.step.checked_sub(1);
         let current = last.and_then(|last| self.stage_of(last)).filter(|stage| stage.index == state.stage);
         let current = current.ok_or_else(|| file.damaged("the step does not match the plan"))?;
+        self.model.resume(&current, &mut self.rays);
         self.optimizer = self.model.optimizer(&current);
         read_memory(&self.model, "", &mut *self.optimizer, &state.updates, &mut file, state.about.step)?;
         let mut done = Ok(());
@@ -148,7 +149,6 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             return Err(file.damaged("it has values that are not finite"));
         }
         self.step = state.about.step;
-        self.model.resume(&current, &mut self.rays);
         Ok(self)
     }
 }

@@ -13,8 +13,9 @@ mod forward;
 mod lookup;
 mod network;
 
-use super::{Factored, Grouping, Shape};
+use super::{Factored, Shape};
 use crate::camera::Ray;
+use crate::field::grouping::{Grouping, Groups};
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Samples};
@@ -177,7 +178,7 @@ impl<T: Real> State<T> {
                 to.extend_from_slice(from);
             }
             offsets.extend(block.offsets[1..].iter().map(|offset| first + offset));
-            for (i, &of) in block.group.iter().enumerate().filter(|(_, of)| **of != forward::NONE) {
+            for (i, &of) in block.group.iter().enumerate().filter(|(_, of)| **of != Groups::NONE) {
                 colored.push(first + i as u32);
                 group.push(shaded.len() as u32 + of);
             }

@@ -10,7 +10,7 @@ use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::loss;
 use crate::model::recipe::Recipe;
-use crate::model::tensorf;
+use crate::model::{dvgo, nerf, ngp, tensorf};
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
 use crate::train::TrainOptions;
@@ -115,6 +115,15 @@ pub struct Config {
     /// grid have no effect.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tensorf: Option<tensorf::Config>,
+    /// Settings of DirectVoxGO, likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dvgo: Option<dvgo::Config>,
+    /// Settings of NeRF, likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub nerf: Option<nerf::Config>,
+    /// Settings of Instant-NGP, likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ngp: Option<ngp::Config>,
 }
 
 /// Use of silhouettes in training.
@@ -405,6 +414,9 @@ impl Default for Config {
             evaluation: Sampling::Step { step: 0.5 },
             carve: CarveConfig::default(),
             tensorf: None,
+            dvgo: None,
+            nerf: None,
+            ngp: None,
         }
     }
 }
@@ -618,6 +630,13 @@ impl Config {
     /// Checks the settings of another model than the voxel grid, and that no setting of the grid contradicts them.
     fn validate_other(&self, recipe: &dyn Recipe) -> Result<()> {
         let kind = recipe.kind();
+        if let Some(other) = self.recipes().into_iter().flatten().map(Recipe::kind).find(|other| *other != kind) {
+            return Err(Error::usage(
+                other,
+                format!("a run trains one model, and `{kind}` is set"),
+                format!("remove `{other}` or `{kind}`"),
+            ));
+        }
         recipe.validate().map_err(|e| e.with_key(|key| format!("{kind}.{key}")))?;
         let of_grid = |set: bool, key: &str| match set {
             true => Err(Error::usage(

@@ -3,22 +3,8 @@
 use crate::error::{Error, Result};
 use crate::field::encoding::Directions;
 use crate::field::factored::Shape;
+use crate::model::stage::Stage;
 use serde::{Deserialize, Serialize};
-
-/// Most nodes along an axis of a cube.
-pub(super) const MOST_NODES: usize = 4096;
-
-/// A stage of training.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Stage {
-    /// Nodes along each axis if the box is a cube. Another box has as many cells, with about equal sides.
-    pub resolution: usize,
-    /// Steps.
-    pub steps: u64,
-    /// Rays per step.
-    pub rays: usize,
-}
 
 /// Settings of the model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -38,7 +24,7 @@ pub struct Config {
     pub directions: Directions,
     /// Distance between samples, in cells.
     pub step: f64,
-    /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::factored::Grouping)), in training; 0 for a color per sample.
+    /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
     pub group: f64,
     /// The same in pictures.
     pub group_in_pictures: f64,
@@ -144,11 +130,7 @@ impl Config {
             check((1..=1024).contains(&width), key, width as f64, "1 to 1024")?;
         }
         check(self.feature_octaves <= 16, "feature_octaves", self.feature_octaves as f64, "0 to 16")?;
-        let (most, octaves_or_degree) = match self.directions {
-            Directions::Frequency(octaves) => (16, octaves),
-            Directions::Harmonics(degree) => (3, degree),
-        };
-        check(octaves_or_degree <= most, "directions", octaves_or_degree as f64, "up to 16 octaves, or harmonics up to degree 3")?;
+        self.directions.validate("directions")?;
         check(self.step > 0.0 && self.step.is_finite(), "step", self.step, "a number of cells above 0")?;
         for (key, share) in [
             ("group", self.group),
@@ -171,10 +153,7 @@ impl Config {
             return Err(Error::usage("stages", "there is no stage", "set at least one"));
         }
         for (i, stage) in self.stages.iter().enumerate() {
-            let key = format!("stages[{i}].resolution");
-            check((2..=MOST_NODES).contains(&stage.resolution), &key, stage.resolution as f64, "2 to 4096")?;
-            check(stage.steps > 0, &format!("stages[{i}].steps"), 0.0, "at least 1")?;
-            check((1..=1 << 20).contains(&stage.rays), &format!("stages[{i}].rays"), stage.rays as f64, "1 to 1048576")?;
+            stage.validate(&format!("stages[{i}]"))?;
         }
         Ok(())
     }

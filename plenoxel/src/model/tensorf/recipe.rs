@@ -20,15 +20,14 @@ impl Recipe for Config {
     }
 
     fn stages(&self) -> Vec<StageLength> {
-        let length =
-            |stage: &Stage| StageLength { resolution: Some(stage.resolution), steps: stage.steps, rays_per_step: Some(stage.rays) };
-        self.stages.iter().map(length).collect()
+        self.stages.iter().map(Stage::length).collect()
     }
 
     fn memory(&self, engine: Engine) -> Memory {
         Memory {
             parameters: self.stages.iter().map(|stage| bytes_of_planes(self, stage.resolution)).max().unwrap_or(0),
             ray: bytes_of_ray(self, engine),
+            ray_of_picture: bytes_of_ray(self, engine),
             size: "stages[*].resolution",
             smaller: "fewer nodes a side, or fewer components",
         }

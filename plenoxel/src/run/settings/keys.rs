@@ -2,7 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::model::plenoxels::{LEARNED_LOSSES, LOSSES};
-use crate::model::tensorf;
+use crate::model::{dvgo, nerf, ngp, tensorf};
 use serde::Serialize;
 use std::sync::LazyLock;
 use strsim::levenshtein;
@@ -25,6 +25,12 @@ const STAGE: &[&str] = &[
 
 /// The two ways to place samples.
 const SAMPLING: &[&str] = &["step", "samples", "far"];
+
+/// The two encodings of directions.
+const DIRECTIONS: &[&str] = &["frequency", "harmonics"];
+
+/// The keys of a stage of a model whose resolution grows.
+const GROWING: &[&str] = &["resolution", "steps", "rays"];
 
 /// The tables of the run and of the voxel grid with their keys. In a path, `[]` stands for any index and `*` for any name.
 const FIXED: &[(&str, &[&str])] = &[
@@ -62,6 +68,9 @@ const FIXED: &[(&str, &[&str])] = &[
             "evaluation",
             "carve",
             "tensorf",
+            "dvgo",
+            "nerf",
+            "ngp",
         ],
     ),
     ("initial", &["density", "color", "random"]),
@@ -77,14 +86,26 @@ const FIXED: &[(&str, &[&str])] = &[
     ("evaluation", SAMPLING),
     ("carve", &["resolution", "rule", "margin", "depth", "photo", "fit", "ridge", "sweeps"]),
     ("carve.photo", &["noise"]),
-    ("tensorf.directions", &["frequency", "harmonics"]),
-    ("tensorf.stages[]", &["resolution", "steps", "rays"]),
+    ("tensorf.directions", DIRECTIONS),
+    ("tensorf.stages[]", GROWING),
+    ("dvgo.directions", DIRECTIONS),
+    ("dvgo.coarse", GROWING),
+    ("dvgo.fine[]", GROWING),
+    ("ngp.directions", DIRECTIONS),
+    ("ngp.stages[]", &["steps", "rays"]),
 ];
 
 /// Every table with its keys: [`FIXED`], and the settings of the other models, whose keys are those of their defaults.
 static TABLES: LazyLock<Vec<(&str, Vec<String>)>> = LazyLock::new(|| {
     let fixed = FIXED.iter().map(|(table, keys)| (*table, keys.iter().map(|key| (*key).to_owned()).collect()));
-    fixed.chain([(tensorf::KIND, keys_of(&tensorf::Config::default()))]).collect()
+    let of_models = [
+        (tensorf::KIND, keys_of(&tensorf::Config::default())),
+        (dvgo::KIND, keys_of(&dvgo::Config::default())),
+        // The defaults lack `near_far`.
+        (nerf::KIND, keys_of(&nerf::Config::authors())),
+        (ngp::KIND, keys_of(&ngp::Config::default())),
+    ];
+    fixed.chain(of_models).collect()
 });
 
 /// Returns the keys of a settings structure.

@@ -18,7 +18,7 @@ pub struct Preset {
 }
 
 /// The presets for training.
-pub const PRESETS: [Preset; 6] = [
+pub const PRESETS: [Preset; 10] = [
     Preset {
         name: "fast",
         purpose: "good quality in short time; the default of `train`",
@@ -27,15 +27,39 @@ pub const PRESETS: [Preset; 6] = [
     },
     Preset {
         name: "quality",
-        purpose: "the best quality",
-        time: "about 15 min at 800 x 800",
+        purpose: "the best quality: a factored field; `bake` makes voxels of it",
+        time: "about 11 min at 800 x 800",
         text: include_str!("../../../presets/quality.toml"),
     },
     Preset {
+        name: "voxels",
+        purpose: "the best quality of a voxel grid",
+        time: "about 15 min at 800 x 800",
+        text: include_str!("../../../presets/voxels.toml"),
+    },
+    Preset {
         name: "tensorf",
-        purpose: "a factored field: the best quality; `plenoxel bake` makes voxels of it for exports",
+        purpose: "TensoRF, scaled for two cores; the same as quality",
         time: "about 11 min at 800 x 800",
-        text: include_str!("../../../presets/tensorf.toml"),
+        text: include_str!("../../../presets/quality.toml"),
+    },
+    Preset {
+        name: "dvgo",
+        purpose: "DirectVoxGO: dense grids with a color network",
+        time: "minutes at 800 x 800",
+        text: include_str!("../../../presets/dvgo.toml"),
+    },
+    Preset {
+        name: "ngp",
+        purpose: "Instant-NGP: a hash grid with two small networks",
+        time: "minutes at 800 x 800",
+        text: include_str!("../../../presets/ngp.toml"),
+    },
+    Preset {
+        name: "nerf",
+        purpose: "NeRF: two networks without a grid, shortened",
+        time: "an hour at 800 x 800",
+        text: include_str!("../../../presets/nerf.toml"),
     },
     Preset {
         name: "plenoxels",

@@ -31,7 +31,7 @@ fn complete() -> Vec<Layers> {
         RARE.iter().try_for_each(|assignment| layers.assign(assignment)).unwrap();
         layers
     };
-    let layers = presets().map(preset).chain([rare("quality")]);
+    let layers = presets().map(preset).chain([rare("voxels")]);
     layers.inspect(|layers| assert!(layers.clone().resolve().is_ok())).collect()
 }
 
@@ -93,7 +93,7 @@ fn numbers_that_no_decimal_ends_survive_the_file() {
 fn a_text_that_is_not_complete_is_a_layer_over_the_defaults() {
     assert_eq!(Config::from_toml("").unwrap(), Config::default());
     assert_eq!(Config::from_toml("seed = 7").unwrap(), Config { seed: 7, ..Config::default() });
-    let mut layers = preset("quality");
+    let mut layers = preset("voxels");
     ["losses.mse=", "losses.huber=1"].iter().try_for_each(|assignment| layers.assign(assignment)).unwrap();
     let complete = layers.resolve().unwrap();
     assert_eq!(Config::from_toml(&text_of(&complete)).unwrap(), complete, "nothing of the defaults is under a complete text");
@@ -169,7 +169,7 @@ fn an_unknown_key_in_a_file_is_reported_with_its_line() {
 #[test]
 fn nothing_shines_through_a_complete_file() {
     let path = std::env::temp_dir().join(format!("plenoxel-complete-{}", std::process::id()));
-    let mut layers = preset("quality");
+    let mut layers = preset("voxels");
     // The defaults have this loss, and the preset a scout.
     ["losses.mse=", "losses.huber=1", "scout="].iter().try_for_each(|assignment| layers.assign(assignment)).unwrap();
     let config = layers.resolve().unwrap();

@@ -18,7 +18,7 @@ use std::sync::Arc;
 ///
 /// Errors: a setting is invalid; a loss needs a voxel grid; there are no training views.
 fn trainer<R: Recipe>(config: &Config, recipe: &R, views: Arc<[View]>) -> Result<Trainer<f32, R::Model>> {
-    let objective = objective_of_any(config, views.len())?;
+    let objective = recipe.own_losses(objective_of_any(config, views.len())?);
     Trainer::with_model(recipe.model(config)?, views, objective, config.train_options())
 }
 

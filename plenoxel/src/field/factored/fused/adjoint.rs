@@ -1,10 +1,11 @@
 //! Cotangents of the parameters from cotangents of pixels.
 
 use super::super::PLANE_OF;
-use super::forward::{Block, NONE, Tables};
+use super::forward::{Block, Tables};
 use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, RUN, add_to_lines, first_rows};
 use super::network::NetworkCotangents;
 use super::{Output, State};
+use crate::field::grouping::Groups;
 use crate::render::along::{COLUMNS, sparsity_slope};
 use autograd::rows::{Buckets, buckets_of};
 use autograd::{Buffer, Real, RowSums, Tensor, parallel};
@@ -189,7 +190,7 @@ fn part<T: Real>(
             let of_shaded = rgb.as_chunks_mut::<3>().0;
             for (own, g) in block.rays().zip(&cotangent.data().as_chunks::<COLUMNS>().0[block.first..]) {
                 along.sigma_adjoint(own.clone(), batch.background, g, &color, &mut density);
-                for i in own.filter(|&i| block.group[i] != NONE) {
+                for i in own.filter(|&i| block.group[i] != Groups::NONE) {
                     let of = &mut of_shaded[block.group[i] as usize];
                     (0..3).for_each(|c| of[c] += along.weight[i] * g[c]);
                 }

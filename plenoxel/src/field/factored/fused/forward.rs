@@ -4,16 +4,13 @@ use super::Batch;
 use super::lookup::{self, Pairs, RUN};
 use super::network::{Activations, Network};
 use crate::camera::Ray;
-use crate::random::{Purpose, uniform};
+use crate::field::grouping::Groups;
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along, COLUMNS};
-use crate::sampling::{Jitter, Occupancy, march};
+use crate::sampling::{Occupancy, march};
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
 use std::ops::Range;
-
-/// Marker for a sample without a color.
-pub const NONE: u32 = u32::MAX;
 
 /// Columns of a sample.
 mod of_sample {
@@ -35,7 +32,7 @@ pub struct Block<T: Real> {
     /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
     columns: [Buffer<T>; of_sample::COUNT],
-    /// Shaded sample whose color each sample has, or [`NONE`].
+    /// Shaded sample whose color each sample has, or [`Groups::NONE`].
     pub group: Buffer<u32>,
     /// Samples at which the color network is evaluated.
     pub shaded: Vec<u32>,
@@ -231,37 +228,9 @@ impl<'a, T: Real> Scene<'a, T> {
 
     /// Forms the groups of each ray and chooses the shaded samples.
     fn form_groups(&self, block: &mut Block<T>) {
-        let (limit, above) = (T::lit(self.batch.grouping.weight), T::lit(self.batch.grouping.above));
-        let mut group = std::mem::replace(&mut block.group, Buffer::stale(0));
-        let (mut shaded, mut rays) = (Vec::new(), Vec::new());
-        let weight = block.weight();
-        for (r, own) in block.rays().enumerate() {
-            let mut draws = Draws { jitter: self.batch.jitter, ray: block.first + r, drawn: 0 };
-            let (mut begin, mut sum) = (own.start, T::zero());
-            for i in own.clone() {
-                sum += weight[i];
-                if sum < limit && i + 1 < own.end {
-                    continue;
-                }
-                let members = begin..i + 1;
-                let number = if sum > above {
-                    let mut rest = T::lit(draws.next()) * sum;
-                    let chosen = members.clone().find(|&k| {
-                        rest -= weight[k];
-                        rest < T::zero()
-                    });
-                    shaded.push(chosen.unwrap_or(i) as u32);
-                    rays.push((block.first + r) as u32);
-                    shaded.len() as u32 - 1
-                } else {
-                    NONE
-                };
-                group[members].fill(number);
-                (begin, sum) = (i + 1, T::zero());
-            }
-        }
+        let Groups { of, shaded, rays } = self.batch.grouping.groups(block.weight(), &block.offsets, block.first, self.batch.jitter);
         block.shaded_at = block.at().map(|at| shaded.iter().map(|&i| at[i as usize]).collect::<Vec<_>>().into());
-        (block.group, block.shaded, block.rays_of_shaded) = (group, shaded, rays);
+        (block.group, block.shaded, block.rays_of_shaded) = (of, shaded, rays);
     }
 
     /// Evaluates the color network.
@@ -280,22 +249,5 @@ impl<'a, T: Real> Scene<'a, T> {
         let (encoded, width) = (self.batch.encoded.data(), self.batch.encoded.shape()[1]);
         let direction = |i: usize| &encoded[block.rays_of_shaded[i] as usize * width..][..width];
         block.activations = self.tables.network.forward(products, direction);
-    }
-}
-
-/// Random numbers of a ray.
-struct Draws {
-    jitter: Jitter,
-    ray: usize,
-    drawn: u64,
-}
-
-impl Draws {
-    fn next(&mut self) -> f64 {
-        self.drawn += 1;
-        match self.jitter {
-            Jitter::None => 0.5,
-            Jitter::PerRay { seed, step } => uniform(seed, Purpose::Shade, step, (self.ray as u64) << 16 | self.drawn),
-        }
     }
 }

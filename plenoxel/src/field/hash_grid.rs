@@ -1,0 +1,200 @@
+//! Multiresolution hash encoding (Müller et al. 2022): features of a position, interpolated in grids of several resolutions.
+//!
+//! With x in [0, 1]³, level l has the scale s = base · growthˡ − 1 and the resolution N = ⌈s⌉ + 1. The position in the grid is u = s x + ½, and
+//! the features of the eight corners of its cell are interpolated trilinearly. The result has the features of all levels, one after another.
+//!
+//! A level has min(N³ rounded up to a multiple of 8, 2ᵀ) rows of a common table. If all N³ nodes have a row, node (i, j, k) has row
+//! i + j N + k N², modulo the number of rows. Otherwise nodes share rows: (i xor j · 2654435761 xor k · 805459861) mod 2ᵀ, in 32 bits. These
+//! are the conventions of tiny-cuda-nn.
+
+mod loops;
+mod sums;
+
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
+use std::sync::Arc;
+
+/// Sizes of a hash grid.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shape {
+    /// Number of levels L.
+    pub levels: usize,
+    /// Features of a level F: 1, 2, 4 or 8.
+    pub features: usize,
+    /// Base-2 logarithm T of the largest number of rows of a level, 3 to 24.
+    pub log2_rows: u32,
+    /// Resolution of the first level.
+    pub base: usize,
+    /// Ratio of the resolutions of consecutive levels.
+    pub growth: f64,
+}
+
+/// One level.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Level {
+    /// Scale s.
+    pub scale: f64,
+    /// Nodes along each axis N.
+    pub resolution: usize,
+    /// First row.
+    pub first: usize,
+    /// Number of rows.
+    pub rows: usize,
+    /// True if nodes share rows.
+    pub hashed: bool,
+}
+
+/// Factors of the coordinates in the hash.
+const PRIMES: [u32; 3] = [1, 2_654_435_761, 805_459_861];
+
+impl Level {
+    /// Returns the factors of the coordinates of a node.
+    #[inline(always)]
+    fn factors(&self) -> [u32; 3] {
+        let n = self.resolution as u32;
+        if self.hashed { PRIMES } else { [1, n, n.wrapping_mul(n)] }
+    }
+
+    /// Returns the row of a node, from the products of its coordinates with the [`factors`](Self::factors).
+    #[inline(always)]
+    fn row(&self, [x, y, z]: [u32; 3]) -> u32 {
+        let rows = self.rows as u32;
+        let row = if self.hashed {
+            (x ^ y ^ z) & (rows - 1)
+        } else {
+            // The outermost node of an axis may be one beyond the grid.
+            let row = x + y + z;
+            if row < rows { row } else { row - rows }
+        };
+        self.first as u32 + row
+    }
+}
+
+/// Layout of a hash grid in its table. Cloning copies a pointer.
+#[derive(Clone, Debug)]
+pub struct HashGrid {
+    shape: Shape,
+    levels: Arc<[Level]>,
+}
+
+impl HashGrid {
+    /// Creates the layout.
+    ///
+    /// Panics if a size is out of range, or if the table has more than 2³¹ rows.
+    #[track_caller]
+    pub fn new(shape: Shape) -> Self {
+        let Shape { levels, features, log2_rows, base, growth } = shape;
+        assert!(
+            levels > 0 && [1, 2, 4, 8].contains(&features),
+            "HashGrid: {levels} levels of {features} features; expected 1, 2, 4 or 8 features"
+        );
+        assert!((3..=24).contains(&log2_rows) && base >= 2 && growth >= 1.0, "HashGrid: invalid sizes {shape:?}");
+        let mut first = 0;
+        let level = |l: usize| {
+            let scale = base as f64 * growth.powi(l as i32) - 1.0;
+            let resolution = scale.ceil() as usize + 1;
+            let (most, nodes) = (1usize << log2_rows, resolution.saturating_pow(3));
+            let rows = nodes.saturating_add(7) / 8 * 8;
+            let level = Level { scale, resolution, first, rows: rows.min(most), hashed: nodes > most };
+            first += level.rows;
+            level
+        };
+        let levels: Arc<[Level]> = (0..levels).map(level).collect();
+        assert!(first < 1 << 31, "HashGrid: a table of {first} rows");
+        HashGrid { shape, levels }
+    }
+
+    /// Returns the sizes.
+    pub fn shape(&self) -> &Shape {
+        &self.shape
+    }
+
+    /// Returns the levels.
+    pub fn levels(&self) -> &[Level] {
+        &self.levels
+    }
+
+    /// Returns the number of rows of the table, whose shape is `[rows, features]`.
+    pub fn rows(&self) -> usize {
+        self.levels.iter().map(|level| level.rows).sum()
+    }
+
+    /// Returns the number of values of an encoded position.
+    pub fn width(&self) -> usize {
+        self.shape.levels * self.shape.features
+    }
+
+    /// Encodes positions `[m, 3]` in the unit cube with a table `[rows, features]`: `[m, width]`. Positions outside are clamped.
+    ///
+    /// Differentiable with respect to the table, with a row-sparse gradient, and to the positions. The gradient with respect to a clamped
+    /// coordinate is 0, and it is discontinuous between cells.
+    ///
+    /// Panics if a shape is another.
+    #[track_caller]
+    pub fn encode<T: Real>(&self, table: &Tensor<T>, positions: &Tensor<T>) -> Tensor<T> {
+        let want = [self.rows(), self.shape.features];
+        assert_eq!(table.shape(), want, "hash_encode: the table must be {want:?}, got {:?}", table.shape());
+        assert!(positions.ndim() == 2 && positions.shape()[1] == 3, "hash_encode: positions must be [m, 3], got {:?}", positions.shape());
+        let (m, width) = (positions.shape()[0], self.width());
+        let (places, data) = (positions.data().as_chunks::<3>().0, table.data());
+        let mut out = Buffer::stale(m * width);
+        parallel::for_each_rows(&mut out, width, |first, out| {
+            let places = &places[first..first + out.len() / width];
+            loops::encode(&self.levels, self.shape.features, data, places, out);
+        });
+        Tensor::from_kernel(out, &[m, width], &[table, positions], Encode { grid: self.clone() })
+    }
+}
+
+/// Kernel that maps a table and positions to encoded positions.
+#[derive(Debug)]
+struct Encode {
+    grid: HashGrid,
+}
+
+impl<T: Real> Kernel<T> for Encode {
+    fn name(&self) -> &'static str {
+        "hash_encode"
+    }
+
+    fn reference(&self, inputs: &[Tensor<T>]) -> Tensor<T> {
+        let [table, positions] = inputs else { unreachable!("hash_encode has two inputs") };
+        let inside = positions.clamp(0.0, 1.0);
+        let levels = self.grid.levels.iter().map(|level| {
+            let u = &inside * level.scale + 0.5;
+            let cells = u.constant_map(T::floor);
+            let above = u - &cells;
+            let below = 1.0 - &above;
+            let corner = |c: usize| {
+                let up = [c & 1, c >> 1 & 1, c >> 2];
+                let row = |cell: &[T; 3]| {
+                    let factors = level.factors();
+                    level.row([0, 1, 2].map(|a| (cell[a].index() + up[a] as u32).wrapping_mul(factors[a])))
+                };
+                let rows: Vec<u32> = cells.data().as_chunks().0.iter().map(row).collect();
+                let share = |a: usize| if up[a] == 1 { above.narrow(1, a, 1) } else { below.narrow(1, a, 1) };
+                table.gather_rows(&Indices::from(rows)) * (share(0) * share(1) * share(2))
+            };
+            (1..8).fold(corner(0), |sum, c| sum + corner(c))
+        });
+        Tensor::concat(&levels.collect::<Vec<_>>().iter().collect::<Vec<_>>(), 1)
+    }
+
+    fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
+        let (positions, g) = (call.input(1), call.cotangent());
+        let (places, features) = (positions.data().as_chunks::<3>().0, self.grid.shape.features);
+        if call.needs(0) {
+            let sums = sums::HashSums::new(&self.grid, places, g.data());
+            out.rows(0, RowSparse::deferred(&[self.grid.rows(), features], Arc::new(sums)));
+        }
+        if call.needs(1) {
+            let (table, width) = (call.input(0), self.grid.width());
+            let mut slopes = Buffer::stale(positions.len());
+            parallel::for_each_rows(&mut slopes, 3, |first, slopes| {
+                let range = first..first + slopes.len() / 3;
+                let g = &g.data()[range.start * width..range.end * width];
+                loops::slopes(&self.grid.levels, features, table.data(), &places[range], g, slopes);
+            });
+            out.dense(1, slopes);
+        }
+    }
+}
