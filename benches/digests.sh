@@ -14,11 +14,11 @@ scene=(--scene-size 100 --scene-views 40,4,2)
 run demo train "${scene[@]}" --preset demo --set 'stages[*].steps=80' "${quiet[@]}"
 run fast train "${scene[@]}" --preset fast --set 'stages[*].steps=60' "${quiet[@]}"
 run paper train "${scene[@]}" --preset paper --downscale 2 --set 'stages[*].steps=60' "${quiet[@]}"
-run quality train "${scene[@]}" --preset voxels --set 'stages[*].steps=60' "${quiet[@]}"
+run voxels train "${scene[@]}" --preset voxels --set 'stages[*].steps=60' "${quiet[@]}"
 run plenoxels train "${scene[@]}" --preset plenoxels --set 'stages[*].steps=60' --set 'stages[0].resolution=64' --set 'stages[1].resolution=128' "${quiet[@]}"
 if [ -n "$lego" ]; then
     run fast-lego train "$lego" --downscale 2 --preset fast --hull off --set 'stages[*].steps=50' "${quiet[@]}"
-    run quality-lego train "$lego" --downscale 2 --preset voxels --set 'stages[*].steps=30' --set 'scout.stages[*].steps=30' --hull off "${quiet[@]}"
+    run voxels-lego train "$lego" --downscale 2 --preset voxels --set 'stages[*].steps=30' --set 'scout.stages[*].steps=30' --hull off "${quiet[@]}"
     run carve carve "$lego" --downscale 4 --resolution 128 --sh-degree 2 --no-images --no-report --quiet
     run carve-init train "$lego" --downscale 4 --init-from "$out/carve" --preset fast --set 'stages[*].steps=30' "${quiet[@]}"
 fi

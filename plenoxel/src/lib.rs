@@ -54,6 +54,7 @@ pub mod rays;
 pub mod render;
 pub mod run;
 pub mod sampling;
+pub mod space;
 pub mod tensor_file;
 pub mod text;
 pub mod train;

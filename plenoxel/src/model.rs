@@ -36,31 +36,20 @@ pub fn kind(path: &Path) -> Result<String> {
     Ok(facts["kind"].as_str().unwrap_or(plenoxels::KIND).to_owned())
 }
 
+fn boxed<M: Model<f32> + 'static>((model, about): (M, About)) -> (Box<dyn Model<f32>>, About) {
+    (Box::new(model), about)
+}
+
 /// Opens the model of a checkpoint for rendering, with the config of its run.
 ///
 /// Errors if the file cannot be read, or if its kind is not one of [`KINDS`].
 pub fn open(path: &Path, config: &Config) -> Result<(Box<dyn Model<f32>>, About)> {
     match &kind(path)?[..] {
-        plenoxels::KIND => {
-            let (model, about) = plenoxels::open(path, config)?;
-            Ok((Box::new(model), about))
-        }
-        tensorf::KIND => {
-            let (model, about) = Tensorf::open(path)?;
-            Ok((Box::new(model), about))
-        }
-        dvgo::KIND => {
-            let (model, about) = Dvgo::open(path)?;
-            Ok((Box::new(model), about))
-        }
-        nerf::KIND => {
-            let (model, about) = Nerf::open(path)?;
-            Ok((Box::new(model), about))
-        }
-        ngp::KIND => {
-            let (model, about) = Ngp::open(path)?;
-            Ok((Box::new(model), about))
-        }
+        plenoxels::KIND => plenoxels::open(path, config).map(boxed),
+        tensorf::KIND => Tensorf::open(path).map(boxed),
+        dvgo::KIND => Dvgo::open(path).map(boxed),
+        nerf::KIND => Nerf::open(path).map(boxed),
+        ngp::KIND => Ngp::open(path).map(boxed),
         other => Err(recipe::unknown(other, &TensorFile::open(path)?)),
     }
 }

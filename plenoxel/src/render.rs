@@ -9,7 +9,7 @@ use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::sampling::{Jitter, Occupancy, Spacing, sample};
 use autograd::{Real, Tensor};
-pub use composite::{Columns, PerSample, Rendered, composite};
+pub use composite::{Columns, PerSample, Rendered, composite, weights};
 pub use field::{Field, Radiance};
 use serde::{Deserialize, Serialize};
 

@@ -15,7 +15,7 @@ use crate::error::{Error, Result};
 use crate::loss::{Evaluation, Objective, Step};
 use crate::rays::{RayBatch, RaySource};
 use crate::sampling::Jitter;
-use autograd::optim::Optimizer;
+use autograd::optim::{Optimizer, Sgd};
 use autograd::{Module, Real, parallel, value_and_grad};
 use ndarray::Array3;
 use serde::{Deserialize, Serialize};
@@ -223,10 +223,9 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         let Some(stage) = self.stage_of(self.step) else { return Ok(None) };
         let in_stage = self.step - stage.first;
         if in_stage == 0 {
-            // Release the memory of the old optimizer before the model grows.
-            self.optimizer = self.model.optimizer(&stage);
+            // Releases the memory of the old optimizer before the model grows.
+            self.optimizer = Box::new(Sgd::new(0.0));
             self.model.begin_stage(&stage, &mut self.rays).map_err(|e| at_step(e, self.step))?;
-            // It may depend on what the model has found.
             self.optimizer = self.model.optimizer(&stage);
         }
         self.model.begin_step(in_stage)?;

@@ -17,7 +17,7 @@ use super::encoding::Directions;
 use super::grouping::{Grouping, Groups};
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use crate::render::{Field, Radiance, RenderOptions, Rendered, composite};
+use crate::render::{Field, Radiance, RenderOptions, Rendered, composite, weights};
 use crate::sampling::{Jitter, Occupancy, Samples, sample};
 use autograd::nn::{Activation, Init, Mlp};
 use autograd::{Indices, Module, Param, Real, Tensor, no_grad, random::Stream};
@@ -67,7 +67,7 @@ pub struct DenseGrid<T: Real> {
     pub opacity_above: f64,
     /// Which samples have their own color in training, that is with jitter.
     pub grouping: Grouping,
-    /// The same in pictures.
+    /// Which samples have their own color in pictures.
     pub grouping_in_pictures: Grouping,
     /// Cells around the nodes outside of which nothing is sampled; `None` for the whole box.
     pub occupied: Option<Occupancy>,
@@ -184,10 +184,7 @@ impl<T: Real> DenseGrid<T> {
     fn grouped_radiance(&self, samples: &Samples<T>, grouping: Grouping, jitter: Jitter) -> Radiance<T> {
         let cells = self.in_cells(&samples.positions);
         let sigma = self.density_in_cells(&cells);
-        let weights = no_grad(|| {
-            let tau = &sigma.detach() * &samples.delta;
-            (-tau.segment_exclusive_sum(&samples.offsets)).exp() * tau.one_minus_exp_neg()
-        });
+        let weights = weights(samples, &sigma);
         let Groups { of, shaded, rays } = grouping.groups(weights.data(), &samples.offsets, 0, jitter);
         let rgb = self.colors(&cells.gather_rows(&Indices::from(shaded)), &samples.directions, &Indices::from(rays));
         let members = of.iter().zip(0u32..).filter(|(group, _)| **group != Groups::NONE);

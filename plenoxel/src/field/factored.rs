@@ -15,7 +15,7 @@ use super::encoding::{Directions, frequency};
 use super::grouping::Grouping;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use crate::render::{Field, Radiance, RenderOptions, Rendered};
+use crate::render::{Field, Radiance, RenderOptions, Rendered, weights};
 use crate::sampling::{Occupancy, Samples};
 use autograd::nn::{Activation, Init, Linear, Mlp};
 use autograd::{Indices, Module, Param, Real, Tensor, impl_module, no_grad, random::Stream};
@@ -292,10 +292,7 @@ impl<T: Real> Field<T> for Factored<T> {
     fn radiance(&self, samples: &Samples<T>) -> Radiance<T> {
         let (tables, cells) = (self.tables(), self.cells(&samples.positions));
         let sigma = density(&tables, &cells);
-        let weights = no_grad(|| {
-            let tau = &sigma.detach() * &samples.delta;
-            (-tau.segment_exclusive_sum(&samples.offsets)).exp() * tau.one_minus_exp_neg()
-        });
+        let weights = weights(samples, &sigma);
         let seen = weights.data().iter().enumerate().filter(|(_, weight)| weight.as_f64() > self.grouping.above);
         let seen = Indices::from(seen.map(|(i, _)| i as u32).collect::<Vec<_>>());
         let directions = self.shape.directions.encode(&samples.directions.segment_repeat(&samples.offsets).gather_rows(&seen));

@@ -11,7 +11,7 @@ use super::encoding::Directions;
 use super::hash_grid::{self, HashGrid};
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use crate::render::{Field, Radiance, RenderOptions, Rendered, composite};
+use crate::render::{Field, Radiance, RenderOptions, Rendered, composite, weights};
 use crate::sampling::{Occupancy, Samples, sample_visible};
 use autograd::nn::{Activation, Init, Mlp};
 use autograd::{Cotangent, Indices, Keep, Op, Param, Real, Tensor, Vjp, impl_module, no_grad, random::Stream};
@@ -132,10 +132,7 @@ impl<T: Real> Field<T> for HashField<T> {
         if self.color_above == 0.0 {
             return Radiance { rgb: colors(&outputs, &directions), sigma };
         }
-        let weights = no_grad(|| {
-            let tau = &sigma.detach() * &samples.delta;
-            (-tau.segment_exclusive_sum(&samples.offsets)).exp() * tau.one_minus_exp_neg()
-        });
+        let weights = weights(samples, &sigma);
         let above = T::lit(self.color_above);
         let seen = (0..).zip(weights.data()).filter(|(_, weight)| **weight > above).map(|(i, _)| i);
         let seen = Indices::from(seen.collect::<Vec<u32>>());

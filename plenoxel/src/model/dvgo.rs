@@ -25,7 +25,7 @@ use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions};
+use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Piecewise, Rates, Scaled, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
 pub use config::{Config, Stage};
@@ -295,13 +295,7 @@ impl<T: Real> Model<T> for Dvgo<T> {
             return Err(file.damaged("the density has no unit"));
         }
         self.field.occupied = cells::read(file)?;
-        let mut done = Ok(());
-        self.visit_mut(&mut |param| {
-            if done.is_ok() {
-                done = file.tensor(param.name(), param.shape()).map(|read| param.replace(read));
-            }
-        });
-        done
+        read_params(self, file)
     }
 }
 

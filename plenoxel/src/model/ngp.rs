@@ -21,7 +21,7 @@ use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Refresh, RunningOccupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params};
+use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde::{Deserialize, Serialize};
@@ -63,7 +63,7 @@ pub struct Config {
     pub directions: Directions,
     /// Optical depth of the longest side of the box before the first step.
     pub depth: f64,
-    /// The same if there is a visual hull.
+    /// Optical depth before the first step if there is a visual hull.
     pub depth_in_hull: f64,
     /// Number of steps along the longest side of the box.
     pub samples: f64,
@@ -344,11 +344,6 @@ impl<T: Real> Model<T> for Ngp<T> {
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {
         let engine = if pass.keep_samples { Engine::Graph } else { self.engine };
         self.render_with(rays, pass.background, pass.jitter, engine)
-    }
-
-    fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
-        let background = view.background;
-        Box::new(move |rays| self.render_with(rays, background, Jitter::None, self.engine))
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {

@@ -27,6 +27,9 @@ pub trait Recipe: Send + Sync {
     /// Returns the stages of training.
     fn stages(&self) -> Vec<StageLength>;
 
+    /// Returns true if the model uses silhouettes.
+    fn uses_silhouettes(&self) -> bool;
+
     /// Returns the memory of the model.
     fn memory(&self, engine: Engine) -> Memory;
 
@@ -64,13 +67,15 @@ pub trait Recipe: Send + Sync {
 pub struct Memory {
     /// Parameters, in the stage that has the most.
     pub parameters: u64,
-    /// What a step keeps for a ray.
+    /// Values of a ray that a step keeps.
     pub ray: u64,
-    /// What a picture needs for a ray of a batch.
+    /// Values of a ray of a batch that a picture needs.
     pub ray_of_picture: u64,
-    /// Setting that determines the parameters, and how to make them fewer, for messages.
+    /// Key of the number of rays in a step, for messages.
+    pub rays: &'static str,
+    /// Key that determines the number of parameters, for messages.
     pub size: &'static str,
-    /// See `size`.
+    /// Advice for fewer parameters, for messages.
     pub smaller: &'static str,
 }
 

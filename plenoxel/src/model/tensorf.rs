@@ -26,7 +26,7 @@ use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions};
+use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde_json::{Value, json};
@@ -180,11 +180,6 @@ impl<T: Real> Model<T> for Tensorf<T> {
         self.render_with(rays, pass.background, pass.jitter, engine)
     }
 
-    fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
-        let background = view.background;
-        Box::new(move |rays| self.render_with(rays, background, Jitter::None, self.engine))
-    }
-
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
         let config = &self.config;
         let falling = |rate: f64, frozen: u64| Falling {
@@ -266,13 +261,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
         }
         self.field.occupied = cells::read(file)?;
         self.field.resample(aabb, nodes);
-        let mut done = Ok(());
-        self.visit_mut(&mut |param| {
-            if done.is_ok() {
-                done = file.tensor(param.name(), param.shape()).map(|read| param.replace(read));
-            }
-        });
-        done
+        read_params(self, file)
     }
 }
 

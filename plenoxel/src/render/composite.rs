@@ -6,7 +6,7 @@
 
 use super::Radiance;
 use crate::sampling::Samples;
-use autograd::{Real, Tensor};
+use autograd::{Real, Tensor, no_grad};
 use std::fmt::Debug;
 use std::sync::Arc;
 
@@ -97,6 +97,14 @@ pub struct PerSample<T: Real> {
     pub radiance: Radiance<T>,
     /// Positions, intervals and rays of the samples.
     pub samples: Samples<T>,
+}
+
+/// Returns the rendering weights wᵢ of samples with densities `sigma` `[m]`, without recording a gradient: `[m]`.
+pub fn weights<T: Real>(samples: &Samples<T>, sigma: &Tensor<T>) -> Tensor<T> {
+    no_grad(|| {
+        let tau = &sigma.detach() * &samples.delta;
+        (-tau.segment_exclusive_sum(&samples.offsets)).exp() * tau.one_minus_exp_neg()
+    })
 }
 
 /// Composites samples to pixels. `background` is `[3]`, or `[n, 3]` for one color per ray.

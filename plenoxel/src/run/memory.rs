@@ -208,7 +208,7 @@ impl Estimate {
 
     /// Estimates a training run of another model than the grid, and its evaluation.
     pub fn of_recipe(config: &Config, recipe: &dyn Recipe, dataset: &Dataset, options: &RunOptions) -> Self {
-        let Memory { parameters, ray, ray_of_picture, size, smaller } = recipe.memory(config.engine);
+        let Memory { parameters, ray, ray_of_picture, rays: key_of_rays, size, smaller } = recipe.memory(config.engine);
         let rays = recipe.stages().iter().map(|stage| stage.rays_per_step.unwrap_or(config.rays_per_step) as u64).max().unwrap_or(0);
         let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
         let (width, height) = dataset.size();
@@ -219,7 +219,7 @@ impl Estimate {
         let own = |key: &str| format!("{}.{key}", recipe.kind());
         let parts = [
             (images, "downscale".to_owned(), "reduce the images by a larger factor"),
-            (step, own("stages[*].rays"), "use fewer rays in a step"),
+            (step, own(key_of_rays), "use fewer rays in a step"),
             (3 * parameters, own(size), smaller),
         ];
         let (_, key, advice) = parts.into_iter().max_by_key(|(bytes, ..)| *bytes).unwrap_or_default();

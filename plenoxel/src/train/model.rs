@@ -56,8 +56,8 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     /// Renders rays. While a step is recorded, gradients flow from the result to the parameters.
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T>;
 
-    /// Creates the optimizer of a stage; schedules count from the stage's first step. It is called at the beginning of each stage, before and after
-    /// [`begin_stage`](Model::begin_stage), and after [`resume`](Model::resume).
+    /// Creates the optimizer of a stage; schedules count from the stage's first step. It is called at the beginning of each stage, after
+    /// [`begin_stage`](Model::begin_stage) or [`resume`](Model::resume).
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>>;
 
     /// Returns a function that renders images of the current model, without jitter. It may precompute data for many rays. It is called

@@ -193,7 +193,7 @@ pub fn forward<T: Real>(mlp: &Mlp<T>, x: &Tensor<T>) -> Option<Tensor<T>> {
     forward_keeping(mlp, x, KEPT)
 }
 
-/// The same, and keeps the hidden activations if there are at most `most` numbers.
+/// Computes the output as [`forward`] does, and keeps the hidden activations if there are at most `most` numbers.
 fn forward_keeping<T: Real>(mlp: &Mlp<T>, x: &Tensor<T>, most: usize) -> Option<Tensor<T>> {
     let curve = Curve::of(mlp.activation)?;
     let widths = || mlp.layers.iter().map(|layer| (layer.inputs(), layer.outputs()));

@@ -22,7 +22,7 @@ pub struct Config {
     /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training of the fine stages; 0 for a color
     /// per sample.
     pub group: f64,
-    /// The same in pictures.
+    /// Weight that completes a group in pictures.
     pub group_in_pictures: f64,
     /// Transmittance below which a ray ends.
     pub stop_below: f64,
@@ -36,7 +36,7 @@ pub struct Config {
     pub fine_opacity: f64,
     /// Least opacity of a sample, and least weight of a color, in the coarse stage.
     pub coarse_above: f64,
-    /// The same in the fine stages, and least opacity of a voxel in whose neighbourhood is sampled.
+    /// Least opacity of a sample, and least weight of a color, in the fine stages; also the least opacity of a voxel in whose neighbourhood is sampled.
     pub fine_above: f64,
     /// Least opacity of a coarse voxel that belongs to the box of the fine stages, and in whose neighbourhood they sample.
     pub occupied_above: f64,

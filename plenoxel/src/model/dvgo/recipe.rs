@@ -30,6 +30,10 @@ impl Recipe for Config {
         self.all_stages().map(Stage::length).collect()
     }
 
+    fn uses_silhouettes(&self) -> bool {
+        false
+    }
+
     fn memory(&self, _: Engine) -> Memory {
         // Expected samples per ray in the coarse stage, and those of them that have a color.
         const SAMPLES: u64 = 150;
@@ -40,6 +44,7 @@ impl Recipe for Config {
             parameters: (voxels * (1 + self.features) * size_of::<f32>()) as u64,
             ray: SAMPLES * 60 + COLORED * (numbers * size_of::<f32>()) as u64,
             ray_of_picture: SAMPLES * 60 + COLORED * (self.hidden * size_of::<f32>()) as u64,
+            rays: "fine[*].rays",
             size: "fine[*].resolution",
             smaller: "use fewer voxels per side",
         }

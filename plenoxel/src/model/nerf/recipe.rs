@@ -24,6 +24,10 @@ impl Recipe for Config {
         self.lengths()
     }
 
+    fn uses_silhouettes(&self) -> bool {
+        false
+    }
+
     fn memory(&self, _: Engine) -> Memory {
         let numbers = self.width * self.depth + self.width + self.color_width + 6 * (self.position_octaves + self.direction_octaves);
         let weights = 2 * (self.depth * self.width * self.width + 2 * self.width * self.width);
@@ -33,6 +37,7 @@ impl Recipe for Config {
             ray_of_picture,
             parameters: (weights * size_of::<f32>()) as u64,
             ray: ((2 * self.coarse_samples + self.fine_samples) * 2 * numbers * size_of::<f32>()) as u64,
+            rays: "rays",
             size: "width",
             smaller: "use fewer or narrower layers",
         }

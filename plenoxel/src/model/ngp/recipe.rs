@@ -24,6 +24,10 @@ impl Recipe for Config {
         self.stages.iter().map(length).collect()
     }
 
+    fn uses_silhouettes(&self) -> bool {
+        true
+    }
+
     fn memory(&self, _: Engine) -> Memory {
         // Expected samples per ray: more in the first steps, fewer once the occupancy is known.
         const SAMPLES: u64 = 40;
@@ -33,6 +37,7 @@ impl Recipe for Config {
             parameters: (encoded << self.log2_rows) as u64 * size_of::<f32>() as u64,
             ray: SAMPLES * (numbers * size_of::<f32>()) as u64,
             ray_of_picture: SAMPLES * ((encoded + 2 * self.hidden) * size_of::<f32>()) as u64,
+            rays: "stages[*].rays",
             size: "log2_rows",
             smaller: "use fewer rows, levels or features",
         }

@@ -642,14 +642,32 @@ impl Config {
             true => Err(Error::usage(
                 key,
                 format!("this setting of a voxel grid has no effect on the model `{kind}`"),
-                format!("remove it, or remove `{kind}`"),
+                "leave it out, or choose a preset of a voxel grid, such as voxels",
             )),
             false => Ok(()),
         };
-        of_grid(!self.stages.is_empty(), "stages")?;
-        of_grid(self.scout.is_some(), "scout")?;
-        of_grid(self.init_from.is_some(), "init_from")?;
-        of_grid(self.prune_from_stage.is_some(), "prune_from_stage")?;
+        let none = Config { stages: Vec::new(), ..Config::default() };
+        of_grid(self.stages != none.stages, "stages")?;
+        of_grid(self.scout != none.scout, "scout")?;
+        of_grid(self.init_from != none.init_from, "init_from")?;
+        of_grid(self.interpolation != none.interpolation, "interpolation")?;
+        of_grid(self.color != none.color, "color")?;
+        of_grid(self.sh_degree != none.sh_degree, "sh_degree")?;
+        of_grid(self.sh_reduction != none.sh_reduction, "sh_reduction")?;
+        of_grid(self.sh_offset != none.sh_offset, "sh_offset")?;
+        of_grid(self.optimizer != none.optimizer, "optimizer")?;
+        of_grid(self.initial != none.initial, "initial")?;
+        of_grid(self.rays_per_step != none.rays_per_step, "rays_per_step")?;
+        of_grid(self.stop_below != none.stop_below, "stop_below")?;
+        of_grid(self.aim != none.aim, "aim")?;
+        of_grid(self.project != none.project, "project")?;
+        of_grid(self.pixels_per_voxel != none.pixels_per_voxel, "pixels_per_voxel")?;
+        of_grid(self.prune_from_stage != none.prune_from_stage, "prune_from_stage")?;
+        of_grid(self.prune_below != none.prune_below, "prune_below")?;
+        of_grid(self.prune_unseen_below != none.prune_unseen_below, "prune_unseen_below")?;
+        if self.hull == Hull::Auto && !recipe.uses_silhouettes() {
+            return Err(Error::usage("hull", format!("the model `{kind}` does not use silhouettes"), "set it to off"));
+        }
         self.losses.keys().try_for_each(|loss| of_grid(!loss::NAMES.contains(&&loss[..]), &format!("losses.{loss}")))
     }
 }

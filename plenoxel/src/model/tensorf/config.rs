@@ -26,7 +26,7 @@ pub struct Config {
     pub step: f64,
     /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
     pub group: f64,
-    /// The same in pictures.
+    /// Weight that completes a group in pictures.
     pub group_in_pictures: f64,
     /// Groups of samples whose weight is not above this have no color.
     pub color_above: f64,
@@ -49,7 +49,7 @@ pub struct Config {
     pub cool_down: f64,
     /// Weight of the L1 norm of the density factors, Σ over planes and lines of the mean absolute value, in the first stage.
     pub density_l1: f64,
-    /// The same in the other stages.
+    /// Weight of the L1 norm of the density factors in the other stages.
     pub density_l1_later: f64,
     /// Treatment of rows of planes without a gradient by Adam: true visits only rows with a gradient.
     pub lazy: bool,

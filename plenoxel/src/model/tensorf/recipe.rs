@@ -23,11 +23,16 @@ impl Recipe for Config {
         self.stages.iter().map(Stage::length).collect()
     }
 
+    fn uses_silhouettes(&self) -> bool {
+        true
+    }
+
     fn memory(&self, engine: Engine) -> Memory {
         Memory {
             parameters: self.stages.iter().map(|stage| bytes_of_planes(self, stage.resolution)).max().unwrap_or(0),
             ray: bytes_of_ray(self, engine),
             ray_of_picture: bytes_of_ray(self, engine),
+            rays: "stages[*].rays",
             size: "stages[*].resolution",
             smaller: "fewer nodes a side, or fewer components",
         }
