@@ -7,6 +7,7 @@ use autograd::Tensor;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
+use plenoxel::camera::lens::Lens;
 use plenoxel::camera::{Camera, Intrinsics};
 use plenoxel::export::web::WebGrid;
 use plenoxel::field::sh;
@@ -70,12 +71,12 @@ fn the_page_reads_a_grid_as_the_library_does() {
         let points: Vec<f32> = (0..3 * POINTS).map(|i| (0.6 * f64::sin(1.7 * (i * i) as f64) * shape.half_width) as f32).collect();
         let directions: Vec<[f64; 3]> =
             points.as_chunks::<3>().0.iter().map(|p| DVec3::from(p.map(f64::from)).normalize().into()).collect();
-        let intrinsics = Intrinsics { width: 12, height: 9, fx: 15.0, fy: 14.0, cx: 5.5, cy: 4.8 };
+        let intrinsics = Intrinsics { width: 12, height: 9, fx: 15.0, fy: 14.0, cx: 5.5, cy: 4.8, lens: Lens::Pinhole };
         // From outside, and from within the box.
         let cameras =
             [DVec3::new(2.5, -1.9, 1.3), DVec3::new(-0.9, 0.8, -0.7)].map(|eye| Camera::look_at(eye, DVec3::ZERO, DVec3::Z, intrinsics));
         let views = cameras.iter().map(|camera| {
-            let Intrinsics { width, height, fx, fy, cx, cy } = camera.intrinsics;
+            let Intrinsics { width, height, fx, fy, cx, cy, .. } = camera.intrinsics;
             let pose = camera.camera_to_world.to_cols_array();
             json!({ "pose": pose, "width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy })
         });

@@ -4,12 +4,14 @@
 //! run x right and y *down* from the top left corner of the image, so the centre of pixel (i, j) is (i + 0.5, j + 0.5). Ray directions have
 //! unit length: t along a ray is world distance.
 
+pub mod lens;
 pub mod placement;
 pub(crate) mod projection;
 
-use glam::{DAffine3, DMat3, DVec3};
+use glam::{DAffine3, DMat3, DVec2, DVec3};
+use lens::Lens;
 
-/// Pinhole intrinsics in pixels.
+/// Image size, focal lengths and principal point in pixels, and the lens.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
     /// Image width in pixels.
@@ -24,31 +26,74 @@ pub struct Intrinsics {
     pub cx: f64,
     /// Vertical principal point in pixels from the top edge.
     pub cy: f64,
+    /// Lens. Its parameters are in focal lengths, so they do not depend on the size of the image.
+    pub lens: Lens,
 }
 
 impl Intrinsics {
-    /// Creates intrinsics with square pixels and a centred principal point from the horizontal field of view in radians: f = W / (2 tan(fov
+    /// Creates intrinsics of a pinhole with square pixels and a centred principal point from the horizontal field of view in radians: f = W / (2 tan(fov
     /// / 2)), c = (W / 2, H / 2).
     pub fn from_fov_x(width: usize, height: usize, fov_x: f64) -> Self {
         Self::centred(width, height, 0.5 * width as f64 / (0.5 * fov_x).tan())
     }
 
-    /// Creates intrinsics with square pixels and a centred principal point from the focal length in pixels.
+    /// Creates intrinsics of a pinhole with square pixels and a centred principal point from the focal length in pixels.
     pub fn centred(width: usize, height: usize, focal: f64) -> Self {
-        Intrinsics { width, height, fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64 }
+        Intrinsics { width, height, fx: focal, fy: focal, cx: 0.5 * width as f64, cy: 0.5 * height as f64, lens: Lens::Pinhole }
     }
 
-    /// Returns the horizontal field of view in radians, 2 atan(W / (2 fx)): the inverse of [`Intrinsics::from_fov_x`].
+    /// Returns the horizontal field of view in radians, 2 atan(W / (2 fx)): the inverse of [`Intrinsics::from_fov_x`]. The lens is ignored.
     pub fn fov_x(&self) -> f64 {
         2.0 * (0.5 * self.width as f64 / self.fx).atan()
     }
 
-    /// Returns the intrinsics of an image reduced by k, whose pixels are the means of `k` x `k` pixels: every parameter is divided by k.
+    /// Returns the intrinsics of an image reduced by k, whose pixels are the means of `k` x `k` pixels: every parameter is divided by k, but
+    /// those of the lens.
     /// Rays through pixel *centres* then pass through the centres of the blocks. `k` must not be 0 and should divide width and height;
     /// otherwise incomplete blocks at the right and bottom are dropped.
     pub fn downscaled(&self, k: usize) -> Self {
         let s = k as f64;
-        Intrinsics { width: self.width / k, height: self.height / k, fx: self.fx / s, fy: self.fy / s, cx: self.cx / s, cy: self.cy / s }
+        Intrinsics {
+            width: self.width / k,
+            height: self.height / k,
+            fx: self.fx / s,
+            fy: self.fy / s,
+            cx: self.cx / s,
+            cy: self.cy / s,
+            lens: self.lens,
+        }
+    }
+
+    /// Returns the direction, in camera axes, in which a point of the image in pixels is seen: of z = -1, or of length 1 for a fisheye.
+    ///
+    /// Panics at points that no direction reaches ([`Intrinsics::check_lens`]).
+    #[inline]
+    fn direction(&self, x: f64, y: f64) -> DVec3 {
+        match self.lens {
+            Lens::Pinhole => DVec3::new((x - self.cx) / self.fx, -(y - self.cy) / self.fy, -1.0),
+            _ => self.direction_through_lens(x, y),
+        }
+    }
+
+    #[inline(never)]
+    fn direction_through_lens(&self, x: f64, y: f64) -> DVec3 {
+        let point = DVec2::new((x - self.cx) / self.fx, (y - self.cy) / self.fy);
+        match self.lens.undistort(point) {
+            Some(d) => DVec3::new(d.x, -d.y, -d.z),
+            None => panic!("the point ({x}, {y}) is beyond the fold of the lens: Intrinsics::check_lens refuses such cameras"),
+        }
+    }
+
+    /// Projects a point in camera axes. Returns pixel coordinates and depth, like [`Camera::project`].
+    #[inline]
+    pub(crate) fn project(&self, local: DVec3) -> Option<(f64, f64, f64)> {
+        let depth = -local.z;
+        if matches!(self.lens, Lens::Pinhole) {
+            return (depth > 0.0).then(|| (self.cx + self.fx * local.x / depth, self.cy - self.fy * local.y / depth, depth));
+        }
+        let point = self.lens.distort(DVec3::new(local.x, -local.y, depth))?;
+        let depth = if let Lens::Fisheye(_) = self.lens { local.length() } else { depth };
+        Some((self.cx + self.fx * point.x, self.cy + self.fy * point.y, depth))
     }
 }
 
@@ -66,14 +111,15 @@ pub struct Ray {
     /// Unit direction.
     pub direction: DVec3,
     /// Length of the direction before normalisation, when its camera z was -1. t / stretch is the depth along the optical axis. The stretch
-    /// is 1 in the image centre and grows towards the corners.
+    /// is 1 in the image centre and grows towards the corners. For a fisheye, whose rays may be at right angles to the axis, it is 1: depth
+    /// is the distance from the camera.
     pub stretch: f64,
 }
 
-/// Pinhole camera: intrinsics and pose.
+/// Camera: intrinsics and pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// Image size, focal lengths, principal point.
+    /// Image size, focal lengths, principal point, lens.
     pub intrinsics: Intrinsics,
     /// Camera-to-world transform: a rotation whose columns are the camera's right, up and backward axes, and the camera's position.
     pub camera_to_world: DAffine3,
@@ -95,23 +141,22 @@ impl Camera {
     }
 
     /// Returns the ray through the point (`x`, `y`) of the image, in pixel coordinates. The ray through the centre of pixel (i, j) is
-    /// `ray(i + 0.5, j + 0.5)`. The direction is R ((x - cx)/fx, -(y - cy)/fy, -1), normalised.
+    /// `ray(i + 0.5, j + 0.5)`. The direction of a pinhole is R ((x - cx)/fx, -(y - cy)/fy, -1), normalised; other lenses: [`lens`].
+    ///
+    /// Panics at points that the lens does not reach. Images of a camera that [`Intrinsics::check_lens`] accepts have none.
+    #[inline]
     pub fn ray(&self, x: f64, y: f64) -> Ray {
-        let k = &self.intrinsics;
-        let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
-        let direction = self.camera_to_world.transform_vector3(direction);
+        let direction = self.camera_to_world.transform_vector3(self.intrinsics.direction(x, y));
         let stretch = direction.length();
         Ray { origin: self.camera_to_world.translation, direction: direction / stretch, stretch }
     }
 
-    /// Projects the world point `p`. Returns `(x, y, depth)`: pixel coordinates, and depth along the optical axis (the distance along the
-    /// ray is the depth times the ray's stretch). Returns `None` for points beside or behind the camera (depth <= 0). Points outside of the
-    /// image have coordinates outside of it.
+    /// Projects the world point `p`. Returns `(x, y, depth)`: pixel coordinates, and depth along the optical axis, of a fisheye the distance
+    /// from the camera (the distance along the ray is the depth times the ray's stretch). Returns `None` for points that the lens does not
+    /// show: beyond its fold, and unless it is a fisheye beside or behind the camera (depth <= 0). Points outside of the image have
+    /// coordinates outside of it.
     pub fn project(&self, p: DVec3) -> Option<(f64, f64, f64)> {
-        let k = &self.intrinsics;
-        let local = self.camera_to_world.inverse().transform_point3(p);
-        let depth = -local.z;
-        (depth > 0.0).then(|| (k.cx + k.fx * local.x / depth, k.cy - k.fy * local.y / depth, depth))
+        self.intrinsics.project(self.camera_to_world.inverse().transform_point3(p))
     }
 }
 

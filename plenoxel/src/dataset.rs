@@ -258,8 +258,8 @@ impl Dataset {
     /// Writes all views to the folder `path` in the NeRF-synthetic format. If depth is known, it also writes 16-bit depth images of the
     /// test views, in thousandths of a world unit, 0 for rays that hit nothing.
     ///
-    /// Errors if the folder is not empty, unless `overwrite`; if a camera has non-square pixels or a principal point off the centre, which
-    /// the format cannot express; or if a file cannot be written.
+    /// Errors if the folder is not empty, unless `overwrite`; if a camera has a lens, non-square pixels or a principal point off the centre,
+    /// which the format cannot express; or if a file cannot be written.
     pub fn write_blender(&self, path: &Path, overwrite: bool) -> Result<()> {
         self.write_blender_changed(path, overwrite, &|_, _| ())
     }

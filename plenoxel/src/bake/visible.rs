@@ -77,10 +77,8 @@ impl Eye {
     /// Returns the distance of the surface in the direction of a point; `None` if the point is outside of the image.
     fn surface(&self, point: DVec3) -> Option<f64> {
         let k = &self.intrinsics;
-        let local = self.world_to_camera.transform_point3(point);
-        let depth = -local.z;
-        let (x, y) = (k.cx + k.fx * local.x / depth, k.cy - k.fy * local.y / depth);
-        let inside = depth > 0.0 && (0.0..k.width as f64).contains(&x) && (0.0..k.height as f64).contains(&y);
+        let (x, y, _) = k.project(self.world_to_camera.transform_point3(point))?;
+        let inside = (0.0..k.width as f64).contains(&x) && (0.0..k.height as f64).contains(&y);
         inside.then(|| f64::from(self.distance[y as usize * k.width + x as usize]))
     }
 }

@@ -2,6 +2,7 @@
 
 use super::file_name;
 use crate::camera::Intrinsics;
+use crate::camera::lens::Lens;
 use crate::dataset::{Dataset, Split, View, image};
 use crate::error::{Error, Result};
 use crate::files;
@@ -22,7 +23,7 @@ pub fn write(dataset: &Dataset, root: &Path, overwrite: bool, change: &dyn Fn(Sp
         if let Some(odd) = cameras.iter().position(|camera| !expressible(&camera.intrinsics) || camera.intrinsics != cameras[0].intrinsics)
         {
             let found = format!("{split} view {odd} has intrinsics that the NeRF-synthetic format cannot express");
-            return Err(Error::input(root, found, "expected one camera with square pixels and a centred principal point"));
+            return Err(Error::input(root, found, "expected one pinhole camera with square pixels and a centred principal point"));
         }
         files::create_dir(&root.join(split.to_string()))?;
         let mut views = dataset.load(split, &|_, _| ())?;
@@ -52,7 +53,7 @@ pub fn write(dataset: &Dataset, root: &Path, overwrite: bool, change: &dyn Fn(Sp
 }
 
 fn expressible(k: &Intrinsics) -> bool {
-    k.fx == k.fy && k.cx == 0.5 * k.width as f64 && k.cy == 0.5 * k.height as f64
+    k.lens == Lens::Pinhole && k.fx == k.fy && k.cx == 0.5 * k.width as f64 && k.cy == 0.5 * k.height as f64
 }
 
 pub(super) fn rows(pose: &DAffine3) -> [[f64; 4]; 4] {

@@ -120,6 +120,7 @@ fn thinned(view: &View, side: usize) -> View {
         fy: all.fy / step,
         cx: moved(all.cx),
         cy: moved(all.cy),
+        lens: all.lens,
     };
     View { name: view.name.clone(), camera: Camera { intrinsics, ..view.camera }, image, depth: None }
 }
