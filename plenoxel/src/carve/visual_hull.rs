@@ -3,7 +3,7 @@
 //! In [`by_footprint`] and [`by_rays`], background pixels have alpha 0. A pixel of a reduced image has alpha 0 only if its whole block has
 //! ([`crate::dataset::image::downscale`]).
 
-use crate::camera::projection::{Pixels, Projection, Rectangle};
+use crate::camera::projection::{EDGES, Pixels, Projection, Rectangle};
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
@@ -122,15 +122,11 @@ struct Silhouette {
     sums: Vec<u32>,
 }
 
-/// Pairs of corners ([`Projection::corners`]) that are joined by an edge.
-const EDGES: [(usize, usize); 12] = [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)];
-
 dispatched! {
 /// Returns, as a mask, the voxels of a brick whose projection lies on background.
 fn outside(silhouette: &Silhouette, [low, high]: [[usize; 3]; 2], mask: u64, margin: f64) -> u64 {
     let projection = &silhouette.projection;
-    if let Some(corners) = projection.corners(low, high) {
-        let bounds = Rectangle::around(&corners, margin);
+    if let Some(bounds) = projection.bounds(low, high, margin) {
         match silhouette.object_pixels(bounds) {
             Some(0) if silhouette.holds(bounds) => return mask,
             // The brick is not visible, or is covered by the object: no voxel lies on background.

@@ -32,8 +32,8 @@ impl Tile {
     }
 }
 
-/// Returns the tiles that intersect the bounding rectangle of a projected brick of cells. If a brick is beside or behind a camera, returns
-/// all tiles of the view.
+/// Returns the tiles that intersect the bounding rectangle of a projected brick of cells. If a brick is beside or behind a camera, or
+/// partly not shown by its lens, returns all tiles of the view.
 pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
     let (aabb, cells) = (matter.aabb(), matter.cells());
     let bricks = matter.masks().iter().enumerate().filter(|(_, mask)| **mask != 0);
@@ -44,11 +44,10 @@ pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
         let mut shows = vec![false; (columns * rows) as usize];
         let projection = Projection::of(&views[v].camera, views[v].size(), aabb, cells);
         for &[low, high] in &boxes {
-            let Some(corners) = projection.corners(low, high) else {
+            let Some(Rectangle { low, high }) = projection.bounds(low, high, 0.0) else {
                 shows.fill(true);
                 break;
             };
-            let Rectangle { low, high } = Rectangle::around(&corners, 0.0);
             let range = |a: usize, n: u32| {
                 let clamped = |x: f64| (x / f64::from(SIDE)).floor().clamp(0.0, f64::from(n)) as u32;
                 clamped(low[a])..(clamped(high[a]) + 1).min(n)
