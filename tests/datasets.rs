@@ -349,9 +349,9 @@ fn broken_images_are_found_on_opening_and_named() {
         folder.refused(3, &["r_1.png", "truncated"]);
     }
     fs::write(&path, b"\xff\xd8\xff\xe0 JFIF and so on, long enough").unwrap();
-    folder.refused(3, &["r_1.png", "JPEG", "PNG"]);
+    folder.refused(3, &["r_1.png", "the JPEG is truncated"]);
     fs::write(&path, "These are not the pixels you are looking for.").unwrap();
-    folder.refused(3, &["r_1.png", "not a PNG image"]);
+    folder.refused(3, &["r_1.png", "not a PNG, JPEG or WebP image", "convert it to PNG or JPEG"]);
     fs::write(&path, "").unwrap();
     folder.refused(3, &["r_1.png", "empty"]);
     let mut absurd = png.clone();

@@ -2,6 +2,7 @@
 //! fuzz targets of `tests/fuzz` call. One more parser is one more entry of [`PARSERS`], and a target there.
 
 use super::memory::peak_of;
+use ::image::{DynamicImage, ImageBuffer, ImageFormat};
 use glam::DVec3;
 use ndarray::{Array2, Array3};
 use plenoxel::camera::{Camera, Intrinsics};
@@ -46,7 +47,7 @@ pub const PARSERS: [Parser; 10] = [
     Parser { name: "transforms.json", valid: transforms, read: read_transforms, repair: |_| (), memory: [MIB, 200] },
     Parser { name: "path.json", valid: paths, read: read_path, repair: |_| (), memory: [2 * MIB, 400] },
     // Deflate makes 1032 of one byte, RGBA 32 of one that has 8 pixels; a row; and what stands beside the pixels.
-    Parser { name: "image.png", valid: images, read: read_image, repair: repair_image, memory: [18 * MIB, 1032 * 32] },
+    Parser { name: "image.png", valid: images, read: read_image, repair: repair_image, memory: [64 * MIB, 1032 * 32] },
     Parser { name: "cloud.ply", valid: clouds, read: read_cloud, repair: |_| (), memory: [MIB, 64] },
     // The bricks of 1024³ voxels.
     Parser { name: "checkpoint", valid: checkpoints, read: read_checkpoint, repair: repair_tensors, memory: [1200 * MIB, 64] },
@@ -169,7 +170,25 @@ fn images() -> Vec<Vec<u8>> {
         written(|path| image::write_rgb(path, rgb.view()).expect("a picture")),
         written(|path| image::write_gray16(path, &gray).expect("a picture")),
         palette,
+        encoded(&rgba, ImageFormat::WebP),
+        encoded(&DynamicImage::ImageRgba8(rgba.clone()).to_luma8(), ImageFormat::Jpeg),
+        turned(&encoded(&DynamicImage::ImageRgba8(rgba.clone()).to_rgb8(), ImageFormat::Jpeg)),
     ]
+}
+
+fn encoded<P>(picture: &ImageBuffer<P, Vec<u8>>, format: ImageFormat) -> Vec<u8>
+where
+    P: ::image::PixelWithColorType<Subpixel = u8>,
+{
+    let mut bytes = Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, format).expect("a picture");
+    bytes.into_inner()
+}
+
+/// A JPEG with an EXIF segment: turned by 90 degrees.
+fn turned(jpeg: &[u8]) -> Vec<u8> {
+    let exif = b"\xff\xe1\0\x22Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
+    [&jpeg[..2], exif, &jpeg[2..]].concat()
 }
 
 fn read_image(path: &Path, bytes: &[u8]) -> Result<Then, String> {
@@ -178,8 +197,11 @@ fn read_image(path: &Path, bytes: &[u8]) -> Result<Then, String> {
     Ok(nothing())
 }
 
-/// The checksums of all chunks.
+/// The checksums of all chunks of a PNG.
 pub fn repair_image(bytes: &mut [u8]) {
+    if !bytes.starts_with(b"\x89PNG") {
+        return;
+    }
     let mut at = 8;
     while let Some(length) = bytes.get(at..at + 4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]) as usize) {
         let end = at + 8 + length;

@@ -1,4 +1,4 @@
-//! NeRF-synthetic folders: `transforms_{train,val,test}.json` and the PNG images they list (Mildenhall et al. 2020).
+//! NeRF-synthetic folders: `transforms_{train,val,test}.json` and the images they list (Mildenhall et al. 2020).
 //!
 //! A file has `camera_angle_x`, the horizontal field of view in radians, and `frames`, each with a `file_path` without extension and a 4 x
 //! 4 camera-to-world `transform_matrix` with OpenGL axes; world z is up. Only listed images are views: the depth and normal images in the
@@ -177,7 +177,7 @@ fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result
         }
     }
     tried.dedup();
-    // An image with another extension is found too, so that the message can say that it is not a PNG.
+    // An image with another extension has it in the list.
     let as_written = root.join(file_path.trim_start_matches("./"));
     let all = || tried.iter().chain([&as_written]);
     // Existing paths that are not files come last, so that the message can say what they are.

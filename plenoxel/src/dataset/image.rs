@@ -1,71 +1,23 @@
-//! Images: PNG decoding and encoding, reduction with a box filter, compositing over a background.
+//! Images: decoding of PNG, JPEG and WebP, encoding of PNG, reduction with a box filter, compositing over a background.
 //!
 //! An image is 8-bit RGBA with *straight* alpha, as stored in files. This takes a quarter of the memory of floats, and the background can
 //! be chosen when a color is read. Values are sRGB as stored. They are not linearised, because published results compare and composite the
 //! stored values.
 
+mod decode;
+mod jpeg;
 mod rows;
+mod webp;
 
 use crate::error::{Error, Result};
 use crate::files;
-use crate::memory;
 use ::image::{ExtendedColorType, ImageEncoder};
 use ndarray::{Array2, Array3, ArrayView3};
-use rows::Rows;
-use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
 pub use ::image::RgbaImage;
+pub use decode::{Orientation, decode, read, read_as, size, size_as};
 pub use rows::MAX_SIDE;
-
-/// Last chunk of every PNG: length 0, name, checksum.
-const END: [u8; 12] = *b"\0\0\0\0IEND\xae\x42\x60\x82";
-
-/// Returns width and height of the PNG file `path` without decoding it: reads its first 26 bytes and its last 12.
-///
-/// A file without the end of a PNG is decoded at once, so that a truncated file is reported when the dataset is opened, not hours later;
-/// its pixels are not kept. Errors if the file is missing, not a regular file, not a PNG, truncated, empty, larger than [`MAX_SIDE`], or
-/// has more pixels than its size allows.
-pub fn size(path: &Path) -> Result<(usize, usize)> {
-    let mut file = files::open(path, files::IMAGE)?;
-    let (width, height) = rows::size(path, &mut file)?;
-    let mut tail = [0_u8; END.len()];
-    let whole = file.seek(SeekFrom::End(-(END.len() as i64))).and_then(|_| file.read_exact(&mut tail)).is_ok() && tail == END;
-    if !whole {
-        file.rewind().map_err(|e| Error::io(path, e, "reading the image"))?;
-        Rows::new(path, BufReader::new(file))?.check()?;
-    }
-    Ok((width as usize, height as usize))
-}
-
-/// Decodes the PNG file `path` (gray, RGB or palette, with or without alpha, of any bit depth) to 8-bit RGBA. 16-bit values are rounded. An
-/// image without alpha is opaque.
-///
-/// Memory: 4 bytes per pixel, for any bit depth. Errors if the file is missing, not a regular file, not a PNG, truncated, damaged, larger
-/// than [`MAX_SIDE`], has more pixels than its size allows, or does not fit into memory.
-pub fn read(path: &Path) -> Result<RgbaImage> {
-    let file = files::open(path, files::IMAGE)?;
-    picture(path, BufReader::new(file))
-}
-
-/// Decodes the bytes of a PNG file like [`read`]. `path` names it in error messages.
-pub fn decode(path: &Path, bytes: &[u8]) -> Result<RgbaImage> {
-    picture(path, Cursor::new(bytes))
-}
-
-fn picture(path: &Path, mut source: impl BufRead + Seek) -> Result<RgbaImage> {
-    let (width, height) = rows::size(path, &mut source)?;
-    let rows = Rows::new(path, source)?;
-    let bytes = 4 * width as usize * height as usize;
-    memory::check(path, &format!("reading an image of {width} x {height} pixels"), bytes as u64)?;
-    let mut pixels = Vec::new();
-    // Address space may be exhausted before memory is.
-    pixels.try_reserve_exact(bytes).map_err(|_| Error::io(path, std::io::ErrorKind::OutOfMemory.into(), "decoding the image"))?;
-    pixels.resize(bytes, 0);
-    rows.read(&mut pixels)?;
-    // The buffer has exactly the size of the image, so this never falls back to the default.
-    Ok(RgbaImage::from_raw(width, height, pixels).unwrap_or_default())
-}
 
 /// Checks that images of `width` x `height` can be reduced by k. k must divide both sides, because blocks of different sizes do not belong
 /// to one camera.
@@ -187,6 +139,7 @@ mod tests {
     use super::*;
     use ::image::{DynamicImage, ImageBuffer, ImageFormat, ImageReader, Luma, LumaA, Rgb, Rgba};
     use std::fs::File;
+    use std::io::BufReader;
 
     fn temporary(name: &str) -> std::path::PathBuf {
         std::env::temp_dir().join(format!("plenoxel-image-{}-{name}", std::process::id()))

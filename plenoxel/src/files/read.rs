@@ -41,7 +41,7 @@ pub const RUN: Kind = Kind { name: "a JSON file that a run wrote", most: 1 << 20
 pub const METRICS: Kind = Kind { name: "the metrics of a run", most: 256 << 20, memory: 1 };
 
 /// An image: up to twice the uncompressed size of the largest accepted image, 16384² pixels of 8 bytes.
-pub const IMAGE: Kind = Kind { name: "a PNG image", most: 4 << 30, memory: 0 };
+pub const IMAGE: Kind = Kind { name: "a PNG, JPEG or WebP image", most: 4 << 30, memory: 0 };
 
 /// A point cloud: up to 2³² points of 16 bytes. Its reader counts the memory of the points by the header.
 pub const CLOUD: Kind = Kind { name: "a PLY file", most: 64 << 30, memory: 1 };

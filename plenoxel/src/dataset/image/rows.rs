@@ -1,14 +1,20 @@
 //! PNG decoding to 8-bit RGBA, row by row. Memory is needed for the result and one row only.
 
+use super::decode::cut_short;
 use crate::error::{Error, Result};
+use crate::memory;
+use ::image::RgbaImage;
 use png::{BitDepth, ColorType, Decoder, DecodingError, InterlaceInfo, Limits, Reader, Transformations};
-use std::io::{BufRead, Read, Seek, SeekFrom};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 /// Largest accepted width or height in pixels. It bounds the memory that a header can request.
 pub const MAX_SIDE: u32 = 16384;
 
-const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
+pub(super) const SIGNATURE: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
+/// Last chunk of every PNG: length 0, name, checksum.
+const END: [u8; 12] = *b"\0\0\0\0IEND\xae\x42\x60\x82";
 /// Number of bytes up to the bit depth and the color type.
 const HEAD: usize = 26;
 /// Largest expansion of Deflate: 258 bytes from two bits.
@@ -16,8 +22,36 @@ const MOST_INFLATION: u64 = 1032;
 /// Memory limit for metadata of a file.
 const MOST_BESIDE: usize = 16 << 20;
 
-/// Reads width and height from the first bytes of a file. `source` is rewound to the start.
-pub(super) fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32, u32)> {
+/// Returns width and height of a PNG file; see [`size_as`](super::size_as). Reads its first 26 bytes and its last 12; a file without the end
+/// of a PNG is decoded.
+pub(super) fn size_of_whole(path: &Path, mut file: File) -> Result<(usize, usize)> {
+    let (width, height) = size(path, &mut file)?;
+    let mut tail = [0_u8; END.len()];
+    let whole = file.seek(SeekFrom::End(-(END.len() as i64))).and_then(|_| file.read_exact(&mut tail)).is_ok() && tail == END;
+    if !whole {
+        file.rewind().map_err(|e| Error::io(path, e, "reading the image"))?;
+        Rows::new(path, BufReader::new(file))?.check()?;
+    }
+    Ok((width as usize, height as usize))
+}
+
+/// Decodes a PNG.
+pub(super) fn picture(path: &Path, mut source: impl BufRead + Seek) -> Result<RgbaImage> {
+    let (width, height) = size(path, &mut source)?;
+    let rows = Rows::new(path, source)?;
+    let bytes = 4 * width as usize * height as usize;
+    memory::check(path, &format!("reading an image of {width} x {height} pixels"), bytes as u64)?;
+    let mut pixels = Vec::new();
+    // Address space may be exhausted before memory is.
+    pixels.try_reserve_exact(bytes).map_err(|_| Error::io(path, std::io::ErrorKind::OutOfMemory.into(), "decoding the image"))?;
+    pixels.resize(bytes, 0);
+    rows.read(&mut pixels)?;
+    // The buffer has exactly the size of the image, so this never falls back to the default.
+    Ok(RgbaImage::from_raw(width, height, pixels).unwrap_or_default())
+}
+
+/// Reads width and height from the first bytes of a file that begins like a PNG. `source` is rewound to the start.
+fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32, u32)> {
     let mut head = Vec::with_capacity(HEAD);
     let read = source.seek(SeekFrom::End(0)).and_then(|length| {
         source.rewind()?;
@@ -26,11 +60,8 @@ pub(super) fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32,
         Ok(length)
     });
     let length = read.map_err(|e| Error::io(path, e, "reading the image's header"))?;
-    if head.is_empty() || !SIGNATURE.starts_with(&head[..head.len().min(8)]) {
-        return Err(not_png(path, &head));
-    }
     if head.len() < HEAD || &head[12..16] != b"IHDR" {
-        return Err(cut_short(path));
+        return Err(cut_short(path, "PNG"));
     }
     let number = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
     let (width, height) = (number(16), number(20));
@@ -48,7 +79,7 @@ pub(super) fn size(path: &Path, source: &mut (impl Read + Seek)) -> Result<(u32,
 }
 
 /// PNG image that is read row by row.
-pub(super) struct Rows<'p, R: BufRead + Seek> {
+struct Rows<'p, R: BufRead + Seek> {
     path: &'p Path,
     reader: Reader<R>,
     row: Vec<u8>,
@@ -56,7 +87,7 @@ pub(super) struct Rows<'p, R: BufRead + Seek> {
 
 impl<'p, R: BufRead + Seek> Rows<'p, R> {
     /// Reads everything before the pixels. `path` names the file in error messages.
-    pub fn new(path: &'p Path, source: R) -> Result<Self> {
+    fn new(path: &'p Path, source: R) -> Result<Self> {
         let mut decoder = Decoder::new_with_limits(source, Limits { bytes: MOST_BESIDE });
         decoder.set_ignore_text_chunk(true);
         decoder.set_ignore_iccp_chunk(true);
@@ -84,7 +115,7 @@ impl<'p, R: BufRead + Seek> Rows<'p, R> {
     }
 
     /// Decodes the image into `pixels`, 4 bytes per pixel.
-    pub fn read(mut self, pixels: &mut [u8]) -> Result<()> {
+    fn read(mut self, pixels: &mut [u8]) -> Result<()> {
         let stride = 4 * self.reader.info().width as usize;
         let mut y = 0;
         while let Some((row, place)) = self.next()? {
@@ -100,7 +131,7 @@ impl<'p, R: BufRead + Seek> Rows<'p, R> {
     }
 
     /// Decodes the image without keeping its pixels.
-    pub fn check(mut self) -> Result<()> {
+    fn check(mut self) -> Result<()> {
         while self.next()?.is_some() {}
         Ok(())
     }
@@ -128,26 +159,11 @@ fn rounded(value: u16) -> u8 {
 
 fn refused(path: &Path, error: DecodingError) -> Error {
     match error {
-        DecodingError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => cut_short(path),
+        DecodingError::IoError(source) if source.kind() == std::io::ErrorKind::UnexpectedEof => cut_short(path, "PNG"),
         DecodingError::IoError(source) => Error::io(path, source, "reading the image"),
         DecodingError::LimitsExceeded => {
             Error::input(path, "the metadata in the file takes too much memory", "write it again as PNG, without metadata")
         }
         other => Error::input(path, format!("the image cannot be decoded ({other})"), "write it again as PNG"),
     }
-}
-
-fn not_png(path: &Path, head: &[u8]) -> Error {
-    let found = match head {
-        [] => "the file is empty",
-        [0xff, 0xd8, ..] => "this is a JPEG image, not a PNG",
-        [b'G', b'I', b'F', ..] => "this is a GIF image, not a PNG",
-        [b'R', b'I', b'F', b'F', ..] => "this is a RIFF file (perhaps WebP), not a PNG",
-        _ => "this is not a PNG image",
-    };
-    Error::input(path, found, "convert it to PNG (gray, RGB or RGBA)")
-}
-
-fn cut_short(path: &Path) -> Error {
-    Error::input(path, "the PNG is truncated", "copy or download the file again")
 }
