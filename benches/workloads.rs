@@ -64,7 +64,7 @@ fn grid(work: &Work) -> VoxelGrid<f32> {
 
 fn open(args: &Arguments, downscale: usize) -> Dataset {
     match &args.data {
-        Some(folder) => dataset::open(Path::new(folder), &OpenOptions { downscale, validation_every: None }).expect("the dataset opens"),
+        Some(folder) => dataset::open(Path::new(folder), &OpenOptions { downscale, ..OpenOptions::default() }).expect("the dataset opens"),
         None => Dataset::procedural(Default::default()).expect("the built-in scene opens"),
     }
 }

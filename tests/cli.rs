@@ -385,7 +385,7 @@ fn each_broken_dataset_is_refused_with_the_place_and_the_remedy() {
     fs::write(folder.path("file"), "x").unwrap();
     refused(&folder.path("file"), &["this is a file", "give the folder"]);
     fs::create_dir(folder.path("empty")).unwrap();
-    refused(&folder.path("empty"), &["no transforms_train.json", "it is empty"]);
+    refused(&folder.path("empty"), &["no format is recognized", "it is empty"]);
 
     // Each of these breaks one file of a whole scene, which is then mended.
     let data = scene(&folder);

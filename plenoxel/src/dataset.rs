@@ -1,18 +1,32 @@
 //! Photographs with known cameras, independent of the file format.
 //!
+//! [`open`] recognizes the format of a folder: NeRF-synthetic ([`blender`]), whose coordinates are the world's, or a capture
+//! ([`transforms`], [`colmap`], [`llff`], [`nsvf`]), which is moved and scaled first ([`normalize`]).
+//!
 //! Opening a [`Dataset`] is cheap: all metadata is parsed and the header of every image is checked, so that a broken file is reported at
-//! once. Pixels are decoded when a split is loaded. [`open`] recognizes the format of a folder. [`Dataset::procedural`] is the built-in
-//! scene, which needs no files and has exact depth.
+//! once. Pixels are decoded when a split is loaded. [`Dataset::procedural`] is the built-in scene, which needs no files and has exact
+//! depth.
 
 pub mod blender;
+pub mod capture;
+pub mod colmap;
 pub mod exposure;
 pub mod image;
+pub mod llff;
+pub mod normalize;
+mod npy;
+pub mod nsvf;
 pub mod procedural;
+pub mod transforms;
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::geometry::Similarity;
+use crate::space::Space;
+use capture::Point;
 use ndarray::{Array2, Array3};
+use normalize::{Normalization, NormalizeOptions};
 use procedural::ProceduralOptions;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -108,18 +122,25 @@ pub fn has_alpha(views: &[View]) -> bool {
 }
 
 /// Options for opening a folder.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OpenOptions {
-    /// Factor by which every image is reduced; must divide width and height. 1 keeps the full size.
+    /// Factor by which every image is reduced. 1 keeps the full size. For a NeRF-synthetic folder it must divide width and height. For a
+    /// capture, the folder `images_k` of images that are reduced already is used if it exists, and incomplete blocks at the right and
+    /// bottom are dropped.
     pub downscale: usize,
     /// Interval at which training views are held out for validation, if the files have no validation split: every n-th view (number n - 1,
     /// 2n - 1, ...). At least 2. `None` leaves the validation split empty.
     pub validation_every: Option<usize>,
+    /// Interval at which views of a capture are test views, if its files have no splits: those whose number by sorted name is a multiple
+    /// of it. At least 2. `None` leaves the test split empty. 8 as in LLFF and mip-NeRF 360.
+    pub test_every: Option<usize>,
+    /// Where the scene of a capture is.
+    pub normalize: NormalizeOptions,
 }
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        OpenOptions { downscale: 1, validation_every: None }
+        OpenOptions { downscale: 1, validation_every: None, test_every: Some(8), normalize: NormalizeOptions::default() }
     }
 }
 
@@ -131,6 +152,9 @@ pub struct Dataset {
     size: (usize, usize),
     frames: [Vec<Frame>; 3],
     source: Source,
+    normalization: Normalization,
+    points: Arc<Vec<Point>>,
+    notes: Vec<String>,
 }
 
 /// View before its pixels are loaded.
@@ -141,6 +165,8 @@ struct Frame {
     camera: Camera,
     /// Path of the image; empty for a rendered view.
     path: PathBuf,
+    /// Width and height of the image before the reduction.
+    full: (usize, usize),
 }
 
 #[derive(Debug, Clone)]
@@ -149,28 +175,58 @@ enum Source {
     Procedural { scene: Arc<procedural::Scene>, supersample: usize },
 }
 
-/// Opens the dataset in the folder `path`. The only supported format is NeRF-synthetic ([`blender`]), recognized by its
-/// transforms_train.json.
+/// Opens the dataset in the folder `path`, in the first of these formats that it has: NeRF-synthetic (transforms_train.json,
+/// [`blender`]), transforms.json ([`transforms`]), COLMAP ([`colmap`]), LLFF (poses_bounds.npy, [`llff`]), NSVF (intrinsics.txt, [`nsvf`]).
 ///
 /// Errors if a file is invalid, naming file and frame; also if `options` do not fit the images (a configuration error).
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
-    if let Some(every @ 0..=1) = options.validation_every {
-        return Err(Error::config("validation_every", every, "2 or more"));
-    }
-    let metadata = std::fs::metadata(path).map_err(|source| match source.kind() {
-        std::io::ErrorKind::NotFound => {
-            Error::input(path, "there is no such folder", "give the folder that contains transforms_train.json")
+    for (key, every) in [("validation_every", options.validation_every), ("test_every", options.test_every)] {
+        if let Some(every @ 0..=1) = every {
+            return Err(Error::config(key, every, "2 or more"));
         }
+    }
+    if options.downscale == 0 {
+        return Err(Error::config("downscale", 0, "1 or more"));
+    }
+    let remedy = "give the folder that contains transforms_train.json, transforms.json, sparse or poses_bounds.npy";
+    let metadata = std::fs::metadata(path).map_err(|source| match source.kind() {
+        std::io::ErrorKind::NotFound => Error::input(path, "there is no such folder", remedy),
         _ => Error::io(path, source, "opening the dataset"),
     })?;
     if !metadata.is_dir() {
-        return Err(Error::input(path, "this is a file", "give the folder that contains transforms_train.json"));
+        return Err(Error::input(path, "this is a file", remedy));
     }
     // A file of this name that cannot be read is reported as unreadable, not as missing.
-    if !files::is_there(&path.join("transforms_train.json")) {
-        return Err(unrecognized(path));
+    let has = |name: &str| files::is_there(&path.join(name));
+    if has("transforms_train.json") {
+        return blender::open(path, options);
     }
-    blender::open(path, options)
+    let model = colmap::find(path);
+    let poses = nsvf::poses(path).filter(|_| has(nsvf::FILE));
+    let found = [
+        has(transforms::FILE).then_some(transforms::FILE),
+        model.is_some().then_some("a reconstruction of COLMAP"),
+        has(llff::FILE).then_some(llff::FILE),
+        poses.is_some().then_some(nsvf::FILE),
+    ];
+    let mut capture = match (&model, &poses) {
+        _ if has(transforms::FILE) => transforms::read(path, options.downscale),
+        (Some(model), _) => colmap::read(path, model, options.downscale),
+        _ if has(llff::FILE) => llff::read(path, options.downscale),
+        (None, Some(poses)) => nsvf::read(path, poses),
+        _ => return Err(unrecognized(path)),
+    }?;
+    let others: Vec<&str> = found.into_iter().flatten().skip(1).collect();
+    if !others.is_empty() {
+        capture.notes.push(format!("the folder also has {}, which is not read", others.join(" and ")));
+    }
+    capture::dataset(path, capture, options)
+}
+
+/// Returns the name of the scene in a folder.
+fn scene_name(root: &Path) -> String {
+    let name = root.canonicalize().ok().and_then(|path| path.file_name().map(|name| name.to_string_lossy().into_owned()));
+    name.unwrap_or_else(|| "scene".into())
 }
 
 impl Dataset {
@@ -197,9 +253,47 @@ impl Dataset {
         self.frames(split).len()
     }
 
-    /// Returns width and height of the images, after the reduction.
+    /// Returns width and height of the images, after the reduction. In a capture of images of several sizes, these are the largest width
+    /// and the largest height.
     pub fn size(&self) -> (usize, usize) {
         self.size
+    }
+
+    /// Returns all sizes of images, width and height after the reduction, with the number of views that have them; the most frequent first.
+    pub fn sizes(&self) -> Vec<((usize, usize), usize)> {
+        let mut counts = std::collections::BTreeMap::new();
+        for frame in self.frames.iter().flatten() {
+            *counts.entry((frame.camera.intrinsics.width, frame.camera.intrinsics.height)).or_insert(0) += 1;
+        }
+        let mut sizes: Vec<_> = counts.into_iter().collect();
+        sizes.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
+        sizes
+    }
+
+    /// Returns the space that fits the cameras, and how it was chosen.
+    pub fn normalization(&self) -> &Normalization {
+        &self.normalization
+    }
+
+    /// Returns the space that fits the cameras.
+    pub fn space(&self) -> Space {
+        self.normalization.space
+    }
+
+    /// Returns the similarity from the world to the frame of the files, for exports. It is the identity for NeRF-synthetic folders and the
+    /// built-in scene.
+    pub fn to_input(&self) -> Similarity {
+        self.normalization.to_world.inverse()
+    }
+
+    /// Returns points of the scene's surfaces in world coordinates, if structure from motion found any.
+    pub fn points(&self) -> &[Point] {
+        &self.points
+    }
+
+    /// Returns what a person should know about the files, such as images that are missing, as sentences without a stop.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
     }
 
     /// Returns the cameras of a split, in the order of its views.
@@ -279,10 +373,10 @@ impl Dataset {
         match &self.source {
             Source::Files { downscale } => {
                 let full = image::read(&frame.path)?;
-                if (full.width() as usize, full.height() as usize) != (self.size.0 * downscale, self.size.1 * downscale) {
+                if (full.width() as usize, full.height() as usize) != frame.full {
                     return Err(Error::input(&frame.path, "the size of the image changed after the dataset was opened", "open it again"));
                 }
-                let image = if *downscale == 1 { full } else { image::downscale(&full, *downscale) };
+                let image = if *downscale == 1 { full } else { image::downscale(&image::cropped(full, *downscale), *downscale) };
                 Ok(View { name, camera, image, depth: None })
             }
             Source::Procedural { scene, supersample } => {
@@ -293,7 +387,7 @@ impl Dataset {
     }
 }
 
-/// Returns the error for a folder without transforms_train.json. It lists the content and guesses the format.
+/// Returns the error for a folder without a known format. It lists the content and guesses what is missing.
 fn unrecognized(path: &Path) -> Error {
     let mut names: Vec<String> = match std::fs::read_dir(path) {
         Ok(entries) => entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect(),
@@ -306,19 +400,16 @@ fn unrecognized(path: &Path) -> Error {
         n => format!("it contains {} and {} more", names[..8].join(", "), n - 8),
     };
     let has = |name: &str| names.iter().any(|found| found == name);
-    let below = names.iter().find(|name| path.join(name).join("transforms_train.json").exists());
+    let files = ["transforms_train.json", "transforms.json", "sparse", "poses_bounds.npy"];
+    let below = names.iter().find(|name| files.iter().any(|file| path.join(name).join(file).exists()));
     let remedy = if let Some(scene) = below {
         format!("give one scene, for example {}", path.join(scene).display())
-    } else if has("transforms.json") {
-        "a dataset in a single transforms.json, as for instant-ngp and nerfstudio, is not supported yet; use a NeRF-synthetic folder".into()
-    } else if has("poses_bounds.npy") {
-        "LLFF captures (poses_bounds.npy) are not supported yet; use a NeRF-synthetic folder".into()
-    } else if has("sparse") {
-        "COLMAP reconstructions (sparse/) are not supported yet; use a NeRF-synthetic folder".into()
+    } else if has("sparse") || has("colmap") {
+        "the reconstruction lacks its cameras or images: expected cameras.bin and images.bin, or .txt, in sparse/0".into()
     } else {
-        "use a NeRF-synthetic folder, with transforms_train.json and the images that it lists".into()
+        "use a NeRF-synthetic folder, or a capture with transforms.json, sparse/0 of COLMAP, or poses_bounds.npy".into()
     };
-    Error::input(path, format!("no transforms_train.json in this folder, {listed}"), remedy)
+    Error::input(path, format!("no format is recognized in this folder, {listed}"), remedy)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
-//! Geometry of rays and grids: the axis-aligned box.
+//! Geometry of rays, grids and frames: the axis-aligned box, and the similarity.
 
-use glam::DVec3;
+use glam::{DAffine3, DMat3, DVec3};
 
 /// Axis-aligned box in world coordinates, including its faces.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,6 +55,46 @@ impl Aabb {
         }
         // A zero direction inside the box would leave the exit infinite; it is not a ray.
         (enter <= exit && exit.is_finite()).then_some((enter, exit))
+    }
+}
+
+/// Similarity p ↦ s R p + t: rotation, scale and translation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Similarity {
+    /// s, positive.
+    pub scale: f64,
+    /// R, a rotation.
+    pub rotation: DMat3,
+    /// t.
+    pub translation: DVec3,
+}
+
+impl Default for Similarity {
+    /// The identity.
+    fn default() -> Self {
+        Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO }
+    }
+}
+
+impl Similarity {
+    /// Returns the similarity that moves `center` to the origin, then rotates and scales.
+    pub fn about(center: DVec3, rotation: DMat3, scale: f64) -> Self {
+        Similarity { scale, rotation, translation: -scale * (rotation * center) }
+    }
+
+    /// Returns the image of a point.
+    pub fn point(&self, p: DVec3) -> DVec3 {
+        self.scale * (self.rotation * p) + self.translation
+    }
+
+    /// Returns the image of a camera: its position is mapped, and its axes are rotated.
+    pub fn camera(&self, camera_to_world: DAffine3) -> DAffine3 {
+        DAffine3 { matrix3: self.rotation * camera_to_world.matrix3, translation: self.point(camera_to_world.translation) }
+    }
+
+    /// Returns the inverse, p ↦ Rᵀ (p - t) / s.
+    pub fn inverse(&self) -> Self {
+        Similarity::about(self.translation, self.rotation.transpose(), 1.0 / self.scale)
     }
 }
 

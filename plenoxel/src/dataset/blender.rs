@@ -8,6 +8,8 @@
 mod intrinsics;
 mod write;
 
+use super::capture::FARTHEST;
+use super::normalize::Normalization;
 use super::{Dataset, Frame, OpenOptions, Source, Split, image};
 use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::error::{Error, Result};
@@ -18,12 +20,11 @@ pub use intrinsics::StatedIntrinsics;
 use intrinsics::is_known;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 pub(super) use write::write;
 
 /// Largest accepted entry of RᵀR - 1. Files written in single precision stay below 1e-6; a scaled or sheared matrix does not.
 const ORTHONORMAL_WITHIN: f64 = 1e-3;
-/// Largest accepted coordinate of a camera. Larger ones overflow when rays are intersected with boxes.
-const FARTHEST: f64 = 1e12;
 /// Content of a file that is kept. The list of views is made from it and needs memory too.
 const KEPT: Kept = Kept { keys: |key| is_known(key) || KEYS.contains(&key), entries: usize::MAX, share: 75 };
 const KEYS: [&str; 3] = ["frames", "file_path", "transform_matrix"];
@@ -61,16 +62,19 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     }
     let frame = |listed: Listed| {
         let intrinsics = Intrinsics::from_fov_x(size.0, size.1, listed.fov_x).downscaled(options.downscale);
-        Frame { name: listed.name, camera: Camera { intrinsics, camera_to_world: listed.camera_to_world }, path: listed.image }
+        let camera = Camera { intrinsics, camera_to_world: listed.camera_to_world };
+        Frame { name: listed.name, camera, path: listed.image, full: size }
     };
     let frames = splits.map(|listed| listed.into_iter().map(frame).collect());
-    let name = root.canonicalize().ok().and_then(|path| path.file_name().map(|name| name.to_string_lossy().into_owned()));
     Ok(Dataset {
-        name: name.unwrap_or_else(|| "scene".into()),
+        name: super::scene_name(root),
         format: "NeRF-synthetic (transforms_train.json)",
         size: (size.0 / options.downscale, size.1 / options.downscale),
         frames,
         source: Source::Files { downscale: options.downscale },
+        normalization: Normalization::none(options)?,
+        points: Arc::default(),
+        notes: Vec::new(),
     })
 }
 

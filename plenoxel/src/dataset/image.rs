@@ -33,6 +33,13 @@ pub fn check_downscale(k: usize, (width, height): (usize, usize)) -> Result<()> 
     Err(Error::usage("downscale", found, format!("expected {}", divisors.join(", "))))
 }
 
+/// Crops an image at the right and bottom so that k divides its width and height.
+pub(super) fn cropped(image: RgbaImage, k: usize) -> RgbaImage {
+    let whole = |side: u32| side - side % k as u32;
+    let (width, height) = (whole(image.width()), whole(image.height()));
+    if (width, height) == image.dimensions() { image } else { ::image::imageops::crop_imm(&image, 0, 0, width, height).to_image() }
+}
+
 /// Reduces an image by k: each pixel is the mean of a block of k x k pixels.
 ///
 /// The means are of alpha and of color *times* alpha. The result has straight alpha, rounded to nearest. Compositing it over any background

@@ -11,6 +11,7 @@ mod scene;
 mod solid;
 mod still_life;
 
+use super::normalize::Normalization;
 use super::{Dataset, Frame, Source, Split, image};
 use crate::camera::{Camera, Intrinsics};
 use crate::error::{Error, Result};
@@ -73,7 +74,8 @@ pub(super) fn dataset(options: ProceduralOptions) -> Result<Dataset> {
         };
         let frame = |k: usize| {
             let eye = CAMERA_DISTANCE * direction(k, count);
-            Frame { name: format!("r_{k}"), camera: Camera::look_at(eye, DVec3::ZERO, DVec3::Z, intrinsics), path: PathBuf::new() }
+            let camera = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, intrinsics);
+            Frame { name: format!("r_{k}"), camera, path: PathBuf::new(), full: (options.width, options.height) }
         };
         (0..count).map(frame).collect()
     });
@@ -83,6 +85,9 @@ pub(super) fn dataset(options: ProceduralOptions) -> Result<Dataset> {
         size: (options.width, options.height),
         frames,
         source: Source::Procedural { scene: Arc::new(Scene::still_life()), supersample: options.supersample },
+        normalization: Normalization::default(),
+        points: Arc::default(),
+        notes: Vec::new(),
     })
 }
 
