@@ -10,7 +10,7 @@ mod memory;
 mod parsers;
 
 use memory::peak_of;
-use parsers::{PARSERS, Parser, try_arguments, try_out};
+use parsers::{Parser, try_arguments, try_out};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, image};
 use plenoxel::evaluate;
@@ -159,7 +159,7 @@ fn hold<S: Strategy>(strategy: S, property: impl Fn(S::Value)) {
 /// Valid inputs are read, and damaged ones in some way.
 fn survives_damage(name: &str) {
     let _alone = alone();
-    let parser: &Parser = PARSERS.iter().find(|parser| parser.name == name).expect("a parser");
+    let parser: &Parser = parsers::parsers().find(|parser| parser.name == name).expect("a parser");
     let valid = (parser.valid)();
     for bytes in &valid {
         assert!(try_out(name, bytes), "a valid input is refused: {:?}", (parser.read)(name.as_ref(), bytes).err());
@@ -195,20 +195,31 @@ damaged! {
     damaged_assignments_are_read_or_refused: "assignments",
     damaged_metrics_are_read_or_refused: "metrics.jsonl",
     damaged_records_are_read_or_refused: "run.json",
+    damaged_captures_are_read_or_refused: "capture.json",
+    damaged_cameras_of_colmap_are_read_or_refused: "cameras.bin",
+    damaged_images_of_colmap_are_read_or_refused: "images.bin",
+    damaged_points_of_colmap_are_read_or_refused: "points3D.bin",
+    damaged_cameras_in_text_are_read_or_refused: "cameras.txt",
+    damaged_images_in_text_are_read_or_refused: "images.txt",
+    damaged_points_in_text_are_read_or_refused: "points3D.txt",
+    damaged_poses_of_llff_are_read_or_refused: "poses_bounds.npy",
+    damaged_intrinsics_of_nsvf_are_read_or_refused: "intrinsics.txt",
+    damaged_poses_of_nsvf_are_read_or_refused: "pose.txt",
 }
 
 #[test]
 #[ignore = "writes the files that fuzzing begins from"]
 fn seeds_for_fuzzing() {
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fuzz/corpus");
-    let write = |target: &str, inputs: &[Vec<u8>]| {
-        let folder = corpus.join(target);
+    let write = |name: &str, inputs: &[Vec<u8>]| {
+        // Text and binary forms of one file have one target.
+        let folder = corpus.join(name.split('.').next().unwrap_or(name));
         std::fs::create_dir_all(&folder).expect("a folder");
         for (i, bytes) in inputs.iter().enumerate() {
-            std::fs::write(folder.join(format!("valid-{i}")), bytes).expect("it is written");
+            std::fs::write(folder.join(format!("{name}-{i}")), bytes).expect("it is written");
         }
     };
-    PARSERS.iter().for_each(|parser| write(parser.name.split('.').next().unwrap_or(parser.name), &(parser.valid)()));
+    parsers::parsers().for_each(|parser| write(parser.name, &(parser.valid)()));
     let lines = ["train data --time 5m --max-memory 8GiB", "filter a --out b --bbox 0,0,0,1,1,1", "train --scene-size 32x24 --set seed=3"];
     write("arguments", &lines.map(|line| line.replace(' ', "\n").into_bytes()));
 }
@@ -218,7 +229,7 @@ fn every_parser_is_tried() {
     let _alone = alone();
     // The list above is by name.
     let tried = include_str!("properties.rs");
-    assert!(PARSERS.iter().all(|parser| tried.contains(&format!("refused: \"{}\"", parser.name))));
+    assert!(parsers::parsers().all(|parser| tried.contains(&format!("refused: \"{}\"", parser.name))));
 }
 
 #[test]

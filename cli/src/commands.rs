@@ -1,6 +1,7 @@
 //! The commands: a module for each, with its arguments and its implementation.
 
 pub mod bake;
+mod capture;
 pub mod carve;
 mod cloud_filters;
 pub mod compare;

@@ -26,7 +26,7 @@ use crate::geometry::Similarity;
 use crate::space::Space;
 use capture::Point;
 use ndarray::{Array2, Array3};
-use normalize::{Normalization, NormalizeOptions};
+use normalize::{CaptureOptions, Normalization};
 use procedural::ProceduralOptions;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -131,16 +131,13 @@ pub struct OpenOptions {
     /// Interval at which training views are held out for validation, if the files have no validation split: every n-th view (number n - 1,
     /// 2n - 1, ...). At least 2. `None` leaves the validation split empty.
     pub validation_every: Option<usize>,
-    /// Interval at which views of a capture are test views, if its files have no splits: those whose number by sorted name is a multiple
-    /// of it. At least 2. `None` leaves the test split empty. 8 as in LLFF and mip-NeRF 360.
-    pub test_every: Option<usize>,
-    /// Where the scene of a capture is.
-    pub normalize: NormalizeOptions,
+    /// Choices about a capture. A NeRF-synthetic folder has only defaults.
+    pub capture: CaptureOptions,
 }
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        OpenOptions { downscale: 1, validation_every: None, test_every: Some(8), normalize: NormalizeOptions::default() }
+        OpenOptions { downscale: 1, validation_every: None, capture: CaptureOptions::default() }
     }
 }
 
@@ -180,11 +177,10 @@ enum Source {
 ///
 /// Errors if a file is invalid, naming file and frame; also if `options` do not fit the images (a configuration error).
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
-    for (key, every) in [("validation_every", options.validation_every), ("test_every", options.test_every)] {
-        if let Some(every @ 0..=1) = every {
-            return Err(Error::config(key, every, "2 or more"));
-        }
+    if let Some(every @ 0..=1) = options.validation_every {
+        return Err(Error::config("validation_every", every, "2 or more"));
     }
+    options.capture.validate()?;
     if options.downscale == 0 {
         return Err(Error::config("downscale", 0, "1 or more"));
     }

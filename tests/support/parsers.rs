@@ -1,5 +1,8 @@
 //! Everything that reads a file or a command line, as a function of bytes, with valid inputs to begin from: what `tests/properties.rs` and the
-//! fuzz targets of `tests/fuzz` call. One more parser is one more entry of [`PARSERS`], and a target there.
+//! fuzz targets of `tests/fuzz` call. One more parser is one more entry of `PARSERS`, and a target there.
+
+#[path = "capture_parsers.rs"]
+mod capture_parsers;
 
 use super::memory::peak_of;
 use ::image::{DynamicImage, ImageBuffer, ImageFormat};
@@ -43,7 +46,11 @@ pub struct Parser {
 const MIB: usize = 1 << 20;
 
 /// All of them.
-pub const PARSERS: [Parser; 10] = [
+pub fn parsers() -> impl Iterator<Item = &'static Parser> {
+    PARSERS.iter().chain(&capture_parsers::PARSERS)
+}
+
+const PARSERS: [Parser; 10] = [
     Parser { name: "transforms.json", valid: transforms, read: read_transforms, repair: |_| (), memory: [MIB, 200] },
     Parser { name: "path.json", valid: paths, read: read_path, repair: |_| (), memory: [2 * MIB, 400] },
     // Deflate makes 1032 of one byte, RGBA 32 of one that has 8 pixels; a row; and what stands beside the pixels.
@@ -61,7 +68,7 @@ pub const PARSERS: [Parser; 10] = [
 /// Reads bytes with the parser of a name. Panics if that panics, takes too much memory, refuses without a name, or reads again something else
 /// than it read. True if the bytes were accepted.
 pub fn try_out(name: &str, bytes: &[u8]) -> bool {
-    let parser = PARSERS.iter().find(|parser| parser.name == name).expect("the name of a parser");
+    let parser = parsers().find(|parser| parser.name == name).expect("the name of a parser");
     let (read, peak) = peak_of(|| (parser.read)(Path::new(name), bytes));
     let [base, each] = parser.memory;
     assert!(peak <= base + each * bytes.len(), "{name}: {peak} bytes of memory for {} of input", bytes.len());

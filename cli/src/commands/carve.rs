@@ -1,5 +1,6 @@
 //! `plenoxel carve`: carves an opaque colored grid from silhouettes and colors, without training.
 
+use super::capture::CaptureFlags;
 use super::new_run::{announce, load};
 use super::train::BuiltInScene;
 use super::{MOST_REDUCTION, whole};
@@ -82,6 +83,9 @@ pub struct CarveArgs {
     half_width: Option<f64>,
 
     #[command(flatten)]
+    capture: CaptureFlags,
+
+    #[command(flatten)]
     built_in: BuiltInScene,
 
     /// Voxels per side of the box [default: 256]
@@ -137,6 +141,7 @@ impl CarveArgs {
                 layers.set(path, Some(value), flag)?;
             }
         }
+        self.capture.set(layers)?;
         self.set.iter().try_for_each(|assignment| layers.assign(assignment))
     }
 }

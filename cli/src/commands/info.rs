@@ -1,7 +1,12 @@
 //! `plenoxel info`: describes a run, a checkpoint or a dataset, and the machine.
 
+mod cameras;
+
+use super::capture::CaptureFlags;
+use crate::images;
 use crate::progress::Console;
 use clap::{Args, ValueHint};
+use plenoxel::camera::lens::Lens;
 use plenoxel::camera::placement::Placement;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
@@ -15,8 +20,10 @@ use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::{RunFolder, RunKind};
 use plenoxel::run::machine;
 use plenoxel::run::memory::{self, bytes};
+use plenoxel::space::Space;
 use plenoxel::tensor_file::TensorFile;
 use plenoxel::text::clock;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -33,12 +40,19 @@ pub struct InfoArgs {
     /// Run folder, checkpoint or dataset folder [default: describe the machine only]
     #[arg(value_hint = ValueHint::AnyPath)]
     path: Option<PathBuf>,
+
+    /// Write a picture of the cameras of a dataset, from above and from the side, as PNG
+    #[arg(long, value_name = "FILE", requires = "path", value_hint = ValueHint::FilePath)]
+    cameras: Option<PathBuf>,
+
+    #[command(flatten)]
+    capture: CaptureFlags,
 }
 
 /// Prints the description of a path.
 pub fn run(args: &InfoArgs, console: &Console<'_>) -> Result<()> {
     if let Some(path) = &args.path {
-        let lines = describe(path)?;
+        let lines = describe(path, args)?;
         lines.iter().try_for_each(|(key, value)| row(console, key, value))?;
     }
     row(console, "instructions", machine::instruction_set())?;
@@ -55,7 +69,11 @@ fn row(console: &Console<'_>, key: &str, value: &str) -> Result<()> {
     console.result(&format!("{key:14} {value}"))
 }
 
-fn describe(path: &Path) -> Result<Lines> {
+fn describe(path: &Path, args: &InfoArgs) -> Result<Lines> {
+    let is_run = files::is_there(&path.join("run.json"));
+    if let (Some(_), true) = (&args.cameras, is_run || path.is_file()) {
+        return Err(Error::usage("--cameras", format!("{} is no dataset folder", path.display()), "give the folder of a dataset"));
+    }
     if path.is_file() {
         if let Some(lines) = of_other_kind(path)? {
             return Ok(lines);
@@ -65,21 +83,29 @@ fn describe(path: &Path) -> Result<Lines> {
         lines.extend(of_grid(&grid, &header));
         return Ok(lines);
     }
-    if files::is_there(&path.join("run.json")) {
+    if is_run {
         return of_run(path);
     }
     if !files::is_there(path) {
         return Err(Error::input(path, "this path does not exist", "give a run folder, a dataset folder or a checkpoint"));
     }
-    let opened = dataset::open(path, &OpenOptions::default());
-    opened.map(|dataset| of_dataset(path, &dataset)).map_err(|e| match e {
+    let opened = dataset::open(path, &OpenOptions { capture: args.capture.options()?, ..OpenOptions::default() });
+    let dataset = opened.map_err(|e| match e {
         // An error about the folder, not about a file in it.
         Error::Input { path: about, found, remedy } if about == path && path.is_dir() => {
             let found = format!("this is neither a run folder (it has no run.json) nor a dataset ({found})");
             Error::input(about, found, remedy)
         }
+        Error::Config { .. } => super::as_flag(e),
         other => other,
-    })
+    })?;
+    let mut lines = of_dataset(path, &dataset);
+    if let Some(out) = &args.cameras {
+        super::check_replaceable(out, &[], Some(path)).map_err(|e| e.with_key(|_| "--cameras".to_owned()))?;
+        images::write(out, &cameras::picture(&dataset))?;
+        lines.push(("picture", format!("{}, from above on the left and from the side on the right", out.display())));
+    }
+    Ok(lines)
 }
 
 /// Describes the checkpoint of a custom model: its kind and its parameters. Returns `None` for a voxel grid.
@@ -179,6 +205,27 @@ fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
     ]
 }
 
+fn lens(lens: &Lens) -> &'static str {
+    match lens {
+        Lens::Pinhole => "pinhole",
+        Lens::Perspective(_) => "perspective with distortion",
+        Lens::Fisheye(_) => "fisheye",
+        Lens::Fov { .. } => "field-of-view model",
+    }
+}
+
+/// The sizes of the images, the most frequent first.
+fn sizes(dataset: &Dataset) -> String {
+    const SHOWN: usize = 4;
+    let sizes = dataset.sizes();
+    if let [((width, height), _)] = sizes[..] {
+        return format!("{width} x {height} pixels");
+    }
+    let shown: Vec<String> = sizes.iter().take(SHOWN).map(|((width, height), count)| format!("{count} of {width} x {height}")).collect();
+    let more = if sizes.len() > SHOWN { format!(", {} more sizes", sizes.len() - SHOWN) } else { String::new() };
+    format!("{}{more} pixels", shown.join(", "))
+}
+
 fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
     let (width, height) = dataset.size();
     let views = Split::ALL.map(|split| format!("{} {split}", dataset.count(split)));
@@ -188,17 +235,27 @@ fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
         ("scene", dataset.name().to_owned()),
         ("format", dataset.format().to_owned()),
         ("views", views.join(", ")),
-        ("size", format!("{width} x {height} pixels")),
+        ("size", sizes(dataset)),
         ("memory", format!("{} as 8-bit RGBA", bytes((4 * width * height * all) as u64))),
         ("convention", "camera to world; camera axes x right, y up, z backwards (OpenGL); world z up".to_owned()),
     ];
+    lines.extend(dataset.notes().iter().map(|note| ("note", note.clone())));
+    lines.extend(dataset.normalization().describe().iter().cloned());
+    if !dataset.points().is_empty() {
+        lines.push(("points", format!("{} of structure from motion", dataset.points().len())));
+    }
     let cameras: Vec<_> = Split::ALL.iter().flat_map(|split| dataset.cameras(*split)).collect();
     let distances = cameras.iter().map(|camera| camera.position().length());
     let nearest = distances.clone().fold(f64::INFINITY, f64::min);
     let farthest = distances.fold(0.0, f64::max);
-    let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), Aabb::cube(Config::default().half_width));
-    let findings = hopeless.map(|found| found.join("; ")).into_iter().chain(warnings);
-    lines.extend(findings.map(|finding| ("warning", finding)));
+    // Only a box can be missed by cameras.
+    if dataset.space() == Space::Box {
+        let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), Aabb::cube(Config::default().half_width));
+        let findings = hopeless.map(|found| found.join("; ")).into_iter().chain(warnings);
+        lines.extend(findings.map(|finding| ("warning", finding)));
+    }
+    let lenses: BTreeSet<&str> = cameras.iter().map(|camera| lens(&camera.intrinsics.lens)).collect();
+    lines.push(("lens", lenses.into_iter().collect::<Vec<_>>().join(", ")));
     if let Some(camera) = cameras.first() {
         let k = &camera.intrinsics;
         let fov = k.fov_x().to_degrees();

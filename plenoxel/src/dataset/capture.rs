@@ -104,8 +104,8 @@ pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) 
     }
     let downscale = (options.downscale / capture.reduced).max(1);
     if capture.reduced > 1 {
-        let asked = if options.downscale == capture.reduced { "" } else { " and no others fit better" };
-        capture.notes.push(format!("the images are those of images_{}{asked}", capture.reduced));
+        let missing = if options.downscale < capture.reduced { ", for there are no larger ones" } else { "" };
+        capture.notes.push(format!("the images are those of images_{}{missing}", capture.reduced));
     }
     if let Some((photo, size)) = capture.photos.iter().zip(&sizes).find(|(_, size)| downscale > size.0.min(size.1)) {
         let found = format!("{downscale} is more than the {} x {} pixels of {}", size.0, size.1, photo.name);
@@ -161,7 +161,7 @@ fn check_presence(root: &Path, capture: &mut Capture) -> Result<()> {
 fn fitted(k: &Intrinsics, (width, height): (usize, usize)) -> Option<Intrinsics> {
     let (sx, sy) = (width as f64 / k.width as f64, height as f64 / k.height as f64);
     let off = (height as f64 - sx * k.height as f64).abs().min((width as f64 - sy * k.width as f64).abs());
-    (off <= ROUNDED).then(|| Intrinsics { width, height, fx: sx * k.fx, fy: sy * k.fy, cx: sx * k.cx, cy: sy * k.cy, lens: k.lens })
+    (off <= ROUNDED).then_some(Intrinsics { width, height, fx: sx * k.fx, fy: sy * k.fy, cx: sx * k.cx, cy: sy * k.cy, lens: k.lens })
 }
 
 fn misfit(path: &Path, stated: (usize, usize), size: (usize, usize)) -> Error {
@@ -186,13 +186,14 @@ fn view_names(photos: &[Photo]) -> Vec<String> {
 
 /// Returns the split of each view: the files' own, or else every n-th by name for testing.
 fn splits(photos: &[Photo], options: &OpenOptions) -> Vec<Split> {
+    let every = options.capture.test_every;
     let own = photos.iter().any(|photo| photo.split.is_some());
     let mut splits: Vec<Split> = photos
         .iter()
         .enumerate()
         .map(|(k, photo)| match photo.split {
             Some(split) => split,
-            None if !own && options.test_every.is_some_and(|n| k.is_multiple_of(n)) => Split::Test,
+            None if !own && every > 0 && k.is_multiple_of(every) => Split::Test,
             None => Split::Train,
         })
         .collect();

@@ -175,14 +175,14 @@ fn image(path: &Path, name: &str, camera: u32, [w, x, y, z]: [f64; 4], t: [f64; 
     if name.is_empty() || base_name(name).is_empty() {
         return Err(Error::input(path, "an image has no name", "use undamaged files"));
     }
-    let length = DQuat::from_xyzw(x, y, z, w).length();
-    if !((length - 1.0).abs() < 1e-3) {
+    let quaternion = DQuat::from_xyzw(x, y, z, w);
+    let is_unit = (quaternion.length() - 1.0).abs() < 1e-3;
+    if !is_unit {
         return refused(format!("has the rotation ({w}, {x}, {y}, {z})"), "expected a quaternion of length 1");
     }
-    let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize()).transpose();
+    let rotation = DMat3::from_quat(quaternion.normalize()).transpose();
     let center = -(rotation * DVec3::from_array(t));
-    // A comparison that fails for NaN.
-    if !(center.abs().max_element() <= FARTHEST) {
+    if !center.is_finite() || center.abs().max_element() > FARTHEST {
         return refused(format!("has the translation {t:?}"), "expected finite coordinates of up to 1e12");
     }
     let camera_to_world = from_opencv(DAffine3 { matrix3: rotation, translation: center });

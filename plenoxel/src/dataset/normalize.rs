@@ -10,7 +10,7 @@
 mod choice;
 mod frame;
 
-pub use choice::{Center, NormalizeOptions, Orient, Scale, SpaceChoice};
+pub use choice::{CaptureOptions, Center, Orient, Scale, SpaceChoice};
 
 use super::OpenOptions;
 use super::capture::Point;
@@ -44,7 +44,7 @@ impl Normalization {
     ///
     /// Errors if `options` ask for anything else.
     pub(super) fn none(options: &OpenOptions) -> Result<Self> {
-        let NormalizeOptions { space, orient, center, scale } = options.normalize;
+        let CaptureOptions { space, orient, center, scale, .. } = options.capture;
         let refused = |key: &str, value: &str| {
             let found = format!("{value} is for captures, and this is a NeRF-synthetic folder, whose coordinates are used as they are");
             Err(Error::usage(key, found, "leave it out"))
@@ -52,7 +52,7 @@ impl Normalization {
         if !matches!(space, SpaceChoice::Auto | SpaceChoice::Box) {
             return refused("space", &space.to_string());
         }
-        let defaults = NormalizeOptions::default();
+        let defaults = CaptureOptions::default();
         if orient != defaults.orient && orient != Orient::None {
             return refused("orient", &orient.to_string());
         }
@@ -74,7 +74,7 @@ impl Normalization {
             let found = format!("all {} cameras are at one point: no depth can be learned", cameras.len());
             return Err(Error::input(root, found, "take pictures from several places"));
         }
-        let choice = options.normalize;
+        let choice = options.capture;
         let near = || frame.near(cameras, points, bounds);
         match choice.space {
             SpaceChoice::Ndc => {
@@ -102,7 +102,7 @@ impl Normalization {
         }
     }
 
-    fn ndc(frame: &Frame, cameras: &[Camera], near: f64, source: &str, why: String, choice: &NormalizeOptions) -> Result<Self> {
+    fn ndc(frame: &Frame, cameras: &[Camera], near: f64, source: &str, why: String, choice: &CaptureOptions) -> Result<Self> {
         choice.check_ndc()?;
         let rotation = frame.mean_axes().transpose();
         let scale = 1.0 / (NEAR * near);
@@ -121,7 +121,7 @@ impl Normalization {
         })
     }
 
-    fn centred(space: Space, why: String, frame: &Frame, cameras: &[Camera], choice: &NormalizeOptions) -> Self {
+    fn centred(space: Space, why: String, frame: &Frame, cameras: &[Camera], choice: &CaptureOptions) -> Self {
         let (rotation, orientation) = frame.orientation(cameras, choice.orient);
         let (center, centered) = frame.center(cameras, choice.center);
         let farthest = cameras.iter().map(|c| (rotation * (c.position() - center)).abs().max_element()).fold(0.0, f64::max);

@@ -110,7 +110,7 @@ impl DataSource {
                     0 => None,
                     every => Some(every),
                 };
-                let options = OpenOptions { downscale, validation_every, ..OpenOptions::default() };
+                let options = OpenOptions { downscale, validation_every, capture: config.capture };
                 dataset::open(path, &options)
             }
             &DataSource::BuiltIn { width, height, train, val, test } => {

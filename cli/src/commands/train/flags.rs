@@ -1,5 +1,6 @@
 //! The flags of `train`, and the configuration resolved from them.
 
+use crate::commands::capture::CaptureFlags;
 use crate::commands::{MOST_REDUCTION, background, number, whole};
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
@@ -24,7 +25,7 @@ Settings are layered: defaults < preset < --config < flags. The run folder has a
 paths in that file, such as stages[0].sampling.step. If stdout is not a terminal, its last line is the JSON object of result.json.";
 
 /// Arguments that conflict with `--resume`, because they are fixed at the start of a run.
-pub const NOT_WHEN_RESUMED: [&str; 20] = [
+pub const NOT_WHEN_RESUMED: [&str; 25] = [
     "out",
     "force",
     "preset",
@@ -45,13 +46,18 @@ pub const NOT_WHEN_RESUMED: [&str; 20] = [
     "hull",
     "engine",
     "tv",
+    "space",
+    "orient",
+    "center",
+    "scale",
+    "test_every",
 ];
 
 /// Train a scene and write a run folder with the trained grid, pictures and results
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct TrainArgs {
-    /// Dataset folder in the NeRF-synthetic format [default: the built-in scene]
+    /// Dataset folder: NeRF-synthetic, transforms.json, COLMAP, LLFF or NSVF [default: the built-in scene]
     #[arg(value_hint = ValueHint::DirPath)]
     data: Option<PathBuf>,
 
@@ -129,6 +135,9 @@ pub struct TrainArgs {
     /// Half the side of the cube that contains the scene, in units of the dataset [default: 1.5; presets demo and paper: 1.4]
     #[arg(long, value_name = "LENGTH", help_heading = "Scene", value_parser = number(f64::NEG_INFINITY), allow_negative_numbers = true)]
     half_width: Option<f64>,
+
+    #[command(flatten)]
+    capture: CaptureFlags,
 
     #[command(flatten)]
     built_in: BuiltInScene,
@@ -258,6 +267,7 @@ impl TrainArgs {
                 layers.set(path, Some(value), flag)?;
             }
         }
+        self.capture.set(layers)?;
         self.set.iter().try_for_each(|assignment| layers.assign(assignment))
     }
 }

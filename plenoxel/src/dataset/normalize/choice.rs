@@ -1,12 +1,13 @@
 //! What a user may choose about the frame of a capture.
 
 use crate::error::{Error, Result};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 
-/// Choices about the frame of a capture; by default all follow from the cameras.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct NormalizeOptions {
+/// Choices about a capture: its frame, which follows from the cameras by default, and its test views. The table `capture` of a configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CaptureOptions {
     /// Space.
     pub space: SpaceChoice,
     /// Orientation, unless the space is NDC.
@@ -15,12 +16,40 @@ pub struct NormalizeOptions {
     pub center: Center,
     /// Scale, unless the space is NDC.
     pub scale: Scale,
+    /// Interval of the test views, if the files have no splits: views whose number by sorted name is a multiple of it. 0 for none. 8 as in
+    /// LLFF and mip-NeRF 360.
+    pub test_every: usize,
 }
 
-impl NormalizeOptions {
+impl Default for CaptureOptions {
+    fn default() -> Self {
+        CaptureOptions {
+            space: SpaceChoice::default(),
+            orient: Orient::default(),
+            center: Center::default(),
+            scale: Scale::default(),
+            test_every: 8,
+        }
+    }
+}
+
+impl CaptureOptions {
+    /// Checks every value. An error names the key.
+    pub fn validate(&self) -> Result<()> {
+        if self.test_every == 1 {
+            return Err(Error::config("test_every", 1, "2 or more, or 0 for none"));
+        }
+        match self.scale {
+            Scale::Factor(factor) if !(1e-12..=1e12).contains(&factor) => {
+                Err(Error::config("scale", factor, "auto, none or a number from 1e-12 to 1e12"))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Checks that nothing is asked for that NDC does not leave open.
     pub(super) fn check_ndc(&self) -> Result<()> {
-        let defaults = NormalizeOptions::default();
+        let defaults = CaptureOptions::default();
         let refused = |key: &str, value: String| {
             let remedy = "leave it out, or use --space contracted";
             Err(Error::usage(key, format!("{value} has no effect in NDC, whose frame is that of the mean camera"), remedy))
@@ -81,9 +110,8 @@ pub enum Center {
     None,
 }
 
-/// Scale of the world.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+/// Scale of the world: `"auto"`, `"none"` or a number.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Scale {
     /// The farthest camera comes to 1 along an axis.
     #[default]
@@ -91,8 +119,49 @@ pub enum Scale {
     /// That of the files.
     None,
     /// World lengths per length of the files, positive.
-    #[serde(untagged)]
     Factor(f64),
+}
+
+impl std::str::FromStr for Scale {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        match text {
+            "auto" => Ok(Scale::Auto),
+            "none" => Ok(Scale::None),
+            number => match number.parse() {
+                Ok(factor) => Ok(Scale::Factor(factor)),
+                Err(_) => Err(Error::config("scale", format!("\"{text}\""), "auto, none or a number")),
+            },
+        }
+    }
+}
+
+impl Serialize for Scale {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        match self {
+            Scale::Factor(factor) => serializer.serialize_f64(*factor),
+            named => serializer.collect_str(named),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Scale {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> std::result::Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(untagged)]
+        enum Written {
+            Number(f64),
+            Name(String),
+        }
+        let refused = || serde::de::Error::custom("not a scale, expected auto, none or a number");
+        match Written::deserialize(deserializer).map_err(|_: D::Error| refused())? {
+            Written::Number(factor) => Ok(Scale::Factor(factor)),
+            Written::Name(name) if name == "auto" => Ok(Scale::Auto),
+            Written::Name(name) if name == "none" => Ok(Scale::None),
+            Written::Name(_) => Err(refused()),
+        }
+    }
 }
 
 macro_rules! names {

@@ -5,6 +5,7 @@
 use super::objective::{LEARNED_LOSSES, LOSSES};
 use crate::camera::Camera;
 use crate::carve::{CarveConfig, CarveOptions};
+use crate::dataset::normalize::CaptureOptions;
 use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -124,6 +125,9 @@ pub struct Config {
     /// Settings of Instant-NGP, likewise.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ngp: Option<ngp::Config>,
+    /// Choices about a capture: where its scene is, and which views are for testing.
+    #[serde(default)]
+    pub capture: CaptureOptions,
 }
 
 /// Use of silhouettes in training.
@@ -417,6 +421,7 @@ impl Default for Config {
             dvgo: None,
             nerf: None,
             ngp: None,
+            capture: CaptureOptions::default(),
         }
     }
 }
@@ -510,6 +515,7 @@ impl Config {
         let epsilon = |key: &str, value: f64| check((1e-30..=1e30).contains(&value), key, value, "1e-30 to 1e30");
         check((1..=64).contains(&self.downscale), "downscale", self.downscale, "1 to 64")?;
         check(self.validation_every != 1, "validation_every", 1, "2 or more, or 0 for none")?;
+        self.capture.validate().map_err(|e| e.with_key(|key| format!("capture.{key}")))?;
         check(
             self.background.iter().all(|c| (0.0..=1.0).contains(c)),
             "background",
