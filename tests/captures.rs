@@ -122,6 +122,33 @@ fn a_similarity_of_the_input_changes_no_camera_of_the_world() {
     in_input(&found).iter().zip(&moved_views).for_each(|((_, camera), view)| assert_close(camera, &view.camera, 1e-9));
 }
 
+#[test]
+fn the_origin_is_what_cameras_look_at_and_their_middle_if_they_look_outwards() {
+    let folder = Folder::new();
+    let origin = |views: &[View]| {
+        write_transforms(&folder, views);
+        let dataset = open(&folder).unwrap();
+        let center = &dataset.normalization().describe()[2].1;
+        (dataset.to_input().translation, center.split(':').next().unwrap().to_owned())
+    };
+    let turned = |angle: f64, view: View| {
+        let mut pose = view.camera.camera_to_world;
+        pose.matrix3 *= DMat3::from_rotation_y(angle);
+        View { camera: Camera { camera_to_world: pose, ..view.camera }, ..view }
+    };
+    // All look at the origin of the files; one that looks elsewhere hardly moves it.
+    let (focus, name) = origin(&views());
+    assert!(focus.length() < 1e-9 && name == "focus", "{focus:?} {name}");
+    let mut astray = views();
+    astray[4] = turned(0.3, astray[4].clone());
+    let (focus, name) = origin(&astray);
+    assert!(focus.length() < 0.05 && name == "focus", "{focus:?} {name}");
+    let outwards: Vec<View> = views().into_iter().map(|view| turned(std::f64::consts::PI, view)).collect();
+    let mean = outwards.iter().map(|view| view.camera.position()).sum::<DVec3>() / 9.0;
+    let (center, name) = origin(&outwards);
+    assert!(center.distance(mean) < 1e-9 && name == "poses", "{center:?} {name}");
+}
+
 /// Cameras side by side that look along -z of the given frame.
 fn forward_facing(spread: f64) -> Vec<View> {
     let place = |k: usize| dvec3(spread * (k % 3) as f64, spread * (k / 3) as f64, 0.1 * spread * (k % 2) as f64);

@@ -230,6 +230,8 @@ fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
     let (width, height) = dataset.size();
     let views = Split::ALL.map(|split| format!("{} {split}", dataset.count(split)));
     let all: usize = Split::ALL.iter().map(|split| dataset.count(*split)).sum();
+    // The world of NDC is the frame of the mean camera.
+    let up = if matches!(dataset.space(), Space::Ndc { .. }) { "y up" } else { "z up" };
     let mut lines = vec![
         ("dataset", path.display().to_string()),
         ("scene", dataset.name().to_owned()),
@@ -237,7 +239,7 @@ fn of_dataset(path: &Path, dataset: &Dataset) -> Lines {
         ("views", views.join(", ")),
         ("size", sizes(dataset)),
         ("memory", format!("{} as 8-bit RGBA", bytes((4 * width * height * all) as u64))),
-        ("convention", "camera to world; camera axes x right, y up, z backwards (OpenGL); world z up".to_owned()),
+        ("convention", format!("camera to world; camera axes x right, y up, z backwards (OpenGL); world {up}")),
     ];
     lines.extend(dataset.notes().iter().map(|note| ("note", note.clone())));
     lines.extend(dataset.normalization().describe().iter().cloned());

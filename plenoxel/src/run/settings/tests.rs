@@ -287,5 +287,8 @@ fn text_of(config: &Config) -> String {
 /// True for values of another type that a key also accepts.
 fn is_another_form(path: &str, text: &str) -> bool {
     let flags = ["aim", "jitter", "project", "initial.random", "tensorf.lazy"];
-    text == "true" && flags.contains(&path) || path == "stages" && text == "[]" || path == "init_from" && text != "\"\""
+    text == "true" && flags.contains(&path)
+        || path == "stages" && text == "[]"
+        || path == "capture.scale" && text.parse::<f64>().is_ok()
+        || path == "init_from" && text != "\"\""
 }
