@@ -1,7 +1,7 @@
 //! The factored field: its gradients, its upsampling, training and resuming.
 
 use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
-use glam::DVec3;
+use glam::{DVec3, dvec3};
 use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
@@ -12,7 +12,8 @@ use plenoxel::loss::{Objective, mse};
 use plenoxel::model::plenoxels::config::Hull;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
 use plenoxel::render::{Engine, Field, Rendered};
-use plenoxel::sampling::Jitter;
+use plenoxel::sampling::{Jitter, Occupancy, Spacing, sample};
+use plenoxel::space::Space;
 use plenoxel::train::{Model, Pass, PlannedStage, TrainOptions, Trainer, ViewOptions};
 
 const BOX: Aabb = Aabb { min: DVec3::splat(-1.4), max: DVec3::splat(1.4) };
@@ -49,6 +50,21 @@ fn dense<T: Real>(stages: &[(usize, u64)]) -> Tensorf<T> {
     model
 }
 
+/// Boxes with the spaces of captures.
+fn spaces() -> [(Space, Aabb); 2] {
+    let ndc = Aabb { min: dvec3(-1.5, -1.6, -1.0), max: dvec3(1.5, 1.6, 1.0) };
+    [(Space::Ndc { a: 1.7, b: 1.9 }, ndc), (Space::Contracted, Aabb::cube(Space::CONTRACTED))]
+}
+
+/// Rays from around the origin that look along −z and to the sides.
+fn rays_of_a_capture(count: usize) -> Vec<Ray> {
+    let random = Stream::new(6);
+    let numbers = random.uniform_tensor::<f64>(&[count, 6], -1.0, 1.0);
+    let ray =
+        |x: &[f64]| Ray { origin: 0.3 * DVec3::from_slice(x), direction: dvec3(0.8 * x[3], 0.8 * x[4], -1.0).normalize(), stretch: 1.0 };
+    numbers.data().chunks(6).map(ray).collect()
+}
+
 fn rays(count: usize) -> Vec<Ray> {
     let random = Stream::new(5);
     let at = |name: &str| random.named(name).uniform_tensor::<f64>(&[count, 3], -0.8, 0.8);
@@ -78,9 +94,9 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
 }
 
 /// A model that the kernel computes.
-fn wide(config: Config) -> Tensorf<f64> {
+fn wide(config: Config, aabb: Aabb) -> Tensorf<f64> {
     let mut model =
-        Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }, BOX, 42).expect("valid settings");
+        Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }, aabb, 42).expect("valid settings");
     let random = Stream::new(11);
     model.visit_mut(&mut |param: &mut Param<f64>| {
         if param.name().starts_with("density") {
@@ -110,29 +126,55 @@ fn all_columns(rendered: &Rendered<f64>) -> Tensor<f64> {
 }
 
 #[test]
-fn the_kernel_agrees_with_the_graph_in_values_and_gradients() {
-    for (octaves, directions) in [(0, Directions::Harmonics(3)), (2, Directions::Frequency(2))] {
-        let mut model = wide(Config { feature_octaves: octaves, directions, ..tiny(&[(9, 1)]) });
-        let rays = rays(70);
-        let mut results = Vec::new();
-        for engine in [Engine::Graph, Engine::Fused] {
-            model.engine = engine;
-            let (value, gradients) = autograd::value_and_grad(|| all_columns(&model.render(&rays, &PASS)));
-            let mut of_params = Vec::new();
-            model.visit(&mut |param| of_params.push((param.name().to_owned(), gradients.array(param.tensor()))));
-            results.push((value, of_params));
-        }
-        let ((want, graph), (got, fused)) = (&results[0], &results[1]);
-        assert!((want - got).abs() < 1e-9 * want.abs(), "{want} {got}");
-        for ((name, want), (_, got)) in graph.iter().zip(fused) {
-            let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
-            let off = want.iter().zip(got).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
-            assert!(off < 1e-9 * scale, "{name}: {off:e} of {scale:e}");
-        }
+fn the_kernel_agrees_with_the_graph_in_the_spaces_of_captures() {
+    for (space, aabb) in spaces() {
+        let mut model = wide(tiny(&[(9, 1)]), aabb).in_space(space);
+        agree(&mut model, &rays_of_a_capture(24), &Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS });
     }
 }
 
-/// Replaces the parameters of a model by tensors.
+#[test]
+fn leaving_out_empty_cells_changes_no_other_sample_in_the_contracted_space() {
+    let (cube, cells) = (Aabb::cube(Space::CONTRACTED), [24; 3]);
+    let full = Stream::new(4).uniform_tensor::<f64>(&[24 * 24 * 24], 0.0, 1.0);
+    let occupancy = Occupancy::new(cube, cells, &full.data().iter().map(|x| *x < 0.05).collect::<Vec<_>>());
+    for jitter in [Jitter::None, Jitter::PerRay { seed: 1, step: 2 }] {
+        let rays = rays_of_a_capture(40);
+        let all = sample::<f64>(&rays, &cube, Spacing::Contracted(0.03), jitter, None);
+        let some = sample::<f64>(&rays, &cube, Spacing::Contracted(0.03), jitter, Some(&occupancy));
+        let kept = all.positions.data().chunks(3).zip(all.t.data()).filter(|(p, _)| occupancy.contains_point(DVec3::from_slice(p)));
+        assert_eq!(some.t.data(), kept.map(|(_, t)| *t).collect::<Vec<_>>());
+        assert!(!some.is_empty() && some.len() < all.len() / 4);
+    }
+}
+
+/// Checks that both engines compute the same pixels and gradients.
+fn agree(model: &mut Tensorf<f64>, rays: &[Ray], pass: &Pass) {
+    let mut results = Vec::new();
+    for engine in [Engine::Graph, Engine::Fused] {
+        model.engine = engine;
+        let (value, gradients) = autograd::value_and_grad(|| all_columns(&model.render(rays, pass)));
+        let mut of_params = Vec::new();
+        model.visit(&mut |param| of_params.push((param.name().to_owned(), gradients.array(param.tensor()))));
+        results.push((value, of_params));
+    }
+    let ((want, graph), (got, fused)) = (&results[0], &results[1]);
+    assert!((want - got).abs() < 1e-9 * want.abs(), "{want} {got}");
+    for ((name, want), (_, got)) in graph.iter().zip(fused) {
+        let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
+        let off = want.iter().zip(got).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
+        assert!(off < 1e-9 * scale, "{name}: {off:e} of {scale:e}");
+    }
+}
+
+#[test]
+fn the_kernel_agrees_with_the_graph_in_values_and_gradients() {
+    for (octaves, directions) in [(0, Directions::Harmonics(3)), (2, Directions::Frequency(2))] {
+        let mut model = wide(Config { feature_octaves: octaves, directions, ..tiny(&[(9, 1)]) }, BOX);
+        agree(&mut model, &rays(70), &PASS);
+    }
+}
+
 fn bind(model: &mut Tensorf<f64>, tensors: &[Tensor<f64>]) {
     let mut next = tensors.iter();
     model.visit_mut(&mut |param: &mut Param<f64>| {
@@ -146,7 +188,7 @@ fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
     let config = Config { group: 0.9, color_above: 0.01, stop_below: 0.01, ..tiny(&[(9, 1)]) };
     let rays = rays(40);
     let pass = Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS };
-    let model = wide(config.clone());
+    let model = wide(config.clone(), BOX);
     let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render(&rays, &pass)));
     // Gradients that can be differentiated again are computed through the reference.
     let mut tables = Vec::new();
@@ -158,7 +200,7 @@ fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
         assert!(want.iter().zip(&got).all(|(a, b)| (a - b).abs() < 1e-9 * scale));
     }
     // Groups are formed by weight: with a larger weight there are fewer colors, and other pixels.
-    let color = |group: f64| wide(Config { group, ..config.clone() }).render(&rays, &pass).rgb.data().to_vec();
+    let color = |group: f64| wide(Config { group, ..config.clone() }, BOX).render(&rays, &pass).rgb.data().to_vec();
     assert_ne!(color(0.9), color(0.0));
 }
 
@@ -166,7 +208,7 @@ fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
 fn groups_do_not_change_the_expected_color() {
     let rays = rays(1);
     let color = |group: f64, step: u64| {
-        let model = wide(Config { group, color_above: 0.0, ..tiny(&[(9, 1)]) });
+        let model = wide(Config { group, color_above: 0.0, ..tiny(&[(9, 1)]) }, BOX);
         let pass = Pass { jitter: Jitter::PerRay { seed: 3, step }, ..PASS };
         model.render(&rays, &pass).rgb.data()[0]
     };

@@ -12,7 +12,9 @@ pub mod walk;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
+use crate::space::{Bend, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
+use glam::DVec3;
 pub use occupancy::Occupancy;
 use occupancy::{Along, Look};
 pub use running::{Refresh, RunningOccupancy};
@@ -26,6 +28,10 @@ pub enum Spacing {
     /// Steps of this world length from the entry of the ray into the box to its exit. The last step ends at the exit, so the lengths sum to
     /// the chord. Jitter shifts the steps by a fraction of a step.
     Step(f64),
+    /// Steps of this length in the contracted space ([`Space::Contracted`](crate::space::Space::Contracted)), from the near plane to
+    /// infinity. t of a sample is then not its distance from the origin, but s ([`Bend`](crate::space::Bend)), whose steps are even; `delta` are lengths
+    /// of s. Jitter shifts the steps by a fraction of a step.
+    Contracted(f64),
     /// Spacing of the source paper: `samples` points evenly spaced over t ∈ [0, far], where t is measured along the direction whose camera
     /// z is −1 (its world length is `stretch · t`). Points inside the box are used. Jitter shifts all points by a fraction of the spacing.
     Points {
@@ -96,28 +102,35 @@ pub(crate) struct March {
     start: f64,
     step: f64,
     points: bool,
+    /// Path of the ray, if it is not straight.
+    bend: Option<Bend>,
 }
 
 /// Computes the intervals of one ray: the only place that defines sample positions.
 pub(crate) fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> March {
-    let none = March { count: 0, near: 0.0, far: 0.0, start: 0.0, step: 1.0, points: false };
+    let none = March { count: 0, near: 0.0, far: 0.0, start: 0.0, step: 1.0, points: false, bend: None };
+    let steps = |near: f64, far: f64, step: f64, bend: Option<Bend>| {
+        if far <= near {
+            return none;
+        }
+        // Interval boundaries inside the chord: near + (k + jitter) step, from k = 1 on, or from k = 0 with jitter.
+        let start = near + if jitter > 0.0 { jitter * step } else { step };
+        let inner = if start < far { ((far - start) / step).ceil() as usize } else { 0 };
+        March { count: inner + 1, near, far, start, step, points: false, bend }
+    };
+    if let Spacing::Contracted(step) = spacing {
+        let bend = Bend::of(ray);
+        return steps(bend.near(), bend.end(), step, Some(bend));
+    }
     let Some((near, far)) = aabb.intersect(ray.origin, ray.direction) else { return none };
     match spacing {
-        Spacing::Step(step) => {
-            if far <= near {
-                return none;
-            }
-            // Interval boundaries inside the chord: near + (k + jitter) step, from k = 1 on, or from k = 0 with jitter.
-            let start = near + if jitter > 0.0 { jitter * step } else { step };
-            let inner = if start < far { ((far - start) / step).ceil() as usize } else { 0 };
-            March { count: inner + 1, near, far, start, step, points: false }
-        }
+        Spacing::Step(step) | Spacing::Contracted(step) => steps(near, far, step, None),
         Spacing::Points { samples, far: limit } => {
             let step = limit * ray.stretch / (samples.max(2) - 1) as f64;
             let first = (near / step - jitter).ceil().max(0.0);
             let last = (far / step - jitter).floor().min(samples as f64 - 1.0);
             let count = if last >= first { (last - first) as usize + 1 } else { 0 };
-            March { count, near, far, start: (first + jitter) * step, step, points: true }
+            March { count, near, far, start: (first + jitter) * step, step, points: true, bend: None }
         }
     }
 }
@@ -162,10 +175,24 @@ impl March {
         found
     }
 
+    /// Returns the position at a place of the ray, in the coordinates of the box.
+    #[inline(always)]
+    pub(crate) fn at(&self, ray: &Ray, s: f64) -> DVec3 {
+        match self.bend {
+            None => ray.origin + s * ray.direction,
+            Some(bend) => contract(ray.origin + bend.distance(s) * ray.direction),
+        }
+    }
+
+    /// Returns true if the ray is straight in the box.
+    pub(crate) fn is_straight(&self) -> bool {
+        self.bend.is_none()
+    }
+
     /// Returns the intervals whose middle lies in an occupied cell.
     #[inline]
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
-        Occupied { march: *self, along: cells.along(ray), next: 0, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
+        Occupied { march: *self, ray: *ray, along: cells.along(ray), next: 0, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
 }
 
@@ -177,6 +204,7 @@ const LOOKS: usize = 16;
 #[derive(Clone, Debug)]
 pub(crate) struct Occupied<'a> {
     march: March,
+    ray: Ray,
     along: Along<'a>,
     /// Next interval to test.
     next: usize,
@@ -209,7 +237,10 @@ impl Occupied<'_> {
         // If the last test found occupied intervals, more are likely to follow.
         let lost = self.count == 0;
         (self.taken, self.count) = (0, 0);
-        if lost && let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
+        if let Some(bend) = march.bend {
+            self.count = occupied_of_bent(march, (bend, &self.ray), &self.along, self.next, &mut self.found);
+            self.next += LOOKS;
+        } else if lost && let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
             // Last k whose middle is not beyond the exit, up to rounding. It is tested again.
             let half = if march.points { 0.0 } else { 0.5 };
             let last = ((exit - march.start) / march.step + half) as usize;
@@ -226,15 +257,30 @@ dispatched! {
 fn occupied_of(march: &March, along: &Along<'_>, first: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
     let all: [(f64, f64); LOOKS] = march.intervals(first);
     let occupied = along.occupied(&all.map(|(middle, _)| middle));
+    kept(&all, &occupied, march.count - first, found)
+}
+}
+
+dispatched! {
+/// Like [`occupied_of`], for a ray that is not straight.
+fn occupied_of_bent(march: &March, path: (Bend, &Ray), along: &Along<'_>, first: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
+    let all: [(f64, f64); LOOKS] = march.intervals(first);
+    let occupied = along.occupied_at(&path.0.positions(path.1, &all.map(|(middle, _)| middle)));
+    kept(&all, &occupied, march.count - first, found)
+}
+}
+
+/// Keeps the occupied intervals among the first `most`. Returns their number.
+#[inline(always)]
+fn kept(all: &[(f64, f64); LOOKS], occupied: &[bool; LOOKS], most: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
     let mut count = 0;
-    for i in 0..LOOKS.min(march.count - first) {
+    for i in 0..LOOKS.min(most) {
         if occupied[i] {
             found[count] = all[i];
             count += 1;
         }
     }
     count
-}
 }
 
 /// Samples a batch of rays through a box. With `occupancy`, samples in empty cells are left out; the positions of the others do not change.
@@ -252,8 +298,8 @@ pub fn sample<T: Real>(rays: &[Ray], aabb: &Aabb, spacing: Spacing, jitter: Jitt
     packed(rays, counts, |r, slots| {
         let march = &marches[r / RUN].0[r % RUN];
         match occupancy {
-            None => (0..march.count).map(|k| march.interval(k)).for_each(|(middle, length)| slots.put(middle, length)),
-            Some(cells) => march.occupied(&rays[r], cells).for_each(|(middle, length)| slots.put(middle, length)),
+            None => (0..march.count).map(|k| march.interval(k)).for_each(|interval| slots.put(march, interval)),
+            Some(cells) => march.occupied(&rays[r], cells).for_each(|interval| slots.put(march, interval)),
         }
     })
 }
@@ -271,10 +317,16 @@ struct Slots<'a, T> {
 }
 
 impl<T: Real> Slots<'_, T> {
-    /// Adds a sample of the current ray, given its distance and the length of its interval.
+    /// Adds a sample of the current ray, given the middle and length of its interval on a march.
     #[inline]
-    fn put(&mut self, t: f64, delta: f64) {
-        let (i, p) = (self.filled, self.ray.origin + t * self.ray.direction);
+    fn put(&mut self, march: &March, (middle, length): (f64, f64)) {
+        self.put_at(march.at(&self.ray, middle), middle, length);
+    }
+
+    /// Adds a sample of the current ray, given its position, its distance and the length of its interval.
+    #[inline]
+    fn put_at(&mut self, p: DVec3, t: f64, delta: f64) {
+        let i = self.filled;
         (self.t[i], self.delta[i]) = (T::lit(t), T::lit(delta));
         self.positions[3 * i..3 * i + 3].copy_from_slice(&[T::lit(p.x), T::lit(p.y), T::lit(p.z)]);
         self.filled += 1;
@@ -317,7 +369,6 @@ fn packed<T: Real>(rays: &[Ray], counts: impl Iterator<Item = u32>, place: impl 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DVec3;
 
     fn ray(origin: [f64; 3], direction: [f64; 3]) -> Ray {
         let d = DVec3::from(direction);

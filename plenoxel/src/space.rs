@@ -3,7 +3,12 @@
 //! A field is a function on a box. The world may be larger than any box: a room seen from inside has walls, windows and sky. A [`Space`]
 //! maps the world, or the part of it that cameras see, to a box.
 
+use crate::camera::{Camera, Ray};
+use crate::error::{Error, Result};
+use crate::geometry::Aabb;
+use glam::{DVec3, dvec3};
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 
 /// Map from the world to the box of a field.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -23,4 +28,235 @@ pub enum Space {
     /// The contraction of mip-NeRF 360 (Barron et al. 2022) in its infinity-norm form: with m = max |xᵢ|, x for m ≤ 1 and
     /// (2 − 1 / m) x / m beyond. The whole world becomes the box [−2, 2]³.
     Contracted,
+}
+
+impl Space {
+    /// Half width of the box of [`Space::Contracted`].
+    pub const CONTRACTED: f64 = 2.0;
+
+    /// Returns rays in the coordinates of the box, if they are straight there. For [`Space::Contracted`] they are those of the world;
+    /// [`Spacing::Contracted`](crate::sampling::Spacing::Contracted) bends them.
+    ///
+    /// A ray in normalized device coordinates begins at the near plane, and its direction has unit length. With o the origin, moved along
+    /// the ray to z = −1, and d the direction: o' = (−a o_x / o_z, −b o_y / o_z, 1 + 2 / o_z) and d' ∝ (−a (d_x / d_z − o_x / o_z), −b (d_y / d_z − o_y / o_z),
+    /// −2 / o_z).
+    pub fn rays<'a>(&self, rays: &'a [Ray]) -> Cow<'a, [Ray]> {
+        match *self {
+            Space::Box | Space::Contracted => Cow::Borrowed(rays),
+            Space::Ndc { a, b } => Cow::Owned(rays.iter().map(|ray| ndc(ray, a, b)).collect()),
+        }
+    }
+}
+
+/// Box of a field, in the coordinates of a space.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Region {
+    /// Space.
+    pub space: Space,
+    /// Box.
+    pub aabb: Aabb,
+}
+
+impl Region {
+    /// Returns a cube of the world around the origin.
+    pub fn cube(half_width: f64) -> Self {
+        Region { space: Space::Box, aabb: Aabb::cube(half_width) }
+    }
+
+    /// Returns the region that cameras see in a space: a cube of the world with this half width; the whole contracted world; the part of
+    /// normalized device coordinates that the rays of the image corners cross, at most 3 times as wide as the image of the reference camera.
+    pub fn of(space: Space, cameras: &[Camera], half_width: f64) -> Self {
+        const WIDEST: f64 = 3.0;
+        let aabb = match space {
+            Space::Box => Aabb::cube(half_width),
+            Space::Contracted => Aabb::cube(Space::CONTRACTED),
+            Space::Ndc { .. } => {
+                let corners = cameras.iter().flat_map(|camera| {
+                    let [width, height] = [camera.intrinsics.width, camera.intrinsics.height].map(|n| n as f64);
+                    [[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]].map(|[x, y]| camera.ray(x, y))
+                });
+                let rays: Vec<Ray> = corners.filter(|ray| ray.direction.z < 0.0).collect();
+                // A ray ends at z = 1, the infinite distance.
+                let ends = space.rays(&rays).iter().flat_map(|ray| [ray.origin, ray.origin + 2.0 / ray.direction.z * ray.direction]).collect::<Vec<_>>();
+                let reach = |axis: usize| ends.iter().map(|end| end[axis].abs()).fold(1.0, f64::max).min(WIDEST);
+                let half = dvec3(reach(0), reach(1), 1.0);
+                Aabb { min: -half, max: half }
+            }
+        };
+        Region { space, aabb }
+    }
+
+    /// Returns the box, for a model that is trained in a box of the world only. `kind` names the model.
+    ///
+    /// Errors if the space is another one.
+    pub fn in_box(&self, kind: &str) -> Result<Aabb> {
+        if self.space == Space::Box {
+            return Ok(self.aabb);
+        }
+        let found = format!("the model `{kind}` is trained in a box, and the space of this capture is {}", self.space);
+        Err(Error::usage("space", found, "use the preset photos, or set it to box and half_width to the size of the object"))
+    }
+}
+
+impl std::fmt::Display for Space {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Space::Box => "box",
+            Space::Ndc { .. } => "ndc",
+            Space::Contracted => "contracted",
+        })
+    }
+}
+
+/// Returns a ray in normalized device coordinates. A ray that does not look along −z sees nothing: it is moved out of the box.
+fn ndc(ray: &Ray, a: f64, b: f64) -> Ray {
+    let d = ray.direction;
+    if d.z >= 0.0 {
+        return Ray { origin: dvec3(0.0, 0.0, 1e6), direction: DVec3::Z, stretch: ray.stretch };
+    }
+    let o = ray.origin - (1.0 + ray.origin.z) / d.z * d;
+    let origin = dvec3(-a * o.x / o.z, -b * o.y / o.z, 1.0 + 2.0 / o.z);
+    let direction = dvec3(-a * (d.x / d.z - o.x / o.z), -b * (d.y / d.z - o.y / o.z), -2.0 / o.z);
+    Ray { origin, direction: direction.normalize(), stretch: ray.stretch }
+}
+
+/// Returns a position of the world in the contracted space ([`Space::Contracted`]).
+#[inline(always)]
+pub fn contract(x: DVec3) -> DVec3 {
+    let m = x.abs().max_element().max(1.0);
+    x * ((2.0 - 1.0 / m) / m)
+}
+
+/// Path of a ray through the contracted space, by a parameter s whose even steps are about even in that space.
+///
+/// Let b be the axis along which the direction d is largest, and t₁ the distance at which the ray leaves the slab |x_b| ≤ 1. Up to there s
+/// is the distance t. Behind it |x_b| = 1 + |d_b| (t − t₁), and 1 / |x_b| falls evenly with s: 1 / |x_b| = 1 − |d_b| (s − t₁), which is 0, at infinity, for
+/// s = t₁ + 1 / |d_b|.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bend {
+    /// t₁
+    turn: f64,
+    /// |d_b|
+    rate: f64,
+}
+
+impl Bend {
+    /// Distance of the near plane from a camera. What is nearer is not seen.
+    const NEAR: f64 = 0.05;
+
+    /// Returns the path of a ray.
+    pub fn of(ray: &Ray) -> Self {
+        let (o, d) = (ray.origin.to_array(), ray.direction.to_array());
+        let b = (1..3).fold(0, |b, axis| if d[axis].abs() > d[b].abs() { axis } else { b });
+        let rate = d[b].abs();
+        Bend { turn: (1.0 - o[b] * d[b].signum()) / rate, rate }
+    }
+
+    /// Returns s at the near plane.
+    pub fn near(&self) -> f64 {
+        self.place(Self::NEAR)
+    }
+
+    /// Returns s at infinity.
+    pub fn end(&self) -> f64 {
+        self.turn + 1.0 / self.rate
+    }
+
+    /// Returns s at a distance from the origin of the ray.
+    pub fn place(&self, t: f64) -> f64 {
+        let m = 1.0 + self.rate * (t - self.turn);
+        if m <= 1.0 { t } else { self.turn + (1.0 - 1.0 / m) / self.rate }
+    }
+
+    /// Returns the distance from the origin of the ray at s.
+    #[inline(always)]
+    pub fn distance(&self, s: f64) -> f64 {
+        let m = 1.0 / (1.0 - self.rate * (s - self.turn));
+        if s <= self.turn { s } else { self.turn + (m - 1.0) / self.rate }
+    }
+
+    /// Returns the positions at several s: x, y and z of each.
+    #[inline(always)]
+    pub(crate) fn positions<const N: usize>(&self, ray: &Ray, s: &[f64; N]) -> [[f64; N]; 3] {
+        let mut at = [[0.0; N]; 3];
+        for i in 0..N {
+            // Intervals beyond the last of the ray may lie beyond infinity.
+            let t = self.distance(s[i].min(self.end() - 1e-9));
+            let x = ray.origin.to_array();
+            let d = ray.direction.to_array();
+            let x = [x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2]];
+            let m = x[0].abs().max(x[1].abs()).max(x[2].abs()).max(1.0);
+            let scale = (2.0 - 1.0 / m) / m;
+            for a in 0..3 {
+                at[a][i] = x[a] * scale;
+            }
+        }
+        at
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autograd::random::Stream;
+
+    /// Rays with origins in [−1.5, 1.5]³ and random directions.
+    fn rays(count: usize) -> Vec<Ray> {
+        let numbers = Stream::new(3).uniform_tensor::<f64>(&[count, 6], -1.0, 1.0);
+        let ray = |x: &[f64]| {
+            let direction = dvec3(x[3], x[4], x[5]).normalize();
+            Ray { origin: 1.5 * dvec3(x[0], x[1], x[2]), direction, stretch: 1.0 }
+        };
+        numbers.data().chunks(6).map(ray).collect()
+    }
+
+    #[test]
+    fn the_contraction_is_continuous_and_maps_infinity_to_the_faces_of_the_box() {
+        assert_eq!(contract(dvec3(0.3, -1.0, 0.5)), dvec3(0.3, -1.0, 0.5));
+        assert!(contract(dvec3(4.0, -2.0, 1.0)).abs_diff_eq(dvec3(1.75, -0.875, 0.4375), 1e-15)); // m = 4: (2 - 1/4) / 4 = 0.4375
+        assert!(contract(dvec3(1e9, 0.0, 0.0)).abs_diff_eq(dvec3(2.0, 0.0, 0.0), 1e-8));
+        for ray in rays(50) {
+            let at = |t: f64| contract(ray.origin + t * ray.direction);
+            for k in 0..1000 {
+                let t = f64::from(k) * 0.01;
+                assert!((at(t + 1e-6) - at(t)).length() < 4e-6, "{ray:?} at {t}");
+            }
+        }
+    }
+
+    #[test]
+    fn places_on_a_bent_ray_and_distances_are_inverse_and_end_at_infinity() {
+        for ray in rays(200) {
+            let bend = Bend::of(&ray);
+            for t in [0.05, 0.3, 1.0, 2.5, 7.0, 100.0, 1e4] {
+                let s = bend.place(t);
+                assert!((bend.distance(s) - t).abs() < 1e-7 * t * t.max(1.0), "{ray:?}: {t} at {s}");
+            }
+            assert!(bend.end() < 6.0 + 1.0 && bend.distance(bend.end() - 1e-9) > 1e7);
+            let s: [f64; 16] = std::array::from_fn(|k| bend.near() + (bend.end() - bend.near()) * k as f64 / 16.0);
+            let at = bend.positions(&ray, &s);
+            for (k, &s) in s.iter().enumerate() {
+                let expected = contract(ray.origin + bend.distance(s) * ray.direction);
+                assert!(dvec3(at[0][k], at[1][k], at[2][k]).abs_diff_eq(expected, 1e-9));
+            }
+        }
+    }
+
+    #[test]
+    fn points_of_a_ray_lie_on_its_ray_in_normalized_device_coordinates() {
+        let space = Space::Ndc { a: 1.6, b: 2.1 };
+        let all = rays(200);
+        for (ray, moved) in all.iter().zip(space.rays(&all).iter()).filter(|(ray, _)| ray.direction.z < -0.1) {
+            assert!((moved.origin.z + 1.0).abs() < 1e-12 && (moved.direction.length() - 1.0).abs() < 1e-12);
+            for z in [-1.5, -4.0, -1e5] {
+                let p = ray.origin + (z - ray.origin.z) / ray.direction.z * ray.direction;
+                let expected = dvec3(-1.6 * p.x / p.z, -2.1 * p.y / p.z, 1.0 + 2.0 / p.z);
+                let along = (expected - moved.origin).dot(moved.direction);
+                assert!((moved.origin + along * moved.direction).abs_diff_eq(expected, 1e-9), "{ray:?} at z = {z}");
+                assert!(along > 0.0);
+            }
+        }
+        let away = Ray { origin: DVec3::ZERO, direction: DVec3::Z, stretch: 1.0 };
+        assert!(crate::geometry::Aabb::cube(2.0).intersect(space.rays(&[away])[0].origin, DVec3::Z).is_none());
+    }
 }

@@ -6,6 +6,7 @@ use crate::loss::Objective;
 use crate::model::Model;
 use crate::model::plenoxels::config::Config;
 use crate::render::Engine;
+use crate::space::Region;
 use crate::tensor_file::TensorFile;
 use crate::train::StageLength;
 
@@ -33,10 +34,10 @@ pub trait Recipe: Send + Sync {
     /// Returns the memory of the model.
     fn memory(&self, engine: Engine) -> Memory;
 
-    /// Creates the model, with the box, seed, hull and engine of a configuration.
+    /// Creates the model in a region, with the seed, hull and engine of a configuration.
     ///
-    /// Errors name the setting that is invalid.
-    fn model(&self, config: &Config) -> Result<Self::Model>
+    /// Errors: a setting is invalid, which the error names; the model is not trained in this space.
+    fn model(&self, config: &Config, region: Region) -> Result<Self::Model>
     where
         Self: Sized;
 

@@ -25,6 +25,7 @@ use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Spacing};
+use crate::space::Space;
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
@@ -41,6 +42,7 @@ pub const KIND: &str = "tensorf";
 pub struct Tensorf<T: Real> {
     config: Config,
     field: Factored<T>,
+    space: Space,
     hull: Hull,
     /// Implementation of rendering.
     pub engine: Engine,
@@ -73,7 +75,12 @@ impl<T: Real> Tensorf<T> {
         let mut field = Factored::new(config.shape(), aabb, aabb.nodes(config.stages[0].resolution), &random);
         field.grouping = Grouping { weight: config.group, above: config.color_above };
         field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
-        Ok(Tensorf { config, field, hull: Hull::Auto, engine: Engine::Fused })
+        Ok(Tensorf { config, field, space: Space::Box, hull: Hull::Auto, engine: Engine::Fused })
+    }
+
+    /// Sets the space of the box. Silhouettes are used in [`Space::Box`] only.
+    pub fn in_space(self, space: Space) -> Self {
+        Tensorf { space, ..self }
     }
 
     /// Sets the use of silhouettes. With [`Hull::Auto`], the default, only cells in the visual hull of the training views are sampled, if they have an alpha
@@ -123,22 +130,30 @@ impl<T: Real> Tensorf<T> {
 
     fn hull(&self, views: &[View]) -> Option<Occupancy> {
         let hull = || visual_hull::by_footprint(views, self.aabb(), [HULL; 3], HULL_MARGIN, &|_| {}).dilated(1);
-        (self.hull == Hull::Auto && has_alpha(views)).then(hull)
+        (self.hull == Hull::Auto && self.space == Space::Box && has_alpha(views)).then(hull)
+    }
+
+    /// Restricts rays to the pixels that show occupied cells.
+    fn aim(&self, rays: &mut RaySource) {
+        if let (Space::Box, Some(occupied)) = (self.space, &self.field.occupied) {
+            rays.aim_at(occupied);
+        }
     }
 
     fn render_with(&self, rays: &[Ray], background: [f32; 3], jitter: Jitter, engine: Engine) -> Rendered<T> {
         let config = &self.config;
         let training = matches!(jitter, Jitter::PerRay { .. });
+        let step = config.step * self.field.cell();
         let options = RenderOptions {
             aabb: self.aabb(),
-            spacing: Spacing::Step(config.step * self.field.cell()),
+            spacing: if self.space == Space::Contracted { Spacing::Contracted(step) } else { Spacing::Step(step) },
             jitter,
             background,
             occupancy: None,
             engine,
             stop_below: if training { config.stop_below } else { config.stop_below_in_pictures },
         };
-        render(&self.field, rays, &options)
+        render(&self.field, &self.space.rays(rays), &options)
     }
 }
 
@@ -224,18 +239,14 @@ impl<T: Real> Model<T> for Tensorf<T> {
             }
             self.field.occupied = Some(occupied);
         }
-        if let Some(occupied) = &self.field.occupied {
-            rays.aim_at(occupied);
-        }
+        self.aim(rays);
         let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
         self.field.resample(aabb, aabb.nodes(self.config.stages[stage.index].resolution));
         Ok(())
     }
 
     fn resume(&mut self, _: &PlannedStage, rays: &mut RaySource) {
-        if let Some(occupied) = &self.field.occupied {
-            rays.aim_at(occupied);
-        }
+        self.aim(rays);
     }
 
     /// Returns the field, a [`Factored<T>`].
@@ -249,6 +260,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {
         cells::write_box(self.aabb(), file);
+        file.fact("space", self.space);
         file.fact("nodes", self.field.nodes());
         cells::write(self.field.occupied.as_ref(), file);
         self.visit(&mut |param| file.owned(param.name(), param.tensor().detach()));
@@ -259,6 +271,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
         if nodes.iter().any(|n| !(2..=4 * MOST_NODES).contains(n)) {
             return Err(file.damaged("the number of nodes is not one of this model"));
         }
+        self.space = file.fact("space")?;
         self.field.occupied = cells::read(file)?;
         self.field.resample(aabb, nodes);
         read_params(self, file)

@@ -6,6 +6,7 @@ use crate::dataset::{self, Dataset, OpenOptions, Split, image};
 use crate::error::{Error, Result};
 use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
+use crate::space::Space;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -85,10 +86,14 @@ impl DataSource {
         }
     }
 
-    /// Checks the poses of the training cameras against the box `aabb`, in world coordinates. Returns warnings as sentences.
+    /// Checks the poses of the training cameras against the box `aabb`, in world coordinates. Returns warnings as sentences. Other spaces than
+    /// [`Space::Box`] are made from the cameras.
     ///
     /// Errors: nothing can be learned from these cameras in this box.
     pub fn check_cameras(&self, dataset: &Dataset, aabb: Aabb) -> Result<Vec<String>> {
+        if dataset.space() != Space::Box {
+            return Ok(Vec::new());
+        }
         let Placement { hopeless, warnings } = Placement::of(&dataset.cameras(Split::Train), aabb);
         match hopeless {
             Some([found, remedy]) => Err(Error::input(self.to_string(), found, remedy)),

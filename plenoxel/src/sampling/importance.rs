@@ -114,7 +114,9 @@ fn refined<T: Real>(rays: &[Ray], section: Section, count: usize, place: impl Fn
         let mut t = Vec::with_capacity(count);
         place(r, (near, far), &mut t);
         let edges = edges(&t, near, far);
-        t.iter().zip(edges.windows(2)).for_each(|(&t, ends)| slots.put(t, ends[1] - ends[0]));
+        t.iter()
+            .zip(edges.windows(2))
+            .for_each(|(&t, ends)| slots.put_at(slots.ray.origin + t * slots.ray.direction, t, ends[1] - ends[0]));
     })
 }
 

@@ -275,12 +275,28 @@ impl Along<'_> {
     /// Tests which distances lie in occupied cells.
     #[inline(always)]
     pub(crate) fn occupied<const N: usize>(&self, t: &[f64; N]) -> [bool; N] {
-        let Occupancy { bricks, masks, .. } = self.cells;
+        self.cells.occupied(|axis, i, cells| self.cell(axis, t[i], cells))
+    }
+
+    /// Tests which positions lie in occupied cells: x, y and z of each.
+    #[inline(always)]
+    pub(crate) fn occupied_at<const N: usize>(&self, at: &[[f64; N]; 3]) -> [bool; N] {
+        let low = self.cells.aabb.min;
+        let per_length = DVec3::from_array(self.cells.cells().map(|n| n as f64)) / (self.cells.aabb.max - low);
+        self.cells.occupied(|axis, i, cells| ((at[axis][i] - low[axis]) * per_length[axis]).max(0.0).min((cells - 1) as f64) as u32)
+    }
+}
+
+impl Occupancy {
+    /// Tests which cells are occupied. `cell(axis, i, n)` is the cell of the i-th place along an axis of n cells.
+    #[inline(always)]
+    fn occupied<const N: usize>(&self, cell: impl Fn(usize, usize, usize) -> u32) -> [bool; N] {
+        let Occupancy { bricks, masks, .. } = self;
         let (mut numbers, mut bits) = ([0; N], [0; N]);
         // Like `BrickGrid::split`, one axis after another, because such loops vectorise.
         for a in 0..3 {
             for i in 0..N {
-                let cell = self.cell(a, t[i], bricks.nodes()[a]);
+                let cell = cell(a, i, bricks.nodes()[a]);
                 numbers[i] = numbers[i] * bricks.count()[a] as u32 + cell / BRICK as u32;
                 bits[i] = bits[i] * BRICK as u32 + cell % BRICK as u32;
             }

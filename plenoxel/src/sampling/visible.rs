@@ -85,7 +85,7 @@ pub fn sample_visible<T: Real>(
             for (front, ray) in fronts.iter_mut().zip(rays).filter(|(front, _)| front.transmittance > 0.0) {
                 front.extend();
                 for &(middle, _) in front.new_intervals() {
-                    positions.extend((ray.origin + middle * ray.direction).to_array().map(T::lit));
+                    positions.extend(front.march.at(ray, middle).to_array().map(T::lit));
                 }
             }
             positions
@@ -104,5 +104,5 @@ pub fn sample_visible<T: Real>(
         }
     }
     let counts: Vec<u32> = fronts.iter().map(|front| front.intervals.len() as u32).collect();
-    packed(rays, counts.into_iter(), |r, slots| fronts[r].intervals.iter().for_each(|&(middle, length)| slots.put(middle, length)))
+    packed(rays, counts.into_iter(), |r, slots| fronts[r].intervals.iter().for_each(|&interval| slots.put(&fronts[r].march, interval)))
 }

@@ -2,11 +2,11 @@
 
 use super::{Config, Dvgo, KIND, Stage, own_losses};
 use crate::error::Result;
-use crate::geometry::Aabb;
 use crate::loss::Objective;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
+use crate::space::Region;
 use crate::train::StageLength;
 
 impl Config {
@@ -50,8 +50,8 @@ impl Recipe for Config {
         }
     }
 
-    fn model(&self, config: &RunConfig) -> Result<Dvgo<f32>> {
-        let mut model = Dvgo::new(self.clone(), Aabb::cube(config.half_width), config.seed)?;
+    fn model(&self, config: &RunConfig, region: Region) -> Result<Dvgo<f32>> {
+        let mut model = Dvgo::new(self.clone(), region.in_box(KIND)?, config.seed)?;
         model.engine = config.engine;
         Ok(model)
     }

@@ -2,11 +2,11 @@
 
 use super::{Config, KIND, Nerf, SAMPLES_IN_PICTURES, coarse_mse};
 use crate::error::Result;
-use crate::geometry::Aabb;
 use crate::loss::Objective;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
+use crate::space::Region;
 use crate::train::StageLength;
 
 impl Recipe for Config {
@@ -43,8 +43,8 @@ impl Recipe for Config {
         }
     }
 
-    fn model(&self, config: &RunConfig) -> Result<Nerf<f32>> {
-        Nerf::new(self.clone(), Aabb::cube(config.half_width), config.seed)
+    fn model(&self, config: &RunConfig, region: Region) -> Result<Nerf<f32>> {
+        Nerf::new(self.clone(), region.in_box(KIND)?, config.seed)
     }
 
     fn own_losses(&self, objective: Objective<f32, Nerf<f32>>) -> Objective<f32, Nerf<f32>> {

@@ -2,10 +2,10 @@
 
 use super::{Config, KIND, Ngp, Stage};
 use crate::error::Result;
-use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
+use crate::space::Region;
 use crate::train::StageLength;
 
 impl Recipe for Config {
@@ -43,8 +43,8 @@ impl Recipe for Config {
         }
     }
 
-    fn model(&self, config: &RunConfig) -> Result<Ngp<f32>> {
-        let mut model = Ngp::new(self.clone(), Aabb::cube(config.half_width), config.seed)?.with_hull(config.hull);
+    fn model(&self, config: &RunConfig, region: Region) -> Result<Ngp<f32>> {
+        let mut model = Ngp::new(self.clone(), region.in_box(KIND)?, config.seed)?.with_hull(config.hull);
         model.engine = config.engine;
         Ok(model)
     }

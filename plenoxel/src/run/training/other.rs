@@ -1,15 +1,15 @@
 //! Runs that train another model than the voxel grid: one with a table of settings of its own ([`Recipe`]).
 
 use super::{Event, Listener, NewRun, OldRun, Outcome, RunOptions, RunSettings, clock};
-use crate::dataset::View;
+use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
-use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::objective_of_any;
 use crate::model::recipe::Recipe;
 use crate::run::budget;
 use crate::run::data::DataSource;
 use crate::run::memory::Estimate;
+use crate::space::Region;
 use crate::train::Trainer;
 use std::path::Path;
 use std::sync::Arc;
@@ -17,16 +17,22 @@ use std::sync::Arc;
 /// Creates the trainer of a run.
 ///
 /// Errors: a setting is invalid; a loss needs a voxel grid; there are no training views.
-fn trainer<R: Recipe>(config: &Config, recipe: &R, views: Arc<[View]>) -> Result<Trainer<f32, R::Model>> {
+fn trainer<R: Recipe>(config: &Config, recipe: &R, region: Region, views: Arc<[View]>) -> Result<Trainer<f32, R::Model>> {
     let objective = recipe.own_losses(objective_of_any(config, views.len())?);
-    Trainer::with_model(recipe.model(config)?, views, objective, config.train_options())
+    Trainer::with_model(recipe.model(config, region)?, views, objective, config.train_options())
+}
+
+/// Returns the region in which a model of a dataset is trained.
+fn region(dataset: &Dataset, config: &Config) -> Region {
+    Region::of(dataset.space(), &dataset.cameras(Split::Train), config.half_width)
 }
 
 /// Trains a model.
 pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Listener<'_>) -> Result<Outcome> {
     let mut recipe = recipe.clone();
     let mut run = NewRun::open(settings, on)?;
-    run.check_cameras(Aabb::cube(run.config.half_width), on)?;
+    let region = region(&run.dataset, &run.config);
+    run.check_cameras(region.aabb, on)?;
     let estimate = Estimate::of_recipe(&run.config, &recipe, &run.dataset, &settings.options);
     on(Event::note(estimate.describe()));
     estimate.check()?;
@@ -35,7 +41,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
-        let begin = |recipe: &R| trainer(config, recipe, views.clone());
+        let begin = |recipe: &R| trainer(config, recipe, region, views.clone());
         recipe = clocks.train.time(|| budget::recipe_on_time(&recipe, seconds, begin))?;
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
             Some(resolution) => format!("{} at {resolution}³", stage.steps),
@@ -45,7 +51,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
         recipe.clone().set(config);
     }
     let NewRun { config, views, clocks, .. } = &mut run;
-    let trainer = clocks.train.time(|| trainer(config, &recipe, views.clone()))?;
+    let trainer = clocks.train.time(|| trainer(config, &recipe, region, views.clone()))?;
     run.learn(trainer, on)
 }
 
@@ -62,6 +68,7 @@ pub fn resume<R: Recipe>(
     on(Event::note(estimate.describe()));
     estimate.check()?;
     run.read(on)?;
-    let trainer = trainer(&run.config, recipe, run.views.clone())?;
+    let region = region(&run.dataset, &run.config);
+    let trainer = trainer(&run.config, recipe, region, run.views.clone())?;
     run.learn(trainer, on)
 }

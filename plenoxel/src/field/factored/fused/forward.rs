@@ -180,7 +180,8 @@ impl<'a, T: Real> Scene<'a, T> {
                 while own < RUN
                     && let Some((middle, length)) = next()
                 {
-                    let place = (start + middle * along).clamp(DVec3::ZERO, most);
+                    let place = if march.is_straight() { start + middle * along } else { (march.at(ray, middle) - aabb.min) * per_length };
+                    let place = place.clamp(DVec3::ZERO, most);
                     (x[end + own], y[end + own], z[end + own]) = (T::lit(place.x), T::lit(place.y), T::lit(place.z));
                     (t[end + own], delta[end + own]) = (T::lit(middle), T::lit(length));
                     own += 1;

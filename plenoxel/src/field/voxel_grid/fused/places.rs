@@ -5,6 +5,7 @@ use crate::field::voxel_grid::GridShape;
 use crate::sampling::{March, Occupancy, Occupied};
 use autograd::lattice::TOGETHER;
 use autograd::{Real, dispatched};
+use glam::DVec3;
 
 /// Number of samples that are looked up together.
 pub(super) const RUN: usize = TOGETHER;
@@ -47,7 +48,12 @@ impl<'a, T: Real> Places<'a, T> {
                 }
             }
         }
-        place(self.ray, &intervals, self.to_voxels, out);
+        if self.march.is_straight() {
+            place(self.ray, &intervals, self.to_voxels, out);
+        } else {
+            let at = intervals.map(|(middle, _)| self.march.at(self.ray, middle));
+            place_each(&at, &intervals, self.to_voxels, out);
+        }
         count
     }
 }
@@ -64,4 +70,13 @@ fn place<T: Real>(ray: &Ray, intervals: &[(f64, f64); RUN], to_voxels: [T; 2], o
         delta[i] = T::lit(length);
     }
 }
+}
+
+/// Like [`place`], for samples at these positions.
+fn place_each<T: Real>(at: &[DVec3; RUN], intervals: &[(f64, f64); RUN], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
+    let [x, y, z, t, delta] = out;
+    for (i, (at, &(middle, length))) in at.iter().zip(intervals).enumerate() {
+        (x[i], y[i], z[i]) = at.to_array().map(|p| T::lit(p) * to_voxels[0] + to_voxels[1]).into();
+        (t[i], delta[i]) = (T::lit(middle), T::lit(length));
+    }
 }
