@@ -192,31 +192,61 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
     if !metadata.is_dir() {
         return Err(Error::input(path, "this is a file", remedy));
     }
-    // A file of this name that cannot be read is reported as unreadable, not as missing.
-    let has = |name: &str| files::is_there(&path.join(name));
-    if has("transforms_train.json") {
-        return blender::open(path, options);
-    }
-    let model = colmap::find(path);
-    let poses = nsvf::poses(path).filter(|_| has(nsvf::FILE));
-    let found = [
-        has(transforms::FILE).then_some(transforms::FILE),
-        model.is_some().then_some("a reconstruction of COLMAP"),
-        has(llff::FILE).then_some(llff::FILE),
-        poses.is_some().then_some(nsvf::FILE),
-    ];
-    let mut capture = match (&model, &poses) {
-        _ if has(transforms::FILE) => transforms::read(path, options.downscale),
-        (Some(model), _) => colmap::read(path, model, options.downscale),
-        _ if has(llff::FILE) => llff::read(path, options.downscale),
-        (None, Some(poses)) => nsvf::read(path, poses),
-        _ => return Err(unrecognized(path)),
+    let formats = formats(path);
+    let mut capture = match formats.first() {
+        Some(Format::Blender) => return blender::open(path, options),
+        Some(Format::Transforms) => transforms::read(path, options.downscale),
+        Some(Format::Colmap(model)) => colmap::read(path, model, options.downscale),
+        Some(Format::Llff) => llff::read(path, options.downscale),
+        Some(Format::Nsvf(poses)) => nsvf::read(path, poses),
+        None => return Err(unrecognized(path)),
     }?;
-    let others: Vec<&str> = found.into_iter().flatten().skip(1).collect();
+    let others: Vec<&str> = formats[1..].iter().map(Format::what).collect();
     if !others.is_empty() {
         capture.notes.push(format!("the folder also has {}, which is not read", others.join(" and ")));
     }
     capture::dataset(path, capture, options)
+}
+
+/// Returns true if [`open`] opens the folder as a capture, not as a NeRF-synthetic scene. Files are not read.
+pub fn is_capture(path: &Path) -> bool {
+    formats(path).first().is_some_and(|format| !matches!(format, Format::Blender))
+}
+
+/// Format of a folder, with the path of the folder that has the poses, where it may have several names.
+enum Format {
+    Blender,
+    Transforms,
+    Colmap(PathBuf),
+    Llff,
+    Nsvf(PathBuf),
+}
+
+impl Format {
+    /// Returns what the folder has of this format.
+    fn what(&self) -> &'static str {
+        match self {
+            Format::Blender => "transforms_train.json",
+            Format::Transforms => transforms::FILE,
+            Format::Colmap(_) => "a reconstruction of COLMAP",
+            Format::Llff => llff::FILE,
+            Format::Nsvf(_) => nsvf::FILE,
+        }
+    }
+}
+
+/// Returns the formats whose files a folder has; the first is the one that is read.
+fn formats(path: &Path) -> Vec<Format> {
+    // A file of this name that cannot be read is reported as unreadable, not as missing.
+    let has = |name: &str| files::is_there(&path.join(name));
+    let found = [
+        has("transforms_train.json").then_some(Format::Blender),
+        has(transforms::FILE).then_some(Format::Transforms),
+        colmap::find(path).map(Format::Colmap),
+        has(llff::FILE).then_some(Format::Llff),
+        nsvf::poses(path).filter(|_| has(nsvf::FILE)).map(Format::Nsvf),
+    ];
+    found.into_iter().flatten().collect()
 }
 
 /// Returns the name of the scene in a folder.

@@ -4,6 +4,7 @@ use crate::commands::capture::CaptureFlags;
 use crate::commands::{MOST_REDUCTION, background, number, whole};
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueHint};
+use plenoxel::dataset::is_capture;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::error::{Error, Result};
 use plenoxel::model::plenoxels::config::Config;
@@ -225,7 +226,11 @@ impl TrainArgs {
     /// Resolves the configuration. Returns it with the name of its preset.
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
         // In equal time, the factored field is better; `fast` is a voxel grid, which other programs read.
-        let default = if self.time.is_some() { "quality" } else { "fast" };
+        let default = match &self.data {
+            Some(data) if is_capture(data) => "photos",
+            _ if self.time.is_some() => "quality",
+            _ => "fast",
+        };
         settings::layered(self.preset.as_deref(), default, self.config.as_deref(), |layers| self.flags(layers))
     }
 

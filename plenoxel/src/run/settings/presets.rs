@@ -18,7 +18,7 @@ pub struct Preset {
 }
 
 /// The presets for training.
-pub const PRESETS: [Preset; 10] = [
+pub const PRESETS: [Preset; 11] = [
     Preset {
         name: "fast",
         purpose: "good quality in short time; the default of `train`",
@@ -30,6 +30,12 @@ pub const PRESETS: [Preset; 10] = [
         purpose: "the best quality: a factored field; `bake` makes voxels of it",
         time: "about 11 min at 800 x 800",
         text: include_str!("../../../presets/quality.toml"),
+    },
+    Preset {
+        name: "photos",
+        purpose: "captures of the real world, with their surroundings; the default of `train` for them",
+        time: "about 11 min at 1000 x 750",
+        text: include_str!("../../../presets/photos.toml"),
     },
     Preset {
         name: "voxels",
