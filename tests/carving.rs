@@ -212,7 +212,7 @@ fn sphere(color: impl Fn(DVec3) -> [f64; 3]) -> Vec<View> {
             let [r, g, b] = color(ray.direction).map(|c| (255.0 * c).round() as u8);
             [r, g, b, 255].into()
         });
-        View { name: format!("r_{k}"), camera, image, depth: None }
+        View { name: format!("r_{k}"), camera, image, depth: None, mask: None }
     });
     views.collect()
 }

@@ -13,6 +13,7 @@ pub mod colmap;
 pub mod exposure;
 pub mod image;
 pub mod llff;
+pub mod mask;
 pub mod normalize;
 mod npy;
 pub mod nsvf;
@@ -25,6 +26,7 @@ use crate::files;
 use crate::geometry::Similarity;
 use crate::space::Space;
 use capture::Point;
+use mask::Mask;
 use ndarray::{Array2, Array3};
 use normalize::{CaptureOptions, Normalization};
 use procedural::ProceduralOptions;
@@ -80,6 +82,8 @@ pub struct View {
     /// Distance along the unit ray of each pixel's centre to the first surface, [height, width]; infinite if there is none. `None` unless
     /// known exactly.
     pub depth: Option<Array2<f32>>,
+    /// Pixels to use, of the size of `image`; `None` for all.
+    pub mask: Option<Mask>,
 }
 
 impl View {
@@ -100,6 +104,12 @@ impl View {
         f32::from(self.image.get_pixel(x as u32, y as u32).0[3]) / 255.0
     }
 
+    /// Returns true if pixel (x, y) is not ignored by the mask.
+    #[inline]
+    pub fn keeps(&self, x: usize, y: usize) -> bool {
+        self.mask.as_ref().is_none_or(|mask| mask.keeps(x, y))
+    }
+
     /// Returns the view with its image reduced by `k` along both axes with a box filter. If k does not divide both sides, the largest
     /// smaller divisor is used. The result has no depth.
     pub fn reduced(&self, k: usize) -> Self {
@@ -107,7 +117,8 @@ impl View {
         let divides = |k: &usize| width.is_multiple_of(*k as u32) && height.is_multiple_of(*k as u32);
         let k = (1..=k).rev().find(divides).unwrap_or(1);
         let camera = Camera { intrinsics: self.camera.intrinsics.downscaled(k), ..self.camera };
-        View { name: self.name.clone(), camera, image: image::downscale(&self.image, k), depth: None }
+        let mask = self.mask.as_ref().map(|mask| mask.reduced(k));
+        View { name: self.name.clone(), camera, image: image::downscale(&self.image, k), depth: None, mask }
     }
 
     /// Returns the whole image over `background`, [height, width, 3] in [0, 1].
@@ -162,6 +173,10 @@ struct Frame {
     camera: Camera,
     /// Path of the image; empty for a rendered view.
     path: PathBuf,
+    /// Path of the mask.
+    mask: Option<PathBuf>,
+    /// Orientation in which the image has the shape of the camera's.
+    orientation: image::Orientation,
     /// Width and height of the image before the reduction.
     full: (usize, usize),
 }
@@ -398,16 +413,18 @@ impl Dataset {
         let (name, camera) = (frame.name.clone(), frame.camera);
         match &self.source {
             Source::Files { downscale } => {
-                let full = image::read(&frame.path)?;
+                let full = image::read_as(&frame.path, frame.orientation)?;
                 if (full.width() as usize, full.height() as usize) != frame.full {
                     return Err(Error::input(&frame.path, "the size of the image changed after the dataset was opened", "open it again"));
                 }
                 let image = if *downscale == 1 { full } else { image::downscale(&image::cropped(full, *downscale), *downscale) };
-                Ok(View { name, camera, image, depth: None })
+                let mask = frame.mask.as_ref().map(|mask| Mask::read(mask, frame.full)).transpose()?;
+                let mask = mask.map(|mask| if *downscale == 1 { mask } else { mask.reduced(*downscale) });
+                Ok(View { name, camera, image, depth: None, mask })
             }
             Source::Procedural { scene, supersample } => {
                 let (image, depth) = scene.render(&camera, *supersample);
-                Ok(View { name, camera, image, depth: Some(depth) })
+                Ok(View { name, camera, image, depth: Some(depth), mask: None })
             }
         }
     }

@@ -5,6 +5,7 @@
 
 use crate::camera::{Camera, Ray};
 use crate::dataset::View;
+use crate::dataset::mask::Mask;
 use crate::error::Result;
 use crate::metrics;
 use crate::render::Rendered;
@@ -14,6 +15,7 @@ use autograd::Real;
 use ndarray::Array3;
 use rayon::prelude::*;
 use serde::Serialize;
+use std::borrow::Cow;
 
 /// Renders the views of a model and compares them with their photographs over the background of `options`.
 ///
@@ -50,7 +52,8 @@ impl<'a, T: Real> Viewer<'a, T> {
         picture_by(&self.show, camera)
     }
 
-    /// Renders each view and compares it with its photograph over the background. `seen(number, view, target, picture)` is called after
+    /// Renders each view and compares it with its photograph over the background. Pixels that a mask ignores do not count in the squared
+    /// error, and are equal to the photograph in SSIM. `seen(number, view, target, picture)` is called after
     /// each view; `target` is the photograph over the background, `[h, w, 3]`.
     ///
     /// Errors if `seen` does; the comparison then stops.
@@ -59,8 +62,9 @@ impl<'a, T: Real> Viewer<'a, T> {
         for (i, view) in views.iter().enumerate() {
             let picture = self.see(&view.camera);
             let target = view.composite(self.background);
-            let (prediction, reference) = (picture.rgb.view(), target.view());
-            let mse = metrics::mse(prediction, reference);
+            let mse = mse(view, &picture.rgb, &target);
+            let compared = kept(view, &picture.rgb, &target);
+            let (prediction, reference) = (picture.rgb.view(), compared.view());
             per_view.push(ViewScore {
                 name: view.name.clone(),
                 psnr: metrics::psnr_of(mse),
@@ -118,6 +122,22 @@ impl Scores {
     }
 }
 
+/// Returns the mean squared error of an image of a view, `[h, w, 3]`, over the pixels that its mask keeps. `target` is the photograph.
+pub(crate) fn mse(view: &View, picture: &Array3<f32>, target: &Array3<f32>) -> f64 {
+    let share = view.mask.as_ref().map_or(1.0, Mask::share);
+    metrics::mse(picture.view(), kept(view, picture, target).view()) / share
+}
+
+/// Returns the photograph with the pixels of the image where the mask ignores them: no error is left there.
+fn kept<'a>(view: &View, picture: &Array3<f32>, target: &'a Array3<f32>) -> Cow<'a, Array3<f32>> {
+    let Some(mask) = &view.mask else { return Cow::Borrowed(target) };
+    let mut kept = target.clone();
+    for ((y, x, c), value) in kept.indexed_iter_mut().filter(|((y, x, _), _)| !mask.keeps(*x, *y)) {
+        *value = picture[[y, x, c]].clamp(0.0, 1.0);
+    }
+    Cow::Owned(kept)
+}
+
 /// Returns the mean PSNR in dB of the plain background against the views, as a baseline.
 pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
     let (width, height) = views.first()?.image.dimensions();
@@ -150,7 +170,7 @@ pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
 pub fn constant_psnr(views: &[View], picture: &Array3<f32>, background: [f32; 3]) -> Option<f64> {
     mean(views.iter().map(|view| {
         let target = view.composite(background);
-        (target.dim() == picture.dim()).then(|| metrics::psnr(picture.view(), target.view()))
+        (target.dim() == picture.dim()).then(|| metrics::psnr_of(mse(view, picture, &target)))
     }))
 }
 
@@ -164,6 +184,24 @@ fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::Intrinsics;
+    use crate::dataset::image::RgbaImage;
+    use glam::DVec3;
+
+    #[test]
+    fn ignored_pixels_do_not_count_in_the_error() {
+        let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(4, 3, 0.7));
+        let gray = |level| RgbaImage::from_pixel(4, 3, [level, level, level, 255].into());
+        let mut view = View { name: String::new(), camera, image: gray(51), depth: None, mask: None };
+        // The image is 0.2 off everywhere, and 0.8 in the first column; photographs are 0.2.
+        let picture = Array3::from_shape_fn((3, 4, 3), |(_, x, _)| if x == 0 { 1.0 } else { 0.4 });
+        let target = view.composite([0.0; 3]);
+        assert!((mse(&view, &picture, &target) - (0.64 + 3.0 * 0.04) / 4.0).abs() < 1e-7);
+        assert_eq!(mse(&view, &picture, &target), metrics::mse(picture.view(), target.view()));
+        view.mask = Some(Mask::new([4, 3], |x, _| x > 0));
+        assert!((mse(&view, &picture, &target) - 0.04).abs() < 1e-7);
+        assert!(constant_psnr(&[view], &picture, [0.0; 3]).is_some_and(|psnr| (psnr - metrics::psnr_of(0.04)).abs() < 1e-5));
+    }
 
     #[test]
     fn means_need_every_value() {

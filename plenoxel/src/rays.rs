@@ -22,7 +22,7 @@ use ndarray::Array3;
 use std::sync::Arc;
 use tiles::Tile;
 
-/// Training pixels of some views: all pixels, or those that can show matter. The order is shuffled in each epoch.
+/// Training pixels of some views: all pixels that their masks keep, or those that can show matter. The order is shuffled in each epoch.
 #[derive(Debug)]
 pub struct RaySource {
     all_views: Arc<[View]>,
@@ -37,14 +37,14 @@ pub struct RaySource {
     /// Tile of every [`apart`](Self::apart)-th pixel; about as many entries as tiles. A binary search for a random pixel would wait for
     /// memory about twelve times.
     guide: Vec<u32>,
-    /// Number of pixels of all views, after reduction.
+    /// Number of pixels of all views that their masks keep, after reduction.
     pixels: u64,
     with_depth: bool,
     channels: Vec<Channel>,
 }
 
 impl RaySource {
-    /// Creates a source of all pixels of `views` over a background. The order depends on the seed.
+    /// Creates a source of all pixels of `views` over a background, but for those that a mask ignores. The order depends on the seed.
     ///
     /// The source owns the views: a `Vec` is moved, an `Arc` is shared, and a slice is copied with its pixels.
     pub fn new(views: impl Into<Arc<[View]>>, background: [f32; 3], seed: u64) -> Self {
@@ -119,7 +119,10 @@ impl RaySource {
         self.reduced.as_deref().unwrap_or(&self.all_views)
     }
 
-    fn set_tiles(&mut self, tiles: Vec<Tile>) {
+    fn set_tiles(&mut self, mut tiles: Vec<Tile>) {
+        if self.views().iter().any(|view| view.mask.is_some()) {
+            tiles = tiles.iter().flat_map(|tile| tile.kept(&self.views()[tile.view as usize])).collect();
+        }
         self.first = vec![0];
         for tile in &tiles {
             self.first.push(self.first[self.first.len() - 1] + tile.pixels() as u64);
@@ -181,7 +184,8 @@ impl RaySource {
         })
     }
 
-    /// Returns the rays of chosen pixels, in the given order: (view, column, row) in the reduced images. Aiming does not restrict them.
+    /// Returns the rays of chosen pixels, in the given order: (view, column, row) in the reduced images. Aiming and masks do not restrict
+    /// them.
     ///
     /// Panics at the caller's line if a pixel is in no view; the message names the first such pixel.
     #[track_caller]

@@ -77,7 +77,11 @@ impl Region {
                 });
                 let rays: Vec<Ray> = corners.filter(|ray| ray.direction.z < 0.0).collect();
                 // A ray ends at z = 1, the infinite distance.
-                let ends = space.rays(&rays).iter().flat_map(|ray| [ray.origin, ray.origin + 2.0 / ray.direction.z * ray.direction]).collect::<Vec<_>>();
+                let ends = space
+                    .rays(&rays)
+                    .iter()
+                    .flat_map(|ray| [ray.origin, ray.origin + 2.0 / ray.direction.z * ray.direction])
+                    .collect::<Vec<_>>();
                 let reach = |axis: usize| ends.iter().map(|end| end[axis].abs()).fold(1.0, f64::max).min(WIDEST);
                 let half = dvec3(reach(0), reach(1), 1.0);
                 Aabb { min: -half, max: half }

@@ -327,7 +327,7 @@ fn run() -> (Config, &'static [View]) {
     let view = |k: usize| {
         let eye = DVec3::new(4.0, k as f64, 1.0);
         let camera = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(4, 4, 0.7));
-        View { name: format!("r_{k}"), camera, image: RgbaImage::from_pixel(4, 4, [90, 80, 70, 255].into()), depth: None }
+        View { name: format!("r_{k}"), camera, image: RgbaImage::from_pixel(4, 4, [90, 80, 70, 255].into()), depth: None, mask: None }
     };
     let config = Config {
         rays_per_step: 8,

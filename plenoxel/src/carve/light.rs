@@ -270,13 +270,15 @@ fn basis(rays: &[Ray], degree: usize) -> Tensor<f32> {
     no_grad(|| sh::basis(&Tensor::from_vec(directions, &[rays.len(), 3]), degree))
 }
 
-/// Returns the pixels that show the object (alpha above 0), view after view, row after row, in batches.
+/// Returns the pixels that show the object (alpha above 0, and kept by the mask), view after view, row after row, in batches.
 pub fn object_pixels(views: &[View]) -> impl Iterator<Item = Vec<Pixel>> + '_ {
     views.chunks(VIEWS).enumerate().flat_map(|(group, views)| {
         let lists = parallel::map_indices(views.len(), |v| {
             let alphas = views[v].image.as_raw().as_chunks::<4>().0;
             let view = (group * VIEWS + v) as u32;
-            let shows = |(i, pixel): (usize, &[u8; 4])| (pixel[3] > 0).then_some(Pixel { view, index: i as u32 });
+            let [width, _] = views[v].size();
+            let is_object = |i: usize, alpha: u8| alpha > 0 && views[v].keeps(i % width, i / width);
+            let shows = |(i, pixel): (usize, &[u8; 4])| is_object(i, pixel[3]).then_some(Pixel { view, index: i as u32 });
             alphas.iter().enumerate().filter_map(shows).collect::<Vec<_>>()
         });
         lists.concat().chunks(BATCH).map(<[Pixel]>::to_vec).collect::<Vec<_>>()

@@ -100,9 +100,9 @@ pub fn by_rays(views: &[View], aabb: Aabb, voxels: [usize; 3], progress: &dyn Fn
     Occupancy::from_masks(aabb, voxels, masks.into_iter().map(AtomicU64::into_inner).collect())
 }
 
-/// Returns true for background pixels.
+/// Returns true for background pixels. Pixels that a mask ignores are none.
 pub(super) fn is_background(view: &View, x: usize, y: usize) -> bool {
-    view.image.get_pixel(x as u32, y as u32).0[3] == 0
+    view.image.get_pixel(x as u32, y as u32).0[3] == 0 && view.keeps(x, y)
 }
 
 fn is_object(view: &View, x: usize, y: usize) -> bool {

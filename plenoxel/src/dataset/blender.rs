@@ -63,7 +63,7 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     let frame = |listed: Listed| {
         let intrinsics = Intrinsics::from_fov_x(size.0, size.1, listed.fov_x).downscaled(options.downscale);
         let camera = Camera { intrinsics, camera_to_world: listed.camera_to_world };
-        Frame { name: listed.name, camera, path: listed.image, full: size }
+        Frame { name: listed.name, camera, path: listed.image, mask: None, orientation: image::Orientation::Stated, full: size }
     };
     let frames = splits.map(|listed| listed.into_iter().map(frame).collect());
     Ok(Dataset {

@@ -6,8 +6,9 @@
 
 mod images;
 
+use super::image::{self, Orientation};
 use super::normalize::Normalization;
-use super::{Dataset, Frame, OpenOptions, Source, Split, image};
+use super::{Dataset, Frame, OpenOptions, Source, Split};
 use crate::camera::{Camera, Intrinsics};
 use crate::error::{Error, Result};
 use glam::{DAffine3, DVec3};
@@ -87,27 +88,28 @@ pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) 
     if let Some(pair) = capture.photos.windows(2).find(|pair| pair[0].name == pair[1].name) {
         return Err(Error::input(root, format!("the image {} has two cameras", pair[0].name), "list each image once"));
     }
-    let sizes: Vec<Result<(usize, usize)>> = capture.photos.par_iter().map(|photo| image::size(&photo.image)).collect();
-    let sizes = sizes.into_iter().collect::<Result<Vec<_>>>()?;
+    let found: Vec<Result<_>> = capture.photos.par_iter().map(fitted).collect();
     let mut resized = 0;
-    for (photo, size) in capture.photos.iter_mut().zip(&sizes) {
-        let stated = (photo.intrinsics.width, photo.intrinsics.height);
-        photo.intrinsics = fitted(&photo.intrinsics, *size).ok_or_else(|| misfit(&photo.image, stated, *size))?;
-        resized += usize::from(stated != *size);
+    let mut images = Vec::new();
+    for (photo, found) in capture.photos.iter_mut().zip(found) {
+        let (orientation, intrinsics) = found?;
+        resized += usize::from((photo.intrinsics.width, photo.intrinsics.height) != (intrinsics.width, intrinsics.height));
+        images.push((orientation, (intrinsics.width, intrinsics.height)));
+        photo.intrinsics = intrinsics;
     }
     if resized > 0 && capture.reduced == 1 {
         capture.notes.push(format!("{resized} images have another size than their cameras state: intrinsics were scaled"));
     }
     let masks = capture.photos.iter().filter(|photo| photo.mask.is_some()).count();
     if masks > 0 {
-        capture.notes.push(format!("the masks of {masks} images are not used"));
+        capture.notes.push(format!("{masks} of {} images have a mask", capture.photos.len()));
     }
     let downscale = (options.downscale / capture.reduced).max(1);
     if capture.reduced > 1 {
         let missing = if options.downscale < capture.reduced { ", for there are no larger ones" } else { "" };
         capture.notes.push(format!("the images are those of images_{}{missing}", capture.reduced));
     }
-    if let Some((photo, size)) = capture.photos.iter().zip(&sizes).find(|(_, size)| downscale > size.0.min(size.1)) {
+    if let Some((photo, (_, size))) = capture.photos.iter().zip(&images).find(|(_, (_, size))| downscale > size.0.min(size.1)) {
         let found = format!("{downscale} is more than the {} x {} pixels of {}", size.0, size.1, photo.name);
         return Err(Error::usage("downscale", found, "use a smaller factor"));
     }
@@ -119,10 +121,10 @@ pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) 
     let names = view_names(&capture.photos);
     let mut frames: [Vec<Frame>; 3] = Default::default();
     let splits = splits(&capture.photos, options);
-    for (((photo, name), full), split) in capture.photos.into_iter().zip(names).zip(sizes).zip(splits) {
+    for (((photo, name), (orientation, full)), split) in capture.photos.into_iter().zip(names).zip(images).zip(splits) {
         let camera_to_world = normalization.to_world.camera(photo.camera_to_world);
         let camera = Camera { intrinsics: photo.intrinsics.downscaled(downscale), camera_to_world };
-        frames[split as usize].push(Frame { name, camera, path: photo.image, full });
+        frames[split as usize].push(Frame { name, camera, path: photo.image, mask: photo.mask, orientation, full });
     }
     if frames[0].is_empty() {
         return Err(Error::input(root, "there is no training view", "list at least one training view"));
@@ -157,8 +159,21 @@ fn check_presence(root: &Path, capture: &mut Capture) -> Result<()> {
     Ok(())
 }
 
+/// Returns the orientation in which an image has the shape that its camera states, and the intrinsics of its size. COLMAP reads images as
+/// stored; programs that turn them as EXIF states come second.
+///
+/// Errors if the image cannot be read, or has another shape.
+fn fitted(photo: &Photo) -> Result<(Orientation, Intrinsics)> {
+    for orientation in [Orientation::Stored, Orientation::Stated] {
+        if let Some(intrinsics) = scaled(&photo.intrinsics, image::size_as(&photo.image, orientation)?) {
+            return Ok((orientation, intrinsics));
+        }
+    }
+    Err(misfit(&photo.image, (photo.intrinsics.width, photo.intrinsics.height), image::size(&photo.image)?))
+}
+
 /// Returns the intrinsics of an image of another size, if it has the same shape.
-fn fitted(k: &Intrinsics, (width, height): (usize, usize)) -> Option<Intrinsics> {
+fn scaled(k: &Intrinsics, (width, height): (usize, usize)) -> Option<Intrinsics> {
     let (sx, sy) = (width as f64 / k.width as f64, height as f64 / k.height as f64);
     let off = (height as f64 - sx * k.height as f64).abs().min((width as f64 - sy * k.width as f64).abs());
     (off <= ROUNDED).then_some(Intrinsics { width, height, fx: sx * k.fx, fy: sy * k.fy, cx: sx * k.cx, cy: sy * k.cy, lens: k.lens })

@@ -75,7 +75,14 @@ pub(super) fn dataset(options: ProceduralOptions) -> Result<Dataset> {
         let frame = |k: usize| {
             let eye = CAMERA_DISTANCE * direction(k, count);
             let camera = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, intrinsics);
-            Frame { name: format!("r_{k}"), camera, path: PathBuf::new(), full: (options.width, options.height) }
+            Frame {
+                name: format!("r_{k}"),
+                camera,
+                path: PathBuf::new(),
+                mask: None,
+                orientation: image::Orientation::Stored,
+                full: (options.width, options.height),
+            }
         };
         (0..count).map(frame).collect()
     });

@@ -1,6 +1,7 @@
 use super::*;
 use crate::camera::{Camera, Intrinsics};
 use crate::dataset::image::RgbaImage;
+use crate::dataset::mask::Mask;
 use crate::dataset::procedural::ProceduralOptions;
 use crate::dataset::{Dataset, Split};
 use ndarray::{Array2, array};
@@ -10,7 +11,7 @@ fn view(pixels: &[[u8; 4]]) -> View {
     let intrinsics = Intrinsics::from_fov_x(pixels.len(), 1, 0.7);
     let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, intrinsics);
     let image = RgbaImage::from_fn(pixels.len() as u32, 1, |x, _| pixels[x as usize].into());
-    View { name: String::new(), camera, image, depth: None }
+    View { name: String::new(), camera, image, depth: None, mask: None }
 }
 
 #[test]
@@ -114,7 +115,7 @@ fn channels_and_depth_of_a_reduced_pixel_are_the_mean_of_its_block() {
         let intrinsics = Intrinsics::from_fov_x(width, 2, 0.7);
         let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, intrinsics);
         let depth = (width == 4).then(|| array![[1.0, 2.0, 5.0, f32::INFINITY], [3.0, 4.0, 5.0, 5.0]]);
-        View { name: format!("r_{width}"), camera, image: image(width as u32), depth }
+        View { name: format!("r_{width}"), camera, image: image(width as u32), depth, mask: None }
     });
     let numbers = |width: usize| Array3::from_shape_fn((2, width, 2), |(y, x, c)| (100 * c + 10 * y + x) as f32);
     let masks = [4, 3].map(|width| Array3::from_elem((2, width, 1), 1.0));
@@ -168,7 +169,7 @@ fn patches_are_squares_of_a_view_anywhere_in_it_and_change_with_step_and_seed() 
     // Views of 6 x 5 and 3 x 3 pixels: 4 x 3 positions of a 3 x 3 patch in the first, one in the second.
     let view = |width: usize, height: usize| {
         let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(width, height, 0.7));
-        View { name: String::new(), camera, image: RgbaImage::new(width as u32, height as u32), depth: None }
+        View { name: String::new(), camera, image: RgbaImage::new(width as u32, height as u32), depth: None, mask: None }
     };
     let source = |seed| RaySource::new([view(6, 5), view(3, 3), view(9, 2)], [1.0; 3], seed);
     let patches = source(1).patches(4, 13_000, 3);
@@ -188,4 +189,28 @@ fn patches_are_squares_of_a_view_anywhere_in_it_and_change_with_step_and_seed() 
     assert!(few == patches[..45] && few != source(1).patches(5, 5, 3) && few != source(2).patches(4, 5, 3));
     let batch = source(1).batch_of::<f64>(&few);
     assert_eq!(batch.target.reshape(&[5, 3, 3, 3]).shape(), [5, 3, 3, 3]);
+}
+
+#[test]
+fn ignored_pixels_are_never_trained_and_the_others_once_in_an_epoch() {
+    let intrinsics = Intrinsics::from_fov_x(13, 6, 0.7);
+    let camera = Camera::look_at(DVec3::X * 3.0, DVec3::ZERO, DVec3::Z, intrinsics);
+    let view = |mask| View { name: String::new(), camera, image: RgbaImage::new(13, 6), depth: None, mask };
+    let mask = Mask::new([13, 6], |x, y| (x + 2 * y) % 5 > 1 && y != 3);
+    let kept = mask.kept();
+    let mut source = RaySource::new(vec![view(None), view(Some(mask.clone())), view(None)], [0.0; 3], 3);
+    let check = |source: &RaySource, expected: u64| {
+        assert_eq!(source.len(), expected);
+        let batch = source.batch::<f32>(0, expected as usize);
+        let mut seen: Vec<(u32, [u32; 2])> = batch.view.iter().copied().zip(batch.pixel.iter().copied()).collect();
+        assert!(seen.iter().all(|&(v, [x, y])| v != 1 || mask.keeps(x as usize, y as usize)));
+        seen.sort_unstable();
+        seen.dedup();
+        assert_eq!(seen.len() as u64, expected);
+    };
+    check(&source, (2 * 13 * 6 + kept) as u64);
+    // Aimed at the whole box, which all pixels show.
+    source.aim_at(&Occupancy::new(Aabb::cube(2.0), [4; 3], &[true; 64]));
+    check(&source, (2 * 13 * 6 + kept) as u64);
+    assert_eq!(source.share(), 1.0);
 }

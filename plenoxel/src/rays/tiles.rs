@@ -30,6 +30,17 @@ impl Tile {
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }
+
+    /// Returns the parts of the tile that the mask of its view keeps: itself without a mask, otherwise runs of its rows.
+    pub fn kept(self, view: &View) -> Vec<Self> {
+        let Some(mask) = &view.mask else { return vec![self] };
+        let (from, to) = (self.x as usize, (self.x + self.width) as usize);
+        let of_row = |y: u32| {
+            let run = move |(x, width): (usize, usize)| Tile { x: x as u32, y, width: width as u32, height: 1, ..self };
+            mask.runs(y as usize, from, to).map(run)
+        };
+        (self.y..self.y + self.height).flat_map(of_row).collect()
+    }
 }
 
 /// Returns the tiles that intersect the bounding rectangle of a projected brick of cells. If a brick is beside or behind a camera, or

@@ -8,6 +8,7 @@
 use super::model::check_kind;
 use super::{Model, TrainOptions, Trainer, plan};
 use crate::dataset::View;
+use crate::dataset::mask::Mask;
 use crate::error::{Error, Result};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use autograd::optim::{Optimizer, Remembered};
@@ -227,7 +228,7 @@ fn of_optimizer<T: Real>(prefix: &str, param: &Param<T>, i: usize) -> String {
     format!("{prefix}{}.optimizer.{i}", param.name())
 }
 
-/// Returns a hash of cameras and pixels: the FNV-1a hash of the hashes of the views.
+/// Returns a hash of cameras, pixels and masks: the FNV-1a hash of the hashes of the views.
 fn fingerprint(views: &[View]) -> String {
     const BASIS: u64 = 0xcbf2_9ce4_8422_2325;
     let more = |hash: u64, word: u64| (hash ^ word).wrapping_mul(0x0000_0100_0000_01b3);
@@ -235,7 +236,8 @@ fn fingerprint(views: &[View]) -> String {
         let camera = format!("{:?}", views[v].camera);
         let hash = camera.bytes().fold(BASIS, |hash, byte| more(hash, byte.into()));
         let pixels = views[v].image.as_raw().chunks(8);
-        pixels.fold(hash, |hash, eight| more(hash, eight.iter().fold(0, |word, &byte| word << 8 | u64::from(byte))))
+        let hash = pixels.fold(hash, |hash, eight| more(hash, eight.iter().fold(0, |word, &byte| word << 8 | u64::from(byte))));
+        views[v].mask.iter().flat_map(Mask::bytes).fold(hash, |hash, keeps| more(hash, keeps.into()))
     });
     format!("{:016x}", hashes.into_iter().fold(BASIS, more))
 }

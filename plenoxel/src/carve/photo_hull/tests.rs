@@ -45,7 +45,7 @@ fn views(count: usize, pit: bool, opaque: bool) -> Vec<View> {
             let color = meets(&ray, pit).map(paint).or_else(|| opaque.then(|| surroundings(ray.direction)));
             color.map_or([0; 4], |[r, g, b]| [r, g, b, 1.0].map(|value| (255.0 * value).round() as u8)).into()
         });
-        View { name: k.to_string(), camera, image, depth: None }
+        View { name: k.to_string(), camera, image, depth: None, mask: None }
     };
     (0..count).map(view).collect()
 }

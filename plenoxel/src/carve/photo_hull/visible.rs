@@ -3,12 +3,13 @@
 use crate::dataset::View;
 use crate::geometry::Aabb;
 use crate::sampling::walk::Walk;
+use ::image::Rgba;
 use autograd::lattice::{BRICK_ROWS, BrickGrid, has};
 use autograd::parallel;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// The ray meets no voxel, or its pixel is background.
+/// The ray meets no voxel, or its pixel is background or ignored by the mask.
 const NOTHING: u32 = u32::MAX;
 /// The ray has not been traversed yet.
 const UNKNOWN: u32 = u32::MAX - 1;
@@ -35,8 +36,14 @@ impl<'a> FirstVoxels<'a> {
             BrickGrid::new(voxels).len() * BRICK_ROWS < UNKNOWN as usize,
             "photo hull: {voxels:?} voxels cannot be numbered with 32 bits"
         );
-        let of_alpha = |&alpha: &u8| if alpha == 0 { NOTHING } else { UNKNOWN };
-        let numbers = views.iter().map(|view| view.image.as_raw().iter().skip(3).step_by(4).map(of_alpha).collect()).collect();
+        let of_view = |view: &View| {
+            let of_pixel = |(x, y, pixel): (u32, u32, &Rgba<u8>)| match pixel.0[3] > 0 && view.keeps(x as usize, y as usize) {
+                true => UNKNOWN,
+                false => NOTHING,
+            };
+            view.image.enumerate_pixels().map(of_pixel).collect()
+        };
+        let numbers = views.iter().map(of_view).collect();
         FirstVoxels { views, walk: Walk::new(aabb, voxels), numbers }
     }
 

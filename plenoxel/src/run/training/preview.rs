@@ -4,10 +4,11 @@
 
 use crate::camera::{Camera, Intrinsics};
 use crate::dataset::image::RgbaImage;
+use crate::dataset::mask::Mask;
 use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
-use crate::evaluate::Viewer;
-use crate::metrics::psnr;
+use crate::evaluate::{Viewer, mse};
+use crate::metrics::psnr_of;
 use crate::run::evenly_spaced;
 use ndarray::Array3;
 use std::time::Instant;
@@ -91,7 +92,7 @@ impl Preview {
         let viewer = viewer();
         let psnr = self.views.iter().map(|view| {
             let (picture, target) = (viewer.see(&view.camera).rgb, view.composite(background));
-            psnr(picture.view(), target.view())
+            psnr_of(mse(view, &picture, &target))
         });
         let sum: f64 = psnr.sum();
         let psnr = (!self.views.is_empty()).then(|| sum / self.views.len() as f64);
@@ -122,7 +123,10 @@ fn thinned(view: &View, side: usize) -> View {
         cy: moved(all.cy),
         lens: all.lens,
     };
-    View { name: view.name.clone(), camera: Camera { intrinsics, ..view.camera }, image, depth: None }
+    let size = [intrinsics.width, intrinsics.height];
+    let (k, first) = (k as usize, first as usize);
+    let mask = view.mask.as_ref().map(|mask| Mask::new(size, |x, y| mask.keeps(k * x + first, k * y + first)));
+    View { name: view.name.clone(), camera: Camera { intrinsics, ..view.camera }, image, depth: None, mask }
 }
 
 /// Downscales a view to at most `side` pixels per side, without the last columns and rows that do not fill a pixel.
@@ -133,7 +137,8 @@ fn reduced(view: &View, side: usize) -> View {
     let image = RgbaImage::from_fn(whole(width), whole(height), |x, y| *view.image.get_pixel(x, y));
     let (width, height) = (image.width() as usize, image.height() as usize);
     let camera = Camera { intrinsics: Intrinsics { width, height, ..view.camera.intrinsics }, ..view.camera };
-    View { name: view.name.clone(), camera, image, depth: None }.reduced(k as usize)
+    // Only looked at, so that no mask is needed.
+    View { name: view.name.clone(), camera, image, depth: None, mask: None }.reduced(k as usize)
 }
 
 /// Schedule of previews: at intervals, checkpoints and stage ends, within a small share of the time.
