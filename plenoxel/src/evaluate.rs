@@ -146,12 +146,15 @@ pub fn background_psnr(views: &[View], background: [f32; 3]) -> Option<f64> {
     constant_psnr(views, &plain, background)
 }
 
-/// Returns the mean image of the views over a background, `[h, w, 3]`; `None` if there are no views. Panics unless all views have one size.
+/// Returns the mean image of the views over a background, `[h, w, 3]`; `None` if there are no views, or if they have
+/// different sizes, as in a capture.
 ///
 /// Needs no memory beyond the result.
 pub fn mean_image(views: &[View], background: [f32; 3]) -> Option<Array3<f32>> {
     let [width, height] = views.first()?.size();
-    assert!(views.iter().all(|view| view.size() == [width, height]), "mean_image: the views have different sizes");
+    if views.iter().any(|view| view.size() != [width, height]) {
+        return None;
+    }
     let mut mean = vec![0.0; 3 * width * height];
     mean.par_chunks_mut(3 * width).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.as_chunks_mut::<3>().0.iter_mut().enumerate() {
