@@ -12,7 +12,8 @@ fn plenoxel(args: &[&str]) -> Answer {
     command::plenoxel(&[args, &["--max-memory", "400MB", "--quiet"]].concat())
 }
 
-const PRESETS: [&str; 11] = ["fast", "quality", "voxels", "tensorf", "dvgo", "ngp", "nerf", "plenoxels", "paper", "demo", "carve"];
+const PRESETS: [&str; 12] =
+    ["fast", "quality", "photos", "voxels", "tensorf", "dvgo", "ngp", "nerf", "plenoxels", "paper", "demo", "carve"];
 
 /// Assignments that keep all that a preset does and make it small: grids, steps and rays.
 fn shortened(preset: &str) -> Vec<String> {
@@ -31,17 +32,24 @@ fn shortened(preset: &str) -> Vec<String> {
     let of_field = count("[[tensorf.stages]]");
     all.extend(of("tensorf.stages", of_field, 12));
     all.extend((0..of_field).map(|i| format!("tensorf.stages[{i}].rays=200")));
-    all.extend(["rays_per_step=200".to_owned(), "carve.resolution=20".to_owned()]);
+    if of_field > 0 {
+        // So few steps make little opaque.
+        all.push("tensorf.occupied_above=1e-4".to_owned());
+    }
+    all.push("carve.resolution=20".to_owned());
     let of_fine = count("[[dvgo.fine]]");
     all.extend(of("dvgo.fine", of_fine, 12));
     all.extend((0..of_fine).map(|i| format!("dvgo.fine[{i}].rays=200")));
-    // So few steps make little opaque.
     let others = [
         ("[dvgo]", &["dvgo.coarse={resolution=12, steps=40, rays=200}", "dvgo.coarse_opacity=1e-2", "dvgo.occupied_above=1e-4"][..]),
         ("[ngp]", &["ngp.stages=[{steps=12, rays=200}]", "ngp.log2_rows=8", "ngp.cells=16", "ngp.refresh_all_until=4"]),
         ("[nerf]", &["nerf.steps=4", "nerf.rays=50", "nerf.width=16", "nerf.decay_steps=4"]),
     ];
-    let shorter = others.into_iter().filter(|(table, _)| count(table) > 0).flat_map(|(_, settings)| settings);
+    let others: Vec<_> = others.into_iter().filter(|(table, _)| count(table) > 0).collect();
+    if of_field == 0 && others.is_empty() {
+        all.push("rays_per_step=200".to_owned());
+    }
+    let shorter = others.into_iter().flat_map(|(_, settings)| settings);
     all.extend(shorter.map(|setting| (*setting).to_owned()));
     all
 }

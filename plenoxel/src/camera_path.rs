@@ -3,6 +3,7 @@
 //! | path | recognised by | world frame | between entries |
 //! | --- | --- | --- | --- |
 //! | [`Turntable`] | | dataset | |
+//! | [`along_cameras`] | | dataset | B-splines, as in instant-ngp |
 //! | instant-ngp `base_cam.json` | `path` | instant-ngp's, converted | B-splines, as in instant-ngp |
 //! | nerfstudio `camera_path.json` | `camera_path` | as in the file | nothing: entries are frames |
 //! | `transforms.json` | `frames` | as in the file | nothing: entries are frames |
@@ -127,6 +128,15 @@ impl Shot {
         let rotation = rotation(self).slerp(rotation(other), t);
         Shot { camera_to_world: DAffine3::from_rotation_translation(rotation, position), fov: self.fov.lerp(other.fov, t) }
     }
+}
+
+/// Returns `frames` frames along the cameras of a capture, in their order: a cubic B-spline over at most 24 of them, evenly spaced in the
+/// list, so that the shakes of a hand-held camera are smoothed. Empty if there are no cameras.
+pub fn along_cameras(cameras: &[Camera], frames: usize) -> Vec<Shot> {
+    const KEYS: usize = 24;
+    let count = cameras.len().min(KEYS);
+    let keys: Vec<Camera> = (0..count).map(|i| cameras[i * cameras.len() / count]).collect();
+    if keys.is_empty() { Vec::new() } else { Keyframes::over(&keys).shots(frames.clamp(1, MOST_FRAMES)) }
 }
 
 /// File format of a path.

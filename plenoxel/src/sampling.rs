@@ -29,7 +29,7 @@ pub enum Spacing {
     /// the chord. Jitter shifts the steps by a fraction of a step.
     Step(f64),
     /// Steps of this length in the contracted space ([`Space::Contracted`](crate::space::Space::Contracted)), from the near plane to
-    /// infinity. t of a sample is then not its distance from the origin, but s ([`Bend`](crate::space::Bend)), whose steps are even; `delta` are lengths
+    /// infinity. t of a sample is then not its distance from the origin, but s ([`Bend`]), whose steps are even; `delta` are lengths
     /// of s. Jitter shifts the steps by a fraction of a step.
     Contracted(f64),
     /// Spacing of the source paper: `samples` points evenly spaced over t ∈ [0, far], where t is measured along the direction whose camera

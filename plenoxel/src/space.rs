@@ -90,15 +90,15 @@ impl Region {
         Region { space, aabb }
     }
 
-    /// Returns the box, for a model that is trained in a box of the world only. `kind` names the model.
+    /// Returns the box, for a model or a command that knows a box of the world only. `what` names it.
     ///
     /// Errors if the space is another one.
-    pub fn in_box(&self, kind: &str) -> Result<Aabb> {
+    pub fn in_box(&self, what: &str) -> Result<Aabb> {
         if self.space == Space::Box {
             return Ok(self.aabb);
         }
-        let found = format!("the model `{kind}` is trained in a box, and the space of this capture is {}", self.space);
-        Err(Error::usage("space", found, "use the preset photos, or set it to box and half_width to the size of the object"))
+        let found = format!("`{what}` needs a box of the world, and the space of this capture is {}", self.space);
+        Err(Error::usage("space", found, "use the preset photos, or set it to box, and half_width to the size of the object"))
     }
 }
 

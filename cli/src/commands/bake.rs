@@ -96,7 +96,8 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     estimate.check()?;
     let (trained, about) = model::open(&path, &config)?;
     let Some(field) = trained.content().and_then(|content| content.downcast_ref::<Factored<f32>>()) else {
-        return Err(Error::input(&path, "the model has no factored field", "use a run of preset tensorf"));
+        let found = "the model has no factored field in a box of the world";
+        return Err(Error::input(&path, found, "use a run of preset quality, not of photos"));
     };
 
     let options = BakeOptions { resolution: args.resolution.unwrap_or_else(|| resolution_of(field)), degree: args.sh_degree };

@@ -7,6 +7,7 @@ use plenoxel::error::Result;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::machine;
+use plenoxel::space::Space;
 
 /// Describes the loading of a split.
 pub fn loading(split: Split, source: &DataSource) -> String {
@@ -26,13 +27,20 @@ pub fn load(console: &Console<'_>, dataset: &Dataset, split: Split, source: &Dat
 pub fn announce(console: &Console<'_>, dataset: &Dataset, config: &Config) {
     let (width, height) = dataset.size();
     let [train, val, test] = Split::ALL.map(|split| dataset.count(split));
+    // Other spaces are as large as what the cameras see.
+    let half_width = if dataset.space() == Space::Box { format!(", half width {}", config.half_width) } else { String::new() };
     console.note(&format!(
-        "scene: {}, {}, {train} train, {val} val, {test} test views of {width} x {height}, background {}, half width {}",
+        "scene: {}, {}, {train} train, {val} val, {test} test views of {width} x {height}, background {}{half_width}",
         dataset.name(),
         dataset.format(),
         background_name(config.background),
-        config.half_width,
     ));
+    for note in dataset.notes() {
+        console.note(&format!("note: {note}"));
+    }
+    for (what, choice) in dataset.normalization().describe() {
+        console.note(&format!("{what}: {choice}"));
+    }
     let threads = machine::threads();
     console.note(&format!("machine: {}, {threads} thread{}", machine::instruction_set(), if threads == 1 { "" } else { "s" }));
 }

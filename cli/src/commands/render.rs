@@ -14,7 +14,7 @@ use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::model::plenoxels::Plenoxels;
-use plenoxel::model::voxel_grid;
+use plenoxel::model::{self, voxel_grid};
 use plenoxel::run::memory::Estimate;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -49,7 +49,7 @@ pub struct RenderArgs {
     #[command(flatten)]
     path: PathArgs,
 
-    /// Channels to render, separated by commas [default: all for views, color for paths]
+    /// Channels to render, separated by commas [default: all for views, without normals if the model has no voxels; color for paths]
     #[arg(long, value_enum, value_name = "KINDS", value_delimiter = ',', help_heading = "Output")]
     channels: Vec<Channel>,
 
@@ -73,7 +73,9 @@ fn views(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
     let (cameras, names) = (dataset.cameras(split), dataset.view_names(split));
     let shots = choose(&dataset, split, &args.view)?.into_iter();
     let shots = shots.map(|number| (cameras[number], found.folder.render(&format!("{split}_{number:03}_{}", names[number])))).collect();
-    let views = render(args, &found, console, shots, &Channel::ALL, || found.folder.create_renders())?;
+    let has_voxels = model::kind(&found.folder.existing_checkpoint()?)? == model::plenoxels::KIND;
+    let default: Vec<Channel> = Channel::ALL.into_iter().filter(|channel| has_voxels || *channel != Channel::Normal).collect();
+    let views = render(args, &found, console, shots, &default, || found.folder.create_renders())?;
     let what = if views == 1 { "view" } else { "views" };
     console.result(&format!("rendered {views} {split} {what} to {}", found.folder.render("").display()))
 }

@@ -1,6 +1,7 @@
 //! instant-ngp's `base_cam.json`: keyframes in instant-ngp's world frame, interpolated by splines.
 
 use super::{CameraPath, Entries, Entry, Format, Fov, Shot};
+use crate::camera::Camera;
 use crate::error::Result;
 use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
 
@@ -73,6 +74,17 @@ fn to_dataset(rotation: DMat3, position: DVec3) -> DAffine3 {
 }
 
 impl Keyframes {
+    /// Returns a cubic spline over cameras, of which there must be at least one, at equal times.
+    pub fn over(cameras: &[Camera]) -> Self {
+        let key = |camera: &Camera| Keyframe {
+            rotation: DQuat::from_mat3(&camera.camera_to_world.matrix3).normalize(),
+            position: camera.position(),
+            fov: 2.0 * (0.5 * camera.intrinsics.height as f64 / camera.intrinsics.fy).atan(),
+        };
+        let times = (1..=cameras.len()).map(|k| k as f64).collect();
+        Keyframes { keys: cameras.iter().map(key).collect(), times, looped: false, order: 3 }
+    }
+
     pub fn len(&self) -> usize {
         self.keys.len()
     }

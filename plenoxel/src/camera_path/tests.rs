@@ -175,3 +175,26 @@ fn damaged_bytes_are_read_or_refused_and_what_is_read_is_finite() {
         }
     }
 }
+
+#[test]
+fn a_path_along_cameras_begins_and_ends_near_the_first_and_last_and_stays_among_them() {
+    let intrinsics = Intrinsics::from_fov_x(40, 30, 0.9);
+    let around = |k: u32| {
+        let angle = f64::from(k) * 0.02;
+        Camera::look_at(DVec3::new(2.0 * angle.cos(), 2.0 * angle.sin(), 0.3), DVec3::ZERO, DVec3::Z, intrinsics)
+    };
+    let cameras: Vec<Camera> = (0..100).map(around).collect();
+    let shots = along_cameras(&cameras, 50);
+    assert_eq!(shots.len(), 50);
+    let camera = |i: usize| shots[i].camera((40, 30));
+    assert!(
+        (camera(0).position() - cameras[0].position()).length() < 0.2 && (camera(49).position() - cameras[99].position()).length() < 0.3
+    );
+    for i in 0..50 {
+        assert!((camera(i).position().truncate().length() - 2.0).abs() < 0.02 && (camera(i).position().z - 0.3).abs() < 1e-9);
+        assert!((camera(i).intrinsics.fx - intrinsics.fx).abs() < 1e-9);
+        let (x, y, _) = camera(i).project(DVec3::ZERO).expect("the origin is in front");
+        assert!((x - 20.0).abs() < 0.5 && (y - 15.0).abs() < 0.5, "frame {i} looks elsewhere: {x} {y}");
+    }
+    assert!(along_cameras(&[], 10).is_empty() && along_cameras(&cameras[..1], 3).len() == 3);
+}

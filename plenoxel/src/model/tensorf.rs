@@ -249,9 +249,9 @@ impl<T: Real> Model<T> for Tensorf<T> {
         self.aim(rays);
     }
 
-    /// Returns the field, a [`Factored<T>`].
+    /// Returns the field, a [`Factored<T>`], if its box is a box of the world.
     fn content(&self) -> Option<&dyn Any> {
-        Some(&self.field)
+        (self.space == Space::Box).then_some(&self.field as &dyn Any)
     }
 
     fn settings(&self) -> Value {

@@ -6,7 +6,7 @@ use crate::commands::whole;
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::camera::Camera;
-use plenoxel::camera_path::{CameraPath, MOST_FRAMES, Turntable};
+use plenoxel::camera_path::{CameraPath, MOST_FRAMES, Turntable, along_cameras};
 use plenoxel::dataset::{Dataset, Split, image};
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
@@ -24,15 +24,17 @@ const SIDE: usize = 400;
 pub enum PathChoice {
     Orbit,
     Spiral,
+    Cameras,
     File(PathBuf),
 }
 
 /// A camera path, and the size and rate of its frames.
 #[derive(Debug, Args)]
 pub struct PathArgs {
-    /// Render a video along a camera path: orbit (one turn around the scene), spiral (two turns, rising and falling), or the cameras of a JSON
-    /// file: base_cam.json of instant-ngp, camera_path.json of nerfstudio, or any transforms.json
-    #[arg(long, value_name = "orbit|spiral|FILE", help_heading = "Path", value_parser = choice)]
+    /// Render a video along a camera path: orbit (one turn around the scene), spiral (two turns, rising and falling), cameras (along the
+    /// training views; the path for captures), or the cameras of a JSON file: base_cam.json of instant-ngp, camera_path.json of nerfstudio, or
+    /// any transforms.json
+    #[arg(long, value_name = "orbit|spiral|cameras|FILE", help_heading = "Path", value_parser = choice)]
     pub path: Option<PathChoice>,
 
     /// Number of frames [default: that of the file, or 120]
@@ -62,7 +64,7 @@ impl PathArgs {
     pub fn film(&self, path: &PathChoice, run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Film> {
         let file = match path {
             PathChoice::File(path) => Some((path, read(path)?)),
-            PathChoice::Orbit | PathChoice::Spiral => None,
+            PathChoice::Orbit | PathChoice::Spiral | PathChoice::Cameras => None,
         };
         let in_file = file.as_ref().and_then(|(_, path)| path.size);
         let views = match (&file, self.size.or(in_file)) {
@@ -81,6 +83,17 @@ impl PathArgs {
                 (stem(file), path.shots(frames))
             }
             (None, PathChoice::Spiral) => ("spiral".to_owned(), table()?.spiral(self.frames.unwrap_or(FRAMES))),
+            (None, PathChoice::Cameras) => {
+                let cameras = views.as_ref().map(|views| views.cameras(Split::Train)).unwrap_or_default();
+                if cameras.is_empty() {
+                    return Err(Error::usage(
+                        "--path",
+                        "cameras needs the views of the run, which cannot be read",
+                        "give their folder with --data",
+                    ));
+                }
+                ("cameras".to_owned(), along_cameras(&cameras, self.frames.unwrap_or(FRAMES)))
+            }
             (None, _) => ("orbit".to_owned(), table()?.orbit(self.frames.unwrap_or(FRAMES))),
         };
         console.note(&format!("frames: {} of {} x {} pixels", shots.len(), size.0, size.1));
@@ -106,7 +119,7 @@ fn read(path: &Path) -> Result<CameraPath> {
         return Err(Error::usage(
             "--path",
             format!("the file {} does not exist", path.display()),
-            "expected orbit, spiral, or a JSON file of cameras",
+            "expected orbit, spiral, cameras, or a JSON file of cameras",
         ));
     }
     CameraPath::parse(path, &files::read_named(path, files::CAMERA_PATH)?)
@@ -131,9 +144,10 @@ fn stem(path: &Path) -> String {
 
 fn choice(text: &str) -> std::result::Result<PathChoice, String> {
     match text {
-        "" => Err("expected orbit, spiral, or a JSON file of cameras".to_owned()),
+        "" => Err("expected orbit, spiral, cameras, or a JSON file of cameras".to_owned()),
         "orbit" => Ok(PathChoice::Orbit),
         "spiral" => Ok(PathChoice::Spiral),
+        "cameras" => Ok(PathChoice::Cameras),
         file => Ok(PathChoice::File(file.into())),
     }
 }

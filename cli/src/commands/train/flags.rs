@@ -156,7 +156,7 @@ pub struct TrainArgs {
     sh_degree: Option<i64>,
 
     /// Store view-dependent color (harmonics of degree 1 and higher) on an N times coarser grid, which saves memory and time
-    /// [default: 4; presets voxels: 3, demo, plenoxels, paper, quality, tensorf, dvgo, ngp and nerf: 1]
+    /// [default: 4; presets voxels: 3, demo, plenoxels, paper, quality, photos, tensorf, dvgo, ngp and nerf: 1]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<i64>(1, 64), allow_negative_numbers = true)]
     sh_reduction: Option<i64>,
 
@@ -166,7 +166,7 @@ pub struct TrainArgs {
     init_from: Option<PathBuf>,
 
     /// Use of the alpha channel of images: auto computes the visual hull of the silhouettes for the size of the box and the initial voxels; off
-    /// uses alpha for compositing only [default: auto; presets paper, plenoxels, dvgo and nerf: off]
+    /// uses alpha for compositing only [default: auto; presets paper, plenoxels, photos, dvgo and nerf: off]
     #[arg(long, help_heading = "Training", value_parser = ["auto", "off"])]
     hull: Option<String>,
 

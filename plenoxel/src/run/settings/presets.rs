@@ -33,7 +33,7 @@ pub const PRESETS: [Preset; 11] = [
     },
     Preset {
         name: "photos",
-        purpose: "captures of the real world, with their surroundings; the default of `train` for them",
+        purpose: "captures of the real world; the default of `train` for them",
         time: "about 11 min at 1000 x 750",
         text: include_str!("../../../presets/photos.toml"),
     },
