@@ -14,7 +14,7 @@ use super::stage::MOST_NODES;
 use crate::camera::Ray;
 use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::field::factored::Factored;
 use crate::field::grouping::Grouping;
 use crate::geometry::Aabb;
@@ -233,11 +233,11 @@ impl<T: Real> Model<T> for Tensorf<T> {
                 self.field.make_opaque();
             }
         } else {
+            // A field that is still thin everywhere, after few steps, keeps the cells that were sampled.
             let occupied = self.occupied();
-            if occupied.fraction() == 0.0 {
-                return Err(Error::usage("occupied_above", "no cell is this opaque", "use a smaller opacity"));
+            if occupied.fraction() > 0.0 {
+                self.field.occupied = Some(occupied);
             }
-            self.field.occupied = Some(occupied);
         }
         self.aim(rays);
         let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
