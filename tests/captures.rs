@@ -1,4 +1,4 @@
-//! What a user sees when opening captures: the same cameras in every format, and the message for everything that can be wrong.
+//! Opening captures: the same cameras in every format, and the message for everything that can be wrong.
 
 #[path = "support/captures.rs"]
 mod support;
@@ -290,7 +290,7 @@ const CAMERAS: &str = "sparse/0/cameras.bin";
 const IMAGES: &str = "sparse/0/images.bin";
 const POINTS: &str = "sparse/0/points3D.bin";
 
-/// Of the binary form. A camera has 56 bytes after the first 8. An image has 4 + 56 + 4 bytes, 8 of the name, and 8 + 48 of points.
+/// Broken binary files of COLMAP. A camera has 56 bytes after the first 8. An image has 4 + 56 + 4 bytes, 8 of the name, and 8 + 48 of points.
 const BINARY: &[Broken] = &[
     (|f, _| cut(f, CAMERAS, 0), &["cameras.bin", "ends within cameras"]),
     (|f, _| cut(f, CAMERAS, 20), &["cameras.bin", "9 cameras, and 12 bytes"]),
@@ -335,7 +335,7 @@ const BINARY: &[Broken] = &[
     (|f, _| f.write("images/r_4.png", b"not an image"), &["r_4.png"]),
 ];
 
-/// Of the text form.
+/// Broken text files of COLMAP.
 const TEXT: &[Broken] = &[
     (|f, _| f.edit("sparse/0/cameras.txt", "PINHOLE", "PINHOL"), &["cameras.txt: line 2", "unknown model \"PINHOL\"", "SIMPLE_PINHOLE"]),
     (|f, _| f.edit("sparse/0/cameras.txt", "PINHOLE", "OPENCV"), &["cameras.txt", "camera 7", "4 parameters", "8 of the model OPENCV"]),
@@ -347,7 +347,7 @@ const TEXT: &[Broken] = &[
     (|f, _| f.edit("sparse/0/points3D.txt", "10 20 30", "10 20 300"), &["points3D.txt: line 1", "blue is \"300\""]),
 ];
 
-/// Of poses_bounds.npy.
+/// Broken LLFF captures.
 const LLFF: &[Broken] = &[
     (|f, _| cut(f, "poses_bounds.npy", 5), &["poses_bounds.npy", "not a NumPy file"]),
     (|f, _| cut(f, "poses_bounds.npy", 30), &["ends within its header"]),
@@ -360,7 +360,7 @@ const LLFF: &[Broken] = &[
     (|f, v| f.write("poses_bounds.npy", poses_npy(&v[..8], [1.0, 2.0])), &["8 poses, but 9 images"]),
 ];
 
-/// Of transforms.json.
+/// Broken transforms.json files.
 const JSON: &[Broken] = &[
     (|f, _| cut(f, "transforms.json", 200), &["transforms.json", "ends early"]),
     (|f, _| f.edit("transforms.json", "\"frames\"", "\"views\""), &["no list \"frames\""]),
@@ -392,7 +392,7 @@ const JSON: &[Broken] = &[
     ),
 ];
 
-/// Of NSVF.
+/// Broken NSVF captures.
 const NSVF: &[Broken] = &[
     (|f, _| f.write("intrinsics.txt", ""), &["intrinsics.txt", "no matrix of intrinsics"]),
     (|f, _| f.write("intrinsics.txt", "nan 0 8 0"), &["intrinsics.txt", "line 1 has \"nan\""]),

@@ -32,14 +32,11 @@ fn shortened(preset: &str) -> Vec<String> {
     let of_field = count("[[tensorf.stages]]");
     all.extend(of("tensorf.stages", of_field, 12));
     all.extend((0..of_field).map(|i| format!("tensorf.stages[{i}].rays=200")));
-    if of_field > 0 {
-        // So few steps make little opaque.
-        all.push("tensorf.occupied_above=1e-4".to_owned());
-    }
     all.push("carve.resolution=20".to_owned());
     let of_fine = count("[[dvgo.fine]]");
     all.extend(of("dvgo.fine", of_fine, 12));
     all.extend((0..of_fine).map(|i| format!("dvgo.fine[{i}].rays=200")));
+    // So few steps make little opaque.
     let others = [
         ("[dvgo]", &["dvgo.coarse={resolution=12, steps=40, rays=200}", "dvgo.coarse_opacity=1e-2", "dvgo.occupied_above=1e-4"][..]),
         ("[ngp]", &["ngp.stages=[{steps=12, rays=200}]", "ngp.log2_rows=8", "ngp.cells=16", "ngp.refresh_all_until=4"]),

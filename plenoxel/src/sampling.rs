@@ -65,14 +65,15 @@ impl Jitter {
     }
 }
 
-/// Packed samples of n rays, m in total.
+/// Packed samples of n rays, m in total. Lengths and positions are those of the box ([`Space`](crate::space::Space)), which are the world's in
+/// [`Space::Box`](crate::space::Space::Box).
 #[derive(Debug, Clone)]
 pub struct Samples<T: Real> {
-    /// Distance of the sample from the ray's origin, `[m]`, world length.
+    /// Distance of the sample from the ray's origin, `[m]`; s of [`Bend`] with [`Spacing::Contracted`].
     pub t: Tensor<T>,
-    /// Length of the sample's interval, `[m]`, world length.
+    /// Length of the sample's interval, `[m]`.
     pub delta: Tensor<T>,
-    /// Position, `[m, 3]`, world frame.
+    /// Position, `[m, 3]`.
     pub positions: Tensor<T>,
     /// Unit direction of each ray, `[n, 3]`.
     pub directions: Tensor<T>,

@@ -34,6 +34,17 @@ impl Space {
     /// Half width of the box of [`Space::Contracted`].
     pub const CONTRACTED: f64 = 2.0;
 
+    /// Checks that the box is one of the world, for a model or a command that knows no other. `what` names it.
+    ///
+    /// Errors if the space is another one.
+    pub fn require_box(&self, what: &str) -> Result<()> {
+        if *self == Space::Box {
+            return Ok(());
+        }
+        let found = format!("`{what}` needs a box of the world, and the space of this capture is {self}");
+        Err(Error::usage("space", found, "use the preset photos, or set space to box, and half_width to the size of the object"))
+    }
+
     /// Returns rays in the coordinates of the box, if they are straight there. For [`Space::Contracted`] they are those of the world;
     /// [`Spacing::Contracted`](crate::sampling::Spacing::Contracted) bends them.
     ///
@@ -58,11 +69,6 @@ pub struct Region {
 }
 
 impl Region {
-    /// Returns a cube of the world around the origin.
-    pub fn cube(half_width: f64) -> Self {
-        Region { space: Space::Box, aabb: Aabb::cube(half_width) }
-    }
-
     /// Returns the region that cameras see in a space: a cube of the world with this half width; the whole contracted world; the part of
     /// normalized device coordinates that the rays of the image corners cross, at most 3 times as wide as the image of the reference camera.
     pub fn of(space: Space, cameras: &[Camera], half_width: f64) -> Self {
@@ -72,8 +78,9 @@ impl Region {
             Space::Contracted => Aabb::cube(Space::CONTRACTED),
             Space::Ndc { .. } => {
                 let corners = cameras.iter().flat_map(|camera| {
-                    let [width, height] = [camera.intrinsics.width, camera.intrinsics.height].map(|n| n as f64);
-                    [[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]].map(|[x, y]| camera.ray(x, y))
+                    // Centers of pixels: beyond them a lens may fold over.
+                    let [right, bottom] = [camera.intrinsics.width, camera.intrinsics.height].map(|n| n as f64 - 0.5);
+                    [[0.5, 0.5], [right, 0.5], [0.5, bottom], [right, bottom]].map(|[x, y]| camera.ray(x, y))
                 });
                 let rays: Vec<Ray> = corners.filter(|ray| ray.direction.z < 0.0).collect();
                 // A ray ends at z = 1, the infinite distance.
@@ -90,15 +97,11 @@ impl Region {
         Region { space, aabb }
     }
 
-    /// Returns the box, for a model or a command that knows a box of the world only. `what` names it.
+    /// Returns the box, for a model that is trained in a box of the world only. `kind` names the model.
     ///
     /// Errors if the space is another one.
-    pub fn in_box(&self, what: &str) -> Result<Aabb> {
-        if self.space == Space::Box {
-            return Ok(self.aabb);
-        }
-        let found = format!("`{what}` needs a box of the world, and the space of this capture is {}", self.space);
-        Err(Error::usage("space", found, "use the preset photos, or set it to box, and half_width to the size of the object"))
+    pub fn in_box(&self, kind: &str) -> Result<Aabb> {
+        self.space.require_box(kind).map(|()| self.aabb)
     }
 }
 
@@ -184,7 +187,7 @@ impl Bend {
     pub(crate) fn positions<const N: usize>(&self, ray: &Ray, s: &[f64; N]) -> [[f64; N]; 3] {
         let mut at = [[0.0; N]; 3];
         for i in 0..N {
-            // Intervals beyond the last of the ray may lie beyond infinity.
+            // The operations of [`contract`], on numbers, because such loops vectorise. Intervals after the last would lie beyond infinity.
             let t = self.distance(s[i].min(self.end() - 1e-9));
             let x = ray.origin.to_array();
             let d = ray.direction.to_array();

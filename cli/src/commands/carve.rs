@@ -13,6 +13,7 @@ use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
 use plenoxel::dataset::{Dataset, Split, has_alpha};
 use plenoxel::error::Result;
 use plenoxel::evaluate::Viewer;
+use plenoxel::geometry::Aabb;
 use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
@@ -21,7 +22,6 @@ use plenoxel::run::folder::{NewFolder, RunFolder, RunKind, RunRecord};
 use plenoxel::run::memory::{self, Estimate};
 use plenoxel::run::settings::{self, CARVE, Layers};
 use plenoxel::run::training::Stopwatch;
-use plenoxel::space::Region;
 use plenoxel::train::{About, ViewOptions};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -159,8 +159,8 @@ pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
     let estimate = Estimate::of_carving(&config, &dataset, 0, !args.no_report);
     console.note(&estimate.describe());
     estimate.check()?;
-    let region = Region { space: dataset.space(), ..Region::cube(config.half_width) };
-    for warning in source.check_cameras(&dataset, region.in_box("carve")?)? {
+    dataset.space().require_box("carve")?;
+    for warning in source.check_cameras(&dataset, Aabb::cube(config.half_width))? {
         console.note(&format!("warning: {warning}"));
     }
     let folder = NewFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;

@@ -48,9 +48,9 @@ pub enum Lens {
 /// Reason why a lens cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unusable {
-    /// What is wrong.
+    /// Problem that was found.
     pub found: String,
-    /// What would be accepted, or what to do.
+    /// Accepted values, or advice.
     pub remedy: String,
 }
 

@@ -25,7 +25,7 @@ const NAMED: usize = 5;
 /// round differently.
 const ROUNDED: f64 = 1.5;
 
-/// What the files of a capture state.
+/// Content of the files of a capture, before images are looked at.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Capture {
     /// The recognized format, as text for people.
@@ -40,7 +40,7 @@ pub struct Capture {
     pub bounds: Option<[f64; 2]>,
     /// Reduction of the images by their folder: 4 for `images_4`.
     pub reduced: usize,
-    /// What a person should know, as sentences without a stop.
+    /// Notes for the user, as sentences without a stop.
     pub notes: Vec<String>,
 }
 
@@ -166,6 +166,8 @@ fn check_presence(root: &Path, capture: &mut Capture) -> Result<()> {
 fn fitted(photo: &Photo) -> Result<(Orientation, Intrinsics)> {
     for orientation in [Orientation::Stored, Orientation::Stated] {
         if let Some(intrinsics) = scaled(&photo.intrinsics, image::size_as(&photo.image, orientation)?) {
+            // Rounded sizes may have pixels that the stated size had not.
+            intrinsics.check_lens().map_err(|unusable| unusable.at(&photo.image, "the camera of the image"))?;
             return Ok((orientation, intrinsics));
         }
     }

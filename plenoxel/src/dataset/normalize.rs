@@ -1,4 +1,4 @@
-//! Where the scene of a capture is: the similarity from the frame of its files to the world in which a field is trained, and the [`Space`].
+//! Frame of a capture: the similarity from the frame of its files to the world in which a field is trained, and the [`Space`].
 //!
 //! Structure from motion finds cameras up to a similarity, and every program that writes them turns, moves and scales them in its own way.
 //! Training needs a known up, centre and size. All choices follow from the cameras alone, in an order that a similarity of the input does

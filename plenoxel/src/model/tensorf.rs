@@ -271,7 +271,8 @@ impl<T: Real> Model<T> for Tensorf<T> {
         if nodes.iter().any(|n| !(2..=4 * MOST_NODES).contains(n)) {
             return Err(file.damaged("the number of nodes is not one of this model"));
         }
-        self.space = file.fact("space")?;
+        // Checkpoints without a space are of a box.
+        self.space = file.fact::<Option<Space>>("space")?.unwrap_or_default();
         self.field.occupied = cells::read(file)?;
         self.field.resample(aabb, nodes);
         read_params(self, file)

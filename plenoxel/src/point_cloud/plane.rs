@@ -1,5 +1,6 @@
 //! Least-squares plane of points.
 
+use crate::geometry::eigen;
 use glam::{DMat3, DVec3};
 
 /// Count, sum and sum of squares of points, from which a plane is computed.
@@ -57,66 +58,19 @@ impl Moments {
             DVec3::new(products.x, squares.y, products.y),
             DVec3::new(products.z, products.y, squares.z),
         );
-        let (values, vectors) = eigen(covariance);
-        let mut ascending = [0, 1, 2];
-        ascending.sort_by(|&a, &b| values[a].total_cmp(&values[b]));
-        let [smallest, middle, largest] = ascending;
+        let [(smallest, normal), (middle, _), (largest, _)] = eigen(covariance);
         // For three points, |AB × AC|² = 27 λ₁ λ₂, with the two nonzero eigenvalues of the covariance.
-        if self.count == 3 && 27.0 * values[middle] * values[largest] < f64::from(f32::EPSILON) {
+        if self.count == 3 && 27.0 * middle * largest < f64::from(f32::EPSILON) {
             return None;
         }
-        Some(Plane { center, normal: vectors.col(smallest).normalize(), deviation: values[smallest].max(0.0).sqrt() })
+        Some(Plane { center, normal: normal.normalize(), deviation: smallest.max(0.0).sqrt() })
     }
-}
-
-/// Computes eigenvalues and eigenvectors (as columns) of a symmetric matrix with Jacobi rotations (Golub and Van Loan, 8.5). Each rotation
-/// makes one off-diagonal entry 0. Convergence is quadratic, so a few sweeps reach the precision of `f64`.
-fn eigen(mut a: DMat3) -> (DVec3, DMat3) {
-    const SWEEPS: usize = 12;
-    let mut vectors = DMat3::IDENTITY;
-    for _ in 0..SWEEPS {
-        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
-            let off = a.col(q)[p];
-            if off == 0.0 {
-                continue;
-            }
-            let theta = (a.col(q)[q] - a.col(p)[p]) / (2.0 * off);
-            let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
-            let c = 1.0 / (t * t + 1.0).sqrt();
-            let s = t * c;
-            let mut rotation = DMat3::IDENTITY;
-            rotation.col_mut(p)[p] = c;
-            rotation.col_mut(q)[q] = c;
-            rotation.col_mut(q)[p] = s;
-            rotation.col_mut(p)[q] = -s;
-            a = rotation.transpose() * a * rotation;
-            vectors *= rotation;
-        }
-    }
-    (DVec3::new(a.x_axis.x, a.y_axis.y, a.z_axis.z), vectors)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::random::{Purpose, uniform};
-
-    #[test]
-    fn eigenvectors_of_a_symmetric_matrix_are_orthonormal_and_put_it_together_again() {
-        for seed in 0..200 {
-            let number = |i| 2.0 * uniform(seed, Purpose::Initial, 0, i) - 1.0;
-            // Every fourth matrix is singular.
-            let half = DMat3::from_cols(
-                DVec3::new(number(0), number(1), number(2)),
-                DVec3::new(number(3), number(4), number(5)),
-                if seed % 4 == 0 { DVec3::ZERO } else { DVec3::new(number(6), number(7), number(8)) },
-            );
-            let a = half * half.transpose();
-            let (values, vectors) = eigen(a);
-            let again = vectors * DMat3::from_diagonal(values) * vectors.transpose();
-            assert!(again.abs_diff_eq(a, 1e-14) && (vectors.transpose() * vectors).abs_diff_eq(DMat3::IDENTITY, 1e-14), "seed {seed}");
-        }
-    }
 
     #[test]
     fn points_that_were_added_up_elsewhere_have_the_plane_that_they_have_one_by_one() {

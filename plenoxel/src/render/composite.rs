@@ -30,7 +30,7 @@ pub struct Rendered<T: Real> {
 ///
 /// A kernel that renders a field implements this trait. [`composite()`] computes the columns from the samples.
 pub trait Columns<T: Real>: Debug + Send + Sync {
-    /// Returns the depth Σ wᵢ tᵢ, `[n]`, world length.
+    /// Returns the depth Σ wᵢ tᵢ, `[n]`, with tᵢ of [`Samples`].
     fn depth(&self) -> Tensor<T>;
 
     /// Returns the sparsity Σ ln(1 + 2σᵢ²), `[n]`.

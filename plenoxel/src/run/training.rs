@@ -41,7 +41,6 @@ use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::{self, Objective, Trainer, objective};
 use crate::run::figures::Figures;
-use crate::space::Region;
 use crate::text::clock;
 use crate::train::{self, Model, PlannedStage, StageProgress, ViewOptions};
 use learning::Learned;
@@ -167,7 +166,7 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     let known = initial.as_deref().map(checkpoint::header).transpose()?;
     // An initial grid has its own box.
     let half_width = known.as_ref().map_or(run.config.half_width, |(header, _)| header.shape().half_width);
-    Region { space: run.dataset.space(), ..Region::cube(half_width) }.in_box(plenoxels::KIND)?;
+    run.dataset.space().require_box(plenoxels::KIND)?;
     run.check_cameras(Aabb::cube(half_width), on)?;
     if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != run.dataset.name()) {
         on(Event::note(format!("the initial grid is of another scene: {}, not {}", header.scene, run.dataset.name())));

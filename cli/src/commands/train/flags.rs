@@ -104,7 +104,7 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     stage_psnr: bool,
 
-    /// Preset of the settings; `plenoxel presets` describes each [default: fast; quality with --time]
+    /// Preset of the settings; `plenoxel presets` describes each [default: photos for captures; else fast, or quality with --time]
     #[arg(long, help_heading = "Settings", value_parser = PossibleValuesParser::new(PRESETS.map(|preset| preset.name)))]
     preset: Option<String>,
 

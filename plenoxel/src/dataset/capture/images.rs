@@ -1,4 +1,4 @@
-//! Where the images of a capture are: in `images`, or reduced in `images_2`, `images_4` or `images_8`.
+//! Folders of the images of a capture: `images`, or reduced in `images_2`, `images_4` or `images_8`.
 
 use crate::error::{Error, Result};
 use crate::files;

@@ -11,7 +11,7 @@ use ::image::{DynamicImage, ImageDecoder, ImageError, RgbaImage, metadata};
 use std::io::{BufRead, BufReader, Cursor, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// How an image whose file states an orientation (EXIF, of JPEG and WebP) is turned.
+/// Treatment of the orientation that a file states (EXIF, of JPEG and WebP).
 ///
 /// COLMAP, and programs that pass its cameras on, ignore the orientation: their cameras belong to the image as stored. Which one a camera
 /// belongs to can be told by its size, unless the image is square or upside down.

@@ -1,4 +1,4 @@
-//! What a user may choose about the frame of a capture.
+//! Settings of the frame of a capture.
 
 use crate::error::{Error, Result};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -116,7 +116,7 @@ pub enum Scale {
     /// The farthest camera comes to 1 along an axis.
     #[default]
     Auto,
-    /// That of the files.
+    /// World lengths are those of the files.
     None,
     /// World lengths per length of the files, positive.
     Factor(f64),

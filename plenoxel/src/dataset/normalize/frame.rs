@@ -4,6 +4,7 @@ use super::super::capture::Point;
 use super::choice::{Center, Orient};
 use super::{NEAR, NEAREST};
 use crate::camera::Camera;
+use crate::geometry::eigen;
 use glam::{DMat3, DVec3};
 
 /// Steps of the search for the focus.
@@ -110,9 +111,9 @@ impl Frame {
     fn principal_axes(&self, cameras: &[Camera]) -> DMat3 {
         let outer = |d: DVec3| DMat3::from_cols(d * d.x, d * d.y, d * d.z);
         let covariance = cameras.iter().map(|camera| outer((camera.position() - self.mean) / self.spread)).fold(DMat3::ZERO, |a, b| a + b);
-        let axes = eigenvectors(covariance);
+        let [(_, smallest), _, (_, largest)] = eigen(covariance);
         let toward = |axis: DVec3, side: DVec3| if axis.dot(side) < 0.0 { -axis } else { axis };
-        let (x, z) = (toward(axes[0], cameras[0].position() - self.mean), toward(axes[2], self.up));
+        let (x, z) = (toward(largest, cameras[0].position() - self.mean), toward(smallest, self.up));
         DMat3::from_cols(x, z.cross(x), z).transpose()
     }
 
@@ -162,45 +163,4 @@ fn focus(cameras: &[Camera], mean: DVec3, spread: f64) -> Option<DVec3> {
         focus = solve(&|origin, across| 1.0 / (across * (focus - origin)).length().max(1e-3))?;
     }
     Some(mean + spread * focus)
-}
-
-/// Returns the eigenvectors of a symmetric matrix, of the largest eigenvalue first (Jacobi's method).
-fn eigenvectors(matrix: DMat3) -> [DVec3; 3] {
-    let (mut a, mut v) = (matrix, DMat3::IDENTITY);
-    // Each sweep at least squares the error; 3 x 3 matrices need about six.
-    for (p, q) in [(0, 1), (0, 2), (1, 2)].into_iter().cycle().take(45) {
-        let off = a.col(q)[p];
-        if off == 0.0 {
-            continue;
-        }
-        let theta = 0.5 * (2.0 * off).atan2(a.col(q)[q] - a.col(p)[p]);
-        let (s, c) = theta.sin_cos();
-        let mut r = DMat3::IDENTITY;
-        r.col_mut(p)[p] = c;
-        r.col_mut(q)[q] = c;
-        r.col_mut(q)[p] = s;
-        r.col_mut(p)[q] = -s;
-        a = r.transpose() * a * r;
-        v *= r;
-    }
-    let mut order = [0, 1, 2];
-    order.sort_by(|&i, &j| a.col(j)[j].total_cmp(&a.col(i)[i]));
-    order.map(|i| v.col(i))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::dvec3;
-
-    #[test]
-    fn eigenvectors_are_in_the_order_of_their_values() {
-        let rotation = DMat3::from_axis_angle(dvec3(1.0, 2.0, -0.5).normalize(), 1.1);
-        let matrix = rotation * DMat3::from_diagonal(dvec3(2.0, 7.0, -1.0)) * rotation.transpose();
-        let found = eigenvectors(matrix);
-        for (vector, (value, axis)) in found.into_iter().zip([(7.0, 1), (2.0, 0), (-1.0, 2)]) {
-            assert!((matrix * vector - value * vector).length() < 1e-12);
-            assert!((vector.dot(rotation.col(axis)).abs() - 1.0).abs() < 1e-12);
-        }
-    }
 }

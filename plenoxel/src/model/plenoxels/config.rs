@@ -632,6 +632,28 @@ impl Config {
     }
 }
 
+/// Settings that only a voxel grid has.
+const OF_GRID: [&str; 18] = [
+    "stages",
+    "scout",
+    "init_from",
+    "interpolation",
+    "color",
+    "sh_degree",
+    "sh_reduction",
+    "sh_offset",
+    "optimizer",
+    "initial",
+    "rays_per_step",
+    "stop_below",
+    "aim",
+    "project",
+    "pixels_per_voxel",
+    "prune_from_stage",
+    "prune_below",
+    "prune_unseen_below",
+];
+
 impl Config {
     /// Checks the settings of another model than the voxel grid, and that no setting of the grid contradicts them.
     fn validate_other(&self, recipe: &dyn Recipe) -> Result<()> {
@@ -652,25 +674,8 @@ impl Config {
             )),
             false => Ok(()),
         };
-        let none = Config { stages: Vec::new(), ..Config::default() };
-        of_grid(self.stages != none.stages, "stages")?;
-        of_grid(self.scout != none.scout, "scout")?;
-        of_grid(self.init_from != none.init_from, "init_from")?;
-        of_grid(self.interpolation != none.interpolation, "interpolation")?;
-        of_grid(self.color != none.color, "color")?;
-        of_grid(self.sh_degree != none.sh_degree, "sh_degree")?;
-        of_grid(self.sh_reduction != none.sh_reduction, "sh_reduction")?;
-        of_grid(self.sh_offset != none.sh_offset, "sh_offset")?;
-        of_grid(self.optimizer != none.optimizer, "optimizer")?;
-        of_grid(self.initial != none.initial, "initial")?;
-        of_grid(self.rays_per_step != none.rays_per_step, "rays_per_step")?;
-        of_grid(self.stop_below != none.stop_below, "stop_below")?;
-        of_grid(self.aim != none.aim, "aim")?;
-        of_grid(self.project != none.project, "project")?;
-        of_grid(self.pixels_per_voxel != none.pixels_per_voxel, "pixels_per_voxel")?;
-        of_grid(self.prune_from_stage != none.prune_from_stage, "prune_from_stage")?;
-        of_grid(self.prune_below != none.prune_below, "prune_below")?;
-        of_grid(self.prune_unseen_below != none.prune_unseen_below, "prune_unseen_below")?;
+        let [own, none] = [self, &Config { stages: Vec::new(), ..Config::default() }].map(|config| serde_json::json!(config));
+        OF_GRID.iter().try_for_each(|key| of_grid(own[key] != none[key], key))?;
         if self.hull == Hull::Auto && !recipe.uses_silhouettes() {
             return Err(Error::usage("hull", format!("the model `{kind}` does not use silhouettes"), "set it to off"));
         }
