@@ -13,10 +13,11 @@ use plenoxel::model::plenoxels::config::Hull;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
 use plenoxel::render::{Engine, Field, Rendered};
 use plenoxel::sampling::{Jitter, Occupancy, Spacing, sample};
-use plenoxel::space::Space;
+use plenoxel::space::{Region, Space};
 use plenoxel::train::{Model, Pass, PlannedStage, TrainOptions, Trainer, ViewOptions};
 
 const BOX: Aabb = Aabb { min: DVec3::splat(-1.4), max: DVec3::splat(1.4) };
+const IN_BOX: Region = Region { space: Space::Box, aabb: BOX };
 
 const PASS: Pass = Pass { background: [1.0; 3], jitter: Jitter::None, keep_samples: false, stage: None };
 
@@ -94,9 +95,9 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
 }
 
 /// A model that the kernel computes.
-fn wide(config: Config, aabb: Aabb) -> Tensorf<f64> {
-    let mut model =
-        Tensorf::<f64>::new(Config { density_components: 16, appearance_components: 32, ..config }, aabb, 42).expect("valid settings");
+fn wide(config: Config, region: Region) -> Tensorf<f64> {
+    let config = Config { density_components: 16, appearance_components: 32, ..config };
+    let mut model = Tensorf::<f64>::in_region(config, region, 42).expect("valid settings");
     let random = Stream::new(11);
     model.visit_mut(&mut |param: &mut Param<f64>| {
         if param.name().starts_with("density") {
@@ -128,7 +129,7 @@ fn all_columns(rendered: &Rendered<f64>) -> Tensor<f64> {
 #[test]
 fn the_kernel_agrees_with_the_graph_in_the_spaces_of_captures() {
     for (space, aabb) in spaces() {
-        let mut model = wide(tiny(&[(9, 1)]), aabb).in_space(space);
+        let mut model = wide(Config { cell_depth: 2.0, ..tiny(&[(9, 1)]) }, Region { space, aabb });
         agree(&mut model, &rays_of_a_capture(24), &Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS });
     }
 }
@@ -170,7 +171,7 @@ fn agree(model: &mut Tensorf<f64>, rays: &[Ray], pass: &Pass) {
 #[test]
 fn the_kernel_agrees_with_the_graph_in_values_and_gradients() {
     for (octaves, directions) in [(0, Directions::Harmonics(3)), (2, Directions::Frequency(2))] {
-        let mut model = wide(Config { feature_octaves: octaves, directions, ..tiny(&[(9, 1)]) }, BOX);
+        let mut model = wide(Config { feature_octaves: octaves, directions, ..tiny(&[(9, 1)]) }, IN_BOX);
         agree(&mut model, &rays(70), &PASS);
     }
 }
@@ -188,7 +189,7 @@ fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
     let config = Config { group: 0.9, color_above: 0.01, stop_below: 0.01, ..tiny(&[(9, 1)]) };
     let rays = rays(40);
     let pass = Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS };
-    let model = wide(config.clone(), BOX);
+    let model = wide(config.clone(), IN_BOX);
     let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render(&rays, &pass)));
     // Gradients that can be differentiated again are computed through the reference.
     let mut tables = Vec::new();
@@ -200,7 +201,7 @@ fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
         assert!(want.iter().zip(&got).all(|(a, b)| (a - b).abs() < 1e-9 * scale));
     }
     // Groups are formed by weight: with a larger weight there are fewer colors, and other pixels.
-    let color = |group: f64| wide(Config { group, ..config.clone() }, BOX).render(&rays, &pass).rgb.data().to_vec();
+    let color = |group: f64| wide(Config { group, ..config.clone() }, IN_BOX).render(&rays, &pass).rgb.data().to_vec();
     assert_ne!(color(0.9), color(0.0));
 }
 
@@ -208,7 +209,7 @@ fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
 fn groups_do_not_change_the_expected_color() {
     let rays = rays(1);
     let color = |group: f64, step: u64| {
-        let model = wide(Config { group, color_above: 0.0, ..tiny(&[(9, 1)]) }, BOX);
+        let model = wide(Config { group, color_above: 0.0, ..tiny(&[(9, 1)]) }, IN_BOX);
         let pass = Pass { jitter: Jitter::PerRay { seed: 3, step }, ..PASS };
         model.render(&rays, &pass).rgb.data()[0]
     };

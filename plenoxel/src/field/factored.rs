@@ -235,7 +235,7 @@ impl<T: Real> Factored<T> {
     }
 
     /// Returns the sides of a cell, world length.
-    fn sides(&self) -> DVec3 {
+    pub fn sides(&self) -> DVec3 {
         (self.aabb.max - self.aabb.min) / DVec3::from_array(self.nodes().map(|n| (n - 1) as f64))
     }
 

@@ -25,7 +25,7 @@ use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Spacing};
-use crate::space::Space;
+use crate::space::{Region, Space};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
@@ -66,21 +66,24 @@ const HULL_MARGIN: f64 = 1.0;
 const MOST_CELLS: usize = 256;
 
 impl<T: Real> Tensorf<T> {
-    /// Creates the model in a box at the resolution of the first stage. `seed` determines the initial parameters.
+    /// Creates the model in a box of the world, at the resolution of the first stage. `seed` determines the initial parameters.
     ///
     /// Errors name the setting that is invalid.
     pub fn new(config: Config, aabb: Aabb, seed: u64) -> Result<Self> {
-        config.validate()?;
-        let random = Stream::new(seed);
-        let mut field = Factored::new(config.shape(), aabb, aabb.nodes(config.stages[0].resolution), &random);
-        field.grouping = Grouping { weight: config.group, above: config.color_above };
-        field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
-        Ok(Tensorf { config, field, space: Space::Box, hull: Hull::Auto, engine: Engine::Fused })
+        Tensorf::in_region(config, Region { space: Space::Box, aabb }, seed)
     }
 
-    /// Sets the space of the box. Silhouettes are used in [`Space::Box`] only.
-    pub fn in_space(self, space: Space) -> Self {
-        Tensorf { space, ..self }
+    /// Creates the model in a region. Silhouettes are used in [`Space::Box`] only.
+    ///
+    /// Errors name the setting that is invalid.
+    pub fn in_region(config: Config, region: Region, seed: u64) -> Result<Self> {
+        config.validate()?;
+        let random = Stream::new(seed);
+        let Region { space, aabb } = region;
+        let mut field = Factored::new(config.shape(), aabb, config.nodes(region, config.stages[0].resolution), &random);
+        field.grouping = Grouping { weight: config.group, above: config.color_above };
+        field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
+        Ok(Tensorf { config, field, space, hull: Hull::Auto, engine: Engine::Fused })
     }
 
     /// Sets the use of silhouettes. With [`Hull::Auto`], the default, only cells in the visual hull of the training views are sampled, if they have an alpha
@@ -112,10 +115,17 @@ impl<T: Real> Tensorf<T> {
         &self.field
     }
 
+    /// Returns the distance between samples, in the coordinates of the box.
+    fn step(&self) -> f64 {
+        // Rays run along the depth of normalized device coordinates.
+        let cell = if matches!(self.space, Space::Ndc { .. }) { self.field.sides().z } else { self.field.cell() };
+        self.config.step * cell
+    }
+
     /// Returns the cells whose opacity, or that of a neighbour, is above [`occupied_above`](Config::occupied_above).
     fn occupied(&self) -> Occupancy {
         // An opacity 1 − exp(−σ · step) above a threshold is a density above another.
-        let threshold = -(-self.config.occupied_above).ln_1p() / (self.config.step * self.field.cell());
+        let threshold = -(-self.config.occupied_above).ln_1p() / self.step();
         let cells = self.field.nodes().map(|n| (n - 1).min(MOST_CELLS));
         let density = |positions: &Tensor<T>| self.field.density(positions);
         match &self.field.occupied {
@@ -143,7 +153,7 @@ impl<T: Real> Tensorf<T> {
     fn render_with(&self, rays: &[Ray], background: [f32; 3], jitter: Jitter, engine: Engine) -> Rendered<T> {
         let config = &self.config;
         let training = matches!(jitter, Jitter::PerRay { .. });
-        let step = config.step * self.field.cell();
+        let step = self.step();
         let options = RenderOptions {
             aabb: self.aabb(),
             spacing: if self.space == Space::Contracted { Spacing::Contracted(step) } else { Spacing::Step(step) },
@@ -241,7 +251,8 @@ impl<T: Real> Model<T> for Tensorf<T> {
         }
         self.aim(rays);
         let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
-        self.field.resample(aabb, aabb.nodes(self.config.stages[stage.index].resolution));
+        let region = Region { space: self.space, aabb };
+        self.field.resample(aabb, self.config.nodes(region, self.config.stages[stage.index].resolution));
         Ok(())
     }
 

@@ -4,6 +4,7 @@ use crate::error::{Error, Result};
 use crate::field::encoding::Directions;
 use crate::field::factored::Shape;
 use crate::model::stage::Stage;
+use crate::space::{Region, Space};
 use serde::{Deserialize, Serialize};
 
 /// Settings of the model.
@@ -22,8 +23,10 @@ pub struct Config {
     pub feature_octaves: usize,
     /// Encoding of directions.
     pub directions: Directions,
-    /// Distance between samples, in cells.
+    /// Distance between samples, in cells; in normalized device coordinates, in lengths of a cell along the depth.
     pub step: f64,
+    /// Length of a cell along the depth of normalized device coordinates, in lengths of its other sides. In other spaces cells are cubes.
+    pub cell_depth: f64,
     /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
     pub group: f64,
     /// Weight that completes a group in pictures.
@@ -69,6 +72,7 @@ impl Default for Config {
             feature_octaves: 0,
             directions: Directions::Harmonics(3),
             step: 1.0,
+            cell_depth: 1.0,
             group: 0.04,
             group_in_pictures: 0.02,
             color_above: 1e-3,
@@ -132,6 +136,7 @@ impl Config {
         check(self.feature_octaves <= 16, "feature_octaves", self.feature_octaves as f64, "0 to 16")?;
         self.directions.validate("directions")?;
         check(self.step > 0.0 && self.step.is_finite(), "step", self.step, "a number of cells above 0")?;
+        check((0.125..=16.0).contains(&self.cell_depth), "cell_depth", self.cell_depth, "a ratio from 0.125 to 16")?;
         for (key, share) in [
             ("group", self.group),
             ("group_in_pictures", self.group_in_pictures),
@@ -169,7 +174,41 @@ impl Config {
         }
     }
 
+    /// Returns the number of nodes along each axis of a region, about `resolution`³ in total.
+    pub(super) fn nodes(&self, region: Region, resolution: usize) -> [usize; 3] {
+        let Region { space, mut aabb } = region;
+        if matches!(space, Space::Ndc { .. }) {
+            aabb.min.z /= self.cell_depth;
+            aabb.max.z /= self.cell_depth;
+        }
+        aabb.nodes(resolution)
+    }
+
     pub(super) fn total_steps(&self) -> u64 {
         self.stages.iter().map(|stage| stage.steps).sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Aabb;
+    use glam::dvec3;
+
+    #[test]
+    fn cells_are_longer_along_the_depth_of_normalized_device_coordinates_only() {
+        let half = dvec3(1.2, 1.5, 1.0);
+        let aabb = Aabb { min: -half, max: half };
+        let config = Config { cell_depth: 4.0, ..Config::default() };
+        let sides = |space| {
+            let nodes = config.nodes(Region { space, aabb }, 101);
+            let total: f64 = nodes.iter().map(|n| (n - 1) as f64).product();
+            assert!((0.95e6..1.05e6).contains(&total), "{nodes:?}");
+            [0, 1, 2].map(|axis| 2.0 * half[axis] / (nodes[axis] - 1) as f64)
+        };
+        let ratio = |space| sides(space)[2] / sides(space)[0];
+        assert!((ratio(Space::Ndc { a: 1.6, b: 2.1 }) / 4.0 - 1.0).abs() < 0.02);
+        assert!((ratio(Space::Box) - 1.0).abs() < 0.02 && (ratio(Space::Contracted) - 1.0).abs() < 0.02);
+        assert!(Config { cell_depth: 0.0, ..config.clone() }.validate().is_err());
     }
 }

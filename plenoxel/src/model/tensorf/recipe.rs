@@ -39,7 +39,7 @@ impl Recipe for Config {
     }
 
     fn model(&self, config: &RunConfig, region: Region) -> Result<Tensorf<f32>> {
-        let mut model = Tensorf::new(self.clone(), region.aabb, config.seed)?.in_space(region.space).with_hull(config.hull);
+        let mut model = Tensorf::in_region(self.clone(), region, config.seed)?.with_hull(config.hull);
         model.engine = config.engine;
         Ok(model)
     }

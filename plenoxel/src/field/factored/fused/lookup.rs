@@ -12,7 +12,7 @@ pub const LANES: usize = 16;
 /// Number of samples between the current one and that whose cotangents are prefetched.
 const AHEAD: usize = 6;
 
-/// Number of samples that are looked up together.
+/// Largest number of samples that are looked up together.
 pub const RUN: usize = 16;
 
 /// Tables of a density or an appearance.
@@ -26,37 +26,60 @@ pub struct Pairs<'a, T> {
     pub width: usize,
 }
 
-/// Position between the nodes of an axis: the lower node, and the distance from it in cells.
-#[derive(Clone, Copy, Default)]
-struct Between<T> {
-    node: usize,
-    share: T,
+/// Cells of up to [`RUN`] samples, in columns.
+struct Cells<T> {
+    /// Number of samples.
+    count: usize,
+    /// Lower node along each axis.
+    node: [[u32; RUN]; 3],
+    /// Distance from the lower node, in cells.
+    share: [[T; RUN]; 3],
+    nodes: [usize; 3],
 }
 
-impl<T: Real> Between<T> {
-    #[inline(always)]
-    fn new(cell: T, nodes: usize) -> Self {
-        let node = (cell.index() as usize).min(nodes - 2);
-        Between { node, share: cell - T::lit(node as f64) }
-    }
-}
-
-/// Cell of a plane: its four rows and their weights.
+/// Cell of one sample in a plane: numbers of its first row and of the row after a row of nodes, and the weights of both and of those that follow them.
 #[derive(Clone, Copy)]
 struct Corner<T> {
-    rows: [usize; 4],
+    rows: [usize; 2],
     weights: [T; 4],
 }
 
-impl<T: Real> Corner<T> {
+/// Rows of one sample in a line: the lower one, and the weights of both.
+#[derive(Clone, Copy)]
+struct Along<T> {
+    row: usize,
+    weights: [T; 2],
+}
+
+impl<T: Real> Cells<T> {
     #[inline(always)]
-    fn new(axis: usize, between: [Between<T>; 3], nodes: [usize; 3]) -> Self {
+    fn new(at: Places<'_, T>, nodes: [usize; 3]) -> Self {
+        let count = at[0].len();
+        let mut cells = Cells { count, node: [[0; RUN]; 3], share: [[T::zero(); RUN]; 3], nodes };
+        for axis in 0..3 {
+            let most = nodes[axis] as u32 - 2;
+            let (at, node, share) = (&at[axis][..count], &mut cells.node[axis][..count], &mut cells.share[axis][..count]);
+            for i in 0..count {
+                node[i] = at[i].index().min(most);
+                share[i] = at[i] - T::lit(f64::from(node[i]));
+            }
+        }
+        cells
+    }
+
+    #[inline(always)]
+    fn corner(&self, axis: usize, i: usize) -> Corner<T> {
         let [b, c] = PLANE_OF[axis];
-        let (b, c, stride) = (between[b], between[c], nodes[c]);
-        let (u, v) = (T::one() - b.share, T::one() - c.share);
-        let first = b.node * stride + c.node;
-        let rows = [first, first + 1, first + stride, first + stride + 1];
-        Corner { rows, weights: [u * v, u * c.share, b.share * v, b.share * c.share] }
+        let (stride, x, y) = (self.nodes[c], self.share[b][i], self.share[c][i]);
+        let (u, v) = (T::one() - x, T::one() - y);
+        let first = self.node[b][i] as usize * stride + self.node[c][i] as usize;
+        Corner { rows: [first, first + stride], weights: [u * v, u * y, x * v, x * y] }
+    }
+
+    #[inline(always)]
+    fn along(&self, axis: usize, i: usize) -> Along<T> {
+        let share = self.share[axis][i];
+        Along { row: self.node[axis][i] as usize, weights: [T::one() - share, share] }
     }
 }
 
@@ -80,6 +103,17 @@ pub fn absorb<T: Real, const FUSED: bool>(sigma: &[T], delta: &[T], opacity: &mu
 }
 }
 
+/// Coefficients of 2 artanh(s) = Σ 2 s²ᵏ⁺¹ / (2k + 1).
+const ARTANH: [f64; 17] = {
+    let mut coefficients = [0.0; 17];
+    let mut k = 0;
+    while k < coefficients.len() {
+        coefficients[k] = 2.0 / (2 * k + 1) as f64;
+        k += 1;
+    }
+    coefficients
+};
+
 /// Returns ln(1 + e) for e in [0, 1], as 2 artanh(e / (2 + e)).
 #[inline(always)]
 fn ln_1p<T: Real>(e: T) -> T {
@@ -87,95 +121,100 @@ fn ln_1p<T: Real>(e: T) -> T {
     let s = e / (T::lit(2.0) + e);
     let square = s * s;
     let mut sum = T::zero();
-    for k in (0..terms).rev() {
-        sum = sum * square + T::lit(2.0 / f64::from(2 * k + 1));
+    for coefficient in ARTANH[..terms].iter().rev() {
+        sum = sum * square + T::lit(*coefficient);
     }
     s * sum
 }
 
-#[inline(always)]
-fn between<T: Real>(at: [T; 3], nodes: [usize; 3]) -> [Between<T>; 3] {
-    [Between::new(at[0], nodes[0]), Between::new(at[1], nodes[1]), Between::new(at[2], nodes[2])]
-}
-
 /// Returns the interpolated chunk of a plane.
+// The loops over a chunk read slices and write an array of their own: only so do compilers make vectors of them for every instruction set.
 #[inline(always)]
-fn plane_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], corner: &Corner<T>, chunks: usize, k: usize) -> [T; LANES] {
-    let (rows, weights) = (corner.rows, corner.weights);
-    let [p, q] = [&table[rows[0] * chunks + k], &table[rows[1] * chunks + k]];
-    let [r, s] = [&table[rows[2] * chunks + k], &table[rows[3] * chunks + k]];
+fn plane_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], corner: Corner<T>, chunks: usize, k: usize) -> [T; LANES] {
+    let Corner { rows, weights } = corner;
+    let (first, second) = (rows[0] * chunks + k, rows[1] * chunks + k);
+    let (p, q, r, s) = (&table[first], &table[first + chunks], &table[second], &table[second + chunks]);
     let mut value = [T::zero(); LANES];
-    for i in 0..LANES {
-        let sum = p[i] * weights[0];
-        let sum = q[i].multiply_add::<FUSED>(weights[1], sum);
-        let sum = r[i].multiply_add::<FUSED>(weights[2], sum);
-        value[i] = s[i].multiply_add::<FUSED>(weights[3], sum);
+    for l in 0..LANES {
+        let sum = p[l] * weights[0];
+        let sum = q[l].multiply_add::<FUSED>(weights[1], sum);
+        let sum = r[l].multiply_add::<FUSED>(weights[2], sum);
+        value[l] = s[l].multiply_add::<FUSED>(weights[3], sum);
     }
     value
 }
 
 /// Returns the interpolated chunk of a line.
 #[inline(always)]
-fn line_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], along: Between<T>, chunks: usize, k: usize) -> [T; LANES] {
-    let (p, q) = (&table[along.node * chunks + k], &table[(along.node + 1) * chunks + k]);
-    let rest = T::one() - along.share;
+fn line_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], along: Along<T>, chunks: usize, k: usize) -> [T; LANES] {
+    let first = along.row * chunks + k;
+    let (p, q) = (&table[first], &table[first + chunks]);
     let mut value = [T::zero(); LANES];
-    for i in 0..LANES {
-        value[i] = q[i].multiply_add::<FUSED>(along.share, p[i] * rest);
+    for l in 0..LANES {
+        value[l] = q[l].multiply_add::<FUSED>(along.weights[1], p[l] * along.weights[0]);
     }
     value
+}
+
+/// Adds `weight` times a chunk to a sum.
+#[inline(always)]
+fn add_to<T: Real, const FUSED: bool>(sum: &mut [T; LANES], value: &[T; LANES], weight: T) {
+    let old = *sum;
+    let mut new = [T::zero(); LANES];
+    for l in 0..LANES {
+        new[l] = value[l].multiply_add::<FUSED>(weight, old[l]);
+    }
+    *sum = new;
 }
 
 /// Positions of up to [`RUN`] samples, in units of cells.
 pub type Places<'a, T> = [&'a [T]; 3];
 
-#[inline(always)]
-fn place<T: Real>(at: Places<'_, T>, i: usize) -> [T; 3] {
-    [at[0][i], at[1][i], at[2][i]]
-}
-
 /// Prefetches the plane rows of samples.
 #[inline(always)]
-fn prefetch<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>) {
-    let (nodes, width) = (pairs.nodes, pairs.width);
-    for i in 0..at[0].len() {
-        let between = between(place(at, i), nodes);
-        for axis in 0..3 {
-            let [first, _, second, _] = Corner::new(axis, between, nodes).rows;
-            for first in [first, second] {
-                parallel::prefetch(&pairs.planes[axis][first * width..][..2 * width]);
+fn prefetch<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>) {
+    let width = pairs.width;
+    for axis in 0..3 {
+        for i in 0..cells.count {
+            for row in cells.corner(axis, i).rows {
+                parallel::prefetch(&pairs.planes[axis][row * width..][..2 * width]);
             }
         }
     }
 }
 
 dispatched! {
-/// Computes the density σ and dσ/ds of samples.
+/// Computes the density σ and dσ/ds of up to [`RUN`] samples.
 pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, sigma: &mut [T], slope: &mut [T]) {
-    prefetch(pairs, at);
-    let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
-    let planes = pairs.planes.map(|table| table.as_chunks::<LANES>().0);
-    let lines = pairs.lines.map(|table| table.as_chunks::<LANES>().0);
-    for (i, sigma) in sigma.iter_mut().enumerate() {
-        let between = between(place(at, i), nodes);
-        let mut sums = [T::zero(); LANES];
-        for axis in 0..3 {
-            let (corner, along) = (Corner::new(axis, between, nodes), between[axis]);
-            for k in 0..chunks {
-                let plane = plane_at::<T, FUSED>(planes[axis], &corner, chunks, k);
-                let line = line_at::<T, FUSED>(lines[axis], along, chunks, k);
+    let cells = Cells::new(at, pairs.nodes);
+    prefetch(pairs, &cells);
+    let chunks = pairs.width / LANES;
+    let mut sums = [[T::zero(); LANES]; RUN];
+    for axis in 0..3 {
+        let (plane, line) = (pairs.planes[axis].as_chunks::<LANES>().0, pairs.lines[axis].as_chunks::<LANES>().0);
+        for k in 0..chunks {
+            for (i, sum) in sums.iter_mut().enumerate().take(cells.count) {
+                let value = plane_at::<T, FUSED>(plane, cells.corner(axis, i), chunks, k);
+                let factor = line_at::<T, FUSED>(line, cells.along(axis, i), chunks, k);
+                let old = *sum;
+                let mut new = [T::zero(); LANES];
                 for l in 0..LANES {
-                    sums[l] = plane[l].multiply_add::<FUSED>(line[l], sums[l]);
+                    new[l] = value[l].multiply_add::<FUSED>(factor[l], old[l]);
                 }
+                *sum = new;
             }
         }
-        let mut width = LANES / 2;
-        while width > 0 {
+    }
+    let mut width = LANES / 2;
+    while width > 0 {
+        for sums in &mut sums {
             for l in 0..width {
                 sums[l] += sums[l + width];
             }
-            width /= 2;
         }
+        width /= 2;
+    }
+    for (sigma, sums) in sigma.iter_mut().zip(&sums) {
         *sigma = sums[0] + T::lit(SHIFT);
     }
     let scale = T::lit(SCALE);
@@ -190,21 +229,21 @@ pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T
 }
 
 dispatched! {
-/// Computes the products plane · line of samples: rows of three times `width` values.
+/// Computes the products plane · line of up to [`RUN`] samples: rows of three times `width` values.
 pub fn products<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
-    prefetch(pairs, at);
-    let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
-    let planes = pairs.planes.map(|table| table.as_chunks::<LANES>().0);
-    let lines = pairs.lines.map(|table| table.as_chunks::<LANES>().0);
-    for (i, out) in out.as_chunks_mut::<LANES>().0.chunks_exact_mut(3 * chunks).enumerate() {
-        let between = between(place(at, i), nodes);
-        for axis in 0..3 {
-            let (corner, along) = (Corner::new(axis, between, nodes), between[axis]);
-            for k in 0..chunks {
-                let plane = plane_at::<T, FUSED>(planes[axis], &corner, chunks, k);
-                let line = line_at::<T, FUSED>(lines[axis], along, chunks, k);
+    let cells = Cells::new(at, pairs.nodes);
+    prefetch(pairs, &cells);
+    let chunks = pairs.width / LANES;
+    let out = out.as_chunks_mut::<LANES>().0;
+    for axis in 0..3 {
+        let (plane, line) = (pairs.planes[axis].as_chunks::<LANES>().0, pairs.lines[axis].as_chunks::<LANES>().0);
+        for (i, out) in out.chunks_exact_mut(3 * chunks).enumerate() {
+            let (corner, along) = (cells.corner(axis, i), cells.along(axis, i));
+            for (k, out) in out[axis * chunks..][..chunks].iter_mut().enumerate() {
+                let value = plane_at::<T, FUSED>(plane, corner, chunks, k);
+                let factor = line_at::<T, FUSED>(line, along, chunks, k);
                 for l in 0..LANES {
-                    out[axis * chunks + k][l] = plane[l] * line[l];
+                    out[l] = value[l] * factor[l];
                 }
             }
         }
@@ -213,25 +252,22 @@ pub fn products<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, 
 }
 
 dispatched! {
-/// Adds the adjoint of lines. `g(i)` is the cotangent of the products of sample i: either three times `width` values, or one value that all products share.
+/// Adds the adjoint of lines, for up to [`RUN`] samples with the cotangents `g`.
 pub fn add_to_lines<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, g: Cotangents<'_, T>, sums: &mut [T]) {
-    prefetch(pairs, at);
+    let cells = Cells::new(at, pairs.nodes);
+    prefetch(pairs, &cells);
     let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
-    let planes = pairs.planes.map(|table| table.as_chunks::<LANES>().0);
     let sums = sums.as_chunks_mut::<LANES>().0;
-    for i in 0..at[0].len() {
-        let between = between(place(at, i), nodes);
-        for axis in 0..3 {
-            let (corner, along) = (Corner::new(axis, between, nodes), between[axis]);
-            let first = nodes[..axis].iter().sum::<usize>() + along.node;
+    for axis in 0..3 {
+        let plane = pairs.planes[axis].as_chunks::<LANES>().0;
+        let before = nodes[..axis].iter().sum::<usize>();
+        let sums = &mut sums[before * chunks..];
+        for i in 0..cells.count {
+            let (corner, along) = (cells.corner(axis, i), cells.along(axis, i));
             for k in 0..chunks {
-                let mut value = plane_at::<T, FUSED>(planes[axis], &corner, chunks, k);
-                g.times(i, axis * chunks + k, 3 * chunks, &mut value);
-                for (row, weight) in [(first, T::one() - along.share), (first + 1, along.share)] {
-                    let sum = &mut sums[row * chunks + k];
-                    for l in 0..LANES {
-                        sum[l] = value[l].multiply_add::<FUSED>(weight, sum[l]);
-                    }
+                let value = g.times(i, axis * chunks + k, 3 * chunks, plane_at::<T, FUSED>(plane, corner, chunks, k));
+                for c in 0..2 {
+                    add_to::<T, FUSED>(&mut sums[(along.row + c) * chunks + k], &value, along.weights[c]);
                 }
             }
         }
@@ -257,16 +293,25 @@ impl<T: Real> Cotangents<'_, T> {
         }
     }
 
-    /// Multiplies chunk `k` of `chunks` by the cotangents of sample i.
+    /// Returns a chunk times the cotangents of chunk `k` of `chunks` of sample i.
     #[inline(always)]
-    fn times(&self, i: usize, k: usize, chunks: usize, value: &mut [T; LANES]) {
+    fn times(&self, i: usize, k: usize, chunks: usize, value: [T; LANES]) -> [T; LANES] {
+        let mut product = [T::zero(); LANES];
         match self {
-            Cotangents::Shared(g) => value.iter_mut().for_each(|v| *v *= g[i]),
+            Cotangents::Shared(g) => {
+                let g = g[i];
+                for l in 0..LANES {
+                    product[l] = value[l] * g;
+                }
+            }
             Cotangents::Each(g) => {
                 let g = &g.as_chunks::<LANES>().0[i * chunks + k];
-                value.iter_mut().zip(g).for_each(|(v, &g)| *v *= g);
+                for l in 0..LANES {
+                    product[l] = value[l] * g[l];
+                }
             }
         }
+        product
     }
 }
 
@@ -303,28 +348,32 @@ pub fn add_to_plane<T: Real, const FUSED: bool>(
     let line = plane.line.as_chunks::<LANES>().0;
     let sums = bucket.sums.as_chunks_mut::<LANES>().0;
     let rows = sums.len() / chunks;
-    for (k, &i) in which.iter().enumerate() {
-        let i = i as usize;
-        if let Some(&later) = which.get(k + AHEAD) {
-            g.prefetch(later as usize, axis * chunks, 3 * chunks, chunks);
-        }
-        let between = between(place(at, i), nodes);
-        let (corner, along) = (Corner::new(axis, between, nodes), between[axis]);
-        for row in corner.rows {
-            let row = row.wrapping_sub(bucket.first);
-            if row < rows {
-                bucket.touched[row / 64] |= 1 << (row % 64);
+    for (first, run) in which.chunks(RUN).enumerate() {
+        let mut places = [[T::zero(); RUN]; 3];
+        for axis in 0..3 {
+            for (place, &i) in places[axis].iter_mut().zip(run) {
+                *place = at[axis][i as usize];
             }
         }
-        for k in 0..chunks {
-            let mut value = line_at::<T, FUSED>(line, along, chunks, k);
-            g.times(i, axis * chunks + k, 3 * chunks, &mut value);
-            for c in 0..4 {
-                let (row, weight) = (corner.rows[c].wrapping_sub(bucket.first), corner.weights[c]);
+        let [x, y, z] = &places;
+        let cells = Cells::new([&x[..run.len()], &y[..run.len()], &z[..run.len()]], nodes);
+        for (c, &i) in run.iter().enumerate() {
+            if let Some(&later) = which.get(first * RUN + c + AHEAD) {
+                g.prefetch(later as usize, axis * chunks, 3 * chunks, chunks);
+            }
+            let (Corner { rows: [p, r], weights }, along) = (cells.corner(axis, c), cells.along(axis, c));
+            let (p, r) = (p.wrapping_sub(bucket.first), r.wrapping_sub(bucket.first));
+            let of = [p, p.wrapping_add(1), r, r.wrapping_add(1)];
+            for row in of {
                 if row < rows {
-                    let sum = &mut sums[row * chunks + k];
-                    for l in 0..LANES {
-                        sum[l] = value[l].multiply_add::<FUSED>(weight, sum[l]);
+                    bucket.touched[row / 64] |= 1 << (row % 64);
+                }
+            }
+            for k in 0..chunks {
+                let value = g.times(i as usize, axis * chunks + k, 3 * chunks, line_at::<T, FUSED>(line, along, chunks, k));
+                for c in 0..4 {
+                    if of[c] < rows {
+                        add_to::<T, FUSED>(&mut sums[of[c] * chunks + k], &value, weights[c]);
                     }
                 }
             }
