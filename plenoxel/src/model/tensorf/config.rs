@@ -25,7 +25,7 @@ pub struct Config {
     pub directions: Directions,
     /// Distance between samples, in cells; in normalized device coordinates, in lengths of a cell along the depth.
     pub step: f64,
-    /// Length of a cell along the depth of normalized device coordinates, in lengths of its other sides. In other spaces cells are cubes.
+    /// Length of a cell along the depth of normalized device coordinates, in lengths of its other sides, 1 to 8. In other spaces cells are cubes.
     pub cell_depth: f64,
     /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
     pub group: f64,
@@ -136,7 +136,7 @@ impl Config {
         check(self.feature_octaves <= 16, "feature_octaves", self.feature_octaves as f64, "0 to 16")?;
         self.directions.validate("directions")?;
         check(self.step > 0.0 && self.step.is_finite(), "step", self.step, "a number of cells above 0")?;
-        check((0.125..=16.0).contains(&self.cell_depth), "cell_depth", self.cell_depth, "a ratio from 0.125 to 16")?;
+        check((1.0..=8.0).contains(&self.cell_depth), "cell_depth", self.cell_depth, "1 to 8")?;
         for (key, share) in [
             ("group", self.group),
             ("group_in_pictures", self.group_in_pictures),

@@ -57,11 +57,14 @@ impl Recipe for Config {
     }
 }
 
-/// Bytes of the planes of a factored field, in a box of usual proportions.
+/// Bytes of the planes of a factored field, in a box of usual proportions. With longer cells there are more nodes across: these are the planes in normalized
+/// device coordinates; in other spaces they are smaller.
 fn bytes_of_planes(config: &Config, resolution: usize) -> u64 {
     const LONG: f64 = 1.2;
     let components = (config.density_components + config.appearance_components) as f64;
-    (LONG * 3.0 * (resolution * resolution) as f64 * components) as u64 * size_of::<f32>() as u64
+    let nodes = (resolution * resolution) as f64;
+    let planes = config.cell_depth.powf(2.0 / 3.0) + 2.0 * config.cell_depth.powf(-1.0 / 3.0);
+    (LONG * planes * nodes * components) as u64 * size_of::<f32>() as u64
 }
 
 /// Bytes of a ray of a factored field: of its samples, and of the samples at which the color network is evaluated.

@@ -34,6 +34,7 @@ struct Cells<T> {
     node: [[u32; RUN]; 3],
     /// Distance from the lower node, in cells.
     share: [[T; RUN]; 3],
+    /// Nodes along each axis.
     nodes: [usize; 3],
 }
 
@@ -128,7 +129,8 @@ fn ln_1p<T: Real>(e: T) -> T {
 }
 
 /// Returns the interpolated chunk of a plane.
-// The loops over a chunk read slices and write an array of their own: only so do compilers make vectors of them for every instruction set.
+// Compilers make vectors of a loop over a chunk, for every instruction set, only if it writes to an array of its own, and not to one that the loop also reads.
+// Closures inside of a dispatched function stay calls if a library function calls them: it has other target features.
 #[inline(always)]
 fn plane_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], corner: Corner<T>, chunks: usize, k: usize) -> [T; LANES] {
     let Corner { rows, weights } = corner;
