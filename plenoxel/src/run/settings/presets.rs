@@ -34,7 +34,7 @@ pub const PRESETS: [Preset; 11] = [
     Preset {
         name: "photos",
         purpose: "captures of the real world; the default of `train` for them",
-        time: "about 9 min at 1008 x 756, forward-facing",
+        time: "9 min at 1008 x 756 (NDC)",
         text: include_str!("../../../presets/photos.toml"),
     },
     Preset {
