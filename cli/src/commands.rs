@@ -10,6 +10,7 @@ pub mod evaluate;
 pub mod export;
 pub mod filter;
 pub mod harmonics;
+pub mod import;
 pub mod info;
 pub mod man;
 mod new_run;

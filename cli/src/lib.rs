@@ -17,7 +17,9 @@ mod progress;
 mod report;
 
 use clap::{Args, Parser, Subcommand};
-use commands::{bake, carve, compare, completions, evaluate, export, filter, harmonics, info, man, presets, render, scene, sweep, train};
+use commands::{
+    bake, carve, compare, completions, evaluate, export, filter, harmonics, import, info, man, presets, render, scene, sweep, train,
+};
 use plenoxel::error::Error;
 use plenoxel::run::{machine, memory};
 use progress::{Console, LogFormat};
@@ -33,6 +35,7 @@ Examples:
   plenoxel train data/lego --preset paper    train a NeRF-synthetic scene as in the source paper
   plenoxel carve data/lego                   carve an opaque colored grid from silhouettes
   plenoxel bake runs/field                   turn a factored field into a voxel grid, for exports
+  plenoxel import ckpt.npz --out runs/lego   turn a checkpoint of svox2, or an octree of PlenOctrees, into a run
   plenoxel evaluate runs/lego-1              compute PSNR and SSIM on the test views
   plenoxel render runs/lego-1 --view 0       render a test view
   plenoxel render runs/lego-1 --path orbit   render a video along a camera path
@@ -62,6 +65,7 @@ enum Command {
     Train(Box<train::TrainArgs>),
     Carve(Box<carve::CarveArgs>),
     Bake(bake::BakeArgs),
+    Import(import::ImportArgs),
     Render(render::RenderArgs),
     Compare(compare::CompareArgs),
     Report(commands::report::ReportArgs),
@@ -130,6 +134,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Train(args) => return train::run(args, &console),
             Command::Carve(args) => carve::run(args, &console),
             Command::Bake(args) => bake::run(args, &console),
+            Command::Import(args) => import::run(args, &console),
             Command::Render(args) => render::run(args, &console),
             Command::Compare(args) => compare::run(args, &console),
             Command::Report(args) => commands::report::run(args, &console),

@@ -188,7 +188,7 @@ fn node(voxel: u32, n: usize) -> [usize; 3] {
 }
 
 /// Bytes per brick of a grid while its lattice is created: masks, links, and the order along a Morton curve.
-const BRICK_BYTES: u64 = 72;
+pub(crate) const BRICK_BYTES: u64 = 72;
 
 /// Creates the lattice of n³ voxels in which these are present.
 fn with_voxels(voxels: &[u32], n: usize) -> Lattice {

@@ -5,9 +5,12 @@
 
 mod read;
 
-pub use read::{CAMERA_PATH, CAMERAS, CLOUD, IMAGE, Kind, METRICS, RECORD, RUN, SETTINGS, TENSORS, is_there, open, read, read_named, text};
+pub use read::{
+    ARRAYS, CAMERA_PATH, CAMERAS, CLOUD, IMAGE, Kind, METRICS, RECORD, RUN, SETTINGS, TENSORS, is_there, open, read, read_named, text,
+};
 
 mod lock;
+pub mod npy;
 mod room;
 
 pub use lock::{FolderLock, is_abandoned};

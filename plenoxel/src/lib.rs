@@ -20,6 +20,7 @@
 //! | [`checkpoint`] | a trained grid in a file |
 //! | [`run`] | complete runs, without printing: settings, run folder, metrics, evaluation |
 //! | [`export`] | a grid as MagicaVoxel .vox, as a mesh of its surface, or for the web viewer |
+//! | [`formats`] | a grid in the files of svox2 and PlenOctrees, in both directions |
 //! | [`metrics`] | PSNR and SSIM |
 //! | [`point_cloud`] | a trained grid as colored points, filters, PLY files |
 //! | [`random`] | random numbers from a seed and a purpose |
@@ -39,6 +40,7 @@ pub mod evaluate;
 pub mod export;
 pub mod field;
 pub mod files;
+pub mod formats;
 pub mod geometry;
 #[cfg(debug_assertions)]
 #[doc(hidden)]

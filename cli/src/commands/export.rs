@@ -1,7 +1,9 @@
 //! `plenoxel export`: exports the grid of a run to files for other programs.
 
 mod mesh;
+mod plenoctree;
 mod ply;
+pub mod svox2;
 mod vox;
 
 use super::numbers;
@@ -22,9 +24,11 @@ Examples:
   plenoxel export ply runs/lego       a colored point cloud, for CloudCompare or MeshLab
   plenoxel export vox runs/lego       voxels, for MagicaVoxel
   plenoxel export mesh runs/lego      a surface mesh, for Blender and other readers of PLY, OBJ, GLB or STL
+  plenoxel export svox2 runs/lego     a checkpoint, for svox2 (Plenoxels)
+  plenoxel export plenoctree runs/lego  an octree, for svox and volrend (PlenOctrees)
   plenoxel export ply --help          the flags of a format";
 
-/// Export the grid of a run as a point cloud, voxels or a mesh
+/// Export the grid of a run as a point cloud, voxels, a mesh, or a file of svox2 or PlenOctrees
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, arg_required_else_help = true)]
 pub struct ExportArgs {
@@ -37,6 +41,9 @@ enum What {
     Ply(Box<ply::PlyArgs>),
     Vox(vox::VoxArgs),
     Mesh(mesh::MeshArgs),
+    Svox2(svox2::Svox2Args),
+    #[command(name = "plenoctree")]
+    PlenOctree(plenoctree::PlenOctreeArgs),
 }
 
 /// Exports a run.
@@ -45,6 +52,8 @@ pub fn run(args: &ExportArgs, console: &Console<'_>) -> Result<()> {
         What::Ply(args) => ply::run(args, console),
         What::Vox(args) => vox::run(args, console),
         What::Mesh(args) => mesh::run(args, console),
+        What::Svox2(args) => svox2::run(args, console),
+        What::PlenOctree(args) => plenoctree::run(args, console),
     }
 }
 

@@ -146,6 +146,11 @@ fn of_run(path: &Path) -> Result<Lines> {
     let stages: Vec<String> = stages.iter().map(|resolution| format!("{resolution}³")).collect();
     lines.push(("stages", if kind == RunKind::Trained { stages.join(", ") } else { format!("none: the grid was {}", kind.name()) }));
     lines.extend(record.baked.map(|baked| ("baked from", baked.run.display().to_string())));
+    lines.extend(
+        record
+            .imported
+            .map(|from| ("imported from", format!("{}, {}, scene_scale {:.4}", from.file.display(), from.format, from.scene_scale))),
+    );
     if folder.checkpoint().exists() {
         match of_other_kind(&folder.checkpoint())? {
             Some(other) => lines.extend(other),

@@ -31,6 +31,9 @@ const KEYS: [&str; 3] = ["frames", "file_path", "transform_matrix"];
 /// Longest accepted path, which is the limit of common systems.
 const LONGEST_PATH: usize = 4096;
 
+/// Name of the format.
+pub const FORMAT: &str = "NeRF-synthetic (transforms_train.json)";
+
 /// Opens the NeRF-synthetic folder `root`. The training file must exist and list frames. Without a validation or test file, these splits
 /// are empty.
 ///
@@ -68,7 +71,7 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     let frames = splits.map(|listed| listed.into_iter().map(frame).collect());
     Ok(Dataset {
         name: super::scene_name(root),
-        format: "NeRF-synthetic (transforms_train.json)",
+        format: FORMAT,
         size: (size.0 / options.downscale, size.1 / options.downscale),
         frames,
         source: Source::Files { downscale: options.downscale },

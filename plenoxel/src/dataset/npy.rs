@@ -1,9 +1,8 @@
 //! NumPy files of one table of double-precision numbers.
 
 use crate::error::{Error, Result};
+use crate::files::npy::Header;
 use std::path::Path;
-
-const MAGIC: &[u8; 6] = b"\x93NUMPY";
 
 /// A table in row-major order.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,30 +17,16 @@ pub struct Table {
 ///
 /// Errors if the file is damaged or has other content.
 pub fn parse(path: &Path, bytes: &[u8]) -> Result<Table> {
-    let remedy = "expected a .npy file of little-endian float64 in C order, with two axes";
-    let bad = |found: String| Error::input(path, found, remedy);
-    let cut = || bad("the file ends within its header".into());
-    let rest = bytes.strip_prefix(MAGIC).ok_or_else(|| bad("this is not a NumPy file".into()))?;
-    let (length, rest) = match rest {
-        [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
-        [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
-        [1..=3, ..] | [] => return Err(cut()),
-        [version, ..] => return Err(bad(format!("the file has version {version} of the format"))),
-    };
-    let (header, data) = rest.split_at_checked(length).ok_or_else(cut)?;
-    let header = String::from_utf8_lossy(header);
-    // The header is a dictionary of Python, written by NumPy in one way.
-    let after = |key: &str| header.split_once(&format!("'{key}':")).map(|(_, rest)| rest.trim_start());
-    match after("descr") {
-        Some(kind) if kind.starts_with("'<f8'") => {}
-        kind => return Err(bad(format!("the numbers are of type {}", kind.map_or("none", |kind| kind.split(',').next().unwrap_or(kind))))),
+    let bad = |found: String| Error::input(path, found, "expected a .npy file of little-endian float64 in C order, with two axes");
+    let mut data = bytes;
+    let header = Header::read(&mut data).map_err(bad)?;
+    if header.kind != "<f8" {
+        return Err(bad(format!("the numbers are of type '{}'", header.kind)));
     }
-    if !after("fortran_order").is_some_and(|order| order.starts_with("False")) {
+    if header.fortran_order {
         return Err(bad("the table is not in C order".into()));
     }
-    let shape = after("shape").and_then(|shape| shape.strip_prefix('(')?.split_once(')')).map_or("none", |(shape, _)| shape);
-    let sides: Vec<Option<usize>> = shape.split(',').filter(|side| !side.trim().is_empty()).map(|side| side.trim().parse().ok()).collect();
-    let [Some(rows), Some(columns)] = sides[..] else { return Err(bad(format!("the table has the shape ({shape})"))) };
+    let [rows, columns] = header.shape[..] else { return Err(bad(format!("the table has the shape {}", header.shape_as_text()))) };
     let expected = rows.checked_mul(columns).and_then(|n| n.checked_mul(8));
     if expected != Some(data.len()) {
         return Err(bad(format!("the table has {rows} x {columns} numbers, but the file {} bytes of them", data.len())));
@@ -56,7 +41,7 @@ mod tests {
     fn file(descr: &str, order: &str, shape: &str, data: &[f64]) -> Vec<u8> {
         let header = format!("{{'descr': '{descr}', 'fortran_order': {order}, 'shape': {shape}, }}\n");
         let data = data.iter().flat_map(|value| value.to_le_bytes());
-        MAGIC.iter().copied().chain([1, 0]).chain((header.len() as u16).to_le_bytes()).chain(header.bytes()).chain(data).collect()
+        b"\x93NUMPY\x01\0".iter().copied().chain((header.len() as u16).to_le_bytes()).chain(header.bytes()).chain(data).collect()
     }
 
     #[test]
@@ -74,7 +59,8 @@ mod tests {
             (good[..40].to_vec(), "ends within its header"),
             (good[..good.len() - 1].to_vec(), "but the file 47 bytes"),
             (b"PK\x03\x04".to_vec(), "not a NumPy file"),
-            ([&MAGIC[..], &[9, 0, 0, 0]].concat(), "version 9"),
+            (b"\x93NUMPY\x09\0\0\0".to_vec(), "version 9"),
+            (b"\x93NUMPY\x02\0\0\0\0\xf0".to_vec(), "more than 65536"),
         ] {
             let message = read(&bytes).unwrap_err().to_string();
             assert!(message.contains(words) && message.contains("float64"), "{message}");

@@ -46,6 +46,9 @@ pub const IMAGE: Kind = Kind { name: "a PNG, JPEG or WebP image", most: 4 << 30,
 /// A point cloud: up to 2³² points of 16 bytes. Its reader counts the memory of the points by the header.
 pub const CLOUD: Kind = Kind { name: "a PLY file", most: 64 << 30, memory: 1 };
 
+/// Arrays of NumPy: a grid of 1024³ voxels with its links and 27 coefficients in half precision. Their reader counts the memory of each array.
+pub const ARRAYS: Kind = Kind { name: "a .npz file of NumPy arrays", most: 128 << 30, memory: 0 };
+
 /// Tensors: up to a grid of 1024³ voxels with 27 harmonics and its optimizer state, in double precision.
 pub const TENSORS: Kind = Kind { name: "a safetensors file", most: 1 << 40, memory: 0 };
 

@@ -33,6 +33,8 @@ pub enum DataSource {
         /// Test views.
         test: usize,
     },
+    /// No views: the grid was imported without a dataset.
+    None,
 }
 
 impl fmt::Display for DataSource {
@@ -42,6 +44,7 @@ impl fmt::Display for DataSource {
             DataSource::BuiltIn { width, height, train, val, test } => {
                 write!(f, "built in, {width} x {height}, {train} train, {val} val, {test} test views")
             }
+            DataSource::None => f.write_str("none"),
         }
     }
 }
@@ -54,11 +57,11 @@ impl DataSource {
         DataSource::Folder { path: absolute.unwrap_or_else(|_| path.to_owned()) }
     }
 
-    /// Returns the folder with the views; `None` for the built-in scene.
+    /// Returns the folder with the views; `None` for the built-in scene and without views.
     pub fn path(&self) -> Option<&Path> {
         match self {
             DataSource::Folder { path } => Some(path),
-            DataSource::BuiltIn { .. } => None,
+            DataSource::BuiltIn { .. } | DataSource::None => None,
         }
     }
 
@@ -79,6 +82,7 @@ impl DataSource {
             DataSource::Folder { path } if path.to_str().is_some_and(|path| path.chars().all(plain)) => format!(" {}", path.display()),
             // Quoted and escaped, so that it fits into a comment of a file.
             DataSource::Folder { path } => format!(" {path:?}"),
+            DataSource::None => String::new(),
             built_in if *built_in == DataSource::of(None) => String::new(),
             DataSource::BuiltIn { width, height, train, val, test } => {
                 format!(" --scene-size {width}x{height} --scene-views {train},{val},{test}")
@@ -128,6 +132,10 @@ impl DataSource {
                     test,
                     ..ProceduralOptions::default()
                 })
+            }
+            DataSource::None => {
+                let found = "the run has no views: its grid was imported without a dataset";
+                Err(Error::usage("data", found, "give the folder with the views, --data DIR"))
             }
         }
     }

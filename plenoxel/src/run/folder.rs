@@ -3,7 +3,7 @@
 mod listing;
 mod record;
 
-pub use record::{Baked, RunKind, RunRecord};
+pub use record::{Baked, Imported, RunKind, RunRecord};
 
 use super::settings::{self, ConfigFile};
 use super::tensorboard;
@@ -47,7 +47,7 @@ const FILES: [&str; 11] = [README, LOSS, REPORT, METRICS, EVALUATION, RESULT, ST
 /// All content of figure files is kept. The figures of the run and of an evaluation are in memory at the same time.
 const FIGURES: json::Kept = json::Kept { keys: |_| true, entries: usize::MAX, share: 45 };
 /// File extensions of `plenoxel export`.
-const EXPORTED: [&str; 5] = ["vox", "ply", "obj", "glb", "stl"];
+const EXPORTED: [&str; 6] = ["vox", "ply", "obj", "glb", "stl", "npz"];
 
 /// A run folder to be created.
 #[derive(Debug)]

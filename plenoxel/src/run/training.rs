@@ -395,7 +395,8 @@ impl<'o> OldRun<'o> {
     fn open(path: &Path, data: Option<DataSource>, options: &'o RunOptions, on: &mut Listener<'_>) -> Result<Self> {
         let (folder, config, mut record) = RunFolder::open(path)?;
         if record.kind != RunKind::Trained {
-            let found = format!("a {} run cannot be resumed", record.kind.name());
+            let article = if record.kind == RunKind::Imported { "an" } else { "a" };
+            let found = format!("{article} {} run cannot be resumed", record.kind.name());
             return Err(Error::input(path, found, "train its grid with --init-from"));
         }
         let folder = folder.locked("--resume")?;

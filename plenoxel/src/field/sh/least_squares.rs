@@ -3,10 +3,11 @@
 use super::{MAX_DEGREE, count};
 
 /// Computes x ← x + A⁻¹ (g − ridge x) for each channel, where the ridge is also added to the diagonal of A. The coefficient of degree 0 has no
-/// ridge. `a` is the lower triangle of Σ w S Sᵀ, row after row, and `g` is Σ w S (c − S·x), for red, then green, then blue.
+/// ridge. `a` is the lower triangle of Σ w S Sᵀ, row after row, and `g` is Σ w S (c − S·x), for one channel after another.
 pub fn improve(x: &mut [f32], a: &[f32], g: &[f32], ridge: f32) {
     const MOST: usize = count(MAX_DEGREE);
-    let count = x.len() / 3;
+    // a has count (count + 1) / 2 numbers.
+    let count = (2 * a.len()).isqrt();
     // A small ridge for degree 0 too: if all directions are equal, A is singular up to rounding.
     let least = 1e-6 * f64::from(a[0]);
     let mut l = [[0.0_f64; MOST]; MOST];

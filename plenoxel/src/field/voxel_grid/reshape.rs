@@ -120,6 +120,12 @@ impl<T: Real> VoxelGrid<T> {
         self.with_voxels(*self.shape(), lattice, density, color)
     }
 
+    /// Adds a layer of voxels with density and color 0 around the present voxels. Absent voxels are read as zeros, so no rendered value
+    /// changes, and the zeros can be converted ([`VoxelGrid::with_color`]).
+    pub fn surrounded(&self) -> Self {
+        self.in_lattice(dilated(self.lattice()))
+    }
+
     /// Returns the grid with the same values and another look-up.
     pub fn with_interpolation(&self, interpolation: Interpolation) -> Self {
         let shape = GridShape { interpolation, ..*self.shape() };
@@ -139,7 +145,7 @@ impl<T: Real> VoxelGrid<T> {
         Self::with_tables(shape, self.lattice().clone(), tables)
     }
 
-    /// Returns the grid with a subset of its voxels.
+    /// Returns the grid with other voxels, among them zeros for those that it does not have.
     fn in_lattice(&self, lattice: Lattice) -> Self {
         let [density, color] = [&self.density, &self.color].map(|table| moved(table.tensor(), self.lattice(), &lattice));
         self.with_voxels(*self.shape(), lattice, density, color)

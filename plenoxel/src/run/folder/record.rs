@@ -20,15 +20,18 @@ pub enum RunKind {
     Carved,
     /// Baking of a trained field.
     Baked,
+    /// Import of a file of another program.
+    Imported,
 }
 
 impl RunKind {
-    /// The name of the kind: trained, carved or baked.
+    /// The name of the kind: trained, carved, baked or imported.
     pub fn name(self) -> &'static str {
         match self {
             RunKind::Trained => "trained",
             RunKind::Carved => "carved",
             RunKind::Baked => "baked",
+            RunKind::Imported => "imported",
         }
     }
 
@@ -38,6 +41,7 @@ impl RunKind {
             RunKind::Trained => "train",
             RunKind::Carved => "carve",
             RunKind::Baked => "bake",
+            RunKind::Imported => "import",
         }
     }
 
@@ -47,6 +51,7 @@ impl RunKind {
             RunKind::Trained => "training",
             RunKind::Carved => "carving",
             RunKind::Baked => "baking",
+            RunKind::Imported => "importing",
         }
     }
 }
@@ -60,6 +65,17 @@ pub struct Baked {
     pub resolution: usize,
     /// Degree of the harmonics.
     pub sh_degree: usize,
+}
+
+/// Origin of an imported grid.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Imported {
+    /// File of the other program.
+    pub file: PathBuf,
+    /// Name of its format.
+    pub format: String,
+    /// Length in the file of one world unit.
+    pub scene_scale: f64,
 }
 
 /// Facts about a run beyond its settings: program, machine and data.
@@ -92,6 +108,9 @@ pub struct RunRecord {
     /// The field that was baked, for a baked run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baked: Option<Baked>,
+    /// The file that was imported, for an imported run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub imported: Option<Imported>,
 }
 
 fn plenoxels_kind() -> String {
@@ -101,24 +120,34 @@ fn plenoxels_kind() -> String {
 impl RunRecord {
     /// The record of a new run of Plenoxels on this machine.
     pub fn new(kind: RunKind, dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> Self {
+        RunRecord { preset: preset.map(str::to_owned), ..Self::of_scene(kind, dataset.name(), dataset.format(), source) }
+    }
+
+    /// The record of a new run of Plenoxels on this machine, for a scene with a name and a format.
+    pub fn of_scene(kind: RunKind, scene: &str, format: &str, source: &DataSource) -> Self {
         RunRecord {
             kind,
             model: plenoxels_kind(),
             program: PROGRAM.to_owned(),
             instruction_set: machine::instruction_set().to_owned(),
             threads: machine::threads(),
-            scene: dataset.name().to_owned(),
-            format: dataset.format().to_owned(),
-            preset: preset.map(str::to_owned),
+            scene: scene.to_owned(),
+            format: format.to_owned(),
+            preset: None,
             data: source.clone(),
             seconds_planned: None,
             baked: None,
+            imported: None,
         }
     }
 
     /// The command line that repeats the run; `config` is the name of its file of settings.
     pub fn command_line(&self, config: &str) -> String {
         let command = self.kind.command();
+        if let Some(Imported { file, scene_scale, .. }) = &self.imported {
+            let data = self.data.path().map_or(String::new(), |_| format!(" --data{}", self.data.arguments()));
+            return format!("plenoxel {command}{} --scene-scale {scene_scale}{data}", DataSource::folder(file).arguments());
+        }
         match &self.baked {
             Some(Baked { run, resolution, sh_degree }) => {
                 let run = DataSource::folder(run).arguments();
