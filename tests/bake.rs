@@ -45,6 +45,9 @@ fn a_baked_field_is_a_run_that_other_commands_take() {
     let [run, baked] = ["field", "baked"].map(|name| folder.path(name));
     train(&run, &["--no-report", "--no-images"]).done();
     plenoxel(&["export", "mesh", &run]).refused(3, &["a factored field has no voxels", &format!("run `plenoxel bake {run}` first")]);
+    for format in ["svox2", "plenoctree"] {
+        plenoxel(&["export", format, &run]).refused(3, &[&format!("run `plenoxel bake {run}` first")]);
+    }
     plenoxel(&["render", &run, "--channels", "normal"]).refused(3, &["run `plenoxel bake RUN` first"]);
 
     let answer = plenoxel(&["bake", &run, "--resolution", "24", "--out", &baked]);

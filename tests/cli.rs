@@ -635,10 +635,13 @@ fn help_mentions_every_command_and_flag() {
         ("render", "--split --view --downscale --data --path --frames --size --fps --channels --format Examples:"),
         ("evaluate", "--split --downscale --samples --json --data Examples:"),
         ("info", "Examples:"),
-        ("export", "ply vox mesh"),
+        ("export", "ply vox mesh svox2 plenoctree"),
+        ("import", "--out --data --scene-scale --background --force --no-report Examples:"),
         ("export ply", "--out --color --min-alpha --min-weight --min-object --coords --bbox --sor-sigma Examples:"),
         ("export vox", "--out --color --min-alpha --solid Examples:"),
         ("export mesh", "--out --color --format --level --min-part --smooth --max-triangles Examples:"),
+        ("export svox2", "--out --best --scene-scale Examples:"),
+        ("export plenoctree", "--out --best --subdivide Examples:"),
         ("scene", "--width --height --train --val --test --exposure-spread --seed --force Examples:"),
     ] {
         let help = plenoxel(&[command.split(' ').collect(), vec!["--help"]].concat());

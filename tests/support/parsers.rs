@@ -15,6 +15,8 @@ use plenoxel::dataset::View;
 use plenoxel::dataset::blender::Transforms;
 use plenoxel::dataset::image::{self, RgbaImage};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use plenoxel::formats::plenoctree::{self, OctreeOptions};
+use plenoxel::formats::{self, svox2};
 use plenoxel::model::plenoxels::Trainer;
 use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Stage};
 use plenoxel::point_cloud::filter::{Filters, Noise, NoiseError, Outliers};
@@ -50,7 +52,7 @@ pub fn parsers() -> impl Iterator<Item = &'static Parser> {
     PARSERS.iter().chain(&capture_parsers::PARSERS)
 }
 
-const PARSERS: [Parser; 10] = [
+const PARSERS: [Parser; 12] = [
     Parser { name: "transforms.json", valid: transforms, read: read_transforms, repair: |_| (), memory: [MIB, 200] },
     Parser { name: "path.json", valid: paths, read: read_path, repair: |_| (), memory: [2 * MIB, 400] },
     // Deflate makes 1032 of one byte, RGBA 32 of one that has 8 pixels; a row; and what stands beside the pixels.
@@ -58,6 +60,9 @@ const PARSERS: [Parser; 10] = [
     Parser { name: "cloud.ply", valid: clouds, read: read_cloud, repair: |_| (), memory: [MIB, 64] },
     // The bricks of 1024³ voxels.
     Parser { name: "checkpoint", valid: checkpoints, read: read_checkpoint, repair: repair_tensors, memory: [1200 * MIB, 64] },
+    // The same bricks; and zeros that deflate makes of a byte are links of voxels that all have one row.
+    Parser { name: "ckpt.npz", valid: svox2_checkpoints, read: read_archive, repair: repair_archive, memory: [1200 * MIB, 1032 * 64] },
+    Parser { name: "tree.npz", valid: octrees, read: read_archive, repair: repair_archive, memory: [1200 * MIB, 1032 * 64] },
     Parser { name: "training", valid: states, read: read_state, repair: repair_tensors, memory: [4 * MIB, 64] },
     Parser { name: "config.toml", valid: configs, read: read_config, repair: |_| (), memory: [2 * MIB, 400] },
     Parser { name: "assignments", valid: assignments, read: read_assignments, repair: |_| (), memory: [2 * MIB, 400] },
@@ -215,10 +220,7 @@ pub fn repair_image(bytes: &mut [u8]) {
         if end + 4 > bytes.len() {
             return;
         }
-        let crc = !bytes[at + 4..end].iter().fold(!0u32, |crc, &byte| {
-            let step = |crc: u32, _| if crc & 1 == 1 { crc >> 1 ^ 0xedb8_8320 } else { crc >> 1 };
-            (0..8).fold(crc ^ u32::from(byte), step)
-        });
+        let crc = crc32(&bytes[at + 4..end]);
         bytes[end..end + 4].copy_from_slice(&crc.to_be_bytes());
         at = end + 4;
     }
@@ -299,6 +301,61 @@ fn read_checkpoint(path: &Path, bytes: &[u8]) -> Result<Then, String> {
             assert!(a.tensor().data() == b.tensor().data(), "{}", a.name());
         }
     }))
+}
+
+fn svox2_checkpoints() -> Vec<Vec<u8>> {
+    let encode = |grid: &VoxelGrid<f32>| svox2::encode(Path::new("grid"), grid, 1.0).expect("it is interpolated");
+    grids().iter().map(encode).collect()
+}
+
+fn octrees() -> Vec<Vec<u8>> {
+    let encode = |grid: &VoxelGrid<f32>| {
+        let options = OctreeOptions { subdivide: 1, scene_scale: 1.0 };
+        plenoctree::encode(Path::new("grid"), grid, &options, &|_, _| ()).expect("it has leaves").0
+    };
+    grids().iter().map(encode).collect()
+}
+
+fn read_archive(path: &Path, bytes: &[u8]) -> Result<Then, String> {
+    let grid = formats::read(path, Cursor::new(bytes), 1.0).map_err(text)?.grid;
+    Ok(Box::new(move || {
+        if grid.shape().resolution > 64 {
+            return;
+        }
+        let again = written(|path| {
+            let header = Header::new(&grid, "imported", [1.0; 3], 42, 0);
+            checkpoint::save(path, &grid, &header).expect("it is written");
+        });
+        let (again, _) = checkpoint::read::<f32>(Path::new("again"), Cursor::new(again)).expect("it is read");
+        assert!(again.shape() == grid.shape() && again.lattice().masks() == grid.lattice().masks());
+    }))
+}
+
+/// The checksums of the stored files of a zip archive, in its central directory and before each file.
+fn repair_archive(bytes: &mut [u8]) {
+    let number = |bytes: &[u8], at: usize, size: usize| {
+        let bytes = bytes.get(at..at.checked_add(size)?)?;
+        Some(bytes.iter().rev().fold(0usize, |number, byte| number << 8 | usize::from(*byte)))
+    };
+    let entries: Vec<usize> = (0..bytes.len()).filter(|at| bytes[*at..].starts_with(b"PK\x01\x02")).collect();
+    for entry in entries {
+        let sizes = [(10, 2), (20, 4), (42, 4)].map(|(at, size)| number(bytes, entry + at, size));
+        let [Some(0), Some(length), Some(file)] = sizes else { continue };
+        let [Some(name), Some(extra)] = [26, 28].map(|at| number(bytes, file + at, 2)) else { continue };
+        let start = file + 30 + name + extra;
+        let Some(crc) = bytes.get(start..start + length).map(crc32) else { continue };
+        for at in [entry + 16, file + 14] {
+            if let Some(stored) = bytes.get_mut(at..at + 4) {
+                stored.copy_from_slice(&crc.to_le_bytes());
+            }
+        }
+    }
+}
+
+/// The checksum of PNG and zip files.
+fn crc32(bytes: &[u8]) -> u32 {
+    let step = |crc: u32, _| if crc & 1 == 1 { crc >> 1 ^ 0xedb8_8320 } else { crc >> 1 };
+    !bytes.iter().fold(!0u32, |crc, &byte| (0..8).fold(crc ^ u32::from(byte), step))
 }
 
 /// The safetensors header's length, by its braces.

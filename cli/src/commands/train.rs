@@ -9,6 +9,7 @@ use crate::interrupt;
 use crate::progress::Console;
 pub use flags::{BuiltInScene, NOT_WHEN_RESUMED, TrainArgs, size};
 use plenoxel::error::Result;
+use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::training::{self, Outcome, RunOptions, RunSettings, Summary};
 use plenoxel::text::clock;
@@ -58,13 +59,14 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     }
 }
 
-/// True for a run that was killed after its final figures and before its report.
+/// True for a run that was killed after its final figures and before its report. A run without views has none.
 fn lacks_page(path: &Path) -> bool {
-    let folder = RunFolder::at(path);
+    let Ok((folder, _, record)) = RunFolder::open(path) else { return false };
     folder.result().is_ok_and(|result| result.is_some())
         && folder.checkpoint().exists()
         && !folder.state().exists()
         && !folder.report().exists()
+        && record.data != DataSource::None
 }
 
 fn options(args: &TrainArgs, stage_psnr: bool) -> RunOptions {

@@ -57,7 +57,7 @@ impl Sphere {
     }
 
     /// Converts the coefficients of a channel from logistic colors: the least-squares fit of degree `to`, which has the same directions.
-    pub fn from_logistic(&self, from: &[f32], to: &Sphere, fitted: &mut [f32]) {
+    pub fn fit_plain(&self, from: &[f32], to: &Sphere, fitted: &mut [f32]) {
         fitted.fill(0.0);
         if from.len() == 1 {
             fitted[0] = (logistic(sh::Y0 as f32 * from[0]) - 0.5) / sh::Y0 as f32;
@@ -72,7 +72,7 @@ impl Sphere {
     /// Converts the coefficients of a channel to logistic colors of the same degree.
     ///
     /// minimize Σ wᵢ (c(dᵢ) − logistic(Σ Yₖ(dᵢ) cₖ))², from the fit to ln(c / (1 − c)) with weights (c (1 − c))².
-    pub fn to_logistic(&self, from: &[f32], fitted: &mut [f32]) {
+    pub fn fit_logistic(&self, from: &[f32], fitted: &mut [f32]) {
         let colors = |sum: f32| (0.5 + sum).clamp(LEAST, 1.0 - LEAST);
         fitted.fill(0.0);
         if from[1..].iter().all(|c| *c == 0.0) {
@@ -132,8 +132,8 @@ mod tests {
         for color in [0.01_f32, 0.3, 0.5, 0.98] {
             let from = [(color - 0.5) / sh::Y0 as f32, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
             let (mut there, mut back) = ([1.0; 9], [1.0]);
-            sphere.to_logistic(&from, &mut there);
-            plain.from_logistic(&there[..1], &plain, &mut back);
+            sphere.fit_logistic(&from, &mut there);
+            plain.fit_plain(&there[..1], &plain, &mut back);
             assert!((logistic(there[0] * sh::Y0 as f32) - color).abs() < 1e-6 && (back[0] - from[0]).abs() < 1e-5, "{color}");
         }
     }
@@ -144,11 +144,11 @@ mod tests {
         let from = [0.1_f32, 0.1, -0.15, 0.05, 0.08, -0.02, 0.04, 0.1, -0.06];
         let (sphere, finer) = (Sphere::new(2), Sphere::new(3));
         let (mut there, mut back) = ([0.0; 9], [0.0; 16]);
-        sphere.to_logistic(&from, &mut there);
+        sphere.fit_logistic(&from, &mut there);
         let colors: Vec<f32> = sphere.sums(&from).map(|sum| 0.5 + sum).collect();
         let logistics = || sphere.sums(&there).map(logistic);
         assert!(difference(colors.iter().copied(), logistics()) < 0.004, "{}", difference(colors.iter().copied(), logistics()));
-        sphere.from_logistic(&there, &finer, &mut back);
+        sphere.fit_plain(&there, &finer, &mut back);
         let again = || finer.sums(&back).map(|sum| 0.5 + sum);
         assert!(difference(logistics(), again()) < 0.002, "{}", difference(logistics(), again()));
     }

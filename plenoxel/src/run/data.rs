@@ -135,7 +135,7 @@ impl DataSource {
             }
             DataSource::None => {
                 let found = "the run has no views: its grid was imported without a dataset";
-                Err(Error::usage("data", found, "give the folder with the views, --data DIR"))
+                Err(Error::usage("--data", found, "give the folder with the views"))
             }
         }
     }

@@ -89,7 +89,7 @@ impl Placed<'_> {
                             Color::Rgb => (own[0] - OFFSET as f32) / sh::Y0 as f32,
                             Color::Sh { .. } => own[0] + ((offset - OFFSET) / sh::Y0) as f32,
                         };
-                        sphere.to_logistic(own, &mut fitted[..channel]);
+                        sphere.fit_logistic(own, &mut fitted[..channel]);
                         own.copy_from_slice(&fitted[..channel]);
                     }
                 }

@@ -1,6 +1,5 @@
 //! Reading of octrees.
 
-use super::place;
 use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -99,7 +98,7 @@ pub(in crate::formats) fn read(file: &mut Npz<'_>, scene_scale: f64) -> Result<I
             let channels = own.chunks_exact((width - 1) / 3).zip(row.chunks_exact_mut(numbers / 3));
             channels.for_each(|(from, to)| match colors {
                 Colors::Plain => to[0] = (logistic(from[0]) - OFFSET as f32) / sh::Y0 as f32,
-                Colors::Harmonics(_) => spheres[0].from_logistic(from, &spheres[1], to),
+                Colors::Harmonics(_) => spheres[0].fit_plain(from, &spheres[1], to),
             });
         }
     });
@@ -158,7 +157,6 @@ fn leaves(path: &Path, child: &[i32], density: impl Fn(usize) -> f32) -> Result<
         for k in 0..CHILDREN {
             let row = node * CHILDREN + k;
             let corner = [0, 1, 2].map(|axis| 2 * corner[axis] + (k >> (2 - axis) & 1) as u32);
-            debug_assert_eq!(k, place(corner[0] as usize, corner[1] as usize, corner[2] as usize));
             if child[row] != 0 {
                 let next = i64::try_from(node).ok().and_then(|node| usize::try_from(node + i64::from(child[row])).ok());
                 let next = next.filter(|next| *next < nodes);
