@@ -71,21 +71,21 @@ fn a_checkpoint_of_svox2_shows_the_same_picture() {
         ("an even reduction", reduced(2), 40.0),
     ] {
         for scale in [1.0, svox2::BLENDER_SCALE] {
-            let bytes = svox2::encode(Path::new(NAME), &grid, scale).unwrap();
+            let bytes = svox2::encode(Path::new(NAME), &grid, scale).unwrap().0;
             let again = read(&bytes, scale).unwrap();
             assert!(again.warnings.is_empty(), "{what}: {:?}", again.warnings);
             assert_relative_eq!(again.grid.shape().half_width, 1.5, max_relative = 1e-6);
             let psnr = between(&grid, &again.grid, 0.02);
             assert!(psnr > least, "{what} at scale {scale}: {psnr} dB");
             // The bytes do not change any more.
-            let twice = svox2::encode(Path::new(NAME), &again.grid, scale).unwrap();
+            let twice = svox2::encode(Path::new(NAME), &again.grid, scale).unwrap().0;
             let third = read(&twice, scale).unwrap().grid;
             assert_eq!(third.color.tensor().data(), again.grid.color.tensor().data(), "{what}");
         }
     }
     // Without the scale the grid is in the world of svox2's cameras: smaller, and denser.
     let grid = whole(harmonics(0, 0.5));
-    let there = read(&svox2::encode(Path::new(NAME), &grid, 0.5).unwrap(), 1.0).unwrap().grid;
+    let there = read(&svox2::encode(Path::new(NAME), &grid, 0.5).unwrap().0, 1.0).unwrap().grid;
     assert_eq!(there.shape().half_width, 0.75);
     assert_eq!(there.density_at([1, 2, 3]), 2.0 * grid.density_at([1, 2, 3]));
 }
@@ -210,7 +210,7 @@ fn an_octree_has_the_constant_voxels_of_a_grid() {
         ("degree 0", ball(shape(12, Nearest, harmonics(0, 0.0)), 3.0), 55.0),
         ("colors that depend on the direction", ball(shape(12, Nearest, harmonics(2, 0.3)), 0.2), 45.0),
     ] {
-        let (bytes, leaves) = plenoctree::encode(Path::new(NAME), &grid, &OctreeOptions::of(Nearest), &|_, _| ()).unwrap();
+        let (bytes, leaves) = plenoctree::encode(Path::new(NAME), &grid, &OctreeOptions::default(), &|_, _| ()).unwrap();
         assert_eq!(leaves, grid.lattice().present(), "{what}");
         let again = read(&bytes, 1.0).unwrap();
         assert_eq!(again.warnings.len(), usize::from(grid.shape().color.channels() > 3), "{what}: {:?}", again.warnings);

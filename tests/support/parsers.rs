@@ -304,14 +304,13 @@ fn read_checkpoint(path: &Path, bytes: &[u8]) -> Result<Then, String> {
 }
 
 fn svox2_checkpoints() -> Vec<Vec<u8>> {
-    let encode = |grid: &VoxelGrid<f32>| svox2::encode(Path::new("grid"), grid, 1.0).expect("it is interpolated");
+    let encode = |grid: &VoxelGrid<f32>| svox2::encode(Path::new("grid"), grid, 1.0).expect("it is interpolated").0;
     grids().iter().map(encode).collect()
 }
 
 fn octrees() -> Vec<Vec<u8>> {
     let encode = |grid: &VoxelGrid<f32>| {
-        let options = OctreeOptions { subdivide: 1, scene_scale: 1.0 };
-        plenoctree::encode(Path::new("grid"), grid, &options, &|_, _| ()).expect("it has leaves").0
+        plenoctree::encode(Path::new("grid"), grid, &OctreeOptions::default(), &|_, _| ()).expect("it has leaves").0
     };
     grids().iter().map(encode).collect()
 }

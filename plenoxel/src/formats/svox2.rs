@@ -157,13 +157,13 @@ fn tables(file: &mut Npz<'_>) -> Result<(Vec<f32>, Array<f32>)> {
     Ok((density.values, harmonics))
 }
 
-/// Encodes a grid as a checkpoint. `scene_scale` is the length in the file of one world unit. Rows are in the order of the voxels, x slowest.
+/// Encodes a grid as a checkpoint. Returns its bytes and its number of rows. `scene_scale` is the length in the file of one world unit. Rows are in the order of the voxels, x slowest.
 ///
 /// The pictures are the same up to the precision of `sh_data`, which is a half. Reduced harmonics are interpolated to every voxel first;
 /// that is exact for odd reductions only. `path` names the grid in error messages.
 ///
 /// Errors: the look-up is nearest, or the harmonics have a degree above 2, which svox2 cannot render.
-pub fn encode(path: &Path, grid: &VoxelGrid<f32>, scene_scale: f64) -> Result<Vec<u8>> {
+pub fn encode(path: &Path, grid: &VoxelGrid<f32>, scene_scale: f64) -> Result<(Vec<u8>, usize)> {
     check_scale(scene_scale)?;
     let shape = *grid.shape();
     if shape.interpolation == Interpolation::Nearest {
@@ -201,5 +201,5 @@ pub fn encode(path: &Path, grid: &VoxelGrid<f32>, scene_scale: f64) -> Result<Ve
     file.floats("density_data", &[rows.len(), 1], &density)?;
     file.halves("sh_data", &[rows.len(), width], &color)?;
     file.integer("basis_type", SPHERICAL_HARMONICS)?;
-    file.finish()
+    Ok((file.finish()?, rows.len()))
 }

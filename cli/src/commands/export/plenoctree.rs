@@ -15,7 +15,7 @@ const BYTES_PER_VOXEL: u64 = 100;
 const EXAMPLES: &str = "\
 Examples:
   plenoxel export plenoctree runs/lego
-  plenoxel export plenoctree runs/lego --subdivide 4 --out lego.npz
+  plenoxel export plenoctree runs/lego --subdivide 2 --out lego.npz
 
 Writes RUN/exports/tree.npz for svox and volrend. Leaves of an octree are constant, and their colors are in (0, 1). The octree of an \
 interpolated grid with view-dependent colors is therefore an approximation; --subdivide makes it better and larger. A factored field must be \
@@ -28,17 +28,16 @@ pub struct PlenOctreeArgs {
     #[command(flatten)]
     exported: Exported,
 
-    /// Leaves per voxel along each axis: 1, 2, 4 or 8 [default: 2 for interpolated grids, 1 for constant voxels]
-    #[arg(long, value_name = "K", help_heading = "Output", value_parser = whole::<usize>(1, 8), allow_negative_numbers = true)]
-    subdivide: Option<usize>,
+    /// Leaves per voxel along each axis: 1, 2, 4 or 8; 1 for grids with constant voxels
+    #[arg(long, value_name = "K", help_heading = "Output", default_value_t = OctreeOptions::default().subdivide, value_parser = whole::<usize>(1, 8), allow_negative_numbers = true)]
+    subdivide: usize,
 }
 
 /// Writes the octree.
 pub fn run(args: &PlenOctreeArgs, console: &Console<'_>) -> Result<()> {
     let Opened { folder, grid, .. } = args.exported.open(console, "npz", BYTES_PER_VOXEL)?;
     let shape = grid.shape();
-    let options = OctreeOptions::of(shape.interpolation);
-    let options = OctreeOptions { subdivide: args.subdivide.unwrap_or(options.subdivide), ..options };
+    let options = OctreeOptions { subdivide: args.subdivide, ..OctreeOptions::default() };
     if shape.interpolation == Interpolation::Trilinear {
         console.note("warning: leaves of an octree are constant; the pictures differ from those of the interpolated grid");
     }

@@ -42,9 +42,9 @@ pub fn run(args: &Svox2Args, console: &Console<'_>) -> Result<()> {
             "warning: the harmonics of this grid are on a coarser grid, and are interpolated to every voxel; pictures differ a little",
         );
     }
-    let file = encode(&folder.checkpoint(), &grid, scale).map_err(as_flag)?;
+    let (file, voxels) = encode(&folder.checkpoint(), &grid, scale).map_err(as_flag)?;
     let path = args.exported.write(&folder, "ckpt.npz", &file, console)?;
-    let (voxels, size) = (grid.lattice().present(), bytes(file.len() as u64));
+    let size = bytes(file.len() as u64);
     console.wrote(&path, &format!("wrote {voxels} voxels at scene_scale {scale:.4} to {} ({size})", path.display()))
 }
 

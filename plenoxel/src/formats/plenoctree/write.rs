@@ -27,10 +27,9 @@ pub struct OctreeOptions {
     pub scene_scale: f64,
 }
 
-impl OctreeOptions {
-    /// Returns the smallest octree for a look-up that resembles the grid: one leaf for a constant voxel, 2³ for an interpolated one.
-    pub fn of(interpolation: Interpolation) -> Self {
-        OctreeOptions { subdivide: if interpolation == Interpolation::Nearest { 1 } else { 2 }, scene_scale: 1.0 }
+impl Default for OctreeOptions {
+    fn default() -> Self {
+        OctreeOptions { subdivide: 1, scene_scale: 1.0 }
     }
 }
 
