@@ -2,7 +2,7 @@
 //! directly.
 //!
 //! Exit codes: 0 success, 2 usage or an invalid setting, 3 bad input, 4 numbers that are not finite, 5 reading or writing, 130 interrupted with
-//! the training saved. A sweep ends with the exit code of its first failed run.
+//! what is finished saved. A sweep ends with the exit code of its first failed run.
 #![forbid(unsafe_code)]
 
 mod chart;
@@ -49,7 +49,7 @@ Examples:
   plenoxel sweep scenes.toml                 run every scene with every method and print the results
 
 Progress is printed to stderr, results to stdout. Exit codes: 0 success, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
-130 interrupted (the training is saved).";
+130 interrupted (what is finished is saved).";
 
 /// Train voxel radiance fields from photographs with known cameras
 #[derive(Debug, Parser)]
