@@ -5,6 +5,7 @@
 //! what is finished saved. A sweep ends with the exit code of its first failed run.
 #![forbid(unsafe_code)]
 
+mod camera_plan;
 mod chart;
 mod child;
 mod commands;
