@@ -1,6 +1,7 @@
 //! The commands: a module for each, with its arguments and its implementation.
 
 pub mod bake;
+pub mod cameras;
 mod capture;
 pub mod carve;
 mod cloud_filters;
@@ -27,7 +28,7 @@ mod trained_run;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Error;
 use plenoxel::run::folder::RunFolder;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Checks that the output file `out` is not a file of one of the `runs` or of the dataset folder `data` that a command reads.
 pub fn check_replaceable(out: &Path, runs: &[&RunFolder], data: Option<&Path>) -> Result<(), Error> {
@@ -51,6 +52,15 @@ fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
     let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
     let others: Vec<String> = others.map(|split| split.to_string()).collect();
     Err(Error::usage("--split", found, format!("choose {}", others.join(" or "))))
+}
+
+/// The folder next to `folder`, with `-` and `ending` after its name: the default of `--out`.
+fn beside(folder: &Path, ending: &str) -> Result<PathBuf, Error> {
+    let whole = folder.canonicalize().map_err(|e| Error::io(folder, e, "reading the folder"))?;
+    let name = whole.file_name().map(|name| format!("{}-{ending}", name.to_string_lossy()));
+    let name = name.ok_or_else(|| Error::usage("--out", format!("{} has no name", folder.display()), "give the folder to write"))?;
+    // A relative path stays relative.
+    Ok(if folder.file_name().is_some() { folder.with_file_name(name) } else { whole.with_file_name(name) })
 }
 
 /// The error with the name of the flag for its setting.

@@ -2,10 +2,12 @@
 //! directly.
 //!
 //! Exit codes: 0 success, 2 usage or an invalid setting, 3 bad input, 4 numbers that are not finite, 5 reading or writing, 130 interrupted with
-//! the training saved. A sweep ends with the exit code of its first failed run.
+//! what is finished saved. A sweep ends with the exit code of its first failed run.
 #![forbid(unsafe_code)]
 
+mod camera_plan;
 mod chart;
+mod child;
 mod commands;
 mod curves;
 mod html;
@@ -18,7 +20,8 @@ mod report;
 
 use clap::{Args, Parser, Subcommand};
 use commands::{
-    bake, carve, compare, completions, evaluate, export, filter, harmonics, import, info, man, presets, render, scene, sweep, train,
+    bake, cameras, carve, compare, completions, evaluate, export, filter, harmonics, import, info, man, presets, render, scene, sweep,
+    train,
 };
 use plenoxel::error::Error;
 use plenoxel::run::{machine, memory};
@@ -32,6 +35,7 @@ const PROGRAM: &str = concat!("plenoxel ", env!("CARGO_PKG_VERSION"));
 const EXAMPLES: &str = "\
 Examples:
   plenoxel train                             train the built-in scene; needs no files
+  plenoxel cameras data/photos --out data/room    compute the cameras of photographs with COLMAP
   plenoxel train data/lego --preset paper    train a NeRF-synthetic scene as in the source paper
   plenoxel carve data/lego                   carve an opaque colored grid from silhouettes
   plenoxel bake runs/field                   turn a factored field into a voxel grid, for exports
@@ -48,7 +52,7 @@ Examples:
   plenoxel sweep scenes.toml                 run every scene with every method and print the results
 
 Progress is printed to stderr, results to stdout. Exit codes: 0 success, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
-130 interrupted (the training is saved).";
+130 interrupted (what is finished is saved).";
 
 /// Train voxel radiance fields from photographs with known cameras
 #[derive(Debug, Parser)]
@@ -62,6 +66,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Cameras(cameras::CamerasArgs),
     Train(Box<train::TrainArgs>),
     Carve(Box<carve::CarveArgs>),
     Bake(bake::BakeArgs),
@@ -131,6 +136,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
     memory::limit(cli.machine.max_memory);
     let code = machine::with_threads(cli.machine.threads, || -> Result<u8, Error> {
         let done = match &cli.command {
+            Command::Cameras(args) => return cameras::run(args, &console),
             Command::Train(args) => return train::run(args, &console),
             Command::Carve(args) => carve::run(args, &console),
             Command::Bake(args) => bake::run(args, &console),

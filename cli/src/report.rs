@@ -2,6 +2,7 @@
 //!
 //! It is built from the run folder and the model, so it can be regenerated at any time.
 
+mod cameras;
 pub mod curves;
 pub mod pictures;
 mod scene;
@@ -48,6 +49,7 @@ impl Report<'_> {
             curves::section(&lines, self.config),
             pictures::stages(self.folder, &result)?,
             stages(&result),
+            cameras::section(self.dataset, &result),
             pictures::panels(self.folder, &result)?,
             costs(self, &result),
             self.settings()?,

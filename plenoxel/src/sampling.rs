@@ -164,16 +164,20 @@ impl March {
         self.start + (f64::from(k as u32) - 1.0) * self.step
     }
 
-    /// Returns the intervals from `first` on.
+    /// Returns the middles and the lengths of the intervals from `first` on.
     #[inline(always)]
-    fn intervals<const N: usize>(&self, first: usize) -> [(f64, f64); N] {
-        let mut found: [(f64, f64); N] = std::array::from_fn(|i| self.inner_interval(first + i));
+    fn intervals<const N: usize>(&self, first: usize) -> [[f64; N]; 2] {
+        // Plain loops vectorise; the compiler does not inline `from_fn` in dispatched loops.
+        let (mut middles, mut lengths) = ([0.0; N], [0.0; N]);
+        for i in 0..N {
+            (middles[i], lengths[i]) = self.inner_interval(first + i);
+        }
         for k in [0, self.count - 1] {
-            if let Some(end) = k.checked_sub(first).filter(|end| *end < N) {
-                found[end] = self.interval(k);
+            if k >= first && k - first < N {
+                (middles[k - first], lengths[k - first]) = self.interval(k);
             }
         }
-        found
+        [middles, lengths]
     }
 
     /// Returns the position at a place of the ray, in the coordinates of the box.
@@ -256,8 +260,8 @@ impl Occupied<'_> {
 dispatched! {
 /// Finds the occupied intervals among the [`LOOKS`] intervals from `first` on. Returns their number.
 fn occupied_of(march: &March, along: &Along<'_>, first: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
-    let all: [(f64, f64); LOOKS] = march.intervals(first);
-    let occupied = along.occupied(&all.map(|(middle, _)| middle));
+    let all: [[f64; LOOKS]; 2] = march.intervals(first);
+    let occupied = along.occupied(&all[0]);
     kept(&all, &occupied, march.count - first, found)
 }
 }
@@ -265,19 +269,19 @@ fn occupied_of(march: &March, along: &Along<'_>, first: usize, found: &mut [(f64
 dispatched! {
 /// Like [`occupied_of`], for a ray that is not straight.
 fn occupied_of_bent(march: &March, path: (Bend, &Ray), along: &Along<'_>, first: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
-    let all: [(f64, f64); LOOKS] = march.intervals(first);
-    let occupied = along.occupied_at(&path.0.positions(path.1, &all.map(|(middle, _)| middle)));
+    let all: [[f64; LOOKS]; 2] = march.intervals(first);
+    let occupied = along.occupied_at(&path.0.positions(path.1, &all[0]));
     kept(&all, &occupied, march.count - first, found)
 }
 }
 
 /// Keeps the occupied intervals among the first `most`. Returns their number.
 #[inline(always)]
-fn kept(all: &[(f64, f64); LOOKS], occupied: &[bool; LOOKS], most: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
+fn kept([middles, lengths]: &[[f64; LOOKS]; 2], occupied: &[bool; LOOKS], most: usize, found: &mut [(f64, f64); LOOKS]) -> usize {
     let mut count = 0;
     for i in 0..LOOKS.min(most) {
         if occupied[i] {
-            found[count] = all[i];
+            found[count] = (middles[i], lengths[i]);
             count += 1;
         }
     }

@@ -184,22 +184,42 @@ impl Bend {
 
     /// Returns the positions at several s: x, y and z of each.
     #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // One short loop for each array: such loops vectorise.
     pub(crate) fn positions<const N: usize>(&self, ray: &Ray, s: &[f64; N]) -> [[f64; N]; 3] {
-        let mut at = [[0.0; N]; 3];
+        let (o, d) = (ray.origin.to_array(), ray.direction.to_array());
+        // Intervals after the last would lie beyond infinity.
+        let last = self.end() - 1e-9;
+        let mut t = [0.0; N];
         for i in 0..N {
-            // The operations of [`contract`], on numbers, because such loops vectorise. Intervals after the last would lie beyond infinity.
-            let t = self.distance(s[i].min(self.end() - 1e-9));
-            let x = ray.origin.to_array();
-            let d = ray.direction.to_array();
-            let x = [x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2]];
-            let m = x[0].abs().max(x[1].abs()).max(x[2].abs()).max(1.0);
-            let scale = (2.0 - 1.0 / m) / m;
-            for a in 0..3 {
-                at[a][i] = x[a] * scale;
+            t[i] = self.distance(s[i].min(last));
+        }
+        // The operations of [`contract`].
+        let (mut at, mut m) = ([[0.0; N]; 3], [1.0; N]);
+        for a in 0..3 {
+            for i in 0..N {
+                at[a][i] = o[a] + t[i] * d[a];
+            }
+            for i in 0..N {
+                m[i] = larger(at[a][i].abs(), m[i]);
+            }
+        }
+        let mut scale = [0.0; N];
+        for i in 0..N {
+            scale[i] = (2.0 - 1.0 / m[i]) / m[i];
+        }
+        for a in 0..3 {
+            for i in 0..N {
+                at[a][i] *= scale[i];
             }
         }
         at
     }
+}
+
+/// Returns the larger of two numbers that are not NaN: one instruction, where [`f64::max`] is several.
+#[inline(always)]
+fn larger(x: f64, y: f64) -> f64 {
+    if x > y { x } else { y }
 }
 
 #[cfg(test)]

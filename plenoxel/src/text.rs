@@ -24,6 +24,15 @@ pub fn brief(text: &str) -> String {
     one_line(&shortened(&words, ALL))
 }
 
+/// Returns names as a list with commas, with at most five of them.
+pub fn listed(names: &[String]) -> String {
+    const NAMED: usize = 5;
+    match names.len() {
+        n if n <= NAMED => names.join(", "),
+        n => format!("{} and {} more", names[..NAMED].join(", "), n - NAMED),
+    }
+}
+
 /// Formats a number with the fewest digits that read back as the same number, with an exponent if it is very large or small.
 pub fn number(value: f64) -> String {
     let text = format!("{value:?}");

@@ -109,8 +109,8 @@ fn split<T, const N: usize>(x: [&mut [T]; N], at: usize) -> ([&mut [T]; N], [&mu
 }
 
 dispatched! {
-fn update_loop<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N]>(x: [&mut [T]; N], g: &[T], f: &F) {
-    update_slices(x, g.len(), |i| g[i], f);
+fn update_loop<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N]>(mut x: [&mut [T]; N], g: &[T], f: &F) {
+    update_slices(&mut x, 0, g.len(), |i| g[i], f);
 }
 }
 
@@ -124,9 +124,10 @@ fn update_short_rows<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -
         for (block, x) in block.iter_mut().zip(&x) {
             block.iter_mut().zip(rows).for_each(|(to, &row)| *to = x[row as usize - part.first]);
         }
-        let slices = block.each_mut().map(|b| b.as_flattened_mut());
+        let mut slices = block.each_mut().map(|b| b.as_flattened_mut());
         // The case of a constant length has its own copy of the loop, which is faster.
-        if g.len() == TOGETHER * W { update_slices(slices, TOGETHER * W, |i| g[i], f) } else { update_slices(slices, g.len(), |i| g[i], f) }
+        let len = TOGETHER * W;
+        if g.len() == len { update_slices(&mut slices, 0, len, |i| g[i], f) } else { update_slices(&mut slices, 0, g.len(), |i| g[i], f) }
         for (block, x) in block.iter().zip(&mut x) {
             block.iter().zip(rows).for_each(|(&from, &row)| x[row as usize - part.first] = from);
         }
@@ -144,28 +145,42 @@ fn update_runs<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T;
         let run = (1..).take_while(|&n| rows.get(k + n).is_some_and(|&row| (row - rows[k]) as usize == n)).count() + 1;
         let (start, len) = ((rows[k] as usize - first) * width, run * width);
         if ALL {
-            update_slices(x.each_mut().map(|x| &mut x[done..start]), start - done, |_| T::zero(), f);
+            update_slices(&mut x, done, start - done, |_| T::zero(), f);
             done = start + len;
         }
         let g = &g[k * width..][..len];
-        update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
+        update_slices(&mut x, start, len, |i| g[i], f);
         k += run;
     }
     if ALL {
         let len = x[0].len() - done;
-        update_slices(x.each_mut().map(|x| &mut x[done..]), len, |_| T::zero(), f);
+        update_slices(&mut x, done, len, |_| T::zero(), f);
     }
 }
 }
 
+/// Updates the elements `start..start + len` of each slice.
 #[inline(always)]
-#[allow(clippy::needless_range_loop)] // The loop indexes N arrays.
-fn update_slices<T: Real, const N: usize>(x: [&mut [T]; N], len: usize, g: impl Fn(usize) -> T, f: &impl Fn([T; N], T) -> [T; N]) {
-    let x = x.map(|x| &mut x[..len]);
+#[allow(clippy::needless_range_loop)] // The loops index N arrays. The compiler does not inline `map` and `from_fn` in dispatched loops.
+fn update_slices<T: Real, const N: usize>(
+    x: &mut [&mut [T]; N],
+    start: usize,
+    len: usize,
+    g: impl Fn(usize) -> T,
+    f: &impl Fn([T; N], T) -> [T; N],
+) {
+    let mut parts: [&mut [T]; N] = std::array::from_fn(|_| Default::default());
+    for (part, x) in parts.iter_mut().zip(x.iter_mut()) {
+        *part = &mut x[start..start + len];
+    }
     for i in 0..len {
-        let new = f(std::array::from_fn(|k| x[k][i]), g(i));
+        let mut old = [T::zero(); N];
         for k in 0..N {
-            x[k][i] = new[k];
+            old[k] = parts[k][i];
+        }
+        let new = f(old, g(i));
+        for k in 0..N {
+            parts[k][i] = new[k];
         }
     }
 }
@@ -208,7 +223,7 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
             // The case of a constant length has its own copy of the loop, which is faster.
             let len = if W == 0 { run * width } else { W };
             let g = &mut sums[start..][..len];
-            update_slices(x.each_mut().map(|x| &mut x[start..][..len]), len, |i| g[i], f);
+            update_slices(&mut x, start, len, |i| g[i], f);
             g.fill(T::zero());
         }
     }

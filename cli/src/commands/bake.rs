@@ -1,7 +1,7 @@
 //! `plenoxel bake`: turns a factored field into a voxel grid, as a new run.
 
 use super::new_run::loading;
-use super::whole;
+use super::{beside, whole};
 use crate::images;
 use crate::progress::Console;
 use crate::report::Report;
@@ -24,7 +24,7 @@ use plenoxel::run::memory::{self, Estimate, Stored};
 use plenoxel::run::training::Stopwatch;
 use plenoxel::train::{About, ViewOptions};
 use serde::Serialize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -89,7 +89,7 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     };
     let data = args.data.as_deref().map_or(record.data, DataSource::folder);
     let dataset = data.reopen(&config)?;
-    let out = args.out.clone().map_or_else(|| beside(&args.run), Ok)?;
+    let out = args.out.clone().map_or_else(|| beside(&args.run, "baked"), Ok)?;
     let folder = NewFolder::choose(Some(&out), dataset.name(), args.force)?;
     let estimate = Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, Split::Test)));
     console.note(&estimate.describe());
@@ -148,15 +148,6 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
         console.note(&report.write(console)?);
     }
     Ok(())
-}
-
-/// The folder next to a run, with `-baked` after its name.
-fn beside(run: &Path) -> Result<PathBuf> {
-    let whole = run.canonicalize().map_err(|e| Error::io(run, e, "reading the folder"))?;
-    let name = whole.file_name().map(|name| format!("{}-baked", name.to_string_lossy()));
-    let name = name.ok_or_else(|| Error::usage("--out", "the run folder has no name", "give the folder to write"))?;
-    // A relative path stays relative.
-    Ok(if run.file_name().is_some() { run.with_file_name(name) } else { whole.with_file_name(name) })
 }
 
 /// Scores on the same test views.

@@ -25,7 +25,7 @@ pub struct CaptureFlags {
     #[arg(long, help_heading = "Scene", value_parser = names(Center::ALL))]
     center: Option<String>,
 
-    /// Scale of a capture: auto (the farthest camera comes to 1), none, or a number that multiplies its lengths [default: auto]
+    /// Scale of a capture: auto (the farthest camera comes to 1, or to 2 if cameras look inwards), none, or a number that multiplies its lengths [default: auto]
     #[arg(long, value_name = "FACTOR", help_heading = "Scene", value_parser = scale, allow_negative_numbers = true)]
     scale: Option<Scale>,
 

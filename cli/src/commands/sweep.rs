@@ -6,6 +6,7 @@ mod job;
 mod plan;
 
 use super::table::{Cell, Failure, Published, Row, RunTable};
+use crate::child::command_line;
 use crate::interrupt::{EXIT_CODE, Watch};
 use crate::progress::Console;
 use child::Program;
@@ -252,7 +253,7 @@ fn describe(job: &Job, state: &State, console: &Console<'_>) -> Result<()> {
     };
     console.result(&format!("{} {}: {what}", job.scene, job.method))?;
     let arguments = job.command_line(state);
-    arguments.iter().try_for_each(|arguments| console.result(&format!("    {}", child::command_line(arguments))))
+    arguments.iter().try_for_each(|arguments| console.result(&format!("    {}", command_line("plenoxel", arguments))))
 }
 
 /// The table of the current results.

@@ -65,7 +65,7 @@ pub fn panels(folder: &RunFolder, result: &Value) -> Result<String> {
         if path.exists() {
             let caption = format!("{name_shown}: {psnr} dB, SSIM {ssim}");
             let picture = embedded(&path, &caption)?;
-            figures += &strip(&picture, &PANEL, &caption, &format!(" data-psnr=\"{order}\""));
+            figures += &strip(&picture, &PANEL, &caption, &format!(" id=\"view-{number}\" data-psnr=\"{order}\""));
         }
     }
     let order = "<label>order <select id=\"order\"><option value=\"\">as listed</option><option value=\"1\">worst first</option>\

@@ -11,6 +11,7 @@ use super::normalize::Normalization;
 use super::{Dataset, Frame, OpenOptions, Source, Split};
 use crate::camera::{Camera, Intrinsics};
 use crate::error::{Error, Result};
+use crate::text::listed;
 use glam::{DAffine3, DVec3};
 pub(super) use images::{ImageFolder, base_name, plain, with_any_extension};
 use rayon::prelude::*;
@@ -19,8 +20,6 @@ use std::sync::Arc;
 
 /// Largest accepted coordinate of a camera. Larger ones overflow when rays are intersected with boxes.
 pub(super) const FARTHEST: f64 = 1e12;
-/// Largest number of names in a note or an error.
-const NAMED: usize = 5;
 /// Largest difference, in pixels of the image, between its height and the height that follows from its width and its camera: reductions
 /// round differently.
 const ROUNDED: f64 = 1.5;
@@ -68,14 +67,6 @@ pub struct Point {
     pub position: DVec3,
     /// Color, 8-bit sRGB.
     pub color: [u8; 3],
-}
-
-/// Returns the names as a list for people, with at most a few of them.
-pub(super) fn listed(names: &[String]) -> String {
-    match names.len() {
-        n if n <= NAMED => names.join(", "),
-        n => format!("{} and {} more", names[..NAMED].join(", "), n - NAMED),
-    }
 }
 
 /// Makes the dataset of a capture in the folder `root`.

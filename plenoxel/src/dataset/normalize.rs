@@ -5,7 +5,8 @@
 //! not change: two files of the same reconstruction give the same world.
 //!
 //! - **NDC** for cameras that look in one direction: the frame of the mean camera (LLFF), with the near plane at depth 1/0.75.
-//! - **Contracted** for all others: +z is up, the middle of the scene is the origin, and all cameras are in [-1, 1]³.
+//! - **Contracted** for all others: +z is up, and the middle of the scene is the origin. All cameras are in [-2, 2]³ if they look inwards, so that what
+//!   they look at fills the part of space that is not contracted; else in [-1, 1]³.
 
 mod choice;
 mod frame;
@@ -26,6 +27,9 @@ use std::path::Path;
 const NEAR: f64 = 0.75;
 /// Largest angle between an optical axis and the mean one in a forward-facing capture, degrees.
 const FORWARD_FACING: f64 = 35.0;
+/// Coordinate of the farthest camera in the contracted space, if cameras look inwards. bonsai, training rays after 4 M rays: 23.51 dB for 1, 23.78 dB for 2,
+/// and less for 4.
+const INWARD_REACH: f64 = 2.0;
 /// Quantile of the depths of points that is taken as the nearest depth.
 const NEAREST: f64 = 0.01;
 
@@ -126,6 +130,10 @@ impl Normalization {
         let (center, centered) = frame.center(cameras, choice.center);
         let farthest = cameras.iter().map(|c| (rotation * (c.position() - center)).abs().max_element()).fold(0.0, f64::max);
         let (scale, scaled) = match choice.scale {
+            Scale::Auto if space == Space::Contracted && frame.looked_at(cameras).is_some() => {
+                let scaled = format!("the farthest camera comes to {INWARD_REACH} along an axis, for the cameras look inwards");
+                (INWARD_REACH / farthest, scaled)
+            }
             Scale::Auto => (1.0 / farthest, "the farthest camera comes to 1 along an axis".to_owned()),
             Scale::None => (1.0, "that of the files".to_owned()),
             Scale::Factor(factor) => (factor, "asked for".to_owned()),

@@ -16,6 +16,7 @@ use crate::error::{Error, Result};
 use crate::files;
 use crate::json::{self, Kept};
 use crate::point_cloud::ply::PlyFile;
+use crate::text::listed;
 use glam::DAffine3;
 pub use intrinsics::Stated;
 use serde_json::Value;
@@ -150,7 +151,7 @@ pub(super) fn read(root: &Path, downscale: usize) -> Result<Capture> {
         });
     }
     if !unlisted.is_empty() {
-        let names = super::capture::listed(&unlisted);
+        let names = listed(&unlisted);
         capture.notes.push(format!("left out {} views that are in no list of a split: {names}", unlisted.len()));
     }
     if let Some(name) = &transforms.points {

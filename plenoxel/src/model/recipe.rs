@@ -49,8 +49,9 @@ pub trait Recipe: Send + Sync {
         objective
     }
 
-    /// Returns the cost of the first step, in units of [`with_cost`](Recipe::with_cost).
-    fn cost_of_first_step(&self) -> f64;
+    /// Returns from which step on the steps of the first stage tell the speed of a machine, and the cost of such a step, in units of
+    /// [`with_cost`](Recipe::with_cost).
+    fn measured_step(&self) -> (u64, f64);
 
     /// Returns settings whose steps cost this much in total: the same training, longer or shorter.
     fn with_cost(&self, cost: f64) -> Self

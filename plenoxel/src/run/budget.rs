@@ -104,9 +104,14 @@ pub fn recipe_on_time<R: Recipe>(recipe: &R, seconds: f64, begin: impl FnOnce(&R
     let mut trainer = begin(recipe)?;
     trainer.step()?;
     let begun = start.elapsed().as_secs_f64();
+    let (from, cost) = recipe.measured_step();
+    for _ in 0..from {
+        trainer.step()?;
+    }
+    let measured_from = start.elapsed().as_secs_f64();
     let enough = (CALIBRATION.0 * seconds).min(CALIBRATION.1);
-    let (mut count, mut spent) = (0, begun);
-    while count < 20 || spent - begun < enough {
+    let (mut count, mut spent) = (0, measured_from);
+    while count < 20 || spent - measured_from < enough {
         let Some(report) = trainer.step()? else { break };
         count += 1;
         spent = start.elapsed().as_secs_f64();
@@ -114,7 +119,7 @@ pub fn recipe_on_time<R: Recipe>(recipe: &R, seconds: f64, begin: impl FnOnce(&R
             break;
         }
     }
-    let unit = (spent - begun) / f64::from(count.max(1)) / recipe.cost_of_first_step();
+    let unit = (spent - measured_from) / f64::from(count.max(1)) / cost;
     let left = seconds - spent - begun;
     if left <= 0.0 {
         let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + begun));

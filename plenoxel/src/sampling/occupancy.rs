@@ -290,19 +290,27 @@ impl Along<'_> {
 impl Occupancy {
     /// Tests which cells are occupied. `cell(axis, i, n)` is the cell of the i-th place along an axis of n cells.
     #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // The compiler does not inline `from_fn` in dispatched loops.
     fn occupied<const N: usize>(&self, cell: impl Fn(usize, usize, usize) -> u32) -> [bool; N] {
         let Occupancy { bricks, masks, .. } = self;
         let (mut numbers, mut bits) = ([0; N], [0; N]);
         // Like `BrickGrid::split`, one axis after another, because such loops vectorise.
         for a in 0..3 {
+            let (mut cells, nodes, count) = ([0; N], bricks.nodes()[a], bricks.count()[a] as u32);
             for i in 0..N {
-                let cell = cell(a, i, bricks.nodes()[a]);
-                numbers[i] = numbers[i] * bricks.count()[a] as u32 + cell / BRICK as u32;
-                bits[i] = bits[i] * BRICK as u32 + cell % BRICK as u32;
+                cells[i] = cell(a, i, nodes);
+            }
+            for i in 0..N {
+                numbers[i] = numbers[i] * count + cells[i] / BRICK as u32;
+                bits[i] = bits[i] * BRICK as u32 + cells[i] % BRICK as u32;
             }
         }
         let masks = parallel::gathered(masks, numbers);
-        std::array::from_fn(|i| has(masks[i], bits[i] as usize))
+        let mut occupied = [false; N];
+        for i in 0..N {
+            occupied[i] = has(masks[i], bits[i] as usize);
+        }
+        occupied
     }
 }
 

@@ -1,57 +1,36 @@
 //! A picture of the cameras of a dataset, from above and from the side.
 
+use crate::camera_plan::{Plan, SIDES};
 use crate::images::strip;
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 use ndarray::Array3;
-use plenoxel::camera::Camera;
-use plenoxel::dataset::{Dataset, Split};
+use plenoxel::dataset::Dataset;
 
-/// Width and height of a view, pixels.
+/// Width and height of a plan, pixels.
 const SIDE: usize = 640;
 /// Pixels around what is drawn.
 const MARGIN: f64 = 24.0;
-/// Length of a drawn frustum, as a share of the width of what is drawn.
-const FRUSTUM: f64 = 0.05;
-/// Largest coordinate of drawn points, in units of the largest of a camera.
-const POINTS_WITHIN: f64 = 2.5;
 /// Colors of the cameras of each split.
 const COLORS: [[f32; 3]; 3] = [[0.0, 0.27, 0.68], [0.1, 0.55, 0.1], [0.85, 0.2, 0.0]];
 const GRAY: [f32; 3] = [0.75; 3];
 const AXES: [f32; 3] = [0.88; 3];
 
 /// Draws the cameras, with training views in blue, validation views in green and test views in red, the axes and the points of structure
-/// from motion: from above (x right, y up), and from the side (x right, z up).
+/// from motion: from above, and from the side.
 pub fn picture(dataset: &Dataset) -> Array3<f32> {
-    let cameras: Vec<(Split, Camera)> =
-        Split::ALL.iter().flat_map(|split| dataset.cameras(*split).into_iter().map(|camera| (*split, camera))).collect();
-    let reach = cameras.iter().map(|(_, camera)| camera.position().abs().max_element()).fold(0.0, f64::max).max(f64::MIN_POSITIVE);
-    let near = |p: &DVec3| p.abs().max_element() <= POINTS_WITHIN * reach;
-    let points: Vec<DVec3> = dataset.points().iter().map(|point| point.position).filter(near).collect();
-    let all = || cameras.iter().map(|(_, camera)| camera.position()).chain(points.iter().copied()).chain([DVec3::ZERO]);
-    let half = 1.1 * all().map(|p| p.abs().max_element()).fold(0.0, f64::max);
-    let views = [0, 1].map(|view| {
-        let flat = move |p: DVec3| if view == 0 { DVec2::new(p.x, p.y) } else { DVec2::new(p.x, p.z) };
+    let plan = Plan::of(dataset);
+    let half = plan.half;
+    let plans = SIDES.map(|flat| {
         let mut canvas = Canvas { pixels: Array3::from_elem((SIDE, SIDE, 3), 1.0), half };
         canvas.line([DVec2::new(-half, 0.0), DVec2::new(half, 0.0)], AXES);
         canvas.line([DVec2::new(0.0, -half), DVec2::new(0.0, half)], AXES);
-        points.iter().for_each(|point| canvas.dot(flat(*point), GRAY));
-        for (split, camera) in &cameras {
-            frustum(camera, 2.0 * FRUSTUM * half).into_iter().for_each(|line| canvas.line(line.map(flat), COLORS[*split as usize]));
+        plan.points.iter().for_each(|point| canvas.dot(flat(*point), GRAY));
+        for (split, camera) in &plan.cameras {
+            plan.frustum(camera).into_iter().for_each(|line| canvas.line(line.map(flat), COLORS[*split as usize]));
         }
         canvas.pixels
     });
-    strip(&[&views[0], &views[1]])
-}
-
-/// Returns the edges of the frustum of a camera, of a length along its axis.
-fn frustum(camera: &Camera, length: f64) -> Vec<[DVec3; 2]> {
-    let (w, h) = (camera.intrinsics.width as f64, camera.intrinsics.height as f64);
-    let corner = |x: f64, y: f64| {
-        let ray = camera.ray(x, y);
-        ray.origin + length * ray.direction
-    };
-    let corners = [corner(0.5, 0.5), corner(w - 0.5, 0.5), corner(w - 0.5, h - 0.5), corner(0.5, h - 0.5)];
-    (0..4).flat_map(|i| [[camera.position(), corners[i]], [corners[i], corners[(i + 1) % 4]]]).collect()
+    strip(&[&plans[0], &plans[1]])
 }
 
 /// A white square that shows [-half, half]², the second coordinate upwards.

@@ -113,7 +113,7 @@ pub enum Center {
 /// Scale of the world: `"auto"`, `"none"` or a number.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Scale {
-    /// The farthest camera comes to 1 along an axis.
+    /// The farthest camera comes to 1 along an axis; in the contracted space to 2, if the cameras look inwards.
     #[default]
     Auto,
     /// World lengths are those of the files.

@@ -123,7 +123,7 @@ impl Frame {
         let focus = || focus(cameras, self.mean, self.spread);
         const FOCUS: &str = "focus: the point nearest to the optical axes";
         match center {
-            Center::Auto => match focus().filter(|focus| self.is_looked_at(cameras, *focus)) {
+            Center::Auto => match self.looked_at(cameras) {
                 Some(focus) => (focus, format!("{FOCUS}, for the cameras look inwards")),
                 None => poses(", for they do not look inwards"),
             },
@@ -136,11 +136,12 @@ impl Frame {
         }
     }
 
-    /// Returns true if the cameras look at a point from around it.
-    fn is_looked_at(&self, cameras: &[Camera], focus: DVec3) -> bool {
+    /// Returns the point that the cameras look at from around it; `None` if they do not look inwards.
+    pub fn looked_at(&self, cameras: &[Camera]) -> Option<DVec3> {
+        let focus = focus(cameras, self.mean, self.spread)?;
         let sees = |camera: &&Camera| (camera.position() - focus).dot(axes(camera)[2]) > 0.0;
         let inwards = cameras.iter().filter(sees).count() as f64;
-        inwards >= INWARDS * cameras.len() as f64 && focus.distance(self.mean) <= FARTHEST_FOCUS * self.spread
+        (inwards >= INWARDS * cameras.len() as f64 && focus.distance(self.mean) <= FARTHEST_FOCUS * self.spread).then_some(focus)
     }
 }
 

@@ -60,8 +60,8 @@ impl Recipe for Config {
         own_losses(self, objective)
     }
 
-    fn cost_of_first_step(&self) -> f64 {
-        cost(&self.coarse)
+    fn measured_step(&self) -> (u64, f64) {
+        (0, cost(&self.coarse))
     }
 
     fn with_cost(&self, budget: f64) -> Self {

@@ -51,8 +51,8 @@ impl Recipe for Config {
         objective.with("coarse", 1.0, coarse_mse)
     }
 
-    fn cost_of_first_step(&self) -> f64 {
-        1.0
+    fn measured_step(&self) -> (u64, f64) {
+        (0, 1.0)
     }
 
     fn with_cost(&self, cost: f64) -> Self {

@@ -49,8 +49,8 @@ impl Recipe for Config {
         Ok(model)
     }
 
-    fn cost_of_first_step(&self) -> f64 {
-        self.stages[0].rays as f64
+    fn measured_step(&self) -> (u64, f64) {
+        (0, self.stages[0].rays as f64)
     }
 
     fn with_cost(&self, cost: f64) -> Self {

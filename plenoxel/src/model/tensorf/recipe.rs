@@ -44,8 +44,10 @@ impl Recipe for Config {
         Ok(model)
     }
 
-    fn cost_of_first_step(&self) -> f64 {
-        cost(&self.stages[0])
+    fn measured_step(&self) -> (u64, f64) {
+        // Rays in opaque matter end at their first samples. Then the field turns into fog, in which they have the most.
+        let fog = if self.opaque_steps > 0 { FOG } else { 1.0 };
+        (self.opaque_steps, fog * cost(&self.stages[0]))
     }
 
     fn with_cost(&self, cost: f64) -> Self {
@@ -106,6 +108,10 @@ fn scaled(stages: &[Stage], budget: f64) -> Vec<Stage> {
 fn cost(stage: &Stage) -> f64 {
     (stage.rays as f64 + 150.0) * (1.0 + stage.resolution as f64 / 1500.0)
 }
+
+/// Duration of a step after the opaque ones, relative to the [`cost`] of the mean step. On lego, 8.3 ms for steps 80 to 140 and 6.9 ms for steps 240 to 400 of
+/// the first stage, on two cores of an Intel Xeon with AVX-512.
+const FOG: f64 = 1.2;
 
 #[cfg(test)]
 mod tests {
