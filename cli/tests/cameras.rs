@@ -212,7 +212,7 @@ fn an_interruption_ends_colmap_and_nothing_half_written_counts() {
         // While it works nobody else does, there.
         let (code, _, err) = run(&folder, &USUAL);
         assert!(code == Some(2) && err.contains("is being written by process"), "{err}");
-        assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill").success());
+        assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().expect("kill").success());
         let (code, out, err) = ended(child);
         assert_eq!((code, out.as_str()), (Some(130), ""), "{err}");
         assert!(err.contains(&format!("interrupted; repeat the command to continue with step {}/3", step + 1)), "{err}");
