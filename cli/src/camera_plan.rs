@@ -12,7 +12,7 @@ const POINTS_WITHIN: f64 = 2.5;
 /// The plans: from above (x right, y up), and from the side (x right, z up).
 pub const SIDES: [fn(DVec3) -> DVec2; 2] = [|p| DVec2::new(p.x, p.y), |p| DVec2::new(p.x, p.z)];
 
-/// What plans show.
+/// Cameras and points of a dataset, to be drawn as plans.
 pub struct Plan {
     /// All cameras, split after split.
     pub cameras: Vec<(Split, Camera)>,

@@ -208,11 +208,8 @@ impl<'a> Carving<'a> {
         let shape = GridShape { resolution: config.resolution, half_width, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
         let density = config.depth / shape.voxel_side();
         let opaque = Opaque::new(lattice, Aabb::cube(shape.half_width), density);
-        let (degree, offset) = match color {
-            Color::Rgb => (0, 0.0),
-            Color::Sh { degree, offset } => (degree, offset as f32),
-        };
-        let seen = Seen { opaque: &opaque, lattice, views: self.views, background, degree, offset };
+        let (degree, offset) = color.harmonics();
+        let seen = Seen { opaque: &opaque, lattice, views: self.views, background, degree, offset: offset as f32 };
         let Fitted { mut table, missed } = match config.fit {
             Fit::Exact => color::fit_exactly(&seen, config.ridge as f32, config.sweeps, progress),
             Fit::Sgd => color::fit_by_descent(&seen, seed, progress),

@@ -47,7 +47,7 @@ impl Format {
 pub struct Imported {
     /// The grid, in the coordinates of the file divided by the scene scale.
     pub grid: VoxelGrid<f32>,
-    /// What the file has and the grid has not, as sentences.
+    /// Differences between the file and the grid, as sentences.
     pub warnings: Vec<String>,
 }
 

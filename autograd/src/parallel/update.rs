@@ -159,9 +159,9 @@ fn update_runs<T: Real, const N: usize, const ALL: bool, F: Fn([T; N], T) -> [T;
 }
 }
 
-/// Updates the elements `start..start + len` of each slice.
+/// Updates the elements `start..start + len` of each slice. They are selected here, because `map` with a closure of a dispatched function is not inlined.
 #[inline(always)]
-#[allow(clippy::needless_range_loop)] // The loops index N arrays. The compiler does not inline `map` and `from_fn` in dispatched loops.
+#[allow(clippy::needless_range_loop)] // The loops index N arrays.
 fn update_slices<T: Real, const N: usize>(
     x: &mut [&mut [T]; N],
     start: usize,

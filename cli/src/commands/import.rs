@@ -7,7 +7,6 @@ use crate::report::Report;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Result;
-use plenoxel::field::voxel_grid::Color;
 use plenoxel::formats::{self, Format};
 use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::model::plenoxels::config::{ColorKind, Config};
@@ -88,16 +87,13 @@ pub fn run(args: &ImportArgs, console: &Console<'_>) -> Result<()> {
     ));
 
     let folder = folder.create()?;
-    let (degree, offset) = match shape.color {
-        Color::Rgb => (0, 0.0),
-        Color::Sh { degree, offset } => (degree, offset),
-    };
+    let (sh_degree, sh_offset) = shape.color.harmonics();
     let config = Config {
         background,
         half_width: shape.half_width,
         color: ColorKind::Sh,
-        sh_degree: degree,
-        sh_offset: offset,
+        sh_degree,
+        sh_offset,
         interpolation: shape.interpolation,
         stages: Vec::new(),
         ..Config::default()

@@ -1,4 +1,5 @@
 //! The header of the NumPy file format, versions 1 to 3 (`numpy.lib.format`): a magic number, and a dictionary of Python as text.
+//! `ndarray-npy` reads neither half precision nor text.
 
 use std::io::Read;
 

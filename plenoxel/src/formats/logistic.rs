@@ -16,6 +16,8 @@ const NODES: [(f64, f64); 4] = [
     (0.796_666_477_413_626_7, 0.222_381_034_453_374_48),
     (0.960_289_856_497_536_2, 0.101_228_536_290_376_26),
 ];
+/// Most harmonics.
+const MOST: usize = sh::count(sh::MAX_DEGREE);
 /// Equal angles around z.
 const ANGLES: usize = 12;
 /// Smallest distance of a color from 0 and 1 that is converted. The logistic function reaches neither.
@@ -80,18 +82,18 @@ impl Sphere {
             return;
         }
         for step in 0..=STEPS {
-            let (mut left, mut right) = (vec![0.0; self.count * (self.count + 1) / 2], vec![0.0; self.count]);
-            let now: Vec<f32> = self.sums(fitted).collect();
-            for (i, (sum, basis)) in self.sums(from).zip(self.basis.chunks_exact(self.count)).enumerate() {
+            let (mut left, mut right) = ([0.0; MOST * (MOST + 1) / 2], [0.0; MOST]);
+            let sums = self.sums(from).zip(self.sums(fitted)).zip(self.basis.chunks_exact(self.count)).zip(&self.weights);
+            for (((sum, now), basis), weight) in sums {
                 let color = colors(sum);
                 let (slope, missing) = if step == 0 {
                     (color * (1.0 - color), logit(color))
                 } else {
-                    let is = logistic(now[i]);
+                    let is = logistic(now);
                     let slope = (is * (1.0 - is)).max(LEAST);
                     (slope, (color - is) / slope)
                 };
-                let weight = self.weights[i] * slope * slope;
+                let weight = weight * slope * slope;
                 let mut at = 0;
                 for (k, y) in basis.iter().enumerate() {
                     right[k] += weight * missing * y;
@@ -101,8 +103,8 @@ impl Sphere {
                     }
                 }
             }
-            let ridge = RIDGE * left[0];
-            improve(fitted, &left, &right, ridge);
+            let (left, right) = (&left[..self.count * (self.count + 1) / 2], &right[..self.count]);
+            improve(fitted, left, right, RIDGE * left[0]);
         }
     }
 }

@@ -26,6 +26,8 @@ mod write;
 pub(super) use read::read;
 pub use write::{OctreeOptions, encode};
 
+/// Children of a node.
+const CHILDREN: usize = 8;
 /// Smallest density of a leaf that svox renders.
 const LEAST_DENSITY: f32 = 0.01;
 

@@ -170,10 +170,7 @@ pub fn encode(path: &Path, grid: &VoxelGrid<f32>, scene_scale: f64) -> Result<(V
         let found = "the grid has constant voxels, and svox2 interpolates between voxels";
         return Err(Error::input(path, found, "export an octree (`plenoxel export plenoctree`), or train from this grid with --init-from"));
     }
-    let (degree, offset) = match shape.color {
-        Color::Rgb => (0, 0.0),
-        Color::Sh { degree, offset } => (degree, offset),
-    };
+    let (degree, offset) = shape.color.harmonics();
     if degree > MOST_DEGREE {
         let found = format!("the grid has harmonics of degree {degree}, and svox2 renders up to degree {MOST_DEGREE}");
         return Err(Error::input(path, found, "train or bake with a lower sh_degree"));

@@ -28,7 +28,7 @@ pub const WORK: &str = "colmap";
 /// Folder of the reconstruction.
 const SPARSE: &str = "sparse/0";
 
-/// What was asked for, and what is finished of it.
+/// Record of the photographs, the settings and the finished steps.
 #[derive(Debug, Serialize, Deserialize)]
 pub struct Record {
     /// The folder of photographs.

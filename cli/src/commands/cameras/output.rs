@@ -1,6 +1,6 @@
 //! The output of COLMAP 3.6 and newer, whose lines may begin with the time and place that glog adds.
 
-/// What COLMAP counts.
+/// Unit of a progress message of COLMAP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     Image,

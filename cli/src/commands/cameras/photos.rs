@@ -22,7 +22,7 @@ pub struct Photo {
     pub size: (usize, usize),
 }
 
-/// What a folder of photographs has.
+/// Content of a folder of photographs.
 #[derive(Debug, Default)]
 pub struct Photos {
     /// The photographs, sorted by name.

@@ -51,7 +51,7 @@ impl Step {
     }
 }
 
-/// What a step works on.
+/// Inputs of a step.
 pub struct Work<'a, 'c> {
     /// When the step began.
     pub begun: Instant,

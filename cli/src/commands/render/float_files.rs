@@ -3,7 +3,7 @@
 use exr::prelude::{Encoding, Image, SpecificChannels, Vec2, WritableImage};
 use ndarray::ArrayView3;
 use plenoxel::error::Result;
-use plenoxel::files::atomically;
+use plenoxel::files::{atomically, npy::Header};
 use std::path::Path;
 
 /// Writes `[h, w, 3]` as the channels R, G, B, and anything else as the channel Y. Programs display channels of these names.
@@ -26,18 +26,11 @@ pub fn write_exr(path: &Path, values: ArrayView3<'_, f32>) -> Result<()> {
     })
 }
 
-/// Encodes `[h, w, 3]`, or `[h, w]` for one channel, in row-major order (NumPy format 1.0). Implemented here, because `ndarray-npy` has many
-/// dependencies for reading headers.
+/// Encodes `[h, w, 3]`, or `[h, w]` for one channel, in row-major order, as a NumPy file.
 pub fn npy(values: ArrayView3<'_, f32>) -> Vec<u8> {
     let (height, width, channels) = values.dim();
-    let shape = if channels == 1 { format!("({height}, {width})") } else { format!("({height}, {width}, {channels})") };
-    let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
-    // Signature (6 bytes), version (2) and length (2); the header is padded to a multiple of 64 bytes and ends in a newline.
-    const BEFORE: usize = 10;
-    let length = (BEFORE + header.len() + 1).next_multiple_of(64) - BEFORE;
-    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-    bytes.extend((length as u16).to_le_bytes());
-    bytes.extend(format!("{header:<width$}\n", width = length - 1).into_bytes());
+    let shape = if channels == 1 { &[height, width][..] } else { &[height, width, channels] };
+    let mut bytes = Header::encode("<f4", shape);
     bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
     bytes
 }

@@ -117,13 +117,13 @@ impl Frame {
         DMat3::from_cols(x, z.cross(x), z).transpose()
     }
 
-    /// Returns the point that becomes the origin, with a description.
-    pub fn center(&self, cameras: &[Camera], center: Center) -> (DVec3, String) {
+    /// Returns the point that becomes the origin, with a description. `looked_at` is [`looked_at`](Self::looked_at).
+    pub fn center(&self, cameras: &[Camera], center: Center, looked_at: Option<DVec3>) -> (DVec3, String) {
         let poses = |why: &str| (self.mean, format!("poses: the mean position of the cameras{why}"));
         let focus = || focus(cameras, self.mean, self.spread);
         const FOCUS: &str = "focus: the point nearest to the optical axes";
         match center {
-            Center::Auto => match self.looked_at(cameras) {
+            Center::Auto => match looked_at {
                 Some(focus) => (focus, format!("{FOCUS}, for the cameras look inwards")),
                 None => poses(", for they do not look inwards"),
             },

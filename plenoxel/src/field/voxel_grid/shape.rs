@@ -51,6 +51,14 @@ impl Color {
         }
     }
 
+    /// Returns degree and offset of the harmonics; 0 and 0 for RGB.
+    pub fn harmonics(self) -> (usize, f64) {
+        match self {
+            Color::Rgb => (0, 0.0),
+            Color::Sh { degree, offset } => (degree, offset),
+        }
+    }
+
     /// Computes density and color of samples from interpolated values, `[m, 1]` and `[m, channels]`. `directions` is `[n, 3]`; ray r owns
     /// the samples `offsets[r]..offsets[r + 1]`.
     pub fn activate<T: Real>(self, density: &Tensor<T>, color: &Tensor<T>, directions: &Tensor<T>, offsets: &Indices) -> Radiance<T> {

@@ -54,10 +54,7 @@ impl Placed<'_> {
     /// Errors: there is not enough memory.
     pub fn leaves(&self, path: &Path, progress: &dyn Fn(usize, usize)) -> Result<Leaves> {
         let shape = *self.grid.shape();
-        let (degree, offset) = match shape.color {
-            Color::Rgb => (0, 0.0),
-            Color::Sh { degree, offset } => (degree, offset),
-        };
+        let (degree, offset) = shape.color.harmonics();
         let (channel, sphere) = (sh::count(degree), Sphere::new(degree));
         let width = 3 * channel + 1;
         let density = self.grid.density.tensor().data();

@@ -1,5 +1,6 @@
 //! Reading of octrees.
 
+use super::CHILDREN;
 use crate::error::{Error, Result};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -12,8 +13,6 @@ use autograd::{Buffer, Lattice, Tensor, parallel};
 use std::ops::Range;
 use std::path::Path;
 
-/// Children of a node.
-const CHILDREN: usize = 8;
 /// Deepest leaf, in halvings of the root.
 const DEEPEST: u32 = 20;
 /// Degree of the harmonics that are fitted to logistic colors: the highest.

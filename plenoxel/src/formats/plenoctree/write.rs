@@ -1,5 +1,6 @@
 //! Writing of octrees.
 
+use super::CHILDREN;
 use super::leaves::{Leaves, Placed};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Interpolation, VoxelGrid};
@@ -9,8 +10,6 @@ use half::f16;
 use std::ops::Range;
 use std::path::Path;
 
-/// Children of a node.
-const CHILDREN: usize = 8;
 /// Nodes whose bytes are made at a time.
 const RUN: usize = 1 << 12;
 /// Deepest node that svox refines, a setting without effect on the picture. svox's default.
