@@ -53,7 +53,7 @@ fn a_run_ends_with_a_page_that_holds_its_figures_its_pictures_and_its_grid() {
         assert!(page.contains(&caption), "{caption}");
     }
     assert_eq!(page.matches("data:image/jpeg;base64,").count(), 4, "the stages, and three test views");
-    assert_eq!(page.matches("<svg").count(), 8, "four curves over steps, and over seconds");
+    assert_eq!(page.matches("<svg").count(), 4 + 4 + 2, "curves over steps and over seconds, and plans of the cameras");
     assert_eq!(page.matches("<span>target</span><span>render</span><span>error</span><span>depth</span>").count(), 3);
     assert!(page.contains("<span>start</span><span>8³</span><span>12³</span><span>photograph</span>"), "the stages have names");
     assert!(page.contains("stages[0]") || page.contains("[[stages]]"), "the settings");
