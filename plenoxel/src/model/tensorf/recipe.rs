@@ -51,6 +51,11 @@ impl Recipe for Config {
     }
 
     fn with_cost(&self, cost: f64) -> Self {
+        let SmallNetwork { below, hidden, group, cost: relative } = SMALL_NETWORK;
+        if self.hidden > hidden && self.group > 0.0 && cost < below * total(&self.stages) {
+            let stages = scaled(&self.stages, cost / relative);
+            return Config { hidden, group: self.group.max(group), stages, ..self.clone() };
+        }
         Config { stages: scaled(&self.stages, cost), ..self.clone() }
     }
 
@@ -82,7 +87,6 @@ fn bytes_of_ray(config: &Config, engine: Engine) -> u64 {
 /// Scales stages to a total cost. In a short run, the earlier stages are shortened less than the last, and the finest stages become coarser: without geometry, and
 /// with few steps for each node, finer planes gain nothing.
 fn scaled(stages: &[Stage], budget: f64) -> Vec<Stage> {
-    let total = |stages: &[Stage]| stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum::<f64>();
     let factor = budget / total(stages);
     let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
     let most = ((finest as f64 * factor.min(1.0).powf(0.13)) as usize).max(2);
@@ -103,6 +107,28 @@ fn scaled(stages: &[Stage], budget: f64) -> Vec<Stage> {
     stages
 }
 
+/// Returns the duration of stages, in the units of [`cost`].
+fn total(stages: &[Stage]) -> f64 {
+    stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum()
+}
+
+/// Color network and groups of short runs.
+struct SmallNetwork {
+    /// Share of the configured cost below which a run is short.
+    below: f64,
+    /// Width of the hidden layers.
+    hidden: usize,
+    /// Least weight that completes a group.
+    group: f64,
+    /// Duration of a step, relative to the configured network and groups.
+    cost: f64,
+}
+
+/// In short runs, more rays improve the result more than more colors on a ray. Ten held-out training views of lego, `quality` with its network of width 128 and
+/// groups of 0.04, and with these: 33.15 and 33.86 dB after one minute (0.09 of the configured cost), 36.25 and 36.15 dB after five (0.4). Rays: 33.3 and 46.0 M
+/// in five minutes.
+const SMALL_NETWORK: SmallNetwork = SmallNetwork { below: 0.3, hidden: 64, group: 0.1, cost: 0.72 };
+
 /// Duration of a step of a factored field, in units of a ray at a resolution of 0. On lego, stages of 400 to 5000 rays at 64 to 300 nodes took 5.1 to 6.0 µs per
 /// unit on two cores of an AMD EPYC with AVX-512.
 fn cost(stage: &Stage) -> f64 {
@@ -120,7 +146,6 @@ mod tests {
     #[test]
     fn stages_of_a_factored_field_cost_what_they_may_and_short_runs_are_coarser() {
         let stages = Config::default().stages;
-        let total = |stages: &[Stage]| stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum::<f64>();
         let whole = total(&stages);
         for factor in [0.03, 0.1, 0.4, 1.0, 3.0] {
             let planned = scaled(&stages, factor * whole);
@@ -130,5 +155,18 @@ mod tests {
             assert_eq!(finest(&planned) < finest(&stages), factor < 1.0, "{factor}");
             assert!(factor > 1.0 || planned[0].steps as f64 >= factor * stages[0].steps as f64);
         }
+    }
+
+    #[test]
+    fn short_runs_have_a_small_network_and_more_steps_for_it() {
+        let config = Config { hidden: 128, group: 0.04, ..Config::default() };
+        let whole = total(&config.stages);
+        let [short, long] = [0.2, 0.5].map(|share| config.with_cost(share * whole));
+        assert_eq!((short.hidden, short.group), (64, 0.1));
+        assert_eq!((long.hidden, long.group), (128, 0.04));
+        assert!((total(&short.stages) / (0.2 * whole / SMALL_NETWORK.cost) - 1.0).abs() < 0.05);
+        // Without groups, the recipe is that of the authors.
+        let authors = Config { group: 0.0, ..config };
+        assert_eq!(authors.with_cost(0.2 * whole).hidden, 128);
     }
 }
