@@ -19,7 +19,12 @@ use serde_json::{Value, json};
 use std::io::Write;
 use std::process::{Command, Stdio};
 
-const SCRIPT: &str = concat!(include_str!("../cli/src/report/viewer.js"), "\n", include_str!("support/viewer.js"));
+const SCRIPT: &str = concat!(
+    include_str!("../cli/src/html/camera.js"),
+    include_str!("../cli/src/report/viewer.js"),
+    "\n",
+    include_str!("support/viewer.js")
+);
 /// Directions in which harmonics are compared, and points where densities are.
 const POINTS: usize = 1000;
 

@@ -24,6 +24,7 @@ pub mod sweep;
 mod table;
 pub mod train;
 mod trained_run;
+pub mod view;
 
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Error;

@@ -1,9 +1,9 @@
-//! The loss curve of a run, like figure 4 of the source paper, with stages side by side and a logarithmic scale.
+//! The curves of loss and PSNR of a run, like figure 4 of the source paper, with stages side by side and a logarithmic scale.
 //!
 //! The pale band shows the minimum and the maximum loss of the steps in a column. The line is a moving average over about 2 % of the run, separate for
 //! each stage, so that the jump at the start of a stage remains visible.
 
-use crate::chart::{Chart, Curve};
+use crate::chart::{Chart, Curve, DECIBELS};
 use plenoxel::train::PlannedStage;
 
 /// Number of points of the curve.
@@ -13,18 +13,35 @@ const REACH: usize = COLUMNS / 100;
 
 /// Draws `losses`, one for each step from 0 on, as SVG. `stages` may have more steps, if the run ended early.
 pub fn loss_svg(losses: &[f64], stages: &[PlannedStage], title: &str) -> String {
-    let steps = stages.last().map_or(0, |stage| stage.first + stage.steps).max(losses.len() as u64).max(1);
-    let columns = columns(losses, stages);
-    let lines = columns.chunk_by(|a, b| a.stage == b.stage).map(|stage| stage.iter().map(|c| (c.step, c.smooth)).collect());
-    let curve = Curve { name: "loss".to_owned(), lines: lines.collect(), band: columns.iter().map(|c| (c.step, c.low, c.high)).collect() };
-    let chart = Chart {
+    let curve = curve("loss", losses, stages);
+    chart(title, "loss", losses.len(), stages, vec![curve]).svg()
+}
+
+/// Draws the PSNR of the training rays, one value for each step from 0 on, and of validation views, by step, as SVG. Values that are not finite are left
+/// out.
+pub fn psnr_svg(training: &[f64], validation: Vec<(f64, f64)>, stages: &[PlannedStage]) -> String {
+    let mut curves = vec![curve("training rays", training, stages)];
+    if !validation.is_empty() {
+        curves.push(Curve { name: "validation views".to_owned(), lines: vec![validation], band: Vec::new() });
+    }
+    chart("PSNR", DECIBELS, training.len(), stages, curves).svg()
+}
+
+fn chart(title: &str, up: &str, taken: usize, stages: &[PlannedStage], curves: Vec<Curve>) -> Chart {
+    let steps = stages.last().map_or(0, |stage| stage.first + stage.steps).max(taken as u64).max(1);
+    Chart {
         title: title.to_owned(),
         across: ("training step".to_owned(), steps as f64),
-        up: "loss".to_owned(),
+        up: up.to_owned(),
         parts: stages.iter().map(|stage| (stage.first as f64, stage.resolution.map_or(String::new(), |n| format!("{n}³")))).collect(),
-        curves: vec![curve],
-    };
-    chart.svg()
+        curves,
+    }
+}
+
+fn curve(name: &str, values: &[f64], stages: &[PlannedStage]) -> Curve {
+    let columns = columns(values, stages);
+    let lines = columns.chunk_by(|a, b| a.stage == b.stage).map(|stage| stage.iter().map(|c| (c.step, c.smooth)).collect());
+    Curve { name: name.to_owned(), lines: lines.collect(), band: columns.iter().map(|c| (c.step, c.low, c.high)).collect() }
 }
 
 /// The steps of a point of the curve.
@@ -99,6 +116,8 @@ mod tests {
         {
             let svg = loss_svg(&losses, &stages(), "a < b & c");
             assert!(svg.contains("a &lt; b &amp; c") && svg.contains("32³"));
+            let svg =
+                svg + &psnr_svg(&losses, losses.iter().map(|loss| (3.0, *loss)).filter(|(_, loss)| loss.is_finite()).collect(), &stages());
             let numbers = svg.split('"').filter(|part| part.starts_with(|c: char| c.is_ascii_digit() || c == '-' || c == 'N'));
             assert!(numbers.into_iter().all(|part| !part.contains("NaN") && !part.contains("inf")), "{losses:?}: {svg}");
         }

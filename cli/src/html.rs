@@ -6,7 +6,9 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use image::DynamicImage;
 use image::codecs::jpeg::JpegEncoder;
+use plenoxel::camera::Camera;
 use plenoxel::dataset::image::RgbaImage;
+use serde_json::{Value, json};
 
 /// Style sheet of all pages, with the light or dark color scheme of the reader.
 const STYLE: &str = "\
@@ -19,6 +21,9 @@ img { display: block; max-width: 100%; border-radius: 4px; }
 .small { font-size: .85rem; opacity: .75; }
 .scroll { overflow-x: auto; }
 ";
+
+/// Script of the camera of a page: rotation, zoom, and controls by mouse, fingers and keys.
+pub const CAMERA: &str = include_str!("html/camera.js");
 
 /// Escapes text for an element or a quoted attribute.
 pub fn escaped(text: &str) -> String {
@@ -34,6 +39,21 @@ pub fn escaped(text: &str) -> String {
         }
     }
     safe
+}
+
+/// Formats a camera for [`CAMERA`]: right, up and backward axes, position, and intrinsics in pixels, without the distortion of its lens.
+pub fn camera(name: &str, camera: &Camera) -> Value {
+    let k = &camera.intrinsics;
+    json!({
+        "name": name,
+        "pose": camera.camera_to_world.to_cols_array(),
+        "width": k.width,
+        "height": k.height,
+        "fx": k.fx,
+        "fy": k.fy,
+        "cx": k.cx,
+        "cy": k.cy,
+    })
 }
 
 /// JPEG quality of embedded pictures.

@@ -1,15 +1,42 @@
 //! Pictures of results: panels of target, render, error and depth; strips; and their color maps.
 
+use clap::ValueEnum;
+use image::RgbImage;
 use image::imageops::crop_imm;
 use ndarray::{Array2, Array3, Axis, Slice, concatenate};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::image::RgbaImage;
 use plenoxel::error::Result;
 use plenoxel::render::picture::Picture;
+use serde::Deserialize;
 use std::path::Path;
 
 /// Error with the brightest color: the absolute difference, averaged over channels.
 pub const ERROR_SCALE: f32 = 0.25;
+
+/// A channel of a rendered picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Channel {
+    Color,
+    Depth,
+    Normal,
+    Opacity,
+}
+
+impl Channel {
+    pub const ALL: [Channel; 4] = [Channel::Color, Channel::Depth, Channel::Normal, Channel::Opacity];
+
+    /// Suffix of its file names.
+    pub fn suffix(self) -> &'static str {
+        match self {
+            Channel::Color => "",
+            Channel::Depth => "_depth",
+            Channel::Normal => "_normal",
+            Channel::Opacity => "_opacity",
+        }
+    }
+}
 
 /// A picture with values in [0, 1], `[h, w, 3]`.
 pub type Rgb = Array3<f32>;
@@ -115,6 +142,23 @@ pub fn normal_map(picture: &Picture) -> Rgb {
         let opacity = picture.opacity[[y, x]].clamp(0.0, 1.0);
         [0, 1, 2].map(|c| (0.5 + 0.5 * normals[[y, x, c]]) * opacity + 1.0 - opacity)
     })
+}
+
+/// Draws a channel for display.
+pub fn shown(channel: Channel, picture: &Picture, range: DepthRange) -> Rgb {
+    match channel {
+        Channel::Color => picture.rgb.clone(),
+        Channel::Depth => depth_map(picture, range),
+        Channel::Normal => normal_map(picture),
+        Channel::Opacity => opacity_map(picture),
+    }
+}
+
+/// Rounds a picture to 8 bits per channel, clamped to [0, 1].
+pub fn to_rgb8(picture: &Rgb) -> RgbImage {
+    let (height, width, _) = picture.dim();
+    let channel = |x: u32, y: u32, c: usize| (picture[[y as usize, x as usize, c]].clamp(0.0, 1.0) * 255.0).round() as u8;
+    RgbImage::from_fn(width as u32, height as u32, |x, y| [0, 1, 2].map(|c| channel(x, y, c)).into())
 }
 
 /// Writes a picture as PNG.

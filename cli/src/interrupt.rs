@@ -52,6 +52,13 @@ pub fn requested() -> bool {
     wished().is_some()
 }
 
+/// Records an interruption that a page asks for. Unlike a signal, it never ends the process.
+pub fn request() {
+    if WATCHED.load(SeqCst) {
+        wished().get_or_insert_with(Instant::now);
+    }
+}
+
 impl Drop for Watch {
     fn drop(&mut self) {
         WATCHED.store(false, SeqCst);

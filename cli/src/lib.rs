@@ -13,6 +13,7 @@ mod curves;
 mod html;
 mod images;
 mod interrupt;
+mod live;
 #[doc(hidden)]
 pub mod parsers;
 mod progress;
@@ -21,7 +22,7 @@ mod report;
 use clap::{Args, Parser, Subcommand};
 use commands::{
     bake, cameras, carve, compare, completions, evaluate, export, filter, harmonics, import, info, man, presets, render, scene, sweep,
-    train,
+    train, view,
 };
 use plenoxel::error::Error;
 use plenoxel::run::{machine, memory};
@@ -43,6 +44,7 @@ Examples:
   plenoxel evaluate runs/lego-1              compute PSNR and SSIM on the test views
   plenoxel render runs/lego-1 --view 0       render a test view
   plenoxel render runs/lego-1 --path orbit   render a video along a camera path
+  plenoxel view runs/lego-1                  look at the scene in a browser; `train --view` shows it while it is learned
   plenoxel report runs/lego-1                regenerate report.html, with an interactive viewer
   plenoxel export ply runs/lego-1            export the voxels as a colored point cloud
   plenoxel export mesh runs/lego-1           export the surface as a mesh
@@ -84,6 +86,7 @@ enum Command {
     Completions(completions::CompletionsArgs),
     Man(man::ManArgs),
     Sweep(sweep::SweepArgs),
+    View(view::ViewArgs),
 }
 
 #[derive(Debug, Args)]
@@ -153,6 +156,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Presets(args) => presets::run(args, &console),
             Command::Completions(args) => completions::run(args, &console),
             Command::Man(args) => man::run(args, &console),
+            Command::View(args) => view::run(args, &console),
             Command::Sweep(args) => return sweep::run(args, &cli.machine.flags(), &console),
         };
         done.map(|()| 0)

@@ -9,7 +9,7 @@ use crate::dataset::mask::Mask;
 use crate::error::Result;
 use crate::metrics;
 use crate::render::Rendered;
-use crate::render::picture::{Picture, picture_by};
+use crate::render::picture::{Picture, picture_by, picture_unless};
 use crate::train::{Model, RenderFn, ViewOptions};
 use autograd::Real;
 use ndarray::Array3;
@@ -50,6 +50,11 @@ impl<'a, T: Real> Viewer<'a, T> {
     /// Renders the image of a camera.
     pub fn see(&self, camera: &Camera) -> Picture {
         picture_by(&self.show, camera)
+    }
+
+    /// Renders the image of a camera, unless `stopped` becomes true meanwhile.
+    pub fn see_unless(&self, camera: &Camera, stopped: impl Fn() -> bool) -> Option<Picture> {
+        picture_unless(&self.show, camera, stopped)
     }
 
     /// Renders each view and compares it with its photograph over the background. Pixels that a mask ignores do not count in the squared

@@ -66,7 +66,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     }
     let dataset = args.run.views(&found)?;
     args.out.iter().try_for_each(|out| super::check_replaceable(out, &[&found.folder], found.source.path()))?;
-    let Loaded { model, about, view } = args.run.load(&found, console, |sampling, stored| {
+    let Loaded { model, about, view } = args.run.of.load(&found, console, |sampling, stored| {
         Estimate::of_evaluation(&found.config, sampling, stored, Some((&dataset, args.run.split)))
     })?;
     let Found { folder, config, preset, source } = found;
@@ -110,7 +110,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         console.result(&figures.sentence())?;
     }
     // The time and rays of the best grid are not known.
-    let of_last = |key: &str| if args.run.best { None } else { trained.get(key) };
+    let of_last = |key: &str| if args.run.of.best { None } else { trained.get(key) };
     let evaluation = Evaluation {
         figures,
         seconds: of_last("seconds").and_then(Value::as_f64),

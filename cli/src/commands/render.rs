@@ -6,8 +6,9 @@ mod movie;
 mod path;
 
 use super::trained_run::{Found, Loaded, TrainedRun};
+use crate::images::Channel;
 use crate::progress::Console;
-use channels::{Channel, FileFormat, Pictures};
+use channels::{FileFormat, Pictures};
 use clap::Args;
 use path::{Film, PathArgs, PathChoice};
 use plenoxel::camera::Camera;
@@ -82,7 +83,7 @@ fn views(args: &RenderArgs, console: &Console<'_>) -> Result<()> {
 
 fn film(args: &RenderArgs, path: &PathChoice, console: &Console<'_>) -> Result<()> {
     let found = args.run.find()?;
-    let Film { name, cameras, fps } = args.path.film(path, &args.run, &found, console)?;
+    let Film { name, cameras, fps } = args.path.film(path, &args.run.of, &found, console)?;
     let folder = found.folder.render(&name);
     let stem = |number: usize| folder.join(format!("frame_{number:04}"));
     let shots: Vec<(Camera, PathBuf)> = cameras.into_iter().enumerate().map(|(number, camera)| (camera, stem(number))).collect();
@@ -113,7 +114,7 @@ fn render(
     let normals = channels.contains(&Channel::Normal);
     let pixels = shots.iter().map(|(camera, _)| camera.intrinsics.width * camera.intrinsics.height).max().unwrap_or(0);
     let Loaded { model, view, .. } =
-        args.run.load(found, console, |sampling, stored| Estimate::of_pictures(&found.config, sampling, stored, pixels, normals))?;
+        args.run.of.load(found, console, |sampling, stored| Estimate::of_pictures(&found.config, sampling, stored, pixels, normals))?;
     prepare()?;
     let grid = || voxel_grid(&*model, found.folder.path(), "rendering normals");
     let normals = normals.then(|| Ok(Plenoxels::of_grid(&found.config, grid()?.normals()))).transpose()?;

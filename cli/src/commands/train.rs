@@ -6,19 +6,29 @@ mod screen;
 
 use super::report;
 use crate::interrupt;
+use crate::live::{Door, LiveTraining, Training};
 use crate::progress::Console;
 pub use flags::{BuiltInScene, NOT_WHEN_RESUMED, TrainArgs, size};
 use plenoxel::error::Result;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
-use plenoxel::run::training::{self, Outcome, RunOptions, RunSettings, Summary};
+use plenoxel::run::training::{self, Event, Outcome, RunOptions, RunSettings, Summary};
 use plenoxel::text::clock;
 use screen::Screen;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Trains a scene and writes a run folder. Returns the exit code: 0, or 130 if it was interrupted.
 pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let mut screen = Screen::new(console, !args.no_images, !args.no_report);
+    let door = args.view.then(|| Door::open(args.port)).transpose()?;
+    let mut live = door.map(|door| LiveTraining::new(door, console));
+    let shared = live.as_ref().map(LiveTraining::shared);
+    let options = |stage_psnr: bool| options(args, stage_psnr, shared);
+    let mut hear = |event: Event<'_>| {
+        live.iter_mut().for_each(|live| live.hear(&event));
+        screen.show(event);
+    };
     let outcome = match &args.resume {
         Some(path) if lacks_page(path) && !args.no_report => {
             console.note("this run is finished; writing its missing report.html");
@@ -26,12 +36,12 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
         }
         Some(path) => {
             let data = args.moved_to();
-            training::resume(path, data, &options(args, false), &mut |event| screen.show(event))
+            training::resume(path, data, &options(false), &mut hear)
         }
         None => {
             let (config, preset) = args.config()?;
             let data = args.source();
-            let options = options(args, args.keeps_stages(&data));
+            let options = options(args.keeps_stages(&data));
             let preset = preset.map(str::to_owned);
             let settings = RunSettings {
                 preset,
@@ -41,10 +51,10 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
                 options,
                 ..RunSettings::new(config, data)
             };
-            training::train(&settings, &mut |event| screen.show(event))
+            training::train(&settings, &mut hear)
         }
     };
-    let shown = screen.finish();
+    let shown = screen.finish().and(live.map_or(Ok(()), LiveTraining::finish));
     match outcome? {
         Outcome::Done(_) => shown.map(|()| 0),
         Outcome::Stopped { steps, total, folder } => {
@@ -69,7 +79,7 @@ fn lacks_page(path: &Path) -> bool {
         && record.data != DataSource::None
 }
 
-fn options(args: &TrainArgs, stage_psnr: bool) -> RunOptions {
+fn options(args: &TrainArgs, stage_psnr: bool, live: Option<Arc<Training>>) -> RunOptions {
     RunOptions {
         checkpoint_every: args.checkpoint_every,
         preview_every: args.preview_every,
@@ -78,6 +88,7 @@ fn options(args: &TrainArgs, stage_psnr: bool) -> RunOptions {
         test_views: if args.no_evaluate { 0 } else { args.test_views.unwrap_or(usize::MAX) },
         report: !args.no_report,
         stop: Box::new(interrupt::requested),
+        save: Box::new(move || live.as_ref().is_some_and(|live| live.wants_checkpoint())),
     }
 }
 

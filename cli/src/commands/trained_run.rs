@@ -1,4 +1,4 @@
-//! A finished run and its views, for `evaluate` and `render`.
+//! A finished run and its views, for `evaluate`, `render` and `view`.
 
 use crate::progress::Console;
 use clap::{Args, ValueHint};
@@ -12,12 +12,12 @@ use plenoxel::run::memory::{Estimate, Stored};
 use plenoxel::train::{About, ViewOptions};
 use std::path::PathBuf;
 
-/// The run, its views, and the sampling.
+/// The run, its model, and the sampling.
 #[derive(Debug, Args)]
-pub struct TrainedRun {
+pub struct TrainedModel {
     /// Run folder written by `plenoxel train` or `plenoxel carve`
     #[arg(value_hint = ValueHint::DirPath)]
-    pub run: PathBuf,
+    run: PathBuf,
 
     /// Use best.safetensors, the checkpoint with the best validation PSNR, instead of the final grid
     #[arg(long)]
@@ -27,6 +27,17 @@ pub struct TrainedRun {
     #[arg(long, value_name = "DIR", help_heading = "Scene", value_hint = ValueHint::DirPath)]
     pub data: Option<PathBuf>,
 
+    /// Number of samples on the longest ray through the box (preset paper: on every ray) [default: the `evaluation` setting of the run]
+    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = super::whole::<u32>(2, 100_000), allow_negative_numbers = true)]
+    samples: Option<u32>,
+}
+
+/// A run, and a choice of its views.
+#[derive(Debug, Args)]
+pub struct TrainedRun {
+    #[command(flatten)]
+    pub of: TrainedModel,
+
     /// Split of the views: train, val or test
     #[arg(long, help_heading = "Scene", default_value_t = Split::Test, value_parser = super::split)]
     pub split: Split,
@@ -34,10 +45,6 @@ pub struct TrainedRun {
     /// Downscale the images by this factor [default: that of the training]
     #[arg(long, value_name = "K", help_heading = "Scene", value_parser = super::whole::<usize>(1, super::MOST_REDUCTION), allow_negative_numbers = true)]
     pub downscale: Option<usize>,
-
-    /// Number of samples on the longest ray through the box (preset paper: on every ray) [default: the `evaluation` setting of the run]
-    #[arg(long, value_name = "N", help_heading = "Rendering", value_parser = super::whole::<u32>(2, 100_000), allow_negative_numbers = true)]
-    pub samples: Option<u32>,
 }
 
 /// An opened run. Its dataset may no longer exist.
@@ -58,16 +65,14 @@ pub struct Loaded {
 impl TrainedRun {
     /// Opens the run folder.
     pub fn find(&self) -> Result<Found> {
-        let (folder, mut config, record) = RunFolder::open(&self.run)?;
-        let folder = if self.best { folder.with_best()? } else { folder };
-        config.downscale = self.downscale.unwrap_or(config.downscale);
-        let source = self.data.as_deref().map_or(record.data, DataSource::folder);
-        Ok(Found { folder, config, preset: record.preset, source })
+        let mut found = self.of.find()?;
+        found.config.downscale = self.downscale.unwrap_or(found.config.downscale);
+        Ok(found)
     }
 
     /// True for the evaluation that defines the scores of a run: its final grid, on the test views at full size, sampled as configured.
     pub fn is_as_trained(&self) -> bool {
-        !self.best && self.split == Split::Test && self.downscale.is_none() && self.samples.is_none()
+        !self.of.best && self.split == Split::Test && self.downscale.is_none() && self.of.samples.is_none()
     }
 
     /// Opens the dataset.
@@ -77,6 +82,28 @@ impl TrainedRun {
         let dataset = found.source.reopen(&found.config)?;
         super::check_split(&dataset, self.split)?;
         Ok(dataset)
+    }
+}
+
+impl TrainedModel {
+    /// Opens the run folder.
+    pub fn find(&self) -> Result<Found> {
+        let (folder, config, record) = RunFolder::open(&self.run)?;
+        let folder = if self.best { folder.with_best()? } else { folder };
+        let source = self.data.as_deref().map_or(record.data, DataSource::folder);
+        Ok(Found { folder, config, preset: record.preset, source })
+    }
+
+    /// Opens the dataset, if it still exists. If the user gave its folder, it must exist. `otherwise` is the consequence of its absence.
+    pub fn views_if_any(&self, found: &Found, console: &Console<'_>, otherwise: &str) -> Result<Option<Dataset>> {
+        match found.source.reopen(&found.config) {
+            Ok(dataset) => Ok(Some(dataset)),
+            Err(error) if self.data.is_some() => Err(error),
+            Err(error) => {
+                console.note(&format!("the views of the run cannot be read ({error}); {otherwise}"));
+                Ok(None)
+            }
+        }
     }
 
     /// Reads the model. `estimate` computes the memory from the sampling, the shape and the number of voxels.

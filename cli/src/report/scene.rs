@@ -1,12 +1,11 @@
 //! The embedded grid of a report, for its viewer, and the loss of quality by its compression. A factored field is baked into a grid first.
 
 use super::Report;
-use crate::html::escaped;
+use crate::html::{self, escaped};
 use crate::progress::{Console, thousands};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use plenoxel::bake::{BakeOptions, bake, resolution_of};
-use plenoxel::camera::Camera;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::Viewer;
@@ -75,7 +74,7 @@ impl Scene {
         let split = if report.dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
         let (cameras, names) = (report.dataset.cameras(split), report.dataset.view_names(split));
         let chosen = evenly_spaced(cameras.len(), VIEWS);
-        let views: Vec<Value> = chosen.into_iter().map(|i| view(names[i], &cameras[i])).collect();
+        let views: Vec<Value> = chosen.into_iter().map(|i| html::camera(names[i], &cameras[i])).collect();
         let size = cameras.first().map_or([1, 1], |camera| [camera.intrinsics.width, camera.intrinsics.height]);
         let settings = json!({
             "grid": small.header(),
@@ -93,7 +92,7 @@ impl Scene {
         format!(
             "<section><h2>Interactive viewer</h2>\n<figure id=\"viewer\"><canvas tabindex=\"0\" style=\"--shape: calc({height} / {width})\" \
              aria-label=\"interactive view of the grid\"></canvas>\n<figcaption>Rotate: drag, or arrow keys. Zoom: wheel, pinch, or + and −. \
-             Move: shift and drag, or two fingers. <label>Start view: <select></select></label> <button type=\"button\" \
+             Move: shift and drag, or two fingers. Look around: ctrl and drag. Fly: W, A, S, D, Q, E. <label>Start view: <select></select></label> <button type=\"button\" \
              id=\"fill\">full screen</button> <button type=\"button\" id=\"save\">save picture</button><br>\n\
              <output></output><br>{}</figcaption></figure></section>",
             escaped(&self.note())
@@ -132,8 +131,9 @@ impl Scene {
         let settings = self.settings.to_string().replace('<', "\\u003c");
         format!(
             "<script type=\"application/json\" id=\"scene\">{settings}</script>\n<script type=\"text/plain\" id=\"grid\">{}</script>\n\
-             <script>\n{}</script>\n",
+             <script>\n{}{}</script>\n",
             STANDARD.encode(&self.bytes),
+            html::CAMERA,
             include_str!("viewer.js"),
         )
     }
@@ -168,19 +168,4 @@ fn baked(field: &Factored<f32>, report: &Report<'_>, console: &Console<'_>) -> R
     let options = BakeOptions { resolution: resolution_of(field).min(BAKED_VOXELS), degree: BAKED_DEGREE };
     let count = console.count("baking for the viewer, voxel", 1);
     bake(field, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
-}
-
-/// A camera for the viewer: right, up and backward axes, position, and intrinsics in pixels.
-fn view(name: &str, camera: &Camera) -> Value {
-    let k = &camera.intrinsics;
-    json!({
-        "name": name,
-        "pose": camera.camera_to_world.to_cols_array(),
-        "width": k.width,
-        "height": k.height,
-        "fx": k.fx,
-        "fy": k.fy,
-        "cx": k.cx,
-        "cy": k.cy,
-    })
 }

@@ -235,9 +235,6 @@ void main() {
 }`;
 }
 
-// How many pixels of a picture of this size show one pixel of a camera, if all that the camera sees is to be in it.
-const fitted = (camera, width, height) => Math.min(width / camera.width, height / camera.height);
-
 // A renderer for a scene.
 class Renderer {
   constructor(canvas, scene, bytes) {
@@ -360,55 +357,6 @@ class Renderer {
   }
 }
 
-// An orbit camera: it rotates around a pivot on its line of sight, zooms and pans.
-class Orbit {
-  constructor(view) { this.from(view); }
-
-  // Takes the place of a view: `pose` has the camera's right, up and backward axes and its position, a row each.
-  from({ pose, width, height, fx, fy, cx, cy }) {
-    Object.assign(this, { width, height, fx, fy, cx, cy, rotation: pose.slice(0, 9), eye: pose.slice(9) });
-    // The point of the line of sight that is nearest to the middle of the box, if that is in front.
-    const away = Math.max(dot(this.eye, this.axis(2)), 0.1);
-    this.pivot = this.eye.map((p, a) => p - away * this.axis(2)[a]);
-  }
-
-  axis(k) { return this.rotation.slice(3 * k, 3 * k + 3); }
-
-  // Rotates the scene by angles in radians to the right and down, but not over the poles.
-  turn(right, down) {
-    const height = Math.asin(Math.max(-1, Math.min(1, this.axis(2)[2])));
-    if (Math.abs(height + down) > 1.55 && Math.abs(height + down) > Math.abs(height)) down = 0;
-    const aside = rotated(this.axis(0), UP, -right), spin = v => rotated(rotated(v, UP, -right), aside, -down);
-    this.eye = spin(this.eye.map((p, a) => p - this.pivot[a])).map((p, a) => p + this.pivot[a]);
-    this.rotation = [0, 1, 2].flatMap(k => spin(this.axis(k)));
-  }
-
-  zoom(factor) {
-    factor = Math.max(0.1, Math.min(10, factor));
-    this.eye = this.eye.map((p, a) => this.pivot[a] + (p - this.pivot[a]) * factor);
-  }
-
-  shift(right, up) {
-    const far = Math.hypot(...this.eye.map((p, a) => p - this.pivot[a]));
-    const by = [0, 1, 2].map(a => -far / this.fx * (right * this.axis(0)[a] + up * this.axis(1)[a]));
-    this.eye = this.eye.map((p, a) => p + by[a]);
-    this.pivot = this.pivot.map((p, a) => p + by[a]);
-  }
-}
-
-const UP = [0, 0, 1];
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-
-// Rodrigues: v turned around a unit axis.
-function rotated(v, [x, y, z], angle) {
-  const c = Math.cos(angle), s = Math.sin(angle), along = (1 - c) * dot(v, [x, y, z]);
-  return [
-    c * v[0] + s * (y * v[2] - z * v[1]) + along * x,
-    c * v[1] + s * (z * v[0] - x * v[2]) + along * y,
-    c * v[2] + s * (x * v[1] - y * v[0]) + along * z,
-  ];
-}
-
 // The viewer on the page. While the camera moves, the resolution is reduced to FRAME milliseconds per frame. At rest, the full resolution is drawn in bands of BAND milliseconds.
 const FRAME = 60, BAND = 150;
 class Viewer {
@@ -435,29 +383,8 @@ class Viewer {
   }
 
   listen(figure, scene) {
-    const { canvas, camera } = this, fingers = new Map();
-    const span = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
-    canvas.addEventListener('pointerdown', e => { canvas.setPointerCapture(e.pointerId); fingers.set(e.pointerId, [e.clientX, e.clientY]); });
-    for (const name of ['pointerup', 'pointercancel']) canvas.addEventListener(name, e => fingers.delete(e.pointerId));
-    canvas.addEventListener('pointermove', e => {
-      const old = fingers.get(e.pointerId);
-      if (!old) return;
-      const before = fingers.size > 1 && span(), share = 1 / fitted(camera, canvas.clientWidth, canvas.clientHeight);
-      const [dx, dy] = [(e.clientX - old[0]) * share, (e.clientY - old[1]) * share];
-      fingers.set(e.pointerId, [e.clientX, e.clientY]);
-      if (fingers.size > 1) { camera.zoom(before / Math.max(1, span())); camera.shift(dx / 2, -dy / 2); }
-      else if (e.shiftKey || e.buttons & 6) camera.shift(dx, -dy);
-      else camera.turn(Math.PI * dx / camera.height, Math.PI * dy / camera.height);
-      this.moved();
-    });
-    canvas.addEventListener('wheel', e => { e.preventDefault(); camera.zoom(Math.exp(1e-3 * e.deltaY)); this.moved(); }, { passive: false });
-    canvas.addEventListener('contextmenu', e => e.preventDefault());
-    canvas.addEventListener('keydown', e => {
-      const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
-      if (step) camera.turn(...step); else if (e.key === '+') camera.zoom(0.9); else if (e.key === '-') camera.zoom(1 / 0.9); else return;
-      e.preventDefault();
-      this.moved();
-    });
+    const { canvas, camera } = this;
+    control(canvas, camera, () => this.moved());
     const select = figure.querySelector('select');
     select.append(...scene.views.map((view, i) => new Option(view.name, i)));
     select.addEventListener('change', () => { camera.from(scene.views[select.value]); this.moved(); });

@@ -26,10 +26,18 @@ pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &Render
 
 /// Renders an image with a function from rays to pixels. No gradient is recorded.
 pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Camera) -> Picture {
+    picture_unless(render, camera, || false).expect("nothing stops it")
+}
+
+/// Renders an image as [`picture_by`] does. Before each chunk of rays it asks `stopped`; returns `None` once that is true.
+pub fn picture_unless<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Camera, stopped: impl Fn() -> bool) -> Option<Picture> {
     let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
     let (mut rgb, mut depth, mut opacity) = (Vec::with_capacity(3 * w * h), Vec::with_capacity(w * h), Vec::with_capacity(w * h));
     let as_f32 = |x: &T| x.as_f64() as f32;
     for start in (0..w * h).step_by(CHUNK) {
+        if stopped() {
+            return None;
+        }
         let rays: Vec<_> = (start..(start + CHUNK).min(w * h)).map(|p| camera.ray((p % w) as f64 + 0.5, (p / w) as f64 + 0.5)).collect();
         let rendered = no_grad(|| render(&rays));
         rgb.extend(rendered.rgb.data().iter().map(as_f32));
@@ -37,9 +45,9 @@ pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Came
         opacity.extend(rendered.opacity.data().iter().map(as_f32));
     }
     let fits = "one value per pixel";
-    Picture {
+    Some(Picture {
         rgb: Array3::from_shape_vec((h, w, 3), rgb).expect(fits),
         depth: Array2::from_shape_vec((h, w), depth).expect(fits),
         opacity: Array2::from_shape_vec((h, w), opacity).expect(fits),
-    }
+    })
 }

@@ -86,6 +86,8 @@ pub struct RunOptions {
     pub report: bool,
     /// Called after each step: `true` saves the run and stops it.
     pub stop: Box<dyn Fn() -> bool + Send + Sync>,
+    /// Called after each step: `true` saves a checkpoint.
+    pub save: Box<dyn Fn() -> bool + Send + Sync>,
 }
 
 impl Default for RunOptions {
@@ -98,6 +100,7 @@ impl Default for RunOptions {
             test_views: usize::MAX,
             report: false,
             stop: Box::new(|| false),
+            save: Box::new(|| false),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Channels of rendered pictures and their file formats.
 
 use super::float_files;
-use crate::images::{self, DepthRange, Rgb};
+use crate::images::{self, Channel, DepthRange};
 use clap::ValueEnum;
 use ndarray::{Array2, Array3, Axis};
 use plenoxel::camera::Camera;
@@ -13,29 +13,6 @@ use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::render::picture::Picture;
 use plenoxel::train::ViewOptions;
 use std::path::{Path, PathBuf};
-
-/// A channel of a rendered picture.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Channel {
-    Color,
-    Depth,
-    Normal,
-    Opacity,
-}
-
-impl Channel {
-    pub const ALL: [Channel; 4] = [Channel::Color, Channel::Depth, Channel::Normal, Channel::Opacity];
-
-    /// Suffix of its file names.
-    pub fn suffix(self) -> &'static str {
-        match self {
-            Channel::Color => "",
-            Channel::Depth => "_depth",
-            Channel::Normal => "_normal",
-            Channel::Opacity => "_opacity",
-        }
-    }
-}
 
 /// File format of a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -89,7 +66,7 @@ impl<'a> Pictures<'a> {
             for &format in self.formats {
                 let file = |ending: &str| file(stem, channel, ending);
                 match format {
-                    FileFormat::Png => images::write(&file("png"), &shown(channel, picture, range))?,
+                    FileFormat::Png => images::write(&file("png"), &images::shown(channel, picture, range))?,
                     FileFormat::Exr => {
                         let values = if channel == Channel::Color { picture.rgb.mapv(linear) } else { values(channel, picture) };
                         float_files::write_exr(&file("exr"), values.view())?;
@@ -107,16 +84,6 @@ fn file(stem: &Path, channel: Channel, ending: &str) -> PathBuf {
     let mut path = stem.as_os_str().to_owned();
     path.push(format!("{}.{ending}", channel.suffix()));
     path.into()
-}
-
-/// A channel for display.
-fn shown(channel: Channel, picture: &Picture, range: DepthRange) -> Rgb {
-    match channel {
-        Channel::Color => picture.rgb.clone(),
-        Channel::Depth => images::depth_map(picture, range),
-        Channel::Normal => images::normal_map(picture),
-        Channel::Opacity => images::opacity_map(picture),
-    }
 }
 
 /// The values of a channel, `[h, w, 1 or 3]`.

@@ -1,7 +1,7 @@
 //! `--path`: camera paths.
 
 use crate::commands::train::size;
-use crate::commands::trained_run::{Found, TrainedRun};
+use crate::commands::trained_run::{Found, TrainedModel};
 use crate::commands::whole;
 use crate::progress::Console;
 use clap::Args;
@@ -61,7 +61,7 @@ pub struct Film {
 
 impl PathArgs {
     /// Returns the cameras of a path. The views of the run, if they still exist, give the parameters that the path leaves open.
-    pub fn film(&self, path: &PathChoice, run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Film> {
+    pub fn film(&self, path: &PathChoice, run: &TrainedModel, found: &Found, console: &Console<'_>) -> Result<Film> {
         let file = match path {
             PathChoice::File(path) => Some((path, read(path)?)),
             PathChoice::Orbit | PathChoice::Spiral | PathChoice::Cameras => None,
@@ -69,7 +69,7 @@ impl PathArgs {
         let in_file = file.as_ref().and_then(|(_, path)| path.size);
         let views = match (&file, self.size.or(in_file)) {
             (Some(_), Some(_)) => None,
-            _ => views(run, found, console)?,
+            _ => run.views_if_any(found, console, "the camera path is computed from the box")?,
         };
         let size = self.size.or(in_file).or(views.as_ref().map(Dataset::size)).unwrap_or((SIDE, SIDE));
         let table = || {
@@ -99,18 +99,6 @@ impl PathArgs {
         console.note(&format!("frames: {} of {} x {} pixels", shots.len(), size.0, size.1));
         let fps = self.fps.or(file.as_ref().and_then(|(_, path)| path.fps)).unwrap_or(FPS);
         Ok(Film { name, cameras: shots.iter().map(|shot| shot.camera(size)).collect(), fps })
-    }
-}
-
-/// Opens the dataset of a run, if it still exists. If the user gave its folder, it must exist.
-fn views(run: &TrainedRun, found: &Found, console: &Console<'_>) -> Result<Option<Dataset>> {
-    match found.source.reopen(&found.config) {
-        Ok(dataset) => Ok(Some(dataset)),
-        Err(error) if run.data.is_some() => Err(error),
-        Err(error) => {
-            console.note(&format!("the views of the run cannot be read ({error}); the camera path is computed from the box"));
-            Ok(None)
-        }
     }
 }
 

@@ -21,6 +21,7 @@ Examples:
   plenoxel train data/lego --downscale 4 --half-width 1.3 --set stages[*].density_rate=30
   plenoxel train data/lego --config runs/lego/config.toml --seed 7
   plenoxel train --resume runs/lego                resume after Ctrl-C or a power cut
+  plenoxel train data/lego --view                  watch the scene as it is learned, in a browser
 
 Settings are layered: defaults < preset < --config < flags. The run folder has all of them in config.toml. --set takes their \
 paths in that file, such as stages[0].sampling.step. If stdout is not a terminal, its last line is the JSON object of result.json.";
@@ -103,6 +104,14 @@ pub struct TrainArgs {
     /// Also compute the test PSNR of each earlier stage, which doubles the evaluation time [default: for the built-in scene only]
     #[arg(long, help_heading = "Output")]
     stage_psnr: bool,
+
+    /// Show the training on a page of this machine: the scene as it is learned, its curves, and buttons to save and to stop. The address is printed
+    #[arg(long, help_heading = "Output")]
+    pub view: bool,
+
+    /// Port of the page on 127.0.0.1; 0 for any free port
+    #[arg(long, value_name = "PORT", help_heading = "Output", value_parser = whole::<u16>(0, u16::MAX.into()), default_value = "0", requires = "view", allow_negative_numbers = true)]
+    pub port: u16,
 
     /// Preset of the settings; `plenoxel presets` describes each [default: photos for captures; else fast, or quality with --time]
     #[arg(long, help_heading = "Settings", value_parser = PossibleValuesParser::new(PRESETS.map(|preset| preset.name)))]

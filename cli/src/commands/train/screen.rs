@@ -80,7 +80,7 @@ impl<'c, 'a> Screen<'c, 'a> {
                     console.drawn(pictures.initial(&stage, see));
                 }
             }
-            Event::Step { report, observation } => {
+            Event::Step { report, observation, .. } => {
                 if let Some(progress) = &mut self.progress {
                     progress.step(report, observation);
                 }

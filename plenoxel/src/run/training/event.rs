@@ -64,6 +64,8 @@ pub enum Event<'a> {
         report: &'a Report,
         /// Facts about the model, the validation PSNR if it was measured, and the time.
         observation: &'a Observation,
+        /// The model after the step.
+        model: &'a dyn Model<f32>,
     },
     /// A preview of the model was rendered.
     Preview {

@@ -106,7 +106,7 @@ impl Job<'_> {
             let last = report.step + 1 == total;
             let due = saved.elapsed().as_secs_f64() >= options.checkpoint_every;
             let stops = !last && (options.stop)();
-            let save = !last && (due || stops);
+            let save = !last && ((options.save)() || due || stops);
             if report.step == stage.first {
                 facts = trainer.model().facts();
             }
@@ -117,7 +117,7 @@ impl Job<'_> {
             let validation_psnr = look.as_ref().and_then(|look| look.psnr);
             let observation = Observation { facts: facts.clone(), validation_psnr, seconds };
             metrics.step(&report, &plan, &observation, save)?;
-            on(Event::Step { report: &report, observation: &observation });
+            on(Event::Step { report: &report, observation: &observation, model });
             if report.ends_stage {
                 on(Event::StageEnded { stage, losses: &losses, see: &|camera: &Camera| viewer().see(camera) });
                 kept.extend(

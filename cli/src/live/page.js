@@ -1,0 +1,140 @@
+// The live page: it sends cameras to the program and shows the pictures that come back. It comes after camera.js.
+//
+// A picture is reduced by a whole factor. While the camera moves, the factor is chosen for FRAME milliseconds per picture; at rest it is halved
+// until the picture is sharp. A new camera aborts the request for a finer picture, and the program stops rendering it.
+
+const FRAME = 80, REST = 100, FACTORS = [1, 2, 4, 8, 16];
+// In training, a picture at rest is rendered again after so many milliseconds, and after so many times the time that it took.
+const AGAIN = 3000, PATIENCE = 10, ASK = 1000;
+
+const pause = milliseconds => new Promise(done => setTimeout(done, milliseconds));
+const find = selector => document.querySelector(selector);
+
+class Live {
+  constructor(scene) {
+    Object.assign(this, { scene, canvas: find('canvas'), status: find('output'), speed: 100, factor: 0, dirty: true, ended: false });
+    this.context = this.canvas.getContext('2d');
+    this.camera = new Orbit(scene.views[0], scene.up, scene.near);
+    const list = find('#views');
+    list.append(...scene.views.map((view, i) => new Option(view.name, i)));
+    list.value = 0;
+    list.addEventListener('change', () => { this.camera.from(scene.views[list.value]); this.moved(); });
+    find('#channel').addEventListener('change', () => this.moved());
+    find('#save').addEventListener('click', () => this.save());
+    control(this.canvas, this.camera, () => this.moved());
+    new ResizeObserver(() => this.moved()).observe(this.canvas);
+    this.draw();
+  }
+
+  // The picture is no longer that of the camera.
+  moved() {
+    this.dirty = true;
+    if (this.refines) this.refines.abort();
+    if (this.wake) this.wake();
+  }
+
+  // Waits for so long, or until the camera moves.
+  rest(milliseconds) {
+    return new Promise(done => {
+      this.wake = done;
+      if (milliseconds < Infinity) setTimeout(done, milliseconds);
+      if (this.dirty) done();
+    });
+  }
+
+  // Asks for pictures, one after the other, as long as the page is open.
+  async draw() {
+    while (!this.ended) {
+      if (this.dirty) {
+        this.dirty = false;
+        const [width, height] = this.size(1), pixels = this.speed * FRAME;
+        this.factor = FACTORS.find(factor => width * height / factor ** 2 <= pixels) || FACTORS.at(-1);
+        await this.picture(this.factor, null);
+      } else if (this.factor > 1) {
+        await this.rest(REST);
+        if (this.dirty) continue;
+        this.factor /= 2;
+        await this.picture(this.factor, this.refines = new AbortController());
+      } else {
+        await this.rest(this.scene.training ? Math.max(AGAIN, PATIENCE * this.took) : Infinity);
+        if (!this.dirty && !document.hidden) await this.picture(1, this.refines = new AbortController());
+      }
+      this.refines = null;
+    }
+  }
+
+  // Width and height of a picture that is reduced by a factor.
+  size(factor) {
+    const ratio = window.devicePixelRatio || 1, [w, h] = [this.canvas.clientWidth * ratio, this.canvas.clientHeight * ratio];
+    const shrink = Math.max(1, Math.sqrt(w * h / this.scene.most_pixels)) * factor;
+    return [w, h].map(side => Math.max(1, Math.floor(side / shrink)));
+  }
+
+  // Asks for a picture and shows it.
+  async picture(factor, abort) {
+    const [width, height] = this.size(factor), { camera } = this, scale = fitted(camera, width, height), begin = performance.now();
+    // The picture's middle stays the middle, whatever the shape of the window.
+    const body = JSON.stringify({
+      pose: [...camera.rotation, ...camera.eye], width, height, fx: camera.fx * scale, fy: camera.fy * scale,
+      cx: camera.cx * scale + 0.5 * (width - scale * camera.width), cy: camera.cy * scale + 0.5 * (height - scale * camera.height),
+      channel: find('#channel').value, format: factor > 1 ? 'jpeg' : 'png',
+    });
+    try {
+      const answer = await fetch('picture', { method: 'POST', body, signal: abort && abort.signal });
+      if (!answer.ok) throw new Error((await answer.text()).trim());
+      const image = await createImageBitmap(await answer.blob()), { canvas } = this, [w, h] = this.size(1);
+      if (this.dirty && abort) return;
+      if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+      this.context.drawImage(image, 0, 0, w, h);
+      this.took = performance.now() - begin;
+      // Small pictures take some time however small they are.
+      if (width * height > 5000) this.speed += 0.5 * (Math.max(1, width * height / this.took) - this.speed);
+      const rendered = /dur=([\d.]+)/.exec(answer.headers.get('Server-Timing') || '');
+      this.status.textContent = `${width} × ${height} pixels in ${this.took.toFixed(0)} ms` + (rendered ? `, rendered in ${rendered[1]} ms` : '');
+    } catch (error) {
+      if (error.name === 'AbortError') return;
+      this.status.textContent = error instanceof TypeError ? 'the program has ended' : error.message;
+      if (error instanceof TypeError) this.ended = true;
+      else { this.factor = 1; await pause(AGAIN); }
+    }
+  }
+
+  save() {
+    const link = document.createElement('a');
+    link.href = this.canvas.toDataURL('image/png');
+    link.download = 'view.png';
+    link.click();
+  }
+}
+
+// Shows the figures of the training, and draws its curves when they have changed.
+async function follow(live) {
+  const section = find('#training'), ask = async (path, method) => (await fetch(path, { method, body: method === 'POST' ? '' : undefined })).json();
+  section.hidden = false;
+  let steps = -1;
+  const show = state => {
+    const decibels = (name, x) => (x === null ? '' : `, ${name} ${x.toFixed(2)} dB`);
+    find('#step').textContent = `step ${state.step} of ${state.steps}, ${state.seconds.toFixed(0)} s` +
+      decibels('training rays', state.psnr) + decibels('validation views', state.validation_psnr) +
+      state.facts.map(([name, value]) => `, ${name} ${value.toLocaleString()}`).join('');
+    Object.assign(find('progress'), { max: state.steps, value: state.step });
+    find('#message').textContent = state.message || (state.saved === null ? '' : `checkpoint: step ${state.saved}`);
+    for (const id of ['#stop', '#checkpoint']) find(id).disabled = !state.goes_on;
+    if (state.goes_on && state.step !== steps) for (const id of ['loss', 'psnr']) find(`#${id}`).src = `${id}.svg?${state.step}`;
+    steps = state.step;
+    if (!state.goes_on) live.ended = true;
+  };
+  for (const id of ['stop', 'checkpoint']) find(`#${id}`).addEventListener('click', async () => show(await ask(id, 'POST')));
+  while (!live.ended) {
+    try { show(await ask('training', 'GET')); } catch { live.ended = true; live.status.textContent = 'the program has ended'; }
+    await pause(document.hidden ? 5 * ASK : ASK);
+  }
+}
+
+(async () => {
+  try {
+    const scene = await (await fetch('scene')).json();
+    window.live = new Live(scene);
+    if (scene.training) follow(window.live);
+  } catch (error) { find('output').textContent = `The scene cannot be shown: ${error.message}`; }
+})();

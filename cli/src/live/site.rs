@@ -1,0 +1,128 @@
+//! The addresses of a live page: the page, its scene, pictures, and the training.
+
+use super::http::{Method, Request, Response};
+use super::order::{Desk, FileFormat, Frame, Shot};
+use super::place::Places;
+use super::server;
+use super::training::Training;
+use crate::html;
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use plenoxel::camera_path::Turntable;
+use plenoxel::dataset::{Dataset, Split};
+use plenoxel::space::Space;
+use serde_json::{Value, json};
+use std::sync::Arc;
+
+/// Largest number of pictures that are waited for, or sent, at once.
+const PICTURES: usize = 8;
+/// JPEG quality of pictures in motion.
+const QUALITY: u8 = 85;
+const JSON: &str = "application/json";
+const SVG: &str = "image/svg+xml";
+
+/// What the page knows of a scene.
+pub struct Scene {
+    /// Title of the page.
+    pub title: String,
+    views: Vec<Value>,
+    /// Vertical axis of the world.
+    up: [u8; 3],
+    /// Smallest distance of the point around which the camera turns from a view.
+    near: f64,
+}
+
+impl Scene {
+    /// Creates the scene of a dataset with its training cameras.
+    pub fn of(title: String, dataset: &Dataset) -> Self {
+        let (cameras, names) = (dataset.cameras(Split::Train), dataset.view_names(Split::Train));
+        let views = names.iter().zip(&cameras).map(|(name, camera)| html::camera(name, camera)).collect();
+        // Forward-facing captures have the axes of their mean camera, and begin at depth 1; in all others +z is up (`dataset/normalize.rs`).
+        let (up, near) = match dataset.space() {
+            Space::Box => ([0, 0, 1], 0.1),
+            Space::Contracted => ([0, 0, 1], 0.5),
+            Space::Ndc { .. } => ([0, 1, 0], 2.0),
+        };
+        Scene { title, views, up, near }
+    }
+
+    /// Creates a scene without a dataset: a camera that sees the box with this half width.
+    pub fn around_box(title: String, half_width: f64) -> Self {
+        const SIZE: (usize, usize) = (800, 600);
+        let shots = Turntable::around_box(half_width).orbit(1);
+        Scene { title, views: shots.iter().map(|shot| html::camera("outside", &shot.camera(SIZE))).collect(), up: [0, 0, 1], near: 0.1 }
+    }
+}
+
+/// The site of a live page.
+pub struct Site {
+    page: String,
+    scene: String,
+    desk: Desk,
+    /// The run, while it is trained.
+    training: Option<Arc<Training>>,
+    pictures: Places,
+}
+
+impl Site {
+    pub fn new(scene: &Scene, desk: Desk, training: Option<Arc<Training>>) -> Self {
+        let Scene { title, views, up, near } = scene;
+        let scene = json!({ "views": views, "up": up, "near": near, "most_pixels": super::MOST_PIXELS, "training": training.is_some() });
+        let body = format!("{}<script>\n{}{}</script>\n", include_str!("page.html"), html::CAMERA, include_str!("page.js"));
+        let page = html::page(title, include_str!("page.css"), &body);
+        Site { page, scene: scene.to_string(), desk, training, pictures: Places::new(PICTURES) }
+    }
+
+    fn picture(&self, request: &Request, gone: &dyn Fn() -> bool) -> Response {
+        let shot = match Shot::parse(&request.body) {
+            Ok(shot) => shot,
+            Err(why) => return Response::refusal(400, &why),
+        };
+        let Some(place) = self.pictures.take() else {
+            return Response::refusal(503, "there are too many requests for pictures");
+        };
+        let format = shot.format;
+        match self.desk.picture(shot, gone) {
+            Some(frame) => Response { place: Some(place), ..encoded(&frame, format) },
+            None => Response::refusal(503, "the program renders no more pictures"),
+        }
+    }
+}
+
+impl server::Site for Site {
+    fn answer(&self, path: &str, request: &Request, gone: &dyn Fn() -> bool) -> Response {
+        match (request.method, path, &self.training) {
+            (Method::Get, "", _) => Response::new("text/html; charset=utf-8", self.page.as_str()),
+            (Method::Get, "scene", _) => Response::new(JSON, self.scene.as_str()),
+            (Method::Post, "picture", _) => self.picture(request, gone),
+            (Method::Get, "training", Some(training)) => Response::new(JSON, training.status().to_string()),
+            (Method::Get, "loss.svg", Some(training)) => Response::new(SVG, training.loss()),
+            (Method::Get, "psnr.svg", Some(training)) => Response::new(SVG, training.psnr()),
+            (Method::Post, "stop", Some(training)) => {
+                training.stop();
+                Response::new(JSON, training.status().to_string())
+            }
+            (Method::Post, "checkpoint", Some(training)) => {
+                training.ask_for_checkpoint();
+                Response::new(JSON, training.status().to_string())
+            }
+            _ => Response::refusal(404, "not found"),
+        }
+    }
+}
+
+/// Encodes a picture.
+fn encoded(frame: &Frame, format: FileFormat) -> Response {
+    let mut bytes = Vec::new();
+    let (media, written) = match format {
+        FileFormat::Jpeg => ("image/jpeg", frame.image.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY))),
+        FileFormat::Png => {
+            let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive);
+            ("image/png", frame.image.write_with_encoder(encoder))
+        }
+    };
+    match written {
+        Ok(()) => Response { seconds: Some(frame.seconds), ..Response::new(media, bytes) },
+        Err(e) => Response::refusal(503, &format!("the picture cannot be encoded: {e}")),
+    }
+}
