@@ -588,6 +588,7 @@ impl Job<'_> {
             run: folder.path().display().to_string(),
             validation_psnr,
             best_validation,
+            poses: learned.poses,
             stages: learned.stages,
             warnings,
             per_view: scores.per_view,
