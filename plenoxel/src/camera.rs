@@ -7,9 +7,11 @@
 pub mod lens;
 pub mod placement;
 pub(crate) mod projection;
+mod tracked;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use lens::Lens;
+pub use tracked::TrackedRays;
 
 /// Image size, focal lengths and principal point in pixels, and the lens.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -5,9 +5,9 @@ pub mod composite;
 mod field;
 pub mod picture;
 
-use crate::camera::Ray;
+use crate::camera::{Ray, TrackedRays};
 use crate::geometry::Aabb;
-use crate::sampling::{Jitter, Occupancy, Spacing, sample};
+use crate::sampling::{Jitter, Occupancy, Samples, Spacing, sample};
 use autograd::{Real, Tensor};
 pub use composite::{Columns, PerSample, Rendered, composite, weights};
 pub use field::{Field, Radiance};
@@ -50,12 +50,27 @@ pub fn render<T: Real>(field: &impl Field<T>, rays: &[Ray], options: &RenderOpti
         Engine::Fused => field.render_fused(rays, options),
         Engine::Graph => None,
     };
-    fused.unwrap_or_else(|| render_graph(field, rays, options))
+    fused.unwrap_or_else(|| render_graph(field, rays, |samples| samples, options))
 }
 
-fn render_graph<T: Real>(field: &impl Field<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+/// Renders a batch of rays like [`render`]. Gradients also flow to the rays, through the positions of samples and the directions in which the field is seen.
+/// The distances of samples from the origins of their rays, and their lengths, are constants.
+pub fn render_tracked<T: Real>(field: &impl Field<T>, rays: &TrackedRays<T>, options: &RenderOptions<'_>) -> Rendered<T> {
+    let fused = match options.engine {
+        Engine::Fused => field.render_fused_tracked(rays, options),
+        Engine::Graph => None,
+    };
+    fused.unwrap_or_else(|| render_graph(field, &rays.rays, |samples| samples.tracking(rays, options.spacing), options))
+}
+
+fn render_graph<T: Real>(
+    field: &impl Field<T>,
+    rays: &[Ray],
+    track: impl FnOnce(Samples<T>) -> Samples<T>,
+    options: &RenderOptions<'_>,
+) -> Rendered<T> {
     let cells = options.occupancy.or(field.reach());
-    let samples = sample(rays, &options.aabb, options.spacing, options.jitter, cells);
+    let samples = track(sample(rays, &options.aabb, options.spacing, options.jitter, cells));
     let radiance = field.radiance(&samples);
     let background = Tensor::from_vec(options.background.map(|c| T::lit(f64::from(c))).to_vec(), &[3]);
     composite(samples, radiance, &background)

@@ -6,6 +6,7 @@
 pub mod importance;
 mod occupancy;
 mod running;
+mod tracked;
 mod visible;
 pub mod walk;
 

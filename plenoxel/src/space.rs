@@ -3,6 +3,8 @@
 //! A field is a function on a box. The world may be larger than any box: a room seen from inside has walls, windows and sky. A [`Space`]
 //! maps the world, or the part of it that cameras see, to a box.
 
+pub(crate) mod tracked;
+
 use crate::camera::{Camera, Ray};
 use crate::error::{Error, Result};
 use crate::geometry::Aabb;
@@ -132,6 +134,19 @@ fn ndc(ray: &Ray, a: f64, b: f64) -> Ray {
 pub fn contract(x: DVec3) -> DVec3 {
     let m = x.abs().max_element().max(1.0);
     x * ((2.0 - 1.0 / m) / m)
+}
+
+/// Returns the cotangent of a position x of the world from that of its [contraction](contract) x s, with s = 2 / m − 1 / m² and m = |x_b| the largest
+/// coordinate beyond 1: s g + (g · x) (2 / m³ − 2 / m²) sign(x_b) e_b.
+pub(crate) fn contract_adjoint(x: DVec3, g: DVec3) -> DVec3 {
+    let m = x.abs().max_element();
+    if m <= 1.0 {
+        return g;
+    }
+    let b = x.abs().max_position();
+    let mut of_x = g * ((2.0 - 1.0 / m) / m);
+    of_x[b] += g.dot(x) * (2.0 / m - 2.0) / (m * m) * x[b].signum();
+    of_x
 }
 
 /// Path of a ray through the contracted space, by a parameter s whose even steps are about even in that space.

@@ -4,20 +4,23 @@
 //! The trainer draws batches, computes and reports. It never prints and never reads a clock.
 
 mod model;
+pub mod poses;
 mod state;
 
 pub(crate) use model::read_params;
 pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, StageProgress, ViewOptions};
 pub use state::{About, about};
 
+use crate::camera::Camera;
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::loss::{Evaluation, Objective, Step};
+use crate::loss::{Evaluation, Objective, POSES, Step};
 use crate::rays::{RayBatch, RaySource};
 use crate::sampling::Jitter;
 use autograd::optim::{Optimizer, Sgd};
 use autograd::{Module, Real, parallel, value_and_grad};
 use ndarray::Array3;
+use poses::{PoseCorrections, PoseFigures};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
@@ -101,6 +104,8 @@ pub struct Trainer<T: Real, M: Model<T>> {
     objective: Objective<T, M>,
     optimizer: Box<dyn Optimizer<T>>,
     loss_optimizer: Box<dyn Optimizer<T>>,
+    /// Corrections of the training views' poses, if the objective has them.
+    poses: Option<PoseCorrections<T>>,
     /// Custom function that draws the batch of a step; `None` for shuffled pixels.
     draw: Option<Draw<T>>,
     step: u64,
@@ -112,16 +117,20 @@ type Draw<T> = Box<dyn Fn(&RaySource, u64) -> RayBatch<T> + Send + Sync>;
 impl<T: Real, M: Model<T>> Trainer<T, M> {
     /// Creates a training run of a model.
     ///
-    /// Errors if there is no training view, or no step to take.
+    /// Errors if there is no training view, or no step to take; if poses are refined ([`Objective::with_poses`]) and the model gives no gradients to rays.
     pub fn with_model(model: M, views: impl Into<Arc<[View]>>, mut objective: Objective<T, M>, options: TrainOptions) -> Result<Self> {
         let rays = RaySource::new(views, options.background, options.seed);
         if rays.is_empty() {
             return Err(Error::usage("views", "there are no training views", "give at least one image"));
         }
+        let poses = objective.param(POSES).is_some().then(|| PoseCorrections::of(rays.all_views()));
+        if poses.is_some() && !model.tracks_rays() {
+            return Err(no_gradients(model.kind()));
+        }
         let plan = plan(&model, &options, rays.len());
         let Some(first) = plan.first() else { return Err(Error::usage("stages", "there is no stage", "set at least one")) };
         let (optimizer, loss_optimizer) = (model.optimizer(first), objective.take_optimizer());
-        Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, draw: None, step: 0 })
+        Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, poses, draw: None, step: 0 })
     }
 
     /// Adds [`RayBatch::depth`](crate::rays::RayBatch::depth) to the batches, for views with a depth image.
@@ -186,6 +195,20 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         &self.objective
     }
 
+    /// Returns the size of the corrections of the training views' poses; `None` if poses are not refined.
+    pub fn pose_figures(&self) -> Option<PoseFigures> {
+        let (poses, learned) = self.poses.as_ref().zip(self.objective.param(POSES))?;
+        Some(poses.figures(learned, self.views()))
+    }
+
+    /// Returns the cameras of the training views, corrected if poses are refined.
+    pub fn cameras(&self) -> Vec<Camera> {
+        match self.poses.as_ref().zip(self.objective.param(POSES)) {
+            None => self.views().iter().map(|view| view.camera).collect(),
+            Some((poses, learned)) => poses.cameras(learned, self.views()),
+        }
+    }
+
     /// Returns the settings that do not depend on the model.
     pub fn options(&self) -> &TrainOptions {
         &self.options
@@ -239,7 +262,10 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         let extent = (self.model.aabb().max - self.model.aabb().min).max_element();
         let (mut losses, mut squared_error, mut samples) = (Vec::new(), 0.0, 0);
         let (loss, gradients) = value_and_grad(|| {
-            let rendered = self.model.render(&batch.rays, &pass);
+            let rendered = match self.poses.as_ref().zip(self.objective.param(POSES)) {
+                None => self.model.render(&batch.rays, &pass),
+                Some((poses, learned)) => self.model.render_tracked(&poses.rays(learned, &batch), &pass),
+            };
             samples = rendered.sample_count;
             let step = Step::new((self.step, seed), &batch, &rendered, &self.model, (extent, background));
             let Evaluation { total, losses: values, prediction } = self.objective.evaluate(step);
@@ -269,6 +295,12 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     fn numeric(&self, found: String) -> Error {
         Error::Numeric { place: format!("step {}", self.step), found, remedy: "lower the learning rates of this stage".to_owned() }
     }
+}
+
+/// The error for poses that are to be refined with a kind of model that gives no gradients to rays.
+pub(crate) fn no_gradients(kind: &str) -> Error {
+    let found = format!("poses cannot be refined with the model {kind}, which gives no gradients to rays");
+    Error::usage(format!("losses.{POSES}"), found, "use the preset photos or quality, or leave out --refine-poses")
 }
 
 /// Plans the stages of a model, one after another.

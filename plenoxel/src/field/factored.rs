@@ -13,7 +13,7 @@ pub mod fused;
 
 use super::encoding::{Directions, frequency};
 use super::grouping::Grouping;
-use crate::camera::Ray;
+use crate::camera::{Ray, TrackedRays};
 use crate::geometry::Aabb;
 use crate::render::{Field, Radiance, RenderOptions, Rendered, weights};
 use crate::sampling::{Occupancy, Samples};
@@ -306,5 +306,9 @@ impl<T: Real> Field<T> for Factored<T> {
 
     fn render_fused(&self, rays: &[Ray], options: &RenderOptions<'_>) -> Option<Rendered<T>> {
         fused::supports(&self.shape).then(|| fused::render(self, rays, options))
+    }
+
+    fn render_fused_tracked(&self, rays: &TrackedRays<T>, options: &RenderOptions<'_>) -> Option<Rendered<T>> {
+        fused::supports(&self.shape).then(|| fused::render_tracked(self, rays, options))
     }
 }

@@ -195,6 +195,7 @@ impl<T: Real, M> Objective<T, M> {
             "huber" => self.with(name, weight, huber),
             "robust" => self.with_adaptive_robust(name, weight, AdaptiveRobust::default()),
             "exposure" => self.with_exposure(weight, views),
+            "poses" => self.with_poses(weight, views),
             "sparsity" => self.with(name, weight, cauchy_sparsity),
             "entropy" => self.with(name, weight, entropy),
             "beta" => self.with(name, weight, beta),
@@ -213,6 +214,11 @@ impl<T: Real, M> Objective<T, M> {
     /// Returns the parameters of the losses.
     pub fn params(&self) -> &[Param<T>] {
         &self.params
+    }
+
+    /// Returns the value of the parameter of this name; `None` if there is none.
+    pub fn param(&self, name: &str) -> Option<&Tensor<T>> {
+        self.params.iter().find(|param| param.name() == name).map(Param::tensor)
     }
 
     /// Returns the optimizer of the parameters of the losses. It takes over their learning rates.
@@ -256,5 +262,17 @@ fn adam_single(rates: Rates) -> Box<dyn Optimizer<f32>> {
 }
 
 /// Names of the losses that [`Objective::with_named`] adds. They do not depend on the type of the model.
-pub const NAMES: [&str; 11] =
-    ["mse", "charbonnier", "huber", "robust", "exposure", "sparsity", "entropy", "beta", "distortion", "opacity", "random_background"];
+pub const NAMES: [&str; 12] = [
+    "mse",
+    "charbonnier",
+    "huber",
+    "robust",
+    "exposure",
+    "poses",
+    "sparsity",
+    "entropy",
+    "beta",
+    "distortion",
+    "opacity",
+    "random_background",
+];

@@ -31,6 +31,11 @@ pub trait Recipe: Send + Sync {
     /// Returns true if the model uses silhouettes.
     fn uses_silhouettes(&self) -> bool;
 
+    /// Returns true if the model gives gradients to rays, so that poses can be refined ([`Model::tracks_rays`](crate::train::Model::tracks_rays)). Default: false.
+    fn tracks_rays(&self) -> bool {
+        false
+    }
+
     /// Returns the memory of the model.
     fn memory(&self, engine: Engine) -> Memory;
 

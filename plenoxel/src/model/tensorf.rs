@@ -11,7 +11,7 @@ pub use super::stage::Stage;
 pub use config::Config;
 
 use super::stage::MOST_NODES;
-use crate::camera::Ray;
+use crate::camera::{Ray, TrackedRays};
 use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
 use crate::error::Result;
@@ -23,7 +23,7 @@ use crate::model::cells;
 use crate::model::plenoxels::config::Hull;
 use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
-use crate::render::{Engine, Field, RenderOptions, Rendered, render};
+use crate::render::{Engine, Field, RenderOptions, Rendered, render, render_tracked};
 use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::space::{Region, Space};
 use crate::tensor_file::{TensorFile, TensorWriter};
@@ -150,20 +150,19 @@ impl<T: Real> Tensorf<T> {
         }
     }
 
-    fn render_with(&self, rays: &[Ray], background: [f32; 3], jitter: Jitter, engine: Engine) -> Rendered<T> {
+    fn options(&self, pass: &Pass) -> RenderOptions<'static> {
         let config = &self.config;
-        let training = matches!(jitter, Jitter::PerRay { .. });
+        let training = matches!(pass.jitter, Jitter::PerRay { .. });
         let step = self.step();
-        let options = RenderOptions {
+        RenderOptions {
             aabb: self.aabb(),
             spacing: if self.space == Space::Contracted { Spacing::Contracted(step) } else { Spacing::Step(step) },
-            jitter,
-            background,
+            jitter: pass.jitter,
+            background: pass.background,
             occupancy: None,
-            engine,
+            engine: if pass.keep_samples { Engine::Graph } else { self.engine },
             stop_below: if training { config.stop_below } else { config.stop_below_in_pictures },
-        };
-        render(&self.field, &self.space.rays(rays), &options)
+        }
     }
 }
 
@@ -201,8 +200,15 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {
-        let engine = if pass.keep_samples { Engine::Graph } else { self.engine };
-        self.render_with(rays, pass.background, pass.jitter, engine)
+        render(&self.field, &self.space.rays(rays), &self.options(pass))
+    }
+
+    fn tracks_rays(&self) -> bool {
+        true
+    }
+
+    fn render_tracked(&self, rays: &TrackedRays<T>, pass: &Pass) -> Rendered<T> {
+        render_tracked(&self.field, &self.space.tracked(rays), &self.options(pass))
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {

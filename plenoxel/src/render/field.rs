@@ -1,7 +1,7 @@
 //! Trait of fields that can be rendered.
 
 use super::{RenderOptions, Rendered};
-use crate::camera::Ray;
+use crate::camera::{Ray, TrackedRays};
 use crate::sampling::{Occupancy, Samples};
 use autograd::{Real, Tensor};
 
@@ -30,6 +30,12 @@ pub trait Field<T: Real>: Send + Sync {
     /// Renders rays in one pass, if this field has a kernel. The result must equal [`composite()`](super::composite()) of the field's
     /// radiance.
     fn render_fused(&self, _rays: &[Ray], _options: &RenderOptions<'_>) -> Option<Rendered<T>> {
+        None
+    }
+
+    /// Renders tracked rays in one pass, if this field has a kernel whose adjoint gives gradients to rays. The result must equal that of the graph
+    /// ([`render_tracked`](super::render_tracked)).
+    fn render_fused_tracked(&self, _rays: &TrackedRays<T>, _options: &RenderOptions<'_>) -> Option<Rendered<T>> {
         None
     }
 }

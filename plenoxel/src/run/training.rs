@@ -591,6 +591,7 @@ impl Job<'_> {
             run: folder.path().display().to_string(),
             validation_psnr,
             best_validation,
+            poses: learned.poses,
             stages: learned.stages,
             warnings,
             per_view: scores.per_view,

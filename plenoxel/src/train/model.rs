@@ -1,7 +1,7 @@
 //! Interface between the trainer and a model.
 
 use super::{About, PlannedStage, TrainOptions};
-use crate::camera::Ray;
+use crate::camera::{Ray, TrackedRays};
 use crate::error::Result;
 use crate::geometry::Aabb;
 use crate::rays::RaySource;
@@ -55,6 +55,17 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
 
     /// Renders rays. While a step is recorded, gradients flow from the result to the parameters.
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T>;
+
+    /// Returns true if [`render_tracked`](Model::render_tracked) gives gradients to rays, which the refinement of camera poses needs. Default: false.
+    fn tracks_rays(&self) -> bool {
+        false
+    }
+
+    /// Renders rays like [`render`](Model::render). Gradients also flow to the origins and directions of the rays, if
+    /// [`tracks_rays`](Model::tracks_rays) returns true. Default: no gradient flows to the rays.
+    fn render_tracked(&self, rays: &TrackedRays<T>, pass: &Pass) -> Rendered<T> {
+        self.render(&rays.rays, pass)
+    }
 
     /// Creates the optimizer of a stage; schedules count from the stage's first step. It is called at the beginning of each stage, after
     /// [`begin_stage`](Model::begin_stage) or [`resume`](Model::resume).

@@ -26,8 +26,11 @@ Examples:
 Settings are layered: defaults < preset < --config < flags. The run folder has all of them in config.toml. --set takes their \
 paths in that file, such as stages[0].sampling.step. If stdout is not a terminal, its last line is the JSON object of result.json.";
 
+/// Weight of the loss `poses` with `--refine-poses`.
+const POSES: f64 = 0.01;
+
 /// Arguments that conflict with `--resume`, because they are fixed at the start of a run.
-pub const NOT_WHEN_RESUMED: [&str; 25] = [
+pub const NOT_WHEN_RESUMED: [&str; 26] = [
     "out",
     "force",
     "preset",
@@ -47,6 +50,7 @@ pub const NOT_WHEN_RESUMED: [&str; 25] = [
     "init_from",
     "hull",
     "engine",
+    "refine_poses",
     "tv",
     "space",
     "orient",
@@ -183,6 +187,11 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Training", value_parser = ["fused", "graph"])]
     engine: Option<String>,
 
+    /// Refine the camera poses of the training views together with the scene, for captures whose poses are not exact; sets the loss poses to 0.01. Only the
+    /// factored field (presets photos, quality and tensorf) supports it
+    #[arg(long, help_heading = "Training")]
+    refine_poses: bool,
+
     /// Weight of the total variation of the whole grid, as in the source paper; sets the losses tv_density and tv_color to W / 2 [default: 0]
     // The paper adds W (Σ over color channels / channels + density) / (2 n³) of sums over cells. Ours are means over cells, and
     // tv_color is one over channels too, so each gets W / 2.
@@ -274,6 +283,7 @@ impl TrainArgs {
             ("--engine", "engine", text(&self.engine)),
             ("--init-from", "init_from", init_from),
             ("--hull", "hull", text(&self.hull)),
+            ("--refine-poses", "losses.poses", self.refine_poses.then_some(Value::Float(POSES))),
             ("--tv", "losses.tv_density", tv.clone()),
             ("--tv", "losses.tv_color", tv),
         ] {

@@ -7,20 +7,25 @@
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
 //! another ([`RowSums`](autograd::RowSums)), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
 //! the sums are bit-identical for any number of threads.
+//!
+//! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of its samples, and adds them up for each ray.
 
 mod adjoint;
 mod forward;
 mod lookup;
 mod network;
+mod positions;
 
 use super::{Factored, Shape};
-use crate::camera::Ray;
+use crate::camera::{Ray, TrackedRays};
 use crate::field::grouping::{Grouping, Groups};
+use crate::geometry::Aabb;
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
-use crate::sampling::{Jitter, Samples};
+use crate::sampling::{Jitter, Samples, Spacing};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
 use forward::{Block, Scene};
+use glam::DVec3;
 use std::sync::Arc;
 
 /// Returns true if the kernel computes fields of these sizes.
@@ -47,10 +52,22 @@ struct Batch<T: Real> {
     jitter: Jitter,
 }
 
+/// Rays to which gradients flow, and how positions become units of cells.
+#[derive(Debug)]
+struct Tracked {
+    rays: Vec<Ray>,
+    spacing: Spacing,
+    aabb: Aabb,
+    /// Cells per length along each axis.
+    per_length: DVec3,
+}
+
 /// Rendered batch, with the data that its adjoint needs.
 #[derive(Debug)]
 struct State<T: Real> {
     batch: Batch<T>,
+    /// `None` if no gradient flows to the rays.
+    tracked: Option<Tracked>,
     /// Empty if no gradient is recorded.
     blocks: Vec<Block<T>>,
 }
@@ -80,12 +97,31 @@ impl<T: Real> render::Columns<T> for Columns<T> {
 
 /// Renders a batch of rays through a field.
 pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[rays.len(), 3]);
+    let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
+    render_inputs(field, rays, (directions, encoded), &[], options)
+}
+
+/// Renders a batch of tracked rays through a field.
+pub fn render_tracked<T: Real>(field: &Factored<T>, tracked: &TrackedRays<T>, options: &RenderOptions<'_>) -> Rendered<T> {
+    let TrackedRays { rays, origins, directions } = tracked;
+    let encoded = field.shape.directions.encode(directions);
+    render_inputs(field, rays, (directions.detach(), encoded.detach()), &[&encoded, origins, directions], options)
+}
+
+/// Renders a batch of rays with these directions and encoded directions. `of_rays` are the inputs of the kernel after the parameters of the field: nothing, or
+/// encoded directions, origins and directions.
+fn render_inputs<T: Real>(
+    field: &Factored<T>,
+    rays: &[Ray],
+    (directions, encoded): (Tensor<T>, Tensor<T>),
+    of_rays: &[&Tensor<T>],
+    options: &RenderOptions<'_>,
+) -> Rendered<T> {
     let n = rays.len();
     let params = field.tables();
-    let tables: Vec<&Tensor<T>> = params.iter().collect();
-    let keep = tables.iter().any(|table| table.is_tracked()) && autograd::is_recording();
-    let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[n, 3]);
-    let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
+    let inputs: Vec<&Tensor<T>> = params.iter().chain(of_rays.iter().copied()).collect();
+    let keep = inputs.iter().any(|input| input.is_tracked()) && autograd::is_recording();
     let background = options.background.map(|c| T::lit(f64::from(c)));
     let jitter = options.jitter;
     let grouping = if matches!(jitter, Jitter::None) { field.grouping_in_pictures } else { field.grouping };
@@ -100,10 +136,16 @@ pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOption
         (count, keep.then_some(block))
     });
     let sample_count = blocks.iter().map(|(count, _)| count).sum();
-    let state = Arc::new(State { batch, blocks: blocks.into_iter().filter_map(|(_, block)| block).collect() });
+    let tracked = (keep && !of_rays.is_empty()).then(|| Tracked {
+        rays: rays.to_vec(),
+        spacing: options.spacing,
+        aabb: options.aabb,
+        per_length: forward::cells_per_length(batch.nodes, &options.aabb),
+    });
+    let state = Arc::new(State { batch, tracked, blocks: blocks.into_iter().filter_map(|(_, block)| block).collect() });
     let kernel = |output| Fused { state: state.clone(), output };
-    let pixels = Tensor::from_kernel(pixels, &[n, COLUMNS], &tables, kernel(Output::Pixels));
-    let sparsity = Tensor::from_kernel(sparsity, &[n], &tables, kernel(Output::Sparsity));
+    let pixels = Tensor::from_kernel(pixels, &[n, COLUMNS], &inputs, kernel(Output::Pixels));
+    let sparsity = Tensor::from_kernel(sparsity, &[n], &inputs, kernel(Output::Sparsity));
     Rendered::new(
         pixels.narrow(1, 0, 3),
         pixels.index_axis(1, column::OPACITY),
@@ -122,7 +164,7 @@ enum Output {
     Sparsity,
 }
 
-/// Kernel that maps the parameters of a field to columns.
+/// Kernel that maps the parameters of a field, and the tensors of tracked rays, to columns.
 #[derive(Debug)]
 struct Fused<T: Real> {
     state: Arc<State<T>>,
@@ -151,8 +193,7 @@ impl<T: Real> Kernel<T> for Fused<T> {
     }
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
-        let count = adjoint::PLANES_AND_LINES + 1 + 2 * 3;
-        let tables: Vec<Tensor<T>> = (0..count).map(|input| call.input(input)).collect();
+        let tables: Vec<Tensor<T>> = (0..adjoint::TABLES).map(|input| call.input(input)).collect();
         let adjoint::Cotangents { planes, dense } = adjoint::cotangents(&self.state, &tables, call.cotangent(), self.output);
         for (input, sums) in planes {
             out.rows(input, RowSparse::deferred(tables[input].shape(), sums));
@@ -165,8 +206,9 @@ impl<T: Real> Kernel<T> for Fused<T> {
 
 impl<T: Real> State<T> {
     /// Computes the same pixels as a graph of small ops.
-    fn composite(&self, tables: &[Tensor<T>]) -> Rendered<T> {
+    fn composite(&self, inputs: &[Tensor<T>]) -> Rendered<T> {
         let batch = &self.batch;
+        let (tables, of_rays) = inputs.split_at(adjoint::TABLES);
         let (mut offsets, mut rays) = (vec![0u32], Vec::new());
         let mut columns: [Vec<T>; 5] = Default::default();
         // Numbers of the shaded samples, and for each sample with a color its number and that of its shaded sample.
@@ -189,12 +231,29 @@ impl<T: Real> State<T> {
         let m = columns[0].len();
         let [x, y, z, t, delta] = columns.map(|values| Tensor::from_vec(values, &[m]));
         let cells = Tensor::stack(&[&x, &y, &z], 1);
-        let directions = batch.encoded.gather_rows(&Indices::from(rays));
+        // Positions in world coordinates are needed for tracked rays only.
+        let samples = Samples { t, delta, positions: cells, directions: batch.directions.clone(), offsets };
+        let (samples, encoded) = match (&self.tracked, of_rays) {
+            (Some(tracked), [encoded, origins, directions]) => (tracked.cells(samples, [origins, directions], batch.nodes), encoded),
+            _ => (samples, &batch.encoded),
+        };
+        let cells = samples.positions.clone();
+        let directions = encoded.gather_rows(&Indices::from(rays));
         let colors = super::colors(tables, batch.shape.feature_octaves, &cells.gather_rows(&Indices::from(shaded)), &directions);
         let rgb = colors.gather_rows(&Indices::from(group)).scatter_rows(&Indices::from(colored), m);
         let radiance = Radiance { sigma: super::density(tables, &cells), rgb };
-        // Positions in world coordinates are not needed any more.
-        let samples = Samples { t, delta, positions: cells, directions: batch.directions.clone(), offsets };
         composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))
+    }
+}
+
+impl Tracked {
+    /// Returns samples whose positions, in units of cells, are functions of the origins and directions of the rays.
+    fn cells<T: Real>(&self, samples: Samples<T>, [origins, directions]: [&Tensor<T>; 2], nodes: [usize; 3]) -> Samples<T> {
+        let rays = TrackedRays { rays: self.rays.clone(), origins: origins.clone(), directions: directions.clone() };
+        let samples = samples.tracking(&rays, self.spacing);
+        let [low, per_length] = [self.aabb.min, self.per_length].map(|v| Tensor::from_vec(v.to_array().map(T::lit).to_vec(), &[3]));
+        let most = Tensor::from_vec(nodes.map(|n| T::lit((n - 1) as f64)).to_vec(), &[3]);
+        let cells = ((&samples.positions - low) * per_length).maximum(&Tensor::zeros(&[3])).minimum(&most);
+        Samples { positions: cells, ..samples }
     }
 }

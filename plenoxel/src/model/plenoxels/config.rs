@@ -14,7 +14,7 @@ use crate::model::recipe::Recipe;
 use crate::model::{dvgo, nerf, ngp, tensorf};
 use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
-use crate::train::TrainOptions;
+use crate::train::{self, TrainOptions};
 use autograd::Real;
 use autograd::optim::{Exponential, Piecewise, Schedule};
 use serde::{Deserialize, Serialize};
@@ -102,7 +102,8 @@ pub struct Config {
     /// Weight of each loss: a number, `{ weight, until }` for a loss that ends, or `{ from, to, steps }` for a weight that changes
     /// exponentially.
     pub losses: BTreeMap<String, Weight>,
-    /// Learning rates of losses with parameters (`robust`, `exposure`), by name of the loss. They replace the loss's own rates.
+    /// Learning rates of losses with parameters (`robust`, `exposure`, `poses`), by name of the loss. They replace the loss's own rates. That of `poses` falls
+    /// to 1 % of it over the run.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub loss_rates: BTreeMap<String, f64>,
     /// Training stages, coarse to fine.
@@ -574,7 +575,7 @@ impl Config {
             let key = format!("loss_rates.{name}");
             let learned: Vec<&str> = LEARNED_LOSSES.into_iter().filter(|loss| self.losses.contains_key(*loss)).collect();
             let remedy = match learned.is_empty() {
-                true => "remove it: only the losses robust and exposure have parameters".to_owned(),
+                true => "remove it: only the losses robust, exposure and poses have parameters".to_owned(),
                 false => format!("expected a rate for {}", learned.join(", ")),
             };
             demand(learned.contains(&name.as_str()), &key, "this loss has no parameters here", &remedy)?;
@@ -620,6 +621,9 @@ impl Config {
             )?;
         }
         sampling("evaluation", self.evaluation)?;
+        if self.losses.contains_key(loss::POSES) && !self.recipe().is_some_and(Recipe::tracks_rays) {
+            return Err(train::no_gradients(self.recipe().map_or(super::KIND, Recipe::kind)));
+        }
         self.recipe().map_or(Ok(()), |recipe| self.validate_other(recipe))?;
         let CarveConfig { resolution, margin, depth, photo, ridge, sweeps, .. } = self.carve;
         let noise = photo.map_or(1.0, |photo| photo.noise);

@@ -4,7 +4,7 @@ use super::config::{Config, Weight};
 use super::{Objective, single};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
-use crate::loss::{self, Cells, EXPOSURE, tv_color, tv_density};
+use crate::loss::{self, Cells, EXPOSURE, POSE_RATE, POSES, tv_color, tv_density};
 use autograd::Real;
 use autograd::optim::Schedule;
 use autograd::single::{cast, is_single};
@@ -24,7 +24,7 @@ pub const LOSSES: [&str; loss::NAMES.len() + OF_GRID.len()] = {
 };
 
 /// Names of the losses with parameters, whose learning rate a config may set.
-pub const LEARNED_LOSSES: [&str; 2] = ["robust", EXPOSURE];
+pub const LEARNED_LOSSES: [&str; 3] = ["robust", EXPOSURE, POSES];
 
 /// Adds a loss by its name in [`LOSSES`] to an objective of a model with a voxel grid. `views` is the number of training views.
 ///
@@ -69,9 +69,16 @@ fn named<T: Real, M>(
         return Err(Error::usage("losses", "there is no loss", "set at least one, such as `mse = 1.0`"));
     }
     let all = config.losses.iter().try_fold(loss::Objective::new(), |objective, (name, weight)| with(objective, name, *weight))?;
-    Ok(config.loss_rates.iter().fold(all, |objective, (loss, &rate)| {
+    let all = config.loss_rates.iter().fold(all, |objective, (loss, &rate)| {
         let of_loss = |name: &&str| *name == loss || name.strip_prefix(loss.as_str()).is_some_and(|rest| rest.starts_with('.'));
         let params: Vec<String> = objective.params().iter().map(|p| p.name()).filter(of_loss).map(str::to_owned).collect();
         params.into_iter().fold(objective, |objective, name| objective.with_rate(&name, rate))
-    }))
+    });
+    Ok(match config.recipe().filter(|_| all.param(POSES).is_some()) {
+        Some(recipe) => {
+            let rate = config.loss_rates.get(POSES).copied().unwrap_or(POSE_RATE);
+            all.with_pose_rate(rate, recipe.stages().iter().map(|stage| stage.steps).sum())
+        }
+        None => all,
+    })
 }

@@ -27,6 +27,10 @@ impl Recipe for Config {
         true
     }
 
+    fn tracks_rays(&self) -> bool {
+        true
+    }
+
     fn memory(&self, engine: Engine) -> Memory {
         Memory {
             parameters: self.stages.iter().map(|stage| bytes_of_planes(self, stage.resolution)).max().unwrap_or(0),

@@ -9,6 +9,7 @@ use crate::dataset::{Split, View};
 use crate::error::{Error, Result};
 use crate::evaluate::{self, Viewer};
 use crate::run::metrics::{History, MetricsFile, Observation};
+use crate::train::poses::PoseFigures;
 use crate::train::{About, Model, PlannedStage, RenderFn, Trainer, ViewOptions};
 use ndarray::Array3;
 use serde::Serialize;
@@ -33,6 +34,8 @@ pub struct Learned<M> {
     /// Renderers of the models at the end of earlier stages, if kept, with their index in `stages`.
     pub kept: Vec<(usize, RenderFn<'static, f32>)>,
     pub steps: u64,
+    /// Corrections of the training views' poses, if they were refined and steps were taken.
+    pub poses: Option<PoseFigures>,
 }
 
 /// Saves a trained model outside its run folder if that cannot be written: in the parent folder, the working directory, or the folder for
@@ -151,6 +154,10 @@ impl Job<'_> {
             }
         };
         let about = trainer.about(dataset.name());
+        let poses = trainer.pose_figures();
+        if let Some(poses) = &poses {
+            on(Event::note(format!("corrections of the training views' poses: {poses}")));
+        }
         let model = trainer.into_model();
         if let Err(e) = folder.save(&model, &about) {
             let kept = match rescued(folder.path(), &model, &about) {
@@ -178,7 +185,7 @@ impl Job<'_> {
             .as_ref()
             .and_then(|image| evaluate::constant_psnr(&views[..views.len().min(VIEWS_OF_MEAN)], image, config.background));
         let training_psnr = of_mean.map(|of_mean| [-10.0 * mean_squared_error.log10(), of_mean]).filter(|_| taken);
-        Ok(Ok(Learned { model, metrics, mean_image, training_psnr, stages, kept, steps: total }))
+        Ok(Ok(Learned { model, metrics, mean_image, training_psnr, stages, kept, steps: total, poses }))
     }
 
     /// Returns the trained model of a run that was killed between its last step and its final figures; `trainer` is a new trainer of the run.
@@ -195,7 +202,7 @@ impl Job<'_> {
         on(Event::Trained);
         let (model, about) = trainer.into_model_of(&folder.existing_checkpoint()?)?;
         let (mean_image, stages) = (self.mean_image(views), summaries(&past, plan));
-        Ok(Learned { model, metrics, mean_image, training_psnr: None, stages, kept: Vec::new(), steps: about.step })
+        Ok(Learned { model, metrics, mean_image, training_psnr: None, stages, kept: Vec::new(), steps: about.step, poses: None })
     }
 
     /// Mean training image, the baseline of the test views, if there are any.

@@ -4,6 +4,7 @@ use super::StageSummary;
 use crate::evaluate::ViewScore;
 use crate::run::figures::Figures;
 use crate::run::metrics::Best;
+use crate::train::poses::PoseFigures;
 use serde::Serialize;
 
 /// Final figures of a run: `result.json` of its folder.
@@ -42,6 +43,9 @@ pub struct Summary {
     pub validation_psnr: Option<f64>,
     /// The best validation PSNR and its step.
     pub best_validation: Option<Best>,
+    /// Corrections of the training views' poses, if they were refined. Test and validation views keep their given poses.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub poses: Option<PoseFigures>,
     /// Each stage.
     pub stages: Vec<StageSummary>,
     /// Reasons to doubt the result.

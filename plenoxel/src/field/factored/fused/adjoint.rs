@@ -3,7 +3,8 @@
 use super::super::PLANE_OF;
 use super::forward::{Block, Tables};
 use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, RUN, add_to_lines, first_rows};
-use super::network::NetworkCotangents;
+use super::network::OfNetwork;
+use super::positions::{self, OfRays};
 use super::{Output, State};
 use crate::field::grouping::Groups;
 use crate::render::along::{COLUMNS, sparsity_slope};
@@ -13,6 +14,8 @@ use std::sync::Arc;
 
 /// Number of tables of planes and lines, which come before those of the network.
 pub const PLANES_AND_LINES: usize = 12;
+/// Number of tables: those, the matrix B, and weight and bias of the three layers. The tensors of tracked rays follow.
+pub const TABLES: usize = PLANES_AND_LINES + 1 + 2 * 3;
 
 /// Cotangents by the number of the input.
 pub struct Cotangents<T: Real> {
@@ -122,10 +125,11 @@ pub fn cotangents<T: Real>(state: &Arc<State<T>>, tables: &[Tensor<T>], cotangen
     let of = Tables::new(&state.batch, tables);
     let parts = parallel::map_indices(state.blocks.len(), |b| part(state, &state.blocks[b], &of, cotangent, output));
     let nodes = state.batch.nodes;
-    let (mut own, mut dense) = (Vec::new(), Vec::new());
-    for (part, of_block) in parts {
+    let (mut own, mut dense, mut rays) = (Vec::new(), Vec::new(), Vec::new());
+    for (part, of_block, of_rays) in parts {
         own.push(part);
         dense.push(of_block);
+        rays.extend(of_rays);
     }
     let sums = sum_in_order(dense);
     let mut dense = Vec::new();
@@ -141,6 +145,9 @@ pub fn cotangents<T: Real>(state: &Arc<State<T>>, tables: &[Tensor<T>], cotangen
         }
     }
     dense.extend((PLANES_AND_LINES..).zip(sums));
+    if state.tracked.is_some() {
+        dense.extend((TABLES..).zip(positions::joined(&rays)));
+    }
     let parts = Arc::new(own);
     let planes =
         [(0, true), (6, false)].into_iter().flat_map(|(first, of_density)| (0..3).map(move |axis| (first + axis, axis, of_density)));
@@ -168,14 +175,15 @@ fn sum_in_order<T: Real>(blocks: Vec<Vec<Buffer<T>>>) -> Vec<Buffer<T>> {
     (0..first.len()).map(sum).collect()
 }
 
-/// Computes the cotangents of one block: those of its samples; and those of the lines of density and appearance, the matrix and the layers.
+/// Computes the cotangents of one block: those of its samples; those of the lines of density and appearance, the matrix and the layers; and those of its rays,
+/// if they are tracked.
 fn part<T: Real>(
     state: &State<T>,
     block: &Block<T>,
     tables: &Tables<'_, T>,
     cotangent: &Tensor<T>,
     output: Output,
-) -> (Part<T>, Vec<Buffer<T>>) {
+) -> (Part<T>, Vec<Buffer<T>>, Option<OfRays<T>>) {
     let batch = &state.batch;
     let mut density = Buffer::stale(block.len());
     let mut rgb = Buffer::zeros(3 * block.shaded.len());
@@ -198,7 +206,7 @@ fn part<T: Real>(
         }
     }
     density.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
-    let (products, network): (Buffer<T>, NetworkCotangents<T>) = tables.network.adjoint(&block.activations, rgb);
+    let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, rgb);
     let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
     let lines =
         [lines(tables.density, block.at(), OfProducts::Shared(&density)), lines(tables.appearance, shaded_at, OfProducts::Each(&products))];
@@ -206,7 +214,11 @@ fn part<T: Real>(
     let live = |i: usize| density[i] != T::zero();
     let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, block.at(), batch.nodes, shift(axis, tables.density), live));
     let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, shaded_at, batch.nodes, shift(axis, tables.appearance), |_| true));
-    (Part { density, products, density_rows, product_rows }, lines.into_iter().chain(network).collect())
+    let rays = state.tracked.as_ref().map(|tracked| {
+        let encoded = tables.network.of_direction(&input);
+        positions::of_rays(tracked, block, tables, [&density, &products], encoded)
+    });
+    (Part { density, products, density_rows, product_rows }, lines.into_iter().chain(parameters).collect(), rays)
 }
 
 /// Returns the cotangents of three lines, one after another.
@@ -215,11 +227,7 @@ fn lines<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: OfProducts<'_, T>) -> B
     let count = at[0].len();
     for first in (0..count).step_by(RUN) {
         let range = first..count.min(first + RUN);
-        let at = at.map(|at| &at[range.clone()]);
-        let g = match g {
-            OfProducts::Shared(g) => OfProducts::Shared(&g[range.clone()]),
-            OfProducts::Each(g) => OfProducts::Each(&g[3 * pairs.width * range.start..3 * pairs.width * range.end]),
-        };
+        let (at, g) = (at.map(|at| &at[range.clone()]), g.of(range.clone(), 3 * pairs.width));
         if parallel::fused() {
             add_to_lines::<T, true>(pairs, at, g, &mut sums);
         } else {

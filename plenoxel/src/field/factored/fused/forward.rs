@@ -5,6 +5,7 @@ use super::lookup::{self, Pairs, RUN};
 use super::network::{Activations, Network};
 use crate::camera::Ray;
 use crate::field::grouping::Groups;
+use crate::geometry::Aabb;
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along, COLUMNS};
 use crate::sampling::{Occupancy, march};
@@ -22,6 +23,11 @@ mod of_sample {
     pub const AFTER: usize = 8;
     /// Number of columns; positions are the first three.
     pub const COUNT: usize = 9;
+}
+
+/// Returns the number of cells per length along each axis of a box.
+pub fn cells_per_length(nodes: [usize; 3], aabb: &Aabb) -> DVec3 {
+    DVec3::from_array(nodes.map(|n| n as f64 - 1.0)) / (aabb.max - aabb.min)
 }
 
 /// Samples of a block of rays.
@@ -162,7 +168,7 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut offsets = vec![0];
         let mut end = 0;
         let most = DVec3::from_array(self.batch.nodes.map(|n| n as f64 - 1.0));
-        let per_length = most / (aabb.max - aabb.min);
+        let per_length = cells_per_length(self.batch.nodes, aabb);
         for (r, ray) in self.rays[first..first + count].iter().enumerate() {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
             let mut occupied = self.cells.map(|cells| march.occupied(ray, cells));

@@ -5,6 +5,7 @@
 use super::super::{PLANE_OF, SCALE, SHIFT};
 use autograd::single::is_single;
 use autograd::{Real, dispatched, parallel};
+use std::ops::Range;
 
 /// Number of components that are computed together. The number of components of a field is a multiple of it.
 pub const LANES: usize = 16;
@@ -27,34 +28,34 @@ pub struct Pairs<'a, T> {
 }
 
 /// Cells of up to [`RUN`] samples, in columns.
-struct Cells<T> {
+pub(super) struct Cells<T> {
     /// Number of samples.
-    count: usize,
+    pub count: usize,
     /// Lower node along each axis.
     node: [[u32; RUN]; 3],
     /// Distance from the lower node, in cells.
-    share: [[T; RUN]; 3],
+    pub share: [[T; RUN]; 3],
     /// Nodes along each axis.
     nodes: [usize; 3],
 }
 
 /// Cell of one sample in a plane: numbers of its first row and of the row after a row of nodes, and the weights of both and of those that follow them.
 #[derive(Clone, Copy)]
-struct Corner<T> {
-    rows: [usize; 2],
+pub(super) struct Corner<T> {
+    pub rows: [usize; 2],
     weights: [T; 4],
 }
 
 /// Rows of one sample in a line: the lower one, and the weights of both.
 #[derive(Clone, Copy)]
-struct Along<T> {
-    row: usize,
+pub(super) struct Along<T> {
+    pub row: usize,
     weights: [T; 2],
 }
 
 impl<T: Real> Cells<T> {
     #[inline(always)]
-    fn new(at: Places<'_, T>, nodes: [usize; 3]) -> Self {
+    pub fn new(at: Places<'_, T>, nodes: [usize; 3]) -> Self {
         let count = at[0].len();
         let mut cells = Cells { count, node: [[0; RUN]; 3], share: [[T::zero(); RUN]; 3], nodes };
         for axis in 0..3 {
@@ -69,7 +70,7 @@ impl<T: Real> Cells<T> {
     }
 
     #[inline(always)]
-    fn corner(&self, axis: usize, i: usize) -> Corner<T> {
+    pub fn corner(&self, axis: usize, i: usize) -> Corner<T> {
         let [b, c] = PLANE_OF[axis];
         let (stride, x, y) = (self.nodes[c], self.share[b][i], self.share[c][i]);
         let (u, v) = (T::one() - x, T::one() - y);
@@ -78,7 +79,7 @@ impl<T: Real> Cells<T> {
     }
 
     #[inline(always)]
-    fn along(&self, axis: usize, i: usize) -> Along<T> {
+    pub fn along(&self, axis: usize, i: usize) -> Along<T> {
         let share = self.share[axis][i];
         Along { row: self.node[axis][i] as usize, weights: [T::one() - share, share] }
     }
@@ -132,7 +133,7 @@ fn ln_1p<T: Real>(e: T) -> T {
 // Compilers make vectors of a loop over a chunk, for every instruction set, only if it writes to an array of its own, and not to one that the loop also reads.
 // Closures inside of a dispatched function stay calls if a library function calls them: it has other target features.
 #[inline(always)]
-fn plane_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], corner: Corner<T>, chunks: usize, k: usize) -> [T; LANES] {
+pub(super) fn plane_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], corner: Corner<T>, chunks: usize, k: usize) -> [T; LANES] {
     let Corner { rows, weights } = corner;
     let (first, second) = (rows[0] * chunks + k, rows[1] * chunks + k);
     let (p, q, r, s) = (&table[first], &table[first + chunks], &table[second], &table[second + chunks]);
@@ -148,7 +149,7 @@ fn plane_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], corner: Corner<T>,
 
 /// Returns the interpolated chunk of a line.
 #[inline(always)]
-fn line_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], along: Along<T>, chunks: usize, k: usize) -> [T; LANES] {
+pub(super) fn line_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], along: Along<T>, chunks: usize, k: usize) -> [T; LANES] {
     let first = along.row * chunks + k;
     let (p, q) = (&table[first], &table[first + chunks]);
     let mut value = [T::zero(); LANES];
@@ -174,7 +175,7 @@ pub type Places<'a, T> = [&'a [T]; 3];
 
 /// Prefetches the plane rows of samples.
 #[inline(always)]
-fn prefetch<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>) {
+pub(super) fn prefetch<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>) {
     let width = pairs.width;
     for axis in 0..3 {
         for i in 0..cells.count {
@@ -286,7 +287,15 @@ pub enum Cotangents<'a, T> {
     Each(&'a [T]),
 }
 
-impl<T: Real> Cotangents<'_, T> {
+impl<'a, T: Real> Cotangents<'a, T> {
+    /// Returns the cotangents of a range of samples with `width` products each.
+    pub fn of(&self, samples: Range<usize>, width: usize) -> Cotangents<'a, T> {
+        match self {
+            Cotangents::Shared(g) => Cotangents::Shared(&g[samples]),
+            Cotangents::Each(g) => Cotangents::Each(&g[width * samples.start..width * samples.end]),
+        }
+    }
+
     /// Prefetches `count` chunks of sample i from chunk `k` of `chunks` on.
     #[inline(always)]
     fn prefetch(&self, i: usize, k: usize, chunks: usize, count: usize) {
@@ -297,7 +306,7 @@ impl<T: Real> Cotangents<'_, T> {
 
     /// Returns a chunk times the cotangents of chunk `k` of `chunks` of sample i.
     #[inline(always)]
-    fn times(&self, i: usize, k: usize, chunks: usize, value: [T; LANES]) -> [T; LANES] {
+    pub fn times(&self, i: usize, k: usize, chunks: usize, value: [T; LANES]) -> [T; LANES] {
         let mut product = [T::zero(); LANES];
         match self {
             Cotangents::Shared(g) => {

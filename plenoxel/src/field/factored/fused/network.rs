@@ -31,8 +31,15 @@ pub struct Activations<T: Real> {
     pub rgb: Buffer<T>,
 }
 
-/// Cotangents of the matrix and of the layers' weights and biases, in the order of the parameters.
-pub type NetworkCotangents<T> = Vec<Buffer<T>>;
+/// Cotangents of the network for m samples.
+pub struct OfNetwork<T: Real> {
+    /// Of the products, `[m, 3 R]`.
+    pub products: Buffer<T>,
+    /// Of the input of the first layer, `[m, inputs]`.
+    pub input: Buffer<T>,
+    /// Of the matrix and of the layers' weights and biases, in the order of the parameters.
+    pub parameters: Vec<Buffer<T>>,
+}
 
 impl<'a, T: Real> Network<'a, T> {
     /// Creates the network from its parameters.
@@ -83,8 +90,14 @@ impl<'a, T: Real> Network<'a, T> {
         Activations { products, inputs, rgb }
     }
 
-    /// Computes the cotangents of the products, `[m, 3 R]`, and of the parameters, from those of the colors, `[m, 3]`.
-    pub fn adjoint(&self, activations: &Activations<T>, mut g: Buffer<T>) -> (Buffer<T>, NetworkCotangents<T>) {
+    /// Returns the cotangents of encoded directions, one row for each sample, from those of the input of the first layer.
+    pub fn of_direction<'g>(&self, input: &'g [T]) -> impl Iterator<Item = &'g [T]> {
+        let encoded = self.features * (1 + 2 * self.octaves);
+        input.chunks_exact(self.layers[0].inputs).map(move |row| &row[encoded..])
+    }
+
+    /// Computes the cotangents of the products and of the parameters from those of the colors, `[m, 3]`.
+    pub fn adjoint(&self, activations: &Activations<T>, mut g: Buffer<T>) -> OfNetwork<T> {
         let m = g.len() / 3;
         g.iter_mut().zip(activations.rgb.iter()).for_each(|(g, &c)| *g *= c * (T::one() - c));
         let mut cotangents = Vec::with_capacity(1 + 2 * self.layers.len());
@@ -114,7 +127,7 @@ impl<'a, T: Real> Network<'a, T> {
         multiply(features, Matrix::transposed(self.basis, self.features, self.products), &mut of_products);
         cotangents.push(of_basis);
         cotangents.reverse();
-        (of_products, cotangents)
+        OfNetwork { products: of_products, input: g, parameters: cotangents }
     }
 }
 

@@ -1,0 +1,129 @@
+//! Cotangents of rays: those of the positions of their samples, and of the directions in which samples are seen.
+
+use super::super::PLANE_OF;
+use super::Tracked;
+use super::forward::{Block, Tables};
+use super::lookup::{Cells, Cotangents, LANES, Pairs, Places, RUN, line_at, plane_at, prefetch};
+use crate::camera::Ray;
+use crate::sampling::Spacing;
+use crate::space::{Bend, contract_adjoint};
+use autograd::{Buffer, Real, dispatched, parallel};
+use glam::DVec3;
+
+/// Cotangents of the rays of a block: of encoded directions, `[rays, e]`, of origins and of directions, `[rays, 3]`.
+pub type OfRays<T> = [Vec<T>; 3];
+
+/// Joins the cotangents of all blocks.
+pub fn joined<T: Real>(blocks: &[OfRays<T>]) -> [Buffer<T>; 3] {
+    [0, 1, 2].map(|k| blocks.iter().flat_map(|block| block[k].iter().copied()).collect::<Vec<_>>().into())
+}
+
+/// Computes the cotangents of the rays of a block from those of the density features of its samples, of the products of its shaded samples, and of the encoded
+/// directions of these.
+pub fn of_rays<'g, T: Real>(
+    tracked: &Tracked,
+    block: &Block<T>,
+    tables: &Tables<'_, T>,
+    [density, products]: [&[T]; 2],
+    encoded: impl Iterator<Item = &'g [T]>,
+) -> OfRays<T> {
+    let mut of_samples = slopes(tables.density, block.at(), Cotangents::Shared(density));
+    let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
+    let of_shaded = slopes(tables.appearance, shaded_at, Cotangents::Each(products));
+    for (shaded, &sample) in block.shaded.iter().enumerate() {
+        (0..3).for_each(|axis| of_samples[axis][sample as usize] += of_shaded[axis][shaded]);
+    }
+    let rays = block.offsets.len() - 1;
+    let mut of_encoded = Vec::new();
+    for (row, &ray) in encoded.zip(&block.rays_of_shaded) {
+        of_encoded.resize(rays * row.len(), T::zero());
+        let sums = &mut of_encoded[(ray as usize - block.first) * row.len()..][..row.len()];
+        sums.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
+    }
+    let (mut of_origins, mut of_directions) = (Vec::with_capacity(3 * rays), Vec::with_capacity(3 * rays));
+    for (ray, own) in tracked.rays[block.first..].iter().zip(block.rays()) {
+        let (mut origin, mut direction) = (DVec3::ZERO, DVec3::ZERO);
+        let position = tracked.position_of(ray);
+        for i in own {
+            let g = DVec3::from_array([0, 1, 2].map(|axis| of_samples[axis][i].as_f64())) * tracked.per_length;
+            let (g, distance) = position(block.t()[i].as_f64(), g);
+            origin += g;
+            direction += distance * g;
+        }
+        of_origins.extend(origin.to_array().map(T::lit));
+        of_directions.extend(direction.to_array().map(T::lit));
+    }
+    [of_encoded, of_origins, of_directions]
+}
+
+impl Tracked {
+    /// Returns a function from t of a sample of a ray, and the cotangent of its position, to the cotangent of o + t d and the distance from o.
+    fn position_of(&self, ray: &Ray) -> impl Fn(f64, DVec3) -> (DVec3, f64) {
+        let (ray, bend) = (*ray, matches!(self.spacing, Spacing::Contracted(_)).then(|| Bend::of(ray)));
+        move |t, g| match bend {
+            None => (g, t),
+            Some(bend) => {
+                let distance = bend.distance(t);
+                (contract_adjoint(ray.origin + distance * ray.direction, g), distance)
+            }
+        }
+    }
+}
+
+/// Returns the cotangents of positions, in units of cells, from those of products.
+fn slopes<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: Cotangents<'_, T>) -> [Vec<T>; 3] {
+    let count = at[0].len();
+    let mut slopes: [Vec<T>; 3] = std::array::from_fn(|_| Vec::with_capacity(count));
+    for first in (0..count).step_by(RUN) {
+        let range = first..count.min(first + RUN);
+        let (at, g) = (at.map(|at| &at[range.clone()]), g.of(range.clone(), 3 * pairs.width));
+        let mut out = [[T::zero(); RUN]; 3];
+        if parallel::fused() {
+            add_slopes::<T, true>(pairs, at, g, &mut out);
+        } else {
+            add_slopes::<T, false>(pairs, at, g, &mut out);
+        }
+        slopes.iter_mut().zip(&out).for_each(|(slopes, out)| slopes.extend_from_slice(&out[..range.len()]));
+    }
+    slopes
+}
+
+dispatched! {
+/// Adds the cotangents of the positions of up to [`RUN`] samples. With a = P L for the axis of a line, P of the axes (b, c), and fractions x and y of the cell
+/// along b and c: ∂a/∂p_a = P ΔL, ∂a/∂p_b = L ((1 − y) ΔP₀ + y ΔP₁), ∂a/∂p_c likewise, where Δ are differences of neighbouring nodes.
+fn add_slopes<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, g: Cotangents<'_, T>, out: &mut [[T; RUN]; 3]) {
+    let cells = Cells::new(at, pairs.nodes);
+    prefetch(pairs, &cells);
+    let chunks = pairs.width / LANES;
+    for axis in 0..3 {
+        let (plane, line) = (pairs.planes[axis].as_chunks::<LANES>().0, pairs.lines[axis].as_chunks::<LANES>().0);
+        let [b, c] = PLANE_OF[axis];
+        for i in 0..cells.count {
+            let (corner, along) = (cells.corner(axis, i), cells.along(axis, i));
+            let (x, y) = (cells.share[b][i], cells.share[c][i]);
+            let (u, v) = (T::one() - x, T::one() - y);
+            let (mut of_a, mut of_b, mut of_c) = ([T::zero(); LANES], [T::zero(); LANES], [T::zero(); LANES]);
+            for k in 0..chunks {
+                let (first, second) = (corner.rows[0] * chunks + k, corner.rows[1] * chunks + k);
+                let (p, q, r, s) = (&plane[first], &plane[first + chunks], &plane[second], &plane[second + chunks]);
+                let (low, high) = (&line[along.row * chunks + k], &line[(along.row + 1) * chunks + k]);
+                let value = g.times(i, axis * chunks + k, 3 * chunks, plane_at::<T, FUSED>(plane, corner, chunks, k));
+                let factor = g.times(i, axis * chunks + k, 3 * chunks, line_at::<T, FUSED>(line, along, chunks, k));
+                let (a, b, c) = (of_a, of_b, of_c);
+                for l in 0..LANES {
+                    of_a[l] = a[l] + value[l] * (high[l] - low[l]);
+                    of_b[l] = b[l] + factor[l] * (v * (r[l] - p[l]) + y * (s[l] - q[l]));
+                    of_c[l] = c[l] + factor[l] * (u * (q[l] - p[l]) + x * (s[l] - r[l]));
+                }
+            }
+            for (axis, lanes) in [(axis, of_a), (b, of_b), (c, of_c)] {
+                let mut sum = out[axis][i];
+                for l in 0..LANES {
+                    sum += lanes[l];
+                }
+                out[axis][i] = sum;
+            }
+        }
+    }
+}
+}

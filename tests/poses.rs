@@ -1,0 +1,260 @@
+//! Refinement of camera poses: gradients of rays, the same bits for any number of threads and after a resumption, and poses that come closer to the true ones.
+
+use autograd::{Gradcheck, Module, Param, Tensor, random::Stream};
+use glam::{DQuat, DVec3, dvec3};
+use ndarray::ArrayD;
+use plenoxel::camera::{Camera, Ray, TrackedRays};
+use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::evaluate::evaluate;
+use plenoxel::field::encoding::Directions;
+use plenoxel::geometry::Aabb;
+use plenoxel::loss::{Objective, mse};
+use plenoxel::model::dvgo::{self, Dvgo};
+use plenoxel::model::plenoxels::config::{Config as RunConfig, Hull};
+use plenoxel::model::tensorf::{Config, Stage, Tensorf};
+use plenoxel::render::{Engine, Rendered};
+use plenoxel::run::settings::Layers;
+use plenoxel::sampling::Jitter;
+use plenoxel::space::{Region, Space};
+use plenoxel::train::{Model, Pass, TrainOptions, Trainer, ViewOptions};
+
+const PASS: Pass = Pass { background: [1.0; 3], jitter: Jitter::PerRay { seed: 3, step: 7 }, keep_samples: false, stage: None };
+
+/// The spaces with their boxes.
+fn regions() -> [Region; 3] {
+    let ndc = Aabb { min: dvec3(-1.5, -1.6, -1.0), max: dvec3(1.5, 1.6, 1.0) };
+    [
+        Region { space: Space::Box, aabb: Aabb::cube(1.4) },
+        Region { space: Space::Ndc { a: 1.7, b: 1.9 }, aabb: ndc },
+        Region { space: Space::Contracted, aabb: Aabb::cube(Space::CONTRACTED) },
+    ]
+}
+
+/// A field that the kernel computes, neither fog nor nothing.
+fn model(config: Config, region: Region, resolution: usize) -> Tensorf<f64> {
+    let config = Config {
+        density_components: 16,
+        appearance_components: 16,
+        features: 4,
+        hidden: 6,
+        step: 1.0,
+        stop_below: 0.0,
+        stages: vec![Stage { resolution, steps: 1, rays: 16 }],
+        ..config
+    };
+    let mut model = Tensorf::<f64>::in_region(config, region, 42).expect("valid settings");
+    let random = Stream::new(11);
+    model.visit_mut(&mut |param: &mut Param<f64>| {
+        if param.name().starts_with("density") {
+            let values = random.named(param.name()).uniform_tensor(param.shape(), 0.2, 0.75);
+            *param = Param::from_tensor(param.name(), values);
+        }
+    });
+    model
+}
+
+/// Rays from around the origin that look along −z and to the sides.
+fn rays(count: usize) -> Vec<Ray> {
+    let numbers = Stream::new(6).uniform_tensor::<f64>(&[count, 6], -1.0, 1.0);
+    let ray =
+        |x: &[f64]| Ray { origin: 0.3 * DVec3::from_slice(x), direction: dvec3(0.8 * x[3], 0.8 * x[4], -1.0).normalize(), stretch: 1.0 };
+    numbers.data().chunks(6).map(ray).collect()
+}
+
+/// Origins and directions, `[n, 3]`.
+fn arrays(rays: &[Ray]) -> [ArrayD<f64>; 2] {
+    [|ray: &Ray| ray.origin, |ray: &Ray| ray.direction].map(|of: fn(&Ray) -> DVec3| {
+        let values: Vec<f64> = rays.iter().flat_map(|ray| of(ray).to_array()).collect();
+        ArrayD::from_shape_vec(vec![rays.len(), 3], values).expect("three numbers per ray")
+    })
+}
+
+/// A number that depends on every column.
+fn all_columns(rendered: &Rendered<f64>) -> Tensor<f64> {
+    let weights = |name: &str, shape: &[usize]| Stream::new(8).named(name).uniform_tensor::<f64>(shape, -1.0, 1.0);
+    let mut sum = (&rendered.rgb * weights("rgb", rendered.rgb.shape())).sum();
+    let columns = [("depth", rendered.depth()), ("opacity", rendered.opacity.clone()), ("sparsity", rendered.sparsity() * 1e-2)];
+    for (name, column) in columns {
+        sum = sum + (&column * weights(name, column.shape())).sum();
+    }
+    sum
+}
+
+#[test]
+fn gradients_of_the_graph_with_respect_to_rays_are_right_in_every_space() {
+    for region in regions() {
+        let config = Config { group: 0.0, color_above: 0.0, directions: Directions::Harmonics(2), feature_octaves: 1, ..Config::default() };
+        let mut model = model(config, region, 5);
+        model.engine = Engine::Graph;
+        let rays = rays(3);
+        // The distances of samples are those of the rays as given, so finite differences do not move them.
+        let pixels = |x: &[Tensor<f64>]| {
+            let tracked = TrackedRays { rays: rays.clone(), origins: x[0].clone(), directions: x[1].clone() };
+            model.render_tracked(&tracked, &PASS).rgb
+        };
+        Gradcheck::new(pixels, arrays(&rays)).named("rays").order(1).run().unwrap_or_else(|e| panic!("{:?}: {e}", region.space));
+    }
+}
+
+#[test]
+fn the_kernel_agrees_with_the_graph_in_values_and_gradients_of_rays() {
+    for region in regions() {
+        for (octaves, directions) in [(0, Directions::Harmonics(3)), (2, Directions::Frequency(2))] {
+            let config = Config { group: 0.0, directions, feature_octaves: octaves, cell_depth: 2.0, ..Config::default() };
+            let mut model = model(config, region, 9);
+            let rays = rays(40);
+            let [origins, directions] = arrays(&rays).map(|array| Tensor::variable(array));
+            let tracked = TrackedRays::new(origins.clone(), directions.clone(), &rays);
+            let mut results = Vec::new();
+            for engine in [Engine::Graph, Engine::Fused] {
+                model.engine = engine;
+                let (value, gradients) = autograd::value_and_grad(|| all_columns(&model.render_tracked(&tracked, &PASS)));
+                let mut all = vec![("origins".to_owned(), gradients.array(&origins)), ("directions".to_owned(), gradients.array(&directions))];
+                model.visit(&mut |param| all.push((param.name().to_owned(), gradients.array(param.tensor()))));
+                results.push((value, all));
+            }
+            let ((want, graph), (got, fused)) = (&results[0], &results[1]);
+            assert!((want - got).abs() < 1e-9 * want.abs(), "{want} {got}");
+            for ((name, want), (_, got)) in graph.iter().zip(fused) {
+                let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
+                let off = want.iter().zip(got).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
+                assert!(off < 1e-9 * scale, "{:?} {name}: {off:e} of {scale:e}", region.space);
+            }
+            // Rays that are not tracked have the same pixels.
+            let plain = model.render(&tracked.rays, &PASS).rgb;
+            assert_eq!(plain.data(), model.render_tracked(&tracked, &PASS).rgb.data());
+        }
+    }
+}
+
+#[test]
+fn gradients_of_rays_are_those_of_the_reference_with_groups_of_samples_too() {
+    for region in regions() {
+        let model = model(Config { group: 0.5, color_above: 0.01, ..Config::default() }, region, 9);
+        let rays = rays(30);
+        let inputs = arrays(&rays).map(|array| Tensor::variable(array));
+        let tracked = TrackedRays::new(inputs[0].clone(), inputs[1].clone(), &rays);
+        let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render_tracked(&tracked, &PASS)));
+        // Gradients that can be differentiated again are computed through the reference.
+        let reference = autograd::grad(&all_columns(&model.render_tracked(&tracked, &PASS)), &inputs.each_ref());
+        for (input, want) in inputs.iter().zip(reference) {
+            let (want, got) = (want.to_array(), adjoint.array(input));
+            let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
+            assert!(want.iter().zip(&got).all(|(a, b)| (a - b).abs() < 1e-9 * scale), "{:?}", region.space);
+        }
+    }
+}
+
+/// Standard deviations of the noise of poses: 0.5°, and 1 % of the distance of the cameras of the built-in scene.
+const NOISE: [f64; 2] = [0.5, 0.01];
+
+/// Returns views whose poses have random errors.
+fn disturbed(views: &[View]) -> Vec<View> {
+    let noise = Stream::new(21).normal_tensor::<f64>(&[views.len(), 6], 0.0, 1.0);
+    let disturbed = |(view, noise): (&View, &[f64])| {
+        let mut view = view.clone();
+        let pose = &mut view.camera.camera_to_world;
+        let turn = DQuat::from_scaled_axis(NOISE[0].to_radians() * DVec3::from_slice(noise));
+        pose.matrix3 = glam::DMat3::from_quat(turn) * pose.matrix3;
+        pose.translation += NOISE[1] * pose.translation.length() * DVec3::from_slice(&noise[3..]);
+        view
+    };
+    views.iter().zip(noise.data().chunks(6)).map(disturbed).collect()
+}
+
+fn views() -> [Vec<View>; 2] {
+    let options = ProceduralOptions { width: 48, height: 48, train: 24, val: 0, test: 6, supersample: 2 };
+    let scene = Dataset::procedural(options).expect("the built-in scene");
+    [Split::Train, Split::Test].map(|split| scene.load(split, &|_, _| {}).expect("its views"))
+}
+
+fn trainer(views: &[View], steps: u64, refine: bool) -> Trainer<f32, Tensorf<f32>> {
+    let stages = [(24, steps / 3), (40, steps - steps / 3)].map(|(resolution, steps)| Stage { resolution, steps, rays: 512 });
+    let config = Config { density_components: 16, appearance_components: 16, hidden: 32, stages: stages.to_vec(), ..Config::default() };
+    let model = Tensorf::new(config, Aabb::cube(1.5), 42).expect("valid settings").with_hull(Hull::Off);
+    let objective = Objective::new().with("mse", 1.0, mse);
+    let objective = if refine { objective.with_poses(0.01, views.len()).with_pose_rate(2e-3, steps) } else { objective };
+    Trainer::with_model(model, views, objective, TrainOptions::default()).expect("a trainer")
+}
+
+#[test]
+fn refined_poses_have_the_same_bits_for_any_number_of_threads_and_after_a_resumption() {
+    let [train, _] = views();
+    let trained = |threads: usize, interrupted: bool| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+        pool.install(|| {
+            let mut trainer = self::trainer(&train, 30, true);
+            if interrupted {
+                (0..17).for_each(|_| drop(trainer.step().expect("a step")));
+                let file = std::env::temp_dir().join(format!("poses-{}.safetensors", std::process::id()));
+                trainer.save(&file, "scene").expect("saved");
+                trainer = self::trainer(&train, 30, true).resumed(&file).expect("resumed");
+                std::fs::remove_file(file).expect("removed");
+            }
+            while trainer.step().expect("a step").is_some() {}
+            let mut bits = Vec::new();
+            trainer.model().visit(&mut |param| bits.extend(param.tensor().data().iter().map(|x| x.to_bits())));
+            let poses = trainer.pose_figures().expect("figures");
+            assert!(poses.mean_degrees > 0.0 && poses.mean_translation > 0.0);
+            (bits, poses)
+        })
+    };
+    let want = trained(1, false);
+    assert!(trained(3, false) == want && trained(2, true) == want);
+}
+
+/// Returns the root mean square errors of cameras against the true ones: of rotations in degrees, and of positions, after the best common rigid motion
+/// and scaling of the positions is taken out by comparing differences from the mean.
+fn errors(cameras: &[Camera], truth: &[View]) -> [f64; 2] {
+    let n = cameras.len() as f64;
+    let pairs = || cameras.iter().zip(truth.iter().map(|view| view.camera));
+    let turns: Vec<DVec3> = pairs()
+        .map(|(camera, truth)| {
+            let [a, b] = [camera, &truth].map(|camera| DQuat::from_mat3(&camera.camera_to_world.matrix3));
+            (a * b.inverse()).to_scaled_axis()
+        })
+        .collect();
+    let moves: Vec<DVec3> = pairs().map(|(camera, truth)| camera.position() - truth.position()).collect();
+    let spread = |errors: &[DVec3]| {
+        let mean = errors.iter().sum::<DVec3>() / n;
+        (errors.iter().map(|error| error.distance_squared(mean)).sum::<f64>() / n).sqrt()
+    };
+    [spread(&turns).to_degrees(), spread(&moves)]
+}
+
+#[test]
+fn poses_with_errors_come_closer_to_the_true_ones_and_the_scene_is_sharper() {
+    let [train, test] = views();
+    let wrong = disturbed(&train);
+    let trained = |views: &[View], refine: bool| {
+        let mut trainer = self::trainer(views, 900, refine);
+        while trainer.step().expect("a step").is_some() {}
+        let psnr = evaluate(trainer.model(), &test, &ViewOptions::over([1.0; 3])).psnr().expect("a figure");
+        (psnr, errors(&trainer.cameras(), &train))
+    };
+    let ((exact, _), (without, before), (refined, after)) = (trained(&train, false), trained(&wrong, false), trained(&wrong, true));
+    println!("exact poses {exact:.2} dB; with errors {before:.4?}: {without:.2} dB; refined {after:.4?}: {refined:.2} dB");
+    assert!(after[0] < 0.5 * before[0] && after[1] < 0.5 * before[1], "{before:?} to {after:?}");
+    assert!(refined > without + 0.5, "{without} to {refined}, {exact} with exact poses");
+}
+
+#[test]
+fn models_without_gradients_of_rays_refuse_to_refine_poses() {
+    let [train, _] = views();
+    let config = dvgo::Config::default();
+    let model = Dvgo::<f32>::new(config, Aabb::cube(1.5), 1).expect("valid settings");
+    let objective = Objective::new().with("mse", 1.0, mse).with_poses(0.01, train.len());
+    let error = Trainer::with_model(model, &train[..], objective, TrainOptions::default()).err().expect("an error");
+    assert!(error.exit_code() == 2 && error.to_string().starts_with("losses.poses"), "{error}");
+    let resolved = |preset: &str| -> Result<RunConfig, plenoxel::error::Error> {
+        let mut layers = Layers::defaults()?.with_preset(preset)?;
+        layers.assign("losses.poses=0.01")?;
+        layers.resolve()
+    };
+    for preset in ["fast", "ngp"] {
+        let error = resolved(preset).expect_err(preset).to_string();
+        assert!(error.contains("losses.poses") && error.contains("photos"), "{error}");
+    }
+    assert!(resolved("photos").is_ok() && resolved("quality").is_ok());
+}
