@@ -3,6 +3,7 @@
 //! | path | recognised by | world frame | between entries |
 //! | --- | --- | --- | --- |
 //! | [`Turntable`] | | dataset | |
+//! | [`spiral`] of forward-facing captures | | dataset | |
 //! | [`along_cameras`] | | dataset | B-splines, as in instant-ngp |
 //! | instant-ngp `base_cam.json` | `path` | instant-ngp's, converted | B-splines, as in instant-ngp |
 //! | nerfstudio `camera_path.json` | `camera_path` | as in the file | nothing: entries are frames |
@@ -23,6 +24,7 @@
 //! Parsers accept any bytes: the size of files is limited ([`CAMERA_PATH`](crate::files::CAMERA_PATH)), and all resulting numbers are in a
 //! range that is safe to compute with.
 
+mod forward_facing;
 mod instant_ngp;
 mod nerfstudio;
 mod transforms;
@@ -32,6 +34,7 @@ use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::dataset::image::MAX_SIDE;
 use crate::error::{Error, Result};
 use crate::json::{self, Kept};
+pub use forward_facing::spiral;
 use glam::{DAffine3, DQuat, DVec3};
 use instant_ngp::Keyframes;
 use serde_json::Value;
@@ -137,6 +140,14 @@ pub fn along_cameras(cameras: &[Camera], frames: usize) -> Vec<Shot> {
     let count = cameras.len().min(KEYS);
     let keys: Vec<Camera> = (0..count).map(|i| cameras[i * cameras.len() / count]).collect();
     if keys.is_empty() { Vec::new() } else { Keyframes::over(&keys).shots(frames.clamp(1, MOST_FRAMES)) }
+}
+
+/// Returns the unit mean of the up axes of cameras; +z if they have no common up.
+pub fn mean_up(cameras: &[Camera]) -> DVec3 {
+    /// Smallest length of the mean that tells up.
+    const CLEAR: f64 = 0.3;
+    let mean = cameras.iter().map(|camera| camera.camera_to_world.matrix3.y_axis).sum::<DVec3>() / cameras.len().max(1) as f64;
+    if mean.length() >= CLEAR { mean.normalize() } else { DVec3::Z }
 }
 
 /// File format of a path.

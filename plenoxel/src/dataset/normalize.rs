@@ -23,6 +23,15 @@ use frame::Frame;
 use glam::DVec3;
 use std::path::Path;
 
+/// Depth of the nearest surface in the world of a capture in NDC, whose near plane is at depth 1.
+pub const NEAREST_DEPTH: f64 = 1.0 / NEAR;
+
+/// Returns the point that cameras look at from around it; `None` if they do not look inwards.
+pub fn looked_at(cameras: &[Camera]) -> Option<DVec3> {
+    let frame = Frame::new(cameras);
+    if frame.spread > 0.0 { frame.looked_at(cameras) } else { None }
+}
+
 /// Share of the nearest depth that LLFF leaves in front of the scene.
 const NEAR: f64 = 0.75;
 /// Largest angle between an optical axis and the mean one in a forward-facing capture, degrees.

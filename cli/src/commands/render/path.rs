@@ -6,10 +6,12 @@ use crate::commands::whole;
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::camera::Camera;
-use plenoxel::camera_path::{CameraPath, MOST_FRAMES, Turntable, along_cameras};
+use plenoxel::camera_path::{CameraPath, MOST_FRAMES, Turntable, along_cameras, mean_up, spiral};
+use plenoxel::dataset::normalize::{NEAREST_DEPTH, looked_at};
 use plenoxel::dataset::{Dataset, Split, image};
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
+use plenoxel::space::Space;
 use std::path::{Path, PathBuf};
 
 /// Default number of frames, that of the source paper's turntable.
@@ -31,8 +33,8 @@ pub enum PathChoice {
 /// A camera path, and the size and rate of its frames.
 #[derive(Debug, Args)]
 pub struct PathArgs {
-    /// Render a video along a camera path: orbit (one turn around the scene), spiral (two turns, rising and falling), cameras (along the
-    /// training views; the path for captures), or the cameras of a JSON file: base_cam.json of instant-ngp, camera_path.json of nerfstudio, or
+    /// Render a video along a camera path: orbit (one turn around what the cameras look at, or a swing if a capture is from one side), spiral (two turns, rising and falling; before a
+    /// forward-facing capture, the spiral of LLFF), cameras (a spline along the training views), or the cameras of a JSON file: base_cam.json of instant-ngp, camera_path.json of nerfstudio, or
     /// any transforms.json
     #[arg(long, value_name = "orbit|spiral|cameras|FILE", help_heading = "Path", value_parser = choice)]
     pub path: Option<PathChoice>,
@@ -72,19 +74,32 @@ impl PathArgs {
             _ => run.views_if_any(found, console, "the camera path is computed from the box")?,
         };
         let size = self.size.or(in_file).or(views.as_ref().map(Dataset::size)).unwrap_or((SIDE, SIDE));
+        let cameras = views.as_ref().map(|views| views.cameras(Split::Train)).unwrap_or_default();
+        let space = views.as_ref().map_or(Space::Box, Dataset::space);
         let table = || {
-            let cameras = views.as_ref().map(|views| views.cameras(Split::Train)).unwrap_or_default();
-            Turntable::like(&cameras).map_or_else(|| Ok(Turntable::around_box(found.half_width()?)), Ok)
+            let table = match space {
+                Space::Box => Turntable::like(&cameras),
+                Space::Contracted => Turntable::around(&cameras, looked_at(&cameras).unwrap_or_default(), mean_up(&cameras)),
+                Space::Ndc { .. } => {
+                    let problem = "orbit leaves the side of the scene that the cameras of a forward-facing capture see";
+                    return Err(Error::usage("--path", problem, "use --path spiral or --path cameras"));
+                }
+            };
+            table.map_or_else(|| Ok(Turntable::around_box(found.half_width()?)), Ok)
         };
+        let count = self.frames.unwrap_or(FRAMES);
         let (name, shots) = match (&file, path) {
             (Some((file, path)), _) => {
                 let frames = self.frames.unwrap_or(if path.is_interpolated() { FRAMES } else { path.entries() });
                 console.note(&format!("{}: {} of {} {}", file.display(), path.format, path.entries(), entries(path)));
                 (stem(file), path.shots(frames))
             }
-            (None, PathChoice::Spiral) => ("spiral".to_owned(), table()?.spiral(self.frames.unwrap_or(FRAMES))),
+            (None, PathChoice::Spiral) => {
+                let shots =
+                    if matches!(space, Space::Ndc { .. }) { spiral(&cameras, NEAREST_DEPTH, count) } else { table()?.spiral(count) };
+                ("spiral".to_owned(), shots)
+            }
             (None, PathChoice::Cameras) => {
-                let cameras = views.as_ref().map(|views| views.cameras(Split::Train)).unwrap_or_default();
                 if cameras.is_empty() {
                     return Err(Error::usage(
                         "--path",
@@ -92,9 +107,9 @@ impl PathArgs {
                         "give their folder with --data",
                     ));
                 }
-                ("cameras".to_owned(), along_cameras(&cameras, self.frames.unwrap_or(FRAMES)))
+                ("cameras".to_owned(), along_cameras(&cameras, count))
             }
-            (None, _) => ("orbit".to_owned(), table()?.orbit(self.frames.unwrap_or(FRAMES))),
+            (None, _) => ("orbit".to_owned(), table()?.orbit(count)),
         };
         console.note(&format!("frames: {} of {} x {} pixels", shots.len(), size.0, size.1));
         let fps = self.fps.or(file.as_ref().and_then(|(_, path)| path.fps)).unwrap_or(FPS);
