@@ -91,6 +91,7 @@ fn slopes<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: Cotangents<'_, T>) -> 
 dispatched! {
 /// Adds the cotangents of the positions of up to [`RUN`] samples. With a = P L for the axis of a line, P of the axes (b, c), and fractions x and y of the cell
 /// along b and c: ∂a/∂p_a = P ΔL, ∂a/∂p_b = L ((1 − y) ΔP₀ + y ΔP₁), ∂a/∂p_c likewise, where Δ are differences of neighbouring nodes.
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 fn add_slopes<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, g: Cotangents<'_, T>, out: &mut [[T; RUN]; 3]) {
     let cells = Cells::new(at, pairs.nodes);
     prefetch(pairs, &cells);
@@ -118,8 +119,8 @@ fn add_slopes<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>
             }
             for (axis, lanes) in [(axis, of_a), (b, of_b), (c, of_c)] {
                 let mut sum = out[axis][i];
-                for l in 0..LANES {
-                    sum += lanes[l];
+                for value in lanes {
+                    sum += value;
                 }
                 out[axis][i] = sum;
             }
