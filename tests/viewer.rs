@@ -7,17 +7,21 @@ use autograd::Tensor;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
+use plenoxel::bake::GridSpace;
 use plenoxel::camera::lens::Lens;
 use plenoxel::camera::{Camera, Intrinsics};
+use plenoxel::evaluate::Viewer;
 use plenoxel::export::web::WebGrid;
 use plenoxel::field::sh;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::model::plenoxels::config::Sampling;
 use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::render::{Engine, Field};
+use plenoxel::space::Space;
 use serde_json::{Value, json};
 use std::io::Write;
 use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 const SCRIPT: &str = concat!(
     include_str!("../cli/src/html/camera.js"),
@@ -30,7 +34,9 @@ const POINTS: usize = 1000;
 
 /// Has node run the script on what is asked; `None` where there is no node.
 fn asked_of_node(asked: &Value) -> Option<Value> {
-    let script = std::env::temp_dir().join(format!("plenoxel-viewer-{}.js", std::process::id()));
+    static COUNT: AtomicUsize = AtomicUsize::new(0);
+    let number = COUNT.fetch_add(1, Ordering::Relaxed);
+    let script = std::env::temp_dir().join(format!("plenoxel-viewer-{}-{number}.js", std::process::id()));
     std::fs::write(&script, SCRIPT).unwrap();
     let started = Command::new("node").arg(&script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
     let Ok(mut node) = started else {
@@ -80,14 +86,10 @@ fn the_page_reads_a_grid_as_the_library_does() {
         // From outside, and from within the box.
         let cameras =
             [DVec3::new(2.5, -1.9, 1.3), DVec3::new(-0.9, 0.8, -0.7)].map(|eye| Camera::look_at(eye, DVec3::ZERO, DVec3::Z, intrinsics));
-        let views = cameras.iter().map(|camera| {
-            let Intrinsics { width, height, fx, fy, cx, cy, .. } = camera.intrinsics;
-            let pose = camera.camera_to_world.to_cols_array();
-            json!({ "pose": pose, "width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy })
-        });
         let background = [0.2, 0.9, 0.4];
+        let coordinates = GridSpace::default();
         let answer = asked_of_node(&json!({
-            "scene": { "grid": small.header(), "sampling": sampling, "background": background, "views": views.collect::<Vec<_>>() },
+            "scene": { "grid": small.header(), "coordinates": coordinates, "sampling": sampling, "background": background, "views": cameras.each_ref().map(view) },
             "bytes": STANDARD.encode(bytes),
             "points": points.as_chunks::<3>().0,
             "directions": directions,
@@ -109,15 +111,67 @@ fn the_page_reads_a_grid_as_the_library_does() {
         assert_eq!(answer["halves"], json!([0x3c00, 0xc100, 0x7bff, 0x7bff, 0, 1]));
 
         let viewer = grid_viewer(&grid, sampling, Engine::Fused, background.map(|c| c as f32));
-        assert!(answer["skipped"].as_u64().unwrap() > 100, "empty space is skipped");
-        for (camera, picture) in cameras.iter().zip(answer["pictures"].as_array().unwrap()) {
-            let known = viewer.see(camera).rgb;
-            let seen: Vec<f64> = picture.as_array().unwrap().iter().flat_map(numbers).collect();
-            let worst = seen.iter().zip(known.iter()).map(|(a, b)| (a - f64::from(*b)).abs()).fold(0.0, f64::max);
-            // Colors are half floats in the page; a ray that ends may lose a thousandth of the light.
-            assert!(seen.len() == known.len() && worst < 4e-3, "{what}: a pixel is {worst} from the library's");
-            let least = known.iter().copied().fold(f32::INFINITY, f32::min);
-            assert!(known.iter().any(|c| c - least > 0.2), "{what}: there is something to see");
-        }
+        assert_same_pictures(&viewer, &cameras, &answer, &what);
+    }
+}
+
+/// The pictures of the page are those of the library.
+fn assert_same_pictures(viewer: &Viewer<'_, f32>, cameras: &[Camera], answer: &Value, what: &str) {
+    assert!(answer["skipped"].as_u64().unwrap() > 100, "empty space is skipped");
+    for (camera, picture) in cameras.iter().zip(answer["pictures"].as_array().unwrap()) {
+        let known = viewer.see(camera).rgb;
+        let seen: Vec<f64> = picture.as_array().unwrap().iter().flat_map(numbers).collect();
+        let worst = seen.iter().zip(known.iter()).map(|(a, b)| (a - f64::from(*b)).abs()).fold(0.0, f64::max);
+        // Colors are half floats in the page; a ray that ends may lose a thousandth of the light.
+        assert!(seen.len() == known.len() && worst < 4e-3, "{what}: a pixel is {worst} from the library's");
+        let least = known.iter().copied().fold(f32::INFINITY, f32::min);
+        assert!(known.iter().any(|c| c - least > 0.2), "{what}: there is something to see");
+    }
+}
+
+/// A camera as the page has it.
+fn view(camera: &Camera) -> Value {
+    let Intrinsics { width, height, fx, fy, cx, cy, .. } = camera.intrinsics;
+    json!({ "pose": camera.camera_to_world.to_cols_array(), "width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy })
+}
+
+#[test]
+fn the_page_marches_the_rays_of_captures_as_the_library_does() {
+    let color = Color::Sh { degree: 2, offset: 0.5 };
+    let intrinsics = Intrinsics { width: 12, height: 9, fx: 11.0, fy: 10.0, cx: 5.5, cy: 4.8, lens: Lens::Pinhole };
+    let camera = |eye: [f64; 3], target: [f64; 3]| Camera::look_at(eye.into(), target.into(), DVec3::new(0.1, 1.0, 0.2), intrinsics);
+    // Inside the part of space that is not contracted, at its border, and in the contracted part; in each, looking at matter.
+    let around = [
+        camera([0.3, -0.2, 0.1], [-0.6, -0.7, 0.4]),
+        camera([1.0, 0.4, -0.9], [-0.5, -0.7, 0.2]),
+        camera([3.0, -1.2, 0.7], [-0.5, -0.7, 0.2]),
+    ];
+    let forward = [camera([0.1, -0.2, 0.05], [-0.3, -0.2, -2.0]), camera([-0.2, 0.1, -0.1], [0.0, -0.2, -1.6])];
+    let spaces: [(GridSpace, f64, &[Camera]); 2] = [
+        (GridSpace { space: Space::Contracted, stretch: DVec3::ONE }, Space::CONTRACTED, &around),
+        (GridSpace { space: Space::Ndc { a: 1.6, b: 2.1 }, stretch: DVec3::new(1.0, 1.0, 0.3) }, 1.3, &forward),
+    ];
+    for (coordinates, half_width, cameras) in spaces {
+        let shape = GridShape { resolution: 33, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+        let (small, bytes) = WebGrid::within(&matter(shape), usize::MAX).unwrap();
+        let grid = small.to_grid();
+        let background = [0.2, 0.9, 0.4];
+        let answer = asked_of_node(&json!({
+            "scene": {
+                "grid": small.header(),
+                "coordinates": coordinates,
+                "sampling": { "step": 0.5 },
+                "background": background,
+                "views": cameras.iter().map(view).collect::<Vec<_>>(),
+            },
+            "bytes": STANDARD.encode(bytes),
+            "points": [],
+            "directions": [],
+            "halves": [],
+        }));
+        let Some(answer) = answer else { return };
+        let background = background.map(|c| c as f32);
+        let viewer = Viewer::new(coordinates.show(&grid, 0.5 * shape.voxel_side(), background), background);
+        assert_same_pictures(&viewer, cameras, &answer, &coordinates.space.to_string());
     }
 }

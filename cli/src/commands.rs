@@ -29,6 +29,7 @@ pub mod view;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::Error;
 use plenoxel::run::folder::RunFolder;
+use plenoxel::space::Space;
 use std::path::{Path, PathBuf};
 
 /// Checks that the output file `out` is not a file of one of the `runs` or of the dataset folder `data` that a command reads.
@@ -53,6 +54,17 @@ fn check_split(dataset: &Dataset, split: Split) -> Result<(), Error> {
     let others = Split::ALL.into_iter().filter(|split| dataset.count(*split) > 0);
     let others: Vec<String> = others.map(|split| split.to_string()).collect();
     Err(Error::usage("--split", found, format!("choose {}", others.join(" or "))))
+}
+
+/// Checks that the field of a checkpoint is one of a box of the world, for commands whose results are.
+fn check_box(checkpoint: &Path, space: Space) -> Result<(), Error> {
+    if space == Space::Box {
+        return Ok(());
+    }
+    let found = format!("the field is in the coordinates of a capture ({space}), and this command needs a box of the world");
+    let remedy =
+        "train with `--space box` and a `half_width` around the object; report.html and `plenoxel render --path` show the field as it is";
+    Err(Error::input(checkpoint, found, remedy))
 }
 
 /// The folder next to `folder`, with `-` and `ending` after its name: the default of `--out`.

@@ -14,7 +14,10 @@
 //!
 //! Harmonics are smoother than the field's color network, and they are interpolated: pictures of the grid differ from those of the field.
 
+mod grid_space;
 mod visible;
+
+pub use grid_space::GridSpace;
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
@@ -26,6 +29,7 @@ use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::memory::{allowance, bytes};
 use crate::sampling::Occupancy;
+use crate::space::Space;
 use autograd::lattice::{BrickGrid, bits_where};
 use autograd::{Buffer, Indices, Lattice, Tensor, no_grad, parallel};
 use glam::DVec3;
@@ -51,35 +55,59 @@ const ROWS: usize = 256;
 const BATCH: usize = 1 << 16;
 
 /// Size of a baked grid.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeOptions {
     /// Number of voxels along each axis, at most 1024.
     pub resolution: usize,
     /// Degree of the harmonics, 0 to 3.
     pub degree: usize,
+    /// Largest rendering weight of a voxel in small pictures of the cameras below which it is left out, unless a neighbour has more; 0 keeps all voxels, and
+    /// so do no cameras.
+    pub least_weight: f32,
 }
 
-/// Returns half the side of the cube of a baked grid, world length.
-fn half_width(field: &Factored<f32>) -> f64 {
-    let aabb = field.aabb();
-    let whole = aabb.max.max(-aabb.min).max_element();
-    field.occupied.as_ref().and_then(Occupancy::half_width).unwrap_or(whole)
+/// Returns half the side of the cube of a baked grid, in the coordinates of the grid.
+fn half_width(field: &Factored<f32>, coordinates: GridSpace) -> f64 {
+    // The rays of the contracted space end at the faces of its box.
+    if coordinates.space == Space::Contracted {
+        return Space::CONTRACTED;
+    }
+    let aabb = field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(field.aabb());
+    (aabb.max.max(-aabb.min) * coordinates.stretch).max_element()
 }
 
-/// Returns the number of voxels along each axis whose sides are about those of the field's cells, at most 512.
-pub fn resolution_of(field: &Factored<f32>) -> usize {
-    ((2.0 * half_width(field) / field.cell()).ceil() as usize).clamp(2, MOST_VOXELS)
+/// Returns the number of voxels along each axis whose sides are about those of the field's cells, at most 512. `space` is that of the box of the field.
+pub fn resolution_of(field: &Factored<f32>, space: Space) -> usize {
+    let coordinates = GridSpace::of(field, space);
+    let cell = (field.sides() * coordinates.stretch).element_sum() / 3.0;
+    ((2.0 * half_width(field, coordinates) / cell).ceil() as usize).clamp(2, MOST_VOXELS)
 }
 
-/// Bakes a field. The colors are fitted to the directions of the `cameras`, or to directions all around if there are none.
-/// `progress(done, all)` is called with numbers of table rows.
+/// Bakes a field. `space` is that of its box. The colors are fitted to the directions of the `cameras`, or to directions all around if there are none.
+/// `progress(done, all)` is called with numbers of table rows. Returns the grid, which is in the coordinates [`GridSpace::of`] the field.
 ///
 /// Errors: no voxel has a density; there is not enough memory.
-pub fn bake(field: &Factored<f32>, options: &BakeOptions, cameras: &[Camera], progress: &dyn Fn(usize, usize)) -> Result<VoxelGrid<f32>> {
-    let BakeOptions { resolution, degree } = *options;
+pub fn bake(
+    field: &Factored<f32>,
+    space: Space,
+    options: &BakeOptions,
+    cameras: &[Camera],
+    progress: &dyn Fn(usize, usize),
+) -> Result<VoxelGrid<f32>> {
+    let BakeOptions { resolution, degree, least_weight } = *options;
+    let coordinates = GridSpace::of(field, space);
     let color = Color::Sh { degree, offset: OFFSET };
-    let shape = GridShape { resolution, half_width: half_width(field), interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
-    let (lattice, density) = no_grad(|| densities(field, &shape))?;
+    let half_width = half_width(field, coordinates);
+    let shape = GridShape { resolution, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+    let plain = GridShape { color: Color::Rgb, ..shape };
+    let (mut lattice, mut density) = no_grad(|| densities(field, &shape, coordinates))?;
+    if least_weight > 0.0 && !cameras.is_empty() {
+        let grid = VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[lattice.rows(), 3]));
+        let weights = visible::weights(&grid, coordinates, cameras);
+        let seen = grid.voxels_where(|row| weights[row] >= least_weight).dilated(1);
+        let grid = grid.pruned(&seen);
+        (lattice, density) = (grid.lattice().clone(), grid.density.tensor().clone());
+    }
     let rows = lattice.rows();
     let needed = (rows * (2 * shape.voxel_bytes() + 4 * size_of::<f32>())) as u64;
     if let Some(allowance) = allowance().filter(|allowance| needed > allowance.bytes) {
@@ -87,10 +115,10 @@ pub fn bake(field: &Factored<f32>, options: &BakeOptions, cameras: &[Camera], pr
         return Err(Error::usage("resolution", found, "use fewer voxels per axis, or a lower degree of harmonics"));
     }
     let sights = (!cameras.is_empty()).then(|| {
-        let plain = GridShape { color: Color::Rgb, ..shape };
-        Sights::new(&VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[rows, 3])), cameras)
+        let grid = VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[rows, 3]));
+        Sights::new(&grid, coordinates, cameras)
     });
-    let painter = Painter { field, shape: &shape, lattice: &lattice, sights, degree };
+    let painter = Painter { field, shape: &shape, lattice: &lattice, coordinates, sights, degree };
     let width = shape.color_width();
     let mut table = Buffer::zeros(rows * width);
     for (first, part) in (0..).step_by(BATCH).zip(table.chunks_mut(BATCH * width)) {
@@ -101,15 +129,15 @@ pub fn bake(field: &Factored<f32>, options: &BakeOptions, cameras: &[Camera], pr
 }
 
 /// Returns the present voxels and the table of their densities, `[rows, 1]`.
-fn densities(field: &Factored<f32>, shape: &GridShape) -> Result<(Lattice, Tensor<f32>)> {
-    let (aabb, nodes) = (Aabb::cube(shape.half_width), [shape.resolution; 3]);
+fn densities(field: &Factored<f32>, shape: &GridShape, coordinates: GridSpace) -> Result<(Lattice, Tensor<f32>)> {
+    let (aabb, nodes) = (coordinates.unstretched(Aabb::cube(shape.half_width)), [shape.resolution; 3]);
     // Nothing outside of the occupied cells was trained.
     let sampled = field.occupied.clone().unwrap_or_else(|| Occupancy::new(field.aabb(), [1; 3], &[true]));
     let sampled = Lattice::from_masks(nodes, sampled.resampled(aabb, nodes).masks().to_vec());
     let mut values = vec![0.0; sampled.rows()];
     for (first, values) in (0..).step_by(BATCH).zip(values.chunks_mut(BATCH)) {
         let rows: Vec<(usize, DVec3)> =
-            (0..values.len()).filter_map(|r| Some((r, center(shape, sampled.node((first + r) as u32)?)))).collect();
+            (0..values.len()).filter_map(|r| Some((r, coordinates.to_box(center(shape, sampled.node((first + r) as u32)?))))).collect();
         let density = field.density(&positions(rows.iter().map(|(_, at)| *at)));
         rows.iter().zip(density.data()).for_each(|((r, _), &density)| values[*r] = density);
     }
@@ -152,11 +180,12 @@ struct Painter<'a> {
     field: &'a Factored<f32>,
     shape: &'a GridShape,
     lattice: &'a Lattice,
+    coordinates: GridSpace,
     sights: Option<Sights>,
     degree: usize,
 }
 
-/// A voxel: its centre, and the directions in which its color is computed.
+/// A voxel: its centre in the box, and the unit directions in the box in which its color is computed.
 struct Sample {
     center: DVec3,
     directions: Vec<DVec3>,
@@ -179,7 +208,8 @@ impl Painter<'_> {
         let owners = Indices::from(owners.collect::<Vec<_>>());
         let directions = positions(samples.iter().flat_map(|(_, sample)| sample.directions.iter().copied()));
         let colors = self.field.shade(&features.gather_rows(&owners), &directions);
-        let basis = sh::basis(&directions, self.degree);
+        let stretched = samples.iter().flat_map(|(_, sample)| sample.directions.iter().map(|d| self.coordinates.stretch * *d));
+        let basis = sh::basis(&positions(stretched), self.degree);
         let (mut colors, mut basis) = (colors.data().chunks_exact(3), basis.data().chunks_exact(count));
         for (r, sample) in &samples {
             let n = sample.directions.len();
@@ -195,19 +225,21 @@ impl Painter<'_> {
         }
     }
 
-    /// Returns the directions in which the color of a voxel is computed.
+    /// Returns the directions in which the color of a voxel is computed, given its centre in the grid.
     fn sample(&self, center: DVec3) -> Sample {
+        let at = self.coordinates.to_box(center);
         let Some(sights) = &self.sights else {
-            return Sample { center, directions: all_around(MOST_DIRECTIONS).collect(), seen: true };
+            return Sample { center: at, directions: all_around(MOST_DIRECTIONS).collect(), seen: true };
         };
-        let seen_by = sights.cameras_that_see(center);
+        let world = self.coordinates.to_world(center);
+        let seen_by = sights.cameras_that_see(world);
         let (cameras, most) = match seen_by.is_empty() {
             true => (sights.cameras().collect(), DIRECTIONS_OF_HIDDEN),
             false => (seen_by, MOST_DIRECTIONS),
         };
         let n = cameras.len().min(most);
-        let directions = (0..n).map(|i| (center - cameras[i * cameras.len() / n]).normalize_or(DVec3::Z)).collect();
-        Sample { center, directions, seen: most == MOST_DIRECTIONS }
+        let direction = |i: usize| self.coordinates.space.ray(&GridSpace::sight(cameras[i * cameras.len() / n], world).0).direction;
+        Sample { center: at, directions: (0..n).map(direction).collect(), seen: most == MOST_DIRECTIONS }
     }
 }
 
@@ -288,7 +320,8 @@ mod tests {
     #[test]
     fn the_density_of_a_blob_is_that_of_the_field_at_voxel_centres() {
         let field = blob();
-        let grid = bake(&field, &BakeOptions { resolution: 20, degree: 0 }, &[], &|_, _| {}).expect("an opaque blob");
+        let grid = bake(&field, Space::Box, &BakeOptions { resolution: 20, degree: 0, least_weight: 0.0 }, &[], &|_, _| {})
+            .expect("an opaque blob");
         let places: Vec<DVec3> = (0..20).map(|k| center(grid.shape(), [k, 9, 10])).collect();
         let at = positions(places.iter().copied());
         let (baked, own) = (grid.density(&at), field.density(&at));
@@ -304,7 +337,8 @@ mod tests {
     #[test]
     fn colors_that_are_linear_in_the_direction_are_reproduced() {
         let field = blob();
-        let grid = bake(&field, &BakeOptions { resolution: 12, degree: 1 }, &[], &|_, _| {}).expect("an opaque blob");
+        let grid = bake(&field, Space::Box, &BakeOptions { resolution: 12, degree: 1, least_weight: 0.0 }, &[], &|_, _| {})
+            .expect("an opaque blob");
         let row = grid.lattice().row([6; 3]).expect("the middle is opaque") as usize;
         let numbers = &grid.color.tensor().data()[row * 12..][..12];
         let directions: Vec<DVec3> = all_around(7).collect();
@@ -326,7 +360,8 @@ mod tests {
                 param.update(|values| values.fill(0.0));
             }
         });
-        let error = bake(&field, &BakeOptions { resolution: 8, degree: 0 }, &[], &|_, _| {}).expect_err("nothing is opaque");
+        let error = bake(&field, Space::Box, &BakeOptions { resolution: 8, degree: 0, least_weight: 0.0 }, &[], &|_, _| {})
+            .expect_err("nothing is opaque");
         assert!(error.to_string().contains("no voxel is opaque"), "{error}");
     }
 }

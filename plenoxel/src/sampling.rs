@@ -13,7 +13,7 @@ pub mod walk;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
-use crate::space::{Bend, contract};
+use crate::space::{Bend, Space, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
 pub use occupancy::Occupancy;
@@ -29,7 +29,7 @@ pub enum Spacing {
     /// Steps of this world length from the entry of the ray into the box to its exit. The last step ends at the exit, so the lengths sum to
     /// the chord. Jitter shifts the steps by a fraction of a step.
     Step(f64),
-    /// Steps of this length in the contracted space ([`Space::Contracted`](crate::space::Space::Contracted)), from the near plane to
+    /// Steps of this length in the contracted space ([`Space::Contracted`]), from the near plane to
     /// infinity. t of a sample is then not its distance from the origin, but s ([`Bend`]), whose steps are even; `delta` are lengths
     /// of s. Jitter shifts the steps by a fraction of a step.
     Contracted(f64),
@@ -41,6 +41,13 @@ pub enum Spacing {
         /// Largest t, in multiples of the direction that is not normalised.
         far: f64,
     },
+}
+
+impl Spacing {
+    /// Returns steps of this length in the box of a space.
+    pub fn even(space: Space, step: f64) -> Self {
+        if space == Space::Contracted { Spacing::Contracted(step) } else { Spacing::Step(step) }
+    }
 }
 
 /// Random shift of each ray's samples. Evaluation uses none.
@@ -66,8 +73,8 @@ impl Jitter {
     }
 }
 
-/// Packed samples of n rays, m in total. Lengths and positions are those of the box ([`Space`](crate::space::Space)), which are the world's in
-/// [`Space::Box`](crate::space::Space::Box).
+/// Packed samples of n rays, m in total. Lengths and positions are those of the box ([`Space`]), which are the world's in
+/// [`Space::Box`].
 #[derive(Debug, Clone)]
 pub struct Samples<T: Real> {
     /// Distance of the sample from the ray's origin, `[m]`; s of [`Bend`] with [`Spacing::Contracted`].

@@ -56,7 +56,70 @@ impl Space {
     pub fn rays<'a>(&self, rays: &'a [Ray]) -> Cow<'a, [Ray]> {
         match *self {
             Space::Box | Space::Contracted => Cow::Borrowed(rays),
-            Space::Ndc { a, b } => Cow::Owned(rays.iter().map(|ray| ndc(ray, a, b)).collect()),
+            Space::Ndc { .. } => Cow::Owned(rays.iter().map(|ray| self.ray(ray)).collect()),
+        }
+    }
+
+    /// Returns one ray as [`rays`](Self::rays) does.
+    pub fn ray(&self, ray: &Ray) -> Ray {
+        match *self {
+            Space::Box | Space::Contracted => *ray,
+            Space::Ndc { a, b } => ndc(ray, a, b),
+        }
+    }
+
+    /// Returns the position in the box of a position x of the world. In normalized device coordinates, x must have z < 0.
+    pub fn to_box(&self, x: DVec3) -> DVec3 {
+        match *self {
+            Space::Box => x,
+            Space::Ndc { a, b } => dvec3(-a * x.x / x.z, -b * x.y / x.z, 1.0 + 2.0 / x.z),
+            Space::Contracted => contract(x),
+        }
+    }
+
+    /// Returns the position in the world of a position p of the box, the inverse of [`to_box`](Self::to_box); `None` if it is at infinity or beyond. Contracted
+    /// space: p for m = max |pᵢ| ≤ 1, p / (m (2 − m)) beyond. NDC: z = 2 / (p_z − 1), x = −p_x z / a, y = −p_y z / b.
+    pub fn to_world(&self, p: DVec3) -> Option<DVec3> {
+        match *self {
+            Space::Box => Some(p),
+            Space::Ndc { a, b } => {
+                let z = 2.0 / (p.z - 1.0);
+                (p.z < 1.0).then(|| dvec3(-p.x * z / a, -p.y * z / b, z))
+            }
+            Space::Contracted => {
+                let m = p.abs().max_element();
+                (m < Self::CONTRACTED).then(|| if m <= 1.0 { p } else { p / (m * (Self::CONTRACTED - m)) })
+            }
+        }
+    }
+
+    /// Returns the t of [`Samples`](crate::sampling::Samples) at a distance from the origin of a ray of the world. It grows with the distance. In
+    /// [`Space::Box`] it is the distance, in [`Space::Contracted`] the s of [`Bend`], and in NDC the distance from the near plane in the box.
+    pub fn place(&self, ray: &Ray, distance: f64) -> f64 {
+        match self {
+            Space::Box => distance,
+            Space::Contracted => Bend::of(ray).place(distance),
+            Space::Ndc { .. } => {
+                let moved = self.ray(ray);
+                (self.to_box(ray.origin + distance * ray.direction) - moved.origin).dot(moved.direction)
+            }
+        }
+    }
+
+    /// Returns the distance from the origin of a ray of the world, given the t of [`Samples`](crate::sampling::Samples): the inverse of
+    /// [`place`](Self::place). Infinite at infinity.
+    pub fn distance(&self, ray: &Ray, place: f64) -> f64 {
+        match self {
+            Space::Box => place,
+            Space::Contracted => {
+                let bend = Bend::of(ray);
+                if place < bend.end() { bend.distance(place) } else { f64::INFINITY }
+            }
+            Space::Ndc { .. } => {
+                let moved = self.ray(ray);
+                let world = self.to_world(moved.origin + place * moved.direction);
+                world.map_or(f64::INFINITY, |world| (world - ray.origin).dot(ray.direction))
+            }
         }
     }
 }
@@ -282,6 +345,32 @@ mod tests {
                 assert!(dvec3(at[0][k], at[1][k], at[2][k]).abs_diff_eq(expected, 1e-9));
             }
         }
+    }
+
+    #[test]
+    fn positions_of_the_world_come_back_from_the_box_and_places_on_rays_from_their_distance() {
+        for space in [Space::Box, Space::Contracted, Space::Ndc { a: 1.6, b: 2.1 }] {
+            let forward = |ray: &&Ray| !matches!(space, Space::Ndc { .. }) || ray.direction.z < -0.1;
+            for ray in rays(200).iter().filter(forward) {
+                for t in [0.3, 1.0, 2.5, 7.0, 100.0] {
+                    // Normalized device coordinates are those of the points before the near plane.
+                    let t = if matches!(space, Space::Ndc { .. }) { t - (1.0 + ray.origin.z) / ray.direction.z } else { t };
+                    let x = ray.origin + t * ray.direction;
+                    let again = space.to_world(space.to_box(x)).expect("a finite position");
+                    assert!(again.abs_diff_eq(x, 1e-9 * (1.0 + x.length_squared())), "{space}: {x} came back as {again}");
+                    let place = space.place(ray, t);
+                    assert!((space.distance(ray, place) - t).abs() < 1e-7 * (1.0 + t * t), "{space}: {t} at {place}");
+                    // A place is where a sample with this t is.
+                    let at = match space {
+                        Space::Contracted => contract(ray.origin + Bend::of(ray).distance(place) * ray.direction),
+                        _ => space.ray(ray).origin + place * space.ray(ray).direction,
+                    };
+                    assert!(at.abs_diff_eq(space.to_box(x), 1e-8), "{space}");
+                }
+            }
+        }
+        assert_eq!((Space::Contracted.to_world(dvec3(0.0, 2.0, 0.0)), Space::Ndc { a: 1.0, b: 1.0 }.to_world(DVec3::Z)), (None, None));
+        assert_eq!(Space::Contracted.distance(&rays(1)[0], 100.0), f64::INFINITY);
     }
 
     #[test]

@@ -64,13 +64,41 @@ class Numbers {
     return grid.degree === null ? sum : sum.map(c => Math.max(c, 0));
   }
 
+  // The ray of a space: its begin and direction in the grid, where the march begins and ends, and the position at t.
+  march(eye, along) {
+    const { grid, scene } = this, axes = scene.coordinates.stretch, length = Math.hypot(...along);
+    const steady = d => d.map(x => (Math.abs(x) < 1e-9 ? x + 1e-9 : x));
+    let d = steady(along.map(x => x / length)), from = eye;
+    if (spaceOf(scene) === 'contracted') {
+      const b = [0, 1, 2].reduce((b, a) => (Math.abs(d[a]) > Math.abs(d[b]) ? a : b), 0), rate = Math.abs(d[b]);
+      const bend = (1 - eye[b] * Math.sign(d[b])) / rate, out = 1 + rate * (0.05 - bend);
+      const cross = [0, 1, 2].map(a => Math.abs(eye[(a + 1) % 3] * d[(a + 2) % 3] - eye[(a + 2) % 3] * d[(a + 1) % 3]));
+      return {
+        d, near: out <= 1 ? 0.05 : bend + (1 - 1 / out) / rate, far: bend + 1 / rate, fastest: 1 + 2 * Math.max(...cross),
+        at: t => {
+          const away = t <= bend ? t : bend + (1 / Math.max(1 - rate * (t - bend), 1e-6) - 1) / rate, p = d.map((x, a) => eye[a] + away * x);
+          const m = Math.max(1, ...p.map(Math.abs));
+          return p.map(x => x * (2 - 1 / m) / m);
+        },
+      };
+    }
+    if (spaceOf(scene) === 'ndc') {
+      if (d[2] >= 0) return { d, near: 0, far: 0 };
+      const { a, b } = scene.coordinates.space.ndc, entry = d.map((x, k) => eye[k] - (1 + eye[2]) / d[2] * x);
+      from = [a * entry[0], b * entry[1], -1].map((x, k) => x * axes[k]);
+      const to = [-a * (d[0] / d[2] + entry[0]), -b * (d[1] / d[2] + entry[1]), 2], size = Math.hypot(...to);
+      d = steady(to.map((x, k) => x / size * axes[k]));
+    }
+    const bounds = d.map((x, a) => [(-grid.half_width - from[a]) / x, (grid.half_width - from[a]) / x]);
+    const near = Math.max(0, ...bounds.map(b => Math.min(...b))), far = Math.min(...bounds.map(b => Math.max(...b)));
+    return { d, near, far, at: t => from.map((p, a) => p + t * d[a]) };
+  }
+
   // `main` of the shader.
   ray(eye, along) {
-    const { grid, side } = this, stretch = Math.hypot(...along), d = along.map(x => x / stretch).map(x => (Math.abs(x) < 1e-9 ? x + 1e-9 : x));
-    const bounds = d.map((x, a) => [(-grid.half_width - eye[a]) / x, (grid.half_width - eye[a]) / x]);
-    const near = Math.max(0, ...bounds.map(b => Math.min(...b))), far = Math.min(...bounds.map(b => Math.max(...b)));
+    const { grid, side } = this, stretch = Math.hypot(...along), { d, near, far, at, fastest } = this.march(eye, along);
     const { step, samples, far: last } = this.scene.sampling;
-    let light = 1, start = near, size = step * side, middle = 0.5, count = Math.ceil((far - near) / size);
+    let light = 1, start = near, size = stepOf(this.scene), middle = 0.5, count = Math.ceil((far - near) / size);
     if (!step) {
       size = last * stretch / (samples - 1);
       start = Math.max(Math.ceil(near / size), 0) * size;
@@ -78,14 +106,14 @@ class Numbers {
       count = Math.min(Math.floor(far / size), samples - 1) - Math.floor(start / size + 0.5) + 1;
     }
     const seen = [0, 0, 0], basis = this.harmonics ? basisAt(grid.harmonics.steps.length / 3, d) : [];
-    const origin = this.voxels(eye), speed = d.map(x => x / side);
     for (let k = 0; far > near && k < count && light >= 1e-3;) {
       const begin = start + k * size, length = middle ? Math.min(size, far - begin) : size, t = begin + middle * length;
-      const u = origin.map((o, a) => o + t * speed[a]), { voxel, brick, free } = this.at(u);
+      const u = this.voxels(at(t)), { voxel, brick, free } = this.at(u);
       if (!voxel) {
         this.skipped = (this.skipped || 0) + 1;
-        const leave = brick.map((b, a) => ((b + (d[a] > 0 ? 1 + free : -free)) * 4 - (this.nearest ? 0.5 : 0) - origin[a]) / speed[a]);
-        k = Math.max(k + 1, Math.ceil((Math.min(...leave) - start) / size - middle));
+        const border = [1, -1].map(sign => brick.map((b, a) => ((b + (sign > 0 ? 1 + free : -free)) * 4 - (this.nearest ? 0.5 : 0) - u[a]) * sign));
+        const leave = fastest ? border.flat().map(x => x / fastest) : border[0].map((x, a) => (d[a] > 0 ? x : border[1][a]) / Math.abs(d[a]));
+        k = Math.max(k + 1, Math.ceil((t + side * Math.min(...leave) - start) / size - middle));
         continue;
       }
       k++;

@@ -1,7 +1,7 @@
 //! `plenoxel bake`: turns a factored field into a voxel grid, as a new run.
 
 use super::new_run::loading;
-use super::{beside, whole};
+use super::{beside, check_box, whole};
 use crate::images;
 use crate::progress::Console;
 use crate::report::Report;
@@ -96,15 +96,20 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     estimate.check()?;
     let (trained, about) = model::open(&path, &config)?;
     let Some(field) = trained.content().and_then(|content| content.downcast_ref::<Factored<f32>>()) else {
-        let found = "the model has no factored field in a box of the world";
-        return Err(Error::input(&path, found, "use a run of preset quality, not of photos"));
+        return Err(Error::input(&path, "the model has no factored field", "use a run of preset quality"));
     };
+    let space = trained.space();
+    check_box(&path, space)?;
 
-    let options = BakeOptions { resolution: args.resolution.unwrap_or_else(|| resolution_of(field)), degree: args.sh_degree };
+    let options = BakeOptions {
+        resolution: args.resolution.unwrap_or_else(|| resolution_of(field, space)),
+        degree: args.sh_degree,
+        least_weight: 0.0,
+    };
     let mut clock = Stopwatch::default();
     let count = console.count("baking, voxel", 1);
     let cameras = dataset.cameras(Split::Train);
-    let grid = clock.time(|| bake(field, &options, &cameras, &|done, all| count.at(done, all)))?;
+    let grid = clock.time(|| bake(field, space, &options, &cameras, &|done, all| count.at(done, all)))?;
     drop(count);
     let voxels = grid.lattice().present();
     console.note(&format!("baked {voxels} voxels at {}³ in {:.1} s", options.resolution, clock.seconds()));

@@ -6,7 +6,7 @@ mod ply;
 pub mod svox2;
 mod vox;
 
-use super::numbers;
+use super::{check_box, numbers};
 use crate::progress::{Console, is_stdout};
 use clap::{Args, Subcommand, ValueHint};
 use glam::DVec3;
@@ -17,6 +17,8 @@ use plenoxel::model::plenoxels::config::Config;
 use plenoxel::model::{self, tensorf};
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::Estimate;
+use plenoxel::space::Space;
+use plenoxel::tensor_file::TensorFile;
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -95,6 +97,8 @@ impl Exported {
         let folder = if self.best { folder.with_best()? } else { folder };
         let path = folder.existing_checkpoint()?;
         if model::kind(&path)? == tensorf::KIND {
+            // Checkpoints without a space are of a box.
+            check_box(&path, TensorFile::open(&path)?.fact::<Option<Space>>("space")?.unwrap_or_default())?;
             let run = self.run.display();
             return Err(Error::input(
                 &path,

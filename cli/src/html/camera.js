@@ -26,11 +26,12 @@ class Orbit {
     this.from(view);
   }
 
-  // Takes the place of a view: `pose` has the camera's right, up and backward axes and its position, a row each.
-  from({ pose, width, height, fx, fy, cx, cy }) {
+  // Takes the place of a view: `pose` has the camera's right, up and backward axes and its position, a row each; `focus` is the distance of what
+  // it looks at, if that is known.
+  from({ pose, width, height, fx, fy, cx, cy, focus }) {
     Object.assign(this, { width, height, fx, fy, cx, cy, rotation: pose.slice(0, 9), eye: pose.slice(9) });
-    // The point of the line of sight that is nearest to the middle of the box, if that is in front.
-    const away = Math.max(dot(this.eye, this.axis(2)), this.near);
+    // Else the point of the line of sight that is nearest to the middle of the box, if that is in front.
+    const away = focus || Math.max(dot(this.eye, this.axis(2)), this.near);
     this.pivot = this.eye.map((p, a) => p - away * this.axis(2)[a]);
   }
 

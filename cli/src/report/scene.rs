@@ -5,7 +5,8 @@ use crate::html::{self, escaped};
 use crate::progress::{Console, thousands};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use plenoxel::bake::{BakeOptions, bake, resolution_of};
+use plenoxel::bake::{BakeOptions, GridSpace, bake, resolution_of};
+use plenoxel::camera_path::mean_up;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::Viewer;
@@ -14,9 +15,11 @@ use plenoxel::field::factored::Factored;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics;
 use plenoxel::model::Model;
+use plenoxel::model::plenoxels::config::Sampling;
 use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::run::evenly_spaced;
 use plenoxel::run::memory::bytes;
+use plenoxel::space::Space;
 use plenoxel::train::ViewOptions;
 use serde_json::{Value, json};
 
@@ -24,18 +27,25 @@ use serde_json::{Value, json};
 const MOST_BYTES: usize = 22_500_000;
 /// Number of test views for the PSNR of the embedded grid.
 const COMPARED: usize = 3;
-/// Maximum number of start views.
+/// Maximum number of start views in a box of the world, and in other spaces, where they are training views.
 const VIEWS: usize = 25;
+const TRAINING_VIEWS: usize = 120;
 
-/// Most voxels along each axis of a grid that is baked for the page.
+/// Most voxels along each axis of a grid that is baked for the page, in a box of the world and in other spaces, whose boxes hold much more.
 const BAKED_VOXELS: usize = 256;
+const BAKED_VOXELS_OF_CAPTURES: usize = 384;
 /// Degree of its harmonics.
 const BAKED_DEGREE: usize = 2;
+/// Rendering weight of voxels that are left out of other spaces. Most of what is in their boxes is behind walls.
+const LEAST_WEIGHT: f32 = 1.0 / 256.0;
+/// Length of a step in other spaces, in sides of voxels.
+const STEP: f64 = 0.5;
 
 /// The embedded grid.
 pub struct Scene {
     /// True if the grid was baked.
     baked: bool,
+    coordinates: GridSpace,
     small: WebGrid,
     bytes: Vec<u8>,
     settings: Value,
@@ -60,7 +70,7 @@ impl Scene {
     /// cannot be baked.
     pub fn of(report: &Report<'_>, console: &Console<'_>) -> Result<Option<Self>> {
         let Some((model, content)) = report.model.and_then(|model| Some((model, model.content()?))) else { return Ok(None) };
-        let baked = match content.downcast_ref().map(|field| baked(field, report, console)) {
+        let baked = match content.downcast_ref().map(|field| baked(field, model.space(), report, console)) {
             Some(Ok(grid)) => Some(grid),
             Some(Err(error)) => {
                 console.note(&format!("the field cannot be shown: {error}"));
@@ -69,21 +79,37 @@ impl Scene {
             None => None,
         };
         let Some(grid) = baked.as_ref().or_else(|| content.downcast_ref()) else { return Ok(None) };
+        let coordinates =
+            content.downcast_ref().map_or_else(GridSpace::default, |field: &Factored<f32>| GridSpace::of(field, model.space()));
         let packed = WebGrid::within(grid, MOST_BYTES);
         let (small, bytes) = packed.map_err(|e| Error::io("report.html", e, "compressing the grid"))?;
-        let split = if report.dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
+        let shown = Shown { grid: small.to_grid(), coordinates };
+        let train = report.dataset.cameras(Split::Train);
+        let (split, most) = match coordinates.space {
+            Space::Box if report.dataset.count(Split::Test) > 0 => (Split::Test, VIEWS),
+            Space::Box => (Split::Train, VIEWS),
+            Space::Ndc { .. } | Space::Contracted => (Split::Train, TRAINING_VIEWS),
+        };
         let (cameras, names) = (report.dataset.cameras(split), report.dataset.view_names(split));
-        let chosen = evenly_spaced(cameras.len(), VIEWS);
-        let views: Vec<Value> = chosen.into_iter().map(|i| html::camera(names[i], &cameras[i])).collect();
+        let chosen = evenly_spaced(cameras.len(), most);
+        let focus = shown.focus();
+        let view = |i: usize| {
+            let mut view = html::camera(names[i], &cameras[i]);
+            view["focus"] = json!(focus(&cameras[i]));
+            view
+        };
+        let views: Vec<Value> = chosen.into_iter().map(view).collect();
         let size = cameras.first().map_or([1, 1], |camera| [camera.intrinsics.width, camera.intrinsics.height]);
         let settings = json!({
             "grid": small.header(),
-            "sampling": report.config.evaluation,
+            "coordinates": coordinates,
+            "up": if coordinates.space == Space::Box { [0.0, 0.0, 1.0] } else { mean_up(&train).to_array() },
+            "sampling": shown.sampling(report.config.evaluation),
             "background": report.config.background,
             "views": views,
         });
-        let cost = Cost::of(report, model, &small)?;
-        Ok(Some(Scene { baked: baked.is_some(), small, bytes, settings, cost, size }))
+        let cost = Cost::of(report, model, &shown)?;
+        Ok(Some(Scene { baked: baked.is_some(), coordinates, small, bytes, settings, cost, size }))
     }
 
     /// The HTML of the viewer.
@@ -92,8 +118,9 @@ impl Scene {
         format!(
             "<section><h2>Interactive viewer</h2>\n<figure id=\"viewer\"><canvas tabindex=\"0\" style=\"--shape: calc({height} / {width})\" \
              aria-label=\"interactive view of the grid\"></canvas>\n<figcaption>Rotate: drag, or arrow keys. Zoom: wheel, pinch, or + and −. \
-             Move: shift and drag, or two fingers. Look around: ctrl and drag. Fly: W, A, S, D, Q, E. <label>Start view: <select></select></label> <button type=\"button\" \
-             id=\"fill\">full screen</button> <button type=\"button\" id=\"save\">save picture</button><br>\n\
+             Move: shift and drag, or two fingers. Look around: ctrl and drag. Fly: W, A, S, D, Q, E. <label>Start view: <select></select></label> \
+             <button type=\"button\" id=\"previous\">previous</button> <button type=\"button\" id=\"next\">next</button> \
+             <button type=\"button\" id=\"fill\">full screen</button> <button type=\"button\" id=\"save\">save picture</button><br>\n\
              <output></output><br>{}</figcaption></figure></section>",
             escaped(&self.note())
         )
@@ -106,8 +133,13 @@ impl Scene {
             1 => String::new(),
             k => format!(", with view-dependent color on a {k} times coarser grid"),
         };
+        let box_of = match self.coordinates.space {
+            Space::Box => "",
+            Space::Ndc { .. } => " of normalized device coordinates",
+            Space::Contracted => " of the contracted world",
+        };
         let what = format!(
-            "the viewer has a compressed grid of {} voxels at {}³{reduction}{}, in {}",
+            "the viewer has a compressed grid of {} voxels at {}³{box_of}{reduction}{}, in {}",
             thousands(header.voxels as u64),
             shape.resolution,
             if self.baked { ", baked from the factored field" } else { "" },
@@ -139,14 +171,41 @@ impl Scene {
     }
 }
 
+/// The grid as the viewer shows it.
+struct Shown {
+    grid: VoxelGrid<f32>,
+    coordinates: GridSpace,
+}
+
+impl Shown {
+    /// Sampling of the viewer.
+    fn sampling(&self, evaluation: Sampling) -> Sampling {
+        if self.coordinates.space == Space::Box { evaluation } else { Sampling::Step { step: STEP } }
+    }
+
+    /// A renderer with the rays and samples of the viewer.
+    fn viewer(&self, report: &Report<'_>) -> Viewer<'_, f32> {
+        let background = report.config.background;
+        match self.coordinates.space {
+            Space::Box => grid_viewer(&self.grid, report.config.evaluation, report.config.engine, background),
+            _ => Viewer::new(self.coordinates.show(&self.grid, STEP * self.grid.shape().voxel_side(), background), background),
+        }
+    }
+
+    /// A function to the distance of what a camera looks at; `None` in a box of the world, whose middle is the pivot.
+    fn focus(&self) -> impl Fn(&Camera) -> Option<f64> + '_ {
+        let matter = (self.coordinates.space != Space::Box).then(|| self.grid.matter());
+        move |camera| self.coordinates.focus(&self.grid, matter.as_ref()?, camera)
+    }
+}
+
 impl Cost {
     /// Measures the loss on a few test views.
-    fn of(report: &Report<'_>, model: &dyn Model<f32>, small: &WebGrid) -> Result<Option<Self>> {
+    fn of(report: &Report<'_>, model: &dyn Model<f32>, small: &Shown) -> Result<Option<Self>> {
         let chosen = evenly_spaced(report.dataset.count(Split::Test), COMPARED);
         let background = report.config.background;
-        let small = small.to_grid();
         let whole = Viewer::of(model, &ViewOptions::over(background));
-        let small = grid_viewer(&small, report.config.evaluation, report.config.engine, background);
+        let small = small.viewer(report);
         let mut sums = [0.0; 3];
         for &i in &chosen {
             let view = report.dataset.load_view(Split::Test, i)?;
@@ -164,8 +223,12 @@ impl Cost {
 }
 
 /// Bakes a field for the page.
-fn baked(field: &Factored<f32>, report: &Report<'_>, console: &Console<'_>) -> Result<VoxelGrid<f32>> {
-    let options = BakeOptions { resolution: resolution_of(field).min(BAKED_VOXELS), degree: BAKED_DEGREE };
+fn baked(field: &Factored<f32>, space: Space, report: &Report<'_>, console: &Console<'_>) -> Result<VoxelGrid<f32>> {
+    let (most, least_weight) = match space {
+        Space::Box => (BAKED_VOXELS, 0.0),
+        Space::Ndc { .. } | Space::Contracted => (BAKED_VOXELS_OF_CAPTURES, LEAST_WEIGHT),
+    };
+    let options = BakeOptions { resolution: resolution_of(field, space).min(most), degree: BAKED_DEGREE, least_weight };
     let count = console.count("baking for the viewer, voxel", 1);
-    bake(field, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
+    bake(field, space, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
 }

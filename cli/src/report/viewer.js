@@ -1,7 +1,8 @@
 // The viewer: ray casting of the trained grid in a fragment shader.
 //
 // It uses the samples of the program (`plenoxel/src/sampling.rs`): intervals of equal length from the entry of a ray into the box, colors and
-// densities at their midpoints, alpha = 1 - exp(-density length). Voxels are stored in an atlas of bricks of 4^3 cells, which have 5^3 corners,
+// densities at their midpoints, alpha = 1 - exp(-density length). The grid of a capture is one of normalized device coordinates, or of the
+// contracted world, in which rays are bent (`plenoxel/src/space.rs`, `plenoxel/src/bake/grid_space.rs`). Voxels are stored in an atlas of bricks of 4^3 cells, which have 5^3 corners,
 // so that the hardware interpolates. A table of links has the place of each brick, or for an empty brick the distance to the nearest one.
 'use strict';
 
@@ -140,11 +141,37 @@ const BASIS = [
   '-0.5900435899 * d.x * (d.x * d.x - 3.0 * d.y * d.y)',
 ];
 
+// The space of the grid's box: box, ndc or contracted.
+const spaceOf = ({ coordinates: { space } }) => (typeof space === 'string' ? space : Object.keys(space)[0]);
+// The length of a step in the t of a ray.
+const stepOf = ({ grid, sampling, coordinates }) => sampling.step * 2 * grid.half_width / grid.resolution / coordinates.stretch[2];
+// Cameras that are not farther from the middle along an axis than this see all of the contracted world.
+const FARTHEST = 8;
+
+// The rays of a space: begin of the ray, and of the march. A ray in normalized device coordinates begins at the near plane. A ray of the
+// contracted world has a parameter t whose even steps are about even in the box; no position moves faster than `fastest` with it.
+const RAYS = {
+  box: '',
+  ndc: `if (d.z >= 0.0) return;
+  vec3 entry = eye - (1.0 + eye.z) / d.z * d;
+  from = vec3(ndc * entry.xy, -1.0) * axes;
+  d = normalize(vec3(-ndc * (d.xy / d.z + entry.xy), 2.0)) * axes;
+  d += vec3(lessThan(abs(d), vec3(1e-9))) * 1e-9;`,
+  contracted: `float rate = abs(d.x), ahead = eye.x * sign(d.x);
+  if (abs(d.y) > rate) { rate = abs(d.y); ahead = eye.y * sign(d.y); }
+  if (abs(d.z) > rate) { rate = abs(d.z); ahead = eye.z * sign(d.z); }
+  float bend = (1.0 - ahead) / rate, out_ = 1.0 + rate * (0.05 - bend);
+  vec3 aside = abs(cross(eye, d));
+  float fastest = 1.0 + 2.0 * max(aside.x, max(aside.y, aside.z));`,
+};
+
 // The shader for a grid: `slabs` textures' worth of four harmonics each lie one behind the other in one texture.
 function shader(scene, slabs) {
   const { grid } = scene, nearest = grid.interpolation === 'nearest', count = grid.harmonics ? grid.harmonics.steps.length / 3 : 0;
   // No ray has more samples.
-  const { step, samples } = scene.sampling, turns = Math.ceil(step ? Math.sqrt(3) * grid.resolution / step : samples) + 2;
+  const { step, samples } = scene.sampling, space = spaceOf(scene), bent = space === 'contracted';
+  const longest = bent ? Math.sqrt(3) * (2 + FARTHEST) / stepOf(scene) : Math.sqrt(3) * grid.resolution / step;
+  const turns = Math.ceil(step ? longest : samples) + 2;
   const lines = [];
   for (let s = 0; s < slabs; s++) {
     lines.push(`h = (textureLod(harmonics, (atlas + vec3(0.0, 0.0, float(${s}) * slab)) / harmonicSize, 0.0) * 255.0 - 128.0) * steps[${s}];`);
@@ -161,6 +188,8 @@ uniform mat3 rotation;
 uniform vec4 lens;              // focal lengths and principal point, pixels
 uniform float height;           // of the picture, pixels
 uniform float resolution, halfWidth, stepLength, slab, harmonicResolution, reduction, offset;
+uniform vec3 axes;              // factors from the box to the grid
+uniform vec2 ndc;
 uniform vec2 points;            // number and largest t of the source paper's samples, or 0
 ${slabs ? `uniform vec4 steps[${slabs}];` : ''}
 out vec4 color;
@@ -182,11 +211,13 @@ void main() {
   float stretch = length(along);
   vec3 d = along / stretch;
   d += vec3(lessThan(abs(d), vec3(1e-9))) * 1e-9;
-  vec3 inverse = 1.0 / d;
-  vec3 low = (-halfWidth - eye) * inverse, high = (halfWidth - eye) * inverse;
-  vec3 first = min(low, high), last = max(low, high);
-  float near = max(max(first.x, first.y), max(first.z, 0.0)), far = min(last.x, min(last.y, last.z));
   color = vec4(background, 1.0);
+  vec3 from = eye;
+  ${RAYS[space]}
+  ${bent ? 'float near = out_ <= 1.0 ? 0.05 : bend + (1.0 - 1.0 / out_) / rate, far = bend + 1.0 / rate;' : `vec3 inverse = 1.0 / d;
+  vec3 low = (-halfWidth - from) * inverse, high = (halfWidth - from) * inverse;
+  vec3 first = min(low, high), last = max(low, high);
+  float near = max(max(first.x, first.y), max(first.z, 0.0)), far = min(last.x, min(last.y, last.z));`}
   if (far <= near) return;
   ${count ? `float basis[${count}]; ${BASIS.slice(0, count).map((b, k) => `basis[${k}] = ${b};`).join(' ')}` : ''}
   float start = near, size = stepLength, half_ = 0.5, count = ceil((far - near) / stepLength);
@@ -197,21 +228,25 @@ void main() {
     count = min(floor(far / size), points.x - 1.0) - floor(start / size + 0.5) + 1.0;
   }
   float side = 2.0 * halfWidth / resolution, k = 0.0, light = 1.0;
-  vec3 sum, seen = vec3(0.0), origin = (eye + halfWidth) / side - 0.5, speed = d / side;
+  vec3 sum, seen = vec3(0.0), origin = (from + halfWidth) / side - 0.5, speed = d / side;
   vec4 h;
   for (int turn = 0; turn < ${turns}; turn++) {
     if (k >= count) break;
     float begin = start + k * size, length_ = size, t = begin;
     if (half_ > 0.0) { length_ = min(size, far - begin); t = begin + 0.5 * length_; }
-    vec3 u = origin + t * speed;
+    ${bent ? `float away = t <= bend ? t : bend + (1.0 / max(1.0 - rate * (t - bend), 1e-6) - 1.0) / rate;
+    vec3 at = from + away * d, extent = abs(at);
+    float m = max(1.0, max(extent.x, max(extent.y, extent.z)));
+    vec3 u = (at * ((2.0 - 1.0 / m) / m) + halfWidth) / side - 0.5;` : 'vec3 u = origin + t * speed;'}
     ivec3 brick;
     vec3 local = inside(u, resolution, brick);
     uint link = texelFetch(links, brick.zyx, 0).r;
     if ((link & 0x80000000u) != 0u) {
       // Nothing nearer than so many bricks: on to where the ray leaves them.
       float free = float(link & 255u) - 1.0;
-      vec3 border = (vec3(brick) + mix(vec3(-free), vec3(1.0 + free), greaterThan(d, vec3(0.0)))) * 4.0 ${nearest ? '- 0.5' : ''};
-      vec3 leave = (border - origin) / speed;
+      ${bent ? `vec3 border = min(u - (vec3(brick) - free) * 4.0, (vec3(brick) + 1.0 + free) * 4.0 - u);
+      vec3 leave = vec3(t + side / fastest * border);` : `vec3 border = (vec3(brick) + mix(vec3(-free), vec3(1.0 + free), greaterThan(d, vec3(0.0)))) * 4.0 ${nearest ? '- 0.5' : ''};
+      vec3 leave = (border - origin) / speed;`}
       k = max(k + 1.0, ceil((min(leave.x, min(leave.y, leave.z)) - start) / size - half_));
       continue;
     }
@@ -249,7 +284,8 @@ class Renderer {
       voxels: this.texture(atlas.size, gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, texels, filter),
     };
     const uniforms = this.uniforms = { atlasSize: atlas.size, resolution: grid.resolution, halfWidth: grid.half_width, offset: grid.offset,
-      background: scene.background };
+      background: scene.background, axes: scene.coordinates.stretch };
+    if (spaceOf(scene) === 'ndc') uniforms.ndc = [scene.coordinates.space.ndc.a, scene.coordinates.space.ndc.b];
     if (harmonics) {
       const { side, links, size: [w, h, d] } = harmonics.atlas, size = [w, h, harmonics.slabs * d];
       this.textures.harmonicLinks = this.texture([side, side, side], gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, links, gl.NEAREST);
@@ -258,7 +294,7 @@ class Renderer {
       Object.assign(uniforms, { harmonicSize: size, slab: d, harmonicResolution: resolution, reduction,
         steps: Array.from({ length: 4 * harmonics.slabs }, (_, f) => steps[f] || 0) });
     }
-    if (scene.sampling.step) uniforms.stepLength = scene.sampling.step * 2 * grid.half_width / grid.resolution;
+    if (scene.sampling.step) uniforms.stepLength = stepOf(scene);
     else Object.assign(uniforms, { stepLength: 1, points: [scene.sampling.samples, scene.sampling.far] });
     this.link(shader(scene, harmonics ? harmonics.slabs : 0));
   }
@@ -372,7 +408,7 @@ class Viewer {
         this.moved();
       } catch (error) { this.status.textContent = `The view cannot be restored: ${error.message}`; }
     });
-    this.camera = new Orbit(scene.views[0]);
+    this.camera = new Orbit(scene.views[0], scene.up);
     // Pixels of a frame and of a band, adapted to the measured times.
     this.pixels = { frame: 10000, band: 10000 };
     this.moving = { last: 0, scale: 1 };
@@ -387,7 +423,12 @@ class Viewer {
     control(canvas, camera, () => this.moved());
     const select = figure.querySelector('select');
     select.append(...scene.views.map((view, i) => new Option(view.name, i)));
-    select.addEventListener('change', () => { camera.from(scene.views[select.value]); this.moved(); });
+    const choose = () => { camera.from(scene.views[select.selectedIndex]); this.moved(); };
+    select.addEventListener('change', choose);
+    for (const [id, by] of [['previous', -1], ['next', 1]]) figure.querySelector(`#${id}`).addEventListener('click', () => {
+      select.selectedIndex = (select.selectedIndex + by + scene.views.length) % scene.views.length;
+      choose();
+    });
     figure.querySelector('#save').addEventListener('click', () => this.save());
     const fill = figure.querySelector('#fill');
     fill.hidden = !document.fullscreenEnabled;

@@ -156,7 +156,7 @@ impl<T: Real> Tensorf<T> {
         let step = self.step();
         RenderOptions {
             aabb: self.aabb(),
-            spacing: if self.space == Space::Contracted { Spacing::Contracted(step) } else { Spacing::Step(step) },
+            spacing: Spacing::even(self.space, step),
             jitter: pass.jitter,
             background: pass.background,
             occupancy: None,
@@ -266,9 +266,13 @@ impl<T: Real> Model<T> for Tensorf<T> {
         self.aim(rays);
     }
 
-    /// Returns the field, a [`Factored<T>`], if its box is a box of the world.
+    /// Returns the field, a [`Factored<T>`].
     fn content(&self) -> Option<&dyn Any> {
-        (self.space == Space::Box).then_some(&self.field as &dyn Any)
+        Some(&self.field)
+    }
+
+    fn space(&self) -> Space {
+        self.space
     }
 
     fn settings(&self) -> Value {

@@ -7,6 +7,7 @@ use crate::geometry::Aabb;
 use crate::rays::RaySource;
 use crate::render::Rendered;
 use crate::sampling::Jitter;
+use crate::space::Space;
 use crate::tensor_file::{TensorFile, TensorWriter};
 use autograd::optim::Optimizer;
 use autograd::{Module, Real};
@@ -123,6 +124,11 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     /// for example. Default: none.
     fn content(&self) -> Option<&dyn Any> {
         None
+    }
+
+    /// Returns the space of the model's box: [`content`](Model::content) is a function of positions in this box. Default: a box of the world.
+    fn space(&self) -> Space {
+        Space::Box
     }
 
     /// Returns a function that renders images of the current model and stays valid when the model changes; `None` if not supported. A run
