@@ -73,13 +73,12 @@ impl Shot {
         if !(rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, TURNED) || rotation.determinant() < 0.0 {
             return Err("the axes of the camera are not those of a rotation".to_owned());
         }
-        // Numbers that are not finite are in no range.
-        if !(position.abs().max_element() <= FARTHEST) {
+        if !(0.0..=FARTHEST).contains(&position.abs().max_element()) {
             return Err(format!("the coordinates of a camera are at most {FARTHEST}"));
         }
         for (side, focal, center) in [(width, fx, cx), (height, fy, cy)] {
             let side = side as f64;
-            if !FOCAL.contains(&(focal / side)) || !(center.abs() <= LONGEST as f64) {
+            if !FOCAL.contains(&(focal / side)) || !(0.0..=LONGEST as f64).contains(&center.abs()) {
                 return Err("the focal length or the principal point is out of bounds".to_owned());
             }
         }
@@ -106,20 +105,33 @@ pub struct Order {
 }
 
 impl Order {
+    /// Number of pixels of the picture.
+    pub fn pixels(&self) -> usize {
+        let intrinsics = self.shot.camera.intrinsics;
+        intrinsics.width * intrinsics.height
+    }
+
+    /// True if the client has gone.
+    pub fn is_cancelled(&self) -> bool {
+        self.cancelled.load(Relaxed)
+    }
+
     /// Renders the picture with `see`, which is given the camera and a function that says when to stop, and sends it. The depth of the colors is that of a
-    /// box with this half width.
-    pub fn fill(self, half_width: f64, see: impl FnOnce(&Camera, &dyn Fn() -> bool) -> Option<Picture>) {
+    /// box with this half width. Returns the duration in seconds; `None` if the client has gone meanwhile.
+    pub fn fill(self, half_width: f64, see: impl FnOnce(&Camera, &dyn Fn() -> bool) -> Option<Picture>) -> Option<f64> {
         let Order { shot: Shot { camera, channel, .. }, cancelled, reply } = self;
         let start = Instant::now();
-        let Some(picture) = see(&camera, &|| cancelled.load(Relaxed)) else { return };
+        let picture = see(&camera, &|| cancelled.load(Relaxed))?;
         let image = images::to_rgb8(&images::shown(channel, &picture, DepthRange::of(&camera, half_width)));
+        let seconds = start.elapsed().as_secs_f64();
         // Nobody may be waiting any more.
-        drop(reply.send(Frame { image, seconds: start.elapsed().as_secs_f64() }));
+        drop(reply.send(Frame { image, seconds }));
+        Some(seconds)
     }
 
     /// Renders the picture with a viewer of a model and sends it.
-    pub fn fill_with(self, half_width: f64, viewer: &Viewer<'_, f32>) {
-        self.fill(half_width, |camera, stopped| viewer.see_unless(camera, stopped));
+    pub fn fill_with(self, half_width: f64, viewer: &Viewer<'_, f32>) -> Option<f64> {
+        self.fill(half_width, |camera, stopped| viewer.see_unless(camera, stopped))
     }
 }
 
@@ -158,7 +170,7 @@ impl Studio {
     /// Waits for the next order whose client is still there.
     pub fn next(&self, wait: Duration) -> Option<Order> {
         let mut order = self.0.recv_timeout(wait).ok()?;
-        while order.cancelled.load(Relaxed) {
+        while order.is_cancelled() {
             order = self.0.try_recv().ok()?;
         }
         Some(order)

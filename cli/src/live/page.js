@@ -87,10 +87,10 @@ class Live {
       if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
       this.context.drawImage(image, 0, 0, w, h);
       this.took = performance.now() - begin;
+      const rendered = Number(/dur=([\d.]+)/.exec(answer.headers.get('Server-Timing'))[1]);
       // Small pictures take some time however small they are.
-      if (width * height > 5000) this.speed += 0.5 * (Math.max(1, width * height / this.took) - this.speed);
-      const rendered = /dur=([\d.]+)/.exec(answer.headers.get('Server-Timing') || '');
-      this.status.textContent = `${width} × ${height} pixels in ${this.took.toFixed(0)} ms` + (rendered ? `, rendered in ${rendered[1]} ms` : '');
+      this.speed += 0.5 * (width * height / Math.max(1, rendered) - this.speed);
+      this.status.textContent = `${width} × ${height} pixels in ${this.took.toFixed(0)} ms, rendered in ${rendered.toFixed(0)} ms`;
     } catch (error) {
       if (error.name === 'AbortError') return;
       this.status.textContent = error instanceof TypeError ? 'the program has ended' : error.message;

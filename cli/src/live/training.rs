@@ -1,6 +1,6 @@
 //! A run that is watched while it is trained: its figures and curves, pictures between its steps, and requests to save or stop.
 
-use super::order::Studio;
+use super::order::{Order, Studio};
 use super::server::{Door, Server};
 use super::site::{Scene, Site};
 use super::studio;
@@ -16,6 +16,9 @@ use serde_json::{Value, json};
 use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+
+/// Seconds of a picture that is rendered without waiting for a turn: one in motion.
+const QUICK: f64 = 0.15;
 
 /// What visitors learn of a run, and what they ask of it.
 #[derive(Default)]
@@ -127,6 +130,10 @@ pub struct LiveTraining<'c, 'a> {
     background: [f32; 3],
     /// The training has its turn until then.
     rests: Instant,
+    /// An order that waits for its turn.
+    waiting: Option<Order>,
+    /// Seconds per pixel of the last picture.
+    pace: f64,
     /// The first error.
     failure: Result<()>,
 }
@@ -141,6 +148,8 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
             server: None,
             background: [0.0; 3],
             rests: Instant::now(),
+            waiting: None,
+            pace: 0.0,
             failure: Ok(()),
         }
     }
@@ -168,7 +177,7 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
             Event::Saved { steps } => self.shared.figures().saved = Some(steps),
             Event::Trained => {
                 // Waiting visitors are told.
-                self.studio = None;
+                (self.studio, self.waiting) = (None, None);
                 let mut figures = self.shared.figures();
                 if figures.state == State::Training && !interrupt::requested() {
                     figures.again = figures.again.replace("train --resume", "view");
@@ -204,15 +213,21 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
         self.draw(model);
     }
 
-    /// Fills an order, if there is one and the training has had its turn: as much time as the last picture took.
+    /// Fills an order, if there is one: at once if that is quick, otherwise if the training has had its turn, as much time as the last picture took.
     fn draw(&mut self, model: &dyn Model<f32>) {
-        let start = Instant::now();
-        let Some(order) = self.studio.as_ref().filter(|_| start >= self.rests).and_then(|studio| studio.next(Duration::ZERO)) else {
+        let Some(studio) = &self.studio else { return };
+        let waiting = self.waiting.take().filter(|order| !order.is_cancelled());
+        let Some(order) = waiting.or_else(|| studio.next(Duration::ZERO)) else { return };
+        let (start, pixels) = (Instant::now(), order.pixels() as f64);
+        if start < self.rests && pixels * self.pace > QUICK {
+            self.waiting = Some(order);
             return;
-        };
+        }
         let aabb = model.aabb();
         let viewer = Viewer::of(model, &ViewOptions::over(self.background));
-        order.fill_with(0.5 * (aabb.max - aabb.min).max_element(), &viewer);
+        if let Some(seconds) = order.fill_with(0.5 * (aabb.max - aabb.min).max_element(), &viewer) {
+            self.pace = seconds / pixels;
+        }
         self.rests = Instant::now() + start.elapsed();
     }
 
