@@ -6,6 +6,7 @@ use crate::progress::{Console, thousands};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use plenoxel::bake::{BakeOptions, GridSpace, bake, resolution_of};
+use plenoxel::camera::Camera;
 use plenoxel::camera_path::mean_up;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
