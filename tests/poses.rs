@@ -104,13 +104,14 @@ fn the_kernel_agrees_with_the_graph_in_values_and_gradients_of_rays() {
             let config = Config { group: 0.0, directions, feature_octaves: octaves, cell_depth: 2.0, ..Config::default() };
             let mut model = model(config, region, 9);
             let rays = rays(40);
-            let [origins, directions] = arrays(&rays).map(|array| Tensor::variable(array));
+            let [origins, directions] = arrays(&rays).map(Tensor::variable);
             let tracked = TrackedRays::new(origins.clone(), directions.clone(), &rays);
             let mut results = Vec::new();
             for engine in [Engine::Graph, Engine::Fused] {
                 model.engine = engine;
                 let (value, gradients) = autograd::value_and_grad(|| all_columns(&model.render_tracked(&tracked, &PASS)));
-                let mut all = vec![("origins".to_owned(), gradients.array(&origins)), ("directions".to_owned(), gradients.array(&directions))];
+                let mut all =
+                    vec![("origins".to_owned(), gradients.array(&origins)), ("directions".to_owned(), gradients.array(&directions))];
                 model.visit(&mut |param| all.push((param.name().to_owned(), gradients.array(param.tensor()))));
                 results.push((value, all));
             }
@@ -121,9 +122,9 @@ fn the_kernel_agrees_with_the_graph_in_values_and_gradients_of_rays() {
                 let off = want.iter().zip(got).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
                 assert!(off < 1e-9 * scale, "{:?} {name}: {off:e} of {scale:e}", region.space);
             }
-            // Rays that are not tracked have the same pixels.
-            let plain = model.render(&tracked.rays, &PASS).rgb;
-            assert_eq!(plain.data(), model.render_tracked(&tracked, &PASS).rgb.data());
+            // Rays that are not tracked have the same pixels, up to the rounding of the directions in normalized device coordinates.
+            let (plain, same) = (model.render(&tracked.rays, &PASS).rgb, model.render_tracked(&tracked, &PASS).rgb);
+            assert!(plain.data().iter().zip(same.data()).all(|(a, b)| (a - b).abs() < 1e-12));
         }
     }
 }
@@ -133,7 +134,7 @@ fn gradients_of_rays_are_those_of_the_reference_with_groups_of_samples_too() {
     for region in regions() {
         let model = model(Config { group: 0.5, color_above: 0.01, ..Config::default() }, region, 9);
         let rays = rays(30);
-        let inputs = arrays(&rays).map(|array| Tensor::variable(array));
+        let inputs = arrays(&rays).map(Tensor::variable);
         let tracked = TrackedRays::new(inputs[0].clone(), inputs[1].clone(), &rays);
         let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render_tracked(&tracked, &PASS)));
         // Gradients that can be differentiated again are computed through the reference.
@@ -204,23 +205,19 @@ fn refined_poses_have_the_same_bits_for_any_number_of_threads_and_after_a_resump
     assert!(trained(3, false) == want && trained(2, true) == want);
 }
 
-/// Returns the root mean square errors of cameras against the true ones: of rotations in degrees, and of positions, after the best common rigid motion
-/// and scaling of the positions is taken out by comparing differences from the mean.
-fn errors(cameras: &[Camera], truth: &[View]) -> [f64; 2] {
-    let n = cameras.len() as f64;
-    let pairs = || cameras.iter().zip(truth.iter().map(|view| view.camera));
-    let turns: Vec<DVec3> = pairs()
-        .map(|(camera, truth)| {
-            let [a, b] = [camera, &truth].map(|camera| DQuat::from_mat3(&camera.camera_to_world.matrix3));
-            (a * b.inverse()).to_scaled_axis()
+/// Returns the root mean square distance, in pixels, between the projections of points of the scene by cameras and by the true cameras. Rotations and translations that move
+/// the image of the scene alike are hardly told apart by small images, so the poses themselves are not compared.
+fn error(cameras: &[Camera], truth: &[View]) -> f64 {
+    let corners = (0..8).map(|k| 0.5 * (dvec3(f64::from(k >> 2), f64::from(k >> 1 & 1), f64::from(k & 1)) * 2.0 - DVec3::ONE));
+    let corners: Vec<DVec3> = corners.collect();
+    let squares = cameras.iter().zip(truth).flat_map(|(camera, view)| {
+        corners.iter().map(move |&corner| {
+            let [(x, y, _), (u, v, _)] =
+                [camera, &view.camera].map(|camera| camera.project(corner).expect("the scene is in front of the cameras"));
+            (x - u).powi(2) + (y - v).powi(2)
         })
-        .collect();
-    let moves: Vec<DVec3> = pairs().map(|(camera, truth)| camera.position() - truth.position()).collect();
-    let spread = |errors: &[DVec3]| {
-        let mean = errors.iter().sum::<DVec3>() / n;
-        (errors.iter().map(|error| error.distance_squared(mean)).sum::<f64>() / n).sqrt()
-    };
-    [spread(&turns).to_degrees(), spread(&moves)]
+    });
+    (squares.sum::<f64>() / (8 * cameras.len()) as f64).sqrt()
 }
 
 #[test]
@@ -231,11 +228,11 @@ fn poses_with_errors_come_closer_to_the_true_ones_and_the_scene_is_sharper() {
         let mut trainer = self::trainer(views, 900, refine);
         while trainer.step().expect("a step").is_some() {}
         let psnr = evaluate(trainer.model(), &test, &ViewOptions::over([1.0; 3])).psnr().expect("a figure");
-        (psnr, errors(&trainer.cameras(), &train))
+        (psnr, error(&trainer.cameras(), &train))
     };
     let ((exact, _), (without, before), (refined, after)) = (trained(&train, false), trained(&wrong, false), trained(&wrong, true));
-    println!("exact poses {exact:.2} dB; with errors {before:.4?}: {without:.2} dB; refined {after:.4?}: {refined:.2} dB");
-    assert!(after[0] < 0.5 * before[0] && after[1] < 0.5 * before[1], "{before:?} to {after:?}");
+    println!("exact poses {exact:.2} dB; with errors of {before:.3} pixels {without:.2} dB; refined to {after:.3} pixels {refined:.2} dB");
+    assert!(after < 0.5 * before, "{before} to {after} pixels");
     assert!(refined > without + 0.5, "{without} to {refined}, {exact} with exact poses");
 }
 
