@@ -11,8 +11,9 @@ use autograd::{Param, Real, Tensor};
 /// Name of the loss and of its parameter, `[views, 6]`.
 pub const POSES: &str = "poses";
 
-/// Learning rate of the corrections at the first step, in rad and in units of the spread of the cameras.
-pub const POSE_RATE: f64 = 1e-3;
+/// Learning rate of the corrections at the first step, in rad and in units of the spread of the cameras. lego at 100 x 100, poses with errors of 0.5 degrees and
+/// 1 % of the distance, which are 2.68 pixels: 0.49 pixels are left with 5e-4 after 800 steps, 0.72 pixels with 2e-3 after 1000 steps.
+pub const POSE_RATE: f64 = 5e-4;
 
 /// Share of the learning rate that is left at the end of the run.
 const LAST: f64 = 0.01;
