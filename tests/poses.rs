@@ -1,6 +1,10 @@
 //! Refinement of camera poses: gradients of rays, the same bits for any number of threads and after a resumption, and poses that come closer to the true ones.
 
-use autograd::{Gradcheck, Module, Param, Tensor, random::Stream};
+#[path = "support/factored.rs"]
+mod factored;
+
+use autograd::{Gradcheck, Module, Tensor, random::Stream};
+use factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
 use glam::{DQuat, DVec3, dvec3};
 use ndarray::ArrayD;
 use plenoxel::camera::{Camera, Ray, TrackedRays};
@@ -13,7 +17,7 @@ use plenoxel::loss::{Objective, mse};
 use plenoxel::model::dvgo::{self, Dvgo};
 use plenoxel::model::plenoxels::config::{Config as RunConfig, Hull};
 use plenoxel::model::tensorf::{Config, Stage, Tensorf};
-use plenoxel::render::{Engine, Rendered};
+use plenoxel::render::Engine;
 use plenoxel::run::settings::Layers;
 use plenoxel::sampling::Jitter;
 use plenoxel::space::{Region, Space};
@@ -21,45 +25,12 @@ use plenoxel::train::{Model, Pass, TrainOptions, Trainer, ViewOptions};
 
 const PASS: Pass = Pass { background: [1.0; 3], jitter: Jitter::PerRay { seed: 3, step: 7 }, keep_samples: false, stage: None };
 
-/// The spaces with their boxes.
-fn regions() -> [Region; 3] {
-    let ndc = Aabb { min: dvec3(-1.5, -1.6, -1.0), max: dvec3(1.5, 1.6, 1.0) };
-    [
-        Region { space: Space::Box, aabb: Aabb::cube(1.4) },
-        Region { space: Space::Ndc { a: 1.7, b: 1.9 }, aabb: ndc },
-        Region { space: Space::Contracted, aabb: Aabb::cube(Space::CONTRACTED) },
-    ]
-}
+const BOX: Region = Region { space: Space::Box, aabb: Aabb { min: DVec3::splat(-1.4), max: DVec3::splat(1.4) } };
 
-/// A field that the kernel computes, neither fog nor nothing.
+/// A field that the kernel computes.
 fn model(config: Config, region: Region, resolution: usize) -> Tensorf<f64> {
-    let config = Config {
-        density_components: 16,
-        appearance_components: 16,
-        features: 4,
-        hidden: 6,
-        step: 1.0,
-        stop_below: 0.0,
-        stages: vec![Stage { resolution, steps: 1, rays: 16 }],
-        ..config
-    };
-    let mut model = Tensorf::<f64>::in_region(config, region, 42).expect("valid settings");
-    let random = Stream::new(11);
-    model.visit_mut(&mut |param: &mut Param<f64>| {
-        if param.name().starts_with("density") {
-            let values = random.named(param.name()).uniform_tensor(param.shape(), 0.2, 0.75);
-            *param = Param::from_tensor(param.name(), values);
-        }
-    });
-    model
-}
-
-/// Rays from around the origin that look along −z and to the sides.
-fn rays(count: usize) -> Vec<Ray> {
-    let numbers = Stream::new(6).uniform_tensor::<f64>(&[count, 6], -1.0, 1.0);
-    let ray =
-        |x: &[f64]| Ray { origin: 0.3 * DVec3::from_slice(x), direction: dvec3(0.8 * x[3], 0.8 * x[4], -1.0).normalize(), stretch: 1.0 };
-    numbers.data().chunks(6).map(ray).collect()
+    let stages = vec![Stage { resolution, steps: 1, rays: 16 }];
+    wide(Config { features: 4, hidden: 6, step: 1.0, stop_below: 0.0, stages, ..config }, region)
 }
 
 /// Origins and directions, `[n, 3]`.
@@ -70,24 +41,13 @@ fn arrays(rays: &[Ray]) -> [ArrayD<f64>; 2] {
     })
 }
 
-/// A number that depends on every column.
-fn all_columns(rendered: &Rendered<f64>) -> Tensor<f64> {
-    let weights = |name: &str, shape: &[usize]| Stream::new(8).named(name).uniform_tensor::<f64>(shape, -1.0, 1.0);
-    let mut sum = (&rendered.rgb * weights("rgb", rendered.rgb.shape())).sum();
-    let columns = [("depth", rendered.depth()), ("opacity", rendered.opacity.clone()), ("sparsity", rendered.sparsity() * 1e-2)];
-    for (name, column) in columns {
-        sum = sum + (&column * weights(name, column.shape())).sum();
-    }
-    sum
-}
-
 #[test]
 fn gradients_of_the_graph_with_respect_to_rays_are_right_in_every_space() {
-    for region in regions() {
+    for region in [BOX, NDC, CONTRACTED] {
         let config = Config { group: 0.0, color_above: 0.0, directions: Directions::Harmonics(2), feature_octaves: 1, ..Config::default() };
         let mut model = model(config, region, 5);
         model.engine = Engine::Graph;
-        let rays = rays(3);
+        let rays = rays_of_a_capture(3);
         // The distances of samples are those of the rays as given, so finite differences do not move them.
         let pixels = |x: &[Tensor<f64>]| {
             let tracked = TrackedRays { rays: rays.clone(), origins: x[0].clone(), directions: x[1].clone() };
@@ -99,29 +59,14 @@ fn gradients_of_the_graph_with_respect_to_rays_are_right_in_every_space() {
 
 #[test]
 fn the_kernel_agrees_with_the_graph_in_values_and_gradients_of_rays() {
-    for region in regions() {
+    for region in [BOX, NDC, CONTRACTED] {
         for (octaves, directions) in [(0, Directions::Harmonics(3)), (2, Directions::Frequency(2))] {
             let config = Config { group: 0.0, directions, feature_octaves: octaves, cell_depth: 2.0, ..Config::default() };
             let mut model = model(config, region, 9);
-            let rays = rays(40);
+            let rays = rays_of_a_capture(40);
             let [origins, directions] = arrays(&rays).map(Tensor::variable);
             let tracked = TrackedRays::new(origins.clone(), directions.clone(), &rays);
-            let mut results = Vec::new();
-            for engine in [Engine::Graph, Engine::Fused] {
-                model.engine = engine;
-                let (value, gradients) = autograd::value_and_grad(|| all_columns(&model.render_tracked(&tracked, &PASS)));
-                let mut all =
-                    vec![("origins".to_owned(), gradients.array(&origins)), ("directions".to_owned(), gradients.array(&directions))];
-                model.visit(&mut |param| all.push((param.name().to_owned(), gradients.array(param.tensor()))));
-                results.push((value, all));
-            }
-            let ((want, graph), (got, fused)) = (&results[0], &results[1]);
-            assert!((want - got).abs() < 1e-9 * want.abs(), "{want} {got}");
-            for ((name, want), (_, got)) in graph.iter().zip(fused) {
-                let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
-                let off = want.iter().zip(got).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
-                assert!(off < 1e-9 * scale, "{:?} {name}: {off:e} of {scale:e}", region.space);
-            }
+            agree(&mut model, &[("origins", &origins), ("directions", &directions)], |model| model.render_tracked(&tracked, &PASS));
             // Rays that are not tracked have the same pixels, up to the rounding of the directions in normalized device coordinates.
             let (plain, same) = (model.render(&tracked.rays, &PASS).rgb, model.render_tracked(&tracked, &PASS).rgb);
             assert!(plain.data().iter().zip(same.data()).all(|(a, b)| (a - b).abs() < 1e-12));
@@ -130,10 +75,21 @@ fn the_kernel_agrees_with_the_graph_in_values_and_gradients_of_rays() {
 }
 
 #[test]
+fn rays_that_see_nothing_have_no_gradient_and_do_not_disturb_the_others() {
+    let mut model = model(Config { group: 0.0, ..Config::default() }, BOX, 9);
+    // The first blocks of the kernel have no samples at all.
+    let mut rays = rays_of_a_capture(48);
+    rays[..32].iter_mut().for_each(|ray| ray.origin += DVec3::splat(50.0));
+    let [origins, directions] = arrays(&rays).map(Tensor::variable);
+    let tracked = TrackedRays::new(origins.clone(), directions.clone(), &rays);
+    agree(&mut model, &[("origins", &origins), ("directions", &directions)], |model| model.render_tracked(&tracked, &PASS));
+}
+
+#[test]
 fn gradients_of_rays_are_those_of_the_reference_with_groups_of_samples_too() {
-    for region in regions() {
+    for region in [BOX, NDC, CONTRACTED] {
         let model = model(Config { group: 0.5, color_above: 0.01, ..Config::default() }, region, 9);
-        let rays = rays(30);
+        let rays = rays_of_a_capture(30);
         let inputs = arrays(&rays).map(Tensor::variable);
         let tracked = TrackedRays::new(inputs[0].clone(), inputs[1].clone(), &rays);
         let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render_tracked(&tracked, &PASS)));

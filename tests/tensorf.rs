@@ -1,7 +1,11 @@
 //! The factored field: its gradients, its upsampling, training and resuming.
 
+#[path = "support/factored.rs"]
+mod factored;
+
 use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
-use glam::{DVec3, dvec3};
+use factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
+use glam::DVec3;
 use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
@@ -11,7 +15,7 @@ use plenoxel::geometry::Aabb;
 use plenoxel::loss::{Objective, mse};
 use plenoxel::model::plenoxels::config::Hull;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
-use plenoxel::render::{Engine, Field, Rendered};
+use plenoxel::render::Field;
 use plenoxel::sampling::{Jitter, Occupancy, Spacing, sample};
 use plenoxel::space::{Region, Space};
 use plenoxel::train::{Model, Pass, PlannedStage, TrainOptions, Trainer, ViewOptions};
@@ -51,21 +55,6 @@ fn dense<T: Real>(stages: &[(usize, u64)]) -> Tensorf<T> {
     model
 }
 
-/// Boxes with the spaces of captures.
-fn spaces() -> [(Space, Aabb); 2] {
-    let ndc = Aabb { min: dvec3(-1.5, -1.6, -1.0), max: dvec3(1.5, 1.6, 1.0) };
-    [(Space::Ndc { a: 1.7, b: 1.9 }, ndc), (Space::Contracted, Aabb::cube(Space::CONTRACTED))]
-}
-
-/// Rays from around the origin that look along −z and to the sides.
-fn rays_of_a_capture(count: usize) -> Vec<Ray> {
-    let random = Stream::new(6);
-    let numbers = random.uniform_tensor::<f64>(&[count, 6], -1.0, 1.0);
-    let ray =
-        |x: &[f64]| Ray { origin: 0.3 * DVec3::from_slice(x), direction: dvec3(0.8 * x[3], 0.8 * x[4], -1.0).normalize(), stretch: 1.0 };
-    numbers.data().chunks(6).map(ray).collect()
-}
-
 fn rays(count: usize) -> Vec<Ray> {
     let random = Stream::new(5);
     let at = |name: &str| random.named(name).uniform_tensor::<f64>(&[count, 3], -0.8, 0.8);
@@ -94,43 +83,12 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
     gradcheck(pixels, inputs);
 }
 
-/// A model that the kernel computes.
-fn wide(config: Config, region: Region) -> Tensorf<f64> {
-    let config = Config { density_components: 16, appearance_components: 32, ..config };
-    let mut model = Tensorf::<f64>::in_region(config, region, 42).expect("valid settings");
-    let random = Stream::new(11);
-    model.visit_mut(&mut |param: &mut Param<f64>| {
-        if param.name().starts_with("density") {
-            let values = random.named(param.name()).uniform_tensor(param.shape(), 0.2, 0.75);
-            *param = Param::from_tensor(param.name(), values);
-        }
-    });
-    model
-}
-
-/// A number that depends on every column.
-fn all_columns(rendered: &Rendered<f64>) -> Tensor<f64> {
-    let random = Stream::new(8);
-    let weights = |name: &str, shape: &[usize]| random.named(name).uniform_tensor::<f64>(shape, -1.0, 1.0);
-    let mut sum = (&rendered.rgb * weights("rgb", rendered.rgb.shape())).sum();
-    let columns = [
-        ("depth", rendered.depth()),
-        ("opacity", rendered.opacity.clone()),
-        ("transmittance", rendered.log_transmittance.clone()),
-        ("distortion", rendered.distortion()),
-        ("sparsity", rendered.sparsity() * 1e-2),
-    ];
-    for (name, column) in columns {
-        sum = sum + (&column * weights(name, column.shape())).sum();
-    }
-    sum
-}
-
 #[test]
 fn the_kernel_agrees_with_the_graph_in_the_spaces_of_captures() {
-    for (space, aabb) in spaces() {
-        let mut model = wide(Config { cell_depth: 2.0, ..tiny(&[(9, 1)]) }, Region { space, aabb });
-        agree(&mut model, &rays_of_a_capture(24), &Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS });
+    let (rays, pass) = (rays_of_a_capture(24), Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS });
+    for region in [NDC, CONTRACTED] {
+        let mut model = wide(Config { cell_depth: 2.0, ..tiny(&[(9, 1)]) }, region);
+        agree(&mut model, &[], |model| model.render(&rays, &pass));
     }
 }
 
@@ -149,30 +107,12 @@ fn leaving_out_empty_cells_changes_no_other_sample_in_the_contracted_space() {
     }
 }
 
-/// Checks that both engines compute the same pixels and gradients.
-fn agree(model: &mut Tensorf<f64>, rays: &[Ray], pass: &Pass) {
-    let mut results = Vec::new();
-    for engine in [Engine::Graph, Engine::Fused] {
-        model.engine = engine;
-        let (value, gradients) = autograd::value_and_grad(|| all_columns(&model.render(rays, pass)));
-        let mut of_params = Vec::new();
-        model.visit(&mut |param| of_params.push((param.name().to_owned(), gradients.array(param.tensor()))));
-        results.push((value, of_params));
-    }
-    let ((want, graph), (got, fused)) = (&results[0], &results[1]);
-    assert!((want - got).abs() < 1e-9 * want.abs(), "{want} {got}");
-    for ((name, want), (_, got)) in graph.iter().zip(fused) {
-        let scale = want.iter().fold(1e-12f64, |most, x| most.max(x.abs()));
-        let off = want.iter().zip(got).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
-        assert!(off < 1e-9 * scale, "{name}: {off:e} of {scale:e}");
-    }
-}
-
 #[test]
 fn the_kernel_agrees_with_the_graph_in_values_and_gradients() {
     for (octaves, directions) in [(0, Directions::Harmonics(3)), (2, Directions::Frequency(2))] {
         let mut model = wide(Config { feature_octaves: octaves, directions, ..tiny(&[(9, 1)]) }, IN_BOX);
-        agree(&mut model, &rays(70), &PASS);
+        let rays = rays(70);
+        agree(&mut model, &[], |model| model.render(&rays, &PASS));
     }
 }
 

@@ -216,7 +216,7 @@ fn part<T: Real>(
     let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, shaded_at, batch.nodes, shift(axis, tables.appearance), |_| true));
     let rays = state.tracked.as_ref().map(|tracked| {
         let encoded = tables.network.of_direction(&input);
-        positions::of_rays(tracked, block, tables, [&density, &products], encoded)
+        positions::of_rays(tracked, block, tables, [&density, &products], (encoded, batch.encoded.shape()[1]))
     });
     (Part { density, products, density_rows, product_rows }, lines.into_iter().chain(parameters).collect(), rays)
 }

@@ -33,11 +33,11 @@ pub struct Activations<T: Real> {
 
 /// Cotangents of the network for m samples.
 pub struct OfNetwork<T: Real> {
-    /// Of the products, `[m, 3 R]`.
+    /// Cotangents of the products, `[m, 3 R]`.
     pub products: Buffer<T>,
-    /// Of the input of the first layer, `[m, inputs]`.
+    /// Cotangents of the input of the first layer, `[m, inputs]`.
     pub input: Buffer<T>,
-    /// Of the matrix and of the layers' weights and biases, in the order of the parameters.
+    /// Cotangents of the matrix and of the layers' weights and biases, in the order of the parameters.
     pub parameters: Vec<Buffer<T>>,
 }
 

@@ -11,21 +11,30 @@ use autograd::{Buffer, Real, dispatched, parallel};
 use glam::DVec3;
 
 /// Cotangents of the rays of a block: of encoded directions, `[rays, e]`, of origins and of directions, `[rays, 3]`.
-pub type OfRays<T> = [Vec<T>; 3];
+pub type OfRays<T> = [Buffer<T>; 3];
 
 /// Joins the cotangents of all blocks.
-pub fn joined<T: Real>(blocks: &[OfRays<T>]) -> [Buffer<T>; 3] {
-    [0, 1, 2].map(|k| blocks.iter().flat_map(|block| block[k].iter().copied()).collect::<Vec<_>>().into())
+pub fn joined<T: Real>(blocks: &[OfRays<T>]) -> OfRays<T> {
+    [0, 1, 2].map(|k| {
+        let mut all = Buffer::stale(blocks.iter().map(|block| block[k].len()).sum());
+        let mut rest = &mut all[..];
+        for block in blocks {
+            let (own, others) = rest.split_at_mut(block[k].len());
+            own.copy_from_slice(&block[k]);
+            rest = others;
+        }
+        all
+    })
 }
 
 /// Computes the cotangents of the rays of a block from those of the density features of its samples, of the products of its shaded samples, and of the encoded
-/// directions of these.
+/// directions of these, `width` numbers each. A ray without samples has the cotangent 0.
 pub fn of_rays<'g, T: Real>(
     tracked: &Tracked,
     block: &Block<T>,
     tables: &Tables<'_, T>,
     [density, products]: [&[T]; 2],
-    encoded: impl Iterator<Item = &'g [T]>,
+    (encoded, width): (impl Iterator<Item = &'g [T]>, usize),
 ) -> OfRays<T> {
     let mut of_samples = slopes(tables.density, block.at(), Cotangents::Shared(density));
     let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
@@ -34,14 +43,13 @@ pub fn of_rays<'g, T: Real>(
         (0..3).for_each(|axis| of_samples[axis][sample as usize] += of_shaded[axis][shaded]);
     }
     let rays = block.offsets.len() - 1;
-    let mut of_encoded = Vec::new();
+    let mut of_encoded = Buffer::zeros(rays * width);
     for (row, &ray) in encoded.zip(&block.rays_of_shaded) {
-        of_encoded.resize(rays * row.len(), T::zero());
-        let sums = &mut of_encoded[(ray as usize - block.first) * row.len()..][..row.len()];
+        let sums = &mut of_encoded[(ray as usize - block.first) * width..][..width];
         sums.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
     }
-    let (mut of_origins, mut of_directions) = (Vec::with_capacity(3 * rays), Vec::with_capacity(3 * rays));
-    for (ray, own) in tracked.rays[block.first..].iter().zip(block.rays()) {
+    let (mut of_origins, mut of_directions) = (Buffer::stale(3 * rays), Buffer::stale(3 * rays));
+    for (r, (ray, own)) in tracked.rays[block.first..].iter().zip(block.rays()).enumerate() {
         let (mut origin, mut direction) = (DVec3::ZERO, DVec3::ZERO);
         let position = tracked.position_of(ray);
         for i in own {
@@ -50,8 +58,8 @@ pub fn of_rays<'g, T: Real>(
             origin += g;
             direction += distance * g;
         }
-        of_origins.extend(origin.to_array().map(T::lit));
-        of_directions.extend(direction.to_array().map(T::lit));
+        of_origins[3 * r..][..3].copy_from_slice(&origin.to_array().map(T::lit));
+        of_directions[3 * r..][..3].copy_from_slice(&direction.to_array().map(T::lit));
     }
     [of_encoded, of_origins, of_directions]
 }
@@ -71,9 +79,9 @@ impl Tracked {
 }
 
 /// Returns the cotangents of positions, in units of cells, from those of products.
-fn slopes<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: Cotangents<'_, T>) -> [Vec<T>; 3] {
+fn slopes<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: Cotangents<'_, T>) -> [Buffer<T>; 3] {
     let count = at[0].len();
-    let mut slopes: [Vec<T>; 3] = std::array::from_fn(|_| Vec::with_capacity(count));
+    let mut slopes = [0, 1, 2].map(|_| Buffer::stale(count));
     for first in (0..count).step_by(RUN) {
         let range = first..count.min(first + RUN);
         let (at, g) = (at.map(|at| &at[range.clone()]), g.of(range.clone(), 3 * pairs.width));
@@ -83,7 +91,7 @@ fn slopes<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: Cotangents<'_, T>) -> 
         } else {
             add_slopes::<T, false>(pairs, at, g, &mut out);
         }
-        slopes.iter_mut().zip(&out).for_each(|(slopes, out)| slopes.extend_from_slice(&out[..range.len()]));
+        slopes.iter_mut().zip(&out).for_each(|(slopes, out)| slopes[range.clone()].copy_from_slice(&out[..range.len()]));
     }
     slopes
 }
