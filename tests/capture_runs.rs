@@ -21,7 +21,7 @@ fn around() -> Vec<View> {
     Dataset::procedural(options).unwrap().load(Split::Train, &|_, _| ()).unwrap()
 }
 
-/// The same pictures as if they were taken from places before the scene.
+/// Pictures of [`around`], as if they were taken from places before the scene.
 fn forward() -> Vec<View> {
     let place = |k: usize| DVec3::new(0.1 * (k % 3) as f64, 0.1 * (k / 3) as f64, 0.02 * (k % 2) as f64);
     let moved = |(k, view): (usize, View)| {
@@ -40,23 +40,34 @@ fn scene(run: &str) -> Value {
     serde_json::from_str(start.split("</script>").next().unwrap()).unwrap()
 }
 
+/// Trains a capture, whose viewer is to be `of` a space. Returns the run folder.
+fn train(input: &captures::Folder, folder: &Folder, of: &str) -> String {
+    let (data, run) = (input.0.display().to_string(), folder.path("run"));
+    let trained = plenoxel(&["train", &data, "--preset=photos", "--set", STAGES, "--no-images", "--out", &run]);
+    assert!(trained.err.contains(&format!("of {of}, baked from the factored field")), "{}", trained.err);
+    trained.done();
+    run
+}
+
+/// Renders films along camera paths.
+fn render(run: &str, paths: &[&str]) {
+    for path in paths {
+        plenoxel(&["render", run, "--path", path, "--frames", "2"]).done();
+        assert!(fs::exists(format!("{run}/renders/{path}/frame_0001.png")).unwrap());
+    }
+}
+
 #[test]
 fn a_capture_from_all_around_has_a_viewer_and_films() {
     let folder = Folder::new("capture-around");
     let input = captures::Folder::new();
     write_transforms(&input, &around());
-    let (data, run) = (input.0.display().to_string(), folder.path("run"));
-    let trained = plenoxel(&["train", &data, "--preset=photos", "--set", STAGES, "--no-images", "--out", &run]);
-    assert!(trained.err.contains("of the contracted world, baked from the factored field"), "{}", trained.err);
-    trained.done();
+    let run = train(&input, &folder, "the contracted world");
     let scene = scene(&run);
     assert_eq!(scene["coordinates"]["space"], "contracted");
     // Training views, though there are test views.
     assert_eq!(scene["views"].as_array().unwrap().len(), 8);
-    for path in ["orbit", "spiral", "cameras"] {
-        plenoxel(&["render", &run, "--path", path, "--frames", "2"]).done();
-        assert!(fs::exists(format!("{run}/renders/{path}/frame_0001.png")).unwrap());
-    }
+    render(&run, &["orbit", "spiral", "cameras"]);
     plenoxel(&["bake", &run]).refused(3, &["coordinates of a capture (contracted)", "--space box"]);
     plenoxel(&["export", "ply", &run]).refused(3, &["coordinates of a capture (contracted)", "--space box"]);
 }
@@ -66,15 +77,9 @@ fn a_forward_facing_capture_has_a_viewer_and_the_spiral_of_llff() {
     let folder = Folder::new("capture-forward");
     let input = captures::Folder::new();
     write_llff(&input, &forward());
-    let (data, run) = (input.0.display().to_string(), folder.path("run"));
-    let trained = plenoxel(&["train", &data, "--preset=photos", "--set", STAGES, "--no-images", "--out", &run]);
-    assert!(trained.err.contains("of normalized device coordinates, baked from the factored field"), "{}", trained.err);
-    trained.done();
+    let run = train(&input, &folder, "normalized device coordinates");
     let coordinates = &scene(&run)["coordinates"];
     assert!(coordinates["space"]["ndc"]["a"].is_f64() && coordinates["stretch"][2].as_f64().unwrap() < 0.5, "{coordinates}");
-    for path in ["spiral", "cameras"] {
-        plenoxel(&["render", &run, "--path", path, "--frames", "2"]).done();
-        assert!(fs::exists(format!("{run}/renders/{path}/frame_0001.png")).unwrap());
-    }
+    render(&run, &["spiral", "cameras"]);
     plenoxel(&["render", &run, "--path", "orbit"]).refused(2, &["forward-facing capture", "--path spiral"]);
 }

@@ -34,6 +34,7 @@ use crate::camera::{Camera, Intrinsics, is_angle_of_view};
 use crate::dataset::image::MAX_SIDE;
 use crate::error::{Error, Result};
 use crate::json::{self, Kept};
+use crate::space::Space;
 pub use forward_facing::spiral;
 use glam::{DAffine3, DQuat, DVec3};
 use instant_ngp::Keyframes;
@@ -142,12 +143,12 @@ pub fn along_cameras(cameras: &[Camera], frames: usize) -> Vec<Shot> {
     if keys.is_empty() { Vec::new() } else { Keyframes::over(&keys).shots(frames.clamp(1, MOST_FRAMES)) }
 }
 
-/// Returns the unit mean of the up axes of cameras; +z if they have no common up.
-pub fn mean_up(cameras: &[Camera]) -> DVec3 {
+/// Returns the up axis of a scene: +z in a box of the world; in other spaces the unit mean of the cameras' up axes, or +z if they have no common up.
+pub fn up_axis(space: Space, cameras: &[Camera]) -> DVec3 {
     /// Smallest length of the mean that tells up.
     const CLEAR: f64 = 0.3;
     let mean = cameras.iter().map(|camera| camera.camera_to_world.matrix3.y_axis).sum::<DVec3>() / cameras.len().max(1) as f64;
-    if mean.length() >= CLEAR { mean.normalize() } else { DVec3::Z }
+    if space != Space::Box && mean.length() >= CLEAR { mean.normalize() } else { DVec3::Z }
 }
 
 /// File format of a path.

@@ -22,7 +22,7 @@ the camera moves, and sharp at rest. The page begins at the first training camer
 
 Only this machine reaches the page, and only with the random address that is printed. Visitors can write nothing. Ctrl-C ends the program.";
 
-/// How often Ctrl-C is looked for.
+/// Interval at which the program checks for Ctrl-C.
 const CHECK: Duration = Duration::from_millis(100);
 
 /// Look at a run in a browser, rendered by the program

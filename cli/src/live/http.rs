@@ -24,11 +24,11 @@ const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 
 /// Time limits of a connection.
 #[derive(Debug, Clone, Copy)]
 pub struct Patience {
-    /// Until the first byte of a request.
+    /// Time until the first byte of a request.
     pub idle: Duration,
-    /// From there to its last byte.
+    /// Time from the first byte to the last.
     pub request: Duration,
-    /// For sending the response.
+    /// Time for sending the response.
     pub response: Duration,
 }
 
@@ -104,7 +104,7 @@ impl Response {
     }
 }
 
-/// Why there is no next request.
+/// Reason why there is no next request.
 #[derive(Debug)]
 pub enum End {
     /// The client closed the connection, or sent nothing more.
@@ -238,7 +238,7 @@ impl Connection {
     }
 }
 
-/// What the head of a request says.
+/// Head of a request.
 struct Head {
     method: Method,
     path: String,

@@ -23,7 +23,7 @@ const FARTHEST: f64 = 1e6;
 const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
 /// Largest error of the entries of Rᵀ R.
 const TURNED: f64 = 1e-3;
-/// How often a waiting connection checks whether its client is still there.
+/// Interval at which a waiting connection checks whether its client is still there.
 const CHECK: Duration = Duration::from_millis(20);
 
 /// File format of a picture.

@@ -18,7 +18,7 @@ const SECRET: usize = 16;
 /// Stack of the thread of a connection, in bytes.
 const STACK: usize = 1 << 20;
 
-/// What is found at the addresses of a server.
+/// Answers to requests, by path.
 pub trait Site: Send + Sync + 'static {
     /// Answers a request for `path`, which is the path behind the secret. `gone` is true once the client has closed the connection.
     fn answer(&self, path: &str, request: &Request, gone: &dyn Fn() -> bool) -> Response;

@@ -8,7 +8,7 @@ use super::training::Training;
 use crate::html;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use plenoxel::camera_path::Turntable;
+use plenoxel::camera_path::{Turntable, up_axis};
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::space::Space;
 use serde_json::{Value, json};
@@ -21,13 +21,13 @@ const QUALITY: u8 = 85;
 const JSON: &str = "application/json";
 const SVG: &str = "image/svg+xml";
 
-/// What the page knows of a scene.
+/// Cameras and axes of a scene, for the page.
 pub struct Scene {
     /// Title of the page.
     pub title: String,
     views: Vec<Value>,
     /// Vertical axis of the world.
-    up: [u8; 3],
+    up: [f64; 3],
     /// Smallest distance of the point around which the camera turns from a view.
     near: f64,
 }
@@ -37,20 +37,25 @@ impl Scene {
     pub fn of(title: String, dataset: &Dataset) -> Self {
         let (cameras, names) = (dataset.cameras(Split::Train), dataset.view_names(Split::Train));
         let views = names.iter().zip(&cameras).map(|(name, camera)| html::camera(name, camera)).collect();
-        // Forward-facing captures have the axes of their mean camera, and begin at depth 1; in all others +z is up (`dataset/normalize.rs`).
-        let (up, near) = match dataset.space() {
-            Space::Box => ([0, 0, 1], 0.1),
-            Space::Contracted => ([0, 0, 1], 0.5),
-            Space::Ndc { .. } => ([0, 1, 0], 2.0),
+        let near = match dataset.space() {
+            Space::Box => 0.1,
+            Space::Contracted => 0.5,
+            // Nothing is seen before depth 1.
+            Space::Ndc { .. } => 2.0,
         };
-        Scene { title, views, up, near }
+        Scene { title, views, up: up_axis(dataset.space(), &cameras).to_array(), near }
     }
 
     /// Creates a scene without a dataset: a camera that sees the box with this half width.
     pub fn around_box(title: String, half_width: f64) -> Self {
         const SIZE: (usize, usize) = (800, 600);
         let shots = Turntable::around_box(half_width).orbit(1);
-        Scene { title, views: shots.iter().map(|shot| html::camera("outside", &shot.camera(SIZE))).collect(), up: [0, 0, 1], near: 0.1 }
+        Scene {
+            title,
+            views: shots.iter().map(|shot| html::camera("outside", &shot.camera(SIZE))).collect(),
+            up: [0.0, 0.0, 1.0],
+            near: 0.1,
+        }
     }
 }
 

@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 /// Seconds of a picture that is rendered without waiting for a turn: one in motion.
 const QUICK: f64 = 0.15;
 
-/// What visitors learn of a run, and what they ask of it.
+/// Figures of a run for visitors, and their requests.
 #[derive(Default)]
 pub struct Training {
     figures: Mutex<Figures>,
@@ -40,8 +40,8 @@ struct Figures {
     seconds: f64,
     /// Number of steps in the last checkpoint.
     saved: Option<u64>,
-    /// Command that resumes the run, or shows it.
-    again: String,
+    /// The run folder.
+    folder: String,
     state: State,
 }
 
@@ -50,7 +50,9 @@ enum State {
     #[default]
     Training,
     Stopping,
-    Ended,
+    /// Stopped before its last step.
+    Stopped,
+    Done,
 }
 
 impl Training {
@@ -64,8 +66,9 @@ impl Training {
         let finite = |x: Option<&f64>| x.copied().filter(|x| x.is_finite());
         let message = match figures.state {
             State::Training => String::new(),
-            State::Stopping => format!("saving and stopping; resume with: {}", figures.again),
-            State::Ended => format!("the training has ended; next: {}", figures.again),
+            State::Stopping => format!("saving and stopping; resume with: plenoxel train --resume {}", figures.folder),
+            State::Stopped => format!("the training has stopped; resume with: plenoxel train --resume {}", figures.folder),
+            State::Done => format!("the training has ended; look at the scene with: plenoxel view {}", figures.folder),
         };
         json!({
             "step": figures.losses.len(),
@@ -154,7 +157,7 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
         }
     }
 
-    /// What visitors ask of the run.
+    /// Figures and requests that the server shares.
     pub fn shared(&self) -> Arc<Training> {
         self.shared.clone()
     }
@@ -169,7 +172,7 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
                 figures.psnr = vec![f64::NAN; history.losses.len()];
                 figures.validation = history.validation.iter().map(|(step, psnr)| (*step as f64, *psnr)).collect();
                 figures.seconds = history.seconds;
-                figures.again = format!("plenoxel train --resume {}", run.folder.path().display());
+                figures.folder = run.folder.path().display().to_string();
                 drop(figures);
                 self.failure = self.start(&run);
             }
@@ -179,10 +182,7 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
                 // Waiting visitors are told.
                 (self.studio, self.waiting) = (None, None);
                 let mut figures = self.shared.figures();
-                if figures.state == State::Training && !interrupt::requested() {
-                    figures.again = figures.again.replace("train --resume", "view");
-                }
-                figures.state = State::Ended;
+                figures.state = if interrupt::requested() { State::Stopped } else { State::Done };
             }
             _ => {}
         }

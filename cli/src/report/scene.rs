@@ -7,7 +7,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use plenoxel::bake::{BakeOptions, GridSpace, bake, resolution_of};
 use plenoxel::camera::Camera;
-use plenoxel::camera_path::mean_up;
+use plenoxel::camera_path::up_axis;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::Viewer;
@@ -104,7 +104,7 @@ impl Scene {
         let settings = json!({
             "grid": small.header(),
             "coordinates": coordinates,
-            "up": if coordinates.space == Space::Box { [0.0, 0.0, 1.0] } else { mean_up(&train).to_array() },
+            "up": up_axis(coordinates.space, &train).to_array(),
             "sampling": shown.sampling(report.config.evaluation),
             "background": report.config.background,
             "views": views,

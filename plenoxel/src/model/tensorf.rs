@@ -8,7 +8,7 @@ mod config;
 mod recipe;
 
 pub use super::stage::Stage;
-pub use config::Config;
+pub use config::{Config, Short};
 
 use super::stage::MOST_NODES;
 use crate::camera::{Ray, TrackedRays};

@@ -9,8 +9,8 @@
 //! *Gauge.* If all cameras and the scene are moved, turned or scaled together, all pixels stay as they are. So photographs cannot tell these seven motions of the
 //! cameras, and a field that follows them no longer fits the given poses of test views. The corrections are the learned numbers without their component along the seven
 //! motions, in the metric Σᵥ |ωᵥ|² + |τᵥ|² / ℓ² with ℓ the root mean square distance of the cameras from their mean position. BARF (Lin et al. 2021) instead lets the
-//! scene move, and afterwards looks for the similarity between the learned and the given cameras; here that similarity is the identity to first order, so test views,
-//! paths and exports keep the given poses.
+//! scene move, and afterwards looks for the similarity between the learned and the given cameras. Here test views, paths and exports keep the given poses. Errors that the
+//! given poses of all training views have in common are not corrected, and motions of second order are not removed; test views are not aligned.
 
 use crate::camera::{Camera, TrackedRays};
 use crate::dataset::View;

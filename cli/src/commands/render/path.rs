@@ -6,7 +6,7 @@ use crate::commands::whole;
 use crate::progress::Console;
 use clap::Args;
 use plenoxel::camera::Camera;
-use plenoxel::camera_path::{CameraPath, MOST_FRAMES, Turntable, along_cameras, mean_up, spiral};
+use plenoxel::camera_path::{CameraPath, MOST_FRAMES, Turntable, along_cameras, spiral, up_axis};
 use plenoxel::dataset::normalize::{NEAREST_DEPTH, looked_at};
 use plenoxel::dataset::{Dataset, Split, image};
 use plenoxel::error::{Error, Result};
@@ -33,9 +33,9 @@ pub enum PathChoice {
 /// A camera path, and the size and rate of its frames.
 #[derive(Debug, Args)]
 pub struct PathArgs {
-    /// Render a video along a camera path: orbit (one turn around what the cameras look at, or a swing if a capture is from one side), spiral (two turns, rising and falling; before a
-    /// forward-facing capture, the spiral of LLFF), cameras (a spline along the training views), or the cameras of a JSON file: base_cam.json of instant-ngp, camera_path.json of nerfstudio, or
-    /// any transforms.json
+    /// Render a video along a camera path. orbit: one turn around what the cameras look at, or a swing if they are all on one side. spiral: two turns
+    /// that rise and fall; for forward-facing captures, the spiral of LLFF. cameras: a spline along the training views. FILE: base_cam.json of instant-ngp,
+    /// camera_path.json of nerfstudio, or any transforms.json
     #[arg(long, value_name = "orbit|spiral|cameras|FILE", help_heading = "Path", value_parser = choice)]
     pub path: Option<PathChoice>,
 
@@ -79,7 +79,7 @@ impl PathArgs {
         let table = || {
             let table = match space {
                 Space::Box => Turntable::like(&cameras),
-                Space::Contracted => Turntable::around(&cameras, looked_at(&cameras).unwrap_or_default(), mean_up(&cameras)),
+                Space::Contracted => Turntable::around(&cameras, looked_at(&cameras).unwrap_or_default(), up_axis(space, &cameras)),
                 Space::Ndc { .. } => {
                     let problem = "orbit leaves the side of the scene that the cameras of a forward-facing capture see";
                     return Err(Error::usage("--path", problem, "use --path spiral or --path cameras"));

@@ -56,8 +56,25 @@ pub struct Config {
     pub density_l1_later: f64,
     /// Treatment of rows of planes without a gradient by Adam: true visits only rows with a gradient.
     pub lazy: bool,
+    /// Changes for a run that is planned for a short time; `None` for none. The settings of a planned run have `None`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub short: Option<Short>,
     /// Stages, with increasing resolution.
     pub stages: Vec<Stage>,
+}
+
+/// Changes for a short run: with a smaller network and fewer colors on a ray, it trains more rays.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Short {
+    /// Share of the configured duration below which a run is short.
+    pub below: f64,
+    /// Replaces [`Config::hidden`].
+    pub hidden: usize,
+    /// Replaces [`Config::group`].
+    pub group: f64,
+    /// Duration of a step with these changes, relative to one without.
+    pub cost: f64,
 }
 
 /// The recipe for two cores.
@@ -87,6 +104,7 @@ impl Default for Config {
             density_l1: 8e-5,
             density_l1_later: 4e-5,
             lazy: true,
+            short: None,
             stages: stages.map(|(resolution, steps, rays)| Stage { resolution, steps, rays }).to_vec(),
         }
     }
@@ -153,6 +171,13 @@ impl Config {
         }
         for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
+        }
+        if let Some(Short { below, hidden, group, cost }) = self.short {
+            check((1..=1024).contains(&hidden), "short.hidden", hidden as f64, "1 to 1024")?;
+            check((0.0..1.0).contains(&group), "short.group", group, "a number in [0, 1)")?;
+            for (key, share) in [("short.below", below), ("short.cost", cost)] {
+                check(share > 0.0 && share <= 1.0, key, share, "a number in (0, 1]")?;
+            }
         }
         if self.stages.is_empty() {
             return Err(Error::usage("stages", "there is no stage", "set at least one"));

@@ -55,12 +55,11 @@ impl Recipe for Config {
     }
 
     fn with_cost(&self, cost: f64) -> Self {
-        let SmallNetwork { below, hidden, group, cost: relative } = SMALL_NETWORK;
-        if self.hidden > hidden && self.group > 0.0 && cost < below * total(&self.stages) {
-            let stages = scaled(&self.stages, cost / relative);
-            return Config { hidden, group: self.group.max(group), stages, ..self.clone() };
+        let config = Config { short: None, ..self.clone() };
+        match self.short.filter(|short| cost < short.below * total(&self.stages)) {
+            None => Config { stages: scaled(&self.stages, cost), ..config },
+            Some(short) => Config { hidden: short.hidden, group: short.group, stages: scaled(&self.stages, cost / short.cost), ..config },
         }
-        Config { stages: scaled(&self.stages, cost), ..self.clone() }
     }
 
     fn set(self, config: &mut RunConfig) {
@@ -116,23 +115,6 @@ fn total(stages: &[Stage]) -> f64 {
     stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum()
 }
 
-/// Color network and groups of short runs.
-struct SmallNetwork {
-    /// Share of the configured cost below which a run is short.
-    below: f64,
-    /// Width of the hidden layers.
-    hidden: usize,
-    /// Least weight that completes a group.
-    group: f64,
-    /// Duration of a step, relative to the configured network and groups.
-    cost: f64,
-}
-
-/// In short runs, more rays improve the result more than more colors on a ray. Ten held-out training views of lego, `quality` with its network of width 128 and
-/// groups of 0.04, and with these: 33.15 and 33.86 dB after one minute (0.09 of the configured cost), 36.25 and 36.15 dB after five (0.4). Rays: 33.3 and 46.0 M
-/// in five minutes.
-const SMALL_NETWORK: SmallNetwork = SmallNetwork { below: 0.3, hidden: 64, group: 0.1, cost: 0.72 };
-
 /// Duration of a step of a factored field, in units of a ray at a resolution of 0. On lego, stages of 400 to 5000 rays at 64 to 300 nodes took 5.1 to 6.0 µs per
 /// unit on two cores of an AMD EPYC with AVX-512.
 fn cost(stage: &Stage) -> f64 {
@@ -145,6 +127,7 @@ const FOG: f64 = 1.2;
 
 #[cfg(test)]
 mod tests {
+    use super::super::config::Short;
     use super::*;
 
     #[test]
@@ -162,15 +145,14 @@ mod tests {
     }
 
     #[test]
-    fn short_runs_have_a_small_network_and_more_steps_for_it() {
-        let config = Config { hidden: 128, group: 0.04, ..Config::default() };
+    fn short_runs_have_the_settings_of_short_runs_and_more_steps_for_them() {
+        let short = Short { below: 0.3, hidden: 64, group: 0.1, cost: 0.7 };
+        let config = Config { hidden: 128, group: 0.04, short: Some(short), ..Config::default() };
         let whole = total(&config.stages);
-        let [short, long] = [0.2, 0.5].map(|share| config.with_cost(share * whole));
-        assert_eq!((short.hidden, short.group), (64, 0.1));
-        assert_eq!((long.hidden, long.group), (128, 0.04));
-        assert!((total(&short.stages) / (0.2 * whole / SMALL_NETWORK.cost) - 1.0).abs() < 0.05);
-        // Without groups, the recipe is that of the authors.
-        let authors = Config { group: 0.0, ..config };
-        assert_eq!(authors.with_cost(0.2 * whole).hidden, 128);
+        let planned = [0.2, 0.5].map(|share| config.with_cost(share * whole));
+        assert_eq!(planned.each_ref().map(|planned| (planned.hidden, planned.group, planned.short)), [(64, 0.1, None), (128, 0.04, None)]);
+        assert!((total(&planned[0].stages) / (0.2 * whole / 0.7) - 1.0).abs() < 0.05);
+        // Without them, a short run has the same network.
+        assert_eq!(Config { short: None, ..config }.with_cost(0.2 * whole).hidden, 128);
     }
 }
