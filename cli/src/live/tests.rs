@@ -153,7 +153,10 @@ fn the_page_its_scene_and_pictures_are_served() {
     assert!(status == 200 && html.contains("&lt;a run&gt;") && html.contains("class Orbit") && html.contains("class Live"), "{status}");
     assert!(!["http://", "https://", "src=\"/"].iter().any(|address| html.contains(address)), "it loads nothing else");
     let scene: Value = serde_json::from_slice(&page.get("scene").1).expect("JSON");
-    assert_eq!((scene["views"].as_array().map(Vec::len), &scene["up"], &scene["training"]), (Some(3), &json!([0, 0, 1]), &json!(false)));
+    assert_eq!(
+        (scene["views"].as_array().map(Vec::len), &scene["up"], &scene["training"]),
+        (Some(3), &json!([0.0, 0.0, 1.0]), &json!(false))
+    );
     let picture = page.picture(&shot(40, 30));
     assert_eq!((picture.dimensions(), picture.get_pixel(7, 9).0), ((40, 30), [255, 128, 0]));
     let mut asked = shot(33, 20);

@@ -89,6 +89,7 @@ const FIXED: &[(&str, &[&str])] = &[
     ("carve", &["resolution", "rule", "margin", "depth", "photo", "fit", "ridge", "sweeps"]),
     ("carve.photo", &["noise"]),
     ("tensorf.directions", DIRECTIONS),
+    ("tensorf.short", &["below", "hidden", "group", "cost"]),
     ("tensorf.stages[]", GROWING),
     ("dvgo.directions", DIRECTIONS),
     ("dvgo.coarse", GROWING),
@@ -101,7 +102,8 @@ const FIXED: &[(&str, &[&str])] = &[
 static TABLES: LazyLock<Vec<(&str, Vec<String>)>> = LazyLock::new(|| {
     let fixed = FIXED.iter().map(|(table, keys)| (*table, keys.iter().map(|key| (*key).to_owned()).collect()));
     let of_models = [
-        (tensorf::KIND, keys_of(&tensorf::Config::default())),
+        // The defaults lack `short`.
+        (tensorf::KIND, [keys_of(&tensorf::Config::default()), vec!["short".to_owned()]].concat()),
         (dvgo::KIND, keys_of(&dvgo::Config::default())),
         // The defaults lack `near_far`.
         (nerf::KIND, keys_of(&nerf::Config::authors())),
