@@ -31,7 +31,7 @@ pub trait Recipe: Send + Sync {
     /// Returns true if the model uses silhouettes.
     fn uses_silhouettes(&self) -> bool;
 
-    /// Returns true if the model gives gradients to rays, so that poses can be refined ([`Model::tracks_rays`](crate::train::Model::tracks_rays)). Default: false.
+    /// Returns true if the model gives gradients to rays, so that poses can be refined ([`Model::tracks_rays`]). Default: false.
     fn tracks_rays(&self) -> bool {
         false
     }
