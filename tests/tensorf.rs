@@ -32,6 +32,7 @@ fn tiny(stages: &[(usize, u64)]) -> Config {
         features: 8,
         hidden: 8,
         step: 1.0,
+        step_in_pictures: 1.0,
         feature_octaves: 1,
         group: 0.0,
         group_in_pictures: 0.0,
@@ -159,6 +160,19 @@ fn groups_do_not_change_the_expected_color() {
     let off = (mean(0.5) - mean(0.0)).abs();
     // Four standard deviations of the mean, with the seed above.
     assert!(spread > 0.0 && off < 4.0 * spread / (DRAWS as f64).sqrt(), "{off} with a spread of {spread}");
+}
+
+#[test]
+fn pictures_have_a_distance_of_samples_of_their_own() {
+    let rays = rays(40);
+    let samples = |step_in_pictures, jitter| {
+        let model = Tensorf::<f64>::new(Config { step_in_pictures, ..tiny(&[(16, 1)]) }, BOX, 42).expect("valid settings");
+        model.render(&rays, &Pass { jitter, ..PASS }).sample_count as f64
+    };
+    let training = Jitter::PerRay { seed: 3, step: 7 };
+    assert_eq!(samples(1.0, training), samples(0.5, training));
+    let ratio = samples(0.5, Jitter::None) / samples(1.0, Jitter::None);
+    assert!((1.9..2.1).contains(&ratio), "{ratio}");
 }
 
 #[test]

@@ -69,14 +69,8 @@ impl<'a, T: Real> Viewer<'a, T> {
             let target = view.composite(self.background);
             let mse = mse(view, &picture.rgb, &target);
             let compared = kept(view, &picture.rgb, &target);
-            let (prediction, reference) = (picture.rgb.view(), compared.view());
-            per_view.push(ViewScore {
-                name: view.name.clone(),
-                psnr: metrics::psnr_of(mse),
-                mse,
-                ssim: metrics::ssim(prediction, reference),
-                ssim_same: metrics::ssim_same(prediction, reference),
-            });
+            let (ssim, ssim_same) = metrics::ssims(picture.rgb.view(), compared.view());
+            per_view.push(ViewScore { name: view.name.clone(), psnr: metrics::psnr_of(mse), mse, ssim, ssim_same });
             seen(i, view, &target, &picture)?;
         }
         Ok(Scores { per_view })

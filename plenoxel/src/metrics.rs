@@ -4,6 +4,7 @@
 //! the mean over the views, not the PSNR of the mean error. Sums are accumulated in f64, row by row in order, so results do not depend on
 //! the number of threads.
 
+use autograd::dispatched;
 use ndarray::{ArrayView3, Axis};
 use rayon::prelude::*;
 
@@ -47,75 +48,68 @@ pub fn mse(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 
 ///
 /// Both images are [height, width, 3]. Panics if the shapes differ. `None` for images smaller than 11 pixels per side.
 pub fn ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> Option<f64> {
-    let (height, width, _) = target.dim();
-    (height >= WINDOW && width >= WINDOW).then(|| mean_ssim(prediction, target, 0))
+    ssims(prediction, target).0
 }
 
 /// Returns the structural similarity as svox2 computes it: like [`ssim`], but with one window per pixel and zero padding around both
 /// images. With bright borders it is slightly higher. Defined for every size; NaN for empty images.
 pub fn ssim_same(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> f64 {
-    mean_ssim(prediction, target, WINDOW / 2)
+    ssims(prediction, target).1
 }
 
-/// Returns the SSIM with `pad` rows and columns of zeros on every side. The filter is separable: each row of windows first takes a weighted
-/// sum of 11 image rows, then of 11 neighbours within the result. Channels are interleaved, so neighbours are `channels` apart.
-fn mean_ssim(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>, pad: usize) -> f64 {
+/// Returns [`ssim`] and [`ssim_same`], in one pass.
+///
+/// The filter is separable: each row of windows first takes a weighted sum of 11 image rows, then of 11 neighbours within the result. Channels are interleaved,
+/// so neighbours are `channels` apart.
+pub fn ssims(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> (Option<f64>, f64) {
     assert_eq!(prediction.shape(), target.shape(), "ssim: prediction and target differ in shape");
     let (height, width, channels) = target.dim();
     let prediction: Vec<f64> = prediction.iter().map(|value| f64::from(value.clamp(0.0, 1.0))).collect();
     let target: Vec<f64> = target.iter().map(|value| f64::from(*value)).collect();
     let weights = gaussian();
     let stride = width * channels;
-    let (rows, columns) = (height + 2 * pad + 1 - WINDOW, (width + 2 * pad + 1 - WINDOW) * channels);
-    let row_sums: Vec<f64> = (0..rows)
+    let pad = WINDOW / 2;
+    let has_valid = height >= WINDOW && width >= WINDOW;
+    let row_sums: Vec<[f64; 2]> = (0..height)
         .into_par_iter()
         .map_init(
-            || vec![vec![0.0; (width + 2 * pad) * channels]; 5],
-            |moments, top| {
+            || (vec![vec![0.0; (width + 2 * pad) * channels]; 5], vec![0.0; stride]),
+            |(moments, values), y| {
+                let above = y.saturating_sub(pad)..(y + pad + 1).min(height);
+                let weights_above = &weights[above.start + pad - y..];
                 for start in (0..stride).step_by(BLOCK) {
-                    let end = (start + BLOCK).min(stride);
+                    let span = start..(start + BLOCK).min(stride);
                     let mut sums = [[0.0; BLOCK]; 5];
-                    for (k, weight) in weights.iter().enumerate() {
-                        // Row `top + k` of the padded image; rows of zeros add nothing.
-                        let Some(y) = (top + k).checked_sub(pad).filter(|y| *y < height) else {
-                            continue;
-                        };
-                        let span = y * stride + start..y * stride + end;
-                        add_moments(&mut sums, *weight, &prediction[span.clone()], &target[span]);
+                    // Rows of zeros around the image add nothing.
+                    for (row, weight) in above.clone().zip(weights_above) {
+                        let [a, b] = [&prediction, &target].map(|image| &image[row * stride..][span.clone()]);
+                        add_moments(&mut sums, *weight, a, b);
                     }
-                    let shift = pad * channels;
                     for (moment, sum) in moments.iter_mut().zip(&sums) {
-                        moment[start + shift..end + shift].copy_from_slice(&sum[..end - start]);
+                        moment[pad * channels..][span.clone()].copy_from_slice(&sum[..span.len()]);
                     }
                 }
-                let mut total = 0.0;
-                for start in (0..columns).step_by(BLOCK) {
-                    let length = BLOCK.min(columns - start);
-                    let mut sums = [[0.0; BLOCK]; 5];
-                    for (sum, moment) in sums.iter_mut().zip(moments.iter()) {
-                        for (k, weight) in weights.iter().enumerate() {
-                            for (to, value) in sum[..length].iter_mut().zip(&moment[start + k * channels..]) {
-                                *to += weight * value;
-                            }
-                        }
-                    }
-                    let [a, b, aa, bb, ab] = &sums;
-                    let values: [f64; BLOCK] = std::array::from_fn(|i| similarity(a[i], b[i], aa[i], bb[i], ab[i]));
-                    total += values[..length].iter().sum::<f64>();
+                for (block, values) in values.chunks_mut(BLOCK).enumerate() {
+                    similarities(moments, block * BLOCK, channels, &weights, values);
                 }
-                total
+                let inside = has_valid && (pad..height - pad).contains(&y);
+                let valid = if inside { values[pad * channels..stride - pad * channels].iter().sum() } else { 0.0 };
+                [valid, values.iter().sum()]
             },
         )
         .collect();
-    row_sums.iter().sum::<f64>() / (rows * columns) as f64
+    let [valid, same] = [0, 1].map(|kind| row_sums.iter().map(|sums| sums[kind]).sum::<f64>());
+    let windows = |height: usize, width: usize| (height * width * channels) as f64;
+    (has_valid.then(|| valid / windows(height - 2 * pad, width - 2 * pad)), same / windows(height, width))
 }
 
+dispatched! {
 /// Adds weight times a, b, a², b² and ab of a stretch of an image row to the five running sums.
-#[inline]
 fn add_moments(sums: &mut [[f64; BLOCK]; 5], weight: f64, a: &[f64], b: &[f64]) {
     // Slices cut to one length let the compiler drop the bounds checks and use vector instructions.
     let n = a.len().min(BLOCK);
-    let [sa, sb, saa, sbb, sab] = sums.each_mut().map(|sum| &mut sum[..n]);
+    let [sa, sb, saa, sbb, sab] = sums;
+    let (sa, sb, saa, sbb, sab) = (&mut sa[..n], &mut sb[..n], &mut saa[..n], &mut sbb[..n], &mut sab[..n]);
     let (a, b) = (&a[..n], &b[..n]);
     for i in 0..n {
         let (wa, wb) = (weight * a[i], weight * b[i]);
@@ -126,9 +120,30 @@ fn add_moments(sums: &mut [[f64; BLOCK]; 5], weight: f64, a: &[f64], b: &[f64]) 
         sab[i] += wa * b[i];
     }
 }
+}
+
+dispatched! {
+/// Computes the SSIM of the windows from `start` on, at most [`BLOCK`], from the moments of their columns.
+fn similarities(moments: &[Vec<f64>], start: usize, channels: usize, weights: &[f64; WINDOW], out: &mut [f64]) {
+    let n = out.len().min(BLOCK);
+    let mut sums = [[0.0; BLOCK]; 5];
+    for (sum, moment) in sums.iter_mut().zip(moments) {
+        for (k, weight) in weights.iter().enumerate() {
+            let values = &moment[start + k * channels..][..n];
+            for i in 0..n {
+                sum[i] += weight * values[i];
+            }
+        }
+    }
+    let [a, b, aa, bb, ab] = &sums;
+    for i in 0..n {
+        out[i] = similarity(a[i], b[i], aa[i], bb[i], ab[i]);
+    }
+}
+}
 
 /// Returns the SSIM of one window from its weighted means of a, b, a², b² and ab.
-#[inline]
+#[inline(always)]
 fn similarity(a: f64, b: f64, aa: f64, bb: f64, ab: f64) -> f64 {
     const C1: f64 = 0.01 * 0.01;
     const C2: f64 = 0.03 * 0.03;

@@ -2,7 +2,7 @@
 
 use super::{Field, RenderOptions, Rendered, render};
 use crate::camera::{Camera, Ray};
-use autograd::{Real, no_grad};
+use autograd::{Real, no_grad, parallel};
 use ndarray::{Array2, Array3};
 
 /// A rendered image.
@@ -38,7 +38,10 @@ pub fn picture_unless<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &
         if stopped() {
             return None;
         }
-        let rays: Vec<_> = (start..(start + CHUNK).min(w * h)).map(|p| camera.ray((p % w) as f64 + 0.5, (p / w) as f64 + 0.5)).collect();
+        let rays = parallel::map_indices(CHUNK.min(w * h - start), |i| {
+            let pixel = start + i;
+            camera.ray((pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5)
+        });
         let rendered = no_grad(|| render(&rays));
         rgb.extend(rendered.rgb.data().iter().map(as_f32));
         depth.extend(rendered.depth().data().iter().map(as_f32));

@@ -128,7 +128,8 @@ fn render_inputs<T: Real>(
     let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, jitter };
     let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params);
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
-    let size = block_of(n);
+    // Without an adjoint, small blocks share the work of background and matter among the threads more evenly.
+    let size = if keep { block_of(n) } else { block_of(n).div_ceil(4) };
     let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();
     let blocks = parallel::map_items(parts, |b, (pixels, sparsity)| {
         let block = scene.render(b * size, pixels, sparsity);

@@ -25,6 +25,8 @@ pub struct Config {
     pub directions: Directions,
     /// Distance between samples, in cells; in normalized device coordinates, in lengths of a cell along the depth.
     pub step: f64,
+    /// Distance between samples in pictures, in the same unit. Training shifts the samples of each ray at random, so the field is trained between them too.
+    pub step_in_pictures: f64,
     /// Length of a cell along the depth of normalized device coordinates, in lengths of its other sides, 1 to 8. In other spaces cells are cubes.
     pub cell_depth: f64,
     /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
@@ -89,6 +91,7 @@ impl Default for Config {
             feature_octaves: 0,
             directions: Directions::Harmonics(3),
             step: 1.0,
+            step_in_pictures: 0.5,
             cell_depth: 1.0,
             group: 0.04,
             group_in_pictures: 0.02,
@@ -120,6 +123,7 @@ impl Config {
             feature_octaves: 2,
             directions: Directions::Frequency(2),
             step: 0.5,
+            step_in_pictures: 0.5,
             group: 0.0,
             group_in_pictures: 0.0,
             color_above: 1e-4,
@@ -153,7 +157,9 @@ impl Config {
         }
         check(self.feature_octaves <= 16, "feature_octaves", self.feature_octaves as f64, "0 to 16")?;
         self.directions.validate("directions")?;
-        check(self.step > 0.0 && self.step.is_finite(), "step", self.step, "a number of cells above 0")?;
+        for (key, step) in [("step", self.step), ("step_in_pictures", self.step_in_pictures)] {
+            check(step > 0.0 && step.is_finite(), key, step, "a number of cells above 0")?;
+        }
         check((1.0..=8.0).contains(&self.cell_depth), "cell_depth", self.cell_depth, "1 to 8")?;
         for (key, share) in [
             ("group", self.group),

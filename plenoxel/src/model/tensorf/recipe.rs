@@ -115,15 +115,15 @@ fn total(stages: &[Stage]) -> f64 {
     stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum()
 }
 
-/// Duration of a step of a factored field, in units of a ray at a resolution of 0. On lego, stages of 400 to 5000 rays at 64 to 300 nodes took 5.1 to 6.0 µs per
-/// unit on two cores of an AMD EPYC with AVX-512.
+/// Duration of a step of a factored field, in units of a ray at a resolution of 0. On lego, a ray took 5.8, 6.5 and 7.0 µs at 90, 180 and 300 nodes on two cores of
+/// an AMD EPYC with AVX-512, and 7.7 to 8.4, 8.6, 10.7 and 13.0 µs at 90, 252, 334 and 418 nodes on two cores of an Intel Xeon with AVX-512.
 fn cost(stage: &Stage) -> f64 {
-    (stage.rays as f64 + 150.0) * (1.0 + stage.resolution as f64 / 1500.0)
+    (stage.rays as f64 + 150.0) * (1.0 + stage.resolution as f64 / 500.0)
 }
 
-/// Duration of a step after the opaque ones, relative to the [`cost`] of the mean step. On lego, 8.3 ms for steps 80 to 140 and 6.9 ms for steps 240 to 400 of
-/// the first stage, on two cores of an Intel Xeon with AVX-512.
-const FOG: f64 = 1.2;
+/// Duration of a step after the opaque ones, relative to the [`cost`] of the mean step: 0.9 to 1.3 on these machines. The costs are those of the
+/// Intel Xeon; runs on the other end early.
+const FOG: f64 = 0.95;
 
 #[cfg(test)]
 mod tests {
