@@ -7,7 +7,7 @@ use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
 use factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
 use glam::DVec3;
 use plenoxel::camera::Ray;
-use plenoxel::dataset::procedural::ProceduralOptions;
+use plenoxel::dataset::procedural::{CAMERA_DISTANCE, ProceduralOptions};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::evaluate::{constant_psnr, evaluate, mean_image};
 use plenoxel::field::encoding::Directions;
@@ -243,6 +243,24 @@ fn a_scene_is_learned_and_a_resumed_run_has_the_same_bits() {
     let untrained = psnr(trainer(&train).model());
     let trained = psnr(whole.model());
     assert!(trained > untrained + 8.0, "{untrained} to {trained}");
+}
+
+#[test]
+fn cells_are_not_smaller_than_pixels() {
+    let (train, _) = views();
+    let nodes = |pixels_per_cell| {
+        let config = Config { pixels_per_cell, ..tiny(&[(41, 1)]) };
+        let model = Tensorf::<f32>::new(config, BOX, 42).expect("valid settings").with_hull(Hull::Off);
+        let mut trainer =
+            Trainer::with_model(model, &train[..], Objective::new().with("mse", 1.0, mse), TrainOptions::default()).expect("a trainer");
+        trainer.step().expect("a step");
+        trainer.model().field().nodes()
+    };
+    assert_eq!(nodes(0.0), [41; 3]);
+    // The cameras look at the middle of the box.
+    let pixel = CAMERA_DISTANCE / train[0].camera.intrinsics.fx;
+    let expected = (2.8 / (2.0 * pixel)) as usize + 1;
+    assert!(expected < 41 && nodes(2.0) == [expected; 3], "{expected}, {:?}", nodes(2.0));
 }
 
 #[test]

@@ -257,7 +257,8 @@ impl<T: Real> Model<T> for Tensorf<T> {
         self.aim(rays);
         let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
         let region = Region { space: self.space, aabb };
-        self.field.resample(aabb, self.config.nodes(region, self.config.stages[stage.index].resolution));
+        let resolution = self.config.bounded(self.config.stages[stage.index].resolution, region, rays.all_views());
+        self.field.resample(aabb, self.config.nodes(region, resolution));
         Ok(())
     }
 

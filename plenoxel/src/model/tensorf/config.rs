@@ -1,5 +1,6 @@
 //! Settings of TensoRF.
 
+use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::field::encoding::Directions;
 use crate::field::factored::Shape;
@@ -29,6 +30,9 @@ pub struct Config {
     pub step_in_pictures: f64,
     /// Length of a cell along the depth of normalized device coordinates, in lengths of its other sides, 1 to 8. In other spaces cells are cubes.
     pub cell_depth: f64,
+    /// Least side of a cell in [`Space::Box`], in pixels of a training view at the middle of the box, on average over the views; 0 for no bound. Stages whose
+    /// resolution has smaller cells get this side: pixels do not determine finer nodes.
+    pub pixels_per_cell: f64,
     /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
     pub group: f64,
     /// Weight that completes a group in pictures.
@@ -93,6 +97,7 @@ impl Default for Config {
             step: 1.0,
             step_in_pictures: 0.5,
             cell_depth: 1.0,
+            pixels_per_cell: 0.0,
             group: 0.04,
             group_in_pictures: 0.02,
             color_above: 1e-3,
@@ -161,6 +166,7 @@ impl Config {
             check(step > 0.0 && step.is_finite(), key, step, "a number of cells above 0")?;
         }
         check((1.0..=8.0).contains(&self.cell_depth), "cell_depth", self.cell_depth, "1 to 8")?;
+        check((0.0..=1e6).contains(&self.pixels_per_cell), "pixels_per_cell", self.pixels_per_cell, "0 to 1e6")?;
         for (key, share) in [
             ("group", self.group),
             ("group_in_pictures", self.group_in_pictures),
@@ -213,6 +219,18 @@ impl Config {
             aabb.max.z /= self.cell_depth;
         }
         aabb.nodes(resolution)
+    }
+
+    /// Returns the resolution of a stage in a region, bounded by [`pixels_per_cell`](Config::pixels_per_cell).
+    pub(super) fn bounded(&self, resolution: usize, Region { space, aabb }: Region, views: &[View]) -> usize {
+        let (middle, side) = (0.5 * (aabb.min + aabb.max), aabb.volume().cbrt());
+        let pixel = |View { camera, .. }: &View| {
+            camera.position().distance(middle).max(0.5 * side) / camera.intrinsics.fx.min(camera.intrinsics.fy)
+        };
+        let mean = views.iter().map(pixel).sum::<f64>() / views.len() as f64;
+        let finest = side / (self.pixels_per_cell * mean);
+        // Without views or without a bound it is NaN or infinite.
+        if space == Space::Box && finest.is_finite() { resolution.min(finest as usize + 1).max(2) } else { resolution }
     }
 
     pub(super) fn total_steps(&self) -> u64 {
