@@ -75,13 +75,13 @@ pub fn ssims(prediction: ArrayView3<'_, f32>, target: ArrayView3<'_, f32>) -> (O
         .map_init(
             || (vec![vec![0.0; (width + 2 * pad) * channels]; 5], vec![0.0; stride]),
             |(moments, values), y| {
-                let above = y.saturating_sub(pad)..(y + pad + 1).min(height);
-                let weights_above = &weights[above.start + pad - y..];
+                let window = y.saturating_sub(pad)..(y + pad + 1).min(height);
+                let weights_of_window = &weights[window.start + pad - y..];
                 for start in (0..stride).step_by(BLOCK) {
                     let span = start..(start + BLOCK).min(stride);
                     let mut sums = [[0.0; BLOCK]; 5];
                     // Rows of zeros around the image add nothing.
-                    for (row, weight) in above.clone().zip(weights_above) {
+                    for (row, weight) in window.clone().zip(weights_of_window) {
                         let [a, b] = [&prediction, &target].map(|image| &image[row * stride..][span.clone()]);
                         add_moments(&mut sums, *weight, a, b);
                     }
