@@ -127,6 +127,14 @@ pub struct Camera {
     pub camera_to_world: DAffine3,
 }
 
+/// Returns the mean width of a pixel, world length, at the middle of a box with this half width: max(d, half width) / f for a camera at the distance d with the focal
+/// length f, in pixels. NaN without cameras.
+pub(crate) fn mean_pixel_width<'c>(cameras: impl IntoIterator<Item = &'c Camera>, middle: DVec3, half_width: f64) -> f64 {
+    let width = |camera: &Camera| camera.position().distance(middle).max(half_width) / camera.intrinsics.fx.min(camera.intrinsics.fy);
+    let (sum, count) = cameras.into_iter().map(width).fold((0.0, 0.0), |(sum, count), width| (sum + width, count + 1.0));
+    sum / count
+}
+
 impl Camera {
     /// Creates a camera at `eye` with `target` in the middle of its image and `up` pointing up in it. If `up` is parallel to the line of
     /// sight, an arbitrary perpendicular direction is used.

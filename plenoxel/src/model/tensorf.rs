@@ -115,8 +115,8 @@ impl<T: Real> Tensorf<T> {
         &self.field
     }
 
-    /// Returns the unit of the distance between samples, in the coordinates of the box.
-    fn cell(&self) -> f64 {
+    /// Returns the side of a cell in which distances between samples are counted, in the coordinates of the box.
+    fn cell_of_steps(&self) -> f64 {
         // Rays run along the depth of normalized device coordinates.
         if matches!(self.space, Space::Ndc { .. }) { self.field.sides().z } else { self.field.cell() }
     }
@@ -124,7 +124,7 @@ impl<T: Real> Tensorf<T> {
     /// Returns the cells whose opacity, or that of a neighbour, is above [`occupied_above`](Config::occupied_above).
     fn occupied(&self) -> Occupancy {
         // An opacity 1 − exp(−σ · step) above a threshold is a density above another.
-        let threshold = -(-self.config.occupied_above).ln_1p() / (self.config.step * self.cell());
+        let threshold = -(-self.config.occupied_above).ln_1p() / (self.config.step * self.cell_of_steps());
         let cells = self.field.nodes().map(|n| (n - 1).min(MOST_CELLS));
         let density = |positions: &Tensor<T>| self.field.density(positions);
         match &self.field.occupied {
@@ -152,7 +152,7 @@ impl<T: Real> Tensorf<T> {
     fn options(&self, pass: &Pass) -> RenderOptions<'static> {
         let config = &self.config;
         let training = matches!(pass.jitter, Jitter::PerRay { .. });
-        let step = if training { config.step } else { config.step_in_pictures } * self.cell();
+        let step = if training { config.step } else { config.step_in_pictures } * self.cell_of_steps();
         RenderOptions {
             aabb: self.aabb(),
             spacing: Spacing::even(self.space, step),

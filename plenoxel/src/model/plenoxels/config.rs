@@ -3,7 +3,7 @@
 //! [`Config`] is the content of a run's `config.toml` and of a preset. Command-line flags change it.
 
 use super::objective::{LEARNED_LOSSES, LOSSES};
-use crate::camera::Camera;
+use crate::camera::{Camera, mean_pixel_width};
 use crate::carve::{CarveConfig, CarveOptions};
 use crate::dataset::normalize::CaptureOptions;
 use crate::error::{Error, Result};
@@ -17,6 +17,7 @@ use crate::sampling::{Jitter, Spacing};
 use crate::train::{self, TrainOptions};
 use autograd::Real;
 use autograd::optim::{Exponential, Piecewise, Schedule};
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -454,9 +455,8 @@ impl Config {
     ///
     /// The reduction of images in a stage is at most n / resolution. The bound therefore holds for reduced pixels too.
     pub fn fitted_to<'c>(&self, cameras: impl IntoIterator<Item = &'c Camera>) -> Self {
-        let pixel = |camera: &Camera| camera.position().length().max(self.half_width) / camera.intrinsics.fx.min(camera.intrinsics.fy);
-        let (sum, count) = cameras.into_iter().map(pixel).fold((0.0, 0.0), |(sum, count), pixel| (sum + pixel, count + 1.0));
-        let finest = 2.0 * self.half_width / (self.pixels_per_voxel * sum / count);
+        let pixel = mean_pixel_width(cameras, DVec3::ZERO, self.half_width);
+        let finest = 2.0 * self.half_width / (self.pixels_per_voxel * pixel);
         let mut fitted = self.clone();
         // Without cameras or without a bound it is NaN or infinite.
         if finest.is_finite() {

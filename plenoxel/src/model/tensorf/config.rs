@@ -1,5 +1,6 @@
 //! Settings of TensoRF.
 
+use crate::camera::mean_pixel_width;
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::field::encoding::Directions;
@@ -31,7 +32,7 @@ pub struct Config {
     /// Length of a cell along the depth of normalized device coordinates, in lengths of its other sides, 1 to 8. In other spaces cells are cubes.
     pub cell_depth: f64,
     /// Least side of a cell in [`Space::Box`], in pixels of a training view at the middle of the box, on average over the views; 0 for no bound. Stages whose
-    /// resolution has smaller cells get this side: pixels do not determine finer nodes.
+    /// resolution has smaller cells get cells of this side.
     pub pixels_per_cell: f64,
     /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
     pub group: f64,
@@ -224,11 +225,8 @@ impl Config {
     /// Returns the resolution of a stage in a region, bounded by [`pixels_per_cell`](Config::pixels_per_cell).
     pub(super) fn bounded(&self, resolution: usize, Region { space, aabb }: Region, views: &[View]) -> usize {
         let (middle, side) = (0.5 * (aabb.min + aabb.max), aabb.volume().cbrt());
-        let pixel = |View { camera, .. }: &View| {
-            camera.position().distance(middle).max(0.5 * side) / camera.intrinsics.fx.min(camera.intrinsics.fy)
-        };
-        let mean = views.iter().map(pixel).sum::<f64>() / views.len() as f64;
-        let finest = side / (self.pixels_per_cell * mean);
+        let pixel = mean_pixel_width(views.iter().map(|view| &view.camera), middle, 0.5 * side);
+        let finest = side / (self.pixels_per_cell * pixel);
         // Without views or without a bound it is NaN or infinite.
         if space == Space::Box && finest.is_finite() { resolution.min(finest as usize + 1).max(2) } else { resolution }
     }

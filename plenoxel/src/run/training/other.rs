@@ -44,7 +44,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
         let begin = |recipe: &R| trainer(config, recipe, region, views.clone());
         recipe = clocks.train.time(|| budget::recipe_on_time(&recipe, seconds, begin))?;
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
-            Some(resolution) => format!("{} at {resolution}³", stage.steps),
+            Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
             None => stage.steps.to_string(),
         });
         on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
