@@ -147,6 +147,33 @@ fn groups_of_samples_share_a_color_in_the_kernel_and_in_its_reference() {
 }
 
 #[test]
+fn small_gradients_of_the_density_can_be_left_out() {
+    let rays = rays(40);
+    // Gradients of the density of the first plane, and of the appearance.
+    let gradients = |gradient_above: f64| {
+        let model = wide(Config { gradient_above, ..tiny(&[(9, 1)]) }, IN_BOX);
+        let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render(&rays, &PASS)));
+        let (mut density, mut appearance) = (Vec::new(), Vec::new());
+        model.visit(&mut |param| match param.name() {
+            "density.plane.x" => density = adjoint.array(param.tensor()).into_iter().collect(),
+            name if name.starts_with("appearance") => appearance.extend(adjoint.array(param.tensor())),
+            _ => {}
+        });
+        assert!(!density.is_empty() && !appearance.is_empty());
+        [density, appearance]
+    };
+    let norm = |x: &[f64]| x.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let [exact, colors] = gradients(0.0);
+    let error = |gradient_above: f64| {
+        let [density, appearance] = gradients(gradient_above);
+        assert_eq!(appearance, colors);
+        norm(&density.iter().zip(&exact).map(|(a, b)| a - b).collect::<Vec<_>>()) / norm(&exact)
+    };
+    let errors = [1e-9, 0.03, 0.3].map(error);
+    assert!(errors[0] < 1e-9 && errors[0] < errors[1] && errors[1] < errors[2] && errors[2] < 0.3, "{errors:?}");
+}
+
+#[test]
 fn groups_do_not_change_the_expected_color() {
     let rays = rays(1);
     let color = |group: f64, step: u64| {

@@ -164,6 +164,9 @@ pub struct Factored<T: Real> {
     pub grouping: Grouping,
     /// The same in pictures.
     pub grouping_in_pictures: Grouping,
+    /// Least gradient ∂L/∂s of the density feature s of a sample that the fused kernel adds to planes and lines, relative to the mean of |∂L/∂s| over the
+    /// samples of the same block of rays; smaller ones count as 0. 0 for exact gradients. Most samples are in empty cells around matter, or behind it.
+    pub gradient_above: f64,
 }
 
 impl<T: Real> Module<T> for Factored<T> {
@@ -200,6 +203,7 @@ impl<T: Real> Factored<T> {
             occupied: None,
             grouping: Grouping::NONE,
             grouping_in_pictures: Grouping::NONE,
+            gradient_above: 0.0,
         }
     }
 

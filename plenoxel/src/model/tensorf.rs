@@ -83,6 +83,7 @@ impl<T: Real> Tensorf<T> {
         let mut field = Factored::new(config.shape(), aabb, config.nodes(region, config.stages[0].resolution), &random);
         field.grouping = Grouping { weight: config.group, above: config.color_above };
         field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
+        field.gradient_above = config.gradient_above;
         Ok(Tensorf { config, field, space, hull: Hull::Auto, engine: Engine::Fused })
     }
 

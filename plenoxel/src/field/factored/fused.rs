@@ -6,7 +6,7 @@
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
 //! another ([`RowSums`](autograd::RowSums)), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
-//! the sums are bit-identical for any number of threads.
+//! the sums are bit-identical for any number of threads. Samples with a small gradient can be left out ([`Factored::gradient_above`]).
 //!
 //! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of its samples, and adds them up for each ray.
 
@@ -49,6 +49,7 @@ struct Batch<T: Real> {
     /// Encoded directions, `[n, e]`.
     encoded: Tensor<T>,
     grouping: Grouping,
+    gradient_above: f64,
     jitter: Jitter,
 }
 
@@ -125,7 +126,8 @@ fn render_inputs<T: Real>(
     let background = options.background.map(|c| T::lit(f64::from(c)));
     let jitter = options.jitter;
     let grouping = if matches!(jitter, Jitter::None) { field.grouping_in_pictures } else { field.grouping };
-    let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, jitter };
+    let gradient_above = field.gradient_above;
+    let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, gradient_above, jitter };
     let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params);
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
     // Without an adjoint, small blocks share the work of background and matter among the threads more evenly.

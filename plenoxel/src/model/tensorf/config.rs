@@ -44,6 +44,9 @@ pub struct Config {
     pub stop_below: f64,
     /// Transmittance below which a ray of a picture ends.
     pub stop_below_in_pictures: f64,
+    /// Least gradient of the density of a sample that the fused kernel uses, relative to the mean
+    /// ([`Factored::gradient_above`](crate::field::factored::Factored::gradient_above)); 0 for exact gradients.
+    pub gradient_above: f64,
     /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.
     pub occupied_above: f64,
     /// Number of steps for which the density is constant. If it is not 0 and there is a visual hull, the density is opaque before the first step; otherwise it is
@@ -104,6 +107,7 @@ impl Default for Config {
             color_above: 1e-3,
             stop_below: 3e-3,
             stop_below_in_pictures: 3e-4,
+            gradient_above: 0.0,
             occupied_above: 0.01,
             opaque_steps: 50,
             factor_rate: 0.02,
@@ -174,6 +178,7 @@ impl Config {
             ("color_above", self.color_above),
             ("stop_below", self.stop_below),
             ("stop_below_in_pictures", self.stop_below_in_pictures),
+            ("gradient_above", self.gradient_above),
             ("occupied_above", self.occupied_above),
             ("cool_down", self.cool_down),
         ] {

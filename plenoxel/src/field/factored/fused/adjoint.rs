@@ -26,14 +26,37 @@ pub struct Cotangents<T: Real> {
 /// Cotangents of one block.
 #[derive(Debug)]
 struct Part<T: Real> {
-    /// ∂L/∂s of each sample.
-    density: Buffer<T>,
+    /// Samples whose density has a gradient.
+    density: OfDensity<T>,
     /// Cotangents of the products of each shaded sample, `[shaded, 3 R]`.
     products: Buffer<T>,
-    /// Samples, sorted by the rows of each plane that they read.
+    /// Samples of `density`, sorted by the rows of each plane that they read.
     density_rows: [Sorted; 3],
     /// Shaded samples, likewise.
     product_rows: [Sorted; 3],
+}
+
+/// Positions of samples, in units of cells, and ∂L/∂s of each.
+#[derive(Debug)]
+struct OfDensity<T: Real> {
+    at: [Buffer<T>; 3],
+    g: Buffer<T>,
+}
+
+impl<T: Real> OfDensity<T> {
+    /// Keeps the samples with the cotangents `g` that are not 0, and not below a share of the mean of |g|.
+    fn new(at: [&[T]; 3], g: &[T], share: f64) -> Self {
+        let least = T::lit(share) * g.iter().map(|g| g.abs()).sum::<T>() / T::lit(g.len().max(1) as f64);
+        // NaN is kept: it must not look like no gradient.
+        let small = |g: T| g == T::zero() || g.abs() < least;
+        let kept: Vec<u32> = (0..g.len() as u32).filter(|&i| !small(g[i as usize])).collect();
+        let of = |all: &[T]| kept.iter().map(|&i| all[i as usize]).collect::<Vec<_>>().into();
+        OfDensity { at: at.map(of), g: of(g) }
+    }
+
+    fn at(&self) -> [&[T]; 3] {
+        self.at.each_ref().map(|at| &at[..])
+    }
 }
 
 /// Samples sorted by the bucket of rows that they read.
@@ -44,14 +67,14 @@ struct Sorted {
 }
 
 impl Sorted {
-    fn new<T: Real>(axis: usize, at: [&[T]; 3], nodes: [usize; 3], shift: u32, live: impl Fn(usize) -> bool) -> Self {
+    fn new<T: Real>(axis: usize, at: [&[T]; 3], nodes: [usize; 3], shift: u32) -> Self {
         let mut rows = Buffer::stale(at[0].len());
         first_rows(axis, at, nodes, &mut rows);
         let (buckets, stride) = (plane_size(axis, nodes).div_ceil(1 << shift), nodes[PLANE_OF[axis][1]] as u32);
         let of = |i: usize| buckets_of([rows[i], rows[i] + 1, rows[i] + stride, rows[i] + stride + 1], shift);
-        let mut places = Buckets::count(buckets, (0..rows.len()).filter(|&i| live(i)).flat_map(of));
+        let mut places = Buckets::count(buckets, (0..rows.len()).flat_map(of));
         let mut samples = Buffer::stale(places.total());
-        for i in (0..rows.len()).filter(|&i| live(i)) {
+        for i in 0..rows.len() {
             of(i).for_each(|bucket| samples[places.take(bucket)] = i as u32);
         }
         Sorted { buckets: places.filled(), samples }
@@ -107,7 +130,7 @@ impl<T: Real> RowSums<T> for PlaneSums<T> {
             let sorted = self.sorted(part);
             let which = &sorted.samples[sorted.buckets.range(bucket)];
             let (at, g) = match self.of_density {
-                true => (block.at(), OfProducts::Shared(&part.density)),
+                true => (part.density.at(), OfProducts::Shared(&part.density.g)),
                 false => (block.shaded_at.each_ref().map(|at| &at[..]), OfProducts::Each(&part.products)),
             };
             let bucket = BucketSums { first: bucket << self.bucket_shift(), sums, touched };
@@ -208,17 +231,19 @@ fn part<T: Real>(
     density.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
     let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, rgb);
     let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
-    let lines =
-        [lines(tables.density, block.at(), OfProducts::Shared(&density)), lines(tables.appearance, shaded_at, OfProducts::Each(&products))];
+    let of_density = OfDensity::new(block.at(), &density, batch.gradient_above);
+    let lines = [
+        lines(tables.density, of_density.at(), OfProducts::Shared(&of_density.g)),
+        lines(tables.appearance, shaded_at, OfProducts::Each(&products)),
+    ];
     let shift = |axis: usize, pairs: Pairs<'_, T>| bucket_shift(axis, batch.nodes, pairs.width);
-    let live = |i: usize| density[i] != T::zero();
-    let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, block.at(), batch.nodes, shift(axis, tables.density), live));
-    let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, shaded_at, batch.nodes, shift(axis, tables.appearance), |_| true));
+    let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, of_density.at(), batch.nodes, shift(axis, tables.density)));
+    let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, shaded_at, batch.nodes, shift(axis, tables.appearance)));
     let rays = state.tracked.as_ref().map(|tracked| {
         let encoded = tables.network.of_direction(&input);
         positions::of_rays(tracked, block, tables, [&density, &products], (encoded, batch.encoded.shape()[1]))
     });
-    (Part { density, products, density_rows, product_rows }, lines.into_iter().chain(parameters).collect(), rays)
+    (Part { density: of_density, products, density_rows, product_rows }, lines.into_iter().chain(parameters).collect(), rays)
 }
 
 /// Returns the cotangents of three lines, one after another.
