@@ -1,6 +1,7 @@
 //! Settings of the models that have a table of their own in the configuration of a run, named by their kind: `[tensorf]`, for example.
 
 use super::{dvgo, nerf, ngp, tensorf};
+use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::loss::Objective;
 use crate::model::Model;
@@ -57,6 +58,15 @@ pub trait Recipe: Send + Sync {
     /// Returns from which step on the steps of the first stage tell the speed of a machine, and the cost of such a step, in units of
     /// [`with_cost`](Recipe::with_cost).
     fn measured_step(&self) -> (u64, f64);
+
+    /// Returns these settings with the sizes that a model has which has begun its first stage with these training views. Default: the same settings.
+    fn fitted_to(self, model: &Self::Model, views: &[View]) -> Self
+    where
+        Self: Sized,
+    {
+        let _ = (model, views);
+        self
+    }
 
     /// Returns settings whose steps cost this much in total: the same training, longer or shorter.
     fn with_cost(&self, cost: f64) -> Self

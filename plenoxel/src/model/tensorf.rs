@@ -138,6 +138,12 @@ impl<T: Real> Tensorf<T> {
         }
     }
 
+    /// Returns the region of the cells that are sampled.
+    fn sampled(&self) -> Region {
+        let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
+        Region { space: self.space, aabb }
+    }
+
     fn hull(&self, views: &[View]) -> Option<Occupancy> {
         let hull = || visual_hull::by_footprint(views, self.aabb(), [HULL; 3], HULL_MARGIN, &|_| {}).dilated(1);
         (self.hull == Hull::Auto && self.space == Space::Box && has_alpha(views)).then(hull)
@@ -256,10 +262,9 @@ impl<T: Real> Model<T> for Tensorf<T> {
             }
         }
         self.aim(rays);
-        let aabb = self.field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(self.aabb());
-        let region = Region { space: self.space, aabb };
+        let region = self.sampled();
         let resolution = self.config.bounded(self.config.stages[stage.index].resolution, region, rays.all_views());
-        self.field.resample(aabb, self.config.nodes(region, resolution));
+        self.field.resample(region.aabb, self.config.nodes(region, resolution));
         Ok(())
     }
 

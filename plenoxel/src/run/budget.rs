@@ -99,9 +99,9 @@ fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result
 /// Scales the settings of another model so that training takes `seconds` on this machine, including the measurement made here. `begin` creates a trainer.
 ///
 /// Errors: the time is too short; those of [`Trainer::step`](train::Trainer::step).
-pub fn recipe_on_time<R: Recipe>(recipe: &R, seconds: f64, begin: impl FnOnce(&R) -> Result<train::Trainer<f32, R::Model>>) -> Result<R> {
+pub fn recipe_on_time<R: Recipe>(recipe: R, seconds: f64, begin: impl FnOnce(&R) -> Result<train::Trainer<f32, R::Model>>) -> Result<R> {
     let start = Instant::now();
-    let mut trainer = begin(recipe)?;
+    let mut trainer = begin(&recipe)?;
     trainer.step()?;
     let begun = start.elapsed().as_secs_f64();
     let (from, cost) = recipe.measured_step();
@@ -125,7 +125,7 @@ pub fn recipe_on_time<R: Recipe>(recipe: &R, seconds: f64, begin: impl FnOnce(&R
         let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + begun));
         return Err(Error::usage("--time", found, "give it more time"));
     }
-    Ok(recipe.with_cost(left / unit))
+    Ok(recipe.fitted_to(trainer.model(), trainer.views()).with_cost(left / unit))
 }
 
 /// Returns `asked` with everything that a time budget changes taken from `found`: lengths of stages, resolutions with density rates, image

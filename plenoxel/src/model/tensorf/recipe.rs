@@ -1,6 +1,7 @@
 //! Training a factored field from the configuration of a run: memory, and lengths of stages.
 
 use super::{Config, KIND, Stage, Tensorf};
+use crate::dataset::View;
 use crate::error::Result;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
@@ -52,6 +53,12 @@ impl Recipe for Config {
         // Rays in opaque matter end at their first samples. Then the field turns into fog, in which they have the most.
         let fog = if self.opaque_steps > 0 { FOG } else { 1.0 };
         (self.opaque_steps, fog * cost(&self.stages[0]))
+    }
+
+    fn fitted_to(self, model: &Tensorf<f32>, views: &[View]) -> Self {
+        let bounded = |stage: &Stage| Stage { resolution: self.bounded(stage.resolution, model.sampled(), views), ..*stage };
+        let stages = self.stages.iter().map(bounded).collect();
+        Config { stages, ..self }
     }
 
     fn with_cost(&self, cost: f64) -> Self {

@@ -42,7 +42,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
         let begin = |recipe: &R| trainer(config, recipe, region, views.clone());
-        recipe = clocks.train.time(|| budget::recipe_on_time(&recipe, seconds, begin))?;
+        recipe = clocks.train.time(|| budget::recipe_on_time(recipe, seconds, begin))?;
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
             Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
             None => stage.steps.to_string(),
