@@ -1,5 +1,8 @@
 //! The hash grid and the model on it: gradients, training, resuming and checkpoints.
 
+#[path = "support/own_losses.rs"]
+mod own_losses;
+
 use autograd::{Module, Param, Real, Tensor, check_kernel, gradcheck, random::Stream};
 use glam::DVec3;
 use ndarray::ArrayD;
@@ -279,6 +282,13 @@ fn the_occupancy_follows_the_field() {
     while trainer.step().expect("a step").is_some() {}
     let occupied = trainer.model().field().occupied.as_ref().expect("cells").fraction();
     assert!(occupied > 0.0 && occupied < 0.5, "{occupied}");
+}
+
+#[test]
+fn exposure_and_other_losses_and_parameters_train_without_change() {
+    let (train, _) = views();
+    let names = own_losses::train(new(&[(20, 128)]), Objective::new().with("mse", 1.0, mse), &train);
+    assert_eq!(names, ["mse", "exposure", "distortion", "thin"]);
 }
 
 #[test]

@@ -2,6 +2,8 @@
 
 #[path = "support/factored.rs"]
 mod factored;
+#[path = "support/own_losses.rs"]
+mod own_losses;
 
 use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
 use factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
@@ -303,6 +305,14 @@ fn a_scene_is_learned_without_silhouettes_too() {
     // An opaque start would stay below.
     let mean = mean_image(&train, [1.0; 3]).and_then(|mean| constant_psnr(&test, &mean, [1.0; 3])).expect("a figure");
     assert!(psnr > mean + 1.0, "{psnr}, {mean} of the mean image");
+}
+
+#[test]
+fn exposure_and_other_losses_and_parameters_train_without_change() {
+    let (train, _) = views();
+    let model = Tensorf::new(tiny(&[(12, 10), (16, 10)]), BOX, 42).expect("valid settings");
+    let names = own_losses::train(model, Objective::new().with("mse", 1.0, mse), &train);
+    assert_eq!(names, ["mse", "exposure", "distortion", "thin"]);
 }
 
 #[test]
