@@ -166,6 +166,7 @@ pub struct Factored<T: Real> {
     pub grouping_in_pictures: Grouping,
     /// Least gradient ∂L/∂s of the density feature s of a sample that the fused kernel adds to planes and lines, relative to the mean of |∂L/∂s| over the
     /// samples of the same block of rays; smaller ones count as 0. 0 for exact gradients. Most samples are in empty cells around matter, or behind it.
+    /// Gradients of rays, and gradients that can be differentiated again, are always exact.
     pub gradient_above: f64,
 }
 

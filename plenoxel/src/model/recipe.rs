@@ -59,7 +59,7 @@ pub trait Recipe: Send + Sync {
     /// [`with_cost`](Recipe::with_cost).
     fn measured_step(&self) -> (u64, f64);
 
-    /// Returns these settings with the sizes that a model has which has begun its first stage with these training views. Default: the same settings.
+    /// Returns these settings with sizes that fit the training views: a plan must know them. `model` has begun its first stage. Default: the same settings.
     fn fitted_to(self, model: &Self::Model, views: &[View]) -> Self
     where
         Self: Sized,

@@ -96,7 +96,8 @@ fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result
     Ok(Config { stages, losses: losses.collect(), ..config })
 }
 
-/// Scales the settings of another model so that training takes `seconds` on this machine, including the measurement made here. `begin` creates a trainer.
+/// Fits the settings of another model to the training views, and scales them so that training takes `seconds` on this machine, including the measurement made
+/// here. `begin` creates a trainer.
 ///
 /// Errors: the time is too short; those of [`Trainer::step`](train::Trainer::step).
 pub fn recipe_on_time<R: Recipe>(recipe: R, seconds: f64, begin: impl FnOnce(&R) -> Result<train::Trainer<f32, R::Model>>) -> Result<R> {

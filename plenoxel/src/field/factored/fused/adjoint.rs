@@ -26,7 +26,7 @@ pub struct Cotangents<T: Real> {
 /// Cotangents of one block.
 #[derive(Debug)]
 struct Part<T: Real> {
-    /// Samples whose density has a gradient.
+    /// Samples whose density gradient is used.
     density: OfDensity<T>,
     /// Cotangents of the products of each shaded sample, `[shaded, 3 R]`.
     products: Buffer<T>,
@@ -208,19 +208,19 @@ fn part<T: Real>(
     output: Output,
 ) -> (Part<T>, Vec<Buffer<T>>, Option<OfRays<T>>) {
     let batch = &state.batch;
-    let mut density = Buffer::stale(block.len());
+    let mut of_features = Buffer::stale(block.len());
     let mut rgb = Buffer::zeros(3 * block.shaded.len());
     match output {
         Output::Sparsity => {
             for (own, &g) in block.rays().zip(&cotangent.data()[block.first..]) {
-                own.for_each(|i| density[i] = g * sparsity_slope(block.sigma()[i]));
+                own.for_each(|i| of_features[i] = g * sparsity_slope(block.sigma()[i]));
             }
         }
         Output::Pixels => {
             let (along, color) = (block.along(), block.color());
             let of_shaded = rgb.as_chunks_mut::<3>().0;
             for (own, g) in block.rays().zip(&cotangent.data().as_chunks::<COLUMNS>().0[block.first..]) {
-                along.sigma_adjoint(own.clone(), batch.background, g, &color, &mut density);
+                along.sigma_adjoint(own.clone(), batch.background, g, &color, &mut of_features);
                 for i in own.filter(|&i| block.group[i] != Groups::NONE) {
                     let of = &mut of_shaded[block.group[i] as usize];
                     (0..3).for_each(|c| of[c] += along.weight[i] * g[c]);
@@ -228,22 +228,22 @@ fn part<T: Real>(
             }
         }
     }
-    density.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
+    of_features.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
     let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, rgb);
     let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
-    let of_density = OfDensity::new(block.at(), &density, batch.gradient_above);
+    let density = OfDensity::new(block.at(), &of_features, batch.gradient_above);
     let lines = [
-        lines(tables.density, of_density.at(), OfProducts::Shared(&of_density.g)),
+        lines(tables.density, density.at(), OfProducts::Shared(&density.g)),
         lines(tables.appearance, shaded_at, OfProducts::Each(&products)),
     ];
     let shift = |axis: usize, pairs: Pairs<'_, T>| bucket_shift(axis, batch.nodes, pairs.width);
-    let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, of_density.at(), batch.nodes, shift(axis, tables.density)));
+    let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, density.at(), batch.nodes, shift(axis, tables.density)));
     let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, shaded_at, batch.nodes, shift(axis, tables.appearance)));
     let rays = state.tracked.as_ref().map(|tracked| {
         let encoded = tables.network.of_direction(&input);
-        positions::of_rays(tracked, block, tables, [&density, &products], (encoded, batch.encoded.shape()[1]))
+        positions::of_rays(tracked, block, tables, [&of_features, &products], (encoded, batch.encoded.shape()[1]))
     });
-    (Part { density: of_density, products, density_rows, product_rows }, lines.into_iter().chain(parameters).collect(), rays)
+    (Part { density, products, density_rows, product_rows }, lines.into_iter().chain(parameters).collect(), rays)
 }
 
 /// Returns the cotangents of three lines, one after another.
