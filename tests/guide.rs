@@ -78,14 +78,14 @@ fn psnr_of_a_short_training(objective: Objective<f32>) -> (f64, f64) {
 fn the_losses_of_the_guide_train() {
     let objective = Objective::<f32>::new()
         .with("mse", 1.0, mse)
-        .with("opaque", Exponential::new(1e-2, 1e-4, 200), |step| (1.0 - &step.rendered.opacity).mean());
+        .with("opaque", Exponential::new(1e-2, 1e-4, 200), |step| step.batch.mean(&(1.0 - &step.rendered.opacity)));
     let with_penalty = objective.with("small", 1e-6, small_densities);
     let (first, last) = psnr_of_a_short_training(with_penalty);
     assert!(last > first + 1.0, "{first} dB, then {last} dB");
 
     let objective = Objective::<f32>::new().with("bounded", 1.0, |step| {
         let error = (&step.prediction - &step.batch.target) * 4.0;
-        arctan(&error).square().mean()
+        step.batch.mean(&arctan(&error).square())
     });
     let (first, last) = psnr_of_a_short_training(objective);
     assert!(last > first + 1.0, "{first} dB, then {last} dB");

@@ -21,7 +21,7 @@ pub fn run() -> Result<()> {
     let objective = Objective::new().with("ln_cosh", 1.0, |step| {
         let error = (&step.rendered.rgb - &step.batch.target) * 10.0;
         let cosh = (error.exp() + (-&error).exp()) / 2.0;
-        cosh.ln().mean()
+        step.batch.mean(&cosh.ln())
     });
 
     // The default settings, reduced to the first two stages.

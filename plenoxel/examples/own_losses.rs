@@ -26,7 +26,7 @@ pub fn run(steps: u64) -> Result<()> {
     let deep = plain().with("depth", 0.03, |step| {
         let depth = step.batch.channel("depth").expect("the trainer was given it").reshape(&[step.batch.len()]);
         let known = Tensor::from_vec(depth.data().iter().map(|d| f32::from(u8::from(*d > 0.0))).collect(), depth.shape());
-        ((step.rendered.depth() - depth).square() * known).mean()
+        step.batch.mean(&((step.rendered.depth() - depth).square() * known))
     });
     let robust = Objective::new().with_adaptive_robust("robust", 0.01, AdaptiveRobust::default());
     let scaled = plain().with_param(Param::from_tensor("scale", Tensor::full(&[3], 1.0)), 1e-3);

@@ -7,9 +7,11 @@
 //! use plenoxel::model::plenoxels::Objective;
 //! let objective = Objective::<f32>::new()
 //!     .with("mse", 1.0, mse)
-//!     .with("bright", 0.01, |step| (1.0 - &step.rendered.rgb).square().mean());
+//!     .with("bright", 0.01, |step| step.batch.mean(&(1.0 - &step.rendered.rgb).square()));
 //! assert_eq!(objective.names().collect::<Vec<_>>(), ["mse", "bright"]);
 //! ```
+//!
+//! Means over rays are those of [`RayBatch::mean`](crate::rays::RayBatch::mean): pixels may differ in how often they are drawn.
 //!
 //! A loss may have parameters, which are trained together with the model ([`Objective::with_param`]): for example the shape of
 //! [`robust`](AdaptiveRobust), or the exposure of each view ([`Objective::with_exposure`]). Losses compare the prediction with the

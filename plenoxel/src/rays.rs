@@ -2,6 +2,7 @@
 
 mod batch;
 mod channel;
+mod importance;
 mod patches;
 #[cfg(test)]
 mod tests;
@@ -18,11 +19,13 @@ use autograd::single::{cast, is_single};
 use autograd::{Buffer, Real, Tensor, parallel};
 use channel::Channel;
 use glam::DVec3;
+use importance::Importance;
 use ndarray::Array3;
 use std::sync::Arc;
 use tiles::Tile;
 
-/// Training pixels of some views: all pixels that their masks keep, or those that can show matter. The order is shuffled in each epoch.
+/// Training pixels of some views: all pixels that their masks keep, or those that can show matter. The order is shuffled in each epoch. An
+/// epoch draws each pixel once, or in proportion to its contrast ([`with_contrast_floor`](Self::with_contrast_floor)).
 #[derive(Debug)]
 pub struct RaySource {
     all_views: Arc<[View]>,
@@ -32,13 +35,19 @@ pub struct RaySource {
     background: [f32; 3],
     seed: u64,
     tiles: Vec<Tile>,
-    /// `first[t]` is the number of pixels before tile t.
+    /// `first[t]` is the number of draws of an epoch from the tiles before tile t.
     first: Vec<u64>,
-    /// Tile of every [`apart`](Self::apart)-th pixel; about as many entries as tiles. A binary search for a random pixel would wait for
+    /// Tile of every [`apart`](Self::apart)-th draw; about as many entries as tiles. A binary search for a random draw would wait for
     /// memory about twelve times.
     guide: Vec<u32>,
+    /// Number of pixels of the tiles.
+    len: u64,
     /// Number of pixels of all views that their masks keep, after reduction.
     pixels: u64,
+    /// 0 draws all pixels equally often.
+    contrast_floor: f64,
+    /// Of the views after reduction.
+    importance: Option<Importance>,
     with_depth: bool,
     channels: Vec<Channel>,
 }
@@ -57,11 +66,27 @@ impl RaySource {
             tiles: Vec::new(),
             first: Vec::new(),
             guide: Vec::new(),
+            len: 0,
             pixels: 0,
+            contrast_floor: 0.0,
+            importance: None,
             with_depth: false,
             channels: Vec::new(),
         };
         source.set_reduction(1);
+        source
+    }
+
+    /// Draws pixel p with a probability proportional to √(σₚ² + floor²), where σₚ² is the variance of the colors of the 3 × 3 pixels around
+    /// it, sRGB in [0, 1], and adds the weights of importance sampling to the batches ([`RayBatch::weight`]). 0 draws all pixels equally
+    /// often. Probabilities are rounded to a quarter of that of a pixel without contrast, and are at most 64 times that.
+    ///
+    /// Panics if the floor is negative or not finite.
+    #[track_caller]
+    pub fn with_contrast_floor(self, floor: f64) -> Self {
+        assert!(floor >= 0.0 && floor.is_finite(), "with_contrast_floor: {floor} is not a contrast");
+        let mut source = RaySource { contrast_floor: floor, ..self };
+        source.set_reduction(source.reduction);
         source
     }
 
@@ -99,9 +124,11 @@ impl RaySource {
             self.reduced = (k > 1).then(|| parallel::map_indices(self.all_views.len(), |v| self.all_views[v].reduced(k)));
             self.reduction = k;
         }
+        let floor = self.contrast_floor;
+        self.importance = (floor > 0.0).then(|| Importance::of(self.views(), self.background, floor));
         let tiles = self.views().iter().enumerate().map(|(v, view)| Tile::of_view(v, view)).collect();
         self.set_tiles(tiles);
-        self.pixels = self.len();
+        self.pixels = self.len;
     }
 
     /// Returns the current reduction of the views, initially 1.
@@ -120,13 +147,20 @@ impl RaySource {
     }
 
     fn set_tiles(&mut self, mut tiles: Vec<Tile>) {
+        if self.importance.is_some() {
+            // A pixel is looked for in its tile.
+            tiles = tiles.iter().flat_map(Tile::parts).collect();
+        }
         if self.views().iter().any(|view| view.mask.is_some()) {
             tiles = tiles.iter().flat_map(|tile| tile.kept(&self.views()[tile.view as usize])).collect();
         }
+        let draws_of = |tile: &Tile| self.importance.as_ref().map_or(tile.pixels() as u64, |importance| importance.of_tile(tile));
+        let draws = parallel::map_indices(tiles.len(), |t| draws_of(&tiles[t]));
         self.first = vec![0];
-        for tile in &tiles {
-            self.first.push(self.first[self.first.len() - 1] + tile.pixels() as u64);
+        for draws in draws {
+            self.first.push(self.first[self.first.len() - 1] + draws);
         }
+        self.len = tiles.iter().map(|tile| tile.pixels() as u64).sum();
         self.tiles = tiles;
         let apart = self.apart();
         self.guide.clear();
@@ -137,9 +171,9 @@ impl RaySource {
         }
     }
 
-    /// Returns the number of pixels between two entries of the guide: the mean number of pixels per tile.
+    /// Returns the number of draws between two entries of the guide: the mean number of draws per tile.
     fn apart(&self) -> u64 {
-        self.len().div_ceil(self.tiles.len().max(1) as u64).max(1)
+        self.draws().div_ceil(self.tiles.len().max(1) as u64).max(1)
     }
 
     /// Restricts the source to the pixels around the projections of cells that may hold matter. Other pixels show the background whatever
@@ -150,17 +184,22 @@ impl RaySource {
 
     /// Returns the fraction of the views' pixels that the source contains.
     pub fn share(&self) -> f64 {
-        self.len() as f64 / self.pixels as f64
+        self.len as f64 / self.pixels as f64
     }
 
-    /// Returns the number of rays in an epoch.
+    /// Returns the number of pixels of the source.
     pub fn len(&self) -> u64 {
+        self.len
+    }
+
+    /// Returns the number of draws of an epoch: [`len`](Self::len), or more if pixels differ in importance.
+    fn draws(&self) -> u64 {
         self.first[self.tiles.len()]
     }
 
     /// Returns true if there are no pixels.
     pub fn is_empty(&self) -> bool {
-        self.len() == 0
+        self.len == 0
     }
 
     /// Returns rays `from..from + n` of the infinite sequence of epochs. The result depends only on the seed and the numbers.
@@ -174,7 +213,7 @@ impl RaySource {
     }
 
     fn batch_in<T: Real>(&self, from: u64, n: usize) -> RayBatch<T> {
-        let total = self.len();
+        let total = self.draws();
         let epochs: Vec<Permutation> = (from / total..=(from + n as u64 - 1) / total)
             .map(|epoch| Permutation::new(total, self.seed, Purpose::RayOrder, epoch))
             .collect();
@@ -185,7 +224,7 @@ impl RaySource {
     }
 
     /// Returns the rays of chosen pixels, in the given order: (view, column, row) in the reduced images. Aiming and masks do not restrict
-    /// them.
+    /// them, and they have no weights.
     ///
     /// Panics at the caller's line if a pixel is in no view; the message names the first such pixel.
     #[track_caller]
@@ -199,33 +238,37 @@ impl RaySource {
             assert!(there, "batch_of: pixel ({v}, {x}, {y}), as view, column and row, is not in {}", of_view());
         }
         self.gathered(pixels.len(), |i| {
-            let (v, x, y) = pixels[i];
-            (v as usize, x as usize, y as usize)
+            let (view, x, y) = pixels[i];
+            Place { view, x, y, weight: 1.0 }
         })
     }
 
-    /// Returns the rays of n pixels, given by view, column and row.
-    fn gathered<T: Real>(&self, n: usize, place: impl Fn(usize) -> (usize, usize, usize) + Sync) -> RayBatch<T> {
+    /// Returns the rays of n pixels.
+    fn gathered<T: Real>(&self, n: usize, place: impl Fn(usize) -> Place + Sync) -> RayBatch<T> {
         let views = self.views();
         let nowhere = Ray { origin: DVec3::ZERO, direction: DVec3::ZERO, stretch: 0.0 };
-        let (mut rays, mut target, mut alpha) = (vec![nowhere; n], Buffer::stale(3 * n), Buffer::stale(n));
+        let (mut rays, mut target) = (vec![nowhere; n], Buffer::stale(3 * n));
+        let (mut alpha, mut weight) = (Buffer::stale(n), Buffer::stale(n));
         let (mut view, mut pixel) = (vec![0; n], vec![[0; 2]; n]);
         const RUN: usize = 512;
         let of_image = target.chunks_mut(3 * RUN).zip(alpha.chunks_mut(RUN));
-        let of_place = view.chunks_mut(RUN).zip(pixel.chunks_mut(RUN));
+        let of_place = view.chunks_mut(RUN).zip(pixel.chunks_mut(RUN)).zip(weight.chunks_mut(RUN));
         let runs = rays.chunks_mut(RUN).zip(of_image).zip(of_place).collect();
-        parallel::for_each_item(runs, |run, ((rays, (target, alpha)), (view, pixel))| {
+        parallel::for_each_item(runs, |run, ((rays, (target, alpha)), ((view, pixel), weight))| {
             for (i, (ray, target)) in rays.iter_mut().zip(target.as_chunks_mut::<3>().0).enumerate() {
-                let (v, x, y) = place(run * RUN + i);
-                let seen = &views[v];
-                *ray = seen.camera.ray(x as f64 + 0.5, y as f64 + 0.5);
+                let place = place(run * RUN + i);
+                let (seen, x, y) = (&views[place.view as usize], place.x as usize, place.y as usize);
+                *ray = place.ray(views);
                 *target = seen.color(x, y, self.background).map(|c| T::lit(f64::from(c)));
                 alpha[i] = T::lit(f64::from(seen.alpha(x, y)));
-                (view[i], pixel[i]) = (v as u32, [x as u32, y as u32]);
+                weight[i] = T::lit(f64::from(place.weight));
+                (view[i], pixel[i]) = (place.view, [place.x, place.y]);
             }
         });
         let (target, alpha) = (Tensor::from_buffer(target, &[n, 3]), Tensor::from_buffer(alpha, &[n]));
-        let mut batch = RayBatch { rays, target, alpha, view, pixel, depth: None, channels: Vec::new() };
+        let weighted = weight.iter().any(|w| *w != T::one());
+        let weight = weighted.then(|| Tensor::from_buffer(weight, &[n]));
+        let mut batch = RayBatch { rays, target, alpha, weight, view, pixel, depth: None, channels: Vec::new() };
         let block = |v: usize| (self.all_views[v].image.width() / views[v].image.width()) as usize;
         if self.with_depth && self.all_views.iter().any(|view| view.depth.is_some()) {
             batch.depth = Some(channel::depth(&batch, &self.all_views, block));
@@ -236,18 +279,21 @@ impl RaySource {
 
     /// Returns the rays of the source at every `stride`-th column and row of the views, tile after tile, in batches of `size`.
     pub fn lattice_of_rays(&self, stride: u32, size: usize) -> impl Iterator<Item = Vec<Ray>> + '_ {
+        let mut pixels = self.lattice(stride);
+        std::iter::from_fn(move || {
+            let rays: Vec<Ray> = pixels.by_ref().take(size).map(|place| place.ray(self.views())).collect();
+            (!rays.is_empty()).then_some(rays)
+        })
+    }
+
+    /// Returns the pixels of the source at every `stride`-th column and row of the views, tile after tile.
+    fn lattice(&self, stride: u32) -> impl Iterator<Item = Place> + '_ {
         let along = move |from: u32, count: u32| (from.next_multiple_of(stride)..from + count).step_by(stride as usize);
         let of_tile = move |tile: &Tile| {
             let &Tile { view, x, y, width, height } = tile;
-            along(y, height).flat_map(move |y| along(x, width).map(move |x| (view as usize, x, y)))
+            along(y, height).flat_map(move |y| along(x, width).map(move |x| Place { view, x, y, weight: 1.0 }))
         };
-        let mut pixels = self.tiles.iter().flat_map(of_tile);
-        let views = self.views();
-        std::iter::from_fn(move || {
-            let ray = |(v, x, y): (usize, u32, u32)| views[v].camera.ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
-            let rays: Vec<Ray> = pixels.by_ref().take(size).map(ray).collect();
-            (!rays.is_empty()).then_some(rays)
-        })
+        self.tiles.iter().flat_map(of_tile)
     }
 
     /// Returns the largest stride between pixels at which at least 8 rays pass through a voxel of this side that is visible in all views. The stride
@@ -263,42 +309,54 @@ impl RaySource {
         (apart * pixels.fold(f64::INFINITY, f64::min)).clamp(1.0, 64.0) as u32
     }
 
-    /// Returns all rays of the source, view after view and row after row, in batches of `size`.
-    fn in_order(&self, size: u64) -> impl Iterator<Item = Vec<Ray>> + '_ {
-        let views = self.views();
-        let ray = |index: u64| {
-            let (v, x, y) = self.place(index);
-            views[v].camera.ray(x as f64 + 0.5, y as f64 + 0.5)
-        };
-        (0..self.len().div_ceil(size)).map(move |batch| (batch * size..((batch + 1) * size).min(self.len())).map(ray).collect())
-    }
-
-    /// Returns all rays of the source, view after view and row after row, in batches of `size`, with the alphas of their pixels. If no view
-    /// has a transparent pixel ([`has_alpha`]), alpha is 0 for pixels of the background color, and 1 for the others.
-    pub fn in_order_with_alpha(&self, size: u64) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
+    /// Returns all rays of the source, tile after tile, in batches of `size`, with the alphas of their pixels. A view is a tile until the source is aimed. If no
+    /// view has a transparent pixel ([`has_alpha`]), alpha is 0 for pixels of the background color, and 1 for the others.
+    pub fn in_order_with_alpha(&self, size: usize) -> impl Iterator<Item = (Vec<Ray>, Vec<f32>)> + '_ {
         let views = self.views();
         let has_alpha = has_alpha(views);
         let in_bytes = |color: [f32; 3]| color.map(|c| (c * 255.0).round() as u8);
-        let alpha = move |index: u64| {
-            let (v, x, y) = self.place(index);
-            let view = &views[v];
+        let alpha = move |place: &Place| {
+            let (view, x, y) = (&views[place.view as usize], place.x as usize, place.y as usize);
             match has_alpha {
                 true => view.alpha(x, y),
                 false => f32::from(u8::from(in_bytes(view.color(x, y, self.background)) != in_bytes(self.background))),
             }
         };
-        self.in_order(size).zip(0..).map(move |(rays, batch)| {
-            let alphas = (batch * size..).take(rays.len()).map(&alpha).collect();
-            (rays, alphas)
+        let mut pixels = self.lattice(1);
+        std::iter::from_fn(move || {
+            let (rays, alphas): (Vec<Ray>, Vec<f32>) = pixels.by_ref().take(size).map(|place| (place.ray(views), alpha(&place))).unzip();
+            (!rays.is_empty()).then_some((rays, alphas))
         })
     }
 
-    /// Returns view, column and row of a pixel of the source.
-    fn place(&self, index: u64) -> (usize, usize, usize) {
-        let guide = self.guide[(index / self.apart()) as usize] as usize;
-        let t = guide + self.first[guide + 1..].iter().take_while(|&&f| f <= index).count();
-        let Tile { view, x, y, width, .. } = self.tiles[t];
-        let pixel = (index - self.first[t]) as u32;
-        (view as usize, (x + pixel % width) as usize, (y + pixel / width) as usize)
+    /// Returns the pixel of a draw of an epoch.
+    fn place(&self, draw: u64) -> Place {
+        let guide = self.guide[(draw / self.apart()) as usize] as usize;
+        let t = guide + self.first[guide + 1..].iter().take_while(|&&f| f <= draw).count();
+        let tile @ &Tile { view, x, y, width, .. } = &self.tiles[t];
+        let in_tile = draw - self.first[t];
+        match &self.importance {
+            None => Place { view, x: x + in_tile as u32 % width, y: y + in_tile as u32 / width, weight: 1.0 },
+            Some(importance) => {
+                let (x, y, draws) = importance.pixel(tile, in_tile);
+                Place { view, x, y, weight: (self.draws() as f64 / self.len as f64 / f64::from(draws)) as f32 }
+            }
+        }
+    }
+}
+
+/// Pixel of a view, with the weight of its rays.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Place {
+    view: u32,
+    x: u32,
+    y: u32,
+    weight: f32,
+}
+
+impl Place {
+    /// Returns the ray through the pixel's centre.
+    fn ray(self, views: &[View]) -> Ray {
+        views[self.view as usize].camera.ray(f64::from(self.x) + 0.5, f64::from(self.y) + 0.5)
     }
 }

@@ -18,7 +18,7 @@ use crate::loss::{Evaluation, Objective, POSES, Step};
 use crate::rays::{RayBatch, RaySource};
 use crate::sampling::Jitter;
 use autograd::optim::{Optimizer, Sgd};
-use autograd::{Module, Real, parallel, value_and_grad};
+use autograd::{Module, Real, Tensor, parallel, value_and_grad};
 use ndarray::Array3;
 use poses::{PoseCorrections, PoseFigures};
 use serde::{Deserialize, Serialize};
@@ -38,12 +38,15 @@ pub struct TrainOptions {
     pub steps: u64,
     /// Shift the samples of each training ray by a random fraction of a step.
     pub jitter: bool,
+    /// Floor of the contrast in proportion to which pixels are drawn ([`RaySource::with_contrast_floor`]); 0 draws all pixels equally often.
+    #[serde(default)]
+    pub contrast_floor: f64,
 }
 
 /// 1000 steps of 4096 jittered rays over white.
 impl Default for TrainOptions {
     fn default() -> Self {
-        TrainOptions { seed: 42, background: [1.0; 3], rays_per_step: 4096, steps: 1000, jitter: true }
+        TrainOptions { seed: 42, background: [1.0; 3], rays_per_step: 4096, steps: 1000, jitter: true, contrast_floor: 0.0 }
     }
 }
 
@@ -119,7 +122,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
     ///
     /// Errors if there is no training view, or no step to take; if poses are refined ([`Objective::with_poses`]) and the model gives no gradients to rays.
     pub fn with_model(model: M, views: impl Into<Arc<[View]>>, mut objective: Objective<T, M>, options: TrainOptions) -> Result<Self> {
-        let rays = RaySource::new(views, options.background, options.seed);
+        let rays = RaySource::new(views, options.background, options.seed).with_contrast_floor(options.contrast_floor);
         if rays.is_empty() {
             return Err(Error::usage("views", "there are no training views", "give at least one image"));
         }
@@ -269,7 +272,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             samples = rendered.sample_count;
             let step = Step::new((self.step, seed), &batch, &rendered, &self.model, (extent, background));
             let Evaluation { total, losses: values, prediction } = self.objective.evaluate(step);
-            squared_error = self.rays.share() * mean_squared_error(prediction.data(), batch.target.data());
+            squared_error = self.rays.share() * mean_squared_error(prediction.data(), &batch);
             losses = values;
             total
         });
@@ -324,9 +327,16 @@ fn at_step(error: Error, step: u64) -> Error {
     }
 }
 
-fn mean_squared_error<T: Real>(x: &[T], y: &[T]) -> f64 {
-    let parts = parallel::map_chunks(x.len(), parallel::CHUNK, |range| {
-        x[range.clone()].iter().zip(&y[range]).map(|(&x, &y)| ((x - y) * (x - y)).as_f64()).sum::<f64>()
+/// Returns the mean squared error of predicted colors `[n, 3]`, with the weights of the rays.
+fn mean_squared_error<T: Real>(colors: &[T], batch: &RayBatch<T>) -> f64 {
+    let (colors, target) = (colors.as_chunks::<3>().0, batch.target.data().as_chunks::<3>().0);
+    let weight = batch.weight.as_ref().map(Tensor::data);
+    let parts = parallel::map_chunks(colors.len(), parallel::CHUNK, |range| {
+        let of_ray = |i: usize| {
+            let error = colors[i].iter().zip(&target[i]).map(|(&x, &y)| ((x - y) * (x - y)).as_f64()).sum::<f64>();
+            weight.map_or(1.0, |weight| weight[i].as_f64()) * error
+        };
+        range.map(of_ray).sum::<f64>()
     });
-    parts.into_iter().sum::<f64>() / x.len() as f64
+    parts.into_iter().sum::<f64>() / (3 * colors.len()) as f64
 }

@@ -62,6 +62,7 @@ pub fn batch() -> RayBatch<f64> {
         rays,
         target: tensor(&[n, 3], 0.05, 0.95, 11),
         alpha: tensor(&[n], 0.1, 0.9, 12),
+        weight: None,
         view: vec![0; n],
         pixel: (0..n as u32).map(|x| [x, 0]).collect(),
         depth: None,

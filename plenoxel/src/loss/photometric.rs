@@ -7,7 +7,7 @@ use autograd::{Real, Tensor};
 
 /// Returns the mean over rays and channels of (C − C*)², where C is the prediction. The source paper sums over channels, which is weight 3.
 pub fn mse<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
-    (&step.prediction - &step.batch.target).square().mean()
+    step.batch.mean(&(&step.prediction - &step.batch.target).square())
 }
 
 /// Returns the mean of (C − C*)² after prediction and photograph are composited over a random color of each ray, uniform in [0, 1]³, instead
@@ -20,12 +20,12 @@ pub fn random_background<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
     let colors = Stream::new(step.seed).named("background").numbered(step.number).uniform_tensor::<T>(&[n, 3], 0.0, 1.0);
     let change = colors - Tensor::from_vec(step.background.map(|c| T::lit(f64::from(c))).to_vec(), &[3]);
     let transparent = step.rendered.log_transmittance.exp() - (1.0 - &step.batch.alpha);
-    (&step.prediction - &step.batch.target + transparent.unsqueeze(1) * change).square().mean()
+    step.batch.mean(&(&step.prediction - &step.batch.target + transparent.unsqueeze(1) * change).square())
 }
 
 /// Returns the mean of √((C − C*)² + ε²) with ε = 10⁻³, a smooth absolute error (Charbonnier et al. 1994).
 pub fn charbonnier<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
-    ((&step.prediction - &step.batch.target).square() + 1e-6).sqrt().mean()
+    step.batch.mean(&((&step.prediction - &step.batch.target).square() + 1e-6).sqrt())
 }
 
 /// Returns the mean of Huber's loss of the error r with threshold δ = 0.1: r² / 2 if |r| <= δ, otherwise δ (|r| − δ / 2).
@@ -34,7 +34,7 @@ pub fn charbonnier<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
 pub fn huber<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
     let error = (&step.prediction - &step.batch.target).abs();
     let c = error.minimum(&Tensor::scalar(T::lit(0.1)));
-    (&c * (&error - 0.5 * &c)).mean()
+    step.batch.mean(&(&c * (&error - 0.5 * &c)))
 }
 
 /// Returns the mean over rays of Σ wᵢ |cᵢ − C*|² over the samples of a ray, where the weights wᵢ are constants (DirectVoxGO): each sample that is seen has about
@@ -42,5 +42,5 @@ pub fn huber<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
 pub fn sample_color<T: Real, M>(step: &Step<'_, T, M>, samples: &PerSample<T>) -> Tensor<T> {
     let target = step.batch.target.segment_repeat(&samples.samples.offsets);
     let errors = (&samples.radiance.rgb - target).square().sum_axis(1);
-    (errors * samples.weights.detach()).sum() / step.batch.len() as f64
+    step.batch.mean(&(errors * samples.weights.detach()).segment_sum(&samples.samples.offsets))
 }

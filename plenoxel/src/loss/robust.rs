@@ -56,7 +56,7 @@ impl<T: Real, M: 'static> Objective<T, M> {
         objective.with(name, weight, move |step: &Step<'_, T, M>| {
             let residual = &step.prediction - &step.batch.target;
             let alpha = (SHAPES[1] - SHAPES[0]) * step.param(&shape).sigmoid() + SHAPES[0];
-            negative_log_likelihood(&residual, &alpha, step.param(&scale)).mean()
+            step.batch.mean(&negative_log_likelihood(&residual, &alpha, step.param(&scale)))
         })
     }
 }

@@ -14,6 +14,9 @@ pub struct RayBatch<T: Real> {
     pub target: Tensor<T>,
     /// Alpha, `[n]`, in [0, 1]: the fraction of the pixel that the object covers; 1 for images without an alpha channel.
     pub alpha: Tensor<T>,
+    /// Weights of importance sampling, `[n]`, with expectation 1: inversely proportional to how often a ray's pixel is drawn. `None` if all
+    /// pixels are drawn equally often. [`RayBatch::mean`] applies them.
+    pub weight: Option<Tensor<T>>,
     /// Number of each ray's view in the source, from 0, for example as an index into a table with one row per view.
     pub view: Vec<u32>,
     /// Column and row of each ray's pixel in the reduced image of its view, from 0 at the top left. The ray passes through the pixel's
@@ -36,6 +39,14 @@ impl<T: Real> RayBatch<T> {
     /// Returns true if there are no rays.
     pub fn is_empty(&self) -> bool {
         self.rays.is_empty()
+    }
+
+    /// Returns the mean over rays and further axes of values `[n, …]`, with the rays' weights: an unbiased estimate of the mean over all pixels.
+    /// Without weights it is `values.mean()`.
+    pub fn mean(&self, values: &Tensor<T>) -> Tensor<T> {
+        let Some(weight) = &self.weight else { return values.mean() };
+        let shape: Vec<usize> = (0..values.shape().len()).map(|axis| if axis == 0 { self.len() } else { 1 }).collect();
+        (values * weight.reshape(&shape)).mean()
     }
 
     /// Returns the channel of this name, `[n, width]`; `None` if the source has no such channel.

@@ -23,7 +23,7 @@ fn every_pixel_of_tiles_of_any_size_has_its_place() {
     let want: Vec<usize> = tiles.iter().flat_map(|&(x, width)| (x..x + width).map(|x| x as usize)).collect();
     assert!(source.len() == want.len() as u64 && source.guide.len() <= tiles.len());
     let places = (0..source.len()).map(|index| source.place(index));
-    assert!(places.eq(want.iter().map(|&x| (0, x, 0))));
+    assert!(places.eq(want.iter().map(|&x| Place { view: 0, x: x as u32, y: 0, weight: 1.0 })));
 }
 
 #[test]
@@ -213,4 +213,65 @@ fn ignored_pixels_are_never_trained_and_the_others_once_in_an_epoch() {
     source.aim_at(&Occupancy::new(Aabb::cube(2.0), [4; 3], &[true; 64]));
     check(&source, (2 * 13 * 6 + kept) as u64);
     assert_eq!(source.share(), 1.0);
+}
+
+/// Returns the variance of the colors around a pixel by its definition.
+fn variance(view: &View, x: i64, y: i64, background: [f32; 3]) -> f64 {
+    let [width, height] = view.size().map(|n| n as i64);
+    let around = (y - 1..=y + 1).flat_map(|y| (x - 1..=x + 1).map(move |x| (x, y)));
+    let inside = around.filter(|(x, y)| (0..width).contains(x) && (0..height).contains(y));
+    let colors: Vec<[f64; 3]> = inside.map(|(x, y)| view.color(x as usize, y as usize, background).map(f64::from)).collect();
+    let n = colors.len() as f64;
+    let of_channel = |c: usize| {
+        let mean = colors.iter().map(|color| color[c]).sum::<f64>() / n;
+        colors.iter().map(|color| (color[c] - mean).powi(2)).sum::<f64>() / n
+    };
+    (0..3).map(of_channel).sum::<f64>() / 3.0
+}
+
+#[test]
+fn pixels_are_drawn_in_proportion_to_their_contrast_and_weights_make_up_for_it() {
+    const FLOOR: f64 = 0.05;
+    let background = [0.3, 0.6, 0.9];
+    let mut views = scene();
+    views[1].mask = Some(Mask::new([24, 16], |x, y| (x + y) % 3 > 0));
+    let uniform = RaySource::new(views.clone(), background, 5);
+    let mut source = RaySource::new(views, background, 5).with_contrast_floor(FLOOR);
+    for reduction in [1, 2] {
+        source.set_reduction(reduction);
+        let n = source.draws();
+        assert!(reduction > 1 || source.len() == uniform.len() && source.share() == 1.0);
+        assert!(n > 4 * source.len());
+        let epoch = source.batch::<f64>(n, n as usize);
+        let mut times = std::collections::BTreeMap::new();
+        places(&epoch).into_iter().for_each(|place| *times.entry(place).or_insert(0) += 1);
+        assert_eq!(times.len() as u64, source.len());
+        for (&(v, x, y), &times) in &times {
+            let want = (variance(&source.views()[v as usize], x.into(), y.into(), background) + FLOOR * FLOOR).sqrt() / FLOOR;
+            assert!((f64::from(times) / 4.0 - want).abs() < 0.126, "{v} {x} {y}: {times}, {want}");
+        }
+        // Over an epoch, the weighted mean is the mean over all pixels; without weights it is not.
+        let pixels: Vec<(u32, u32, u32)> = times.into_keys().collect();
+        let all = source.batch_of::<f64>(&pixels);
+        assert!(all.weight.is_none());
+        let [exact, weighted, biased] = [all.target.mean(), epoch.mean(&epoch.target), epoch.target.mean()].map(|mean| mean.item());
+        assert!((weighted / exact - 1.0).abs() < 1e-6 && (biased / exact - 1.0).abs() > 1e-3, "{weighted} {biased} {exact}");
+        let of_alpha = epoch.mean(&epoch.alpha).item() / all.alpha.mean().item();
+        assert!((of_alpha - 1.0).abs() < 1e-6);
+    }
+    source.set_reduction(1);
+    source.aim_at(&Occupancy::new(Aabb::cube(0.1), [1; 3], &[true]));
+    assert!(source.share() < 0.9, "{}", source.share());
+    let batch = source.batch::<f64>(0, source.draws() as usize);
+    assert!((batch.weight.unwrap().mean().item() - 1.0).abs() < 1e-6);
+}
+
+#[test]
+fn without_contrast_pixels_have_no_weights() {
+    let source = RaySource::new([view(&[[7, 8, 9, 255]; 20])], [1.0; 3], 0).with_contrast_floor(0.02);
+    let batch = source.batch::<f32>(0, 80);
+    assert!(batch.weight.is_none());
+    let mut columns: Vec<u32> = batch.pixel.iter().map(|pixel| pixel[0]).collect();
+    columns.sort_unstable();
+    assert!(columns.chunks(4).zip(0..).all(|(same, x)| same == [x; 4]));
 }

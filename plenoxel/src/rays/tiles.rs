@@ -31,6 +31,13 @@ impl Tile {
         self.width as usize * self.height as usize
     }
 
+    /// Returns the parts of the tile, at most 8 pixels wide and high.
+    pub fn parts(&self) -> impl Iterator<Item = Self> + use<> {
+        let Tile { view, x, y, width, height } = *self;
+        let along = |from: u32, count: u32| (from..from + count).step_by(SIDE as usize).map(move |at| (at, SIDE.min(from + count - at)));
+        along(y, height).flat_map(move |(y, height)| along(x, width).map(move |(x, width)| Tile { view, x, y, width, height }))
+    }
+
     /// Returns the parts of the tile that the mask of its view keeps: itself without a mask, otherwise runs of its rows.
     pub fn kept(self, view: &View) -> Vec<Self> {
         let Some(mask) = &view.mask else { return vec![self] };

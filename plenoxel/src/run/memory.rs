@@ -108,7 +108,7 @@ impl Estimate {
         // It renders after the optimizer state is freed.
         let reporting = (evaluation + comparison.max(page)).saturating_sub(optimizer);
         let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
-        let images = images(dataset, config.downscale, views);
+        let images = images(dataset, config.downscale, views) + importance(config, dataset);
         let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
         let voxels = (format!("stages[{index}].resolution"), "use fewer voxels per side, a lower sh_degree, or a higher sh_reduction");
         let parts = [
@@ -214,7 +214,7 @@ impl Estimate {
         let (width, height) = dataset.size();
         let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
-        let images = images(dataset, config.downscale, views);
+        let images = images(dataset, config.downscale, views) + importance(config, dataset);
         let step = (rays * ray).max(EVALUATION_RAYS * ray_of_picture).max(hull) + comparison;
         let own = |key: &str| format!("{}.{key}", recipe.kind());
         let parts = [
@@ -404,6 +404,14 @@ fn images(dataset: &Dataset, downscale: usize, views: usize) -> u64 {
     // Pixels are decoded row by row to 8 bits, into the image counted above unless it will be reduced.
     let decoding = if downscale > 1 { threads * 4 * pixels * (downscale * downscale) as u64 } else { 0 };
     views as u64 * pixels * per_pixel + decoding
+}
+
+/// Bytes of the importance of the training pixels: a byte of each, and the tiles of 8 × 8 pixels in which they are found.
+fn importance(config: &Config, dataset: &Dataset) -> u64 {
+    const TILE: usize = 32;
+    let (width, height) = dataset.size();
+    let pixels = dataset.count(Split::Train) * width * height;
+    if config.contrast_floor > 0.0 { (pixels + pixels / 64 * TILE) as u64 } else { 0 }
 }
 
 /// Bytes for comparing the views of a split, one after the other, if there are any.

@@ -83,7 +83,7 @@ const LEAST_WEIGHT: f64 = 0.05;
 const LEAST_OBJECT: f64 = 0.7;
 
 /// Rays per batch.
-const RAYS_PER_BATCH: u64 = 1 << 15;
+const RAYS_PER_BATCH: usize = 1 << 15;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Coords {
@@ -172,7 +172,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
         engine: config.engine,
         stop_below: 0.0,
     };
-    let total = rays.len().div_ceil(RAYS_PER_BATCH) as usize;
+    let total = rays.len().div_ceil(RAYS_PER_BATCH as u64) as usize;
     let count = console.count("rendering the training rays, batch", total);
     let batches = rays.in_order_with_alpha(RAYS_PER_BATCH).enumerate().map(|(done, batch)| {
         count.at(done, total);

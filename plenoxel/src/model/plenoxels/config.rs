@@ -59,6 +59,11 @@ pub struct Config {
     pub stop_below: f64,
     /// Number of rays per training step.
     pub rays_per_step: usize,
+    /// Floor f of the contrast in proportion to which training pixels are drawn: √(σ² + f²), where σ² is the variance of the colors of the
+    /// 3 x 3 pixels around a pixel. Losses of rays have the weights that make their expectation the mean over all pixels. 0 draws all pixels
+    /// equally often.
+    #[serde(default)]
+    pub contrast_floor: f64,
     /// Draw training rays only from pixels on or around the projection of the remaining voxels, because other rays cross empty space only.
     /// A stage that begins without empty space draws from all pixels. Needs no alpha channel.
     ///
@@ -393,6 +398,7 @@ impl Default for Config {
             engine: Engine::Fused,
             stop_below: 0.0,
             rays_per_step: 4096,
+            contrast_floor: 0.0,
             aim: false,
             jitter: true,
             project: false,
@@ -487,8 +493,8 @@ impl Config {
 
     /// Returns the settings of the trainer, which do not depend on the model.
     pub fn train_options(&self) -> TrainOptions {
-        let Config { seed, background, rays_per_step, jitter, .. } = *self;
-        TrainOptions { seed, background, rays_per_step, jitter, ..TrainOptions::default() }
+        let Config { seed, background, rays_per_step, jitter, contrast_floor, .. } = *self;
+        TrainOptions { seed, background, rays_per_step, jitter, contrast_floor, ..TrainOptions::default() }
     }
 
     /// Returns true if the config has a stage to train; without one it is a config for carving.
@@ -530,6 +536,8 @@ impl Config {
         color("sh_offset", self.sh_offset)?;
         check((0.0..=1e6).contains(&self.pixels_per_voxel), "pixels_per_voxel", self.pixels_per_voxel, "0 to 1e6")?;
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
+        let floor = self.contrast_floor;
+        check(floor == 0.0 || (0.005..=1.0).contains(&floor), "contrast_floor", floor, "0.005 to 1, or 0 for none")?;
         decay("stop_below", self.stop_below)?;
         density("prune_below", self.prune_below)?;
         check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;

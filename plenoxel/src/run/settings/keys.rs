@@ -50,6 +50,7 @@ const FIXED: &[(&str, &[&str])] = &[
             "engine",
             "stop_below",
             "rays_per_step",
+            "contrast_floor",
             "aim",
             "jitter",
             "project",
