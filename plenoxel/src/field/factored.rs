@@ -52,7 +52,7 @@ impl_module!(Factors { planes, lines });
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 /// Axes of the plane that belongs to the line of each axis.
-const PLANE_OF: [[usize; 2]; 3] = [[1, 2], [0, 2], [0, 1]];
+pub const PLANE_OF: [[usize; 2]; 3] = [[1, 2], [0, 2], [0, 1]];
 
 impl<T: Real> Factors<T> {
     /// Creates factors of 0.1 · N(0, 1).

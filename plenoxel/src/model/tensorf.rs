@@ -6,6 +6,7 @@
 
 mod config;
 mod recipe;
+mod total_variation;
 
 pub use super::stage::Stage;
 pub use config::{Config, Short};

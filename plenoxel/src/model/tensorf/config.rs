@@ -64,6 +64,9 @@ pub struct Config {
     pub density_l1: f64,
     /// Weight of the L1 norm of the density factors in the other stages.
     pub density_l1_later: f64,
+    /// Weight of the total variation of the density planes, 0.02 Σ over planes of the mean squared differences of neighbours along both axes; the authors'
+    /// `TV_weight_density`. It is evaluated at every tenth step, on a fifth of the rows. 0 for none.
+    pub density_tv: f64,
     /// Treatment of rows of planes without a gradient by Adam: true visits only rows with a gradient.
     pub lazy: bool,
     /// Changes for a run that is planned for a short time; `None` for none. The settings of a planned run have `None`.
@@ -116,6 +119,7 @@ impl Default for Config {
             cool_down: 0.4,
             density_l1: 8e-5,
             density_l1_later: 4e-5,
+            density_tv: 0.0,
             lazy: true,
             short: None,
             stages: stages.map(|(resolution, steps, rays)| Stage { resolution, steps, rays }).to_vec(),
@@ -190,6 +194,7 @@ impl Config {
         for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
         }
+        check((0.0..=1e3).contains(&self.density_tv), "density_tv", self.density_tv, "0 to 1000")?;
         if let Some(Short { below, hidden, group, cost }) = self.short {
             check((1..=1024).contains(&hidden), "short.hidden", hidden as f64, "1 to 1024")?;
             check((0.0..1.0).contains(&group), "short.group", group, "a number in [0, 1)")?;

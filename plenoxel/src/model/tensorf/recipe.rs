@@ -1,8 +1,9 @@
 //! Training a factored field from the configuration of a run: memory, and lengths of stages.
 
-use super::{Config, KIND, Stage, Tensorf};
+use super::{Config, KIND, Stage, Tensorf, total_variation};
 use crate::dataset::View;
 use crate::error::Result;
+use crate::loss::Objective;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
@@ -52,6 +53,10 @@ impl Recipe for Config {
     fn measured_step(&self) -> (u64, f64) {
         // In opaque matter, rays end at their first samples.
         (self.opaque_steps, cost(&self.stages[0]))
+    }
+
+    fn own_losses(&self, objective: Objective<f32, Tensorf<f32>>) -> Objective<f32, Tensorf<f32>> {
+        total_variation::with_density(objective, self.density_tv)
     }
 
     fn fitted_to(self, model: &Tensorf<f32>, views: &[View]) -> Self {
