@@ -46,7 +46,7 @@ pub struct RaySource {
     pixels: u64,
     /// 0 draws all pixels equally often.
     contrast_floor: f64,
-    /// Of the views after reduction.
+    /// Importance of the pixels of the reduced views; `None` if all pixels are drawn equally often.
     importance: Option<Importance>,
     with_depth: bool,
     channels: Vec<Channel>,

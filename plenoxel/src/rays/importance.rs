@@ -31,7 +31,7 @@ impl Importance {
         let floor = floor as f32;
         let draws = |variance: f32| ((variance + floor * floor).sqrt() * (DRAWS_OF_FLAT / floor)).round().clamp(1.0, 255.0) as u8;
         Importance {
-            draws: parallel::map_indices(views.len(), |v| variance(&views[v], background, draws)),
+            draws: parallel::map_indices(views.len(), |v| of_contrast(&views[v], background, draws)),
             columns: views.iter().map(|view| view.size()[0]).collect(),
         }
     }
@@ -62,9 +62,9 @@ impl Importance {
     }
 }
 
-/// Returns `to` of the variance of the colors of the 3 × 3 pixels around each pixel, mean over channels, row by row. Pixels beyond the border are left
-/// out.
-fn variance(view: &View, background: [f32; 3], to: impl Fn(f32) -> u8) -> Vec<u8> {
+/// Returns `draws(σ²)` for each pixel, row by row, where σ² is the variance of the colors of the 3 × 3 pixels around it, mean over channels. Pixels beyond
+/// the border are left out.
+fn of_contrast(view: &View, background: [f32; 3], draws: impl Fn(f32) -> u8) -> Vec<u8> {
     let [width, height] = view.size();
     // Colors of three rows, channel after channel.
     let mut colors = [(); 3].map(|()| vec![0.0; 3 * width]);
@@ -104,7 +104,7 @@ fn variance(view: &View, background: [f32; 3], to: impl Fn(f32) -> u8) -> Vec<u8
                 *variance += (around(&squares) - mean * mean).max(0.0) / 3.0;
             }
         }
-        out.extend(variance.iter().map(|&variance| to(variance)));
+        out.extend(variance.iter().map(|&variance| draws(variance)));
     }
     out
 }

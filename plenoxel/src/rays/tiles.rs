@@ -75,11 +75,7 @@ pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
                 shows[(row * columns + own.start) as usize..(row * columns + own.end.max(own.start)) as usize].fill(true);
             }
         }
-        let tile = |t: u32| {
-            let (x, y) = (t % columns * SIDE, t / columns * SIDE);
-            Tile { x, y, width: SIDE.min(all.width - x), height: SIDE.min(all.height - y), ..all }
-        };
-        (0..columns * rows).filter(|&t| shows[t as usize]).map(tile).collect::<Vec<_>>()
+        all.parts().zip(shows).filter(|(_, shows)| *shows).map(|(tile, _)| tile).collect::<Vec<_>>()
     });
     of_views.concat()
 }

@@ -129,7 +129,8 @@ fn total(stages: &[Stage]) -> f64 {
 
 /// Duration of a step of a factored field, in units of a ray at a resolution of 0. On lego, a ray took 5.8, 6.5 and 7.0 µs at 90, 180 and 300 nodes on two cores of
 /// an AMD EPYC with AVX-512, and 7.7 to 8.4, 8.6, 10.7 and 13.0 µs at 90, 252, 334 and 418 nodes on two cores of an Intel Xeon with AVX-512. The costs are those of
-/// the Xeon. Steps of the first stage, after the opaque ones, took 0.95 to 1.3 times as long as their cost says; runs for which that is much end early.
+/// the Xeon. Steps of the first stage, after the opaque ones, took 0.95 to 1.3 times as long as their cost says. The more it is, the earlier a
+/// planned run ends.
 fn cost(stage: &Stage) -> f64 {
     (stage.rays as f64 + 150.0) * (1.0 + stage.resolution as f64 / 500.0)
 }

@@ -11,8 +11,9 @@ use autograd::{Indices, Real, Tensor};
 const SCALE: f64 = 0.02;
 /// Steps between two evaluations.
 const INTERVAL: u64 = 10;
-/// Share of the rows of a plane that an evaluation reads, in runs of neighbours.
+/// Share of the rows of a plane that an evaluation reads.
 const SHARE: f64 = 0.2;
+/// Number of differences between neighbouring rows in a run; an evaluation reads whole runs.
 const RUN: usize = 8;
 
 /// Adds the total variation of the density planes to an objective, with the authors' `TV_weight_density` as its weight; 0 adds nothing. The authors evaluate
