@@ -17,7 +17,7 @@ use plenoxel::geometry::Aabb;
 use plenoxel::loss::{Objective, mse};
 use plenoxel::model::plenoxels::config::Hull;
 use plenoxel::model::tensorf::{Config, Stage, Tensorf, density_l1};
-use plenoxel::render::Field;
+use plenoxel::render::{Field, Rendered};
 use plenoxel::sampling::{Jitter, Occupancy, Spacing, sample};
 use plenoxel::space::{Region, Space};
 use plenoxel::train::{Model, Pass, PlannedStage, TrainOptions, Trainer, ViewOptions};
@@ -69,6 +69,23 @@ fn rays(count: usize) -> Vec<Ray> {
             Ray { origin, direction: (point(&to, i) - origin).normalize(), stretch: 1.0 }
         })
         .collect()
+}
+
+#[test]
+fn pictures_have_the_pixels_of_renderings() {
+    for region in [IN_BOX, NDC, CONTRACTED] {
+        let model = wide(Config { group_in_pictures: 0.02, color_above: 1e-3, stop_below_in_pictures: 1e-3, ..tiny(&[(30, 1)]) }, region);
+        let rays = if region == IN_BOX { rays(200) } else { rays_of_a_capture(200) };
+        let picture = model.viewer(&ViewOptions::over([1.0; 3]))(&rays);
+        let rendered = no_grad(|| model.render(&rays, &PASS));
+        let columns = |of: &Rendered<f64>| [of.rgb.clone(), of.depth(), of.opacity.clone()];
+        for (picture, rendered) in columns(&picture).iter().zip(columns(&rendered)) {
+            let off = picture.data().iter().zip(rendered.data()).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
+            assert!(off < 2e-3, "{region:?}: {off}");
+        }
+        let (fewer, all) = (picture.sample_count, rendered.sample_count);
+        assert!(fewer <= all && fewer > 400, "{region:?}: {fewer} of {all}");
+    }
 }
 
 #[test]

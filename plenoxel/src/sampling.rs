@@ -207,6 +207,13 @@ impl March {
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
         Occupied { march: *self, ray: *ray, along: cells.along(ray), next: 0, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
+
+    /// Returns the number of intervals whose middle lies before a distance on a straight ray, or a few less.
+    #[inline]
+    fn before(&self, distance: f64) -> usize {
+        let half = if self.points { 0.0 } else { 0.5 };
+        ((distance - self.start) / self.step + half) as usize
+    }
 }
 
 /// Number of intervals that are tested together.
@@ -244,6 +251,12 @@ impl Iterator for Occupied<'_> {
 }
 
 impl Occupied<'_> {
+    /// Leaves out the intervals of a straight ray before a distance, none of which lies in an occupied cell.
+    #[inline]
+    pub(crate) fn from(self, distance: f64) -> Self {
+        if self.march.is_straight() { Self { next: self.march.before(distance), ..self } } else { self }
+    }
+
     /// Tests the next intervals, or skips empty bricks.
     fn look(&mut self) {
         let march = &self.march;
@@ -254,10 +267,7 @@ impl Occupied<'_> {
             self.count = occupied_of_bent(march, (bend, &self.ray), &self.along, self.next, &mut self.found);
             self.next += LOOKS;
         } else if lost && let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
-            // Last k whose middle is not beyond the exit, up to rounding. It is tested again.
-            let half = if march.points { 0.0 } else { 0.5 };
-            let last = ((exit - march.start) / march.step + half) as usize;
-            self.next = (self.next + 1).max(last);
+            self.next = (self.next + 1).max(march.before(exit));
         } else {
             self.count = occupied_of(march, &self.along, self.next, &mut self.found);
             self.next += LOOKS;

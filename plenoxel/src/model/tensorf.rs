@@ -17,6 +17,7 @@ use crate::carve::visual_hull;
 use crate::dataset::{View, has_alpha};
 use crate::error::Result;
 use crate::field::factored::Factored;
+use crate::field::factored::fused::{self, Densities};
 use crate::field::grouping::Grouping;
 use crate::geometry::Aabb;
 use crate::loss::Step;
@@ -28,7 +29,7 @@ use crate::render::{Engine, Field, RenderOptions, Rendered, render, render_track
 use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::space::{Region, Space};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
+use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde_json::{Value, json};
@@ -63,6 +64,8 @@ impl<T: Real> Module<T> for Tensorf<T> {
 const HULL: usize = 128;
 /// Pixels around the silhouettes that belong to the hull.
 const HULL_MARGIN: f64 = 1.0;
+/// Opacity of a sample that pictures leave out.
+const NEGLIGIBLE: f64 = 1e-5;
 /// Most cells of an occupancy along each axis.
 const MOST_CELLS: usize = 256;
 
@@ -208,6 +211,16 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {
         render(&self.field, &self.space.rays(rays), &self.options(pass))
+    }
+
+    fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
+        let pass = Pass { background: view.background, jitter: Jitter::None, keep_samples: false, stage: None };
+        if self.engine != Engine::Fused || !fused::supports(self.field.shape()) {
+            return Box::new(move |rays| self.render(rays, &pass));
+        }
+        let options = self.options(&pass);
+        let densities = Densities::new(&self.field, NEGLIGIBLE / (self.config.step_in_pictures * self.cell_of_steps()));
+        Box::new(move |rays| fused::render_picture(&self.field, &densities, &self.space.rays(rays), &options))
     }
 
     fn tracks_rays(&self) -> bool {

@@ -16,8 +16,10 @@ pub struct Picture {
     pub opacity: Array2<f32>,
 }
 
-/// Number of rays rendered at a time. It bounds the memory.
-const CHUNK: usize = 4096;
+/// Side of the squares of pixels that are rendered at a time. It bounds the memory.
+const TILE: usize = 64;
+/// Side of the squares of pixels, in a tile, whose rays follow each other.
+const PACKET: usize = 8;
 
 /// Renders an image of a field.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {
@@ -29,28 +31,50 @@ pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Came
     picture_unless(render, camera, || false).expect("nothing stops it")
 }
 
-/// Renders an image as [`picture_by`] does. Before each chunk of rays it asks `stopped`; returns `None` once that is true.
+/// Renders an image as [`picture_by`] does. Before each tile of rays it asks `stopped`; returns `None` once that is true.
 pub fn picture_unless<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Camera, stopped: impl Fn() -> bool) -> Option<Picture> {
-    let (w, h) = (camera.intrinsics.width, camera.intrinsics.height);
-    let (mut rgb, mut depth, mut opacity) = (Vec::with_capacity(3 * w * h), Vec::with_capacity(w * h), Vec::with_capacity(w * h));
-    let as_f32 = |x: &T| x.as_f64() as f32;
-    for start in (0..w * h).step_by(CHUNK) {
+    let size = [camera.intrinsics.width, camera.intrinsics.height];
+    let [w, h] = size;
+    let mut picture = Picture { rgb: Array3::zeros((h, w, 3)), depth: Array2::zeros((h, w)), opacity: Array2::zeros((h, w)) };
+    for corner in (0..h).step_by(TILE).flat_map(|y| (0..w).step_by(TILE).map(move |x| [x, y])) {
         if stopped() {
             return None;
         }
-        let rays = parallel::map_indices(CHUNK.min(w * h - start), |i| {
-            let pixel = start + i;
-            camera.ray((pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5)
-        });
+        let pixels = pixels_of_tile(corner, size);
+        let rays = parallel::map_indices(pixels.len(), |i| camera.ray(pixels[i][0] as f64 + 0.5, pixels[i][1] as f64 + 0.5));
         let rendered = no_grad(|| render(&rays));
-        rgb.extend(rendered.rgb.data().iter().map(as_f32));
-        depth.extend(rendered.depth().data().iter().map(as_f32));
-        opacity.extend(rendered.opacity.data().iter().map(as_f32));
+        let (rgb, depth, opacity) = (rendered.rgb.data(), rendered.depth(), rendered.opacity.data());
+        let as_f32 = |x: T| x.as_f64() as f32;
+        for (i, &[x, y]) in pixels.iter().enumerate() {
+            (0..3).for_each(|c| picture.rgb[[y, x, c]] = as_f32(rgb[3 * i + c]));
+            picture.depth[[y, x]] = as_f32(depth.data()[i]);
+            picture.opacity[[y, x]] = as_f32(opacity[i]);
+        }
     }
-    let fits = "one value per pixel";
-    Some(Picture {
-        rgb: Array3::from_shape_vec((h, w, 3), rgb).expect(fits),
-        depth: Array2::from_shape_vec((h, w), depth).expect(fits),
-        opacity: Array2::from_shape_vec((h, w), opacity).expect(fits),
-    })
+    Some(picture)
+}
+
+/// Returns the pixels of a tile that lie in an image, packet after packet, so that rays that follow each other see nearly the same part of the scene.
+fn pixels_of_tile(corner: [usize; 2], size: [usize; 2]) -> Vec<[usize; 2]> {
+    let range = |a: usize, from: usize, side: usize| from..(from + side).min(size[a]).min(corner[a] + TILE);
+    let packets = range(1, corner[1], TILE).step_by(PACKET).flat_map(|y| range(0, corner[0], TILE).step_by(PACKET).map(move |x| [x, y]));
+    let pixels = |[x, y]: [usize; 2]| range(1, y, PACKET).flat_map(move |y| range(0, x, PACKET).map(move |x| [x, y]));
+    packets.flat_map(pixels).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tiles_have_each_pixel_of_an_image_once() {
+        for size in [[1, 1], [64, 64], [65, 130], [100, 61]] {
+            let mut found = vec![0; size[0] * size[1]];
+            for corner in (0..size[1]).step_by(TILE).flat_map(|y| (0..size[0]).step_by(TILE).map(move |x| [x, y])) {
+                pixels_of_tile(corner, size).into_iter().for_each(|[x, y]| found[y * size[0] + x] += 1);
+            }
+            assert!(found.iter().all(|&count| count == 1), "{size:?}");
+        }
+        assert_eq!(pixels_of_tile([0, 0], [100, 100])[64..66], [[8, 0], [9, 0]]);
+    }
 }

@@ -2,7 +2,7 @@
 
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use autograd::lattice::{BRICK, BrickGrid, bits, has, next_in, previous_in};
+use autograd::lattice::{BRICK, BrickGrid, bits, bits_where, has, next_in, previous_in};
 use autograd::{Real, Tensor, no_grad, parallel};
 use glam::DVec3;
 use std::sync::Arc;
@@ -69,6 +69,26 @@ impl Occupancy {
             thin.into_iter().for_each(|(brick, bit)| masks[brick - first] &= !(1 << bit));
         }
         Self::from_masks(self.aabb, self.cells(), masks)
+    }
+
+    /// Returns the occupied cells whose boxes satisfy a condition.
+    pub(crate) fn kept(&self, keep: impl Fn(Aabb) -> bool + Sync) -> Self {
+        let masks = parallel::map_indices(self.masks.len(), |brick| {
+            bits_where(self.masks[brick], |bit| keep(self.box_between(self.bricks.node(brick, bit), 1)))
+        });
+        Self::from_masks(self.aabb, self.cells(), masks)
+    }
+
+    /// Returns the boxes of the bricks of 4³ cells that have occupied cells.
+    pub(crate) fn boxes_of_bricks(&self) -> impl Iterator<Item = Aabb> + '_ {
+        let full = self.masks.iter().enumerate().filter(|(_, mask)| **mask != 0);
+        full.map(|(brick, _)| self.box_between(self.bricks.place(brick).map(|place| place * BRICK), BRICK))
+    }
+
+    /// Returns the box of the cells from `low` on, `count` along each axis.
+    fn box_between(&self, low: [usize; 3], count: usize) -> Aabb {
+        let min = self.aabb.min + self.sides() * DVec3::from_array(low.map(|k| k as f64));
+        Aabb { min, max: min + self.sides() * count as f64 }
     }
 
     /// Returns the sides of a cell, world length.
@@ -225,12 +245,76 @@ impl Occupancy {
         Self::from_masks(self.aabb, self.cells(), masks)
     }
 
+    /// Returns a distance before which none of some straight rays is in an occupied cell; infinite if they are in none at all. The nearer the rays are to each
+    /// other, the larger it is.
+    ///
+    /// Ray r is in the box around the middle ray, at distance t, whose half sides are a + b t along each axis. Where all bricks nearer than k to the middle ray
+    /// are empty, the rays go on to where their box leaves these bricks.
+    pub(crate) fn free_until(&self, rays: &[Ray]) -> f64 {
+        /// Rounding of positions, in cells.
+        const ROUNDING: f64 = 1e-6;
+        let Some(middle) = rays.get(rays.len() / 2).map(|ray| self.along(ray)) else { return f64::INFINITY };
+        let (mut a, mut b) = (DVec3::splat(ROUNDING), DVec3::ZERO);
+        for along in rays.iter().map(|ray| self.along(ray)) {
+            a = a.max((along.start - middle.start).abs() + ROUNDING);
+            b = b.max((along.slope - middle.slope).abs());
+        }
+        // The lowest and the highest place of the rays along each axis are linear in t.
+        let lowest = |axis: usize| Line { start: middle.start[axis] - a[axis], slope: middle.slope[axis] - b[axis] };
+        let highest = |axis: usize| Line { start: middle.start[axis] + a[axis], slope: middle.slope[axis] + b[axis] };
+        let (count, cells) = (self.bricks.count(), self.cells().map(|n| n as f64));
+        let enters = |axis: usize| highest(axis).until_above(0.0, 0.0).max(lowest(axis).negative().until_above(-cells[axis], 0.0));
+        let mut t = enters(0).max(enters(1)).max(enters(2));
+        while t.is_finite() {
+            let at = middle.start + t * middle.slope;
+            let place: [usize; 3] = std::array::from_fn(|axis| (at[axis].max(0.0) as usize / BRICK).min(count[axis] - 1));
+            let free = usize::from(self.distance[self.bricks.number(place)]);
+            let mut exit = f64::INFINITY;
+            // There is nothing beyond the box.
+            for axis in 0..3 {
+                if place[axis] + free < count[axis] {
+                    exit = exit.min(highest(axis).until_above(((place[axis] + free) * BRICK) as f64, t));
+                }
+                if place[axis] + 1 > free {
+                    exit = exit.min(lowest(axis).negative().until_above(-(((place[axis] + 1 - free) * BRICK) as f64), t));
+                }
+            }
+            if free == 0 || exit <= t + ROUNDING {
+                break;
+            }
+            t = exit;
+        }
+        t
+    }
+
     /// Prepares look-ups along a ray.
     #[inline]
     pub(crate) fn along(&self, ray: &Ray) -> Along<'_> {
         let per_length = DVec3::from_array(self.cells().map(|n| n as f64)) / (self.aabb.max - self.aabb.min);
         let slope = ray.direction * per_length;
         Along { cells: self, start: (ray.origin - self.aabb.min) * per_length, slope, per_cell: slope.recip() }
+    }
+}
+
+/// A number that is linear in the distance t along a ray: start + t slope.
+#[derive(Clone, Copy)]
+struct Line {
+    start: f64,
+    slope: f64,
+}
+
+impl Line {
+    fn negative(self) -> Self {
+        Line { start: -self.start, slope: -self.slope }
+    }
+
+    /// Returns the least distance, from `t` on, from which the number is above a limit; infinite if it never is.
+    fn until_above(self, limit: f64, t: f64) -> f64 {
+        match self.start + t * self.slope > limit {
+            true => t,
+            false if self.slope > 0.0 => (limit - self.start) / self.slope,
+            false => f64::INFINITY,
+        }
     }
 }
 
@@ -482,6 +566,39 @@ mod tests {
                 t += 0.01;
             }
             assert!(strides > 0);
+        }
+    }
+
+    #[test]
+    fn rays_that_are_led_together_pass_no_occupied_cell_before() {
+        let aabb = Aabb { min: DVec3::new(-1.0, -0.8, -1.1), max: DVec3::new(0.9, 1.2, 1.0) };
+        let number = |k: u64| 2.0 * uniform(5, Purpose::Initial, 1, k) - 1.0;
+        let point = |k: u64| DVec3::new(number(k), number(k + 1), number(k + 2));
+        for share in [0.0, 0.0003, 0.01] {
+            let some = Occupancy { aabb, ..scattered([70, 52, 66], share) };
+            let (mut far, mut none) = (0, 0);
+            for packet in 0..400u64 {
+                let (origin, target) = (3.0 * point(100 * packet).normalize(), point(100 * packet + 3));
+                // Rays of a packet of pixels, and some that have nothing in common.
+                let spread = if packet % 10 == 0 { 1.0 } else { 0.01 };
+                let ray = |k: u64| {
+                    let origin = origin + 0.2 * spread * point(100 * packet + 6 * k + 6);
+                    Ray { origin, direction: (target + spread * point(100 * packet + 6 * k + 9) - origin).normalize(), stretch: 1.0 }
+                };
+                let rays: Vec<Ray> = (0..12).map(ray).collect();
+                let until = some.free_until(&rays);
+                for ray in &rays {
+                    let Some((near, end)) = aabb.intersect(ray.origin, ray.direction) else { continue };
+                    for k in 0..300 {
+                        let t = near + (until.min(end) - near) * (f64::from(k) + 0.5) / 300.0;
+                        assert!(t > until || t < near || !some.contains_point(ray.origin + t * ray.direction), "packet {packet} at {t}");
+                    }
+                    far += usize::from(until > near + 0.2);
+                }
+                none += usize::from(until.is_infinite());
+            }
+            assert!(far > 400 && none > 10, "{far} {none}");
+            assert!(share > 0.0 || none > 340, "{none}");
         }
     }
 }

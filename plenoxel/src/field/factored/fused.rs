@@ -11,6 +11,7 @@
 //! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of its samples, and adds them up for each ray.
 
 mod adjoint;
+mod densities;
 mod forward;
 mod lookup;
 mod network;
@@ -24,6 +25,7 @@ use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Samples, Spacing};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
+pub use densities::Densities;
 use forward::{Block, Scene};
 use glam::DVec3;
 use std::sync::Arc;
@@ -100,14 +102,23 @@ impl<T: Real> render::Columns<T> for Columns<T> {
 pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[rays.len(), 3]);
     let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
-    render_inputs(field, rays, (directions, encoded), &[], options)
+    render_inputs(field, rays, (directions, encoded), &[], (options, None))
+}
+
+/// Renders a batch of rays for a picture, without recording a gradient, with the densities of a table of the same field.
+pub fn render_picture<T: Real>(field: &Factored<T>, densities: &Densities<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    autograd::no_grad(|| {
+        let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[rays.len(), 3]);
+        let encoded = field.shape.directions.encode(&directions);
+        render_inputs(field, rays, (directions, encoded), &[], (options, Some(densities)))
+    })
 }
 
 /// Renders a batch of tracked rays through a field.
 pub fn render_tracked<T: Real>(field: &Factored<T>, tracked: &TrackedRays<T>, options: &RenderOptions<'_>) -> Rendered<T> {
     let TrackedRays { rays, origins, directions } = tracked;
     let encoded = field.shape.directions.encode(directions);
-    render_inputs(field, rays, (directions.detach(), encoded.detach()), &[&encoded, origins, directions], options)
+    render_inputs(field, rays, (directions.detach(), encoded.detach()), &[&encoded, origins, directions], (options, None))
 }
 
 /// Renders a batch of rays with these directions and encoded directions. `of_rays` are the inputs of the kernel after the parameters of the field: nothing, or
@@ -117,7 +128,7 @@ fn render_inputs<T: Real>(
     rays: &[Ray],
     (directions, encoded): (Tensor<T>, Tensor<T>),
     of_rays: &[&Tensor<T>],
-    options: &RenderOptions<'_>,
+    (options, densities): (&RenderOptions<'_>, Option<&Densities<T>>),
 ) -> Rendered<T> {
     let n = rays.len();
     let params = field.tables();
@@ -128,10 +139,10 @@ fn render_inputs<T: Real>(
     let grouping = if matches!(jitter, Jitter::None) { field.grouping_in_pictures } else { field.grouping };
     let gradient_above = field.gradient_above;
     let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, gradient_above, jitter };
-    let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params);
+    let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params).with_densities(densities);
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
     // Without an adjoint, small blocks share the work of background and matter among the threads more evenly.
-    let size = if keep { block_of(n) } else { block_of(n).div_ceil(4) };
+    let size = if keep || densities.is_some() { block_of(n) } else { block_of(n).div_ceil(4) };
     let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();
     let blocks = parallel::map_items(parts, |b, (pixels, sparsity)| {
         let block = scene.render(b * size, pixels, sparsity);

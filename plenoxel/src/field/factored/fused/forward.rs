@@ -1,6 +1,7 @@
 //! Pixels of rays, one block of rays at a time.
 
 use super::Batch;
+use super::densities::{self, Densities};
 use super::lookup::{self, Pairs, RUN};
 use super::network::{Activations, Network};
 use crate::camera::Ray;
@@ -8,10 +9,13 @@ use crate::field::grouping::Groups;
 use crate::geometry::Aabb;
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along, COLUMNS};
-use crate::sampling::{Occupancy, march};
+use crate::sampling::{Occupancy, Spacing, march};
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
 use std::ops::Range;
+
+/// Number of rays that are led through the empty space before the first matter together, in pictures.
+const PACKET: usize = 64;
 
 /// Columns of a sample.
 mod of_sample {
@@ -110,6 +114,7 @@ pub struct Scene<'a, T: Real> {
     options: &'a RenderOptions<'a>,
     cells: Option<&'a Occupancy>,
     tables: Tables<'a, T>,
+    densities: Option<&'a Densities<T>>,
 }
 
 /// Parameters of a field.
@@ -143,7 +148,12 @@ impl<'a, T: Real> Scene<'a, T> {
         cells: Option<&'a Occupancy>,
         tables: &'a [Tensor<T>],
     ) -> Self {
-        Scene { batch, rays, options, cells, tables: Tables::new(batch, tables) }
+        Scene { batch, rays, options, cells, tables: Tables::new(batch, tables), densities: None }
+    }
+
+    /// Reads the densities from a table.
+    pub fn with_densities(self, densities: Option<&'a Densities<T>>) -> Self {
+        Scene { densities, cells: densities.map_or(self.cells, |densities| Some(densities.cells())), ..self }
     }
 
     /// Renders rays from `first` on, one for each entry of `sparsity`.
@@ -169,9 +179,17 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut end = 0;
         let most = DVec3::from_array(self.batch.nodes.map(|n| n as f64 - 1.0));
         let per_length = cells_per_length(self.batch.nodes, aabb);
-        for (r, ray) in self.rays[first..first + count].iter().enumerate() {
+        let rays = &self.rays[first..first + count];
+        let mut free_until = 0.0;
+        for (r, ray) in rays.iter().enumerate() {
+            if let Some(densities) = self.densities
+                && r % PACKET == 0
+                && !matches!(spacing, Spacing::Contracted(_))
+            {
+                free_until = densities.cells().free_until(&rays[r..count.min(r + PACKET)]);
+            }
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells));
+            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells).from(free_until));
             let mut all = (0..march.count).map(move |k| march.interval(k));
             let mut next = || occupied.as_mut().map_or_else(|| all.next(), Iterator::next);
             let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
@@ -199,10 +217,11 @@ impl<'a, T: Real> Scene<'a, T> {
                 let (x, y, z, delta) = (&x[run.clone()], &y[run.clone()], &z[run.clone()], &delta[run.clone()]);
                 let (sigma, slope) = (&mut sigma[run.clone()], &mut slope[run.clone()]);
                 let (weight, after) = (&mut weight[run.clone()], &mut after[run]);
-                if parallel::fused() {
-                    lookup::density::<T, true>(self.tables.density, [x, y, z], sigma, slope);
-                } else {
-                    lookup::density::<T, false>(self.tables.density, [x, y, z], sigma, slope);
+                match (self.densities, parallel::fused()) {
+                    (Some(densities), true) => densities::at::<T, true>(densities, [x, y, z], sigma),
+                    (Some(densities), false) => densities::at::<T, false>(densities, [x, y, z], sigma),
+                    (None, true) => lookup::density::<T, true>(self.tables.density, [x, y, z], sigma, slope),
+                    (None, false) => lookup::density::<T, false>(self.tables.density, [x, y, z], sigma, slope),
                 }
                 if parallel::fused() {
                     lookup::absorb::<T, true>(sigma, delta, weight, after);

@@ -32,7 +32,7 @@ pub(super) struct Cells<T> {
     /// Number of samples.
     pub count: usize,
     /// Lower node along each axis.
-    node: [[u32; RUN]; 3],
+    pub node: [[u32; RUN]; 3],
     /// Distance from the lower node, in cells.
     pub share: [[T; RUN]; 3],
     /// Nodes along each axis.
@@ -119,12 +119,19 @@ const ARTANH: [f64; 17] = {
 /// Returns ln(1 + e) for e in [0, 1], as 2 artanh(e / (2 + e)).
 #[inline(always)]
 fn ln_1p<T: Real>(e: T) -> T {
-    let terms = if is_single::<T>() { 7 } else { 17 };
     let s = e / (T::lit(2.0) + e);
+    if const { is_single::<T>() } { artanh_series::<T, 7>(s) } else { artanh_series::<T, 17>(s) }
+}
+
+/// Returns the first terms of 2 artanh(s). Their number is a constant, so that loops over samples vectorise.
+#[inline(always)]
+fn artanh_series<T: Real, const TERMS: usize>(s: T) -> T {
     let square = s * s;
     let mut sum = T::zero();
-    for coefficient in ARTANH[..terms].iter().rev() {
-        sum = sum * square + T::lit(*coefficient);
+    let mut k = TERMS;
+    while k > 0 {
+        k -= 1;
+        sum = sum * square + T::lit(ARTANH[k]);
     }
     s * sum
 }
@@ -186,6 +193,20 @@ pub(super) fn prefetch<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>) {
     }
 }
 
+/// Adds up the lanes of each sum, into the first.
+#[inline(always)]
+pub(super) fn add_lanes<T: Real, const N: usize>(sums: &mut [[T; LANES]; N]) {
+    let mut width = LANES / 2;
+    while width > 0 {
+        for sums in &mut *sums {
+            for l in 0..width {
+                sums[l] += sums[l + width];
+            }
+        }
+        width /= 2;
+    }
+}
+
 dispatched! {
 /// Computes the density σ and dσ/ds of up to [`RUN`] samples.
 pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, sigma: &mut [T], slope: &mut [T]) {
@@ -208,27 +229,23 @@ pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T
             }
         }
     }
-    let mut width = LANES / 2;
-    while width > 0 {
-        for sums in &mut sums {
-            for l in 0..width {
-                sums[l] += sums[l + width];
-            }
-        }
-        width /= 2;
-    }
+    add_lanes(&mut sums);
     for (sigma, sums) in sigma.iter_mut().zip(&sums) {
         *sigma = sums[0] + T::lit(SHIFT);
     }
-    let scale = T::lit(SCALE);
     for (sigma, slope) in sigma.iter_mut().zip(slope) {
-        let x = *sigma;
-        let e = (-x.abs()).exp_::<FUSED>();
-        let above = T::one() / (T::one() + e);
-        *slope = scale * if x > T::zero() { above } else { e * above };
-        *sigma = scale * (x.max(T::zero()) + ln_1p(e));
+        (*sigma, *slope) = density_of::<T, FUSED>(*sigma);
     }
 }
+}
+
+/// Returns the density σ and dσ/ds of a density feature s − 10.
+#[inline(always)]
+pub(super) fn density_of<T: Real, const FUSED: bool>(x: T) -> (T, T) {
+    let scale = T::lit(SCALE);
+    let e = (-x.abs()).exp_::<FUSED>();
+    let above = T::one() / (T::one() + e);
+    (scale * (x.max(T::zero()) + ln_1p(e)), scale * if x > T::zero() { above } else { e * above })
 }
 
 dispatched! {

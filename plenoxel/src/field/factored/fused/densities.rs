@@ -1,0 +1,301 @@
+//! Densities of a field that does not change, for pictures.
+//!
+//! In each cell, the product of a bilinear plane and a linear line is trilinear, and so is the sum of products, the density feature s. A table of s at the nodes
+//! therefore gives the same densities as the factors, up to rounding, and a sample reads eight numbers instead of 18 rows. Nodes are stored in bricks of 4³
+//! cells. Samples whose opacity is surely below a bound are left out.
+
+use super::super::{Factored, PLANE_OF, SCALE, SHIFT};
+use super::lookup::{Cells, LANES, Pairs, Places, RUN, add_lanes, density_of};
+use crate::geometry::Aabb;
+use crate::render::Field;
+use crate::sampling::Occupancy;
+use autograd::lattice::{BRICK, BrickGrid};
+use autograd::parallel::gathered;
+use autograd::{Real, dispatched, parallel};
+use glam::DVec3;
+
+/// Nodes along the side of a brick of cells.
+const SIDE: usize = BRICK + 1;
+/// Entries of a brick in the table: its nodes in row-major order, and some that are not used.
+const ENTRIES: usize = 128;
+/// Density feature of bricks that are left out. The density is 0.
+const NOTHING: f64 = -1e3;
+/// Bricks that one task computes.
+const TOGETHER: usize = 256;
+
+/// Table of the density features at the nodes of a field.
+#[derive(Debug)]
+pub struct Densities<T> {
+    nodes: [usize; 3],
+    bricks: BrickGrid,
+    /// Place of each brick in the table; 0 for those that are left out.
+    links: Vec<u32>,
+    /// s − 10 at the nodes.
+    features: Vec<T>,
+    cells: Occupancy,
+}
+
+impl<T: Real> Densities<T> {
+    /// Computes the table. Samples are left out if the densities of all nodes around them, 1 / length, are at most `negligible`.
+    pub fn new(field: &Factored<T>, negligible: f64) -> Self {
+        let nodes = field.nodes();
+        let bricks = BrickGrid::new(nodes.map(|n| n - 1));
+        let reach = field.reach().cloned().unwrap_or_else(|| Occupancy::full(field.aabb(), nodes.map(|n| n - 1)));
+        // σ = SCALE softplus(s − 10)
+        let least = T::lit((negligible / SCALE).exp_m1().ln());
+        let tables = field.tables();
+        let pairs = Pairs {
+            planes: [0, 1, 2].map(|axis| tables[axis].data()),
+            lines: [0, 1, 2].map(|axis| tables[3 + axis].data()),
+            nodes,
+            width: field.shape().density_components,
+        };
+        let reached = reached(&reach, bricks, |aabb| nodes_around(field, aabb));
+        let parts = parallel::map_chunks(reached.len(), TOGETHER, |range| {
+            let (mut kept, mut features) = (Vec::new(), Vec::new());
+            for &brick in &reached[range] {
+                let low = bricks.place(brick as usize).map(|place| place * BRICK);
+                let mut values = [T::lit(NOTHING); ENTRIES];
+                match parallel::fused() {
+                    true => features_of::<T, true>(pairs, low, &mut values),
+                    false => features_of::<T, false>(pairs, low, &mut values),
+                }
+                if values.iter().any(|&value| value > least) {
+                    kept.push(brick);
+                    features.extend_from_slice(&values);
+                }
+            }
+            (kept, features)
+        });
+        let mut links = vec![0; bricks.len()];
+        let mut features = vec![T::lit(NOTHING); ENTRIES];
+        features.reserve_exact(parts.iter().map(|(_, features)| features.len()).sum());
+        for (kept, values) in parts {
+            for (place, brick) in ((features.len() / ENTRIES) as u32..).zip(kept) {
+                links[brick as usize] = place;
+            }
+            features.extend(values);
+        }
+        let table = Densities { nodes, bricks, links, features, cells: reach };
+        let cells = table.cells.kept(|aabb| {
+            let [low, high] = nodes_around(field, aabb);
+            let mut nodes =
+                (low[0]..=high[0]).flat_map(|i| (low[1]..=high[1]).flat_map(move |j| (low[2]..=high[2]).map(move |k| [i, j, k])));
+            nodes.any(|node| table.feature(node) > least)
+        });
+        Densities { cells, ..table }
+    }
+
+    /// Returns the cells outside of which all samples are left out.
+    pub fn cells(&self) -> &Occupancy {
+        &self.cells
+    }
+
+    /// Returns s − 10 at a node.
+    fn feature(&self, node: [usize; 3]) -> T {
+        let place = [0, 1, 2].map(|a| node[a].min(self.nodes[a] - 2) / BRICK);
+        let [i, j, k] = [0, 1, 2].map(|a| node[a] - BRICK * place[a]);
+        self.features[self.links[self.bricks.number(place)] as usize * ENTRIES + (i * SIDE + j) * SIDE + k]
+    }
+}
+
+/// Returns the lowest and the highest node of the cells that overlap a box, along each axis.
+fn nodes_around<T: Real>(field: &Factored<T>, aabb: Aabb) -> [[usize; 3]; 2] {
+    /// Rounding of positions, in cells.
+    const ROUNDING: f64 = 1e-3;
+    let (low, sides, most) = (field.aabb().min, field.sides(), field.nodes().map(|n| n - 1));
+    let node = |at: DVec3| [0, 1, 2].map(|a| at[a].clamp(0.0, most[a] as f64) as usize);
+    let (from, to) = ((aabb.min - low) / sides - ROUNDING, (aabb.max - low) / sides + ROUNDING);
+    let (from, to) = (node(from.floor()), node(to.ceil()));
+    // At the upper face, samples read the last cell.
+    [[0, 1, 2].map(|a| from[a].min(most[a] - 1)), [0, 1, 2].map(|a| to[a].max(1))]
+}
+
+/// Returns the bricks that overlap bricks of occupied cells, in order. `nodes_around` maps a box to its nodes.
+fn reached(cells: &Occupancy, bricks: BrickGrid, nodes_around: impl Fn(Aabb) -> [[usize; 3]; 2]) -> Vec<u32> {
+    let mut reached = vec![false; bricks.len()];
+    for aabb in cells.boxes_of_bricks() {
+        let [low, high] = nodes_around(aabb);
+        let range = |a: usize| low[a] / BRICK..=(high[a] - 1) / BRICK;
+        for (i, j) in range(0).flat_map(|i| range(1).map(move |j| (i, j))) {
+            let [first, last] = [*range(2).start(), *range(2).end()].map(|k| bricks.number([i, j, k]));
+            reached[first..=last].fill(true);
+        }
+    }
+    (0..).zip(reached).filter(|(_, reached)| *reached).map(|(brick, _)| brick).collect()
+}
+
+dispatched! {
+/// Computes s − 10 at the nodes of a brick, from its lowest node.
+fn features_of<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, low: [usize; 3], out: &mut [T; ENTRIES]) {
+    let chunks = pairs.width / LANES;
+    // The last brick may have fewer nodes; its other entries are not read.
+    let node = |axis: usize, local: usize| (low[axis] + local).min(pairs.nodes[axis] - 1);
+    for i in 0..SIDE {
+        for j in 0..SIDE {
+            let mut sums = [[T::zero(); LANES]; SIDE];
+            for axis in 0..3 {
+                let (plane, line) = (pairs.planes[axis].as_chunks::<LANES>().0, pairs.lines[axis].as_chunks::<LANES>().0);
+                let [b, c] = PLANE_OF[axis];
+                for (k, sum) in sums.iter_mut().enumerate() {
+                    let at = [node(0, i), node(1, j), node(2, k)];
+                    let (row, along) = (at[b] * pairs.nodes[c] + at[c], at[axis]);
+                    for chunk in 0..chunks {
+                        let (p, l) = (&plane[row * chunks + chunk], &line[along * chunks + chunk]);
+                        let old = *sum;
+                        let mut new = [T::zero(); LANES];
+                        for lane in 0..LANES {
+                            new[lane] = p[lane].multiply_add::<FUSED>(l[lane], old[lane]);
+                        }
+                        *sum = new;
+                    }
+                }
+            }
+            add_lanes(&mut sums);
+            for (k, sum) in sums.iter().enumerate() {
+                out[(i * SIDE + j) * SIDE + k] = sum[0] + T::lit(SHIFT);
+            }
+        }
+    }
+}
+}
+
+dispatched! {
+/// Reads the densities σ of up to [`RUN`] samples.
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+pub fn at<T: Real, const FUSED: bool>(table: &Densities<T>, at: Places<'_, T>, sigma: &mut [T]) {
+    let Cells { node, share, .. } = Cells::new(at, table.nodes);
+    let (mut numbers, mut entries) = ([0; RUN], [0; RUN]);
+    for a in 0..3 {
+        let count = table.bricks.count()[a] as u32;
+        for i in 0..RUN {
+            numbers[i] = numbers[i] * count + node[a][i] / BRICK as u32;
+            entries[i] = entries[i] * SIDE as u32 + node[a][i] % BRICK as u32;
+        }
+    }
+    let links = gathered(&table.links, numbers);
+    for i in 0..RUN {
+        entries[i] += links[i] * ENTRIES as u32;
+    }
+    // Interpolated along z, then y, then x.
+    let mut of_x = [[T::zero(); RUN]; 2];
+    for x in 0..2 {
+        let mut of_y = [[T::zero(); RUN]; 2];
+        for y in 0..2 {
+            let (mut below, mut above) = (entries, entries);
+            for i in 0..RUN {
+                below[i] += ((x * SIDE + y) * SIDE) as u32;
+                above[i] = below[i] + 1;
+            }
+            let (below, above) = (gathered(&table.features, below), gathered(&table.features, above));
+            for i in 0..RUN {
+                of_y[y][i] = (above[i] - below[i]).multiply_add::<FUSED>(share[2][i], below[i]);
+            }
+        }
+        for i in 0..RUN {
+            of_x[x][i] = (of_y[1][i] - of_y[0][i]).multiply_add::<FUSED>(share[1][i], of_y[0][i]);
+        }
+    }
+    let mut found = [T::zero(); RUN];
+    for i in 0..RUN {
+        let feature = (of_x[1][i] - of_x[0][i]).multiply_add::<FUSED>(share[0][i], of_x[0][i]);
+        found[i] = density_of::<T, FUSED>(feature).0;
+    }
+    sigma.copy_from_slice(&found[..sigma.len()]);
+}
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::encoding::Directions;
+    use crate::field::factored::Shape;
+    use autograd::random::Stream;
+    use autograd::{Module, Param, Tensor};
+
+    const BOX: Aabb = Aabb { min: DVec3::new(-1.0, -0.7, -1.2), max: DVec3::new(1.1, 0.9, 0.8) };
+
+    /// A field with dense and with empty parts.
+    fn field(nodes: [usize; 3]) -> Factored<f64> {
+        let directions = Directions::Harmonics(1);
+        let shape = Shape { density_components: 16, appearance_components: 16, features: 4, hidden: 4, feature_octaves: 0, directions };
+        let mut field = Factored::new(shape, BOX, nodes, &Stream::new(3));
+        field.visit_mut(&mut |param: &mut Param<f64>| {
+            if param.name().starts_with("density") {
+                *param = Param::from_tensor(param.name(), param.tensor() * 7.0);
+            }
+        });
+        field
+    }
+
+    fn positions(count: usize) -> Tensor<f64> {
+        let shares = Stream::new(4).uniform_tensor::<f64>(&[count, 3], 0.0, 1.0);
+        let side = BOX.max - BOX.min;
+        let at = |share: &[f64]| {
+            // Some lie on faces of the box.
+            let share = DVec3::from_slice(share);
+            BOX.min + side * (1.1 * share - 0.05).clamp(DVec3::ZERO, DVec3::ONE)
+        };
+        Tensor::from_vec(shares.data().chunks(3).flat_map(|share| at(share).to_array()).collect(), &[count, 3])
+    }
+
+    fn read(table: &Densities<f64>, field: &Factored<f64>, positions: &Tensor<f64>) -> Vec<f64> {
+        let cells = field.cells(positions);
+        let all = cells.data().chunks(3 * RUN).flat_map(|run| {
+            let column = |axis: usize| run.iter().skip(axis).step_by(3).copied().collect::<Vec<_>>();
+            let [x, y, z] = [0, 1, 2].map(column);
+            let mut sigma = vec![0.0; x.len()];
+            match parallel::fused() {
+                true => at::<f64, true>(table, [&x, &y, &z], &mut sigma),
+                false => at::<f64, false>(table, [&x, &y, &z], &mut sigma),
+            }
+            sigma
+        });
+        all.collect()
+    }
+
+    #[test]
+    fn the_table_has_the_densities_of_the_factors() {
+        for nodes in [[2, 2, 2], [5, 9, 4], [6, 13, 10]] {
+            let field = field(nodes);
+            let at = positions(1000);
+            let (want, found) = (field.density(&at), read(&Densities::new(&field, 0.0), &field, &at));
+            for (want, found) in want.data().iter().zip(&found) {
+                assert!((want - found).abs() < 1e-10 * (1.0 + want), "{nodes:?}: {found} instead of {want}");
+            }
+        }
+    }
+
+    #[test]
+    fn only_samples_below_the_bound_and_outside_of_the_reach_are_left_out() {
+        let nodes = [30, 21, 26];
+        for cells in [None, Some([17, 24, 19])] {
+            let mut field = field(nodes);
+            // The reach may belong to an earlier, larger box.
+            let larger = Aabb { min: BOX.min - 0.1, max: BOX.max + 0.2 };
+            let scattered = |cells: [usize; 3]| {
+                let numbers = Stream::new(9).uniform_tensor::<f64>(&[cells.iter().product()], 0.0, 1.0);
+                Occupancy::new(larger, cells, &numbers.data().iter().map(|&number| number < 0.5).collect::<Vec<_>>())
+            };
+            field.occupied = cells.map(scattered);
+            let negligible = 0.5;
+            let table = Densities::new(&field, negligible);
+            let at = positions(20_000);
+            let (want, found) = (field.density(&at), read(&table, &field, &at));
+            let mut left_out = 0;
+            for ((at, &want), &found) in at.data().chunks(3).zip(want.data()).zip(&found) {
+                let at = DVec3::from_slice(at);
+                let reached = field.occupied.as_ref().is_none_or(|reach| reach.contains_point(at));
+                let inside = table.cells().contains_point(at.min(BOX.max - 1e-9));
+                assert!(!inside || reached);
+                if reached && inside {
+                    assert!((want - found).abs() < 1e-10 * (1.0 + want) || want <= negligible, "{found} instead of {want} at {at}");
+                } else if reached {
+                    assert!(want <= negligible, "{want} at {at} is left out");
+                    left_out += 1;
+                }
+            }
+            assert!(left_out > 1000, "{left_out}");
+        }
+    }
+}
