@@ -1,7 +1,6 @@
 //! The specification against closed forms.
 
-mod support;
-
+use crate::support::{ray, rays};
 use approx::assert_relative_eq;
 use autograd::{Tensor, no_grad, value_and_grad};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
@@ -9,7 +8,6 @@ use plenoxel::field::{Field, Radiance};
 use plenoxel::geometry::Aabb;
 use plenoxel::render::{Engine, RenderOptions, Rendered, render};
 use plenoxel::sampling::{Jitter, Samples, Spacing};
-use support::{ray, rays};
 
 const CUBE: f64 = 1.0;
 

@@ -1,9 +1,6 @@
 //! `plenoxel bake`, and the page and the exports of a factored field.
 
-#[path = "support/command.rs"]
-mod command;
-
-use command::{Answer, Folder, plenoxel};
+use crate::command::{Answer, Folder, plenoxel};
 use serde_json::Value;
 use std::fs;
 

@@ -1,13 +1,8 @@
 //! Runs of captures: the viewer of the page, films, and what needs a box of the world.
 
-#[path = "support/captures.rs"]
-#[allow(dead_code)]
-mod captures;
-#[path = "support/command.rs"]
-mod command;
-
+use crate::capture_folders as captures;
+use crate::command::{Folder, plenoxel};
 use captures::{write_llff, write_transforms};
-use command::{Folder, plenoxel};
 use glam::DVec3;
 use plenoxel::camera::Camera;
 use plenoxel::dataset::procedural::ProceduralOptions;

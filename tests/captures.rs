@@ -1,8 +1,6 @@
 //! Opening captures: the same cameras in every format, and the message for everything that can be wrong.
 
-#[path = "support/captures.rs"]
-mod support;
-
+use crate::capture_folders::*;
 use glam::{DAffine3, DMat3, DVec3, dvec3};
 use plenoxel::camera::Camera;
 use plenoxel::dataset::normalize::{CaptureOptions, Center, Orient, Scale, SpaceChoice};
@@ -11,7 +9,6 @@ use plenoxel::dataset::{self, Dataset, OpenOptions, Split, View};
 use plenoxel::error::Error;
 use plenoxel::geometry::Similarity;
 use plenoxel::space::Space;
-use support::*;
 
 /// Nine views of the built-in scene.
 fn views() -> Vec<View> {

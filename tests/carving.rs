@@ -66,7 +66,7 @@ fn the_footprint_rule_carves_no_voxel_that_holds_matter() {
     }
 }
 
-/// `cargo test --release --test carving -- --ignored --nocapture`: half a minute for figures that no assertion needs.
+/// `cargo test --release --test models carving -- --ignored --nocapture`: half a minute for figures that no assertion needs.
 #[test]
 #[ignore = "figures"]
 fn needless_voxels_of_the_rules_against_the_ideal_hull() {
@@ -124,7 +124,7 @@ fn over_surroundings(mut views: Vec<View>) -> Vec<View> {
     views
 }
 
-/// `cargo test --release --test carving -- --ignored --nocapture`: what the photo hull carves of the hollows that no silhouette shows, and what
+/// `cargo test --release --test models carving -- --ignored --nocapture`: what the photo hull carves of the hollows that no silhouette shows, and what
 /// of matter. A voxel is full by as many of 64 points as lie in matter.
 #[test]
 #[ignore = "figures"]

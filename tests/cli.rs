@@ -1,10 +1,7 @@
 //! The command line, called like any function: what a user types, what comes back, what lies in the folder afterwards.
 
-#[path = "support/command.rs"]
-mod command;
-#[path = "support/events.rs"]
-mod events;
-
+use crate::command;
+use crate::events;
 use command::{Answer, Folder, SHORT, plenoxel};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split, exposure, image};

@@ -1,7 +1,6 @@
 //! Reading a field at another resolution.
 
-mod support;
-
+use crate::support::{numbers, rays};
 use approx::assert_relative_eq;
 use autograd::Module;
 use autograd::{Tensor, no_grad};
@@ -10,7 +9,6 @@ use plenoxel::field::voxel_grid::fused::largest_weights;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::render::{Engine, RenderOptions, render};
 use plenoxel::sampling::{Jitter, Spacing};
-use support::{numbers, rays};
 
 /// Voxel centres of a grid of n³ in the cube ±1.
 fn centers(n: usize) -> Vec<[f64; 3]> {

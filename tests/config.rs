@@ -1,8 +1,6 @@
 //! Settings: presets, and runs that their config.toml repeats; values at the edges of what is accepted.
 
-#[path = "support/command.rs"]
-mod command;
-
+use crate::command;
 use command::{Answer, Folder};
 use plenoxel::model::plenoxels::config::{ColorKind, Config, Hull, Initial, OptimizerConfig, Sampling, Weight};
 use std::fs;

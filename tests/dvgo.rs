@@ -1,8 +1,6 @@
 //! DirectVoxGO: its gradients, the samples that it leaves out, training and resuming.
 
-#[path = "support/own_losses.rs"]
-mod own_losses;
-
+use crate::own_losses;
 use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
 use glam::DVec3;
 use plenoxel::camera::Ray;

@@ -1,9 +1,6 @@
 //! `plenoxel render` along paths and to all file formats: what a user types, and what other programs find in the files.
 
-#[path = "support/command.rs"]
-mod command;
-
-use command::{Folder, plenoxel};
+use crate::command::{Folder, plenoxel};
 use exr::prelude::{ReadChannels, ReadLayers, read};
 use plenoxel::dataset::image;
 use serde_json::{Value, json};

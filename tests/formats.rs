@@ -1,8 +1,6 @@
 //! Grids in the files of svox2 and PlenOctrees: written, read again, and read from files that NumPy wrote (`tests/support/formats.py`).
 
-#[path = "support/command.rs"]
-mod command;
-
+use crate::command;
 use approx::assert_relative_eq;
 use command::{Folder, plenoxel, train};
 use glam::DVec3;

@@ -3,8 +3,7 @@
 //! The graph itself is held to finite differences in `gradients.rs` and to closed forms in `analytic_scenes.rs`. To see that this suite can
 //! fail, change any one term of `sigma_of_ray` in `render/fused/adjoint.rs`: most of it does.
 
-mod support;
-
+use crate::support;
 use autograd::{Lattice, Real, Tensor, no_grad};
 use plenoxel::camera::Ray;
 use plenoxel::field::sh;

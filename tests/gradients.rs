@@ -1,10 +1,9 @@
 //! Whole renders and every loss against finite differences, in f64, first and second derivatives.
 //!
 //! Kinks are avoided: densities are positive and harmonics small, so that no activation is at its corner, and targets keep off the
-//! rendered colors. Prints the table with `cargo test --test gradients -- --nocapture`.
+//! rendered colors. Prints the table with `cargo test --test kernels gradients -- --nocapture`.
 
-mod support;
-
+use crate::support::{batch, grid_of, numbers, rays, shape};
 use autograd::{Gradcheck, Lattice, Tensor, check_kernel, grad};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::field::{Field, sh};
@@ -13,7 +12,6 @@ use plenoxel::loss::{self, Objective, Step};
 use plenoxel::model::plenoxels;
 use plenoxel::render::{Engine, RenderOptions, Rendered, render};
 use plenoxel::sampling::{Jitter, Spacing};
-use support::{batch, grid_of, numbers, rays, shape};
 
 fn options() -> RenderOptions<'static> {
     RenderOptions {

@@ -1,6 +1,6 @@
 //! Who imports whom: no circle between the modules of a crate, and training and rendering know no field.
 //!
-//! The listing: `cargo test --test imports -- --nocapture`.
+//! The listing: `cargo test --test programs imports -- --nocapture`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;

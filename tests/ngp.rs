@@ -1,8 +1,6 @@
 //! The hash grid and the model on it: gradients, training, resuming and checkpoints.
 
-#[path = "support/own_losses.rs"]
-mod own_losses;
-
+use crate::own_losses;
 use autograd::{Module, Param, Real, Tensor, check_kernel, gradcheck, random::Stream};
 use glam::DVec3;
 use ndarray::ArrayD;

@@ -19,10 +19,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-mod support {
-    pub mod command;
-}
-use support::command::{Folder, plenoxel};
+use crate::command::{Folder, plenoxel};
 
 /// A multilayer perceptron of the position.
 struct Field<T: Real> {

@@ -1,9 +1,6 @@
 //! Point clouds on the command line: a run as points, and the clouds of others cleaned.
 
-#[path = "support/command.rs"]
-mod command;
-
-use command::{Folder, plenoxel};
+use crate::command::{Folder, plenoxel};
 use plenoxel::point_cloud::ply::PlyFile;
 use std::fs;
 use std::path::Path;

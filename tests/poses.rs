@@ -1,10 +1,7 @@
 //! Refinement of camera poses: gradients of rays, the same bits for any number of threads and after a resumption, and poses that come closer to the true ones.
 
-#[path = "support/factored.rs"]
-mod factored;
-
+use crate::factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
 use autograd::{Gradcheck, Module, Tensor, random::Stream};
-use factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
 use glam::{DQuat, DVec3, dvec3};
 use ndarray::ArrayD;
 use plenoxel::camera::{Camera, Ray, TrackedRays};
@@ -179,7 +176,7 @@ fn error(cameras: &[Camera], truth: &[View]) -> f64 {
 /// Seeds and sizes are fixed, so the figures are too: 1.35 pixels before and 0.72 after; 16.70 dB without refinement, 17.05 dB with, and 17.62 dB with exact
 /// poses.
 #[test]
-#[cfg_attr(debug_assertions, ignore = "a minute without optimization: cargo test --profile research --test poses")]
+#[cfg_attr(debug_assertions, ignore = "a minute without optimization: cargo test --profile research --test kernels poses")]
 fn poses_with_errors_come_closer_to_the_true_ones_and_the_scene_is_sharper() {
     let [train, test] = views();
     let wrong = disturbed(&train);

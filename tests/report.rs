@@ -1,11 +1,8 @@
 //! `report.html`: that the page is whole, needs nothing from elsewhere, and holds the grid.
 
-#[path = "support/command.rs"]
-mod command;
-
+use crate::command::{Folder, plenoxel, train};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use command::{Folder, plenoxel, train};
 use flate2::read::ZlibDecoder;
 use serde_json::Value;
 use std::fs;

@@ -1,7 +1,6 @@
 //! Gradients of look-ups are rows all the way into the optimizer.
 
-mod support;
-
+use crate::support::{batch, rays, shape};
 use autograd::optim::{Optimizer, Sgd};
 use autograd::{Grad, Tensor, value_and_grad};
 use plenoxel::field::voxel_grid::{Color, Interpolation, VoxelGrid};
@@ -9,7 +8,6 @@ use plenoxel::geometry::Aabb;
 use plenoxel::loss::{sampled_total_variation, total_variation};
 use plenoxel::render::{Engine, RenderOptions, render};
 use plenoxel::sampling::{Jitter, Spacing};
-use support::{batch, rays, shape};
 
 fn options() -> RenderOptions<'static> {
     RenderOptions {

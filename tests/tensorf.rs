@@ -1,12 +1,8 @@
 //! The factored field: its gradients, its upsampling, training and resuming.
 
-#[path = "support/factored.rs"]
-mod factored;
-#[path = "support/own_losses.rs"]
-mod own_losses;
-
+use crate::factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
+use crate::own_losses;
 use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
-use factored::{CONTRACTED, NDC, agree, all_columns, rays_of_a_capture, wide};
 use glam::DVec3;
 use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::{CAMERA_DISTANCE, ProceduralOptions};
@@ -250,7 +246,7 @@ fn a_finer_grid_of_the_same_nodes_is_the_same_field() {
     let before = model.field().density(&positions);
     // Three cells become six: a node on each old one, and one in the middle, where linear functions are what they were.
     let mut source = plenoxel::rays::RaySource::new(views().0, [1.0; 3], 1);
-    let stage = PlannedStage { index: 1, resolution: Some(7), steps: 1, first: 1, first_ray: 256, rays_per_step: 256 };
+    let stage = PlannedStage { index: 1, resolution: Some(7), steps: 1, first: 1, first_ray: 256, rays_per_step: 256, ray_cost: 1.0 };
     model.begin_stage(&stage, &mut source).expect("a stage");
     let after = model.field().density(&positions);
     for (a, b) in before.data().iter().zip(after.data()) {

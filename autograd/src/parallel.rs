@@ -108,7 +108,21 @@ pub fn for_each_chunk<E: Send>(out: &mut [E], size: usize, f: impl Fn(usize, &mu
         }
         return;
     }
+    chunks_by(out, size, &f);
+}
+
+// These call a function by reference: the compiler makes one copy of rayon's code for each type of elements, and not for each function.
+
+fn chunks_by<E: Send>(out: &mut [E], size: usize, f: &(dyn Fn(usize, &mut [E]) + Sync)) {
     out.par_chunks_mut(size).enumerate().for_each(|(i, chunk)| f(i * size, chunk));
+}
+
+fn indices_by<R: Send>(n: usize, f: &(dyn Fn(usize) -> R + Sync)) -> Vec<R> {
+    (0..n).into_par_iter().map(f).collect()
+}
+
+fn items_by<I: Send, R: Send>(items: Vec<I>, f: &(dyn Fn(usize, I) -> R + Sync)) -> Vec<R> {
+    items.into_par_iter().enumerate().map(|(i, item)| f(i, item)).collect()
 }
 
 /// Calls `f(i)` for each i in `0..n`, in parallel, and collects the results in order.
@@ -116,17 +130,18 @@ pub fn map_indices<R: Send>(n: usize, f: impl Fn(usize) -> R + Sync + Send) -> V
     if n <= 1 {
         return (0..n).map(f).collect();
     }
-    (0..n).into_par_iter().map(f).collect()
+    indices_by(n, &f)
 }
 
 /// Calls `f(i, item)` for every item, in parallel and in no particular order.
 pub fn for_each_item<I: Send>(items: Vec<I>, f: impl Fn(usize, I) + Sync + Send) {
-    items.into_par_iter().enumerate().for_each(|(i, item)| f(i, item));
+    // A list of units takes no memory.
+    items_by(items, &f);
 }
 
 /// Calls `f(i, item)` for every item, in parallel, and collects the results in order.
 pub fn map_items<I: Send, R: Send>(items: Vec<I>, f: impl Fn(usize, I) -> R + Sync + Send) -> Vec<R> {
-    items.into_par_iter().enumerate().map(|(i, item)| f(i, item)).collect()
+    items_by(items, &f)
 }
 
 /// Calls `f(start..end)` for consecutive chunks of `0..n`, in parallel, and collects the results in chunk order.

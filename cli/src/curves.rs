@@ -99,6 +99,7 @@ mod tests {
             steps: 50,
             first_ray: 0,
             rays_per_step: 1,
+            ray_cost: 1.0,
         };
         [16, 32].into_iter().enumerate().map(planned).collect()
     }

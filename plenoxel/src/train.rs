@@ -65,6 +65,8 @@ pub struct PlannedStage {
     pub first_ray: u64,
     /// Number of rays per step.
     pub rays_per_step: usize,
+    /// Expected duration of a ray, in a unit that is the same for all stages.
+    pub ray_cost: f64,
 }
 
 /// Result of a training step.
@@ -309,9 +311,9 @@ pub(crate) fn no_gradients(kind: &str) -> Error {
 /// Plans the stages of a model, one after another.
 fn plan<T: Real, M: Model<T>>(model: &M, options: &TrainOptions, rays_per_epoch: u64) -> Vec<PlannedStage> {
     let (mut first, mut first_ray) = (0, 0);
-    let plan = |(index, StageLength { resolution, steps, rays_per_step })| {
+    let plan = |(index, StageLength { resolution, steps, rays_per_step, ray_cost })| {
         let rays_per_step = rays_per_step.unwrap_or(options.rays_per_step);
-        let stage = PlannedStage { index, resolution, first, steps, first_ray, rays_per_step };
+        let stage = PlannedStage { index, resolution, first, steps, first_ray, rays_per_step, ray_cost };
         first += steps;
         first_ray += steps * rays_per_step as u64;
         stage

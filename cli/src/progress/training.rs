@@ -1,7 +1,6 @@
 //! Progress of a training run: a bar for each stage, or lines of text.
 
 use super::{Console, Counted, Meter, Standing, metric};
-use plenoxel::run::budget::step_cost;
 use plenoxel::run::memory::{self, bytes};
 use plenoxel::run::metrics::{Observation, figures};
 use plenoxel::text::clock;
@@ -114,15 +113,17 @@ impl Training<'_, '_> {
     }
 
     /// Estimates the remaining seconds of the run, including the final evaluation; `None` during the first two steps of a stage. The current stage is
-    /// estimated with its measured pace, later stages with [`step_cost`], and a pixel of a test view as `EVALUATION_RAY` training rays of the last stage.
+    /// estimated with its measured pace, later stages with the relative costs of their rays, and a pixel of a test view as `EVALUATION_RAY` training rays of
+    /// the last stage.
     fn remaining(&self, report: &Report) -> Option<f64> {
         let now = &self.plan[report.stage];
         let step = Some(self.step_seconds.value).filter(|_| self.step_seconds.count > 0.0)?;
-        let cost = |stage: &PlannedStage| step_cost(stage.resolution.unwrap_or(1)) / step_cost(now.resolution.unwrap_or(1));
+        let ray = step / (now.rays_per_step as f64 * now.ray_cost);
+        let cost = |stage: &PlannedStage| ray * stage.ray_cost;
         let here = (now.first + now.steps - report.step - 1) as f64;
-        let later = self.plan[report.stage + 1..].iter().map(|stage| stage.steps as f64 * cost(stage));
-        let evaluation = self.plan.last().map_or(0.0, cost) * EVALUATION_RAY * self.rays_to_evaluate / report.rays.max(1) as f64;
-        Some(step * (here + later.sum::<f64>() + evaluation))
+        let later = self.plan[report.stage + 1..].iter().map(|stage| (stage.steps * stage.rays_per_step as u64) as f64 * cost(stage));
+        let evaluation = self.plan.last().map_or(0.0, cost) * EVALUATION_RAY * self.rays_to_evaluate;
+        Some(step * here + later.sum::<f64>() + evaluation)
     }
 }
 

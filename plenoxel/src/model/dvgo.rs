@@ -231,7 +231,7 @@ impl<T: Real> Model<T> for Dvgo<T> {
     }
 
     fn stages(&self, _: &TrainOptions, _: u64) -> Vec<StageLength> {
-        [&self.config.coarse].into_iter().chain(&self.config.fine).map(Stage::length).collect()
+        self.config.lengths()
     }
 
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {

@@ -310,6 +310,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
             resolution: Some(stage.resolution),
             steps: stage.step_count(rays_per_epoch, options.rays_per_step),
             rays_per_step: None,
+            ray_cost: config::ray_cost(stage.resolution),
         };
         self.stages.iter().map(length).collect()
     }

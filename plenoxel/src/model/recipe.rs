@@ -56,8 +56,10 @@ pub trait Recipe: Send + Sync {
     }
 
     /// Returns from which step on the steps of the first stage tell the speed of a machine, and the cost of such a step, in units of
-    /// [`with_cost`](Recipe::with_cost).
-    fn measured_step(&self) -> (u64, f64);
+    /// [`with_cost`](Recipe::with_cost). `model` has begun its first stage.
+    fn measured_step(&self, model: &Self::Model) -> (u64, f64)
+    where
+        Self: Sized;
 
     /// Returns these settings with sizes that fit the training views: a plan must know them. `model` has begun its first stage. Default: the same settings.
     fn fitted_to(self, model: &Self::Model, views: &[View]) -> Self
@@ -68,8 +70,8 @@ pub trait Recipe: Send + Sync {
         self
     }
 
-    /// Returns settings whose steps cost this much in total: the same training, longer or shorter.
-    fn with_cost(&self, cost: f64) -> Self
+    /// Returns settings whose steps cost this much in total: the same training, longer or shorter. `model` has begun its first stage.
+    fn with_cost(&self, model: &Self::Model, cost: f64) -> Self
     where
         Self: Sized;
 

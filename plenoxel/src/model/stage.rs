@@ -31,8 +31,8 @@ impl Stage {
         check((1..=1 << 20).contains(&self.rays), "rays", self.rays as u64, "1 to 1048576")
     }
 
-    /// Returns the stage as the plan of a run states it.
-    pub(super) fn length(&self) -> StageLength {
-        StageLength { resolution: Some(self.resolution), steps: self.steps, rays_per_step: Some(self.rays) }
+    /// Returns the stage as the plan of a run states it, with the expected duration of a ray.
+    pub(super) fn length(&self, ray_cost: f64) -> StageLength {
+        StageLength { resolution: Some(self.resolution), steps: self.steps, rays_per_step: Some(self.rays), ray_cost }
     }
 }

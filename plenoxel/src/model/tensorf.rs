@@ -23,7 +23,6 @@ use crate::geometry::Aabb;
 use crate::loss::Step;
 use crate::model::cells;
 use crate::model::plenoxels::config::Hull;
-use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render, render_tracked};
 use crate::sampling::{Jitter, Occupancy, Spacing};
@@ -258,7 +257,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
     }
 
     fn stages(&self, _: &TrainOptions, _: u64) -> Vec<StageLength> {
-        Recipe::stages(&self.config)
+        self.config.lengths(self.space)
     }
 
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {

@@ -7,7 +7,7 @@
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::model::plenoxels::Trainer;
-use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
+use crate::model::plenoxels::config::{Config, Scout, Stage, Weight, ray_cost};
 use crate::model::recipe::Recipe;
 use crate::text::clock;
 use crate::train;
@@ -19,9 +19,6 @@ use std::time::Instant;
 /// 1.05 for stages of 2000 steps.
 const CLEARING: (f64, f64) = (0.147, 780.0);
 const CLEARED: f64 = 0.8;
-/// Exponent of the duration of a step as a function of the resolution, for 128 to 448 voxels per side. The measured mean is 0.73 on a machine
-/// without AVX-512 and 0.93 on one with it, where memory access dominates. The larger value makes runs end early rather than late.
-const GROWTH: f64 = 0.9;
 /// Cost of the start of a stage at 256 voxels per side, as a number of training rays at 128. It grows with the square of the resolution: the grid
 /// is resampled and pruned.
 const RAYS_TO_BEGIN: f64 = 2.2e6;
@@ -105,7 +102,7 @@ pub fn recipe_on_time<R: Recipe>(recipe: R, seconds: f64, begin: impl FnOnce(&R)
     let mut trainer = begin(&recipe)?;
     trainer.step()?;
     let begun = start.elapsed().as_secs_f64();
-    let (from, cost) = recipe.measured_step();
+    let (from, cost) = recipe.measured_step(trainer.model());
     for _ in 0..from {
         trainer.step()?;
     }
@@ -126,7 +123,8 @@ pub fn recipe_on_time<R: Recipe>(recipe: R, seconds: f64, begin: impl FnOnce(&R)
         let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + begun));
         return Err(Error::usage("--time", found, "give it more time"));
     }
-    Ok(recipe.fitted_to(trainer.model(), trainer.views()).with_cost(left / unit))
+    let model = trainer.model();
+    Ok(recipe.fitted_to(model, trainer.views()).with_cost(model, left / unit))
 }
 
 /// Returns `asked` with everything that a time budget changes taken from `found`: lengths of stages, resolutions with density rates, image
@@ -192,11 +190,6 @@ fn speed(resolution: usize, begin: f64, seconds: f64, mut step: impl FnMut() -> 
     Ok(Speed { resolution, step: taken / steps, begin, spent: begin + taken })
 }
 
-/// Expected duration of a step at a resolution, relative to a grid of a single voxel.
-pub fn step_cost(resolution: usize) -> f64 {
-    (resolution as f64).powf(GROWTH)
-}
-
 /// Cost of the k-th step of the first stage, relative to the mean step.
 fn in_fog(k: u32) -> f64 {
     let (slope, usual) = CLEARING;
@@ -206,7 +199,7 @@ fn in_fog(k: u32) -> f64 {
 /// Factor for the lengths of all stages with which training takes the planned time.
 fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, speed: &Speed) -> Result<f64> {
     // Duration of a step at a resolution, in seconds.
-    let step = |resolution: usize| speed.step * step_cost(resolution) / step_cost(speed.resolution);
+    let step = |resolution: usize| speed.step * ray_cost(resolution) / ray_cost(speed.resolution);
     let begin = |stages: &[Stage]| {
         let share = if stages[0].resolution == stages[1].resolution { ONLY_LOOKED_AT } else { 1.0 };
         share * RAYS_TO_BEGIN / rays_per_step as f64 * step(128) * (stages[1].resolution as f64 / 256.0).powi(2)
@@ -292,7 +285,7 @@ mod tests {
         let factors = [10.0, 100.0, 1000.0].map(|seconds| of(seconds).unwrap());
         assert!(factors.is_sorted_by(|short, long| short < long), "{factors:?}");
         // What the grid of 128 voxels a side costs: a step, and what 220 steps do to begin another of 256, a quarter of it for its own.
-        let twice = 2f64.powf(GROWTH);
+        let twice = ray_cost(2);
         let begins = 220.0 * 0.01 * twice * (0.25 + 1.0);
         let steps = 0.01 * (100.0 + 200.0 * twice + 400.0 * twice * twice);
         assert!((1.0 + begins + factors[1] * steps - 100.0).abs() < 1e-9, "{factors:?}");

@@ -83,7 +83,7 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     /// steps.
     fn stages(&self, options: &TrainOptions, rays_per_epoch: u64) -> Vec<StageLength> {
         let _ = rays_per_epoch;
-        vec![StageLength { resolution: None, steps: options.steps, rays_per_step: None }]
+        vec![StageLength { resolution: None, steps: options.steps, rays_per_step: None, ray_cost: 1.0 }]
     }
 
     /// Changes the model at the beginning of a stage, for example by resampling or pruning. It may reduce the images and restrict the rays
@@ -256,4 +256,6 @@ pub struct StageLength {
     pub steps: u64,
     /// Number of rays per step; `None` for [`TrainOptions::rays_per_step`].
     pub rays_per_step: Option<usize>,
+    /// Expected duration of a ray, in a unit that is the same for all stages. Estimates of the remaining time use it.
+    pub ray_cost: f64,
 }

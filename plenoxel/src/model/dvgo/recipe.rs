@@ -13,6 +13,11 @@ impl Config {
     fn all_stages(&self) -> impl Iterator<Item = &Stage> {
         [&self.coarse].into_iter().chain(&self.fine)
     }
+
+    /// Returns the stages of a run.
+    pub(super) fn lengths(&self) -> Vec<StageLength> {
+        self.all_stages().map(|stage| stage.length(1.0)).collect()
+    }
 }
 
 impl Recipe for Config {
@@ -27,7 +32,7 @@ impl Recipe for Config {
     }
 
     fn stages(&self) -> Vec<StageLength> {
-        self.all_stages().map(Stage::length).collect()
+        self.lengths()
     }
 
     fn uses_silhouettes(&self) -> bool {
@@ -60,11 +65,11 @@ impl Recipe for Config {
         own_losses(self, objective)
     }
 
-    fn measured_step(&self) -> (u64, f64) {
+    fn measured_step(&self, _: &Dvgo<f32>) -> (u64, f64) {
         (0, cost(&self.coarse))
     }
 
-    fn with_cost(&self, budget: f64) -> Self {
+    fn with_cost(&self, _: &Dvgo<f32>, budget: f64) -> Self {
         let total = |stages: &[Stage]| stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum::<f64>();
         let coarse = total(&[self.coarse]);
         // Without enough coarse steps, nothing is opaque: a short run shortens them last.

@@ -96,7 +96,7 @@ impl Config {
 
     /// Returns the stages: the steps around the middle of the box, and the others.
     pub(super) fn lengths(&self) -> Vec<StageLength> {
-        let length = |steps: u64| StageLength { resolution: None, steps, rays_per_step: Some(self.rays) };
+        let length = |steps: u64| StageLength { resolution: None, steps, rays_per_step: Some(self.rays), ray_cost: 1.0 };
         [self.crop_steps, self.steps - self.crop_steps].into_iter().filter(|steps| *steps > 0).map(length).collect()
     }
 

@@ -51,11 +51,11 @@ impl Recipe for Config {
         objective.with("coarse", 1.0, coarse_mse)
     }
 
-    fn measured_step(&self) -> (u64, f64) {
+    fn measured_step(&self, _: &Nerf<f32>) -> (u64, f64) {
         (0, 1.0)
     }
 
-    fn with_cost(&self, cost: f64) -> Self {
+    fn with_cost(&self, _: &Nerf<f32>, cost: f64) -> Self {
         let steps = (cost.round() as u64).max(1);
         let share = steps as f64 / self.steps as f64;
         let decay_steps = ((self.decay_steps as f64 * share).round() as u64).max(1);

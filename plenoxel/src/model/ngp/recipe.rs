@@ -20,7 +20,7 @@ impl Recipe for Config {
     }
 
     fn stages(&self) -> Vec<StageLength> {
-        let length = |stage: &Stage| StageLength { resolution: None, steps: stage.steps, rays_per_step: Some(stage.rays) };
+        let length = |stage: &Stage| StageLength { resolution: None, steps: stage.steps, rays_per_step: Some(stage.rays), ray_cost: 1.0 };
         self.stages.iter().map(length).collect()
     }
 
@@ -49,11 +49,11 @@ impl Recipe for Config {
         Ok(model)
     }
 
-    fn measured_step(&self) -> (u64, f64) {
+    fn measured_step(&self, _: &Ngp<f32>) -> (u64, f64) {
         (0, self.stages[0].rays as f64)
     }
 
-    fn with_cost(&self, cost: f64) -> Self {
+    fn with_cost(&self, _: &Ngp<f32>, cost: f64) -> Self {
         let whole: f64 = self.stages.iter().map(|stage| stage.steps as f64 * stage.rays as f64).sum();
         let scaled = |steps: u64| ((steps as f64 * cost / whole).round() as u64).max(1);
         Config {

@@ -65,7 +65,7 @@ pub struct Config {
     /// Weight of the L1 norm of the density factors in the other stages.
     pub density_l1_later: f64,
     /// Weight of the total variation of the density planes, 0.02 Σ over planes of the mean squared differences of neighbours along both axes; the authors'
-    /// `TV_weight_density`. It is evaluated at every tenth step, on a fifth of the rows. 0 for none.
+    /// `TV_weight_density`. A step reads a twentieth of each plane. 0 for none.
     pub density_tv: f64,
     /// Treatment of rows of planes without a gradient by Adam: true visits only rows with a gradient.
     pub lazy: bool,

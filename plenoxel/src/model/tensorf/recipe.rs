@@ -7,7 +7,7 @@ use crate::loss::Objective;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
-use crate::space::Region;
+use crate::space::{Region, Space};
 use crate::train::StageLength;
 
 impl Recipe for Config {
@@ -22,7 +22,7 @@ impl Recipe for Config {
     }
 
     fn stages(&self) -> Vec<StageLength> {
-        self.stages.iter().map(Stage::length).collect()
+        self.lengths(Space::Box)
     }
 
     fn uses_silhouettes(&self) -> bool {
@@ -50,9 +50,9 @@ impl Recipe for Config {
         Ok(model)
     }
 
-    fn measured_step(&self) -> (u64, f64) {
+    fn measured_step(&self, model: &Tensorf<f32>) -> (u64, f64) {
         // In opaque matter, rays end at their first samples.
-        (self.opaque_steps, cost(&self.stages[0]))
+        (self.opaque_steps, self.cost_in(model.space).step(&self.stages[0]))
     }
 
     fn own_losses(&self, objective: Objective<f32, Tensorf<f32>>) -> Objective<f32, Tensorf<f32>> {
@@ -66,16 +66,37 @@ impl Recipe for Config {
         Config { stages, ..self }
     }
 
-    fn with_cost(&self, cost: f64) -> Self {
-        let config = Config { short: None, ..self.clone() };
-        match self.short.filter(|short| cost < short.below * total(&self.stages)) {
-            None => Config { stages: scaled(&self.stages, cost), ..config },
-            Some(short) => Config { hidden: short.hidden, group: short.group, stages: scaled(&self.stages, cost / short.cost), ..config },
-        }
+    fn with_cost(&self, model: &Tensorf<f32>, cost: f64) -> Self {
+        self.planned(self.cost_in(model.space), cost)
     }
 
     fn set(self, config: &mut RunConfig) {
         config.tensorf = Some(self);
+    }
+}
+
+impl Config {
+    /// Returns the costs in a space. Cells that are longer along the depth make the planes across it larger.
+    fn cost_in(&self, space: Space) -> Cost {
+        Cost { across: if matches!(space, Space::Ndc { .. }) { self.cell_depth.cbrt() } else { 1.0 } }
+    }
+
+    /// Returns the stages of a run in a space.
+    pub(super) fn lengths(&self, space: Space) -> Vec<StageLength> {
+        let costs = self.cost_in(space);
+        self.stages.iter().map(|stage| stage.length(costs.step(stage) / stage.rays as f64)).collect()
+    }
+
+    /// Returns settings whose steps cost this much in total.
+    fn planned(&self, costs: Cost, cost: f64) -> Self {
+        let config = Config { short: None, ..self.clone() };
+        match self.short.filter(|short| cost < short.below * costs.total(&self.stages)) {
+            None => Config { stages: costs.scaled(&self.stages, cost), ..config },
+            Some(short) => {
+                let stages = costs.scaled(&self.stages, cost / short.cost);
+                Config { hidden: short.hidden, group: short.group, stages, ..config }
+            }
+        }
     }
 }
 
@@ -99,40 +120,49 @@ fn bytes_of_ray(config: &Config, engine: Engine) -> u64 {
     SAMPLES * of_sample + COLORED * of_color
 }
 
-/// Scales stages to a total cost. In a short run, the earlier stages are shortened less than the last, and the finest stages become coarser: without geometry, and
-/// with few steps for each node, finer planes gain nothing.
-fn scaled(stages: &[Stage], budget: f64) -> Vec<Stage> {
-    let factor = budget / total(stages);
-    let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
-    let most = ((finest as f64 * factor.min(1.0).powf(0.13)) as usize).max(2);
-    let shortened = |stage: &Stage| {
-        let steps = (stage.steps as f64 * factor.max(factor.sqrt().min(1.0))).round() as u64;
-        Stage { resolution: stage.resolution.min(most), steps: steps.max(1), ..*stage }
-    };
-    let mut stages: Vec<Stage> = stages.iter().map(shortened).collect();
-    if let Some((last, earlier)) = stages.split_last_mut() {
-        let left = budget - total(earlier);
-        // At least a third for the last stage.
-        if left < budget / 3.0 {
-            let shrink = budget / 1.5 / total(earlier);
-            earlier.iter_mut().for_each(|stage| stage.steps = ((stage.steps as f64 * shrink) as u64).max(1));
+/// Durations of steps.
+#[derive(Clone, Copy, Debug)]
+struct Cost {
+    /// Nodes along a side of the largest plane, relative to the resolution.
+    across: f64,
+}
+
+impl Cost {
+    /// Scales stages to a total cost. In a short run, the earlier stages are shortened less than the last, and the finest stages become coarser: without geometry,
+    /// and with few steps for each node, finer planes gain nothing.
+    fn scaled(self, stages: &[Stage], budget: f64) -> Vec<Stage> {
+        let factor = budget / self.total(stages);
+        let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
+        let most = ((finest as f64 * factor.min(1.0).powf(0.13)) as usize).max(2);
+        let shortened = |stage: &Stage| {
+            let steps = (stage.steps as f64 * factor.max(factor.sqrt().min(1.0))).round() as u64;
+            Stage { resolution: stage.resolution.min(most), steps: steps.max(1), ..*stage }
+        };
+        let mut stages: Vec<Stage> = stages.iter().map(shortened).collect();
+        if let Some((last, earlier)) = stages.split_last_mut() {
+            let left = budget - self.total(earlier);
+            // At least a third for the last stage.
+            if left < budget / 3.0 {
+                let shrink = budget / 1.5 / self.total(earlier);
+                earlier.iter_mut().for_each(|stage| stage.steps = ((stage.steps as f64 * shrink) as u64).max(1));
+            }
+            last.steps = ((left.max(budget / 3.0) / self.step(last)).round() as u64).max(1);
         }
-        last.steps = ((left.max(budget / 3.0) / cost(last)).round() as u64).max(1);
+        stages
     }
-    stages
-}
 
-/// Returns the duration of stages, in the units of [`cost`].
-fn total(stages: &[Stage]) -> f64 {
-    stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum()
-}
+    /// Returns the duration of stages, in the units of [`step`](Cost::step).
+    fn total(self, stages: &[Stage]) -> f64 {
+        stages.iter().map(|stage| stage.steps as f64 * self.step(stage)).sum()
+    }
 
-/// Duration of a step of a factored field, in units of a ray at a resolution of 0. On lego, a ray took 5.8, 6.5 and 7.0 µs at 90, 180 and 300 nodes on two cores of
-/// an AMD EPYC with AVX-512, and 7.7 to 8.4, 8.6, 10.7 and 13.0 µs at 90, 252, 334 and 418 nodes on two cores of an Intel Xeon with AVX-512. The costs are those of
-/// the Xeon. Steps of the first stage, after the opaque ones, took 0.95 to 1.3 times as long as their cost says. The more it is, the earlier a
-/// planned run ends.
-fn cost(stage: &Stage) -> f64 {
-    (stage.rays as f64 + 150.0) * (1.0 + stage.resolution as f64 / 500.0)
+    /// Returns the duration of a step, in units of a ray at a resolution of 0. On lego, a ray took 5.8, 6.5 and 7.0 µs at 90, 180 and 300 nodes on two cores of an
+    /// AMD EPYC with AVX-512, and 7.7 to 8.4, 8.6, 10.7 and 13.0 µs at 90, 252, 334 and 418 nodes on two cores of an Intel Xeon with AVX-512. The costs are
+    /// those of the Xeon. Steps of the first stage, after the opaque ones, took 0.95 to 1.3 times as long as their cost says. The more it is, the earlier a
+    /// planned run ends.
+    fn step(self, stage: &Stage) -> f64 {
+        (stage.rays as f64 + 150.0) * (1.0 + self.across * stage.resolution as f64 / 500.0)
+    }
 }
 
 #[cfg(test)]
@@ -142,11 +172,11 @@ mod tests {
 
     #[test]
     fn stages_of_a_factored_field_cost_what_they_may_and_short_runs_are_coarser() {
-        let stages = Config::default().stages;
-        let whole = total(&stages);
+        let (stages, costs) = (Config::default().stages, Cost { across: 1.5 });
+        let whole = costs.total(&stages);
         for factor in [0.03, 0.1, 0.4, 1.0, 3.0] {
-            let planned = scaled(&stages, factor * whole);
-            let share = total(&planned) / (factor * whole);
+            let planned = costs.scaled(&stages, factor * whole);
+            let share = costs.total(&planned) / (factor * whole);
             assert!((0.95..1.05).contains(&share), "{factor}: {share}");
             let finest = |stages: &[Stage]| stages.iter().map(|stage| stage.resolution).max();
             assert_eq!(finest(&planned) < finest(&stages), factor < 1.0, "{factor}");
@@ -158,11 +188,12 @@ mod tests {
     fn short_runs_have_the_settings_of_short_runs_and_more_steps_for_them() {
         let short = Short { below: 0.3, hidden: 64, group: 0.1, cost: 0.7 };
         let config = Config { hidden: 128, group: 0.04, short: Some(short), ..Config::default() };
-        let whole = total(&config.stages);
-        let planned = [0.2, 0.5].map(|share| config.with_cost(share * whole));
+        let costs = config.cost_in(Space::Box);
+        let whole = costs.total(&config.stages);
+        let planned = [0.2, 0.5].map(|share| config.planned(costs, share * whole));
         assert_eq!(planned.each_ref().map(|planned| (planned.hidden, planned.group, planned.short)), [(64, 0.1, None), (128, 0.04, None)]);
-        assert!((total(&planned[0].stages) / (0.2 * whole / 0.7) - 1.0).abs() < 0.05);
+        assert!((costs.total(&planned[0].stages) / (0.2 * whole / 0.7) - 1.0).abs() < 0.05);
         // Without them, a short run has the same network.
-        assert_eq!(Config { short: None, ..config }.with_cost(0.2 * whole).hidden, 128);
+        assert_eq!(Config { short: None, ..config }.planned(costs, 0.2 * whole).hidden, 128);
     }
 }
