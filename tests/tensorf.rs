@@ -72,12 +72,16 @@ fn pictures_have_the_pixels_of_renderings() {
     for region in [IN_BOX, NDC, CONTRACTED] {
         let model = wide(Config { group_in_pictures: 0.02, color_above: 1e-3, stop_below_in_pictures: 1e-3, ..tiny(&[(30, 1)]) }, region);
         let rays = if region == IN_BOX { rays(200) } else { rays_of_a_capture(200) };
-        let picture = model.viewer(&ViewOptions::over([1.0; 3]))(&rays);
+        let viewer = model.viewer(&ViewOptions::over([1.0; 3]));
+        // The first rays are rendered without a table.
+        (0..8).for_each(|_| drop(viewer(&vec![Ray { origin: DVec3::splat(99.0), direction: DVec3::X, stretch: 1.0 }; 1 << 14])));
+        let picture = viewer(&rays);
         let rendered = no_grad(|| model.render(&rays, &PASS));
         let columns = |of: &Rendered<f64>| [of.rgb.clone(), of.depth(), of.opacity.clone()];
         for (picture, rendered) in columns(&picture).iter().zip(columns(&rendered)) {
             let off = picture.data().iter().zip(rendered.data()).fold(0.0f64, |most, (a, b)| most.max((a - b).abs()));
-            assert!(off < 2e-3, "{region:?}: {off}");
+            // A table rounds differently.
+            assert!(off > 0.0 && off < 1e-6, "{region:?}: {off}");
         }
         let (fewer, all) = (picture.sample_count, rendered.sample_count);
         assert!(fewer <= all && fewer > 400, "{region:?}: {fewer} of {all}");

@@ -34,6 +34,8 @@ use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde_json::{Value, json};
 use std::any::Any;
 use std::path::Path;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 /// Kind of this model in checkpoints.
 pub const KIND: &str = "tensorf";
@@ -65,6 +67,8 @@ const HULL: usize = 128;
 const HULL_MARGIN: f64 = 1.0;
 /// Opacity of a sample that pictures leave out.
 const NEGLIGIBLE: f64 = 1e-5;
+/// Rays that a viewer renders before it computes a table of densities, which takes about as long.
+const RAYS_BEFORE_TABLE: usize = 1 << 17;
 /// Most cells of an occupancy along each axis.
 const MOST_CELLS: usize = 256;
 
@@ -218,8 +222,16 @@ impl<T: Real> Model<T> for Tensorf<T> {
             return Box::new(move |rays| self.render(rays, &pass));
         }
         let options = self.options(&pass);
-        let densities = Densities::new(&self.field, NEGLIGIBLE / (self.config.step_in_pictures * self.cell_of_steps()));
-        Box::new(move |rays| fused::render_picture(&self.field, &densities, &self.space.rays(rays), &options))
+        let negligible = NEGLIGIBLE / (self.config.step_in_pictures * self.cell_of_steps());
+        let (rendered, densities) = (AtomicUsize::new(0), OnceLock::new());
+        Box::new(move |rays| {
+            let enough = rendered.fetch_add(rays.len(), Relaxed) >= RAYS_BEFORE_TABLE;
+            let densities = if enough { densities.get_or_init(|| Densities::new(&self.field, negligible)).as_ref() } else { None };
+            match densities {
+                Some(densities) => fused::render_picture(&self.field, densities, &self.space.rays(rays), &options),
+                None => self.render(rays, &pass),
+            }
+        })
     }
 
     fn tracks_rays(&self) -> bool {

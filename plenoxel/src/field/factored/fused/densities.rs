@@ -11,7 +11,7 @@ use crate::render::Field;
 use crate::sampling::Occupancy;
 use autograd::lattice::{BRICK, BrickGrid};
 use autograd::parallel::gathered;
-use autograd::{Real, dispatched, parallel};
+use autograd::{Real, Tensor, dispatched, parallel};
 use glam::DVec3;
 
 /// Nodes along the side of a brick of cells.
@@ -36,8 +36,9 @@ pub struct Densities<T> {
 }
 
 impl<T: Real> Densities<T> {
-    /// Computes the table. Samples are left out if the densities of all nodes around them, 1 / length, are at most `negligible`.
-    pub fn new(field: &Factored<T>, negligible: f64) -> Self {
+    /// Computes the table. Samples are left out if the densities of all nodes around them, 1 / length, are at most `negligible`. `None` if the table would take
+    /// more memory than the field itself.
+    pub fn new(field: &Factored<T>, negligible: f64) -> Option<Self> {
         let nodes = field.nodes();
         let bricks = BrickGrid::new(nodes.map(|n| n - 1));
         let reach = field.reach().cloned().unwrap_or_else(|| Occupancy::full(field.aabb(), nodes.map(|n| n - 1)));
@@ -50,40 +51,44 @@ impl<T: Real> Densities<T> {
             nodes,
             width: field.shape().density_components,
         };
+        let features = |brick: u32| {
+            let low = bricks.place(brick as usize).map(|place| place * BRICK);
+            let mut values = [T::lit(NOTHING); ENTRIES];
+            match parallel::fused() {
+                true => features_of::<T, true>(pairs, low, &mut values),
+                false => features_of::<T, false>(pairs, low, &mut values),
+            }
+            values
+        };
         let reached = reached(&reach, bricks, |aabb| nodes_around(field, aabb));
-        let parts = parallel::map_chunks(reached.len(), TOGETHER, |range| {
-            let (mut kept, mut features) = (Vec::new(), Vec::new());
-            for &brick in &reached[range] {
-                let low = bricks.place(brick as usize).map(|place| place * BRICK);
-                let mut values = [T::lit(NOTHING); ENTRIES];
-                match parallel::fused() {
-                    true => features_of::<T, true>(pairs, low, &mut values),
-                    false => features_of::<T, false>(pairs, low, &mut values),
-                }
-                if values.iter().any(|&value| value > least) {
-                    kept.push(brick);
-                    features.extend_from_slice(&values);
-                }
-            }
-            (kept, features)
+        let kept = parallel::map_chunks(reached.len(), TOGETHER, |range| {
+            let dense = |brick: &u32| features(*brick).iter().any(|&value| value > least);
+            reached[range].iter().copied().filter(dense).collect::<Vec<_>>()
         });
-        let mut links = vec![0; bricks.len()];
-        let mut features = vec![T::lit(NOTHING); ENTRIES];
-        features.reserve_exact(parts.iter().map(|(_, features)| features.len()).sum());
-        for (kept, values) in parts {
-            for (place, brick) in ((features.len() / ENTRIES) as u32..).zip(kept) {
-                links[brick as usize] = place;
-            }
-            features.extend(values);
+        let kept = kept.concat();
+        let size = ENTRIES * (kept.len() + 1);
+        if size > tables.iter().map(Tensor::len).sum() {
+            return None;
         }
-        let table = Densities { nodes, bricks, links, features, cells: reach };
+        let mut links = vec![0; bricks.len()];
+        for (place, &brick) in (1..).zip(&kept) {
+            links[brick as usize] = place;
+        }
+        let mut table = vec![T::lit(NOTHING); size];
+        // They are computed again: that takes less time than the memory to keep them.
+        parallel::for_each_chunk(&mut table[ENTRIES..], TOGETHER * ENTRIES, |first, values| {
+            for (values, &brick) in values.chunks_exact_mut(ENTRIES).zip(&kept[first / ENTRIES..]) {
+                values.copy_from_slice(&features(brick));
+            }
+        });
+        let table = Densities { nodes, bricks, links, features: table, cells: reach };
         let cells = table.cells.kept(|aabb| {
             let [low, high] = nodes_around(field, aabb);
             let mut nodes =
                 (low[0]..=high[0]).flat_map(|i| (low[1]..=high[1]).flat_map(move |j| (low[2]..=high[2]).map(move |k| [i, j, k])));
             nodes.any(|node| table.feature(node) > least)
         });
-        Densities { cells, ..table }
+        Some(Densities { cells, ..table })
     }
 
     /// Returns the cells outside of which all samples are left out.
@@ -211,14 +216,14 @@ mod tests {
     use crate::field::encoding::Directions;
     use crate::field::factored::Shape;
     use autograd::random::Stream;
-    use autograd::{Module, Param, Tensor};
+    use autograd::{Module, Param};
 
     const BOX: Aabb = Aabb { min: DVec3::new(-1.0, -0.7, -1.2), max: DVec3::new(1.1, 0.9, 0.8) };
 
     /// A field with dense and with empty parts.
     fn field(nodes: [usize; 3]) -> Factored<f64> {
         let directions = Directions::Harmonics(1);
-        let shape = Shape { density_components: 16, appearance_components: 16, features: 4, hidden: 4, feature_octaves: 0, directions };
+        let shape = Shape { density_components: 16, appearance_components: 64, features: 4, hidden: 4, feature_octaves: 0, directions };
         let mut field = Factored::new(shape, BOX, nodes, &Stream::new(3));
         field.visit_mut(&mut |param: &mut Param<f64>| {
             if param.name().starts_with("density") {
@@ -259,7 +264,7 @@ mod tests {
         for nodes in [[2, 2, 2], [5, 9, 4], [6, 13, 10]] {
             let field = field(nodes);
             let at = positions(1000);
-            let (want, found) = (field.density(&at), read(&Densities::new(&field, 0.0), &field, &at));
+            let (want, found) = (field.density(&at), read(&Densities::new(&field, 0.0).expect("a small table"), &field, &at));
             for (want, found) in want.data().iter().zip(&found) {
                 assert!((want - found).abs() < 1e-10 * (1.0 + want), "{nodes:?}: {found} instead of {want}");
             }
@@ -279,7 +284,7 @@ mod tests {
             };
             field.occupied = cells.map(scattered);
             let negligible = 0.5;
-            let table = Densities::new(&field, negligible);
+            let table = Densities::new(&field, negligible).expect("a small table");
             let at = positions(20_000);
             let (want, found) = (field.density(&at), read(&table, &field, &at));
             let mut left_out = 0;
