@@ -20,6 +20,9 @@ const SIDE: usize = BRICK + 1;
 const ENTRIES: usize = 128;
 /// Density feature of bricks that are left out. The density is 0.
 const NOTHING: f64 = -1e3;
+/// Largest size of the table relative to the field. Objects in empty space need 1.0 to 1.2 times as much as the field; captures, whose boxes are full of thin fog,
+/// need 1.8 times as much, and their pictures take 0.98 of the time.
+const MOST: f64 = 1.5;
 /// Bricks that one task computes.
 const TOGETHER: usize = 256;
 
@@ -37,7 +40,7 @@ pub struct Densities<T> {
 
 impl<T: Real> Densities<T> {
     /// Computes the table. Samples are left out if the densities of all nodes around them, 1 / length, are at most `negligible`. `None` if the table would take
-    /// more memory than the field itself.
+    /// more than 1.5 times the memory of the field.
     pub fn new(field: &Factored<T>, negligible: f64) -> Option<Self> {
         let nodes = field.nodes();
         let bricks = BrickGrid::new(nodes.map(|n| n - 1));
@@ -67,7 +70,7 @@ impl<T: Real> Densities<T> {
         });
         let kept = kept.concat();
         let size = ENTRIES * (kept.len() + 1);
-        if size > tables.iter().map(Tensor::len).sum() {
+        if size as f64 > MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64 {
             return None;
         }
         let mut links = vec![0; bricks.len()];
