@@ -253,7 +253,7 @@ impl Iterator for Occupied<'_> {
 impl Occupied<'_> {
     /// Leaves out the intervals of a straight ray before a distance, none of which lies in an occupied cell.
     #[inline]
-    pub(crate) fn from(self, distance: f64) -> Self {
+    pub(crate) fn starting_at(self, distance: f64) -> Self {
         if self.march.is_straight() { Self { next: self.march.before(distance), ..self } } else { self }
     }
 

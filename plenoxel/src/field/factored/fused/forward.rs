@@ -189,7 +189,7 @@ impl<'a, T: Real> Scene<'a, T> {
                 free_until = densities.cells().free_until(&rays[r..count.min(r + PACKET)]);
             }
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells).from(free_until));
+            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells).starting_at(free_until));
             let mut all = (0..march.count).map(move |k| march.interval(k));
             let mut next = || occupied.as_mut().map_or_else(|| all.next(), Iterator::next);
             let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
