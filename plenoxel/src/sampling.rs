@@ -208,7 +208,7 @@ impl March {
         Occupied { march: *self, ray: *ray, along: cells.along(ray), next: 0, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
 
-    /// Returns the number of intervals whose middle lies before a distance on a straight ray, or a few less.
+    /// Returns the number of intervals whose middle lies before a distance on a straight ray, or one less.
     #[inline]
     fn before(&self, distance: f64) -> usize {
         let half = if self.points { 0.0 } else { 0.5 };

@@ -32,6 +32,7 @@ mod stages;
 mod start;
 
 pub use objective::{LEARNED_LOSSES, LOSSES, objective, objective_of_any, with_loss};
+pub(crate) use stages::ray_cost;
 
 use crate::camera::Ray;
 use crate::checkpoint::{self, Header};
@@ -310,7 +311,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
             resolution: Some(stage.resolution),
             steps: stage.step_count(rays_per_epoch, options.rays_per_step),
             rays_per_step: None,
-            ray_cost: config::ray_cost(stage.resolution),
+            ray_cost: ray_cost(stage.resolution),
         };
         self.stages.iter().map(length).collect()
     }

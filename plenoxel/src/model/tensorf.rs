@@ -67,7 +67,7 @@ const HULL: usize = 128;
 const HULL_MARGIN: f64 = 1.0;
 /// Opacity of a sample that pictures leave out.
 const NEGLIGIBLE: f64 = 1e-5;
-/// Rays that a viewer renders before it computes a table of densities, which takes about as long.
+/// Number of rays that a viewer renders before it computes a table of densities. The computation takes about as long as these rays.
 const RAYS_BEFORE_TABLE: usize = 1 << 17;
 /// Most cells of an occupancy along each axis.
 const MOST_CELLS: usize = 256;
@@ -218,15 +218,13 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
         let pass = Pass { background: view.background, jitter: Jitter::None, keep_samples: false, stage: None };
-        if self.engine != Engine::Fused || !fused::supports(self.field.shape()) {
-            return Box::new(move |rays| self.render(rays, &pass));
-        }
+        let fuses = self.engine == Engine::Fused && fused::supports(self.field.shape());
         let options = self.options(&pass);
         let negligible = NEGLIGIBLE / (self.config.step_in_pictures * self.cell_of_steps());
         let (rendered, densities) = (AtomicUsize::new(0), OnceLock::new());
         Box::new(move |rays| {
-            let enough = rendered.fetch_add(rays.len(), Relaxed) >= RAYS_BEFORE_TABLE;
-            let densities = if enough { densities.get_or_init(|| Densities::new(&self.field, negligible)).as_ref() } else { None };
+            let many = rendered.fetch_add(rays.len(), Relaxed) >= RAYS_BEFORE_TABLE;
+            let densities = if fuses && many { densities.get_or_init(|| Densities::new(&self.field, negligible)).as_ref() } else { None };
             match densities {
                 Some(densities) => fused::render_picture(&self.field, densities, &self.space.rays(rays), &options),
                 None => self.render(rays, &pass),

@@ -20,6 +20,8 @@ pub struct Picture {
 const TILE: usize = 64;
 /// Side of the squares of pixels, in a tile, whose rays follow each other.
 const PACKET: usize = 8;
+/// Number of rays of such a square.
+pub(crate) const RAYS_OF_PACKET: usize = PACKET * PACKET;
 
 /// Renders an image of a field.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {

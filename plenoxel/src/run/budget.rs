@@ -7,7 +7,8 @@
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::model::plenoxels::Trainer;
-use crate::model::plenoxels::config::{Config, Scout, Stage, Weight, ray_cost};
+use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
+use crate::model::plenoxels::ray_cost;
 use crate::model::recipe::Recipe;
 use crate::text::clock;
 use crate::train;

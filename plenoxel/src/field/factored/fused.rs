@@ -26,7 +26,7 @@ use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Samples, Spacing};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
 pub use densities::Densities;
-use forward::{Block, Scene};
+use forward::{Block, Scene, Tables};
 use glam::DVec3;
 use std::sync::Arc;
 
@@ -100,18 +100,19 @@ impl<T: Real> render::Columns<T> for Columns<T> {
 
 /// Renders a batch of rays through a field.
 pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
-    let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[rays.len(), 3]);
-    let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
-    render_inputs(field, rays, (directions, encoded), &[], (options, None))
+    render_inputs(field, rays, directions_of(field, rays), &[], (options, None))
 }
 
 /// Renders a batch of rays for a picture, without recording a gradient, with the densities of a table of the same field.
 pub fn render_picture<T: Real>(field: &Factored<T>, densities: &Densities<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
-    autograd::no_grad(|| {
-        let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[rays.len(), 3]);
-        let encoded = field.shape.directions.encode(&directions);
-        render_inputs(field, rays, (directions, encoded), &[], (options, Some(densities)))
-    })
+    autograd::no_grad(|| render_inputs(field, rays, directions_of(field, rays), &[], (options, Some(densities))))
+}
+
+/// Returns the directions of rays, `[n, 3]`, and their encodings, `[n, e]`.
+fn directions_of<T: Real>(field: &Factored<T>, rays: &[Ray]) -> (Tensor<T>, Tensor<T>) {
+    let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[rays.len(), 3]);
+    let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
+    (directions, encoded)
 }
 
 /// Renders a batch of tracked rays through a field.
@@ -139,10 +140,11 @@ fn render_inputs<T: Real>(
     let grouping = if matches!(jitter, Jitter::None) { field.grouping_in_pictures } else { field.grouping };
     let gradient_above = field.gradient_above;
     let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, gradient_above, jitter };
-    let scene = Scene::new(&batch, rays, options, options.occupancy.or(field.reach()), &params).with_densities(densities);
+    let cells = densities.map(Densities::cells).or(options.occupancy).or(field.reach());
+    let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), densities };
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
     // Without an adjoint, small blocks share the work of background and matter among the threads more evenly.
-    let size = if keep || densities.is_some() { block_of(n) } else { block_of(n).div_ceil(4) };
+    let size = if keep { block_of(n) } else { block_of(n).div_ceil(4) };
     let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();
     let blocks = parallel::map_items(parts, |b, (pixels, sparsity)| {
         let block = scene.render(b * size, pixels, sparsity);

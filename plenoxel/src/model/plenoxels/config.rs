@@ -331,14 +331,6 @@ impl Sampling {
     }
 }
 
-/// Returns the expected duration of a ray at a resolution, relative to a grid of a single voxel.
-pub fn ray_cost(resolution: usize) -> f64 {
-    /// Exponent for 128 to 448 voxels per side. The measured mean is 0.73 on a machine without AVX-512 and 0.93 on one with it, where memory access dominates.
-    /// The larger value makes planned runs end early rather than late.
-    const GROWTH: f64 = 0.9;
-    (resolution as f64).powf(GROWTH)
-}
-
 impl Stage {
     /// Returns a plain stage of `steps` steps at a resolution: samples half a voxel apart (svox2), images of full size, and constant
     /// learning rates, 1 for the density and 0.03 for colors.

@@ -102,8 +102,9 @@ impl<T: Real> Kernel<T> for TotalVariation {
             add_differences(along, &own[width..], own, &mut sums[width..]);
             add_differences(along, own, &own[width..], sums);
         });
-        let rows: Vec<u32> = (self.lines.start * self.columns..self.lines.end * self.columns).map(|row| row as u32).collect();
-        out.rows(0, RowSparse::new(plane.shape(), rows.into(), gradient));
+        let mut rows = Buffer::stale(values.len() / width);
+        rows.iter_mut().zip((self.lines.start * self.columns) as u32..).for_each(|(to, row)| *to = row);
+        out.rows(0, RowSparse::new(plane.shape(), rows, gradient));
     }
 }
 

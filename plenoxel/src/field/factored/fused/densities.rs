@@ -39,8 +39,8 @@ pub struct Densities<T> {
 }
 
 impl<T: Real> Densities<T> {
-    /// Computes the table. Samples are left out if the densities of all nodes around them, 1 / length, are at most `negligible`. `None` if the table would take
-    /// more than 1.5 times the memory of the field.
+    /// Computes the table. Samples are left out if the densities of all nodes around them, 1 / length, are at most `negligible`. `None` if the table would need
+    /// more than 1.5 times the memory of the field, or more than 2³² entries.
     pub fn new(field: &Factored<T>, negligible: f64) -> Option<Self> {
         let nodes = field.nodes();
         let bricks = BrickGrid::new(nodes.map(|n| n - 1));
@@ -70,7 +70,9 @@ impl<T: Real> Densities<T> {
         });
         let kept = kept.concat();
         let size = ENTRIES * (kept.len() + 1);
-        if size as f64 > MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64 {
+        let most = (MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64) as usize;
+        // Entries have numbers of 32 bits.
+        if size > most.min(u32::MAX as usize) {
             return None;
         }
         let mut links = vec![0; bricks.len()];
@@ -78,7 +80,7 @@ impl<T: Real> Densities<T> {
             links[brick as usize] = place;
         }
         let mut table = vec![T::lit(NOTHING); size];
-        // They are computed again: that takes less time than the memory to keep them.
+        // The features are computed a second time: keeping those of the first pass would double the memory.
         parallel::for_each_chunk(&mut table[ENTRIES..], TOGETHER * ENTRIES, |first, values| {
             for (values, &brick) in values.chunks_exact_mut(ENTRIES).zip(&kept[first / ENTRIES..]) {
                 values.copy_from_slice(&features(brick));

@@ -9,13 +9,11 @@ use crate::field::grouping::Groups;
 use crate::geometry::Aabb;
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along, COLUMNS};
+use crate::render::picture::RAYS_OF_PACKET;
 use crate::sampling::{Occupancy, Spacing, march};
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
 use std::ops::Range;
-
-/// Number of rays that are led through the empty space before the first matter together, in pictures.
-const PACKET: usize = 64;
 
 /// Columns of a sample.
 mod of_sample {
@@ -109,12 +107,14 @@ impl<T: Real> Block<T> {
 
 /// Inputs of rendering a batch.
 pub struct Scene<'a, T: Real> {
-    batch: &'a Batch<T>,
-    rays: &'a [Ray],
-    options: &'a RenderOptions<'a>,
-    cells: Option<&'a Occupancy>,
-    tables: Tables<'a, T>,
-    densities: Option<&'a Densities<T>>,
+    pub batch: &'a Batch<T>,
+    pub rays: &'a [Ray],
+    pub options: &'a RenderOptions<'a>,
+    /// Cells outside of which nothing is sampled; `None` for the whole box.
+    pub cells: Option<&'a Occupancy>,
+    pub tables: Tables<'a, T>,
+    /// Table from which densities are read, in pictures.
+    pub densities: Option<&'a Densities<T>>,
 }
 
 /// Parameters of a field.
@@ -141,21 +141,6 @@ impl<'a, T: Real> Tables<'a, T> {
 }
 
 impl<'a, T: Real> Scene<'a, T> {
-    pub fn new(
-        batch: &'a Batch<T>,
-        rays: &'a [Ray],
-        options: &'a RenderOptions<'a>,
-        cells: Option<&'a Occupancy>,
-        tables: &'a [Tensor<T>],
-    ) -> Self {
-        Scene { batch, rays, options, cells, tables: Tables::new(batch, tables), densities: None }
-    }
-
-    /// Reads the densities from a table.
-    pub fn with_densities(self, densities: Option<&'a Densities<T>>) -> Self {
-        Scene { densities, cells: densities.map_or(self.cells, |densities| Some(densities.cells())), ..self }
-    }
-
     /// Renders rays from `first` on, one for each entry of `sparsity`.
     pub fn render(&self, first: usize, pixels: &mut [T], sparsity: &mut [T]) -> Block<T> {
         let mut block = self.samples(first, sparsity.len());
@@ -182,11 +167,12 @@ impl<'a, T: Real> Scene<'a, T> {
         let rays = &self.rays[first..first + count];
         let mut free_until = 0.0;
         for (r, ray) in rays.iter().enumerate() {
+            // Neighbouring rays of a picture skip the empty space in front of the scene together.
             if let Some(densities) = self.densities
-                && r % PACKET == 0
+                && r % RAYS_OF_PACKET == 0
                 && !matches!(spacing, Spacing::Contracted(_))
             {
-                free_until = densities.cells().free_until(&rays[r..count.min(r + PACKET)]);
+                free_until = densities.cells().free_until(&rays[r..count.min(r + RAYS_OF_PACKET)]);
             }
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
             let mut occupied = self.cells.map(|cells| march.occupied(ray, cells).starting_at(free_until));
