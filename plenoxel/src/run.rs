@@ -5,7 +5,7 @@
 //! | [`settings`] | defaults < preset < file < assignments, resolved to a configuration |
 //! | [`data`] | the source of the views, recorded by a run |
 //! | [`memory`], [`machine`] | memory estimates; threads, vector instructions and the time |
-//! | [`budget`] | time budgets: lengths of the stages for training of a given duration |
+//! | [`budget`], [`pace`] | time budgets: lengths of the stages for training of a given duration |
 //! | [`folder`] | the files of a run, by name |
 //! | [`metrics`], [`tensorboard`] | the metrics of training, as JSON lines and as TensorBoard events |
 //! | [`training`] | the run itself, reported as events |
@@ -20,6 +20,7 @@ pub mod folder;
 pub mod machine;
 pub mod memory;
 pub mod metrics;
+pub mod pace;
 pub mod settings;
 pub mod tensorboard;
 pub mod training;

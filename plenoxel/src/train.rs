@@ -177,6 +177,19 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         self
     }
 
+    /// Changes the settings of the model, and plans the stages again. The steps that were taken must be the same with the new settings.
+    ///
+    /// Panics if the new plan has another current stage, or has ended.
+    #[track_caller]
+    pub fn replan(&mut self, change: impl FnOnce(&mut M)) {
+        let before = self.step.checked_sub(1).and_then(|last| self.stage_of(last));
+        change(&mut self.model);
+        self.plan = plan(&self.model, &self.options, self.rays.len());
+        let after = self.step.checked_sub(1).and_then(|last| self.stage_of(last));
+        let place = |stage: PlannedStage| (stage.index, stage.first, stage.first_ray, stage.rays_per_step, stage.resolution);
+        assert_eq!(before.map(place), after.map(place), "replan: the current stage is another");
+    }
+
     /// Returns the current model.
     pub fn model(&self) -> &M {
         &self.model

@@ -176,6 +176,7 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
                 drop(figures);
                 self.failure = self.start(&run);
             }
+            Event::Planned { plan } => self.shared.figures().plan = plan.to_vec(),
             Event::Step { report, observation, model } => self.step(report, observation, model),
             Event::Saved { steps } => self.shared.figures().saved = Some(steps),
             Event::Trained => {

@@ -66,6 +66,12 @@ impl<'a> Console<'a> {
 }
 
 impl Training<'_, '_> {
+    /// Replaces the plan.
+    pub fn plan(&mut self, plan: &[PlannedStage]) {
+        self.plan = plan.to_vec();
+        self.total = plan.iter().map(|stage| stage.steps).sum();
+    }
+
     /// Shows the progress of a countable task between two steps.
     pub fn count(&self, what: &str, done: usize, total: usize) {
         self.meter.show((done as u64, total as u64), false, || Counted { what, done, total });

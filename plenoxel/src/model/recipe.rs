@@ -70,10 +70,53 @@ pub trait Recipe: Send + Sync {
         self
     }
 
-    /// Returns settings whose steps cost this much in total: the same training, longer or shorter. `model` has begun its first stage.
-    fn with_cost(&self, model: &Self::Model, cost: f64) -> Self
+    /// Returns settings whose steps cost this much in total: the same training, longer or shorter. `model` has begun its first stage, and has taken `taken` steps
+    /// which the first stage may keep: if it does, it has more steps than these.
+    fn with_cost(&self, model: &Self::Model, cost: f64, taken: u64) -> Self
     where
         Self: Sized;
+
+    /// Returns these settings as a plan for `seconds` will probably change them, apart from lengths and sizes, and the duration of a step with them, relative to
+    /// one without the changes. If the guess is right, the steps that measure the speed belong to the plan. Default: the same settings.
+    fn likely_for(&self, seconds: f64) -> (Self, f64)
+    where
+        Self: Sized + Clone,
+    {
+        let _ = seconds;
+        (self.clone(), 1.0)
+    }
+
+    /// Returns true if training with these settings has the same first `steps` steps as training with `other`. Default: false.
+    fn begins_as(&self, other: &Self, steps: u64) -> bool
+    where
+        Self: Sized,
+    {
+        let _ = (other, steps);
+        false
+    }
+
+    /// Returns the number of steps after which the length of the last stage should be adjusted to the measured speed; `None`, the default, if it cannot be.
+    fn adjusted_after(&self) -> Option<u64> {
+        None
+    }
+
+    /// Returns these settings with another number of steps in the last stage, or with the nearest number for which the first `taken` steps stay the same.
+    /// Called if [`adjusted_after`](Recipe::adjusted_after) is not `None`.
+    fn with_last_stage(&self, steps: u64, taken: u64) -> Self
+    where
+        Self: Sized + Clone,
+    {
+        let _ = (steps, taken);
+        self.clone()
+    }
+
+    /// Replaces the settings of a model by these, which [begin as](Recipe::begins_as) the former do. The default does nothing.
+    fn change(self, model: &mut Self::Model)
+    where
+        Self: Sized,
+    {
+        let _ = model;
+    }
 
     /// Puts the settings into a configuration.
     fn set(self, config: &mut Config)

@@ -23,6 +23,7 @@ use crate::geometry::Aabb;
 use crate::loss::Step;
 use crate::model::cells;
 use crate::model::plenoxels::config::Hull;
+use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, render, render_tracked};
 use crate::sampling::{Jitter, Occupancy, Spacing};
@@ -31,11 +32,12 @@ use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::any::Any;
 use std::path::Path;
-use std::sync::OnceLock;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
+use std::sync::{Arc, OnceLock};
 
 /// Kind of this model in checkpoints.
 pub const KIND: &str = "tensorf";
@@ -44,6 +46,8 @@ pub const KIND: &str = "tensorf";
 #[derive(Debug)]
 pub struct Tensorf<T: Real> {
     config: Config,
+    /// Number of steps of the run. The learning rates of the current optimizer follow it when a plan changes.
+    total_steps: Arc<AtomicU64>,
     field: Factored<T>,
     space: Space,
     hull: Hull,
@@ -91,7 +95,8 @@ impl<T: Real> Tensorf<T> {
         field.grouping = Grouping { weight: config.group, above: config.color_above };
         field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
         field.gradient_above = config.gradient_above;
-        Ok(Tensorf { config, field, space, hull: Hull::Auto, engine: Engine::Fused })
+        let total_steps = Arc::new(AtomicU64::new(config.total_steps()));
+        Ok(Tensorf { config, total_steps, field, space, hull: Hull::Auto, engine: Engine::Fused })
     }
 
     /// Sets the use of silhouettes. With [`Hull::Auto`], the default, only cells in the visual hull of the training views are sampled, if they have an alpha
@@ -108,7 +113,7 @@ impl<T: Real> Tensorf<T> {
         // Box, nodes and values are in the file.
         let mut model =
             Tensorf::new(Config { stages: config.stages.iter().copied().take(1).collect(), ..config.clone() }, Aabb::cube(1.0), 0)?;
-        model.config = config;
+        model.set_config(config);
         let about = model.load(path)?;
         Ok((model, about))
     }
@@ -116,6 +121,11 @@ impl<T: Real> Tensorf<T> {
     /// Returns the settings of the model.
     pub fn config(&self) -> &Config {
         &self.config
+    }
+
+    fn set_config(&mut self, config: Config) {
+        self.total_steps.store(config.total_steps(), Relaxed);
+        self.config = config;
     }
 
     /// Returns the field.
@@ -187,7 +197,7 @@ struct Falling {
     last: f64,
     cool_down: f64,
     first: u64,
-    total: u64,
+    total: Arc<AtomicU64>,
     frozen: u64,
 }
 
@@ -197,7 +207,7 @@ impl Schedule for Falling {
         if step < self.frozen {
             return 0.0;
         }
-        let done = step as f64 / self.total as f64;
+        let done = step as f64 / self.total.load(Relaxed) as f64;
         let left = if self.cool_down > 0.0 { ((1.0 - done) / self.cool_down).clamp(0.0, 1.0) } else { 1.0 };
         left * self.rate * self.last.powf(done)
     }
@@ -247,7 +257,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
             last: config.last_rate,
             cool_down: config.cool_down,
             first: stage.first,
-            total: config.total_steps(),
+            total: self.total_steps.clone(),
             frozen,
         };
         let mut rates = Rates::new(falling(config.factor_rate, 0));
@@ -306,6 +316,11 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn settings(&self) -> Value {
         json!(self.config)
+    }
+
+    /// A plan may have changed after the run was saved.
+    fn continues(&self, saved: &Value, steps: u64) -> bool {
+        Config::deserialize(saved).is_ok_and(|saved| self.config.begins_as(&saved, steps))
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {

@@ -1,4 +1,4 @@
-//! Time budget: the lengths of the stages for training of a given duration, computed once before the first step.
+//! Time budget of the voxel grid: the lengths of the stages for training of a given duration, computed once before the first step.
 //!
 //! The speed of the machine is measured with up to twenty seconds of discarded steps. The relative cost of the stages is taken from runs on
 //! lego of NeRF-synthetic at 800 x 800 (`benches/history`). It varies between scenes by about a quarter, and so does the actual duration. The
@@ -9,9 +9,6 @@ use crate::error::{Error, Result};
 use crate::model::plenoxels::Trainer;
 use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
 use crate::model::plenoxels::ray_cost;
-use crate::model::recipe::Recipe;
-use crate::text::clock;
-use crate::train;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -27,7 +24,7 @@ const RAYS_TO_BEGIN: f64 = 2.2e6;
 const ONLY_LOOKED_AT: f64 = 0.5;
 /// Duration of the speed measurement: its share of the planned time, and its maximum in seconds. It takes at least a few steps. With 3 seconds,
 /// two plans for eleven minutes, made half an hour apart, differed by half in their number of steps.
-const CALIBRATION: (f64, f64) = (0.03, 20.0);
+pub(super) const MEASURING: (f64, f64) = (0.03, 20.0);
 /// Share of the configured steps below which the finest stages become coarser, and the factor of their resolution: in short runs, more steps
 /// improve the result more than more voxels. On lego, `fast` reaches in 29 seconds at 256 voxels per side, measurement included, the PSNR that
 /// it reaches at 320 in 30 seconds without the measurement.
@@ -94,40 +91,6 @@ fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result
     Ok(Config { stages, losses: losses.collect(), ..config })
 }
 
-/// Fits the settings of another model to the training views, and scales them so that training takes `seconds` on this machine, including the measurement made
-/// here. `begin` creates a trainer.
-///
-/// Errors: the time is too short; those of [`Trainer::step`](train::Trainer::step).
-pub fn recipe_on_time<R: Recipe>(recipe: R, seconds: f64, begin: impl FnOnce(&R) -> Result<train::Trainer<f32, R::Model>>) -> Result<R> {
-    let start = Instant::now();
-    let mut trainer = begin(&recipe)?;
-    trainer.step()?;
-    let begun = start.elapsed().as_secs_f64();
-    let (from, cost) = recipe.measured_step(trainer.model());
-    for _ in 0..from {
-        trainer.step()?;
-    }
-    let measured_from = start.elapsed().as_secs_f64();
-    let enough = (CALIBRATION.0 * seconds).min(CALIBRATION.1);
-    let (mut count, mut spent) = (0, measured_from);
-    while count < 20 || spent - measured_from < enough {
-        let Some(report) = trainer.step()? else { break };
-        count += 1;
-        spent = start.elapsed().as_secs_f64();
-        if report.ends_stage {
-            break;
-        }
-    }
-    let unit = (spent - measured_from) / f64::from(count.max(1)) / cost;
-    let left = seconds - spent - begun;
-    if left <= 0.0 {
-        let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + begun));
-        return Err(Error::usage("--time", found, "give it more time"));
-    }
-    let model = trainer.model();
-    Ok(recipe.fitted_to(model, trainer.views()).with_cost(model, left / unit))
-}
-
 /// Returns `asked` with everything that a time budget changes taken from `found`: lengths of stages, resolutions with density rates, image
 /// reductions and loss weights. The result equals `found` if `found` is a plan for `asked`.
 pub fn planned_like(asked: Config, found: &Config) -> Config {
@@ -181,7 +144,7 @@ fn measure(config: &Config, views: &Arc<[View]>, seconds: f64) -> Result<Speed> 
 /// Measures the speed of a machine that took `begin` seconds before the first step. `step` takes a step and returns its duration; it is called for a
 /// share of the planned `seconds`.
 fn speed(resolution: usize, begin: f64, seconds: f64, mut step: impl FnMut() -> Result<f64>) -> Result<Speed> {
-    let enough = (CALIBRATION.0 * seconds).min(CALIBRATION.1);
+    let enough = (MEASURING.0 * seconds).min(MEASURING.1);
     let (mut count, mut steps, mut taken) = (0, 0.0, 0.0);
     while count < 3 || taken < enough {
         taken += step()?;
@@ -263,7 +226,7 @@ mod tests {
                 };
                 let speed = speed(128, slower * BEGIN[0], promised, step).unwrap();
                 let spent = speed.spent;
-                assert!(spent >= slower * BEGIN[0] + (CALIBRATION.0 * promised).min(CALIBRATION.1), "{spent} s");
+                assert!(spent >= slower * BEGIN[0] + (MEASURING.0 * promised).min(MEASURING.1), "{spent} s");
                 let plan = planned(config.clone(), &asked, promised, &speed).unwrap();
                 let [first, second] = [0, 1].map(|stage| plan.stages[stage].steps.unwrap());
                 assert_eq!(plan.stages[1].resolution, 320);

@@ -41,6 +41,7 @@ use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::{self, Objective, Trainer, objective};
 use crate::run::figures::Figures;
+use crate::run::pace::Begun;
 use crate::text::clock;
 use crate::train::{self, Model, PlannedStage, StageProgress, ViewOptions};
 use learning::Learned;
@@ -204,7 +205,7 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     if let scouts @ 1.. = trainer.model().scout_stages() {
         on(Event::note(format!("scout: {scouts} short stages first locate the objects, because there are no silhouettes")));
     }
-    run.learn(trainer, on)
+    run.learn((trainer, Vec::new()), &mut |_, _| None, on)
 }
 
 /// Trains a custom model. `start` builds its trainer from the config, the dataset and the training views. It may use any part of the config;
@@ -225,7 +226,7 @@ pub fn train_model<M: Model<f32>>(
     let NewRun { config, dataset, views, clocks, .. } = &mut run;
     let trainer = clocks.train.time(|| start(config, dataset, views.clone()))?;
     run.check_cameras(trainer.model().aabb(), on)?;
-    run.learn(trainer, on)
+    run.learn((trainer, Vec::new()), &mut |_, _| None, on)
 }
 
 /// A new run.
@@ -293,22 +294,22 @@ impl<'s> NewRun<'s> {
         Ok(())
     }
 
-    /// Creates the folder, trains and evaluates. Nothing is written or overwritten before all checks of the input.
-    fn learn<M: Model<f32>>(self, trainer: train::Trainer<f32, M>, on: &mut Listener<'_>) -> Result<Outcome> {
+    /// Creates the folder, trains and evaluates; `adjust` may change the plan. Nothing is written or overwritten before all checks of the input.
+    fn learn<M: Model<f32>>(self, begun: Begun<M>, adjust: &mut Adjust<'_, M>, on: &mut Listener<'_>) -> Result<Outcome> {
         let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved, warnings } = self;
         let RunSettings { data, preset, time, options, .. } = settings;
         check_disk(settings.out.as_deref().unwrap_or(Path::new("runs")), saved.saturating_sub(folder.overwritten()), on)?;
         let folder = folder.create()?;
         let record = RunRecord {
             seconds_planned: *time,
-            model: trainer.model().kind().to_owned(),
+            model: begun.0.model().kind().to_owned(),
             ..RunRecord::new(RunKind::Trained, &dataset, preset.as_deref(), data)
         };
         folder.describe(&config, &record)?;
         on(Event::note(format!("run: {}", folder.path().display())));
-        let metrics = MetricsFile::create(&folder, trainer.total_steps())?;
-        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options, warnings: &warnings };
-        let learned = job.learn(trainer, (metrics, History::default()), preview, &views, &mut clocks, on)?;
+        let metrics = MetricsFile::create(&folder, begun.0.total_steps())?;
+        let mut job = Job { folder: &folder, config, dataset: &dataset, record: &record, options, warnings: &warnings };
+        let learned = job.learn(begun, adjust, (metrics, History::default()), preview, &views, &mut clocks, on)?;
         drop(views);
         job.conclude(learned, clocks, on)
     }
@@ -445,9 +446,9 @@ impl<'o> OldRun<'o> {
         let as_it_began = !record.is_of_own_model() && config.init_from.is_none();
         let aabb = if as_it_began { Aabb::cube(config.half_width) } else { trainer.model().aabb() };
         let warnings = record.data.check_cameras(&dataset, aabb)?;
-        let job = Job { folder: &folder, config: &config, dataset: &dataset, record: &record, options, warnings: &warnings };
+        let mut job = Job { folder: &folder, config, dataset: &dataset, record: &record, options, warnings: &warnings };
         let learned = match state {
-            Some(_) => job.learn(trainer, (metrics, past), preview, &views, &mut clocks, on)?,
+            Some(_) => job.learn((trainer, Vec::new()), &mut |_, _| None, (metrics, past), preview, &views, &mut clocks, on)?,
             None => Ok(job.learned(trainer, &plan, (metrics, past), &views, on)?),
         };
         drop(views);
@@ -529,13 +530,16 @@ fn check_disk(folder: &Path, saved: u64, on: &mut Listener<'_>) -> Result<()> {
 /// A new or resumed run.
 struct Job<'a> {
     folder: &'a RunFolder,
-    config: &'a Config,
+    config: Config,
     dataset: &'a Dataset,
     record: &'a RunRecord,
     options: &'a RunOptions,
     /// Warnings about its cameras.
     warnings: &'a [String],
 }
+
+/// Looks at a run after a step, whose seconds of training it is given; returns the new configuration if it has changed the plan.
+type Adjust<'a, M> = dyn FnMut(&mut train::Trainer<f32, M>, f64) -> Option<Config> + 'a;
 
 /// A stopped run: steps taken, and total steps.
 struct Stopped(u64, u64);
@@ -553,7 +557,7 @@ impl Job<'_> {
         mut clocks: Clocks,
         on: &mut Listener<'_>,
     ) -> Result<Outcome> {
-        let Job { folder, config, dataset, .. } = *self;
+        let Job { folder, ref config, dataset, .. } = *self;
         let mut learned = match learned {
             Ok(learned) => learned,
             // Without the lock, so that the caller can resume the run.

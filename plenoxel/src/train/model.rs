@@ -143,6 +143,13 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         Value::Null
     }
 
+    /// Returns true if a run that was saved after `steps` steps, when the settings of its model were `saved`, goes on with the settings of this model. Default:
+    /// they are the same.
+    fn continues(&self, saved: &Value, steps: u64) -> bool {
+        let _ = steps;
+        self.settings() == *saved
+    }
+
     /// Writes everything that [`read`](Model::read) needs. Default: the parameters by name.
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {
         self.visit(&mut |param| {

@@ -119,7 +119,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             let found = format!("the saved run has other {what}");
             Err(Error::input(file.path(), found, "resume with the settings and the data that the run began with, or train again"))
         };
-        if state.options != self.options || state.settings != self.model.settings() {
+        if state.options != self.options || !self.model.continues(&state.settings, state.about.step) {
             return other("settings");
         }
         if state.precision != size_of::<T>() {

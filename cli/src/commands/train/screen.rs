@@ -75,6 +75,12 @@ impl<'c, 'a> Screen<'c, 'a> {
                 self.folder = Some(run.folder.clone());
                 self.interrupt = Some(Watch::begin());
             }
+            Event::Planned { plan } => {
+                self.plan = plan.to_vec();
+                if let Some(progress) = &mut self.progress {
+                    progress.plan(plan);
+                }
+            }
             Event::Initial { stage, see } => {
                 if let Some(pictures) = &mut self.pictures {
                     console.drawn(pictures.initial(&stage, see));

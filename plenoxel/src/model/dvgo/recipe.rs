@@ -69,7 +69,7 @@ impl Recipe for Config {
         (0, cost(&self.coarse))
     }
 
-    fn with_cost(&self, _: &Dvgo<f32>, budget: f64) -> Self {
+    fn with_cost(&self, _: &Dvgo<f32>, budget: f64, _: u64) -> Self {
         let total = |stages: &[Stage]| stages.iter().map(|stage| stage.steps as f64 * cost(stage)).sum::<f64>();
         let coarse = total(&[self.coarse]);
         // Without enough coarse steps, nothing is opaque: a short run shortens them last.

@@ -55,7 +55,7 @@ impl Recipe for Config {
         (0, 1.0)
     }
 
-    fn with_cost(&self, _: &Nerf<f32>, cost: f64) -> Self {
+    fn with_cost(&self, _: &Nerf<f32>, cost: f64, _: u64) -> Self {
         let steps = (cost.round() as u64).max(1);
         let share = steps as f64 / self.steps as f64;
         let decay_steps = ((self.decay_steps as f64 * share).round() as u64).max(1);

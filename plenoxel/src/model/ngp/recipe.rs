@@ -53,7 +53,7 @@ impl Recipe for Config {
         (0, self.stages[0].rays as f64)
     }
 
-    fn with_cost(&self, _: &Ngp<f32>, cost: f64) -> Self {
+    fn with_cost(&self, _: &Ngp<f32>, cost: f64, _: u64) -> Self {
         let whole: f64 = self.stages.iter().map(|stage| stage.steps as f64 * stage.rays as f64).sum();
         let scaled = |steps: u64| ((steps as f64 * cost / whole).round() as u64).max(1);
         Config {

@@ -244,6 +244,13 @@ impl Config {
     pub(super) fn total_steps(&self) -> u64 {
         self.stages.iter().map(|stage| stage.steps).sum()
     }
+
+    /// Returns the number of first steps whose learning rates do not depend on the number of steps of the run.
+    pub(super) fn steps_at_full_rate(&self) -> u64 {
+        let constant = if self.last_rate == 1.0 { (1.0 - self.cool_down) * self.total_steps() as f64 } else { 0.0 };
+        // One less for rounding.
+        (constant as u64).saturating_sub(1)
+    }
 }
 
 #[cfg(test)]

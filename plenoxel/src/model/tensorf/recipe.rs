@@ -1,6 +1,6 @@
 //! Training a factored field from the configuration of a run: memory, and lengths of stages.
 
-use super::{Config, KIND, Stage, Tensorf, total_variation};
+use super::{Config, KIND, Short, Stage, Tensorf, total_variation};
 use crate::dataset::View;
 use crate::error::Result;
 use crate::loss::Objective;
@@ -9,6 +9,7 @@ use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
 use crate::space::{Region, Space};
 use crate::train::StageLength;
+use std::iter;
 
 impl Recipe for Config {
     type Model = Tensorf<f32>;
@@ -66,8 +67,53 @@ impl Recipe for Config {
         Config { stages, ..self }
     }
 
-    fn with_cost(&self, model: &Tensorf<f32>, cost: f64) -> Self {
-        self.planned(self.cost_in(model.space), cost)
+    fn with_cost(&self, model: &Tensorf<f32>, cost: f64, taken: u64) -> Self {
+        self.planned(self.cost_in(model.space), cost, taken)
+    }
+
+    fn likely_for(&self, seconds: f64) -> (Self, f64) {
+        let whole = UNIT * Cost { across: 1.0 }.total(&self.stages);
+        let short = self.short.filter(|short| seconds < short.below * whole);
+        (self.shortened(short), short.map_or(1.0, |short| short.cost))
+    }
+
+    fn begins_as(&self, other: &Self, steps: u64) -> bool {
+        let without_stages = |config: &Config| Config { stages: Vec::new(), ..config.clone() };
+        // The stages up to the last of these steps; of that one, the length does not matter.
+        let stages = |config: &Config| {
+            let mut first = 0;
+            let begun = config.stages.iter().map(|stage| {
+                let begun = Stage { steps: stage.steps.min(steps.saturating_sub(first)), ..*stage };
+                first += stage.steps;
+                begun
+            });
+            begun.take_while(|stage| stage.steps > 0).collect::<Vec<Stage>>()
+        };
+        let same_rates = self.total_steps() == other.total_steps() || steps <= self.steps_at_full_rate().min(other.steps_at_full_rate());
+        without_stages(self) == without_stages(other) && stages(self) == stages(other) && same_rates
+    }
+
+    fn adjusted_after(&self) -> Option<u64> {
+        let first = self.total_steps() - self.stages.last()?.steps;
+        let until = self.steps_at_full_rate();
+        // In the last stage if it has many steps at the full rate: after some of them, so that its speed is known, and before the others, so that it can still
+        // become shorter.
+        const MANY: u64 = 40;
+        (until > 0).then_some(if until > first + MANY { first.midpoint(until) } else { until - until / 12 })
+    }
+
+    fn with_last_stage(&self, steps: u64, taken: u64) -> Self {
+        let mut stages = self.stages.clone();
+        if let Some((last, earlier)) = stages.split_last_mut() {
+            let least = ((taken + 2) as f64 / (1.0 - self.cool_down)).ceil() as u64;
+            let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
+            last.steps = steps.max(least.saturating_sub(before));
+        }
+        Config { stages, ..self.clone() }
+    }
+
+    fn change(self, model: &mut Tensorf<f32>) {
+        model.set_config(self);
     }
 
     fn set(self, config: &mut RunConfig) {
@@ -87,16 +133,17 @@ impl Config {
         self.stages.iter().map(|stage| stage.length(costs.step(stage) / stage.rays as f64)).collect()
     }
 
-    /// Returns settings whose steps cost this much in total.
-    fn planned(&self, costs: Cost, cost: f64) -> Self {
-        let config = Config { short: None, ..self.clone() };
-        match self.short.filter(|short| cost < short.below * costs.total(&self.stages)) {
-            None => Config { stages: costs.scaled(&self.stages, cost), ..config },
-            Some(short) => {
-                let stages = costs.scaled(&self.stages, cost / short.cost);
-                Config { hidden: short.hidden, group: short.group, stages, ..config }
-            }
-        }
+    /// Returns settings whose steps cost this much in total, with more than `taken` in the first stage.
+    fn planned(&self, costs: Cost, cost: f64, taken: u64) -> Self {
+        let short = self.short.filter(|short| cost < short.below * costs.total(&self.stages));
+        let stages = costs.scaled(&self.stages, cost / short.map_or(1.0, |short| short.cost), taken);
+        Config { stages, ..self.shortened(short) }
+    }
+
+    /// Returns these settings with the changes for a short run, or without any.
+    fn shortened(&self, short: Option<Short>) -> Self {
+        let (hidden, group) = short.map_or((self.hidden, self.group), |short| (short.hidden, short.group));
+        Config { hidden, group, short: None, ..self.clone() }
     }
 }
 
@@ -120,6 +167,9 @@ fn bytes_of_ray(config: &Config, engine: Engine) -> u64 {
     SAMPLES * of_sample + COLORED * of_color
 }
 
+/// Usual duration of the unit of [`Cost::step`] on two cores, in seconds. A wrong guess costs a second measurement only.
+const UNIT: f64 = 5.8e-6;
+
 /// Durations of steps.
 #[derive(Clone, Copy, Debug)]
 struct Cost {
@@ -129,8 +179,8 @@ struct Cost {
 
 impl Cost {
     /// Scales stages to a total cost. In a short run, the earlier stages are shortened less than the last, and the finest stages become coarser: without geometry,
-    /// and with few steps for each node, finer planes gain nothing.
-    fn scaled(self, stages: &[Stage], budget: f64) -> Vec<Stage> {
+    /// and with few steps for each node, finer planes gain nothing. The first stage has more than `taken` steps.
+    fn scaled(self, stages: &[Stage], budget: f64, taken: u64) -> Vec<Stage> {
         let factor = budget / self.total(stages);
         let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
         let most = ((finest as f64 * factor.min(1.0).powf(0.13)) as usize).max(2);
@@ -140,13 +190,12 @@ impl Cost {
         };
         let mut stages: Vec<Stage> = stages.iter().map(shortened).collect();
         if let Some((last, earlier)) = stages.split_last_mut() {
-            let left = budget - self.total(earlier);
             // At least a third for the last stage.
-            if left < budget / 3.0 {
-                let shrink = budget / 1.5 / self.total(earlier);
-                earlier.iter_mut().for_each(|stage| stage.steps = ((stage.steps as f64 * shrink) as u64).max(1));
-            }
-            last.steps = ((left.max(budget / 3.0) / self.step(last)).round() as u64).max(1);
+            let shrink = (budget / 1.5 / self.total(earlier)).min(1.0);
+            let least = iter::once(taken + 1).chain(iter::repeat(1));
+            earlier.iter_mut().zip(least).for_each(|(stage, least)| stage.steps = ((stage.steps as f64 * shrink) as u64).max(least));
+            let left = (budget - self.total(earlier)).max(budget / 3.0);
+            last.steps = ((left / self.step(last)).round() as u64).max(1);
         }
         stages
     }
@@ -167,7 +216,6 @@ impl Cost {
 
 #[cfg(test)]
 mod tests {
-    use super::super::config::Short;
     use super::*;
 
     #[test]
@@ -175,7 +223,7 @@ mod tests {
         let (stages, costs) = (Config::default().stages, Cost { across: 1.5 });
         let whole = costs.total(&stages);
         for factor in [0.03, 0.1, 0.4, 1.0, 3.0] {
-            let planned = costs.scaled(&stages, factor * whole);
+            let planned = costs.scaled(&stages, factor * whole, 0);
             let share = costs.total(&planned) / (factor * whole);
             assert!((0.95..1.05).contains(&share), "{factor}: {share}");
             let finest = |stages: &[Stage]| stages.iter().map(|stage| stage.resolution).max();
@@ -190,10 +238,10 @@ mod tests {
         let config = Config { hidden: 128, group: 0.04, short: Some(short), ..Config::default() };
         let costs = config.cost_in(Space::Box);
         let whole = costs.total(&config.stages);
-        let planned = [0.2, 0.5].map(|share| config.planned(costs, share * whole));
+        let planned = [0.2, 0.5].map(|share| config.planned(costs, share * whole, 0));
         assert_eq!(planned.each_ref().map(|planned| (planned.hidden, planned.group, planned.short)), [(64, 0.1, None), (128, 0.04, None)]);
         assert!((costs.total(&planned[0].stages) / (0.2 * whole / 0.7) - 1.0).abs() < 0.05);
         // Without them, a short run has the same network.
-        assert_eq!(Config { short: None, ..config }.planned(costs, 0.2 * whole).hidden, 128);
+        assert_eq!(Config { short: None, ..config }.planned(costs, 0.2 * whole, 0).hidden, 128);
     }
 }

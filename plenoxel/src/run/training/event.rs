@@ -51,6 +51,11 @@ pub enum Event<'a> {
         /// The history of a resumed run.
         history: &'a History,
     },
+    /// The plan has changed: the last stage was adjusted to the measured speed.
+    Planned {
+        /// The stages with their steps.
+        plan: &'a [PlannedStage],
+    },
     /// The model before its first step, before the first stage prunes it. A resumed run does not emit this event again.
     Initial {
         /// The first stage.

@@ -3,12 +3,13 @@
 use super::best::BestModel;
 use super::event::Underway;
 use super::preview::{Look, Preview};
-use super::{Clocks, Event, Job, Listener, Stopped, watched};
+use super::{Adjust, Clocks, Event, Job, Listener, Stopped, watched};
 use crate::camera::Camera;
 use crate::dataset::{Split, View};
 use crate::error::{Error, Result};
 use crate::evaluate::{self, Viewer};
 use crate::run::metrics::{History, MetricsFile, Observation};
+use crate::run::pace::Begun;
 use crate::train::poses::PoseFigures;
 use crate::train::{About, Model, PlannedStage, RenderFn, Trainer, ViewOptions};
 use ndarray::Array3;
@@ -60,26 +61,30 @@ pub struct StageSummary {
 }
 
 impl Job<'_> {
-    /// Trains the model; only the steps count as training time. Returns [`Stopped`] if the run was stopped and its state was saved.
+    /// Trains the model; only the steps count as training time. `reports` are of the steps that were taken before this run had a folder. Returns [`Stopped`] if
+    /// the run was stopped and its state was saved.
+    #[expect(clippy::too_many_arguments, reason = "each is needed once")]
     pub fn learn<M: Model<f32>>(
-        &self,
-        mut trainer: Trainer<f32, M>,
+        &mut self,
+        (mut trainer, reports): Begun<M>,
+        adjust: &mut Adjust<'_, M>,
         (mut metrics, past): (MetricsFile, History),
         preview: Preview,
         views: &[View],
         clocks: &mut Clocks,
         on: &mut Listener<'_>,
     ) -> Result<std::result::Result<Learned<M>, Stopped>> {
-        let Job { folder, config, dataset, options, .. } = *self;
-        let plan = trainer.plan().to_vec();
-        let total = trainer.total_steps();
+        let Job { folder, dataset, record, options, .. } = *self;
+        let mut plan = trainer.plan().to_vec();
+        let mut total = trainer.total_steps();
         let mut stages = summaries(&past, &plan);
         let mut kept = Vec::new();
         let mut best = BestModel::of(folder, &past);
-        let options_of_view = ViewOptions::over(config.background);
+        let background = self.config.background;
+        let options_of_view = ViewOptions::over(background);
         let first = |split| dataset.cameras(split).into_iter().next();
         let mut preview = preview.begin(first(Split::Test).or(first(Split::Train)).filter(|_| options.pictures));
-        let run = Underway { folder, config, dataset };
+        let run = Underway { folder, config: &self.config, dataset };
         on(Event::Started { run, plan: &plan, test_views: self.test_views().len(), history: &past });
         if let Some(&stage) = plan.first().filter(|_| trainer.steps_taken() == 0) {
             on(Event::Initial { stage, see: &|camera: &Camera| Viewer::of(trainer.model(), &options_of_view).see(camera) });
@@ -88,10 +93,14 @@ impl Job<'_> {
         let mut facts = trainer.model().facts();
         let mut saved = Instant::now();
         let (mut mean_squared_error, mut taken) = (0.0, false);
+        let mut reports = reports.into_iter();
         let last_psnr = loop {
             let begins = plan.iter().any(|stage| stage.first == trainer.steps_taken());
             let progress = if begins { trainer.model().progress() } else { None };
-            let mut step = || trainer.step();
+            let mut step = || match reports.next() {
+                Some(report) => Ok(Some(report)),
+                None => trainer.step(),
+            };
             let report = match clocks.train.time(|| match &progress {
                 Some(progress) => watched(progress, on, step),
                 None => step(),
@@ -106,17 +115,19 @@ impl Job<'_> {
             mean_squared_error += if taken { SMOOTHED * (error - mean_squared_error) } else { error };
             taken = true;
             let stage = plan[report.stage];
+            // Steps that were taken before are not stopped at.
+            let now = report.step + 1 == trainer.steps_taken();
             let last = report.step + 1 == total;
             let due = saved.elapsed().as_secs_f64() >= options.checkpoint_every;
-            let stops = !last && (options.stop)();
-            let save = !last && ((options.save)() || due || stops);
+            let stops = now && !last && (options.stop)();
+            let save = now && !last && ((options.save)() || due || stops);
             if report.step == stage.first {
                 facts = trainer.model().facts();
             }
             let model = trainer.model();
             let viewer = || Viewer::of(model, &options_of_view);
             let seconds = clocks.train.seconds();
-            let look = preview.look(viewer, report.ends_stage, save, config.background);
+            let look = preview.look(viewer, report.ends_stage, save, background);
             let validation_psnr = look.as_ref().and_then(|look| look.psnr);
             let observation = Observation { facts: facts.clone(), validation_psnr, seconds };
             metrics.step(&report, &plan, &observation, save)?;
@@ -152,6 +163,13 @@ impl Job<'_> {
                 on(Event::Trained);
                 return Ok(Err(Stopped(report.step + 1, total)));
             }
+            if now && let Some(config) = adjust(&mut trainer, seconds) {
+                self.config = config;
+                folder.describe(&self.config, record)?;
+                plan = trainer.plan().to_vec();
+                total = trainer.total_steps();
+                on(Event::Planned { plan: &plan });
+            }
         };
         let about = trainer.about(dataset.name());
         let poses = trainer.pose_figures();
@@ -181,9 +199,8 @@ impl Job<'_> {
             return Ok(Err(Stopped(total, total)));
         }
         let mean_image = self.mean_image(views);
-        let of_mean = mean_image
-            .as_ref()
-            .and_then(|image| evaluate::constant_psnr(&views[..views.len().min(VIEWS_OF_MEAN)], image, config.background));
+        let of_mean =
+            mean_image.as_ref().and_then(|image| evaluate::constant_psnr(&views[..views.len().min(VIEWS_OF_MEAN)], image, background));
         let training_psnr = of_mean.map(|of_mean| [-10.0 * mean_squared_error.log10(), of_mean]).filter(|_| taken);
         Ok(Ok(Learned { model, metrics, mean_image, training_psnr, stages, kept, steps: total, poses }))
     }
@@ -197,7 +214,7 @@ impl Job<'_> {
         views: &[View],
         on: &mut Listener<'_>,
     ) -> Result<Learned<M>> {
-        let Job { folder, config, dataset, .. } = *self;
+        let Job { folder, ref config, dataset, .. } = *self;
         on(Event::Started { run: Underway { folder, config, dataset }, plan, test_views: self.test_views().len(), history: &past });
         on(Event::Trained);
         let (model, about) = trainer.into_model_of(&folder.existing_checkpoint()?)?;

@@ -6,9 +6,9 @@ use crate::error::Result;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::objective_of_any;
 use crate::model::recipe::Recipe;
-use crate::run::budget;
 use crate::run::data::DataSource;
 use crate::run::memory::Estimate;
+use crate::run::pace::{self, Pace};
 use crate::space::Region;
 use crate::train::Trainer;
 use std::path::Path;
@@ -38,21 +38,27 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
     estimate.check()?;
     run.saved = estimate.saved();
     run.read(on)?;
+    let (mut begun, mut pace) = (None, None);
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
         let begin = |recipe: &R| trainer(config, recipe, region, views.clone());
-        recipe = clocks.train.time(|| budget::recipe_on_time(recipe, seconds, begin))?;
+        let planned = clocks.train.time(|| pace::plan(&recipe, seconds, begin))?;
+        (recipe, begun) = (planned.recipe, planned.begun);
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
             Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
             None => stage.steps.to_string(),
         });
         on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
         recipe.clone().set(config);
+        pace = Some(Pace::new(recipe.clone(), config.clone(), seconds));
     }
     let NewRun { config, views, clocks, .. } = &mut run;
-    let trainer = clocks.train.time(|| trainer(config, &recipe, region, views.clone()))?;
-    run.learn(trainer, on)
+    let begun = match begun {
+        Some(begun) => begun,
+        None => (clocks.train.time(|| trainer(config, &recipe, region, views.clone()))?, Vec::new()),
+    };
+    run.learn(begun, &mut |trainer, seconds| pace.as_mut()?.after_step(trainer, seconds), on)
 }
 
 /// Resumes a run.

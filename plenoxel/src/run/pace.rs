@@ -1,0 +1,210 @@
+//! Time budget of the models that have a [`Recipe`]: a plan before the run begins ([`plan`]), and one adjustment of its last stage ([`Pace`]).
+//!
+//! A plan is a number of steps for each stage. It is part of the settings of the run, which thus repeat the run bit by bit: neither measured steps that belong to
+//! the plan nor the adjustment change what the steps before were ([`Recipe::begins_as`]).
+
+use super::budget::MEASURING;
+use crate::error::{Error, Result};
+use crate::model::plenoxels::config::Config;
+use crate::model::recipe::Recipe;
+use crate::text::clock;
+use crate::train::{PlannedStage, Report, Trainer};
+use std::time::Instant;
+
+/// [`MEASURING`] for a plan that is adjusted later. The measured steps are steps of the run, which should not be too long in its first stage.
+const MEASURING_FIRST: (f64, f64) = (0.01, 3.0);
+
+/// A trainer, and the reports of the steps that it has taken.
+pub type Begun<M> = (Trainer<f32, M>, Vec<Report>);
+
+/// Settings that are planned for a time.
+pub struct Planned<R: Recipe> {
+    /// The settings.
+    pub recipe: R,
+    /// The trainer whose speed was measured, and the reports of its steps, if these steps belong to the plan.
+    pub begun: Option<Begun<R::Model>>,
+}
+
+/// Fits settings to the training views, and scales them so that training takes `seconds` on this machine, including the measurement made here. `begin` creates a
+/// trainer.
+///
+/// Errors: the time is too short; those of [`Trainer::step`].
+pub fn plan<R: Recipe + Clone>(recipe: &R, seconds: f64, begin: impl FnOnce(&R) -> Result<Trainer<f32, R::Model>>) -> Result<Planned<R>> {
+    let start = Instant::now();
+    let (measured, duration) = recipe.likely_for(seconds);
+    let mut trainer = begin(&measured)?;
+    let mut reports: Vec<Report> = trainer.step()?.into_iter().collect();
+    let begun = start.elapsed().as_secs_f64();
+    let (from, cost) = measured.measured_step(trainer.model());
+    for _ in 0..from {
+        reports.extend(trainer.step()?);
+    }
+    let measured_from = start.elapsed().as_secs_f64();
+    let measuring = if recipe.adjusted_after().is_some() { MEASURING_FIRST } else { MEASURING };
+    let enough = (measuring.0 * seconds).min(measuring.1);
+    let (mut count, mut spent) = (0, measured_from);
+    while count < 20 || spent - measured_from < enough {
+        let Some(report) = trainer.step()? else { break };
+        count += 1;
+        spent = start.elapsed().as_secs_f64();
+        let ends_stage = report.ends_stage;
+        reports.push(report);
+        if ends_stage {
+            break;
+        }
+    }
+    let unit = (spent - measured_from) / f64::from(count.max(1)) / cost / duration;
+    let fitted = |recipe: &R| recipe.clone().fitted_to(trainer.model(), trainer.views());
+    let planned = |left: f64, taken: u64| fitted(recipe).with_cost(trainer.model(), left / unit, taken);
+    let going_on = (begun < seconds).then(|| planned(seconds - begun, trainer.steps_taken()));
+    if let Some(recipe) = going_on.filter(|going_on| going_on.begins_as(&fitted(&measured), trainer.steps_taken())) {
+        trainer.replan(|model| recipe.clone().change(model));
+        return Ok(Planned { recipe, begun: Some((trainer, reports)) });
+    }
+    let left = seconds - spent - begun;
+    if left <= 0.0 {
+        let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + begun));
+        return Err(Error::usage("--time", found, "give it more time"));
+    }
+    Ok(Planned { recipe: planned(left, 0), begun: None })
+}
+
+/// Follows a planned run, and adjusts the length of its last stage once so that training ends on time.
+pub struct Pace<R> {
+    recipe: R,
+    config: Config,
+    seconds: f64,
+    /// Number of steps after which the plan is adjusted; `None` if it is not, or was.
+    after: Option<u64>,
+    /// Seconds of training after the first step of the current stage.
+    since: f64,
+}
+
+/// Fewest steps of a stage from which the speed is taken.
+const MEASURED: u64 = 10;
+
+impl<R: Recipe + Clone> Pace<R> {
+    /// Follows a run with these settings, which are those of `config` for its model, planned for `seconds`.
+    pub fn new(recipe: R, config: Config, seconds: f64) -> Self {
+        let after = recipe.adjusted_after();
+        Pace { recipe, config, seconds, after, since: 0.0 }
+    }
+
+    /// Looks at the time after a step; `now` is the number of seconds of training. Returns the new configuration if the plan changed.
+    pub fn after_step(&mut self, trainer: &mut Trainer<f32, R::Model>, now: f64) -> Option<Config> {
+        let (taken, plan) = (trainer.steps_taken(), trainer.plan());
+        let stage = plan.iter().find(|stage| taken <= stage.first + stage.steps)?;
+        if taken == stage.first + 1 {
+            // The first step begins the stage.
+            self.since = now;
+        }
+        if self.after != Some(taken) || taken - stage.first <= MEASURED {
+            return None;
+        }
+        self.after = None;
+        let cost = |stage: &PlannedStage| stage.rays_per_step as f64 * stage.ray_cost;
+        let unit = (now - self.since) / (taken - stage.first - 1) as f64 / cost(stage);
+        let (last, earlier) = plan.split_last()?;
+        let to_come = |stage: &PlannedStage| stage.steps - taken.saturating_sub(stage.first).min(stage.steps);
+        let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * cost(stage)).sum();
+        let left = ((self.seconds - now) / unit - before).max(0.0) / cost(last);
+        let adjusted = self.recipe.with_last_stage(taken.saturating_sub(last.first) + left.round() as u64, taken);
+        assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
+        trainer.replan(|model| adjusted.clone().change(model));
+        adjusted.set(&mut self.config);
+        Some(self.config.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    use crate::dataset::procedural::ProceduralOptions;
+    use crate::dataset::{Dataset, Split};
+    use crate::loss::{Objective, mse};
+    use crate::model::Model;
+    use crate::model::tensorf::{self, Short, Stage, Tensorf};
+    use crate::space::{Region, Space};
+    use crate::train::TrainOptions;
+    use autograd::Module;
+
+    fn recipe(stages: &[(usize, u64)]) -> tensorf::Config {
+        tensorf::Config {
+            density_components: 2,
+            appearance_components: 2,
+            features: 4,
+            hidden: 8,
+            opaque_steps: 3,
+            short: Some(Short { below: 0.5, hidden: 4, group: 0.2, cost: 0.8 }),
+            stages: stages.iter().map(|&(resolution, steps)| Stage { resolution, steps, rays: 32 }).collect(),
+            ..tensorf::Config::default()
+        }
+    }
+
+    fn trainer(recipe: &tensorf::Config) -> Result<Trainer<f32, Tensorf<f32>>> {
+        let scene = ProceduralOptions { width: 16, height: 12, train: 3, val: 1, test: 1, ..ProceduralOptions::default() };
+        let views = Dataset::procedural(scene)?.load(Split::Train, &|_, _| ())?;
+        let region = Region { space: Space::Box, aabb: crate::geometry::Aabb::cube(1.5) };
+        let model = Recipe::model(recipe, &Config::default(), region)?;
+        Trainer::with_model(model, views, Objective::new().with("mse", 1.0, mse), TrainOptions::default())
+    }
+
+    /// Trains to the end; returns all parameters.
+    fn trained(mut trainer: Trainer<f32, Tensorf<f32>>) -> Vec<f32> {
+        while trainer.step().unwrap().is_some() {}
+        let mut values = Vec::new();
+        trainer.model().visit(&mut |param| values.extend_from_slice(param.tensor().data()));
+        values
+    }
+
+    #[test]
+    fn measured_steps_of_the_plan_are_those_of_a_run_from_the_beginning() {
+        let asked = recipe(&[(8, 2000), (12, 40_000), (40, 100_000)]);
+        let Planned { recipe, begun } = plan(&asked, 1.0, trainer).unwrap();
+        assert_eq!((recipe.short, recipe.hidden, recipe.group), (None, 4, 0.2));
+        let (begun, reports) = begun.expect("a short plan is what a second leads to");
+        assert!(reports.len() as u64 == begun.steps_taken() && reports.len() >= 24 && recipe.stages[0].steps > begun.steps_taken());
+        assert_eq!(begun.model().settings(), serde_json::json!(recipe));
+        // Fewer steps at the end, so that the test is short.
+        let less = recipe.with_last_stage(1, begun.steps_taken());
+        let mut going_on = begun;
+        going_on.replan(|model| less.clone().change(model));
+        assert_eq!(trained(going_on), trained(trainer(&less).unwrap()));
+    }
+
+    #[test]
+    fn a_plan_that_was_not_guessed_begins_anew() {
+        let asked = recipe(&[(8, 100), (16, 200)]);
+        // So long that the network stays, and too long for any steps to be guessed.
+        let unlikely = tensorf::Config { short: Some(Short { below: 1e-9, ..asked.short.unwrap() }), last_rate: 0.5, ..asked };
+        let Planned { recipe, begun } = plan(&unlikely, 1.0, trainer).unwrap();
+        assert!(begun.is_none() && recipe.hidden == 8);
+        assert!(plan(&unlikely, 1e-9, trainer).err().unwrap().to_string().contains("--time"));
+    }
+
+    #[test]
+    fn the_last_stage_is_adjusted_once_and_the_run_repeats_from_its_settings() {
+        let with_cool_down = |cool_down: f64| tensorf::Config { short: None, cool_down, ..recipe(&[(8, 30), (8, 200)]) };
+        // Without the cool-down there are 138 or 25 of 230 steps. A step is adjusted after 83, or before the last stage, after 22.
+        let cases = [(0.4, 0.1, 970), (0.4, 1.0, 112), (0.4, 10.0, 112), (0.89, 0.1, 970), (0.89, 0.3, 303), (0.89, 10.0, 189)];
+        for (cool_down, of_a_step, steps) in cases {
+            let asked = with_cool_down(cool_down);
+            let mut pace = Pace::new(asked.clone(), Config::default(), 100.0);
+            let (mut trainer, mut changed) = (trainer(&asked).unwrap(), None);
+            while trainer.step().unwrap().is_some() {
+                let now = of_a_step * trainer.steps_taken() as f64;
+                if let Some(config) = pace.after_step(&mut trainer, now) {
+                    assert!(changed.replace(config.tensorf.unwrap()).is_none(), "adjusted once");
+                }
+            }
+            let changed = changed.expect("an adjusted plan");
+            assert_eq!((changed.stages[1].steps, trainer.steps_taken()), (steps, 30 + steps), "{cool_down}, {of_a_step} s a step");
+            let again = super::tests::trainer(&changed).unwrap();
+            assert_eq!(trained(trainer), trained(again));
+        }
+        // Rates that fall from the first step on know the whole length.
+        let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };
+        assert!(falling.adjusted_after().is_none());
+    }
+}
