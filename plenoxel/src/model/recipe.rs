@@ -95,13 +95,13 @@ pub trait Recipe: Send + Sync {
         false
     }
 
-    /// Returns the number of steps after which the length of the last stage should be adjusted to the measured speed; `None`, the default, if it cannot be.
-    fn adjusted_after(&self) -> Option<u64> {
-        None
+    /// Returns the number of first steps that stay the same if the last stage becomes longer. Default: 0.
+    fn steps_before_length_matters(&self) -> u64 {
+        0
     }
 
     /// Returns these settings with another number of steps in the last stage, or with the nearest number for which the first `taken` steps stay the same.
-    /// Called if [`adjusted_after`](Recipe::adjusted_after) is not `None`.
+    /// Called if [`steps_before_length_matters`](Recipe::steps_before_length_matters) is not 0.
     fn with_last_stage(&self, steps: u64, taken: u64) -> Self
     where
         Self: Sized + Clone,

@@ -1,7 +1,7 @@
-//! Time budget of the models that have a [`Recipe`]: a plan before the run begins ([`plan`]), and one adjustment of its last stage ([`Pace`]).
+//! Time budget of the models that have a [`Recipe`]: a plan before the run begins ([`plan`]), and adjustments of its last stage ([`Pace`]).
 //!
 //! A plan is a number of steps for each stage. It is part of the settings of the run, which thus repeat the run bit by bit: neither measured steps that belong to
-//! the plan nor the adjustment change what the steps before were ([`Recipe::begins_as`]).
+//! the plan nor adjustments change what the steps before were ([`Recipe::begins_as`]).
 
 use super::budget::MEASURING;
 use crate::error::{Error, Result};
@@ -40,7 +40,7 @@ pub fn plan<R: Recipe + Clone>(recipe: &R, seconds: f64, begin: impl FnOnce(&R) 
         reports.extend(trainer.step()?);
     }
     let measured_from = start.elapsed().as_secs_f64();
-    let measuring = if recipe.adjusted_after().is_some() { MEASURING_FIRST } else { MEASURING };
+    let measuring = if recipe.steps_before_length_matters() > 0 { MEASURING_FIRST } else { MEASURING };
     let enough = (measuring.0 * seconds).min(measuring.1);
     let (mut count, mut spent) = (0, measured_from);
     while count < 20 || spent - measured_from < enough {
@@ -69,13 +69,14 @@ pub fn plan<R: Recipe + Clone>(recipe: &R, seconds: f64, begin: impl FnOnce(&R) 
     Ok(Planned { recipe: planned(left, 0), begun: None })
 }
 
-/// Follows a planned run, and adjusts the length of its last stage once so that training ends on time.
+/// Follows a planned run, and adjusts the length of its last stage twice so that training ends on time: early, when a wrong plan can still become much shorter,
+/// and in the last stage, whose speed is known then.
 pub struct Pace<R> {
     recipe: R,
     config: Config,
     seconds: f64,
-    /// Number of steps after which the plan is adjusted; `None` if it is not, or was.
-    after: Option<u64>,
+    /// Numbers of steps after which the plan is adjusted.
+    after: Vec<u64>,
     /// Seconds of training after the first step of the current stage.
     since: f64,
 }
@@ -86,7 +87,7 @@ const MEASURED: u64 = 10;
 impl<R: Recipe + Clone> Pace<R> {
     /// Follows a run with these settings, which are those of `config` for its model, planned for `seconds`.
     pub fn new(recipe: R, config: Config, seconds: f64) -> Self {
-        let after = recipe.adjusted_after();
+        let after = vec![recipe.steps_before_length_matters() / 3];
         Pace { recipe, config, seconds, after, since: 0.0 }
     }
 
@@ -98,22 +99,34 @@ impl<R: Recipe + Clone> Pace<R> {
             // The first step begins the stage.
             self.since = now;
         }
-        if self.after != Some(taken) || taken - stage.first <= MEASURED {
+        if !self.after.contains(&taken) || taken - stage.first <= MEASURED {
             return None;
         }
-        self.after = None;
         let cost = |stage: &PlannedStage| stage.rays_per_step as f64 * stage.ray_cost;
         let unit = (now - self.since) / (taken - stage.first - 1) as f64 / cost(stage);
         let (last, earlier) = plan.split_last()?;
         let to_come = |stage: &PlannedStage| stage.steps - taken.saturating_sub(stage.first).min(stage.steps);
         let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * cost(stage)).sum();
         let left = ((self.seconds - now) / unit - before).max(0.0) / cost(last);
-        let adjusted = self.recipe.with_last_stage(taken.saturating_sub(last.first) + left.round() as u64, taken);
+        let (first, steps) = (last.first, taken.saturating_sub(last.first) + left.round() as u64);
+        let adjusted = self.recipe.with_last_stage(steps.max(1), taken);
         assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
         trainer.replan(|model| adjusted.clone().change(model));
-        adjusted.set(&mut self.config);
+        self.recipe = adjusted;
+        if self.after.len() == 1 {
+            self.after.push(second(first, self.recipe.steps_before_length_matters()));
+        }
+        self.recipe.clone().set(&mut self.config);
         Some(self.config.clone())
     }
+}
+
+/// Returns the number of steps after which a plan is adjusted for the second time; its last stage begins after `first` steps, and its length matters after
+/// `until`.
+fn second(first: u64, until: u64) -> u64 {
+    const MANY: u64 = 4 * MEASURED;
+    // After steps from which the speed is known, and before steps that let the stage become shorter.
+    if until > first + MANY { first.midpoint(until) } else { until - until / 12 }
 }
 
 #[cfg(test)]
@@ -184,27 +197,27 @@ mod tests {
     }
 
     #[test]
-    fn the_last_stage_is_adjusted_once_and_the_run_repeats_from_its_settings() {
+    fn the_last_stage_is_adjusted_and_the_run_repeats_from_its_settings() {
         let with_cool_down = |cool_down: f64| tensorf::Config { short: None, cool_down, ..recipe(&[(8, 30), (8, 200)]) };
-        // Without the cool-down there are 138 or 25 of 230 steps. A step is adjusted after 83, or before the last stage, after 22.
-        let cases = [(0.4, 0.1, 970), (0.4, 1.0, 112), (0.4, 10.0, 112), (0.89, 0.1, 970), (0.89, 0.3, 303), (0.89, 10.0, 189)];
-        for (cool_down, of_a_step, steps) in cases {
+        for (cool_down, of_a_step) in [(0.4, 0.1), (0.4, 0.5), (0.4, 1.0), (0.75, 0.1), (0.75, 0.3), (0.75, 10.0)] {
             let asked = with_cool_down(cool_down);
             let mut pace = Pace::new(asked.clone(), Config::default(), 100.0);
-            let (mut trainer, mut changed) = (trainer(&asked).unwrap(), None);
+            let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
             while trainer.step().unwrap().is_some() {
-                let now = of_a_step * trainer.steps_taken() as f64;
-                if let Some(config) = pace.after_step(&mut trainer, now) {
-                    assert!(changed.replace(config.tensorf.unwrap()).is_none(), "adjusted once");
-                }
+                // From the 35th step on, steps take a tenth longer.
+                let taken = trainer.steps_taken() as f64;
+                let now = of_a_step * (taken + 0.1 * (taken - 35.0).max(0.0));
+                plans.extend(pace.after_step(&mut trainer, now).and_then(|config| config.tensorf));
             }
-            let changed = changed.expect("an adjusted plan");
-            assert_eq!((changed.stages[1].steps, trainer.steps_taken()), (steps, 30 + steps), "{cool_down}, {of_a_step} s a step");
-            let again = super::tests::trainer(&changed).unwrap();
+            // After so long a step, nothing is left to adjust later.
+            assert_eq!(plans.len(), if of_a_step > 5.0 { 1 } else { 2 }, "{cool_down}, {of_a_step}");
+            let took = of_a_step * (1.1 * trainer.steps_taken() as f64 - 3.5);
+            assert!((took - 100.0).abs() < 2.0 || of_a_step > 5.0, "{cool_down}, {of_a_step}: {took}");
+            let again = super::tests::trainer(plans.last().unwrap()).unwrap();
             assert_eq!(trained(trainer), trained(again));
         }
         // Rates that fall from the first step on know the whole length.
         let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };
-        assert!(falling.adjusted_after().is_none());
+        assert!(Pace::new(falling, Config::default(), 100.0).after == [0]);
     }
 }

@@ -93,13 +93,8 @@ impl Recipe for Config {
         without_stages(self) == without_stages(other) && stages(self) == stages(other) && same_rates
     }
 
-    fn adjusted_after(&self) -> Option<u64> {
-        let first = self.total_steps() - self.stages.last()?.steps;
-        let until = self.steps_at_full_rate();
-        // In the last stage if it has many steps at the full rate: after some of them, so that its speed is known, and before the others, so that it can still
-        // become shorter.
-        const MANY: u64 = 40;
-        (until > 0).then_some(if until > first + MANY { first.midpoint(until) } else { until - until / 12 })
+    fn steps_before_length_matters(&self) -> u64 {
+        self.steps_at_full_rate()
     }
 
     fn with_last_stage(&self, steps: u64, taken: u64) -> Self {
