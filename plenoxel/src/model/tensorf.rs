@@ -139,12 +139,20 @@ impl<T: Real> Tensorf<T> {
         if matches!(self.space, Space::Ndc { .. }) { self.field.sides().z } else { self.field.cell() }
     }
 
+    /// Returns true if the fused kernel computes the field.
+    fn fuses(&self) -> bool {
+        self.engine == Engine::Fused && fused::supports(self.field.shape())
+    }
+
     /// Returns the cells whose opacity, or that of a neighbour, is above [`occupied_above`](Config::occupied_above).
     fn occupied(&self) -> Occupancy {
         // An opacity 1 − exp(−σ · step) above a threshold is a density above another.
         let threshold = -(-self.config.occupied_above).ln_1p() / (self.config.step * self.cell_of_steps());
         let cells = self.field.nodes().map(|n| (n - 1).min(MOST_CELLS));
-        let density = |positions: &Tensor<T>| self.field.density(positions);
+        let density = |positions: &Tensor<T>| match self.fuses() {
+            true => fused::density(&self.field, positions),
+            false => self.field.density(positions),
+        };
         match &self.field.occupied {
             // Outside of the cells that were sampled, the density has its initial value.
             Some(sampled) => {
@@ -228,7 +236,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
         let pass = Pass { background: view.background, jitter: Jitter::None, keep_samples: false, stage: None };
-        let fuses = self.engine == Engine::Fused && fused::supports(self.field.shape());
+        let fuses = self.fuses();
         let options = self.options(&pass);
         let negligible = NEGLIGIBLE / (self.config.step_in_pictures * self.cell_of_steps());
         let (rendered, densities) = (AtomicUsize::new(0), OnceLock::new());

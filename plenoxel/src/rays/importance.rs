@@ -11,7 +11,7 @@
 
 use super::tiles::Tile;
 use crate::dataset::View;
-use autograd::parallel;
+use autograd::{dispatched, parallel};
 
 /// Number of times that each pixel is drawn in an epoch.
 #[derive(Debug)]
@@ -29,9 +29,8 @@ impl Importance {
     /// Computes the importance of the pixels of views over a background.
     pub fn of(views: &[View], background: [f32; 3], floor: f64) -> Self {
         let floor = floor as f32;
-        let draws = |variance: f32| ((variance + floor * floor).sqrt() * (DRAWS_OF_FLAT / floor)).round().clamp(1.0, 255.0) as u8;
         Importance {
-            draws: parallel::map_indices(views.len(), |v| of_contrast(&views[v], background, draws)),
+            draws: parallel::map_indices(views.len(), |v| of_contrast(&views[v], background, floor)),
             columns: views.iter().map(|view| view.size()[0]).collect(),
         }
     }
@@ -62,9 +61,10 @@ impl Importance {
     }
 }
 
-/// Returns `draws(σ²)` for each pixel, row by row, where σ² is the variance of the colors of the 3 × 3 pixels around it, mean over channels. Pixels beyond
-/// the border are left out.
-fn of_contrast(view: &View, background: [f32; 3], draws: impl Fn(f32) -> u8) -> Vec<u8> {
+dispatched! {
+/// Returns the number of draws of each pixel, row by row, from the variance of the colors of the 3 × 3 pixels around it, mean over channels. Pixels beyond the
+/// border are left out.
+fn of_contrast(view: &View, background: [f32; 3], floor: f32) -> Vec<u8> {
     let [width, height] = view.size();
     // Colors of three rows, channel after channel.
     let mut colors = [(); 3].map(|()| vec![0.0; 3 * width]);
@@ -76,7 +76,7 @@ fn of_contrast(view: &View, background: [f32; 3], draws: impl Fn(f32) -> u8) -> 
     };
     // Sums over the rows, with a column of zeros on both sides.
     let (mut sum, mut squares) = (vec![0.0; width + 2], vec![0.0; width + 2]);
-    let mut variance = vec![0.0; width];
+    let (mut variance, mut shares) = (vec![0.0; width], vec![0.0; width]);
     let mut out = Vec::with_capacity(width * height);
     fill(&mut colors[0], 0);
     for y in 0..height {
@@ -85,6 +85,12 @@ fn of_contrast(view: &View, background: [f32; 3], draws: impl Fn(f32) -> u8) -> 
         }
         let rows = y.saturating_sub(1)..(y + 2).min(height);
         variance.fill(0.0);
+        // Of each of the pixels around.
+        shares.fill(1.0 / (3 * rows.len()) as f32);
+        for x in [0, width - 1] {
+            let columns = 3 - usize::from(x == 0) - usize::from(x + 1 == width);
+            shares[x] = 1.0 / (rows.len() * columns) as f32;
+        }
         for c in 0..3 {
             let inner = 1..width + 1;
             sum[inner.clone()].fill(0.0);
@@ -96,15 +102,16 @@ fn of_contrast(view: &View, background: [f32; 3], draws: impl Fn(f32) -> u8) -> 
                     *square += c * c;
                 }
             }
-            for (x, variance) in variance.iter_mut().enumerate() {
-                let columns = 3 - usize::from(x == 0) - usize::from(x + 1 == width);
-                let share = 1.0 / (rows.len() * columns) as f32;
-                let around = |of: &[f32]| (of[x] + of[x + 1] + of[x + 2]) * share;
-                let mean = around(&sum);
-                *variance += (around(&squares) - mean * mean).max(0.0) / 3.0;
+            let (sum, squares) = ([&sum[..width], &sum[1..=width], &sum[2..]], [&squares[..width], &squares[1..=width], &squares[2..]]);
+            for x in 0..width {
+                let around = |of: [&[f32]; 3]| (of[0][x] + of[1][x] + of[2][x]) * shares[x];
+                let mean = around(sum);
+                variance[x] += (around(squares) - mean * mean).max(0.0) / 3.0;
             }
         }
+        let draws = |variance: f32| ((variance + floor * floor).sqrt() * (DRAWS_OF_FLAT / floor)).round().clamp(1.0, 255.0) as u8;
         out.extend(variance.iter().map(|&variance| draws(variance)));
     }
     out
+}
 }

@@ -3,7 +3,7 @@
 use crate::camera::projection::{Projection, Rectangle};
 use crate::dataset::View;
 use crate::sampling::Occupancy;
-use autograd::parallel;
+use autograd::{dispatched, parallel};
 
 /// Side of a tile in pixels.
 const SIDE: u32 = 8;
@@ -60,24 +60,30 @@ pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
         let all = Tile::of_view(v, &views[v]);
         let (columns, rows) = (all.width.div_ceil(SIDE), all.height.div_ceil(SIDE));
         let mut shows = vec![false; (columns * rows) as usize];
-        let projection = Projection::of(&views[v].camera, views[v].size(), aabb, cells);
-        for &[low, high] in &boxes {
-            let Some(Rectangle { low, high }) = projection.bounds(low, high, 0.0) else {
-                shows.fill(true);
-                break;
-            };
-            let range = |a: usize, n: u32| {
-                let clamped = |x: f64| (x / f64::from(SIDE)).floor().clamp(0.0, f64::from(n)) as u32;
-                clamped(low[a])..(clamped(high[a]) + 1).min(n)
-            };
-            for row in range(1, rows) {
-                let own = range(0, columns);
-                shows[(row * columns + own.start) as usize..(row * columns + own.end.max(own.start)) as usize].fill(true);
-            }
-        }
+        mark(&Projection::of(&views[v].camera, views[v].size(), aabb, cells), &boxes, [columns, rows], &mut shows);
         all.parts().zip(shows).filter(|(_, shows)| *shows).map(|(tile, _)| tile).collect::<Vec<_>>()
     });
     of_views.concat()
+}
+
+dispatched! {
+/// Marks the tiles, of which there are `columns` by `rows`, that show one of the boxes of cells.
+fn mark(projection: &Projection, boxes: &[[[usize; 3]; 2]], [columns, rows]: [u32; 2], shows: &mut [bool]) {
+    for &[low, high] in boxes {
+        let Some(Rectangle { low, high }) = projection.bounds(low, high, 0.0) else {
+            shows.fill(true);
+            return;
+        };
+        let range = |a: usize, n: u32| {
+            let clamped = |x: f64| (x / f64::from(SIDE)).floor().clamp(0.0, f64::from(n)) as u32;
+            clamped(low[a])..(clamped(high[a]) + 1).min(n)
+        };
+        for row in range(1, rows) {
+            let own = range(0, columns);
+            shows[(row * columns + own.start) as usize..(row * columns + own.end.max(own.start)) as usize].fill(true);
+        }
+    }
+}
 }
 
 #[cfg(test)]

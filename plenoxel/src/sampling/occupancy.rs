@@ -104,18 +104,29 @@ impl Occupancy {
     /// Returns the cells of another division of space, whose centres lie in occupied cells.
     pub fn resampled(&self, aabb: Aabb, cells: [usize; 3]) -> Self {
         let all = Occupancy { aabb, bricks: BrickGrid::new(cells), masks: [].into(), distance: [].into() };
+        // Along each axis, the number of the cell of this division that has the centre.
+        let places = [0, 1, 2].map(|a| (0..cells[a]).map(|k| self.place(all.center([k; 3]), a)).collect::<Vec<_>>());
         let masks = parallel::map_indices(all.bricks.len(), |brick| {
-            let full = bits(all.bricks.inside(brick)).filter(|&bit| self.contains_point(all.center(all.bricks.node(brick, bit))));
-            full.fold(0, |mask, bit| mask | 1 << bit)
+            bits_where(all.bricks.inside(brick), |bit| {
+                let node = all.bricks.node(brick, bit);
+                let [Some(x), Some(y), Some(z)] = [0, 1, 2].map(|a| places[a][node[a]]) else { return false };
+                self.contains([x, y, z])
+            })
         });
         Self::from_masks(aabb, cells, masks)
     }
 
+    /// Returns the number of the cell along an axis that has a point; `None` outside of the box.
+    fn place(&self, at: DVec3, axis: usize) -> Option<usize> {
+        let (low, high, n) = (self.aabb.min[axis], self.aabb.max[axis], self.cells()[axis] as f64);
+        let place = (at[axis] - low) / (high - low) * n;
+        (place >= 0.0 && place < n).then_some(place as usize)
+    }
+
     /// Returns true if a point lies in an occupied cell.
     pub fn contains_point(&self, at: DVec3) -> bool {
-        let cell = (at - self.aabb.min) / (self.aabb.max - self.aabb.min) * DVec3::from_array(self.cells().map(|n| n as f64));
-        let inside = (0..3).all(|a| cell[a] >= 0.0 && cell[a] < self.cells()[a] as f64);
-        inside && self.contains(cell.to_array().map(|k| k as usize))
+        let [Some(x), Some(y), Some(z)] = [0, 1, 2].map(|axis| self.place(at, axis)) else { return false };
+        self.contains([x, y, z])
     }
 
     /// Creates an occupancy from one mask per brick, as in [`autograd::Lattice::masks`].

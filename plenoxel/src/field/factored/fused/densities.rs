@@ -1,17 +1,17 @@
-//! Densities of a field that does not change, for pictures.
+//! Densities of a field that does not change: at given positions, and as a table for pictures.
 //!
 //! In each cell, the product of a bilinear plane and a linear line is trilinear, and so is the sum of products, the density feature s. A table of s at the nodes
 //! therefore gives the same densities as the factors, up to rounding, and a sample reads eight numbers instead of 18 rows. Nodes are stored in bricks of 4³
 //! cells. Samples whose opacity is surely below a bound are left out.
 
 use super::super::{Factored, PLANE_OF, SCALE, SHIFT};
-use super::lookup::{Cells, LANES, Pairs, Places, RUN, add_lanes, density_of};
+use super::lookup::{self, Cells, LANES, Pairs, Places, RUN, add_lanes, density_of};
 use crate::geometry::Aabb;
 use crate::render::Field;
 use crate::sampling::Occupancy;
 use autograd::lattice::{BRICK, BrickGrid};
 use autograd::parallel::gathered;
-use autograd::{Real, Tensor, dispatched, parallel};
+use autograd::{Real, Tensor, dispatched, no_grad, parallel};
 use glam::DVec3;
 
 /// Nodes along the side of a brick of cells.
@@ -48,12 +48,7 @@ impl<T: Real> Densities<T> {
         // σ = SCALE softplus(s − 10)
         let least = T::lit((negligible / SCALE).exp_m1().ln());
         let tables = field.tables();
-        let pairs = Pairs {
-            planes: [0, 1, 2].map(|axis| tables[axis].data()),
-            lines: [0, 1, 2].map(|axis| tables[3 + axis].data()),
-            nodes,
-            width: field.shape().density_components,
-        };
+        let pairs = pairs_of(field, &tables);
         let features = |brick: u32| {
             let low = bricks.place(brick as usize).map(|place| place * BRICK);
             let mut values = [T::lit(NOTHING); ENTRIES];
@@ -107,6 +102,40 @@ impl<T: Real> Densities<T> {
         let [i, j, k] = [0, 1, 2].map(|a| node[a] - BRICK * place[a]);
         self.features[self.links[self.bricks.number(place)] as usize * ENTRIES + (i * SIDE + j) * SIDE + k]
     }
+}
+
+/// Returns the factors of the density among the tables of a field.
+fn pairs_of<'a, T: Real>(field: &Factored<T>, tables: &'a [Tensor<T>]) -> Pairs<'a, T> {
+    Pairs {
+        planes: [0, 1, 2].map(|axis| tables[axis].data()),
+        lines: [0, 1, 2].map(|axis| tables[3 + axis].data()),
+        nodes: field.nodes(),
+        width: field.shape().density_components,
+    }
+}
+
+/// Returns the densities at positions `[m, 3]`, as [`Field::density`](crate::render::Field::density) does, without recording a gradient.
+pub fn density<T: Real>(field: &Factored<T>, positions: &Tensor<T>) -> Tensor<T> {
+    let cells = no_grad(|| field.cells(positions));
+    let tables = field.tables();
+    let (pairs, cells) = (pairs_of(field, &tables), cells.data().as_chunks::<3>().0);
+    let mut sigma = vec![T::zero(); cells.len()];
+    parallel::for_each_chunk(&mut sigma, parallel::CHUNK / RUN * RUN, |first, sigma| {
+        for (cells, sigma) in cells[first..].chunks(RUN).zip(sigma.chunks_mut(RUN)) {
+            let columns = [0, 1, 2].map(|axis| {
+                let mut column = [T::zero(); RUN];
+                column.iter_mut().zip(cells).for_each(|(at, cell)| *at = cell[axis]);
+                column
+            });
+            let at = columns.each_ref().map(|column| &column[..sigma.len()]);
+            let mut slope = [T::zero(); RUN];
+            match parallel::fused() {
+                true => lookup::density::<T, true>(pairs, at, sigma, &mut slope),
+                false => lookup::density::<T, false>(pairs, at, sigma, &mut slope),
+            }
+        }
+    });
+    Tensor::from_vec(sigma, &[cells.len()])
 }
 
 /// Returns the lowest and the highest node of the cells that overlap a box, along each axis.
@@ -262,6 +291,18 @@ mod tests {
             sigma
         });
         all.collect()
+    }
+
+    #[test]
+    fn densities_at_positions_are_those_of_the_graph() {
+        for nodes in [[9, 12, 10], [30, 17, 24]] {
+            let (field, at) = (field(nodes), positions(3 * RUN + 5));
+            let (want, found) = (no_grad(|| field.density(&at)), density(&field, &at));
+            assert_eq!(found.shape(), want.shape());
+            for (want, found) in want.data().iter().zip(found.data()) {
+                assert!((want - found).abs() <= 1e-12 * want.abs().max(1.0), "{want} {found}");
+            }
+        }
     }
 
     #[test]
