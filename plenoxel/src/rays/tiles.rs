@@ -3,6 +3,7 @@
 use crate::camera::projection::{Projection, Rectangle};
 use crate::dataset::View;
 use crate::sampling::Occupancy;
+use autograd::lattice::BrickGrid;
 use autograd::{dispatched, parallel};
 
 /// Side of a tile in pixels.
@@ -50,12 +51,15 @@ impl Tile {
     }
 }
 
-/// Returns the tiles that intersect the bounding rectangle of a projected brick of cells. If a brick is beside or behind a camera, or
+/// Returns the tiles that show matter: those that intersect the bounding rectangle of a projected brick of cells. If a brick is beside or behind a camera, or
 /// partly not shown by its lens, returns all tiles of the view.
 pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
     let (aabb, cells) = (matter.aabb(), matter.cells());
-    let bricks = matter.masks().iter().enumerate().filter(|(_, mask)| **mask != 0);
-    let boxes: Vec<[[usize; 3]; 2]> = bricks.map(|(brick, _)| matter.bricks().bounds(brick)).collect();
+    // A ray into a brick whose neighbours are all full passes one of them, and at last one that is not: these bricks are enough.
+    let full = |brick: usize| matter.masks()[brick] != 0;
+    let bricks = (0..matter.masks().len())
+        .filter(|&brick| full(brick) && !neighbours(matter.bricks(), brick).is_some_and(|all| all.into_iter().all(full)));
+    let boxes: Vec<[[usize; 3]; 2]> = bricks.map(|brick| matter.bricks().bounds(brick)).collect();
     let of_views = parallel::map_indices(views.len(), |v| {
         let all = Tile::of_view(v, &views[v]);
         let (columns, rows) = (all.width.div_ceil(SIDE), all.height.div_ceil(SIDE));
@@ -64,6 +68,19 @@ pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
         all.parts().zip(shows).filter(|(_, shows)| *shows).map(|(tile, _)| tile).collect::<Vec<_>>()
     });
     of_views.concat()
+}
+
+/// Returns the bricks that share a face with a brick; `None` if the brick is at a face of the box.
+fn neighbours(bricks: BrickGrid, brick: usize) -> Option<[usize; 6]> {
+    let (place, count) = (bricks.place(brick), bricks.count());
+    let inner = (0..3).all(|a| place[a] > 0 && place[a] + 1 < count[a]);
+    inner.then(|| {
+        std::array::from_fn(|n| {
+            let mut next = place;
+            next[n / 2] = if n % 2 == 0 { place[n / 2] - 1 } else { place[n / 2] + 1 };
+            bricks.number(next)
+        })
+    })
 }
 
 dispatched! {
@@ -103,7 +120,7 @@ mod tests {
         let cells = [30; 3];
         let ball = |v: usize| {
             let at = [v / 900, v / 30 % 30, v % 30].map(|k| (k as f64 + 0.5) / 15.0 - 1.0);
-            dvec3(at[0] - 0.3, at[1], at[2]).length() < 0.3
+            dvec3(at[0] - 0.2, at[1], at[2]).length() < 0.45
         };
         let matter = Occupancy::new(Aabb::cube(1.0), cells, &(0..27000).map(ball).collect::<Vec<_>>());
         let mut times = vec![vec![0; 50 * 37]; views.len()];
