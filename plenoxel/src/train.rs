@@ -177,9 +177,10 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         self
     }
 
-    /// Changes the settings of the model, and plans the stages again. The steps that were taken must be the same with the new settings.
+    /// Changes the settings of the model, and plans the stages again. The steps that were taken must be the same with the new settings. The optimizer stays, so
+    /// its schedules must follow the settings of the model.
     ///
-    /// Panics if the new plan has another current stage, or has ended.
+    /// Panics if the new plan has another current stage, or no further step.
     #[track_caller]
     pub fn replan(&mut self, change: impl FnOnce(&mut M)) {
         let before = self.step.checked_sub(1).and_then(|last| self.stage_of(last));
@@ -188,6 +189,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         let after = self.step.checked_sub(1).and_then(|last| self.stage_of(last));
         let place = |stage: PlannedStage| (stage.index, stage.first, stage.first_ray, stage.rays_per_step, stage.resolution);
         assert_eq!(before.map(place), after.map(place), "replan: the current stage is another");
+        assert!(self.step < self.total_steps(), "replan: the run has ended");
     }
 
     /// Returns the current model.

@@ -67,7 +67,7 @@ impl<'a> Console<'a> {
 
 impl Training<'_, '_> {
     /// Replaces the plan.
-    pub fn plan(&mut self, plan: &[PlannedStage]) {
+    pub fn replace_plan(&mut self, plan: &[PlannedStage]) {
         self.plan = plan.to_vec();
         self.total = plan.iter().map(|stage| stage.steps).sum();
     }

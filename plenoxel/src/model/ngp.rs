@@ -136,7 +136,9 @@ impl Config {
         Config {
             log2_rows: 19,
             finest_resolution: 2048,
-            depth_in_hull: 1.0,
+            // The authors have no hull. With their depth of 1, thin fog in a hull loses its colors: lego at 100 x 100 stays at 17.4 dB, with 10 it has 25.3 dB after
+            // 150 steps of 1024 rays.
+            depth_in_hull: 10.0,
             // Steps of √3 / 1024 of the unit cube.
             samples: 1024.0 / 3f64.sqrt(),
             color_above: 0.0,

@@ -70,14 +70,14 @@ pub trait Recipe: Send + Sync {
         self
     }
 
-    /// Returns settings whose steps cost this much in total: the same training, longer or shorter. `model` has begun its first stage, and has taken `taken` steps
-    /// which the first stage may keep: if it does, it has more steps than these.
+    /// Returns settings whose steps cost this much in total: the same training, longer or shorter. `model` has begun its first stage. If the run keeps the `taken`
+    /// steps that the model has taken, the first stage must be longer than these.
     fn with_cost(&self, model: &Self::Model, cost: f64, taken: u64) -> Self
     where
         Self: Sized;
 
-    /// Returns these settings as a plan for `seconds` will probably change them, apart from lengths and sizes, and the duration of a step with them, relative to
-    /// one without the changes. If the guess is right, the steps that measure the speed belong to the plan. Default: the same settings.
+    /// Returns a guess of the settings that a plan for `seconds` will have, apart from lengths and sizes, and the duration of a step with them relative to one
+    /// with these settings. If the guess is right, the steps that measure the speed belong to the plan. Default: these settings.
     fn likely_for(&self, seconds: f64) -> (Self, f64)
     where
         Self: Sized + Clone,

@@ -150,7 +150,7 @@ impl<T: Real> Tensorf<T> {
         let threshold = -(-self.config.occupied_above).ln_1p() / (self.config.step * self.cell_of_steps());
         let cells = self.field.nodes().map(|n| (n - 1).min(MOST_CELLS));
         let density = |positions: &Tensor<T>| match self.fuses() {
-            true => fused::density(&self.field, positions),
+            true => fused::densities_at(&self.field, positions),
             false => self.field.density(positions),
         };
         match &self.field.occupied {

@@ -85,7 +85,7 @@ fn of_contrast(view: &View, background: [f32; 3], floor: f32) -> Vec<u8> {
         }
         let rows = y.saturating_sub(1)..(y + 2).min(height);
         variance.fill(0.0);
-        // Of each of the pixels around.
+        // Weight of each neighbouring pixel in the mean.
         shares.fill(1.0 / (3 * rows.len()) as f32);
         for x in [0, width - 1] {
             let columns = 3 - usize::from(x == 0) - usize::from(x + 1 == width);

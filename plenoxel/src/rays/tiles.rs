@@ -55,10 +55,10 @@ impl Tile {
 /// partly not shown by its lens, returns all tiles of the view.
 pub fn showing(views: &[View], matter: &Occupancy) -> Vec<Tile> {
     let (aabb, cells) = (matter.aabb(), matter.cells());
-    // A ray into a brick whose neighbours are all full passes one of them, and at last one that is not: these bricks are enough.
-    let full = |brick: usize| matter.masks()[brick] != 0;
-    let bricks = (0..matter.masks().len())
-        .filter(|&brick| full(brick) && !neighbours(matter.bricks(), brick).is_some_and(|all| all.into_iter().all(full)));
+    // A ray through an interior brick, whose six neighbours have matter, also crosses a border brick, so only border bricks are projected.
+    let has_matter = |brick: usize| matter.masks()[brick] != 0;
+    let is_interior = |brick: usize| neighbours(matter.bricks(), brick).is_some_and(|all| all.into_iter().all(has_matter));
+    let bricks = (0..matter.masks().len()).filter(|&brick| has_matter(brick) && !is_interior(brick));
     let boxes: Vec<[[usize; 3]; 2]> = bricks.map(|brick| matter.bricks().bounds(brick)).collect();
     let of_views = parallel::map_indices(views.len(), |v| {
         let all = Tile::of_view(v, &views[v]);

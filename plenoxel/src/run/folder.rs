@@ -193,7 +193,7 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Writes `config.toml`, `run.json` and `README.md`, before the first step.
+    /// Writes `config.toml`, `run.json` and `README.md`, before the first step and when the plan changes.
     pub fn describe(&self, config: &Config, record: &RunRecord) -> Result<()> {
         let about = match record.is_of_own_model() {
             false => {

@@ -253,6 +253,11 @@ pub fn lines(text: &str) -> impl Iterator<Item = (&str, Line<'_>)> {
     text.lines().filter_map(|text| Some((text, serde_json::from_str(text).ok()?)))
 }
 
+/// Returns the number of steps between two lines.
+fn every(total_steps: u64) -> u64 {
+    (total_steps / LINES).max(1)
+}
+
 impl MetricsFile {
     /// Creates the metrics of a run of `total_steps` steps.
     ///
@@ -268,12 +273,17 @@ impl MetricsFile {
             file: file.map_err(|e| Error::io(&path, e, "creating the metrics"))?,
             path,
             events: EventFile::create(folder.path(), taken)?,
-            every: (total_steps / LINES).max(1),
+            every: every(total_steps),
             since: Sums::default(),
             rays: known.rays,
             samples: known.samples,
             known,
         })
+    }
+
+    /// Sets the number of steps of a run whose plan has changed.
+    pub fn plan(&mut self, total_steps: u64) {
+        self.every = every(total_steps);
     }
 
     /// Opens the metrics of a run that resumes after `taken` steps. Removes the lines of later steps.

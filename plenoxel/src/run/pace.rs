@@ -8,77 +8,103 @@ use crate::error::{Error, Result};
 use crate::model::plenoxels::config::Config;
 use crate::model::recipe::Recipe;
 use crate::text::clock;
-use crate::train::{PlannedStage, Report, Trainer};
+use crate::train::{Model, PlannedStage, Report, Trainer};
 use std::time::Instant;
 
 /// [`MEASURING`] for a plan that is adjusted later. The measured steps are steps of the run, which should not be too long in its first stage.
 const MEASURING_FIRST: (f64, f64) = (0.01, 3.0);
 
-/// A trainer, and the reports of the steps that it has taken.
-pub type Begun<M> = (Trainer<f32, M>, Vec<Report>);
+/// A trainer, and the steps that it has taken.
+pub struct Begun<M: Model<f32>> {
+    /// The trainer.
+    pub trainer: Trainer<f32, M>,
+    /// Reports of its steps, with the seconds of training after each.
+    pub reports: Vec<(Report, f64)>,
+}
+
+impl<M: Model<f32>> Begun<M> {
+    /// A trainer that has taken no step here.
+    pub fn new(trainer: Trainer<f32, M>) -> Self {
+        Begun { trainer, reports: Vec::new() }
+    }
+}
 
 /// Settings that are planned for a time.
 pub struct Planned<R: Recipe> {
     /// The settings.
     pub recipe: R,
-    /// The trainer whose speed was measured, and the reports of its steps, if these steps belong to the plan.
+    /// The trainer whose speed was measured, if its steps belong to the plan.
     pub begun: Option<Begun<R::Model>>,
 }
 
 /// Fits settings to the training views, and scales them so that training takes `seconds` on this machine, including the measurement made here. `begin` creates a
-/// trainer.
+/// trainer. If `keep` is false, the measured steps do not become steps of the run.
 ///
-/// Errors: the time is too short; those of [`Trainer::step`].
-pub fn plan<R: Recipe + Clone>(recipe: &R, seconds: f64, begin: impl FnOnce(&R) -> Result<Trainer<f32, R::Model>>) -> Result<Planned<R>> {
+/// Errors: the time or the first stage is too short; those of [`Trainer::step`].
+pub fn plan<R: Recipe + Clone>(
+    recipe: &R,
+    seconds: f64,
+    keep: bool,
+    begin: impl FnOnce(&R) -> Result<Trainer<f32, R::Model>>,
+) -> Result<Planned<R>> {
     let start = Instant::now();
     let (measured, duration) = recipe.likely_for(seconds);
     let mut trainer = begin(&measured)?;
-    let mut reports: Vec<Report> = trainer.step()?.into_iter().collect();
-    let begun = start.elapsed().as_secs_f64();
+    // The last step of a stage is not taken: a plan may have more steps in it.
+    let most = measured.stages().first().map_or(0, |stage| stage.steps.saturating_sub(1));
+    let mut reports = Vec::new();
+    let mut step = |trainer: &mut Trainer<f32, R::Model>| -> Result<f64> {
+        let report = trainer.step()?;
+        let now = start.elapsed().as_secs_f64();
+        reports.extend(report.map(|report| (report, now)));
+        Ok(now)
+    };
+    let startup = step(&mut trainer)?;
     let (from, cost) = measured.measured_step(trainer.model());
-    for _ in 0..from {
-        reports.extend(trainer.step()?);
+    let mut measured_from = startup;
+    while trainer.steps_taken() < (from + 1).min(most) {
+        measured_from = step(&mut trainer)?;
     }
-    let measured_from = start.elapsed().as_secs_f64();
-    let measuring = if recipe.steps_before_length_matters() > 0 { MEASURING_FIRST } else { MEASURING };
+    let measuring = if keep && recipe.steps_before_length_matters() > 0 { MEASURING_FIRST } else { MEASURING };
     let enough = (measuring.0 * seconds).min(measuring.1);
     let (mut count, mut spent) = (0, measured_from);
-    while count < 20 || spent - measured_from < enough {
-        let Some(report) = trainer.step()? else { break };
+    while trainer.steps_taken() < most && (count < 20 || spent - measured_from < enough) {
+        spent = step(&mut trainer)?;
         count += 1;
-        spent = start.elapsed().as_secs_f64();
-        let ends_stage = report.ends_stage;
-        reports.push(report);
-        if ends_stage {
-            break;
-        }
     }
-    let unit = (spent - measured_from) / f64::from(count.max(1)) / cost / duration;
-    let fitted = |recipe: &R| recipe.clone().fitted_to(trainer.model(), trainer.views());
-    let planned = |left: f64, taken: u64| fitted(recipe).with_cost(trainer.model(), left / unit, taken);
-    let going_on = (begun < seconds).then(|| planned(seconds - begun, trainer.steps_taken()));
-    if let Some(recipe) = going_on.filter(|going_on| going_on.begins_as(&fitted(&measured), trainer.steps_taken())) {
+    if count == 0 {
+        let found = "the first stage is too short to measure the speed of the machine";
+        return Err(Error::usage("--time", found, "use more steps in the first stage, or leave out --time"));
+    }
+    let unit = (spent - measured_from) / f64::from(count) / cost / duration;
+    let planned =
+        |left: f64, taken: u64| recipe.clone().fitted_to(trainer.model(), trainer.views()).with_cost(trainer.model(), left / unit, taken);
+    let taken = trainer.steps_taken();
+    let continued = (keep && startup < seconds).then(|| planned(seconds - startup, taken));
+    if let Some(recipe) = continued.filter(|continued| continued.begins_as(&measured, taken)) {
         trainer.replan(|model| recipe.clone().change(model));
-        return Ok(Planned { recipe, begun: Some((trainer, reports)) });
+        return Ok(Planned { recipe, begun: Some(Begun { trainer, reports }) });
     }
-    let left = seconds - spent - begun;
+    let left = seconds - spent - startup;
     if left <= 0.0 {
-        let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + begun));
+        let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + startup));
         return Err(Error::usage("--time", found, "give it more time"));
     }
     Ok(Planned { recipe: planned(left, 0), begun: None })
 }
 
 /// Follows a planned run, and adjusts the length of its last stage twice so that training ends on time: early, when a wrong plan can still become much shorter,
-/// and in the last stage, whose speed is known then.
+/// and in the last stage, whose speed is known then. A run that is resumed keeps the plan with which it was saved.
 pub struct Pace<R> {
     recipe: R,
     config: Config,
     seconds: f64,
-    /// Numbers of steps after which the plan is adjusted.
-    after: Vec<u64>,
-    /// Seconds of training after the first step of the current stage.
-    since: f64,
+    /// Number of steps after which the plan is adjusted next; `None` if it is not.
+    adjust_at: Option<u64>,
+    /// True after the first adjustment.
+    adjusted: bool,
+    /// Number of the first step of the current stage, and seconds of training after it; `None` if that was not seen.
+    stage_started: Option<(u64, f64)>,
 }
 
 /// Fewest steps of a stage from which the speed is taken.
@@ -87,8 +113,9 @@ const MEASURED: u64 = 10;
 impl<R: Recipe + Clone> Pace<R> {
     /// Follows a run with these settings, which are those of `config` for its model, planned for `seconds`.
     pub fn new(recipe: R, config: Config, seconds: f64) -> Self {
-        let after = vec![recipe.steps_before_length_matters() / 3];
-        Pace { recipe, config, seconds, after, since: 0.0 }
+        let until = recipe.steps_before_length_matters();
+        let adjust_at = (until > 0).then_some(until / 3);
+        Pace { recipe, config, seconds, adjust_at, adjusted: false, stage_started: None }
     }
 
     /// Looks at the time after a step; `now` is the number of seconds of training. Returns the new configuration if the plan changed.
@@ -96,26 +123,31 @@ impl<R: Recipe + Clone> Pace<R> {
         let (taken, plan) = (trainer.steps_taken(), trainer.plan());
         let stage = plan.iter().find(|stage| taken <= stage.first + stage.steps)?;
         if taken == stage.first + 1 {
-            // The first step begins the stage.
-            self.since = now;
+            // The first step begins the stage, so it is not measured.
+            self.stage_started = Some((stage.first, now));
         }
-        if !self.after.contains(&taken) || taken - stage.first <= MEASURED {
+        if taken < self.adjust_at? {
             return None;
         }
+        if taken > self.recipe.steps_before_length_matters() {
+            self.adjust_at = None;
+            return None;
+        }
+        let (_, started) = self.stage_started.filter(|(first, _)| *first == stage.first && taken > first + MEASURED)?;
         let cost = |stage: &PlannedStage| stage.rays_per_step as f64 * stage.ray_cost;
-        let unit = (now - self.since) / (taken - stage.first - 1) as f64 / cost(stage);
+        let unit = (now - started) / (taken - stage.first - 1) as f64 / cost(stage);
         let (last, earlier) = plan.split_last()?;
         let to_come = |stage: &PlannedStage| stage.steps - taken.saturating_sub(stage.first).min(stage.steps);
         let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * cost(stage)).sum();
-        let left = ((self.seconds - now) / unit - before).max(0.0) / cost(last);
-        let (first, steps) = (last.first, taken.saturating_sub(last.first) + left.round() as u64);
-        let adjusted = self.recipe.with_last_stage(steps.max(1), taken);
+        let left = ((self.seconds - now) / unit - before) / cost(last);
+        let (first, steps) = (last.first, taken.saturating_sub(last.first) + left.round().max(1.0) as u64);
+        let adjusted = self.recipe.with_last_stage(steps, taken);
         assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
         trainer.replan(|model| adjusted.clone().change(model));
         self.recipe = adjusted;
-        if self.after.len() == 1 {
-            self.after.push(second(first, self.recipe.steps_before_length_matters()));
-        }
+        let until = self.recipe.steps_before_length_matters();
+        self.adjust_at = if self.adjusted { None } else { Some(second_adjustment(first, until)) };
+        self.adjusted = true;
         self.recipe.clone().set(&mut self.config);
         Some(self.config.clone())
     }
@@ -123,7 +155,7 @@ impl<R: Recipe + Clone> Pace<R> {
 
 /// Returns the number of steps after which a plan is adjusted for the second time; its last stage begins after `first` steps, and its length matters after
 /// `until`.
-fn second(first: u64, until: u64) -> u64 {
+fn second_adjustment(first: u64, until: u64) -> u64 {
     const MANY: u64 = 4 * MEASURED;
     // After steps from which the speed is known, and before steps that let the stage become shorter.
     if until > first + MANY { first.midpoint(until) } else { until - until / 12 }
@@ -136,7 +168,6 @@ mod tests {
     use crate::dataset::procedural::ProceduralOptions;
     use crate::dataset::{Dataset, Split};
     use crate::loss::{Objective, mse};
-    use crate::model::Model;
     use crate::model::tensorf::{self, Short, Stage, Tensorf};
     use crate::space::{Region, Space};
     use crate::train::TrainOptions;
@@ -174,16 +205,30 @@ mod tests {
     #[test]
     fn measured_steps_of_the_plan_are_those_of_a_run_from_the_beginning() {
         let asked = recipe(&[(8, 2000), (12, 40_000), (40, 100_000)]);
-        let Planned { recipe, begun } = plan(&asked, 1.0, trainer).unwrap();
+        let Planned { recipe, begun } = plan(&asked, 1.0, true, trainer).unwrap();
         assert_eq!((recipe.short, recipe.hidden, recipe.group), (None, 4, 0.2));
-        let (begun, reports) = begun.expect("a short plan is what a second leads to");
+        let Begun { trainer: begun, reports } = begun.expect("a short plan is what a second leads to");
         assert!(reports.len() as u64 == begun.steps_taken() && reports.len() >= 24 && recipe.stages[0].steps > begun.steps_taken());
+        assert!(reports.iter().all(|(report, _)| !report.ends_stage) && reports.is_sorted_by_key(|(_, seconds)| *seconds));
         assert_eq!(begun.model().settings(), serde_json::json!(recipe));
         // Fewer steps at the end, so that the test is short.
         let less = recipe.with_last_stage(1, begun.steps_taken());
         let mut going_on = begun;
         going_on.replan(|model| less.clone().change(model));
         assert_eq!(trained(going_on), trained(trainer(&less).unwrap()));
+        // On request, the run begins anew.
+        assert!(plan(&asked, 1.0, false, trainer).unwrap().begun.is_none());
+    }
+
+    #[test]
+    fn measuring_ends_before_the_first_stage_does_and_a_bounded_first_stage_begins_anew() {
+        let asked = tensorf::Config { short: None, ..recipe(&[(8, 12), (40, 100_000)]) };
+        let begun = plan(&asked, 2.0, true, trainer).unwrap().begun.expect("steps of the plan");
+        assert!(begun.trainer.steps_taken() == 11 && begun.reports.iter().all(|(report, _)| !report.ends_stage));
+        let bounded = tensorf::Config { pixels_per_cell: 4.0, ..recipe(&[(8, 100), (8, 200)]) };
+        assert!(plan(&bounded, 60.0, true, trainer).unwrap().begun.is_none());
+        let short = tensorf::Config { short: None, ..recipe(&[(8, 3), (8, 200)]) };
+        assert!(plan(&short, 1.0, true, trainer).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
@@ -191,9 +236,9 @@ mod tests {
         let asked = recipe(&[(8, 100), (16, 200)]);
         // So long that the network stays, and too long for any steps to be guessed.
         let unlikely = tensorf::Config { short: Some(Short { below: 1e-9, ..asked.short.unwrap() }), last_rate: 0.5, ..asked };
-        let Planned { recipe, begun } = plan(&unlikely, 1.0, trainer).unwrap();
+        let Planned { recipe, begun } = plan(&unlikely, 1.0, true, trainer).unwrap();
         assert!(begun.is_none() && recipe.hidden == 8);
-        assert!(plan(&unlikely, 1e-9, trainer).err().unwrap().to_string().contains("--time"));
+        assert!(plan(&unlikely, 1e-9, true, trainer).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
@@ -209,8 +254,7 @@ mod tests {
                 let now = of_a_step * (taken + 0.1 * (taken - 35.0).max(0.0));
                 plans.extend(pace.after_step(&mut trainer, now).and_then(|config| config.tensorf));
             }
-            // After so long a step, nothing is left to adjust later.
-            assert_eq!(plans.len(), if of_a_step > 5.0 { 1 } else { 2 }, "{cool_down}, {of_a_step}");
+            assert_eq!(plans.len(), 2, "{cool_down}, {of_a_step}");
             let took = of_a_step * (1.1 * trainer.steps_taken() as f64 - 3.5);
             assert!((took - 100.0).abs() < 2.0 || of_a_step > 5.0, "{cool_down}, {of_a_step}: {took}");
             let again = super::tests::trainer(plans.last().unwrap()).unwrap();
@@ -218,6 +262,6 @@ mod tests {
         }
         // Rates that fall from the first step on know the whole length.
         let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };
-        assert!(Pace::new(falling, Config::default(), 100.0).after == [0]);
+        assert!(Pace::new(falling, Config::default(), 100.0).adjust_at.is_none());
     }
 }

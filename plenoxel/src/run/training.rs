@@ -205,7 +205,7 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     if let scouts @ 1.. = trainer.model().scout_stages() {
         on(Event::note(format!("scout: {scouts} short stages first locate the objects, because there are no silhouettes")));
     }
-    run.learn((trainer, Vec::new()), &mut |_, _| None, on)
+    run.learn(Begun::new(trainer), &mut |_, _| None, on)
 }
 
 /// Trains a custom model. `start` builds its trainer from the config, the dataset and the training views. It may use any part of the config;
@@ -226,7 +226,7 @@ pub fn train_model<M: Model<f32>>(
     let NewRun { config, dataset, views, clocks, .. } = &mut run;
     let trainer = clocks.train.time(|| start(config, dataset, views.clone()))?;
     run.check_cameras(trainer.model().aabb(), on)?;
-    run.learn((trainer, Vec::new()), &mut |_, _| None, on)
+    run.learn(Begun::new(trainer), &mut |_, _| None, on)
 }
 
 /// A new run.
@@ -302,12 +302,12 @@ impl<'s> NewRun<'s> {
         let folder = folder.create()?;
         let record = RunRecord {
             seconds_planned: *time,
-            model: begun.0.model().kind().to_owned(),
+            model: begun.trainer.model().kind().to_owned(),
             ..RunRecord::new(RunKind::Trained, &dataset, preset.as_deref(), data)
         };
         folder.describe(&config, &record)?;
         on(Event::note(format!("run: {}", folder.path().display())));
-        let metrics = MetricsFile::create(&folder, begun.0.total_steps())?;
+        let metrics = MetricsFile::create(&folder, begun.trainer.total_steps())?;
         let mut job = Job { folder: &folder, config, dataset: &dataset, record: &record, options, warnings: &warnings };
         let learned = job.learn(begun, adjust, (metrics, History::default()), preview, &views, &mut clocks, on)?;
         drop(views);
@@ -448,7 +448,7 @@ impl<'o> OldRun<'o> {
         let warnings = record.data.check_cameras(&dataset, aabb)?;
         let mut job = Job { folder: &folder, config, dataset: &dataset, record: &record, options, warnings: &warnings };
         let learned = match state {
-            Some(_) => job.learn((trainer, Vec::new()), &mut |_, _| None, (metrics, past), preview, &views, &mut clocks, on)?,
+            Some(_) => job.learn(Begun::new(trainer), &mut |_, _| None, (metrics, past), preview, &views, &mut clocks, on)?,
             None => Ok(job.learned(trainer, &plan, (metrics, past), &views, on)?),
         };
         drop(views);

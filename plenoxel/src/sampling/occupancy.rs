@@ -104,7 +104,7 @@ impl Occupancy {
     /// Returns the cells of another division of space, whose centres lie in occupied cells.
     pub fn resampled(&self, aabb: Aabb, cells: [usize; 3]) -> Self {
         let all = Occupancy { aabb, bricks: BrickGrid::new(cells), masks: [].into(), distance: [].into() };
-        // Along each axis, the number of the cell of this division that has the centre.
+        // For each new cell along an axis, the old cell that contains its centre.
         let places = [0, 1, 2].map(|a| (0..cells[a]).map(|k| self.place(all.center([k; 3]), a)).collect::<Vec<_>>());
         let masks = parallel::map_indices(all.bricks.len(), |brick| {
             bits_where(all.bricks.inside(brick), |bit| {

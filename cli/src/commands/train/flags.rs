@@ -122,8 +122,9 @@ pub struct TrainArgs {
     preset: Option<String>,
 
     /// Duration of training on this machine, such as 90s, 5m or 1h. The program measures the speed of the machine, scales the lengths of all
-    /// stages, and reduces the resolution of the finest stages if the time is short. The presets quality and photos adjust the length of the
-    /// last stage while they train; quality has a smaller color network if the time is short (tensorf.short). The settings record the plan
+    /// stages, and reduces the resolution of the finest stages if the time is short. With the presets quality and photos, the length of
+    /// the last stage is adjusted during training; quality has a smaller color network if the time is short (tensorf.short). The settings
+    /// record the plan
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,
 

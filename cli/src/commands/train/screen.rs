@@ -78,7 +78,7 @@ impl<'c, 'a> Screen<'c, 'a> {
             Event::Planned { plan } => {
                 self.plan = plan.to_vec();
                 if let Some(progress) = &mut self.progress {
-                    progress.plan(plan);
+                    progress.replace_plan(plan);
                 }
             }
             Event::Initial { stage, see } => {

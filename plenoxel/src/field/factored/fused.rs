@@ -25,7 +25,7 @@ use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Samples, Spacing};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
-pub use densities::{Densities, density};
+pub use densities::{Densities, densities_at};
 use forward::{Block, Scene, Tables};
 use glam::DVec3;
 use std::sync::Arc;

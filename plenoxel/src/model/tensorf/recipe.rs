@@ -9,6 +9,7 @@ use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
 use crate::space::{Region, Space};
 use crate::train::StageLength;
+use autograd::parallel;
 use std::iter;
 
 impl Recipe for Config {
@@ -72,7 +73,7 @@ impl Recipe for Config {
     }
 
     fn likely_for(&self, seconds: f64) -> (Self, f64) {
-        let whole = UNIT * Cost { across: 1.0 }.total(&self.stages);
+        let whole = UNIT / parallel::threads() as f64 * Cost { across: 1.0 }.total(&self.stages);
         let short = self.short.filter(|short| seconds < short.below * whole);
         (self.shortened(short), short.map_or(1.0, |short| short.cost))
     }
@@ -162,8 +163,8 @@ fn bytes_of_ray(config: &Config, engine: Engine) -> u64 {
     SAMPLES * of_sample + COLORED * of_color
 }
 
-/// Usual duration of the unit of [`Cost::step`] on two cores, in seconds. A wrong guess costs a second measurement only.
-const UNIT: f64 = 5.8e-6;
+/// Usual duration of the unit of [`Cost::step`] on a core, in seconds. If it leads to a wrong guess, the measured steps are discarded, and the run begins anew.
+const UNIT: f64 = 11.6e-6;
 
 /// Durations of steps.
 #[derive(Clone, Copy, Debug)]

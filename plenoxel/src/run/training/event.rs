@@ -51,12 +51,13 @@ pub enum Event<'a> {
         /// The history of a resumed run.
         history: &'a History,
     },
-    /// The plan has changed: the last stage was adjusted to the measured speed.
+    /// The plan has changed: the last stage was adjusted to the measured speed ([`Pace`](crate::run::pace::Pace)).
     Planned {
         /// The stages with their steps.
         plan: &'a [PlannedStage],
     },
-    /// The model before its first step, before the first stage prunes it. A resumed run does not emit this event again.
+    /// The model before its first step, before the first stage prunes it; or after the steps that measured the speed of the machine, if they are steps of the run
+    /// ([`Begun`](crate::run::pace::Begun)). A resumed run does not emit this event again.
     Initial {
         /// The first stage.
         stage: PlannedStage,
@@ -69,7 +70,7 @@ pub enum Event<'a> {
         report: &'a Report,
         /// Facts about the model, the validation PSNR if it was measured, and the time.
         observation: &'a Observation,
-        /// The model after the step.
+        /// The model after the step, or after the last of the steps that were taken before training started.
         model: &'a dyn Model<f32>,
     },
     /// A preview of the model was rendered.

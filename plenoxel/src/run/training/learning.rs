@@ -66,7 +66,7 @@ impl Job<'_> {
     #[expect(clippy::too_many_arguments, reason = "each is needed once")]
     pub fn learn<M: Model<f32>>(
         &mut self,
-        (mut trainer, reports): Begun<M>,
+        begun: Begun<M>,
         adjust: &mut Adjust<'_, M>,
         (mut metrics, past): (MetricsFile, History),
         preview: Preview,
@@ -75,6 +75,7 @@ impl Job<'_> {
         on: &mut Listener<'_>,
     ) -> Result<std::result::Result<Learned<M>, Stopped>> {
         let Job { folder, dataset, record, options, .. } = *self;
+        let Begun { mut trainer, reports } = begun;
         let mut plan = trainer.plan().to_vec();
         let mut total = trainer.total_steps();
         let mut stages = summaries(&past, &plan);
@@ -86,7 +87,7 @@ impl Job<'_> {
         let mut preview = preview.begin(first(Split::Test).or(first(Split::Train)).filter(|_| options.pictures));
         let run = Underway { folder, config: &self.config, dataset };
         on(Event::Started { run, plan: &plan, test_views: self.test_views().len(), history: &past });
-        if let Some(&stage) = plan.first().filter(|_| trainer.steps_taken() == 0) {
+        if let Some(&stage) = plan.first().filter(|_| trainer.steps_taken() == reports.len() as u64) {
             on(Event::Initial { stage, see: &|camera: &Camera| Viewer::of(trainer.model(), &options_of_view).see(camera) });
         }
         let mut losses = past.losses;
@@ -97,14 +98,17 @@ impl Job<'_> {
         let last_psnr = loop {
             let begins = plan.iter().any(|stage| stage.first == trainer.steps_taken());
             let progress = if begins { trainer.model().progress() } else { None };
-            let mut step = || match reports.next() {
-                Some(report) => Ok(Some(report)),
-                None => trainer.step(),
-            };
-            let report = match clocks.train.time(|| match &progress {
-                Some(progress) => watched(progress, on, step),
-                None => step(),
-            }) {
+            let (report, replayed) = reports.next().unzip();
+            let mut step = || trainer.step();
+            let report = match report.map_or_else(
+                || {
+                    clocks.train.time(|| match &progress {
+                        Some(progress) => watched(progress, on, step),
+                        None => step(),
+                    })
+                },
+                |report| Ok(Some(report)),
+            ) {
                 Ok(Some(report)) => report,
                 Ok(None) => break None,
                 // There is no checkpoint: the metrics so far show what happened.
@@ -115,18 +119,18 @@ impl Job<'_> {
             mean_squared_error += if taken { SMOOTHED * (error - mean_squared_error) } else { error };
             taken = true;
             let stage = plan[report.stage];
-            // Steps that were taken before are not stopped at.
-            let now = report.step + 1 == trainer.steps_taken();
             let last = report.step + 1 == total;
             let due = saved.elapsed().as_secs_f64() >= options.checkpoint_every;
-            let stops = now && !last && (options.stop)();
-            let save = now && !last && ((options.save)() || due || stops);
+            // The run neither stops nor saves after a step that was taken before: the trainer is further.
+            let goes_on = !last && report.step + 1 == trainer.steps_taken();
+            let stops = goes_on && (options.stop)();
+            let save = goes_on && ((options.save)() || due || stops);
             if report.step == stage.first {
                 facts = trainer.model().facts();
             }
             let model = trainer.model();
             let viewer = || Viewer::of(model, &options_of_view);
-            let seconds = clocks.train.seconds();
+            let seconds = replayed.unwrap_or_else(|| clocks.train.seconds());
             let look = preview.look(viewer, report.ends_stage, save, background);
             let validation_psnr = look.as_ref().and_then(|look| look.psnr);
             let observation = Observation { facts: facts.clone(), validation_psnr, seconds };
@@ -163,11 +167,14 @@ impl Job<'_> {
                 on(Event::Trained);
                 return Ok(Err(Stopped(report.step + 1, total)));
             }
-            if now && let Some(config) = adjust(&mut trainer, seconds) {
+            if goes_on && let Some(config) = adjust(&mut trainer, seconds) {
                 self.config = config;
-                folder.describe(&self.config, record)?;
                 plan = trainer.plan().to_vec();
                 total = trainer.total_steps();
+                metrics.plan(total);
+                if let Err(e) = folder.check_identity().and_then(|()| folder.describe(&self.config, record)) {
+                    on(Event::note(format!("the adjusted plan was not written to the run folder: {e}")));
+                }
                 on(Event::Planned { plan: &plan });
             }
         };

@@ -3,12 +3,13 @@
 use super::{Event, Listener, NewRun, OldRun, Outcome, RunOptions, RunSettings, clock};
 use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
+use crate::loss::POSES;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::objective_of_any;
 use crate::model::recipe::Recipe;
 use crate::run::data::DataSource;
 use crate::run::memory::Estimate;
-use crate::run::pace::{self, Pace};
+use crate::run::pace::{self, Begun, Pace};
 use crate::space::Region;
 use crate::train::Trainer;
 use std::path::Path;
@@ -43,7 +44,9 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
         let begin = |recipe: &R| trainer(config, recipe, region, views.clone());
-        let planned = clocks.train.time(|| pace::plan(&recipe, seconds, begin))?;
+        // The schedule of the poses counts all steps of the run.
+        let adjusts = !config.losses.contains_key(POSES);
+        let planned = clocks.train.time(|| pace::plan(&recipe, seconds, adjusts, begin))?;
         (recipe, begun) = (planned.recipe, planned.begun);
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
             Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
@@ -51,12 +54,12 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
         });
         on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
         recipe.clone().set(config);
-        pace = Some(Pace::new(recipe.clone(), config.clone(), seconds));
+        pace = adjusts.then(|| Pace::new(recipe.clone(), config.clone(), seconds));
     }
     let NewRun { config, views, clocks, .. } = &mut run;
     let begun = match begun {
         Some(begun) => begun,
-        None => (clocks.train.time(|| trainer(config, &recipe, region, views.clone()))?, Vec::new()),
+        None => Begun::new(clocks.train.time(|| trainer(config, &recipe, region, views.clone()))?),
     };
     run.learn(begun, &mut |trainer, seconds| pace.as_mut()?.after_step(trainer, seconds), on)
 }

@@ -1,4 +1,4 @@
-//! Densities of a field that does not change: at given positions, and as a table for pictures.
+//! Densities of a field without gradients: at given positions, and as a table for pictures.
 //!
 //! In each cell, the product of a bilinear plane and a linear line is trilinear, and so is the sum of products, the density feature s. A table of s at the nodes
 //! therefore gives the same densities as the factors, up to rounding, and a sample reads eight numbers instead of 18 rows. Nodes are stored in bricks of 4³
@@ -115,7 +115,10 @@ fn pairs_of<'a, T: Real>(field: &Factored<T>, tables: &'a [Tensor<T>]) -> Pairs<
 }
 
 /// Returns the densities at positions `[m, 3]`, as [`Field::density`](crate::render::Field::density) does, without recording a gradient.
-pub fn density<T: Real>(field: &Factored<T>, positions: &Tensor<T>) -> Tensor<T> {
+///
+/// Panics if the kernel does not [support](super::supports) the field.
+pub fn densities_at<T: Real>(field: &Factored<T>, positions: &Tensor<T>) -> Tensor<T> {
+    assert!(super::supports(field.shape()), "the kernel does not compute fields of this shape");
     let cells = no_grad(|| field.cells(positions));
     let tables = field.tables();
     let (pairs, cells) = (pairs_of(field, &tables), cells.data().as_chunks::<3>().0);
@@ -297,7 +300,7 @@ mod tests {
     fn densities_at_positions_are_those_of_the_graph() {
         for nodes in [[9, 12, 10], [30, 17, 24]] {
             let (field, at) = (field(nodes), positions(3 * RUN + 5));
-            let (want, found) = (no_grad(|| field.density(&at)), density(&field, &at));
+            let (want, found) = (no_grad(|| field.density(&at)), densities_at(&field, &at));
             assert_eq!(found.shape(), want.shape());
             for (want, found) in want.data().iter().zip(found.data()) {
                 assert!((want - found).abs() <= 1e-12 * want.abs().max(1.0), "{want} {found}");
