@@ -46,10 +46,15 @@ pub struct Training<'c, 'a> {
     validation_psnr: Option<f64>,
 }
 
+/// Returns the number of steps of a plan.
+fn steps(plan: &[PlannedStage]) -> u64 {
+    plan.iter().map(|stage| stage.steps).sum()
+}
+
 impl<'a> Console<'a> {
     /// Progress of a training run. `rays_to_evaluate` is the number of pixels of the final evaluation, `seconds` the training time of a resumed run.
     pub fn training(&self, plan: &[PlannedStage], rays_to_evaluate: f64, seconds: f64) -> Training<'_, 'a> {
-        let total = plan.iter().map(|p| p.steps).sum();
+        let total = steps(plan);
         Training {
             meter: Meter::new(self, total),
             plan: plan.to_vec(),
@@ -69,7 +74,7 @@ impl Training<'_, '_> {
     /// Replaces the plan.
     pub fn replace_plan(&mut self, plan: &[PlannedStage]) {
         self.plan = plan.to_vec();
-        self.total = plan.iter().map(|stage| stage.steps).sum();
+        self.total = steps(plan);
     }
 
     /// Shows the progress of a countable task between two steps.

@@ -123,6 +123,9 @@ mod tests {
             dvec3(at[0] - 0.2, at[1], at[2]).length() < 0.45
         };
         let matter = Occupancy::new(Aabb::cube(1.0), cells, &(0..27000).map(ball).collect::<Vec<_>>());
+        let has_matter = |brick: usize| matter.masks()[brick] != 0;
+        let interior = |brick: &usize| neighbours(matter.bricks(), *brick).is_some_and(|all| all.into_iter().all(has_matter));
+        assert!((0..matter.masks().len()).filter(interior).count() > 0, "bricks inside of matter");
         let mut times = vec![vec![0; 50 * 37]; views.len()];
         for tile in showing(&views, &matter) {
             for (x, y) in (0..tile.pixels() as u32).map(|p| (tile.x + p % tile.width, tile.y + p / tile.width)) {

@@ -48,7 +48,7 @@ impl<T: Real> Densities<T> {
         // σ = SCALE softplus(s − 10)
         let least = T::lit((negligible / SCALE).exp_m1().ln());
         let tables = field.tables();
-        let pairs = pairs_of(field, &tables);
+        let pairs = Pairs::of(&tables[..6], field.nodes(), field.shape().density_components);
         let features = |brick: u32| {
             let low = bricks.place(brick as usize).map(|place| place * BRICK);
             let mut values = [T::lit(NOTHING); ENTRIES];
@@ -104,16 +104,6 @@ impl<T: Real> Densities<T> {
     }
 }
 
-/// Returns the factors of the density among the tables of a field.
-fn pairs_of<'a, T: Real>(field: &Factored<T>, tables: &'a [Tensor<T>]) -> Pairs<'a, T> {
-    Pairs {
-        planes: [0, 1, 2].map(|axis| tables[axis].data()),
-        lines: [0, 1, 2].map(|axis| tables[3 + axis].data()),
-        nodes: field.nodes(),
-        width: field.shape().density_components,
-    }
-}
-
 /// Returns the densities at positions `[m, 3]`, as [`Field::density`](crate::render::Field::density) does, without recording a gradient.
 ///
 /// Panics if the kernel does not [support](super::supports) the field.
@@ -121,7 +111,7 @@ pub fn densities_at<T: Real>(field: &Factored<T>, positions: &Tensor<T>) -> Tens
     assert!(super::supports(field.shape()), "the kernel does not compute fields of this shape");
     let cells = no_grad(|| field.cells(positions));
     let tables = field.tables();
-    let (pairs, cells) = (pairs_of(field, &tables), cells.data().as_chunks::<3>().0);
+    let (pairs, cells) = (Pairs::of(&tables[..6], field.nodes(), field.shape().density_components), cells.data().as_chunks::<3>().0);
     let mut sigma = vec![T::zero(); cells.len()];
     parallel::for_each_chunk(&mut sigma, parallel::CHUNK / RUN * RUN, |first, sigma| {
         for (cells, sigma) in cells[first..].chunks(RUN).zip(sigma.chunks_mut(RUN)) {

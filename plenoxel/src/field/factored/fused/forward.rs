@@ -126,15 +126,9 @@ pub struct Tables<'a, T> {
 
 impl<'a, T: Real> Tables<'a, T> {
     pub fn new(batch: &Batch<T>, tables: &'a [Tensor<T>]) -> Self {
-        let pairs = |first: usize, width: usize| Pairs {
-            planes: [0, 1, 2].map(|axis| tables[first + axis].data()),
-            lines: [0, 1, 2].map(|axis| tables[first + 3 + axis].data()),
-            nodes: batch.nodes,
-            width,
-        };
         Tables {
-            density: pairs(0, batch.shape.density_components),
-            appearance: pairs(6, batch.shape.appearance_components),
+            density: Pairs::of(&tables[..6], batch.nodes, batch.shape.density_components),
+            appearance: Pairs::of(&tables[6..12], batch.nodes, batch.shape.appearance_components),
             network: Network::new(&batch.shape, &tables[12..]),
         }
     }

@@ -4,7 +4,7 @@
 
 use super::super::{PLANE_OF, SCALE, SHIFT};
 use autograd::single::is_single;
-use autograd::{Real, dispatched, parallel};
+use autograd::{Real, Tensor, dispatched, parallel};
 use std::ops::Range;
 
 /// Number of components that are computed together. The number of components of a field is a multiple of it.
@@ -25,6 +25,14 @@ pub struct Pairs<'a, T> {
     pub nodes: [usize; 3],
     /// Components of each pair.
     pub width: usize,
+}
+
+impl<'a, T: Real> Pairs<'a, T> {
+    /// Takes three planes and three lines of `width` components from the tables of a field.
+    pub fn of(tables: &'a [Tensor<T>], nodes: [usize; 3], width: usize) -> Self {
+        let data = |first: usize| [0, 1, 2].map(|axis| tables[first + axis].data());
+        Pairs { planes: data(0), lines: data(3), nodes, width }
+    }
 }
 
 /// Cells of up to [`RUN`] samples, in columns.
