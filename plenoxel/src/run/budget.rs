@@ -7,7 +7,7 @@
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::model::plenoxels::Trainer;
-use crate::model::plenoxels::config::{Config, Scout, Stage, Weight};
+use crate::model::plenoxels::config::{Config, Stage, Weight};
 use crate::model::plenoxels::ray_cost;
 use std::sync::Arc;
 use std::time::Instant;
@@ -89,34 +89,6 @@ fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result
         (name, weight)
     });
     Ok(Config { stages, losses: losses.collect(), ..config })
-}
-
-/// Returns `asked` with everything that a time budget changes taken from `found`: lengths of stages, resolutions with density rates, image
-/// reductions and loss weights. The result equals `found` if `found` is a plan for `asked`.
-pub fn planned_like(asked: Config, found: &Config) -> Config {
-    let like = |(asked, found): (Stage, &Stage)| {
-        let planned = asked.at_most(found.resolution);
-        // It may have been scaled twice, with rounding.
-        let same = (planned.density_rate / found.density_rate - 1.0).abs() < 1e-9;
-        Stage {
-            steps: found.steps,
-            epochs: found.epochs,
-            density_warm_up: found.density_warm_up,
-            density_rate: if same { found.density_rate } else { planned.density_rate },
-            image_reduction: planned.image_reduction.min(found.image_reduction),
-            ..planned
-        }
-    };
-    let stages = |asked: Vec<Stage>, found: &[Stage]| match asked.len() == found.len() {
-        true => asked.into_iter().zip(found).map(like).collect(),
-        false => asked,
-    };
-    let scout = match (asked.scout, &found.scout) {
-        (Some(asked), Some(found)) => Some(Scout { stages: stages(asked.stages, &found.stages), ..asked }),
-        (asked, _) => asked,
-    };
-    // Schedules of weights are counted in steps.
-    Config { stages: stages(asked.stages, &found.stages), scout, losses: found.losses.clone(), ..asked }
 }
 
 /// Reduces the resolution of the finest stages.
@@ -265,28 +237,6 @@ mod tests {
         let found = coarser(Config { stages: stages.into(), ..Config::default() }).stages;
         let of = |k: usize| (found[k].resolution, found[k].density_rate);
         assert_eq!([of(0), of(1), of(2)], [(128, 10.0), (256, 8.0), (256, 8.0)]);
-    }
-
-    #[test]
-    fn a_sweep_knows_its_plans_from_other_runs() {
-        let stage = Config::default().stages[0];
-        let stages = [128, 320].map(|resolution| Stage { resolution, density_rate: 10.0, image_reduction: 4, ..stage });
-        let asked = Config { stages: stages.into(), ..Config::default() };
-        let camera = Dataset::procedural(ProceduralOptions { width: 100, height: 100, ..ProceduralOptions::default() });
-        let cameras = camera.unwrap().cameras(Split::Train);
-        let fitted = Config { pixels_per_voxel: 1.0, ..asked.clone() }.fitted_to(&cameras);
-        assert!(fitted.stages[1].resolution < 128 && fitted.stages[0].image_reduction < 4);
-        for found in [asked.clone(), coarser(asked.clone()), Config { pixels_per_voxel: 0.0, ..coarser(fitted) }] {
-            let mut found = found;
-            found.stages.iter_mut().for_each(|stage| stage.steps = Some(17));
-            assert_eq!(planned_like(asked.clone(), &found), found);
-            let mut other = found.clone();
-            other.stages[1].density_rate *= 1.01;
-            assert_ne!(planned_like(asked.clone(), &other), other);
-            let mut finer = found;
-            finer.stages[1].resolution = 400;
-            assert_ne!(planned_like(asked.clone(), &finer), finer);
-        }
     }
 
     #[test]

@@ -302,6 +302,7 @@ impl<'s> NewRun<'s> {
         let folder = folder.create()?;
         let record = RunRecord {
             seconds_planned: *time,
+            asked: time.map(|_| Box::new(settings.config.clone())),
             model: begun.trainer.model().kind().to_owned(),
             ..RunRecord::new(RunKind::Trained, &dataset, preset.as_deref(), data)
         };

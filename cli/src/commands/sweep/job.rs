@@ -7,9 +7,8 @@ use plenoxel::error::{Error, Result};
 use plenoxel::files;
 use plenoxel::json;
 use plenoxel::model::plenoxels::config::Config;
-use plenoxel::run::budget;
 use plenoxel::run::data::DataSource;
-use plenoxel::run::folder::{RunFolder, RunKind};
+use plenoxel::run::folder::{RunFolder, RunKind, RunRecord};
 use plenoxel::run::settings;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -81,7 +80,7 @@ impl Job {
             Ok(run) => run,
             Err(e) => return State::Different(e.to_string()),
         };
-        let different = self.asked.differences(&config, &record.data, record.seconds_planned);
+        let different = self.asked.differences(&config, &record);
         if !different.is_empty() {
             return State::Different(different.join("; "));
         }
@@ -172,13 +171,16 @@ fn remove(path: &Path) -> Result<()> {
 
 impl Asked {
     /// Lists the differences between a run and the requested settings.
-    fn differences(&self, config: &Config, source: &DataSource, planned: Option<f64>) -> Vec<String> {
-        let asked = match (self.time, planned) {
-            (Some(seconds), Some(planned)) if planned != seconds => return vec![format!("time is {planned} s, not {seconds} s")],
-            (Some(_), _) => budget::planned_like(self.config.clone(), config),
-            (None, _) => self.config.clone(),
+    fn differences(&self, config: &Config, record: &RunRecord) -> Vec<String> {
+        let found = match (self.time, record.seconds_planned, &record.asked) {
+            (Some(seconds), Some(planned), _) if planned != seconds => return vec![format!("time is {planned} s, not {seconds} s")],
+            (Some(_), Some(_), None) => return vec!["an earlier version planned it, which did not record its settings before".to_owned()],
+            // The plan changed them.
+            (Some(_), _, Some(asked)) => asked,
+            _ => config,
         };
+        let source = &record.data;
         let data = (source != &self.source).then(|| format!("data is {source}, not {}", self.source));
-        data.into_iter().chain(settings::differences(config, &asked)).collect()
+        data.into_iter().chain(settings::differences(found, &self.config)).collect()
     }
 }

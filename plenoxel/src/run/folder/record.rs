@@ -3,6 +3,7 @@
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::model::plenoxels::config::Config;
 use crate::model::{self, plenoxels};
 use crate::run::data::DataSource;
 use crate::run::{PROGRAM, machine};
@@ -105,6 +106,9 @@ pub struct RunRecord {
     /// Planned seconds of training, if it was planned by time.
     #[serde(default)]
     pub seconds_planned: Option<f64>,
+    /// Settings before they were planned by time. Runs of earlier versions do not record them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub asked: Option<Box<Config>>,
     /// The field that was baked, for a baked run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baked: Option<Baked>,
@@ -136,6 +140,7 @@ impl RunRecord {
             preset: None,
             data: source.clone(),
             seconds_planned: None,
+            asked: None,
             baked: None,
             imported: None,
         }

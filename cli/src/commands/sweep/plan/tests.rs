@@ -1,5 +1,7 @@
 use super::*;
+use crate::commands::sweep::job::State;
 use crate::commands::table::figures;
+use plenoxel::run::folder::{RunFolder, RunKind, RunRecord};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
@@ -209,4 +211,33 @@ fn the_sweeps_that_are_shipped_are_plans() {
         let found = (figures::mean(&psnr), figures::deviation(&psnr));
         assert!(psnr.len() == 8 && (found.0 - mean).abs() < 0.006 && (found.1 - deviation).abs() < 0.016, "{}: {found:?}", published.name);
     }
+}
+
+#[test]
+fn a_plan_by_time_is_compared_by_its_settings_before() {
+    let text = "[[scenes]]\nscene_size = 32\n[[methods]]\npreset = \"quality\"\ntime = \"9s\"\n";
+    let mut job = read("planned", text).unwrap().jobs.remove(0);
+    job.folder = std::env::temp_dir().join(format!("plenoxel-sweep-{}-planned", std::process::id()));
+    let mut planned = job.asked.config.clone();
+    planned.tensorf.as_mut().expect("a factored field").stages.iter_mut().for_each(|stage| stage.steps += 17);
+    let mut record = RunRecord {
+        model: "tensorf".to_owned(),
+        seconds_planned: Some(9.0),
+        asked: Some(Box::new(job.asked.config.clone())),
+        ..RunRecord::of_scene(RunKind::Trained, "procedural", "built in", &job.asked.source)
+    };
+    let state = |record: &RunRecord| {
+        std::fs::create_dir_all(&job.folder).unwrap();
+        RunFolder::at(&job.folder).describe(&planned, record).unwrap();
+        let state = job.state();
+        std::fs::remove_dir_all(&job.folder).unwrap();
+        state
+    };
+    assert_eq!(state(&record), State::CutShort);
+    record.asked.as_mut().unwrap().seed += 1;
+    assert!(matches!(state(&record), State::Different(found) if found.contains("seed")));
+    record.asked = None;
+    assert!(matches!(state(&record), State::Different(found) if found.contains("earlier version")));
+    record.seconds_planned = Some(10.0);
+    assert!(matches!(state(&record), State::Different(found) if found.contains("10 s, not 9 s")));
 }
