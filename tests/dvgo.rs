@@ -103,7 +103,7 @@ fn what_is_left_out_changes_a_color_by_no_more_than_its_opacity() {
 #[test]
 fn groups_share_a_color_and_have_gradients() {
     let mut grid = grid::<f64>([5; 3], true);
-    grid.grouping_in_pictures = Grouping { weight: 0.3, above: 0.0 };
+    grid.grouping_in_pictures = Grouping { weight: 0.3, ..Grouping::NONE };
     let rendered = rendered(&grid, &rays(4), Engine::Fused, 0.0);
     let samples = rendered.samples().expect("samples");
     let own = |r: usize| samples.samples.offsets[r] as usize..samples.samples.offsets[r + 1] as usize;

@@ -84,8 +84,8 @@ fn rays_that_see_nothing_have_no_gradient_and_do_not_disturb_the_others() {
 
 #[test]
 fn gradients_of_rays_are_those_of_the_reference_with_groups_of_samples_too() {
-    for region in [BOX, NDC, CONTRACTED] {
-        let model = model(Config { group: 0.5, color_above: 0.01, ..Config::default() }, region, 9);
+    for (region, compact_groups) in [BOX, NDC, CONTRACTED].into_iter().flat_map(|region| [(region, false), (region, true)]) {
+        let model = model(Config { group: 0.5, compact_groups, color_above: 0.01, ..Config::default() }, region, 9);
         let rays = rays_of_a_capture(30);
         let inputs = arrays(&rays).map(Tensor::variable);
         let tracked = TrackedRays::new(inputs[0].clone(), inputs[1].clone(), &rays);

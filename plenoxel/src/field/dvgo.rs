@@ -14,7 +14,7 @@
 mod samples;
 
 use super::encoding::Directions;
-use super::grouping::{Grouping, Groups};
+use super::grouping::Grouping;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::render::{Field, Radiance, RenderOptions, Rendered, composite, weights};
@@ -185,12 +185,10 @@ impl<T: Real> DenseGrid<T> {
         let cells = self.in_cells(&samples.positions);
         let sigma = self.density_in_cells(&cells);
         let weights = weights(samples, &sigma);
-        let Groups { of, shaded, rays } = grouping.groups(weights.data(), &samples.offsets, 0, jitter);
-        let rgb = self.colors(&cells.gather_rows(&Indices::from(shaded)), &samples.directions, &Indices::from(rays));
-        let members = of.iter().zip(0u32..).filter(|(group, _)| **group != Groups::NONE);
-        let (groups, colored): (Vec<u32>, Vec<u32>) = members.unzip();
-        let rgb = if grouping.weight == 0.0 { rgb } else { rgb.gather_rows(&Indices::from(groups)) };
-        Radiance { sigma, rgb: rgb.scatter_rows(&Indices::from(colored), samples.len()) }
+        let groups = grouping.groups(weights.data(), [samples.t.data(), samples.delta.data()], &samples.offsets, 0, jitter);
+        let at = groups.mean_positions(weights.data(), &cells);
+        let rgb = self.colors(&at, &samples.directions, &Indices::from(groups.rays.clone()));
+        Radiance { sigma, rgb: groups.colors_of_samples(&rgb) }
     }
 }
 

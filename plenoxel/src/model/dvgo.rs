@@ -69,7 +69,7 @@ fn coarse_field<T: Real>(config: &Config, aabb: Aabb, nodes: [usize; 3]) -> Dens
     let unit = voxel(aabb, config.coarse.resolution);
     let mut field = DenseGrid::new(aabb, nodes, 3, None, shift_of(config.coarse_opacity), unit);
     field.opacity_above = config.coarse_above;
-    let grouping = Grouping { weight: 0.0, above: config.coarse_above };
+    let grouping = Grouping { above: config.coarse_above, ..Grouping::NONE };
     (field.grouping, field.grouping_in_pictures) = (grouping, grouping);
     field
 }
@@ -81,7 +81,7 @@ fn fine_field<T: Real>(config: &Config, aabb: Aabb, nodes: [usize; 3], seed: u64
     let unit = voxel(aabb, config.fine[config.fine.len() - 1].resolution);
     let mut field = DenseGrid::new(aabb, nodes, features, Some(network), shift_of(config.fine_opacity), unit);
     field.opacity_above = config.fine_above;
-    let grouping = |weight: f64| Grouping { weight, above: config.fine_above };
+    let grouping = |weight: f64| Grouping { weight, above: config.fine_above, compact: false };
     (field.grouping, field.grouping_in_pictures) = (grouping(config.group), grouping(config.group_in_pictures));
     field
 }

@@ -92,8 +92,8 @@ impl<T: Real> Tensorf<T> {
         let random = Stream::new(seed);
         let Region { space, aabb } = region;
         let mut field = Factored::new(config.shape(), aabb, config.nodes(region, config.stages[0].resolution), &random);
-        field.grouping = Grouping { weight: config.group, above: config.color_above };
-        field.grouping_in_pictures = Grouping { weight: config.group_in_pictures, above: config.color_above };
+        let grouping = |weight: f64| Grouping { weight, above: config.color_above, compact: config.compact_groups };
+        (field.grouping, field.grouping_in_pictures) = (grouping(config.group), grouping(config.group_in_pictures));
         field.gradient_above = config.gradient_above;
         let total_steps = Arc::new(AtomicU64::new(config.total_steps()));
         Ok(Tensorf { config, total_steps, field, space, hull: Hull::Auto, engine: Engine::Fused })

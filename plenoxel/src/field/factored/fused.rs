@@ -1,7 +1,7 @@
 //! Fused kernel: the pixels of [`composite()`] in one pass over a factored field, with a hand-written adjoint.
 //!
 //! *Forward.* Rays are processed in blocks. Each block computes the densities of its samples and their weights, forms groups
-//! ([`Grouping`]), and evaluates the color network at one member of each group, for all groups of the block together.
+//! ([`Grouping`]), and evaluates the color network at one position of each group, for all groups of the block together.
 //!
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
@@ -225,27 +225,23 @@ impl<T: Real> State<T> {
     fn composite(&self, inputs: &[Tensor<T>]) -> Rendered<T> {
         let batch = &self.batch;
         let (tables, of_rays) = inputs.split_at(adjoint::TABLES);
-        let (mut offsets, mut rays) = (vec![0u32], Vec::new());
-        let mut columns: [Vec<T>; 5] = Default::default();
-        // Numbers of the shaded samples, and for each sample with a color its number and that of its shaded sample.
-        let (mut shaded, mut colored, mut group) = (Vec::new(), Vec::new(), Vec::new());
+        let mut offsets = vec![0u32];
+        let mut columns: [Vec<T>; 6] = Default::default();
+        let (mut of, mut shaded, mut numbers) = (Vec::new(), Vec::new(), Vec::new());
         for block in &self.blocks {
-            let first = columns[0].len() as u32;
+            let (first, before) = (columns[0].len() as u32, shaded.len() as u32);
             let [x, y, z] = block.at();
-            for (to, from) in columns.iter_mut().zip([x, y, z, block.t(), block.delta()]) {
+            for (to, from) in columns.iter_mut().zip([x, y, z, block.t(), block.delta(), block.weight()]) {
                 to.extend_from_slice(from);
             }
             offsets.extend(block.offsets[1..].iter().map(|offset| first + offset));
-            for (i, &of) in block.group.iter().enumerate().filter(|(_, of)| **of != Groups::NONE) {
-                colored.push(first + i as u32);
-                group.push(shaded.len() as u32 + of);
-            }
-            shaded.extend(block.shaded.iter().map(|sample| first + sample));
-            rays.extend(block.rays_of_shaded.iter().copied());
+            of.extend(block.groups.of.iter().map(|&group| if group == Groups::NONE { group } else { before + group }));
+            shaded.extend(block.groups.shaded.iter().map(|shaded| first + shaded.start..first + shaded.end));
+            numbers.extend_from_slice(&block.groups.rays);
         }
+        let groups = Groups { of: of.into(), shaded, rays: numbers };
         let offsets = Indices::from(offsets);
-        let m = columns[0].len();
-        let [x, y, z, t, delta] = columns.map(|values| Tensor::from_vec(values, &[m]));
+        let [x, y, z, t, delta, weights] = columns.map(|values| Tensor::from_vec(values, &[groups.of.len()]));
         let cells = Tensor::stack(&[&x, &y, &z], 1);
         // Positions in world coordinates are needed for tracked rays only.
         let samples = Samples { t, delta, positions: cells, directions: batch.directions.clone(), offsets };
@@ -254,9 +250,9 @@ impl<T: Real> State<T> {
             _ => (samples, &batch.encoded),
         };
         let cells = samples.positions.clone();
-        let directions = encoded.gather_rows(&Indices::from(rays));
-        let colors = super::colors(tables, batch.shape.feature_octaves, &cells.gather_rows(&Indices::from(shaded)), &directions);
-        let rgb = colors.gather_rows(&Indices::from(group)).scatter_rows(&Indices::from(colored), m);
+        let directions = encoded.gather_rows(&Indices::from(groups.rays.clone()));
+        let colors = super::colors(tables, batch.shape.feature_octaves, &groups.mean_positions(weights.data(), &cells), &directions);
+        let rgb = groups.colors_of_samples(&colors);
         let radiance = Radiance { sigma: super::density(tables, &cells), rgb };
         composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))
     }

@@ -38,6 +38,8 @@ pub struct Config {
     pub group: f64,
     /// Weight that completes a group in pictures.
     pub group_in_pictures: f64,
+    /// True for the color at the mean position of a group; false for that of a member that is drawn.
+    pub compact_groups: bool,
     /// Groups of samples whose weight is not above this have no color.
     pub color_above: f64,
     /// Transmittance below which a training ray ends.
@@ -107,6 +109,7 @@ impl Default for Config {
             pixels_per_cell: 0.0,
             group: 0.04,
             group_in_pictures: 0.02,
+            compact_groups: false,
             color_above: 1e-3,
             stop_below: 3e-3,
             stop_below_in_pictures: 3e-4,

@@ -28,7 +28,7 @@ pub struct Cotangents<T: Real> {
 struct Part<T: Real> {
     /// Samples whose density gradient is used.
     density: OfDensity<T>,
-    /// Cotangents of the products of each shaded sample, `[shaded, 3 R]`.
+    /// Cotangents of the products of each group, `[groups, 3 R]`.
     products: Buffer<T>,
     /// Samples of `density`, sorted by the rows of each plane that they read.
     density_rows: [Sorted; 3],
@@ -131,7 +131,7 @@ impl<T: Real> RowSums<T> for PlaneSums<T> {
             let which = &sorted.samples[sorted.buckets.range(bucket)];
             let (at, g) = match self.of_density {
                 true => (part.density.at(), OfProducts::Shared(&part.density.g)),
-                false => (block.shaded_at.each_ref().map(|at| &at[..]), OfProducts::Each(&part.products)),
+                false => (block.groups_at.each_ref().map(|at| &at[..]), OfProducts::Each(&part.products)),
             };
             let bucket = BucketSums { first: bucket << self.bucket_shift(), sums, touched };
             if parallel::fused() {
@@ -209,7 +209,7 @@ fn part<T: Real>(
 ) -> (Part<T>, Vec<Buffer<T>>, Option<OfRays<T>>) {
     let batch = &state.batch;
     let mut of_features = Buffer::stale(block.len());
-    let mut rgb = Buffer::zeros(3 * block.shaded.len());
+    let mut rgb = Buffer::zeros(3 * block.groups.shaded.len());
     match output {
         Output::Sparsity => {
             for (own, &g) in block.rays().zip(&cotangent.data()[block.first..]) {
@@ -218,11 +218,11 @@ fn part<T: Real>(
         }
         Output::Pixels => {
             let (along, color) = (block.along(), block.color());
-            let of_shaded = rgb.as_chunks_mut::<3>().0;
+            let of_groups = rgb.as_chunks_mut::<3>().0;
             for (own, g) in block.rays().zip(&cotangent.data().as_chunks::<COLUMNS>().0[block.first..]) {
                 along.sigma_adjoint(own.clone(), batch.background, g, &color, &mut of_features);
-                for i in own.filter(|&i| block.group[i] != Groups::NONE) {
-                    let of = &mut of_shaded[block.group[i] as usize];
+                for i in own.filter(|&i| block.groups.of[i] != Groups::NONE) {
+                    let of = &mut of_groups[block.groups.of[i] as usize];
                     (0..3).for_each(|c| of[c] += along.weight[i] * g[c]);
                 }
             }
@@ -230,15 +230,15 @@ fn part<T: Real>(
     }
     of_features.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
     let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, rgb);
-    let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
+    let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
     let density = OfDensity::new(block.at(), &of_features, batch.gradient_above);
     let lines = [
         lines(tables.density, density.at(), OfProducts::Shared(&density.g)),
-        lines(tables.appearance, shaded_at, OfProducts::Each(&products)),
+        lines(tables.appearance, groups_at, OfProducts::Each(&products)),
     ];
     let shift = |axis: usize, pairs: Pairs<'_, T>| bucket_shift(axis, batch.nodes, pairs.width);
     let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, density.at(), batch.nodes, shift(axis, tables.density)));
-    let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, shaded_at, batch.nodes, shift(axis, tables.appearance)));
+    let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, groups_at, batch.nodes, shift(axis, tables.appearance)));
     let rays = state.tracked.as_ref().map(|tracked| {
         let encoded = tables.network.of_direction(&input);
         positions::of_rays(tracked, block, tables, [&of_features, &products], (encoded, batch.encoded.shape()[1]))

@@ -40,14 +40,10 @@ pub struct Block<T: Real> {
     /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
     columns: [Buffer<T>; of_sample::COUNT],
-    /// Shaded sample whose color each sample has, or [`Groups::NONE`].
-    pub group: Buffer<u32>,
-    /// Samples at which the color network is evaluated.
-    pub shaded: Vec<u32>,
-    /// Number of the ray of each shaded sample.
-    pub rays_of_shaded: Vec<u32>,
-    /// Positions of the shaded samples.
-    pub shaded_at: [Buffer<T>; 3],
+    /// Samples that share a color.
+    pub groups: Groups,
+    /// Positions of the groups, where the color network is evaluated.
+    pub groups_at: [Buffer<T>; 3],
     /// Values of the color network.
     pub activations: Activations<T>,
 }
@@ -88,7 +84,8 @@ impl<T: Real> Block<T> {
         &self.columns[of_sample::SLOPE][..self.len()]
     }
 
-    fn weight(&self) -> &[T] {
+    /// Returns the weight of each sample.
+    pub fn weight(&self) -> &[T] {
         &self.columns[of_sample::WEIGHT][..self.len()]
     }
 
@@ -101,7 +98,7 @@ impl<T: Real> Block<T> {
     #[inline(always)]
     pub fn color(&self) -> impl Fn(usize) -> [T; 3] + '_ {
         let colors = self.activations.rgb.as_chunks::<3>().0;
-        |i| colors.get(self.group[i] as usize).copied().unwrap_or([T::zero(); 3])
+        |i| colors.get(self.groups.of[i] as usize).copied().unwrap_or([T::zero(); 3])
     }
 }
 
@@ -224,28 +221,30 @@ impl<'a, T: Real> Scene<'a, T> {
             first,
             offsets,
             columns,
-            group: Buffer::stale(end),
-            shaded: Vec::new(),
-            rays_of_shaded: Vec::new(),
-            shaded_at: std::array::from_fn(|_| Buffer::stale(0)),
+            groups: Groups { of: Buffer::stale(0), shaded: Vec::new(), rays: Vec::new() },
+            groups_at: std::array::from_fn(|_| Buffer::stale(0)),
             activations: Activations::default(),
         }
     }
 
-    /// Forms the groups of each ray and chooses the shaded samples.
+    /// Forms the groups of each ray and computes their positions.
     fn form_groups(&self, block: &mut Block<T>) {
-        let Groups { of, shaded, rays } = self.batch.grouping.groups(block.weight(), &block.offsets, block.first, self.batch.jitter);
-        block.shaded_at = block.at().map(|at| shaded.iter().map(|&i| at[i as usize]).collect::<Vec<_>>().into());
-        (block.group, block.shaded, block.rays_of_shaded) = (of, shaded, rays);
+        let groups = self.batch.grouping.groups(block.weight(), [block.t(), block.delta()], &block.offsets, block.first, self.batch.jitter);
+        let mut means = [0, 1, 2].map(|_| Buffer::zeros(groups.shaded.len()));
+        let at = block.at();
+        for (group, sample, share) in groups.shares(block.weight()) {
+            (0..3).for_each(|axis| means[axis][group] += share * at[axis][sample]);
+        }
+        (block.groups, block.groups_at) = (groups, means);
     }
 
     /// Evaluates the color network.
     fn shade(&self, block: &mut Block<T>) {
         let pairs = self.tables.appearance;
-        let mut products = Buffer::stale(block.shaded.len() * 3 * pairs.width);
+        let mut products = Buffer::stale(block.groups.shaded.len() * 3 * pairs.width);
         for (run, products) in products.chunks_mut(RUN * 3 * pairs.width).enumerate() {
             let range = run * RUN..run * RUN + products.len() / (3 * pairs.width);
-            let at = block.shaded_at.each_ref().map(|at| &at[range.clone()]);
+            let at = block.groups_at.each_ref().map(|at| &at[range.clone()]);
             if parallel::fused() {
                 lookup::products::<T, true>(pairs, at, products);
             } else {
@@ -253,7 +252,7 @@ impl<'a, T: Real> Scene<'a, T> {
             }
         }
         let (encoded, width) = (self.batch.encoded.data(), self.batch.encoded.shape()[1]);
-        let direction = |i: usize| &encoded[block.rays_of_shaded[i] as usize * width..][..width];
+        let direction = |i: usize| &encoded[block.groups.rays[i] as usize * width..][..width];
         block.activations = self.tables.network.forward(products, direction);
     }
 }

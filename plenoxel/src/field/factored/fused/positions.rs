@@ -27,7 +27,7 @@ pub fn joined<T: Real>(blocks: &[OfRays<T>]) -> OfRays<T> {
     })
 }
 
-/// Computes the cotangents of the rays of a block from those of the density features of its samples, of the products of its shaded samples, and of the encoded
+/// Computes the cotangents of the rays of a block from those of the density features of its samples, of the products of its groups, and of the encoded
 /// directions of these, `width` numbers each. A ray without samples has the cotangent 0.
 pub fn of_rays<'g, T: Real>(
     tracked: &Tracked,
@@ -37,14 +37,14 @@ pub fn of_rays<'g, T: Real>(
     (encoded, width): (impl Iterator<Item = &'g [T]>, usize),
 ) -> OfRays<T> {
     let mut of_samples = slopes(tables.density, block.at(), Cotangents::Shared(density));
-    let shaded_at = block.shaded_at.each_ref().map(|at| &at[..]);
-    let of_shaded = slopes(tables.appearance, shaded_at, Cotangents::Each(products));
-    for (shaded, &sample) in block.shaded.iter().enumerate() {
-        (0..3).for_each(|axis| of_samples[axis][sample as usize] += of_shaded[axis][shaded]);
+    let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
+    let of_groups = slopes(tables.appearance, groups_at, Cotangents::Each(products));
+    for (group, sample, share) in block.groups.shares(block.weight()) {
+        (0..3).for_each(|axis| of_samples[axis][sample] += share * of_groups[axis][group]);
     }
     let rays = block.offsets.len() - 1;
     let mut of_encoded = Buffer::zeros(rays * width);
-    for (row, &ray) in encoded.zip(&block.rays_of_shaded) {
+    for (row, &ray) in encoded.zip(&block.groups.rays) {
         let sums = &mut of_encoded[(ray as usize - block.first) * width..][..width];
         sums.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
     }
