@@ -7,8 +7,10 @@
 mod support;
 
 use autograd::nn::{Activation, Mlp};
+use autograd::optim::{Adam, AdamMode, Optimizer};
 use autograd::random::Stream;
-use autograd::{Buffer, Indices, Tensor, add_rows};
+use autograd::{Buffer, Indices, Module, Param, Tensor, add_rows};
+use plenoxel::field::hash_grid::{HashGrid, Shape};
 use std::hint::black_box;
 use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat};
 
@@ -53,6 +55,47 @@ fn network(args: &Arguments, width: usize) {
     print(&name, Some(median(&forward)), &both, "dense", Some(products * 1e-6 / median(&both)));
 }
 
+/// A hash grid and a network, the density part of Instant-NGP.
+struct Encoded {
+    table: Param<f32>,
+    network: Mlp<f32>,
+}
+
+impl Module<f32> for Encoded {
+    fn visit(&self, f: &mut dyn FnMut(&Param<f32>)) {
+        f(&self.table);
+        self.network.visit(f);
+    }
+
+    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<f32>)) {
+        f(&mut self.table);
+        self.network.visit_mut(f);
+    }
+}
+
+/// A training step of a hash grid (16 levels of two features, 16 to 2048 nodes a side, 2¹⁹ rows a level) with the layers 32, 64, 16 at 262 144 positions:
+/// forward, adjoint of the mean square, Adam of the rows that were read.
+fn hash_step(args: &Arguments) {
+    const NAME: &str = "hash_step";
+    if !args.wants(NAME) {
+        return;
+    }
+    let growth = 128f64.powf(1.0 / 15.0);
+    let grid = HashGrid::new(Shape { levels: 16, features: 2, log2_rows: 19, base: 16, growth });
+    let table = Param::from_tensor("table", tensor(&[grid.rows(), 2], 1) * 1e-4);
+    let mut model = Encoded { table, network: Mlp::new("net", &[32, 64, 16], Activation::Relu, &Stream::new(1)) };
+    let positions = tensor(&[1 << 18, 3], 2);
+    let forward = |model: &Encoded| model.network.forward(&grid.encode(model.table.tensor(), &positions));
+    let values = repeat(args.repeats, || drop(black_box(autograd::no_grad(|| forward(&model)))));
+    let (mut adam, mut steps) = (Adam::new(1e-3, AdamMode::Lazy), 0);
+    let times = repeat(args.repeats, || {
+        let gradients = forward(&model).square().mean().backward();
+        adam.step(&mut model, &gradients, steps);
+        steps += 1;
+    });
+    print(NAME, Some(median(&values)), &times, "rows", None);
+}
+
 fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str, gflop_per_s: Option<f64>) {
     let row = serde_json::json!({
         "workload": format!("op:{name}"), "fwd_ms": forward, "ms": median(both), "ms_min": both[0], "ms_max": both[both.len() - 1],
@@ -82,6 +125,7 @@ fn run() {
     for width in [16, 64, 128, 256] {
         network(&args, width);
     }
+    hash_step(&args);
     row(&args, "sum_16M", &[&[16_000_000]], |x| x[0].sum());
     for width in [4, 28] {
         let name = format!("scatter_add{width}");

@@ -69,8 +69,10 @@ fn rays(count: usize) -> Vec<Ray> {
 
 #[test]
 fn pictures_have_the_pixels_of_renderings() {
-    for region in [IN_BOX, NDC, CONTRACTED] {
-        let model = wide(Config { group_in_pictures: 0.02, color_above: 1e-3, stop_below_in_pictures: 1e-3, ..tiny(&[(30, 1)]) }, region);
+    for (region, compact_groups) in [IN_BOX, NDC, CONTRACTED].into_iter().flat_map(|region| [(region, false), (region, true)]) {
+        let config =
+            Config { group_in_pictures: 0.02, compact_groups, color_above: 1e-3, stop_below_in_pictures: 1e-3, ..tiny(&[(30, 1)]) };
+        let model = wide(config, region);
         let rays = if region == IN_BOX { rays(200) } else { rays_of_a_capture(200) };
         let viewer = model.viewer(&ViewOptions::over([1.0; 3]));
         // The first rays are rendered without a table.
@@ -196,6 +198,22 @@ fn small_gradients_of_the_density_can_be_left_out() {
 }
 
 #[test]
+fn groups_with_a_drawn_member_do_not_change_the_expected_color() {
+    let rays = rays(1);
+    let color = |group: f64, step: u64| {
+        let model = wide(Config { group, color_above: 0.0, ..tiny(&[(9, 1)]) }, IN_BOX);
+        let pass = Pass { jitter: Jitter::PerRay { seed: 3, step }, ..PASS };
+        model.render(&rays, &pass).rgb.data()[0]
+    };
+    const DRAWS: u64 = 4000;
+    let mean = |group: f64| (0..DRAWS).map(|step| color(group, step)).sum::<f64>() / DRAWS as f64;
+    let spread = (0..100).map(|step| (color(0.5, step) - color(0.0, step)).powi(2)).sum::<f64>().sqrt() / 10.0;
+    let off = (mean(0.5) - mean(0.0)).abs();
+    // Four standard deviations of the mean, with the seed above.
+    assert!(spread > 0.0 && off < 4.0 * spread / (DRAWS as f64).sqrt(), "{off} with a spread of {spread}");
+}
+
+#[test]
 fn pictures_have_a_distance_of_samples_of_their_own() {
     let rays = rays(40);
     let samples = |step_in_pictures, jitter| {
@@ -211,11 +229,12 @@ fn pictures_have_a_distance_of_samples_of_their_own() {
 #[test]
 fn training_has_the_same_bits_for_any_number_of_threads() {
     let (train, _) = views();
-    let trained = |threads: usize| {
+    let trained = |threads: usize, compact_groups: bool| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
+            let config = tiny(&[(16, 30), (24, 30)]);
             let config =
-                Config { density_components: 16, appearance_components: 16, group: 0.1, stop_below: 1e-3, ..tiny(&[(16, 30), (24, 30)]) };
+                Config { density_components: 16, appearance_components: 16, group: 0.1, compact_groups, stop_below: 1e-3, ..config };
             let objective = Objective::new().with("mse", 1.0, mse);
             let model = Tensorf::<f32>::new(config, BOX, 42).expect("valid settings");
             let mut trainer = Trainer::with_model(model, &train[..], objective, TrainOptions::default()).expect("a trainer");
@@ -225,8 +244,10 @@ fn training_has_the_same_bits_for_any_number_of_threads() {
             bits
         })
     };
-    let want = trained(1);
-    assert!([2, 3].into_iter().all(|threads| trained(threads) == want));
+    for compact_groups in [false, true] {
+        let want = trained(1, compact_groups);
+        assert!([2, 3].into_iter().all(|threads| trained(threads, compact_groups) == want));
+    }
 }
 
 #[test]

@@ -164,3 +164,28 @@ fn a_sweep_survives_a_failed_run_and_repeats_only_that() {
     assert_eq!((code, err.matches("already finished").count()), (Some(0), 6), "{err}");
     fs::remove_dir_all(root).expect("it is removed");
 }
+
+#[test]
+fn runs_that_were_planned_by_time_are_recognized() {
+    let root = folder("planned");
+    let methods = r#"
+        [[methods]]
+        preset = "demo"
+        time = "1s"
+        set = ["rays_per_step=200", "stages=[{resolution=6, steps=4, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]"]
+        [[methods]]
+        preset = "quality"
+        time = "3s"
+        "#;
+    fs::write(root.join("plan.toml"), format!("[[scenes]]\nscene_size = 24\nscene_views = [4, 0, 1]\n{methods}")).expect("the file");
+    let (code, _, err) = plenoxel(&root, &["sweep", "plan.toml"]);
+    assert_eq!(code, Some(0), "{err}");
+    let (_, out, err) = plenoxel(&root, &["sweep", "plan.toml", "--dry-run"]);
+    assert_eq!(out.matches("finished").count(), 2, "{out}{err}");
+    // Other settings make other runs.
+    fs::write(root.join("plan.toml"), format!("set = [\"seed=5\"]\n[[scenes]]\nscene_size = 24\nscene_views = [4, 0, 1]\n{methods}"))
+        .expect("the file");
+    let (_, out, _) = plenoxel(&root, &["sweep", "plan.toml", "--dry-run"]);
+    assert_eq!(out.matches("seed is 42, not 5").count(), 2, "{out}");
+    fs::remove_dir_all(root).expect("it is removed");
+}

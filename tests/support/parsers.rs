@@ -492,7 +492,8 @@ fn records() -> Vec<Vec<u8>> {
     };
     let folder = record("{\"kind\": \"folder\", \"path\": \"/data/lego\"}");
     let built_in = record("{\"kind\": \"built_in\", \"width\": 20, \"height\": 10, \"train\": 5, \"val\": 0, \"test\": 2}");
-    vec![folder.into(), built_in.into()]
+    let planned = folder.replace("\"preset\"", "\"seconds_planned\": 9.5, \"asked\": {\"seed\": \"7\"}, \"preset\"");
+    vec![folder.into(), built_in.into(), planned.into()]
 }
 
 fn read_record(path: &Path, bytes: &[u8]) -> Result<Then, String> {

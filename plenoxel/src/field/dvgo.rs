@@ -186,7 +186,7 @@ impl<T: Real> DenseGrid<T> {
         let sigma = self.density_in_cells(&cells);
         let weights = weights(samples, &sigma);
         let groups = grouping.groups(weights.data(), [samples.t.data(), samples.delta.data()], &samples.offsets, 0, jitter);
-        let at = groups.mean_positions(weights.data(), &cells);
+        let at = groups.positions(weights.data(), &cells);
         let rgb = self.colors(&at, &samples.directions, &Indices::from(groups.rays.clone()));
         Radiance { sigma, rgb: groups.colors_of_samples(&rgb) }
     }

@@ -6,29 +6,29 @@ use autograd::{Buffer, Indices, Real, Tensor};
 use std::ops::Range;
 
 /// Which samples have their own color. Consecutive samples of a ray form a group as soon as their weights sum to `weight`. The color network is evaluated at one
-/// position of the group, and gives its color to all members.
+/// position of the group, and gives its color to all members: an approximation of the color of each sample, exact for a `weight` of 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Grouping {
     /// Weight that completes a group; 0 for groups of one sample.
     pub weight: f64,
     /// Groups whose weight is not above this have no color.
     pub above: f64,
-    /// True: the position is the mean of those of the members, weighted by their weights, which are constants for gradients; a group whose weight is above
-    /// `above` also ends at a gap between samples and with [`MOST`] members. False: it is the position of one member, which is drawn with a probability
+    /// True: the position is the mean of those of the members, weighted by their weights, which are constants for gradients. A group whose weight is above
+    /// `above` also ends at a gap between samples, and when it has [`MOST_MEMBERS`]. False: it is the position of one member, which is drawn with a probability
     /// proportional to its weight, so that the expected color of a pixel does not change. Without jitter, the member at half the weight is chosen.
     pub compact: bool,
 }
 
-/// Largest number of samples in a compact group.
-pub const MOST: usize = 8;
+/// Number of samples with which a compact group ends.
+pub const MOST_MEMBERS: usize = 8;
 
 /// Groups of the samples of some rays.
 #[derive(Debug)]
 pub(crate) struct Groups {
     /// Number of the group of each sample, or [`Groups::NONE`].
     pub of: Buffer<u32>,
-    /// Samples of each group at whose mean position the color network is evaluated: all or one.
-    pub shaded: Vec<Range<u32>>,
+    /// Samples whose mean position is that of the group: all members, or the one that was drawn.
+    pub sources: Vec<Range<u32>>,
     /// Number of the ray of each group.
     pub rays: Vec<u32>,
 }
@@ -37,17 +37,25 @@ impl Groups {
     /// Marker for a sample without a color.
     pub const NONE: u32 = u32::MAX;
 
-    /// Returns all shaded samples: the number of the group, that of the sample, and the share of the sample in the position of the group.
+    /// Returns the number of groups.
+    pub fn len(&self) -> usize {
+        self.sources.len()
+    }
+
+    /// Returns the sources of all groups: the number of the group, that of the sample, and the share of the sample in the position of the group.
     pub fn shares<'a, T: Real>(&'a self, weights: &'a [T]) -> impl Iterator<Item = (usize, usize, T)> {
-        self.shaded.iter().enumerate().flat_map(move |(group, shaded)| {
-            let members = shaded.start as usize..shaded.end as usize;
-            let sum: T = weights[members.clone()].iter().copied().sum();
-            members.map(move |i| (group, i, weights[i] / sum))
+        self.sources.iter().enumerate().flat_map(move |(group, sources)| {
+            let sources = sources.start as usize..sources.end as usize;
+            let sum: T = weights[sources.clone()].iter().copied().sum();
+            sources.map(move |i| (group, i, weights[i] / sum))
         })
     }
 
-    /// Returns the mean positions of the groups, `[g, 3]`, from those of the samples, `[m, 3]`.
-    pub fn mean_positions<T: Real>(&self, weights: &[T], positions: &Tensor<T>) -> Tensor<T> {
+    /// Returns the positions of the groups, `[g, 3]`, from those of the samples, `[m, 3]`.
+    pub fn positions<T: Real>(&self, weights: &[T], positions: &Tensor<T>) -> Tensor<T> {
+        if self.sources.iter().all(|sources| sources.len() == 1) {
+            return positions.gather_rows(&Indices::from(self.sources.iter().map(|sources| sources.start).collect::<Vec<_>>()));
+        }
         let (mut groups, mut samples, mut shares) = (Vec::new(), Vec::new(), Vec::new());
         for (group, sample, share) in self.shares(weights) {
             groups.push(group as u32);
@@ -55,14 +63,16 @@ impl Groups {
             shares.push(share);
         }
         let shares = Tensor::from_vec(shares, &[samples.len(), 1]);
-        (positions.gather_rows(&Indices::from(samples)) * shares).scatter_rows(&Indices::from(groups), self.shaded.len())
+        (positions.gather_rows(&Indices::from(samples)) * shares).scatter_rows(&Indices::from(groups), self.len())
     }
 
     /// Returns the colors of the samples, `[m, 3]`, from those of the groups, `[g, 3]`.
     pub fn colors_of_samples<T: Real>(&self, colors: &Tensor<T>) -> Tensor<T> {
         let members = self.of.iter().zip(0u32..).filter(|(group, _)| **group != Groups::NONE);
         let (groups, colored): (Vec<u32>, Vec<u32>) = members.unzip();
-        colors.gather_rows(&Indices::from(groups)).scatter_rows(&Indices::from(colored), self.of.len())
+        // Groups of one sample are in the order of the samples.
+        let colors = if colored.len() == self.len() { colors.clone() } else { colors.gather_rows(&Indices::from(groups)) };
+        colors.scatter_rows(&Indices::from(colored), self.of.len())
     }
 }
 
@@ -77,7 +87,7 @@ impl Grouping {
         const TOUCHING: f64 = 0.51;
         let (limit, above, touching) = (T::lit(self.weight), T::lit(self.above), T::lit(TOUCHING));
         let mut of = Buffer::stale(weights.len());
-        let (mut shaded, mut rays) = (Vec::new(), Vec::new());
+        let (mut sources, mut rays) = (Vec::new(), Vec::new());
         for (r, own) in offsets.windows(2).enumerate() {
             let (start, end) = (own[0] as usize, own[1] as usize);
             let mut draws = Draws { jitter, ray: first + r, drawn: 0 };
@@ -85,16 +95,16 @@ impl Grouping {
             for i in start..end {
                 sum += weights[i];
                 let next = i + 1;
-                let ends = || next - begin >= MOST || t[next] - t[i] > touching * (delta[next] + delta[i]);
+                let ends = || next - begin >= MOST_MEMBERS || t[next] - t[i] > touching * (delta[next] + delta[i]);
                 if sum < limit && next < end && !(self.compact && sum > above && ends()) {
                     continue;
                 }
                 let members = begin..next;
                 let number = if sum > above {
-                    let from = if self.compact { members.clone() } else { draws.member(&weights[members.clone()], sum, begin) };
-                    shaded.push(from.start as u32..from.end as u32);
+                    let own = if self.compact { members.clone() } else { draws.member(&weights[members.clone()], sum, begin) };
+                    sources.push(own.start as u32..own.end as u32);
                     rays.push((first + r) as u32);
-                    shaded.len() as u32 - 1
+                    sources.len() as u32 - 1
                 } else {
                     Groups::NONE
                 };
@@ -102,7 +112,7 @@ impl Grouping {
                 (begin, sum) = (next, T::zero());
             }
         }
-        Groups { of, shaded, rays }
+        Groups { of, sources, rays }
     }
 }
 
@@ -138,6 +148,10 @@ impl Draws {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::Ray;
+    use crate::geometry::Aabb;
+    use crate::sampling::{Spacing, sample};
+    use glam::DVec3;
 
     /// Groups of two rays without jitter, the first with `weights` at unit distances but for a gap before sample 5, the second with the last of the `weights`.
     fn groups(grouping: Grouping, weights: &[f64]) -> Groups {
@@ -150,28 +164,28 @@ mod tests {
     fn compact_groups_end_at_gaps_and_when_they_have_many_members() {
         let weights = [0.1, 0.1, 0.2, 0.05, 0.01, 0.1, 0.01, 0.2];
         let found = groups(Grouping { weight: 0.15, above: 0.02, compact: true }, &weights);
-        assert_eq!(found.shaded, [0..2, 2..3, 3..5, 5..7, 7..8]);
+        assert_eq!(found.sources, [0..2, 2..3, 3..5, 5..7, 7..8]);
         assert_eq!(found.of[..], [0, 0, 1, 2, 2, 3, 3, 4]);
         assert_eq!(found.rays, [7, 7, 7, 7, 8]);
         // A group that would have no color goes on.
-        assert_eq!(groups(Grouping { weight: 0.3, above: 0.07, compact: true }, &weights).shaded, [0..3, 3..7, 7..8]);
+        assert_eq!(groups(Grouping { weight: 0.3, above: 0.07, compact: true }, &weights).sources, [0..3, 3..7, 7..8]);
         let fog = groups(Grouping { weight: 0.5, above: 0.0, compact: true }, &[1e-3; 25]);
-        let lengths: Vec<usize> = fog.shaded.iter().map(Range::len).collect();
+        let lengths: Vec<usize> = fog.sources.iter().map(Range::len).collect();
         assert_eq!(lengths, [5, 8, 8, 3, 1]);
-        assert_eq!(groups(Grouping::NONE, &weights).shaded.len(), weights.len());
+        assert_eq!(groups(Grouping::NONE, &weights).sources.len(), weights.len());
     }
 
     #[test]
     fn other_groups_end_with_their_weight_and_have_the_position_of_one_member() {
         let weights = [0.1, 0.1, 0.2, 0.05, 0.01, 0.1, 0.01, 0.2];
         let found = groups(Grouping { weight: 0.15, above: 0.02, compact: false }, &weights);
-        assert_eq!(found.shaded, [1..2, 2..3, 5..6, 7..8]);
+        assert_eq!(found.sources, [1..2, 2..3, 5..6, 7..8]);
         assert_eq!(found.of[..], [0, 0, 1, 2, 2, 2, Groups::NONE, 3]);
         // With jitter, a member is drawn as often as its weight says.
         let grouping = Grouping { weight: 0.5, above: 0.0, compact: false };
         let drawn = |step: u64| {
             let jitter = Jitter::PerRay { seed: 3, step };
-            grouping.groups(&[0.1, 0.3, 0.1], [&[0.0, 1.0, 2.0], &[1.0; 3]], &[0, 3], 0, jitter).shaded[0].start
+            grouping.groups(&[0.1, 0.3, 0.1], [&[0.0, 1.0, 2.0], &[1.0; 3]], &[0, 3], 0, jitter).sources[0].start
         };
         const DRAWS: u64 = 4000;
         let share = (0..DRAWS).filter(|&step| drawn(step) == 1).count() as f64 / DRAWS as f64;
@@ -180,15 +194,31 @@ mod tests {
     }
 
     #[test]
-    fn mean_positions_are_those_of_the_matter_and_colors_return_to_the_members() {
+    fn positions_are_those_of_the_matter_and_colors_return_to_the_members() {
         let weights = [0.1, 0.3, 0.0, 0.2];
         let found = groups(Grouping { weight: 0.4, above: 0.0, compact: true }, &weights);
-        assert_eq!(found.shaded, [0..2, 3..4]);
+        assert_eq!(found.sources, [0..2, 3..4]);
         let positions = Tensor::from_vec(vec![0.0, 4.0, 8.0, 4.0, 4.0, 0.0, 9.0, 9.0, 9.0, 1.0, 2.0, 3.0], &[4, 3]);
-        let means = found.mean_positions(&weights, &positions);
+        let means = found.positions(&weights, &positions);
         let want = [3.0, 4.0, 2.0, 1.0, 2.0, 3.0];
         assert!(means.data().iter().zip(want).all(|(a, b): (&f64, f64)| (a - b).abs() < 1e-12));
         let colors = found.colors_of_samples(&Tensor::from_vec(vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0], &[2, 3]));
         assert_eq!(colors.data(), [1.0, 2.0, 3.0, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 4.0, 5.0, 6.0]);
+    }
+
+    #[test]
+    fn jitter_makes_no_gaps() {
+        let ray = Ray { origin: DVec3::new(-0.3, 0.2, 4.0), direction: DVec3::new(0.1, -0.05, -1.0).normalize(), stretch: 1.0 };
+        for spacing in [Spacing::Step(0.05), Spacing::Contracted(0.05)] {
+            for step in 0..50 {
+                let jitter = Jitter::PerRay { seed: 5, step };
+                let samples = sample::<f32>(&[ray], &Aabb::cube(1.5), spacing, jitter, None);
+                let weights = vec![1e-6; samples.len()];
+                let grouping = Grouping { weight: 0.5, above: 0.0, compact: true };
+                let groups = grouping.groups(&weights, [samples.t.data(), samples.delta.data()], &samples.offsets, 0, jitter);
+                let (_, full) = groups.sources.split_last().expect("samples");
+                assert!(full.len() > 4 && full.iter().all(|sources| sources.len() == MOST_MEMBERS), "{spacing:?}, {step}");
+            }
+        }
     }
 }

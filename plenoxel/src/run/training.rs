@@ -32,6 +32,7 @@ use super::folder::{NewFolder, RunFolder, RunKind, RunRecord};
 use super::machine;
 use super::memory::{self, Estimate};
 use super::metrics::{History, MetricsFile};
+use super::settings;
 use crate::checkpoint;
 use crate::dataset::{Dataset, Split, View};
 use crate::error::{Error, Result};
@@ -302,7 +303,7 @@ impl<'s> NewRun<'s> {
         let folder = folder.create()?;
         let record = RunRecord {
             seconds_planned: *time,
-            asked: time.map(|_| Box::new(settings.config.clone())),
+            asked: time.map(|_| settings::values(&settings.config)),
             model: begun.trainer.model().kind().to_owned(),
             ..RunRecord::new(RunKind::Trained, &dataset, preset.as_deref(), data)
         };

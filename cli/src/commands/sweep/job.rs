@@ -173,14 +173,16 @@ impl Asked {
     /// Lists the differences between a run and the requested settings.
     fn differences(&self, config: &Config, record: &RunRecord) -> Vec<String> {
         let found = match (self.time, record.seconds_planned, &record.asked) {
+            (Some(_), None, _) => return vec!["it was not planned by time".to_owned()],
             (Some(seconds), Some(planned), _) if planned != seconds => return vec![format!("time is {planned} s, not {seconds} s")],
-            (Some(_), Some(_), None) => return vec!["an earlier version planned it, which did not record its settings before".to_owned()],
-            // The plan changed them.
-            (Some(_), _, Some(asked)) => asked,
-            _ => config,
+            (Some(_), _, None) => {
+                return vec!["it was planned by an earlier version, which did not record the settings before the plan".to_owned()];
+            }
+            (Some(_), _, Some(asked)) => asked.clone(),
+            (None, ..) => settings::values(config),
         };
         let source = &record.data;
         let data = (source != &self.source).then(|| format!("data is {source}, not {}", self.source));
-        data.into_iter().chain(settings::differences(found, &self.config)).collect()
+        data.into_iter().chain(settings::differences(&found, &settings::values(&self.config))).collect()
     }
 }

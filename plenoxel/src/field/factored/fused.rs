@@ -227,19 +227,19 @@ impl<T: Real> State<T> {
         let (tables, of_rays) = inputs.split_at(adjoint::TABLES);
         let mut offsets = vec![0u32];
         let mut columns: [Vec<T>; 6] = Default::default();
-        let (mut of, mut shaded, mut numbers) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut of, mut sources, mut numbers) = (Vec::new(), Vec::new(), Vec::new());
         for block in &self.blocks {
-            let (first, before) = (columns[0].len() as u32, shaded.len() as u32);
+            let (first, before) = (columns[0].len() as u32, sources.len() as u32);
             let [x, y, z] = block.at();
             for (to, from) in columns.iter_mut().zip([x, y, z, block.t(), block.delta(), block.weight()]) {
                 to.extend_from_slice(from);
             }
             offsets.extend(block.offsets[1..].iter().map(|offset| first + offset));
             of.extend(block.groups.of.iter().map(|&group| if group == Groups::NONE { group } else { before + group }));
-            shaded.extend(block.groups.shaded.iter().map(|shaded| first + shaded.start..first + shaded.end));
+            sources.extend(block.groups.sources.iter().map(|own| first + own.start..first + own.end));
             numbers.extend_from_slice(&block.groups.rays);
         }
-        let groups = Groups { of: of.into(), shaded, rays: numbers };
+        let groups = Groups { of: of.into(), sources, rays: numbers };
         let offsets = Indices::from(offsets);
         let [x, y, z, t, delta, weights] = columns.map(|values| Tensor::from_vec(values, &[groups.of.len()]));
         let cells = Tensor::stack(&[&x, &y, &z], 1);
@@ -251,7 +251,7 @@ impl<T: Real> State<T> {
         };
         let cells = samples.positions.clone();
         let directions = encoded.gather_rows(&Indices::from(groups.rays.clone()));
-        let colors = super::colors(tables, batch.shape.feature_octaves, &groups.mean_positions(weights.data(), &cells), &directions);
+        let colors = super::colors(tables, batch.shape.feature_octaves, &groups.positions(weights.data(), &cells), &directions);
         let rgb = groups.colors_of_samples(&colors);
         let radiance = Radiance { sigma: super::density(tables, &cells), rgb };
         composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))

@@ -38,7 +38,8 @@ pub struct Config {
     pub group: f64,
     /// Weight that completes a group in pictures.
     pub group_in_pictures: f64,
-    /// True for the color at the mean position of a group; false for that of a member that is drawn.
+    /// True: the color of a group is that of the mean position of its samples, and a group also ends at gaps and with eight samples, in training and in
+    /// pictures. False: it is that of one sample, which is drawn by weight ([`Grouping::compact`](crate::field::grouping::Grouping)).
     pub compact_groups: bool,
     /// Groups of samples whose weight is not above this have no color.
     pub color_above: f64,

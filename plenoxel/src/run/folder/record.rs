@@ -3,11 +3,11 @@
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::files;
-use crate::model::plenoxels::config::Config;
 use crate::model::{self, plenoxels};
 use crate::run::data::DataSource;
 use crate::run::{PROGRAM, machine};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Origin of the grid of a run.
@@ -106,9 +106,9 @@ pub struct RunRecord {
     /// Planned seconds of training, if it was planned by time.
     #[serde(default)]
     pub seconds_planned: Option<f64>,
-    /// Settings before they were planned by time. Runs of earlier versions do not record them.
+    /// Settings before they were planned by time, as [`settings::values`](crate::run::settings::values) returns them. Runs of earlier versions do not record them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub asked: Option<Box<Config>>,
+    pub asked: Option<BTreeMap<String, String>>,
     /// The field that was baked, for a baked run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baked: Option<Baked>,

@@ -5,9 +5,8 @@ use crate::model::plenoxels::config::Config;
 use std::collections::{BTreeMap, BTreeSet};
 use toml::Value;
 
-/// The keys whose values differ from the requested ones, each as `key is x, not y`.
-pub fn differences(found: &Config, asked: &Config) -> Vec<String> {
-    let (found, asked) = (values(found), values(asked));
+/// The keys whose [`values`] differ from the requested ones, each as `key is x, not y`.
+pub fn differences(found: &BTreeMap<String, String>, asked: &BTreeMap<String, String>) -> Vec<String> {
     let keys: BTreeSet<&String> = found.keys().chain(asked.keys()).collect();
     let said = |value: Option<&String>| value.map_or_else(|| "unset".to_owned(), String::clone);
     let differs = keys.into_iter().filter(|key| found.get(*key) != asked.get(*key));
@@ -30,12 +29,12 @@ mod tests {
     #[test]
     fn differences_are_named_by_key_with_both_values() {
         let found = Config::default();
-        assert!(differences(&found, &found).is_empty());
+        assert!(differences(&values(&found), &values(&found)).is_empty());
         let mut asked = found.clone();
         asked.seed = 7;
         asked.stages.truncate(1);
         asked.stages[0].resolution = 5;
-        let said = differences(&found, &asked);
+        let said = differences(&values(&found), &values(&asked));
         assert!(said.contains(&"seed is 42, not 7".to_owned()), "{said:?}");
         let resolution = format!("stages[0].resolution is {}, not 5", found.stages[0].resolution);
         assert!(said.contains(&resolution), "{said:?}");

@@ -2,6 +2,7 @@ use super::*;
 use crate::commands::sweep::job::State;
 use crate::commands::table::figures;
 use plenoxel::run::folder::{RunFolder, RunKind, RunRecord};
+use plenoxel::run::settings::values;
 use std::ffi::OsString;
 use std::path::PathBuf;
 
@@ -223,7 +224,7 @@ fn a_plan_by_time_is_compared_by_its_settings_before() {
     let mut record = RunRecord {
         model: "tensorf".to_owned(),
         seconds_planned: Some(9.0),
-        asked: Some(Box::new(job.asked.config.clone())),
+        asked: Some(values(&job.asked.config)),
         ..RunRecord::of_scene(RunKind::Trained, "procedural", "built in", &job.asked.source)
     };
     let state = |record: &RunRecord| {
@@ -234,10 +235,12 @@ fn a_plan_by_time_is_compared_by_its_settings_before() {
         state
     };
     assert_eq!(state(&record), State::CutShort);
-    record.asked.as_mut().unwrap().seed += 1;
+    record.asked.as_mut().unwrap().insert("seed".to_owned(), "43".to_owned());
     assert!(matches!(state(&record), State::Different(found) if found.contains("seed")));
     record.asked = None;
     assert!(matches!(state(&record), State::Different(found) if found.contains("earlier version")));
-    record.seconds_planned = Some(10.0);
-    assert!(matches!(state(&record), State::Different(found) if found.contains("10 s, not 9 s")));
+    for (seconds, part) in [(Some(10.0), "10 s, not 9 s"), (None, "not planned by time")] {
+        record.seconds_planned = seconds;
+        assert!(matches!(state(&record), State::Different(found) if found.contains(part)));
+    }
 }

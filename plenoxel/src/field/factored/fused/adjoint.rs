@@ -32,7 +32,7 @@ struct Part<T: Real> {
     products: Buffer<T>,
     /// Samples of `density`, sorted by the rows of each plane that they read.
     density_rows: [Sorted; 3],
-    /// Shaded samples, likewise.
+    /// Groups, sorted likewise.
     product_rows: [Sorted; 3],
 }
 
@@ -209,7 +209,7 @@ fn part<T: Real>(
 ) -> (Part<T>, Vec<Buffer<T>>, Option<OfRays<T>>) {
     let batch = &state.batch;
     let mut of_features = Buffer::stale(block.len());
-    let mut rgb = Buffer::zeros(3 * block.groups.shaded.len());
+    let mut rgb = Buffer::zeros(3 * block.groups.len());
     match output {
         Output::Sparsity => {
             for (own, &g) in block.rays().zip(&cotangent.data()[block.first..]) {

@@ -221,7 +221,7 @@ impl<'a, T: Real> Scene<'a, T> {
             first,
             offsets,
             columns,
-            groups: Groups { of: Buffer::stale(0), shaded: Vec::new(), rays: Vec::new() },
+            groups: Groups { of: Buffer::stale(0), sources: Vec::new(), rays: Vec::new() },
             groups_at: std::array::from_fn(|_| Buffer::stale(0)),
             activations: Activations::default(),
         }
@@ -230,7 +230,7 @@ impl<'a, T: Real> Scene<'a, T> {
     /// Forms the groups of each ray and computes their positions.
     fn form_groups(&self, block: &mut Block<T>) {
         let groups = self.batch.grouping.groups(block.weight(), [block.t(), block.delta()], &block.offsets, block.first, self.batch.jitter);
-        let mut means = [0, 1, 2].map(|_| Buffer::zeros(groups.shaded.len()));
+        let mut means = [0, 1, 2].map(|_| Buffer::zeros(groups.len()));
         let at = block.at();
         for (group, sample, share) in groups.shares(block.weight()) {
             (0..3).for_each(|axis| means[axis][group] += share * at[axis][sample]);
@@ -241,7 +241,7 @@ impl<'a, T: Real> Scene<'a, T> {
     /// Evaluates the color network.
     fn shade(&self, block: &mut Block<T>) {
         let pairs = self.tables.appearance;
-        let mut products = Buffer::stale(block.groups.shaded.len() * 3 * pairs.width);
+        let mut products = Buffer::stale(block.groups.len() * 3 * pairs.width);
         for (run, products) in products.chunks_mut(RUN * 3 * pairs.width).enumerate() {
             let range = run * RUN..run * RUN + products.len() / (3 * pairs.width);
             let at = block.groups_at.each_ref().map(|at| &at[range.clone()]);

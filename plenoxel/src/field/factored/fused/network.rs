@@ -1,4 +1,4 @@
-//! The color network on arrays: forward and adjoint for the samples of one block.
+//! The color network on arrays: forward and adjoint for the groups of samples of one block.
 
 use super::super::Shape;
 use autograd::{Buffer, Matrix, Real, Tensor, dispatched, multiply, parallel};
@@ -20,7 +20,7 @@ pub struct Network<'a, T> {
     layers: Vec<Layer<'a, T>>,
 }
 
-/// Values of m samples that the adjoint reads.
+/// Values of m groups that the adjoint reads.
 #[derive(Debug, Default)]
 pub struct Activations<T: Real> {
     /// Products plane · line, `[m, 3 R]`.
@@ -31,7 +31,7 @@ pub struct Activations<T: Real> {
     pub rgb: Buffer<T>,
 }
 
-/// Cotangents of the network for m samples.
+/// Cotangents of the network for m groups.
 pub struct OfNetwork<T: Real> {
     /// Cotangents of the products, `[m, 3 R]`.
     pub products: Buffer<T>,
@@ -57,7 +57,7 @@ impl<'a, T: Real> Network<'a, T> {
         }
     }
 
-    /// Computes the colors from products and encoded directions: `direction(i)` is the encoded direction of sample i.
+    /// Computes the colors from products and encoded directions: `direction(i)` is the encoded direction of group i.
     pub fn forward(&self, products: Buffer<T>, direction: impl Fn(usize) -> &'a [T]) -> Activations<T> {
         let m = products.len() / self.products;
         let mut features = Buffer::stale(m * self.features);
@@ -90,7 +90,7 @@ impl<'a, T: Real> Network<'a, T> {
         Activations { products, inputs, rgb }
     }
 
-    /// Returns the cotangents of encoded directions, one row for each sample, from those of the input of the first layer.
+    /// Returns the cotangents of encoded directions, one row for each group, from those of the input of the first layer.
     pub fn of_direction<'g>(&self, input: &'g [T]) -> impl Iterator<Item = &'g [T]> {
         let encoded = self.features * (1 + 2 * self.octaves);
         input.chunks_exact(self.layers[0].inputs).map(move |row| &row[encoded..])
