@@ -286,7 +286,7 @@ fn text_of(config: &Config) -> String {
 
 /// True for values of another type that a key also accepts.
 fn is_another_form(path: &str, text: &str) -> bool {
-    let flags = ["aim", "jitter", "project", "initial.random", "tensorf.lazy"];
+    let flags = ["aim", "jitter", "project", "initial.random", "tensorf.lazy", "tensorf.compact_groups"];
     text == "true" && flags.contains(&path)
         || path == "stages" && text == "[]"
         || path == "capture.scale" && text.parse::<f64>().is_ok()
