@@ -64,26 +64,17 @@ impl<'a, T: Real> Viewer<'a, T> {
     /// Errors if `seen` does; the comparison then stops.
     pub fn compare(&self, views: &[View], mut seen: impl FnMut(usize, &View, &Array3<f32>, &Picture) -> Result<()>) -> Result<Scores> {
         let mut per_view = Vec::with_capacity(views.len());
-        let mut rendered = views.first().map(|view| self.see(&view.camera));
         for (i, view) in views.iter().enumerate() {
-            let Some(picture) = rendered.take() else { break };
-            // Comparing uses one thread for a part of the time; the next view is rendered meanwhile.
-            let next = || views.get(i + 1).map(|view| self.see(&view.camera));
-            let ((score, target), following) = rayon::join(|| score(view, &picture, self.background), next);
-            per_view.push(score);
+            let picture = self.see(&view.camera);
+            let target = view.composite(self.background);
+            let mse = mse(view, &picture.rgb, &target);
+            let compared = kept(view, &picture.rgb, &target);
+            let (ssim, ssim_same) = metrics::ssims(picture.rgb.view(), compared.view());
+            per_view.push(ViewScore { name: view.name.clone(), psnr: metrics::psnr_of(mse), mse, ssim, ssim_same });
             seen(i, view, &target, &picture)?;
-            rendered = following;
         }
         Ok(Scores { per_view })
     }
-}
-
-/// Compares the image of a view with its photograph over a background; returns the photograph too.
-fn score(view: &View, picture: &Picture, background: [f32; 3]) -> (ViewScore, Array3<f32>) {
-    let target = view.composite(background);
-    let mse = mse(view, &picture.rgb, &target);
-    let (ssim, ssim_same) = metrics::ssims(picture.rgb.view(), kept(view, &picture.rgb, &target).view());
-    (ViewScore { name: view.name.clone(), psnr: metrics::psnr_of(mse), mse, ssim, ssim_same }, target)
 }
 
 /// Scores of one view.

@@ -47,9 +47,8 @@ const BASE: u64 = 60_000_000;
 const CARVING_PIXELS: u64 = 1 << 16;
 /// Bytes per pixel of rendered pictures: five numbers each for colors and normals, their encoded form, and the file.
 const PICTURE_BYTES: u64 = 100;
-/// Bytes per pixel of a view during its comparison with the photograph: the picture, the photograph in floats, both in double precision for SSIM, and the
-/// picture of the next view.
-const COMPARED_BYTES: u64 = 102;
+/// Bytes per pixel of a view during its comparison with the photograph: the picture, the photograph in floats, and both in double precision for SSIM.
+const COMPARED_BYTES: u64 = 82;
 /// Bytes per pixel of a view while its panel is drawn at the end of training: picture, photograph, error and depth, all four side by side in floats
 /// and in 8 bits, and the mean of the training images.
 const DRAWN_BYTES: u64 = 130;
