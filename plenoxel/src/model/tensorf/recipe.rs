@@ -153,9 +153,9 @@ fn bytes_of_planes(config: &Config, resolution: usize) -> u64 {
     (LONG * planes * nodes * components) as u64 * size_of::<f32>() as u64
 }
 
-/// Bytes of a ray of a factored field: of its samples, and of the samples at which the color network is evaluated.
+/// Bytes of a ray of a factored field: of its samples, and of the groups for which the color network is evaluated.
 fn bytes_of_ray(config: &Config, engine: Engine) -> u64 {
-    // Measured on lego; in the first stage, a ray has more samples with a color.
+    // Measured on lego with one drawn sample in each group; in the first stage, a ray has more groups.
     const SAMPLES: u64 = 24;
     const COLORED: u64 = 6;
     let of_sample = 120 + if engine == Engine::Graph { 400 * config.density_components as u64 } else { 0 };
