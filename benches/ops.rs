@@ -10,7 +10,14 @@ use autograd::nn::{Activation, Mlp};
 use autograd::optim::{Adam, AdamMode, Optimizer};
 use autograd::random::Stream;
 use autograd::{Buffer, Indices, Module, Param, Tensor, add_rows};
+use glam::DVec3;
+use plenoxel::camera::Ray;
+use plenoxel::field::encoding::Directions;
+use plenoxel::field::factored::{self, Factored};
 use plenoxel::field::hash_grid::{HashGrid, Shape};
+use plenoxel::geometry::Aabb;
+use plenoxel::render::{Engine, RenderOptions, render};
+use plenoxel::sampling::{Jitter, Spacing};
 use std::hint::black_box;
 use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat};
 
@@ -96,6 +103,39 @@ fn hash_step(args: &Arguments) {
     print(NAME, Some(median(&values)), &times, "rows", None);
 }
 
+/// A training step of a factored field of the sizes of the preset `quality`, with 300 nodes a side, in thin fog: 4096 rays of 64 samples, each with a color.
+fn planes_step(args: &Arguments) {
+    const NAME: &str = "planes_step";
+    if !args.wants(NAME) {
+        return;
+    }
+    let (directions, aabb) = (Directions::Harmonics(3), Aabb { min: DVec3::NEG_ONE, max: DVec3::ONE });
+    let shape =
+        factored::Shape { density_components: 16, appearance_components: 48, features: 32, hidden: 128, feature_octaves: 0, directions };
+    let mut model = Factored::<f32>::new(shape, aabb, [300; 3], &Stream::new(1));
+    let starts = numbers(2 * 4096, 2);
+    let origins = starts.as_chunks::<2>().0.iter().map(|&[x, y]| DVec3::new(2.0 * f64::from(x) - 1.0, 2.0 * f64::from(y) - 1.0, 2.0));
+    let rays: Vec<Ray> = origins.map(|origin| Ray { origin, direction: DVec3::NEG_Z, stretch: 1.0 }).collect();
+    let options = RenderOptions {
+        aabb,
+        spacing: Spacing::Step(2.0 / 64.0),
+        jitter: Jitter::None,
+        background: [1.0; 3],
+        occupancy: None,
+        engine: Engine::Fused,
+        stop_below: 0.0,
+    };
+    assert_eq!(render(&model, &rays, &options).sample_count, 4096 * 64, "samples of the script it is compared with");
+    let values = repeat(args.repeats, || drop(black_box(autograd::no_grad(|| render(&model, &rays, &options)))));
+    let (mut adam, mut steps) = (Adam::new(1e-3, AdamMode::Lazy), 0);
+    let times = repeat(args.repeats, || {
+        let gradients = render(&model, &rays, &options).rgb.square().mean().backward();
+        adam.step(&mut model, &gradients, steps);
+        steps += 1;
+    });
+    print(NAME, Some(median(&values)), &times, "rows", None);
+}
+
 fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str, gflop_per_s: Option<f64>) {
     let row = serde_json::json!({
         "workload": format!("op:{name}"), "fwd_ms": forward, "ms": median(both), "ms_min": both[0], "ms_max": both[both.len() - 1],
@@ -126,6 +166,7 @@ fn run() {
         network(&args, width);
     }
     hash_step(&args);
+    planes_step(&args);
     row(&args, "sum_16M", &[&[16_000_000]], |x| x[0].sum());
     for width in [4, 28] {
         let name = format!("scatter_add{width}");

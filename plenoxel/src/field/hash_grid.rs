@@ -5,7 +5,8 @@
 //!
 //! A level has min(N³ rounded up to a multiple of 8, 2ᵀ) rows of a common table. If all N³ nodes have a row, node (i, j, k) has row
 //! i + j N + k N², modulo the number of rows. Otherwise nodes share rows: (i xor j · 2654435761 xor k · 805459861) mod 2ᵀ, in 32 bits. These
-//! are the conventions of tiny-cuda-nn.
+//! are the conventions of tiny-cuda-nn, except for the order of the levels in the table: those whose nodes share rows are first, so that each
+//! has one bucket of 2ᵀ rows in the sums of gradients.
 
 mod loops;
 mod sums;
@@ -88,19 +89,23 @@ impl HashGrid {
             "HashGrid: {levels} levels of {features} features; expected 1, 2, 4 or 8 features"
         );
         assert!((3..=24).contains(&log2_rows) && base >= 2 && growth >= 1.0, "HashGrid: invalid sizes {shape:?}");
-        let mut first = 0;
+        let most = 1usize << log2_rows;
         let level = |l: usize| {
             let scale = base as f64 * growth.powi(l as i32) - 1.0;
             let resolution = scale.ceil() as usize + 1;
-            let (most, nodes) = (1usize << log2_rows, resolution.saturating_pow(3));
-            let rows = nodes.saturating_add(7) / 8 * 8;
-            let level = Level { scale, resolution, first, rows: rows.min(most), hashed: nodes > most };
-            first += level.rows;
-            level
+            let nodes = resolution.saturating_pow(3);
+            Level { scale, resolution, first: 0, rows: (nodes.saturating_add(7) / 8 * 8).min(most), hashed: nodes > most }
         };
-        let levels: Arc<[Level]> = (0..levels).map(level).collect();
+        let mut levels: Vec<Level> = (0..levels).map(level).collect();
+        let mut first = 0;
+        for hashed in [true, false] {
+            for level in levels.iter_mut().filter(|level| level.hashed == hashed) {
+                level.first = first;
+                first += level.rows;
+            }
+        }
         assert!(first < 1 << 31, "HashGrid: a table of {first} rows");
-        HashGrid { shape, levels }
+        HashGrid { shape, levels: levels.into() }
     }
 
     /// Returns the sizes.
@@ -183,7 +188,7 @@ impl<T: Real> Kernel<T> for Encode {
         let (positions, g) = (call.input(1), call.cotangent());
         let (places, features) = (positions.data().as_chunks::<3>().0, self.grid.shape.features);
         if call.needs(0) {
-            let sums = sums::HashSums::new(&self.grid, places, g.data());
+            let sums = sums::HashSums { grid: self.grid.clone(), positions: positions.clone(), g: g.clone() };
             out.rows(0, RowSparse::deferred(&[self.grid.rows(), features], Arc::new(sums)));
         }
         if call.needs(1) {

@@ -52,7 +52,7 @@ pub struct HashField<T: Real> {
 impl_module!(HashField { table, density, color });
 
 /// Name of the table.
-pub const TABLE: &str = "table";
+pub const TABLE: &str = "hash_table";
 
 impl<T: Real> HashField<T> {
     /// Creates a field. The table is uniform in ±10⁻⁴; the networks' weights have [`Init::XavierUniform`].

@@ -1,144 +1,137 @@
 //! Adjoint of the table: sums of contributions to its rows, which the optimizer requests one bucket of rows after another.
 //!
-//! Positions are divided into chunks of a size that depends on their number only. Each chunk writes its contributions and sorts them by bucket.
-//! Consecutive positions in the same cell, as along a ray, contribute together.
+//! A bucket has as many rows as the largest level, and its sums stay in the cache. The contributions of all positions to its levels are computed when
+//! they are added; none is stored. Consecutive positions in the same cell, as along a ray, contribute together.
 
 use super::loops::{Cells, TOGETHER, group, with_features};
 use super::{HashGrid, Level};
-use autograd::rows::Buckets;
-use autograd::{Buffer, Real, RowSums, dispatched, parallel};
-
-/// Contributions of a chunk of positions.
-#[derive(Debug)]
-struct Part<T: Real> {
-    buckets: Buckets,
-    /// Rows, sorted by bucket.
-    rows: Buffer<u32>,
-    /// Contributions to the rows, `[rows, features]`.
-    values: Buffer<T>,
-}
+use autograd::{Real, RowSums, Tensor, dispatched, parallel};
+use std::ops::Range;
 
 /// Sums of the contributions to all rows.
 #[derive(Debug)]
 pub struct HashSums<T: Real> {
-    features: usize,
-    parts: Vec<Part<T>>,
-}
-
-/// Returns the base-2 logarithm of the number of rows in a bucket, whose sums fit into the cache of a core.
-fn bucket_shift(features: usize) -> u32 {
-    const NUMBERS: usize = 1 << 15;
-    (NUMBERS / features).ilog2()
+    pub grid: HashGrid,
+    /// Positions `[m, 3]`.
+    pub positions: Tensor<T>,
+    /// Cotangents of their encodings `[m, levels · features]`.
+    pub g: Tensor<T>,
 }
 
 impl<T: Real> HashSums<T> {
-    /// Computes the contributions of positions from the cotangents `g` `[places, levels · features]` of their encodings.
-    pub fn new(grid: &HashGrid, places: &[[T; 3]], g: &[T]) -> Self {
-        let (features, width) = (grid.shape.features, grid.width());
-        let shift = bucket_shift(features);
-        let buckets = grid.rows().div_ceil(1 << shift);
-        let parts = parallel::map_chunks(places.len(), places.len().div_ceil(64).max(1024), |range| {
-            let most = 8 * grid.levels.len() * range.len();
-            let (mut rows, mut values) = (Buffer::<u32>::stale(most), Buffer::<T>::stale(most * features));
-            let g = &g[range.start * width..range.end * width];
-            let count = with_features!(features, contributions::<T>(&grid.levels, &places[range.clone()], g, &mut rows, &mut values));
-            sorted(buckets, shift, features, &rows[..count], &values)
-        });
-        HashSums { features, parts }
+    /// Returns the rows of a bucket.
+    fn rows(&self, bucket: usize) -> Range<usize> {
+        bucket << self.bucket_shift()..(bucket + 1) << self.bucket_shift()
     }
-}
-
-/// Sorts contributions by bucket.
-fn sorted<T: Real>(buckets: usize, shift: u32, features: usize, rows: &[u32], values: &[T]) -> Part<T> {
-    let bucket = |row: u32| (row >> shift) as usize;
-    let mut places = Buckets::count(buckets, rows.iter().map(|&row| bucket(row)));
-    let (mut sorted_rows, mut sorted_values) = (Buffer::stale(rows.len()), Buffer::stale(rows.len() * features));
-    for (&row, value) in rows.iter().zip(values.chunks_exact(features)) {
-        let to = places.take(bucket(row));
-        sorted_rows[to] = row;
-        sorted_values[to * features..][..features].copy_from_slice(value);
-    }
-    Part { buckets: places.filled(), rows: sorted_rows, values: sorted_values }
 }
 
 impl<T: Real> RowSums<T> for HashSums<T> {
     fn bucket_shift(&self) -> u32 {
-        bucket_shift(self.features)
+        self.grid.shape.log2_rows.max(6)
     }
 
-    fn is_empty(&self, bucket: usize) -> bool {
-        self.parts.iter().all(|part| part.buckets.range(bucket).is_empty())
+    fn is_empty(&self, _bucket: usize) -> bool {
+        self.positions.is_empty()
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        let first = (bucket << self.bucket_shift()) as u32;
-        for part in &self.parts {
-            let range = part.buckets.range(bucket);
-            let (rows, values) = (&part.rows[range.clone()], &part.values[range.start * self.features..range.end * self.features]);
-            with_features!(self.features, add::<T>(first, rows, values, sums, touched));
+        let (rows, levels) = (self.rows(bucket), &self.grid.levels);
+        let (places, g) = (self.positions.data().as_chunks::<3>().0, self.g.data());
+        for l in 0..levels.len() {
+            if levels[l].first < rows.end && rows.start < levels[l].first + levels[l].rows {
+                with_features!(self.grid.shape.features, add::<T>(levels, l, places, g, rows.clone(), sums, touched));
+            }
         }
     }
 }
 
-dispatched! {
-/// Writes the contributions of positions, level after level. Returns their number.
-fn contributions<T: Real, const F: usize, const FUSED: bool>(
-    levels: &[Level],
-    places: &[[T; 3]],
-    g: &[T],
-    rows: &mut [u32],
-    values: &mut [T],
-) -> usize {
-    let (g, width) = (g.as_chunks::<F>().0, levels.len());
-    let (rows, values) = (rows.as_chunks_mut::<8>().0, values.as_chunks_mut::<F>().0.as_chunks_mut::<8>().0);
-    let mut count = 0;
-    for (l, level) in levels.iter().enumerate() {
-        // Rows and contributions of the current cell, unless it has none.
-        let mut own = [0; 8];
-        let mut sums = [[T::zero(); F]; 8];
-        let mut any = false;
-        for (places, g) in places.chunks(TOGETHER).zip(g.chunks(TOGETHER * width)) {
-            let cells = Cells::new::<FUSED>(level, &group(places));
-            for i in 0..places.len() {
-                let g = &g[i * width + l];
-                if g.iter().all(|&g| g == T::zero()) {
-                    continue;
-                }
-                let here = std::array::from_fn(|c| cells.rows[c][i]);
-                if any && here != own {
-                    (rows[count], values[count]) = (own, sums);
-                    count += 1;
-                    sums = [[T::zero(); F]; 8];
-                }
-                (own, any) = (here, true);
-                let weights = cells.weights(i);
-                for c in 0..8 {
-                    for f in 0..F {
-                        sums[c][f] = g[f].multiply_add::<FUSED>(weights[c], sums[c][f]);
-                    }
+/// Sums of the rows of a bucket.
+struct Sums<'a, T, const F: usize> {
+    rows: Range<u32>,
+    /// True if all rows of the level are in the bucket.
+    all: bool,
+    sums: &'a mut [[T; F]],
+    touched: &'a mut [u64],
+}
+
+impl<T: Real, const F: usize> Sums<'_, T, F> {
+    /// Prefetches the rows of a group of positions.
+    #[inline(always)]
+    fn prefetch(&self, cells: &Cells<T>) {
+        for rows in &cells.rows {
+            for &row in rows {
+                if let Some(sum) = self.sums.get(row.wrapping_sub(self.rows.start) as usize) {
+                    parallel::prefetch(sum);
                 }
             }
         }
-        if any {
-            (rows[count], values[count]) = (own, sums);
-            count += 1;
+    }
+
+    /// Adds to the rows of the corners of a cell that are in the bucket.
+    #[inline(always)]
+    fn add(&mut self, rows: &[u32; 8], values: &[[T; F]; 8]) {
+        for (row, value) in rows.iter().zip(values) {
+            if self.all || self.rows.contains(row) {
+                let row = (row - self.rows.start) as usize;
+                self.touched[row / 64] |= 1 << (row % 64);
+                let sum = &mut self.sums[row];
+                for f in 0..F {
+                    sum[f] += value[f];
+                }
+            }
         }
     }
-    8 * count
-}
 }
 
 dispatched! {
-/// Adds contributions to the rows of a bucket that begins at row `first`.
-fn add<T: Real, const F: usize, const FUSED: bool>(first: u32, rows: &[u32], values: &[T], sums: &mut [T], touched: &mut [u64]) {
-    let sums = sums.as_chunks_mut::<F>().0;
-    for (&row, value) in rows.iter().zip(values.as_chunks::<F>().0) {
-        let row = (row - first) as usize;
-        touched[row / 64] |= 1 << (row % 64);
-        let sum = &mut sums[row];
-        for f in 0..F {
-            sum[f] += value[f];
+/// Adds the contributions of positions to the rows of level `l` that are in a bucket.
+fn add<T: Real, const F: usize, const FUSED: bool>(
+    levels: &[Level],
+    l: usize,
+    places: &[[T; 3]],
+    g: &[T],
+    rows: Range<usize>,
+    sums: &mut [T],
+    touched: &mut [u64],
+) {
+    let (g, width, level) = (g.as_chunks::<F>().0, levels.len(), &levels[l]);
+    let all = rows.start <= level.first && level.first + level.rows <= rows.end;
+    let mut bucket = Sums { rows: rows.start as u32..rows.end as u32, all, sums: sums.as_chunks_mut::<F>().0, touched };
+    // Rows and contributions of the current cell, unless it has none.
+    let mut own = [0; 8];
+    let mut values = [[T::zero(); F]; 8];
+    let mut any = false;
+    let mut groups = places.chunks(TOGETHER).zip(g.chunks(TOGETHER * width)).peekable();
+    let mut next = Cells::new::<FUSED>(level, &group(places.chunks(TOGETHER).next().unwrap_or_default()));
+    while let Some((places, g)) = groups.next() {
+        let cells = next;
+        // What the next group reads is prefetched.
+        if let Some((places, g)) = groups.peek() {
+            next = Cells::new::<FUSED>(level, &group(places));
+            bucket.prefetch(&next);
+            g.iter().skip(l).step_by(width).for_each(parallel::prefetch);
         }
+        for i in 0..places.len() {
+            let g = &g[i * width + l];
+            if g.iter().all(|&g| g == T::zero()) {
+                continue;
+            }
+            let here = std::array::from_fn(|c| cells.rows[c][i]);
+            if any && here != own {
+                bucket.add(&own, &values);
+                values = [[T::zero(); F]; 8];
+            }
+            (own, any) = (here, true);
+            let weights = cells.weights(i);
+            for c in 0..8 {
+                for f in 0..F {
+                    values[c][f] = g[f].multiply_add::<FUSED>(weights[c], values[c][f]);
+                }
+            }
+        }
+    }
+    if any {
+        bucket.add(&own, &values);
     }
 }
 }
