@@ -27,13 +27,44 @@ fn the_page_of_a_factored_field_shows_a_baked_grid() {
     let folder = Folder::new("bake-page");
     let run = folder.path("field");
     let trained = train(&run, &["--no-images"]);
-    assert!(trained.err.contains("baked from the factored field") && trained.err.contains("that of the field"), "{}", trained.err);
+    assert!(trained.err.contains("baked from the field") && trained.err.contains("that of the field"), "{}", trained.err);
     trained.done();
     let page = fs::read_to_string(folder.path("field/report.html")).unwrap();
-    assert!(page.contains("<figure id=\"viewer\">") && page.contains("id=\"grid\"") && page.contains("baked from the factored field"));
+    assert!(page.contains("<figure id=\"viewer\">") && page.contains("id=\"grid\"") && page.contains("baked from the field"));
     // The bits do not depend on the number of threads.
     plenoxel(&["report", &run, "--threads=3"]).done();
     assert!(fs::read_to_string(folder.path("field/report.html")).unwrap() == page);
+}
+
+#[test]
+fn every_model_without_voxels_can_be_baked() {
+    let folder = Folder::new("bake-models");
+    let presets: [(&str, &[&str]); 3] = [
+        ("ngp", &["ngp.stages=[{steps=60, rays=512}]", "ngp.log2_rows=12", "ngp.finest_resolution=64"]),
+        (
+            "dvgo",
+            &[
+                "dvgo.coarse={resolution=12, steps=40, rays=256}",
+                "dvgo.fine=[{resolution=24, steps=60, rays=256}]",
+                "dvgo.coarse_opacity=1e-2",
+            ],
+        ),
+        ("nerf", &["nerf.steps=60", "nerf.rays=64", "nerf.width=32", "nerf.depth=3", "nerf.skip=2"]),
+    ];
+    for (preset, settings) in presets {
+        let [run, baked] = [preset.to_owned(), format!("{preset}-baked")].map(|name| folder.path(&name));
+        let settings: Vec<String> = settings.iter().map(|setting| format!("--set={setting}")).collect();
+        let words = ["train", "--preset", preset, "--scene-size=24", "--scene-views=8,1,2", "--no-images", "--no-report", "--out", &run];
+        plenoxel(&words.into_iter().chain(settings.iter().map(|setting| &setting[..])).collect::<Vec<_>>()).done();
+        plenoxel(&["export", "mesh", &run]).refused(3, &[&format!("a model of kind `{preset}` has no voxels")]);
+        let result = plenoxel(&["bake", &run, "--resolution=24", "--out", &baked]).json();
+        let number = |key: &str| result[key].as_f64().unwrap();
+        assert!((number("psnr") - number("psnr_of_field")).abs() < 3.0, "{result}");
+        plenoxel(&["export", "ply", &baked]).done();
+        let shown = plenoxel(&["report", &run]);
+        assert!(shown.err.contains("baked from the field"), "{}", shown.err);
+        shown.done();
+    }
 }
 
 #[test]
@@ -41,7 +72,8 @@ fn a_baked_field_is_a_run_that_other_commands_take() {
     let folder = Folder::new("bake");
     let [run, baked] = ["field", "baked"].map(|name| folder.path(name));
     train(&run, &["--no-report", "--no-images"]).done();
-    plenoxel(&["export", "mesh", &run]).refused(3, &["a factored field has no voxels", &format!("run `plenoxel bake {run}` first")]);
+    plenoxel(&["export", "mesh", &run])
+        .refused(3, &["a model of kind `tensorf` has no voxels", &format!("run `plenoxel bake {run}` first")]);
     for format in ["svox2", "plenoctree"] {
         plenoxel(&["export", format, &run]).refused(3, &[&format!("run `plenoxel bake {run}` first")]);
     }

@@ -39,7 +39,7 @@ fn scene(run: &str) -> Value {
 fn train(input: &captures::Folder, folder: &Folder, of: &str) -> String {
     let (data, run) = (input.0.display().to_string(), folder.path("run"));
     let trained = plenoxel(&["train", &data, "--preset=photos", "--set", STAGES, "--no-images", "--out", &run]);
-    assert!(trained.err.contains(&format!("of {of}, baked from the factored field")), "{}", trained.err);
+    assert!(trained.err.contains(&format!("of {of}, baked from the field")), "{}", trained.err);
     trained.done();
     run
 }

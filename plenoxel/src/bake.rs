@@ -1,8 +1,8 @@
-//! Baking: a sparse voxel grid with harmonics that resembles a [factored field](crate::field::factored), for viewers and exports.
+//! Baking: a sparse voxel grid with harmonics that resembles a [field](crate::render::ShadedField), for viewers and exports.
 //!
 //! 1. The grid is the smallest cube around the origin that contains the field's occupied cells. A voxel has the raw density r = σ − 25
 //!    softplus(−x − 6) at its centre, where σ = 25 softplus(x) is that of the field. max(0, r) is σ up to 1.2 per world length. Unlike σ, r is
-//!    nearly linear in the field's feature x, below 0 too: interpolation between voxels places a surface where the field has it. If σ were
+//!    nearly linear in x, the density feature of a [factored field](crate::field::factored), below 0 too: interpolation between voxels places a surface where the field has it. If σ were
 //!    interpolated, every surface would grow by up to half a voxel.
 //! 2. A voxel is present if it or a neighbour has a density above 0.
 //! 3. The harmonics of a voxel v are the least-squares fit to the field's colors c at its centre, in the directions d of the cameras that see
@@ -12,7 +12,7 @@
 //!
 //!    A voxel that no camera sees has its mean color.
 //!
-//! Harmonics are smoother than the field's color network, and they are interpolated: pictures of the grid differ from those of the field.
+//! Harmonics are smoother than a color network, and they are interpolated: pictures of the grid differ from those of the field.
 
 mod grid_space;
 mod visible;
@@ -21,15 +21,16 @@ pub use grid_space::GridSpace;
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
-use crate::field::Field;
-use crate::field::factored::{Factored, SCALE};
+use crate::field::factored::SCALE;
 use crate::field::sh;
 use crate::field::sh::least_squares::improve;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::memory::{allowance, bytes};
+use crate::render::ShadedField;
 use crate::sampling::Occupancy;
 use crate::space::Space;
+use crate::train::Model;
 use autograd::lattice::{BrickGrid, bits_where};
 use autograd::{Buffer, Indices, Lattice, Tensor, no_grad, parallel};
 use glam::DVec3;
@@ -54,6 +55,20 @@ const ROWS: usize = 256;
 /// Rows between reports of progress.
 const BATCH: usize = 1 << 16;
 
+/// Sides of a box without cells, in voxels.
+const VOXELS_WITHOUT_CELLS: f64 = 256.0;
+
+/// What is baked.
+#[derive(Clone, Copy)]
+pub struct Source<'a> {
+    /// The field, a function of positions in the box.
+    pub field: &'a dyn ShadedField<f32>,
+    /// The box.
+    pub aabb: Aabb,
+    /// Space of the box.
+    pub space: Space,
+}
+
 /// Size of a baked grid.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BakeOptions {
@@ -66,41 +81,51 @@ pub struct BakeOptions {
     pub least_weight: f32,
 }
 
-/// Returns half the side of the cube of a baked grid, in the coordinates of the grid.
-fn half_width(field: &Factored<f32>, coordinates: GridSpace) -> f64 {
-    // The rays of the contracted space end at the faces of its box.
-    if coordinates.space == Space::Contracted {
-        return Space::CONTRACTED;
+impl<'a> Source<'a> {
+    /// Returns the field of a model; `None` if the model has none.
+    pub fn of(model: &'a dyn Model<f32>) -> Option<Self> {
+        model.shaded().map(|field| Source { field, aabb: model.aabb(), space: model.space() })
     }
-    let aabb = field.occupied.as_ref().and_then(Occupancy::bounds).unwrap_or(field.aabb());
-    (aabb.max.max(-aabb.min) * coordinates.stretch).max_element()
+
+    /// Returns the coordinates of the baked grid.
+    pub fn coordinates(&self) -> GridSpace {
+        GridSpace::of(self.space, self.sides())
+    }
+
+    /// Returns the number of voxels along each axis whose sides are about those of the field's cells, at most 512. A box without cells has 256.
+    pub fn resolution(&self) -> usize {
+        let cell = (self.sides() * self.coordinates().stretch).element_sum() / 3.0;
+        ((2.0 * self.half_width() / cell).ceil() as usize).clamp(2, MOST_VOXELS)
+    }
+
+    /// Returns the sides of a cell, or of a voxel where there are no cells.
+    fn sides(&self) -> DVec3 {
+        let side = (self.aabb.max - self.aabb.min).max_element() / VOXELS_WITHOUT_CELLS;
+        self.field.cell_sides().unwrap_or(DVec3::splat(side))
+    }
+
+    /// Returns half the side of the cube of the baked grid, in the coordinates of the grid.
+    fn half_width(&self) -> f64 {
+        // The rays of the contracted space end at the faces of its box.
+        if self.space == Space::Contracted {
+            return Space::CONTRACTED;
+        }
+        let aabb = self.field.reach().and_then(Occupancy::bounds).unwrap_or(self.aabb);
+        (aabb.max.max(-aabb.min) * self.coordinates().stretch).max_element()
+    }
 }
 
-/// Returns the number of voxels along each axis whose sides are about those of the field's cells, at most 512. `space` is that of the box of the field.
-pub fn resolution_of(field: &Factored<f32>, space: Space) -> usize {
-    let coordinates = GridSpace::of(field, space);
-    let cell = (field.sides() * coordinates.stretch).element_sum() / 3.0;
-    ((2.0 * half_width(field, coordinates) / cell).ceil() as usize).clamp(2, MOST_VOXELS)
-}
-
-/// Bakes a field. `space` is that of its box. The colors are fitted to the directions of the `cameras`, or to directions all around if there are none.
-/// `progress(done, all)` is called with numbers of table rows. Returns the grid, which is in the coordinates [`GridSpace::of`] the field.
+/// Bakes a field. The colors are fitted to the directions of the `cameras`, or to directions all around if there are none.
+/// `progress(done, all)` is called with numbers of table rows. Returns the grid, which is in the [coordinates](Source::coordinates) of the source.
 ///
 /// Errors: no voxel has a density; there is not enough memory.
-pub fn bake(
-    field: &Factored<f32>,
-    space: Space,
-    options: &BakeOptions,
-    cameras: &[Camera],
-    progress: &dyn Fn(usize, usize),
-) -> Result<VoxelGrid<f32>> {
+pub fn bake(source: Source<'_>, options: &BakeOptions, cameras: &[Camera], progress: &dyn Fn(usize, usize)) -> Result<VoxelGrid<f32>> {
     let BakeOptions { resolution, degree, least_weight } = *options;
-    let coordinates = GridSpace::of(field, space);
+    let (coordinates, half_width) = (source.coordinates(), source.half_width());
     let color = Color::Sh { degree, offset: OFFSET };
-    let half_width = half_width(field, coordinates);
     let shape = GridShape { resolution, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
     let plain = GridShape { color: Color::Rgb, ..shape };
-    let (mut lattice, mut density) = no_grad(|| densities(field, &shape, coordinates))?;
+    let (mut lattice, mut density) = no_grad(|| densities(source, &shape, coordinates))?;
     if least_weight > 0.0 && !cameras.is_empty() {
         let grid = VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[lattice.rows(), 3]));
         let weights = visible::weights(&grid, coordinates, cameras);
@@ -118,7 +143,7 @@ pub fn bake(
         let grid = VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[rows, 3]));
         Sights::new(&grid, coordinates, cameras)
     });
-    let painter = Painter { field, shape: &shape, lattice: &lattice, coordinates, sights, degree };
+    let painter = Painter { field: source.field, shape: &shape, lattice: &lattice, coordinates, sights, degree };
     let width = shape.color_width();
     let mut table = Buffer::zeros(rows * width);
     for (first, part) in (0..).step_by(BATCH).zip(table.chunks_mut(BATCH * width)) {
@@ -129,16 +154,16 @@ pub fn bake(
 }
 
 /// Returns the present voxels and the table of their densities, `[rows, 1]`.
-fn densities(field: &Factored<f32>, shape: &GridShape, coordinates: GridSpace) -> Result<(Lattice, Tensor<f32>)> {
+fn densities(source: Source<'_>, shape: &GridShape, coordinates: GridSpace) -> Result<(Lattice, Tensor<f32>)> {
     let (aabb, nodes) = (coordinates.unstretched(Aabb::cube(shape.half_width)), [shape.resolution; 3]);
     // Nothing outside of the occupied cells was trained.
-    let sampled = field.occupied.clone().unwrap_or_else(|| Occupancy::new(field.aabb(), [1; 3], &[true]));
+    let sampled = source.field.reach().cloned().unwrap_or_else(|| Occupancy::new(source.aabb, [1; 3], &[true]));
     let sampled = Lattice::from_masks(nodes, sampled.resampled(aabb, nodes).masks().to_vec());
     let mut values = vec![0.0; sampled.rows()];
     for (first, values) in (0..).step_by(BATCH).zip(values.chunks_mut(BATCH)) {
         let rows: Vec<(usize, DVec3)> =
             (0..values.len()).filter_map(|r| Some((r, coordinates.to_box(center(shape, sampled.node((first + r) as u32)?))))).collect();
-        let density = field.density(&positions(rows.iter().map(|(_, at)| *at)));
+        let density = source.field.density(&positions(rows.iter().map(|(_, at)| *at)));
         rows.iter().zip(density.data()).for_each(|((r, _), &density)| values[*r] = density);
     }
     let density = |node| sampled.row(node).map_or(EMPTY, |row| raw(values[row as usize]));
@@ -177,7 +202,7 @@ fn positions(points: impl Iterator<Item = DVec3>) -> Tensor<f32> {
 
 /// Inputs of the fit of the colors.
 struct Painter<'a> {
-    field: &'a Factored<f32>,
+    field: &'a dyn ShadedField<f32>,
     shape: &'a GridShape,
     lattice: &'a Lattice,
     coordinates: GridSpace,
@@ -276,7 +301,8 @@ fn all_around(n: usize) -> impl Iterator<Item = DVec3> {
 mod tests {
     use super::*;
     use crate::field::encoding::Directions;
-    use crate::field::factored::Shape;
+    use crate::field::factored::{Factored, Shape};
+    use crate::render::Field;
     use autograd::Module;
     use autograd::random::Stream;
 
@@ -317,11 +343,15 @@ mod tests {
         field
     }
 
+    fn source(field: &Factored<f32>) -> Source<'_> {
+        Source { field, aabb: field.aabb(), space: Space::Box }
+    }
+
     #[test]
     fn the_density_of_a_blob_is_that_of_the_field_at_voxel_centres() {
         let field = blob();
-        let grid = bake(&field, Space::Box, &BakeOptions { resolution: 20, degree: 0, least_weight: 0.0 }, &[], &|_, _| {})
-            .expect("an opaque blob");
+        let grid =
+            bake(source(&field), &BakeOptions { resolution: 20, degree: 0, least_weight: 0.0 }, &[], &|_, _| {}).expect("an opaque blob");
         let places: Vec<DVec3> = (0..20).map(|k| center(grid.shape(), [k, 9, 10])).collect();
         let at = positions(places.iter().copied());
         let (baked, own) = (grid.density(&at), field.density(&at));
@@ -337,8 +367,8 @@ mod tests {
     #[test]
     fn colors_that_are_linear_in_the_direction_are_reproduced() {
         let field = blob();
-        let grid = bake(&field, Space::Box, &BakeOptions { resolution: 12, degree: 1, least_weight: 0.0 }, &[], &|_, _| {})
-            .expect("an opaque blob");
+        let grid =
+            bake(source(&field), &BakeOptions { resolution: 12, degree: 1, least_weight: 0.0 }, &[], &|_, _| {}).expect("an opaque blob");
         let row = grid.lattice().row([6; 3]).expect("the middle is opaque") as usize;
         let numbers = &grid.color.tensor().data()[row * 12..][..12];
         let directions: Vec<DVec3> = all_around(7).collect();
@@ -360,7 +390,7 @@ mod tests {
                 param.update(|values| values.fill(0.0));
             }
         });
-        let error = bake(&field, Space::Box, &BakeOptions { resolution: 8, degree: 0, least_weight: 0.0 }, &[], &|_, _| {})
+        let error = bake(source(&field), &BakeOptions { resolution: 8, degree: 0, least_weight: 0.0 }, &[], &|_, _| {})
             .expect_err("nothing is opaque");
         assert!(error.to_string().contains("no voxel is opaque"), "{error}");
     }

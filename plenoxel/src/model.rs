@@ -61,9 +61,9 @@ pub fn voxel_grid<'m>(model: &'m dyn Model<f32>, path: &Path, what: &str) -> Res
     let grid = model.content().and_then(|content| content.downcast_ref());
     grid.ok_or_else(|| {
         let found = format!("a model of kind `{}` has no voxels", model.kind());
-        let remedy = match model.kind() {
-            tensorf::KIND => "run `plenoxel bake RUN` first".to_owned(),
-            _ => format!("use a run of kind `{}`", plenoxels::KIND),
+        let remedy = match model.shaded() {
+            Some(_) => "run `plenoxel bake RUN` first".to_owned(),
+            None => format!("use a run of kind `{}`", plenoxels::KIND),
         };
         Error::input(path, found, format!("{what} needs a voxel grid: {remedy}"))
     })

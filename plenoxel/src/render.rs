@@ -10,7 +10,7 @@ use crate::geometry::Aabb;
 use crate::sampling::{Jitter, Occupancy, Samples, Spacing, sample};
 use autograd::{Real, Tensor};
 pub use composite::{Columns, PerSample, Rendered, composite, weights};
-pub use field::{Field, Radiance};
+pub use field::{Field, Radiance, ShadedField};
 use serde::{Deserialize, Serialize};
 
 /// Implementation that renders a batch of rays.

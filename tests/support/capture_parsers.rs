@@ -44,7 +44,7 @@ fn captures() -> Vec<Vec<u8>> {
     vec![ngp.into_bytes(), studio.into_bytes()]
 }
 
-fn read_capture(path: &Path, bytes: &[u8]) -> Result<Then, String> {
+pub fn read_capture(path: &Path, bytes: &[u8]) -> Result<Then, String> {
     let read = transforms::Transforms::parse(path, bytes).map_err(text)?;
     Ok(Box::new(move || {
         for frame in read.frames {

@@ -12,7 +12,6 @@ use plenoxel::camera::{Camera, Intrinsics};
 use plenoxel::camera_path::CameraPath;
 use plenoxel::checkpoint::{self, Header};
 use plenoxel::dataset::View;
-use plenoxel::dataset::blender::Transforms;
 use plenoxel::dataset::image::{self, RgbaImage};
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::formats::plenoctree::{self, OctreeOptions};
@@ -53,7 +52,7 @@ pub fn parsers() -> impl Iterator<Item = &'static Parser> {
 }
 
 const PARSERS: [Parser; 12] = [
-    Parser { name: "transforms.json", valid: transforms, read: read_transforms, repair: |_| (), memory: [MIB, 200] },
+    Parser { name: "transforms.json", valid: transforms, read: capture_parsers::read_capture, repair: |_| (), memory: [MIB, 200] },
     Parser { name: "path.json", valid: paths, read: read_path, repair: |_| (), memory: [2 * MIB, 400] },
     // Deflate makes 1032 of one byte, RGBA 32 of one that has 8 pixels; a row; and what stands beside the pixels.
     Parser { name: "image.png", valid: images, read: read_image, repair: repair_image, memory: [64 * MIB, 1032 * 32] },
@@ -129,19 +128,6 @@ fn transforms() -> Vec<Vec<u8>> {
     );
     let utf16 = format!("\u{feff}{stated}").encode_utf16().flat_map(u16::to_be_bytes).collect();
     vec![whole(&frames.join(",\n")).into_bytes(), format!("\u{feff}{}", whole("")).into_bytes(), stated.into_bytes(), utf16]
-}
-
-fn read_transforms(path: &Path, bytes: &[u8]) -> Result<Then, String> {
-    let read = Transforms::parse(path, bytes).map_err(text)?;
-    Ok(Box::new(move || {
-        // Whatever is stated is the same or another, for images of any size.
-        let _ = read.intrinsics.check(Path::new("again"), read.fov_x, (8, 8));
-        let intrinsics = Intrinsics::from_fov_x(8, 8, read.fov_x);
-        for (_, camera_to_world) in read.frames {
-            let ray = Camera { intrinsics, camera_to_world }.ray(0.5, 0.5);
-            assert!(ray.direction.is_normalized() && ray.origin.is_finite(), "{ray:?}");
-        }
-    }))
 }
 
 fn paths() -> Vec<Vec<u8>> {

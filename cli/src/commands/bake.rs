@@ -1,4 +1,4 @@
-//! `plenoxel bake`: turns a factored field into a voxel grid, as a new run.
+//! `plenoxel bake`: turns a field of another model into a voxel grid, as a new run.
 
 use super::new_run::loading;
 use super::{beside, check_box, whole};
@@ -7,11 +7,10 @@ use crate::progress::Console;
 use crate::report::Report;
 use clap::{Args, ValueHint};
 use ndarray::Array3;
-use plenoxel::bake::{BakeOptions, OFFSET, bake, resolution_of};
+use plenoxel::bake::{BakeOptions, OFFSET, Source, bake};
 use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::{Scores, ViewScore, Viewer};
-use plenoxel::field::factored::Factored;
 use plenoxel::field::voxel_grid::Interpolation;
 use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::model::plenoxels::config::{ColorKind, Config};
@@ -38,11 +37,11 @@ on up to 25 test views. If stdout is not a terminal, its last line is a JSON obj
 /// Most test views on which the field and the grid are compared.
 const COMPARED: usize = 25;
 
-/// Turn a factored field (preset tensorf) into a voxel grid with spherical harmonics, for exports
+/// Turn the field of a model (presets quality, tensorf, dvgo, ngp, nerf) into a voxel grid with spherical harmonics, for exports
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct BakeArgs {
-    /// Run folder of a factored field, written by `plenoxel train`
+    /// Run folder of the model, written by `plenoxel train`
     #[arg(value_hint = ValueHint::DirPath)]
     run: PathBuf,
 
@@ -80,13 +79,10 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     let (source, config, record) = RunFolder::open(&args.run)?;
     let source = if args.best { source.with_best()? } else { source };
     let path = source.existing_checkpoint()?;
-    let stored = match model::kind(&path)? {
-        kind if kind == model::tensorf::KIND => Stored::read(&path)?,
-        kind if kind == model::plenoxels::KIND => {
-            return Err(Error::input(&path, "this is a voxel grid already", "export it without `plenoxel bake`"));
-        }
-        other => return Err(Error::input(&path, format!("a model of kind `{other}` cannot be baked"), "use a run of preset tensorf")),
-    };
+    if model::kind(&path)? == model::plenoxels::KIND {
+        return Err(Error::input(&path, "this is a voxel grid already", "export it without `plenoxel bake`"));
+    }
+    let stored = Stored::read(&path)?;
     let data = args.data.as_deref().map_or(record.data, DataSource::folder);
     let dataset = data.reopen(&config)?;
     let out = args.out.clone().map_or_else(|| beside(&args.run, "baked"), Ok)?;
@@ -95,21 +91,17 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     console.note(&estimate.describe());
     estimate.check()?;
     let (trained, about) = model::open(&path, &config)?;
-    let Some(field) = trained.content().and_then(|content| content.downcast_ref::<Factored<f32>>()) else {
-        return Err(Error::input(&path, "the model has no factored field", "use a run of preset quality"));
+    let Some(field) = Source::of(&*trained) else {
+        return Err(Error::input(&path, format!("a model of kind `{}` cannot be baked", trained.kind()), "use a run of preset quality"));
     };
-    let space = trained.space();
-    check_box(&path, space)?;
+    check_box(&path, field.space)?;
 
-    let options = BakeOptions {
-        resolution: args.resolution.unwrap_or_else(|| resolution_of(field, space)),
-        degree: args.sh_degree,
-        least_weight: 0.0,
-    };
+    let options =
+        BakeOptions { resolution: args.resolution.unwrap_or_else(|| field.resolution()), degree: args.sh_degree, least_weight: 0.0 };
     let mut clock = Stopwatch::default();
     let count = console.count("baking, voxel", 1);
     let cameras = dataset.cameras(Split::Train);
-    let grid = clock.time(|| bake(field, space, &options, &cameras, &|done, all| count.at(done, all)))?;
+    let grid = clock.time(|| bake(field, &options, &cameras, &|done, all| count.at(done, all)))?;
     drop(count);
     let voxels = grid.lattice().present();
     console.note(&format!("baked {voxels} voxels at {}³ in {:.1} s", options.resolution, clock.seconds()));
@@ -123,6 +115,9 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
         interpolation: Interpolation::Trilinear,
         stages: Vec::new(),
         tensorf: None,
+        dvgo: None,
+        ngp: None,
+        nerf: None,
         ..config
     };
     let from = source.path().canonicalize().unwrap_or_else(|_| source.path().to_owned());

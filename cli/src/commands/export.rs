@@ -14,7 +14,7 @@ use plenoxel::checkpoint::{self, Header};
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::model::plenoxels::config::Config;
-use plenoxel::model::{self, tensorf};
+use plenoxel::model::{self, plenoxels};
 use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::Estimate;
 use plenoxel::space::Space;
@@ -96,13 +96,14 @@ impl Exported {
         let (folder, config, record) = RunFolder::open(&self.run)?;
         let folder = if self.best { folder.with_best()? } else { folder };
         let path = folder.existing_checkpoint()?;
-        if model::kind(&path)? == tensorf::KIND {
+        let kind = model::kind(&path)?;
+        if kind != plenoxels::KIND {
             // Checkpoints without a space are of a box.
             check_box(&path, TensorFile::open(&path)?.fact::<Option<Space>>("space")?.unwrap_or_default())?;
             let run = self.run.display();
             return Err(Error::input(
                 &path,
-                "a factored field has no voxels",
+                format!("a model of kind `{kind}` has no voxels"),
                 format!("run `plenoxel bake {run}` first, and export its result"),
             ));
         }

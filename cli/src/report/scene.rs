@@ -1,18 +1,17 @@
-//! The embedded grid of a report, for its viewer, and the loss of quality by its compression. A factored field is baked into a grid first.
+//! The embedded grid of a report, for its viewer, and the loss of quality by its compression. Other fields are baked into a grid first.
 
 use super::Report;
 use crate::html::{self, escaped};
 use crate::progress::{Console, thousands};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use plenoxel::bake::{BakeOptions, GridSpace, bake, resolution_of};
+use plenoxel::bake::{BakeOptions, GridSpace, Source, bake};
 use plenoxel::camera::Camera;
 use plenoxel::camera_path::up_axis;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::Viewer;
 use plenoxel::export::web::WebGrid;
-use plenoxel::field::factored::Factored;
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::metrics;
 use plenoxel::model::Model;
@@ -67,11 +66,12 @@ struct Cost {
 }
 
 impl Scene {
-    /// Compresses the voxel grid of a report, or bakes and compresses its factored field; `None` if its model has neither, or if the field
-    /// cannot be baked.
+    /// Compresses the voxel grid of a report, or bakes and compresses its field; `None` if its model has neither, or if the field cannot be
+    /// baked.
     pub fn of(report: &Report<'_>, console: &Console<'_>) -> Result<Option<Self>> {
-        let Some((model, content)) = report.model.and_then(|model| Some((model, model.content()?))) else { return Ok(None) };
-        let baked = match content.downcast_ref().map(|field| baked(field, model.space(), report, console)) {
+        let Some(model) = report.model else { return Ok(None) };
+        let source = Source::of(model);
+        let baked = match source.map(|source| baked(source, report, console)) {
             Some(Ok(grid)) => Some(grid),
             Some(Err(error)) => {
                 console.note(&format!("the field cannot be shown: {error}"));
@@ -79,9 +79,8 @@ impl Scene {
             }
             None => None,
         };
-        let Some(grid) = baked.as_ref().or_else(|| content.downcast_ref()) else { return Ok(None) };
-        let coordinates =
-            content.downcast_ref().map_or_else(GridSpace::default, |field: &Factored<f32>| GridSpace::of(field, model.space()));
+        let Some(grid) = baked.as_ref().or_else(|| model.content()?.downcast_ref()) else { return Ok(None) };
+        let coordinates = source.map_or_else(GridSpace::default, |source| source.coordinates());
         let packed = WebGrid::within(grid, MOST_BYTES);
         let (small, bytes) = packed.map_err(|e| Error::io("report.html", e, "compressing the grid"))?;
         let shown = Shown { grid: small.to_grid(), coordinates };
@@ -143,7 +142,7 @@ impl Scene {
             "the viewer has a compressed grid of {} voxels at {}³{box_of}{reduction}{}, in {}",
             thousands(header.voxels as u64),
             shape.resolution,
-            if self.baked { ", baked from the factored field" } else { "" },
+            if self.baked { ", baked from the field" } else { "" },
             bytes(self.bytes.len() as u64)
         );
         match &self.cost {
@@ -224,12 +223,12 @@ impl Cost {
 }
 
 /// Bakes a field for the page.
-fn baked(field: &Factored<f32>, space: Space, report: &Report<'_>, console: &Console<'_>) -> Result<VoxelGrid<f32>> {
-    let (most, least_weight) = match space {
+fn baked(source: Source<'_>, report: &Report<'_>, console: &Console<'_>) -> Result<VoxelGrid<f32>> {
+    let (most, least_weight) = match source.space {
         Space::Box => (BAKED_VOXELS, 0.0),
         Space::Ndc { .. } | Space::Contracted => (BAKED_VOXELS_OF_CAPTURES, LEAST_WEIGHT),
     };
-    let options = BakeOptions { resolution: resolution_of(field, space).min(most), degree: BAKED_DEGREE, least_weight };
+    let options = BakeOptions { resolution: source.resolution().min(most), degree: BAKED_DEGREE, least_weight };
     let count = console.count("baking for the viewer, voxel", 1);
-    bake(field, space, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
+    bake(source, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
 }

@@ -1,13 +1,11 @@
 //! Coordinates of a baked grid, and rendering in them.
 
 use crate::camera::{Camera, Ray};
-use crate::field::factored::Factored;
 use crate::field::voxel_grid::VoxelGrid;
 use crate::geometry::Aabb;
 use crate::render::{Engine, RenderOptions, Rendered, render};
 use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::space::Space;
-use autograd::Real;
 use glam::DVec3;
 use serde::{Serialize, Serializer};
 
@@ -42,9 +40,8 @@ const INFINITY: f64 = 1e-4;
 const STOP_BELOW: f64 = 1e-4;
 
 impl GridSpace {
-    /// Returns the coordinates in which the cells of a field are cubes, up to the roundings of their numbers.
-    pub fn of<T: Real>(field: &Factored<T>, space: Space) -> Self {
-        let sides = field.sides();
+    /// Returns the coordinates in which cells with these sides are cubes, up to the roundings of their numbers.
+    pub(super) fn of(space: Space, sides: DVec3) -> Self {
         let depth = if matches!(space, Space::Ndc { .. }) { 0.5 * (sides.x + sides.y) / sides.z } else { 1.0 };
         GridSpace { space, stretch: DVec3::new(1.0, 1.0, depth) }
     }

@@ -154,7 +154,7 @@ fn check_presence(root: &Path, capture: &mut Capture) -> Result<()> {
 /// stored; programs that turn them as EXIF states come second.
 ///
 /// Errors if the image cannot be read, or has another shape.
-fn fitted(photo: &Photo) -> Result<(Orientation, Intrinsics)> {
+pub(super) fn fitted(photo: &Photo) -> Result<(Orientation, Intrinsics)> {
     for orientation in [Orientation::Stored, Orientation::Stated] {
         if let Some(intrinsics) = scaled(&photo.intrinsics, image::size_as(&photo.image, orientation)?) {
             // Rounded sizes may have pixels that the stated size had not.

@@ -184,7 +184,7 @@ fn points(path: &Path) -> Result<Vec<Point>> {
 
 impl Stated {
     /// Returns the intrinsics for images of a size, which is the stated one if there is one.
-    fn intrinsics(&self, path: &Path, file_path: &str, size: (usize, usize)) -> Result<Intrinsics> {
+    pub(super) fn intrinsics(&self, path: &Path, file_path: &str, size: (usize, usize)) -> Result<Intrinsics> {
         let intrinsics = self.at(size);
         intrinsics.check_lens().map_err(|unusable| unusable.at(path, &format!("camera of {file_path}")))?;
         Ok(intrinsics)

@@ -17,7 +17,7 @@ use super::encoding::Directions;
 use super::grouping::Grouping;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use crate::render::{Field, Radiance, RenderOptions, Rendered, composite, weights};
+use crate::render::{Field, Radiance, RenderOptions, Rendered, ShadedField, composite, weights};
 use crate::sampling::{Jitter, Occupancy, Samples, sample};
 use autograd::nn::{Activation, Init, Mlp};
 use autograd::{Indices, Module, Param, Real, Tensor, no_grad, random::Stream};
@@ -167,17 +167,17 @@ impl<T: Real> DenseGrid<T> {
         (raw + self.shift).softplus() / self.unit
     }
 
-    /// Returns the colors at positions in units of cells, from the rays with these numbers: `[m, 3]`. `directions` are those of all rays.
-    fn colors(&self, cells: &Tensor<T>, directions: &Tensor<T>, rays: &Indices) -> Tensor<T> {
-        let features = self.features.tensor().trilinear(cells, self.nodes);
-        let logits = match &self.network {
-            None => features,
-            Some(ColorNetwork { directions: encoding, layers }) => {
-                let encoded = encoding.encode(directions).gather_rows(rays);
-                layers.forward(&Tensor::concat(&[&features, &encoded], 1))
-            }
-        };
-        logits.sigmoid()
+    /// Returns the features at positions in units of cells: `[m, features]`.
+    fn features_in_cells(&self, cells: &Tensor<T>) -> Tensor<T> {
+        self.features.tensor().trilinear(cells, self.nodes)
+    }
+
+    /// Returns the colors of features. `encoded` returns their directions, encoded.
+    fn shade_encoded(&self, features: &Tensor<T>, encoded: impl FnOnce(&Directions) -> Tensor<T>) -> Tensor<T> {
+        match &self.network {
+            None => features.sigmoid(),
+            Some(ColorNetwork { directions, layers }) => layers.forward(&Tensor::concat(&[features, &encoded(directions)], 1)).sigmoid(),
+        }
     }
 
     /// Returns density and color of samples whose colors are those of groups.
@@ -187,7 +187,8 @@ impl<T: Real> DenseGrid<T> {
         let weights = weights(samples, &sigma);
         let groups = grouping.groups(weights.data(), [samples.t.data(), samples.delta.data()], &samples.offsets, 0, jitter);
         let at = groups.positions(weights.data(), &cells);
-        let rgb = self.colors(&at, &samples.directions, &Indices::from(groups.rays.clone()));
+        let rays = Indices::from(groups.rays.clone());
+        let rgb = self.shade_encoded(&self.features_in_cells(&at), |encoding| encoding.encode(&samples.directions).gather_rows(&rays));
         Radiance { sigma, rgb: groups.colors_of_samples(&rgb) }
     }
 }
@@ -215,5 +216,19 @@ impl<T: Real> Field<T> for DenseGrid<T> {
         let radiance = self.grouped_radiance(&samples, grouping, options.jitter);
         let background = Tensor::from_vec(options.background.map(|c| T::lit(f64::from(c))).to_vec(), &[3]);
         Some(composite(samples, radiance, &background))
+    }
+}
+
+impl<T: Real> ShadedField<T> for DenseGrid<T> {
+    fn features(&self, positions: &Tensor<T>) -> Tensor<T> {
+        self.features_in_cells(&self.in_cells(positions))
+    }
+
+    fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+        self.shade_encoded(features, |encoding| encoding.encode(directions))
+    }
+
+    fn cell_sides(&self) -> Option<DVec3> {
+        Some(self.sides())
     }
 }

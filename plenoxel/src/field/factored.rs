@@ -15,7 +15,7 @@ use super::encoding::{Directions, frequency};
 use super::grouping::Grouping;
 use crate::camera::{Ray, TrackedRays};
 use crate::geometry::Aabb;
-use crate::render::{Field, Radiance, RenderOptions, Rendered, weights};
+use crate::render::{Field, Radiance, RenderOptions, Rendered, ShadedField, weights};
 use crate::sampling::{Occupancy, Samples};
 use autograd::nn::{Activation, Init, Linear, Mlp};
 use autograd::{Indices, Module, Param, Real, Tensor, impl_module, no_grad, random::Stream};
@@ -264,16 +264,6 @@ impl<T: Real> Factored<T> {
         self.aabb = aabb;
     }
 
-    /// Returns the appearance features at world positions `[m, 3]`: `[m, features]`.
-    pub fn features(&self, positions: &Tensor<T>) -> Tensor<T> {
-        features(&self.tables(), &self.cells(positions))
-    }
-
-    /// Returns the colors of appearance features `[m, features]`, seen along unit directions `[m, 3]`: `[m, 3]`, in [0, 1].
-    pub fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
-        shade(&self.tables(), self.shape.feature_octaves, features, &self.shape.directions.encode(directions))
-    }
-
     /// Returns positions `[m, 3]` in units of cells.
     fn cells(&self, positions: &Tensor<T>) -> Tensor<T> {
         let [low, sides] = [self.aabb.min, self.sides()].map(|v| Tensor::from_vec(v.to_array().map(T::lit).to_vec(), &[3]));
@@ -315,5 +305,19 @@ impl<T: Real> Field<T> for Factored<T> {
 
     fn render_fused_tracked(&self, rays: &TrackedRays<T>, options: &RenderOptions<'_>) -> Option<Rendered<T>> {
         fused::supports(&self.shape).then(|| fused::render_tracked(self, rays, options))
+    }
+}
+
+impl<T: Real> ShadedField<T> for Factored<T> {
+    fn features(&self, positions: &Tensor<T>) -> Tensor<T> {
+        features(&self.tables(), &self.cells(positions))
+    }
+
+    fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+        shade(&self.tables(), self.shape.feature_octaves, features, &self.shape.directions.encode(directions))
+    }
+
+    fn cell_sides(&self) -> Option<DVec3> {
+        Some(self.sides())
     }
 }

@@ -2,7 +2,7 @@
 //! direction to the color.
 
 use super::encoding::{Directions, frequency};
-use crate::render::{Field, Radiance};
+use crate::render::{Field, Radiance, ShadedField};
 use crate::sampling::Samples;
 use autograd::nn::{Activation, Mlp};
 use autograd::{Real, Tensor, impl_module, random::Stream};
@@ -87,8 +87,27 @@ impl<T: Real> NerfField<T> {
         let raw = trunk.index_axis(1, 0);
         let sigma = self.activate(&noise.map_or(raw.clone(), |noise| &raw + noise));
         let directions = Directions::Frequency(self.shape.direction_octaves).encode(&samples.directions).segment_repeat(&samples.offsets);
-        let rgb = self.color.forward(&Tensor::concat(&[&trunk.narrow(1, 1, self.shape.width), &directions], 1)).sigmoid();
-        Radiance { sigma, rgb }
+        Radiance { sigma, rgb: self.shade_encoded(&self.feature(&trunk), &directions) }
+    }
+
+    /// Returns the feature in outputs of the trunk.
+    fn feature(&self, trunk: &Tensor<T>) -> Tensor<T> {
+        trunk.narrow(1, 1, self.shape.width)
+    }
+
+    /// Returns the colors of features and encoded directions.
+    fn shade_encoded(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+        self.color.forward(&Tensor::concat(&[features, directions], 1)).sigmoid()
+    }
+}
+
+impl<T: Real> ShadedField<T> for NerfField<T> {
+    fn features(&self, positions: &Tensor<T>) -> Tensor<T> {
+        self.feature(&self.trunk(positions))
+    }
+
+    fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+        self.shade_encoded(features, &Directions::Frequency(self.shape.direction_octaves).encode(directions))
     }
 }
 

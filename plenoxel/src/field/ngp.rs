@@ -11,10 +11,11 @@ use super::encoding::Directions;
 use super::hash_grid::{self, HashGrid};
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use crate::render::{Field, Radiance, RenderOptions, Rendered, composite, weights};
+use crate::render::{Field, Radiance, RenderOptions, Rendered, ShadedField, composite, weights};
 use crate::sampling::{Occupancy, Samples, sample_visible};
 use autograd::nn::{Activation, Init, Mlp};
 use autograd::{Cotangent, Indices, Keep, Op, Param, Real, Tensor, Vjp, impl_module, no_grad, random::Stream};
+use glam::DVec3;
 
 /// Sizes of a field.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -117,6 +118,27 @@ impl<T: Real> HashField<T> {
         let sigma = exponential(&outputs.index_axis(1, 0)) * (self.depth / self.extent());
         (outputs, sigma)
     }
+
+    /// Returns the colors of outputs of the density network and encoded directions.
+    fn shade_encoded(&self, outputs: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+        self.color.forward(&Tensor::concat(&[outputs, directions], 1)).sigmoid()
+    }
+}
+
+impl<T: Real> ShadedField<T> for HashField<T> {
+    /// Returns the outputs of the density network.
+    fn features(&self, positions: &Tensor<T>) -> Tensor<T> {
+        self.outputs(positions).0
+    }
+
+    fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T> {
+        self.shade_encoded(features, &self.shape.directions.encode(directions))
+    }
+
+    fn cell_sides(&self) -> Option<DVec3> {
+        let finest = self.grid.levels().iter().map(|level| level.resolution).max()?;
+        Some(DVec3::splat(self.extent() / finest as f64))
+    }
 }
 
 impl<T: Real> Field<T> for HashField<T> {
@@ -128,15 +150,14 @@ impl<T: Real> Field<T> for HashField<T> {
     fn radiance(&self, samples: &Samples<T>) -> Radiance<T> {
         let (outputs, sigma) = self.outputs(&samples.positions);
         let directions = no_grad(|| self.shape.directions.encode(&samples.directions).segment_repeat(&samples.offsets));
-        let colors = |outputs: &Tensor<T>, directions: &Tensor<T>| self.color.forward(&Tensor::concat(&[outputs, directions], 1)).sigmoid();
         if self.color_above == 0.0 {
-            return Radiance { rgb: colors(&outputs, &directions), sigma };
+            return Radiance { rgb: self.shade_encoded(&outputs, &directions), sigma };
         }
         let weights = weights(samples, &sigma);
         let above = T::lit(self.color_above);
         let seen = (0..).zip(weights.data()).filter(|(_, weight)| **weight > above).map(|(i, _)| i);
         let seen = Indices::from(seen.collect::<Vec<u32>>());
-        let rgb = colors(&outputs.gather_rows(&seen), &directions.gather_rows(&seen));
+        let rgb = self.shade_encoded(&outputs.gather_rows(&seen), &directions.gather_rows(&seen));
         Radiance { sigma, rgb: rgb.scatter_rows(&seen, samples.len()) }
     }
 

@@ -22,7 +22,7 @@ use crate::geometry::Aabb;
 use crate::loss::{Objective, entropy, mse, sample_color};
 use crate::model::cells;
 use crate::rays::RaySource;
-use crate::render::{Engine, Field, RenderOptions, Rendered, render};
+use crate::render::{Engine, Field, RenderOptions, Rendered, ShadedField, render};
 use crate::sampling::{Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
@@ -204,6 +204,10 @@ impl<T: Real> Model<T> for Dvgo<T> {
 
     fn aabb(&self) -> Aabb {
         self.field.aabb()
+    }
+
+    fn shaded(&self) -> Option<&dyn ShadedField<T>> {
+        Some(&self.field)
     }
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {

@@ -17,7 +17,7 @@ use crate::geometry::Aabb;
 use crate::loss::{Objective, Step, mse};
 use crate::random::{Purpose, Stream};
 use crate::rays::RaySource;
-use crate::render::{Rendered, composite};
+use crate::render::{Rendered, ShadedField, composite};
 use crate::sampling::importance::{Section, importance, stratified};
 use crate::sampling::{Jitter, Occupancy, Samples};
 use crate::tensor_file::{TensorFile, TensorWriter};
@@ -125,6 +125,10 @@ impl<T: Real> Model<T> for Nerf<T> {
 
     fn aabb(&self) -> Aabb {
         self.aabb
+    }
+
+    fn shaded(&self) -> Option<&dyn ShadedField<T>> {
+        Some(&self.fine)
     }
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {

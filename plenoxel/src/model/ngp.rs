@@ -23,7 +23,7 @@ use crate::model::cells;
 use crate::model::plenoxels::config::Hull;
 use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
-use crate::render::{Engine, Field, RenderOptions, Rendered, render};
+use crate::render::{Engine, Field, RenderOptions, Rendered, ShadedField, render};
 use crate::sampling::{Jitter, Occupancy, Refresh, RunningOccupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
@@ -346,6 +346,10 @@ impl<T: Real> Model<T> for Ngp<T> {
 
     fn aabb(&self) -> Aabb {
         self.field.aabb()
+    }
+
+    fn shaded(&self) -> Option<&dyn ShadedField<T>> {
+        Some(&self.field)
     }
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {

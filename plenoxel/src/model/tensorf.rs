@@ -25,7 +25,7 @@ use crate::model::cells;
 use crate::model::plenoxels::config::Hull;
 use crate::model::recipe::Recipe;
 use crate::rays::RaySource;
-use crate::render::{Engine, Field, RenderOptions, Rendered, render, render_tracked};
+use crate::render::{Engine, Field, RenderOptions, Rendered, ShadedField, render, render_tracked};
 use crate::sampling::{Jitter, Occupancy, Spacing};
 use crate::space::{Region, Space};
 use crate::tensor_file::{TensorFile, TensorWriter};
@@ -34,7 +34,6 @@ use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
 use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde::Deserialize;
 use serde_json::{Value, json};
-use std::any::Any;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, OnceLock};
@@ -313,8 +312,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
         self.aim(rays);
     }
 
-    /// Returns the field, a [`Factored<T>`].
-    fn content(&self) -> Option<&dyn Any> {
+    fn shaded(&self) -> Option<&dyn ShadedField<T>> {
         Some(&self.field)
     }
 

@@ -4,6 +4,7 @@ use super::{RenderOptions, Rendered};
 use crate::camera::{Ray, TrackedRays};
 use crate::sampling::{Occupancy, Samples};
 use autograd::{Real, Tensor};
+use glam::DVec3;
 
 /// Density and color at samples.
 #[derive(Debug, Clone)]
@@ -36,6 +37,20 @@ pub trait Field<T: Real>: Send + Sync {
     /// Renders tracked rays in one pass, if this field has a kernel whose adjoint gives gradients to rays. The result must equal that of the graph
     /// ([`render_tracked`](super::render_tracked)).
     fn render_fused_tracked(&self, _rays: &TrackedRays<T>, _options: &RenderOptions<'_>) -> Option<Rendered<T>> {
+        None
+    }
+}
+
+/// A field whose color is a function of a feature of the position, and of the direction. It can be [baked](crate::bake).
+pub trait ShadedField<T: Real>: Field<T> {
+    /// Returns the features at world positions `[m, 3]`: `[m, F]`.
+    fn features(&self, positions: &Tensor<T>) -> Tensor<T>;
+
+    /// Returns the colors of features `[m, F]`, seen along unit directions `[m, 3]`: `[m, 3]`, in [0, 1].
+    fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T>;
+
+    /// Returns the sides of the smallest cells, world length; `None` if the field has no cells.
+    fn cell_sides(&self) -> Option<DVec3> {
         None
     }
 }

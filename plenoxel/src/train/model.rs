@@ -5,7 +5,7 @@ use crate::camera::{Ray, TrackedRays};
 use crate::error::Result;
 use crate::geometry::Aabb;
 use crate::rays::RaySource;
-use crate::render::Rendered;
+use crate::render::{Rendered, ShadedField};
 use crate::sampling::Jitter;
 use crate::space::Space;
 use crate::tensor_file::{TensorFile, TensorWriter};
@@ -120,13 +120,18 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         [("model".to_owned(), Value::Object(model))].into_iter().collect()
     }
 
-    /// Returns the representation of the model, for code that needs a certain type. Exports and the viewer of the report need a voxel grid,
-    /// for example. Default: none.
+    /// Returns the representation of the model, for code that needs a certain type. Exports need a voxel grid, for example. Default: none.
     fn content(&self) -> Option<&dyn Any> {
         None
     }
 
-    /// Returns the space of the model's box: [`content`](Model::content) is a function of positions in this box. Default: a box of the world.
+    /// Returns the field from which a voxel grid can be [baked](crate::bake), for exports and the viewer of the report. Default: none.
+    fn shaded(&self) -> Option<&dyn ShadedField<T>> {
+        None
+    }
+
+    /// Returns the space of the model's box: [`content`](Model::content) and [`shaded`](Model::shaded) are functions of positions in this box. Default: a box of
+    /// the world.
     fn space(&self) -> Space {
         Space::Box
     }
