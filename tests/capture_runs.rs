@@ -63,8 +63,62 @@ fn a_capture_from_all_around_has_a_viewer_and_films() {
     // Training views, though there are test views.
     assert_eq!(scene["views"].as_array().unwrap().len(), 8);
     render(&run, &["orbit", "spiral", "cameras"]);
+    // Distances in units of the dataset, whose cameras are at 4 from the middle; in the world of the run they are at 1.
+    plenoxel(&["render", &run, "--view=0", "--channels=depth", "--format=npy"]).done();
+    let depth = floats(&fs::read(format!("{run}/renders/test_000_r_0_depth.npy")).unwrap());
+    let near = depth.iter().copied().fold(f32::INFINITY, f32::min);
+    assert!(near > 1.5 && depth.iter().any(|depth| (2.5..5.5).contains(depth)), "nearest {near}");
     plenoxel(&["bake", &run]).refused(3, &["coordinates of a capture (contracted)", "--space box"]);
     plenoxel(&["export", "ply", &run]).refused(3, &["coordinates of a capture (contracted)", "--space box"]);
+}
+
+/// The numbers of an NPY file of 32-bit floats.
+fn floats(npy: &[u8]) -> Vec<f32> {
+    let header = 10 + usize::from(u16::from_le_bytes([npy[8], npy[9]]));
+    npy[header..].as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect()
+}
+
+/// The scale from the dataset to the world of a run.
+fn scale_of(run: &str) -> f64 {
+    let record: Value = serde_json::from_str(&fs::read_to_string(format!("{run}/run.json")).unwrap()).unwrap();
+    let to_world: plenoxel::geometry::Similarity = serde_json::from_value(record["to_world"].clone()).unwrap();
+    to_world.scale
+}
+
+#[test]
+fn exports_of_a_capture_are_in_the_coordinates_of_the_dataset() {
+    let folder = Folder::new("capture-box");
+    let input = captures::Folder::new();
+    write_transforms(&input, &around());
+    let (data, run) = (input.0.display().to_string(), folder.path("run"));
+    let grid = [
+        "--preset=demo",
+        "--space=box",
+        "--half-width=0.4",
+        "--set",
+        "stages=[{resolution=16, steps=150, sampling={step=0.5}, density_rate=1.0, color_rate=0.05}]",
+    ];
+    plenoxel(&[&["train", &data, "--no-images", "--no-report", "--out", &run][..], &grid].concat()).done();
+    // The half width of 0.4 in the world of the run is 1.74 in the dataset.
+    let farthest = |file: &str, positions: Vec<[f64; 3]>| {
+        let most = positions.iter().flatten().fold(0.0f64, |most, x| most.max(x.abs()));
+        assert!((0.6..1.8).contains(&most), "{file}: {most}");
+    };
+    let keep = ["--min-alpha=0", "--min-weight=0", "--min-object=0"];
+    plenoxel(&[&["export", "ply", &run][..], &keep].concat()).done();
+    let cloud = plenoxel::point_cloud::ply::PlyFile::open(format!("{run}/exports/cloud.ply").as_ref()).unwrap();
+    let side = 0.8 / 16.0 / scale_of(&run);
+    assert!(cloud.header().remarks.contains(&format!("comment voxel_side {side}")), "{:?}", cloud.header().remarks);
+    farthest("cloud", cloud.positions().unwrap().into_iter().map(|p| p.to_array()).collect());
+    let middle = cloud.positions().unwrap().iter().sum::<DVec3>() / cloud.len() as f64;
+    // A box is in the coordinates of the file.
+    let within = format!("--bbox=-9,-9,{},9,9,9", middle[2]);
+    plenoxel(&[&["export", "ply", &run, &within][..], &keep].concat()).done();
+    let above = plenoxel::point_cloud::ply::PlyFile::open(format!("{run}/exports/cloud.ply").as_ref()).unwrap();
+    assert!(above.positions().unwrap().iter().all(|p| p.z >= middle[2]) && above.len() < cloud.len() && above.len() > 0);
+    plenoxel(&["export", "mesh", &run, "--level=1"]).done();
+    let mesh = plenoxel::point_cloud::ply::PlyFile::open(format!("{run}/exports/mesh.ply").as_ref()).unwrap();
+    farthest("mesh", mesh.positions().unwrap().into_iter().map(|p| p.to_array()).collect());
 }
 
 #[test]

@@ -254,12 +254,16 @@ fn intrinsics_lenses_and_masks_are_those_of_a_transforms_json() {
 
     for (more, words) in [
         (r#""fl_x": -5"#, ["fl_x is -5", "positive"]),
+        (r#""camera_angle_x": 0.6911112070083618, "fl_x": 11.1"#, ["fl_x is 11.1, but camera_angle_x", "give w and h"]),
         (r#""camera_angle_x": 0.69, "w": 8, "h": 16"#, ["the image has 4 x 4 pixels", "its camera 8 x 16"]),
         (r#""camera_angle_x": 0.69, "camera_model": "EQUIRECTANGULAR""#, ["EQUIRECTANGULAR", "frame 0"]),
         (r#""camera_angle_x": 0.69, "rolling_shutter": [0, 1, 0, 0]"#, ["rolling_shutter is", "not supported"]),
     ] {
         with(more).refused(3, &words);
     }
+    let folder = Folder::scene();
+    folder.edit("\"rotation\": 0.1", "\"mask_path\": \"gone.png\"");
+    folder.refused(3, &["the mask \"gone.png\" of frame 0 does not exist", "looked for"]);
 }
 
 #[test]

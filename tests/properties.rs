@@ -197,7 +197,6 @@ damaged! {
     damaged_assignments_are_read_or_refused: "assignments",
     damaged_metrics_are_read_or_refused: "metrics.jsonl",
     damaged_records_are_read_or_refused: "run.json",
-    damaged_captures_are_read_or_refused: "capture.json",
     damaged_cameras_of_colmap_are_read_or_refused: "cameras.bin",
     damaged_images_of_colmap_are_read_or_refused: "images.bin",
     damaged_points_of_colmap_are_read_or_refused: "points3D.bin",

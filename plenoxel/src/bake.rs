@@ -1,8 +1,9 @@
 //! Baking: a sparse voxel grid with harmonics that resembles a [field](crate::render::ShadedField), for viewers and exports.
 //!
-//! 1. The grid is the smallest cube around the origin that contains the field's occupied cells. A voxel has the raw density r = σ − 25
-//!    softplus(−x − 6) at its centre, where σ = 25 softplus(x) is that of the field. max(0, r) is σ up to 1.2 per world length. Unlike σ, r is
-//!    nearly linear in x, the density feature of a [factored field](crate::field::factored), below 0 too: interpolation between voxels places a surface where the field has it. If σ were
+//! 1. The grid is the smallest cube around the origin that contains the field's occupied cells. A voxel has the raw density r = σ − a
+//!    softplus(−x − 6) at its centre. There σ = a softplus(x) is the density of the field, x is not below −10, and a = min(25, 1 / (2 s)) with the side
+//!    s of a voxel. max(0, r) differs from σ by at most 0.05 a: an opacity of 0.025 of a voxel. Unlike σ, r is nearly linear in x, below 0 too. With
+//!    a = 25, x is the density feature of a [factored field](crate::field::factored). Interpolation between voxels places a surface where the field has it. If σ were
 //!    interpolated, every surface would grow by up to half a voxel.
 //! 2. A voxel is present if it or a neighbour has a density above 0.
 //! 3. The harmonics of a voxel v are the least-squares fit to the field's colors c at its centre, in the directions d of the cameras that see
@@ -40,9 +41,9 @@ use visible::Sights;
 pub const OFFSET: f64 = 0.5;
 /// Feature x at which the raw density bends down, times −1; it is 0 at half of that.
 const BEND: f32 = 6.0;
-/// Raw density of voxels whose centres are not in occupied cells.
-const EMPTY: f32 = -100.0;
-/// Most voxels along each axis of [`resolution_of`].
+/// Least x.
+const LEAST: f32 = -10.0;
+/// Most voxels along each axis of [`Source::resolution`].
 const MOST_VOXELS: usize = 512;
 /// Most directions in which the color of a voxel is computed.
 const MOST_DIRECTIONS: usize = 32;
@@ -58,7 +59,7 @@ const BATCH: usize = 1 << 16;
 /// Sides of a box without cells, in voxels.
 const VOXELS_WITHOUT_CELLS: f64 = 256.0;
 
-/// What is baked.
+/// A field to bake, with its box.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
     /// The field, a function of positions in the box.
@@ -135,10 +136,7 @@ pub fn bake(source: Source<'_>, options: &BakeOptions, cameras: &[Camera], progr
     }
     let rows = lattice.rows();
     let needed = (rows * (2 * shape.voxel_bytes() + 4 * size_of::<f32>())) as u64;
-    if let Some(allowance) = allowance().filter(|allowance| needed > allowance.bytes) {
-        let found = format!("baking {} voxels needs about {} of memory, but {allowance}", lattice.present(), bytes(needed));
-        return Err(Error::usage("resolution", found, "use fewer voxels per axis, or a lower degree of harmonics"));
-    }
+    check_memory(&format!("baking {} voxels", lattice.present()), needed)?;
     let sights = (!cameras.is_empty()).then(|| {
         let grid = VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[rows, 3]));
         Sights::new(&grid, coordinates, cameras)
@@ -153,12 +151,21 @@ pub fn bake(source: Source<'_>, options: &BakeOptions, cameras: &[Camera], progr
     Ok(VoxelGrid::with_lattice(shape, lattice, density, Tensor::from_buffer(table, &[rows, width])))
 }
 
+/// Errors if there is less memory than `what` needs.
+fn check_memory(what: &str, needed: u64) -> Result<()> {
+    let Some(allowance) = allowance().filter(|allowance| needed > allowance.bytes) else { return Ok(()) };
+    let found = format!("{what} needs about {} of memory, but {allowance}", bytes(needed));
+    Err(Error::usage("resolution", found, "use fewer voxels per axis, or a lower degree of harmonics"))
+}
+
 /// Returns the present voxels and the table of their densities, `[rows, 1]`.
 fn densities(source: Source<'_>, shape: &GridShape, coordinates: GridSpace) -> Result<(Lattice, Tensor<f32>)> {
     let (aabb, nodes) = (coordinates.unstretched(Aabb::cube(shape.half_width)), [shape.resolution; 3]);
     // Nothing outside of the occupied cells was trained.
     let sampled = source.field.reach().cloned().unwrap_or_else(|| Occupancy::new(source.aabb, [1; 3], &[true]));
     let sampled = Lattice::from_masks(nodes, sampled.resampled(aabb, nodes).masks().to_vec());
+    let needed = (sampled.rows() * size_of::<f32>()) as u64;
+    check_memory(&format!("sampling the densities of {} voxels", sampled.present()), needed)?;
     let mut values = vec![0.0; sampled.rows()];
     for (first, values) in (0..).step_by(BATCH).zip(values.chunks_mut(BATCH)) {
         let rows: Vec<(usize, DVec3)> =
@@ -166,7 +173,8 @@ fn densities(source: Source<'_>, shape: &GridShape, coordinates: GridSpace) -> R
         let density = source.field.density(&positions(rows.iter().map(|(_, at)| *at)));
         rows.iter().zip(density.data()).for_each(|((r, _), &density)| values[*r] = density);
     }
-    let density = |node| sampled.row(node).map_or(EMPTY, |row| raw(values[row as usize]));
+    let scale = (0.5 / shape.voxel_side()).min(SCALE) as f32;
+    let density = |node| raw(sampled.row(node).map_or(0.0, |row| values[row as usize]), scale);
     let bricks = BrickGrid::new(nodes);
     let dense = parallel::map_indices(bricks.len(), |b| bits_where(bricks.inside(b), |bit| density(bricks.node(b, bit)) > 0.0));
     if dense.iter().all(|mask| *mask == 0) {
@@ -180,12 +188,11 @@ fn densities(source: Source<'_>, shape: &GridShape, coordinates: GridSpace) -> R
     Ok((lattice, Tensor::from_vec(table, &[rows, 1])))
 }
 
-/// Returns the raw density of a voxel from the density of the field.
-fn raw(density: f32) -> f32 {
-    let scale = SCALE as f32;
+/// Returns the raw density of a voxel from the density of the field. `scale` is a.
+fn raw(density: f32, scale: f32) -> f32 {
     let softplus = |x: f32| x.max(0.0) + (-x.abs()).exp().ln_1p();
     // The inverse of the softplus. For large densities, the exponential overflows and x is the density itself.
-    let x = (density / scale).exp_m1().max(f32::MIN_POSITIVE).ln().min(density / scale);
+    let x = (density / scale).exp_m1().max(f32::MIN_POSITIVE).ln().min(density / scale).max(LEAST);
     density - scale * softplus(-x - BEND)
 }
 

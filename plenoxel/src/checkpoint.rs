@@ -209,7 +209,11 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
     let value = file.facts()?;
     if let Some(kind) = value["kind"].as_str().filter(|kind| *kind != KIND) {
         let found = format!("a model of kind `{kind}` has no voxels");
-        return Err(Error::input(path, found, format!("use a model of kind `{KIND}`; `plenoxel bake` makes one from a factored field")));
+        return Err(Error::input(
+            path,
+            found,
+            format!("use a model of kind `{KIND}`; `plenoxel bake` makes one from a model without voxels"),
+        ));
     }
     let format = value["format"].as_str().unwrap_or("none");
     if ![FORMAT, SPARSE_FORMAT, REDUCED_FORMAT].contains(&format) {

@@ -1,6 +1,6 @@
 //! Export of grids to files of other programs.
 //!
-//! Positions are those of the dataset, z up, unless a format requires otherwise. Colors are 8-bit sRGB, as in the photographs.
+//! Positions are in the world of the run, z up; [`mesh::Mesh::moved`] moves them to the coordinates of the dataset. Colors are 8-bit sRGB, as in the photographs.
 //! View-dependent colors are evaluated in one direction: for each voxel opposite to its outward direction, or in a given direction for all.
 
 pub mod mesh;

@@ -1,6 +1,7 @@
 //! Geometry of rays, grids and frames: the axis-aligned box, and the similarity.
 
 use glam::{DAffine3, DMat3, DVec3};
+use serde::{Deserialize, Serialize};
 
 /// Axis-aligned box in world coordinates, including its faces.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,8 +59,9 @@ impl Aabb {
     }
 }
 
-/// Similarity p ↦ s R p + t: rotation, scale and translation.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Similarity p ↦ s R p + t: rotation, scale and translation. In files, it is the 3 x 4 matrix (s R | t).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(into = "[[f64; 4]; 3]", try_from = "[[f64; 4]; 3]")]
 pub struct Similarity {
     /// s, positive.
     pub scale: f64,
@@ -98,6 +100,35 @@ impl Similarity {
     }
 }
 
+impl From<Similarity> for [[f64; 4]; 3] {
+    fn from(of: Similarity) -> Self {
+        let rows = (of.scale * of.rotation).transpose();
+        [0, 1, 2].map(|i| {
+            let row = rows.col(i);
+            [row.x, row.y, row.z, of.translation[i]]
+        })
+    }
+}
+
+impl TryFrom<[[f64; 4]; 3]> for Similarity {
+    type Error = &'static str;
+
+    fn try_from(rows: [[f64; 4]; 3]) -> Result<Self, Self::Error> {
+        let scaled = DMat3::from_cols_array_2d(&rows.map(|[x, y, z, _]| [x, y, z])).transpose();
+        let scale = scaled.determinant().cbrt();
+        let rotation = scaled * scale.recip();
+        let error = rotation.transpose() * rotation - DMat3::IDENTITY;
+        let translation = DVec3::from_array(rows.map(|row| row[3]));
+        // Not a number is not near either.
+        let near = error.to_cols_array().into_iter().all(|value| value.abs() < 1e-6);
+        if scale > 0.0 && near && translation.is_finite() {
+            Ok(Similarity { scale, rotation, translation })
+        } else {
+            Err("expected a similarity, a 3 x 4 matrix of a rotation, a positive scale and a translation")
+        }
+    }
+}
+
 /// Computes eigenvalues and unit eigenvectors of a symmetric matrix, the smallest value first, with Jacobi rotations (Golub and Van Loan,
 /// 8.5). Each rotation makes one off-diagonal entry 0. Convergence is quadratic, so a few sweeps reach the precision of `f64`.
 pub(crate) fn eigen(mut a: DMat3) -> [(f64, DVec3); 3] {
@@ -131,6 +162,24 @@ pub(crate) fn eigen(mut a: DMat3) -> [(f64, DVec3); 3] {
 mod tests {
     use super::*;
     use crate::random::{Purpose, uniform};
+
+    #[test]
+    fn a_similarity_survives_being_written_and_read_and_others_are_refused() {
+        let rotation = DMat3::from_axis_angle(DVec3::new(1.0, 2.0, -0.5).normalize(), 0.8);
+        let of = Similarity::about(DVec3::new(3.0, -1.0, 2.0), rotation, 0.25);
+        let again: Similarity = serde_json::from_str(&serde_json::to_string(&of).unwrap()).unwrap();
+        let p = DVec3::new(0.3, 5.0, -2.0);
+        assert!((again.point(p) - of.point(p)).length() < 1e-12 && (again.scale - 0.25).abs() < 1e-15);
+        assert!((of.inverse().point(of.point(p)) - p).length() < 1e-12);
+        for rows in [
+            "[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]",
+            "[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]",
+            "[[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]",
+            "[[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
+        ] {
+            assert!(serde_json::from_str::<Similarity>(rows).is_err(), "{rows}");
+        }
+    }
 
     #[test]
     fn eigenvectors_of_a_symmetric_matrix_are_orthonormal_and_put_it_together_again() {

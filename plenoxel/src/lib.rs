@@ -15,7 +15,7 @@
 //! | [`train`] | batch → render → loss → gradients → optimizer, for any [`Model`](train::Model) |
 //! | [`model`] | radiance fields with their training recipes: [`model::plenoxels`] |
 //! | [`evaluate`] | PSNR and SSIM of a model on the images of a split |
-//! | [`bake`] | a voxel grid with the density and the colors of a factored field |
+//! | [`bake`] | a voxel grid with the density and the colors of a field without voxels |
 //! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |
 //! | [`checkpoint`] | a trained grid in a file |
 //! | [`run`] | complete runs, without printing: settings, run folder, metrics, evaluation |

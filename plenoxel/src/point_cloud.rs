@@ -10,6 +10,7 @@ pub mod ply;
 mod sums;
 mod tree;
 
+use crate::geometry::Similarity;
 use glam::DVec3;
 
 /// Points with optional attributes. Every list that is present has one entry per point.
@@ -48,6 +49,15 @@ impl PointCloud {
     /// Returns the values of the field of this name.
     pub fn field(&self, name: &str) -> Option<&[f32]> {
         self.fields.iter().find(|field| field.name == name).map(|field| &field.values[..])
+    }
+
+    /// Returns the image of the cloud under a similarity. Scalar fields are unchanged.
+    pub fn moved(mut self, by: &Similarity) -> Self {
+        self.positions.iter_mut().for_each(|position| *position = by.point(*position));
+        for normal in self.normals.iter_mut().flatten() {
+            *normal = (by.rotation * DVec3::from(normal.map(f64::from))).as_vec3().to_array();
+        }
+        self
     }
 
     /// Returns the points with the given numbers, in that order.

@@ -6,7 +6,13 @@ use plenoxel::dataset::{colmap, llff, nsvf, transforms};
 use std::path::Path;
 
 pub const PARSERS: [Parser; 10] = [
-    Parser { name: "capture.json", valid: captures, read: read_capture, repair: |_| (), memory: [MIB, 400] },
+    Parser {
+        name: "transforms.json",
+        valid: || [super::transforms(), captures()].concat(),
+        read: read_capture,
+        repair: |_| (),
+        memory: [MIB, 400],
+    },
     Parser { name: "cameras.bin", valid: || vec![cameras_bin()], read: read_colmap, repair: |_| (), memory: [MIB, 64] },
     Parser { name: "images.bin", valid: || vec![images_bin()], read: read_colmap, repair: |_| (), memory: [MIB, 64] },
     Parser { name: "points3D.bin", valid: || vec![points_bin()], read: read_colmap, repair: |_| (), memory: [MIB, 64] },
@@ -44,7 +50,7 @@ fn captures() -> Vec<Vec<u8>> {
     vec![ngp.into_bytes(), studio.into_bytes()]
 }
 
-pub fn read_capture(path: &Path, bytes: &[u8]) -> Result<Then, String> {
+fn read_capture(path: &Path, bytes: &[u8]) -> Result<Then, String> {
     let read = transforms::Transforms::parse(path, bytes).map_err(text)?;
     Ok(Box::new(move || {
         for frame in read.frames {

@@ -51,8 +51,7 @@ pub fn parsers() -> impl Iterator<Item = &'static Parser> {
     PARSERS.iter().chain(&capture_parsers::PARSERS)
 }
 
-const PARSERS: [Parser; 12] = [
-    Parser { name: "transforms.json", valid: transforms, read: capture_parsers::read_capture, repair: |_| (), memory: [MIB, 200] },
+const PARSERS: [Parser; 11] = [
     Parser { name: "path.json", valid: paths, read: read_path, repair: |_| (), memory: [2 * MIB, 400] },
     // Deflate makes 1032 of one byte, RGBA 32 of one that has 8 pixels; a row; and what stands beside the pixels.
     Parser { name: "image.png", valid: images, read: read_image, repair: repair_image, memory: [64 * MIB, 1032 * 32] },

@@ -1,4 +1,4 @@
-//! `plenoxel bake`: turns a field of another model into a voxel grid, as a new run.
+//! `plenoxel bake`: turns the field of a model without voxels into a voxel grid, as a new run.
 
 use super::new_run::loading;
 use super::{beside, check_box, whole};
@@ -92,7 +92,11 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     estimate.check()?;
     let (trained, about) = model::open(&path, &config)?;
     let Some(field) = Source::of(&*trained) else {
-        return Err(Error::input(&path, format!("a model of kind `{}` cannot be baked", trained.kind()), "use a run of preset quality"));
+        return Err(Error::input(
+            &path,
+            format!("a model of kind `{}` cannot be baked", trained.kind()),
+            "use a run of preset quality, photos, tensorf, dvgo, ngp or nerf",
+        ));
     };
     check_box(&path, field.space)?;
 
@@ -122,7 +126,8 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     };
     let from = source.path().canonicalize().unwrap_or_else(|_| source.path().to_owned());
     let baked = Baked { run: from, resolution: options.resolution, sh_degree: options.degree };
-    let record = RunRecord { baked: Some(baked), ..RunRecord::new(RunKind::Baked, &dataset, record.preset.as_deref(), &data) };
+    let new = RunRecord::new(RunKind::Baked, &dataset, record.preset.as_deref(), &data);
+    let record = RunRecord { baked: Some(baked), to_world: record.to_world.or(new.to_world), ..new };
     folder.describe(&config, &record)?;
     let model = Plenoxels::of_grid(&config, grid);
     folder.save(&model, &About { step: about.step, seed: about.seed, scene: about.scene, background: config.background })?;

@@ -69,7 +69,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let Loaded { model, about, view } = args.run.of.load(&found, console, |sampling, stored| {
         Estimate::of_evaluation(&found.config, sampling, stored, Some((&dataset, args.run.split)))
     })?;
-    let Found { folder, config, preset, source } = found;
+    let Found { folder, config, preset, source, .. } = found;
     // Another scene is an error only with --keep, because a folder may have been renamed.
     let same_scene = about.scene == dataset.name();
     if !same_scene && args.keep {

@@ -101,7 +101,8 @@ pub fn run(args: &ImportArgs, console: &Console<'_>) -> Result<()> {
     let file = args.file.canonicalize().unwrap_or_else(|_| args.file.clone());
     let imported = Imported { file, format: format.name().to_owned(), scene_scale: scale };
     let about = dataset.as_ref().map_or(format.name(), Dataset::format);
-    let record = RunRecord { imported: Some(imported), ..RunRecord::of_scene(RunKind::Imported, &scene, about, &source) };
+    let to_world = dataset.as_ref().map(|dataset| dataset.normalization().to_world);
+    let record = RunRecord { imported: Some(imported), to_world, ..RunRecord::of_scene(RunKind::Imported, &scene, about, &source) };
     folder.describe(&config, &record)?;
     let model = Plenoxels::of_grid(&config, grid);
     folder.save(&model, &About { scene: scene.clone(), background, seed: config.seed, step: 0 })?;

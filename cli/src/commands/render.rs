@@ -33,7 +33,7 @@ Views are written to RUN/renders/<split>_<index>_<name>.png, with the background
 blue is far, white is empty), _normal (world x, y, z as red, green, blue; white is empty) and _opacity. Frames of a path are written to
 RUN/renders/<path>/frame_0000.png and so on. The PNG frames are combined to RUN/renders/<path>.gif and .mp4; earlier files are replaced.
 
-EXR and NPY files have 32-bit floats. Depth is the distance along the ray in units of the dataset (NaN where empty). Normals are unit vectors in
+EXR and NPY files have 32-bit floats. Depth is the distance along the ray in units of the dataset (NaN where empty, infinite at infinity). Normals are unit vectors in
 world coordinates (0 where empty). Opacity is from 0 to 1. Color is linear light in EXR and sRGB in NPY, not clamped.";
 
 /// Render a run from its views, or as a video along a camera path
@@ -118,7 +118,7 @@ fn render(
     prepare()?;
     let grid = || voxel_grid(&*model, found.folder.path(), "rendering normals");
     let normals = normals.then(|| Ok(Plenoxels::of_grid(&found.config, grid()?.normals()))).transpose()?;
-    let pictures = Pictures::new(&*model, normals.as_ref(), &view, &channels, &args.format);
+    let pictures = Pictures::new(&*model, normals.as_ref(), &view, 1.0 / found.to_world.scale, &channels, &args.format);
     let count = console.count("rendering", shots.len());
     let start = Instant::now();
     for (done, (camera, stem)) in shots.iter().enumerate() {

@@ -16,7 +16,7 @@ Examples:
   plenoxel report runs/lego --data elsewhere/lego
 
 `train` and `carve` also write this page. It is a single file that needs no network. It has the settings, curves, pictures and results, and an
-interactive viewer of the grid, or of a grid that is baked from another field. The grid of the viewer is quantized to 8 and 16 bits, and
+interactive viewer of the grid, or of a grid that is baked from a field without voxels. The grid of the viewer is quantized to 8 and 16 bits, and
 resampled if it exceeds 30 MB. The page states its PSNR and that of the model.";
 
 /// Regenerate report.html of a run, with pictures, curves and an interactive viewer

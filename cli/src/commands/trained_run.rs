@@ -4,6 +4,7 @@ use crate::progress::Console;
 use clap::{Args, ValueHint};
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
+use plenoxel::geometry::Similarity;
 use plenoxel::model::plenoxels::config::{Config, Sampling};
 use plenoxel::model::{self, Model};
 use plenoxel::run::data::DataSource;
@@ -53,6 +54,8 @@ pub struct Found {
     pub config: Config,
     pub preset: Option<String>,
     pub source: DataSource,
+    /// From the coordinates of the dataset to the world of the run.
+    pub to_world: Similarity,
 }
 
 /// The model of a run, and its render options.
@@ -91,7 +94,7 @@ impl TrainedModel {
         let (folder, config, record) = RunFolder::open(&self.run)?;
         let folder = if self.best { folder.with_best()? } else { folder };
         let source = self.data.as_deref().map_or(record.data, DataSource::folder);
-        Ok(Found { folder, config, preset: record.preset, source })
+        Ok(Found { folder, config, preset: record.preset, source, to_world: record.to_world.unwrap_or_default() })
     }
 
     /// Opens the dataset, if it still exists. If the user gave its folder, it must exist. `otherwise` is the consequence of its absence.

@@ -36,7 +36,8 @@ const BAKED_VOXELS: usize = 256;
 const BAKED_VOXELS_OF_CAPTURES: usize = 384;
 /// Degree of its harmonics.
 const BAKED_DEGREE: usize = 2;
-/// Rendering weight of voxels that are left out of other spaces. Most of what is in their boxes is behind walls.
+/// Rendering weight of voxels that are left out of other spaces, and of fields that may have matter where no camera looks. Most of what is in their boxes is
+/// behind walls.
 const LEAST_WEIGHT: f32 = 1.0 / 256.0;
 /// Length of a step in other spaces, in sides of voxels.
 const STEP: f64 = 0.5;
@@ -225,7 +226,9 @@ impl Cost {
 /// Bakes a field for the page.
 fn baked(source: Source<'_>, report: &Report<'_>, console: &Console<'_>) -> Result<VoxelGrid<f32>> {
     let (most, least_weight) = match source.space {
-        Space::Box => (BAKED_VOXELS, 0.0),
+        Space::Box if source.field.reach().is_some() => (BAKED_VOXELS, 0.0),
+        // Nothing says where the field was trained.
+        Space::Box => (BAKED_VOXELS, LEAST_WEIGHT),
         Space::Ndc { .. } | Space::Contracted => (BAKED_VOXELS_OF_CAPTURES, LEAST_WEIGHT),
     };
     let options = BakeOptions { resolution: source.resolution().min(most), degree: BAKED_DEGREE, least_weight };

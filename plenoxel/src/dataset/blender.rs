@@ -2,14 +2,15 @@
 //!
 //! A file has `camera_angle_x`, the horizontal field of view in radians, and `frames`, each with a `file_path` without extension and a 4 x
 //! 4 camera-to-world `transform_matrix` with OpenGL axes; world z is up. Only listed images are views: the depth and normal images in the
-//! test folder of the original scenes are not. The files may state other intrinsics, lenses and masks: the keys are those of
+//! test folder of the original scenes are not. The files may state other intrinsics, lenses and masks, by the keys of
 //! [`transforms.json`](super::transforms).
 
 mod write;
 
-use super::capture::{Photo, fitted};
+use super::capture::{Photo, base_name, fitted};
+use super::image::Orientation;
 use super::normalize::Normalization;
-use super::transforms::Transforms;
+use super::transforms::{Listed, Transforms};
 use super::{Dataset, Frame, OpenOptions, Source, Split, image};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
@@ -52,14 +53,15 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     }
     let downscale = options.downscale;
     let frame = |photo: Photo| {
-        let (orientation, intrinsics) = fitted(&photo)?;
+        let (orientation, intrinsics) = fitted(&photo, &[Orientation::Stated])?;
         let full = (intrinsics.width, intrinsics.height);
         image::check_downscale(downscale, full)?;
         let camera = Camera { intrinsics: intrinsics.downscaled(downscale), camera_to_world: photo.camera_to_world };
         Ok(Frame { name: photo.name, camera, path: photo.image, mask: photo.mask, orientation, full })
     };
     let [train, val, test] = splits.map(|photos| photos.into_par_iter().map(frame).collect::<Vec<Result<Frame>>>());
-    let frames = [train, val, test].map(|frames| frames.into_iter().collect::<Result<Vec<Frame>>>());
+    // The first error in the order of the files is reported.
+    let frames = [train, val, test].map(|frames| frames.into_iter().collect::<Result<Vec<_>>>());
     let [train, val, test] = frames;
     let frames = [train?, val?, test?];
     let sized = |side: fn(&Frame) -> usize| frames.iter().flatten().map(side).max().unwrap_or(0);
@@ -84,7 +86,7 @@ fn file_name(root: &Path, split: Split) -> PathBuf {
 /// Errors if an image does not exist.
 fn photos(root: &Path, split: Split, transforms: Transforms) -> Result<Vec<Photo>> {
     let path = file_name(root, split);
-    let photo = |(k, frame): (usize, super::transforms::Listed)| {
+    let photo = |(k, frame): (usize, Listed)| {
         let image = find_image(root, split, &frame.file_path).map_err(|tried| {
             let tried: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
             let found = format!("the image \"{}\" of frame {k} does not exist", frame.file_path);
@@ -94,22 +96,32 @@ fn photos(root: &Path, split: Split, transforms: Transforms) -> Result<Vec<Photo
         Ok(Photo {
             name: image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default(),
             intrinsics: frame.stated.intrinsics(&path, &frame.file_path, size)?,
-            mask: frame.mask_path.map(|mask| root.join(mask)),
+            mask: frame.mask_path.map(|mask| mask_of(root, &mask, &path, k)).transpose()?,
             camera_to_world: frame.camera_to_world,
-            split: Some(split),
+            split: None,
             image,
         })
     };
     transforms.frames.into_iter().enumerate().map(photo).collect()
 }
 
+/// Returns the path of the mask of frame `k`.
+///
+/// Errors if it does not exist.
+fn mask_of(root: &Path, name: &str, path: &Path, k: usize) -> Result<PathBuf> {
+    let mask = root.join(name);
+    if files::is_there(&mask) {
+        return Ok(mask);
+    }
+    Err(Error::input(path, format!("the mask \"{name}\" of frame {k} does not exist"), format!("looked for {}", mask.display())))
+}
+
 /// Returns the image of a `file_path`: relative to the scene as written, or its last part in the split's folder. `.png` is appended unless
 /// present. If there is no such image, returns the paths that were tried.
 fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result<PathBuf, Vec<PathBuf>> {
-    let file_path = file_path.replace('\\', "/");
-    let base = file_path.rsplit('/').next().unwrap_or(&file_path);
+    let base = base_name(file_path);
     let folder = root.join(split.to_string());
-    let mut tried = vec![root.join(file_path.trim_start_matches("./")), folder.join(base)];
+    let mut tried = vec![root.join(file_path), folder.join(base)];
     if !file_path.to_ascii_lowercase().ends_with(".png") {
         for path in &mut tried {
             path.as_mut_os_string().push(".png");
@@ -117,7 +129,7 @@ fn find_image(root: &Path, split: Split, file_path: &str) -> std::result::Result
     }
     tried.dedup();
     // An image with another extension has it in the list.
-    let as_written = root.join(file_path.trim_start_matches("./"));
+    let as_written = root.join(file_path);
     let all = || tried.iter().chain([&as_written]);
     // Existing paths that are not files come last, so that the message can say what they are.
     let found = all().find(|path| path.is_file()).or_else(|| all().find(|path| files::is_there(path))).cloned();

@@ -24,6 +24,9 @@ pub(super) const FARTHEST: f64 = 1e12;
 /// round differently.
 const ROUNDED: f64 = 1.5;
 
+/// COLMAP reads images as stored; programs that turn them as EXIF states come second.
+const ORIENTATIONS: [Orientation; 2] = [Orientation::Stored, Orientation::Stated];
+
 /// Content of the files of a capture, before images are looked at.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Capture {
@@ -79,7 +82,7 @@ pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) 
     if let Some(pair) = capture.photos.windows(2).find(|pair| pair[0].name == pair[1].name) {
         return Err(Error::input(root, format!("the image {} has two cameras", pair[0].name), "list each image once"));
     }
-    let found: Vec<Result<_>> = capture.photos.par_iter().map(fitted).collect();
+    let found: Vec<Result<_>> = capture.photos.par_iter().map(|photo| fitted(photo, &ORIENTATIONS)).collect();
     let mut resized = 0;
     let mut images = Vec::new();
     for (photo, found) in capture.photos.iter_mut().zip(found) {
@@ -150,12 +153,11 @@ fn check_presence(root: &Path, capture: &mut Capture) -> Result<()> {
     Ok(())
 }
 
-/// Returns the orientation in which an image has the shape that its camera states, and the intrinsics of its size. COLMAP reads images as
-/// stored; programs that turn them as EXIF states come second.
+/// Returns the first orientation in which an image has the shape that its camera states, and the intrinsics of its size.
 ///
 /// Errors if the image cannot be read, or has another shape.
-pub(super) fn fitted(photo: &Photo) -> Result<(Orientation, Intrinsics)> {
-    for orientation in [Orientation::Stored, Orientation::Stated] {
+pub(super) fn fitted(photo: &Photo, orientations: &[Orientation]) -> Result<(Orientation, Intrinsics)> {
+    for &orientation in orientations {
         if let Some(intrinsics) = scaled(&photo.intrinsics, image::size_as(&photo.image, orientation)?) {
             // Rounded sizes may have pixels that the stated size had not.
             intrinsics.check_lens().map_err(|unusable| unusable.at(&photo.image, "the camera of the image"))?;

@@ -186,6 +186,10 @@ impl Stated {
     /// Returns the intrinsics for images of a size, which is the stated one if there is one.
     pub(super) fn intrinsics(&self, path: &Path, file_path: &str, size: (usize, usize)) -> Result<Intrinsics> {
         let intrinsics = self.at(size);
+        if let Some(found) = self.conflict(&intrinsics) {
+            let remedy = "give w and h of the images from which the cameras were computed, or leave camera_angle_x out";
+            return Err(Error::input(path, format!("for {file_path}, {found}"), remedy));
+        }
         intrinsics.check_lens().map_err(|unusable| unusable.at(path, &format!("camera of {file_path}")))?;
         Ok(intrinsics)
     }

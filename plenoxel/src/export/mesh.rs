@@ -20,14 +20,17 @@ mod smoothing;
 use super::{SURFACE_ALPHA, directions, near_colors};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::{Interpolation, VoxelGrid};
+use crate::geometry::Similarity;
 use autograd::{Real, parallel};
 use cases::{CORNERS, EDGES};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 
-/// Triangle mesh in the dataset's world coordinates.
+/// Triangle mesh.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Mesh {
-    /// World position of each vertex.
+    /// Rotation from the coordinates of the mesh to the world, whose z is up.
+    pub upright: DMat3,
+    /// Position of each vertex; [`mesh`] returns a mesh in world coordinates.
     pub positions: Vec<[f32; 3]>,
     /// Unit normal of each vertex, pointing out of the matter.
     pub normals: Vec<[f32; 3]>,
@@ -40,7 +43,16 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Returns the enclosed volume, world length³, by the divergence theorem: Σ a · (b × c) / 6.
+    /// Returns the image of the mesh under a similarity.
+    pub fn moved(mut self, by: &Similarity) -> Self {
+        let moved = |p: [f32; 3], map: &dyn Fn(DVec3) -> DVec3| map(DVec3::from(p.map(f64::from))).as_vec3().to_array();
+        self.positions.iter_mut().for_each(|p| *p = moved(*p, &|p| by.point(p)));
+        self.normals.iter_mut().for_each(|n| *n = moved(*n, &|n| by.rotation * n));
+        self.upright *= by.rotation.transpose();
+        self
+    }
+
+    /// Returns the enclosed volume, length³, by the divergence theorem: Σ a · (b × c) / 6.
     pub fn volume(&self) -> f64 {
         let corner = |v: u32| DVec3::from(self.positions[v as usize].map(f64::from));
         self.triangles.iter().map(|t| t.map(corner)).map(|[a, b, c]| a.dot(b.cross(c)) / 6.0).sum()
@@ -110,6 +122,7 @@ pub fn mesh<T: Real>(grid: &VoxelGrid<T>, options: &MeshOptions) -> Result<Mesh>
     let [points, normals] = [|v: &Vertex| v.position, |v: &Vertex| v.normal].map(|part| vertices.iter().map(part).collect::<Vec<_>>());
     let colors = near_colors(grid, &points, &directions(&normals, options.direction), &rows);
     Ok(Mesh {
+        upright: DMat3::IDENTITY,
         positions: points.iter().map(|point| point.as_vec3().to_array()).collect(),
         normals: normals.iter().map(|normal| normal.as_vec3().to_array()).collect(),
         colors,

@@ -2,7 +2,7 @@
 
 use super::mesh::Mesh;
 use crate::error::{Error, Result};
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use serde_json::{Value, json};
 use std::fmt::{self, Display, Write};
 use std::str::FromStr;
@@ -10,14 +10,14 @@ use std::str::FromStr;
 /// Format of a mesh file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MeshFormat {
-    /// Stanford PLY, binary little endian, z up; colors as bytes `red`, `green`, `blue`.
+    /// Stanford PLY, binary little endian; colors as bytes `red`, `green`, `blue`.
     Ply,
-    /// Wavefront OBJ, text, z up; colors after the positions, `v x y z r g b`, in [0, 1].
+    /// Wavefront OBJ, text; colors after the positions, `v x y z r g b`, in [0, 1].
     Obj,
-    /// Binary glTF 2.0. Positions are those of the dataset; the node is rotated so that the dataset's z becomes glTF's y, which is up. The
+    /// Binary glTF 2.0. Positions are those of the dataset; the node is rotated so that the z of the world becomes glTF's y, which is up. The
     /// material is unlit, because the colors include the lighting. Colors are linear, as glTF requires.
     Glb,
-    /// Binary STL, z up: triangles with one normal each. The format has no colors.
+    /// Binary STL: triangles with one normal each. The format has no colors.
     Stl,
 }
 
@@ -146,13 +146,14 @@ fn glb(mesh: &Mesh, comment: &str) -> Result<Vec<u8>> {
         binary.extend(bytes);
     }
     let half = std::f64::consts::FRAC_1_SQRT_2;
+    let to_y_up = DQuat::from_xyzw(-half, 0.0, 0.0, half) * DQuat::from_mat3(&mesh.upright);
     let document = json!({
         "asset": { "version": "2.0", "generator": comment },
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
         // A quarter turn around x: (x, y, z) to (x, z, −y).
-        "nodes": [{ "mesh": 0, "rotation": [-half, 0.0, 0.0, half] }],
+        "nodes": [{ "mesh": 0, "rotation": to_y_up.to_array() }],
         "meshes": [{ "primitives": [{ "attributes": { "POSITION": 0, "NORMAL": 1, "COLOR_0": 2 }, "indices": 3, "material": 0 }] }],
         "materials": [{
             "pbrMetallicRoughness": { "baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0 },

@@ -14,7 +14,7 @@ use glam::DVec3;
 /// Frame of the points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Coordinates {
-    /// World frame of the dataset: voxel k has its centre at (k + ½) · side − half width.
+    /// World of the run: voxel k has its centre at (k + ½) · side − half width.
     World,
     /// Voxel indices, 0 to n − 1.
     Grid,

@@ -2,6 +2,7 @@
 
 use super::{Field, RenderOptions, Rendered, render};
 use crate::camera::{Camera, Ray};
+use crate::space::Space;
 use autograd::{Real, no_grad, parallel};
 use ndarray::{Array2, Array3};
 
@@ -10,10 +11,22 @@ use ndarray::{Array2, Array3};
 pub struct Picture {
     /// Color, `[h, w, 3]`, sRGB, not clamped.
     pub rgb: Array3<f32>,
-    /// Depth Σ wᵢ tᵢ, `[h, w]`, world length.
+    /// Depth Σ wᵢ tᵢ, `[h, w]`, with the t of the space of the field's box ([`Samples`](crate::sampling::Samples)).
     pub depth: Array2<f32>,
     /// Opacity, `[h, w]`, in [0, 1].
     pub opacity: Array2<f32>,
+}
+
+impl Picture {
+    /// Returns the distance along each ray to the mean depth, `[h, w]`, world length: infinite at infinity, not a number where the picture is empty. `space` is
+    /// that of the box of the field.
+    pub fn distances(&self, camera: &Camera, space: Space) -> Array2<f32> {
+        Array2::from_shape_fn(self.depth.dim(), |(y, x)| {
+            // 0 / 0 is not a number.
+            let t = f64::from(self.depth[[y, x]] / self.opacity[[y, x]]);
+            if t.is_nan() { f32::NAN } else { space.distance(&camera.ray(x as f64 + 0.5, y as f64 + 0.5), t) as f32 }
+        })
+    }
 }
 
 /// Side of the squares of pixels that are rendered at a time. It bounds the memory.

@@ -19,8 +19,8 @@ Examples:
   plenoxel export mesh runs/lego --smooth 10 --max-triangles 200000
   plenoxel export mesh runs/lego --format stl              for 3D printing; without colors
 
-Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the coordinates of the dataset, z up. GLB files are rotated, \
-because glTF has y up. A higher level removes fog, but also thin parts. Small parts are removed first, then the surface is smoothed, then \
+Writes RUN/exports/mesh.<format>: a closed surface with normals and colors, in the coordinates of the dataset. GLB files have a rotation \
+to y up, the axis of glTF. A higher level removes fog, but also thin parts. Small parts are removed first, then the surface is smoothed, then \
 decimated.";
 
 /// Export the surface of a run as a colored mesh
@@ -37,7 +37,7 @@ pub struct MeshArgs {
     #[arg(long, value_name = "FORMAT", help_heading = "Output", value_parser = format)]
     format: Option<MeshFormat>,
 
-    /// Density of the isosurface, 1 / world length [default: the density at which a voxel has an alpha of 0.3]
+    /// Density of the isosurface, 1 / length of the dataset [default: the density at which a voxel has an alpha of 0.3]
     #[arg(long, value_name = "SIGMA", help_heading = "Surface", value_parser = number(f64::MIN_POSITIVE), allow_negative_numbers = true)]
     level: Option<f64>,
 
@@ -63,15 +63,19 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
         (None, Some(Ok(named))) => named,
         (given, _) => given.unwrap_or(MeshFormat::Ply),
     };
-    let Opened { folder, grid, .. } = args.exported.open(console, &format.to_string(), BYTES_PER_VOXEL)?;
+    let Opened { folder, grid, record, .. } = args.exported.open(console, &format.to_string(), BYTES_PER_VOXEL)?;
+    let to_world = record.to_world.unwrap_or_default();
     let options = MeshOptions {
-        level: args.level,
-        direction: args.colors.direction(),
+        // The level is per length of the dataset.
+        level: args.level.map(|level| level / to_world.scale),
+        direction: args.colors.direction().map(|direction| to_world.rotation * direction),
         min_part: args.min_part,
         smooth: args.smooth,
         max_triangles: args.max_triangles,
     };
     let surface = mesh(&grid, &options).map_err(as_flag)?;
+    let volume = surface.volume() * to_world.scale.powi(-3);
+    let surface = surface.moved(&to_world.inverse());
     if surface.parts_left_out > 0 {
         let parts = if surface.parts_left_out == 1 { "part" } else { "parts" };
         console.note(&format!("removed {} {parts} of fewer than {} triangles (--min-part)", surface.parts_left_out, args.min_part));
@@ -87,11 +91,7 @@ pub fn run(args: &MeshArgs, console: &Console<'_>) -> Result<()> {
     let file = args.exported.write(&folder, &format!("mesh.{format}"), &bytes, console)?;
     console.wrote(
         &file,
-        &format!(
-            "wrote {vertices} vertices and {triangles} triangles with an enclosed volume of {:.4} to {}",
-            surface.volume(),
-            file.display()
-        ),
+        &format!("wrote {vertices} vertices and {triangles} triangles with an enclosed volume of {:.4} to {}", volume, file.display()),
     )
 }
 

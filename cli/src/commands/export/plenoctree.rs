@@ -18,7 +18,7 @@ Examples:
   plenoxel export plenoctree runs/lego --subdivide 2 --out lego.npz
 
 Writes RUN/exports/tree.npz for svox and volrend. Leaves of an octree are constant, and their colors are in (0, 1). The octree of an \
-interpolated grid with view-dependent colors is therefore an approximation; --subdivide makes it better and larger. A factored field must be \
+interpolated grid with view-dependent colors is therefore an approximation; --subdivide makes it better and larger. A model without voxels must be \
 baked first (`plenoxel bake`).";
 
 /// Export the grid of a run as an octree of PlenOctrees (svox N3Tree)

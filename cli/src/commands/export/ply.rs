@@ -104,9 +104,11 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
         Coords::World => Coordinates::World,
         Coords::Grid => Coordinates::Grid,
     };
+    let to_world = record.to_world.unwrap_or_default();
+    let voxel_side = side / to_world.scale;
     let lengths = match coordinates {
-        Coordinates::World => UnitLengths { voxel: Some(side), world: 1.0 },
-        Coordinates::Grid => UnitLengths { voxel: Some(1.0), world: 1.0 / side },
+        Coordinates::World => UnitLengths { voxel: Some(voxel_side), world: 1.0 },
+        Coordinates::Grid => UnitLengths { voxel: Some(1.0), world: 1.0 / voxel_side },
     };
     // Filters are checked before the training views are rendered, which may take minutes.
     let filters = args.filters.filters(lengths)?;
@@ -117,12 +119,19 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
 
     let color = match (args.color, &seen) {
         (ColorChoice::Seen, Some(seen)) => ColorFrom::Seen(seen),
-        (ColorChoice::Along(direction), _) => ColorFrom::Direction(direction),
+        (ColorChoice::Along(direction), _) => ColorFrom::Direction(to_world.rotation * direction),
         _ => ColorFrom::Mean,
     };
     let (min_weight, min_object) = (args.min_weight, args.min_object);
     let visible = seen.as_ref().filter(|_| chooses).map(|seen| Visible { seen, min_weight, min_object });
-    let cloud = from_grid::points(&grid, &VoxelOptions { coordinates, color, min_alpha: args.min_alpha, visible });
+    let mut cloud = from_grid::points(&grid, &VoxelOptions { coordinates, color, min_alpha: args.min_alpha, visible });
+    if coordinates == Coordinates::World {
+        cloud = cloud.moved(&to_world.inverse());
+    }
+    // Density is per length.
+    for density in cloud.fields.iter_mut().filter(|field| field.name == "density").flat_map(|field| &mut field.values) {
+        *density *= to_world.scale as f32;
+    }
 
     let values = field.as_deref().and_then(|name| cloud.field(name));
     let (left, report) = filters.apply(&cloud.positions, values).map_err(as_flag)?;
@@ -132,7 +141,7 @@ pub fn run(args: &PlyArgs, console: &Console<'_>) -> Result<()> {
     let (n, half) = (grid.shape().resolution, grid.shape().half_width);
     let frame = match coordinates {
         Coordinates::World => "those of the dataset".to_owned(),
-        Coordinates::Grid => format!("voxel indices; world = (index + 0.5) * {side} - {half}"),
+        Coordinates::Grid => format!("voxel indices; world of the run = (index + 0.5) * {side} - {half}"),
     };
     let comments = [
         format!("{} voxels per side, scene {}, {} steps", n, header.scene, header.step),

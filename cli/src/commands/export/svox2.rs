@@ -18,7 +18,7 @@ Examples:
   plenoxel import runs/lego/exports/ckpt.npz --data data/lego --out runs/again
 
 Writes RUN/exports/ckpt.npz for svox2's render_imgs.py. The pictures are the same, up to the half precision of the colors. The grid must be \
-interpolated, with harmonics of degree 2 or less. Other fields must be baked first (`plenoxel bake`).";
+interpolated, with harmonics of degree 2 or less. A model without voxels must be baked first (`plenoxel bake`).";
 
 /// Export the grid of a run as a checkpoint of svox2 (Plenoxels)
 #[derive(Debug, Args)]

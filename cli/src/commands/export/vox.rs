@@ -38,8 +38,12 @@ pub struct VoxArgs {
 
 /// Writes the voxels of a run.
 pub fn run(args: &VoxArgs, console: &Console<'_>) -> Result<()> {
-    let Opened { folder, grid, .. } = args.exported.open(console, "vox", BYTES_PER_VOXEL)?;
-    let options = VoxOptions { min_alpha: args.min_alpha, solid: args.solid, direction: args.colors.direction() };
+    let Opened { folder, grid, record, .. } = args.exported.open(console, "vox", BYTES_PER_VOXEL)?;
+    let options = VoxOptions {
+        min_alpha: args.min_alpha,
+        solid: args.solid,
+        direction: args.colors.direction().map(|direction| record.to_world.unwrap_or_default().rotation * direction),
+    };
     let model = vox(&grid, &options).map_err(as_flag)?;
     let file = args.exported.write(&folder, "grid.vox", &model.to_bytes().map_err(as_flag)?, console)?;
     console.wrote(&file, &format!("wrote {} voxels in {} colors to {}", model.voxels.len(), model.palette.len(), file.display()))

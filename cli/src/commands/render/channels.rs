@@ -11,6 +11,7 @@ use plenoxel::files::write_atomically;
 use plenoxel::model::Model;
 use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::render::picture::Picture;
+use plenoxel::space::Space;
 use plenoxel::train::ViewOptions;
 use std::path::{Path, PathBuf};
 
@@ -30,16 +31,20 @@ pub struct Pictures<'a> {
     color: Viewer<'a, f32>,
     normals: Option<Viewer<'a, f32>>,
     half_width: f64,
+    space: Space,
+    /// Units of the dataset in a world length.
+    unit: f64,
     channels: &'a [Channel],
     formats: &'a [FileFormat],
 }
 
 impl<'a> Pictures<'a> {
-    /// Creates a writer for a model. `normals` is required if it is among the channels.
+    /// Creates a writer for a model. `normals` is required if it is among the channels. `unit` is the number of units of the dataset in a world length.
     pub fn new(
         model: &'a dyn Model<f32>,
         normals: Option<&'a Plenoxels<f32>>,
         view: &ViewOptions,
+        unit: f64,
         channels: &'a [Channel],
         formats: &'a [FileFormat],
     ) -> Self {
@@ -49,6 +54,8 @@ impl<'a> Pictures<'a> {
             color: Viewer::of(model, view),
             normals: normals.map(|normals| Viewer::of(normals, &of_normals)),
             half_width: 0.5 * (aabb.max - aabb.min).max_element(),
+            space: model.space(),
+            unit,
             channels,
             formats,
         }
@@ -68,14 +75,26 @@ impl<'a> Pictures<'a> {
                 match format {
                     FileFormat::Png => images::write(&file("png"), &images::shown(channel, picture, range))?,
                     FileFormat::Exr => {
-                        let values = if channel == Channel::Color { picture.rgb.mapv(linear) } else { values(channel, picture) };
+                        let values =
+                            if channel == Channel::Color { picture.rgb.mapv(linear) } else { self.values(channel, picture, camera) };
                         float_files::write_exr(&file("exr"), values.view())?;
                     }
-                    FileFormat::Npy => write_atomically(&file("npy"), &float_files::npy(values(channel, picture).view()))?,
+                    FileFormat::Npy => write_atomically(&file("npy"), &float_files::npy(self.values(channel, picture, camera).view()))?,
                 }
             }
         }
         Ok(())
+    }
+
+    /// The values of a channel, `[h, w, 1 or 3]`.
+    fn values(&self, channel: Channel, picture: &Picture, camera: &Camera) -> Array3<f32> {
+        let one = |values: Array2<f32>| values.insert_axis(Axis(2));
+        match channel {
+            Channel::Color => picture.rgb.clone(),
+            Channel::Depth => one(picture.distances(camera, self.space) * self.unit as f32),
+            Channel::Normal => images::unit_normals(picture),
+            Channel::Opacity => one(picture.opacity.clone()),
+        }
     }
 }
 
@@ -84,18 +103,6 @@ fn file(stem: &Path, channel: Channel, ending: &str) -> PathBuf {
     let mut path = stem.as_os_str().to_owned();
     path.push(format!("{}.{ending}", channel.suffix()));
     path.into()
-}
-
-/// The values of a channel, `[h, w, 1 or 3]`.
-fn values(channel: Channel, picture: &Picture) -> Array3<f32> {
-    let one = |values: Array2<f32>| values.insert_axis(Axis(2));
-    match channel {
-        Channel::Color => picture.rgb.clone(),
-        // 0 / 0 is NaN where the picture is empty.
-        Channel::Depth => one(&picture.depth / &picture.opacity),
-        Channel::Normal => images::unit_normals(picture),
-        Channel::Opacity => one(picture.opacity.clone()),
-    }
 }
 
 /// Linear light of an sRGB value (IEC 61966-2-1), odd around 0.

@@ -5,6 +5,7 @@ use crate::camera::lens::Lens;
 use crate::camera::{Intrinsics, is_angle_of_view};
 use crate::error::{Error, Result};
 use crate::json;
+use crate::text::number;
 use serde_json::Value;
 use std::path::Path;
 
@@ -60,6 +61,8 @@ pub struct Stated {
     /// Width and height of the image in pixels.
     pub size: Option<(usize, usize)>,
     focal: [Option<Focal>; 2],
+    /// `camera_angle_x`, radians.
+    angle_x: Option<f64>,
     center: [Option<f64>; 2],
     lens: Lens,
 }
@@ -148,7 +151,19 @@ impl Stated {
         let k = [coefficient("k1")?, coefficient("k2")?, coefficient("k3")?, coefficient("k4")?];
         let lens = Lens::from_transforms(model, k, [coefficient("p1")?, coefficient("p2")?]);
         let lens = lens.map_err(|unusable| unusable.at(path, &format!("frame {number}")))?;
-        Ok(Stated { size, focal, center: [center("cx")?, center("cy")?], lens })
+        let angle_x = layers.get("camera_angle_x").and_then(Value::as_f64);
+        Ok(Stated { size, focal, angle_x, center: [center("cx")?, center("cy")?], lens })
+    }
+
+    /// Returns how `camera_angle_x` contradicts a focal length in pixels, if the file does not state the size of the images to which that belongs.
+    pub(super) fn conflict(&self, intrinsics: &Intrinsics) -> Option<String> {
+        let (Some(Focal::Pixels(focal)), Some(angle), None) = (self.focal[0], self.angle_x, self.size) else { return None };
+        let of_angle = 0.5 * intrinsics.width as f64 / (0.5 * angle).tan();
+        let moved = 0.5 * intrinsics.width as f64 * (focal / of_angle - 1.0).abs();
+        (moved > 1.0).then(|| {
+            let [focal, of_angle] = [focal, of_angle].map(number);
+            format!("fl_x is {focal}, but camera_angle_x and the width of {} pixels give {of_angle}", intrinsics.width)
+        })
     }
 
     /// Returns the intrinsics for images of a size.

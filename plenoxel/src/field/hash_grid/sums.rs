@@ -1,7 +1,8 @@
 //! Adjoint of the table: sums of contributions to its rows, which the optimizer requests one bucket of rows after another.
 //!
-//! A bucket has as many rows as the largest level, and its sums stay in the cache. The contributions of all positions to its levels are computed when
-//! they are added; none is stored. Consecutive positions in the same cell, as along a ray, contribute together.
+//! A bucket has as many rows as the largest level, but at most 8 MB in single precision. The contributions of all positions to its levels are computed when they are added;
+//! none is stored. Consecutive positions in the same cell, as along a ray, contribute together. There are about as many tasks as levels that share rows, so more threads than
+//! levels are of no use.
 
 use super::loops::{Cells, TOGETHER, group, with_features};
 use super::{HashGrid, Level};
@@ -27,7 +28,8 @@ impl<T: Real> HashSums<T> {
 
 impl<T: Real> RowSums<T> for HashSums<T> {
     fn bucket_shift(&self) -> u32 {
-        self.grid.shape.log2_rows.max(6)
+        const NUMBERS: usize = 1 << 21;
+        self.grid.shape.log2_rows.clamp(6, (NUMBERS / self.grid.shape.features).ilog2())
     }
 
     fn is_empty(&self, _bucket: usize) -> bool {

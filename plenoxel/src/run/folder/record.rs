@@ -3,6 +3,7 @@
 use crate::dataset::Dataset;
 use crate::error::{Error, Result};
 use crate::files;
+use crate::geometry::Similarity;
 use crate::model::{self, plenoxels};
 use crate::run::data::DataSource;
 use crate::run::{PROGRAM, machine};
@@ -109,6 +110,9 @@ pub struct RunRecord {
     /// Settings before they were planned by time, as [`settings::values`](crate::run::settings::values) returns them. Runs of earlier versions do not record them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub asked: Option<BTreeMap<String, String>>,
+    /// From the coordinates of the dataset to the world of the run. Runs of earlier versions, and those without a dataset, do not record it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub to_world: Option<Similarity>,
     /// The field that was baked, for a baked run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub baked: Option<Baked>,
@@ -124,7 +128,8 @@ fn plenoxels_kind() -> String {
 impl RunRecord {
     /// The record of a new run of Plenoxels on this machine.
     pub fn new(kind: RunKind, dataset: &Dataset, preset: Option<&str>, source: &DataSource) -> Self {
-        RunRecord { preset: preset.map(str::to_owned), ..Self::of_scene(kind, dataset.name(), dataset.format(), source) }
+        let to_world = Some(dataset.normalization().to_world);
+        RunRecord { preset: preset.map(str::to_owned), to_world, ..Self::of_scene(kind, dataset.name(), dataset.format(), source) }
     }
 
     /// The record of a new run of Plenoxels on this machine, for a scene with a name and a format.
@@ -141,6 +146,7 @@ impl RunRecord {
             data: source.clone(),
             seconds_planned: None,
             asked: None,
+            to_world: None,
             baked: None,
             imported: None,
         }

@@ -1,5 +1,0 @@
-#![no_main]
-
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    plenoxel_fuzz::parsers::try_out("capture.json", bytes);
-});
