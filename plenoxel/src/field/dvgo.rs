@@ -228,7 +228,9 @@ impl<T: Real> ShadedField<T> for DenseGrid<T> {
         self.shade_encoded(features, |encoding| encoding.encode(directions))
     }
 
+    /// Half the sides of a cell: the softplus of an interpolated raw density may rise from nothing to matter within a cell. lego, 160 nodes a side, 33.37 dB: baked with
+    /// as many voxels as cells 27.49 dB, with twice as many along each axis 31.08 dB.
     fn cell_sides(&self) -> Option<DVec3> {
-        Some(self.sides())
+        Some(0.5 * self.sides())
     }
 }
