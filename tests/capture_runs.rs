@@ -115,7 +115,7 @@ fn exports_of_a_capture_are_in_the_coordinates_of_the_dataset() {
     let within = format!("--bbox=-9,-9,{},9,9,9", middle[2]);
     plenoxel(&[&["export", "ply", &run, &within][..], &keep].concat()).done();
     let above = plenoxel::point_cloud::ply::PlyFile::open(format!("{run}/exports/cloud.ply").as_ref()).unwrap();
-    assert!(above.positions().unwrap().iter().all(|p| p.z >= middle[2]) && above.len() < cloud.len() && above.len() > 0);
+    assert!(above.positions().unwrap().iter().all(|p| p.z >= middle[2]) && above.len() < cloud.len() && !above.is_empty());
     plenoxel(&["export", "mesh", &run, "--level=1"]).done();
     let mesh = plenoxel::point_cloud::ply::PlyFile::open(format!("{run}/exports/mesh.ply").as_ref()).unwrap();
     farthest("mesh", mesh.positions().unwrap().into_iter().map(|p| p.to_array()).collect());
