@@ -161,6 +161,7 @@ impl<'a, T: Real> Network<'a, T> {
         };
         let Some(lowest) = (0..self.layers.len()).find(|&l| needed(l, to)) else { return };
         let mut g = Buffer::copy_of(g);
+        drop_tiny(&mut g);
         for (l, layer) in self.layers.iter().enumerate().skip(lowest).rev() {
             let cotangent = Matrix::new(&g, m, layer.outputs);
             if let Some(sum) = &mut to.of_params[2 * l + 1] {
@@ -303,6 +304,17 @@ dispatched! {
 fn multiply_by<T: Real, F: Fn(T) -> T>(g: &mut [T], y: &[T], slope: &F) {
     for (g, &y) in g.iter_mut().zip(y) {
         *g *= slope(y);
+    }
+}
+}
+
+dispatched! {
+/// Sets cotangents to 0 that are below 10¹² times the smallest normal number, such as those of samples behind opaque matter. Their products would be subnormal,
+/// and processors take up to 40 times as long for these: eight layers of 128 with cotangents of 10⁻³⁶ took 9200 instead of 220 ms.
+fn drop_tiny<T: Real>(g: &mut [T]) {
+    let least = T::min_positive_value() * T::lit(1e12);
+    for g in g {
+        *g = if g.abs() < least { T::zero() } else { *g };
     }
 }
 }
