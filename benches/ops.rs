@@ -9,7 +9,7 @@ mod support;
 use autograd::nn::{Activation, Mlp};
 use autograd::optim::{Adam, AdamMode, Optimizer};
 use autograd::random::Stream;
-use autograd::{Buffer, Indices, Module, Param, Tensor, add_rows};
+use autograd::{Buffer, Indices, Module, Param, Real, Tensor, add_rows, impl_module};
 use glam::DVec3;
 use plenoxel::camera::Ray;
 use plenoxel::field::encoding::Directions;
@@ -63,25 +63,26 @@ fn network(args: &Arguments, width: usize) {
 }
 
 /// A hash grid and a network, the density part of Instant-NGP.
-struct Encoded {
-    table: Param<f32>,
-    network: Mlp<f32>,
+struct Encoded<T: Real> {
+    table: Param<T>,
+    network: Mlp<T>,
 }
 
-impl Module<f32> for Encoded {
-    fn visit(&self, f: &mut dyn FnMut(&Param<f32>)) {
-        f(&self.table);
-        self.network.visit(f);
-    }
+impl_module!(Encoded { table, network });
 
-    fn visit_mut(&mut self, f: &mut dyn FnMut(&mut Param<f32>)) {
-        f(&mut self.table);
-        self.network.visit_mut(f);
-    }
+/// Measures a forward pass, and a training step: forward pass, adjoint of the mean square, Adam of the rows that were read.
+fn training_step<M: Module<f32>>(args: &Arguments, name: &str, model: &mut M, forward: impl Fn(&M) -> Tensor<f32>) {
+    let values = repeat(args.repeats, || drop(black_box(autograd::no_grad(|| forward(model)))));
+    let (mut adam, mut steps) = (Adam::new(1e-3, AdamMode::Lazy), 0);
+    let times = repeat(args.repeats, || {
+        let gradients = forward(model).square().mean().backward();
+        adam.step(model, &gradients, steps);
+        steps += 1;
+    });
+    print(name, Some(median(&values)), &times, "rows", None);
 }
 
-/// A training step of a hash grid (16 levels of two features, 16 to 2048 nodes a side, 2¹⁹ rows a level) with the layers 32, 64, 16 at 262 144 positions:
-/// forward, adjoint of the mean square, Adam of the rows that were read.
+/// A training step of a hash grid (16 levels of two features, 16 to 2048 nodes a side, 2¹⁹ rows a level) with the layers 32, 64, 16 at 262 144 positions.
 fn hash_step(args: &Arguments) {
     const NAME: &str = "hash_step";
     if !args.wants(NAME) {
@@ -92,15 +93,7 @@ fn hash_step(args: &Arguments) {
     let table = Param::from_tensor("table", tensor(&[grid.rows(), 2], 1) * 1e-4);
     let mut model = Encoded { table, network: Mlp::new("net", &[32, 64, 16], Activation::Relu, &Stream::new(1)) };
     let positions = tensor(&[1 << 18, 3], 2);
-    let forward = |model: &Encoded| model.network.forward(&grid.encode(model.table.tensor(), &positions));
-    let values = repeat(args.repeats, || drop(black_box(autograd::no_grad(|| forward(&model)))));
-    let (mut adam, mut steps) = (Adam::new(1e-3, AdamMode::Lazy), 0);
-    let times = repeat(args.repeats, || {
-        let gradients = forward(&model).square().mean().backward();
-        adam.step(&mut model, &gradients, steps);
-        steps += 1;
-    });
-    print(NAME, Some(median(&values)), &times, "rows", None);
+    training_step(args, NAME, &mut model, |model| model.network.forward(&grid.encode(model.table.tensor(), &positions)));
 }
 
 /// A training step of a factored field of the sizes of the preset `quality`, with 300 nodes a side, in thin fog: 4096 rays of 64 samples, each with a color.
@@ -126,14 +119,7 @@ fn planes_step(args: &Arguments) {
         stop_below: 0.0,
     };
     assert_eq!(render(&model, &rays, &options).sample_count, 4096 * 64, "samples of the script it is compared with");
-    let values = repeat(args.repeats, || drop(black_box(autograd::no_grad(|| render(&model, &rays, &options)))));
-    let (mut adam, mut steps) = (Adam::new(1e-3, AdamMode::Lazy), 0);
-    let times = repeat(args.repeats, || {
-        let gradients = render(&model, &rays, &options).rgb.square().mean().backward();
-        adam.step(&mut model, &gradients, steps);
-        steps += 1;
-    });
-    print(NAME, Some(median(&values)), &times, "rows", None);
+    training_step(args, NAME, &mut model, |model| render(model, &rays, &options).rgb);
 }
 
 fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str, gflop_per_s: Option<f64>) {

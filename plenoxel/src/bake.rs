@@ -41,7 +41,7 @@ use visible::Sights;
 pub const OFFSET: f64 = 0.5;
 /// Feature x at which the raw density bends down, times −1; it is 0 at half of that.
 const BEND: f32 = 6.0;
-/// Least x.
+/// The least x of a voxel.
 const LEAST: f32 = -10.0;
 /// Most voxels along each axis of [`Source::resolution`].
 const MOST_VOXELS: usize = 512;
@@ -56,10 +56,10 @@ const ROWS: usize = 256;
 /// Rows between reports of progress.
 const BATCH: usize = 1 << 16;
 
-/// Sides of a box without cells, in voxels.
+/// Number of voxels along the longest side of a box, if the field has no cells.
 const VOXELS_WITHOUT_CELLS: f64 = 256.0;
 
-/// A field to bake, with its box.
+/// Field to bake, with its box.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
     /// The field, a function of positions in the box.
@@ -93,16 +93,16 @@ impl<'a> Source<'a> {
         GridSpace::of(self.space, self.sides())
     }
 
-    /// Returns the number of voxels along each axis whose sides are about those of the field's cells, at most 512. A box without cells has 256.
+    /// Returns the number of voxels along each axis with which the grid is about as fine as the field, at most 512.
     pub fn resolution(&self) -> usize {
         let cell = (self.sides() * self.coordinates().stretch).element_sum() / 3.0;
         ((2.0 * self.half_width() / cell).ceil() as usize).clamp(2, MOST_VOXELS)
     }
 
-    /// Returns the sides of a cell, or of a voxel where there are no cells.
+    /// Returns the sides of voxels that are as fine as the field.
     fn sides(&self) -> DVec3 {
         let side = (self.aabb.max - self.aabb.min).max_element() / VOXELS_WITHOUT_CELLS;
-        self.field.cell_sides().unwrap_or(DVec3::splat(side))
+        self.field.voxel_sides().unwrap_or(DVec3::splat(side))
     }
 
     /// Returns half the side of the cube of the baked grid, in the coordinates of the grid.

@@ -20,7 +20,7 @@ pub mod nsvf;
 pub mod procedural;
 pub mod transforms;
 
-use crate::camera::Camera;
+use crate::camera::{Camera, Intrinsics};
 use crate::error::{Error, Result};
 use crate::files;
 use crate::geometry::Similarity;
@@ -264,6 +264,12 @@ fn formats(path: &Path) -> Vec<Format> {
     found.into_iter().flatten().collect()
 }
 
+/// Returns the largest width and the largest height of images.
+fn largest(frames: &[Vec<Frame>; 3]) -> (usize, usize) {
+    let most = |side: fn(&Intrinsics) -> usize| frames.iter().flatten().map(|frame| side(&frame.camera.intrinsics)).max().unwrap_or(0);
+    (most(|k| k.width), most(|k| k.height))
+}
+
 /// Returns the name of the scene in a folder.
 fn scene_name(root: &Path) -> String {
     let name = root.canonicalize().ok().and_then(|path| path.file_name().map(|name| name.to_string_lossy().into_owned()));
@@ -294,7 +300,7 @@ impl Dataset {
         self.frames(split).len()
     }
 
-    /// Returns width and height of the images, after the reduction. In a capture of images of several sizes, these are the largest width
+    /// Returns width and height of the images, after the reduction. If images have several sizes, these are the largest width
     /// and the largest height.
     pub fn size(&self) -> (usize, usize) {
         self.size

@@ -7,11 +7,11 @@
 
 mod write;
 
-use super::capture::{Photo, base_name, fitted};
+use super::capture::{base_name, misfit, resized};
 use super::image::Orientation;
 use super::normalize::Normalization;
 use super::transforms::{Listed, Transforms};
-use super::{Dataset, Frame, OpenOptions, Source, Split, image};
+use super::{Dataset, Frame, OpenOptions, Source, Split, image, largest};
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::files;
@@ -34,12 +34,17 @@ pub const FORMAT: &str = "NeRF-synthetic (transforms_train.json)";
 ///
 /// Errors if the JSON, a matrix or an image's header is invalid, naming file and frame.
 pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
+    let downscale = options.downscale;
     let mut splits = [Vec::new(), Vec::new(), Vec::new()];
     let has_val = files::is_there(&file_name(root, Split::Val));
     for split in Split::ALL {
         let path = file_name(root, split);
         if split == Split::Train || files::is_there(&path) {
-            splits[split as usize] = photos(root, split, Transforms::parse(&path, &files::read(&path, files::CAMERAS)?)?)?;
+            let transforms = Transforms::parse(&path, &files::read(&path, files::CAMERAS)?)?;
+            let frames: Vec<Result<Frame>> =
+                transforms.frames.par_iter().enumerate().map(|(k, listed)| frame(root, split, k, listed, downscale)).collect();
+            // The first error in the order of the file is reported.
+            splits[split as usize] = frames.into_iter().collect::<Result<Vec<_>>>()?;
         }
     }
     if splits[0].is_empty() {
@@ -48,28 +53,14 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
     if let (Some(every), false) = (options.validation_every, has_val) {
         let (held, kept) =
             std::mem::take(&mut splits[0]).into_iter().enumerate().partition::<Vec<_>, _>(|(k, _)| (k + 1).is_multiple_of(every));
-        splits[0] = kept.into_iter().map(|(_, photo)| photo).collect();
-        splits[1] = held.into_iter().map(|(_, photo)| photo).collect();
+        splits[0] = kept.into_iter().map(|(_, frame)| frame).collect();
+        splits[1] = held.into_iter().map(|(_, frame)| frame).collect();
     }
-    let downscale = options.downscale;
-    let frame = |photo: Photo| {
-        let (orientation, intrinsics) = fitted(&photo, &[Orientation::Stated])?;
-        let full = (intrinsics.width, intrinsics.height);
-        image::check_downscale(downscale, full)?;
-        let camera = Camera { intrinsics: intrinsics.downscaled(downscale), camera_to_world: photo.camera_to_world };
-        Ok(Frame { name: photo.name, camera, path: photo.image, mask: photo.mask, orientation, full })
-    };
-    let [train, val, test] = splits.map(|photos| photos.into_par_iter().map(frame).collect::<Vec<Result<Frame>>>());
-    // The first error in the order of the files is reported.
-    let frames = [train, val, test].map(|frames| frames.into_iter().collect::<Result<Vec<_>>>());
-    let [train, val, test] = frames;
-    let frames = [train?, val?, test?];
-    let sized = |side: fn(&Frame) -> usize| frames.iter().flatten().map(side).max().unwrap_or(0);
     Ok(Dataset {
         name: super::scene_name(root),
         format: FORMAT,
-        size: (sized(|frame| frame.camera.intrinsics.width), sized(|frame| frame.camera.intrinsics.height)),
-        frames,
+        size: largest(&splits),
+        frames: splits,
         source: Source::Files { downscale },
         normalization: Normalization::none(options)?,
         points: Arc::default(),
@@ -81,28 +72,28 @@ fn file_name(root: &Path, split: Split) -> PathBuf {
     root.join(format!("transforms_{split}.json"))
 }
 
-/// Returns the views of a file with the images of the scene `root`, in the order of the file.
+/// Returns view `k` of a file of the scene `root`, with its image.
 ///
-/// Errors if an image does not exist.
-fn photos(root: &Path, split: Split, transforms: Transforms) -> Result<Vec<Photo>> {
+/// Errors if the image does not exist or cannot be read, or has another shape than its camera.
+fn frame(root: &Path, split: Split, k: usize, listed: &Listed, downscale: usize) -> Result<Frame> {
     let path = file_name(root, split);
-    let photo = |(k, frame): (usize, Listed)| {
-        let image = find_image(root, split, &frame.file_path).map_err(|tried| {
-            let tried: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
-            let found = format!("the image \"{}\" of frame {k} does not exist", frame.file_path);
-            Error::input(&path, found, format!("looked for {}", tried.join(" and ")))
-        })?;
-        let size = frame.stated.size.map_or_else(|| image::size(&image), Ok)?;
-        Ok(Photo {
-            name: image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default(),
-            intrinsics: frame.stated.intrinsics(&path, &frame.file_path, size)?,
-            mask: frame.mask_path.map(|mask| mask_of(root, &mask, &path, k)).transpose()?,
-            camera_to_world: frame.camera_to_world,
-            split: None,
-            image,
-        })
-    };
-    transforms.frames.into_iter().enumerate().map(photo).collect()
+    let image = find_image(root, split, &listed.file_path).map_err(|tried| {
+        let tried: Vec<String> = tried.iter().map(|path| path.display().to_string()).collect();
+        let found = format!("the image \"{}\" of frame {k} does not exist", listed.file_path);
+        Error::input(&path, found, format!("looked for {}", tried.join(" and ")))
+    })?;
+    let full = image::size(&image)?;
+    let stated = listed.stated.intrinsics(&path, &listed.file_path, listed.stated.size.unwrap_or(full))?;
+    let intrinsics = resized(&image, &stated, full)?.ok_or_else(|| misfit(&image, (stated.width, stated.height), full))?;
+    image::check_downscale(downscale, full)?;
+    Ok(Frame {
+        name: image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default(),
+        camera: Camera { intrinsics: intrinsics.downscaled(downscale), camera_to_world: listed.camera_to_world },
+        path: image,
+        mask: listed.mask_path.as_ref().map(|mask| mask_of(root, mask, &path, k)).transpose()?,
+        orientation: Orientation::Stated,
+        full,
+    })
 }
 
 /// Returns the path of the mask of frame `k`.

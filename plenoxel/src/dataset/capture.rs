@@ -8,7 +8,7 @@ mod images;
 
 use super::image::{self, Orientation};
 use super::normalize::Normalization;
-use super::{Dataset, Frame, OpenOptions, Source, Split};
+use super::{Dataset, Frame, OpenOptions, Source, Split, largest};
 use crate::camera::{Camera, Intrinsics};
 use crate::error::{Error, Result};
 use crate::text::listed;
@@ -23,9 +23,6 @@ pub(super) const FARTHEST: f64 = 1e12;
 /// Largest difference, in pixels of the image, between its height and the height that follows from its width and its camera: reductions
 /// round differently.
 const ROUNDED: f64 = 1.5;
-
-/// COLMAP reads images as stored; programs that turn them as EXIF states come second.
-const ORIENTATIONS: [Orientation; 2] = [Orientation::Stored, Orientation::Stated];
 
 /// Content of the files of a capture, before images are looked at.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -82,7 +79,7 @@ pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) 
     if let Some(pair) = capture.photos.windows(2).find(|pair| pair[0].name == pair[1].name) {
         return Err(Error::input(root, format!("the image {} has two cameras", pair[0].name), "list each image once"));
     }
-    let found: Vec<Result<_>> = capture.photos.par_iter().map(|photo| fitted(photo, &ORIENTATIONS)).collect();
+    let found: Vec<Result<_>> = capture.photos.par_iter().map(fitted).collect();
     let mut resized = 0;
     let mut images = Vec::new();
     for (photo, found) in capture.photos.iter_mut().zip(found) {
@@ -123,11 +120,10 @@ pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) 
     if frames[0].is_empty() {
         return Err(Error::input(root, "there is no training view", "list at least one training view"));
     }
-    let sized = |side: fn(&Frame) -> usize| frames.iter().flatten().map(side).max().unwrap_or(0);
     Ok(Dataset {
         name: super::scene_name(root),
         format: capture.format,
-        size: (sized(|frame| frame.camera.intrinsics.width), sized(|frame| frame.camera.intrinsics.height)),
+        size: largest(&frames),
         frames,
         source: Source::Files { downscale },
         normalization,
@@ -153,14 +149,13 @@ fn check_presence(root: &Path, capture: &mut Capture) -> Result<()> {
     Ok(())
 }
 
-/// Returns the first orientation in which an image has the shape that its camera states, and the intrinsics of its size.
+/// Returns the orientation in which an image has the shape that its camera states, and the intrinsics of its size. COLMAP reads images as
+/// stored; programs that turn them as EXIF states come second.
 ///
 /// Errors if the image cannot be read, or has another shape.
-pub(super) fn fitted(photo: &Photo, orientations: &[Orientation]) -> Result<(Orientation, Intrinsics)> {
-    for &orientation in orientations {
-        if let Some(intrinsics) = scaled(&photo.intrinsics, image::size_as(&photo.image, orientation)?) {
-            // Rounded sizes may have pixels that the stated size had not.
-            intrinsics.check_lens().map_err(|unusable| unusable.at(&photo.image, "the camera of the image"))?;
+fn fitted(photo: &Photo) -> Result<(Orientation, Intrinsics)> {
+    for orientation in [Orientation::Stored, Orientation::Stated] {
+        if let Some(intrinsics) = resized(&photo.image, &photo.intrinsics, image::size_as(&photo.image, orientation)?)? {
             return Ok((orientation, intrinsics));
         }
     }
@@ -168,13 +163,21 @@ pub(super) fn fitted(photo: &Photo, orientations: &[Orientation]) -> Result<(Ori
 }
 
 /// Returns the intrinsics of an image of another size, if it has the same shape.
-fn scaled(k: &Intrinsics, (width, height): (usize, usize)) -> Option<Intrinsics> {
+///
+/// Errors if the lens folds over in the image.
+pub(super) fn resized(image: &Path, k: &Intrinsics, (width, height): (usize, usize)) -> Result<Option<Intrinsics>> {
     let (sx, sy) = (width as f64 / k.width as f64, height as f64 / k.height as f64);
     let off = (height as f64 - sx * k.height as f64).abs().min((width as f64 - sy * k.width as f64).abs());
-    (off <= ROUNDED).then_some(Intrinsics { width, height, fx: sx * k.fx, fy: sy * k.fy, cx: sx * k.cx, cy: sy * k.cy, lens: k.lens })
+    if off > ROUNDED {
+        return Ok(None);
+    }
+    let intrinsics = Intrinsics { width, height, fx: sx * k.fx, fy: sy * k.fy, cx: sx * k.cx, cy: sy * k.cy, lens: k.lens };
+    // Rounded sizes may have pixels that the stated size had not.
+    intrinsics.check_lens().map_err(|unusable| unusable.at(image, "the camera of the image"))?;
+    Ok(Some(intrinsics))
 }
 
-fn misfit(path: &Path, stated: (usize, usize), size: (usize, usize)) -> Error {
+pub(super) fn misfit(path: &Path, stated: (usize, usize), size: (usize, usize)) -> Error {
     let found = format!("the image has {} x {} pixels, but its camera {} x {}", size.0, size.1, stated.0, stated.1);
     let turned = stated == (size.1, size.0);
     let remedy = if turned { "turn the image as the cameras were computed" } else { "use the images that the cameras were computed from" };

@@ -228,9 +228,9 @@ impl<T: Real> ShadedField<T> for DenseGrid<T> {
         self.shade_encoded(features, |encoding| encoding.encode(directions))
     }
 
-    /// Half the sides of a cell: the softplus of an interpolated raw density may rise from nothing to matter within a cell. lego, 160 nodes a side, 33.37 dB: baked with
-    /// as many voxels as cells 27.49 dB, with twice as many along each axis 31.08 dB.
-    fn cell_sides(&self) -> Option<DVec3> {
+    /// Returns half the sides of a cell: within a cell, the density may rise from nothing to matter. lego with 160 nodes a side has 33.37 dB. Baked with as many voxels
+    /// as cells it has 27.49 dB, with twice as many along each axis 31.08 dB.
+    fn voxel_sides(&self) -> Option<DVec3> {
         Some(0.5 * self.sides())
     }
 }

@@ -317,7 +317,7 @@ impl<T: Real> ShadedField<T> for Factored<T> {
         shade(&self.tables(), self.shape.feature_octaves, features, &self.shape.directions.encode(directions))
     }
 
-    fn cell_sides(&self) -> Option<DVec3> {
+    fn voxel_sides(&self) -> Option<DVec3> {
         Some(self.sides())
     }
 }

@@ -135,7 +135,7 @@ impl<T: Real> ShadedField<T> for HashField<T> {
         self.shade_encoded(features, &self.shape.directions.encode(directions))
     }
 
-    fn cell_sides(&self) -> Option<DVec3> {
+    fn voxel_sides(&self) -> Option<DVec3> {
         let finest = self.grid.levels().iter().map(|level| level.resolution).max()?;
         Some(DVec3::splat(self.extent() / finest as f64))
     }

@@ -49,8 +49,8 @@ pub trait ShadedField<T: Real>: Field<T> {
     /// Returns the colors of features `[m, F]`, seen along unit directions `[m, 3]`: `[m, 3]`, in [0, 1].
     fn shade(&self, features: &Tensor<T>, directions: &Tensor<T>) -> Tensor<T>;
 
-    /// Returns the sides of voxels that resolve the field, world length; `None` if the field has no cells.
-    fn cell_sides(&self) -> Option<DVec3> {
+    /// Returns the sides of voxels that are as fine as the field, world length; `None` if the field has no cells.
+    fn voxel_sides(&self) -> Option<DVec3> {
         None
     }
 }
