@@ -3,7 +3,7 @@
 //! One ray passes through the centre of each pixel. Rendered images are clamped to [0, 1] and not rounded. Photographs are composited over
 //! the background in floating point. See [`crate::metrics`] for the formulas.
 
-use crate::camera::{Camera, Ray};
+use crate::camera::{Camera, Intrinsics, Ray};
 use crate::dataset::View;
 use crate::dataset::mask::Mask;
 use crate::error::Result;
@@ -16,6 +16,7 @@ use ndarray::Array3;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::borrow::Cow;
+use std::time::Instant;
 
 /// Renders the views of a model and compares them with their photographs over the background of `options`.
 ///
@@ -55,6 +56,26 @@ impl<'a, T: Real> Viewer<'a, T> {
     /// Renders the image of a camera, unless `stopped` becomes true meanwhile.
     pub fn see_unless(&self, camera: &Camera, stopped: impl Fn() -> bool) -> Option<Picture> {
         picture_unless(&self.show, camera, stopped)
+    }
+
+    /// Renders the image of a camera in about `seconds`: if all pixels take longer, one ray is rendered for each block of k × k pixels, k a power of 2 up to 16.
+    /// The time is predicted from one ray for each block of 16 × 16.
+    pub fn glance(&self, camera: &Camera, seconds: f64) -> Picture {
+        const COARSEST: usize = 16;
+        let Intrinsics { width, height, .. } = camera.intrinsics;
+        let by = |k: usize| {
+            let intrinsics = camera.intrinsics.downscaled(k.min(width).min(height));
+            self.see(&Camera { intrinsics, ..*camera })
+        };
+        let start = Instant::now();
+        let coarse = by(COARSEST);
+        let allowed = seconds / start.elapsed().as_secs_f64();
+        let finer = [1, 2, 4, 8].into_iter().find(|k| ((COARSEST / k).pow(2) as f64) < allowed);
+        match finer {
+            Some(1) => self.see(camera),
+            Some(k) => by(k).enlarged([width, height]),
+            None => coarse.enlarged([width, height]),
+        }
     }
 
     /// Renders each view and compares it with its photograph over the background. Pixels that a mask ignores do not count in the squared
@@ -186,8 +207,9 @@ fn mean(values: impl ExactSizeIterator<Item = Option<f64>>) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::Intrinsics;
     use crate::dataset::image::RgbaImage;
+    use crate::geometry::Aabb;
+    use crate::model::nerf::{Config, Nerf};
     use glam::DVec3;
 
     #[test]
@@ -210,5 +232,19 @@ mod tests {
         assert_eq!(mean([Some(1.0), Some(2.0)].into_iter()), Some(1.5));
         assert_eq!(mean([Some(1.0), None].into_iter()), None);
         assert_eq!(mean([None; 0].into_iter()), None);
+    }
+
+    #[test]
+    fn a_glance_has_as_many_pixels_as_the_seconds_allow() {
+        let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(40, 24, 0.7));
+        let config = Config { depth: 2, width: 8, skip: 0, color_width: 4, coarse_samples: 4, fine_samples: 4, ..Config::default() };
+        let model = Nerf::<f32>::new(config, Aabb::cube(0.5), 1).unwrap();
+        let viewer = Viewer::of(&model, &ViewOptions::over([1.0; 3]));
+        assert_eq!(viewer.glance(&camera, 1e6).rgb, viewer.see(&camera).rgb);
+        let coarse = viewer.glance(&camera, 0.0).rgb;
+        assert_eq!(coarse.dim(), (24, 40, 3));
+        // Blocks of a height of 24 and a width of 20.
+        assert_eq!(coarse[[0, 0, 0]], coarse[[23, 19, 0]]);
+        assert_ne!(coarse[[0, 19, 0]], coarse[[0, 20, 0]]);
     }
 }

@@ -18,6 +18,21 @@ pub struct Picture {
 }
 
 impl Picture {
+    /// Returns the image with `[width, height]` pixels, each equal to the one at its place.
+    pub(crate) fn enlarged(&self, [width, height]: [usize; 2]) -> Picture {
+        let (h, w) = self.depth.dim();
+        let place = |y: usize, x: usize| [y * h / height, x * w / width];
+        let channel = |of: &Array2<f32>| Array2::from_shape_fn((height, width), |(y, x)| of[place(y, x)]);
+        Picture {
+            rgb: Array3::from_shape_fn((height, width, 3), |(y, x, c)| {
+                let [y, x] = place(y, x);
+                self.rgb[[y, x, c]]
+            }),
+            depth: channel(&self.depth),
+            opacity: channel(&self.opacity),
+        }
+    }
+
     /// Returns the distance along each ray to the mean depth, `[h, w]`, world length: infinite at infinity, not a number where the picture is empty. `space` is
     /// that of the box of the field.
     pub fn distances(&self, camera: &Camera, space: Space) -> Array2<f32> {

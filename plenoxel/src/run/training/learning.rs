@@ -2,7 +2,7 @@
 
 use super::best::BestModel;
 use super::event::Underway;
-use super::preview::{Look, Preview};
+use super::preview::{GLANCE, Look, Preview};
 use super::{Adjust, Clocks, Event, Job, Listener, Stopped, watched};
 use crate::camera::Camera;
 use crate::dataset::{Split, View};
@@ -88,7 +88,7 @@ impl Job<'_> {
         let run = Underway { folder, config: &self.config, dataset };
         on(Event::Started { run, plan: &plan, test_views: self.test_views().len(), history: &past });
         if let Some(&stage) = plan.first().filter(|_| trainer.steps_taken() == reports.len() as u64) {
-            on(Event::Initial { stage, see: &|camera: &Camera| Viewer::of(trainer.model(), &options_of_view).see(camera) });
+            on(Event::Initial { stage, see: &|camera: &Camera| Viewer::of(trainer.model(), &options_of_view).glance(camera, GLANCE) });
         }
         let mut losses = past.losses;
         let mut facts = trainer.model().facts();
@@ -137,7 +137,7 @@ impl Job<'_> {
             metrics.step(&report, &plan, &observation, save)?;
             on(Event::Step { report: &report, observation: &observation, model });
             if report.ends_stage {
-                on(Event::StageEnded { stage, losses: &losses, see: &|camera: &Camera| viewer().see(camera) });
+                on(Event::StageEnded { stage, losses: &losses, see: &|camera: &Camera| viewer().glance(camera, GLANCE) });
                 kept.extend(
                     (options.stage_psnr && !last).then(|| model.frozen(&options_of_view)).flatten().map(|show| (stages.len(), show)),
                 );

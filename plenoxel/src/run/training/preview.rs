@@ -19,6 +19,8 @@ const VIEWS: usize = 4;
 const SIDE: usize = 128;
 /// Maximum number of pixels along the longer side of the picture.
 const PICTURE_SIDE: usize = 256;
+/// Seconds of a picture, so that models whose rays take long do not delay the training. Slower pictures have fewer pixels.
+pub const GLANCE: f64 = 4.0;
 /// Maximum share of the training time for previews: for those at intervals and checkpoints, and for those at stage ends.
 const SHARES: [f64; 2] = [0.03, 0.05];
 /// Minimum training time in seconds for that share, so that the stages of short runs have previews too.
@@ -97,8 +99,8 @@ impl Preview {
         let sum: f64 = psnr.sum();
         let psnr = (!self.views.is_empty()).then(|| sum / self.views.len() as f64);
         let picture = self.camera.as_ref().map(|camera| match &self.shown {
-            Some(view) => (viewer.see(&view.camera).rgb, Some(view.composite(background))),
-            None => (viewer.see(camera).rgb, None),
+            Some(view) => (viewer.glance(&view.camera, GLANCE).rgb, Some(view.composite(background))),
+            None => (viewer.glance(camera, GLANCE).rgb, None),
         });
         self.pace.took(start, self.pace.now());
         Some(Look { psnr, picture })
