@@ -205,7 +205,8 @@ impl March {
     /// Returns the intervals whose middle lies in an occupied cell.
     #[inline]
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
-        Occupied { march: *self, ray: *ray, along: cells.along(ray), next: 0, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
+        let (along, end) = (cells.along(ray), self.count);
+        Occupied { march: *self, ray: *ray, along, next: 0, end, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
 
     /// Returns the number of intervals whose middle lies before a distance on a straight ray, or one less.
@@ -216,6 +217,8 @@ impl March {
     }
 }
 
+/// Distances that leave out nothing.
+pub(crate) const EVERYWHERE: [f64; 2] = [0.0, f64::INFINITY];
 /// Number of intervals that are tested together.
 const LOOKS: usize = 16;
 
@@ -226,8 +229,9 @@ pub(crate) struct Occupied<'a> {
     march: March,
     ray: Ray,
     along: Along<'a>,
-    /// Next interval to test.
+    /// Next interval to test, and the first that is not tested any more.
     next: usize,
+    end: usize,
     /// Result of the last test: `count` intervals, of which `taken` were returned.
     found: [(f64, f64); LOOKS],
     taken: usize,
@@ -240,7 +244,7 @@ impl Iterator for Occupied<'_> {
     #[inline]
     fn next(&mut self) -> Option<(f64, f64)> {
         while self.taken == self.count {
-            if self.next >= self.march.count {
+            if self.next >= self.end {
                 return None;
             }
             self.look();
@@ -251,10 +255,16 @@ impl Iterator for Occupied<'_> {
 }
 
 impl Occupied<'_> {
-    /// Leaves out the intervals of a straight ray before a distance, none of which lies in an occupied cell.
+    /// Leaves out the intervals of a straight ray outside of two distances, none of which lies in an occupied cell ([`Occupancy::section`]).
     #[inline]
-    pub(crate) fn starting_at(self, distance: f64) -> Self {
-        if self.march.is_straight() { Self { next: self.march.before(distance), ..self } } else { self }
+    pub(crate) fn between(self, [from, to]: [f64; 2]) -> Self {
+        let march = &self.march;
+        // The last interval of a march is shorter, so that its middle is nearer than that of a whole one.
+        if march.is_straight() {
+            Self { next: march.before(from), end: self.end.min(march.before(to).saturating_add(2)), ..self }
+        } else {
+            self
+        }
     }
 
     /// Tests the next intervals, or skips empty bricks.

@@ -261,7 +261,7 @@ impl Occupancy {
     ///
     /// Ray r is in the box around the middle ray, at distance t, whose half sides are a + b t along each axis. Where all bricks nearer than k to the middle ray
     /// are empty, the rays go on to where their box leaves these bricks.
-    pub(crate) fn free_until(&self, rays: &[Ray]) -> f64 {
+    fn free_until(&self, rays: &[Ray]) -> f64 {
         /// Rounding of positions, in cells.
         const ROUNDING: f64 = 1e-6;
         let Some(middle) = rays.get(rays.len() / 2).map(|ray| self.along(ray)) else { return f64::INFINITY };
@@ -296,6 +296,17 @@ impl Occupancy {
             t = exit;
         }
         t
+    }
+
+    /// Returns two distances outside of which none of some straight rays is in an occupied cell ([`free_until`](Self::free_until), from both ends): the first
+    /// is infinite if they are in none at all.
+    pub(crate) fn section(&self, rays: &[Ray]) -> [f64; 2] {
+        let from = self.free_until(rays);
+        let exits = rays.iter().filter_map(|ray| self.aabb.intersect(ray.origin, ray.direction)).map(|(_, exit)| exit);
+        let Some(end) = exits.reduce(f64::max).filter(|_| from.is_finite()) else { return [f64::INFINITY, f64::NEG_INFINITY] };
+        let back: Vec<Ray> =
+            rays.iter().map(|ray| Ray { origin: ray.origin + end * ray.direction, direction: -ray.direction, ..*ray }).collect();
+        [from, end - self.free_until(&back)]
     }
 
     /// Prepares look-ups along a ray.
@@ -581,13 +592,13 @@ mod tests {
     }
 
     #[test]
-    fn rays_that_are_led_together_pass_no_occupied_cell_before() {
+    fn rays_that_are_led_together_pass_no_occupied_cell_outside_of_their_section() {
         let aabb = Aabb { min: DVec3::new(-1.0, -0.8, -1.1), max: DVec3::new(0.9, 1.2, 1.0) };
         let number = |k: u64| 2.0 * uniform(5, Purpose::Initial, 1, k) - 1.0;
         let point = |k: u64| DVec3::new(number(k), number(k + 1), number(k + 2));
         for (share, far_enough, sees_nothing) in [(0.0, 3000, 340), (0.0003, 400, 10), (0.01, 0, 0)] {
             let some = Occupancy { aabb, ..scattered([70, 52, 66], share) };
-            let (mut far, mut none) = (0, 0);
+            let (mut far, mut back, mut none) = (0, 0, 0);
             for packet in 0..400u64 {
                 let (origin, target) = (3.0 * point(100 * packet).normalize(), point(100 * packet + 3));
                 // Rays of a packet of pixels, and some that have nothing in common.
@@ -597,18 +608,20 @@ mod tests {
                     Ray { origin, direction: (target + spread * point(100 * packet + 6 * k + 9) - origin).normalize(), stretch: 1.0 }
                 };
                 let rays: Vec<Ray> = (0..12).map(ray).collect();
-                let until = some.free_until(&rays);
+                let [from, to] = some.section(&rays);
                 for ray in &rays {
                     let Some((near, end)) = aabb.intersect(ray.origin, ray.direction) else { continue };
                     for k in 0..300 {
-                        let t = near + (until.min(end) - near) * (f64::from(k) + 0.5) / 300.0;
-                        assert!(t > until || t < near || !some.contains_point(ray.origin + t * ray.direction), "packet {packet} at {t}");
+                        let t = near + (end - near) * (f64::from(k) + 0.5) / 300.0;
+                        let free = t < from || t > to;
+                        assert!(!free || !some.contains_point(ray.origin + t * ray.direction), "packet {packet} at {t}");
                     }
-                    far += usize::from(until > near + 0.2);
+                    far += usize::from(from > near + 0.2);
+                    back += usize::from(to < end - 0.2);
                 }
-                none += usize::from(until.is_infinite());
+                none += usize::from(from.is_infinite());
             }
-            assert!(far >= far_enough && none >= sees_nothing, "{share}: {far} and {none}");
+            assert!(far.min(back) >= far_enough && none >= sees_nothing, "{share}: {far}, {back} and {none}");
         }
     }
 }

@@ -37,7 +37,7 @@ use crate::camera::Ray;
 use crate::field::{Field, sh};
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, RenderOptions, Rendered, composite};
-use crate::sampling::{Occupancy, Samples};
+use crate::sampling::{Jitter, Occupancy, Samples};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Param, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
 use forward::{Block, Scene};
 pub use seen::{Seen, largest_weights, seen};
@@ -159,7 +159,8 @@ pub(super) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
     let tables: Vec<&Tensor<T>> = grid.params().map(Param::tensor).collect();
     let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording() && n <= CHUNK;
     let mut pixels = Buffer::stale(n * COLUMNS);
-    let scene = batch.scene(grid, rays, options);
+    let packets = !keep && matches!(options.jitter, Jitter::None);
+    let scene = Scene { packets, ..batch.scene(grid, rays, options) };
     let mut sample_count = 0;
     let mut blocks = Vec::new();
     for (chunk, pixels) in pixels.chunks_mut(CHUNK * COLUMNS).enumerate() {

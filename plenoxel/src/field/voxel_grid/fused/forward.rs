@@ -7,7 +7,8 @@ use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along};
-use crate::sampling::{Occupancy, march};
+use crate::render::picture::RAYS_OF_PACKET;
+use crate::sampling::{EVERYWHERE, Occupancy, Spacing, march};
 use autograd::lattice::NodeMap;
 use autograd::{Buffer, Real, Tensor, parallel};
 
@@ -79,6 +80,8 @@ pub(super) struct Scene<'a, T: Real> {
     pub cells: Option<&'a Occupancy>,
     /// Density, color and, if harmonics are reduced, harmonics.
     pub tables: [&'a [T]; 3],
+    /// True for pictures, whose rays are those of neighbouring pixels: they skip the empty space around the scene together.
+    pub packets: bool,
 }
 
 impl<'a, T: Real> Scene<'a, T> {
@@ -90,7 +93,7 @@ impl<'a, T: Real> Scene<'a, T> {
         cells: Option<&'a Occupancy>,
         tables: impl IntoIterator<Item = &'a Tensor<T>>,
     ) -> Self {
-        let mut scene = Scene { batch, rays, options, cells, tables: [&[]; 3] };
+        let mut scene = Scene { batch, rays, options, cells, tables: [&[]; 3], packets: false };
         scene.tables.iter_mut().zip(tables).for_each(|(table, tensor)| *table = tensor.data());
         scene
     }
@@ -121,9 +124,17 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut group = Group::none();
         let mut kept = [0; RUN];
         let mut end = 0;
-        for (r, ray) in self.rays[first..first + count].iter().enumerate() {
+        let rays = &self.rays[first..first + count];
+        let mut section = EVERYWHERE;
+        for (r, ray) in rays.iter().enumerate() {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut places = Places::new(march, ray, self.cells, &self.batch.layout.shape);
+            if let Some(cells) =
+                self.cells.filter(|_| self.packets && r % RAYS_OF_PACKET == 0 && !matches!(spacing, Spacing::Contracted(_)))
+            {
+                section = cells.section(&rays[r..count.min(r + RAYS_OF_PACKET)]);
+            }
+            let occupied = self.cells.map(|cells| march.occupied(ray, cells).between(section));
+            let mut places = Places::new(march, ray, occupied, &self.batch.layout.shape);
             let mut left = T::one();
             // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
             while left >= stop {

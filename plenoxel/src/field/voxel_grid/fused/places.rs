@@ -2,7 +2,7 @@
 
 use crate::camera::Ray;
 use crate::field::voxel_grid::GridShape;
-use crate::sampling::{March, Occupancy, Occupied};
+use crate::sampling::{March, Occupied};
 use autograd::lattice::TOGETHER;
 use autograd::{Real, dispatched};
 use glam::DVec3;
@@ -23,10 +23,11 @@ pub(super) struct Places<'a, T> {
 }
 
 impl<'a, T: Real> Places<'a, T> {
-    pub fn new(march: March, ray: &'a Ray, cells: Option<&'a Occupancy>, shape: &GridShape) -> Self {
+    /// Starts at the first sample of a march, or at the first of `occupied`.
+    pub fn new(march: March, ray: &'a Ray, occupied: Option<Occupied<'a>>, shape: &GridShape) -> Self {
         let scale = 1.0 / shape.voxel_side();
         let to_voxels = [T::lit(scale), T::lit(shape.half_width * scale - 0.5)];
-        Places { ray, to_voxels, march, next: 0, occupied: cells.map(|cells| march.occupied(ray, cells)) }
+        Places { ray, to_voxels, march, next: 0, occupied }
     }
 
     /// Writes voxel coordinates, middles and lengths of the next samples, at most [`RUN`]. Returns their number; 0 at the end.
