@@ -206,7 +206,8 @@ impl March {
     #[inline]
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
         let (along, end) = (cells.along(ray), self.count);
-        Occupied { march: *self, ray: *ray, along, next: 0, end, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
+        let per_cell = if self.is_straight() { 0.0 } else { along.side() / (Bend::steepest(ray) * self.step) };
+        Occupied { march: *self, ray: *ray, along, per_cell, next: 0, end, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
 
     /// Returns the number of intervals whose middle lies before a distance on a straight ray, or one less.
@@ -229,6 +230,8 @@ pub(crate) struct Occupied<'a> {
     march: March,
     ray: Ray,
     along: Along<'a>,
+    /// Intervals of a ray that is not straight in which its position changes by at most one cell along any axis.
+    per_cell: f64,
     /// Next interval to test, and the first that is not tested any more.
     next: usize,
     end: usize,
@@ -267,6 +270,12 @@ impl Occupied<'_> {
         }
     }
 
+    /// Returns a number of intervals of a ray that is not straight, from the next one on, whose middles are in no occupied cell.
+    fn skipped_bent(&self) -> usize {
+        let s = self.march.interval(self.next).0;
+        (self.along.clearance(self.march.at(&self.ray, s)) * self.per_cell) as usize
+    }
+
     /// Tests the next intervals, or skips empty bricks.
     fn look(&mut self) {
         let march = &self.march;
@@ -274,6 +283,16 @@ impl Occupied<'_> {
         let lost = self.count == 0;
         (self.taken, self.count) = (0, 0);
         if let Some(bend) = march.bend {
+            while lost && self.next < self.end {
+                let skipped = self.skipped_bent();
+                if skipped < LOOKS / 2 {
+                    break;
+                }
+                self.next += skipped;
+            }
+            if self.next >= self.end {
+                return;
+            }
             self.count = occupied_of_bent(march, (bend, &self.ray), &self.along, self.next, &mut self.found);
             self.next += LOOKS;
         } else if lost && let Look::EmptyUntil(exit) = self.along.look(march.interval(self.next).0) {
@@ -449,5 +468,26 @@ mod tests {
             all.t.data().iter().zip(all.positions.data().chunks(3)).filter(|(_, p)| p[0] >= 0.0).map(|(&t, _)| t).collect();
         assert_eq!(some.t.data(), kept);
         assert!(kept.len() < all.len());
+    }
+
+    #[test]
+    fn bent_rays_skip_no_occupied_cell() {
+        let aabb = Aabb::cube(Space::CONTRACTED);
+        let numbers = autograd::random::Stream::new(3).uniform_tensor::<f64>(&[200, 6], -1.0, 1.0);
+        for share in [0.0, 2e-4, 0.01, 0.3] {
+            let chosen = autograd::random::Stream::new(4).uniform_tensor::<f64>(&[60 * 50 * 70], 0.0, 1.0);
+            let cells = Occupancy::new(aabb, [60, 50, 70], &chosen.data().iter().map(|&number| number < share).collect::<Vec<_>>());
+            let mut skipped = 0;
+            for x in numbers.data().as_chunks::<6>().0 {
+                let ray = ray([1.5 * x[0], 1.5 * x[1], 1.5 * x[2]], [x[3], x[4], x[5]]);
+                let march = march(&ray, &aabb, Spacing::Contracted(0.004), 0.3);
+                let occupied = march.occupied(&ray, &cells);
+                skipped += occupied.skipped_bent();
+                let all = (0..march.count).map(|k| march.interval(k));
+                let want: Vec<_> = all.filter(|interval| cells.contains_point(march.at(&ray, interval.0))).collect();
+                assert_eq!(occupied.collect::<Vec<_>>(), want, "{share}: {ray:?}");
+            }
+            assert!(share > 0.001 || skipped > 1000, "{share}: {skipped}");
+        }
     }
 }

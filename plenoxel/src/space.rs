@@ -260,6 +260,14 @@ impl Bend {
         if s <= self.turn { s } else { self.turn + (m - 1.0) / self.rate }
     }
 
+    /// Returns a bound of |dp_a / ds| along each axis a, for the positions p on the path of a ray: 1 + 2 max |(o × d)_a|.
+    ///
+    /// Where |x_k| > 1 is the largest coordinate, let u = 1 / |x_k| and x_j = A |x_k| + B. Then p_k = ± (2 − u), p_j = (A + B u) (2 − u), |A + B u| ≤ 1 and
+    /// |du / ds| ≤ |d_k|, so that |dp_j / ds| ≤ |d_k| (1 + 2 |B|), and |d_k B| = |o_j d_k − o_k d_j|.
+    pub(crate) fn steepest(ray: &Ray) -> f64 {
+        1.0 + 2.0 * ray.origin.cross(ray.direction).abs().max_element()
+    }
+
     /// Returns the positions at several s: x, y and z of each.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // One short loop for each array: such loops vectorise.
@@ -345,6 +353,22 @@ mod tests {
                 assert!(dvec3(at[0][k], at[1][k], at[2][k]).abs_diff_eq(expected, 1e-9));
             }
         }
+    }
+
+    #[test]
+    fn no_coordinate_changes_faster_on_a_bent_ray_than_the_bound() {
+        let mut tightest = f64::INFINITY;
+        for ray in rays(2000) {
+            let (bend, bound) = (Bend::of(&ray), Bend::steepest(&ray));
+            let at = |s: f64| contract(ray.origin + bend.distance(s) * ray.direction);
+            for k in 0..500 {
+                let s = bend.near() + (bend.end() - bend.near() - 1e-3) * f64::from(k) / 500.0;
+                let steepest = ((at(s + 1e-6) - at(s)) / 1e-6).abs().max_element();
+                assert!(steepest <= bound + 1e-4, "{ray:?} at {s}: {steepest} above {bound}");
+                tightest = tightest.min(bound / steepest);
+            }
+        }
+        assert!(tightest < 1.1, "{tightest}");
     }
 
     #[test]

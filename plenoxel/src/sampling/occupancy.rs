@@ -314,7 +314,7 @@ impl Occupancy {
     pub(crate) fn along(&self, ray: &Ray) -> Along<'_> {
         let per_length = DVec3::from_array(self.cells().map(|n| n as f64)) / (self.aabb.max - self.aabb.min);
         let slope = ray.direction * per_length;
-        Along { cells: self, start: (ray.origin - self.aabb.min) * per_length, slope, per_cell: slope.recip() }
+        Along { cells: self, per_length, start: (ray.origin - self.aabb.min) * per_length, slope, per_cell: slope.recip() }
     }
 }
 
@@ -344,6 +344,8 @@ impl Line {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Along<'a> {
     cells: &'a Occupancy,
+    /// Cells per length along each axis.
+    per_length: DVec3,
     start: DVec3,
     slope: DVec3,
     /// Reciprocal of the slope.
@@ -384,11 +386,33 @@ impl Along<'_> {
         self.cells.occupied(|axis, i, cells| self.cell(axis, t[i], cells))
     }
 
+    /// Returns a number of cells: there are no occupied ones nearer than this to a position, along any axis. 0 near occupied cells.
+    #[inline]
+    pub(crate) fn clearance(&self, at: DVec3) -> f64 {
+        let Occupancy { aabb, bricks, distance, .. } = self.cells;
+        let place = (at - aabb.min) * self.per_length;
+        let brick: [usize; 3] = std::array::from_fn(|a| (place[a].max(0.0) as usize).min(bricks.nodes()[a] - 1) / BRICK);
+        let free = distance[bricks.number(brick)];
+        if free < 2 {
+            return 0.0;
+        }
+        // All bricks nearer than `free` are empty.
+        (0..3).fold(f64::INFINITY, |clear, a| {
+            let (here, reach) = (brick[a] as f64, f64::from(free));
+            let [low, high] = [(here + 1.0 - reach) * BRICK as f64, (here + reach) * BRICK as f64];
+            clear.min(place[a] - low).min(high - place[a])
+        })
+    }
+
+    /// Returns the shortest side of a cell.
+    pub(crate) fn side(&self) -> f64 {
+        1.0 / self.per_length.max_element()
+    }
+
     /// Tests which positions lie in occupied cells: x, y and z of each.
     #[inline(always)]
     pub(crate) fn occupied_at<const N: usize>(&self, at: &[[f64; N]; 3]) -> [bool; N] {
-        let low = self.cells.aabb.min;
-        let per_length = DVec3::from_array(self.cells.cells().map(|n| n as f64)) / (self.cells.aabb.max - low);
+        let (low, per_length) = (self.cells.aabb.min, self.per_length);
         self.cells.occupied(|axis, i, cells| ((at[axis][i] - low[axis]) * per_length[axis]).max(0.0).min((cells - 1) as f64) as u32)
     }
 }
