@@ -32,6 +32,8 @@ use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Kind of this model in checkpoints.
 pub const KIND: &str = "ngp";
@@ -220,6 +222,7 @@ impl Config {
 #[derive(Debug)]
 pub struct Ngp<T: Real> {
     config: Config,
+    decays: Arc<Decays>,
     field: HashField<T>,
     /// Densities of the cells; `None` before the first step.
     running: Option<RunningOccupancy>,
@@ -254,7 +257,11 @@ impl<T: Real> Ngp<T> {
         config.validate()?;
         let mut field = HashField::new(config.shape(), aabb, &Stream::new(seed));
         field.color_above = config.color_above;
-        Ok(Ngp { config, field, running: None, hull: Hull::Auto, seed, first: 0, engine: Engine::Fused })
+        let decays = Arc::new(Decays::default());
+        let mut model =
+            Ngp { config: config.clone(), decays, field, running: None, hull: Hull::Auto, seed, first: 0, engine: Engine::Fused };
+        model.set_config(config);
+        Ok(model)
     }
 
     /// Sets the use of silhouettes. With [`Hull::Auto`], the default, only cells in the visual hull of the training views are sampled, if they have an alpha
@@ -276,6 +283,12 @@ impl<T: Real> Ngp<T> {
     /// Returns the settings of the model.
     pub fn config(&self) -> &Config {
         &self.config
+    }
+
+    fn set_config(&mut self, config: Config) {
+        self.decays.from.store(config.decay_from, Relaxed);
+        self.decays.every.store(config.decay_every, Relaxed);
+        self.config = config;
     }
 
     /// Returns the field.
@@ -321,20 +334,27 @@ impl<T: Real> Ngp<T> {
     }
 }
 
-/// Learning rate that is multiplied by a factor at step `from` of the run, and after every `every` steps from then on.
+/// Steps at which the learning rates decay ([`Config::decay_from`], [`Config::decay_every`]). The rates of the current optimizer follow them when a plan changes.
+#[derive(Debug, Default)]
+struct Decays {
+    from: AtomicU64,
+    every: AtomicU64,
+}
+
+/// Learning rate that is multiplied by a factor at every decay.
 #[derive(Debug)]
 struct Decaying {
     rate: f64,
     factor: f64,
-    from: u64,
-    every: u64,
+    decays: Arc<Decays>,
     /// Number of steps before the stage.
     first: u64,
 }
 
 impl Schedule for Decaying {
     fn at(&self, step: u64) -> f64 {
-        let decays = (self.first + step).checked_sub(self.from).map_or(0, |since| 1 + since / self.every);
+        let (from, every) = (self.decays.from.load(Relaxed), self.decays.every.load(Relaxed));
+        let decays = (self.first + step).checked_sub(from).map_or(0, |since| 1 + since / every);
         self.rate * self.factor.powi(i32::try_from(decays).unwrap_or(i32::MAX))
     }
 }
@@ -358,8 +378,8 @@ impl<T: Real> Model<T> for Ngp<T> {
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
-        let Config { table_rate, network_rate, decay, decay_from, decay_every, .. } = self.config;
-        let decaying = |rate: f64| Decaying { rate, factor: decay, from: decay_from, every: decay_every, first: stage.first };
+        let Config { table_rate, network_rate, decay, .. } = self.config;
+        let decaying = |rate: f64| Decaying { rate, factor: decay, decays: self.decays.clone(), first: stage.first };
         let mut rates = Rates::new(decaying(network_rate)).with(TABLE, decaying(table_rate));
         for layer in self.field.networks().into_iter().flat_map(|network| &network.layers) {
             rates = rates.with(layer.bias.name(), 0.0);
@@ -403,6 +423,11 @@ impl<T: Real> Model<T> for Ngp<T> {
 
     fn settings(&self) -> Value {
         json!(self.config)
+    }
+
+    /// A plan may have changed after the run was saved.
+    fn continues(&self, saved: &Value, steps: u64) -> bool {
+        Config::deserialize(saved).is_ok_and(|saved| self.config.begins_as(&saved, steps))
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {

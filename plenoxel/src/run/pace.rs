@@ -168,10 +168,10 @@ mod tests {
     use crate::dataset::procedural::ProceduralOptions;
     use crate::dataset::{Dataset, Split};
     use crate::loss::{Objective, mse};
-    use crate::model::tensorf::{self, Short, Stage, Tensorf};
+    use crate::model::ngp;
+    use crate::model::tensorf::{self, Short, Stage};
     use crate::space::{Region, Space};
     use crate::train::TrainOptions;
-    use autograd::Module;
 
     fn recipe(stages: &[(usize, u64)]) -> tensorf::Config {
         tensorf::Config {
@@ -186,7 +186,7 @@ mod tests {
         }
     }
 
-    fn trainer(recipe: &tensorf::Config) -> Result<Trainer<f32, Tensorf<f32>>> {
+    fn trainer<R: Recipe>(recipe: &R) -> Result<Trainer<f32, R::Model>> {
         let scene = ProceduralOptions { width: 16, height: 12, train: 3, val: 1, test: 1, ..ProceduralOptions::default() };
         let views = Dataset::procedural(scene)?.load(Split::Train, &|_, _| ())?;
         let region = Region { space: Space::Box, aabb: crate::geometry::Aabb::cube(1.5) };
@@ -195,7 +195,7 @@ mod tests {
     }
 
     /// Trains to the end; returns all parameters.
-    fn trained(mut trainer: Trainer<f32, Tensorf<f32>>) -> Vec<f32> {
+    fn trained(mut trainer: Trainer<f32, impl Model<f32>>) -> Vec<f32> {
         while trainer.step().unwrap().is_some() {}
         let mut values = Vec::new();
         trainer.model().visit(&mut |param| values.extend_from_slice(param.tensor().data()));
@@ -263,5 +263,36 @@ mod tests {
         // Rates that fall from the first step on know the whole length.
         let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };
         assert!(Pace::new(falling, Config::default(), 100.0).adjust_at.is_none());
+    }
+
+    #[test]
+    fn a_hash_grid_whose_steps_become_faster_ends_on_time_and_repeats_from_its_settings() {
+        let asked = ngp::Config {
+            levels: 2,
+            log2_rows: 6,
+            finest_resolution: 24,
+            hidden: 8,
+            color_layers: 1,
+            samples: 16.0,
+            cells: 8,
+            decay_from: 200,
+            decay_every: 50,
+            stages: vec![ngp::Stage { steps: 300, rays: 16 }],
+            ..ngp::Config::default()
+        };
+        let mut pace = Pace::new(asked.clone(), Config::default(), 100.0);
+        let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
+        // The first twenty steps take 0.33 seconds, as the plan expects, and the others 0.1.
+        let seconds = |taken: u64| 0.1 * taken as f64 + 0.23 * taken.min(20) as f64;
+        while trainer.step().unwrap().is_some() {
+            let now = seconds(trainer.steps_taken());
+            plans.extend(pace.after_step(&mut trainer, now).and_then(|config| config.ngp));
+        }
+        let took = seconds(trainer.steps_taken());
+        assert!(plans.len() == 2 && (85.0..105.0).contains(&took), "{took}");
+        let last = plans.last().unwrap();
+        let share = last.stages[0].steps as f64 / 300.0;
+        assert!((last.decay_from as f64 / 200.0 - share).abs() < 0.01 && (last.decay_every as f64 / 50.0 - share).abs() < 0.02);
+        assert_eq!(trained(trainer), trained(super::tests::trainer(last).unwrap()));
     }
 }

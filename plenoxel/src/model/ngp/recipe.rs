@@ -7,6 +7,7 @@ use crate::model::recipe::{Memory, Recipe};
 use crate::render::Engine;
 use crate::space::Region;
 use crate::train::StageLength;
+use std::iter;
 
 impl Recipe for Config {
     type Model = Ngp<f32>;
@@ -53,18 +54,63 @@ impl Recipe for Config {
         (0, self.stages[0].rays as f64)
     }
 
-    fn with_cost(&self, _: &Ngp<f32>, cost: f64, _: u64) -> Self {
+    fn with_cost(&self, _: &Ngp<f32>, cost: f64, taken: u64) -> Self {
         let whole: f64 = self.stages.iter().map(|stage| stage.steps as f64 * stage.rays as f64).sum();
-        let scaled = |steps: u64| ((steps as f64 * cost / whole).round() as u64).max(1);
-        Config {
-            stages: self.stages.iter().map(|stage| Stage { steps: scaled(stage.steps), ..*stage }).collect(),
-            decay_from: scaled(self.decay_from),
-            decay_every: scaled(self.decay_every),
-            ..self.clone()
-        }
+        let factor = cost / whole;
+        let least = iter::once(taken + 1).chain(iter::repeat(1));
+        let scaled = |(stage, least): (&Stage, u64)| Stage { steps: scaled(stage.steps, factor).max(least), ..*stage };
+        Config { stages: self.stages.iter().zip(least).map(scaled).collect(), ..self.clone() }.with_decays_of(self, factor)
+    }
+
+    fn begins_as(&self, other: &Self, steps: u64) -> bool {
+        // The last stage and the decays may differ if they come later.
+        let begin = |config: &Config| {
+            let mut stages = config.stages.clone();
+            stages.last_mut().into_iter().for_each(|last| last.steps = 0);
+            Config { stages, decay_from: 0, decay_every: 1, ..config.clone() }
+        };
+        self == other || begin(self) == begin(other) && steps <= self.steps_at_full_rate().min(other.steps_at_full_rate())
+    }
+
+    fn steps_before_length_matters(&self) -> u64 {
+        self.steps_at_full_rate()
+    }
+
+    fn with_last_stage(&self, steps: u64, taken: u64) -> Self {
+        let total: u64 = self.stages.iter().map(|stage| stage.steps).sum();
+        let mut stages = self.stages.clone();
+        let Some((last, earlier)) = stages.split_last_mut() else { return self.clone() };
+        let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
+        // The rates decay after the steps that were taken.
+        let least = (taken + 1) as f64 * total as f64 / self.decay_from.clamp(1, total) as f64;
+        let total_steps = (before + steps).max(least.ceil() as u64 + 1);
+        last.steps = total_steps - before;
+        Config { stages, ..self.clone() }.with_decays_of(self, total_steps as f64 / total as f64)
+    }
+
+    fn change(self, model: &mut Ngp<f32>) {
+        model.set_config(self);
     }
 
     fn set(self, config: &mut RunConfig) {
         config.ngp = Some(self);
+    }
+}
+
+/// Returns a number of steps, multiplied by a factor.
+fn scaled(steps: u64, factor: f64) -> u64 {
+    ((steps as f64 * factor).round() as u64).max(1)
+}
+
+impl Config {
+    /// Returns these settings with the decays of others, for steps that are `factor` times as many.
+    fn with_decays_of(self, other: &Self, factor: f64) -> Self {
+        Config { decay_from: scaled(other.decay_from, factor), decay_every: scaled(other.decay_every, factor), ..self }
+    }
+
+    /// Returns the number of steps before the first decay, without the last step of the run.
+    fn steps_at_full_rate(&self) -> u64 {
+        let total: u64 = self.stages.iter().map(|stage| stage.steps).sum();
+        self.decay_from.min(total - 1)
     }
 }
