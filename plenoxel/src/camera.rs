@@ -66,6 +66,12 @@ impl Intrinsics {
         }
     }
 
+    /// Returns the intrinsics of an image of the same view with other numbers of pixels.
+    pub fn resized(&self, width: usize, height: usize) -> Self {
+        let [x, y] = [width as f64 / self.width as f64, height as f64 / self.height as f64];
+        Intrinsics { width, height, fx: self.fx * x, fy: self.fy * y, cx: self.cx * x, cy: self.cy * y, lens: self.lens }
+    }
+
     /// Returns the direction, in camera axes, in which a point of the image in pixels is seen: of z = -1, or of length 1 for a fisheye.
     ///
     /// Panics at points that no direction reaches ([`Intrinsics::check_lens`]).

@@ -58,24 +58,24 @@ impl<'a, T: Real> Viewer<'a, T> {
         picture_unless(&self.show, camera, stopped)
     }
 
-    /// Renders the image of a camera in about `seconds`: if all pixels take longer, one ray is rendered for each block of k × k pixels, k a power of 2 up to 16.
-    /// The time is predicted from one ray for each block of 16 × 16.
+    /// Renders the image of a camera in about `seconds`: if all pixels take longer, one ray is rendered for k × k pixels, k a power of 2 up to 16, and the image is
+    /// enlarged. Which k depends on the speed of the machine.
     pub fn glance(&self, camera: &Camera, seconds: f64) -> Picture {
-        const COARSEST: usize = 16;
         let Intrinsics { width, height, .. } = camera.intrinsics;
-        let by = |k: usize| {
-            let intrinsics = camera.intrinsics.downscaled(k.min(width).min(height));
-            self.see(&Camera { intrinsics, ..*camera })
-        };
-        let start = Instant::now();
-        let coarse = by(COARSEST);
-        let allowed = seconds / start.elapsed().as_secs_f64();
-        let finer = [1, 2, 4, 8].into_iter().find(|k| ((COARSEST / k).pow(2) as f64) < allowed);
-        match finer {
-            Some(1) => self.see(camera),
-            Some(k) => by(k).enlarged([width, height]),
-            None => coarse.enlarged([width, height]),
+        for k in [16, 8, 4, 2] {
+            let [w, h] = [width, height].map(|n| (n / k).max(1));
+            let start = Instant::now();
+            let coarse = self.see(&Camera { intrinsics: camera.intrinsics.resized(w, h), ..*camera });
+            // Few rays do not use all threads: where the whole image seems to take too long, the next finer one tells more.
+            let of_ray = start.elapsed().as_secs_f64() / (w * h) as f64;
+            if of_ray * (width * height) as f64 <= seconds {
+                break;
+            }
+            if 4.0 * of_ray * (w * h) as f64 > seconds {
+                return coarse.enlarged([width, height]);
+            }
         }
+        self.see(camera)
     }
 
     /// Renders each view and compares it with its photograph over the background. Pixels that a mask ignores do not count in the squared
@@ -243,7 +243,7 @@ mod tests {
         assert_eq!(viewer.glance(&camera, 1e6).rgb, viewer.see(&camera).rgb);
         let coarse = viewer.glance(&camera, 0.0).rgb;
         assert_eq!(coarse.dim(), (24, 40, 3));
-        // Blocks of a height of 24 and a width of 20.
+        // Two pixels beside each other.
         assert_eq!(coarse[[0, 0, 0]], coarse[[23, 19, 0]]);
         assert_ne!(coarse[[0, 19, 0]], coarse[[0, 20, 0]]);
     }

@@ -13,6 +13,7 @@ pub mod walk;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
+use crate::render::picture::RAYS_OF_PACKET;
 use crate::space::{Bend, Space, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
@@ -206,8 +207,8 @@ impl March {
     #[inline]
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
         let (along, end) = (cells.along(ray), self.count);
-        let per_cell = if self.is_straight() { 0.0 } else { along.side() / (Bend::steepest(ray) * self.step) };
-        Occupied { march: *self, ray: *ray, along, per_cell, next: 0, end, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
+        let intervals_per_cell = if self.is_straight() { 0.0 } else { along.side() / (Bend::steepest(ray) * self.step) };
+        Occupied { march: *self, ray: *ray, along, intervals_per_cell, next: 0, end, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
 
     /// Returns the number of intervals whose middle lies before a distance on a straight ray, or one less.
@@ -218,8 +219,29 @@ impl March {
     }
 }
 
-/// Distances that leave out nothing.
-pub(crate) const EVERYWHERE: [f64; 2] = [0.0, f64::INFINITY];
+/// Sections of the rays of a picture that may lie in occupied cells: neighbouring rays skip the empty space around the scene together.
+#[derive(Debug)]
+pub(crate) struct Sections<'a> {
+    cells: Option<&'a Occupancy>,
+    section: [f64; 2],
+}
+
+impl<'a> Sections<'a> {
+    /// Sections of rays through these cells. Without cells, and for rays that are not straight, they are whole rays.
+    pub(crate) fn new(cells: Option<&'a Occupancy>, spacing: Spacing) -> Self {
+        Sections { cells: cells.filter(|_| !matches!(spacing, Spacing::Contracted(_))), section: [0.0, f64::INFINITY] }
+    }
+
+    /// Returns the section of ray r, which follows ray r − 1.
+    #[inline]
+    pub(crate) fn of(&mut self, rays: &[Ray], r: usize) -> [f64; 2] {
+        if let Some(cells) = self.cells.filter(|_| r.is_multiple_of(RAYS_OF_PACKET)) {
+            self.section = cells.section(&rays[r..rays.len().min(r + RAYS_OF_PACKET)]);
+        }
+        self.section
+    }
+}
+
 /// Number of intervals that are tested together.
 const LOOKS: usize = 16;
 
@@ -231,7 +253,7 @@ pub(crate) struct Occupied<'a> {
     ray: Ray,
     along: Along<'a>,
     /// Intervals of a ray that is not straight in which its position changes by at most one cell along any axis.
-    per_cell: f64,
+    intervals_per_cell: f64,
     /// Next interval to test, and the first that is not tested any more.
     next: usize,
     end: usize,
@@ -272,8 +294,9 @@ impl Occupied<'_> {
 
     /// Returns a number of intervals of a ray that is not straight, from the next one on, whose middles are in no occupied cell.
     fn skipped_bent(&self) -> usize {
-        let s = self.march.interval(self.next).0;
-        (self.along.clearance(self.march.at(&self.ray, s)) * self.per_cell) as usize
+        // At infinity, there is no position.
+        let s = self.march.interval(self.next).0.min(self.march.far - 1e-9);
+        (self.along.clearance(self.march.at(&self.ray, s)) * self.intervals_per_cell) as usize
     }
 
     /// Tests the next intervals, or skips empty bricks.
@@ -288,7 +311,7 @@ impl Occupied<'_> {
                 if skipped < LOOKS / 2 {
                     break;
                 }
-                self.next += skipped;
+                self.next = self.next.saturating_add(skipped);
             }
             if self.next >= self.end {
                 return;

@@ -93,8 +93,9 @@ pub fn plan<R: Recipe + Clone>(
     Ok(Planned { recipe: planned(left, 0), begun: None })
 }
 
-/// Follows a planned run, and adjusts the length of its last stage twice so that training ends on time: early, when a wrong plan can still become much shorter,
-/// and in the last stage, whose speed is known then. A run that is resumed keeps the plan with which it was saved.
+/// Follows a planned run, and adjusts the length of its last stage so that training ends on time: early, when a wrong plan can still become much shorter,
+/// and in the last stage, whose speed is known then. A run of one stage is adjusted again and again, as long as its length does not matter: the first steps
+/// of a stage are slower. A run that is resumed keeps the plan with which it was saved.
 pub struct Pace<R> {
     recipe: R,
     config: Config,
@@ -103,8 +104,9 @@ pub struct Pace<R> {
     adjust_at: Option<u64>,
     /// True after the first adjustment.
     adjusted: bool,
-    /// Number of the first step of the current stage, and seconds of training after it; `None` if that was not seen.
-    stage_started: Option<(u64, f64)>,
+    /// Stage and number of steps from which on the speed is measured, and seconds of training until then: the first step that was seen of the stage, or, in a run of
+    /// one stage, the last adjustment.
+    measured_from: Option<(usize, u64, f64)>,
 }
 
 /// Fewest steps of a stage from which the speed is taken.
@@ -115,16 +117,16 @@ impl<R: Recipe + Clone> Pace<R> {
     pub fn new(recipe: R, config: Config, seconds: f64) -> Self {
         let until = recipe.steps_before_length_matters();
         let adjust_at = (until > 0).then_some(until / 3);
-        Pace { recipe, config, seconds, adjust_at, adjusted: false, stage_started: None }
+        Pace { recipe, config, seconds, adjust_at, adjusted: false, measured_from: None }
     }
 
     /// Looks at the time after a step; `now` is the number of seconds of training. Returns the new configuration if the plan changed.
     pub fn after_step(&mut self, trainer: &mut Trainer<f32, R::Model>, now: f64) -> Option<Config> {
         let (taken, plan) = (trainer.steps_taken(), trainer.plan());
         let stage = plan.iter().find(|stage| taken <= stage.first + stage.steps)?;
-        if taken == stage.first + 1 {
-            // The first step begins the stage, so it is not measured.
-            self.stage_started = Some((stage.first, now));
+        // The step that begins a stage is not measured.
+        if self.measured_from.is_none_or(|(index, ..)| index != stage.index) {
+            self.measured_from = Some((stage.index, taken, now));
         }
         if taken < self.adjust_at? {
             return None;
@@ -133,9 +135,9 @@ impl<R: Recipe + Clone> Pace<R> {
             self.adjust_at = None;
             return None;
         }
-        let (_, started) = self.stage_started.filter(|(first, _)| *first == stage.first && taken > first + MEASURED)?;
+        let (_, from, started) = self.measured_from.filter(|(index, from, _)| *index == stage.index && taken >= from + MEASURED)?;
         let cost = |stage: &PlannedStage| stage.rays_per_step as f64 * stage.ray_cost;
-        let unit = (now - started) / (taken - stage.first - 1) as f64 / cost(stage);
+        let unit = (now - started) / (taken - from) as f64 / cost(stage);
         let (last, earlier) = plan.split_last()?;
         let to_come = |stage: &PlannedStage| stage.steps - taken.saturating_sub(stage.first).min(stage.steps);
         let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * cost(stage)).sum();
@@ -146,8 +148,13 @@ impl<R: Recipe + Clone> Pace<R> {
         trainer.replan(|model| adjusted.clone().change(model));
         self.recipe = adjusted;
         let until = self.recipe.steps_before_length_matters();
-        self.adjust_at = if self.adjusted { None } else { Some(second_adjustment(first, until)) };
-        self.adjusted = true;
+        let again = if first == 0 {
+            self.measured_from = Some((0, taken, now));
+            Some(taken.midpoint(until)).filter(|next| *next >= taken + MEASURED)
+        } else {
+            (!self.adjusted).then(|| second_adjustment(first, until))
+        };
+        (self.adjust_at, self.adjusted) = (again, true);
         self.recipe.clone().set(&mut self.config);
         Some(self.config.clone())
     }
@@ -284,15 +291,18 @@ mod tests {
         let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
         // The first twenty steps take 0.33 seconds, as the plan expects, and the others 0.1.
         let seconds = |taken: u64| 0.1 * taken as f64 + 0.23 * taken.min(20) as f64;
+        // The steps that were measured for the plan are not seen.
+        (0..21).for_each(|_| drop(trainer.step().unwrap()));
         while trainer.step().unwrap().is_some() {
             let now = seconds(trainer.steps_taken());
             plans.extend(pace.after_step(&mut trainer, now).and_then(|config| config.ngp));
         }
         let took = seconds(trainer.steps_taken());
-        assert!(plans.len() == 2 && (85.0..105.0).contains(&took), "{took}");
+        assert!(plans.len() > 2 && (98.0..101.0).contains(&took), "{took}, {}", plans.len());
         let last = plans.last().unwrap();
         let share = last.stages[0].steps as f64 / 300.0;
-        assert!((last.decay_from as f64 / 200.0 - share).abs() < 0.01 && (last.decay_every as f64 / 50.0 - share).abs() < 0.02);
+        // Rounded in each adjustment.
+        assert!((last.decay_from as f64 / 200.0 - share).abs() < 0.1 && (last.decay_every as f64 / 50.0 - share).abs() < 0.1);
         assert_eq!(trained(trainer), trained(super::tests::trainer(last).unwrap()));
     }
 }

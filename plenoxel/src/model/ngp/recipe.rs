@@ -111,6 +111,6 @@ impl Config {
     /// Returns the number of steps before the first decay, without the last step of the run.
     fn steps_at_full_rate(&self) -> u64 {
         let total: u64 = self.stages.iter().map(|stage| stage.steps).sum();
-        self.decay_from.min(total - 1)
+        self.decay_from.min(total.saturating_sub(1))
     }
 }

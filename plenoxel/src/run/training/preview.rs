@@ -19,7 +19,7 @@ const VIEWS: usize = 4;
 const SIDE: usize = 128;
 /// Maximum number of pixels along the longer side of the picture.
 const PICTURE_SIDE: usize = 256;
-/// Seconds of a picture, so that models whose rays take long do not delay the training. Slower pictures have fewer pixels.
+/// Seconds of a picture. Pictures of models whose rays take long have fewer pixels, so that they do not delay the training.
 pub const GLANCE: f64 = 4.0;
 /// Maximum share of the training time for previews: for those at intervals and checkpoints, and for those at stage ends.
 const SHARES: [f64; 2] = [0.03, 0.05];

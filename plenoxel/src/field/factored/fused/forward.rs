@@ -9,8 +9,7 @@ use crate::field::grouping::Groups;
 use crate::geometry::Aabb;
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along, COLUMNS};
-use crate::render::picture::RAYS_OF_PACKET;
-use crate::sampling::{EVERYWHERE, Occupancy, Spacing, march};
+use crate::sampling::{Occupancy, Sections, march};
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
 use std::ops::Range;
@@ -156,17 +155,10 @@ impl<'a, T: Real> Scene<'a, T> {
         let most = DVec3::from_array(self.batch.nodes.map(|n| n as f64 - 1.0));
         let per_length = cells_per_length(self.batch.nodes, aabb);
         let rays = &self.rays[first..first + count];
-        let mut section = EVERYWHERE;
+        let mut sections = Sections::new(self.densities.map(Densities::cells), *spacing);
         for (r, ray) in rays.iter().enumerate() {
-            // Neighbouring rays of a picture skip the empty space around the scene together.
-            if let Some(densities) = self.densities
-                && r % RAYS_OF_PACKET == 0
-                && !matches!(spacing, Spacing::Contracted(_))
-            {
-                section = densities.cells().section(&rays[r..count.min(r + RAYS_OF_PACKET)]);
-            }
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells).between(section));
+            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells).between(sections.of(rays, r)));
             let mut all = (0..march.count).map(move |k| march.interval(k));
             let mut next = || occupied.as_mut().map_or_else(|| all.next(), Iterator::next);
             let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);

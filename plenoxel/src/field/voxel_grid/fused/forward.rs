@@ -7,8 +7,7 @@ use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along};
-use crate::render::picture::RAYS_OF_PACKET;
-use crate::sampling::{EVERYWHERE, Occupancy, Spacing, march};
+use crate::sampling::{Occupancy, Sections, march};
 use autograd::lattice::NodeMap;
 use autograd::{Buffer, Real, Tensor, parallel};
 
@@ -125,15 +124,10 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut kept = [0; RUN];
         let mut end = 0;
         let rays = &self.rays[first..first + count];
-        let mut section = EVERYWHERE;
+        let mut sections = Sections::new(self.cells.filter(|_| self.packets), *spacing);
         for (r, ray) in rays.iter().enumerate() {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            if let Some(cells) =
-                self.cells.filter(|_| self.packets && r % RAYS_OF_PACKET == 0 && !matches!(spacing, Spacing::Contracted(_)))
-            {
-                section = cells.section(&rays[r..count.min(r + RAYS_OF_PACKET)]);
-            }
-            let occupied = self.cells.map(|cells| march.occupied(ray, cells).between(section));
+            let occupied = self.cells.map(|cells| march.occupied(ray, cells).between(sections.of(rays, r)));
             let mut places = Places::new(march, ray, occupied, &self.batch.layout.shape);
             let mut left = T::one();
             // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
