@@ -13,7 +13,6 @@ pub mod walk;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::random::{Purpose, uniform};
-use crate::render::picture::RAYS_OF_PACKET;
 use crate::space::{Bend, Space, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
@@ -218,6 +217,11 @@ impl March {
         ((distance - self.start) / self.step + half) as usize
     }
 }
+
+/// Side of the squares of pixels, in a picture, whose rays follow each other.
+pub(crate) const PACKET: usize = 8;
+/// Number of rays of such a square.
+const RAYS_OF_PACKET: usize = PACKET * PACKET;
 
 /// Sections of the rays of a picture that may lie in occupied cells: neighbouring rays skip the empty space around the scene together.
 #[derive(Debug)]

@@ -2,6 +2,7 @@
 
 use super::{Field, RenderOptions, Rendered, render};
 use crate::camera::{Camera, Ray};
+use crate::sampling::PACKET;
 use crate::space::Space;
 use autograd::{Real, no_grad, parallel};
 use ndarray::{Array2, Array3};
@@ -46,10 +47,6 @@ impl Picture {
 
 /// Side of the squares of pixels that are rendered at a time. It bounds the memory.
 const TILE: usize = 64;
-/// Side of the squares of pixels, in a tile, whose rays follow each other.
-const PACKET: usize = 8;
-/// Number of rays of such a square.
-pub(crate) const RAYS_OF_PACKET: usize = PACKET * PACKET;
 
 /// Renders an image of a field.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {
