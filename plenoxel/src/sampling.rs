@@ -223,7 +223,7 @@ pub(crate) const PACKET: usize = 8;
 /// Number of rays of such a square.
 const RAYS_OF_PACKET: usize = PACKET * PACKET;
 
-/// Sections of the rays of a picture that may lie in occupied cells: neighbouring rays skip the empty space around the scene together.
+/// Sections of the rays of a picture outside of which there are no occupied cells. Rays of a packet have the same.
 #[derive(Debug)]
 pub(crate) struct Sections<'a> {
     cells: Option<&'a Occupancy>,

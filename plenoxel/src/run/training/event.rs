@@ -61,7 +61,7 @@ pub enum Event<'a> {
     Initial {
         /// The first stage.
         stage: PlannedStage,
-        /// Renders the model from a camera.
+        /// Renders the model from a camera, with fewer pixels if its rays take long ([`Viewer::glance`](crate::evaluate::Viewer::glance)).
         see: &'a dyn Fn(&Camera) -> Picture,
     },
     /// A step was taken.
@@ -92,7 +92,7 @@ pub enum Event<'a> {
         stage: PlannedStage,
         /// Loss of each step so far.
         losses: &'a [f64],
-        /// Renders the current model from a camera.
+        /// Renders the current model from a camera, as in [`Event::Initial`].
         see: &'a dyn Fn(&Camera) -> Picture,
     },
     /// A checkpoint from which the run can resume was saved.

@@ -79,7 +79,7 @@ pub(super) struct Scene<'a, T: Real> {
     pub cells: Option<&'a Occupancy>,
     /// Density, color and, if harmonics are reduced, harmonics.
     pub tables: [&'a [T]; 3],
-    /// True for pictures, whose rays are those of neighbouring pixels: they skip the empty space around the scene together.
+    /// True for pictures, whose rays are those of neighbouring pixels: packets of them skip the empty space around the scene together ([`Sections`]).
     pub packets: bool,
 }
 
