@@ -166,6 +166,10 @@ fn bytes_of_ray(config: &Config, engine: Engine) -> u64 {
 /// Usual duration of the unit of [`Cost::step`] on a core, in seconds. If it leads to a wrong guess, the measured steps are discarded, and the run begins anew.
 const UNIT: f64 = 11.6e-6;
 
+/// Share of the configured duration below which steps have fewer rays, in proportion to the root of the share. lego, ten held-out views: at 0.017 of the whole,
+/// 28.73 dB, with fewer rays 29.55 dB; at 0.033, 31.31 and 31.57 dB, with 0.2 in place of 0.1 31.48 dB.
+const MANY_STEPS: f64 = 0.1;
+
 /// Durations of steps.
 #[derive(Clone, Copy, Debug)]
 struct Cost {
@@ -175,16 +179,20 @@ struct Cost {
 
 impl Cost {
     /// Scales stages to a total cost. In a short run, the earlier stages are shortened less than the last, and the finest stages become coarser: without geometry,
-    /// and with few steps for each node, finer planes gain nothing. The first stage has more than `taken` steps.
+    /// and with few steps for each node, finer planes gain nothing. In a very short run, the steps after the first stage have fewer rays. The first stage has more
+    /// than `taken` steps.
     fn scaled(self, stages: &[Stage], budget: f64, taken: u64) -> Vec<Stage> {
         let factor = budget / self.total(stages);
         let finest = stages.iter().map(|stage| stage.resolution).max().unwrap_or(0);
         let most = ((finest as f64 * factor.min(1.0).powf(0.13)) as usize).max(2);
-        let shortened = |stage: &Stage| {
-            let steps = (stage.steps as f64 * factor.max(factor.sqrt().min(1.0))).round() as u64;
-            Stage { resolution: stage.resolution.min(most), steps: steps.max(1), ..*stage }
+        let fewer = (factor / MANY_STEPS).sqrt().min(1.0);
+        let shortened = |(number, stage): (usize, &Stage)| {
+            // The speed is measured in the first stage, whose steps have few rays already.
+            let rays = if number == 0 { stage.rays } else { (stage.rays as f64 * fewer).ceil() as usize };
+            let steps = (stage.steps as f64 * factor.max(factor.sqrt().min(1.0)) * stage.rays as f64 / rays as f64).round() as u64;
+            Stage { resolution: stage.resolution.min(most), steps: steps.max(1), rays }
         };
-        let mut stages: Vec<Stage> = stages.iter().map(shortened).collect();
+        let mut stages: Vec<Stage> = stages.iter().enumerate().map(shortened).collect();
         if let Some((last, earlier)) = stages.split_last_mut() {
             // At least a third for the last stage.
             let shrink = (budget / 1.5 / self.total(earlier)).min(1.0);
@@ -225,6 +233,11 @@ mod tests {
             let finest = |stages: &[Stage]| stages.iter().map(|stage| stage.resolution).max();
             assert_eq!(finest(&planned) < finest(&stages), factor < 1.0, "{factor}");
             assert!(factor > 1.0 || planned[0].steps as f64 >= factor * stages[0].steps as f64);
+            assert_eq!(planned[0].rays, stages[0].rays);
+            assert!(
+                planned[1..].iter().zip(&stages[1..]).all(|(planned, stage)| (planned.rays < stage.rays) == (factor < MANY_STEPS)),
+                "{factor}"
+            );
         }
     }
 
