@@ -109,10 +109,11 @@ struct Machine {
 }
 
 impl Machine {
-    /// The command-line flags for these settings, for child processes.
-    fn flags(&self) -> Vec<String> {
-        let threads = self.threads.map(|n| format!("--threads={n}"));
-        threads.into_iter().chain(self.max_memory.map(|bytes| format!("--max-memory={bytes}"))).collect()
+    /// The command-line flags of each of `together` child processes, which share the threads and the memory.
+    fn flags(&self, together: usize) -> Vec<String> {
+        let threads = if together > 1 { Some((self.threads.unwrap_or_else(machine::threads) / together).max(1)) } else { self.threads };
+        let memory = self.max_memory.map(|bytes| bytes / together as u64);
+        threads.map(|n| format!("--threads={n}")).into_iter().chain(memory.map(|bytes| format!("--max-memory={bytes}"))).collect()
     }
 }
 
@@ -157,7 +158,7 @@ pub fn run<A: Into<OsString> + Clone>(args: impl IntoIterator<Item = A>, streams
             Command::Completions(args) => completions::run(args, &console),
             Command::Man(args) => man::run(args, &console),
             Command::View(args) => view::run(args, &console),
-            Command::Sweep(args) => return sweep::run(args, &cli.machine.flags(), &console),
+            Command::Sweep(args) => return sweep::run(args, &cli.machine, &console),
         };
         done.map(|()| 0)
     });

@@ -175,7 +175,7 @@ fn runs_that_were_planned_by_time_are_recognized() {
         set = ["rays_per_step=200", "stages=[{resolution=6, steps=4, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]"]
         [[methods]]
         preset = "quality"
-        time = "3s"
+        time = "8s"
         "#;
     fs::write(root.join("plan.toml"), format!("[[scenes]]\nscene_size = 24\nscene_views = [4, 0, 1]\n{methods}")).expect("the file");
     let (code, _, err) = plenoxel(&root, &["sweep", "plan.toml"]);
@@ -188,4 +188,134 @@ fn runs_that_were_planned_by_time_are_recognized() {
     let (_, out, _) = plenoxel(&root, &["sweep", "plan.toml", "--dry-run"]);
     assert_eq!(out.matches("seed is 42, not 5").count(), 2, "{out}");
     fs::remove_dir_all(root).expect("it is removed");
+}
+
+/// Two small runs of the built-in scene.
+const TWO: &str = r#"
+set = ["rays_per_step=100", "stages=[{resolution=6, steps=4, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]"]
+
+[[scenes]]
+scene_size = 24
+scene_views = [4, 0, 1]
+
+[[methods]]
+name = "one"
+
+[[methods]]
+name = "two"
+set = ["seed=5"]
+"#;
+
+/// The columns of table.csv that do not depend on the machine.
+fn results(root: &Path, out: &str) -> Vec<String> {
+    let csv = fs::read_to_string(root.join(out).join("table.csv")).expect("a table");
+    let names: Vec<&str> = csv.lines().next().expect("names").split(',').collect();
+    let psnr = names.iter().position(|name| *name == "psnr").expect("a column");
+    csv.lines().map(|line| line.split(',').take(2).chain(line.split(',').nth(psnr)).collect::<Vec<_>>().join(",")).collect()
+}
+
+#[test]
+fn runs_at_the_same_time_have_the_results_of_runs_one_after_another() {
+    let root = folder("together");
+    fs::write(root.join("plan.toml"), TWO).expect("the file");
+    for (out, more) in [("alone", &[][..]), ("both", &["--jobs=2"])] {
+        let (code, _, err) = plenoxel(&root, &[&["sweep", "plan.toml", "--out", out], more].concat());
+        assert_eq!(code, Some(0), "{err}");
+    }
+    assert_eq!(results(&root, "alone"), results(&root, "both"));
+    // Both had one of the two threads.
+    let log = fs::read_to_string(root.join("both/procedural/one.log")).expect("a log");
+    assert!(log.contains("1 thread"), "{log}");
+    fs::remove_dir_all(root).expect("removed");
+}
+
+/// Programs that stand for Slurm: `sbatch` prints a number and keeps its arguments, `squeue` prints a file.
+#[cfg(unix)]
+fn fake_slurm(root: &Path) -> String {
+    use std::os::unix::fs::PermissionsExt;
+    let bin = root.join("bin");
+    fs::create_dir_all(&bin).expect("a folder");
+    let here = root.display();
+    for (name, text) in [
+        ("sbatch", format!("#!/bin/sh\nprintf '%s\\n' \"$@\" >> {here}/asked\necho 41\n")),
+        ("squeue", format!("#!/bin/sh\ncat {here}/queue 2> /dev/null || exit 1\n")),
+    ] {
+        fs::write(bin.join(name), text).expect("a program");
+        fs::set_permissions(bin.join(name), fs::Permissions::from_mode(0o755)).expect("executable");
+    }
+    format!("{}:{}", bin.display(), std::env::var("PATH").unwrap_or_default())
+}
+
+#[cfg(unix)]
+#[test]
+fn a_sweep_is_submitted_as_a_job_array_whose_tasks_make_its_runs() {
+    let root = folder("slurm");
+    fs::write(root.join("plan.toml"), TWO).expect("the file");
+    let path = fake_slurm(&root);
+    let sweep = |more: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_plenoxel"));
+        let command =
+            command.current_dir(&root).env("PATH", &path).args(["sweep", "plan.toml", "--out", "swept", "--threads=2"]).args(more);
+        let Output { status, stdout, stderr } = command.output().expect("it runs");
+        (status.code(), String::from_utf8_lossy(&stdout).into_owned(), String::from_utf8_lossy(&stderr).into_owned())
+    };
+    let slurm = ["--engine=slurm", "--jobs=3", "--slurm", "partition=long", "--slurm", "mem=900M"];
+
+    let (code, out, err) = sweep(&[&slurm[..], &["--dry-run"]].concat());
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("sbatch --parsable --array=1-2%3") && out.contains("--task \"$run\""), "{out}");
+    assert!(!root.join("asked").exists() && !root.join("swept").exists());
+
+    let (code, _, err) = sweep(&slurm);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(err.contains("submitted 2 runs as job 41"), "{err}");
+    let asked = fs::read_to_string(root.join("asked")).expect("arguments");
+    for option in ["--array=1-2%3", "--cpus-per-task=2", "--mem=900M", "--partition=long", "--requeue", "--dependency=afterany:41"] {
+        assert!(asked.lines().any(|line| line == option), "{option} in {asked}");
+    }
+
+    // Nothing is submitted or made here while Slurm still has runs.
+    fs::write(root.join("queue"), "2|PENDING|Resources\n").expect("a queue");
+    for more in [&slurm[..], &[]] {
+        let (code, _, err) = sweep(more);
+        assert!(
+            code == Some(2) && err.contains("Slurm still has 1 of its runs: procedural/two is pending (Resources), task 41_2"),
+            "{err}"
+        );
+    }
+    let (code, out, _) = sweep(&["--status"]);
+    assert!(code == Some(0) && out.contains("procedural one: to run\n") && out.contains("procedural two: to run; Slurm: pending"), "{out}");
+    fs::remove_file(root.join("queue")).expect("removed");
+
+    // What Slurm would run.
+    let script = |name: &str, task: &str| {
+        let mut command = Command::new("sh");
+        let done =
+            command.arg(root.join("swept/slurm").join(name)).current_dir(&root).env("SLURM_ARRAY_TASK_ID", task).output().expect("it runs");
+        (done.status.code(), String::from_utf8_lossy(&done.stderr).into_owned())
+    };
+    for (name, task) in [("task.sh", "1"), ("task.sh", "2"), ("task.sh", "2"), ("table.sh", "")] {
+        let (code, err) = script(name, task);
+        assert_eq!(code, Some(0), "{err}");
+    }
+    let (code, _, err) = plenoxel(&root, &["sweep", "plan.toml", "--out", "local"]);
+    assert_eq!(code, Some(0), "{err}");
+    assert_eq!(results(&root, "swept"), results(&root, "local"));
+    let (_, out, _) = sweep(&["--status"]);
+    assert_eq!(out.lines().filter(|line| line.contains(": finished: ")).count(), 2, "{out}");
+    // All runs are finished: nothing is submitted.
+    fs::remove_file(root.join("asked")).expect("removed");
+    assert!(sweep(&slurm).0 == Some(0) && !root.join("asked").exists());
+
+    for (more, says) in [
+        (&["--slurm", "time=3"][..], "add --engine slurm"),
+        (&["--engine=slurm", "--slurm", "array=1-3"], "`array` is set by the sweep"),
+        (&["--engine=slurm", "--slurm=--time=3"], "without dashes"),
+        (&["--task", "procedural/three"], "unknown run `procedural/three`"),
+        (&["--engine=ssh"], "local, slurm"),
+    ] {
+        let (code, _, err) = sweep(more);
+        assert!(code == Some(2) && err.contains(says), "{says} in {err}");
+    }
+    fs::remove_dir_all(root).expect("removed");
 }

@@ -3,21 +3,26 @@
 mod child;
 mod flags;
 mod job;
+mod local;
 mod plan;
+mod slurm;
 
-use super::table::{Cell, Failure, Published, Row, RunTable};
+use super::table::{Cell, Published, Row, RunTable};
+use crate::Machine;
 use crate::child::command_line;
 use crate::interrupt::{EXIT_CODE, Watch};
 use crate::progress::Console;
 use child::Program;
 use clap::builder::PossibleValuesParser;
-use clap::{ArgGroup, Args, ValueHint};
+use clap::{ArgGroup, Args, ValueEnum, ValueHint};
 use job::{Job, State};
+use local::Runner;
 use plan::Plan;
 use plenoxel::error::{Error, Result};
 use plenoxel::files::{self, FolderLock};
-use plenoxel::run::settings::PRESETS;
-use std::ffi::OsString;
+use plenoxel::run::settings::{self, PRESETS};
+use std::collections::BTreeMap;
+use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
 const EXAMPLES: &str = "\
@@ -25,6 +30,11 @@ Examples:
   plenoxel sweep --scene data/lego --scene procedural --preset fast --preset paper --out sweeps/first
   plenoxel sweep nerf.toml                   run the sweep in sweeps/nerf, or resume it
   plenoxel sweep nerf.toml --dry-run         list the runs and their states
+  plenoxel sweep nerf.toml --jobs 4          make four runs at the same time
+  plenoxel sweep nerf.toml --engine slurm --threads 8 --slurm partition=long
+                                             submit a job array with one run in each task, and a job
+                                             after it that writes the table
+  plenoxel sweep nerf.toml --status          list what is finished, running, queued or failed
   plenoxel sweep nerf.toml --scene data/lego --scene data/chair    run its methods on other scenes
 
 The TOML file lists scenes and methods. Every scene is run with every method. Keys are flags of train
@@ -60,8 +70,13 @@ relative to the file. Example:
 
 Run folders are OUT/SCENE/METHOD, with the log next to them in METHOD.log. The table is written to
 table.md (and stdout), table.csv with all results, and table.html with pictures. SIGINT and SIGTERM
-are forwarded to the current run, which saves its state. Repeat the command to resume the sweep and
-to retry failed runs. The exit code is that of the first failed run, or 0.";
+are forwarded to the current runs, which save their states. Repeat the command to resume the sweep
+and to retry failed runs. The exit code is that of the first failed run, or 0.
+
+With Slurm, the sweep folder must be on a file system that all nodes share. Its subfolder slurm has
+the scripts and the output of the tasks. A task has the CPUs of --threads (without it 2), 1.5 times
+the estimated memory, and, if all runs have --time, twice that time and half an hour. Options of
+--slurm replace these. A task that Slurm requeues resumes its run.";
 
 /// Run every scene of a list with every method, skip finished runs, and print a table of the results
 #[derive(Debug, Args)]
@@ -89,13 +104,47 @@ pub struct SweepArgs {
     force: bool,
 
     /// List the runs with their states and commands, without running them
-    #[arg(long, help_heading = "Output")]
+    #[arg(long, help_heading = "Output", group = "instead")]
     dry_run: bool,
+
+    /// List the runs with their states: finished, running, queued, failed
+    #[arg(long, help_heading = "Output", group = "instead")]
+    status: bool,
+
+    /// Write the table of the current results, without running anything
+    #[arg(long, help_heading = "Output", group = "instead")]
+    table: bool,
+
+    /// Where the runs are made: on this machine, or as a job array of Slurm
+    #[arg(long, help_heading = "Machine", value_enum, default_value_t = Engine::Local)]
+    engine: Engine,
+
+    /// Number of runs at the same time; on this machine, they share its threads [default: 1; with Slurm, no limit]
+    #[arg(long, help_heading = "Machine", value_name = "N", value_parser = super::whole::<usize>(1, MOST_TOGETHER), allow_negative_numbers = true)]
+    jobs: Option<usize>,
+
+    /// Option of sbatch for the runs, such as partition=long, time=4:00:00 or exclusive; may be repeated
+    #[arg(long, help_heading = "Machine", value_name = "KEY=VALUE")]
+    slurm: Vec<String>,
+
+    /// Make only this run, without the lock of the sweep and without a table: for the tasks of a job array
+    #[arg(long, help_heading = "Machine", value_name = "SCENE/METHOD", group = "instead", conflicts_with_all = ["engine", "jobs", "slurm"])]
+    task: Option<String>,
 
     /// Set any key of the configuration of all runs; may be repeated
     #[arg(long, value_name = "KEY=VALUE", help_heading = "Settings")]
     set: Vec<String>,
 }
+
+/// Where runs are made.
+#[derive(Debug, Clone, Copy, PartialEq, ValueEnum)]
+enum Engine {
+    Local,
+    Slurm,
+}
+
+/// Largest number of runs at the same time.
+const MOST_TOGETHER: u64 = 1024;
 
 /// Lock file of a sweep folder, by which it is recognized.
 const LOCK: &str = "sweep.lock";
@@ -111,45 +160,73 @@ fn check_place(out: &Path) -> Result<()> {
     Err(Error::usage("--out", found, "choose a new folder or a sweep folder"))
 }
 
-/// Makes the unfinished runs, and writes the table. `machine` are additional flags for each run. Returns the exit code.
-pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Result<u8> {
+/// Makes the unfinished runs, or submits them, and writes the table. Returns the exit code.
+pub fn run(args: &SweepArgs, machine: &Machine, console: &Console<'_>) -> Result<u8> {
     let named = args.file.as_deref().and_then(Path::file_stem).unwrap_or_default();
     let out = args.out.clone().unwrap_or_else(|| Path::new("sweeps").join(named));
     let plan = match &args.file {
         Some(file) => Plan::from_file(file, &args.scene, &args.set, &out)?,
         None => Plan::from_flags(&args.scene, &args.preset, &args.set, &out)?,
     };
+    if let Some(name) = &args.task {
+        return task(args, &plan, name, machine, console);
+    }
     let states: Vec<State> = plan.jobs.iter().map(Job::state).collect();
-    if args.dry_run {
-        return plan.jobs.iter().zip(&states).try_for_each(|(job, state)| describe(job, state, console)).map(|()| 0);
+    let slurm = match args.engine {
+        Engine::Local if !args.slurm.is_empty() => {
+            return Err(Error::usage("--slurm", "the runs of this sweep are made on this machine", "add --engine slurm"));
+        }
+        Engine::Local => None,
+        Engine::Slurm => Some(slurm::Submission {
+            out: &out,
+            jobs: slurm::unfinished(&plan.jobs, &states),
+            sweep: args.command_line(&out, machine),
+            threads: machine.threads,
+            together: args.jobs,
+            options: slurm::options(&args.slurm)?,
+        }),
+    };
+    if args.status || args.dry_run {
+        let queued = if args.status { slurm::queued(&out) } else { BTreeMap::new() };
+        plan.jobs.iter().zip(&states).try_for_each(|(job, state)| describe(job, state, &queued, args.dry_run, console))?;
+        return slurm
+            .filter(|slurm| args.dry_run && !slurm.jobs.is_empty())
+            .map_or(Ok(0), |slurm| console.text(&slurm.describe()?).map(|()| 0));
     }
     if !args.force {
         plan.jobs.iter().zip(&states).try_for_each(|(job, state)| check(job, state))?;
     }
     check_place(&out)?;
     files::create_dir(&out)?;
-    let program = Program { path: child::this_program()?, machine: machine.to_vec(), lock: FolderLock::acquire(&out, LOCK, "--out")? };
-    // Signals are forwarded to the child, which saves its state. The sweep waits for it.
-    let watch = Watch::begin();
-    let (mut failed, mut interrupted) = (Vec::new(), false);
-    for (index, job) in plan.jobs.iter().enumerate() {
-        let sweep = Sweep { program: &program, watch: &watch, console, index, of: plan.jobs.len() };
-        let failure = sweep.finish(job)?;
-        interrupted = watch.requested();
-        if interrupted {
-            break;
-        }
-        if let Some(failure) = failure {
-            job.remember(&failure)?;
-            failed.push((job, failure));
-        }
+    let lock = FolderLock::acquire(&out, LOCK, "--out")?;
+    if args.table {
+        return write_table(&plan, &out, console).map(|()| 0);
     }
+    check_queue(&out)?;
+    match slurm {
+        Some(submission) if submission.jobs.is_empty() => write_table(&plan, &out, console).map(|()| 0),
+        Some(submission) => {
+            let submitted = submission.submit()?;
+            let (runs, array, table) = (submitted.runs.len(), submitted.array, submitted.table);
+            console.note(&format!(
+                "submitted {runs} runs as job {array}, and the table as job {table}; --status lists them, scancel {array} cancels them"
+            ));
+            Ok(0)
+        }
+        None => make(&plan, &out, args.jobs.unwrap_or(1), Program::new(machine, args.jobs.unwrap_or(1), lock)?, console),
+    }
+}
+
+/// Makes the unfinished runs on this machine, and writes the table. Returns the exit code.
+fn make(plan: &Plan, out: &Path, together: usize, program: Program, console: &Console<'_>) -> Result<u8> {
+    // Signals are forwarded to the children, which save their states. The sweep waits for them.
+    let watch = Watch::begin();
+    let failed = Runner::new(&program, &watch, console, plan.jobs.len()).finish_all(&plan.jobs, together)?;
+    let interrupted = watch.requested();
     drop(watch);
-    console.text(table(&plan, &out).write(&out)?.trim_end())?;
-    console.note(&format!("table: {}", out.join("table.html").display()));
+    write_table(plan, out, console)?;
     if interrupted {
-        console.error("interrupted; repeat the command to resume the sweep", EXIT_CODE);
-        return Ok(EXIT_CODE);
+        return Ok(stopped(console));
     }
     let Some((first, failure)) = failed.first() else { return Ok(0) };
     let (count, of, log) = (failed.len(), plan.jobs.len(), first.log());
@@ -160,65 +237,71 @@ pub fn run(args: &SweepArgs, machine: &[String], console: &Console<'_>) -> Resul
     Ok(failure.code)
 }
 
-/// The context of a run in a sweep.
-struct Sweep<'a, 'c> {
-    program: &'a Program,
-    watch: &'a Watch,
-    console: &'a Console<'c>,
-    index: usize,
-    of: usize,
+/// Makes one run of the sweep, and returns the exit code. Others may make other runs meanwhile.
+fn task(args: &SweepArgs, plan: &Plan, name: &str, machine: &Machine, console: &Console<'_>) -> Result<u8> {
+    let names: Vec<String> = plan.jobs.iter().map(Job::name).collect();
+    let index = names.iter().position(|known| known == name).ok_or_else(|| {
+        let known: Vec<&str> = names.iter().map(String::as_str).collect();
+        settings::unknown_name("run", name, &known, "--task")
+    })?;
+    let job = &plan.jobs[index];
+    if !args.force {
+        check(job, &job.state())?;
+    }
+    files::create_dir(job.place())?;
+    let program = Program::new(machine, 1, FolderLock::acquire(job.place(), &job.lock(), "--task")?)?;
+    let watch = Watch::begin();
+    let failure = Runner::new(&program, &watch, console, plan.jobs.len()).finish(job, index)?;
+    if watch.requested() {
+        return Ok(stopped(console));
+    }
+    Ok(failure.map_or(0, |failure| failure.code))
 }
 
-impl Sweep<'_, '_> {
-    /// Completes a run. Returns its failure, if it failed.
-    fn finish(&self, job: &Job) -> Result<Option<Failure>> {
-        job.forget()?;
-        let state = job.state();
-        if state == State::Finished {
-            self.note(job, &format!("already finished: {}", said(job)));
-            return Ok(None);
-        }
-        job.folder.parent().map_or(Ok(()), files::create_dir)?;
-        if !matches!(state, State::Interrupted | State::Unevaluated) {
-            job.remove_log()?;
-        }
-        if let Some(arguments) = job.command_line(&state) {
-            self.note(job, if state == State::Interrupted { "resuming" } else { "starting" });
-            if let Err(failure) = self.process(job, &arguments)? {
-                return Ok(Some(failure));
-            }
-        }
-        if job.state() == State::Unevaluated {
-            // The command writes the scores to the run folder.
-            if let Err(failure) = self.process(job, &job.evaluation())? {
-                return Ok(Some(failure));
-            }
-        }
-        self.note(job, &said(job));
-        Ok(None)
-    }
+/// Says that the sweep was interrupted, and returns the exit code.
+fn stopped(console: &Console<'_>) -> u8 {
+    console.error("interrupted; repeat the command to resume the sweep", EXIT_CODE);
+    EXIT_CODE
+}
 
-    /// Runs the program, and returns its output on stdout, or its failure.
-    fn process(&self, job: &Job, arguments: &[OsString]) -> Result<std::result::Result<String, Failure>> {
-        let progress = self.console.relay(self.of);
-        let ended = self.program.run(arguments, &job.log(), self.watch, |line| progress.say(self.index, || self.line(job, line)))?;
-        drop(progress);
-        if ended.code == 0 {
-            return Ok(Ok(ended.out));
-        }
-        let failure = Failure { code: ended.code, error: ended.last };
-        if !self.watch.requested() {
-            self.note(job, &format!("failed with exit code {}: {}", failure.code, failure.error));
-        }
-        Ok(Err(failure))
-    }
+/// Writes the table of the current results.
+fn write_table(plan: &Plan, out: &Path, console: &Console<'_>) -> Result<()> {
+    console.text(table(plan, out).write(out)?.trim_end())?;
+    console.note(&format!("table: {}", out.join("table.html").display()));
+    Ok(())
+}
 
-    fn note(&self, job: &Job, text: &str) {
-        self.console.note(&self.line(job, text));
-    }
+/// Checks that Slurm has no runs of an earlier submission.
+fn check_queue(out: &Path) -> Result<()> {
+    let queued = slurm::queued(out);
+    let Some((run, state)) = queued.first_key_value() else { return Ok(()) };
+    let found = format!("Slurm still has {} of its runs: {run} is {state}", queued.len());
+    Err(Error::usage("--out", found, "wait until they have ended (--status lists them), or cancel them with scancel"))
+}
 
-    fn line(&self, job: &Job, text: &str) -> String {
-        format!("{}/{} {} {}: {text}", self.index + 1, self.of, job.scene, job.method)
+impl SweepArgs {
+    /// The command line of the same sweep, on another machine with the same file system.
+    fn command_line(&self, out: &Path, machine: &Machine) -> Vec<OsString> {
+        let flag = |name: &str, value: &OsStr| {
+            let mut flag = OsString::from(format!("--{name}="));
+            flag.push(value);
+            flag
+        };
+        let machine = machine.flags(1).into_iter().map(OsString::from);
+        let scenes = self.scene.iter().map(|scene| flag("scene", scene.as_ref()));
+        let presets = self.preset.iter().map(|preset| flag("preset", preset.as_ref()));
+        let set = self.set.iter().map(|set| flag("set", set.as_ref()));
+        let force = self.force.then(|| OsString::from("--force"));
+        let file = self.file.iter().map(|file| file.clone().into_os_string());
+        machine
+            .chain(["sweep".into()])
+            .chain(scenes)
+            .chain(presets)
+            .chain(set)
+            .chain(force)
+            .chain([flag("out", out.as_os_str())])
+            .chain(file)
+            .collect()
     }
 }
 
@@ -241,18 +324,20 @@ fn check(job: &Job, state: &State) -> Result<()> {
     }
 }
 
-/// Prints the state of a run, and the command that completes it.
-fn describe(job: &Job, state: &State, console: &Console<'_>) -> Result<()> {
+/// Prints the state of a run, and what Slurm says about it. With `command`, also prints the command that completes it.
+fn describe(job: &Job, state: &State, queued: &BTreeMap<String, String>, command: bool, console: &Console<'_>) -> Result<()> {
     let what = match (state, job.cell()) {
         (State::Finished, _) => format!("finished: {}", said(job)),
         (State::Different(how), _) => format!("blocked by a run with other settings: {how}"),
+        _ if job.is_running() => format!("running: {}", job.last_line()),
         (State::Unevaluated, _) => "to evaluate".to_owned(),
         (State::Interrupted, _) => "to resume".to_owned(),
         (_, Cell::Failed(failure)) => format!("to retry, failed with exit code {}: {}", failure.code, failure.error),
         (State::New | State::CutShort, _) => "to run".to_owned(),
     };
-    console.result(&format!("{} {}: {what}", job.scene, job.method))?;
-    let arguments = job.command_line(state);
+    let queue = queued.get(&job.name()).map_or(String::new(), |queue| format!("; Slurm: {queue}"));
+    console.result(&format!("{} {}: {what}{queue}", job.scene, job.method))?;
+    let arguments = job.command_line(state).filter(|_| command);
     arguments.iter().try_for_each(|arguments| console.result(&format!("    {}", command_line("plenoxel", arguments))))
 }
 

@@ -1,5 +1,6 @@
 //! Runs as child processes: the sweep continues if a run crashes or is killed for lack of memory, and the peak memory of each run is measured separately.
 
+use crate::Machine;
 use crate::child::{Last, ask_to_stop, code, command_line, follow};
 use crate::interrupt::Watch;
 use plenoxel::error::{Error, Result};
@@ -16,7 +17,7 @@ pub struct Program {
     pub path: PathBuf,
     /// Flags for all runs: threads and memory.
     pub machine: Vec<String>,
-    /// The lock of the sweep. Child processes inherit it, so that a run that outlives its sweep keeps it.
+    /// The lock of the sweep or of its run. Child processes inherit it, so that a run that outlives its sweep keeps it.
     pub lock: FolderLock,
 }
 
@@ -31,7 +32,7 @@ pub struct Ended {
 }
 
 /// Path of this program. On Linux it refers to the running program even if its file was replaced, so that a sweep uses a single version.
-pub fn this_program() -> Result<PathBuf> {
+fn this_program() -> Result<PathBuf> {
     let link = Path::new("/proc/self/exe");
     if link.exists() {
         return Ok(link.to_owned());
@@ -40,6 +41,11 @@ pub fn this_program() -> Result<PathBuf> {
 }
 
 impl Program {
+    /// This program, of which `together` children share the machine.
+    pub fn new(machine: &Machine, together: usize, lock: FolderLock) -> Result<Self> {
+        Ok(Program { path: this_program()?, machine: machine.flags(together), lock })
+    }
+
     /// Runs the program to its end. Its stderr is appended to the file `log` and passed to `said` line by line. A request to stop the sweep is forwarded
     /// to the program.
     pub fn run(&self, arguments: &[OsString], log: &Path, watch: &Watch, mut said: impl FnMut(&str)) -> Result<Ended> {

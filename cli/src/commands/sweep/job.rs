@@ -71,6 +71,32 @@ impl Call {
 }
 
 impl Job {
+    /// Its name: SCENE/METHOD.
+    pub fn name(&self) -> String {
+        format!("{}/{}", self.scene, self.method)
+    }
+
+    /// Folder of the run folder, the log and the lock.
+    pub fn place(&self) -> &Path {
+        self.folder.parent().unwrap_or(Path::new(""))
+    }
+
+    /// Name of the lock file of a task that makes the run. Names of runs have no dots, so it cannot conflict with a run.
+    pub fn lock(&self) -> String {
+        format!("{}.lock", self.method)
+    }
+
+    /// True if a process writes to the run folder.
+    pub fn is_running(&self) -> bool {
+        RunFolder::at(&self.folder).shared("RUN").is_err()
+    }
+
+    /// Returns the last line of the log.
+    pub fn last_line(&self) -> String {
+        let text = files::read(&self.log(), files::METRICS).map_or(String::new(), |bytes| String::from_utf8_lossy(&bytes).into_owned());
+        text.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("started").to_owned()
+    }
+
     /// Determines the state from the files in the folder.
     pub fn state(&self) -> State {
         if RunFolder::at(&self.folder).is_empty() {
