@@ -3,9 +3,12 @@
 //!
 //!     cargo bench --bench workloads -- --data nerf_synthetic/lego W1
 //!
-//! `graph:W1` and so on are the same through the graph of small ops; `scaling:W1` and `scaling:W2` double one size after the other. Without
-//! `--data` the rays are of the built-in scene. Peak memory is the process's, so give one workload at a time to compare it.
+//! `graph:W1` and so on are the same through the graph of small ops; `scaling:W1` and `scaling:W2` double one size after the other. `scale:RUN` measures what
+//! several machines that train one scene would send (`support/scale.rs`). Without `--data` the rays are of the built-in scene. Peak memory is the process's, so
+//! give one workload at a time to compare it.
 
+#[path = "support/scale.rs"]
+mod scale;
 mod support;
 
 use autograd::Lattice;
@@ -134,6 +137,9 @@ fn run() {
         if args.wants(name) {
             scaling(&args, name, &work);
         }
+    }
+    for folder in args.names.iter().filter_map(|name| name.strip_prefix("scale:")) {
+        scale::run(folder, &open(&args, 1));
     }
     if args.wants("W3") {
         let lattice = Lattice::bricks([128; 3]);
