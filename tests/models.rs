@@ -7,6 +7,8 @@ mod own_losses;
 #[path = "support/mod.rs"]
 mod support;
 
+#[path = "added_losses.rs"]
+mod added_losses;
 #[path = "analytic_scenes.rs"]
 mod analytic_scenes;
 #[path = "bake.rs"]

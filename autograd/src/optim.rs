@@ -92,6 +92,8 @@ pub struct Remembered<'a, T: Real> {
 /// assert_eq!(rates.at("density", 250_000), 0.05);
 /// assert_eq!(rates.at("color", 250_000), 0.01);
 /// assert!(rates.names().eq(["density"]));
+/// let joined = rates.joined(Rates::new(1.0).with("color", 0.5));
+/// assert_eq!((joined.at("color", 0), joined.at("other", 0)), (0.5, 0.01));
 /// ```
 #[derive(Debug)]
 pub struct Rates {
@@ -108,6 +110,12 @@ impl Rates {
     /// Sets the schedule of the parameter with the given name. If a name is set several times, the last schedule is used.
     pub fn with(mut self, name: impl Into<String>, schedule: impl Schedule + 'static) -> Self {
         self.by_name.push((name.into(), Box::new(schedule)));
+        self
+    }
+
+    /// Adds the schedules of the names of `other`, whose default is dropped.
+    pub fn joined(mut self, other: Rates) -> Self {
+        self.by_name.extend(other.by_name);
         self
     }
 

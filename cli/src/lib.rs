@@ -25,10 +25,13 @@ use commands::{
     train, view,
 };
 use plenoxel::error::Error;
+use plenoxel::run::data::DataSource;
+use plenoxel::run::training::Listener;
 use plenoxel::run::{machine, memory};
 use progress::{Console, LogFormat};
 use std::ffi::OsString;
 use std::io::Write;
+use std::path::Path;
 
 /// Program name and version, recorded by runs.
 const PROGRAM: &str = concat!("plenoxel ", env!("CARGO_PKG_VERSION"));
@@ -127,6 +130,28 @@ pub struct Streams<'a> {
     pub terminal: bool,
     /// True if stdout is a terminal; the JSON line for programs is then not printed.
     pub read_by_people: bool,
+}
+
+/// Calls `run` with a listener that writes the pictures and the report of a training run to its folder, as `train` does, and prints nothing. Returns the result
+/// of `run`, and whether the report was written.
+pub fn with_pages<R>(run: impl FnOnce(&mut Listener<'_>) -> R) -> (R, Result<(), Error>) {
+    silently(|console| {
+        let mut screen = train::Screen::new(console, true, true);
+        let result = run(&mut |event| screen.show(event));
+        (result, screen.finish())
+    })
+}
+
+/// Writes report.html of a run, as `report` does, and prints nothing. `data` is the source of its views if it is another than the recorded one.
+///
+/// Errors: the folder is not a finished run; its views cannot be read; there is not enough memory; the page cannot be written.
+pub fn write_report(run: &Path, data: Option<DataSource>) -> Result<(), Error> {
+    silently(|console| commands::report::write(run, data, console))
+}
+
+fn silently<R>(f: impl FnOnce(&Console<'_>) -> R) -> R {
+    let streams = Streams { out: &mut std::io::sink(), err: &mut std::io::sink(), terminal: false, read_by_people: true };
+    f(&Console::new(streams, LogFormat::Plain, true))
 }
 
 /// Runs a command line, which begins with the program name, and returns the exit code.

@@ -1,7 +1,8 @@
 //! Photographs with known cameras, independent of the file format.
 //!
 //! [`open`] recognizes the format of a folder: NeRF-synthetic ([`blender`]), whose coordinates are the world's, or a capture
-//! ([`transforms`], [`colmap`], [`llff`], [`nsvf`]), which is moved and scaled first ([`normalize`]).
+//! ([`transforms`], [`colmap`], [`llff`], [`nsvf`]), which is moved and scaled first ([`normalize`]). A program may also give photographs in memory
+//! ([`memory`]).
 //!
 //! Opening a [`Dataset`] is cheap: all metadata is parsed and the header of every image is checked, so that a broken file is reported at
 //! once. Pixels are decoded when a split is loaded. [`Dataset::procedural`] is the built-in scene, which needs no files and has exact
@@ -14,6 +15,7 @@ pub mod exposure;
 pub mod image;
 pub mod llff;
 pub mod mask;
+pub mod memory;
 pub mod normalize;
 mod npy;
 pub mod nsvf;
@@ -171,7 +173,7 @@ struct Frame {
     name: String,
     /// Camera with the intrinsics after the reduction.
     camera: Camera,
-    /// Path of the image; empty for a rendered view.
+    /// Path of the image; empty for a rendered view and for one in memory.
     path: PathBuf,
     /// Path of the mask.
     mask: Option<PathBuf>,
@@ -185,6 +187,7 @@ struct Frame {
 enum Source {
     Files { downscale: usize },
     Procedural { scene: Arc<procedural::Scene>, supersample: usize },
+    Memory { photographs: Arc<memory::Photographs>, downscale: usize },
 }
 
 /// Opens the dataset in the folder `path`, in the first of these formats that it has: NeRF-synthetic (transforms_train.json,
@@ -357,7 +360,7 @@ impl Dataset {
     pub fn scene(&self) -> Option<&procedural::Scene> {
         match &self.source {
             Source::Procedural { scene, .. } => Some(scene),
-            Source::Files { .. } => None,
+            Source::Files { .. } | Source::Memory { .. } => None,
         }
     }
 
@@ -431,6 +434,10 @@ impl Dataset {
             Source::Procedural { scene, supersample } => {
                 let (image, depth) = scene.render(&camera, *supersample);
                 Ok(View { name, camera, image, depth: Some(depth), mask: None })
+            }
+            Source::Memory { photographs, downscale } => {
+                let view = photographs.view(&name, camera, *downscale);
+                view.ok_or_else(|| Error::input(name, "there is no such view in memory", "this is a bug in the program"))
             }
         }
     }

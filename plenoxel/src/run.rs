@@ -8,12 +8,14 @@
 //! | [`budget`], [`pace`] | time budgets: lengths of the stages for training of a given duration |
 //! | [`folder`] | the files of a run, by name |
 //! | [`metrics`], [`tensorboard`] | the metrics of training, as JSON lines and as TensorBoard events |
-//! | [`training`] | the run itself, reported as events |
+//! | [`training`], [`carving`] | the run itself, reported as events |
 //! | [`figures`] | mean test scores with their definitions |
+//! | [`visibility`](mod@visibility) | visibility of voxels in the training views |
 //!
 //! Modules here may read the clock and the system; [`train`](crate::train) may not.
 
 pub mod budget;
+pub mod carving;
 pub mod data;
 pub mod figures;
 pub mod folder;
@@ -24,6 +26,7 @@ pub mod pace;
 pub mod settings;
 pub mod tensorboard;
 pub mod training;
+pub mod visibility;
 
 /// Program name and version, recorded by runs.
 pub const PROGRAM: &str = concat!("plenoxel ", env!("CARGO_PKG_VERSION"));

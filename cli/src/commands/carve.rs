@@ -1,29 +1,24 @@
 //! `plenoxel carve`: carves an opaque colored grid from silhouettes and colors, without training.
 
 use super::capture::CaptureFlags;
-use super::new_run::{announce, load};
+use super::new_run::{announce, loading};
 use super::train::BuiltInScene;
 use super::{MOST_REDUCTION, whole};
 use crate::images;
-use crate::progress::Console;
+use crate::progress::{Console, Count};
 use crate::report::Report;
 use clap::{Args, ValueHint};
 use plenoxel::carve::photo_hull::PhotoConfig;
-use plenoxel::carve::{self, Carving, Colored, Fit, Progress, Rule};
-use plenoxel::dataset::{Dataset, Split, has_alpha};
+use plenoxel::carve::Rule;
+use plenoxel::dataset::Split;
 use plenoxel::error::Result;
 use plenoxel::evaluate::Viewer;
-use plenoxel::geometry::Aabb;
-use plenoxel::model::plenoxels::Plenoxels;
 use plenoxel::model::plenoxels::config::Config;
+use plenoxel::run::carving::{Carved, CarvingSettings, CarvingSummary, Event, carve};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::evenly_spaced;
-use plenoxel::run::folder::{NewFolder, RunFolder, RunKind, RunRecord};
-use plenoxel::run::memory::{self, Estimate};
 use plenoxel::run::settings::{self, CARVE, Layers};
-use plenoxel::run::training::Stopwatch;
-use plenoxel::train::{About, ViewOptions};
-use serde::Serialize;
+use plenoxel::train::ViewOptions;
 use std::path::PathBuf;
 use toml::Value;
 
@@ -146,119 +141,73 @@ impl CarveArgs {
     }
 }
 
-/// Number of voxels per side above which the memory of the colors is estimated before the hull, because the hull takes long.
-const LARGE: usize = 256;
-
 /// Carves a scene and writes a run folder.
 pub fn run(args: &CarveArgs, console: &Console<'_>) -> Result<()> {
-    let source = args.source();
     let (config, preset) = args.config()?;
-    let mut load_clock = Stopwatch::default();
-    let dataset = load_clock.time(|| source.open(&config))?;
-    announce(console, &dataset, &config);
-    let estimate = Estimate::of_carving(&config, &dataset, 0, !args.no_report);
-    console.note(&estimate.describe());
-    estimate.check()?;
-    dataset.space().require_box("carve")?;
-    for warning in source.check_cameras(&dataset, Aabb::cube(config.half_width))? {
-        console.note(&format!("warning: {warning}"));
-    }
-    let folder = NewFolder::choose(args.out.as_deref(), dataset.name(), args.force)?;
-    let views = load_clock.time(|| load(console, &dataset, Split::Train, &source))?;
-
-    let mut hull_clock = Stopwatch::default();
-    // A coarse hull overestimates the number of voxels. If not even half of them fit into memory, the command fails early.
-    if config.carve.resolution > LARGE {
-        let expected = hull_clock.time(|| carve::voxels_expected(&views, &config.carve_options())).unwrap_or(0.0);
-        Estimate::of_carving(&config, &dataset, (0.5 * expected) as usize, !args.no_report).check()?;
-    }
-    let count = console.count("carving, view", views.len());
-    let progress = |progress| match progress {
-        Progress::Views(done) => count.at(done, views.len()),
-        Progress::Round { round, carved, left } => {
-            console.note(&format!("photo hull, round {round}: carved {carved} voxels, {left} are left"))
+    let preset = preset.map(str::to_owned);
+    let report = !args.no_report;
+    let settings = CarvingSettings { config, preset, data: args.source(), out: args.out.clone(), force: args.force, report };
+    // The counter of the current phase.
+    let mut count: Option<(&str, Count<'_, '_>)> = None;
+    let mut shown = Ok(());
+    carve(&settings, &mut |event| {
+        let (phase, text, done, total) = match event {
+            Event::Loading { source, done, total } => ("loading", loading(Split::Train, source), done, total),
+            Event::Carving { done, total } => ("carving", "carving, view".to_owned(), done, total),
+            Event::Coloring { done, total } => ("coloring", "coloring, pass".to_owned(), done, total),
+            Event::Round { round, carved, left } => {
+                return console.note(&format!("photo hull, round {round}: carved {carved} voxels, {left} are left"));
+            }
+            other => {
+                count = None;
+                match other {
+                    Event::Note(text) => console.note(&text),
+                    Event::Opened { dataset, config } => announce(console, dataset, config),
+                    Event::Saved { run } if !args.no_images => {
+                        if let Some(views) = console.drawn(draw(run)) {
+                            console.note(&format!("wrote pictures of {views} views to images/carved.png"));
+                        }
+                    }
+                    Event::Finished { summary, run } => shown = finish(args, console, summary, run),
+                    _ => {}
+                }
+                return;
+            }
+        };
+        if count.as_ref().is_none_or(|(shown, _)| *shown != phase) {
+            count = Some((phase, console.count(&text, total)));
         }
-    };
-    let carving = hull_clock.time(|| Carving::new(&views, &config.carve_options(), &progress))?;
-    drop(count);
-    let (n, left) = (config.carve.resolution, carving.voxels());
-    let share = 100.0 * left as f64 / (n as f64).powi(3);
-    console.note(&format!("carved {n}³ voxels in {:.2} s: {left} are left, {share:.1} %", hull_clock.seconds()));
-    if share > 50.0 {
-        console.note(
-            "most of the box is left because the photographs rule out little of it; use more views, images with alpha, or a smaller --half-width",
-        );
-    }
-    let estimate = Estimate::of_carving(&config, &dataset, carving.rows(), !args.no_report);
-    console.note(&estimate.describe());
-    estimate.check()?;
+        if let Some((_, count)) = &count {
+            count.at(done, total);
+        }
+    })?;
+    shown
+}
 
-    // Nothing is written or overwritten before all checks of the input.
-    let folder = folder.create()?;
-    let record = RunRecord::new(RunKind::Carved, &dataset, preset, &source);
-    folder.describe(&config, &record)?;
-    console.note(&format!("run: {}", folder.path().display()));
-    let mut color_clock = Stopwatch::default();
-    let passes = match config.carve.fit {
-        Fit::Exact => config.carve.sweeps + 1,
-        Fit::Sgd => carve::color::EPOCHS + 1,
-    };
-    let count = console.count("coloring, pass", passes);
-    let colored = color_clock.time(|| carving.color(&|done| count.at(done, passes)));
-    drop(count);
-    if colored.missed > 0.0 && has_alpha(&views) {
-        console.note(&format!(
-            "{:.2} % of the object pixels show no voxel: those parts are thinner than a pixel or outside the box (--half-width)",
-            100.0 * colored.missed
-        ));
-    }
-    let Colored { grid, missed } = colored;
-    let model = Plenoxels::of_grid(&config, grid);
-    folder.save(&model, &About { scene: dataset.name().to_owned(), background: config.background, seed: config.seed, step: 0 })?;
-    drop(carving);
-    drop(views);
-
-    if !args.no_images
-        && let Some(views) = console.drawn(draw(&folder, &config, &dataset, &model))
-    {
-        console.note(&format!("wrote pictures of {views} views to images/carved.png"));
-    }
-    let summary = Summary {
-        seconds: hull_clock.seconds() + color_clock.seconds(),
-        seconds_hull: hull_clock.seconds(),
-        seconds_color: color_clock.seconds(),
-        seconds_load: load_clock.seconds(),
-        peak_memory_bytes: memory::peak(),
-        resolution: n,
-        voxels: left,
-        rule: config.carve.rule,
-        fit: config.carve.fit,
-        missed_object_pixels: missed,
-        scene: dataset.name().to_owned(),
-        run: folder.path().display().to_string(),
-    };
-    folder.write_result(&summary)?;
-    let Summary { seconds, seconds_hull, seconds_color, .. } = summary;
+/// Prints the results and writes the report.
+fn finish(args: &CarveArgs, console: &Console<'_>, summary: &CarvingSummary, run: Carved<'_>) -> Result<()> {
+    let CarvingSummary { seconds, seconds_hull, seconds_color, .. } = summary;
     console.result(&format!(
         "carved in {seconds:.2} s: hull {seconds_hull:.2} s, colors {seconds_color:.2} s; evaluate it on test views with `plenoxel evaluate`"
     ))?;
-    if config.carve.rule == Rule::Footprint {
+    if summary.rule == Rule::Footprint {
         console.note(
             "the footprint rule keeps every voxel that any pixel may show, as a start for --init-from; --carve rays carves closer to the silhouettes and has \
              a better test PSNR (lego: 23.7 dB instead of 19.1 dB)",
         );
     }
+    let Carved { folder, config, record, dataset, model } = run;
     console.result(&format!("run folder: {}", folder.path().display()))?;
-    console.record(&summary)?;
+    console.record(summary)?;
     if !args.no_report {
-        let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: Some(&model) };
+        let report = Report { folder, config, record, dataset, model: Some(model) };
         console.note(&report.write(console)?);
     }
     Ok(())
 }
 
 /// Renders the model from some cameras, writes the pictures side by side, and returns their number.
-fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, model: &Plenoxels<f32>) -> Result<usize> {
+fn draw(Carved { folder, config, dataset, model, .. }: Carved<'_>) -> Result<usize> {
     const MOST: usize = 4;
     let split = if dataset.count(Split::Test) > 0 { Split::Test } else { Split::Train };
     let cameras = dataset.cameras(split);
@@ -268,21 +217,4 @@ fn draw(folder: &RunFolder, config: &Config, dataset: &Dataset, model: &Plenoxel
     folder.create_images()?;
     images::write(&folder.image("carved.png"), &images::strip(&pictures.iter().collect::<Vec<_>>()))?;
     Ok(pictures.len())
-}
-
-/// Final figures. `seconds` is the time of carving and coloring, without reading images.
-#[derive(Debug, Serialize)]
-struct Summary {
-    seconds: f64,
-    seconds_hull: f64,
-    seconds_color: f64,
-    seconds_load: f64,
-    peak_memory_bytes: Option<u64>,
-    resolution: usize,
-    voxels: usize,
-    rule: Rule,
-    fit: Fit,
-    missed_object_pixels: f64,
-    scene: String,
-    run: String,
 }

@@ -12,7 +12,7 @@ use plenoxel::space::Space;
 /// Describes the loading of a split.
 pub fn loading(split: Split, source: &DataSource) -> String {
     match source {
-        DataSource::Folder { .. } | DataSource::None => format!("reading {split} images"),
+        DataSource::Folder { .. } | DataSource::Memory { .. } | DataSource::None => format!("reading {split} images"),
         DataSource::BuiltIn { .. } => format!("rendering {split} images of the built-in scene"),
     }
 }

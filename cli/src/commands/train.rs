@@ -5,7 +5,7 @@ mod pictures;
 mod screen;
 
 use super::report;
-use crate::interrupt;
+use crate::interrupt::{self, Watch};
 use crate::live::{Door, LiveTraining, Training};
 use crate::progress::Console;
 pub use flags::{BuiltInScene, NOT_WHEN_RESUMED, TrainArgs, size};
@@ -14,7 +14,7 @@ use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunFolder;
 use plenoxel::run::training::{self, Event, Outcome, RunOptions, RunSettings, Summary};
 use plenoxel::text::clock;
-use screen::Screen;
+pub use screen::Screen;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -25,7 +25,9 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
     let mut live = door.map(|door| LiveTraining::new(door, console));
     let shared = live.as_ref().map(LiveTraining::shared);
     let options = |stage_psnr: bool| options(args, stage_psnr, shared);
+    let mut interruption = Interruption::default();
     let mut hear = |event: Event<'_>| {
+        interruption.hear(&event);
         live.iter_mut().for_each(|live| live.hear(&event));
         screen.show(event);
     };
@@ -65,6 +67,35 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
             };
             console.error(&text, interrupt::EXIT_CODE);
             Ok(interrupt::EXIT_CODE)
+        }
+    }
+}
+
+/// Lets an interruption of the training save it and stop.
+#[derive(Default)]
+struct Interruption {
+    /// Active during training.
+    watch: Option<Watch>,
+    folder: Option<RunFolder>,
+}
+
+impl Interruption {
+    fn hear(&mut self, event: &Event<'_>) {
+        match event {
+            Event::Started { run, .. } => {
+                self.folder = Some(run.folder.clone());
+                self.watch = Some(Watch::begin());
+            }
+            Event::Trained => {
+                self.watch = None;
+                if let Some(folder) = &self.folder {
+                    let again = format!("plenoxel train --resume {}", folder.path().display());
+                    interrupt::on_exit(format!(
+                        "interrupted; the trained model is saved; write its final figures and report with: {again}"
+                    ));
+                }
+            }
+            _ => {}
         }
     }
 }

@@ -62,7 +62,7 @@ pub fn open(root: &Path, options: &OpenOptions) -> Result<Dataset> {
         size: largest(&splits),
         frames: splits,
         source: Source::Files { downscale },
-        normalization: Normalization::none(options)?,
+        normalization: Normalization::none(options, "this is a NeRF-synthetic folder")?,
         points: Arc::default(),
         notes: Vec::new(),
     })
@@ -149,7 +149,7 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
 }
 
 /// Validates and converts the rows of a camera-to-world matrix, which must be finite. An error completes the sentence of [`pose`].
-pub(crate) fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, &'static str)> {
+pub fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, &'static str)> {
     if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6) {
         return Err((format!("has the last row {:?}", m[3]), "expected a rigid motion, whose last row is 0 0 0 1"));
     }

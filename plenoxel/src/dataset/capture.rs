@@ -111,7 +111,8 @@ pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) 
 
     let names = view_names(&capture.photos);
     let mut frames: [Vec<Frame>; 3] = Default::default();
-    let splits = splits(&capture.photos, options);
+    let stated: Vec<_> = capture.photos.iter().map(|photo| photo.split).collect();
+    let splits = splits(&stated, options);
     for (((photo, name), (orientation, full)), split) in capture.photos.into_iter().zip(names).zip(images).zip(splits) {
         let camera_to_world = normalization.to_world.camera(photo.camera_to_world);
         let camera = Camera { intrinsics: photo.intrinsics.downscaled(downscale), camera_to_world };
@@ -197,14 +198,14 @@ fn view_names(photos: &[Photo]) -> Vec<String> {
     photos.iter().map(|photo| photo.name.replace('/', "_")).collect()
 }
 
-/// Returns the split of each view: the files' own, or else every n-th by name for testing.
-fn splits(photos: &[Photo], options: &OpenOptions) -> Vec<Split> {
+/// Returns the split of each view: the stated one, or else every n-th for testing, in the order of the views.
+pub(super) fn splits(stated: &[Option<Split>], options: &OpenOptions) -> Vec<Split> {
     let every = options.capture.test_every;
-    let own = photos.iter().any(|photo| photo.split.is_some());
-    let mut splits: Vec<Split> = photos
+    let own = stated.iter().any(Option::is_some);
+    let mut splits: Vec<Split> = stated
         .iter()
         .enumerate()
-        .map(|(k, photo)| match photo.split {
+        .map(|(k, stated)| match *stated {
             Some(split) => split,
             None if !own && every > 0 && k.is_multiple_of(every) => Split::Test,
             None => Split::Train,

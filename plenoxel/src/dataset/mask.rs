@@ -42,6 +42,11 @@ impl Mask {
         }
     }
 
+    /// Returns width and height in pixels.
+    pub fn size(&self) -> [usize; 2] {
+        [self.width, self.keeps.len().checked_div(self.width).unwrap_or(0)]
+    }
+
     /// Returns true if pixel (x, y) is kept.
     #[inline]
     pub fn keeps(&self, x: usize, y: usize) -> bool {

@@ -55,11 +55,11 @@ pub struct Normalization {
 impl Normalization {
     /// Returns the identity, for datasets whose coordinates are the world's.
     ///
-    /// Errors if `options` ask for anything else.
-    pub(super) fn none(options: &OpenOptions) -> Result<Self> {
+    /// Errors if `options` ask for anything else; `reason` says why nothing else is possible.
+    pub(super) fn none(options: &OpenOptions, reason: &str) -> Result<Self> {
         let CaptureOptions { space, orient, center, scale, .. } = options.capture;
         let refused = |key: &str, value: &str| {
-            let found = format!("{value} is for captures, and this is a NeRF-synthetic folder, whose coordinates are used as they are");
+            let found = format!("{value} is for captures, and {reason}, whose coordinates are used as they are");
             Err(Error::usage(key, found, "leave it out"))
         };
         if !matches!(space, SpaceChoice::Auto | SpaceChoice::Box) {

@@ -41,6 +41,12 @@ impl<'a, T: Real, M> Step<'a, T, M> {
         Step { number, seed, batch, rendered, model, extent, background, prediction: rendered.rgb.clone(), params: &[] }
     }
 
+    /// Returns the step without its model, for losses of any model.
+    pub fn without_model(&self) -> Step<'_, T, ()> {
+        let Step { number, seed, batch, rendered, extent, background, ref prediction, params, .. } = *self;
+        Step { number, seed, batch, rendered, model: &(), extent, background, prediction: prediction.clone(), params }
+    }
+
     /// Returns the step with another prediction.
     fn predicted(&self, prediction: Tensor<T>) -> Self {
         Step { prediction, ..*self }
@@ -70,6 +76,8 @@ struct Term<T: Real, M> {
 }
 
 /// Weighted sum of named losses for a model of type `M`, with the parameters of the losses. Weights may change over the run.
+///
+/// The losses of an objective for the type `()` do not read the model. [`Objective::joined`] adds them to the objective of any model.
 ///
 /// As a [`Module`] it consists of the parameters of its losses.
 pub struct Objective<T: Real, M> {
@@ -175,6 +183,30 @@ impl<T: Real, M> Objective<T, M> {
             Some(before) => Box::new(move |step| predict(&step.predicted(before(step)))),
         });
         self
+    }
+
+    /// Adds the losses, parameters and predictions of an objective that does not read the model. Its predictions are applied last.
+    ///
+    /// Panics if both have a parameter of the same name.
+    #[track_caller]
+    pub fn joined(mut self, other: Objective<T, ()>) -> Self
+    where
+        M: 'static,
+    {
+        let Objective { terms, predict, params, rates } = other;
+        for Term { name, weight, loss, needs_samples } in terms {
+            let loss: LossFn<T, M> = Box::new(move |step| loss(&step.without_model()));
+            self.terms.push(Term { name, weight, loss, needs_samples });
+        }
+        for param in params {
+            assert!(self.param(param.name()).is_none(), "joined: parameter `{}` exists already", param.name());
+            self.params.push(param);
+        }
+        self.rates = self.rates.joined(rates);
+        match predict {
+            Some(predict) => self.predicting(move |step| predict(&step.without_model())),
+            None => self,
+        }
     }
 
     /// Returns true if a loss reads the values of every sample.

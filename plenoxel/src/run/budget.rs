@@ -6,9 +6,8 @@
 
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::model::plenoxels::Trainer;
 use crate::model::plenoxels::config::{Config, Stage, Weight};
-use crate::model::plenoxels::ray_cost;
+use crate::model::plenoxels::{Objective, Trainer, ray_cost};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -47,8 +46,15 @@ struct Speed {
 ///
 /// The result depends on the speed of the machine. It is a number of steps, so a run with these settings repeats bit by bit.
 ///
-/// Errors: the run starts from another run; the time is too short for the stages; those of [`Trainer::step`].
-pub fn on_time(config: Config, views: &Arc<[View]>, seconds: f64) -> Result<Config> {
+/// The measured steps have the `objective` of the config and the number of training views.
+///
+/// Errors: the run starts from another run; the time is too short for the stages; those of `objective` and of [`Trainer::step`].
+pub fn on_time(
+    config: Config,
+    views: &Arc<[View]>,
+    seconds: f64,
+    objective: &dyn Fn(&Config, usize) -> Result<Objective<f32>>,
+) -> Result<Config> {
     if config.init_from.is_some() {
         return Err(Error::usage(
             "--time",
@@ -59,7 +65,7 @@ pub fn on_time(config: Config, views: &Arc<[View]>, seconds: f64) -> Result<Conf
     let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
     let config = config.fitted_to(views.iter().map(|view| &view.camera));
-    let speed = measure(&config, views, seconds)?;
+    let speed = measure(&config, views, seconds, objective(&config, views.len())?)?;
     planned(config, &steps, seconds, &speed)
 }
 
@@ -99,10 +105,10 @@ fn coarser(config: Config) -> Config {
 }
 
 /// Measures the speed with steps of the first stage, for a share of the planned `seconds`.
-fn measure(config: &Config, views: &Arc<[View]>, seconds: f64) -> Result<Speed> {
+fn measure(config: &Config, views: &Arc<[View]>, seconds: f64, objective: Objective<f32>) -> Result<Speed> {
     let start = Instant::now();
     let endless = Stage { steps: Some(1 << 20), epochs: None, ..config.stages[0] };
-    let mut trainer = Trainer::<f32>::new(Config { stages: vec![endless], ..config.clone() }, views.clone())?;
+    let mut trainer = Trainer::with_losses(Config { stages: vec![endless], ..config.clone() }, views.clone(), objective, Arc::default())?;
     // The first step begins the stage; a scout comes before it.
     let last = trainer.plan().len() - 1;
     while trainer.step()?.is_some_and(|report| report.stage < last) {}
@@ -247,11 +253,11 @@ mod tests {
         let losses = [("mse", Weight::Constant(1.0)), ("beta", Weight::Until { weight: 1e-9, until: 250 })];
         let losses = losses.map(|(name, weight)| (name.to_owned(), weight)).into();
         let config = Config { stages: vec![stage], losses, rays_per_step: 16, ..Config::default() };
-        let planned = on_time(config.clone(), &views, 10.0).unwrap();
+        let planned = on_time(config.clone(), &views, 10.0, &objective).unwrap();
         let Stage { steps: Some(steps), density_warm_up, .. } = planned.stages[0] else { panic!("steps are planned") };
         let Weight::Until { until, .. } = planned.losses["beta"] else { panic!("a weight keeps its form") };
         assert!(steps.abs_diff(2 * density_warm_up) <= 2 && density_warm_up.abs_diff(2 * until) <= 2, "{steps} {density_warm_up} {until}");
         let from = Config { init_from: Some("run".into()), ..config };
-        assert!(on_time(from, &views, 1.0).unwrap_err().to_string().contains("--init-from"));
+        assert!(on_time(from, &views, 1.0, &objective).unwrap_err().to_string().contains("--init-from"));
     }
 }

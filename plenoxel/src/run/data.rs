@@ -1,6 +1,7 @@
 //! The source of the views of a run: a dataset folder or the built-in scene. A run records it so that it can be evaluated later.
 
 use crate::camera::placement::Placement;
+use crate::dataset::memory::Photographs;
 use crate::dataset::procedural::ProceduralOptions;
 use crate::dataset::{self, Dataset, OpenOptions, Split, image};
 use crate::error::{Error, Result};
@@ -10,6 +11,7 @@ use crate::space::Space;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Source of views.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -33,6 +35,14 @@ pub enum DataSource {
         /// Test views.
         test: usize,
     },
+    /// Photographs in the memory of a program. A run records only their number, so they must be given again to resume or to evaluate it.
+    Memory {
+        /// Number of views.
+        views: usize,
+        /// The photographs; `None` if this source was read from the record of a run.
+        #[serde(skip)]
+        photographs: Option<Arc<Photographs>>,
+    },
     /// No views: the grid was imported without a dataset.
     None,
 }
@@ -44,6 +54,7 @@ impl fmt::Display for DataSource {
             DataSource::BuiltIn { width, height, train, val, test } => {
                 write!(f, "built in, {width} x {height}, {train} train, {val} val, {test} test views")
             }
+            DataSource::Memory { views, .. } => write!(f, "arrays, {views} views"),
             DataSource::None => f.write_str("none"),
         }
     }
@@ -57,11 +68,11 @@ impl DataSource {
         DataSource::Folder { path: absolute.unwrap_or_else(|_| path.to_owned()) }
     }
 
-    /// Returns the folder with the views; `None` for the built-in scene and without views.
+    /// Returns the folder with the views; `None` for the built-in scene, for views in memory and without views.
     pub fn path(&self) -> Option<&Path> {
         match self {
             DataSource::Folder { path } => Some(path),
-            DataSource::BuiltIn { .. } | DataSource::None => None,
+            DataSource::BuiltIn { .. } | DataSource::Memory { .. } | DataSource::None => None,
         }
     }
 
@@ -75,6 +86,11 @@ impl DataSource {
         DataSource::BuiltIn { width: options.width, height: options.height, train: options.train, val: options.val, test: options.test }
     }
 
+    /// Photographs in memory.
+    pub fn memory(photographs: Arc<Photographs>) -> Self {
+        DataSource::Memory { views: photographs.views.len(), photographs: Some(photographs) }
+    }
+
     /// The command-line arguments for this source, each preceded by a space.
     pub fn arguments(&self) -> String {
         let plain = |c: char| c.is_alphanumeric() || "/._-+=:,@%".contains(c);
@@ -82,6 +98,8 @@ impl DataSource {
             DataSource::Folder { path } if path.to_str().is_some_and(|path| path.chars().all(plain)) => format!(" {}", path.display()),
             // Quoted and escaped, so that it fits into a comment of a file.
             DataSource::Folder { path } => format!(" {path:?}"),
+            // A placeholder: no argument names the memory of a program.
+            DataSource::Memory { .. } => " DATA".to_owned(),
             DataSource::None => String::new(),
             built_in if *built_in == DataSource::of(None) => String::new(),
             DataSource::BuiltIn { width, height, train, val, test } => {
@@ -109,18 +127,23 @@ impl DataSource {
     /// reduced size.
     pub fn open(&self, config: &Config) -> Result<Dataset> {
         let downscale = config.downscale;
+        let validation_every = match config.validation_every {
+            0 => None,
+            every => Some(every),
+        };
+        let options = OpenOptions { downscale, validation_every, capture: config.capture };
         match self {
             DataSource::Folder { path } => {
                 if path.to_str().is_none() {
                     let found = "the name of this folder is not UTF-8, so a run cannot record it";
                     return Err(Error::input(path, found, "rename it, or use a symbolic link with a UTF-8 name"));
                 }
-                let validation_every = match config.validation_every {
-                    0 => None,
-                    every => Some(every),
-                };
-                let options = OpenOptions { downscale, validation_every, capture: config.capture };
                 dataset::open(path, &options)
+            }
+            DataSource::Memory { photographs: Some(photographs), .. } => photographs.open(&options),
+            DataSource::Memory { photographs: None, .. } => {
+                let found = "the views of this run were in the memory of the program that trained it";
+                Err(Error::usage("--data", found, "give the views again, or a folder with the same views"))
             }
             &DataSource::BuiltIn { width, height, train, val, test } => {
                 image::check_downscale(downscale, (width, height))?;

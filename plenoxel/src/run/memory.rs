@@ -14,7 +14,7 @@ use crate::checkpoint;
 use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
-use crate::field::voxel_grid::{Color, GridShape};
+use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
 use crate::memory;
 use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
 use crate::model::recipe::{Memory, Recipe};
@@ -155,6 +155,16 @@ impl Estimate {
             key: "RUN".to_owned(),
             advice: "use a machine with more memory, or fewer --samples",
         }
+    }
+
+    /// Estimates finding the visibility of the voxels of a grid in the training views
+    /// ([`visibility`](crate::run::visibility::visibility())).
+    pub fn of_visibility(config: &Config, grid: &VoxelGrid<f32>, dataset: &Dataset) -> Self {
+        let stored = Stored::Grid { shape: *grid.shape(), voxels: grid.lattice().present() };
+        let rendering = Self::of_evaluation(config, config.evaluation, &stored, Some((dataset, Split::Train)));
+        // The sums of each row.
+        let sums = grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>());
+        Estimate { grid: rendering.grid + sums as u64, ..rendering }
     }
 
     /// Estimates writing the report of a run whose grid has `voxels` voxels. A few views are rendered for it.

@@ -39,6 +39,7 @@ use crate::error::{Error, Result};
 use crate::evaluate::{self, Scores, Viewer};
 use crate::files;
 use crate::geometry::Aabb;
+use crate::loss;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::{self, Objective, Trainer, objective};
 use crate::run::figures::Figures;
@@ -137,32 +138,59 @@ pub type Listener<'l> = dyn FnMut(Event<'_>) + Send + 'l;
 ///
 /// Errors: a setting is invalid, data cannot be read, a number is not finite, or a file cannot be written.
 pub fn train(settings: &RunSettings, on: &mut Listener<'_>) -> Result<Outcome> {
+    train_adding(settings, &loss::Objective::new, on)
+}
+
+/// Creates the losses that a program adds to those of a config, whatever model it names. It is called for each trainer of a run: those that measure the speed of
+/// the machine have the same losses.
+pub type MakeLosses<'l> = dyn Fn() -> loss::Objective<f32, ()> + 'l;
+
+/// Trains the model that the config names with further losses. The config may then have no losses of its own.
+///
+/// Errors: those of [`train()`]; a parameter of the losses has the name of one of the config's.
+pub fn train_adding(settings: &RunSettings, losses: &MakeLosses<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
     match &settings.config {
-        Config { tensorf: Some(recipe), .. } => other::train(settings, recipe, on),
-        Config { dvgo: Some(recipe), .. } => other::train(settings, recipe, on),
-        Config { nerf: Some(recipe), .. } => other::train(settings, recipe, on),
-        Config { ngp: Some(recipe), .. } => other::train(settings, recipe, on),
-        _ => train_with(settings, objective, on),
+        Config { tensorf: Some(recipe), .. } => other::train(settings, recipe, losses, on),
+        Config { dvgo: Some(recipe), .. } => other::train(settings, recipe, losses, on),
+        Config { nerf: Some(recipe), .. } => other::train(settings, recipe, losses, on),
+        Config { ngp: Some(recipe), .. } => other::train(settings, recipe, losses, on),
+        _ => train_plenoxels(settings, &|config, views| with_losses(config, || objective(config, views), losses), on),
     }
 }
 
+/// Adds losses to the objective of a config, which may have none.
+fn with_losses<M: 'static>(
+    config: &Config,
+    own: impl FnOnce() -> Result<loss::Objective<f32, M>>,
+    losses: &MakeLosses<'_>,
+) -> Result<loss::Objective<f32, M>> {
+    let losses = losses();
+    let own = if config.losses.is_empty() && losses.names().next().is_some() { loss::Objective::new() } else { own()? };
+    if let Some(param) = losses.params().iter().find(|param| own.param(param.name()).is_some()) {
+        let found = format!("a loss of the settings has a parameter `{}`", param.name());
+        return Err(Error::usage(format!("parameter {}", param.name()), found, "choose another name"));
+    }
+    Ok(own.joined(losses))
+}
+
 /// Trains Plenoxels with a custom objective. `objective` builds it from the config and the number of training views. The losses of the config are
-/// used only if `objective` adds them, as [`plenoxels::objective`](objective()) does.
+/// used only if `objective` adds them, as [`plenoxels::objective`](objective()) does. If the run is planned by time, the objective is also built for the steps
+/// that measure the speed of the machine.
 ///
 /// Errors: those of [`train()`] and of `objective`.
 pub fn train_with(
     settings: &RunSettings,
-    objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
+    objective: impl Fn(&Config, usize) -> Result<Objective<f32>>,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
-    train_plenoxels(settings, Box::new(objective), on)
+    train_plenoxels(settings, &objective, on)
 }
 
 /// A function that builds an objective from a config and the number of training views.
-type MakeObjective<'o> = Box<dyn FnOnce(&Config, usize) -> Result<Objective<f32>> + 'o>;
+type MakeObjective<'o> = dyn Fn(&Config, usize) -> Result<Objective<f32>> + 'o;
 
 /// [`train_with`], compiled once.
-fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
+fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
     settings.config.check_stages()?;
     let mut run = NewRun::open(settings, on)?;
     let from = run.config.init_from.as_deref().map(RunFolder::open).transpose()?;
@@ -185,7 +213,7 @@ fn train_plenoxels(settings: &RunSettings, objective: MakeObjective<'_>, on: &mu
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
-        *config = clocks.train.time(|| budget::on_time(config.clone(), views, seconds))?;
+        *config = clocks.train.time(|| budget::on_time(config.clone(), views, seconds, objective))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
         on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
     }
@@ -321,12 +349,25 @@ impl<'s> NewRun<'s> {
 ///
 /// Errors: those of [`train()`]; the run has ended or saved no checkpoint.
 pub fn resume(path: &Path, data: Option<DataSource>, options: &RunOptions, on: &mut Listener<'_>) -> Result<Outcome> {
+    resume_adding(path, data, options, &loss::Objective::new, on)
+}
+
+/// Resumes a run started by [`train_adding`], with the same losses.
+///
+/// Errors: those of [`resume`] and of [`train_adding`].
+pub fn resume_adding(
+    path: &Path,
+    data: Option<DataSource>,
+    options: &RunOptions,
+    losses: &MakeLosses<'_>,
+    on: &mut Listener<'_>,
+) -> Result<Outcome> {
     match RunFolder::open(path)?.1 {
-        Config { tensorf: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
-        Config { dvgo: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
-        Config { nerf: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
-        Config { ngp: Some(recipe), .. } => other::resume(path, &recipe, data, options, on),
-        _ => resume_with(path, data, options, objective, on),
+        Config { tensorf: Some(recipe), .. } => other::resume(path, &recipe, data, options, losses, on),
+        Config { dvgo: Some(recipe), .. } => other::resume(path, &recipe, data, options, losses, on),
+        Config { nerf: Some(recipe), .. } => other::resume(path, &recipe, data, options, losses, on),
+        Config { ngp: Some(recipe), .. } => other::resume(path, &recipe, data, options, losses, on),
+        _ => resume_plenoxels(path, data, options, &|config, views| with_losses(config, || objective(config, views), losses), on),
     }
 }
 
@@ -337,10 +378,10 @@ pub fn resume_with(
     path: &Path,
     data: Option<DataSource>,
     options: &RunOptions,
-    objective: impl FnOnce(&Config, usize) -> Result<Objective<f32>>,
+    objective: impl Fn(&Config, usize) -> Result<Objective<f32>>,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
-    resume_plenoxels(path, data, options, Box::new(objective), on)
+    resume_plenoxels(path, data, options, &objective, on)
 }
 
 /// [`resume_with`], compiled once.
@@ -348,7 +389,7 @@ fn resume_plenoxels(
     path: &Path,
     data: Option<DataSource>,
     options: &RunOptions,
-    objective: MakeObjective<'_>,
+    objective: &MakeObjective<'_>,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
     let mut run = OldRun::open(path, data, options, on)?;

@@ -9,16 +9,17 @@ use clap::{Args, ValueEnum, ValueHint};
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
-use plenoxel::field::voxel_grid::fused::{Seen, seen};
+use plenoxel::field::voxel_grid::fused::Seen;
 use plenoxel::model::plenoxels::config::Config;
-use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, Visible, VoxelOptions};
+use plenoxel::point_cloud::from_grid::{
+    self, ColorFrom, Coordinates, LEAST_ALPHA, LEAST_OBJECT, LEAST_WEIGHT, Visible, VoxelOptions,
+};
 use plenoxel::point_cloud::ply::encode;
-use plenoxel::rays::RaySource;
-use plenoxel::render::RenderOptions;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunRecord;
-use plenoxel::run::memory::{Estimate, Stored};
-use plenoxel::sampling::Jitter;
+use plenoxel::run::memory::Estimate;
+use plenoxel::run::visibility::visibility;
+use std::cell::RefCell;
 use std::path::PathBuf;
 
 /// Memory per voxel in bytes: positions, rows, normals and colors.
@@ -75,15 +76,6 @@ pub struct PlyArgs {
     #[command(flatten)]
     filters: CloudFilters,
 }
-
-/// Chosen by inspecting clouds of lego, of both presets. The alpha is lower than in other exports, because the training views select voxels as well,
-/// and because no voxel of a short run, such as one of the preset `paper`, has an alpha of 0.3.
-const LEAST_ALPHA: f64 = 0.05;
-const LEAST_WEIGHT: f64 = 0.05;
-const LEAST_OBJECT: f64 = 0.7;
-
-/// Rays per batch.
-const RAYS_PER_BATCH: usize = 1 << 15;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Coords {
@@ -163,29 +155,13 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
         other => other,
     })?;
     check_split(&dataset, Split::Train)?;
-    let stored = Stored::Grid { shape: *grid.shape(), voxels: grid.lattice().present() };
-    let mut estimate = Estimate::of_evaluation(config, config.evaluation, &stored, Some((&dataset, Split::Train)));
-    // The sums of each row.
-    estimate.grid += (grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>())) as u64;
+    let estimate = Estimate::of_visibility(config, grid, &dataset);
     console.note(&estimate.describe());
     estimate.check()?;
     let views = load(console, &dataset, Split::Train, &source)?;
-    let rays = RaySource::new(views, config.background, config.seed);
-    let occupancy = grid.matter();
-    let options = RenderOptions {
-        aabb: grid.aabb(),
-        spacing: config.evaluation.spacing(grid.shape().voxel_side()),
-        jitter: Jitter::None,
-        background: config.background,
-        occupancy: Some(&occupancy),
-        engine: config.engine,
-        stop_below: 0.0,
-    };
-    let total = rays.len().div_ceil(RAYS_PER_BATCH as u64) as usize;
-    let count = console.count("rendering the training rays, batch", total);
-    let batches = rays.in_order_with_alpha(RAYS_PER_BATCH).enumerate().map(|(done, batch)| {
-        count.at(done, total);
-        batch
-    });
-    Ok(seen(grid, batches, &options))
+    // The number of batches is known at the first one.
+    let count = RefCell::new(None);
+    Ok(visibility(grid, views, config, &|done, total| {
+        count.borrow_mut().get_or_insert_with(|| console.count("rendering the training rays, batch", total)).at(done, total);
+    }))
 }

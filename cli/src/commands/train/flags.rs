@@ -10,6 +10,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::settings::{self, Layers, PRESETS};
+use plenoxel::text::duration;
 use std::path::{Path, PathBuf};
 use toml::Value;
 
@@ -297,21 +298,6 @@ impl TrainArgs {
         self.capture.set(layers)?;
         self.set.iter().try_for_each(|assignment| layers.assign(assignment))
     }
-}
-
-/// Parses a duration such as `90`, `90s`, `1.5m` or `1h` to seconds.
-fn duration(text: &str) -> std::result::Result<f64, String> {
-    let number = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
-    let unit = match &text[number.len()..] {
-        "" | "s" => Some(1.0),
-        "m" | "min" => Some(60.0),
-        "h" => Some(3600.0),
-        _ => None,
-    };
-    let seconds = unit.and_then(|unit| Some(number.parse::<f64>().ok()? * unit));
-    seconds
-        .filter(|s| *s > 0.0 && *s <= 1e6)
-        .ok_or_else(|| "expected a duration above 0 and up to 1e6 seconds, such as 90s, 5m or 1h".to_owned())
 }
 
 /// Parses a duration, or `off` to infinity.

@@ -5,7 +5,6 @@ use super::say;
 use crate::commands::new_run::{announce, loading};
 use crate::curves::loss_svg;
 use crate::images;
-use crate::interrupt::{self, Watch};
 use crate::progress::{Console, Count, Training};
 use crate::report::Report;
 use plenoxel::error::Result;
@@ -19,8 +18,6 @@ pub struct Screen<'c, 'a> {
     draws: bool,
     reports: bool,
     count: Option<Count<'c, 'a>>,
-    /// Active during training.
-    interrupt: Option<Watch>,
     progress: Option<Training<'c, 'a>>,
     pictures: Option<Pictures>,
     folder: Option<RunFolder>,
@@ -37,7 +34,6 @@ impl<'c, 'a> Screen<'c, 'a> {
             draws,
             reports,
             count: None,
-            interrupt: None,
             progress: None,
             pictures: None,
             folder: None,
@@ -73,7 +69,6 @@ impl<'c, 'a> Screen<'c, 'a> {
                 let (width, height) = run.dataset.size();
                 self.progress = Some(console.training(plan, (test_views * width * height) as f64, history.seconds));
                 self.folder = Some(run.folder.clone());
-                self.interrupt = Some(Watch::begin());
             }
             Event::Planned { plan } => {
                 self.plan = plan.to_vec();
@@ -109,15 +104,7 @@ impl<'c, 'a> Screen<'c, 'a> {
             }
             Event::Saved { .. } => {}
             Event::Failed { losses } => drop(console.drawn(self.draw_loss(losses))),
-            Event::Trained => {
-                (self.progress, self.interrupt) = (None, None);
-                if let Some(folder) = &self.folder {
-                    let again = format!("plenoxel train --resume {}", folder.path().display());
-                    interrupt::on_exit(format!(
-                        "interrupted; the trained model is saved; write its final figures and report with: {again}"
-                    ));
-                }
-            }
+            Event::Trained => self.progress = None,
             Event::Evaluating { done, total } => {
                 self.count.get_or_insert_with(|| console.count("evaluating", total)).at(done, total);
             }

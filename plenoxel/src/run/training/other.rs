@@ -1,6 +1,6 @@
 //! Runs that train another model than the voxel grid: one with a table of settings of its own ([`Recipe`]).
 
-use super::{Event, Listener, NewRun, OldRun, Outcome, RunOptions, RunSettings, clock};
+use super::{Event, Listener, MakeLosses, NewRun, OldRun, Outcome, RunOptions, RunSettings, clock, with_losses};
 use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
 use crate::loss::POSES;
@@ -15,11 +15,17 @@ use crate::train::Trainer;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Creates the trainer of a run.
+/// Creates the trainer of a run with further losses.
 ///
 /// Errors: a setting is invalid; a loss needs a voxel grid; there are no training views.
-fn trainer<R: Recipe>(config: &Config, recipe: &R, region: Region, views: Arc<[View]>) -> Result<Trainer<f32, R::Model>> {
-    let objective = recipe.own_losses(objective_of_any(config, views.len())?);
+fn trainer<R: Recipe>(
+    config: &Config,
+    recipe: &R,
+    region: Region,
+    views: Arc<[View]>,
+    losses: &MakeLosses<'_>,
+) -> Result<Trainer<f32, R::Model>> {
+    let objective = recipe.own_losses(with_losses(config, || objective_of_any(config, views.len()), losses)?);
     Trainer::with_model(recipe.model(config, region)?, views, objective, config.train_options())
 }
 
@@ -29,7 +35,12 @@ fn region(dataset: &Dataset, config: &Config) -> Region {
 }
 
 /// Trains a model.
-pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Listener<'_>) -> Result<Outcome> {
+pub fn train<R: Recipe + Clone>(
+    settings: &RunSettings,
+    recipe: &R,
+    losses: &MakeLosses<'_>,
+    on: &mut Listener<'_>,
+) -> Result<Outcome> {
     let mut recipe = recipe.clone();
     let mut run = NewRun::open(settings, on)?;
     let region = region(&run.dataset, &run.config);
@@ -43,7 +54,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
-        let begin = |recipe: &R| trainer(config, recipe, region, views.clone());
+        let begin = |recipe: &R| trainer(config, recipe, region, views.clone(), losses);
         // The schedule of the poses counts all steps of the run.
         let adjusts = !config.losses.contains_key(POSES);
         let planned = clocks.train.time(|| pace::plan(&recipe, seconds, adjusts, begin))?;
@@ -59,7 +70,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, on: &mut Lis
     let NewRun { config, views, clocks, .. } = &mut run;
     let begun = match begun {
         Some(begun) => begun,
-        None => Begun::new(clocks.train.time(|| trainer(config, &recipe, region, views.clone()))?),
+        None => Begun::new(clocks.train.time(|| trainer(config, &recipe, region, views.clone(), losses))?),
     };
     run.learn(begun, &mut |trainer, seconds| pace.as_mut()?.after_step(trainer, seconds), on)
 }
@@ -70,6 +81,7 @@ pub fn resume<R: Recipe>(
     recipe: &R,
     data: Option<DataSource>,
     options: &RunOptions,
+    losses: &MakeLosses<'_>,
     on: &mut Listener<'_>,
 ) -> Result<Outcome> {
     let mut run = OldRun::open(path, data, options, on)?;
@@ -78,6 +90,6 @@ pub fn resume<R: Recipe>(
     estimate.check()?;
     run.read(on)?;
     let region = region(&run.dataset, &run.config);
-    let trainer = trainer(&run.config, recipe, region, run.views.clone())?;
+    let trainer = trainer(&run.config, recipe, region, run.views.clone(), losses)?;
     run.learn(trainer, on)
 }
