@@ -163,6 +163,7 @@ fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, s
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::plenoxels::objective;
 
     use crate::dataset::procedural::ProceduralOptions;
     use crate::dataset::{Dataset, Split};
