@@ -11,9 +11,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::field::voxel_grid::VoxelGrid;
 use plenoxel::field::voxel_grid::fused::Seen;
 use plenoxel::model::plenoxels::config::Config;
-use plenoxel::point_cloud::from_grid::{
-    self, ColorFrom, Coordinates, LEAST_ALPHA, LEAST_OBJECT, LEAST_WEIGHT, Visible, VoxelOptions,
-};
+use plenoxel::point_cloud::from_grid::{self, ColorFrom, Coordinates, LEAST_ALPHA, LEAST_OBJECT, LEAST_WEIGHT, Visible, VoxelOptions};
 use plenoxel::point_cloud::ply::encode;
 use plenoxel::run::data::DataSource;
 use plenoxel::run::folder::RunRecord;

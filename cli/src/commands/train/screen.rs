@@ -29,17 +29,7 @@ pub struct Screen<'c, 'a> {
 impl<'c, 'a> Screen<'c, 'a> {
     /// Creates the listener. It writes pictures if `draws` is true, and the report if `reports` is true.
     pub fn new(console: &'c Console<'a>, draws: bool, reports: bool) -> Self {
-        Screen {
-            console,
-            draws,
-            reports,
-            count: None,
-            progress: None,
-            pictures: None,
-            folder: None,
-            plan: Vec::new(),
-            failure: Ok(()),
-        }
+        Screen { console, draws, reports, count: None, progress: None, pictures: None, folder: None, plan: Vec::new(), failure: Ok(()) }
     }
 
     /// Handles an event. If a picture cannot be written, the run continues with a note.

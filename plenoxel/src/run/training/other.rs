@@ -35,12 +35,7 @@ fn region(dataset: &Dataset, config: &Config) -> Region {
 }
 
 /// Trains a model.
-pub fn train<R: Recipe + Clone>(
-    settings: &RunSettings,
-    recipe: &R,
-    losses: &MakeLosses<'_>,
-    on: &mut Listener<'_>,
-) -> Result<Outcome> {
+pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &MakeLosses<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
     let mut recipe = recipe.clone();
     let mut run = NewRun::open(settings, on)?;
     let region = region(&run.dataset, &run.config);
