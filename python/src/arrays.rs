@@ -110,7 +110,8 @@ pub fn entries<'py>(object: &Bound<'py, PyAny>, name: &str) -> PyResult<Vec<Boun
         true => None,
         false => object.try_iter().and_then(Iterator::collect).ok(),
     };
-    let entries = entries.ok_or_else(|| dtype(name, format!("this is a {}", object.get_type()), "expected an array or a list of arrays"))?;
+    let entries =
+        entries.ok_or_else(|| dtype(name, format!("this is a {}", object.get_type()), "expected an array or a list of arrays"))?;
     if entries.is_empty() { Err(array(name, "there is no entry", "give at least one")) } else { Ok(entries) }
 }
 

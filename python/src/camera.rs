@@ -39,7 +39,11 @@ impl Axes {
         match text {
             "opengl" => Ok(Axes::OpenGl),
             "opencv" => Ok(Axes::OpenCv),
-            _ => Err(invalid("axes", format!("\"{text}\""), "\"opengl\" (x right, y up, z backwards) or \"opencv\" (x right, y down, z forwards)")),
+            _ => Err(invalid(
+                "axes",
+                format!("\"{text}\""),
+                "\"opengl\" (x right, y up, z backwards) or \"opencv\" (x right, y down, z forwards)",
+            )),
         }
     }
 }
@@ -94,13 +98,7 @@ pub fn intrinsics(k: &ArrayD<f64>, [width, height]: [usize; 2], name: &str) -> P
 impl PyCamera {
     #[new]
     #[pyo3(signature = (camera_to_world, intrinsics, width, height, *, axes = "opengl"))]
-    fn new(
-        camera_to_world: &Bound<'_, PyAny>,
-        intrinsics: &Bound<'_, PyAny>,
-        width: usize,
-        height: usize,
-        axes: &str,
-    ) -> PyResult<Self> {
+    fn new(camera_to_world: &Bound<'_, PyAny>, intrinsics: &Bound<'_, PyAny>, width: usize, height: usize, axes: &str) -> PyResult<Self> {
         let size = checked_size(width, height)?;
         let k = self::intrinsics(&finite(intrinsics, "intrinsics")?, size, "intrinsics")?;
         let pose = pose(&finite(camera_to_world, "camera_to_world")?, Axes::parse(axes)?, "camera_to_world")?;

@@ -1,7 +1,7 @@
 //! The tables of a voxel grid.
 
-use crate::run::{Loaded, shown};
 use crate::errors::{attempt, compute};
+use crate::run::{Loaded, shown};
 use ndarray::Array2;
 use numpy::{PyArray2, PyArrayDyn};
 use plenoxel::error::Result;

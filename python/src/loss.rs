@@ -150,7 +150,9 @@ fn evaluate(py: Python<'_>, place: &str, function: &Py<PyAny>, params: &[Py<Para
     };
     match &tensor.get().0 {
         Values::Single(tensor) if tensor.len() == 1 => Ok(tensor.clone()),
-        Values::Single(tensor) => Err(array(place, format!("the loss has the shape {:?}", tensor.shape()), "expected one number; take its mean or sum")),
+        Values::Single(tensor) => {
+            Err(array(place, format!("the loss has the shape {:?}", tensor.shape()), "expected one number; take its mean or sum"))
+        }
         Values::Double(_) => Err(dtype(place, "the loss is float64", "expected float32, as the columns of the step are")),
     }
 }

@@ -255,7 +255,8 @@ impl TrainedRun {
         if let Some(level) = level.filter(|level| !(level.is_finite() && *level > 0.0)) {
             return Err(invalid("level", level, "a density above 0"));
         }
-        let unit = |direction: [f64; 3]| DVec3::from(direction).try_normalize().ok_or_else(|| invalid("direction", "0", "a vector that is not 0"));
+        let unit =
+            |direction: [f64; 3]| DVec3::from(direction).try_normalize().ok_or_else(|| invalid("direction", "0", "a vector that is not 0"));
         let direction = direction.map(unit).transpose()?.map(|direction| to_world.rotation * direction);
         let options = MeshOptions { level: level.map(|level| level / to_world.scale), direction, min_part, smooth, max_triangles };
         attempt(py, || {

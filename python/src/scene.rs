@@ -90,7 +90,8 @@ pub fn dataset(
         let mask = masks.as_ref().map(|masks| mask(&masks[number], size, &of("masks"))).transpose()?;
         let split = splits.as_ref().and_then(|splits| splits[number].as_deref());
         let split = split.map(str::parse::<Split>).transpose().map_err(raised)?;
-        let name = names.as_ref().map_or_else(|| format!("view_{number:0width$}", width = n.to_string().len()), |names| names[number].clone());
+        let name =
+            names.as_ref().map_or_else(|| format!("view_{number:0width$}", width = n.to_string().len()), |names| names[number].clone());
         views.push(Photograph { name, image, mask, camera: Camera { intrinsics, camera_to_world }, split });
     }
     warn_about_axes(py, &views, axes)?;
@@ -106,7 +107,11 @@ fn each(all: ArrayD<f64>, n: usize, vector: &[usize], matrix: &[usize], name: &s
     if shape.first() == Some(&n) && (shape[1..] == *vector || shape[1..] == *matrix) {
         return Ok(all.outer_iter().map(|one| one.to_owned()).collect());
     }
-    Err(array(name, format!("the array has the shape {shape:?}"), format!("expected K [3, 3] or (fx, fy, cx, cy), or one for each of {n} images")))
+    Err(array(
+        name,
+        format!("the array has the shape {shape:?}"),
+        format!("expected K [3, 3] or (fx, fy, cx, cy), or one for each of {n} images"),
+    ))
 }
 
 /// Reads a mask: pixels that are not 0 are used.
@@ -131,7 +136,8 @@ fn warn_about_axes(py: Python<'_>, views: &[Photograph], axes: Axes) -> PyResult
         return Ok(());
     }
     let other = if axes == Axes::OpenGl { "opencv" } else { "opengl" };
-    let message = format!("camera_to_world: the cameras look away from each other's middle; if they stand around an object, give axes=\"{other}\"");
+    let message =
+        format!("camera_to_world: the cameras look away from each other's middle; if they stand around an object, give axes=\"{other}\"");
     PyErr::warn(py, &py.get_type::<PyUserWarning>(), &std::ffi::CString::new(message).unwrap_or_default(), 2)
 }
 

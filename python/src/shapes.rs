@@ -73,9 +73,15 @@ impl PyPoints {
     /// Writes a PLY file.
     fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
         if ending(&path) != "ply" {
-            return Err(raised(Error::usage("path", format!("{} does not end in .ply", path.display()), "choose a name that ends in .ply")));
+            return Err(raised(Error::usage(
+                "path",
+                format!("{} does not end in .ply", path.display()),
+                "choose a name that ends in .ply",
+            )));
         }
-        attempt(py, || files::write_atomically(&path, &encode(&self.cloud, &[PROGRAM.to_owned(), format!("voxel_side {}", self.voxel_side)])))
+        attempt(py, || {
+            files::write_atomically(&path, &encode(&self.cloud, &[PROGRAM.to_owned(), format!("voxel_side {}", self.voxel_side)]))
+        })
     }
 
     fn __len__(&self) -> usize {

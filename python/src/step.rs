@@ -58,7 +58,9 @@ impl PyStep {
 
     fn content(&self) -> PyResult<Arc<Content>> {
         let content = self.content.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        content.ok_or_else(|| state("step", "the call of the loss is over", "read the columns in the loss, and keep numbers as column.numpy().copy()"))
+        content.ok_or_else(|| {
+            state("step", "the call of the loss is over", "read the columns in the loss, and keep numbers as column.numpy().copy()")
+        })
     }
 
     fn column(&self, of: impl FnOnce(&Content) -> Tensor<f32>) -> PyResult<PyTensor> {

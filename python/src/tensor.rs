@@ -2,10 +2,10 @@
 //!
 //! Shapes and axes are checked here, so that a mistake is an exception and not a panic.
 
+mod gradients;
 mod index;
 mod operands;
 mod ops;
-mod gradients;
 
 pub use gradients::{external, grad, gradcheck};
 pub use ops::{concat, maximum, minimum, stack, where_};

@@ -135,9 +135,7 @@ fn run(
     }
     let outcome = outcome.map_err(raised)?;
     let ended = match outcome {
-        Outcome::Done(summary) => {
-            Ended { folder: PathBuf::from(&summary.run), finished: true, steps: summary.steps, total: summary.steps }
-        }
+        Outcome::Done(summary) => Ended { folder: PathBuf::from(&summary.run), finished: true, steps: summary.steps, total: summary.steps },
         Outcome::Stopped { steps, total, folder } => Ended { folder: folder.path().to_owned(), finished: false, steps, total },
     };
     match heard {

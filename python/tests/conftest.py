@@ -8,6 +8,7 @@ import plenoxel as px
 #: Settings of a run of a few steps.
 SMALL = {
     "hull": "off",
+    "scout": None,
     "rays_per_step": 256,
     "stages": [{"resolution": 16, "steps": 30, "density_rate": 30.0, "color_rate": 0.05, "sampling": {"step": 0.5}}],
     "page": False,

@@ -47,8 +47,8 @@ def test_every_column_has_a_gradient(scene, small, tmp_path):
 
 
 def test_a_loss_trains_another_model(scene, tmp_path):
-    settings = {"tensorf": {"initial_resolution": 8}, "tensorf.stages[*].steps": 2, "rays_per_step": 64, "page": False, "progress": False}
-    run = px.train(scene, "quality", out=tmp_path / "run", **settings, loss={"mine": mse})
+    tensorf = {"tensorf.stages": [{"resolution": 8, "steps": 2, "rays": 64}], "tensorf.short": None}
+    run = px.train(scene, "quality", out=tmp_path / "run", **tensorf, page=False, progress=False, loss={"mine": mse})
     assert run.model == "tensorf" and "mine" in run.metrics()[-1]["losses"]
 
 

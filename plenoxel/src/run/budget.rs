@@ -167,6 +167,7 @@ mod tests {
 
     use crate::dataset::procedural::ProceduralOptions;
     use crate::dataset::{Dataset, Split};
+    use crate::model::plenoxels::objective;
 
     #[test]
     fn fog_clears_until_a_step_is_cheaper_than_the_mean() {
@@ -254,11 +255,11 @@ mod tests {
         let losses = [("mse", Weight::Constant(1.0)), ("beta", Weight::Until { weight: 1e-9, until: 250 })];
         let losses = losses.map(|(name, weight)| (name.to_owned(), weight)).into();
         let config = Config { stages: vec![stage], losses, rays_per_step: 16, ..Config::default() };
-        let planned = on_time(config.clone(), &views, 10.0, &objective).unwrap();
+        let planned = on_time(config.clone(), &views, 10.0, &objective::<f32>).unwrap();
         let Stage { steps: Some(steps), density_warm_up, .. } = planned.stages[0] else { panic!("steps are planned") };
         let Weight::Until { until, .. } = planned.losses["beta"] else { panic!("a weight keeps its form") };
         assert!(steps.abs_diff(2 * density_warm_up) <= 2 && density_warm_up.abs_diff(2 * until) <= 2, "{steps} {density_warm_up} {until}");
         let from = Config { init_from: Some("run".into()), ..config };
-        assert!(on_time(from, &views, 1.0, &objective).unwrap_err().to_string().contains("--init-from"));
+        assert!(on_time(from, &views, 1.0, &objective::<f32>).unwrap_err().to_string().contains("--init-from"));
     }
 }

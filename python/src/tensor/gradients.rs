@@ -3,7 +3,7 @@
 use super::{PyTensor, Values};
 use crate::arrays::numbers;
 use crate::errors::{array, compute, dtype, gradcheck as failed, state};
-use autograd::{Gradcheck, GradSink, Kernel, KernelCall, Real, Tensor, no_grad};
+use autograd::{GradSink, Gradcheck, Kernel, KernelCall, Real, Tensor, no_grad};
 use ndarray::ArrayD;
 use pyo3::prelude::*;
 use std::cell::Cell;
@@ -28,13 +28,18 @@ fn gradients(py: Python<'_>, y: &PyTensor, wrt: &[PyTensor], create_graph: bool)
         return Err(array("grad", format!("y has the shape {:?}", y.0.shape()), "expected a scalar; take its sum or mean"));
     }
     if let Some(number) = wrt.iter().position(|x| !super::read!(&x.0, x => x.is_tracked())) {
-        return Err(state("grad", &format!("tensor {number} of wrt is a constant"), "make it a variable with Tensor(value, requires_grad=True)"));
+        return Err(state(
+            "grad",
+            &format!("tensor {number} of wrt is a constant"),
+            "make it a variable with Tensor(value, requires_grad=True)",
+        ));
     }
     if wrt.iter().any(|x| x.0.dtype() != y.0.dtype()) {
         return Err(dtype("grad", "y and wrt are of float32 and float64", "use one precision"));
     }
     let found = compute(py, || {
-        let (single, double) = (|| of_all(&y.0, wrt, Values::as_single, Values::Single), || of_all(&y.0, wrt, Values::as_double, Values::Double));
+        let (single, double) =
+            (|| of_all(&y.0, wrt, Values::as_single, Values::Single), || of_all(&y.0, wrt, Values::as_double, Values::Double));
         let all = || if let Values::Single(_) = y.0 { single() } else { double() };
         once_only(|| if create_graph { all() } else { no_grad(all) })
     })?;
@@ -54,12 +59,7 @@ impl Values {
     }
 }
 
-fn of_all<T: Real>(
-    y: &Values,
-    wrt: &[PyTensor],
-    read: fn(&Values) -> Option<&Tensor<T>>,
-    write: fn(Tensor<T>) -> Values,
-) -> Vec<PyTensor> {
+fn of_all<T: Real>(y: &Values, wrt: &[PyTensor], read: fn(&Values) -> Option<&Tensor<T>>, write: fn(Tensor<T>) -> Values) -> Vec<PyTensor> {
     let Some(y) = read(y) else { return Vec::new() };
     let wrt: Vec<&Tensor<T>> = wrt.iter().filter_map(|x| read(&x.0)).collect();
     autograd::grad(y, &wrt).into_iter().map(|gradient| PyTensor(write(gradient))).collect()

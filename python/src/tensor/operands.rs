@@ -55,7 +55,8 @@ pub fn broadcast(op: &str, a: &[usize], b: &[usize]) -> PyResult<Vec<usize>> {
         _ => None,
     });
     let shape: Option<Vec<usize>> = sides.collect();
-    let shape = shape.ok_or_else(|| array(op, format!("the shapes {a:?} and {b:?} do not broadcast"), "expected equal sides, or sides of 1"))?;
+    let shape =
+        shape.ok_or_else(|| array(op, format!("the shapes {a:?} and {b:?} do not broadcast"), "expected equal sides, or sides of 1"))?;
     check_size(op, &shape)?;
     Ok(shape)
 }
