@@ -163,8 +163,6 @@ fn factor(stages: &[Stage], steps: &[u64], rays_per_step: usize, seconds: f64, s
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::plenoxels::objective;
-
     use crate::dataset::procedural::ProceduralOptions;
     use crate::dataset::{Dataset, Split};
     use crate::model::plenoxels::objective;
