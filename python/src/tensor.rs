@@ -12,7 +12,7 @@ pub use ops::{concat, maximum, minimum, stack, where_};
 
 use crate::arrays::{numbers, view};
 use crate::errors::{array, compute, dtype, invalid};
-use autograd::Tensor;
+use autograd::{Real, Tensor};
 use pyo3::prelude::*;
 
 /// The numbers of a tensor, in one of two precisions.
@@ -122,7 +122,7 @@ impl PyTensor {
             Some("float64") => true,
             Some("float32") => false,
             Some(other) => return Err(invalid("dtype", format!("\"{other}\""), "\"float32\" or \"float64\"")),
-            None => value.getattr("dtype").and_then(|dtype| Ok(dtype.str()?.to_string() == "float64")).unwrap_or(false),
+            None => value.getattr("dtype").and_then(|dtype| Ok(dtype.str()? == "float64")).unwrap_or(false),
         };
         let values = match value.cast::<PyTensor>() {
             Ok(tensor) => tensor.get().converted(double),
@@ -187,7 +187,7 @@ impl PyTensor {
     /// Returns the value of a tensor with one element.
     fn item(&self) -> PyResult<f64> {
         match self.0.len() {
-            1 => Ok(read!(&self.0, x => f64::from(x.data()[0]))),
+            1 => Ok(read!(&self.0, x => x.data()[0].as_f64())),
             _ => Err(array("item", format!("the tensor has the shape {:?}", self.0.shape()), "expected one element")),
         }
     }
