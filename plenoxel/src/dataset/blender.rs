@@ -148,7 +148,9 @@ pub(crate) fn pose(matrix: &Value) -> std::result::Result<DAffine3, (String, &'s
     rigid(m)
 }
 
-/// Validates and converts the rows of a camera-to-world matrix, which must be finite. An error completes the sentence of [`pose`].
+/// Validates and converts the rows of a camera-to-world matrix, which must be finite.
+///
+/// Errors: the matrix is not a rotation and a translation. The problem completes the sentence "the matrix of camera k ...", and the remedy follows it.
 pub fn rigid(m: [[f64; 4]; 4]) -> std::result::Result<DAffine3, (String, &'static str)> {
     if m[3].iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6) {
         return Err((format!("has the last row {:?}", m[3]), "expected a rigid motion, whose last row is 0 0 0 1"));
