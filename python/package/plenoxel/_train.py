@@ -203,7 +203,7 @@ def _with_bar(progress: bool, callback: Callable[[dict[str, Any]], Any] | None, 
 
 def _bar() -> Any:
     try:
-        from tqdm.auto import tqdm
+        from tqdm.auto import tqdm  # type: ignore[import-untyped, unused-ignore]
     except ImportError:
         return None
     return tqdm(total=None, unit="step", desc="training")
