@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn a_negative_number_is_a_value_that_the_flag_itself_refuses() {
-        const TEXTS: [&str; 7] = ["KEY=VALUE", "DATA", "SPLIT", "NAME", "FORMAT", "FORMATS", "orbit|spiral|cameras|FILE"];
+        const TEXTS: [&str; 8] = ["KEY=VALUE", "SCENE/METHOD", "DATA", "SPLIT", "NAME", "FORMAT", "FORMATS", "orbit|spiral|cameras|FILE"];
         for command in all() {
             for flag in
                 command.get_opts().filter(|flag| flag.get_value_hint() == ValueHint::Unknown && flag.get_possible_values().is_empty())
