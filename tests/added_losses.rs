@@ -12,9 +12,9 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 use crate::command::Folder;
 
-const OF_MODELS: [(&str, [&str; 4]); 2] = [
-    ("voxels", ["stages[0].resolution=8", "stages[0].steps=12", "rays_per_step=64", "hull=off"]),
-    ("tensorf", ["tensorf.initial_resolution=8", "tensorf.stages[*].steps=3", "rays_per_step=64", "seed=1"]),
+const OF_MODELS: [(&str, [&str; 2]); 2] = [
+    ("demo", ["stages=[{resolution=8, steps=12, sampling={step=1.0}, density_rate=0.5, color_rate=0.05}]", "rays_per_step=64"]),
+    ("tensorf", ["tensorf.stages=[{resolution=8, steps=12, rays=64}]", "seed=1"]),
 ];
 
 fn settings(preset: &str, assignments: &[&str], out: &Path) -> RunSettings {
@@ -56,7 +56,7 @@ fn an_added_loss_with_a_parameter_resumes_to_the_same_bits() {
         });
         objective.with_param(Param::from_tensor("scale", Tensor::full(&[3], 0.9)), 0.05)
     };
-    let settings = |out: &Path| settings("voxels", &OF_MODELS[0].1, out);
+    let settings = |out: &Path| settings(OF_MODELS[0].0, &OF_MODELS[0].1, out);
     let mut values = Vec::new();
     let done = train_adding(&settings(&whole), &losses, &mut |event| {
         if let Event::Step { report, .. } = event {
