@@ -53,11 +53,11 @@ fn shortened(preset: &str) -> Vec<String> {
 fn is_repeated_by_its_settings(folder: &Folder, name: &str, args: &[&str], settings: &[String]) -> String {
     let [first, second] = ["first", "second"].map(|run| folder.path(&format!("{name}-{run}")));
     let settings = settings.iter().flat_map(|assignment| ["--set", assignment]);
-    plenoxel(&args.iter().copied().chain(settings).chain(["--no-images", "--out", &first]).collect::<Vec<_>>()).done();
+    plenoxel(&args.iter().copied().chain(settings).chain(["--no-images", "--no-report", "--out", &first]).collect::<Vec<_>>()).done();
     let config = format!("{first}/config.toml");
     let text = fs::read_to_string(&config).unwrap();
     let line = text.lines().find_map(|line| line.strip_prefix("# plenoxel ")).unwrap().replace("THIS_FILE", &config);
-    let line: Vec<&str> = line.split_whitespace().chain(["--no-images", "--threads", "1", "--out", &second]).collect();
+    let line: Vec<&str> = line.split_whitespace().chain(["--no-images", "--no-report", "--threads", "1", "--out", &second]).collect();
     plenoxel(&line).done();
     for file in ["checkpoint.safetensors", "config.toml"] {
         let [a, b] = [&first, &second].map(|run| fs::read(format!("{run}/{file}")).unwrap());
