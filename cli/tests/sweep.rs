@@ -287,7 +287,7 @@ fn a_sweep_is_submitted_as_a_job_array_whose_tasks_make_its_runs() {
     assert!(code == Some(0) && out.contains("procedural one: to run\n") && out.contains("procedural two: to run; Slurm: pending"), "{out}");
     fs::remove_file(root.join("queue")).expect("removed");
 
-    // What Slurm would run.
+    // Slurm would run these scripts.
     let script = |name: &str, task: &str| {
         let mut command = Command::new("sh");
         let done =

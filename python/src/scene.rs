@@ -171,7 +171,7 @@ impl Scene {
         self.dataset.size()
     }
 
-    /// What a person should know about the files, as sentences.
+    /// Remarks on the files for the user, as sentences.
     #[getter]
     fn notes(&self) -> Vec<String> {
         self.dataset.notes().to_vec()

@@ -25,7 +25,7 @@ pub struct Ended {
     total: u64,
 }
 
-/// What a run does besides training.
+/// Arguments of a run besides its settings: losses, listener, checkpoints, evaluation and page.
 #[derive(FromPyObject)]
 pub struct Extras<'py> {
     /// Losses: name, weight, function.

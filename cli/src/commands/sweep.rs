@@ -115,7 +115,7 @@ pub struct SweepArgs {
     #[arg(long, help_heading = "Output", group = "instead")]
     table: bool,
 
-    /// Where the runs are made: on this machine, or as a job array of Slurm
+    /// Make the runs on this machine, or submit them to Slurm as a job array
     #[arg(long, help_heading = "Machine", value_enum, default_value_t = Engine::Local)]
     engine: Engine,
 
@@ -136,7 +136,7 @@ pub struct SweepArgs {
     set: Vec<String>,
 }
 
-/// Where runs are made.
+/// The runs are made on this machine, or by Slurm.
 #[derive(Debug, Clone, Copy, PartialEq, ValueEnum)]
 enum Engine {
     Local,
@@ -179,7 +179,7 @@ pub fn run(args: &SweepArgs, machine: &Machine, console: &Console<'_>) -> Result
         Engine::Local => None,
         Engine::Slurm => Some(slurm::Submission {
             out: &out,
-            jobs: slurm::unfinished(&plan.jobs, &states),
+            jobs: plan.jobs.iter().zip(&states).filter(|(_, state)| **state != State::Finished).map(|(job, _)| job).collect(),
             sweep: args.command_line(&out, machine),
             threads: machine.threads,
             together: args.jobs,

@@ -3,7 +3,7 @@
 //! The run folders on the shared file system are the only state: a task that is requeued, or an array that is submitted again, resumes the runs that have begun.
 //! Only the numbers of the last jobs are kept, for the question whether they are still queued.
 
-use super::job::{Job, State};
+use super::job::Job;
 use crate::child::command_line;
 use plenoxel::error::{Error, Result};
 use plenoxel::files;
@@ -39,7 +39,7 @@ pub struct Submitted {
     pub runs: Vec<String>,
 }
 
-/// What is submitted.
+/// A sweep that is submitted to Slurm.
 pub struct Submission<'a> {
     /// Folder of the sweep.
     pub out: &'a Path,
@@ -79,19 +79,22 @@ impl Submission<'_> {
 
     /// The script of a task.
     fn task(&self) -> Result<String> {
-        let list = command_line("sed", &[OsString::from("RANGE"), self.folder().join("runs").into()])
-            .replace("RANGE", r#"-n "${SLURM_ARRAY_TASK_ID}p""#);
-        let sweep = [&self.sweep[..], &["--task".into()]].concat();
+        let list = command_line("cat", &[self.folder().join("runs")]);
+        let call = self.call("--task")?;
         Ok(format!(
-            "#!/bin/sh\n# A task of a job array: makes one run of the sweep. Signals reach the program, which saves the run.\nrun=$({list})\nexec {} \"$run\"\n",
-            command_line(&program()?, &sweep)
+            "#!/bin/sh\n# A task of a job array: makes one run of the sweep. Signals reach the program, which saves the run.\nrun=$({list} | sed -n \"${{SLURM_ARRAY_TASK_ID}}p\")\n{call} \"$run\"\n"
         ))
     }
 
     /// The script of the job that writes the table.
     fn table(&self) -> Result<String> {
-        let sweep = [&self.sweep[..], &["--table".into()]].concat();
-        Ok(format!("#!/bin/sh\n# Writes the table of the results.\nexec {}\n", command_line(&program()?, &sweep)))
+        Ok(format!("#!/bin/sh\n# Writes the table of the results.\n{}\n", self.call("--table")?))
+    }
+
+    /// The line of a script that becomes the sweep with one more flag. The program is named by its path, for other machines that share its file system.
+    fn call(&self, flag: &str) -> Result<String> {
+        let program = std::env::current_exe().map_err(|e| Error::io("plenoxel", e, "finding this program"))?;
+        Ok(command_line("exec", &[&[program.into()], &self.sweep[..], &[flag.into()]].concat()))
     }
 
     /// Arguments of sbatch for the job array.
@@ -193,12 +196,6 @@ fn folder(out: &Path) -> PathBuf {
     out.join("slurm")
 }
 
-/// Path of this program, for other machines that share its file system.
-fn program() -> Result<String> {
-    let path = std::env::current_exe().map_err(|e| Error::io("plenoxel", e, "finding this program"))?;
-    Ok(path.to_string_lossy().into_owned())
-}
-
 /// Estimated memory of a run.
 fn bytes_of(job: &Job) -> Result<u64> {
     let (config, options) = (&job.asked.config, RunOptions::default());
@@ -244,9 +241,4 @@ pub fn queued(out: &Path) -> BTreeMap<String, String> {
         Some((run.clone(), format!("{state}{why}, task {}_{number}", submitted.array)))
     };
     lines.lines().filter_map(task).collect()
-}
-
-/// The unfinished jobs of a sweep.
-pub fn unfinished<'j>(jobs: &'j [Job], states: &[State]) -> Vec<&'j Job> {
-    jobs.iter().zip(states).filter(|(_, state)| **state != State::Finished).map(|(job, _)| job).collect()
 }
