@@ -260,6 +260,27 @@ fn batches_of_ones_own_are_what_a_loss_sees() {
 }
 
 #[test]
+fn a_setting_draws_patches() {
+    let patches = |patch_size: u32| {
+        let objective = Objective::<f32>::new().with("patches", 1.0, move |step| {
+            let (count, side) = (step.batch.len() / 64, 8);
+            let square = |k: usize, i: usize| step.batch.pixel[64 * k + i];
+            for (k, i) in (0..count).flat_map(|k| (0..64).map(move |i| (k, i))) {
+                assert_eq!(square(k, i), [square(k, 0)[0] + (i % side) as u32, square(k, 0)[1] + (i / side) as u32], "row after row");
+            }
+            mse(step)
+        });
+        let config = Config { patch_size, rays_per_step: 200, contrast_floor: 0.05, ..config() };
+        Trainer::with_objective(config, views(Split::Train), objective)
+    };
+    let mut trainer = patches(8).expect("a valid config");
+    let rays: Vec<usize> = (0..3).map(|_| trainer.step().expect("finite numbers").expect("a step").rays).collect();
+    assert_eq!(rays, [192; 3], "three patches of 64 pixels");
+    let text = patches(63).err().expect("it is refused").to_string();
+    assert!(text.starts_with("patch_size: no training view has 63 x 63 pixels"), "{text}");
+}
+
+#[test]
 fn weights_and_rates_follow_their_schedules() {
     let train = views(Split::Train);
     let first = Stage { density_warm_up: 4, rate_decay: 0.5, color_decay: Some(0.25), ..stage(8, 8) };

@@ -7,8 +7,7 @@ mod model;
 pub mod poses;
 mod state;
 
-pub(crate) use model::read_params;
-pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, StageProgress, ViewOptions};
+pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, StageProgress, ViewOptions, read_params};
 pub use state::{About, about};
 
 use crate::camera::Camera;
@@ -41,12 +40,28 @@ pub struct TrainOptions {
     /// Floor of the contrast in proportion to which pixels are drawn ([`RaySource::with_contrast_floor`]); 0 draws all pixels equally often.
     #[serde(default)]
     pub contrast_floor: f64,
+    /// Side of the square patches of pixels that are drawn ([`RaySource::patches`]), for losses that compare a pixel with its neighbours. A step then has
+    /// `rays_per_step` / `patch_size`² patches, rounded down, but at least one. 1 draws single pixels.
+    #[serde(default = "single_pixels")]
+    pub patch_size: u32,
+}
+
+fn single_pixels() -> u32 {
+    1
 }
 
 /// 1000 steps of 4096 jittered rays over white.
 impl Default for TrainOptions {
     fn default() -> Self {
-        TrainOptions { seed: 42, background: [1.0; 3], rays_per_step: 4096, steps: 1000, jitter: true, contrast_floor: 0.0 }
+        TrainOptions {
+            seed: 42,
+            background: [1.0; 3],
+            rays_per_step: 4096,
+            steps: 1000,
+            jitter: true,
+            contrast_floor: 0.0,
+            patch_size: single_pixels(),
+        }
     }
 }
 
@@ -128,6 +143,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         if rays.is_empty() {
             return Err(Error::usage("views", "there are no training views", "give at least one image"));
         }
+        check_patches(&rays, options.patch_size)?;
         let poses = objective.param(POSES).is_some().then(|| PoseCorrections::of(rays.all_views()));
         if poses.is_some() && !model.tracks_rays() {
             return Err(no_gradients(model.kind()));
@@ -270,11 +286,16 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             self.optimizer = Box::new(Sgd::new(0.0));
             self.model.begin_stage(&stage, &mut self.rays).map_err(|e| at_step(e, self.step))?;
             self.optimizer = self.model.optimizer(&stage);
+            check_patches(&self.rays, self.options.patch_size)?;
         }
         self.model.begin_step(in_stage)?;
-        let TrainOptions { seed, background, jitter, .. } = self.options;
+        let TrainOptions { seed, background, jitter, patch_size, .. } = self.options;
         let batch = match &self.draw {
             Some(draw) => draw(&self.rays, self.step),
+            None if patch_size > 1 => {
+                let count = stage.rays_per_step / (patch_size * patch_size) as usize;
+                self.rays.batch_of(&self.rays.patches(self.step, count.max(1), patch_size))
+            }
             None => self.rays.batch::<T>(stage.first_ray + in_stage * stage.rays_per_step as u64, stage.rays_per_step),
         };
         let jitter = if jitter { Jitter::PerRay { seed, step: self.step } } else { Jitter::None };
@@ -289,7 +310,9 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             samples = rendered.sample_count;
             let step = Step::new((self.step, seed), &batch, &rendered, &self.model, (extent, background));
             let Evaluation { total, losses: values, prediction } = self.objective.evaluate(step);
-            squared_error = self.rays.share() * mean_squared_error(prediction.data(), &batch);
+            // Patches are drawn from all pixels.
+            let share = if patch_size > 1 { 1.0 } else { self.rays.share() };
+            squared_error = share * mean_squared_error(prediction.data(), &batch);
             losses = values;
             total
         });
@@ -321,6 +344,25 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
 pub(crate) fn no_gradients(kind: &str) -> Error {
     let found = format!("poses cannot be refined with the model {kind}, which gives no gradients to rays");
     Error::usage(format!("losses.{POSES}"), found, "use the preset photos or quality, or leave out --refine-poses")
+}
+
+/// Errors if patches of this side cannot be drawn.
+fn check_patches(rays: &RaySource, side: u32) -> Result<()> {
+    if side == 1 {
+        return Ok(());
+    }
+    if rays.views().iter().any(|view| view.mask.is_some()) {
+        let found = format!("patches of {side} x {side} pixels cannot be drawn from views with masks");
+        return Err(Error::usage("patch_size", found, "set patch_size = 1, or use views without masks"));
+    }
+    let holds = |view: &View| view.size().iter().all(|&n| n >= side as usize);
+    match rays.views().iter().any(holds) {
+        true => Ok(()),
+        false => {
+            let found = format!("no training view has {side} x {side} pixels, after the reduction of this stage");
+            Err(Error::usage("patch_size", found, "set a smaller patch_size"))
+        }
+    }
 }
 
 /// Plans the stages of a model, one after another.

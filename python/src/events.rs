@@ -1,7 +1,7 @@
 //! Events of a run as dicts.
 
 use plenoxel::run::training::Event;
-use plenoxel::train::PlannedStage;
+use plenoxel::train::{PlannedStage, Report};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -43,17 +43,9 @@ impl Message {
             Event::Loading { split, done, total, .. } => Message::Loading { split: split.to_string(), done: *done, total: *total },
             Event::Started { run, plan, .. } => Message::Started { folder: run.folder.path().display().to_string(), steps: total(plan) },
             Event::Planned { plan } => Message::Planned { steps: total(plan) },
-            Event::Step { report, observation, .. } => Message::Step(Box::new(StepFigures {
-                step: report.step,
-                stage: report.stage,
-                loss: report.loss,
-                losses: report.losses.clone(),
-                psnr: report.psnr,
-                validation_psnr: observation.validation_psnr,
-                rays: report.rays,
-                seconds: observation.seconds,
-                facts: observation.facts.clone(),
-            })),
+            Event::Step { report, observation, .. } => {
+                Message::step(report, observation.validation_psnr, observation.seconds, observation.facts.clone())
+            }
             Event::StageEnded { stage, .. } => {
                 Message::StageEnded { stage: stage.index, resolution: stage.resolution, steps: stage.first + stage.steps }
             }
@@ -61,6 +53,21 @@ impl Message {
             Event::Evaluating { done, total } => Message::Evaluating { done: *done, total: *total },
             _ => return None,
         })
+    }
+
+    /// The message of a step after `seconds` of training.
+    pub fn step(report: &Report, validation_psnr: Option<f64>, seconds: f64, facts: Vec<(&'static str, f64)>) -> Self {
+        Message::Step(Box::new(StepFigures {
+            step: report.step,
+            stage: report.stage,
+            loss: report.loss,
+            losses: report.losses.clone(),
+            psnr: report.psnr,
+            validation_psnr,
+            rays: report.rays,
+            seconds,
+            facts,
+        }))
     }
 
     /// The dict that a callback is given: `kind`, and the figures of the event.

@@ -1,7 +1,7 @@
 //! The Python package `plenoxel`: the module `plenoxel._plenoxel`, on which the files of `package/plenoxel` build.
 //!
 //! Everything that computes runs without the lock of the interpreter ([`errors::compute`]), and long work on a thread of its own ([`background`]). No thread of
-//! the library waits for Python, but the one that trains while it calls a loss.
+//! the library waits for Python, but the one that trains or renders while it calls a loss or a field.
 #![deny(unsafe_code)]
 
 mod arrays;
@@ -10,6 +10,7 @@ mod camera;
 mod carving;
 mod errors;
 mod events;
+mod field;
 mod grid;
 mod loss;
 mod run;
@@ -30,6 +31,8 @@ mod _plenoxel {
     use super::carving::carve;
     #[pymodule_export]
     use super::errors::after_fork;
+    #[pymodule_export]
+    use super::field::{TrainedField, train_field};
     #[pymodule_export]
     use super::grid::Grid;
     #[pymodule_export]

@@ -13,9 +13,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// A loss: name, weight, function of a step.
 pub type Loss = (String, f64, Py<PyAny>);
 
-/// A parameter of losses, which is trained together with the model by Adam (β₁ = 0.9, β₂ = 0.99).
+/// A parameter of losses or of a field, which is trained by Adam (β₁ = 0.9, β₂ = 0.99).
 ///
-/// A loss reads it with `step.param(name)`.
+/// A loss reads it with `step.param(name)`, a field as `params[name]`.
 ///
 /// Args:
 ///     name: Name, unique in a run.
@@ -25,16 +25,30 @@ pub type Loss = (String, f64, Py<PyAny>);
 pub struct Param {
     /// Name.
     #[pyo3(get)]
-    name: String,
+    pub name: String,
     /// Learning rate.
     #[pyo3(get)]
-    rate: f64,
+    pub rate: f64,
     value: Mutex<Tensor<f32>>,
 }
 
 impl Param {
-    fn tensor(&self) -> Tensor<f32> {
+    pub fn tensor(&self) -> Tensor<f32> {
         self.value.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Shows a value, as a constant.
+    pub fn set(&self, value: &Tensor<f32>) {
+        *self.value.lock().unwrap_or_else(PoisonError::into_inner) = value.detach();
+    }
+}
+
+/// Errors: two parameters have the same name.
+pub fn check_names(params: &[Py<Param>]) -> PyResult<()> {
+    let names: Vec<&str> = params.iter().map(|param| param.get().name.as_str()).collect();
+    match names.iter().enumerate().find_map(|(i, name)| names[..i].contains(name).then_some(name)) {
+        Some(name) => Err(invalid("params", format!("two parameters `{name}`"), "different names")),
+        None => Ok(()),
     }
 }
 
@@ -56,7 +70,7 @@ impl Param {
         }
     }
 
-    /// The value, as the last step that was taken read it.
+    /// The value, as the last step that was taken read it; for a field, after its training.
     #[getter]
     fn value<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
         let tensor = self.tensor();
@@ -77,7 +91,7 @@ impl Failure {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
-    fn set(&self, error: PyErr) {
+    pub fn set(&self, error: PyErr) {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
     }
 }
@@ -92,10 +106,7 @@ pub struct Losses {
 impl Losses {
     /// Errors: two losses or two parameters have the same name; a weight is not finite.
     pub fn new(py: Python<'_>, terms: Vec<Loss>, params: Vec<Py<Param>>, failure: Failure) -> PyResult<Self> {
-        let names: Vec<&str> = params.iter().map(|param| param.get().name.as_str()).collect();
-        if let Some(name) = names.iter().enumerate().find_map(|(i, name)| names[..i].contains(name).then_some(name)) {
-            return Err(invalid("params", format!("two parameters `{name}`"), "different names"));
-        }
+        check_names(&params)?;
         if let Some((name, weight, _)) = terms.iter().find(|(_, weight, _)| !weight.is_finite()) {
             return Err(invalid(&format!("loss {name}"), weight, "a finite weight"));
         }
@@ -136,7 +147,7 @@ fn evaluate(py: Python<'_>, place: &str, function: &Py<PyAny>, params: &[Py<Para
     for param in params {
         let param = param.get();
         let tensor = step.param(&param.name);
-        *param.value.lock().unwrap_or_else(PoisonError::into_inner) = tensor.detach();
+        param.set(tensor);
         read.push((param.name.clone(), tensor.clone()));
     }
     let seen = Bound::new(py, PyStep::new(step, read))?;

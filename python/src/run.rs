@@ -9,11 +9,12 @@ use crate::tensor::{PyTensor, Values};
 use glam::DVec3;
 use ndarray::{Array2, Array3};
 use numpy::{PyArray2, PyArrayDyn, ToPyArray};
-use plenoxel::dataset::Split;
+use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::{ViewScore, Viewer};
 use plenoxel::export::mesh::{MeshOptions, mesh};
 use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::geometry::Similarity;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::model::{self, Model};
 use plenoxel::point_cloud::filter::{Filters, Outliers};
@@ -77,17 +78,51 @@ impl TrainedRun {
     }
 
     /// From the coordinates of the dataset to the world of the run.
-    fn to_world(&self) -> plenoxel::geometry::Similarity {
+    fn to_world(&self) -> Similarity {
         self.record.to_world.unwrap_or_default()
     }
 
     fn view_options(&self, background: Option<[f32; 3]>) -> PyResult<ViewOptions> {
-        let background = background.unwrap_or(self.config.background);
-        match background.iter().all(|value| (0.0..=1.0).contains(value)) {
-            true => Ok(ViewOptions::over(background)),
-            false => Err(invalid("background", format!("{background:?}"), "three values in [0, 1]")),
-        }
+        over(background.unwrap_or(self.config.background))
     }
+}
+
+/// Options for pictures over a background.
+///
+/// Errors: a value is outside of [0, 1].
+pub fn over(background: [f32; 3]) -> PyResult<ViewOptions> {
+    match background.iter().all(|value| (0.0..=1.0).contains(value)) {
+        true => Ok(ViewOptions::over(background)),
+        false => Err(invalid("background", format!("{background:?}"), "three values in [0, 1]")),
+    }
+}
+
+/// Renders the image of a camera in the coordinates of the dataset.
+pub fn see(model: &dyn Model<f32>, camera: &PyCamera, to_world: &Similarity, options: &ViewOptions) -> Picture {
+    let camera = moved(&camera.0, to_world);
+    let picture = Viewer::of(model, options).see(&camera);
+    let depth = picture.distances(&camera, model.space()) / to_world.scale as f32;
+    Picture { rgb: picture.rgb, depth, opacity: picture.opacity }
+}
+
+/// The scores of a model on views of a split, as JSON.
+pub fn scores(
+    model: &dyn Model<f32>,
+    views: &[View],
+    split: Split,
+    dataset: &Dataset,
+    config: &Config,
+    options: &ViewOptions,
+) -> Result<String> {
+    #[derive(Serialize)]
+    struct Evaluation {
+        #[serde(flatten)]
+        figures: Figures,
+        per_view: Vec<ViewScore>,
+    }
+    let scores = Viewer::of(model, options).compare(views, |_, _, _, _| Ok(()))?;
+    let figures = Figures::new(&scores, split, dataset, config, model, options);
+    plenoxel::json::line(&Evaluation { figures, per_view: scores.per_view })
 }
 
 #[pymethods]
@@ -141,24 +176,11 @@ impl TrainedRun {
     /// Renders the image of a camera.
     fn render(&self, py: Python<'_>, camera: &PyCamera, background: Option<[f32; 3]>) -> PyResult<Picture> {
         let options = self.view_options(background)?;
-        let to_world = self.to_world();
-        let camera = moved(&camera.0, &to_world);
-        attempt(py, || {
-            let model = &self.loaded()?.model;
-            let picture = Viewer::of(&**model, &options).see(&camera);
-            let depth = picture.distances(&camera, model.space()) / to_world.scale as f32;
-            Ok(Picture { rgb: picture.rgb, depth, opacity: picture.opacity })
-        })
+        attempt(py, || Ok(see(&*self.loaded()?.model, camera, &self.to_world(), &options)))
     }
 
     /// Scores of the views of a split, as JSON.
     fn evaluate(&self, py: Python<'_>, split: &str, downscale: Option<usize>, background: Option<[f32; 3]>) -> PyResult<String> {
-        #[derive(Serialize)]
-        struct Evaluation {
-            #[serde(flatten)]
-            figures: Figures,
-            per_view: Vec<ViewScore>,
-        }
         let split: Split = split.parse().map_err(raised)?;
         let options = self.view_options(background)?;
         let config = Config { downscale: downscale.unwrap_or(self.config.downscale), ..self.config.clone() };
@@ -171,9 +193,7 @@ impl TrainedRun {
             Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, split))).check()?;
             let loaded = self.loaded()?;
             let views = dataset.load(split, &|_, _| ())?;
-            let scores = Viewer::of(&*loaded.model, &options).compare(&views, |_, _, _, _| Ok(()))?;
-            let figures = Figures::new(&scores, split, &dataset, &config, &*loaded.model, &options);
-            plenoxel::json::line(&Evaluation { figures, per_view: scores.per_view })
+            scores(&*loaded.model, &views, split, &dataset, &config, &options)
         })
     }
 

@@ -142,7 +142,7 @@ fn warn_about_axes(py: Python<'_>, views: &[Photograph], axes: Axes) -> PyResult
 }
 
 /// Parses the name of a split, of which a scene must have views.
-fn split_of(dataset: &Dataset, text: &str) -> PyResult<Split> {
+pub fn split_of(dataset: &Dataset, text: &str) -> PyResult<Split> {
     let split: Split = text.parse().map_err(raised)?;
     if dataset.count(split) == 0 {
         let found = format!("the scene has no {split} views");

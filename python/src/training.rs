@@ -30,21 +30,21 @@ pub struct Ended {
 pub struct Extras<'py> {
     /// Losses: name, weight, function.
     #[pyo3(item)]
-    losses: Vec<Loss>,
+    pub losses: Vec<Loss>,
     #[pyo3(item)]
-    params: Vec<Py<Param>>,
+    pub params: Vec<Py<Param>>,
     /// Called with each event; `None` for no callback.
     #[pyo3(item)]
-    listener: Option<Bound<'py, PyAny>>,
+    pub listener: Option<Bound<'py, PyAny>>,
     #[pyo3(item)]
-    checkpoint_every: Bound<'py, PyAny>,
+    pub checkpoint_every: Bound<'py, PyAny>,
     #[pyo3(item)]
-    test_views: Option<usize>,
+    pub test_views: Option<usize>,
     /// Write pictures and the report.
     #[pyo3(item)]
-    page: bool,
+    pub page: bool,
     #[pyo3(item)]
-    threads: Option<usize>,
+    pub threads: Option<usize>,
 }
 
 /// Trains a model of a scene.
@@ -84,9 +84,7 @@ fn run(
     work: impl FnOnce(RunOptions, &MakeLosses<'_>, &mut Listener<'_>) -> Result<Outcome> + Send,
 ) -> PyResult<Ended> {
     let Extras { losses, params, listener, checkpoint_every, test_views, page, threads } = extras;
-    if let Some(threads) = threads.filter(|threads| !(1..=machine::MOST_THREADS).contains(threads)) {
-        return Err(invalid("threads", threads, &format!("1 to {}", machine::MOST_THREADS)));
-    }
+    checked_threads(threads)?;
     let (failure, stop) = (Failure::default(), Arc::new(AtomicBool::new(false)));
     let losses = Losses::new(py, losses, params, failure.clone())?;
     let asked = stop.clone();
@@ -144,8 +142,16 @@ fn run(
     }
 }
 
+/// Errors if there cannot be so many threads.
+pub fn checked_threads(threads: Option<usize>) -> PyResult<()> {
+    match threads.filter(|threads| !(1..=machine::MOST_THREADS).contains(threads)) {
+        Some(threads) => Err(invalid("threads", threads, &format!("1 to {}", machine::MOST_THREADS))),
+        None => Ok(()),
+    }
+}
+
 /// Seconds of a number, or of a text such as "90s", "5m" or "1h".
-fn seconds(key: &str, value: &Bound<'_, PyAny>) -> PyResult<f64> {
+pub fn seconds(key: &str, value: &Bound<'_, PyAny>) -> PyResult<f64> {
     let text = value.str()?.to_string();
     duration(&text).map_err(|expected| raised(Error::usage(key, format!("invalid value {text}"), expected)))
 }

@@ -202,7 +202,7 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
 /// Reads the values of all parameters by name.
 ///
 /// Errors if the file lacks a parameter, or has it in another shape.
-pub(crate) fn read_params<T: Real, M: Module<T> + ?Sized>(module: &mut M, file: &mut TensorFile<'_>) -> Result<()> {
+pub fn read_params<T: Real, M: Module<T> + ?Sized>(module: &mut M, file: &mut TensorFile<'_>) -> Result<()> {
     let mut done = Ok(());
     module.visit_mut(&mut |param| {
         if done.is_ok() {

@@ -47,6 +47,7 @@ from ._plenoxel import (
     where,
 )
 from ._plenoxel import VERSION as __version__
+from ._field import Field, TrainedField, train_field
 from ._run import Run, Scores, load
 from ._scenes import dataset, open, procedural
 from ._torch import torch_loss
@@ -60,6 +61,7 @@ __all__ = [
     "Camera",
     "DtypeError",
     "Error",
+    "Field",
     "FileError",
     "GradcheckError",
     "Grid",
@@ -77,6 +79,7 @@ __all__ = [
     "StateError",
     "Step",
     "Tensor",
+    "TrainedField",
     "carve",
     "concat",
     "dataset",
@@ -93,5 +96,6 @@ __all__ = [
     "stack",
     "torch_loss",
     "train",
+    "train_field",
     "where",
 ]

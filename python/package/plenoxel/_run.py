@@ -35,6 +35,13 @@ class Scores:
     figures: dict[str, Any] = field(repr=False)
 
 
+def scores_of(text: str) -> Scores:
+    """Return the scores in a text of JSON."""
+    figures = json.loads(text)
+    per_view = figures.pop("per_view")
+    return Scores(psnr=figures["psnr"], ssim=figures["ssim"], per_view=per_view, figures=figures)
+
+
 class Run:
     """A run in its folder. The model is read when it is needed first.
 
@@ -96,9 +103,7 @@ class Run:
         Raises:
             SettingsError: The scene has no such views; or they were arrays of another process: give the scene to `load`.
         """
-        figures = json.loads(self._inner.evaluate(split, downscale, None if background is None else list(background)))
-        per_view = figures.pop("per_view")
-        return Scores(psnr=figures["psnr"], ssim=figures["ssim"], per_view=per_view, figures=figures)
+        return scores_of(self._inner.evaluate(split, downscale, None if background is None else list(background)))
 
     def parameters(self) -> dict[str, np.ndarray]:
         """Return the parameters of the model by name, as read-only arrays without a copy."""

@@ -77,11 +77,11 @@ def train(
         NumericError: The loss or the model is not finite.
         Any exception of a loss.
     """
-    ended = _with_bar(
+    ended = with_bar(
         progress,
         callback,
         lambda listener: _plenoxel.train(
-            scene, preset, config, settings, time, out, force, _extras(loss, params, listener, checkpoint_every, test_views, page, threads)
+            scene, preset, config, settings, time, out, force, extras(loss, params, listener, checkpoint_every, test_views, page, threads)
         ),
     )
     return _run(ended, scene)
@@ -109,10 +109,10 @@ def resume(
     The other arguments are those of `train`.
     """
     folder = run.folder if isinstance(run, Run) else run
-    ended = _with_bar(
+    ended = with_bar(
         progress,
         callback,
-        lambda listener: _plenoxel.resume(folder, scene, _extras(loss, params, listener, checkpoint_every, test_views, page, threads)),
+        lambda listener: _plenoxel.resume(folder, scene, extras(loss, params, listener, checkpoint_every, test_views, page, threads)),
     )
     return _run(ended, scene)
 
@@ -146,7 +146,7 @@ def _run(ended: Any, scene: Scene | None) -> Run:
     return load(ended.folder, scene)
 
 
-def _extras(loss, params, listener, checkpoint_every, test_views, page, threads) -> dict[str, Any]:
+def extras(loss, params, listener, checkpoint_every, test_views, page, threads) -> dict[str, Any]:
     return {
         "losses": _losses(loss),
         "params": list(params),
@@ -181,7 +181,7 @@ def _name(loss: Any) -> str:
     return "loss" if name == "<lambda>" else name
 
 
-def _with_bar(progress: bool, callback: Callable[[dict[str, Any]], Any] | None, run: Callable[[Any], Any]) -> Any:
+def with_bar(progress: bool, callback: Callable[[dict[str, Any]], Any] | None, run: Callable[[Any], Any]) -> Any:
     """Call `run` with a listener for a bar and a callback."""
     bar = _bar() if progress else None
     if bar is None:

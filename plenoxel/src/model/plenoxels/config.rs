@@ -64,6 +64,11 @@ pub struct Config {
     /// equally often.
     #[serde(default)]
     pub contrast_floor: f64,
+    /// Side of the square patches in which training pixels are drawn, for losses that compare a pixel with its neighbours; 1 draws single pixels. A step has
+    /// `rays_per_step` / `patch_size`² patches, rounded down, but at least one. Their pixels are listed patch after patch and row after row. Patches are drawn from
+    /// all pixels equally often: `contrast_floor` and `aim` have no effect.
+    #[serde(default = "single_pixels")]
+    pub patch_size: u32,
     /// Draw training rays only from pixels on or around the projection of the remaining voxels, because other rays cross empty space only.
     /// A stage that begins without empty space draws from all pixels. Needs no alpha channel.
     ///
@@ -295,6 +300,10 @@ fn one<N: From<u8>>() -> N {
     N::from(1)
 }
 
+fn single_pixels() -> u32 {
+    1
+}
+
 /// Positions of samples along a ray.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, deny_unknown_fields)]
@@ -399,6 +408,7 @@ impl Default for Config {
             stop_below: 0.0,
             rays_per_step: 4096,
             contrast_floor: 0.0,
+            patch_size: 1,
             aim: false,
             jitter: true,
             project: false,
@@ -493,8 +503,8 @@ impl Config {
 
     /// Returns the settings of the trainer, which do not depend on the model.
     pub fn train_options(&self) -> TrainOptions {
-        let Config { seed, background, rays_per_step, jitter, contrast_floor, .. } = *self;
-        TrainOptions { seed, background, rays_per_step, jitter, contrast_floor, ..TrainOptions::default() }
+        let Config { seed, background, rays_per_step, jitter, contrast_floor, patch_size, .. } = *self;
+        TrainOptions { seed, background, rays_per_step, jitter, contrast_floor, patch_size, ..TrainOptions::default() }
     }
 
     /// Returns true if the config has a stage to train; without one it is a config for carving.
@@ -538,6 +548,7 @@ impl Config {
         check((1..=1 << 22).contains(&self.rays_per_step), "rays_per_step", self.rays_per_step, "1 to 4194304")?;
         let floor = self.contrast_floor;
         check(floor == 0.0 || (0.005..=1.0).contains(&floor), "contrast_floor", floor, "0.005 to 1, or 0 for none")?;
+        check((1..=64).contains(&self.patch_size), "patch_size", self.patch_size, "1 to 64")?;
         decay("stop_below", self.stop_below)?;
         density("prune_below", self.prune_below)?;
         check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;

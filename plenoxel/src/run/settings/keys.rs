@@ -51,6 +51,7 @@ const FIXED: &[(&str, &[&str])] = &[
             "stop_below",
             "rays_per_step",
             "contrast_floor",
+            "patch_size",
             "aim",
             "jitter",
             "project",
