@@ -18,6 +18,8 @@ use plenoxel::train::{Model, Pass, PlannedStage, read_params};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::{Value, json};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
 /// Opacity of a step in a cell above which the cell is always sampled.
 const OCCUPIED_ABOVE: f64 = 0.01;
@@ -57,11 +59,13 @@ struct PyField {
     occupied: Option<Occupancy>,
     seed: u64,
     failure: Failure,
+    stop: Arc<AtomicBool>,
 }
 
 impl PyField {
-    /// Creates a model with the initial values of `params`. `failure` takes the first exception of the functions, which then return NaN.
-    fn new(object: Py<PyAny>, params: &[Py<Param>], sampling: Sampling, seed: u64, failure: Failure) -> Self {
+    /// Creates a model with the initial values of `params`. `failure` takes the first exception of the functions, which then return NaN. After it, or once `stop`
+    /// is true, pictures are empty, so that an evaluation ends soon.
+    fn new(object: Py<PyAny>, params: &[Py<Param>], sampling: Sampling, seed: u64, failure: Failure, stop: Arc<AtomicBool>) -> Self {
         let trained = |param: &Py<Param>| TrainedParam::from_tensor(param.get().name.clone(), param.get().tensor());
         let refresh = Refresh { decay: 0.95, limit: OCCUPIED_ABOVE / sampling.step(), every: 16, warm_up: 256 };
         let running = (sampling.cells > 0).then(|| RunningOccupancy::new(Occupancy::full(sampling.aabb(), [sampling.cells; 3]), refresh));
@@ -74,6 +78,7 @@ impl PyField {
             occupied: None,
             seed,
             failure,
+            stop,
         }
     }
 
@@ -170,12 +175,15 @@ impl Model<f32> for PyField {
     }
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<f32> {
+        let is_picture = pass.stage.is_none();
+        let ended = is_picture && (self.stop.load(Relaxed) || self.failure.is_set());
+        let nothing = ended.then(|| Occupancy::new(self.aabb(), [1; 3], &[false]));
         let options = RenderOptions {
             aabb: self.aabb(),
             spacing: Spacing::Step(self.sampling.step()),
             jitter: pass.jitter,
             background: pass.background,
-            occupancy: None,
+            occupancy: nothing.as_ref(),
             engine: Engine::Graph,
             stop_below: 0.0,
         };

@@ -172,6 +172,22 @@ def test_a_wrong_argument_is_an_exception(scene, name):
     assert message in str(raised.value)
 
 
+def test_an_exception_ends_the_evaluation(scene):
+    class Failing(Ball):
+        pictures = 0
+
+        def radiance(self, positions, directions, params):
+            # A training step has 64 rays of at most 42 samples, a picture has 576 rays.
+            if len(positions) > 64 * 42:
+                Failing.pictures += 1
+                raise LookupError("in a picture")
+            return super().radiance(positions, directions, params)
+
+    with pytest.raises(LookupError, match="in a picture"):
+        px.train_field(scene, Failing(), **SMALL)
+    assert Failing.pictures == 1
+
+
 def test_a_file_of_another_field_is_refused(scene, tmp_path):
     file = tmp_path / "field.safetensors"
     px.train_field(scene, Ball(), **SMALL, out=file, test_views=0)

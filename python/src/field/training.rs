@@ -129,7 +129,7 @@ pub fn train_field(py: Python<'_>, scene: &Scene, field: Py<PyAny>, options: Fie
     };
     let objective = objective.joined(Losses::new(py, losses, params, failure.clone())?.objective());
     let sampling = Sampling { half_width: options.half_width, samples: options.samples as usize, cells: options.cells as usize };
-    let model = PyField::new(field, &options.params, sampling, options.seed as u64, failure.clone());
+    let model = PyField::new(field, &options.params, sampling, options.seed as u64, failure.clone(), stop.clone());
     let (config, every) = (options.config(), seconds("checkpoint_every", &checkpoint_every)?);
     let dataset = attempt(py, || scene.source.open(&config))?;
     let hears = listener.is_some();
