@@ -276,6 +276,8 @@ fn a_setting_draws_patches() {
     let mut trainer = patches(8).expect("a valid config");
     let rays: Vec<usize> = (0..3).map(|_| trainer.step().expect("finite numbers").expect("a step").rays).collect();
     assert_eq!(rays, [192; 3], "three patches of 64 pixels");
+    let text = patches(15).err().expect("it is refused").to_string();
+    assert!(text.starts_with("patch_size: a patch has 225 pixels, but a step of stage 0 has 200 rays"), "{text}");
     let text = patches(63).err().expect("it is refused").to_string();
     assert!(text.starts_with("patch_size: no training view has 63 x 63 pixels"), "{text}");
 }

@@ -40,8 +40,8 @@ pub struct TrainOptions {
     /// Floor of the contrast in proportion to which pixels are drawn ([`RaySource::with_contrast_floor`]); 0 draws all pixels equally often.
     #[serde(default)]
     pub contrast_floor: f64,
-    /// Side of the square patches of pixels that are drawn ([`RaySource::patches`]), for losses that compare a pixel with its neighbours. A step then has
-    /// `rays_per_step` / `patch_size`² patches, rounded down, but at least one. 1 draws single pixels.
+    /// Side of the square patches of pixels that are drawn ([`RaySource::patches`]), for losses that compare a pixel with its neighbours. A step then has the
+    /// stage's number of rays / `patch_size`² patches, rounded down. 1 draws single pixels.
     #[serde(default = "single_pixels")]
     pub patch_size: u32,
 }
@@ -126,7 +126,7 @@ pub struct Trainer<T: Real, M: Model<T>> {
     loss_optimizer: Box<dyn Optimizer<T>>,
     /// Corrections of the training views' poses, if the objective has them.
     poses: Option<PoseCorrections<T>>,
-    /// Custom function that draws the batch of a step; `None` for shuffled pixels.
+    /// Custom function that draws the batch of a step; `None` for shuffled pixels or patches.
     draw: Option<Draw<T>>,
     step: u64,
 }
@@ -137,19 +137,22 @@ type Draw<T> = Box<dyn Fn(&RaySource, u64) -> RayBatch<T> + Send + Sync>;
 impl<T: Real, M: Model<T>> Trainer<T, M> {
     /// Creates a training run of a model.
     ///
-    /// Errors if there is no training view, or no step to take; if poses are refined ([`Objective::with_poses`]) and the model gives no gradients to rays.
+    /// Errors if there is no training view, or no step to take; if poses are refined ([`Objective::with_poses`]) and the model gives no gradients to rays; if
+    /// patches are larger than all views or have more pixels than a step has rays, or if a view has a mask.
     pub fn with_model(model: M, views: impl Into<Arc<[View]>>, mut objective: Objective<T, M>, options: TrainOptions) -> Result<Self> {
-        let rays = RaySource::new(views, options.background, options.seed).with_contrast_floor(options.contrast_floor);
+        // Patches are drawn regardless of contrast.
+        let floor = if options.patch_size > 1 { 0.0 } else { options.contrast_floor };
+        let rays = RaySource::new(views, options.background, options.seed).with_contrast_floor(floor);
         if rays.is_empty() {
             return Err(Error::usage("views", "there are no training views", "give at least one image"));
         }
-        check_patches(&rays, options.patch_size)?;
         let poses = objective.param(POSES).is_some().then(|| PoseCorrections::of(rays.all_views()));
         if poses.is_some() && !model.tracks_rays() {
             return Err(no_gradients(model.kind()));
         }
         let plan = plan(&model, &options, rays.len());
         let Some(first) = plan.first() else { return Err(Error::usage("stages", "there is no stage", "set at least one")) };
+        plan.iter().try_for_each(|stage| check_patches(&rays, options.patch_size, stage))?;
         let (optimizer, loss_optimizer) = (model.optimizer(first), objective.take_optimizer());
         Ok(Trainer { model, options, plan, rays, objective, optimizer, loss_optimizer, poses, draw: None, step: 0 })
     }
@@ -168,7 +171,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         Trainer { rays: self.rays.with_channel(name, images), ..self }
     }
 
-    /// Replaces the shuffled pixels by custom batches, such as patches or chosen pixels. `draw` returns the batch of a step; steps are
+    /// Replaces the shuffled pixels or patches by custom batches, such as patches or chosen pixels. `draw` returns the batch of a step; steps are
     /// numbered over the whole run. Runs are reproducible if the batch depends only on the number.
     ///
     /// ```
@@ -277,7 +280,8 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
 
     /// Takes the next step. Returns `None` when the run is over.
     ///
-    /// Errors if the loss or the model is no longer finite, naming the step; also returns the errors of [`Model::begin_stage`].
+    /// Errors if the loss or the model is no longer finite, naming the step, or if the views of a stage are too small for patches; also returns the errors of
+    /// [`Model::begin_stage`] and [`Model::begin_step`].
     pub fn step(&mut self) -> Result<Option<Report>> {
         let Some(stage) = self.stage_of(self.step) else { return Ok(None) };
         let in_stage = self.step - stage.first;
@@ -286,7 +290,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             self.optimizer = Box::new(Sgd::new(0.0));
             self.model.begin_stage(&stage, &mut self.rays).map_err(|e| at_step(e, self.step))?;
             self.optimizer = self.model.optimizer(&stage);
-            check_patches(&self.rays, self.options.patch_size)?;
+            check_patches(&self.rays, self.options.patch_size, &stage)?;
         }
         self.model.begin_step(in_stage)?;
         let TrainOptions { seed, background, jitter, patch_size, .. } = self.options;
@@ -294,7 +298,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             Some(draw) => draw(&self.rays, self.step),
             None if patch_size > 1 => {
                 let count = stage.rays_per_step / (patch_size * patch_size) as usize;
-                self.rays.batch_of(&self.rays.patches(self.step, count.max(1), patch_size))
+                self.rays.batch_of(&self.rays.patches(self.step, count, patch_size))
             }
             None => self.rays.batch::<T>(stage.first_ray + in_stage * stage.rays_per_step as u64, stage.rays_per_step),
         };
@@ -310,7 +314,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             samples = rendered.sample_count;
             let step = Step::new((self.step, seed), &batch, &rendered, &self.model, (extent, background));
             let Evaluation { total, losses: values, prediction } = self.objective.evaluate(step);
-            // Patches are drawn from all pixels.
+            // Rays that are aimed are a share of all; patches are not aimed.
             let share = if patch_size > 1 { 1.0 } else { self.rays.share() };
             squared_error = share * mean_squared_error(prediction.data(), &batch);
             losses = values;
@@ -346,23 +350,29 @@ pub(crate) fn no_gradients(kind: &str) -> Error {
     Error::usage(format!("losses.{POSES}"), found, "use the preset photos or quality, or leave out --refine-poses")
 }
 
-/// Errors if patches of this side cannot be drawn.
-fn check_patches(rays: &RaySource, side: u32) -> Result<()> {
+/// Errors if patches of this side cannot be drawn in a stage.
+fn check_patches(rays: &RaySource, side: u32, stage: &PlannedStage) -> Result<()> {
     if side == 1 {
         return Ok(());
     }
+    let PlannedStage { index, rays_per_step, .. } = *stage;
+    let refused = |found: String, remedy: &str| Err(Error::usage("patch_size", found, remedy));
     if rays.views().iter().any(|view| view.mask.is_some()) {
         let found = format!("patches of {side} x {side} pixels cannot be drawn from views with masks");
-        return Err(Error::usage("patch_size", found, "set patch_size = 1, or use views without masks"));
+        return refused(found, "set patch_size = 1, or use views without masks");
     }
     let holds = |view: &View| view.size().iter().all(|&n| n >= side as usize);
-    match rays.views().iter().any(holds) {
-        true => Ok(()),
-        false => {
-            let found = format!("no training view has {side} x {side} pixels, after the reduction of this stage");
-            Err(Error::usage("patch_size", found, "set a smaller patch_size"))
-        }
+    if !rays.views().iter().any(holds) {
+        return refused(
+            format!("no training view has {side} x {side} pixels at the resolution of stage {index}"),
+            "set a smaller patch_size",
+        );
     }
+    if (side * side) as usize > rays_per_step {
+        let found = format!("a patch has {} pixels, but a step of stage {index} has {rays_per_step} rays", side * side);
+        return refused(found, "set a smaller patch_size, or more rays");
+    }
+    Ok(())
 }
 
 /// Plans the stages of a model, one after another.

@@ -1,15 +1,16 @@
-//! Fields whose density and color are functions of Python.
+//! Fields that are written in Python.
 
 mod training;
 
 pub use training::{TrainedField, train_field};
 
-use crate::errors::{array, dtype};
-use crate::loss::{Failure, Param};
+use crate::errors::{array, dtype, invalid};
+use crate::loss::{Failure, Param, check_names};
 use crate::tensor::{PyTensor, Values};
 use autograd::optim::{Adam, AdamMode, Exponential, Optimizer, Rates};
 use autograd::{Module, Param as TrainedParam, Tensor};
 use plenoxel::camera::Ray;
+use plenoxel::error::{Error, Result};
 use plenoxel::geometry::Aabb;
 use plenoxel::render::{Engine, Field, Radiance, RenderOptions, Rendered, render};
 use plenoxel::sampling::{Occupancy, Refresh, RunningOccupancy, Samples, Spacing};
@@ -48,7 +49,7 @@ impl Sampling {
     }
 }
 
-/// A field of Python as a model of the library: `density(positions, params)` and `radiance(positions, directions, params)`.
+/// A field written in Python as a model of the library: `density(positions, params)` and `radiance(positions, directions, params)`.
 struct PyField {
     object: Py<PyAny>,
     params: Vec<TrainedParam<f32>>,
@@ -82,6 +83,11 @@ impl PyField {
         }
     }
 
+    /// Selects the cells that are sampled. If the density is low and the same everywhere, no cell is above the mean, and all are sampled.
+    fn occupy(&mut self) {
+        self.occupied = self.running.as_ref().map(RunningOccupancy::occupied).filter(|cells| cells.fraction() > 0.0);
+    }
+
     /// Calls a function of the field with tensors and the parameters. Returns tensors of the shapes that are expected; NaN after an exception.
     fn call<const N: usize>(&self, function: &str, arguments: &[Tensor<f32>], expected: [&[usize]; N]) -> [Tensor<f32>; N] {
         let called = Python::attach(|py| {
@@ -107,7 +113,7 @@ fn single(tensor: Tensor<f32>) -> PyTensor {
 
 /// Reads the density, or the pair of density and color, that a function returned.
 ///
-/// Errors: it is something else; a shape is another; a density is negative.
+/// Errors: it is something else; a shape is another; a density is negative or NaN.
 fn results<const N: usize>(result: &Bound<'_, PyAny>, place: &str, expected: [&[usize]; N]) -> PyResult<[Tensor<f32>; N]> {
     let wanted = if N == 1 { "return a Tensor [n], the density" } else { "return two Tensors, the density [n] and the color [n, 3]" };
     let other = || PyResult::Ok(dtype(place, format!("the function returned a {}", result.get_type().name()?), wanted));
@@ -119,7 +125,7 @@ fn results<const N: usize>(result: &Bound<'_, PyAny>, place: &str, expected: [&[
         },
     };
     if returned.len() != N {
-        return Err(array(place, format!("the function returned {} tensors", returned.len()), wanted));
+        return Err(array(place, format!("the number of returned tensors is {}", returned.len()), wanted));
     }
     let tensors = returned.iter().map(|tensor| tensor.single(place)).collect::<PyResult<Vec<_>>>()?;
     for (tensor, shape) in tensors.iter().zip(expected) {
@@ -128,8 +134,8 @@ fn results<const N: usize>(result: &Bound<'_, PyAny>, place: &str, expected: [&[
             return Err(array(place, found, format!("expected {shape:?}; {wanted}")));
         }
     }
-    if let Some(negative) = tensors[0].data().iter().find(|density| **density < 0.0) {
-        return Err(array(place, format!("the density {negative} is negative"), "expected 0 or more, such as softplus of a number"));
+    if let Some(density) = tensors[0].data().iter().find(|density| density.is_nan() || **density < 0.0) {
+        return Err(array(place, format!("a density is {density}"), "expected 0 or more, such as softplus of a number"));
     }
     Ok(std::array::from_fn(|k| tensors[k].clone()))
 }
@@ -192,24 +198,29 @@ impl Model<f32> for PyField {
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<f32>> {
         let decaying = |rate: f64| Exponential::new(rate, LAST_RATE * rate, stage.steps);
-        let rates =
-            self.params.iter().zip(&self.rates).fold(Rates::new(0.0), |rates, (param, &rate)| rates.with(param.name(), decaying(rate)));
+        // A schedule cannot fall from 0, which is the rate of all others.
+        let trained = self.params.iter().zip(&self.rates).filter(|(_, rate)| **rate > 0.0);
+        let rates = trained.fold(Rates::new(0.0), |rates, (param, &rate)| rates.with(param.name(), decaying(rate)));
         Box::new(Adam::new(rates, AdamMode::Dense).betas(0.9, 0.99))
     }
 
-    fn begin_step(&mut self, in_stage: u64) -> plenoxel::error::Result<()> {
-        // The functions are those of this field, and the estimates change.
+    fn begin_step(&mut self, in_stage: u64) -> Result<()> {
+        // `density` borrows the whole field, so the estimates are taken out while they change.
         if let Some(mut running) = self.running.take_if(|running| running.refresh().is_due(in_stage)) {
             running.update(self.seed, in_stage, |at| self.density(at));
-            self.occupied = Some(running.occupied());
             self.running = Some(running);
+            self.occupy();
         }
-        Ok(())
+        match self.failure.is_set() {
+            // The exception replaces this error.
+            true => Err(Error::usage("field", "a function of the field failed", "see its exception")),
+            false => Ok(()),
+        }
     }
 
     fn settings(&self) -> Value {
         let Sampling { half_width, samples, cells } = self.sampling;
-        json!({ "half_width": half_width, "samples": samples, "cells": cells })
+        json!({ "half_width": half_width, "samples": samples, "cells": cells, "rates": self.rates })
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {
@@ -219,12 +230,12 @@ impl Model<f32> for PyField {
         }
     }
 
-    fn read(&mut self, file: &mut TensorFile<'_>, _: usize) -> plenoxel::error::Result<()> {
+    fn read(&mut self, file: &mut TensorFile<'_>, _: usize) -> Result<()> {
         read_params(self, file)?;
         if let Some(running) = &mut self.running {
             let estimates = file.tensor::<f32>(ESTIMATES, &[running.estimates().len()])?;
             running.set_estimates(estimates.data().to_vec());
-            self.occupied = Some(running.occupied());
+            self.occupy();
         }
         Ok(())
     }
@@ -232,3 +243,14 @@ impl Model<f32> for PyField {
 
 /// Name of the estimates of the cells' densities in a file.
 const ESTIMATES: &str = "occupancy.estimates";
+
+/// Errors if there is no parameter, two have the same name, or a name means something else in the file of a training.
+fn check_params(params: &[Py<Param>]) -> PyResult<()> {
+    check_names(params)?;
+    let taken = |name: &str| name == ESTIMATES || name == "__metadata__" || name.starts_with("loss.") || name.contains(".optimizer.");
+    match params.iter().map(|param| &param.get().name).find(|name| taken(name)) {
+        Some(name) => Err(invalid("field.params", format!("a parameter `{name}`"), "another name; the file of a training has this one")),
+        None if params.is_empty() => Err(invalid("field.params", "[]", "at least one Param")),
+        None => Ok(()),
+    }
+}

@@ -82,7 +82,7 @@ impl Param {
     }
 }
 
-/// The first exception of a loss.
+/// The first exception of a loss or of a field.
 #[derive(Clone, Default)]
 pub struct Failure(Arc<Mutex<Option<PyErr>>>);
 

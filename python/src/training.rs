@@ -15,6 +15,7 @@ use pyo3::types::PyDict;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+use std::sync::mpsc::Sender;
 
 /// How a run ended: its folder, the steps that it took, and those of its plan. It has final figures if `finished`.
 #[pyclass(module = "plenoxel._plenoxel", frozen, get_all)]
@@ -84,7 +85,6 @@ fn run(
     work: impl FnOnce(RunOptions, &MakeLosses<'_>, &mut Listener<'_>) -> Result<Outcome> + Send,
 ) -> PyResult<Ended> {
     let Extras { losses, params, listener, checkpoint_every, test_views, page, threads } = extras;
-    checked_threads(threads)?;
     let (failure, stop) = (Failure::default(), Arc::new(AtomicBool::new(false)));
     let losses = Losses::new(py, losses, params, failure.clone())?;
     let asked = stop.clone();
@@ -96,16 +96,10 @@ fn run(
         stop: Box::new(move || asked.load(Relaxed)),
         ..RunOptions::default()
     };
-    let hears = listener.is_some();
-    let training = |sender: std::sync::mpsc::Sender<Message>| {
-        let tell = move |event: &Event<'_>| {
-            if let Some(message) = Message::of(event).filter(|_| hears) {
-                // Nobody listens after an exception.
-                drop(sender.send(message));
-            }
-        };
+    let training = |tell: &(dyn Fn(Message) + Sync)| {
         let make = || losses.objective();
-        let run = || match page {
+        let tell = |event: &Event<'_>| Message::of(event).into_iter().for_each(tell);
+        match page {
             false => work(options, &make, &mut |event| tell(&event)),
             true => {
                 let (outcome, written) = plenoxel_cli::with_pages(|pages| {
@@ -116,17 +110,9 @@ fn run(
                 });
                 written.and(outcome)
             }
-        };
-        match threads {
-            None => run(),
-            Some(_) => machine::with_threads(threads, run)?,
         }
     };
-    let hear = |message: Message| match &listener {
-        Some(listener) => listener.call1((message.to_dict(py)?,)).map(drop),
-        None => Ok(()),
-    };
-    let (outcome, heard) = background::run(py, &stop, training, hear)?;
+    let (outcome, heard) = in_background(py, listener.as_ref(), threads, &stop, training)?;
     // A loss that failed has made the loss NaN, which the library reports as such.
     if let Some(error) = failure.take() {
         return Err(error);
@@ -142,12 +128,40 @@ fn run(
     }
 }
 
-/// Errors if there cannot be so many threads.
-pub fn checked_threads(threads: Option<usize>) -> PyResult<()> {
-    match threads.filter(|threads| !(1..=machine::MOST_THREADS).contains(threads)) {
-        Some(threads) => Err(invalid("threads", threads, &format!("1 to {}", machine::MOST_THREADS))),
-        None => Ok(()),
+/// Runs `work` in the background with a number of threads. It is given a function that hands messages to `listener`. An exception of `listener`, or Ctrl-C, sets
+/// `stop`; it is returned with the result.
+///
+/// Errors: there cannot be so many threads.
+pub fn in_background<R: Send>(
+    py: Python<'_>,
+    listener: Option<&Bound<'_, PyAny>>,
+    threads: Option<usize>,
+    stop: &Arc<AtomicBool>,
+    work: impl FnOnce(&(dyn Fn(Message) + Sync)) -> Result<R> + Send,
+) -> PyResult<(Result<R>, Option<PyErr>)> {
+    if let Some(threads) = threads.filter(|threads| !(1..=machine::MOST_THREADS).contains(threads)) {
+        return Err(invalid("threads", threads, &format!("1 to {}", machine::MOST_THREADS)));
     }
+    let hears = listener.is_some();
+    let working = |sender: Sender<Message>| {
+        let run = || {
+            work(&|message| {
+                if hears {
+                    // Nobody listens after an exception.
+                    drop(sender.send(message));
+                }
+            })
+        };
+        match threads {
+            None => run(),
+            Some(_) => machine::with_threads(threads, run)?,
+        }
+    };
+    let hear = |message: Message| match listener {
+        Some(listener) => listener.call1((message.to_dict(py)?,)).map(drop),
+        None => Ok(()),
+    };
+    background::run(py, stop, working, hear)
 }
 
 /// Seconds of a number, or of a text such as "90s", "5m" or "1h".

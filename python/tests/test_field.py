@@ -125,6 +125,12 @@ def returning(density=None, radiance=None):
     return Wrong()
 
 
+def named(name):
+    field = Ball()
+    field.params.append(px.Param(name, 0.0))
+    return field
+
+
 def colors(x):
     return x * 0.0
 
@@ -132,23 +138,29 @@ def colors(x):
 WRONG = {
     "no density": (lambda: returning(density=lambda x: None), px.DtypeError, "field.density: the function returned a NoneType"),
     "a density with an axis too many": (lambda: returning(density=lambda x: x), px.ArrayError, "expected [512]"),
-    "a negative density": (lambda: returning(density=lambda x: x[:, 0] * 0 - 1), px.ArrayError, "the density -1 is negative"),
-    "only a density": (lambda: returning(radiance=lambda x: x[:, 0] * 0), px.ArrayError, "field.radiance: the function returned 1 tensors"),
+    "a negative density": (lambda: returning(density=lambda x: x[:, 0] * 0 - 1), px.ArrayError, "field.density: a density is -1; expected 0 or more"),
+    "a density of NaN": (lambda: returning(density=lambda x: x[:, 0] / 0.0 * 0.0), px.ArrayError, "field.density: a density is NaN"),
+    "only a density": (lambda: returning(radiance=lambda x: x[:, 0] * 0), px.ArrayError, "field.radiance: the number of returned tensors is 1"),
     "an array": (lambda: returning(radiance=lambda x: (np.zeros(3), 1)), px.DtypeError, "field.radiance: the function returned a tuple"),
     "float64": (lambda: returning(radiance=lambda x: (x[:, 0].to("float64"), colors(x))), px.DtypeError, "is float64; expected float32"),
     "NaN": (lambda: returning(radiance=lambda x: (x[:, 0] * 0, colors(x) / 0.0)), px.NumericError, "the loss is NaN"),
     "an exception": (lambda: returning(radiance=lambda x: {}["key"]), KeyError, "key"),
     "no parameters": (lambda: type("Bare", (), {})(), px.SettingsError, "field.params: invalid value []"),
+    "a name of the file": (lambda: named("occupancy.estimates"), px.SettingsError, "a parameter `occupancy.estimates`"),
+    "a name of a loss": (lambda: named("loss.scale"), px.SettingsError, "a parameter `loss.scale`"),
+    "a name of an optimizer": (lambda: named("x.optimizer.0"), px.SettingsError, "a parameter `x.optimizer.0`"),
+    "two parameters of one name": (lambda: named("radius"), px.SettingsError, "two parameters `radius`"),
     "no functions": (lambda: type("Bare", (), {"params": Ball().params})(), AttributeError, "density"),
 }
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_field_is_an_exception(scene, name):
+def test_a_wrong_field_is_an_exception_in_the_first_step(scene, name):
     make, error, message = WRONG[name]
+    steps = []
     with pytest.raises(error) as raised:
-        px.train_field(scene, make(), **SMALL)
-    assert message in str(raised.value)
+        px.train_field(scene, make(), **SMALL, callback=lambda event: steps.append(event["kind"]))
+    assert message in str(raised.value) and "step" not in steps
 
 
 ARGUMENTS = {
@@ -158,6 +170,9 @@ ARGUMENTS = {
     "too many cells": ({"cells": 1000}, px.SettingsError, "cells: invalid value 1000; expected 0 to 256"),
     "a box without volume": ({"half_width": 0.0}, px.SettingsError, "half_width: invalid value 0"),
     "a background out of range": ({"background": (2, 0, 0)}, px.SettingsError, "background: invalid value"),
+    "a folder that does not exist": ({"out": "nowhere/field.safetensors"}, px.SettingsError, "expected a file in a folder that exists"),
+    "a file that exists": ({"out": __file__}, px.SettingsError, "expected a file that does not exist, or resume=True or force=True"),
+    "too many threads": ({"threads": 100000}, px.SettingsError, "threads: invalid value 100000"),
     "resume without a file": ({"resume": True}, px.SettingsError, "resume: invalid value True; expected out"),
     "a text for steps": ({"steps": "many"}, TypeError, "steps"),
     "negative steps": ({"steps": -1}, px.SettingsError, "steps: invalid value -1"),
@@ -170,6 +185,20 @@ def test_a_wrong_argument_is_an_exception(scene, name):
     with pytest.raises(error) as raised:
         px.train_field(scene, Ball(), **{**SMALL, **arguments})
     assert message in str(raised.value)
+
+
+def test_a_field_of_the_same_low_density_everywhere_is_sampled(scene):
+    class Fog(Ball):
+        def density(self, positions, params):
+            return params["density"].softplus() * 0.01 + positions[:, 0] * 0.0
+
+    fog = Fog()
+    fog.params[0] = px.Param("radius", 1.2, rate=0.0)
+    before = values(fog)
+    px.train_field(scene, fog, **SMALL, test_views=0)
+    after = values(fog)
+    assert after["density"] != before["density"] and (after["color"] != before["color"]).all()
+    assert after["radius"] == before["radius"]
 
 
 def test_an_exception_ends_the_evaluation(scene):
@@ -193,8 +222,11 @@ def test_a_file_of_another_field_is_refused(scene, tmp_path):
     px.train_field(scene, Ball(), **SMALL, out=file, test_views=0)
     with pytest.raises(px.InputError, match="field.safetensors"):
         px.train_field(scene, Network(), **SMALL, out=file, resume=True)
-    with pytest.raises(px.InputError, match="other settings"):
-        px.train_field(scene, Ball(), **{**SMALL, "steps": 30}, out=file, resume=True)
+    faster = Ball()
+    faster.params[0] = px.Param("radius", 1.2, rate=0.03)
+    for field, settings in ((Ball(), {**SMALL, "steps": 30}), (faster, SMALL)):
+        with pytest.raises(px.InputError, match="other settings"):
+            px.train_field(scene, field, **settings, out=file, resume=True)
     file.write_bytes(b"not a file of tensors")
     with pytest.raises(px.InputError, match="field.safetensors"):
         px.train_field(scene, Ball(), **SMALL, out=file, resume=True)

@@ -1,8 +1,7 @@
-"""Fields whose density and color are functions of Python."""
+"""Fields that are written in Python."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, Callable, Mapping, Protocol, Sequence
 
 from . import _plenoxel
@@ -13,17 +12,20 @@ from ._train import Losses, extras, with_bar
 if TYPE_CHECKING:
     import os
 
+    import numpy as np
+
 
 class Field(Protocol):
     """What `train_field` needs of a field. A class need not inherit from this one."""
 
-    #: The parameters. Their values are updated by training.
-    params: Sequence[Param]
+    @property
+    def params(self) -> Sequence[Param]:
+        """The parameters. Training begins with their values and updates them."""
 
-    def density(self, positions: Tensor, params: Mapping[str, Tensor]) -> Tensor:
+    def density(self, positions: Tensor, params: Mapping[str, Tensor], /) -> Tensor:
         """Return the density at positions ``[n, 3]``: ``[n]``, 1 / length, 0 or more."""
 
-    def radiance(self, positions: Tensor, directions: Tensor, params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def radiance(self, positions: Tensor, directions: Tensor, params: Mapping[str, Tensor], /) -> tuple[Tensor, Tensor]:
         """Return the density ``[n]`` and the color ``[n, 3]``, sRGB, at positions that are seen along unit directions ``[n, 3]``."""
 
 
@@ -38,6 +40,8 @@ class TrainedField:
         self.scores: Scores | None = None if inner.scores is None else scores_of(inner.scores)
         #: Number of steps taken.
         self.steps: int = inner.steps
+        #: The similarity from the coordinates of the dataset to the world of the field, ``[4, 4]``.
+        self.to_world: np.ndarray = inner.to_world
 
     @property
     def psnr(self) -> float | None:
@@ -72,6 +76,7 @@ def train_field(
     loss: Losses | None = None,
     params: Sequence[Param] = (),
     out: str | os.PathLike[str] | None = None,
+    force: bool = False,
     resume: bool = False,
     callback: Callable[[dict[str, Any]], Any] | None = None,
     progress: bool = True,
@@ -84,8 +89,9 @@ def train_field(
     ``field.density`` and ``field.radiance`` are called with tensors of all samples of a step, and their ops are recorded one by one. This is slow: a step takes
     many times as long as one of `train`, whose fields have kernels. Use it to try a representation, not to train large scenes.
 
-    The field fills the cube ``[-half_width, half_width]³`` of the world in which a scene is trained (``scene.to_world``); space outside is empty. Parameters are
-    trained by Adam. Their rates fall exponentially to a tenth. Runs have the same bits for the same seed and the same functions.
+    The field fills the cube ``[-half_width, half_width]³`` of its world; space outside is empty. The world is that of the dataset, but captures are turned, moved
+    and scaled (``TrainedField.to_world``). Parameters are trained by Adam. Their rates fall exponentially to a tenth. Runs have the same bits for the same seed,
+    functions and initial values.
 
     Args:
         scene: The views.
@@ -93,15 +99,17 @@ def train_field(
         steps: Number of steps.
         rays_per_step: Number of rays per step.
         samples: Number of samples on the side of the cube.
-        cells: Number of cells along each axis. Cells with a low density are not sampled; ``density`` is called for random points in them. 0 samples all.
+        cells: Number of cells along each axis. Cells with a low density are not sampled. For this, ``density`` is called with random points of
+            all cells. 0 samples all.
         half_width: Half of the side of the cube.
         seed: Seed of all random numbers.
         background: Background color, sRGB in [0, 1].
         downscale: Reduce images by this factor.
         loss: A loss or several, as for `train`. The default is the mean squared error of the colors.
         params: Parameters of the losses.
-        out: File, such as "field.safetensors", to which the training is saved every ``checkpoint_every``, at its end, and on Ctrl-C.
-        resume: Resume from this file, with the same arguments. A training that is complete is read and evaluated.
+        out: File, such as "field.safetensors", to which the training is saved every ``checkpoint_every``, at its end, on Ctrl-C, and on an exception of the callback.
+        force: Overwrite the file.
+        resume: Resume from this file, with the same arguments and losses. If the training is complete, it is only loaded and evaluated.
         callback: Called with each event, a dict with its ``kind``: planned, step or saved.
         progress: Show a bar, if tqdm is installed.
         checkpoint_every: Checkpoint interval, seconds or such as "5m".
@@ -109,8 +117,12 @@ def train_field(
         threads: Number of threads; results do not depend on it.
 
     Raises:
-        ArrayError: A function of the field returned another shape, or a density below 0.
+        SettingsError: An argument is out of range; ``out`` exists already.
+        ArrayError: A function of the field returned another shape, or a density that is NaN or below 0.
+        NumericError: The loss or a parameter is not finite.
         InputError: Images cannot be read, or the file to resume has other parameters, settings or views.
+        FileError: The file cannot be written.
+        KeyboardInterrupt: Ctrl-C.
         Any exception of the functions.
     """
     options = {
@@ -124,6 +136,7 @@ def train_field(
         "background": list(background),
         "downscale": downscale,
         "out": out,
+        "force": force,
         "resume": resume,
     }
     inner = with_bar(

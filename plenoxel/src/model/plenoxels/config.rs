@@ -65,9 +65,9 @@ pub struct Config {
     #[serde(default)]
     pub contrast_floor: f64,
     /// Side of the square patches in which training pixels are drawn, for losses that compare a pixel with its neighbours; 1 draws single pixels. A step has
-    /// `rays_per_step` / `patch_size`² patches, rounded down, but at least one. Their pixels are listed patch after patch and row after row. Patches are drawn from
-    /// all pixels equally often: `contrast_floor` and `aim` have no effect.
-    #[serde(default = "single_pixels")]
+    /// n / `patch_size`² patches, rounded down, where n is the number of rays of the stage. Pixels are listed patch after patch and row after row. Every position
+    /// of a patch inside a view is equally likely, so pixels near the border are drawn less often. `contrast_floor`, `aim` and silhouettes do not restrict patches.
+    #[serde(default = "one")]
     pub patch_size: u32,
     /// Draw training rays only from pixels on or around the projection of the remaining voxels, because other rays cross empty space only.
     /// A stage that begins without empty space draws from all pixels. Needs no alpha channel.
@@ -298,10 +298,6 @@ pub struct Scout {
 
 fn one<N: From<u8>>() -> N {
     N::from(1)
-}
-
-fn single_pixels() -> u32 {
-    1
 }
 
 /// Positions of samples along a ray.
