@@ -32,7 +32,7 @@ class Field(Protocol):
 class TrainedField:
     """A trained field: `train_field` returns it. ``field.params`` have the trained values."""
 
-    def __init__(self, inner: Any, field: Field):
+    def __init__(self, inner: _plenoxel.TrainedField, field: Field):
         self._inner = inner
         #: The field.
         self.field = field
