@@ -1,5 +1,8 @@
 """Fields in Python."""
 
+import threading
+import time
+
 import numpy as np
 import pytest
 
@@ -74,13 +77,29 @@ def test_the_parameters_are_updated_and_resumed_to_the_same_bits(scene, tmp_path
     px.train_field(scene, whole, **SMALL, test_views=0)
     assert all((before[name] != value).any() for name, value in values(whole).items())
 
+    heard = threading.Event()
+
     def stop(event):
         if event["kind"] == "step" and event["step"] == 7:
+            heard.set()
             raise InterruptedError
 
+    class Waiting(Ball):
+        calls = 0
+
+        def radiance(self, positions, directions, params):
+            self.calls += 1
+            # Steps are faster than exceptions of a callback.
+            if self.calls == 12:
+                heard.wait()
+                time.sleep(0.5)
+            return super().radiance(positions, directions, params)
+
     file = tmp_path / "field.safetensors"
+    waiting = Waiting()
     with pytest.raises(InterruptedError):
-        px.train_field(scene, Ball(), **SMALL, out=file, callback=stop)
+        px.train_field(scene, waiting, **SMALL, out=file, callback=stop)
+    assert 8 <= waiting.calls <= 12
     cut = Ball()
     assert px.train_field(scene, cut, **SMALL, out=file, resume=True, test_views=0).steps == SMALL["steps"]
     again = Ball()

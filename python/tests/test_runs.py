@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -78,12 +79,23 @@ def test_an_exception_of_a_callback_saves_the_run_and_is_raised(scene, small, ru
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are sent as on Unix")
 def test_an_interruption_saves_the_run(scene, small, run, tmp_path):
+    signalled = threading.Event()
+
     def callback(event):
         if event["kind"] == "step" and event["step"] == 3:
+            signalled.set()
             os.kill(os.getpid(), signal.SIGINT)
 
+    def waiting(step):
+        # Steps are faster than signals.
+        if step.number == 10:
+            signalled.wait()
+            time.sleep(0.5)
+        return 0.0 * step.rgb.sum()
+
     with pytest.raises(px.Interrupted, match="resume with plenoxel.resume") as interrupted:
-        px.train(scene, out=tmp_path / "run", **small, callback=callback)
+        px.train(scene, out=tmp_path / "run", **small, callback=callback, loss=waiting)
+    assert 4 <= interrupted.value.steps <= 11
     assert isinstance(interrupted.value, KeyboardInterrupt) and interrupted.value.total == 30
     done = px.resume(interrupted.value.folder, page=False, progress=False)
     assert done.psnr == run.psnr
