@@ -34,7 +34,7 @@ struct Sampling {
     half_width: f64,
     /// Number of samples on the side of the box.
     samples: usize,
-    /// Number of cells along each axis that are skipped where the density is low; 0 for none.
+    /// Number of cells along each axis; those of low density are skipped. 0 samples everywhere.
     cells: usize,
 }
 

@@ -15,7 +15,6 @@ use plenoxel::error::Result;
 use plenoxel::loss::{Objective, mse};
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::evenly_spaced;
-
 use plenoxel::train::{TrainOptions, Trainer, ViewOptions};
 use pyo3::prelude::*;
 use std::path::PathBuf;
@@ -62,7 +61,7 @@ impl FieldOptions {
             ("samples", self.samples, 1, 4096),
             ("cells", self.cells, 0, 256),
             ("seed", self.seed, 0, i64::MAX),
-            ("downscale", self.downscale, 1, i64::MAX),
+            ("downscale", self.downscale, 1, 64),
         ];
         if let Some((key, value, least, most)) = numbers.into_iter().find(|&(_, value, least, most)| !(least..=most).contains(&value)) {
             return Err(invalid(key, value, &format!("{least} to {most}")));
@@ -80,12 +79,13 @@ impl FieldOptions {
         self.config().validate().map_err(raised)
     }
 
-    /// The settings of a run that say how images are read and rendered.
+    /// The settings of a run that a field shares: how images are read, drawn and rendered.
     fn config(&self) -> Config {
         let mut config = Config {
             half_width: self.half_width,
             background: self.background,
             seed: self.seed as u64,
+            rays_per_step: self.rays_per_step as usize,
             downscale: self.downscale as usize,
             ..Config::default()
         };
@@ -94,13 +94,7 @@ impl FieldOptions {
     }
 
     fn train_options(&self) -> TrainOptions {
-        TrainOptions {
-            seed: self.seed as u64,
-            background: self.background,
-            rays_per_step: self.rays_per_step as usize,
-            steps: self.steps as u64,
-            ..TrainOptions::default()
-        }
+        TrainOptions { steps: self.steps as u64, ..self.config().train_options() }
     }
 }
 
