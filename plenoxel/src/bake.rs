@@ -56,6 +56,8 @@ const ROWS: usize = 256;
 /// Rows between reports of progress.
 const BATCH: usize = 1 << 16;
 
+/// Fewest voxels along each axis.
+const LEAST_VOXELS: usize = 2;
 /// Number of voxels along the longest side of a box, if the field has no cells.
 const VOXELS_WITHOUT_CELLS: f64 = 256.0;
 
@@ -75,6 +77,8 @@ pub struct Source<'a> {
 pub struct BakeOptions {
     /// Number of voxels along each axis, at most 1024.
     pub resolution: usize,
+    /// Most voxels of the grid. If matter fills more, as the fog of a field whose training has just begun, the resolution is lowered.
+    pub most_voxels: usize,
     /// Degree of the harmonics, 0 to 3.
     pub degree: usize,
     /// Largest rendering weight of a voxel in small pictures of the cameras below which it is left out, unless a neighbour has more; 0 keeps all voxels, and
@@ -96,7 +100,7 @@ impl<'a> Source<'a> {
     /// Returns the number of voxels along each axis with which the grid is about as fine as the field, at most 512.
     pub fn resolution(&self) -> usize {
         let cell = (self.sides() * self.coordinates().stretch).element_sum() / 3.0;
-        ((2.0 * self.half_width() / cell).ceil() as usize).clamp(2, MOST_VOXELS)
+        ((2.0 * self.half_width() / cell).ceil() as usize).clamp(LEAST_VOXELS, MOST_VOXELS)
     }
 
     /// Returns the sides of voxels that are as fine as the field.
@@ -121,26 +125,25 @@ impl<'a> Source<'a> {
 ///
 /// Errors: no voxel has a density; there is not enough memory.
 pub fn bake(source: Source<'_>, options: &BakeOptions, cameras: &[Camera], progress: &dyn Fn(usize, usize)) -> Result<VoxelGrid<f32>> {
-    let BakeOptions { resolution, degree, least_weight } = *options;
-    let (coordinates, half_width) = (source.coordinates(), source.half_width());
-    let color = Color::Sh { degree, offset: OFFSET };
-    let shape = GridShape { resolution, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
-    let plain = GridShape { color: Color::Rgb, ..shape };
-    let (mut lattice, mut density) = no_grad(|| densities(source, &shape, coordinates))?;
-    if least_weight > 0.0 && !cameras.is_empty() {
-        let grid = VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[lattice.rows(), 3]));
-        let weights = visible::weights(&grid, coordinates, cameras);
-        let seen = grid.voxels_where(|row| weights[row] >= least_weight).dilated(1);
-        let grid = grid.pruned(&seen);
-        (lattice, density) = (grid.lattice().clone(), grid.density.tensor().clone());
-    }
+    let degree = options.degree;
+    let coordinates = source.coordinates();
+    let mut resolution = options.resolution;
+    let plain = loop {
+        let grid = opaque(source, resolution, options.least_weight, cameras)?;
+        let voxels = grid.lattice().present();
+        if voxels <= options.most_voxels || resolution <= LEAST_VOXELS {
+            break grid;
+        }
+        // Voxels of fog grow with the cube of the resolution, those of surfaces with its square.
+        let ratio = (options.most_voxels as f64 / voxels as f64).cbrt();
+        resolution = ((resolution as f64 * ratio) as usize).clamp(LEAST_VOXELS, resolution - 1);
+    };
+    let shape = GridShape { color: Color::Sh { degree, offset: OFFSET }, ..*plain.shape() };
+    let (lattice, density) = (plain.lattice().clone(), plain.density.tensor().clone());
     let rows = lattice.rows();
     let needed = (rows * (2 * shape.voxel_bytes() + 4 * size_of::<f32>())) as u64;
     check_memory(&format!("baking {} voxels", lattice.present()), needed)?;
-    let sights = (!cameras.is_empty()).then(|| {
-        let grid = VoxelGrid::with_lattice(plain, lattice.clone(), density.clone(), Tensor::zeros(&[rows, 3]));
-        Sights::new(&grid, coordinates, cameras)
-    });
+    let sights = (!cameras.is_empty()).then(|| Sights::new(&plain, coordinates, cameras));
     let painter = Painter { field: source.field, shape: &shape, lattice: &lattice, coordinates, sights, degree };
     let width = shape.color_width();
     let mut table = Buffer::zeros(rows * width);
@@ -156,6 +159,21 @@ fn check_memory(what: &str, needed: u64) -> Result<()> {
     let Some(allowance) = allowance().filter(|allowance| needed > allowance.bytes) else { return Ok(()) };
     let found = format!("{what} needs about {} of memory, but {allowance}", bytes(needed));
     Err(Error::usage("resolution", found, "use fewer voxels per axis, or a lower degree of harmonics"))
+}
+
+/// Returns a grid of the present voxels, with densities and without colors. Voxels that the cameras see with less than `least_weight` are absent.
+fn opaque(source: Source<'_>, resolution: usize, least_weight: f32, cameras: &[Camera]) -> Result<VoxelGrid<f32>> {
+    let (coordinates, half_width) = (source.coordinates(), source.half_width());
+    let shape = GridShape { resolution, half_width, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
+    let (lattice, density) = no_grad(|| densities(source, &shape, coordinates))?;
+    let rows = lattice.rows();
+    let grid = VoxelGrid::with_lattice(shape, lattice, density, Tensor::zeros(&[rows, 3]));
+    if least_weight == 0.0 || cameras.is_empty() {
+        return Ok(grid);
+    }
+    let weights = visible::weights(&grid, coordinates, cameras);
+    let seen = grid.voxels_where(|row| weights[row] >= least_weight).dilated(1);
+    Ok(grid.pruned(&seen))
 }
 
 /// Returns the present voxels and the table of their densities, `[rows, 1]`.
@@ -358,7 +376,8 @@ mod tests {
     fn the_density_of_a_blob_is_that_of_the_field_at_voxel_centres() {
         let field = blob();
         let grid =
-            bake(source(&field), &BakeOptions { resolution: 20, degree: 0, least_weight: 0.0 }, &[], &|_, _| {}).expect("an opaque blob");
+            bake(source(&field), &BakeOptions { resolution: 20, degree: 0, most_voxels: usize::MAX, least_weight: 0.0 }, &[], &|_, _| {})
+                .expect("an opaque blob");
         let places: Vec<DVec3> = (0..20).map(|k| center(grid.shape(), [k, 9, 10])).collect();
         let at = positions(places.iter().copied());
         let (baked, own) = (grid.density(&at), field.density(&at));
@@ -375,7 +394,8 @@ mod tests {
     fn colors_that_are_linear_in_the_direction_are_reproduced() {
         let field = blob();
         let grid =
-            bake(source(&field), &BakeOptions { resolution: 12, degree: 1, least_weight: 0.0 }, &[], &|_, _| {}).expect("an opaque blob");
+            bake(source(&field), &BakeOptions { resolution: 12, degree: 1, most_voxels: usize::MAX, least_weight: 0.0 }, &[], &|_, _| {})
+                .expect("an opaque blob");
         let row = grid.lattice().row([6; 3]).expect("the middle is opaque") as usize;
         let numbers = &grid.color.tensor().data()[row * 12..][..12];
         let directions: Vec<DVec3> = all_around(7).collect();
@@ -390,6 +410,20 @@ mod tests {
     }
 
     #[test]
+    fn a_grid_has_no_more_voxels_than_asked_for() {
+        let field = blob();
+        let voxels = |most_voxels| {
+            let options = BakeOptions { resolution: 24, most_voxels, degree: 0, least_weight: 0.0 };
+            let grid = bake(source(&field), &options, &[], &|_, _| {}).expect("an opaque blob");
+            (grid.shape().resolution, grid.lattice().present())
+        };
+        let (resolution, all) = voxels(usize::MAX);
+        assert_eq!(resolution, 24);
+        let (resolution, some) = voxels(all / 6);
+        assert!(resolution < 24 && (all / 20..=all / 6).contains(&some), "{some} of {all} at {resolution}³");
+    }
+
+    #[test]
     fn a_field_without_density_cannot_be_baked() {
         let mut field = blob();
         field.visit_mut(&mut |param| {
@@ -397,8 +431,9 @@ mod tests {
                 param.update(|values| values.fill(0.0));
             }
         });
-        let error = bake(source(&field), &BakeOptions { resolution: 8, degree: 0, least_weight: 0.0 }, &[], &|_, _| {})
-            .expect_err("nothing is opaque");
+        let error =
+            bake(source(&field), &BakeOptions { resolution: 8, degree: 0, most_voxels: usize::MAX, least_weight: 0.0 }, &[], &|_, _| {})
+                .expect_err("nothing is opaque");
         assert!(error.to_string().contains("no voxel is opaque"), "{error}");
     }
 }

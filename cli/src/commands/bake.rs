@@ -34,6 +34,8 @@ Examples:
 The result is a run folder for evaluate, render, export and report. A grid has smoother colors than the field: the command prints the PSNR of both \
 on up to 25 test views. If stdout is not a terminal, its last line is a JSON object with the results.";
 
+/// Most voxels of a grid whose resolution is not given.
+const MOST_VOXELS: usize = 16_000_000;
 /// Most test views on which the field and the grid are compared.
 const COMPARED: usize = 25;
 
@@ -49,7 +51,7 @@ pub struct BakeArgs {
     #[arg(long)]
     best: bool,
 
-    /// Voxels per side of the box [default: as many as the field has cells, at most 512]
+    /// Voxels per side of the box [default: as many as the field has cells, at most 512; fewer if more than 16 million voxels would be opaque]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<usize>(2, 1024), allow_negative_numbers = true)]
     resolution: Option<usize>,
 
@@ -100,15 +102,25 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     };
     check_box(&path, field.space)?;
 
-    let options =
-        BakeOptions { resolution: args.resolution.unwrap_or_else(|| field.resolution()), degree: args.sh_degree, least_weight: 0.0 };
+    let options = BakeOptions {
+        resolution: args.resolution.unwrap_or_else(|| field.resolution()),
+        most_voxels: if args.resolution.is_some() { usize::MAX } else { MOST_VOXELS },
+        degree: args.sh_degree,
+        least_weight: 0.0,
+    };
     let mut clock = Stopwatch::default();
     let count = console.count("baking, voxel", 1);
     let cameras = dataset.cameras(Split::Train);
     let grid = clock.time(|| bake(field, &options, &cameras, &|done, all| count.at(done, all)))?;
     drop(count);
-    let voxels = grid.lattice().present();
-    console.note(&format!("baked {voxels} voxels at {}³ in {:.1} s", options.resolution, clock.seconds()));
+    let (voxels, resolution) = (grid.lattice().present(), grid.shape().resolution);
+    if resolution < options.resolution {
+        let wanted = options.resolution;
+        console.note(&format!(
+            "the field has {wanted} voxels per side, which would be too many: much of its box is opaque; --resolution sets their number"
+        ));
+    }
+    console.note(&format!("baked {voxels} voxels at {resolution}³ in {:.1} s", clock.seconds()));
 
     let folder = folder.create()?;
     let config = Config {
@@ -125,7 +137,7 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
         ..config
     };
     let from = source.path().canonicalize().unwrap_or_else(|_| source.path().to_owned());
-    let baked = Baked { run: from, resolution: options.resolution, sh_degree: options.degree };
+    let baked = Baked { run: from, resolution, sh_degree: options.degree };
     let new = RunRecord::new(RunKind::Baked, &dataset, record.preset.as_deref(), &data);
     let record = RunRecord { baked: Some(baked), to_world: record.to_world.or(new.to_world), ..new };
     folder.describe(&config, &record)?;

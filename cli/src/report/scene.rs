@@ -34,6 +34,8 @@ const TRAINING_VIEWS: usize = 120;
 /// Most voxels along each axis of a grid that is baked for the page, in a box of the world and in other spaces, whose boxes hold much more.
 const BAKED_VOXELS: usize = 256;
 const BAKED_VOXELS_OF_CAPTURES: usize = 384;
+/// Most voxels of that grid.
+const MOST_BAKED: usize = 4_000_000;
 /// Degree of its harmonics.
 const BAKED_DEGREE: usize = 2;
 /// Rendering weight of voxels that are left out of other spaces, and of fields that may have matter where no camera looks. Most of what is in their boxes is
@@ -231,7 +233,7 @@ fn baked(source: Source<'_>, report: &Report<'_>, console: &Console<'_>) -> Resu
         Space::Box => (BAKED_VOXELS, LEAST_WEIGHT),
         Space::Ndc { .. } | Space::Contracted => (BAKED_VOXELS_OF_CAPTURES, LEAST_WEIGHT),
     };
-    let options = BakeOptions { resolution: source.resolution().min(most), degree: BAKED_DEGREE, least_weight };
+    let options = BakeOptions { resolution: source.resolution().min(most), most_voxels: MOST_BAKED, degree: BAKED_DEGREE, least_weight };
     let count = console.count("baking for the viewer, voxel", 1);
     bake(source, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
 }
