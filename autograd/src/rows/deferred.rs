@@ -1,8 +1,10 @@
 //! Row-sparse gradients with lazy sums, which are computed bucket by bucket.
 
+use super::sparse::RowSparse;
 use crate::pool::Buffer;
 use crate::real::Real;
 use std::fmt::Debug;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// A row-sparse gradient whose sums have not been computed. The sums of each bucket of rows can be computed independently, in an order that depends on the
@@ -33,7 +35,7 @@ impl<T: Real> LazySum<T> {
     }
 
     /// Returns the buckets of a part that lie in a bucket of the sum. A bucket of the sum has the larger of the two bucket sizes.
-    fn inside(&self, part: &dyn RowSums<T>, bucket: usize) -> std::ops::Range<usize> {
+    fn inside(&self, part: &dyn RowSums<T>, bucket: usize) -> Range<usize> {
         let finer = self.bucket_shift() - part.bucket_shift();
         let all = self.table_rows.div_ceil(1 << part.bucket_shift());
         bucket << finer..((bucket + 1) << finer).min(all)
@@ -57,6 +59,41 @@ impl<T: Real> RowSums<T> for LazySum<T> {
             for ((sums, touched), b) in chunks.filter(|(_, b)| !part.is_empty(*b)) {
                 part.add(b, sums, touched);
             }
+        }
+    }
+}
+
+/// A gradient whose sums are known, in buckets of 2^`shift` rows.
+#[derive(Debug)]
+pub(super) struct Known<T: Real> {
+    pub gradient: RowSparse<T>,
+    pub shift: u32,
+}
+
+impl<T: Real> Known<T> {
+    /// Returns the places of the rows of a bucket among all rows of the gradient.
+    fn places(&self, bucket: usize) -> Range<usize> {
+        let before = |bucket: usize| self.gradient.rows().partition_point(|&row| (row as usize) < bucket << self.shift);
+        before(bucket)..before(bucket + 1)
+    }
+}
+
+impl<T: Real> RowSums<T> for Known<T> {
+    fn bucket_shift(&self) -> u32 {
+        self.shift
+    }
+
+    fn is_empty(&self, bucket: usize) -> bool {
+        self.places(bucket).is_empty()
+    }
+
+    fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
+        let (width, places) = (self.gradient.width(), self.places(bucket));
+        let values = self.gradient.data()[places.start * width..places.end * width].chunks_exact(width.max(1));
+        for (&row, values) in self.gradient.rows()[places].iter().zip(values) {
+            let local = row as usize - (bucket << self.shift);
+            sums[local * width..][..width].iter_mut().zip(values).for_each(|(sum, &value)| *sum += value);
+            touched[local / 64] |= 1 << (local % 64);
         }
     }
 }

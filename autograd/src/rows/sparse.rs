@@ -1,6 +1,6 @@
 //! [`RowSparse`]: row-sparse gradients.
 
-use super::deferred::{LazySum, RowGroups, RowSums};
+use super::deferred::{Known, LazySum, RowGroups, RowSums};
 use super::merge::union;
 use crate::parallel::{self, split_lengths};
 use crate::pool::Buffer;
@@ -52,16 +52,22 @@ impl<T: Real> RowSparse<T> {
         RowSparse { shape: IxDyn(shape), sums: Some(sums), merged: OnceLock::new() }
     }
 
-    /// Returns the sum of two gradients of the same table. The sum is lazy if both gradients are lazy and not yet computed.
+    /// Returns the sum of two gradients of the same table. The sum is lazy if one of them is lazy and not yet computed.
     pub(crate) fn plus(self, other: Self) -> Self {
-        if let (Some(a), Some(b)) = (&self.sums, &other.sums)
-            && self.merged.get().is_none()
-            && other.merged.get().is_none()
-        {
-            let sum = LazySum::new([a.clone(), b.clone()], self.shape()[0], self.width());
-            return Self::deferred(self.shape(), Arc::new(sum));
-        }
-        union(self, other)
+        let (shape, width) = (self.shape().to_vec(), self.width());
+        let (a, b) = match (self.lazy(), other.lazy()) {
+            (Some(a), Some(b)) => (a, b),
+            // The sums of a lazy part come first, so that the sum of both has the bits of the union.
+            (Some(lazy), None) => (lazy.clone(), Arc::new(Known { gradient: other, shift: lazy.bucket_shift() }) as Arc<dyn RowSums<T>>),
+            (None, Some(lazy)) => (lazy.clone(), Arc::new(Known { gradient: self, shift: lazy.bucket_shift() }) as Arc<dyn RowSums<T>>),
+            (None, None) => return union(self, other),
+        };
+        Self::deferred(&shape, Arc::new(LazySum::new([a, b], shape[0], width)))
+    }
+
+    /// Returns the lazy sums to share them, or `None` if they have already been computed.
+    fn lazy(&self) -> Option<Arc<dyn RowSums<T>>> {
+        self.sums.clone().filter(|_| self.merged.get().is_none())
     }
 
     /// Computes the sums now and drops the contributions, which frees their memory.
@@ -121,7 +127,7 @@ impl<T: Real> RowSparse<T> {
 
     /// Returns the lazy sums, or `None` if they have already been computed.
     pub(crate) fn unmerged(&self) -> Option<&dyn RowSums<T>> {
-        if self.merged.get().is_some() { None } else { self.sums.as_deref() }
+        self.sums.as_deref().filter(|_| self.merged.get().is_none())
     }
 
     /// Returns the rows and their sums, which are computed on first use.
@@ -222,6 +228,20 @@ mod tests {
             assert_eq!(both.to_dense().data(), twice.data(), "buckets of 2^{a} and 2^{b} rows");
             assert_eq!(both.rows(), deferred(3).rows());
             assert_eq!(both.plus(deferred_by(a, 3)).to_dense().data(), (deferred(3).to_dense() * 3.0).data());
+        }
+    }
+
+    #[test]
+    fn a_sum_for_later_and_known_rows_have_the_bits_of_their_union() {
+        let mut known: Vec<u32> = (0..1003).filter(|row| row % 5 == 0 || (400..520).contains(row)).collect();
+        known.push(1002);
+        let values: Vec<f64> = (0..3 * known.len()).map(|i| 1.0 / (i as f64 + 3.0)).collect();
+        let known = || RowSparse::new(&[1003, 3], known.clone().into(), values.clone().into());
+        let want = union(deferred(3).added_up(), known());
+        for sum in [deferred(3).plus(known()), known().plus(deferred(3)), known().plus(deferred_by(6, 3))] {
+            assert!(sum.unmerged().is_some());
+            assert_eq!(sum.to_dense().data(), want.to_dense().data());
+            assert_eq!((sum.rows(), sum.data()), (want.rows(), want.data()));
         }
     }
 
