@@ -46,6 +46,9 @@ pub struct Training<'c, 'a> {
     validation_psnr: Option<f64>,
 }
 
+/// Share by which the number of steps of a plan must change for a note.
+const WORTH_A_NOTE: f64 = 0.1;
+
 /// Returns the number of steps of a plan.
 fn steps(plan: &[PlannedStage]) -> u64 {
     plan.iter().map(|stage| stage.steps).sum()
@@ -71,10 +74,13 @@ impl<'a> Console<'a> {
 }
 
 impl Training<'_, '_> {
-    /// Replaces the plan.
+    /// Replaces the plan, and says so if its length differs enough.
     pub fn replace_plan(&mut self, plan: &[PlannedStage]) {
-        self.plan = plan.to_vec();
-        self.total = steps(plan);
+        let (before, now) = (self.total, steps(plan));
+        if before.abs_diff(now) as f64 > WORTH_A_NOTE * before as f64 {
+            self.meter.console.note(&format!("the plan was adjusted to the speed of this machine: {now} steps instead of {before}"));
+        }
+        (self.plan, self.total) = (plan.to_vec(), now);
     }
 
     /// Shows the progress of a countable task between two steps.
