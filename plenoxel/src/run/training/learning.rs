@@ -2,8 +2,10 @@
 
 use super::best::BestModel;
 use super::event::Underway;
+use super::job::{Adjust, Clocks, Job, Stopped};
 use super::preview::{GLANCE, Look, Preview};
-use super::{Adjust, Clocks, Event, Job, Listener, Stopped, watched};
+use super::started::watched;
+use super::{Event, Listener};
 use crate::camera::Camera;
 use crate::dataset::{Split, View};
 use crate::error::{Error, Result};

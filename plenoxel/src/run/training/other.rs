@@ -1,6 +1,7 @@
 //! Runs that train another model than the voxel grid: one with a table of settings of its own ([`Recipe`]).
 
-use super::{Event, Listener, MakeLosses, NewRun, OldRun, Outcome, RunOptions, RunSettings, clock, with_losses};
+use super::started::{NewRun, OldRun};
+use super::{Event, Listener, MakeLosses, Outcome, RunOptions, RunSettings, with_losses};
 use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
 use crate::loss::POSES;
@@ -11,6 +12,7 @@ use crate::run::data::DataSource;
 use crate::run::memory::Estimate;
 use crate::run::pace::{self, Begun, Pace};
 use crate::space::Region;
+use crate::text::clock;
 use crate::train::Trainer;
 use std::path::Path;
 use std::sync::Arc;
