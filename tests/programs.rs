@@ -27,5 +27,7 @@ mod formats;
 mod guide;
 #[path = "imports.rs"]
 mod imports;
+#[path = "refusals.rs"]
+mod refusals;
 #[path = "report.rs"]
 mod report;
