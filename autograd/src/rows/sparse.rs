@@ -55,14 +55,18 @@ impl<T: Real> RowSparse<T> {
     /// Returns the sum of two gradients of the same table. The sum is lazy if one of them is lazy and not yet computed.
     pub(crate) fn plus(self, other: Self) -> Self {
         let (shape, width) = (self.shape().to_vec(), self.width());
-        let (a, b) = match (self.lazy(), other.lazy()) {
-            (Some(a), Some(b)) => (a, b),
-            // The sums of a lazy part come first, so that the sum of both has the bits of the union.
-            (Some(lazy), None) => (lazy.clone(), Arc::new(Known { gradient: other, shift: lazy.bucket_shift() }) as Arc<dyn RowSums<T>>),
-            (None, Some(lazy)) => (lazy.clone(), Arc::new(Known { gradient: self, shift: lazy.bucket_shift() }) as Arc<dyn RowSums<T>>),
+        // The sums of a lazy part come first, so that the sum of both has the bits of the union.
+        let with_known = |lazy: Arc<dyn RowSums<T>>, gradient: Self| -> [Arc<dyn RowSums<T>>; 2] {
+            let shift = lazy.bucket_shift();
+            [lazy, Arc::new(Known { gradient, shift })]
+        };
+        let parts = match (self.lazy(), other.lazy()) {
+            (Some(a), Some(b)) => [a, b],
+            (Some(lazy), None) => with_known(lazy, other),
+            (None, Some(lazy)) => with_known(lazy, self),
             (None, None) => return union(self, other),
         };
-        Self::deferred(&shape, Arc::new(LazySum::new([a, b], shape[0], width)))
+        Self::deferred(&shape, Arc::new(LazySum::new(parts, shape[0], width)))
     }
 
     /// Returns the lazy sums to share them, or `None` if they have already been computed.
