@@ -35,7 +35,7 @@ The result is a run folder for evaluate, render, export and report. A grid has s
 on up to 25 test views. If stdout is not a terminal, its last line is a JSON object with the results.";
 
 /// Most voxels of a grid whose resolution is not given.
-const MOST_VOXELS: usize = 16_000_000;
+const MOST_VOXELS: usize = 8_000_000;
 /// Most test views on which the field and the grid are compared.
 const COMPARED: usize = 25;
 
@@ -51,7 +51,7 @@ pub struct BakeArgs {
     #[arg(long)]
     best: bool,
 
-    /// Voxels per side of the box [default: as many as the field has cells, at most 512; fewer if more than 16 million voxels would be opaque]
+    /// Voxels per side of the box [default: as many as the field has cells, at most 512; fewer if more than 8 million voxels would be opaque]
     #[arg(long, value_name = "N", help_heading = "Model", value_parser = whole::<usize>(2, 1024), allow_negative_numbers = true)]
     resolution: Option<usize>,
 
