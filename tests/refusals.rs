@@ -1,4 +1,4 @@
-//! What the command line refuses: broken data, settings, runs and outputs, each with a message and an exit code, and with nothing written.
+//! Refusals of the command line: broken data, settings, runs and outputs end with a message and an exit code, and nothing is written.
 
 use crate::cli::{names, scene, train, train_on};
 use crate::command::{Folder, plenoxel};

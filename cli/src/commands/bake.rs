@@ -117,7 +117,7 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     if resolution < options.resolution {
         let wanted = options.resolution;
         console.note(&format!(
-            "the field has {wanted} voxels per side, which would be too many: much of its box is opaque; --resolution sets their number"
+            "{resolution} voxels per side instead of {wanted}: most of the box is opaque, and a grid has at most {MOST_VOXELS} voxels unless --resolution is given"
         ));
     }
     console.note(&format!("baked {voxels} voxels at {resolution}³ in {:.1} s", clock.seconds()));

@@ -1,4 +1,4 @@
-//! What a new and a resumed run have in common: from the trained model to the final figures, and the clocks.
+//! The common part of new and resumed runs: evaluation of the trained model, the final figures, and the clocks.
 
 use super::learning::Learned;
 use super::started::load;

@@ -221,8 +221,7 @@ fn check_loss(name: &str, weight: Weight) -> Result<()> {
     }
 }
 
-// Limits for which squares and sums stay finite in single precision.
-
+/// Checks a density. Within the limit, squares and sums of densities stay finite in single precision; so do those of [`color`].
 fn density(key: &str, value: f64) -> Result<()> {
     check((0.0..=1e12).contains(&value), key, value, "0 to 1e12")
 }
