@@ -3,7 +3,7 @@
 // A picture is reduced by a whole factor. While the camera moves, the factor is chosen for FRAME milliseconds per picture; at rest it is halved
 // until the picture is sharp. A new camera aborts the request for a finer picture, and the program stops rendering it.
 
-const FRAME = 80, REST = 100, FACTORS = [1, 2, 4, 8, 16];
+const FRAME = 80, REST = 100, FACTORS = [1, 2, 3, 4, 6, 8, 12, 16];
 // In training, a picture at rest is rendered again after so many milliseconds, and after so many times the time that it took.
 const AGAIN = 3000, PATIENCE = 10, ASK = 1000;
 
@@ -53,7 +53,7 @@ class Live {
       } else if (this.factor > 1) {
         await this.rest(REST);
         if (this.dirty) continue;
-        this.factor /= 2;
+        this.factor = Math.ceil(this.factor / 2);
         await this.picture(this.factor, this.refines = new AbortController());
       } else {
         await this.rest(this.scene.training ? Math.max(AGAIN, PATIENCE * this.took) : Infinity);
