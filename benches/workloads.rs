@@ -1,5 +1,5 @@
-//! The work that other systems are timed on: real rays of a NeRF-synthetic scene reduced to 100 × 100, 5000 a step, 200 points on a ray, the
-//! cube ±1.4. Times are of a whole step: batch, render, loss, backward, optimizer, projection of the rows it touched.
+//! Measures the workloads that other systems are timed on: rays of a NeRF-synthetic scene reduced to 100 × 100, 5000 a step, 200 points on a ray,
+//! the cube ±1.4. Times are of a whole step: batch, render, loss, backward, optimizer, projection of the rows it touched.
 //!
 //!     cargo bench --bench workloads -- --data nerf_synthetic/lego W1
 //!

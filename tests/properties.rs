@@ -1,4 +1,4 @@
-//! Whatever the bytes of a file and the words of a command line: they are read, or refused by name; nothing panics, and memory stays in
+//! Any bytes of a file and any words of a command line are read, or refused with an error that names them. Nothing panics, and memory stays in
 //! proportion to the input.
 //!
 //! Inputs are valid ones that are damaged, and some made up; always the same. `PROPTEST_CASES=100000` tries more, `PROPTEST_RNG_SEED=7`

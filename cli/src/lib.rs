@@ -59,7 +59,7 @@ Examples:
 Progress is printed to stderr, results to stdout. Exit codes: 0 success, 2 usage, 3 bad input, 4 numeric failure, 5 reading or writing, \
 130 interrupted (what is finished is saved).";
 
-/// Train voxel radiance fields from photographs with known cameras
+/// Train radiance fields from photographs with known cameras
 #[derive(Debug, Parser)]
 #[command(name = "plenoxel", version, after_help = EXAMPLES, max_term_width = 110, arg_required_else_help = true)]
 struct Cli {

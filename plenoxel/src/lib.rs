@@ -13,7 +13,9 @@
 //! | [`render`] | volume rendering; [`render::composite`](mod@render::composite) is the reference implementation |
 //! | [`loss`] | losses and their weighted sum |
 //! | [`train`] | batch → render → loss → gradients → optimizer, for any [`Model`](train::Model) |
-//! | [`model`] | radiance fields with their training recipes: [`model::plenoxels`] |
+//! | [`model`] | radiance fields with their training recipes: [`plenoxels`](model::plenoxels), [`tensorf`](model::tensorf), [`dvgo`](model::dvgo), [`ngp`](model::ngp), [`nerf`](model::nerf) |
+//! | [`space`] | the map from the world to the box of a field: the identity, NDC, a contraction |
+//! | [`tensor_file`] | named tensors in a safetensors file |
 //! | [`evaluate`] | PSNR and SSIM of a model on the images of a split |
 //! | [`bake`] | a voxel grid with the density and the colors of a field without voxels |
 //! | [`carve`] | an opaque grid from silhouettes and colors, without gradients |

@@ -221,7 +221,7 @@ impl March {
 /// Side of the squares of pixels, in a picture, whose rays follow each other.
 pub(crate) const PACKET: usize = 8;
 /// Number of rays of such a square.
-const RAYS_OF_PACKET: usize = PACKET * PACKET;
+pub(crate) const RAYS_OF_PACKET: usize = PACKET * PACKET;
 
 /// Sections of the rays of a picture outside of which there are no occupied cells. Rays of a packet have the same.
 #[derive(Debug)]

@@ -1,4 +1,4 @@
-//! NumPy arrays in and out.
+//! Conversion of NumPy arrays to tensors and tables, and back.
 //!
 //! Arrays that come in may have any strides; they are copied. Tensors and tables that go out are read-only views of their own memory.
 

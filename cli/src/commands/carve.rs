@@ -37,7 +37,7 @@ with `carve.`. If stdout is not a terminal, its last line is a JSON object with 
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct CarveArgs {
-    /// Dataset folder in the NeRF-synthetic format [default: the built-in scene]
+    /// Dataset folder, as for `train`; a capture needs --space box [default: the built-in scene]
     #[arg(value_hint = ValueHint::DirPath)]
     data: Option<PathBuf>,
 

@@ -19,10 +19,10 @@ function rotated(v, [x, y, z], angle) {
 const fitted = (camera, width, height) => Math.min(width / camera.width, height / camera.height);
 
 // A camera that rotates around a pivot on its line of sight, zooms, pans, looks around and flies. `up` is the vertical axis of the scene; the
-// pivot is at least `near` away when the camera takes the place of a view.
+// pivot is at least `near` away when the camera takes the place of a view, and no control moves the camera beyond coordinates of `far`.
 class Orbit {
-  constructor(view, up = [0, 0, 1], near = 0.1) {
-    Object.assign(this, { up, near });
+  constructor(view, up = [0, 0, 1], near = 0.1, far = Infinity) {
+    Object.assign(this, { up, near, far });
     this.from(view);
   }
 
@@ -36,6 +36,9 @@ class Orbit {
   }
 
   axis(k) { return this.rotation.slice(3 * k, 3 * k + 3); }
+
+  // Tells whether the camera may move there.
+  holds(eye) { return [eye, this.eye].map(place => Math.max(this.far, ...place.map(Math.abs))).reduce((next, now) => next <= now); }
 
   // Distance from the pivot.
   away() { return Math.hypot(...this.eye.map((p, a) => p - this.pivot[a])); }
@@ -65,8 +68,10 @@ class Orbit {
   }
 
   zoom(factor) {
-    factor = Math.max(0.1, Math.min(10, factor));
-    this.eye = this.eye.map((p, a) => this.pivot[a] + (p - this.pivot[a]) * factor);
+    // The camera never reaches the pivot: it would have no distance left to zoom.
+    factor = Math.max(0.1, 1e-3 * this.near / this.away(), Math.min(10, factor));
+    const eye = this.eye.map((p, a) => this.pivot[a] + (p - this.pivot[a]) * factor);
+    if (this.holds(eye)) this.eye = eye;
   }
 
   // Moves the scene by pixels of the camera.
@@ -78,7 +83,9 @@ class Orbit {
   // Moves the camera along its axes (right, up, backward), in units of the world.
   fly(by) {
     const step = [0, 1, 2].map(a => by[0] * this.axis(0)[a] + by[1] * this.axis(1)[a] + by[2] * this.axis(2)[a]);
-    this.eye = this.eye.map((p, a) => p + step[a]);
+    const eye = this.eye.map((p, a) => p + step[a]);
+    if (!this.holds(eye)) return;
+    this.eye = eye;
     this.pivot = this.pivot.map((p, a) => p + step[a]);
   }
 }
@@ -89,6 +96,7 @@ const FLY = { KeyW: [0, 0, -1], KeyS: [0, 0, 1], KeyA: [-1, 0, 0], KeyD: [1, 0, 
 // Moves a camera by mouse, fingers and keys of a canvas, and calls `moved` each time.
 function control(canvas, camera, moved) {
   const fingers = new Map(), flying = new Set();
+  let flies = false;
   const span = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
   canvas.addEventListener('pointerdown', e => { canvas.setPointerCapture(e.pointerId); fingers.set(e.pointerId, [e.clientX, e.clientY]); });
   for (const name of ['pointerup', 'pointercancel']) canvas.addEventListener(name, e => fingers.delete(e.pointerId));
@@ -109,7 +117,7 @@ function control(canvas, camera, moved) {
   canvas.addEventListener('keydown', e => {
     if (e.ctrlKey || e.metaKey || e.altKey) return;
     const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
-    if (FLY[e.code]) { if (!flying.size) fly(); flying.add(e.code); }
+    if (FLY[e.code]) { flying.add(e.code); fly(); }
     else if (step) { camera.turn(...step); moved(); }
     else if (e.key === '+' || e.key === '-') { camera.zoom(e.key === '+' ? 0.9 : 1 / 0.9); moved(); }
     else return;
@@ -120,11 +128,14 @@ function control(canvas, camera, moved) {
 
   // Flies while keys are down: in a second, most of the way to the pivot.
   function fly() {
+    if (flies) return;
+    flies = true;
     let last = performance.now();
     const frame = now => {
       const far = 0.8 * Math.max(camera.away(), camera.near) * Math.min(now - last, 100) / 1000;
       last = now;
-      if (!flying.size) return;
+      flies = flying.size > 0;
+      if (!flies) return;
       for (const key of flying) camera.fly(FLY[key].map(x => far * x));
       moved();
       requestAnimationFrame(frame);

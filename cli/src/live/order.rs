@@ -1,6 +1,7 @@
 //! Orders for pictures: from the threads of connections to the thread that has the model.
 
 use crate::images::{self, Channel, DepthRange};
+use crate::interrupt;
 use glam::{DAffine3, DMat3, DVec3};
 use image::RgbImage;
 use plenoxel::camera::lens::Lens;
@@ -17,8 +18,6 @@ use std::time::{Duration, Instant};
 pub const MOST_PIXELS: usize = 1 << 22;
 /// Largest side of a picture, in pixels.
 const LONGEST: usize = 8192;
-/// Largest coordinate of a camera.
-const FARTHEST: f64 = 1e6;
 /// Focal lengths, in sides of the picture.
 const FOCAL: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
 /// Largest error of the entries of Rᵀ R.
@@ -45,10 +44,10 @@ pub struct Shot {
 }
 
 impl Shot {
-    /// Parses the body of a request: a JSON object.
+    /// Parses the body of a request: a JSON object. `far` is the largest coordinate of a camera.
     ///
     /// Errors: it is not one, or its numbers are out of bounds.
-    pub fn parse(json: &[u8]) -> Result<Self, String> {
+    pub fn parse(json: &[u8], far: f64) -> Result<Self, String> {
         #[derive(Deserialize)]
         #[serde(deny_unknown_fields)]
         struct Asked {
@@ -73,8 +72,8 @@ impl Shot {
         if !(rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, TURNED) || rotation.determinant() < 0.0 {
             return Err("the axes of the camera are not those of a rotation".to_owned());
         }
-        if !(0.0..=FARTHEST).contains(&position.abs().max_element()) {
-            return Err(format!("the coordinates of a camera are at most {FARTHEST}"));
+        if !(0.0..=far).contains(&position.abs().max_element()) {
+            return Err(format!("the coordinates of a camera are at most {far}"));
         }
         for (side, focal, center) in [(width, fx, cx), (height, fy, cy)] {
             let side = side as f64;
@@ -129,9 +128,9 @@ impl Order {
         Some(seconds)
     }
 
-    /// Renders the picture with a viewer of a model and sends it.
+    /// Renders the picture with a viewer of a model and sends it, unless the program is interrupted.
     pub fn fill_with(self, half_width: f64, viewer: &Viewer<'_, f32>) -> Option<f64> {
-        self.fill(half_width, |camera, stopped| viewer.see_unless(camera, stopped))
+        self.fill(half_width, |camera, stopped| viewer.see_unless(camera, &|| stopped() || interrupt::requested()))
     }
 }
 

@@ -4,25 +4,30 @@
 // until the picture is sharp. A new camera aborts the request for a finer picture, and the program stops rendering it.
 
 const FRAME = 80, REST = 100, FACTORS = [1, 2, 3, 4, 6, 8, 12, 16];
-// In training, a picture at rest is rendered again after so many milliseconds, and after so many times the time that it took.
-const AGAIN = 3000, PATIENCE = 10, ASK = 1000;
+// In training, a picture at rest is rendered again after AGAIN milliseconds and PATIENCE times the time that it took. It is as sharp as LONGEST
+// milliseconds allow. The figures are asked for every ASK milliseconds.
+const AGAIN = 3000, PATIENCE = 25, LONGEST = 4000, ASK = 1000;
 
 const pause = milliseconds => new Promise(done => setTimeout(done, milliseconds));
 const find = selector => document.querySelector(selector);
 
 class Live {
   constructor(scene) {
-    Object.assign(this, { scene, canvas: find('canvas'), status: find('output'), speed: 100, factor: 0, dirty: true, ended: false });
+    Object.assign(this, { scene, canvas: find('canvas'), status: find('output'), speed: 100, factor: 0, took: 0, dirty: true, ended: false });
     this.context = this.canvas.getContext('2d');
-    this.camera = new Orbit(scene.views[0], scene.up, scene.near);
+    this.camera = new Orbit(scene.views[0], scene.up, scene.near, scene.far);
     const list = find('#views');
     list.append(...scene.views.map((view, i) => new Option(view.name, i)));
     list.value = 0;
     list.addEventListener('change', () => { this.camera.from(scene.views[list.value]); this.moved(); });
     find('#channel').addEventListener('change', () => this.moved());
     find('#save').addEventListener('click', () => this.save());
-    control(this.canvas, this.camera, () => this.moved());
+    // A camera that has moved is none of the list, so that each of the list can be chosen again.
+    control(this.canvas, this.camera, () => { list.selectedIndex = -1; this.moved(); });
     new ResizeObserver(() => this.moved()).observe(this.canvas);
+    const scaled = () => matchMedia(`(resolution: ${window.devicePixelRatio}dppx)`).addEventListener('change', () => { this.moved(); scaled(); }, { once: true });
+    scaled();
+    document.addEventListener('visibilitychange', () => { if (document.hidden && this.refines) this.refines.abort(); });
     this.draw();
   }
 
@@ -42,22 +47,32 @@ class Live {
     });
   }
 
-  // Asks for pictures, one after the other, as long as the page is open.
+  // Tells whether the picture at rest stays as it is.
+  sharp() {
+    if (this.factor === 1) return true;
+    const [width, height] = this.size(Math.ceil(this.factor / 2));
+    return this.scene.training && width * height / this.speed > LONGEST;
+  }
+
+  // Asks for pictures, one after the other, as long as the page is open and seen.
   async draw() {
     while (!this.ended) {
-      if (this.dirty) {
+      if (document.hidden) {
+        await new Promise(done => document.addEventListener('visibilitychange', done, { once: true }));
+        this.dirty = true;
+      } else if (this.dirty) {
         this.dirty = false;
         const [width, height] = this.size(1), pixels = this.speed * FRAME;
         this.factor = FACTORS.find(factor => width * height / factor ** 2 <= pixels) || FACTORS.at(-1);
         await this.picture(this.factor, null);
-      } else if (this.factor > 1) {
+      } else if (!this.sharp()) {
         await this.rest(REST);
         if (this.dirty) continue;
         this.factor = Math.ceil(this.factor / 2);
         await this.picture(this.factor, this.refines = new AbortController());
       } else {
         await this.rest(this.scene.training ? Math.max(AGAIN, PATIENCE * this.took) : Infinity);
-        if (!this.dirty && !document.hidden) await this.picture(1, this.refines = new AbortController());
+        if (!this.dirty && !document.hidden) await this.picture(this.factor, this.refines = new AbortController());
       }
       this.refines = null;
     }
@@ -83,9 +98,10 @@ class Live {
       const answer = await fetch('picture', { method: 'POST', body, signal: abort && abort.signal });
       if (!answer.ok) throw new Error((await answer.text()).trim());
       const image = await createImageBitmap(await answer.blob()), { canvas } = this, [w, h] = this.size(1);
-      if (this.dirty && abort) return;
+      if (this.dirty && abort) return image.close();
       if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
       this.context.drawImage(image, 0, 0, w, h);
+      image.close();
       this.took = performance.now() - begin;
       const rendered = Number(/dur=([\d.]+)/.exec(answer.headers.get('Server-Timing'))[1]);
       // Small pictures take some time however small they are.
@@ -93,9 +109,9 @@ class Live {
       this.status.textContent = `${width} × ${height} pixels in ${this.took.toFixed(0)} ms, rendered in ${rendered.toFixed(0)} ms`;
     } catch (error) {
       if (error.name === 'AbortError') return;
-      this.status.textContent = error instanceof TypeError ? 'the program has ended' : error.message;
-      if (error instanceof TypeError) this.ended = true;
-      else { this.factor = 1; await pause(AGAIN); }
+      this.status.textContent = error instanceof TypeError ? 'the program does not answer; trying again' : error.message;
+      await this.rest(AGAIN);
+      this.dirty = true;
     }
   }
 
@@ -109,10 +125,16 @@ class Live {
 
 // Shows the figures of the training, and draws its curves when they have changed.
 async function follow(live) {
-  const section = find('#training'), ask = async (path, method) => (await fetch(path, { method, body: method === 'POST' ? '' : undefined })).json();
-  section.hidden = false;
+  find('#training').hidden = false;
+  const ask = async (path, method) => {
+    const answer = await fetch(path, { method, body: method === 'POST' ? '' : undefined });
+    if (!answer.ok) throw new Error((await answer.text()).trim());
+    return answer.json();
+  };
   let steps = -1;
   const show = state => {
+    // An earlier state can come late.
+    if (live.ended && state.goes_on) return;
     const decibels = (name, x) => (x === null ? '' : `, ${name} ${x.toFixed(2)} dB`);
     find('#step').textContent = `step ${state.step} of ${state.steps}, ${state.seconds.toFixed(0)} s` +
       decibels('training rays', state.psnr) + decibels('validation views', state.validation_psnr) +
@@ -124,10 +146,13 @@ async function follow(live) {
     steps = state.step;
     if (!state.goes_on) live.ended = true;
   };
-  for (const id of ['stop', 'checkpoint']) find(`#${id}`).addEventListener('click', async () => show(await ask(id, 'POST')));
-  while (!live.ended) {
-    try { show(await ask('training', 'GET')); } catch { live.ended = true; live.status.textContent = 'the program has ended'; }
-    await pause(document.hidden ? 5 * ASK : ASK);
+  for (const id of ['stop', 'checkpoint']) find(`#${id}`).addEventListener('click', async () => {
+    try { show(await ask(id, 'POST')); } catch (error) { live.status.textContent = error.message; }
+  });
+  // Until the program ends, which writes the figures and the page of the run after the training.
+  for (let answers = true; answers || !live.ended;) {
+    try { show(await ask('training', 'GET')); answers = true; } catch { answers = false; }
+    await pause(answers && !document.hidden ? ASK : 5 * ASK);
   }
 }
 

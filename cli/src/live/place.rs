@@ -1,4 +1,4 @@
-//! Places: limits on what is done at once.
+//! Limits on the number of things that are done at the same time.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};

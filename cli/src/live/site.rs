@@ -30,7 +30,15 @@ pub struct Scene {
     up: [f64; 3],
     /// Smallest distance of the point around which the camera turns from a view.
     near: f64,
+    /// Largest coordinate of a camera.
+    far: f64,
 }
+
+/// Largest coordinate of a camera in a space that is not bent.
+const FAR: f64 = 1e6;
+/// Largest coordinate of a camera in contracted space, where the samples on a ray grow in number with the distance of the camera, and the same
+/// relative to the training cameras.
+const FAR_IN_CONTRACTED: (f64, f64) = (30.0, 2.0);
 
 impl Scene {
     /// Creates the scene of a dataset with its training cameras.
@@ -43,7 +51,12 @@ impl Scene {
             // Nothing is seen before depth 1.
             Space::Ndc { .. } => 2.0,
         };
-        Scene { title, views, up: up_axis(dataset.space(), &cameras).to_array(), near }
+        let farthest = cameras.iter().map(|camera| camera.position().abs().max_element()).fold(0.0, f64::max);
+        let far = match dataset.space() {
+            Space::Contracted => FAR_IN_CONTRACTED.0.max(FAR_IN_CONTRACTED.1 * farthest),
+            Space::Box | Space::Ndc { .. } => FAR,
+        };
+        Scene { title, views, up: up_axis(dataset.space(), &cameras).to_array(), near, far }
     }
 
     /// Creates a scene without a dataset: a camera that sees the box with this half width.
@@ -55,6 +68,7 @@ impl Scene {
             views: shots.iter().map(|shot| html::camera("outside", &shot.camera(SIZE))).collect(),
             up: [0.0, 0.0, 1.0],
             near: 0.1,
+            far: FAR,
         }
     }
 }
@@ -63,6 +77,8 @@ impl Scene {
 pub struct Site {
     page: String,
     scene: String,
+    /// Largest coordinate of a camera.
+    far: f64,
     desk: Desk,
     /// The run, while it is trained.
     training: Option<Arc<Training>>,
@@ -71,15 +87,15 @@ pub struct Site {
 
 impl Site {
     pub fn new(scene: &Scene, desk: Desk, training: Option<Arc<Training>>) -> Self {
-        let Scene { title, views, up, near } = scene;
-        let scene = json!({ "views": views, "up": up, "near": near, "most_pixels": super::MOST_PIXELS, "training": training.is_some() });
+        let Scene { title, views, up, near, far } = scene;
+        let scene = json!({ "views": views, "up": up, "near": near, "far": far, "most_pixels": super::MOST_PIXELS, "training": training.is_some() });
         let body = format!("{}<script>\n{}{}</script>\n", include_str!("page.html"), html::CAMERA, include_str!("page.js"));
         let page = html::page(title, include_str!("page.css"), &body);
-        Site { page, scene: scene.to_string(), desk, training, pictures: Places::new(PICTURES) }
+        Site { page, scene: scene.to_string(), far: *far, desk, training, pictures: Places::new(PICTURES) }
     }
 
     fn picture(&self, request: &Request, gone: &dyn Fn() -> bool) -> Response {
-        let shot = match Shot::parse(&request.body) {
+        let shot = match Shot::parse(&request.body, self.far) {
             Ok(shot) => shot,
             Err(why) => return Response::refusal(400, &why),
         };

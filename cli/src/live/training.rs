@@ -226,8 +226,8 @@ impl<'c, 'a> LiveTraining<'c, 'a> {
         }
         let aabb = model.aabb();
         let viewer = Viewer::of(model, &ViewOptions::over(self.background));
-        if let Some(seconds) = order.fill_with(0.5 * (aabb.max - aabb.min).max_element(), &viewer) {
-            self.pace = seconds / pixels;
+        if order.fill_with(0.5 * (aabb.max - aabb.min).max_element(), &viewer).is_some() {
+            self.pace = start.elapsed().as_secs_f64() / pixels;
         }
         self.rests = Instant::now() + start.elapsed();
     }

@@ -1,4 +1,4 @@
-//! The ops.
+//! The methods of `Tensor` that compute. Each calls the op of `autograd` of the same name.
 
 use super::operands::{Operand, broadcast, check_size};
 use super::{PyTensor, Values, each};

@@ -123,9 +123,9 @@ pub struct TrainArgs {
     preset: Option<String>,
 
     /// Duration of training on this machine, such as 90s, 5m or 1h. The program measures the speed of the machine, scales the lengths of all
-    /// stages, and reduces the resolution of the finest stages if the time is short. With the presets quality and photos, the length of
-    /// the last stage is adjusted during training; quality has a smaller color network if the time is short (tensorf.short). The settings
-    /// record the plan
+    /// stages, and reduces the resolution of the finest stages if the time is short. With the presets quality, tensorf, photos and
+    /// ngp, the length of the last stage is adjusted during training. If the time is short, quality, tensorf and photos have a smaller color
+    /// network (tensorf.short). The settings record the plan
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,
 
@@ -145,7 +145,7 @@ pub struct TrainArgs {
     #[arg(long, value_name = "K", help_heading = "Scene", value_parser = whole::<i64>(1, MOST_REDUCTION), allow_negative_numbers = true)]
     downscale: Option<i64>,
 
-    /// Background color: white, black, or three numbers r,g,b in [0, 1] [default: white]
+    /// Background color: white, black, or three numbers r,g,b in [0, 1] [default: white; preset photos: 0.5,0.5,0.5]
     #[arg(long, help_heading = "Scene", value_parser = background, allow_hyphen_values = true)]
     background: Option<[f64; 3]>,
 

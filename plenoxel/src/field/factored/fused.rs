@@ -23,7 +23,7 @@ use crate::field::grouping::{Grouping, Groups};
 use crate::geometry::Aabb;
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
-use crate::sampling::{Jitter, Samples, Spacing};
+use crate::sampling::{Jitter, RAYS_OF_PACKET, Samples, Spacing};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
 pub use densities::{Densities, densities_at};
 use forward::{Block, Scene, Tables};
@@ -143,8 +143,8 @@ fn render_inputs<T: Real>(
     let cells = densities.map(Densities::cells).or(options.occupancy).or(field.reach());
     let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), densities };
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
-    // Without an adjoint, small blocks share the work of background and matter among the threads more evenly.
-    let size = if keep { block_of(n) } else { block_of(n).div_ceil(4) };
+    // Without an adjoint, small blocks share the work of background and matter among the threads more evenly. They are whole packets of pixels.
+    let size = if keep { block_of(n) } else { block_of(n).div_ceil(4).next_multiple_of(RAYS_OF_PACKET) };
     let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();
     let blocks = parallel::map_items(parts, |b, (pixels, sparsity)| {
         let block = scene.render(b * size, pixels, sparsity);

@@ -70,7 +70,7 @@ pub const PRESETS: [Preset; 11] = [
     Preset {
         name: "plenoxels",
         purpose: "Plenoxels as published, for comparison",
-        time: "2 hours or more at 800 x 800",
+        time: "1.6 hours or more at 800 x 800",
         text: include_str!("../../../presets/plenoxels.toml"),
     },
     Preset {

@@ -139,7 +139,8 @@ impl<'a, T: Real> Scene<'a, T> {
         let (along, color, sigma) = (block.along(), block.color(), block.sigma());
         for ((own, pixel), sparsity) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0).zip(sparsity) {
             *pixel = along.pixel(own.clone(), self.batch.background, |i| sigma[i], &color);
-            *sparsity = sigma[own].iter().map(|&sigma| along::sparsity(sigma)).sum();
+            // Pictures do not need it.
+            *sparsity = if self.densities.is_some() { T::zero() } else { sigma[own].iter().map(|&sigma| along::sparsity(sigma)).sum() };
         }
         drop(color);
         block
