@@ -130,7 +130,7 @@ impl Order {
 
     /// Renders the picture with a viewer of a model and sends it, unless the program is interrupted.
     pub fn fill_with(self, half_width: f64, viewer: &Viewer<'_, f32>) -> Option<f64> {
-        self.fill(half_width, |camera, stopped| viewer.see_unless(camera, &|| stopped() || interrupt::requested()))
+        self.fill(half_width, |camera, stopped| viewer.see_unless(camera, || stopped() || interrupt::requested()))
     }
 }
 
