@@ -38,7 +38,7 @@ pub struct Scene {
 const FAR: f64 = 1e6;
 /// Largest coordinate of a camera in contracted space, where the samples on a ray grow in number with the distance of the camera, and the same
 /// relative to the training cameras.
-const FAR_IN_CONTRACTED: (f64, f64) = (30.0, 2.0);
+const FAR_IN_CONTRACTED: (f64, f64) = (10.0, 2.0);
 
 impl Scene {
     /// Creates the scene of a dataset with its training cameras.
