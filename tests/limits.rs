@@ -100,6 +100,16 @@ fn settings_with_long_names_take_no_more_than_others() {
 }
 
 #[test]
+fn pictures_for_the_page_of_a_training_count() {
+    let _alone = alone();
+    let folder = Folder::new("limit-view");
+    let run = folder.path("run");
+    let small = ["--preset", "demo", "--scene-size", "16x12", "--scene-views", "2,1,1", "--no-report"];
+    let train = [&["train", "--view", "--out", &run][..], &small].concat();
+    limited(300, &train).refused(2, &["--view: the command needs about", "--max-memory allows 300 MB; leave it out"]);
+}
+
+#[test]
 fn what_a_run_says_of_itself_is_bounded_too() {
     let _alone = alone();
     let folder = Folder::new("limit-run");

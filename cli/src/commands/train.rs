@@ -6,7 +6,7 @@ mod screen;
 
 use super::report;
 use crate::interrupt::{self, Watch};
-use crate::live::{Door, LiveTraining, Training};
+use crate::live::{Door, LiveTraining, MOST_PIXELS, Training};
 use crate::progress::Console;
 pub use flags::{BuiltInScene, NOT_WHEN_RESUMED, TrainArgs, size};
 use plenoxel::error::Result;
@@ -118,6 +118,7 @@ fn options(args: &TrainArgs, stage_psnr: bool, live: Option<Arc<Training>>) -> R
         stage_psnr,
         test_views: if args.no_evaluate { 0 } else { args.test_views.unwrap_or(usize::MAX) },
         report: !args.no_report,
+        shown_pixels: if live.is_some() { MOST_PIXELS } else { 0 },
         stop: Box::new(interrupt::requested),
         save: Box::new(move || live.as_ref().is_some_and(|live| live.wants_checkpoint())),
     }

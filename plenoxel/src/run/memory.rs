@@ -47,6 +47,8 @@ const BASE: u64 = 60_000_000;
 const CARVING_PIXELS: u64 = 1 << 16;
 /// Bytes per pixel of rendered pictures: five numbers each for colors and normals, their encoded form, and the file.
 const PICTURE_BYTES: u64 = 100;
+/// Advice for the page of `--view`, for messages.
+const LEAVE_OUT: &str = "leave it out";
 /// Bytes per pixel of a view during its comparison with the photograph: the picture, the photograph in floats, and both in double precision for SSIM.
 const COMPARED_BYTES: u64 = 82;
 /// Bytes per pixel of a view while its panel is drawn at the end of training: picture, photograph, error and depth, all four side by side in floats
@@ -101,6 +103,7 @@ impl Estimate {
         let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let step = step.max().unwrap_or(0).max(hull);
         let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
+        let shown = PICTURE_BYTES * options.shown_pixels as u64;
         let evaluation = evaluation_samples(config, config.evaluation, &shape) * evaluation_bytes_per_sample(config.engine, &shape);
         // A copy of the tables as bytes.
         let saving = tables(index);
@@ -117,10 +120,11 @@ impl Estimate {
             (evaluation, ("evaluation".to_owned(), "use fewer samples per ray")),
             (grid + optimizer + saving, voxels),
             (page, ("report.html".to_owned(), "leave it out with --no-report")),
+            (shown, ("--view".to_owned(), LEAVE_OUT)),
         ];
         let (key, advice) = parts.into_iter().max_by_key(|(bytes, _)| *bytes).map(|(_, setting)| setting).unwrap_or_default();
         Estimate {
-            images,
+            images: images + shown,
             grid,
             optimizer,
             // The free buffers of the graph engine differ in size between training and evaluation, and both are kept.
@@ -221,6 +225,7 @@ impl Estimate {
         let Memory { parameters, ray, ray_of_picture, rays: key_of_rays, size, smaller } = recipe.memory(config.engine);
         let rays = recipe.stages().iter().map(|stage| stage.rays_per_step.unwrap_or(config.rays_per_step) as u64).max().unwrap_or(0);
         let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
+        let shown = PICTURE_BYTES * options.shown_pixels as u64;
         let (width, height) = dataset.size();
         let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
@@ -231,10 +236,11 @@ impl Estimate {
             (images, "downscale".to_owned(), "reduce the images by a larger factor"),
             (step, own(key_of_rays), "use fewer rays in a step"),
             (3 * parameters, own(size), smaller),
+            (shown, "--view".to_owned(), LEAVE_OUT),
         ];
         let (_, key, advice) = parts.into_iter().max_by_key(|(bytes, ..)| *bytes).unwrap_or_default();
         // The values of a stage and of the stage before, and both moments of Adam.
-        Estimate { images, grid: 2 * parameters, optimizer: 2 * parameters, step, expected: true, key, advice }
+        Estimate { images: images + shown, grid: 2 * parameters, optimizer: 2 * parameters, step, expected: true, key, advice }
     }
 
     /// Estimates reading a trained grid of `voxels` voxels and exporting all of them, with `bytes_per_voxel` for the export.

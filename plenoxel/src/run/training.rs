@@ -77,6 +77,8 @@ pub struct RunOptions {
     pub test_views: usize,
     /// Include report.html in the memory estimate.
     pub report: bool,
+    /// Largest number of pixels of a picture that a listener renders between steps, for the memory estimate; 0 for none.
+    pub shown_pixels: usize,
     /// Called after each step: `true` saves the run and stops it.
     pub stop: Box<dyn Fn() -> bool + Send + Sync>,
     /// Called after each step: `true` saves a checkpoint.
@@ -92,6 +94,7 @@ impl Default for RunOptions {
             stage_psnr: false,
             test_views: usize::MAX,
             report: false,
+            shown_pixels: 0,
             stop: Box::new(|| false),
             save: Box::new(|| false),
         }
