@@ -3,6 +3,7 @@
 use super::new_run::load;
 use super::panels::Panels;
 use super::trained_run::{Found, Loaded, TrainedRun};
+use super::whole;
 use crate::progress::{Console, is_stdout};
 use clap::{Args, ValueHint};
 use plenoxel::dataset::Split;
@@ -40,6 +41,10 @@ pub struct EvaluateArgs {
     #[command(flatten)]
     run: TrainedRun,
 
+    /// Evaluate N evenly spaced views of the split instead of all of them. The scores are then not written to the run folder
+    #[arg(long, alias = "test-views", value_name = "N", help_heading = "Evaluation", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "keep", allow_negative_numbers = true)]
+    views: Option<usize>,
+
     /// Print only the JSON object
     #[arg(long, help_heading = "Output")]
     json: bool,
@@ -76,10 +81,10 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         let found = format!("the run was trained on another scene: {}, not {}", about.scene, dataset.name());
         return Err(Error::usage("--keep", found, "evaluate the views of its scene, or leave out --keep"));
     }
-    let keeps = (args.keep || args.run.is_as_trained()) && same_scene && lacks_scores;
+    let keeps = (args.keep || args.run.is_as_trained()) && args.views.is_none() && same_scene && lacks_scores;
     // The lock is held until the panels and the scores are written.
     let folder = if keeps { folder.shared("RUN")? } else { folder };
-    let views = load(console, &dataset, args.run.split, &source)?;
+    let views = load(console, &dataset, args.run.split, args.views.unwrap_or(usize::MAX), &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
     if !same_scene {
         console.note(&format!("the run was trained on another scene: {}, not {}", about.scene, dataset.name()));

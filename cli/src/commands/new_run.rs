@@ -6,6 +6,7 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::Result;
 use plenoxel::model::plenoxels::config::Config;
 use plenoxel::run::data::DataSource;
+use plenoxel::run::evenly_spaced;
 use plenoxel::run::machine;
 use plenoxel::space::Space;
 
@@ -17,10 +18,11 @@ pub fn loading(split: Split, source: &DataSource) -> String {
     }
 }
 
-/// Loads the views of a split, with progress.
-pub fn load(console: &Console<'_>, dataset: &Dataset, split: Split, source: &DataSource) -> Result<Vec<View>> {
-    let count = console.count(&loading(split, source), dataset.count(split));
-    dataset.load(split, &|done, total| count.at(done, total))
+/// Loads at most `most` evenly spaced views of a split, with progress.
+pub fn load(console: &Console<'_>, dataset: &Dataset, split: Split, most: usize, source: &DataSource) -> Result<Vec<View>> {
+    let numbers = evenly_spaced(dataset.count(split), most);
+    let count = console.count(&loading(split, source), numbers.len());
+    dataset.load_views(split, &numbers, &|done, total| count.at(done, total))
 }
 
 /// Prints the scene and the machine.

@@ -144,14 +144,18 @@ impl<T: Real> Dvgo<T> {
         };
         match found.bounds() {
             Some(_) => Ok(found),
-            None => Err(Error::usage(key, "no voxel is this opaque", "use a smaller opacity, or more steps")),
+            None => Err(Error::usage(
+                key,
+                "no voxel is this opaque, so the training has learned nothing yet",
+                "use more steps, more --time, or a smaller opacity",
+            )),
         }
     }
 
     /// Leaves out the cells whose voxel and neighbours are transparent.
     fn prune(&mut self) -> Result<()> {
         let (aabb, cells) = self.cells();
-        let opaque = self.opaque("fine_above", self.config.fine_above)?.dilated(1);
+        let opaque = self.opaque("dvgo.fine_above", self.config.fine_above)?.dilated(1);
         self.field.occupied = Some(match &self.field.occupied {
             Some(sampled) => opaque.intersection(&sampled.resampled(aabb, cells)),
             None => opaque,
@@ -172,7 +176,7 @@ impl<T: Real> Dvgo<T> {
 
     /// Replaces the coarse field by a fine one in the box of what is opaque.
     fn begin_fine(&mut self) -> Result<()> {
-        let opaque = self.opaque("occupied_above", self.config.occupied_above)?;
+        let opaque = self.opaque("dvgo.occupied_above", self.config.occupied_above)?;
         let tight = opaque.bounds().unwrap_or(self.field.aabb());
         let more = 0.5 * (self.config.box_scale - 1.0) * (tight.max - tight.min);
         let aabb = Aabb { min: tight.min - more, max: tight.max + more };

@@ -62,13 +62,14 @@ pub fn plan<R: Recipe + Clone>(
     let startup = step(&mut trainer)?;
     let (from, cost) = measured.measured_step(trainer.model());
     let mut measured_from = startup;
-    while trainer.steps_taken() < (from + 1).min(most) {
+    // Measuring ends with the time, which is then too short.
+    while trainer.steps_taken() < (from + 1).min(most) && measured_from < seconds {
         measured_from = step(&mut trainer)?;
     }
     let measuring = if keep && recipe.steps_before_length_matters() > 0 { MEASURING_FIRST } else { MEASURING };
     let enough = (measuring.0 * seconds).min(measuring.1);
     let (mut count, mut spent) = (0, measured_from);
-    while trainer.steps_taken() < most && (count < 20 || spent - measured_from < enough) {
+    while trainer.steps_taken() < most && (count < 20 || spent - measured_from < enough) && (count == 0 || spent < seconds) {
         spent = step(&mut trainer)?;
         count += 1;
     }
@@ -87,8 +88,8 @@ pub fn plan<R: Recipe + Clone>(
     }
     let left = seconds - spent - startup;
     if left <= 0.0 {
-        let found = format!("{} is too short: beginning to train takes {}", clock(seconds), clock(spent + startup));
-        return Err(Error::usage("--time", found, "give it more time"));
+        let found = format!("{} is too short: beginning to train takes {} or more", clock(seconds), clock(spent + startup));
+        return Err(Error::usage("--time", found, "give it several times as much"));
     }
     Ok(Planned { recipe: planned(left, 0), begun: None })
 }

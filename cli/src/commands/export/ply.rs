@@ -156,7 +156,7 @@ fn look(args: &PlyArgs, config: &Config, record: RunRecord, grid: &VoxelGrid<f32
     let estimate = Estimate::of_visibility(config, grid, &dataset);
     console.note(&estimate.describe());
     estimate.check()?;
-    let views = load(console, &dataset, Split::Train, &source)?;
+    let views = load(console, &dataset, Split::Train, usize::MAX, &source)?;
     // The number of batches is known at the first one.
     let count = RefCell::new(None);
     Ok(visibility(grid, views, config, &|done, total| {

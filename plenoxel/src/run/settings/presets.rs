@@ -70,7 +70,7 @@ pub const PRESETS: [Preset; 11] = [
     Preset {
         name: "plenoxels",
         purpose: "Plenoxels as published, for comparison",
-        time: "1.6 hours or more at 800 x 800",
+        time: "from 1.6 hours at 800 x 800",
         text: include_str!("../../../presets/plenoxels.toml"),
     },
     Preset {
