@@ -93,8 +93,13 @@ def test_an_interruption_saves_the_run(scene, small, run, tmp_path):
             time.sleep(0.5)
         return 0.0 * step.rgb.sum()
 
-    with pytest.raises(px.Interrupted, match="resume with plenoxel.resume") as interrupted:
-        px.train(scene, out=tmp_path / "run", **small, callback=callback, loss=waiting)
+    # A program that a shell has started in the background ignores the signal.
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(px.Interrupted, match="resume with plenoxel.resume") as interrupted:
+            px.train(scene, out=tmp_path / "run", **small, callback=callback, loss=waiting)
+    finally:
+        signal.signal(signal.SIGINT, former)
     assert 4 <= interrupted.value.steps <= 11
     assert isinstance(interrupted.value, KeyboardInterrupt) and interrupted.value.total == 30
     done = px.resume(interrupted.value.folder, page=False, progress=False)

@@ -4,7 +4,7 @@
 
 ADDRESS is what the program printed. The script prints the time of the first picture, the pictures a second while the mouse drags the scene, and every message of the
 console. It saves screenshots in FOLDER: at rest, in the middle of the dragging, of each channel, and from the fourth camera. With `--stop` it also presses
-"save a checkpoint" and "save and stop". It exits with 1 if the console has a message or a request failed.
+"save a checkpoint" and "save and stop". It exits with 1 if the console had a message, or a request failed, before that.
 
 Needs Playwright (`pip install playwright`) and Chromium (Debian's package `chromium`), which it does not install.
 """
@@ -94,6 +94,8 @@ def main():
         page.select_option("#views", "3")
         page.wait_for_timeout(REST)
         page.screenshot(path=asked.folder / "camera.png")
+        # A program that has stopped no longer answers, which the console tells.
+        before_stop = list(messages)
         if asked.stop:
             for button in ["#checkpoint", "#stop"]:
                 page.click(button)
@@ -101,8 +103,8 @@ def main():
                 print(f"{button}:", page.inner_text("#message"))
             page.screenshot(path=asked.folder / "stopped.png")
         browser.close()
-    print("console:", messages or "clean")
-    sys.exit(bool(messages))
+    print("console:", before_stop or "clean")
+    sys.exit(bool(before_stop))
 
 
 if __name__ == "__main__":

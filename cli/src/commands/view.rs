@@ -49,7 +49,7 @@ pub fn run(args: &ViewArgs, console: &Console<'_>) -> Result<()> {
     let title = found.folder.path().file_name().unwrap_or_default().to_string_lossy().into_owned();
     let scene = match &dataset {
         Some(dataset) => Scene::of(title, dataset),
-        None => Scene::around_box(title, half_width),
+        None => Scene::around_box(title, half_width, model.space()),
     };
     let (desk, studio) = live::studio();
     let interrupt = Watch::begin();

@@ -57,8 +57,9 @@ class Orbit {
 
   // Rotates the scene to the right and down, in radians.
   turn(right, down) {
-    const arm = this.spin(this.eye.map((p, a) => p - this.pivot[a]), right, down);
-    this.eye = arm.map((p, a) => p + this.pivot[a]);
+    const { rotation } = this, arm = this.spin(this.eye.map((p, a) => p - this.pivot[a]), right, down);
+    const eye = arm.map((p, a) => p + this.pivot[a]);
+    if (this.holds(eye)) this.eye = eye; else this.rotation = rotation;
   }
 
   // Rotates the camera in its place: the scene moves to the right and down, in radians.

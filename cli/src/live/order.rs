@@ -116,7 +116,7 @@ impl Order {
     }
 
     /// Renders the picture with `see`, which is given the camera and a function that says when to stop, and sends it. The depth of the colors is that of a
-    /// box with this half width. Returns the duration in seconds; `None` if the client has gone meanwhile.
+    /// box with this half width. Returns the duration in seconds; `None` if `see` was stopped.
     pub fn fill(self, half_width: f64, see: impl FnOnce(&Camera, &dyn Fn() -> bool) -> Option<Picture>) -> Option<f64> {
         let Order { shot: Shot { camera, channel, .. }, cancelled, reply } = self;
         let start = Instant::now();
@@ -128,7 +128,7 @@ impl Order {
         Some(seconds)
     }
 
-    /// Renders the picture with a viewer of a model and sends it, unless the program is interrupted.
+    /// Renders the picture with a viewer of a model and sends it, as [`Order::fill`] does. It stops if the client has gone or the program is interrupted.
     pub fn fill_with(self, half_width: f64, viewer: &Viewer<'_, f32>) -> Option<f64> {
         self.fill(half_width, |camera, stopped| viewer.see_unless(camera, || stopped() || interrupt::requested()))
     }
@@ -148,7 +148,7 @@ pub fn studio() -> (Desk, Studio) {
 }
 
 impl Desk {
-    /// Orders a picture and waits for it; `None` if the client has gone meanwhile, which cancels the order, or if the studio is closed.
+    /// Orders a picture and waits for it; `None` if the client has gone meanwhile, which cancels the order, if the program is interrupted, or if the studio is closed.
     pub fn picture(&self, shot: Shot, gone: &dyn Fn() -> bool) -> Option<Frame> {
         let (reply, frame) = mpsc::sync_channel(1);
         let cancelled = Arc::new(AtomicBool::new(false));

@@ -67,12 +67,12 @@ class Live {
         await this.picture(this.factor, null);
       } else if (!this.sharp()) {
         await this.rest(REST);
-        if (this.dirty) continue;
+        if (this.dirty || this.ended) continue;
         this.factor = Math.ceil(this.factor / 2);
         await this.picture(this.factor, this.refines = new AbortController());
       } else {
         await this.rest(this.scene.training ? Math.max(AGAIN, PATIENCE * this.took) : Infinity);
-        if (!this.dirty && !document.hidden) await this.picture(this.factor, this.refines = new AbortController());
+        if (!this.dirty && !this.ended && !document.hidden) await this.picture(this.factor, this.refines = new AbortController());
       }
       this.refines = null;
     }
@@ -108,7 +108,7 @@ class Live {
       this.speed += 0.5 * (width * height / Math.max(1, rendered) - this.speed);
       this.status.textContent = `${width} × ${height} pixels in ${this.took.toFixed(0)} ms, rendered in ${rendered.toFixed(0)} ms`;
     } catch (error) {
-      if (error.name === 'AbortError') return;
+      if (error.name === 'AbortError' || this.ended) return;
       this.status.textContent = error instanceof TypeError ? 'the program does not answer; trying again' : error.message;
       await this.rest(AGAIN);
       this.dirty = true;

@@ -8,6 +8,7 @@ use super::training::Training;
 use crate::html;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use plenoxel::camera::Camera;
 use plenoxel::camera_path::{Turntable, up_axis};
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::space::Space;
@@ -36,9 +37,19 @@ pub struct Scene {
 
 /// Largest coordinate of a camera in a space that is not bent.
 const FAR: f64 = 1e6;
-/// Largest coordinate of a camera in contracted space, where the samples on a ray grow in number with the distance of the camera, and the same
-/// relative to the training cameras.
-const FAR_IN_CONTRACTED: (f64, f64) = (10.0, 2.0);
+/// Largest coordinate of a camera in contracted space, where the samples on a ray grow in number with the distance of the camera. It is at least
+/// `FAR_OF_CAMERAS` times the largest of the training cameras.
+const FAR_IN_CONTRACTED: f64 = 10.0;
+const FAR_OF_CAMERAS: f64 = 2.0;
+
+/// Returns the largest coordinate of a camera in a space with these cameras.
+fn far<'c>(space: Space, cameras: impl Iterator<Item = &'c Camera>) -> f64 {
+    let farthest = cameras.map(|camera| camera.position().abs().max_element()).fold(0.0, f64::max);
+    match space {
+        Space::Contracted => FAR_IN_CONTRACTED.max(FAR_OF_CAMERAS * farthest),
+        Space::Box | Space::Ndc { .. } => FAR,
+    }
+}
 
 impl Scene {
     /// Creates the scene of a dataset with its training cameras.
@@ -51,24 +62,20 @@ impl Scene {
             // Nothing is seen before depth 1.
             Space::Ndc { .. } => 2.0,
         };
-        let farthest = cameras.iter().map(|camera| camera.position().abs().max_element()).fold(0.0, f64::max);
-        let far = match dataset.space() {
-            Space::Contracted => FAR_IN_CONTRACTED.0.max(FAR_IN_CONTRACTED.1 * farthest),
-            Space::Box | Space::Ndc { .. } => FAR,
-        };
+        let far = far(dataset.space(), cameras.iter());
         Scene { title, views, up: up_axis(dataset.space(), &cameras).to_array(), near, far }
     }
 
-    /// Creates a scene without a dataset: a camera that sees the box with this half width.
-    pub fn around_box(title: String, half_width: f64) -> Self {
+    /// Creates a scene without a dataset: a camera that sees the box with this half width in a space.
+    pub fn around_box(title: String, half_width: f64, space: Space) -> Self {
         const SIZE: (usize, usize) = (800, 600);
-        let shots = Turntable::around_box(half_width).orbit(1);
+        let cameras: Vec<Camera> = Turntable::around_box(half_width).orbit(1).iter().map(|shot| shot.camera(SIZE)).collect();
         Scene {
             title,
-            views: shots.iter().map(|shot| html::camera("outside", &shot.camera(SIZE))).collect(),
+            views: cameras.iter().map(|camera| html::camera("outside", camera)).collect(),
             up: [0.0, 0.0, 1.0],
             near: 0.1,
-            far: FAR,
+            far: far(space, cameras.iter()),
         }
     }
 }

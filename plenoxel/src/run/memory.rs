@@ -26,7 +26,7 @@ use std::path::Path;
 /// An estimate in bytes, by purpose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate {
-    /// 8-bit images of the training views or of the test views, whichever are more, and full-size images during decoding.
+    /// 8-bit images of the training views or of the test views, whichever are more, full-size images during decoding, and the pictures of the page of `--view`.
     pub images: u64,
     /// Tables of the finest grid, of the previous grid, and of kept stages.
     pub grid: u64,
