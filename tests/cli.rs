@@ -473,7 +473,7 @@ fn what_is_carved_is_a_run_that_other_commands_take_and_training_starts_from() {
     for file in ["checkpoint.safetensors", "config.toml", "images/carved.png", "result.json", "run.json", "README.md"] {
         assert!(Path::new(&format!("{carved}/{file}")).exists(), "{file}");
     }
-    // Some of the views give no score of the run.
+    // Scores of a part of the views are not written to the run folder.
     let few = plenoxel(&["evaluate", &carved, "--quiet", "--views", "1"]).json();
     assert!(few["views"] == 1 && !Path::new(&format!("{carved}/evaluation.json")).exists(), "{few}");
     plenoxel(&["evaluate", &carved, "--views", "1", "--keep"]).refused(2, &["--views", "--keep"]);

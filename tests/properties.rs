@@ -266,7 +266,7 @@ fn what_comparing_large_views_takes_is_estimated() {
     let config = Config::default();
     let grid = VoxelGrid::<f32>::random(config.grid_shape(8), 1.0, 0.1, 1);
     let stored = Stored::Grid { shape: *grid.shape(), voxels: 512 };
-    let estimate = Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, Split::Test)));
+    let estimate = Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, Split::Test, usize::MAX)));
     let viewer = grid_viewer(&grid, config.evaluation, config.engine, config.background);
     let (scores, peak) = peak_of(|| viewer.compare(&views, |_, _, _, _| Ok(())).expect("scores"));
     assert!(scores.psnr().is_some() && peak as u64 <= estimate.step + (20 << 20), "{peak} bytes, and {} estimated", estimate.step);

@@ -190,7 +190,7 @@ impl TrainedRun {
                 return Err(Error::usage("split", format!("the scene has no {split} views"), "choose another split"));
             }
             let stored = Stored::read(&self.folder.existing_checkpoint()?)?;
-            Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, split))).check()?;
+            Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, split, usize::MAX))).check()?;
             let loaded = self.loaded()?;
             let views = dataset.load(split, &|_, _| ())?;
             scores(&*loaded.model, &views, split, &dataset, &config, &options)

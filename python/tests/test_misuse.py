@@ -80,7 +80,7 @@ def test_cameras_that_look_away_are_warned_of(arrays):
 
 
 TRAININGS = {
-    "an unknown key": ({"resolution": 3}, px.SettingsError, "resolution: unknown key `resolution`; other keys: stages[*].resolution"),
+    "an unknown key": ({"resolution": 3}, px.SettingsError, "resolution: unknown key `resolution`; similar keys elsewhere: stages[*].resolution"),
     "a misspelled key": ({"rays_per_stp": 3}, px.SettingsError, "did you mean `rays_per_step`?"),
     "a misspelled table": ({"losses": {"msee": 1}}, px.SettingsError, "losses.msee"),
     "a value of the wrong type": ({"rays_per_step": "many"}, px.SettingsError, "rays_per_step"),

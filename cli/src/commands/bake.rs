@@ -89,7 +89,7 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     let dataset = data.reopen(&config)?;
     let out = args.out.clone().map_or_else(|| beside(&args.run, "baked"), Ok)?;
     let folder = NewFolder::choose(Some(&out), dataset.name(), args.force)?;
-    let estimate = Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, Split::Test)));
+    let estimate = Estimate::of_evaluation(&config, config.evaluation, &stored, Some((&dataset, Split::Test, COMPARED)));
     console.note(&estimate.describe());
     estimate.check()?;
     let (trained, about) = model::open(&path, &config)?;

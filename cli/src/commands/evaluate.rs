@@ -42,7 +42,7 @@ pub struct EvaluateArgs {
     run: TrainedRun,
 
     /// Evaluate N evenly spaced views of the split instead of all of them. The scores are then not written to the run folder
-    #[arg(long, alias = "test-views", value_name = "N", help_heading = "Evaluation", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "keep", allow_negative_numbers = true)]
+    #[arg(long, alias = "test-views", value_name = "N", help_heading = "Scene", value_parser = whole::<usize>(1, usize::MAX as u64), conflicts_with = "keep", allow_negative_numbers = true)]
     views: Option<usize>,
 
     /// Print only the JSON object
@@ -70,9 +70,10 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
         check_keep(args.run.split, lacks_scores)?;
     }
     let dataset = args.run.views(&found)?;
+    let most = args.views.unwrap_or(usize::MAX);
     args.out.iter().try_for_each(|out| super::check_replaceable(out, &[&found.folder], found.source.path()))?;
     let Loaded { model, about, view } = args.run.of.load(&found, console, |sampling, stored| {
-        Estimate::of_evaluation(&found.config, sampling, stored, Some((&dataset, args.run.split)))
+        Estimate::of_evaluation(&found.config, sampling, stored, Some((&dataset, args.run.split, most)))
     })?;
     let Found { folder, config, preset, source, .. } = found;
     // Another scene is an error only with --keep, because a folder may have been renamed.
@@ -84,7 +85,7 @@ pub fn run(args: &EvaluateArgs, console: &Console<'_>) -> Result<()> {
     let keeps = (args.keep || args.run.is_as_trained()) && args.views.is_none() && same_scene && lacks_scores;
     // The lock is held until the panels and the scores are written.
     let folder = if keeps { folder.shared("RUN")? } else { folder };
-    let views = load(console, &dataset, args.run.split, args.views.unwrap_or(usize::MAX), &source)?;
+    let views = load(console, &dataset, args.run.split, most, &source)?;
     let seconds_load = start.elapsed().as_secs_f64();
     if !same_scene {
         console.note(&format!("the run was trained on another scene: {}, not {}", about.scene, dataset.name()));

@@ -37,8 +37,11 @@ class Orbit {
 
   axis(k) { return this.rotation.slice(3 * k, 3 * k + 3); }
 
-  // Tells whether the camera may move there.
-  holds(eye) { return [eye, this.eye].map(place => Math.max(this.far, ...place.map(Math.abs))).reduce((next, now) => next <= now); }
+  // Tells whether the camera may move there: within `far`, or not farther out than it is.
+  holds(eye) {
+    const reach = place => Math.max(...place.map(Math.abs));
+    return reach(eye) <= Math.max(this.far, reach(this.eye));
+  }
 
   // Distance from the pivot.
   away() { return Math.hypot(...this.eye.map((p, a) => p - this.pivot[a])); }

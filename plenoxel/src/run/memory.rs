@@ -143,18 +143,18 @@ impl Estimate {
         available().map(|available| (available.saturating_sub(self.total() - held) / row) as usize)
     }
 
-    /// Estimates rendering a trained grid of `voxels` voxels, and comparing it with the views of a split if `compare` has one.
-    pub fn of_evaluation(config: &Config, sampling: Sampling, stored: &Stored, compare: Option<(&Dataset, Split)>) -> Self {
+    /// Estimates rendering a stored model, and comparing it with at most so many views of a split if `compare` has one.
+    pub fn of_evaluation(config: &Config, sampling: Sampling, stored: &Stored, compare: Option<(&Dataset, Split, usize)>) -> Self {
         let rendering = match stored {
             Stored::Grid { shape, .. } => evaluation_samples(config, sampling, shape) * evaluation_bytes_per_sample(config.engine, shape),
             Stored::Other { recipe, .. } => EVALUATION_RAYS * recipe.memory(config.engine).ray_of_picture,
         };
         Estimate {
-            images: compare.map_or(0, |(dataset, split)| images(dataset, config.downscale, dataset.count(split))),
+            images: compare.map_or(0, |(dataset, split, most)| images(dataset, config.downscale, dataset.count(split).min(most))),
             // The file and the tables read from it.
             grid: 2 * stored.bytes(),
             optimizer: 0,
-            step: rendering + compare.map_or(0, |(dataset, split)| comparison(dataset, split, COMPARED_BYTES)),
+            step: rendering + compare.map_or(0, |(dataset, split, _)| comparison(dataset, split, COMPARED_BYTES)),
             expected: false,
             key: "RUN".to_owned(),
             advice: "use a machine with more memory, or fewer --samples",
@@ -165,7 +165,7 @@ impl Estimate {
     /// ([`visibility`](crate::run::visibility::visibility())).
     pub fn of_visibility(config: &Config, grid: &VoxelGrid<f32>, dataset: &Dataset) -> Self {
         let stored = Stored::Grid { shape: *grid.shape(), voxels: grid.lattice().present() };
-        let rendering = Self::of_evaluation(config, config.evaluation, &stored, Some((dataset, Split::Train)));
+        let rendering = Self::of_evaluation(config, config.evaluation, &stored, Some((dataset, Split::Train, usize::MAX)));
         // The sums of each row.
         let sums = grid.lattice().rows() * (size_of::<[u64; 5]>() + size_of::<[f32; 6]>());
         Estimate { grid: rendering.grid + sums as u64, ..rendering }

@@ -192,7 +192,7 @@ fn check_key(pattern: &str, key: &str, place: &str) -> Result<()> {
     };
     match places.is_empty() {
         true => Err(unknown_name("key", key, &known, place)),
-        false => Err(Error::usage(place, format!("unknown key `{key}`"), format!("other keys: {}", places.join(", ")))),
+        false => Err(Error::usage(place, format!("unknown key `{key}`"), format!("similar keys elsewhere: {}", places.join(", ")))),
     }
 }
 
