@@ -526,6 +526,22 @@ fn harmonics_are_drawn_into_a_file() {
 }
 
 #[test]
+fn a_time_may_include_the_evaluation_and_the_run_says_so() {
+    let folder = Folder::new("including");
+    let run = folder.path("run");
+    let stages = "tensorf.stages=[{resolution=8, steps=20000, rays=32}, {resolution=8, steps=20000, rays=32}]";
+    let tiny = ["train", "--preset=quality", "--scene-size=16", "--scene-views=4,0,2", "--set", stages, "--out", &run, "--no-report"];
+    let with = |more: &[&str]| plenoxel(&[&tiny, more].concat());
+    with(&["--including-evaluation"]).refused(2, &["--time"]);
+    with(&["--including-evaluation", "--time=3s", "--no-evaluate"]).refused(2, &["--including-evaluation", "--no-evaluate"]);
+    let answer = with(&["--including-evaluation", "--time=3s"]);
+    assert!(answer.err.contains("planned for 0:03 with evaluation"), "{}", answer.err);
+    assert_eq!(answer.json()["views"], 2);
+    let record: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.path("run/run.json")).unwrap()).unwrap();
+    assert_eq!((&record["seconds_planned"], &record["with_evaluation"]), (&3.0.into(), &true.into()));
+}
+
+#[test]
 fn some_test_views_or_none_are_compared_and_the_figures_say_so() {
     let folder = Folder::new("some-views");
     let [some, none] = ["some", "none"].map(|name| folder.path(name));

@@ -66,7 +66,7 @@ pub fn train(
     let time = time.map(|time| seconds("time", time)).transpose()?;
     let (preset, data) = (preset.map(str::to_owned), scene.source.clone());
     run(py, extras, move |options, losses, on| {
-        let settings = RunSettings { config, preset, data, out, force, time, options };
+        let settings = RunSettings { preset, out, force, time, options, ..RunSettings::new(config, data) };
         train_adding(&settings, losses, on)
     })
 }

@@ -50,6 +50,7 @@ pub fn run(args: &TrainArgs, console: &Console<'_>) -> Result<u8> {
                 out: args.out.clone(),
                 force: args.force,
                 time: args.time,
+                with_evaluation: args.including_evaluation,
                 options,
                 ..RunSettings::new(config, data)
             };

@@ -1,16 +1,13 @@
 //! Progress of a training run: a bar for each stage, or lines of text.
 
 use super::{Console, Counted, Meter, Standing, metric};
+use plenoxel::evaluate::PIXEL_COST;
 use plenoxel::run::memory::{self, bytes};
 use plenoxel::run::metrics::{Observation, figures};
 use plenoxel::text::clock;
 use plenoxel::train::{PlannedStage, Report};
 use serde::Serialize;
 use std::collections::BTreeMap;
-
-/// Time to evaluate one pixel of a test view (reading, rendering, PSNR, SSIM), relative to one training ray of the last stage. Measured: 0.17 on the
-/// built-in scene, 0.20 and 0.23 on lego.
-const EVALUATION_RAY: f64 = 0.2;
 
 /// An exponential moving average with smoothing factor `share`. The first values have larger weights, so that it is unbiased.
 #[derive(Debug, Clone, Copy)]
@@ -44,6 +41,8 @@ pub struct Training<'c, 'a> {
     step_seconds: Smoothed,
     seconds: f64,
     validation_psnr: Option<f64>,
+    /// Seconds of the final evaluation per cost of a ray, if they were measured.
+    evaluation: Option<f64>,
 }
 
 /// Share by which the number of steps of a plan must change for a note.
@@ -69,6 +68,7 @@ impl<'a> Console<'a> {
             step_seconds: Smoothed::new(0.05),
             seconds,
             validation_psnr: None,
+            evaluation: None,
         }
     }
 }
@@ -96,6 +96,7 @@ impl Training<'_, '_> {
         self.mse.add(10f64.powf(-0.1 * report.psnr));
         self.loss.add(report.loss);
         let stage = self.plan[report.stage];
+        self.evaluation = seen.evaluation_seconds.map(|seconds| seconds / stage.ray_cost).or(self.evaluation);
         if report.step == stage.first {
             // The first step of a stage includes the creation of its grid, so its duration is not representative.
             (self.step_seconds, self.samples) = (Smoothed::new(0.05), Smoothed::new(0.05));
@@ -130,8 +131,8 @@ impl Training<'_, '_> {
     }
 
     /// Estimates the remaining seconds of the run, including the final evaluation; `None` during the first two steps of a stage. The current stage is
-    /// estimated with its measured pace, later stages with the relative costs of their rays, and a pixel of a test view as `EVALUATION_RAY` training rays of
-    /// the last stage.
+    /// estimated with its measured pace, later stages with the relative costs of their rays. The evaluation was measured, or a pixel of a test view counts as
+    /// [`PIXEL_COST`] training rays of the last stage.
     fn remaining(&self, report: &Report) -> Option<f64> {
         let now = &self.plan[report.stage];
         let step = Some(self.step_seconds.value).filter(|_| self.step_seconds.count > 0.0)?;
@@ -139,7 +140,10 @@ impl Training<'_, '_> {
         let cost = |stage: &PlannedStage| ray * stage.ray_cost;
         let here = (now.first + now.steps - report.step - 1) as f64;
         let later = self.plan[report.stage + 1..].iter().map(|stage| (stage.steps * stage.rays_per_step as u64) as f64 * cost(stage));
-        let evaluation = self.plan.last().map_or(0.0, cost) * EVALUATION_RAY * self.rays_to_evaluate;
+        let evaluation = self.plan.last().map_or(0.0, |last| match self.evaluation {
+            Some(measured) => measured * last.ray_cost,
+            None => cost(last) * PIXEL_COST * self.rays_to_evaluate,
+        });
         Some(step * here + later.sum::<f64>() + evaluation)
     }
 }

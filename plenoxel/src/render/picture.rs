@@ -89,9 +89,26 @@ fn pixels_of_tile(corner: [usize; 2], size: [usize; 2]) -> Vec<[usize; 2]> {
     packets.flat_map(pixels).collect()
 }
 
+/// Returns the rays of `count` packets of pixels, at even places of the images of some cameras.
+pub(crate) fn sampled_packets(cameras: &[Camera], count: usize) -> Vec<Ray> {
+    // Steps of the additive sequence that fills the square evenly: powers of the inverse of 1.3247, the root of x³ = x + 1.
+    const STEPS: [f64; 2] = [0.754_877_666_246_692_7, 0.569_840_290_998_053_2];
+    let packet = |k: usize| {
+        let camera = &cameras[k * cameras.len() / count];
+        let size = [camera.intrinsics.width, camera.intrinsics.height];
+        let corner = |axis: usize| ((k as f64 * STEPS[axis]).fract() * size[axis].saturating_sub(PACKET) as f64) as usize;
+        let [x, y] = [corner(0), corner(1)];
+        let side = move |axis: usize| PACKET.min(size[axis]);
+        (0..side(1)).flat_map(move |j| (0..side(0)).map(move |i| camera.ray((x + i) as f64 + 0.5, (y + j) as f64 + 0.5)))
+    };
+    (0..count).flat_map(packet).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::Intrinsics;
+    use glam::DVec3;
 
     #[test]
     fn tiles_have_each_pixel_of_an_image_once() {
@@ -103,5 +120,20 @@ mod tests {
             assert!(found.iter().all(|&count| count == 1), "{size:?}");
         }
         assert_eq!(pixels_of_tile([0, 0], [100, 100])[64..66], [[8, 0], [9, 0]]);
+    }
+
+    #[test]
+    fn sampled_packets_are_pixels_of_all_cameras_spread_over_their_images() {
+        let camera = |width, height| Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(width, height, 0.7));
+        let cameras = [camera(100, 61), camera(5, 3)];
+        let rays = sampled_packets(&cameras, 64);
+        assert_eq!(rays.len(), 32 * 64 + 32 * 15);
+        let place = |camera: &Camera, ray: &Ray| camera.project(ray.origin + ray.direction).expect("it is seen");
+        let places: Vec<_> = rays[..32 * 64].iter().map(|ray| place(&cameras[0], ray)).collect();
+        assert!(places.iter().all(|(x, y, _)| (x.fract() - 0.5).abs() < 1e-9 && (y.fract() - 0.5).abs() < 1e-9));
+        for (quarter, [x, y]) in [[0.0, 0.0], [50.0, 0.0], [0.0, 30.5], [50.0, 30.5]].into_iter().enumerate() {
+            let inside = places.iter().filter(|(u, v, _)| (x..x + 50.0).contains(u) && (y..y + 30.5).contains(v)).count();
+            assert!((350..680).contains(&inside), "quarter {quarter}: {inside}");
+        }
     }
 }

@@ -167,6 +167,8 @@ pub struct Observation {
     pub validation_psnr: Option<f64>,
     /// Seconds of training so far.
     pub seconds: f64,
+    /// Estimated seconds of the final evaluation, if they were measured after the step.
+    pub evaluation_seconds: Option<f64>,
 }
 
 /// Collects facts about a model by name, and learning rates by the name of their parameter with the suffix `_rate`. Whole numbers become integers.
@@ -313,7 +315,7 @@ impl MetricsFile {
                 None => since.losses.push((name.clone(), *value)),
             }
         }
-        let Observation { facts, validation_psnr, seconds } = seen;
+        let Observation { facts, validation_psnr, seconds, .. } = seen;
         let (validation_psnr, seconds) = (*validation_psnr, *seconds);
         let must = must || report.ends_stage || validation_psnr.is_some();
         if !(report.step + 1).is_multiple_of(self.every) && !must {

@@ -5,6 +5,7 @@
 
 use super::budget::MEASURING;
 use crate::error::{Error, Result};
+use crate::evaluate::PIXEL_COST;
 use crate::model::plenoxels::config::Config;
 use crate::model::recipe::Recipe;
 use crate::text::clock;
@@ -29,6 +30,19 @@ impl<M: Model<f32>> Begun<M> {
     }
 }
 
+/// Largest share of a time that is kept for the evaluation at its end.
+const MOST_FOR_EVALUATION: f64 = 0.5;
+
+/// Returns what is left of `seconds` for training if the evaluation at the end takes `evaluation` seconds, but at least half.
+pub(super) fn without_evaluation(seconds: f64, evaluation: f64) -> f64 {
+    seconds - evaluation.min(MOST_FOR_EVALUATION * seconds)
+}
+
+/// Returns the expected duration of a step of a stage, in the unit of [`PlannedStage::ray_cost`].
+fn step_cost(stage: &PlannedStage) -> f64 {
+    stage.rays_per_step as f64 * stage.ray_cost
+}
+
 /// Settings that are planned for a time.
 pub struct Planned<R: Recipe> {
     /// The settings.
@@ -37,13 +51,14 @@ pub struct Planned<R: Recipe> {
     pub begun: Option<Begun<R::Model>>,
 }
 
-/// Fits settings to the training views, and scales them so that training takes `seconds` on this machine, including the measurement made here. `begin` creates a
-/// trainer. If `keep` is false, the measured steps do not become steps of the run.
+/// Fits settings to the training views, and scales them so that training takes `seconds` on this machine, including the measurement made here and the evaluation
+/// of `evaluated` pixels at the end. `begin` creates a trainer. If `keep` is false, the measured steps do not become steps of the run.
 ///
 /// Errors: the time or the first stage is too short; those of [`Trainer::step`].
 pub fn plan<R: Recipe + Clone>(
     recipe: &R,
     seconds: f64,
+    evaluated: f64,
     keep: bool,
     begin: impl FnOnce(&R) -> Result<Trainer<f32, R::Model>>,
 ) -> Result<Planned<R>> {
@@ -77,7 +92,11 @@ pub fn plan<R: Recipe + Clone>(
         let found = "the first stage is too short to measure the speed of the machine";
         return Err(Error::usage("--time", found, "use more steps in the first stage, or leave out --time"));
     }
-    let unit = (spent - measured_from) / f64::from(count) / cost / duration;
+    let step = (spent - measured_from) / f64::from(count);
+    let unit = step / cost / duration;
+    let stages = trainer.plan();
+    let evaluation = stages.last().map_or(0.0, |last| step / step_cost(&stages[0]) * last.ray_cost * PIXEL_COST * evaluated);
+    let seconds = without_evaluation(seconds, evaluation);
     let planned =
         |left: f64, taken: u64| recipe.clone().fitted_to(trainer.model(), trainer.views()).with_cost(trainer.model(), left / unit, taken);
     let taken = trainer.steps_taken();
@@ -94,13 +113,18 @@ pub fn plan<R: Recipe + Clone>(
     Ok(Planned { recipe: planned(left, 0), begun: None })
 }
 
-/// Follows a planned run, and adjusts the length of its last stage so that training ends on time: early, when a wrong plan can still become much shorter,
+/// Estimates the seconds of the evaluation of a model.
+type Evaluation<M> = Box<dyn Fn(&M) -> f64>;
+
+/// Follows a planned run, and adjusts the length of its last stage so that it ends on time: early, when a wrong plan can still become much shorter,
 /// and in the last stage, whose speed is known then. A run of one stage is adjusted again and again, as long as its length does not matter: the first steps
 /// of a stage are slower. A run that is resumed keeps the plan with which it was saved.
-pub struct Pace<R> {
+pub struct Pace<R: Recipe> {
     recipe: R,
     config: Config,
     seconds: f64,
+    /// The evaluation, if it is part of the time.
+    evaluation: Option<Evaluation<R::Model>>,
     /// Number of steps after which the plan is adjusted next; `None` if it is not.
     adjust_at: Option<u64>,
     /// True after the first adjustment.
@@ -114,14 +138,14 @@ pub struct Pace<R> {
 const MEASURED: u64 = 10;
 
 impl<R: Recipe + Clone> Pace<R> {
-    /// Follows a run with these settings, which are those of `config` for its model, planned for `seconds`.
-    pub fn new(recipe: R, config: Config, seconds: f64) -> Self {
+    /// Follows a run with these settings, which are those of `config` for its model, planned for `seconds`, in which `evaluation` is included.
+    pub fn new(recipe: R, config: Config, seconds: f64, evaluation: Option<Evaluation<R::Model>>) -> Self {
         let until = recipe.steps_before_length_matters();
         let adjust_at = (until > 0).then_some(until / 3);
-        Pace { recipe, config, seconds, adjust_at, adjusted: false, measured_from: None }
+        Pace { recipe, config, seconds, evaluation, adjust_at, adjusted: false, measured_from: None }
     }
 
-    /// Looks at the time after a step; `now` is the number of seconds of training. Returns the new configuration if the plan changed.
+    /// Looks at the time after a step; `now` is how much of it is spent, in seconds. Returns the new configuration if the plan changed.
     pub fn after_step(&mut self, trainer: &mut Trainer<f32, R::Model>, now: f64) -> Option<Config> {
         let (taken, plan) = (trainer.steps_taken(), trainer.plan());
         let stage = plan.iter().find(|stage| taken <= stage.first + stage.steps)?;
@@ -137,12 +161,12 @@ impl<R: Recipe + Clone> Pace<R> {
             return None;
         }
         let (_, from, started) = self.measured_from.filter(|(index, from, _)| *index == stage.index && taken >= from + MEASURED)?;
-        let cost = |stage: &PlannedStage| stage.rays_per_step as f64 * stage.ray_cost;
-        let unit = (now - started) / (taken - from) as f64 / cost(stage);
+        let unit = (now - started) / (taken - from) as f64 / step_cost(stage);
         let (last, earlier) = plan.split_last()?;
+        let evaluation = self.evaluation.as_ref().map_or(0.0, |of| of(trainer.model()) * last.ray_cost / stage.ray_cost);
         let to_come = |stage: &PlannedStage| stage.steps - taken.saturating_sub(stage.first).min(stage.steps);
-        let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * cost(stage)).sum();
-        let left = ((self.seconds - now) / unit - before) / cost(last);
+        let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * step_cost(stage)).sum();
+        let left = ((without_evaluation(self.seconds, evaluation) - now) / unit - before) / step_cost(last);
         let (first, steps) = (last.first, taken.saturating_sub(last.first) + left.round().max(1.0) as u64);
         let adjusted = self.recipe.with_last_stage(steps, taken);
         assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
@@ -213,7 +237,7 @@ mod tests {
     #[test]
     fn measured_steps_of_the_plan_are_those_of_a_run_from_the_beginning() {
         let asked = recipe(&[(8, 2000), (12, 40_000), (40, 100_000)]);
-        let Planned { recipe, begun } = plan(&asked, 1.0, true, trainer).unwrap();
+        let Planned { recipe, begun } = plan(&asked, 1.0, 0.0, true, trainer).unwrap();
         assert_eq!((recipe.short, recipe.hidden, recipe.group), (None, 4, 0.2));
         let Begun { trainer: begun, reports } = begun.expect("a short plan is what a second leads to");
         assert!(reports.len() as u64 == begun.steps_taken() && reports.len() >= 24 && recipe.stages[0].steps > begun.steps_taken());
@@ -225,18 +249,18 @@ mod tests {
         going_on.replan(|model| less.clone().change(model));
         assert_eq!(trained(going_on), trained(trainer(&less).unwrap()));
         // On request, the run begins anew.
-        assert!(plan(&asked, 1.0, false, trainer).unwrap().begun.is_none());
+        assert!(plan(&asked, 1.0, 0.0, false, trainer).unwrap().begun.is_none());
     }
 
     #[test]
     fn measuring_ends_before_the_first_stage_does_and_a_bounded_first_stage_begins_anew() {
         let asked = tensorf::Config { short: None, ..recipe(&[(8, 12), (40, 100_000)]) };
-        let begun = plan(&asked, 2.0, true, trainer).unwrap().begun.expect("steps of the plan");
+        let begun = plan(&asked, 2.0, 0.0, true, trainer).unwrap().begun.expect("steps of the plan");
         assert!(begun.trainer.steps_taken() == 11 && begun.reports.iter().all(|(report, _)| !report.ends_stage));
         let bounded = tensorf::Config { pixels_per_cell: 4.0, ..recipe(&[(8, 100), (8, 200)]) };
-        assert!(plan(&bounded, 60.0, true, trainer).unwrap().begun.is_none());
+        assert!(plan(&bounded, 60.0, 0.0, true, trainer).unwrap().begun.is_none());
         let short = tensorf::Config { short: None, ..recipe(&[(8, 3), (8, 200)]) };
-        assert!(plan(&short, 1.0, true, trainer).err().unwrap().to_string().contains("--time"));
+        assert!(plan(&short, 1.0, 0.0, true, trainer).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
@@ -244,9 +268,9 @@ mod tests {
         let asked = recipe(&[(8, 100), (16, 200)]);
         // So long that the network stays, and too long for any steps to be guessed.
         let unlikely = tensorf::Config { short: Some(Short { below: 1e-9, ..asked.short.unwrap() }), last_rate: 0.5, ..asked };
-        let Planned { recipe, begun } = plan(&unlikely, 1.0, true, trainer).unwrap();
+        let Planned { recipe, begun } = plan(&unlikely, 1.0, 0.0, true, trainer).unwrap();
         assert!(begun.is_none() && recipe.hidden == 8);
-        assert!(plan(&unlikely, 1e-9, true, trainer).err().unwrap().to_string().contains("--time"));
+        assert!(plan(&unlikely, 1e-9, 0.0, true, trainer).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
@@ -254,7 +278,7 @@ mod tests {
         let with_cool_down = |cool_down: f64| tensorf::Config { short: None, cool_down, ..recipe(&[(8, 30), (8, 200)]) };
         for (cool_down, of_a_step) in [(0.4, 0.1), (0.4, 0.5), (0.4, 1.0), (0.75, 0.1), (0.75, 0.3), (0.75, 10.0)] {
             let asked = with_cool_down(cool_down);
-            let mut pace = Pace::new(asked.clone(), Config::default(), 100.0);
+            let mut pace = Pace::new(asked.clone(), Config::default(), 100.0, None);
             let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
             while trainer.step().unwrap().is_some() {
                 // From the 35th step on, steps take a tenth longer.
@@ -270,7 +294,22 @@ mod tests {
         }
         // Rates that fall from the first step on know the whole length.
         let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };
-        assert!(Pace::new(falling, Config::default(), 100.0).adjust_at.is_none());
+        assert!(Pace::new(falling, Config::default(), 100.0, None).adjust_at.is_none());
+    }
+
+    #[test]
+    fn an_evaluation_that_is_included_ends_on_time_and_takes_at_most_half_of_it() {
+        for (evaluation, trained) in [(30.0, 70.0), (80.0, 50.0)] {
+            let asked = tensorf::Config { short: None, ..recipe(&[(8, 30), (8, 200)]) };
+            let mut pace = Pace::new(asked.clone(), Config::default(), 100.0, Some(Box::new(move |_| evaluation)));
+            let mut trainer = trainer(&asked).unwrap();
+            while trainer.step().unwrap().is_some() {
+                let now = 0.5 * trainer.steps_taken() as f64;
+                let _ = pace.after_step(&mut trainer, now);
+            }
+            let took = 0.5 * trainer.steps_taken() as f64;
+            assert!((took - trained).abs() < 1.0, "{evaluation}: {took}");
+        }
     }
 
     #[test]
@@ -288,7 +327,7 @@ mod tests {
             stages: vec![ngp::Stage { steps: 300, rays: 16 }],
             ..ngp::Config::default()
         };
-        let mut pace = Pace::new(asked.clone(), Config::default(), 100.0);
+        let mut pace = Pace::new(asked.clone(), Config::default(), 100.0, None);
         let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
         // The first twenty steps take 0.33 seconds, as the plan expects, and the others 0.1.
         let seconds = |taken: u64| 0.1 * taken as f64 + 0.23 * taken.min(20) as f64;

@@ -59,6 +59,8 @@ pub struct RunSettings {
     pub force: bool,
     /// Planned duration of training on this machine, in seconds; `None` for the steps of the config.
     pub time: Option<f64>,
+    /// True if `time` is that of the whole run, from its beginning to the figures of the evaluation; at least half of it is for training.
+    pub with_evaluation: bool,
     /// Settings that do not affect the training.
     pub options: RunOptions,
 }
@@ -104,7 +106,21 @@ impl Default for RunOptions {
 impl RunSettings {
     /// Settings for a run with a config on some views, and defaults for everything else.
     pub fn new(config: Config, data: DataSource) -> Self {
-        RunSettings { config, preset: None, data, out: None, force: false, time: None, options: RunOptions::default() }
+        RunSettings {
+            config,
+            preset: None,
+            data,
+            out: None,
+            force: false,
+            time: None,
+            with_evaluation: false,
+            options: RunOptions::default(),
+        }
+    }
+
+    /// Says what the time includes.
+    fn included(&self) -> &'static str {
+        if self.with_evaluation { " with evaluation" } else { "" }
     }
 }
 
@@ -205,10 +221,11 @@ fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &m
     run.read(on)?;
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
-        let NewRun { config, views, clocks, .. } = &mut run;
-        *config = clocks.train.time(|| budget::on_time(config.clone(), views, seconds, objective))?;
+        let NewRun { config, views, clocks, dataset, .. } = &mut run;
+        let evaluated = if settings.with_evaluation { other::pixels(&job::test_cameras(dataset, &settings.options)) } else { 0.0 };
+        *config = clocks.train.time(|| budget::on_time(config.clone(), views, seconds, evaluated, objective))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
-        on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
+        on(Event::note(format!("planned for {}{}: steps {}", clock(seconds), settings.included(), stages.collect::<Vec<_>>().join(", "))));
     }
     let objective = objective(&run.config, run.views.len())?;
     let NewRun { config, views, clocks, .. } = &mut run;

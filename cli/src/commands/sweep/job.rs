@@ -42,6 +42,8 @@ pub struct Asked {
     pub source: DataSource,
     /// Requested seconds of training (`--time`); the lengths of the stages are then computed at the start of the run.
     pub time: Option<f64>,
+    /// True if these are the seconds of the whole run (`--including-evaluation`).
+    pub with_evaluation: bool,
 }
 
 /// State of a run.
@@ -201,6 +203,14 @@ impl Asked {
         let found = match (self.time, record.seconds_planned, &record.asked) {
             (Some(_), None, _) => return vec!["it was not planned by time".to_owned()],
             (Some(seconds), Some(planned), _) if planned != seconds => return vec![format!("time is {planned} s, not {seconds} s")],
+            (Some(_), ..) if record.with_evaluation != self.with_evaluation => {
+                let does = |included: bool| if included { "includes" } else { "does not include" };
+                return vec![format!(
+                    "its time {} evaluation, and this one {} it",
+                    does(record.with_evaluation),
+                    does(self.with_evaluation)
+                )];
+            }
             (Some(_), _, None) => {
                 return vec!["it was planned by an earlier version, which did not record the settings before the plan".to_owned()];
             }

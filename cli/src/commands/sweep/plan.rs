@@ -263,8 +263,13 @@ fn reduction(value: &Value, place: &str) -> Result<usize> {
 fn asked(call: &Call, place: &str) -> Result<Asked> {
     let cli = crate::Cli::try_parse_from(["plenoxel".into()].into_iter().chain(call.arguments(&[])));
     let asked = match cli.map(|cli| cli.command) {
-        Ok(crate::Command::Train(args)) => args.config().map(|(config, _)| Asked { config, source: args.source(), time: args.time }),
-        Ok(crate::Command::Carve(args)) => args.config().map(|(config, _)| Asked { config, source: args.source(), time: None }),
+        Ok(crate::Command::Train(args)) => args.config().map(|(config, _)| {
+            let with_evaluation = args.including_evaluation;
+            Asked { config, source: args.source(), time: args.time, with_evaluation }
+        }),
+        Ok(crate::Command::Carve(args)) => {
+            args.config().map(|(config, _)| Asked { config, source: args.source(), time: None, with_evaluation: false })
+        }
         Ok(_) => Err(Error::config("command", call.command, COMMANDS.join(" or "))),
         Err(answer) => return Err(flags::refusal(&answer, call.command, place)),
     };

@@ -31,11 +31,12 @@ paths in that file, such as stages[0].sampling.step. If stdout is not a terminal
 const POSES: f64 = 0.01;
 
 /// Arguments that conflict with `--resume`, because they are fixed at the start of a run.
-pub const NOT_WHEN_RESUMED: [&str; 26] = [
+pub const NOT_WHEN_RESUMED: [&str; 27] = [
     "out",
     "force",
     "preset",
     "time",
+    "including_evaluation",
     "config",
     "set",
     "seed",
@@ -128,6 +129,11 @@ pub struct TrainArgs {
     /// network (tensorf.short). The settings record the plan
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,
+
+    /// Let --time be that of the whole run, from the start of the program to the figures of the test views. At least half of it is for training. The length of
+    /// the training follows the measured speed of pictures with the presets quality, tensorf, photos and ngp, and an estimate with others
+    #[arg(long, help_heading = "Settings", requires = "time", conflicts_with = "no_evaluate")]
+    pub including_evaluation: bool,
 
     /// TOML file of settings that override the preset; a complete file, such as the config.toml of a run, replaces the preset
     #[arg(long, value_name = "FILE", help_heading = "Settings", value_hint = ValueHint::FilePath)]

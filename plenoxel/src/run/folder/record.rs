@@ -107,6 +107,9 @@ pub struct RunRecord {
     /// Planned seconds of training, if it was planned by time.
     #[serde(default)]
     pub seconds_planned: Option<f64>,
+    /// True if these are the seconds of the whole run with its evaluation.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub with_evaluation: bool,
     /// Settings before they were planned by time, as [`settings::values`](crate::run::settings::values) returns them. Runs of earlier versions do not record them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub asked: Option<BTreeMap<String, String>>,
@@ -145,6 +148,7 @@ impl RunRecord {
             preset: None,
             data: source.clone(),
             seconds_planned: None,
+            with_evaluation: false,
             asked: None,
             to_world: None,
             baked: None,

@@ -3,6 +3,7 @@
 use super::learning::Learned;
 use super::started::load;
 use super::{Event, Listener, Outcome, RunOptions, Summary, event};
+use crate::camera::Camera;
 use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
 use crate::evaluate::{self, Scores, Viewer};
@@ -35,7 +36,12 @@ pub struct Stopped(pub u64, pub u64);
 impl Job<'_> {
     /// Indices of the test views for the final evaluation.
     pub fn test_views(&self) -> Vec<usize> {
-        evenly_spaced(self.dataset.count(Split::Test), self.options.test_views)
+        test_views(self.dataset, self.options)
+    }
+
+    /// Cameras of the test views for the final evaluation.
+    pub fn test_cameras(&self) -> Vec<Camera> {
+        test_cameras(self.dataset, self.options)
     }
 
     /// Evaluates the model on the test views and writes the final figures.
@@ -94,6 +100,17 @@ impl Job<'_> {
         on(Event::Evaluated { summary: &summary, run: about });
         Ok(Outcome::Done(Box::new(summary)))
     }
+}
+
+/// Indices of the test views of a dataset for the final evaluation.
+fn test_views(dataset: &Dataset, options: &RunOptions) -> Vec<usize> {
+    evenly_spaced(dataset.count(Split::Test), options.test_views)
+}
+
+/// Cameras of the test views of a dataset for the final evaluation.
+pub fn test_cameras(dataset: &Dataset, options: &RunOptions) -> Vec<Camera> {
+    let cameras = dataset.cameras(Split::Test);
+    test_views(dataset, options).into_iter().map(|view| cameras[view]).collect()
 }
 
 /// Scores of the final model, and of the kept models of earlier stages.

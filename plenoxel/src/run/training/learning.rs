@@ -86,7 +86,7 @@ impl Job<'_> {
         let background = self.config.background;
         let options_of_view = ViewOptions::over(background);
         let first = |split| dataset.cameras(split).into_iter().next();
-        let mut preview = preview.begin(first(Split::Test).or(first(Split::Train)).filter(|_| options.pictures));
+        let mut preview = preview.begin(first(Split::Test).or(first(Split::Train)).filter(|_| options.pictures), self.test_cameras());
         let run = Underway { folder, config: &self.config, dataset };
         on(Event::Started { run, plan: &plan, test_views: self.test_views().len(), history: &past });
         if let Some(&stage) = plan.first().filter(|_| trainer.steps_taken() == reports.len() as u64) {
@@ -135,7 +135,8 @@ impl Job<'_> {
             let seconds = replayed.unwrap_or_else(|| clocks.train.seconds());
             let look = preview.look(viewer, report.ends_stage, save, background);
             let validation_psnr = look.as_ref().and_then(|look| look.psnr);
-            let observation = Observation { facts: facts.clone(), validation_psnr, seconds };
+            let evaluation_seconds = look.as_ref().map(|look| look.evaluation_seconds);
+            let observation = Observation { facts: facts.clone(), validation_psnr, seconds, evaluation_seconds };
             metrics.step(&report, &plan, &observation, save)?;
             on(Event::Step { report: &report, observation: &observation, model });
             if report.ends_stage {

@@ -1,9 +1,11 @@
 //! Runs that train another model than the voxel grid: one with a table of settings of its own ([`Recipe`]).
 
 use super::started::{NewRun, OldRun};
-use super::{Event, Listener, MakeLosses, Outcome, RunOptions, RunSettings, with_losses};
+use super::{Event, Listener, MakeLosses, Outcome, RunOptions, RunSettings, job, with_losses};
+use crate::camera::Camera;
 use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
+use crate::evaluate::Viewer;
 use crate::loss::POSES;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::objective_of_any;
@@ -13,9 +15,10 @@ use crate::run::memory::Estimate;
 use crate::run::pace::{self, Begun, Pace};
 use crate::space::Region;
 use crate::text::clock;
-use crate::train::Trainer;
+use crate::train::{Trainer, ViewOptions};
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Instant;
 
 /// Creates the trainer of a run with further losses.
 ///
@@ -36,8 +39,14 @@ fn region(dataset: &Dataset, config: &Config) -> Region {
     Region::of(dataset.space(), &dataset.cameras(Split::Train), config.half_width)
 }
 
+/// Returns the number of pixels of some cameras.
+pub fn pixels(cameras: &[Camera]) -> f64 {
+    cameras.iter().map(|camera| (camera.intrinsics.width * camera.intrinsics.height) as f64).sum()
+}
+
 /// Trains a model.
 pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &MakeLosses<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
+    let began = Instant::now();
     let mut recipe = recipe.clone();
     let mut run = NewRun::open(settings, on)?;
     let region = region(&run.dataset, &run.config);
@@ -50,26 +59,40 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
     let (mut begun, mut pace) = (None, None);
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
-        let NewRun { config, views, clocks, .. } = &mut run;
+        let NewRun { config, views, clocks, dataset, .. } = &mut run;
+        // What is included in the time is counted from the beginning.
+        let (evaluated, before) = match settings.with_evaluation {
+            true => (job::test_cameras(dataset, &settings.options), began.elapsed().as_secs_f64()),
+            false => (Vec::new(), 0.0),
+        };
         let begin = |recipe: &R| trainer(config, recipe, region, views.clone(), losses);
         // The schedule of the poses counts all steps of the run.
         let adjusts = !config.losses.contains_key(POSES);
-        let planned = clocks.train.time(|| pace::plan(&recipe, seconds, adjusts, begin))?;
+        let planned = clocks.train.time(|| pace::plan(&recipe, seconds - before, pixels(&evaluated), adjusts, begin))?;
         (recipe, begun) = (planned.recipe, planned.begun);
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
             Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
             None => stage.steps.to_string(),
         });
-        on(Event::note(format!("planned for {}: steps {}", clock(seconds), stages.collect::<Vec<_>>().join(", "))));
+        on(Event::note(format!("planned for {}{}: steps {}", clock(seconds), settings.included(), stages.collect::<Vec<_>>().join(", "))));
         recipe.clone().set(config);
-        pace = adjusts.then(|| Pace::new(recipe.clone(), config.clone(), seconds));
+        pace = adjusts.then(|| {
+            let view = ViewOptions::over(config.background);
+            let evaluation = move |model: &R::Model| {
+                let start = Instant::now();
+                let viewer = Viewer::of(model, &view);
+                start.elapsed().as_secs_f64() + viewer.seconds_for(&evaluated)
+            };
+            Pace::new(recipe.clone(), config.clone(), seconds, settings.with_evaluation.then(|| Box::new(evaluation) as _))
+        });
     }
     let NewRun { config, views, clocks, .. } = &mut run;
     let begun = match begun {
         Some(begun) => begun,
         None => Begun::new(clocks.train.time(|| trainer(config, &recipe, region, views.clone(), losses))?),
     };
-    run.learn(begun, &mut |trainer, seconds| pace.as_mut()?.after_step(trainer, seconds), on)
+    let spent = |training: f64| if settings.with_evaluation { began.elapsed().as_secs_f64() } else { training };
+    run.learn(begun, &mut |trainer, seconds| pace.as_mut()?.after_step(trainer, spent(seconds)), on)
 }
 
 /// Resumes a run.

@@ -34,6 +34,8 @@ pub struct Preview {
     shown: Option<View>,
     /// Camera of the picture if there are no validation views; `None` if no picture is wanted.
     camera: Option<Camera>,
+    /// Cameras of the views of the final evaluation.
+    evaluated: Vec<Camera>,
 }
 
 /// Result of a preview.
@@ -42,12 +44,14 @@ pub struct Look {
     pub psnr: Option<f64>,
     /// A picture, if one was wanted, and the photograph of the same view, if there is one.
     pub picture: Option<(Array3<f32>, Option<Array3<f32>>)>,
+    /// Estimated seconds of the final evaluation, with the model as it is now.
+    pub evaluation_seconds: f64,
 }
 
 /// No previews.
 impl Default for Preview {
     fn default() -> Self {
-        Preview { views: Vec::new(), pace: Pace::new(f64::INFINITY), shown: None, camera: None }
+        Preview { views: Vec::new(), pace: Pace::new(f64::INFINITY), shown: None, camera: None, evaluated: Vec::new() }
     }
 }
 
@@ -65,17 +69,18 @@ impl Preview {
             views.push(thinned(&view, SIDE));
             shown = shown.or_else(|| Some(reduced(&view, PICTURE_SIDE)));
         }
-        Ok(Preview { views, pace: Pace::new(every), shown, camera: None })
+        Ok(Preview { views, pace: Pace::new(every), shown, camera: None, evaluated: Vec::new() })
     }
 
-    /// Starts the clock of the previews. They include a picture if `camera` is given; it is used if there are no validation views.
-    pub fn begin(self, camera: Option<Camera>) -> Self {
+    /// Starts the clock of the previews. They include a picture if `camera` is given; it is used if there are no validation views. `evaluated` are the cameras of the
+    /// final evaluation.
+    pub fn begin(self, camera: Option<Camera>, evaluated: Vec<Camera>) -> Self {
         let camera = camera.map(|camera| {
             let Intrinsics { width, height, .. } = camera.intrinsics;
             let intrinsics = camera.intrinsics.downscaled(width.max(height).div_ceil(PICTURE_SIDE).min(width).min(height));
             Camera { intrinsics, ..camera }
         });
-        Preview { pace: Pace::new(self.pace.every), camera, ..self }
+        Preview { pace: Pace::new(self.pace.every), camera, evaluated, ..self }
     }
 
     /// Makes a preview if one is due: at intervals, at checkpoints and at stage ends, within the allowed share of the time.
@@ -102,8 +107,9 @@ impl Preview {
             Some(view) => (viewer.glance(&view.camera, GLANCE).rgb, Some(view.composite(background))),
             None => (viewer.glance(camera, GLANCE).rgb, None),
         });
+        let evaluation_seconds = viewer.seconds_for(&self.evaluated);
         self.pace.took(start, self.pace.now());
-        Some(Look { psnr, picture })
+        Some(Look { psnr, picture, evaluation_seconds })
     }
 }
 

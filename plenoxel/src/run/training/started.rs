@@ -91,11 +91,12 @@ impl<'s> NewRun<'s> {
     /// Creates the folder, trains and evaluates; `adjust` may change the plan. Nothing is written or overwritten before all checks of the input.
     pub fn learn<M: Model<f32>>(self, begun: Begun<M>, adjust: &mut Adjust<'_, M>, on: &mut Listener<'_>) -> Result<Outcome> {
         let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved, warnings } = self;
-        let RunSettings { data, preset, time, options, .. } = settings;
+        let RunSettings { data, preset, time, with_evaluation, options, .. } = settings;
         check_disk(settings.out.as_deref().unwrap_or(Path::new("runs")), saved.saturating_sub(folder.overwritten()), on)?;
         let folder = folder.create()?;
         let record = RunRecord {
             seconds_planned: *time,
+            with_evaluation: time.is_some() && *with_evaluation,
             asked: time.map(|_| settings::values(&settings.config)),
             model: begun.trainer.model().kind().to_owned(),
             ..RunRecord::new(RunKind::Trained, &dataset, preset.as_deref(), data)

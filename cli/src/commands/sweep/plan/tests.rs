@@ -237,6 +237,9 @@ fn a_plan_by_time_is_compared_by_its_settings_before() {
     assert_eq!(state(&record), State::CutShort);
     record.asked.as_mut().unwrap().insert("seed".to_owned(), "43".to_owned());
     assert!(matches!(state(&record), State::Different(found) if found.contains("seed")));
+    record.with_evaluation = true;
+    assert!(matches!(state(&record), State::Different(found) if found.contains("its time includes evaluation")));
+    record.with_evaluation = false;
     record.asked = None;
     assert!(matches!(state(&record), State::Different(found) if found.contains("earlier version")));
     for (seconds, part) in [(Some(10.0), "10 s, not 9 s"), (None, "not planned by time")] {
