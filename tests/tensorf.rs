@@ -108,10 +108,27 @@ fn gradients_of_pixels_with_respect_to_every_parameter_are_right_in_both_orders(
 #[test]
 fn the_kernel_agrees_with_the_graph_in_the_spaces_of_captures() {
     let (rays, pass) = (rays_of_a_capture(24), Pass { jitter: Jitter::PerRay { seed: 3, step: 7 }, ..PASS });
-    for region in [NDC, CONTRACTED] {
-        let mut model = wide(Config { cell_depth: 2.0, ..tiny(&[(9, 1)]) }, region);
+    for (region, gradient_scaling) in [(NDC, 0.0), (CONTRACTED, 0.0), (CONTRACTED, 2.0)] {
+        let mut model = wide(Config { cell_depth: 2.0, gradient_scaling, ..tiny(&[(9, 1)]) }, region);
         agree(&mut model, &[], |model| model.render(&rays, &pass));
     }
+}
+
+#[test]
+fn gradients_are_scaled_near_cameras_but_not_in_normalized_device_coordinates() {
+    let rays = rays_of_a_capture(24);
+    let rendered = |region: Region, gradient_scaling: f64| {
+        let model = wide(Config { gradient_scaling, ..tiny(&[(9, 1)]) }, region);
+        let (pixels, adjoint) = autograd::value_and_grad(|| model.render(&rays, &PASS).rgb.sum());
+        let mut gradient = Vec::new();
+        model.visit(&mut |param| gradient.extend(adjoint.array(param.tensor())));
+        (pixels, gradient)
+    };
+    let norm = |(_, gradient): &(f64, Vec<f64>)| gradient.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let [exact, near, far] = [0.0, 1e-3, 100.0].map(|scaling| rendered(CONTRACTED, scaling));
+    // Samples begin at a distance of 0.05.
+    assert!(near == exact && far.0 == exact.0 && norm(&far) < 0.1 * norm(&exact), "{} of {}", norm(&far), norm(&exact));
+    assert!(rendered(NDC, 100.0) == rendered(NDC, 0.0));
 }
 
 #[test]

@@ -168,6 +168,10 @@ pub struct Factored<T: Real> {
     /// samples of the same block of rays; smaller ones count as 0. 0 for exact gradients. Most samples are in empty cells around matter, or behind it.
     /// Gradients of rays, and gradients that can be differentiated again, are always exact.
     pub gradient_above: f64,
+    /// Gradient scaling (Philip and Deschaintre 2023): the gradients of density and color of a sample at the distance t from the camera are multiplied by
+    /// min(1, (t / d)²), with d this length; 0 for exact gradients. Near a camera, rays are dense, and only this camera sees the place: without scaling, matter forms there
+    /// that no other view contradicts.
+    pub gradient_scaling: f64,
 }
 
 impl<T: Real> Module<T> for Factored<T> {
@@ -205,6 +209,7 @@ impl<T: Real> Factored<T> {
             grouping: Grouping::NONE,
             grouping_in_pictures: Grouping::NONE,
             gradient_above: 0.0,
+            gradient_scaling: 0.0,
         }
     }
 
@@ -278,6 +283,23 @@ impl<T: Real> Factored<T> {
     }
 }
 
+/// Returns the factor of the gradients of a sample at the distance `t` from the camera ([`Factored::gradient_scaling`]).
+#[inline(always)]
+fn gradient_share<T: Real>(t: T, scaling: f64) -> T {
+    let d = T::lit(scaling);
+    if t < d { t * t / (d * d) } else { T::one() }
+}
+
+/// Returns the same densities and colors, with gradients that are scaled by the distances `t`, `[n]`: x̂ + s (x − x̂), where no gradient flows through x̂ = x.
+fn with_scaled_gradients<T: Real>(radiance: Radiance<T>, t: &Tensor<T>, scaling: f64) -> Radiance<T> {
+    if scaling == 0.0 {
+        return radiance;
+    }
+    let share = Tensor::from_vec(t.data().iter().map(|&t| gradient_share(t, scaling)).collect(), &[t.len()]);
+    let scaled = |x: &Tensor<T>, share: &Tensor<T>| x.detach() + share * (x - x.detach());
+    Radiance { sigma: scaled(&radiance.sigma, &share), rgb: scaled(&radiance.rgb, &share.unsqueeze(1)) }
+}
+
 impl<T: Real> Field<T> for Factored<T> {
     fn density(&self, positions: &Tensor<T>) -> Tensor<T> {
         density(&self.tables(), &self.cells(positions))
@@ -292,7 +314,7 @@ impl<T: Real> Field<T> for Factored<T> {
         let seen = Indices::from(seen.map(|(i, _)| i as u32).collect::<Vec<_>>());
         let directions = self.shape.directions.encode(&samples.directions.segment_repeat(&samples.offsets).gather_rows(&seen));
         let rgb = colors(&tables, self.shape.feature_octaves, &cells.gather_rows(&seen), &directions);
-        Radiance { sigma, rgb: rgb.scatter_rows(&seen, samples.len()) }
+        with_scaled_gradients(Radiance { sigma, rgb: rgb.scatter_rows(&seen, samples.len()) }, &samples.t, self.gradient_scaling)
     }
 
     fn reach(&self) -> Option<&Occupancy> {

@@ -94,6 +94,8 @@ impl<T: Real> Tensorf<T> {
         let grouping = |weight: f64| Grouping { weight, above: config.color_above, compact: config.compact_groups };
         (field.grouping, field.grouping_in_pictures) = (grouping(config.group), grouping(config.group_in_pictures));
         field.gradient_above = config.gradient_above;
+        // In normalized device coordinates, rays are parallel, and no denser near the camera.
+        field.gradient_scaling = if matches!(space, Space::Ndc { .. }) { 0.0 } else { config.gradient_scaling };
         let total_steps = Arc::new(AtomicU64::new(config.total_steps()));
         Ok(Tensorf { config, total_steps, field, space, hull: Hull::Auto, engine: Engine::Fused })
     }

@@ -52,6 +52,7 @@ struct Batch<T: Real> {
     encoded: Tensor<T>,
     grouping: Grouping,
     gradient_above: f64,
+    gradient_scaling: f64,
     jitter: Jitter,
 }
 
@@ -138,8 +139,17 @@ fn render_inputs<T: Real>(
     let background = options.background.map(|c| T::lit(f64::from(c)));
     let jitter = options.jitter;
     let grouping = if matches!(jitter, Jitter::None) { field.grouping_in_pictures } else { field.grouping };
-    let gradient_above = field.gradient_above;
-    let batch = Batch { shape: field.shape, nodes: field.nodes(), background, directions, encoded, grouping, gradient_above, jitter };
+    let batch = Batch {
+        shape: field.shape,
+        nodes: field.nodes(),
+        background,
+        directions,
+        encoded,
+        grouping,
+        gradient_above: field.gradient_above,
+        gradient_scaling: field.gradient_scaling,
+        jitter,
+    };
     let cells = densities.map(Densities::cells).or(options.occupancy).or(field.reach());
     let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), densities };
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
@@ -254,6 +264,7 @@ impl<T: Real> State<T> {
         let colors = super::colors(tables, batch.shape.feature_octaves, &groups.positions(weights.data(), &cells), &directions);
         let rgb = groups.colors_of_samples(&colors);
         let radiance = Radiance { sigma: super::density(tables, &cells), rgb };
+        let radiance = super::with_scaled_gradients(radiance, &samples.t, batch.gradient_scaling);
         composite(samples, radiance, &Tensor::from_vec(batch.background.to_vec(), &[3]))
     }
 }

@@ -50,6 +50,9 @@ pub struct Config {
     /// Least gradient of the density of a sample that the fused kernel uses, relative to the mean
     /// ([`Factored::gradient_above`](crate::field::factored::Factored::gradient_above)); 0 for exact gradients.
     pub gradient_above: f64,
+    /// Distance from a camera, world length of the run, below which gradients are scaled by the square of the distance
+    /// ([`Factored::gradient_scaling`](crate::field::factored::Factored::gradient_scaling)); 0 for exact gradients. Not used in normalized device coordinates.
+    pub gradient_scaling: f64,
     /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.
     pub occupied_above: f64,
     /// Number of steps for which the density is constant. If it is not 0 and there is a visual hull, the density is opaque before the first step; otherwise it is
@@ -115,6 +118,7 @@ impl Default for Config {
             stop_below: 3e-3,
             stop_below_in_pictures: 3e-4,
             gradient_above: 0.0,
+            gradient_scaling: 0.0,
             occupied_above: 0.01,
             opaque_steps: 50,
             factor_rate: 0.02,
@@ -198,6 +202,7 @@ impl Config {
         for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
         }
+        check((0.0..=1e3).contains(&self.gradient_scaling), "gradient_scaling", self.gradient_scaling, "0 to 1000")?;
         check((0.0..=1e3).contains(&self.density_tv), "density_tv", self.density_tv, "0 to 1000")?;
         if let Some(Short { below, hidden, group, cost }) = self.short {
             check((1..=1024).contains(&hidden), "short.hidden", hidden as f64, "1 to 1024")?;

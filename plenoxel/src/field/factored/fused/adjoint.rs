@@ -1,6 +1,6 @@
 //! Cotangents of the parameters from cotangents of pixels.
 
-use super::super::PLANE_OF;
+use super::super::{PLANE_OF, gradient_share};
 use super::forward::{Block, Tables};
 use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, RUN, add_to_lines, first_rows};
 use super::network::OfNetwork;
@@ -223,12 +223,15 @@ fn part<T: Real>(
                 along.sigma_adjoint(own.clone(), batch.background, g, &color, &mut of_features);
                 for i in own.filter(|&i| block.groups.of[i] != Groups::NONE) {
                     let of = &mut of_groups[block.groups.of[i] as usize];
-                    (0..3).for_each(|c| of[c] += along.weight[i] * g[c]);
+                    let weight = along.weight[i] * gradient_share(along.t[i], batch.gradient_scaling);
+                    (0..3).for_each(|c| of[c] += weight * g[c]);
                 }
             }
         }
     }
-    of_features.iter_mut().zip(block.slope()).for_each(|(g, &slope)| *g *= slope);
+    for ((g, &slope), &t) in of_features.iter_mut().zip(block.slope()).zip(block.t()) {
+        *g *= slope * gradient_share(t, batch.gradient_scaling);
+    }
     let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, rgb);
     let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
     let density = OfDensity::new(block.at(), &of_features, batch.gradient_above);
