@@ -223,6 +223,8 @@ pub struct Bend {
     turn: f64,
     /// |d_b|
     rate: f64,
+    /// What is subtracted from s, so that it is 0 at the origin of the ray: not 0 only if the ray begins behind the slab.
+    start: f64,
 }
 
 impl Bend {
@@ -234,7 +236,8 @@ impl Bend {
         let (o, d) = (ray.origin.to_array(), ray.direction.to_array());
         let b = (1..3).fold(0, |b, axis| if d[axis].abs() > d[b].abs() { axis } else { b });
         let rate = d[b].abs();
-        Bend { turn: (1.0 - o[b] * d[b].signum()) / rate, rate }
+        let bend = Bend { turn: (1.0 - o[b] * d[b].signum()) / rate, rate, start: 0.0 };
+        Bend { start: bend.place(0.0), ..bend }
     }
 
     /// Returns s at the near plane.
@@ -244,18 +247,20 @@ impl Bend {
 
     /// Returns s at infinity.
     pub fn end(&self) -> f64 {
-        self.turn + 1.0 / self.rate
+        self.turn + 1.0 / self.rate - self.start
     }
 
     /// Returns s at a distance from the origin of the ray.
     pub fn place(&self, t: f64) -> f64 {
         let m = 1.0 + self.rate * (t - self.turn);
-        if m <= 1.0 { t } else { self.turn + (1.0 - 1.0 / m) / self.rate }
+        let s = if m <= 1.0 { t } else { self.turn + (1.0 - 1.0 / m) / self.rate };
+        s - self.start
     }
 
     /// Returns the distance from the origin of the ray at s.
     #[inline(always)]
     pub fn distance(&self, s: f64) -> f64 {
+        let s = s + self.start;
         let m = 1.0 / (1.0 - self.rate * (s - self.turn));
         if s <= self.turn { s } else { self.turn + (m - 1.0) / self.rate }
     }
@@ -333,6 +338,20 @@ mod tests {
             for k in 0..1000 {
                 let t = f64::from(k) * 0.01;
                 assert!((at(t + 1e-6) - at(t)).length() < 4e-6, "{ray:?} at {t}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_parameter_of_a_bent_ray_begins_with_0_and_grows_wherever_the_ray_begins() {
+        for x in [-3.0, -1.5, 0.3, 1.0, 1.5, 3.0, 40.0] {
+            let ray = Ray { origin: dvec3(x, 0.2, -0.1), direction: dvec3(1.0, 0.3, -0.2).normalize(), stretch: 1.0 };
+            let bend = Bend::of(&ray);
+            let places = [0.0, 0.01, 0.1, 1.0, 5.0, 100.0].map(|t| (t, bend.place(t)));
+            assert_eq!(places[0].1, 0.0);
+            assert!(places.is_sorted_by(|(_, before), (_, s)| before < s) && places[5].1 < bend.end(), "{x}: {places:?}");
+            for (t, s) in places {
+                assert!((bend.distance(s) - t).abs() < 1e-9 * (1.0 + t * t), "{x}, {t}: {}", bend.distance(s));
             }
         }
     }

@@ -169,7 +169,7 @@ pub struct Factored<T: Real> {
     /// Gradients of rays, and gradients that can be differentiated again, are always exact.
     pub gradient_above: f64,
     /// Gradient scaling (Philip and Deschaintre 2023): the gradients of density and color of a sample at the distance t from the camera are multiplied by
-    /// min(1, (t / d)²), with d this length; 0 for exact gradients. Near a camera, rays are dense, and only this camera sees the place: without scaling, matter forms there
+    /// min(1, (t / d)²), with d this length and t that of [`Samples`]; 0 for exact gradients. In a contracted space, t is a distance there. Gradients of rays are scaled too. Near a camera, rays are dense, and only this camera sees the place: without scaling, matter forms there
     /// that no other view contradicts.
     pub gradient_scaling: f64,
 }

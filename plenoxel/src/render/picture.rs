@@ -89,14 +89,15 @@ fn pixels_of_tile(corner: [usize; 2], size: [usize; 2]) -> Vec<[usize; 2]> {
     packets.flat_map(pixels).collect()
 }
 
-/// Returns the rays of `count` packets of pixels, at even places of the images of some cameras.
+/// Returns the rays of `count` packets of pixels, at places that fill the images of some cameras evenly, also the first ones of them.
 pub(crate) fn sampled_packets(cameras: &[Camera], count: usize) -> Vec<Ray> {
-    // Steps of the additive sequence that fills the square evenly: powers of the inverse of 1.3247, the root of x³ = x + 1.
-    const STEPS: [f64; 2] = [0.754_877_666_246_692_7, 0.569_840_290_998_053_2];
+    // Steps of an additive sequence that fills the cube evenly: powers of the inverse of the root of x⁴ = x + 1.
+    const STEPS: [f64; 3] = [0.819_172_513_396_164_5, 0.671_043_606_703_789_3, 0.549_700_477_901_970_3];
     let packet = |k: usize| {
-        let camera = &cameras[k * cameras.len() / count];
+        let at = |axis: usize, count: usize| ((0.5 + k as f64 * STEPS[axis]).fract() * count as f64) as usize;
+        let camera = &cameras[at(2, cameras.len())];
         let size = [camera.intrinsics.width, camera.intrinsics.height];
-        let corner = |axis: usize| ((k as f64 * STEPS[axis]).fract() * size[axis].saturating_sub(PACKET) as f64) as usize;
+        let corner = |axis: usize| at(axis, (size[axis] + 1).saturating_sub(PACKET).max(1));
         let [x, y] = [corner(0), corner(1)];
         let side = move |axis: usize| PACKET.min(size[axis]);
         (0..side(1)).flat_map(move |j| (0..side(0)).map(move |i| camera.ray((x + i) as f64 + 0.5, (y + j) as f64 + 0.5)))
@@ -127,13 +128,14 @@ mod tests {
         let camera = |width, height| Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(width, height, 0.7));
         let cameras = [camera(100, 61), camera(5, 3)];
         let rays = sampled_packets(&cameras, 64);
-        assert_eq!(rays.len(), 32 * 64 + 32 * 15);
-        let place = |camera: &Camera, ray: &Ray| camera.project(ray.origin + ray.direction).expect("it is seen");
-        let places: Vec<_> = rays[..32 * 64].iter().map(|ray| place(&cameras[0], ray)).collect();
+        let small = rays.iter().filter(|ray| ray.direction == cameras[1].ray(0.5, 0.5).direction).count();
+        assert!((28..=36).contains(&small) && rays.len() == small * 15 + (64 - small) * 64, "{small} packets of the small image");
+        let place = |ray: &Ray| cameras[0].project(ray.origin + ray.direction).expect("it is seen");
+        let places: Vec<_> = sampled_packets(&cameras[..1], 64).iter().map(place).collect();
         assert!(places.iter().all(|(x, y, _)| (x.fract() - 0.5).abs() < 1e-9 && (y.fract() - 0.5).abs() < 1e-9));
         for (quarter, [x, y]) in [[0.0, 0.0], [50.0, 0.0], [0.0, 30.5], [50.0, 30.5]].into_iter().enumerate() {
             let inside = places.iter().filter(|(u, v, _)| (x..x + 50.0).contains(u) && (y..y + 30.5).contains(v)).count();
-            assert!((350..680).contains(&inside), "quarter {quarter}: {inside}");
+            assert!((768..1280).contains(&inside), "quarter {quarter}: {inside}");
         }
     }
 }

@@ -4,7 +4,7 @@
 //! lego of NeRF-synthetic at 800 x 800 (`benches/history`). It varies between scenes by about a quarter, and so does the actual duration. The
 //! plan is a number of steps for each stage and is part of the settings of the run, which thus repeat the run bit by bit on any machine.
 
-use super::pace::without_evaluation;
+use super::pace::TimeBudget;
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::evaluate::PIXEL_COST;
@@ -39,11 +39,11 @@ struct Speed {
     step: f64,
     /// Seconds before the first step.
     begin: f64,
-    /// Duration of the measurement, in seconds.
+    /// Seconds that are not for steps of the run: those of the measurement, and of what else is included in the time.
     spent: f64,
 }
 
-/// Scales the stages so that training takes `seconds` on this machine, including the measurement made here and the evaluation of `evaluated` pixels. Everything counted in steps is
+/// Scales the stages so that the run takes its `time` on this machine, including the measurement made here. Everything counted in steps is
 /// scaled: stages, warm-ups and loss schedules. If the time is short, the finest stages also become coarser.
 ///
 /// The result depends on the speed of the machine. It is a number of steps, so a run with these settings repeats bit by bit.
@@ -54,8 +54,7 @@ struct Speed {
 pub fn on_time(
     config: Config,
     views: &Arc<[View]>,
-    seconds: f64,
-    evaluated: f64,
+    time: TimeBudget,
     objective: &dyn Fn(&Config, usize) -> Result<Objective<f32>>,
 ) -> Result<Config> {
     if config.init_from.is_some() {
@@ -68,10 +67,11 @@ pub fn on_time(
     let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
     let config = config.fitted_to(views.iter().map(|view| &view.camera));
-    let speed = measure(&config, views, seconds, objective(&config, views.len())?)?;
+    let speed = measure(&config, views, time.seconds, objective(&config, views.len())?)?;
     let finest = config.stages.last().map_or(0, |stage| stage.resolution);
     let ray = speed.step * ray_cost(finest) / ray_cost(speed.resolution) / config.rays_per_step as f64;
-    planned(config, &steps, without_evaluation(seconds, PIXEL_COST * ray * evaluated), &speed)
+    let otherwise = time.spent + time.kept_for(PIXEL_COST * ray * time.evaluated);
+    planned(config, &steps, time.seconds, &Speed { spent: speed.spent + otherwise, ..speed })
 }
 
 /// The plan for a machine of this speed; `steps` are the configured numbers of steps.
@@ -258,11 +258,11 @@ mod tests {
         let losses = [("mse", Weight::Constant(1.0)), ("beta", Weight::Until { weight: 1e-9, until: 250 })];
         let losses = losses.map(|(name, weight)| (name.to_owned(), weight)).into();
         let config = Config { stages: vec![stage], losses, rays_per_step: 16, ..Config::default() };
-        let planned = on_time(config.clone(), &views, 10.0, 0.0, &objective::<f32>).unwrap();
+        let planned = on_time(config.clone(), &views, TimeBudget::of_training(10.0), &objective::<f32>).unwrap();
         let Stage { steps: Some(steps), density_warm_up, .. } = planned.stages[0] else { panic!("steps are planned") };
         let Weight::Until { until, .. } = planned.losses["beta"] else { panic!("a weight keeps its form") };
         assert!(steps.abs_diff(2 * density_warm_up) <= 2 && density_warm_up.abs_diff(2 * until) <= 2, "{steps} {density_warm_up} {until}");
         let from = Config { init_from: Some("run".into()), ..config };
-        assert!(on_time(from, &views, 1.0, 0.0, &objective::<f32>).unwrap_err().to_string().contains("--init-from"));
+        assert!(on_time(from, &views, TimeBudget::of_training(1.0), &objective::<f32>).unwrap_err().to_string().contains("--init-from"));
     }
 }

@@ -167,7 +167,7 @@ pub struct Observation {
     pub validation_psnr: Option<f64>,
     /// Seconds of training so far.
     pub seconds: f64,
-    /// Estimated seconds of the final evaluation, if they were measured after the step.
+    /// Estimated seconds of rendering for the final evaluation, if they were measured after the step.
     pub evaluation_seconds: Option<f64>,
 }
 

@@ -30,12 +30,27 @@ impl<M: Model<f32>> Begun<M> {
     }
 }
 
-/// Largest share of a time that is kept for the evaluation at its end.
-const MOST_FOR_EVALUATION: f64 = 0.5;
+/// Time for which a run is planned.
+#[derive(Clone, Copy, Debug)]
+pub struct TimeBudget {
+    /// Seconds in all.
+    pub seconds: f64,
+    /// Seconds of it that were spent before the training.
+    pub spent: f64,
+    /// Number of pixels whose evaluation is included; 0 if it is not.
+    pub evaluated: f64,
+}
 
-/// Returns what is left of `seconds` for training if the evaluation at the end takes `evaluation` seconds, but at least half.
-pub(super) fn without_evaluation(seconds: f64, evaluation: f64) -> f64 {
-    seconds - evaluation.min(MOST_FOR_EVALUATION * seconds)
+impl TimeBudget {
+    /// Time for training alone.
+    pub fn of_training(seconds: f64) -> Self {
+        TimeBudget { seconds, spent: 0.0, evaluated: 0.0 }
+    }
+
+    /// Returns the seconds that are kept for an evaluation: `evaluation`, but at most half of what is left for training and evaluation.
+    pub(super) fn kept_for(&self, evaluation: f64) -> f64 {
+        evaluation.min(0.5 * (self.seconds - self.spent).max(0.0))
+    }
 }
 
 /// Returns the expected duration of a step of a stage, in the unit of [`PlannedStage::ray_cost`].
@@ -51,18 +66,18 @@ pub struct Planned<R: Recipe> {
     pub begun: Option<Begun<R::Model>>,
 }
 
-/// Fits settings to the training views, and scales them so that training takes `seconds` on this machine, including the measurement made here and the evaluation
-/// of `evaluated` pixels at the end. `begin` creates a trainer. If `keep` is false, the measured steps do not become steps of the run.
+/// Fits settings to the training views, and scales them so that the run takes its `time` on this machine, including the measurement made here. `begin` creates a
+/// trainer. If `keep` is false, the measured steps do not become steps of the run.
 ///
 /// Errors: the time or the first stage is too short; those of [`Trainer::step`].
 pub fn plan<R: Recipe + Clone>(
     recipe: &R,
-    seconds: f64,
-    evaluated: f64,
+    time: TimeBudget,
     keep: bool,
     begin: impl FnOnce(&R) -> Result<Trainer<f32, R::Model>>,
 ) -> Result<Planned<R>> {
     let start = Instant::now();
+    let seconds = time.seconds - time.spent;
     let (measured, duration) = recipe.likely_for(seconds);
     let mut trainer = begin(&measured)?;
     // The last step of a stage is not taken: a plan may have more steps in it.
@@ -95,19 +110,19 @@ pub fn plan<R: Recipe + Clone>(
     let step = (spent - measured_from) / f64::from(count);
     let unit = step / cost / duration;
     let stages = trainer.plan();
-    let evaluation = stages.last().map_or(0.0, |last| step / step_cost(&stages[0]) * last.ray_cost * PIXEL_COST * evaluated);
-    let seconds = without_evaluation(seconds, evaluation);
+    let evaluation = stages.last().map_or(0.0, |last| step / step_cost(&stages[0]) * last.ray_cost * PIXEL_COST * time.evaluated);
+    let training = seconds - time.kept_for(evaluation);
     let planned =
         |left: f64, taken: u64| recipe.clone().fitted_to(trainer.model(), trainer.views()).with_cost(trainer.model(), left / unit, taken);
     let taken = trainer.steps_taken();
-    let continued = (keep && startup < seconds).then(|| planned(seconds - startup, taken));
+    let continued = (keep && startup < training).then(|| planned(training - startup, taken));
     if let Some(recipe) = continued.filter(|continued| continued.begins_as(&measured, taken)) {
         trainer.replan(|model| recipe.clone().change(model));
         return Ok(Planned { recipe, begun: Some(Begun { trainer, reports }) });
     }
-    let left = seconds - spent - startup;
+    let left = training - spent - startup;
     if left <= 0.0 {
-        let found = format!("{} is too short: beginning to train takes {} or more", clock(seconds), clock(spent + startup));
+        let found = format!("{} is too short: beginning to train takes {} or more", clock(time.seconds), clock(time.seconds - left));
         return Err(Error::usage("--time", found, "give it several times as much"));
     }
     Ok(Planned { recipe: planned(left, 0), begun: None })
@@ -122,14 +137,14 @@ type Evaluation<M> = Box<dyn Fn(&M) -> f64>;
 pub struct Pace<R: Recipe> {
     recipe: R,
     config: Config,
-    seconds: f64,
+    time: TimeBudget,
     /// The evaluation, if it is part of the time.
     evaluation: Option<Evaluation<R::Model>>,
     /// Number of steps after which the plan is adjusted next; `None` if it is not.
     adjust_at: Option<u64>,
     /// True after the first adjustment.
     adjusted: bool,
-    /// Stage and number of steps from which on the speed is measured, and seconds of training until then: the first step that was seen of the stage, or, in a run of
+    /// Stage and number of steps from which on the speed is measured, and seconds that were spent until then: the first step that was seen of the stage, or, in a run of
     /// one stage, the last adjustment.
     measured_from: Option<(usize, u64, f64)>,
 }
@@ -138,11 +153,11 @@ pub struct Pace<R: Recipe> {
 const MEASURED: u64 = 10;
 
 impl<R: Recipe + Clone> Pace<R> {
-    /// Follows a run with these settings, which are those of `config` for its model, planned for `seconds`, in which `evaluation` is included.
-    pub fn new(recipe: R, config: Config, seconds: f64, evaluation: Option<Evaluation<R::Model>>) -> Self {
+    /// Follows a run with these settings, which are those of `config` for its model, planned for `time`, in which `evaluation` is included.
+    pub fn new(recipe: R, config: Config, time: TimeBudget, evaluation: Option<Evaluation<R::Model>>) -> Self {
         let until = recipe.steps_before_length_matters();
         let adjust_at = (until > 0).then_some(until / 3);
-        Pace { recipe, config, seconds, evaluation, adjust_at, adjusted: false, measured_from: None }
+        Pace { recipe, config, time, evaluation, adjust_at, adjusted: false, measured_from: None }
     }
 
     /// Looks at the time after a step; `now` is how much of it is spent, in seconds. Returns the new configuration if the plan changed.
@@ -166,7 +181,7 @@ impl<R: Recipe + Clone> Pace<R> {
         let evaluation = self.evaluation.as_ref().map_or(0.0, |of| of(trainer.model()) * last.ray_cost / stage.ray_cost);
         let to_come = |stage: &PlannedStage| stage.steps - taken.saturating_sub(stage.first).min(stage.steps);
         let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * step_cost(stage)).sum();
-        let left = ((without_evaluation(self.seconds, evaluation) - now) / unit - before) / step_cost(last);
+        let left = ((self.time.seconds - self.time.kept_for(evaluation) - now) / unit - before) / step_cost(last);
         let (first, steps) = (last.first, taken.saturating_sub(last.first) + left.round().max(1.0) as u64);
         let adjusted = self.recipe.with_last_stage(steps, taken);
         assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
@@ -237,7 +252,7 @@ mod tests {
     #[test]
     fn measured_steps_of_the_plan_are_those_of_a_run_from_the_beginning() {
         let asked = recipe(&[(8, 2000), (12, 40_000), (40, 100_000)]);
-        let Planned { recipe, begun } = plan(&asked, 1.0, 0.0, true, trainer).unwrap();
+        let Planned { recipe, begun } = plan(&asked, TimeBudget::of_training(1.0), true, trainer).unwrap();
         assert_eq!((recipe.short, recipe.hidden, recipe.group), (None, 4, 0.2));
         let Begun { trainer: begun, reports } = begun.expect("a short plan is what a second leads to");
         assert!(reports.len() as u64 == begun.steps_taken() && reports.len() >= 24 && recipe.stages[0].steps > begun.steps_taken());
@@ -248,19 +263,27 @@ mod tests {
         let mut going_on = begun;
         going_on.replan(|model| less.clone().change(model));
         assert_eq!(trained(going_on), trained(trainer(&less).unwrap()));
+        // An evaluation of so many pixels takes half of the time, and reading the views nearly all of it.
+        let steps = |time: TimeBudget| {
+            plan(&asked, time, true, trainer).map(|planned| planned.recipe.stages.iter().map(|stage| stage.steps).sum::<u64>())
+        };
+        let [all, half] = [0.0, 1e15].map(|evaluated| steps(TimeBudget { evaluated, ..TimeBudget::of_training(1.0) }).unwrap());
+        assert!((0.3..0.75).contains(&(half as f64 / all as f64)), "{half} of {all}");
+        let late = steps(TimeBudget { spent: 1.5, ..TimeBudget::of_training(1.0) }).unwrap_err().to_string();
+        assert!(late.contains("0:01 is too short") && late.contains("0:0"), "{late}");
         // On request, the run begins anew.
-        assert!(plan(&asked, 1.0, 0.0, false, trainer).unwrap().begun.is_none());
+        assert!(plan(&asked, TimeBudget::of_training(1.0), false, trainer).unwrap().begun.is_none());
     }
 
     #[test]
     fn measuring_ends_before_the_first_stage_does_and_a_bounded_first_stage_begins_anew() {
         let asked = tensorf::Config { short: None, ..recipe(&[(8, 12), (40, 100_000)]) };
-        let begun = plan(&asked, 2.0, 0.0, true, trainer).unwrap().begun.expect("steps of the plan");
+        let begun = plan(&asked, TimeBudget::of_training(2.0), true, trainer).unwrap().begun.expect("steps of the plan");
         assert!(begun.trainer.steps_taken() == 11 && begun.reports.iter().all(|(report, _)| !report.ends_stage));
         let bounded = tensorf::Config { pixels_per_cell: 4.0, ..recipe(&[(8, 100), (8, 200)]) };
-        assert!(plan(&bounded, 60.0, 0.0, true, trainer).unwrap().begun.is_none());
+        assert!(plan(&bounded, TimeBudget::of_training(60.0), true, trainer).unwrap().begun.is_none());
         let short = tensorf::Config { short: None, ..recipe(&[(8, 3), (8, 200)]) };
-        assert!(plan(&short, 1.0, 0.0, true, trainer).err().unwrap().to_string().contains("--time"));
+        assert!(plan(&short, TimeBudget::of_training(1.0), true, trainer).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
@@ -268,9 +291,9 @@ mod tests {
         let asked = recipe(&[(8, 100), (16, 200)]);
         // So long that the network stays, and too long for any steps to be guessed.
         let unlikely = tensorf::Config { short: Some(Short { below: 1e-9, ..asked.short.unwrap() }), last_rate: 0.5, ..asked };
-        let Planned { recipe, begun } = plan(&unlikely, 1.0, 0.0, true, trainer).unwrap();
+        let Planned { recipe, begun } = plan(&unlikely, TimeBudget::of_training(1.0), true, trainer).unwrap();
         assert!(begun.is_none() && recipe.hidden == 8);
-        assert!(plan(&unlikely, 1e-9, 0.0, true, trainer).err().unwrap().to_string().contains("--time"));
+        assert!(plan(&unlikely, TimeBudget::of_training(1e-9), true, trainer).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
@@ -278,7 +301,7 @@ mod tests {
         let with_cool_down = |cool_down: f64| tensorf::Config { short: None, cool_down, ..recipe(&[(8, 30), (8, 200)]) };
         for (cool_down, of_a_step) in [(0.4, 0.1), (0.4, 0.5), (0.4, 1.0), (0.75, 0.1), (0.75, 0.3), (0.75, 10.0)] {
             let asked = with_cool_down(cool_down);
-            let mut pace = Pace::new(asked.clone(), Config::default(), 100.0, None);
+            let mut pace = Pace::new(asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
             let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
             while trainer.step().unwrap().is_some() {
                 // From the 35th step on, steps take a tenth longer.
@@ -294,21 +317,23 @@ mod tests {
         }
         // Rates that fall from the first step on know the whole length.
         let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };
-        assert!(Pace::new(falling, Config::default(), 100.0, None).adjust_at.is_none());
+        assert!(Pace::new(falling, Config::default(), TimeBudget::of_training(100.0), None).adjust_at.is_none());
     }
 
     #[test]
     fn an_evaluation_that_is_included_ends_on_time_and_takes_at_most_half_of_it() {
-        for (evaluation, trained) in [(30.0, 70.0), (80.0, 50.0)] {
+        // The time before the training is given, and half of the rest is for training at least.
+        for (spent, evaluation, trained) in [(0.0, 30.0, 70.0), (0.0, 80.0, 50.0), (20.0, 30.0, 50.0), (20.0, 80.0, 40.0)] {
+            let time = TimeBudget { seconds: 100.0, spent, evaluated: 1.0 };
             let asked = tensorf::Config { short: None, ..recipe(&[(8, 30), (8, 200)]) };
-            let mut pace = Pace::new(asked.clone(), Config::default(), 100.0, Some(Box::new(move |_| evaluation)));
+            let mut pace = Pace::new(asked.clone(), Config::default(), time, Some(Box::new(move |_| evaluation)));
             let mut trainer = trainer(&asked).unwrap();
             while trainer.step().unwrap().is_some() {
-                let now = 0.5 * trainer.steps_taken() as f64;
+                let now = spent + 0.5 * trainer.steps_taken() as f64;
                 let _ = pace.after_step(&mut trainer, now);
             }
             let took = 0.5 * trainer.steps_taken() as f64;
-            assert!((took - trained).abs() < 1.0, "{evaluation}: {took}");
+            assert!((took - trained).abs() < 1.0, "{spent}, {evaluation}: {took}");
         }
     }
 
@@ -327,7 +352,7 @@ mod tests {
             stages: vec![ngp::Stage { steps: 300, rays: 16 }],
             ..ngp::Config::default()
         };
-        let mut pace = Pace::new(asked.clone(), Config::default(), 100.0, None);
+        let mut pace = Pace::new(asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
         let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
         // The first twenty steps take 0.33 seconds, as the plan expects, and the others 0.1.
         let seconds = |taken: u64| 0.1 * taken as f64 + 0.23 * taken.min(20) as f64;

@@ -38,12 +38,13 @@ use crate::geometry::Aabb;
 use crate::loss;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::{self, Objective, Trainer, objective};
-use crate::run::pace::Begun;
+use crate::run::pace::{Begun, TimeBudget};
 use crate::text::clock;
 use crate::train::{self, Model, StageProgress};
 use started::{NewRun, OldRun, estimate, watched};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Instant;
 
 /// Settings of a new run.
 pub struct RunSettings {
@@ -200,6 +201,7 @@ type MakeObjective<'o> = dyn Fn(&Config, usize) -> Result<Objective<f32>> + 'o;
 
 /// [`train_with`], compiled once.
 fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
+    let began = Instant::now();
     settings.config.check_stages()?;
     let mut run = NewRun::open(settings, on)?;
     let from = run.config.init_from.as_deref().map(RunFolder::open).transpose()?;
@@ -222,8 +224,16 @@ fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &m
     if let Some(seconds) = settings.time {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, dataset, .. } = &mut run;
-        let evaluated = if settings.with_evaluation { other::pixels(&job::test_cameras(dataset, &settings.options)) } else { 0.0 };
-        *config = clocks.train.time(|| budget::on_time(config.clone(), views, seconds, evaluated, objective))?;
+        let time = match settings.with_evaluation {
+            true => {
+                // Stages that are kept are evaluated too.
+                let pictures = if settings.options.stage_psnr { 2.0 } else { 1.0 };
+                let evaluated = pictures * other::pixels(&job::test_cameras(dataset, &settings.options));
+                TimeBudget { seconds, spent: began.elapsed().as_secs_f64(), evaluated }
+            }
+            false => TimeBudget::of_training(seconds),
+        };
+        *config = clocks.train.time(|| budget::on_time(config.clone(), views, time, objective))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
         on(Event::note(format!("planned for {}{}: steps {}", clock(seconds), settings.included(), stages.collect::<Vec<_>>().join(", "))));
     }

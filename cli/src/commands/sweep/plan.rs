@@ -245,6 +245,11 @@ fn job(
             Some(reduction(value, &place(&format!("{}.{EVALUATE_DOWNSCALE}", method.path)))?).filter(|k| *k != asked.config.downscale)
         }
     };
+    if evaluate_downscale.is_some() && asked.with_evaluation {
+        let found =
+            format!("{EVALUATE_DOWNSCALE} evaluates after the training, and including_evaluation counts the evaluation of the training");
+        return Err(Error::usage(place(&method.path), found, "leave out one of them"));
+    }
     // The evaluation at another image size follows the training.
     let skips = evaluate_downscale.is_some() && command == COMMANDS[0] && !call.flags.iter().any(|flag| flag.key == "no_evaluate");
     call.flags.extend(skips.then(|| Flag { key: "no_evaluate".to_owned(), text: "--no-evaluate".to_owned() }));

@@ -130,8 +130,8 @@ pub struct TrainArgs {
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,
 
-    /// Let --time be that of the whole run, from the start of the program to the figures of the test views. At least half of it is for training. The length of
-    /// the training follows the measured speed of pictures with the presets quality, tensorf, photos and ngp, and an estimate with others
+    /// Let --time be that of the whole run, from the start of the program to the figures of the test views. At most half of what is left after reading is kept
+    /// for the evaluation. Where the plan is adjusted during training, the speed of pictures is measured; otherwise it is estimated
     #[arg(long, help_heading = "Settings", requires = "time", conflicts_with = "no_evaluate")]
     pub including_evaluation: bool,
 

@@ -104,7 +104,7 @@ pub struct RunRecord {
     pub preset: Option<String>,
     /// Source of the views.
     pub data: DataSource,
-    /// Planned seconds of training, if it was planned by time.
+    /// Planned seconds of training, or of the whole run, if it was planned by time.
     #[serde(default)]
     pub seconds_planned: Option<f64>,
     /// True if these are the seconds of the whole run with its evaluation.

@@ -78,6 +78,7 @@ impl Job<'_> {
             baseline_mean_image_psnr: mean_image_psnr,
             seconds: clocks.train.seconds(),
             seconds_planned: self.record.seconds_planned,
+            with_evaluation: self.record.with_evaluation,
             seconds_load: clocks.load.seconds(),
             seconds_evaluate: clocks.evaluate.seconds(),
             peak_memory_bytes: memory::peak(),

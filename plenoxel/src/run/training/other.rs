@@ -12,7 +12,7 @@ use crate::model::plenoxels::objective_of_any;
 use crate::model::recipe::Recipe;
 use crate::run::data::DataSource;
 use crate::run::memory::Estimate;
-use crate::run::pace::{self, Begun, Pace};
+use crate::run::pace::{self, Begun, Pace, TimeBudget};
 use crate::space::Region;
 use crate::text::clock;
 use crate::train::{Trainer, ViewOptions};
@@ -61,14 +61,17 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, dataset, .. } = &mut run;
         // What is included in the time is counted from the beginning.
-        let (evaluated, before) = match settings.with_evaluation {
-            true => (job::test_cameras(dataset, &settings.options), began.elapsed().as_secs_f64()),
-            false => (Vec::new(), 0.0),
+        let (time, evaluated) = match settings.with_evaluation {
+            true => {
+                let cameras = job::test_cameras(dataset, &settings.options);
+                (TimeBudget { seconds, spent: began.elapsed().as_secs_f64(), evaluated: pixels(&cameras) }, cameras)
+            }
+            false => (TimeBudget::of_training(seconds), Vec::new()),
         };
         let begin = |recipe: &R| trainer(config, recipe, region, views.clone(), losses);
         // The schedule of the poses counts all steps of the run.
         let adjusts = !config.losses.contains_key(POSES);
-        let planned = clocks.train.time(|| pace::plan(&recipe, seconds - before, pixels(&evaluated), adjusts, begin))?;
+        let planned = clocks.train.time(|| pace::plan(&recipe, time, adjusts, begin))?;
         (recipe, begun) = (planned.recipe, planned.begun);
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
             Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
@@ -83,7 +86,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
                 let viewer = Viewer::of(model, &view);
                 start.elapsed().as_secs_f64() + viewer.seconds_for(&evaluated)
             };
-            Pace::new(recipe.clone(), config.clone(), seconds, settings.with_evaluation.then(|| Box::new(evaluation) as _))
+            Pace::new(recipe.clone(), config.clone(), time, settings.with_evaluation.then(|| Box::new(evaluation) as _))
         });
     }
     let NewRun { config, views, clocks, .. } = &mut run;

@@ -44,7 +44,7 @@ pub struct Look {
     pub psnr: Option<f64>,
     /// A picture, if one was wanted, and the photograph of the same view, if there is one.
     pub picture: Option<(Array3<f32>, Option<Array3<f32>>)>,
-    /// Estimated seconds of the final evaluation, with the model as it is now.
+    /// Estimated seconds of rendering for the final evaluation, with the model as it is now.
     pub evaluation_seconds: f64,
 }
 

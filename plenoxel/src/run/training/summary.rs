@@ -19,8 +19,11 @@ pub struct Summary {
     pub baseline_mean_image_psnr: Option<f64>,
     /// Seconds of training.
     pub seconds: f64,
-    /// Planned seconds of training (`--time`).
+    /// Planned seconds of training, or of the whole run (`--time`).
     pub seconds_planned: Option<f64>,
+    /// True if those are the seconds of the whole run with its evaluation.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub with_evaluation: bool,
     /// Seconds of reading images.
     pub seconds_load: f64,
     /// Seconds of rendering and comparing test views.

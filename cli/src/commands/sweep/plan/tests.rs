@@ -159,6 +159,10 @@ fn a_run_may_be_compared_at_another_size_than_it_was_made_at() {
     .unwrap();
     let found: Vec<_> = plan.jobs.iter().map(|job| (job.asked.config.downscale, job.evaluate_downscale)).collect();
     assert_eq!(found, [(2, Some(1)), (4, None), (1, Some(8))]);
+    let both =
+        "[[scenes]]\n[[methods]]\npreset = \"fast\"\ndownscale = 2\nevaluate_downscale = 1\ntime = \"1m\"\nincluding_evaluation = true";
+    let error = read("both", both).unwrap_err().to_string();
+    assert!(error.contains("evaluate_downscale") && error.contains("including_evaluation"), "{error}");
     // Training skips the evaluation, which a second command makes.
     let leaves = |job: &Job| job.call.flags.iter().any(|flag| flag.text == "--no-evaluate");
     assert_eq!(plan.jobs.iter().map(leaves).collect::<Vec<_>>(), [true, false, false]);
