@@ -199,7 +199,7 @@ impl<T: Real> Tensorf<T> {
 }
 
 /// Learning rate that falls exponentially over a run of `total` steps, of which `first` came before, and in the last share `cool_down` of the run also linearly
-/// to 0; 0 for the first `frozen` steps of the run. It rises linearly in the first `warm_up` steps.
+/// to 0; 0 for the first `frozen` steps of the run.
 #[derive(Debug)]
 struct Falling {
     rate: f64,
@@ -208,7 +208,6 @@ struct Falling {
     first: u64,
     total: Arc<AtomicU64>,
     frozen: u64,
-    warm_up: u64,
 }
 
 impl Schedule for Falling {
@@ -219,8 +218,7 @@ impl Schedule for Falling {
         }
         let done = step as f64 / self.total.load(Relaxed) as f64;
         let left = if self.cool_down > 0.0 { ((1.0 - done) / self.cool_down).clamp(0.0, 1.0) } else { 1.0 };
-        let warm = if step < self.warm_up { (step + 1) as f64 / self.warm_up as f64 } else { 1.0 };
-        warm * left * self.rate * self.last.powf(done)
+        left * self.rate * self.last.powf(done)
     }
 }
 
@@ -270,11 +268,10 @@ impl<T: Real> Model<T> for Tensorf<T> {
             first: stage.first,
             total: self.total_steps.clone(),
             frozen,
-            warm_up: 0,
         };
         let mut rates = Rates::new(falling(config.factor_rate, 0));
         for name in self.field.network_names() {
-            rates = rates.with(name, Falling { warm_up: config.network_warm_up, ..falling(config.network_rate, 0) });
+            rates = rates.with(name, falling(config.network_rate, 0));
         }
         let mut l1 = Vec::new();
         self.field.density_factors().visit(&mut |param| {
@@ -363,22 +360,4 @@ pub fn density_l1<T: Real>(step: &Step<'_, T, Tensorf<T>>) -> Tensor<T> {
         sum = Some(sum.take().map_or_else(|| mean.clone(), |sum| sum + &mean));
     });
     sum.unwrap_or_else(|| Tensor::zeros(&[]))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn rates_rise_over_the_steps_of_the_run_and_fall_at_its_end() {
-        let falling = |first: u64, frozen: u64, warm_up: u64| {
-            let total = Arc::new(AtomicU64::new(100));
-            Falling { rate: 2.0, last: 1.0, cool_down: 0.4, first, total, frozen, warm_up }
-        };
-        let rates = |of: Falling| [0, 4, 20, 75].map(|step| (1e9 * of.at(step)).round() / 1e9);
-        assert_eq!(rates(falling(0, 0, 10)), [0.2, 1.0, 2.0, 1.25]);
-        // A later stage continues.
-        assert_eq!(rates(falling(5, 0, 10)), [1.2, 2.0, 2.0, 1.0]);
-        assert_eq!(rates(falling(0, 5, 0)), [0.0, 0.0, 2.0, 1.25]);
-    }
 }

@@ -62,8 +62,6 @@ pub struct Config {
     pub factor_rate: f64,
     /// Learning rate of the matrix B and the network.
     pub network_rate: f64,
-    /// Number of steps in which the learning rate of the matrix B and the network rises linearly from 0.
-    pub network_warm_up: u64,
     /// Share of the learning rates that is left at the end of the run; they fall exponentially.
     pub last_rate: f64,
     /// Share of the steps of the run, at its end, during which the learning rates also fall linearly to 0.
@@ -125,7 +123,6 @@ impl Default for Config {
             opaque_steps: 50,
             factor_rate: 0.02,
             network_rate: 5e-3,
-            network_warm_up: 0,
             last_rate: 1.0,
             cool_down: 0.4,
             density_l1: 8e-5,
