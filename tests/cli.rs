@@ -534,11 +534,11 @@ fn a_time_may_include_the_evaluation_and_the_run_says_so() {
     let with = |more: &[&str]| plenoxel(&[&tiny, more].concat());
     with(&["--including-evaluation"]).refused(2, &["--time"]);
     with(&["--including-evaluation", "--time=3s", "--no-evaluate"]).refused(2, &["--including-evaluation", "--no-evaluate"]);
-    let answer = with(&["--including-evaluation", "--time=3s"]);
-    assert!(answer.err.contains("planned for 0:03 with evaluation"), "{}", answer.err);
+    let answer = with(&["--including-evaluation", "--time=12s"]);
+    assert!(answer.err.contains("planned for 0:12 with evaluation"), "{}", answer.err);
     assert_eq!(answer.json()["views"], 2);
     let record: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.path("run/run.json")).unwrap()).unwrap();
-    assert_eq!((&record["seconds_planned"], &record["with_evaluation"]), (&3.0.into(), &true.into()));
+    assert_eq!((&record["seconds_planned"], &record["with_evaluation"]), (&12.0.into(), &true.into()));
 }
 
 #[test]

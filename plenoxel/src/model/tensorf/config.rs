@@ -90,10 +90,17 @@ pub struct Short {
     pub below: f64,
     /// Replaces [`Config::hidden`].
     pub hidden: usize,
+    /// Replaces [`Config::network_rate`]: a smaller network needs a larger one. Files of earlier versions do not have it.
+    #[serde(default = "rate_of_earlier_versions")]
+    pub network_rate: f64,
     /// Replaces [`Config::group`].
     pub group: f64,
     /// Duration of a step with these changes, relative to one without.
     pub cost: f64,
+}
+
+fn rate_of_earlier_versions() -> f64 {
+    5e-3
 }
 
 /// The recipe for two cores.
@@ -204,7 +211,8 @@ impl Config {
         }
         check((0.0..=1e3).contains(&self.gradient_scaling), "gradient_scaling", self.gradient_scaling, "0 to 1000")?;
         check((0.0..=1e3).contains(&self.density_tv), "density_tv", self.density_tv, "0 to 1000")?;
-        if let Some(Short { below, hidden, group, cost }) = self.short {
+        if let Some(Short { below, hidden, network_rate, group, cost }) = self.short {
+            check(network_rate > 0.0 && network_rate <= 1.0, "short.network_rate", network_rate, "a number in (0, 1]")?;
             check((1..=1024).contains(&hidden), "short.hidden", hidden as f64, "1 to 1024")?;
             check((0.0..1.0).contains(&group), "short.group", group, "a number in [0, 1)")?;
             for (key, share) in [("short.below", below), ("short.cost", cost)] {
