@@ -217,13 +217,14 @@ pub(crate) fn contract_adjoint(x: DVec3, g: DVec3) -> DVec3 {
 /// Let b be the axis along which the direction d is largest, and t₁ the distance at which the ray leaves the slab |x_b| ≤ 1. Up to there s
 /// is the distance t. Behind it |x_b| = 1 + |d_b| (t − t₁), and 1 / |x_b| falls evenly with s: 1 / |x_b| = 1 − |d_b| (s − t₁), which is 0, at infinity, for
 /// s = t₁ + 1 / |d_b|.
+/// If the ray begins behind the slab, the s of this formula is not 0 at its origin, where its value s₀ is subtracted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bend {
     /// t₁
     turn: f64,
     /// |d_b|
     rate: f64,
-    /// What is subtracted from s, so that it is 0 at the origin of the ray: not 0 only if the ray begins behind the slab.
+    /// The value s₀ of the formula at the origin of the ray. It is 0 if the ray begins before or in the slab.
     start: f64,
 }
 

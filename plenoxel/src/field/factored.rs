@@ -168,9 +168,9 @@ pub struct Factored<T: Real> {
     /// samples of the same block of rays; smaller ones count as 0. 0 for exact gradients. Most samples are in empty cells around matter, or behind it.
     /// Gradients of rays, and gradients that can be differentiated again, are always exact.
     pub gradient_above: f64,
-    /// Gradient scaling (Philip and Deschaintre 2023): the gradients of density and color of a sample at the distance t from the camera are multiplied by
-    /// min(1, (t / d)²), with d this length and t that of [`Samples`]; 0 for exact gradients. In a contracted space, t is a distance there. Gradients of rays are scaled too. Near a camera, rays are dense, and only this camera sees the place: without scaling, matter forms there
-    /// that no other view contradicts.
+    /// Gradient scaling (Philip and Deschaintre 2023), a length d: the gradients of density and color of a sample at t ([`Samples`]) are multiplied by
+    /// min(1, (t / d)²), in the graph and in the kernel; 0 for exact gradients. Gradients of rays become smaller with them. Near a camera, rays are dense and no
+    /// other camera sees the place, so that matter may form there which no other view contradicts.
     pub gradient_scaling: f64,
 }
 

@@ -144,8 +144,8 @@ pub struct Pace<R: Recipe> {
     adjust_at: Option<u64>,
     /// True after the first adjustment.
     adjusted: bool,
-    /// Stage and number of steps from which on the speed is measured, and seconds that were spent until then: the first step that was seen of the stage, or, in a run of
-    /// one stage, the last adjustment.
+    /// Stage and number of steps from which on the speed is measured, and seconds that were spent until then: the first step that was seen of the stage, or the
+    /// last adjustment in a run of one stage.
     measured_from: Option<(usize, u64, f64)>,
 }
 
@@ -263,14 +263,14 @@ mod tests {
         let mut going_on = begun;
         going_on.replan(|model| less.clone().change(model));
         assert_eq!(trained(going_on), trained(trainer(&less).unwrap()));
-        // An evaluation of so many pixels takes half of the time, and reading the views nearly all of it.
+        // An evaluation of so many pixels takes half of the time, and reading the views may take more than all of it.
         let steps = |time: TimeBudget| {
             plan(&asked, time, true, trainer).map(|planned| planned.recipe.stages.iter().map(|stage| stage.steps).sum::<u64>())
         };
         let [all, half] = [0.0, 1e15].map(|evaluated| steps(TimeBudget { evaluated, ..TimeBudget::of_training(1.0) }).unwrap());
         assert!((0.3..0.75).contains(&(half as f64 / all as f64)), "{half} of {all}");
         let late = steps(TimeBudget { spent: 1.5, ..TimeBudget::of_training(1.0) }).unwrap_err().to_string();
-        assert!(late.contains("0:01 is too short") && late.contains("0:0"), "{late}");
+        assert!(late.contains("0:01 is too short"), "{late}");
         // On request, the run begins anew.
         assert!(plan(&asked, TimeBudget::of_training(1.0), false, trainer).unwrap().begun.is_none());
     }

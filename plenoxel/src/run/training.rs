@@ -38,13 +38,12 @@ use crate::geometry::Aabb;
 use crate::loss;
 use crate::model::plenoxels::config::Config;
 use crate::model::plenoxels::{self, Objective, Trainer, objective};
-use crate::run::pace::{Begun, TimeBudget};
+use crate::run::pace::Begun;
 use crate::text::clock;
 use crate::train::{self, Model, StageProgress};
 use started::{NewRun, OldRun, estimate, watched};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
 
 /// Settings of a new run.
 pub struct RunSettings {
@@ -60,7 +59,8 @@ pub struct RunSettings {
     pub force: bool,
     /// Planned duration of training on this machine, in seconds; `None` for the steps of the config.
     pub time: Option<f64>,
-    /// True if `time` is that of the whole run, from its beginning to the figures of the evaluation; at least half of it is for training.
+    /// True if `time` is that of the whole run, from its beginning to the figures of the evaluation; at most half of what is left after
+    /// reading is kept for the evaluation.
     pub with_evaluation: bool,
     /// Settings that do not affect the training.
     pub options: RunOptions,
@@ -201,7 +201,6 @@ type MakeObjective<'o> = dyn Fn(&Config, usize) -> Result<Objective<f32>> + 'o;
 
 /// [`train_with`], compiled once.
 fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
-    let began = Instant::now();
     settings.config.check_stages()?;
     let mut run = NewRun::open(settings, on)?;
     let from = run.config.init_from.as_deref().map(RunFolder::open).transpose()?;
@@ -221,21 +220,19 @@ fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &m
     run.saved = estimate.saved();
     let initial = initial.as_deref().map(checkpoint::load).transpose()?.map(|(grid, _)| grid);
     run.read(on)?;
-    if let Some(seconds) = settings.time {
+    // Stages that are kept are evaluated too.
+    let pictures = if settings.options.stage_psnr { 2.0 } else { 1.0 };
+    if let Some(time) = run.time_budget(pictures) {
         on(Event::note("measuring the speed of this machine"));
-        let NewRun { config, views, clocks, dataset, .. } = &mut run;
-        let time = match settings.with_evaluation {
-            true => {
-                // Stages that are kept are evaluated too.
-                let pictures = if settings.options.stage_psnr { 2.0 } else { 1.0 };
-                let evaluated = pictures * other::pixels(&job::test_cameras(dataset, &settings.options));
-                TimeBudget { seconds, spent: began.elapsed().as_secs_f64(), evaluated }
-            }
-            false => TimeBudget::of_training(seconds),
-        };
+        let NewRun { config, views, clocks, .. } = &mut run;
         *config = clocks.train.time(|| budget::on_time(config.clone(), views, time, objective))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
-        on(Event::note(format!("planned for {}{}: steps {}", clock(seconds), settings.included(), stages.collect::<Vec<_>>().join(", "))));
+        on(Event::note(format!(
+            "planned for {}{}: steps {}",
+            clock(time.seconds),
+            settings.included(),
+            stages.collect::<Vec<_>>().join(", ")
+        )));
     }
     let objective = objective(&run.config, run.views.len())?;
     let NewRun { config, views, clocks, .. } = &mut run;

@@ -50,7 +50,7 @@ pub struct Config {
     /// Least gradient of the density of a sample that the fused kernel uses, relative to the mean
     /// ([`Factored::gradient_above`](crate::field::factored::Factored::gradient_above)); 0 for exact gradients.
     pub gradient_above: f64,
-    /// Distance from a camera, length of the box, below which gradients are scaled by the square of the distance
+    /// Distance from a camera, in units of the box, below which gradients are scaled by the square of the distance
     /// ([`Factored::gradient_scaling`](crate::field::factored::Factored::gradient_scaling)); 0 for exact gradients. Not used in normalized device coordinates.
     pub gradient_scaling: f64,
     /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.

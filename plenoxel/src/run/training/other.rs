@@ -2,7 +2,6 @@
 
 use super::started::{NewRun, OldRun};
 use super::{Event, Listener, MakeLosses, Outcome, RunOptions, RunSettings, job, with_losses};
-use crate::camera::Camera;
 use crate::dataset::{Dataset, Split, View};
 use crate::error::Result;
 use crate::evaluate::Viewer;
@@ -12,7 +11,7 @@ use crate::model::plenoxels::objective_of_any;
 use crate::model::recipe::Recipe;
 use crate::run::data::DataSource;
 use crate::run::memory::Estimate;
-use crate::run::pace::{self, Begun, Pace, TimeBudget};
+use crate::run::pace::{self, Begun, Pace};
 use crate::space::Region;
 use crate::text::clock;
 use crate::train::{Trainer, ViewOptions};
@@ -39,14 +38,8 @@ fn region(dataset: &Dataset, config: &Config) -> Region {
     Region::of(dataset.space(), &dataset.cameras(Split::Train), config.half_width)
 }
 
-/// Returns the number of pixels of some cameras.
-pub fn pixels(cameras: &[Camera]) -> f64 {
-    cameras.iter().map(|camera| (camera.intrinsics.width * camera.intrinsics.height) as f64).sum()
-}
-
 /// Trains a model.
 pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &MakeLosses<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
-    let began = Instant::now();
     let mut recipe = recipe.clone();
     let mut run = NewRun::open(settings, on)?;
     let region = region(&run.dataset, &run.config);
@@ -57,17 +50,9 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
     run.saved = estimate.saved();
     run.read(on)?;
     let (mut begun, mut pace) = (None, None);
-    if let Some(seconds) = settings.time {
+    if let Some(time) = run.time_budget(1.0) {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, dataset, .. } = &mut run;
-        // What is included in the time is counted from the beginning.
-        let (time, evaluated) = match settings.with_evaluation {
-            true => {
-                let cameras = job::test_cameras(dataset, &settings.options);
-                (TimeBudget { seconds, spent: began.elapsed().as_secs_f64(), evaluated: pixels(&cameras) }, cameras)
-            }
-            false => (TimeBudget::of_training(seconds), Vec::new()),
-        };
         let begin = |recipe: &R| trainer(config, recipe, region, views.clone(), losses);
         // The schedule of the poses counts all steps of the run.
         let adjusts = !config.losses.contains_key(POSES);
@@ -77,10 +62,15 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
             Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
             None => stage.steps.to_string(),
         });
-        on(Event::note(format!("planned for {}{}: steps {}", clock(seconds), settings.included(), stages.collect::<Vec<_>>().join(", "))));
+        on(Event::note(format!(
+            "planned for {}{}: steps {}",
+            clock(time.seconds),
+            settings.included(),
+            stages.collect::<Vec<_>>().join(", ")
+        )));
         recipe.clone().set(config);
         pace = adjusts.then(|| {
-            let view = ViewOptions::over(config.background);
+            let (view, evaluated) = (ViewOptions::over(config.background), job::test_cameras(dataset, &settings.options));
             let evaluation = move |model: &R::Model| {
                 let start = Instant::now();
                 let viewer = Viewer::of(model, &view);
@@ -94,6 +84,8 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
         Some(begun) => begun,
         None => Begun::new(clocks.train.time(|| trainer(config, &recipe, region, views.clone(), losses))?),
     };
+    // What includes the evaluation includes everything from the beginning.
+    let began = run.began;
     let spent = |training: f64| if settings.with_evaluation { began.elapsed().as_secs_f64() } else { training };
     run.learn(begun, &mut |trainer, seconds| pace.as_mut()?.after_step(trainer, spent(seconds)), on)
 }

@@ -1,10 +1,11 @@
 //! A new or resumed run, from its settings or its folder to its first step.
 
-use super::job::{Adjust, Clocks, Job};
+use super::job::{self, Adjust, Clocks, Job};
 use super::preview::Preview;
 use super::{Event, Listener, Outcome, RunOptions, RunSettings};
 use crate::dataset::{Dataset, Split, View};
 use crate::error::{Error, Result};
+use crate::evaluate;
 use crate::files;
 use crate::geometry::Aabb;
 use crate::model::plenoxels::config::Config;
@@ -13,7 +14,7 @@ use crate::run::folder::{NewFolder, RunFolder, RunKind, RunRecord};
 use crate::run::machine;
 use crate::run::memory::Estimate;
 use crate::run::metrics::{History, MetricsFile};
-use crate::run::pace::Begun;
+use crate::run::pace::{Begun, TimeBudget};
 use crate::run::settings;
 use crate::text::clock;
 use crate::train::{self, Model, PlannedStage, StageProgress};
@@ -21,7 +22,7 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// A new run.
 pub struct NewRun<'s> {
@@ -38,11 +39,14 @@ pub struct NewRun<'s> {
     pub saved: u64,
     /// Warnings about the cameras.
     pub warnings: Vec<String>,
+    /// When the run began.
+    pub began: Instant,
 }
 
 impl<'s> NewRun<'s> {
     /// Opens the dataset and chooses the folder. Writes nothing.
     pub fn open(settings: &'s RunSettings, on: &mut Listener<'_>) -> Result<Self> {
+        let began = Instant::now();
         let config = settings.config.clone();
         config.validate()?;
         if let (Some(from), Some(to)) = (&config.init_from, &settings.out)
@@ -68,6 +72,19 @@ impl<'s> NewRun<'s> {
             clocks,
             saved: 0,
             warnings: Vec::new(),
+            began,
+        })
+    }
+
+    /// Returns the time for which the run is planned, if it is; `pictures` is the number of pictures of each test view that are evaluated.
+    pub fn time_budget(&self, pictures: f64) -> Option<TimeBudget> {
+        let RunSettings { time, with_evaluation, options, .. } = self.settings;
+        time.map(|seconds| match with_evaluation {
+            true => {
+                let evaluated = pictures * evaluate::pixels(&job::test_cameras(&self.dataset, options)) as f64;
+                TimeBudget { seconds, spent: self.began.elapsed().as_secs_f64(), evaluated }
+            }
+            false => TimeBudget::of_training(seconds),
         })
     }
 
@@ -90,7 +107,7 @@ impl<'s> NewRun<'s> {
 
     /// Creates the folder, trains and evaluates; `adjust` may change the plan. Nothing is written or overwritten before all checks of the input.
     pub fn learn<M: Model<f32>>(self, begun: Begun<M>, adjust: &mut Adjust<'_, M>, on: &mut Listener<'_>) -> Result<Outcome> {
-        let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved, warnings } = self;
+        let NewRun { settings, config, dataset, folder, views, preview, mut clocks, saved, warnings, .. } = self;
         let RunSettings { data, preset, time, with_evaluation, options, .. } = settings;
         check_disk(settings.out.as_deref().unwrap_or(Path::new("runs")), saved.saturating_sub(folder.overwritten()), on)?;
         let folder = folder.create()?;
