@@ -19,7 +19,7 @@ fn train(out: &str, more: &[&str]) -> Answer {
         "--scene-views=8,1,2",
         "--set",
         STAGES,
-        "--set=tensorf.opaque_steps=5",
+        "--set=tensorf.frozen_steps=5",
         "--out",
         out,
     ];

@@ -213,10 +213,20 @@ impl<T: Real> Factored<T> {
         }
     }
 
-    /// Makes the field opaque: the density feature is set to about s = 13 everywhere, by the first component of each pair.
+    /// Makes the field opaque: the density feature is set to about s = 13 everywhere.
     pub fn make_opaque(&mut self) {
-        const FEATURE: f64 = 13.0;
-        self.density.set_first((FEATURE / 3.0).sqrt());
+        self.set_density_feature(13.0);
+    }
+
+    /// Makes the field a uniform fog: the density is set to about `density` everywhere, in units of the box. Densities below 25 softplus(−10) = 0.0011 become
+    /// this one.
+    pub fn make_fog(&mut self, density: f64) {
+        self.set_density_feature(((density / SCALE).exp_m1().ln() - SHIFT).max(0.0));
+    }
+
+    /// Sets the density feature everywhere, by the first component of each pair. The other components keep their values, whose sum is about 0.
+    fn set_density_feature(&mut self, feature: f64) {
+        self.density.set_first((feature / 3.0).sqrt());
     }
 
     /// Returns the sizes of the field.

@@ -279,7 +279,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
             l1.push((param.name().to_owned(), weight));
         });
         for (name, _) in &l1 {
-            rates = rates.with(name.clone(), falling(config.factor_rate, config.opaque_steps));
+            rates = rates.with(name.clone(), falling(config.factor_rate, config.frozen_steps));
         }
         let mode = if config.lazy { AdamMode::Lazy } else { AdamMode::Dense };
         Box::new(Adam::new(rates, mode).betas(0.9, 0.99).epsilon(1e-12).l1(l1))
@@ -292,9 +292,12 @@ impl<T: Real> Model<T> for Tensorf<T> {
     fn begin_stage(&mut self, stage: &PlannedStage, rays: &mut RaySource) -> Result<()> {
         if stage.index == 0 {
             self.field.occupied = self.hull(rays.all_views());
+            let Config { frozen_steps, initial_density, .. } = self.config;
             // Without a hull, an opaque field would be the whole box, in which nothing is seen.
-            if self.field.occupied.is_some() && self.config.opaque_steps > 0 {
+            if self.field.occupied.is_some() && frozen_steps > 0 {
                 self.field.make_opaque();
+            } else if initial_density > 0.0 {
+                self.field.make_fog(initial_density);
             }
         } else {
             // A field that is still thin everywhere, after few steps, keeps the cells that were sampled.

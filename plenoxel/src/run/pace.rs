@@ -226,8 +226,8 @@ mod tests {
             appearance_components: 2,
             features: 4,
             hidden: 8,
-            opaque_steps: 3,
-            short: Some(Short { below: 0.5, hidden: 4, network_rate: 5e-3, group: 0.2, cost: 0.8 }),
+            frozen_steps: 3,
+            short: Some(Short { below: 0.5, hidden: 4, group: 0.2, cost: 0.8 }),
             stages: stages.iter().map(|&(resolution, steps)| Stage { resolution, steps, rays: 32 }).collect(),
             ..tensorf::Config::default()
         }

@@ -55,9 +55,12 @@ pub struct Config {
     pub gradient_scaling: f64,
     /// Least opacity 1 − exp(−σ · step) of a cell that is sampled, once a stage has been trained.
     pub occupied_above: f64,
-    /// Number of steps for which the density is constant. If it is not 0 and there is a visual hull, the density is opaque before the first step; otherwise it is
-    /// the authors' random density.
-    pub opaque_steps: u64,
+    /// Density before the first step, in units of the box, if there is no visual hull; 0 for the authors' random density, which is about 0.0011. A ray of length
+    /// l through this fog has opacity 1 − exp(−σ l). With a visual hull and [`frozen_steps`](Config::frozen_steps), the hull is opaque instead.
+    pub initial_density: f64,
+    /// Number of steps, from the beginning of the run, for which the density is constant, and only colors are learned.
+    #[serde(alias = "opaque_steps")]
+    pub frozen_steps: u64,
     /// Learning rate of planes and lines.
     pub factor_rate: f64,
     /// Learning rate of the matrix B and the network.
@@ -90,17 +93,10 @@ pub struct Short {
     pub below: f64,
     /// Replaces [`Config::hidden`].
     pub hidden: usize,
-    /// Replaces [`Config::network_rate`]: a smaller network needs a larger one. Files of earlier versions do not have it.
-    #[serde(default = "rate_of_earlier_versions")]
-    pub network_rate: f64,
     /// Replaces [`Config::group`].
     pub group: f64,
     /// Duration of a step with these changes, relative to one without.
     pub cost: f64,
-}
-
-fn rate_of_earlier_versions() -> f64 {
-    5e-3
 }
 
 /// The recipe for two cores.
@@ -127,7 +123,8 @@ impl Default for Config {
             gradient_above: 0.0,
             gradient_scaling: 0.0,
             occupied_above: 0.01,
-            opaque_steps: 50,
+            initial_density: 0.0,
+            frozen_steps: 50,
             factor_rate: 0.02,
             network_rate: 5e-3,
             last_rate: 1.0,
@@ -158,7 +155,7 @@ impl Config {
             color_above: 1e-4,
             stop_below: 0.0,
             stop_below_in_pictures: 0.0,
-            opaque_steps: 0,
+            frozen_steps: 0,
             network_rate: 1e-3,
             last_rate: 0.1,
             cool_down: 0.0,
@@ -209,10 +206,10 @@ impl Config {
         for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
         }
+        check((0.0..=100.0).contains(&self.initial_density), "initial_density", self.initial_density, "0 to 100")?;
         check((0.0..=1e3).contains(&self.gradient_scaling), "gradient_scaling", self.gradient_scaling, "0 to 1000")?;
         check((0.0..=1e3).contains(&self.density_tv), "density_tv", self.density_tv, "0 to 1000")?;
-        if let Some(Short { below, hidden, network_rate, group, cost }) = self.short {
-            check(network_rate > 0.0 && network_rate <= 1.0, "short.network_rate", network_rate, "a number in (0, 1]")?;
+        if let Some(Short { below, hidden, group, cost }) = self.short {
             check((1..=1024).contains(&hidden), "short.hidden", hidden as f64, "1 to 1024")?;
             check((0.0..1.0).contains(&group), "short.group", group, "a number in [0, 1)")?;
             for (key, share) in [("short.below", below), ("short.cost", cost)] {

@@ -53,8 +53,8 @@ impl Recipe for Config {
     }
 
     fn measured_step(&self, model: &Tensorf<f32>) -> (u64, f64) {
-        // In opaque matter, rays end at their first samples.
-        (self.opaque_steps, self.cost_in(model.space).step(&self.stages[0]))
+        // While the density is constant, rays end at other samples: in opaque matter at their first ones.
+        (self.frozen_steps, self.cost_in(model.space).step(&self.stages[0]))
     }
 
     fn own_losses(&self, objective: Objective<f32, Tensorf<f32>>) -> Objective<f32, Tensorf<f32>> {
@@ -138,9 +138,8 @@ impl Config {
 
     /// Returns these settings with the changes for a short run, or without any.
     fn shortened(&self, short: Option<Short>) -> Self {
-        let usual = (self.hidden, self.group, self.network_rate);
-        let (hidden, group, network_rate) = short.map_or(usual, |short| (short.hidden, short.group, short.network_rate));
-        Config { hidden, group, network_rate, short: None, ..self.clone() }
+        let (hidden, group) = short.map_or((self.hidden, self.group), |short| (short.hidden, short.group));
+        Config { hidden, group, short: None, ..self.clone() }
     }
 }
 
@@ -244,15 +243,12 @@ mod tests {
 
     #[test]
     fn short_runs_have_the_settings_of_short_runs_and_more_steps_for_them() {
-        let short = Short { below: 0.3, hidden: 64, network_rate: 4e-3, group: 0.1, cost: 0.7 };
+        let short = Short { below: 0.3, hidden: 64, group: 0.1, cost: 0.7 };
         let config = Config { hidden: 128, group: 0.04, short: Some(short), ..Config::default() };
         let costs = config.cost_in(Space::Box);
         let whole = costs.total(&config.stages);
         let planned = [0.2, 0.5].map(|share| config.planned(costs, share * whole, 0));
-        assert_eq!(
-            planned.each_ref().map(|planned| (planned.hidden, planned.network_rate, planned.short)),
-            [(64, 4e-3, None), (128, 5e-3, None)]
-        );
+        assert_eq!(planned.each_ref().map(|planned| (planned.hidden, planned.short)), [(64, None), (128, None)]);
         assert_eq!(planned.each_ref().map(|planned| planned.group), [0.1, 0.04]);
         assert!((costs.total(&planned[0].stages) / (0.2 * whole / 0.7) - 1.0).abs() < 0.05);
         // Without them, a short run has the same network.

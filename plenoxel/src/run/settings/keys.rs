@@ -91,7 +91,7 @@ const FIXED: &[(&str, &[&str])] = &[
     ("carve", &["resolution", "rule", "margin", "depth", "photo", "fit", "ridge", "sweeps"]),
     ("carve.photo", &["noise"]),
     ("tensorf.directions", DIRECTIONS),
-    ("tensorf.short", &["below", "hidden", "network_rate", "group", "cost"]),
+    ("tensorf.short", &["below", "hidden", "group", "cost"]),
     ("tensorf.stages[]", GROWING),
     ("dvgo.directions", DIRECTIONS),
     ("dvgo.coarse", GROWING),
