@@ -350,6 +350,26 @@ fn a_scene_is_learned_without_silhouettes_too() {
 }
 
 #[test]
+fn without_a_hull_the_field_begins_as_a_fog_whose_density_is_constant_at_first() {
+    let (train, _) = views();
+    let (frozen_steps, density) = (2, 0.5);
+    let config = Config { initial_density: density, frozen_steps, ..tiny(&[(9, 4)]) };
+    let model = Tensorf::<f32>::new(config, BOX, 42).expect("valid settings").with_hull(Hull::Off);
+    let objective = Objective::new().with("mse", 1.0, mse);
+    let mut trainer = Trainer::with_model(model, &train[..], objective, TrainOptions::default()).expect("a trainer");
+    let positions = Stream::new(9).uniform_tensor(&[20, 3], -1.3, 1.3);
+    let mut densities = (0..4).map(|_| {
+        trainer.step().expect("a step");
+        no_grad(|| trainer.model().field().density(&positions)).to_array()
+    });
+    let first = densities.next().expect("a step");
+    // The other components are random.
+    assert!(first.iter().all(|sigma| (0.5..2.0).contains(&(f64::from(*sigma) / density))), "{first}");
+    let later: Vec<bool> = densities.map(|densities| densities == first).collect();
+    assert_eq!(later, [true, false, false]);
+}
+
+#[test]
 fn exposure_and_other_losses_and_parameters_train_without_change() {
     let (train, _) = views();
     let model = Tensorf::new(tiny(&[(12, 10), (16, 10)]), BOX, 42).expect("valid settings");
