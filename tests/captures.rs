@@ -2,7 +2,8 @@
 
 use crate::capture_folders::*;
 use glam::{DAffine3, DMat3, DVec3, dvec3};
-use plenoxel::camera::Camera;
+use plenoxel::camera::lens::Lens;
+use plenoxel::camera::{Camera, Intrinsics};
 use plenoxel::dataset::normalize::{CaptureOptions, Center, Orient, Scale, SpaceChoice};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split, View};
@@ -187,6 +188,28 @@ fn cameras_that_face_forward_before_the_scene_get_ndc_and_others_do_not() {
     write_transforms(&folder, &forward_facing(0.2));
     assert_eq!(open(&folder).unwrap().space(), Space::Contracted);
     refused(open_with(&folder, ndc), 2, &["space", "ndc needs the depth of the nearest surface"]);
+}
+
+#[test]
+fn llff_has_the_lens_of_the_reconstruction_that_it_was_made_from() {
+    let folder = Folder::new();
+    let views = views();
+    write_llff(&folder, &views);
+    let pinhole = open(&folder).unwrap().cameras(Split::Train)[0].intrinsics;
+    let with_cameras = |cameras: &[(usize, f64, f64)]| {
+        let line =
+            |(k, (width, focal, radial)): (usize, &(usize, f64, f64))| format!("{k} SIMPLE_RADIAL {width} 12 {focal} 8 6 {radial}\n");
+        folder.write("sparse/0/cameras.txt", cameras.iter().enumerate().map(line).collect::<String>());
+        let dataset = open(&folder).unwrap();
+        (dataset.cameras(Split::Train)[0].intrinsics, dataset.notes().len())
+    };
+    let lens = Lens::perspective([0.02, 0.0, 0.0, 0.0], [0.0; 3], [0.0; 2]);
+    let focal = pinhole.fx;
+    // A camera of another size or focal length is not that of the views.
+    assert_eq!(with_cameras(&[(32, focal, 0.1), (16, focal, 0.02), (16, 1.01 * focal, 0.1)]), (Intrinsics { lens, ..pinhole }, 0));
+    // Cameras that may be meant and differ: nothing says which one it is.
+    assert_eq!(with_cameras(&[(16, focal, 0.02), (16, focal, 0.1)]), (pinhole, 1));
+    assert_eq!(with_cameras(&[(16, 1.01 * focal, 0.02)]), (pinhole, 1));
 }
 
 #[test]

@@ -109,6 +109,11 @@ fn open(path: &Path) -> Result<binary::Source<'_, BufReader<std::fs::File>>> {
     Ok(binary::Source::new(path, BufReader::new(file), length))
 }
 
+/// Reads the cameras of a reconstruction, if there are any.
+pub(super) fn cameras_in(folder: &Path) -> Result<Cameras> {
+    file(folder, "cameras").map_or(Ok(Cameras::new()), |path| cameras(&path))
+}
+
 /// Reads the points beside cameras, if there are any.
 pub(super) fn points_in(folder: &Path) -> Result<Vec<Point>> {
     file(folder, "points3D").map_or(Ok(Vec::new()), |path| points(&path))

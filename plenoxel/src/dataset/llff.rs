@@ -1,7 +1,10 @@
 //! LLFF: `poses_bounds.npy`, and images in the order of their names (Mildenhall et al. 2019).
 //!
 //! A row has a 3 x 5 matrix, row by row, and the smallest and the largest depth. The columns of the matrix are the camera's down, right and
-//! backward axis, its position, and height, width and focal length in pixels. Cameras are pinholes whose principal point is the centre.
+//! backward axis, its position, and height, width and focal length in pixels.
+//!
+//! The file has no lens, and the images are not undistorted. NeRF, Plenoxels and TensoRF take them as pinholes. The lens is in `sparse/0`, the
+//! reconstruction from which the file was made: a camera of its `cameras` with the same size and focal length takes the place of the pinhole.
 
 use super::blender::rigid;
 use super::capture::{Capture, FARTHEST, ImageFolder, Photo};
@@ -18,6 +21,8 @@ pub const FILE: &str = "poses_bounds.npy";
 const FORMAT: &str = "LLFF (poses_bounds.npy)";
 /// The file: up to 100 000 views of 136 bytes.
 const POSES: Kind = Kind { name: "a NumPy file of poses", most: 16 << 20, memory: 2 };
+/// Largest relative difference of a focal length and that of the reconstruction that it was copied from.
+const SAME_FOCAL: f64 = 1e-6;
 /// Numbers of a view.
 const COLUMNS: usize = 17;
 
@@ -83,18 +88,40 @@ pub(super) fn read(root: &Path, downscale: usize) -> Result<Capture> {
             "keep exactly the images that have a pose: they belong together by the order of their names",
         ));
     }
+    // The poses were made from a reconstruction, and are in its frame.
+    let model = root.join("sparse/0");
+    let (cameras, points) = (colmap::cameras_in(&model)?, colmap::points_in(&model)?);
+    let intrinsics: Vec<_> = poses.iter().map(|pose| reconstructed(&cameras, &pose.intrinsics)).collect();
+    let pinholes = intrinsics.iter().filter(|found| found.is_none()).count();
+    let mut notes = Vec::new();
+    if !cameras.is_empty() && pinholes > 0 {
+        notes.push(format!(
+            "{pinholes} of {} views are pinholes: {} has no camera of their size and focal length",
+            poses.len(),
+            model.display()
+        ));
+    }
     let near = poses.iter().map(|pose| pose.bounds[0]).fold(f64::INFINITY, f64::min);
     let far = poses.iter().map(|pose| pose.bounds[1]).fold(0.0, f64::max);
-    let photos = poses.iter().zip(&names).map(|(pose, name)| Photo {
+    let photos = poses.iter().zip(&names).zip(intrinsics).map(|((pose, name), intrinsics)| Photo {
         name: name.clone(),
         image: folder.path.join(name),
         mask: None,
-        intrinsics: pose.intrinsics,
+        intrinsics: intrinsics.unwrap_or(pose.intrinsics),
         camera_to_world: pose.camera_to_world,
         split: None,
     });
-    // The poses were made from a reconstruction, and are in its frame.
-    let points = colmap::points_in(&root.join("sparse/0"))?;
     let bounds = (near > 0.0 && far > near).then_some([near, far]);
-    Ok(Capture { format: FORMAT, photos: photos.collect(), points, bounds, reduced: folder.reduced, ..Capture::default() })
+    Ok(Capture { format: FORMAT, photos: photos.collect(), points, bounds, reduced: folder.reduced, notes, ..Capture::default() })
+}
+
+/// Returns the camera of a reconstruction with the size and the focal length of a pinhole. `None` if there is none, or if there are several
+/// that differ: the file does not say which belongs to which view.
+fn reconstructed(cameras: &colmap::Cameras, pinhole: &Intrinsics) -> Option<Intrinsics> {
+    let fits = |camera: &&Intrinsics| {
+        (camera.width, camera.height) == (pinhole.width, pinhole.height) && (camera.fx / pinhole.fx - 1.0).abs() < SAME_FOCAL
+    };
+    let mut fitting = cameras.values().filter(fits);
+    let first = *fitting.next()?;
+    fitting.all(|camera| *camera == first).then_some(first)
 }
