@@ -378,6 +378,7 @@ const LLFF: &[Broken] = &[
     (|f, _| f.write("poses_bounds.npy", npy("<f8", "False", "(1, 17)", &[f64::NAN; 17])), &["row 0 has the number NaN"]),
     (|f, _| f.write("poses_bounds.npy", npy("<f8", "False", "(1, 17)", &[1.0; 17])), &["row 0 is not a rotation"]),
     (|f, v| f.write("poses_bounds.npy", poses_npy(&v[..8], [1.0, 2.0])), &["8 poses, but 9 images"]),
+    (|f, _| f.write("sparse/0/cameras.txt", "1 SIMPLE_RADIAL 16 12 ten 8 6 0"), &["cameras.txt", "line 1", "\"ten\""]),
 ];
 
 /// Broken transforms.json files.
