@@ -96,7 +96,7 @@ pub(super) fn read(root: &Path, downscale: usize) -> Result<Capture> {
     let mut notes = Vec::new();
     if !cameras.is_empty() && pinholes > 0 {
         notes.push(format!(
-            "{pinholes} of {} views are pinholes: {} has no camera of their size and focal length",
+            "{pinholes} of {} views are pinholes: {} has no single camera of their size and focal length",
             poses.len(),
             model.display()
         ));
