@@ -237,6 +237,21 @@ fn a_closure_of_the_user_is_a_loss_like_any_other() {
 }
 
 #[test]
+fn a_view_that_does_not_fit_the_others_counts_less() {
+    let mut views = views(Split::Train);
+    views[3].image = views[10].image.clone();
+    let name = views[3].name.clone();
+    let losses = ["mse", "outlier_views"].map(|loss| (loss.to_owned(), Weight::Constant(1.0))).into();
+    let mut trainer = Trainer::<f32>::new(Config { losses, ..config() }, views).expect("a valid config");
+    assert!(trainer.outlier_views().is_empty());
+    while let Some(report) = trainer.step().expect("finite numbers") {
+        assert_eq!(report.losses[1], ("outlier_views".to_owned(), 0.0));
+    }
+    let outliers = trainer.outlier_views();
+    assert!(outliers.len() == 1 && outliers[0].name == name && outliers[0].weight < 0.5, "{outliers:?}");
+}
+
+#[test]
 fn losses_of_a_config_beside_an_objective_are_refused() {
     let with =
         |losses: &[&str]| Config { losses: losses.iter().map(|name| (name.to_string(), Weight::Constant(1.0))).collect(), ..config() };

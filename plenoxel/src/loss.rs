@@ -20,6 +20,7 @@
 mod exposure;
 mod objective;
 mod opacity;
+mod outlier_views;
 mod photometric;
 mod poses;
 mod robust;
@@ -29,6 +30,7 @@ mod total_variation;
 pub use exposure::EXPOSURE;
 pub use objective::{Evaluation, NAMES, Objective, Step};
 pub use opacity::{beta, entropy, opacity_supervision};
+pub use outlier_views::{OUTLIER_VIEWS, ViewWeight};
 pub use photometric::{charbonnier, huber, mse, random_background, sample_color};
 pub use poses::{POSE_RATE, POSES};
 pub use robust::AdaptiveRobust;

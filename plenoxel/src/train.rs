@@ -13,7 +13,7 @@ pub use state::{About, about};
 use crate::camera::Camera;
 use crate::dataset::View;
 use crate::error::{Error, Result};
-use crate::loss::{Evaluation, Objective, POSES, Step};
+use crate::loss::{Evaluation, Objective, POSES, Step, ViewWeight};
 use crate::rays::{RayBatch, RaySource};
 use crate::sampling::Jitter;
 use autograd::optim::{Optimizer, Sgd};
@@ -240,6 +240,14 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         Some(poses.figures(learned, self.views()))
     }
 
+    /// Returns the training views that count less because they do not fit the others, with their weights
+    /// ([`Objective::with_outlier_views`]).
+    pub fn outlier_views(&self) -> Vec<ViewWeight> {
+        let weights = self.objective.view_weights().unwrap_or_default();
+        let all = self.views().iter().zip(weights).map(|(view, weight)| ViewWeight { name: view.name.clone(), weight });
+        all.filter(|view| view.weight < 1.0).collect()
+    }
+
     /// Returns the cameras of the training views, corrected if poses are refined.
     pub fn cameras(&self) -> Vec<Camera> {
         match self.poses.as_ref().zip(self.objective.param(POSES)) {
@@ -302,6 +310,8 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             }
             None => self.rays.batch::<T>(stage.first_ray + in_stage * stage.rays_per_step as u64, stage.rays_per_step),
         };
+        // The training PSNR counts all rays alike; the losses do not.
+        let weighted = self.objective.view_weights().map(|weights| batch.weighted(&weights));
         let jitter = if jitter { Jitter::PerRay { seed, step: self.step } } else { Jitter::None };
         let pass = Pass { background, jitter, keep_samples: self.objective.needs_samples(), stage: Some(stage.index) };
         let extent = (self.model.aabb().max - self.model.aabb().min).max_element();
@@ -312,7 +322,7 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
                 Some((poses, learned)) => self.model.render_tracked(&poses.rays(learned, &batch), &pass),
             };
             samples = rendered.sample_count;
-            let step = Step::new((self.step, seed), &batch, &rendered, &self.model, (extent, background));
+            let step = Step::new((self.step, seed), weighted.as_ref().unwrap_or(&batch), &rendered, &self.model, (extent, background));
             let Evaluation { total, losses: values, prediction } = self.objective.evaluate(step);
             // Rays that are aimed are a share of all; patches are not aimed.
             let share = if patch_size > 1 { 1.0 } else { self.rays.share() };

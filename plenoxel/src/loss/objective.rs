@@ -228,6 +228,7 @@ impl<T: Real, M> Objective<T, M> {
             "robust" => self.with_adaptive_robust(name, weight, AdaptiveRobust::default()),
             "exposure" => self.with_exposure(weight, views),
             "poses" => self.with_poses(weight, views),
+            "outlier_views" => self.with_outlier_views(weight, views),
             "sparsity" => self.with(name, weight, cauchy_sparsity),
             "entropy" => self.with(name, weight, entropy),
             "beta" => self.with(name, weight, beta),
@@ -294,13 +295,14 @@ fn adam_single(rates: Rates) -> Box<dyn Optimizer<f32>> {
 }
 
 /// Names of the losses that [`Objective::with_named`] adds. They do not depend on the type of the model.
-pub const NAMES: [&str; 12] = [
+pub const NAMES: [&str; 13] = [
     "mse",
     "charbonnier",
     "huber",
     "robust",
     "exposure",
     "poses",
+    "outlier_views",
     "sparsity",
     "entropy",
     "beta",

@@ -4,7 +4,7 @@ use super::config::{Config, Weight};
 use super::{Objective, single};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::VoxelGrid;
-use crate::loss::{self, Cells, EXPOSURE, POSE_RATE, POSES, tv_color, tv_density};
+use crate::loss::{self, Cells, EXPOSURE, OUTLIER_VIEWS, POSE_RATE, POSES, tv_color, tv_density};
 use autograd::Real;
 use autograd::optim::Schedule;
 use autograd::single::{cast, is_single};
@@ -24,7 +24,7 @@ pub const LOSSES: [&str; loss::NAMES.len() + OF_GRID.len()] = {
 };
 
 /// Names of the losses with parameters, whose learning rate a config may set.
-pub const LEARNED_LOSSES: [&str; 3] = ["robust", EXPOSURE, POSES];
+pub const LEARNED_LOSSES: [&str; 4] = ["robust", EXPOSURE, POSES, OUTLIER_VIEWS];
 
 /// Adds a loss by its name in [`LOSSES`] to an objective of a model with a voxel grid. `views` is the number of training views.
 ///

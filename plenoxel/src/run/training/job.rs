@@ -91,6 +91,7 @@ impl Job<'_> {
             validation_psnr,
             best_validation,
             poses: learned.poses,
+            outlier_views: learned.outlier_views,
             stages: learned.stages,
             warnings,
             per_view: scores.per_view,

@@ -10,6 +10,7 @@ use crate::camera::Camera;
 use crate::dataset::{Split, View};
 use crate::error::{Error, Result};
 use crate::evaluate::{self, Viewer};
+use crate::loss::ViewWeight;
 use crate::run::metrics::{History, MetricsFile, Observation};
 use crate::run::pace::Begun;
 use crate::train::poses::PoseFigures;
@@ -39,6 +40,8 @@ pub struct Learned<M> {
     pub steps: u64,
     /// Corrections of the training views' poses, if they were refined and steps were taken.
     pub poses: Option<PoseFigures>,
+    /// Training views that counted less at the end, because they do not fit the others.
+    pub outlier_views: Vec<ViewWeight>,
 }
 
 /// Saves a trained model outside its run folder if that cannot be written: in the parent folder, the working directory, or the folder for
@@ -186,6 +189,11 @@ impl Job<'_> {
         if let Some(poses) = &poses {
             on(Event::note(format!("corrections of the training views' poses: {poses}")));
         }
+        let outlier_views = trainer.outlier_views();
+        if !outlier_views.is_empty() {
+            let all: Vec<String> = outlier_views.iter().map(|view| format!("{} (weight {:.2})", view.name, view.weight)).collect();
+            on(Event::note(format!("training views that do not fit the others and count less: {}", all.join(", "))));
+        }
         let model = trainer.into_model();
         if let Err(e) = folder.save(&model, &about) {
             let kept = match rescued(folder.path(), &model, &about) {
@@ -212,7 +220,7 @@ impl Job<'_> {
         let of_mean =
             mean_image.as_ref().and_then(|image| evaluate::constant_psnr(&views[..views.len().min(VIEWS_OF_MEAN)], image, background));
         let training_psnr = of_mean.map(|of_mean| [-10.0 * mean_squared_error.log10(), of_mean]).filter(|_| taken);
-        Ok(Ok(Learned { model, metrics, mean_image, training_psnr, stages, kept, steps: total, poses }))
+        Ok(Ok(Learned { model, metrics, mean_image, training_psnr, stages, kept, steps: total, poses, outlier_views }))
     }
 
     /// Returns the trained model of a run that was killed between its last step and its final figures; `trainer` is a new trainer of the run.
@@ -229,7 +237,17 @@ impl Job<'_> {
         on(Event::Trained);
         let (model, about) = trainer.into_model_of(&folder.existing_checkpoint()?)?;
         let (mean_image, stages) = (self.mean_image(views), summaries(&past, plan));
-        Ok(Learned { model, metrics, mean_image, training_psnr: None, stages, kept: Vec::new(), steps: about.step, poses: None })
+        Ok(Learned {
+            model,
+            metrics,
+            mean_image,
+            training_psnr: None,
+            stages,
+            kept: Vec::new(),
+            steps: about.step,
+            poses: None,
+            outlier_views: Vec::new(),
+        })
     }
 
     /// Mean training image, the baseline of the test views, if there are any.

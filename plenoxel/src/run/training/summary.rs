@@ -2,6 +2,7 @@
 
 use super::StageSummary;
 use crate::evaluate::ViewScore;
+use crate::loss::ViewWeight;
 use crate::run::figures::Figures;
 use crate::run::metrics::Best;
 use crate::train::poses::PoseFigures;
@@ -49,6 +50,9 @@ pub struct Summary {
     /// Corrections of the training views' poses, if they were refined. Test and validation views keep their given poses.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub poses: Option<PoseFigures>,
+    /// Training views that counted less at the end, because they do not fit the others.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub outlier_views: Vec<ViewWeight>,
     /// Each stage.
     pub stages: Vec<StageSummary>,
     /// Reasons to doubt the result.
