@@ -48,7 +48,9 @@ fn configs() -> Vec<(&'static str, Config)> {
         (
             "learned losses",
             Config {
-                losses: [("robust", 0.01), ("exposure", 1e-3), ("mse", 1.0)].map(|(name, w)| (name.to_owned(), Weight::Constant(w))).into(),
+                losses: [("robust", 0.01), ("exposure", 1e-3), ("mse", 1.0), ("outlier_views", 1.0)]
+                    .map(|(name, w)| (name.to_owned(), Weight::Constant(w)))
+                    .into(),
                 loss_rates: [("robust".to_owned(), 0.02)].into(),
                 ..base.clone()
             },

@@ -243,12 +243,19 @@ fn a_view_that_does_not_fit_the_others_counts_less() {
     let name = views[3].name.clone();
     let losses = ["mse", "outlier_views"].map(|loss| (loss.to_owned(), Weight::Constant(1.0))).into();
     let mut trainer = Trainer::<f32>::new(Config { losses, ..config() }, views).expect("a valid config");
-    assert!(trainer.outlier_views().is_empty());
+    assert_eq!(trainer.outlier_views(), Some(Vec::new()));
     while let Some(report) = trainer.step().expect("finite numbers") {
         assert_eq!(report.losses[1], ("outlier_views".to_owned(), 0.0));
     }
-    let outliers = trainer.outlier_views();
+    let outliers = trainer.outlier_views().expect("the loss is one of the config");
     assert!(outliers.len() == 1 && outliers[0].name == name && outliers[0].weight < 0.5, "{outliers:?}");
+}
+
+#[test]
+fn weights_of_views_alone_are_no_objective() {
+    let losses = [("outlier_views".to_owned(), Weight::Constant(1.0))].into();
+    let error = Trainer::<f32>::new(Config { losses, ..config() }, views(Split::Train)).err().expect("an error");
+    assert!(error.to_string().contains("there is no loss"), "{error}");
 }
 
 #[test]

@@ -11,7 +11,7 @@
 //! assert_eq!(objective.names().collect::<Vec<_>>(), ["mse", "bright"]);
 //! ```
 //!
-//! Means over rays are those of [`RayBatch::mean`](crate::rays::RayBatch::mean): pixels may differ in how often they are drawn.
+//! Means over rays are those of [`RayBatch::mean`](crate::rays::RayBatch::mean): pixels may differ in how often they are drawn, and views in their weight.
 //!
 //! A loss may have parameters, which are trained together with the model ([`Objective::with_param`]): for example the shape of
 //! [`robust`](AdaptiveRobust), or the exposure of each view ([`Objective::with_exposure`]). Losses compare the prediction with the

@@ -240,12 +240,12 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
         Some(poses.figures(learned, self.views()))
     }
 
-    /// Returns the training views that count less because they do not fit the others, with their weights
-    /// ([`Objective::with_outlier_views`]).
-    pub fn outlier_views(&self) -> Vec<ViewWeight> {
-        let weights = self.objective.view_weights().unwrap_or_default();
-        let all = self.views().iter().zip(weights).map(|(view, weight)| ViewWeight { name: view.name.clone(), weight });
-        all.filter(|view| view.weight < 1.0).collect()
+    /// Returns the training views whose weight is below 0.9 because they do not fit the others; `None` without
+    /// [`Objective::with_outlier_views`].
+    pub fn outlier_views(&self) -> Option<Vec<ViewWeight>> {
+        let all =
+            self.views().iter().zip(self.objective.view_weights()?).map(|(view, weight)| ViewWeight { name: view.name.clone(), weight });
+        Some(all.filter(|view| view.weight < 0.9).collect())
     }
 
     /// Returns the cameras of the training views, corrected if poses are refined.
@@ -310,8 +310,9 @@ impl<T: Real, M: Model<T>> Trainer<T, M> {
             }
             None => self.rays.batch::<T>(stage.first_ray + in_stage * stage.rays_per_step as u64, stage.rays_per_step),
         };
-        // The training PSNR counts all rays alike; the losses do not.
-        let weighted = self.objective.view_weights().map(|weights| batch.weighted(&weights));
+        // The training PSNR counts all views alike; the losses do not.
+        let weights = self.objective.view_weights().filter(|weights| weights.iter().any(|&weight| weight < 1.0));
+        let weighted = weights.map(|weights| batch.weighted(&weights));
         let jitter = if jitter { Jitter::PerRay { seed, step: self.step } } else { Jitter::None };
         let pass = Pass { background, jitter, keep_samples: self.objective.needs_samples(), stage: Some(stage.index) };
         let extent = (self.model.aabb().max - self.model.aabb().min).max_element();

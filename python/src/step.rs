@@ -130,7 +130,7 @@ impl PyStep {
         self.column(|x| x.batch.alpha.clone())
     }
 
-    /// Weights of importance sampling, `[n]`, with expectation 1; None if all pixels are drawn equally often. `mean` applies them.
+    /// Weights, `[n]`: those of importance sampling, times that of the ray's view (the loss `outlier_views`); None if all are 1. `mean` applies them.
     #[getter]
     fn weight(&self) -> PyResult<Option<PyTensor>> {
         Ok(self.content()?.batch.weight.as_ref().map(single))
@@ -176,7 +176,7 @@ impl PyStep {
         })
     }
 
-    /// Returns the mean over rays and further axes of values `[n, ...]`, with the weights of importance sampling: an estimate of the mean over all pixels.
+    /// Returns the mean over rays and further axes of values `[n, ...]`, with the weights of the rays.
     fn mean(&self, py: Python<'_>, values: &PyTensor) -> PyResult<PyTensor> {
         let (content, values) = (self.content()?, values.single("mean")?);
         if values.shape().first() != Some(&content.batch.len()) {

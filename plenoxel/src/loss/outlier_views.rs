@@ -1,21 +1,24 @@
 //! Smaller weights for training views that do not fit the others.
 //!
-//! Some photographs of a capture disagree with the rest: something moved, the camera shook or its stabilizer bent the picture, the pose is wrong. A field that is
-//! trained for long follows such a view, and pictures near it become worse. Here the mean squared error eᵥ of each view is learned, by the loss
+//! Some photographs of a capture disagree with the rest: something moved, a stabilizer bent the picture, the pose is wrong. A field that is trained for long follows
+//! such a view, and pictures near it become worse. Its error stays above that of the other views. So the mean squared error eᵥ of each view v is learned by the loss
 //!
-//! mean over rays of r / eᵥ + ln eᵥ,
+//! mean over rays of (r + 10⁻⁸) / eᵥ + ln eᵥ,
 //!
-//! where r is the squared error of a ray of view v, as a constant: its minimum over eᵥ is at the mean of r. Only the gradient counts; a constant is subtracted, so
-//! that the value is 0. The views are compared by the modified z-score (Iglewicz and Hoaglin 1993) of sᵥ = ln eᵥ:
+//! where r is the squared error of a ray of v, as a constant. Its minimum is at the mean of r + 10⁻⁸. Only its gradient counts; a constant is subtracted, so that its
+//! value is 0. The views are compared by the modified z-score (Iglewicz and Hoaglin 1993) of sᵥ = ln eᵥ:
 //!
-//! zᵥ = (sᵥ − median s) / max(1.4826 median |s − median s|, 0.1),
+//! zᵥ = (sᵥ − median s) / max(1.4826 median |s − median s|, 0.1).
 //!
-//! and rays of a view have the weight max(0.1, exp(−½ max(0, zᵥ − 2.5)²)) in all means over rays. 1.4826 times the median deviation is the standard deviation of
-//! normal numbers, so a view that is hard by as much as the views differ keeps its weight. What only one view shows is still learned: steps of Adam do not depend on
-//! the size of a gradient.
+//! 1.4826 times the median deviation is the standard deviation of normal numbers. Where views differ much, a hard view therefore keeps its weight. The rays of a view
+//! have the weight
+//!
+//! wᵥ = max(0.1, exp(−½ max(0, zᵥ − 2.5)²))
+//!
+//! in all means over rays ([`RayBatch::mean`](crate::rays::RayBatch::mean)). Views that no ray was drawn from have weight 1, and do not count in the medians. With
+//! Adam, what only one view shows is still learned, for its steps do not depend on the size of a gradient.
 
 use super::{Objective, Step};
-use crate::rays::RayBatch;
 use autograd::optim::Schedule;
 use autograd::{Indices, Param, Real, Tensor};
 use serde::Serialize;
@@ -25,6 +28,8 @@ pub const OUTLIER_VIEWS: &str = "outlier_views";
 
 /// Mean squared error of a view before the first step.
 const FIRST: f64 = 0.01;
+/// Squared error of a ray that is exact; without it, s of a view that is exact would fall without end.
+const SMALLEST_ERROR: f64 = 1e-8;
 /// Learning rate of s.
 const RATE: f64 = 0.01;
 /// Smallest standard deviation of s; 0.1 are 0.43 dB.
@@ -44,8 +49,8 @@ pub struct ViewWeight {
 }
 
 impl<T: Real, M: 'static> Objective<T, M> {
-    /// Gives smaller weights to the rays of those of the `views` training views that do not fit the others. The weights do not depend on `weight`, as long as
-    /// it is not 0.
+    /// Gives smaller weights to the rays of those of the `views` training views that do not fit the others. Any `weight` above 0 gives the same weights; from a
+    /// step with 0 on, they stay as they are.
     ///
     /// Panics if the objective has them already.
     #[track_caller]
@@ -58,14 +63,15 @@ impl<T: Real, M: 'static> Objective<T, M> {
 impl<T: Real, M> Objective<T, M> {
     /// Returns the weight of each training view; `None` without [`with_outlier_views`](Self::with_outlier_views).
     pub(crate) fn view_weights(&self) -> Option<Vec<f64>> {
-        let logarithms = self.param(OUTLIER_VIEWS)?.data().iter().map(|s| s.as_f64());
-        Some(weights(&logarithms.collect::<Vec<f64>>()))
+        let first = T::lit(FIRST.ln());
+        let logarithms = self.param(OUTLIER_VIEWS)?.data().iter().map(|&s| (s != first).then(|| s.as_f64()));
+        Some(weights(&logarithms.collect::<Vec<_>>()))
     }
 }
 
-/// Returns 0, with the gradient of the mean of r / eᵥ + ln eᵥ.
+/// Returns 0, with the gradient of the mean of (r + 10⁻⁸) / eᵥ + ln eᵥ.
 fn learned_errors<T: Real, M>(step: &Step<'_, T, M>) -> Tensor<T> {
-    let errors = (&step.prediction - &step.batch.target).square().mean_axis(1).detach();
+    let errors = (&step.prediction - &step.batch.target).square().mean_axis(1).detach() + SMALLEST_ERROR;
     let logarithms = step.param(OUTLIER_VIEWS).gather_rows(&Indices::from(step.batch.view.clone())).reshape(&[step.batch.len()]);
     let loss = step.batch.mean(&misfit(&errors, &logarithms));
     &loss - loss.detach()
@@ -76,16 +82,17 @@ fn misfit<T: Real>(errors: &Tensor<T>, logarithms: &Tensor<T>) -> Tensor<T> {
     errors * (-logarithms).exp() + logarithms
 }
 
-/// Returns the weights of views from the logarithms of their mean squared errors.
-fn weights(logarithms: &[f64]) -> Vec<f64> {
-    let middle = median(logarithms);
-    let distances: Vec<f64> = logarithms.iter().map(|s| (s - middle).abs()).collect();
+/// Returns the weights of views from the logarithms of their mean squared errors; `None` for a view that no ray was drawn from.
+fn weights(logarithms: &[Option<f64>]) -> Vec<f64> {
+    let known: Vec<f64> = logarithms.iter().copied().flatten().collect();
+    let middle = median(&known);
+    let distances: Vec<f64> = known.iter().map(|s| (s - middle).abs()).collect();
     let deviation = (1.4826 * median(&distances)).max(SMALLEST_DEVIATION);
-    let weight = |s: &f64| {
+    let weight = |s: f64| {
         let excess = ((s - middle) / deviation - TYPICAL).max(0.0);
         (-0.5 * excess * excess).exp().max(SMALLEST_WEIGHT)
     };
-    logarithms.iter().map(weight).collect()
+    logarithms.iter().map(|s| s.map_or(1.0, weight)).collect()
 }
 
 /// Returns the middle of some numbers, or the mean of the two in the middle; 0 without numbers.
@@ -95,18 +102,6 @@ fn median(numbers: &[f64]) -> f64 {
     match sorted.len() {
         0 => 0.0,
         n => 0.5 * (sorted[(n - 1) / 2] + sorted[n / 2]),
-    }
-}
-
-impl<T: Real> RayBatch<T> {
-    /// Returns the batch with the weight of each ray multiplied by that of its view.
-    pub(crate) fn weighted(&self, of_views: &[f64]) -> Self {
-        let of_rays = Tensor::from_vec(self.view.iter().map(|&v| T::lit(of_views[v as usize])).collect(), &[self.len()]);
-        let weight = match &self.weight {
-            None => of_rays,
-            Some(weight) => weight * of_rays,
-        };
-        RayBatch { weight: Some(weight), ..self.clone() }
     }
 }
 
@@ -131,6 +126,7 @@ mod tests {
     fn a_view_that_is_much_worse_than_the_views_differ_has_a_small_weight() {
         // Deviations of the others from the median: 0, 0.1 and 0.2, so that the standard deviation is about 0.15.
         let others = [-6.2, -6.1, -6.0, -5.9, -5.8];
+        let weights = |all: &[f64]| super::weights(&all.iter().copied().map(Some).collect::<Vec<_>>());
         let of = |last: f64| weights(&[&others[..], &[last]].concat());
         assert_eq!(of(-5.6), [1.0; 6]);
         assert_eq!(of(-7.0), [1.0; 6]);
@@ -142,5 +138,6 @@ mod tests {
         assert_eq!(weights(&[-8.0, -7.0, -6.0, -5.0, -4.0]), [1.0; 5]);
         assert_eq!(weights(&[-5.0]), [1.0]);
         assert!(weights(&[]).is_empty());
+        assert_eq!(super::weights(&[None, None, Some(-6.0), Some(-6.1), None]), [1.0; 5]);
     }
 }

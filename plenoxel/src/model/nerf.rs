@@ -183,7 +183,7 @@ impl<T: Real> Model<T> for Nerf<T> {
 /// Returns the mean over rays and channels of (C − C*)², where C is the color of the first pass: the loss from which the coarse network learns.
 pub fn coarse_mse<T: Real>(step: &Step<'_, T, Nerf<T>>) -> Tensor<T> {
     let coarse = step.rendered.coarse.as_ref().expect("a color of the first pass");
-    (coarse - &step.batch.target).square().mean()
+    step.batch.mean(&(coarse - &step.batch.target).square())
 }
 
 /// Returns the objective of the paper: the mean squared errors of both passes.

@@ -14,8 +14,8 @@ pub struct RayBatch<T: Real> {
     pub target: Tensor<T>,
     /// Alpha, `[n]`, in [0, 1]: the fraction of the pixel that the object covers; 1 for images without an alpha channel.
     pub alpha: Tensor<T>,
-    /// Weights of importance sampling, `[n]`, with expectation 1: inversely proportional to how often a ray's pixel is drawn. `None` if all
-    /// pixels are drawn equally often. [`RayBatch::mean`] applies them.
+    /// Weights, `[n]`: those of importance sampling, with expectation 1 and inversely proportional to how often a ray's pixel is drawn, times that of
+    /// the ray's view ([`Objective::with_outlier_views`](crate::loss::Objective::with_outlier_views)). `None` if all are 1. [`RayBatch::mean`] applies them.
     pub weight: Option<Tensor<T>>,
     /// Number of each ray's view in the source, from 0, for example as an index into a table with one row per view.
     pub view: Vec<u32>,
@@ -41,12 +41,22 @@ impl<T: Real> RayBatch<T> {
         self.rays.is_empty()
     }
 
-    /// Returns the mean over rays and further axes of values `[n, …]`, with the rays' weights: an unbiased estimate of the mean over all pixels.
-    /// Without weights it is `values.mean()`.
+    /// Returns the mean over rays and further axes of values `[n, …]`, with the rays' weights: with those of importance sampling alone, an unbiased
+    /// estimate of the mean over all pixels. Without weights it is `values.mean()`.
     pub fn mean(&self, values: &Tensor<T>) -> Tensor<T> {
         let Some(weight) = &self.weight else { return values.mean() };
         let shape: Vec<usize> = (0..values.shape().len()).map(|axis| if axis == 0 { self.len() } else { 1 }).collect();
         (values * weight.reshape(&shape)).mean()
+    }
+
+    /// Returns the batch with the weight of each ray multiplied by that of its view.
+    pub(crate) fn weighted(&self, of_views: &[f64]) -> Self {
+        let of_rays = Tensor::from_vec(self.view.iter().map(|&v| T::lit(of_views[v as usize])).collect(), &[self.len()]);
+        let weight = match &self.weight {
+            None => of_rays,
+            Some(weight) => weight * of_rays,
+        };
+        RayBatch { weight: Some(weight), ..self.clone() }
     }
 
     /// Returns the channel of this name, `[n, width]`; `None` if the source has no such channel.

@@ -77,8 +77,8 @@ pub struct TrainArgs {
     #[arg(long, help_heading = "Output")]
     pub force: bool,
 
-    /// Resume the run in this folder from its last checkpoint, with its own settings. Give the flags of this section, such as --test-views, again. If
-    /// the dataset has moved, give its new folder as DATA
+    /// Resume the run in this folder from its last checkpoint, with its own settings. Flags that do not change the training, such as
+    /// --test-views and --no-report, are not remembered. If the dataset has moved, give its new folder as DATA
     #[arg(long, value_name = "RUN", help_heading = "Output", value_hint = ValueHint::DirPath, conflicts_with_all = NOT_WHEN_RESUMED)]
     pub resume: Option<PathBuf>,
 

@@ -107,8 +107,8 @@ pub struct Config {
     /// Weight of each loss: a number, `{ weight, until }` for a loss that ends, or `{ from, to, steps }` for a weight that changes
     /// exponentially.
     pub losses: BTreeMap<String, Weight>,
-    /// Learning rates of losses with parameters (`robust`, `exposure`, `poses`), by name of the loss. They replace the loss's own rates. That of `poses` falls
-    /// to 1 % of it over the run.
+    /// Learning rates of losses with parameters (`robust`, `exposure`, `poses`, `outlier_views`), by name of the loss. They replace the loss's own rates. That of
+    /// `poses` falls to 1 % of it over the run.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub loss_rates: BTreeMap<String, f64>,
     /// Training stages, coarse to fine.

@@ -65,7 +65,8 @@ fn named<T: Real, M>(
     config: &Config,
     with: impl Fn(loss::Objective<T, M>, &str, Weight) -> Result<loss::Objective<T, M>>,
 ) -> Result<loss::Objective<T, M>> {
-    if config.losses.is_empty() {
+    // Weights of views alone give no gradient to the model.
+    if config.losses.keys().all(|name| name == OUTLIER_VIEWS) {
         return Err(Error::usage("losses", "there is no loss", "set at least one, such as `mse = 1.0`"));
     }
     let all = config.losses.iter().try_fold(loss::Objective::new(), |objective, (name, weight)| with(objective, name, *weight))?;

@@ -40,8 +40,8 @@ pub struct Learned<M> {
     pub steps: u64,
     /// Corrections of the training views' poses, if they were refined and steps were taken.
     pub poses: Option<PoseFigures>,
-    /// Training views that counted less at the end, because they do not fit the others.
-    pub outlier_views: Vec<ViewWeight>,
+    /// Training views that counted less at the end, if they may and steps were taken.
+    pub outlier_views: Option<Vec<ViewWeight>>,
 }
 
 /// Saves a trained model outside its run folder if that cannot be written: in the parent folder, the working directory, or the folder for
@@ -190,9 +190,9 @@ impl Job<'_> {
             on(Event::note(format!("corrections of the training views' poses: {poses}")));
         }
         let outlier_views = trainer.outlier_views();
-        if !outlier_views.is_empty() {
-            let all: Vec<String> = outlier_views.iter().map(|view| format!("{} (weight {:.2})", view.name, view.weight)).collect();
-            on(Event::note(format!("training views that do not fit the others and count less: {}", all.join(", "))));
+        if let Some(outliers) = outlier_views.as_ref().filter(|outliers| !outliers.is_empty()) {
+            let all: Vec<String> = outliers.iter().map(|view| format!("{} (weight {:.2})", view.name, view.weight)).collect();
+            on(Event::note(format!("training views with a much larger error than the others, which count less: {}", all.join(", "))));
         }
         let model = trainer.into_model();
         if let Err(e) = folder.save(&model, &about) {
@@ -246,7 +246,7 @@ impl Job<'_> {
             kept: Vec::new(),
             steps: about.step,
             poses: None,
-            outlier_views: Vec::new(),
+            outlier_views: None,
         })
     }
 

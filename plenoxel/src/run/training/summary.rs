@@ -50,9 +50,9 @@ pub struct Summary {
     /// Corrections of the training views' poses, if they were refined. Test and validation views keep their given poses.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub poses: Option<PoseFigures>,
-    /// Training views that counted less at the end, because they do not fit the others.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub outlier_views: Vec<ViewWeight>,
+    /// Training views that counted less at the end, with the loss `outlier_views`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub outlier_views: Option<Vec<ViewWeight>>,
     /// Each stage.
     pub stages: Vec<StageSummary>,
     /// Reasons to doubt the result.

@@ -105,7 +105,7 @@ impl Config {
             let key = format!("loss_rates.{name}");
             let learned: Vec<&str> = LEARNED_LOSSES.into_iter().filter(|loss| self.losses.contains_key(*loss)).collect();
             let remedy = match learned.is_empty() {
-                true => "remove it: only the losses robust, exposure and poses have parameters".to_owned(),
+                true => format!("remove it: only the losses {} have parameters", LEARNED_LOSSES.join(", ")),
                 false => format!("expected a rate for {}", learned.join(", ")),
             };
             demand(learned.contains(&name.as_str()), &key, "this loss has no parameters here", &remedy)?;
