@@ -26,7 +26,7 @@ use serde::Serialize;
 /// Name of the loss and of its parameter s, `[views, 1]`.
 pub const OUTLIER_VIEWS: &str = "outlier_views";
 
-/// Mean squared error of a view before the first step.
+/// Mean squared error of a view before its first ray. A view whose error is exactly this one has had no ray.
 const FIRST: f64 = 0.01;
 /// Squared error of a ray that is exact; without it, s of a view that is exact would fall without end.
 const SMALLEST_ERROR: f64 = 1e-8;
@@ -49,8 +49,8 @@ pub struct ViewWeight {
 }
 
 impl<T: Real, M: 'static> Objective<T, M> {
-    /// Gives smaller weights to the rays of those of the `views` training views that do not fit the others. Any `weight` above 0 gives the same weights; from a
-    /// step with 0 on, they stay as they are.
+    /// Gives smaller weights to the rays of those of the `views` training views that do not fit the others. The weights of the views hardly depend
+    /// on `weight`; in steps where it is 0, they stay as they are.
     ///
     /// Panics if the objective has them already.
     #[track_caller]

@@ -40,7 +40,7 @@ pub struct Learned<M> {
     pub steps: u64,
     /// Corrections of the training views' poses, if they were refined and steps were taken.
     pub poses: Option<PoseFigures>,
-    /// Training views that counted less at the end, if they may and steps were taken.
+    /// Training views that counted less at the end; `None` without the loss `outlier_views`, or if no steps were taken.
     pub outlier_views: Option<Vec<ViewWeight>>,
 }
 
