@@ -75,16 +75,30 @@ fn shades_its_features(run: &str) {
 fn every_model_without_voxels_can_be_baked() {
     let folder = Folder::new("bake-models");
     let presets: [(&str, &[&str]); 3] = [
-        ("ngp", &["ngp.stages=[{steps=60, rays=512}]", "ngp.log2_rows=12", "ngp.finest_resolution=64"]),
+        ("ngp", &["ngp.stages=[{steps=60, rays=512}]", "ngp.log2_rows=12", "ngp.finest_resolution=64", "ngp.samples=64", "ngp.cells=32"]),
         (
             "dvgo",
             &[
                 "dvgo.coarse={resolution=12, steps=40, rays=256}",
                 "dvgo.fine=[{resolution=24, steps=200, rays=256}]",
                 "dvgo.coarse_opacity=1e-2",
+                "dvgo.hidden=16",
             ],
         ),
-        ("nerf", &["nerf.steps=30", "nerf.rays=64", "nerf.width=32", "nerf.depth=3", "nerf.skip=2"]),
+        (
+            "nerf",
+            &[
+                "nerf.steps=30",
+                "nerf.rays=64",
+                "nerf.width=8",
+                "nerf.depth=2",
+                "nerf.skip=1",
+                "nerf.color_width=8",
+                "nerf.position_octaves=3",
+                "nerf.coarse_samples=16",
+                "nerf.fine_samples=16",
+            ],
+        ),
     ];
     for (preset, settings) in presets {
         let [run, baked] = [preset.to_owned(), format!("{preset}-baked")].map(|name| folder.path(&name));

@@ -21,9 +21,8 @@ pub(crate) use update::update;
 /// `#[inline(always)]`; otherwise they are compiled for the baseline only. Results differ between the versions if a loop uses fused multiply-add: see
 /// [`fused`](crate::parallel::fused).
 ///
-/// A crate that uses the macro needs no dependency except this one, since the macro refers to the crate `multiversion` through it. Builds with debug
-/// assertions, including normal test builds, have the baseline version only: every crate that uses a generic loop compiles it again, and compiling four
-/// versions of each would take minutes. Tests should therefore also run with `--release`.
+/// A crate that uses the macro needs no dependency except this one, since the macro refers to the crate `multiversion` through it. Test
+/// builds choose among the same versions, but the compiler vectorizes loops from `opt-level = 2` on only: tests of kernels should also run with `--release`.
 ///
 /// ```
 /// use autograd::{Real, dispatched, parallel};
@@ -57,11 +56,11 @@ pub(crate) use update::update;
 macro_rules! dispatched {
     ($(#[$meta:meta])* $visibility:vis fn $($rest:tt)*) => {
         $(#[$meta])*
-        #[cfg_attr(not(debug_assertions), $crate::multiversion::multiversion(targets(
+        #[$crate::multiversion::multiversion(targets(
             "x86_64+avx512f+avx512vl+avx512bw+avx512dq+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
             "x86_64+avx2+fma+bmi1+bmi2+lzcnt+popcnt",
             "aarch64+neon",
-        )))]
+        ))]
         $visibility fn $($rest)*
     };
 }
@@ -70,15 +69,18 @@ pub(crate) use dispatched;
 /// Returns true if [`dispatched!`](crate::dispatched) loops run in a version that has fused multiply-add instructions.
 pub fn fused() -> bool {
     #[cfg(target_arch = "x86_64")]
-    let available = std::is_x86_feature_detected!("avx2")
-        && std::is_x86_feature_detected!("fma")
-        && std::is_x86_feature_detected!("bmi1")
-        && std::is_x86_feature_detected!("bmi2")
-        && std::is_x86_feature_detected!("lzcnt")
-        && std::is_x86_feature_detected!("popcnt");
+    {
+        std::is_x86_feature_detected!("avx2")
+            && std::is_x86_feature_detected!("fma")
+            && std::is_x86_feature_detected!("bmi1")
+            && std::is_x86_feature_detected!("bmi2")
+            && std::is_x86_feature_detected!("lzcnt")
+            && std::is_x86_feature_detected!("popcnt")
+    }
     #[cfg(not(target_arch = "x86_64"))]
-    let available = cfg!(target_arch = "aarch64");
-    available && !cfg!(debug_assertions)
+    {
+        cfg!(target_arch = "aarch64")
+    }
 }
 
 /// Returns the number of threads of the current pool. Results must not depend on it.
