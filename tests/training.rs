@@ -242,13 +242,20 @@ fn a_view_that_does_not_fit_the_others_counts_less() {
     views[3].image = views[10].image.clone();
     let name = views[3].name.clone();
     let losses = ["mse", "outlier_views"].map(|loss| (loss.to_owned(), Weight::Constant(1.0))).into();
-    let mut trainer = Trainer::<f32>::new(Config { losses, ..config() }, views).expect("a valid config");
+    let config = Config { losses, ..config() };
+    let mut trainer = Trainer::<f32>::new(config.clone(), views.clone()).expect("a valid config");
     assert_eq!(trainer.outlier_views(), Some(Vec::new()));
     while let Some(report) = trainer.step().expect("finite numbers") {
         assert_eq!(report.losses[1], ("outlier_views".to_owned(), 0.0));
     }
     let outliers = trainer.outlier_views().expect("the loss is one of the config");
     assert!(outliers.len() == 1 && outliers[0].name == name && outliers[0].weight < 0.5, "{outliers:?}");
+
+    // Errors that are learned too slowly stay the same for all views.
+    let slow = Config { loss_rates: [("outlier_views".to_owned(), 1e-6)].into(), ..config };
+    let mut trainer = Trainer::<f32>::new(slow, views).expect("a valid config");
+    while trainer.step().expect("finite numbers").is_some() {}
+    assert_eq!(trainer.outlier_views(), Some(Vec::new()));
 }
 
 #[test]
