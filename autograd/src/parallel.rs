@@ -22,7 +22,7 @@ pub(crate) use update::update;
 /// [`fused`](crate::parallel::fused).
 ///
 /// A crate that uses the macro needs no dependency except this one, since the macro refers to the crate `multiversion` through it. Test
-/// builds choose among the same versions, but the compiler vectorizes loops from `opt-level = 2` on only: tests of kernels should also run with `--release`.
+/// builds choose among the same versions, but the compiler vectorizes loops only at `opt-level = 2` and above. Also test kernels with `--release`.
 ///
 /// ```
 /// use autograd::{Real, dispatched, parallel};
