@@ -77,6 +77,17 @@ pub fn plan<R: Recipe + Clone>(
     begin: impl FnOnce(&R) -> Result<Trainer<f32, R::Model>>,
 ) -> Result<Planned<R>> {
     let start = Instant::now();
+    plan_by(|| start.elapsed().as_secs_f64(), recipe, time, keep, begin)
+}
+
+/// [`plan`] with a clock, which returns the seconds since the beginning.
+fn plan_by<R: Recipe + Clone>(
+    elapsed: impl Fn() -> f64,
+    recipe: &R,
+    time: TimeBudget,
+    keep: bool,
+    begin: impl FnOnce(&R) -> Result<Trainer<f32, R::Model>>,
+) -> Result<Planned<R>> {
     let seconds = time.seconds - time.spent;
     let (measured, duration) = recipe.likely_for(seconds);
     let mut trainer = begin(&measured)?;
@@ -85,7 +96,7 @@ pub fn plan<R: Recipe + Clone>(
     let mut reports = Vec::new();
     let mut step = |trainer: &mut Trainer<f32, R::Model>| -> Result<f64> {
         let report = trainer.step()?;
-        let now = start.elapsed().as_secs_f64();
+        let now = elapsed();
         reports.extend(report.map(|report| (report, now)));
         Ok(now)
     };
@@ -219,6 +230,7 @@ mod tests {
     use crate::model::tensorf::{self, Short, Stage};
     use crate::space::{Region, Space};
     use crate::train::TrainOptions;
+    use std::cell::Cell;
 
     fn recipe(stages: &[(usize, u64)]) -> tensorf::Config {
         tensorf::Config {
@@ -241,6 +253,16 @@ mod tests {
         Trainer::with_model(model, views, Objective::new().with("mse", 1.0, mse), TrainOptions::default())
     }
 
+    /// A plan by a clock whose steps take ten milliseconds.
+    fn planned(recipe: &tensorf::Config, time: TimeBudget, keep: bool) -> Result<Planned<tensorf::Config>> {
+        let readings = Cell::new(0);
+        let elapsed = || {
+            readings.set(readings.get() + 1);
+            0.01 * f64::from(readings.get())
+        };
+        plan_by(elapsed, recipe, time, keep, trainer)
+    }
+
     /// Trains to the end; returns all parameters.
     fn trained(mut trainer: Trainer<f32, impl Model<f32>>) -> Vec<f32> {
         while trainer.step().unwrap().is_some() {}
@@ -252,7 +274,7 @@ mod tests {
     #[test]
     fn measured_steps_of_the_plan_are_those_of_a_run_from_the_beginning() {
         let asked = recipe(&[(8, 2000), (12, 40_000), (40, 100_000)]);
-        let Planned { recipe, begun } = plan(&asked, TimeBudget::of_training(1.0), true, trainer).unwrap();
+        let Planned { recipe, begun } = planned(&asked, TimeBudget::of_training(1.0), true).unwrap();
         assert_eq!((recipe.short, recipe.hidden, recipe.group), (None, 4, 0.2));
         let Begun { trainer: begun, reports } = begun.expect("a short plan is what a second leads to");
         assert!(reports.len() as u64 == begun.steps_taken() && reports.len() >= 24 && recipe.stages[0].steps > begun.steps_taken());
@@ -265,25 +287,25 @@ mod tests {
         assert_eq!(trained(going_on), trained(trainer(&less).unwrap()));
         // An evaluation of so many pixels takes half of the time, and reading the views may take more than all of it.
         let steps = |time: TimeBudget| {
-            plan(&asked, time, true, trainer).map(|planned| planned.recipe.stages.iter().map(|stage| stage.steps).sum::<u64>())
+            planned(&asked, time, true).map(|planned| planned.recipe.stages.iter().map(|stage| stage.steps).sum::<u64>())
         };
         let [all, half] = [0.0, 1e15].map(|evaluated| steps(TimeBudget { evaluated, ..TimeBudget::of_training(1.0) }).unwrap());
         assert!((0.3..0.75).contains(&(half as f64 / all as f64)), "{half} of {all}");
         let late = steps(TimeBudget { spent: 1.5, ..TimeBudget::of_training(1.0) }).unwrap_err().to_string();
         assert!(late.contains("0:01 is too short"), "{late}");
         // On request, the run begins anew.
-        assert!(plan(&asked, TimeBudget::of_training(1.0), false, trainer).unwrap().begun.is_none());
+        assert!(planned(&asked, TimeBudget::of_training(1.0), false).unwrap().begun.is_none());
     }
 
     #[test]
     fn measuring_ends_before_the_first_stage_does_and_a_bounded_first_stage_begins_anew() {
         let asked = tensorf::Config { short: None, ..recipe(&[(8, 12), (40, 100_000)]) };
-        let begun = plan(&asked, TimeBudget::of_training(2.0), true, trainer).unwrap().begun.expect("steps of the plan");
+        let begun = planned(&asked, TimeBudget::of_training(2.0), true).unwrap().begun.expect("steps of the plan");
         assert!(begun.trainer.steps_taken() == 11 && begun.reports.iter().all(|(report, _)| !report.ends_stage));
         let bounded = tensorf::Config { pixels_per_cell: 4.0, ..recipe(&[(8, 100), (8, 200)]) };
-        assert!(plan(&bounded, TimeBudget::of_training(60.0), true, trainer).unwrap().begun.is_none());
+        assert!(planned(&bounded, TimeBudget::of_training(60.0), true).unwrap().begun.is_none());
         let short = tensorf::Config { short: None, ..recipe(&[(8, 3), (8, 200)]) };
-        assert!(plan(&short, TimeBudget::of_training(1.0), true, trainer).err().unwrap().to_string().contains("--time"));
+        assert!(planned(&short, TimeBudget::of_training(1.0), true).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
@@ -291,9 +313,9 @@ mod tests {
         let asked = recipe(&[(8, 100), (16, 200)]);
         // So long that the network stays, and too long for any steps to be guessed.
         let unlikely = tensorf::Config { short: Some(Short { below: 1e-9, ..asked.short.unwrap() }), last_rate: 0.5, ..asked };
-        let Planned { recipe, begun } = plan(&unlikely, TimeBudget::of_training(1.0), true, trainer).unwrap();
+        let Planned { recipe, begun } = planned(&unlikely, TimeBudget::of_training(1.0), true).unwrap();
         assert!(begun.is_none() && recipe.hidden == 8);
-        assert!(plan(&unlikely, TimeBudget::of_training(1e-9), true, trainer).err().unwrap().to_string().contains("--time"));
+        assert!(planned(&unlikely, TimeBudget::of_training(1e-9), true).err().unwrap().to_string().contains("--time"));
     }
 
     #[test]
