@@ -321,7 +321,7 @@ mod tests {
     #[test]
     fn the_last_stage_is_adjusted_and_the_run_repeats_from_its_settings() {
         let with_cool_down = |cool_down: f64| tensorf::Config { short: None, cool_down, ..recipe(&[(8, 30), (8, 200)]) };
-        for (cool_down, of_a_step) in [(0.4, 0.1), (0.4, 0.5), (0.4, 1.0), (0.75, 0.1), (0.75, 0.3), (0.75, 10.0)] {
+        for (cool_down, of_a_step) in [(0.4, 0.2), (0.4, 0.5), (0.4, 1.0), (0.75, 0.2), (0.75, 0.3), (0.75, 10.0)] {
             let asked = with_cool_down(cool_down);
             let mut pace = Pace::new(asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
             let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());

@@ -27,6 +27,8 @@ pub struct Layers {
     table: Table,
     /// Path of each value that was set, and the place where it was set; later entries take precedence.
     places: Vec<(String, String)>,
+    /// Outermost key of each value that a flag has set.
+    flagged: Vec<String>,
 }
 
 impl Layers {
@@ -69,6 +71,7 @@ impl Layers {
         keys::check_path(path, flag)?;
         table::set(&mut self.table, path, value.as_ref(), flag)?;
         self.places.push((path.replace("[*]", "[]"), flag.to_owned()));
+        self.flagged.extend(value.and(path.split(['.', '[']).next()).map(str::to_owned));
         Ok(())
     }
 
@@ -111,7 +114,7 @@ impl Layers {
                 path.rsplit_once('.').filter(|_| complaint.starts_with("expected table, found")).map_or(&path[..], |(outer, _)| outer);
             refusal(placed(key), value_at(&self.table, key), complaint)
         })?;
-        config.validate().map_err(|e| e.with_key(placed))?;
+        config.validate().and_then(|()| config.check_effect(self.flagged.iter().map(String::as_str))).map_err(|e| e.with_key(placed))?;
         Ok(config)
     }
 }

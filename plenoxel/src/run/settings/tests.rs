@@ -229,6 +229,21 @@ fn in_a_file(path: &str) -> String {
 }
 
 #[test]
+fn a_flag_without_effect_on_the_model_is_refused_even_with_the_default_value() {
+    let ngp = || Layers::defaults().unwrap().with_preset("ngp").unwrap();
+    for (assignment, key) in [("sh_degree=2", "sh_degree"), ("optimizer.beta1=0.9", "optimizer")] {
+        let mut layers = ngp();
+        layers.assign(assignment).unwrap();
+        let message = layers.resolve().unwrap_err().to_string();
+        assert!(message.contains(key) && message.contains("no effect on the model `ngp`"), "{message}");
+    }
+    // The complete file of a run has every key.
+    let mut layers = Layers::default();
+    layers.file(&ConfigFile::parse(Path::new("my.toml"), text_of(&ngp().resolve().unwrap()).as_bytes()).unwrap()).unwrap();
+    assert!(layers.resolve().is_ok());
+}
+
+#[test]
 fn each_value_out_of_range_or_of_another_type_is_refused_by_the_name_of_its_key() {
     const NUMBERS: [&str; 16] = [
         "-1",

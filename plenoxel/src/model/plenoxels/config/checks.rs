@@ -186,14 +186,7 @@ impl Config {
             ));
         }
         recipe.validate().map_err(|e| e.with_key(|key| format!("{kind}.{key}")))?;
-        let of_grid = |set: bool, key: &str| match set {
-            true => Err(Error::usage(
-                key,
-                format!("this setting of a voxel grid has no effect on the model `{kind}`"),
-                "leave it out, or choose a preset of a voxel grid, such as voxels",
-            )),
-            false => Ok(()),
-        };
+        let of_grid = |set: bool, key: &str| if set { Err(no_effect(key, kind)) } else { Ok(()) };
         let [own, none] = [self, &Config { stages: Vec::new(), ..Config::default() }].map(|config| serde_json::json!(config));
         OF_GRID.iter().try_for_each(|key| of_grid(own[key] != none[key], key))?;
         if self.hull == Hull::Auto && !recipe.uses_silhouettes() {
@@ -201,6 +194,21 @@ impl Config {
         }
         self.losses.keys().try_for_each(|loss| of_grid(!loss::NAMES.contains(&&loss[..]), &format!("losses.{loss}")))
     }
+
+    /// Checks keys that a user has set. If one has no effect on the model, it is an error even with the default value.
+    pub fn check_effect<'a>(&self, mut keys: impl Iterator<Item = &'a str>) -> Result<()> {
+        let without_effect = |recipe: &dyn Recipe| Some(no_effect(keys.find(|key| OF_GRID.contains(key))?, recipe.kind()));
+        self.recipe().and_then(without_effect).map_or(Ok(()), Err)
+    }
+}
+
+/// The error for a setting of a voxel grid that another model does not have.
+fn no_effect(key: &str, kind: &str) -> Error {
+    Error::usage(
+        key,
+        format!("this setting of a voxel grid has no effect on the model `{kind}`"),
+        "leave it out, or choose a preset of a voxel grid, such as voxels",
+    )
 }
 
 /// Checks the weight of a loss.
