@@ -181,7 +181,11 @@ fn paths_that_are_no_scene_say_what_they_are() {
     let open = |path: &Path| dataset::open(path, &OpenOptions::default());
     refused(open(&folder.path("nowhere")), 3, &["nowhere", "no such folder"]);
     refused(open(&folder.path("transforms_train.json")), 3, &["this is a file", "folder"]);
-    refused(open(&folder.path("train")), 3, &["no format is recognized", "r_0.png, r_1.png"]);
+    let scene = folder.0.to_string_lossy().into_owned();
+    refused(open(&folder.path("train")), 3, &["no format is recognized", "r_0.png, r_1.png", "give the folder of the scene", &scene]);
+    let photographs = Folder::new();
+    photographs.image("a.png", 4, 4, [255; 4]);
+    refused(open(&photographs.0), 3, &["photographs need cameras", "plenoxel cameras"]);
     let parent = Folder::new();
     refused(open(&parent.0), 3, &["no format is recognized", "it is empty"]);
     fs::create_dir(parent.path("lego")).unwrap();
@@ -262,7 +266,10 @@ fn intrinsics_lenses_and_masks_are_those_of_a_transforms_json() {
         with(more).refused(3, &words);
     }
     let folder = Folder::scene();
-    folder.edit("\"rotation\": 0.1", "\"mask_path\": \"gone.png\"");
+    folder.image("train/mask.png", 4, 5, [255; 4]);
+    folder.edit("\"rotation\": 0.1", "\"mask_path\": \"train/mask.png\"");
+    folder.refused(3, &["mask.png", "the mask has 4 x 5 pixels, but its image has 4 x 4"]);
+    folder.edit("\"mask_path\": \"train/mask.png\"", "\"mask_path\": \"gone.png\"");
     folder.refused(3, &["the mask \"gone.png\" of frame 0 does not exist", "looked for"]);
 }
 

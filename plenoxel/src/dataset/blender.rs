@@ -9,6 +9,7 @@ mod write;
 
 use super::capture::{base_name, misfit, resized};
 use super::image::Orientation;
+use super::mask::Mask;
 use super::normalize::Normalization;
 use super::transforms::{Listed, Transforms};
 use super::{Dataset, Frame, OpenOptions, Source, Split, image, largest};
@@ -86,11 +87,13 @@ fn frame(root: &Path, split: Split, k: usize, listed: &Listed, downscale: usize)
     let stated = listed.stated.intrinsics(&path, &listed.file_path, listed.stated.size.unwrap_or(full))?;
     let intrinsics = resized(&image, &stated, full)?.ok_or_else(|| misfit(&image, (stated.width, stated.height), full))?;
     image::check_downscale(downscale, full)?;
+    let mask = listed.mask_path.as_ref().map(|mask| mask_of(root, mask, &path, k)).transpose()?;
+    mask.iter().try_for_each(|mask| Mask::check_file(mask, full))?;
     Ok(Frame {
         name: image.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default(),
         camera: Camera { intrinsics: intrinsics.downscaled(downscale), camera_to_world: listed.camera_to_world },
         path: image,
-        mask: listed.mask_path.as_ref().map(|mask| mask_of(root, mask, &path, k)).transpose()?,
+        mask,
         orientation: Orientation::Stated,
         full,
     })

@@ -7,6 +7,7 @@
 mod images;
 
 use super::image::{self, Orientation};
+use super::mask::Mask;
 use super::normalize::Normalization;
 use super::{Dataset, Frame, OpenOptions, Source, Split, largest};
 use crate::camera::{Camera, Intrinsics};
@@ -157,6 +158,7 @@ fn check_presence(root: &Path, capture: &mut Capture) -> Result<()> {
 fn fitted(photo: &Photo) -> Result<(Orientation, Intrinsics)> {
     for orientation in [Orientation::Stored, Orientation::Stated] {
         if let Some(intrinsics) = resized(&photo.image, &photo.intrinsics, image::size_as(&photo.image, orientation)?)? {
+            photo.mask.iter().try_for_each(|mask| Mask::check_file(mask, (intrinsics.width, intrinsics.height)))?;
             return Ok((orientation, intrinsics));
         }
     }

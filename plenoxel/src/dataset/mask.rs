@@ -27,11 +27,7 @@ impl Mask {
     /// Errors if the file is no image, has another size, or ignores every pixel.
     pub fn read(path: &Path, size: (usize, usize)) -> Result<Self> {
         let mask = image::read_as(path, image::Orientation::Stored)?;
-        let found = (mask.width() as usize, mask.height() as usize);
-        if found != size {
-            let found = format!("the mask has {} x {} pixels, but its image has {} x {}", found.0, found.1, size.0, size.1);
-            return Err(Error::input(path, found, "write a mask of the size of its image"));
-        }
+        check(path, (mask.width() as usize, mask.height() as usize), size)?;
         let mask = Mask::new([size.0, size.1], |x, y| {
             let [r, g, b, alpha] = mask.get_pixel(x as u32, y as u32).0;
             r.max(g).max(b).min(alpha) >= 128
@@ -40,6 +36,11 @@ impl Mask {
             0 => Err(Error::input(path, "the mask ignores every pixel", "make it white where the image is used, or leave the image out")),
             _ => Ok(mask),
         }
+    }
+
+    /// Checks that the file of a mask has the size of its image, as stored, without decoding it.
+    pub(super) fn check_file(path: &Path, size: (usize, usize)) -> Result<()> {
+        check(path, image::size_as(path, image::Orientation::Stored)?, size)
     }
 
     /// Returns width and height in pixels.
@@ -86,6 +87,15 @@ impl Mask {
         let whole = Mask::new(size, |x, y| block(x, y).all(|keeps| keeps));
         if whole.kept() > 0 { whole } else { Mask::new(size, |x, y| block(x, y).any(|keeps| keeps)) }
     }
+}
+
+/// Checks the size of a mask.
+fn check(path: &Path, mask: (usize, usize), image: (usize, usize)) -> Result<()> {
+    if mask == image {
+        return Ok(());
+    }
+    let found = format!("the mask has {} x {} pixels, but its image has {} x {}", mask.0, mask.1, image.0, image.1);
+    Err(Error::input(path, found, "write a mask of the size of its image"))
 }
 
 #[cfg(test)]
