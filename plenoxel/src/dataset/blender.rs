@@ -75,7 +75,7 @@ fn file_name(root: &Path, split: Split) -> PathBuf {
 
 /// Returns view `k` of a file of the scene `root`, with its image.
 ///
-/// Errors if the image does not exist or cannot be read, or has another shape than its camera.
+/// Errors if the image does not exist or cannot be read, or has another shape than its camera, or if its mask has another size.
 fn frame(root: &Path, split: Split, k: usize, listed: &Listed, downscale: usize) -> Result<Frame> {
     let path = file_name(root, split);
     let image = find_image(root, split, &listed.file_path).map_err(|tried| {

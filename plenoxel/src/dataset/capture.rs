@@ -72,8 +72,8 @@ pub struct Point {
 
 /// Makes the dataset of a capture in the folder `root`.
 ///
-/// Errors if there is no image, if fewer than half of the images exist, if an image has another shape than its camera states, or if
-/// `options` do not fit.
+/// Errors if there is no image, if fewer than half of the images exist, if an image has another shape than its camera states or a mask another
+/// size than its image, or if `options` do not fit.
 pub(super) fn dataset(root: &Path, mut capture: Capture, options: &OpenOptions) -> Result<Dataset> {
     check_presence(root, &mut capture)?;
     capture.photos.sort_by(|a, b| a.name.cmp(&b.name));
