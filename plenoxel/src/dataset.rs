@@ -456,20 +456,18 @@ fn unrecognized(path: &Path) -> Error {
         n => format!("it contains {} and {} more", names[..8].join(", "), n - 8),
     };
     let has = |name: &str| names.iter().any(|found| found == name);
-    let files = ["transforms_train.json", "transforms.json", "sparse", "poses_bounds.npy"];
+    let files = ["transforms_train.json", "transforms.json", "sparse", "poses_bounds.npy", "intrinsics.txt"];
     let is_scene = |folder: &Path| files.iter().any(|file| folder.join(file).exists());
     let below = names.iter().find(|name| is_scene(&path.join(name)));
     let above = path.parent().map(|parent| if parent == Path::new("") { Path::new("..") } else { parent });
-    let is_photograph =
-        |name: &String| ["jpg", "jpeg", "png", "webp"].contains(&name.rsplit('.').next().unwrap_or("").to_lowercase().as_str());
     let remedy = if let Some(scene) = below {
         format!("give one scene, for example {}", path.join(scene).display())
     } else if let Some(scene) = above.filter(|folder| is_scene(folder)) {
         format!("give the folder of the scene, {}", scene.display())
-    } else if names.iter().any(is_photograph) {
-        format!("photographs need cameras: `plenoxel cameras {}` computes them with COLMAP", path.display())
     } else if has("sparse") || has("colmap") {
         "the reconstruction lacks its cameras or images: expected cameras.bin and images.bin, or .txt, in sparse/0".into()
+    } else if names.iter().any(|name| image::is_photograph(name)) {
+        format!("photographs need cameras: `plenoxel cameras {}` computes them with COLMAP", path.display())
     } else {
         "use a NeRF-synthetic folder, or a capture with transforms.json, sparse/0 of COLMAP, poses_bounds.npy, or intrinsics.txt of NSVF"
             .into()

@@ -19,6 +19,14 @@ pub use ::image::RgbaImage;
 pub use decode::{Orientation, decode, read, read_as, size, size_as};
 pub use rows::MAX_SIDE;
 
+/// Extensions of the images that are read, in lower case.
+const EXTENSIONS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
+
+/// Returns true if the name of a file is that of an image that can be read.
+pub fn is_photograph(name: &str) -> bool {
+    name.rsplit_once('.').is_some_and(|(_, extension)| EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(extension)))
+}
+
 /// Checks that images of `width` x `height` can be reduced by k. k must divide both sides, because blocks of different sizes do not belong
 /// to one camera.
 ///

@@ -1,13 +1,11 @@
 //! The photographs of a folder.
 
-use plenoxel::dataset::image::{Orientation, size_as};
+use plenoxel::dataset::image::{Orientation, is_photograph, size_as};
 use plenoxel::error::{Error, Result};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// Extensions of the files that training reads, in lower case.
-const EXTENSIONS: [&str; 4] = ["jpg", "jpeg", "png", "webp"];
 /// Fewest photographs that can have cameras.
 const FEWEST: usize = 2;
 
@@ -49,7 +47,7 @@ pub fn find(folder: &Path) -> Result<Photos> {
         match entry.file_name().into_string() {
             // Hidden files are notes of systems, such as `._IMG_1.jpg`.
             Ok(name) if name.starts_with('.') => {}
-            Ok(name) if is_photo(&name) && !name.contains(['\n', '\r']) => names.push(name),
+            Ok(name) if is_photograph(&name) && !name.contains(['\n', '\r']) => names.push(name),
             Ok(name) => others.push(name),
             Err(name) => others.push(name.to_string_lossy().into_owned()),
         }
@@ -63,10 +61,6 @@ pub fn find(folder: &Path) -> Result<Photos> {
     let read = read?;
     let turned = read.iter().filter(|(_, turned)| *turned).count();
     Ok(Photos { all: read.into_iter().map(|(photo, _)| photo).collect(), turned, others })
-}
-
-fn is_photo(name: &str) -> bool {
-    name.rsplit_once('.').is_some_and(|(_, extension)| EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(extension)))
 }
 
 /// Reads the header of a photograph. The second value is true if it is stored turned by 90°.
