@@ -1,41 +1,49 @@
-//! Groups of samples that share a color, so that a color network is evaluated less often.
+//! Groups of samples with one evaluation of the color network each.
 
 use crate::random::{Purpose, uniform};
 use crate::sampling::Jitter;
 use autograd::{Buffer, Indices, Real, Tensor};
 use std::ops::Range;
 
-/// Which samples have their own color. Consecutive samples of a ray form a group as soon as their weights sum to `weight`. The color network is evaluated at one
-/// position of the group, and gives its color to all members: an approximation of the color of each sample, exact for a `weight` of 0.
+/// At which positions of a ray the color network is evaluated. Consecutive samples of a ray form a group as soon as their weights sum to `weight`. The network is
+/// evaluated at one position of each group: an approximation of the color of each sample, exact for a `weight` of 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Grouping {
     /// Weight that completes a group; 0 for groups of one sample.
     pub weight: f64,
     /// Groups whose weight is not above this have no color.
     pub above: f64,
-    /// True: the position is the mean of those of the members, weighted by their weights, which are constants for gradients. A group whose weight is above
-    /// `above` also ends at a gap between samples, and when it has [`MOST_MEMBERS`]. False: it is the position of one member, which is drawn with a probability
-    /// proportional to its weight, so that the expected color of a pixel does not change. Without jitter, the member at half the weight is chosen.
+    /// True: the position is the mean of those of the members, weighted by their weights, which are constants for gradients, and all members have its color. A
+    /// group whose weight is above `above` also ends at a gap between samples, and when it has [`MOST_MEMBERS`]. False: it is the position of one member,
+    /// which is drawn with a probability proportional to its weight; without jitter, it is the member at half the weight. The colors of the samples between
+    /// two drawn members are interpolated, linearly in the distance t along the ray.
     pub compact: bool,
 }
 
 /// Number of samples with which a compact group ends.
 pub const MOST_MEMBERS: usize = 8;
 
-/// Groups of the samples of some rays.
+/// Groups of the samples of some rays. Sample i has the color (1 − sᵢ) c_g + sᵢ c_{g+1} with g = `of[i]` and sᵢ = `toward_next[i]`.
 #[derive(Debug)]
-pub(crate) struct Groups {
-    /// Number of the group of each sample, or [`Groups::NONE`].
+pub(crate) struct Groups<T: Real> {
+    /// Number g of the group whose color a sample has, or the first of two; [`NONE`] for no color.
     pub of: Buffer<u32>,
+    /// Share sᵢ of the color of the next group; 0 for the color of one group.
+    pub toward_next: Buffer<T>,
     /// Samples whose mean position is that of the group: all members, or the one that was drawn.
     pub sources: Vec<Range<u32>>,
     /// Number of the ray of each group.
     pub rays: Vec<u32>,
 }
 
-impl Groups {
-    /// Marker for a sample without a color.
-    pub const NONE: u32 = u32::MAX;
+/// Marker for a sample without a color.
+pub(crate) const NONE: u32 = u32::MAX;
+
+impl<T: Real> Groups<T> {
+    /// Returns groups of no samples.
+    pub fn empty() -> Self {
+        Groups { of: Buffer::stale(0), toward_next: Buffer::stale(0), sources: Vec::new(), rays: Vec::new() }
+    }
 
     /// Returns the number of groups.
     pub fn len(&self) -> usize {
@@ -43,7 +51,7 @@ impl Groups {
     }
 
     /// Returns the sources of all groups: the number of the group, that of the sample, and the share of the sample in the position of the group.
-    pub fn shares<'a, T: Real>(&'a self, weights: &'a [T]) -> impl Iterator<Item = (usize, usize, T)> {
+    pub fn shares<'a>(&'a self, weights: &'a [T]) -> impl Iterator<Item = (usize, usize, T)> {
         self.sources.iter().enumerate().flat_map(move |(group, sources)| {
             let sources = sources.start as usize..sources.end as usize;
             let sum: T = weights[sources.clone()].iter().copied().sum();
@@ -52,7 +60,7 @@ impl Groups {
     }
 
     /// Returns the positions of the groups, `[g, 3]`, from those of the samples, `[m, 3]`.
-    pub fn positions<T: Real>(&self, weights: &[T], positions: &Tensor<T>) -> Tensor<T> {
+    pub fn positions(&self, weights: &[T], positions: &Tensor<T>) -> Tensor<T> {
         if self.sources.iter().all(|sources| sources.len() == 1) {
             return positions.gather_rows(&Indices::from(self.sources.iter().map(|sources| sources.start).collect::<Vec<_>>()));
         }
@@ -67,12 +75,71 @@ impl Groups {
     }
 
     /// Returns the colors of the samples, `[m, 3]`, from those of the groups, `[g, 3]`.
-    pub fn colors_of_samples<T: Real>(&self, colors: &Tensor<T>) -> Tensor<T> {
-        let members = self.of.iter().zip(0u32..).filter(|(group, _)| **group != Groups::NONE);
-        let (groups, colored): (Vec<u32>, Vec<u32>) = members.unzip();
-        // Groups of one sample are in the order of the samples.
-        let colors = if colored.len() == self.len() { colors.clone() } else { colors.gather_rows(&Indices::from(groups)) };
+    pub fn colors_of_samples(&self, colors: &Tensor<T>) -> Tensor<T> {
+        let colored: Vec<u32> = (0..self.of.len() as u32).filter(|&i| self.of[i as usize] != NONE).collect();
+        let first: Vec<u32> = colored.iter().map(|&i| self.of[i as usize]).collect();
+        let toward_next: Vec<T> = colored.iter().map(|&i| self.toward_next[i as usize]).collect();
+        let colors = if toward_next.iter().any(|&share| share > T::zero()) {
+            let last = self.len() as u32 - 1;
+            let next = Indices::from(first.iter().map(|&group| last.min(group + 1)).collect::<Vec<_>>());
+            let first = colors.gather_rows(&Indices::from(first));
+            &first + (colors.gather_rows(&next) - &first) * Tensor::from_vec(toward_next, &[colored.len(), 1])
+        } else if colored.len() == self.len() {
+            // Groups of one sample are in the order of the samples.
+            colors.clone()
+        } else {
+            colors.gather_rows(&Indices::from(first))
+        };
         colors.scatter_rows(&Indices::from(colored), self.of.len())
+    }
+
+    /// Returns the color of a sample from those of the groups.
+    #[inline(always)]
+    pub fn color(&self, colors: &[[T; 3]], i: usize) -> [T; 3] {
+        let (group, share) = (self.of[i] as usize, self.toward_next[i]);
+        let Some(&first) = colors.get(group) else { return [T::zero(); 3] };
+        if share == T::zero() {
+            return first;
+        }
+        let next = colors[group + 1];
+        [0, 1, 2].map(|c| first[c] + share * (next[c] - first[c]))
+    }
+
+    /// Adds the cotangent g of the color of a sample to the cotangents of the colors of its groups.
+    #[inline(always)]
+    pub fn add_cotangent(&self, of_groups: &mut [[T; 3]], i: usize, g: [T; 3]) {
+        let (group, share) = (self.of[i] as usize, self.toward_next[i]);
+        if group == NONE as usize {
+            return;
+        }
+        if share == T::zero() {
+            (0..3).for_each(|c| of_groups[group][c] += g[c]);
+            return;
+        }
+        (0..3).for_each(|c| {
+            of_groups[group][c] += (T::one() - share) * g[c];
+            of_groups[group + 1][c] += share * g[c];
+        });
+    }
+
+    /// Interpolates the colors of the samples `own` of a ray, whose groups from `first` on have one source each.
+    fn interpolate(&mut self, own: Range<usize>, first: usize, t: &[T]) {
+        let source = |group: usize| self.sources[group].start as usize;
+        for i in own {
+            let group = self.of[i] as usize;
+            if group == NONE as usize {
+                continue;
+            }
+            // The sources on both sides of the sample, in front of it and behind it.
+            let (front, behind) = if i < source(group) { (group.wrapping_sub(1), group) } else { (group, group + 1) };
+            if i < source(group) && group == first || behind == self.sources.len() {
+                continue;
+            }
+            self.of[i] = front as u32;
+            let (from, to) = (t[source(front)], t[source(behind)]);
+            // Distances may be equal after rounding.
+            self.toward_next[i] = if to > from { ((t[i] - from) / (to - from)).max(T::zero()).min(T::one()) } else { T::zero() };
+        }
     }
 }
 
@@ -82,16 +149,16 @@ impl Grouping {
 
     /// Forms the groups of rays from the weights, distances t and lengths of their samples. Ray r owns the samples `offsets[r]..offsets[r + 1]`; it has the number
     /// `first` + r, which determines its random numbers.
-    pub(crate) fn groups<T: Real>(self, weights: &[T], [t, delta]: [&[T]; 2], offsets: &[u32], first: usize, jitter: Jitter) -> Groups {
+    pub(crate) fn groups<T: Real>(self, weights: &[T], [t, delta]: [&[T]; 2], offsets: &[u32], first: usize, jitter: Jitter) -> Groups<T> {
         /// Distance of the middles of two intervals that touch, relative to the sum of their lengths, up to rounding.
         const TOUCHING: f64 = 0.51;
         let (limit, above, touching) = (T::lit(self.weight), T::lit(self.above), T::lit(TOUCHING));
-        let mut of = Buffer::stale(weights.len());
-        let (mut sources, mut rays) = (Vec::new(), Vec::new());
+        let mut groups = Groups { of: Buffer::stale(weights.len()), toward_next: Buffer::zeros(weights.len()), ..Groups::empty() };
         for (r, own) in offsets.windows(2).enumerate() {
             let (start, end) = (own[0] as usize, own[1] as usize);
             let mut draws = Draws { jitter, ray: first + r, drawn: 0 };
             let (mut begin, mut sum) = (start, T::zero());
+            let before = groups.len();
             for i in start..end {
                 sum += weights[i];
                 let next = i + 1;
@@ -102,17 +169,20 @@ impl Grouping {
                 let members = begin..next;
                 let number = if sum > above {
                     let own = if self.compact { members.clone() } else { draws.member(&weights[members.clone()], sum, begin) };
-                    sources.push(own.start as u32..own.end as u32);
-                    rays.push((first + r) as u32);
-                    sources.len() as u32 - 1
+                    groups.sources.push(own.start as u32..own.end as u32);
+                    groups.rays.push((first + r) as u32);
+                    groups.len() as u32 - 1
                 } else {
-                    Groups::NONE
+                    NONE
                 };
-                of[members].fill(number);
+                groups.of[members].fill(number);
                 (begin, sum) = (next, T::zero());
             }
+            if !self.compact {
+                groups.interpolate(start..end, before, t);
+            }
         }
-        Groups { of, sources, rays }
+        groups
     }
 }
 
@@ -154,7 +224,7 @@ mod tests {
     use glam::DVec3;
 
     /// Groups of two rays without jitter, the first with `weights` at unit distances but for a gap before sample 5, the second with the last of the `weights`.
-    fn groups(grouping: Grouping, weights: &[f64]) -> Groups {
+    fn groups(grouping: Grouping, weights: &[f64]) -> Groups<f64> {
         let n = weights.len();
         let t: Vec<f64> = (0..n).map(|i| if i < 5 { i as f64 } else { i as f64 + 1.0 }).collect();
         grouping.groups(weights, [&t, &vec![1.0; n]], &[0, n as u32 - 1, n as u32], 7, Jitter::None)
@@ -176,11 +246,26 @@ mod tests {
     }
 
     #[test]
-    fn other_groups_end_with_their_weight_and_have_the_position_of_one_member() {
+    fn other_groups_end_with_their_weight_and_colors_between_their_drawn_members_are_interpolated() {
         let weights = [0.1, 0.1, 0.2, 0.05, 0.01, 0.1, 0.01, 0.2];
         let found = groups(Grouping { weight: 0.15, above: 0.02, compact: false }, &weights);
         assert_eq!(found.sources, [1..2, 2..3, 5..6, 7..8]);
-        assert_eq!(found.of[..], [0, 0, 1, 2, 2, 2, Groups::NONE, 3]);
+        assert_eq!(found.of[..], [0, 0, 1, 1, 1, 2, NONE, 3]);
+        assert_eq!(found.toward_next[..], [0.0, 0.0, 0.0, 0.25, 0.5, 0.0, 0.0, 0.0]);
+        let colors = Tensor::from_vec((0..12).map(|k| (k * k) as f64).collect(), &[4, 3]);
+        let rows = colors.data().as_chunks::<3>().0;
+        let of_samples = found.colors_of_samples(&colors);
+        assert_eq!(of_samples.data()[9..12], [0.75 * 9.0 + 0.25 * 36.0, 0.75 * 16.0 + 0.25 * 49.0, 0.75 * 25.0 + 0.25 * 64.0]);
+        // Both forms of the colors agree, and the adjoint is the transpose: ⟨g, C c⟩ = ⟨Cᵀ g, c⟩.
+        let (mut product, mut of_groups) = (0.0, [[0.0; 3]; 4]);
+        for (i, want) in of_samples.data().as_chunks::<3>().0.iter().enumerate() {
+            assert_eq!(found.color(rows, i), *want);
+            let g = [0, 1, 2].map(|c| (7 * i + c + 1) as f64);
+            product += (0..3).map(|c| g[c] * want[c]).sum::<f64>();
+            found.add_cotangent(&mut of_groups, i, g);
+        }
+        let transposed: f64 = of_groups.as_flattened().iter().zip(colors.data()).map(|(g, c)| g * c).sum();
+        assert!((product - transposed).abs() < 1e-9 * product.abs(), "{product}, {transposed}");
         // With jitter, a member is drawn as often as its weight says.
         let grouping = Grouping { weight: 0.5, above: 0.0, compact: false };
         let drawn = |step: u64| {

@@ -19,7 +19,7 @@ mod positions;
 
 use super::{Factored, Shape};
 use crate::camera::{Ray, TrackedRays};
-use crate::field::grouping::{Grouping, Groups};
+use crate::field::grouping::{self, Grouping, Groups};
 use crate::geometry::Aabb;
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
@@ -237,7 +237,7 @@ impl<T: Real> State<T> {
         let (tables, of_rays) = inputs.split_at(adjoint::TABLES);
         let mut offsets = vec![0u32];
         let mut columns: [Vec<T>; 6] = Default::default();
-        let (mut of, mut sources, mut numbers) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut of, mut toward_next, mut sources, mut numbers) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         for block in &self.blocks {
             let (first, before) = (columns[0].len() as u32, sources.len() as u32);
             let [x, y, z] = block.at();
@@ -245,11 +245,12 @@ impl<T: Real> State<T> {
                 to.extend_from_slice(from);
             }
             offsets.extend(block.offsets[1..].iter().map(|offset| first + offset));
-            of.extend(block.groups.of.iter().map(|&group| if group == Groups::NONE { group } else { before + group }));
+            of.extend(block.groups.of.iter().map(|&group| if group == grouping::NONE { group } else { before + group }));
+            toward_next.extend_from_slice(&block.groups.toward_next);
             sources.extend(block.groups.sources.iter().map(|own| first + own.start..first + own.end));
             numbers.extend_from_slice(&block.groups.rays);
         }
-        let groups = Groups { of: of.into(), sources, rays: numbers };
+        let groups = Groups { of: of.into(), toward_next: toward_next.into(), sources, rays: numbers };
         let offsets = Indices::from(offsets);
         let [x, y, z, t, delta, weights] = columns.map(|values| Tensor::from_vec(values, &[groups.of.len()]));
         let cells = Tensor::stack(&[&x, &y, &z], 1);

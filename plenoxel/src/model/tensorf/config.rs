@@ -34,12 +34,14 @@ pub struct Config {
     /// Least side of a cell in [`Space::Box`], in pixels of a training view at the middle of the box, on average over the views; 0 for no bound. Stages whose
     /// resolution has smaller cells get cells of this side.
     pub pixels_per_cell: f64,
-    /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training; 0 for a color per sample.
+    /// Weight that completes a group of samples, for which the color network is evaluated once ([`Grouping`](crate::field::grouping::Grouping)), in training; 0
+    /// for each sample.
     pub group: f64,
     /// Weight that completes a group in pictures.
     pub group_in_pictures: f64,
-    /// True: the color of a group is that of the mean position of its samples, and a group also ends at gaps and with eight samples, in training and in
-    /// pictures. False: it is that of one sample, which is drawn by weight ([`Grouping::compact`](crate::field::grouping::Grouping)).
+    /// True: the samples of a group have the color of their mean position, and a group also ends at gaps and with eight samples, in training and in pictures.
+    /// False: the network is evaluated at one sample of each group, which is drawn by weight, and colors between such samples are interpolated
+    /// ([`Grouping::compact`](crate::field::grouping::Grouping)).
     pub compact_groups: bool,
     /// Groups of samples whose weight is not above this have no color.
     pub color_above: f64,

@@ -6,7 +6,6 @@ use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, 
 use super::network::OfNetwork;
 use super::positions::{self, OfRays};
 use super::{Output, State};
-use crate::field::grouping::Groups;
 use crate::render::along::{COLUMNS, sparsity_slope};
 use autograd::rows::{Buckets, buckets_of};
 use autograd::{Buffer, Real, RowSums, Tensor, parallel};
@@ -221,10 +220,9 @@ fn part<T: Real>(
             let of_groups = rgb.as_chunks_mut::<3>().0;
             for (own, g) in block.rays().zip(&cotangent.data().as_chunks::<COLUMNS>().0[block.first..]) {
                 along.sigma_adjoint(own.clone(), batch.background, g, &color, &mut of_features);
-                for i in own.filter(|&i| block.groups.of[i] != Groups::NONE) {
-                    let of = &mut of_groups[block.groups.of[i] as usize];
+                for i in own {
                     let weight = along.weight[i] * gradient_share(along.t[i], batch.gradient_scaling);
-                    (0..3).for_each(|c| of[c] += weight * g[c]);
+                    block.groups.add_cotangent(of_groups, i, [0, 1, 2].map(|c| weight * g[c]));
                 }
             }
         }

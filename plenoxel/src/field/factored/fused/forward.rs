@@ -39,8 +39,8 @@ pub struct Block<T: Real> {
     /// Ray r of the block owns the samples `offsets[r]..offsets[r + 1]`.
     pub offsets: Vec<u32>,
     columns: [Buffer<T>; of_sample::COUNT],
-    /// Samples that share a color.
-    pub groups: Groups,
+    /// Groups that have colors.
+    pub groups: Groups<T>,
     /// Positions of the groups, where the color network is evaluated.
     pub groups_at: [Buffer<T>; 3],
     /// Values of the color network.
@@ -97,7 +97,7 @@ impl<T: Real> Block<T> {
     #[inline(always)]
     pub fn color(&self) -> impl Fn(usize) -> [T; 3] + '_ {
         let colors = self.activations.rgb.as_chunks::<3>().0;
-        |i| colors.get(self.groups.of[i] as usize).copied().unwrap_or([T::zero(); 3])
+        |i| self.groups.color(colors, i)
     }
 }
 
@@ -214,7 +214,7 @@ impl<'a, T: Real> Scene<'a, T> {
             first,
             offsets,
             columns,
-            groups: Groups { of: Buffer::stale(0), sources: Vec::new(), rays: Vec::new() },
+            groups: Groups::empty(),
             groups_at: std::array::from_fn(|_| Buffer::stale(0)),
             activations: Activations::default(),
         }
