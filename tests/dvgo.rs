@@ -101,17 +101,19 @@ fn what_is_left_out_changes_a_color_by_no_more_than_its_opacity() {
 }
 
 #[test]
-fn groups_share_a_color_and_have_gradients() {
+fn colors_between_the_drawn_members_of_groups_are_interpolated_and_have_gradients() {
     let mut grid = grid::<f64>([5; 3], true);
     grid.grouping_in_pictures = Grouping { weight: 0.3, ..Grouping::NONE };
     let rendered = rendered(&grid, &rays(4), Engine::Fused, 0.0);
     let samples = rendered.samples().expect("samples");
     let own = |r: usize| samples.samples.offsets[r] as usize..samples.samples.offsets[r + 1] as usize;
+    let (t, red) = (samples.samples.t.data(), samples.radiance.rgb.index_axis(1, 0));
     for r in 0..4 {
-        let colors: Vec<&[f64]> = own(r).map(|i| &samples.radiance.rgb.data()[3 * i..][..3]).collect();
-        let different = 1 + colors.windows(2).filter(|pair| pair[0] != pair[1]).count();
-        // Each group but the last has a weight of at least 0.3, of at most 1.
-        assert!(different <= 4 && colors.len() > 4, "{different} of {}", colors.len());
+        let slopes: Vec<f64> = own(r).skip(1).map(|i| (red.data()[i] - red.data()[i - 1]) / (t[i] - t[i - 1])).collect();
+        let bends = slopes.windows(2).filter(|pair| (pair[0] - pair[1]).abs() > 1e-9).count();
+        // Each group but the last has a weight of at least 0.3, of at most 1. A color bends at their members only.
+        assert!(bends <= 4 && slopes.len() > 5, "{bends} of {}", slopes.len());
+        assert!(slopes.iter().any(|&slope| slope != 0.0));
     }
     let gradients = rendered.rgb.sum().backward();
     grid.visit(&mut |param| assert!(gradients.of(param).is_some(), "{}", param.name()));
