@@ -65,9 +65,9 @@ pub struct DenseGrid<T: Real> {
     pub unit: f64,
     /// Samples whose own opacity is not above this are left out by the fused engine: they have no density, no color and no gradient.
     pub opacity_above: f64,
-    /// Which samples have their own color in training, that is with jitter.
+    /// Where the color network is evaluated in training, that is with jitter.
     pub grouping: Grouping,
-    /// Which samples have their own color in pictures.
+    /// The same in pictures.
     pub grouping_in_pictures: Grouping,
     /// Cells around the nodes outside of which nothing is sampled; `None` for the whole box.
     pub occupied: Option<Occupancy>,

@@ -160,7 +160,7 @@ pub struct Factored<T: Real> {
     color: Mlp<T>,
     /// Cells outside of which nothing is sampled; `None` for the whole box.
     pub occupied: Option<Occupancy>,
-    /// Which samples have their own color in training, that is with jitter.
+    /// Where the color network is evaluated in training, that is with jitter.
     pub grouping: Grouping,
     /// The same in pictures.
     pub grouping_in_pictures: Grouping,

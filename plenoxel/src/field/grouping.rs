@@ -26,7 +26,7 @@ pub const MOST_MEMBERS: usize = 8;
 /// Groups of the samples of some rays. Sample i has the color (1 − sᵢ) c_g + sᵢ c_{g+1} with g = `of[i]` and sᵢ = `toward_next[i]`.
 #[derive(Debug)]
 pub(crate) struct Groups<T: Real> {
-    /// Number g of the group whose color a sample has, or the first of two; [`NONE`] for no color.
+    /// Number g of the group whose color a sample has, or the first of two; [`NO_COLOR`] for no color.
     pub of: Buffer<u32>,
     /// Share sᵢ of the color of the next group; 0 for the color of one group.
     pub toward_next: Buffer<T>,
@@ -37,7 +37,7 @@ pub(crate) struct Groups<T: Real> {
 }
 
 /// Marker for a sample without a color.
-pub(crate) const NONE: u32 = u32::MAX;
+pub(crate) const NO_COLOR: u32 = u32::MAX;
 
 impl<T: Real> Groups<T> {
     /// Returns groups of no samples.
@@ -76,7 +76,7 @@ impl<T: Real> Groups<T> {
 
     /// Returns the colors of the samples, `[m, 3]`, from those of the groups, `[g, 3]`.
     pub fn colors_of_samples(&self, colors: &Tensor<T>) -> Tensor<T> {
-        let colored: Vec<u32> = (0..self.of.len() as u32).filter(|&i| self.of[i as usize] != NONE).collect();
+        let colored: Vec<u32> = (0..self.of.len() as u32).filter(|&i| self.of[i as usize] != NO_COLOR).collect();
         let first: Vec<u32> = colored.iter().map(|&i| self.of[i as usize]).collect();
         let toward_next: Vec<T> = colored.iter().map(|&i| self.toward_next[i as usize]).collect();
         let colors = if toward_next.iter().any(|&share| share > T::zero()) {
@@ -109,7 +109,7 @@ impl<T: Real> Groups<T> {
     #[inline(always)]
     pub fn add_cotangent(&self, of_groups: &mut [[T; 3]], i: usize, g: [T; 3]) {
         let (group, share) = (self.of[i] as usize, self.toward_next[i]);
-        if group == NONE as usize {
+        if group == NO_COLOR as usize {
             return;
         }
         if share == T::zero() {
@@ -127,14 +127,15 @@ impl<T: Real> Groups<T> {
         let source = |group: usize| self.sources[group].start as usize;
         for i in own {
             let group = self.of[i] as usize;
-            if group == NONE as usize {
+            if group == NO_COLOR as usize {
                 continue;
             }
-            // The sources on both sides of the sample, in front of it and behind it.
-            let (front, behind) = if i < source(group) { (group.wrapping_sub(1), group) } else { (group, group + 1) };
-            if i < source(group) && group == first || behind == self.sources.len() {
+            // The first group whose source is behind the sample. There is none in front of the first source, and none behind the last.
+            let behind = group + usize::from(i >= source(group));
+            if behind == first || behind == self.sources.len() {
                 continue;
             }
+            let front = behind - 1;
             self.of[i] = front as u32;
             let (from, to) = (t[source(front)], t[source(behind)]);
             // Distances may be equal after rounding.
@@ -173,7 +174,7 @@ impl Grouping {
                     groups.rays.push((first + r) as u32);
                     groups.len() as u32 - 1
                 } else {
-                    NONE
+                    NO_COLOR
                 };
                 groups.of[members].fill(number);
                 (begin, sum) = (next, T::zero());
@@ -250,7 +251,7 @@ mod tests {
         let weights = [0.1, 0.1, 0.2, 0.05, 0.01, 0.1, 0.01, 0.2];
         let found = groups(Grouping { weight: 0.15, above: 0.02, compact: false }, &weights);
         assert_eq!(found.sources, [1..2, 2..3, 5..6, 7..8]);
-        assert_eq!(found.of[..], [0, 0, 1, 1, 1, 2, NONE, 3]);
+        assert_eq!(found.of[..], [0, 0, 1, 1, 1, 2, NO_COLOR, 3]);
         assert_eq!(found.toward_next[..], [0.0, 0.0, 0.0, 0.25, 0.5, 0.0, 0.0, 0.0]);
         let colors = Tensor::from_vec((0..12).map(|k| (k * k) as f64).collect(), &[4, 3]);
         let rows = colors.data().as_chunks::<3>().0;

@@ -245,7 +245,7 @@ impl<T: Real> State<T> {
                 to.extend_from_slice(from);
             }
             offsets.extend(block.offsets[1..].iter().map(|offset| first + offset));
-            of.extend(block.groups.of.iter().map(|&group| if group == grouping::NONE { group } else { before + group }));
+            of.extend(block.groups.of.iter().map(|&group| if group == grouping::NO_COLOR { group } else { before + group }));
             toward_next.extend_from_slice(&block.groups.toward_next);
             sources.extend(block.groups.sources.iter().map(|own| first + own.start..first + own.end));
             numbers.extend_from_slice(&block.groups.rays);

@@ -19,8 +19,8 @@ pub struct Config {
     pub directions: Directions,
     /// Distance between samples, in voxels of the stage.
     pub step: f64,
-    /// Weight that completes a group of samples with one color ([`Grouping`](crate::field::grouping::Grouping)), in training of the fine stages; 0 for a color
-    /// per sample.
+    /// Weight that completes a group of samples, for which the color network is evaluated once ([`Grouping`](crate::field::grouping::Grouping)), in training of
+    /// the fine stages; 0 for each sample.
     pub group: f64,
     /// Weight that completes a group in pictures.
     pub group_in_pictures: f64,
