@@ -38,6 +38,8 @@ pub enum Purpose {
     Importance = 7,
     /// Noise of the density.
     Noise = 8,
+    /// Gradients that are pruned.
+    Pruning = 9,
 }
 
 /// Returns 64 random bits for (seed, purpose, step, index).
@@ -51,7 +53,7 @@ pub fn uniform(seed: u64, purpose: Purpose, step: u64, index: u64) -> f64 {
 }
 
 /// Returns the stream whose first number is that of (seed, purpose, step, index).
-fn stream(seed: u64, purpose: Purpose, step: u64, index: u64) -> Stream {
+pub(crate) fn stream(seed: u64, purpose: Purpose, step: u64, index: u64) -> Stream {
     Stream::new(mix(mix(seed ^ (purpose as u64) << 56) ^ step) ^ mix(index))
 }
 

@@ -12,7 +12,7 @@ pub mod walk;
 
 use crate::camera::Ray;
 use crate::geometry::Aabb;
-use crate::random::{Purpose, uniform};
+use crate::random::{self, Purpose, Stream, uniform};
 use crate::space::{Bend, Space, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
@@ -69,6 +69,14 @@ impl Jitter {
         match self {
             Jitter::None => 0.0,
             Jitter::PerRay { seed, step } => uniform(seed, Purpose::Jitter, step, ray as u64),
+        }
+    }
+
+    /// Returns a stream for the rays from a first one on; `None` without jitter.
+    pub(crate) fn stream(self, purpose: Purpose, first: usize) -> Option<Stream> {
+        match self {
+            Jitter::None => None,
+            Jitter::PerRay { seed, step } => Some(random::stream(seed, purpose, step, first as u64)),
         }
     }
 }

@@ -164,9 +164,9 @@ pub struct Factored<T: Real> {
     pub grouping: Grouping,
     /// The same in pictures.
     pub grouping_in_pictures: Grouping,
-    /// Least gradient ∂L/∂s of the density feature s of a sample that the fused kernel adds to planes and lines, relative to the mean of |∂L/∂s| over the
-    /// samples of the same block of rays; smaller ones count as 0. 0 for exact gradients. Most samples are in empty cells around matter, or behind it.
-    /// Gradients of rays, and gradients that can be differentiated again, are always exact.
+    /// Threshold of stochastic pruning (Ye et al. 2020) in the adjoint of the fused kernel. With jitter, gradients of the density feature of a sample, and of the
+    /// color of a group, below this share τ of their mean over the same block of rays are used with the probability |g| / τ, and become as large as τ; the
+    /// others count as 0. Their expectation is unchanged. 0 for exact gradients. Gradients that can be differentiated again are always exact.
     pub gradient_above: f64,
     /// Gradient scaling (Philip and Deschaintre 2023), a length d: the gradients of density and color of a sample at t ([`Samples`]) are multiplied by
     /// min(1, (t / d)²), in the graph and in the kernel; 0 for exact gradients. Gradients of rays become smaller with them. Near a camera, rays are dense and no

@@ -6,7 +6,7 @@
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
 //! another ([`RowSums`](autograd::RowSums)), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
-//! the sums are bit-identical for any number of threads. Samples with a small gradient can be left out ([`Factored::gradient_above`]).
+//! the sums are bit-identical for any number of threads. Small gradients can be pruned at random ([`Factored::gradient_above`]).
 //!
 //! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of its samples, and adds them up for each ray.
 
@@ -16,6 +16,7 @@ mod forward;
 mod lookup;
 mod network;
 mod positions;
+mod pruning;
 
 use super::{Factored, Shape};
 use crate::camera::{Ray, TrackedRays};

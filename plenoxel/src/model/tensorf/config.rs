@@ -49,7 +49,7 @@ pub struct Config {
     pub stop_below: f64,
     /// Transmittance below which a ray of a picture ends.
     pub stop_below_in_pictures: f64,
-    /// Least gradient of the density of a sample that the fused kernel uses, relative to the mean
+    /// Gradients of density and color below this share of their mean are pruned at random by the fused kernel
     /// ([`Factored::gradient_above`](crate::field::factored::Factored::gradient_above)); 0 for exact gradients.
     pub gradient_above: f64,
     /// Distance from a camera, in units of the box, below which gradients are scaled by the square of the distance
@@ -196,7 +196,6 @@ impl Config {
             ("color_above", self.color_above),
             ("stop_below", self.stop_below),
             ("stop_below_in_pictures", self.stop_below_in_pictures),
-            ("gradient_above", self.gradient_above),
             ("occupied_above", self.occupied_above),
             ("cool_down", self.cool_down),
         ] {
@@ -209,6 +208,7 @@ impl Config {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
         }
         check((0.0..=100.0).contains(&self.initial_density), "initial_density", self.initial_density, "0 to 100")?;
+        check((0.0..=100.0).contains(&self.gradient_above), "gradient_above", self.gradient_above, "0 to 100")?;
         check((0.0..=1e3).contains(&self.gradient_scaling), "gradient_scaling", self.gradient_scaling, "0 to 1000")?;
         check((0.0..=1e3).contains(&self.density_tv), "density_tv", self.density_tv, "0 to 1000")?;
         if let Some(Short { below, hidden, group, cost }) = self.short {

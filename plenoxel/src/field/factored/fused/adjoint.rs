@@ -5,7 +5,9 @@ use super::forward::{Block, Tables};
 use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, RUN, add_to_lines, first_rows};
 use super::network::OfNetwork;
 use super::positions::{self, OfRays};
+use super::pruning::{self, prune};
 use super::{Output, State};
+use crate::random::Purpose;
 use crate::render::along::{COLUMNS, sparsity_slope};
 use autograd::rows::{Buckets, buckets_of};
 use autograd::{Buffer, Real, RowSums, Tensor, parallel};
@@ -25,36 +27,41 @@ pub struct Cotangents<T: Real> {
 /// Cotangents of one block.
 #[derive(Debug)]
 struct Part<T: Real> {
-    /// Samples whose density gradient is used.
-    density: OfDensity<T>,
-    /// Cotangents of the products of each group, `[groups, 3 R]`.
-    products: Buffer<T>,
-    /// Samples of `density`, sorted by the rows of each plane that they read.
-    density_rows: [Sorted; 3],
-    /// Groups, sorted likewise.
-    product_rows: [Sorted; 3],
+    /// Of the density features of samples.
+    density: Kept<T>,
+    /// Of the products of groups.
+    products: Kept<T>,
 }
 
-/// Positions of samples, in units of cells, and ∂L/∂s of each.
+/// Samples or groups that [`prune`] has kept.
 #[derive(Debug)]
-struct OfDensity<T: Real> {
+pub struct Kept<T: Real> {
+    /// Their numbers in the block.
+    pub numbers: Vec<u32>,
+    /// Their positions, in units of cells.
     at: [Buffer<T>; 3],
+    /// ∂L/∂s of each sample, or the cotangents of the products of each group, `[groups, 3 R]`.
     g: Buffer<T>,
+    of_density: bool,
+    /// They, sorted by the rows of each plane that they read.
+    sorted: [Sorted; 3],
 }
 
-impl<T: Real> OfDensity<T> {
-    /// Keeps the samples with the cotangents `g` that are not 0, and not below a share of the mean of |g|.
-    fn new(at: [&[T]; 3], g: &[T], share: f64) -> Self {
-        let least = T::lit(share) * g.iter().map(|g| g.abs()).sum::<T>() / T::lit(g.len().max(1) as f64);
-        // NaN is kept: it must not look like no gradient.
-        let small = |g: T| g == T::zero() || g.abs() < least;
-        let kept: Vec<u32> = (0..g.len() as u32).filter(|&i| !small(g[i as usize])).collect();
-        let of = |all: &[T]| kept.iter().map(|&i| all[i as usize]).collect::<Vec<_>>().into();
-        OfDensity { at: at.map(of), g: of(g) }
+impl<T: Real> Kept<T> {
+    /// Takes the samples or groups with these numbers, and their cotangents, from the positions `at` of all.
+    fn new(numbers: Vec<u32>, at: [&[T]; 3], g: Buffer<T>, of: Pairs<'_, T>, of_density: bool) -> Self {
+        let at = at.map(|at| pruning::rows(at, 1, &numbers));
+        let places = at.each_ref().map(|at| &at[..]);
+        let sorted = [0, 1, 2].map(|axis| Sorted::new(axis, places, of.nodes, bucket_shift(axis, of.nodes, of.width)));
+        Kept { numbers, at, g, of_density, sorted }
     }
 
-    fn at(&self) -> [&[T]; 3] {
+    pub fn at(&self) -> [&[T]; 3] {
         self.at.each_ref().map(|at| &at[..])
+    }
+
+    pub fn g(&self) -> OfProducts<'_, T> {
+        if self.of_density { OfProducts::Shared(&self.g) } else { OfProducts::Each(&self.g) }
     }
 }
 
@@ -109,8 +116,8 @@ impl<T: Real> PlaneSums<T> {
         if self.of_density { shape.density_components } else { shape.appearance_components }
     }
 
-    fn sorted<'a>(&self, part: &'a Part<T>) -> &'a Sorted {
-        &(if self.of_density { &part.density_rows } else { &part.product_rows })[self.axis]
+    fn kept<'a>(&self, part: &'a Part<T>) -> &'a Kept<T> {
+        if self.of_density { &part.density } else { &part.products }
     }
 }
 
@@ -120,18 +127,15 @@ impl<T: Real> RowSums<T> for PlaneSums<T> {
     }
 
     fn is_empty(&self, bucket: usize) -> bool {
-        self.parts.iter().all(|part| self.sorted(part).buckets.range(bucket).is_empty())
+        self.parts.iter().all(|part| self.kept(part).sorted[self.axis].buckets.range(bucket).is_empty())
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
         let plane = PlaneOf { axis: self.axis, line: self.line.data(), nodes: self.state.batch.nodes, width: self.width() };
-        for (part, block) in self.parts.iter().zip(&self.state.blocks) {
-            let sorted = self.sorted(part);
+        for kept in self.parts.iter().map(|part| self.kept(part)) {
+            let sorted = &kept.sorted[self.axis];
             let which = &sorted.samples[sorted.buckets.range(bucket)];
-            let (at, g) = match self.of_density {
-                true => (part.density.at(), OfProducts::Shared(&part.density.g)),
-                false => (block.groups_at.each_ref().map(|at| &at[..]), OfProducts::Each(&part.products)),
-            };
+            let (at, g) = (kept.at(), kept.g());
             let bucket = BucketSums { first: bucket << self.bucket_shift(), sums, touched };
             if parallel::fused() {
                 lookup::add_to_plane::<T, true>(plane, at, which, g, bucket);
@@ -230,30 +234,30 @@ fn part<T: Real>(
     for ((g, &slope), &t) in of_features.iter_mut().zip(block.slope()).zip(block.t()) {
         *g *= slope * gradient_share(t, batch.gradient_scaling);
     }
-    let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, rgb);
+    let random = |which| batch.jitter.stream(Purpose::Pruning, block.first).map(|stream| stream.numbered(which));
+    let samples = prune(&mut of_features, 1, batch.gradient_above, random(0));
+    let groups = prune(&mut rgb, 3, batch.gradient_above, random(1));
+    let OfNetwork { products, input, parameters } =
+        tables.network.adjoint(&block.activations.rows(&groups), pruning::rows(&rgb, 3, &groups));
+    let of_samples = pruning::rows(&of_features, 1, &samples);
     let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
-    let density = OfDensity::new(block.at(), &of_features, batch.gradient_above);
-    let lines = [
-        lines(tables.density, density.at(), OfProducts::Shared(&density.g)),
-        lines(tables.appearance, groups_at, OfProducts::Each(&products)),
-    ];
-    let shift = |axis: usize, pairs: Pairs<'_, T>| bucket_shift(axis, batch.nodes, pairs.width);
-    let density_rows = [0, 1, 2].map(|axis| Sorted::new(axis, density.at(), batch.nodes, shift(axis, tables.density)));
-    let product_rows = [0, 1, 2].map(|axis| Sorted::new(axis, groups_at, batch.nodes, shift(axis, tables.appearance)));
+    let density = Kept::new(samples, block.at(), of_samples, tables.density, true);
+    let products = Kept::new(groups, groups_at, products, tables.appearance, false);
+    let lines = [lines(tables.density, &density), lines(tables.appearance, &products)];
     let rays = state.tracked.as_ref().map(|tracked| {
         let encoded = tables.network.of_direction(&input);
-        positions::of_rays(tracked, block, tables, [&of_features, &products], (encoded, batch.encoded.shape()[1]))
+        positions::of_rays(tracked, block, tables, [&density, &products], (encoded, batch.encoded.shape()[1]))
     });
-    (Part { density, products, density_rows, product_rows }, lines.into_iter().chain(parameters).collect(), rays)
+    (Part { density, products }, lines.into_iter().chain(parameters).collect(), rays)
 }
 
 /// Returns the cotangents of three lines, one after another.
-fn lines<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: OfProducts<'_, T>) -> Buffer<T> {
+fn lines<T: Real>(pairs: Pairs<'_, T>, kept: &Kept<T>) -> Buffer<T> {
     let mut sums = Buffer::zeros(pairs.nodes.iter().sum::<usize>() * pairs.width);
-    let count = at[0].len();
+    let count = kept.numbers.len();
     for first in (0..count).step_by(RUN) {
         let range = first..count.min(first + RUN);
-        let (at, g) = (at.map(|at| &at[range.clone()]), g.of(range.clone(), 3 * pairs.width));
+        let (at, g) = (kept.at().map(|at| &at[range.clone()]), kept.g().of(range.clone(), 3 * pairs.width));
         if parallel::fused() {
             add_to_lines::<T, true>(pairs, at, g, &mut sums);
         } else {

@@ -1,6 +1,7 @@
 //! The color network on arrays: forward and adjoint for the groups of samples of one block.
 
 use super::super::Shape;
+use super::pruning;
 use autograd::{Buffer, Matrix, Real, Tensor, dispatched, multiply, parallel};
 
 /// Linear layer.
@@ -29,6 +30,14 @@ pub struct Activations<T: Real> {
     inputs: Vec<Buffer<T>>,
     /// Colors, `[m, 3]`.
     pub rgb: Buffer<T>,
+}
+
+impl<T: Real> Activations<T> {
+    /// Returns the values of the groups with these numbers.
+    pub fn rows(&self, numbers: &[u32]) -> Self {
+        let of = |all: &Buffer<T>| pruning::rows(all, 3 * all.len() / self.rgb.len().max(1), numbers);
+        Activations { products: of(&self.products), inputs: self.inputs.iter().map(of).collect(), rgb: of(&self.rgb) }
+    }
 }
 
 /// Cotangents of the network for m groups.

@@ -2,6 +2,7 @@
 
 use super::super::PLANE_OF;
 use super::Tracked;
+use super::adjoint::Kept;
 use super::forward::{Block, Tables};
 use super::lookup::{Cells, Cotangents, LANES, Pairs, Places, RUN, line_at, plane_at, prefetch};
 use crate::camera::Ray;
@@ -27,25 +28,25 @@ pub fn joined<T: Real>(blocks: &[OfRays<T>]) -> OfRays<T> {
     })
 }
 
-/// Computes the cotangents of the rays of a block from those of the density features of its samples, of the products of its groups, and of the encoded
-/// directions of these, `width` numbers each. A ray without samples has the cotangent 0.
+/// Computes the cotangents of the rays of a block from those of the density features of samples, of the products of groups, and of the encoded directions of
+/// these, `width` numbers each. A ray without samples has the cotangent 0.
 pub fn of_rays<'g, T: Real>(
     tracked: &Tracked,
     block: &Block<T>,
     tables: &Tables<'_, T>,
-    [density, products]: [&[T]; 2],
+    [density, products]: [&Kept<T>; 2],
     (encoded, width): (impl Iterator<Item = &'g [T]>, usize),
 ) -> OfRays<T> {
-    let mut of_samples = slopes(tables.density, block.at(), Cotangents::Shared(density));
-    let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
-    let of_groups = slopes(tables.appearance, groups_at, Cotangents::Each(products));
+    let mut of_samples = slopes(tables.density, density, block.len());
+    let of_groups = slopes(tables.appearance, products, block.groups.len());
     for (group, sample, share) in block.groups.shares(block.weight()) {
         (0..3).for_each(|axis| of_samples[axis][sample] += share * of_groups[axis][group]);
     }
     let rays = block.offsets.len() - 1;
     let mut of_encoded = Buffer::zeros(rays * width);
-    for (row, &ray) in encoded.zip(&block.groups.rays) {
-        let sums = &mut of_encoded[(ray as usize - block.first) * width..][..width];
+    for (row, &group) in encoded.zip(&products.numbers) {
+        let ray = block.groups.rays[group as usize] as usize - block.first;
+        let sums = &mut of_encoded[ray * width..][..width];
         sums.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
     }
     let (mut of_origins, mut of_directions) = (Buffer::stale(3 * rays), Buffer::stale(3 * rays));
@@ -78,20 +79,21 @@ impl Tracked {
     }
 }
 
-/// Returns the cotangents of positions, in units of cells, from those of products.
-fn slopes<T: Real>(pairs: Pairs<'_, T>, at: [&[T]; 3], g: Cotangents<'_, T>) -> [Buffer<T>; 3] {
-    let count = at[0].len();
-    let mut slopes = [0, 1, 2].map(|_| Buffer::stale(count));
-    for first in (0..count).step_by(RUN) {
-        let range = first..count.min(first + RUN);
-        let (at, g) = (at.map(|at| &at[range.clone()]), g.of(range.clone(), 3 * pairs.width));
+/// Returns the cotangents of the positions of `all` samples or groups, in units of cells, from those of the products of some; the others have 0.
+fn slopes<T: Real>(pairs: Pairs<'_, T>, kept: &Kept<T>, all: usize) -> [Buffer<T>; 3] {
+    let mut slopes = [0, 1, 2].map(|_| Buffer::zeros(all));
+    for (run, numbers) in kept.numbers.chunks(RUN).enumerate() {
+        let range = run * RUN..run * RUN + numbers.len();
+        let (at, g) = (kept.at().map(|at| &at[range.clone()]), kept.g().of(range, 3 * pairs.width));
         let mut out = [[T::zero(); RUN]; 3];
         if parallel::fused() {
             add_slopes::<T, true>(pairs, at, g, &mut out);
         } else {
             add_slopes::<T, false>(pairs, at, g, &mut out);
         }
-        slopes.iter_mut().zip(&out).for_each(|(slopes, out)| slopes[range.clone()].copy_from_slice(&out[..range.len()]));
+        for (slopes, out) in slopes.iter_mut().zip(&out) {
+            numbers.iter().zip(out).for_each(|(&i, &slope)| slopes[i as usize] = slope);
+        }
     }
     slopes
 }
