@@ -218,7 +218,17 @@ fn pruned_gradients_have_the_expectation_of_exact_ones() {
         all
     };
     let exact: Vec<_> = (0..DRAWS).map(|step| gradients(0.0, step)).collect();
-    // Squared norms of the error of one gradient, relative to the gradient, and of the mean of all errors, relative to what independent errors would have.
+    // Without jitter, nothing is drawn.
+    let picture = |gradient_above: f64| {
+        let model = thin(Config { gradient_above, ..tiny(&[(9, 1)]) });
+        let (_, adjoint) = autograd::value_and_grad(|| all_columns(&model.render(&rays, &PASS)));
+        let mut all = Vec::new();
+        model.visit(&mut |param| all.push(adjoint.array(param.tensor())));
+        all
+    };
+    assert_eq!(picture(0.0), picture(1.0));
+    // For each input, the squared norm of the errors, relative to that of the gradients. And that of the sum of all errors, relative to the expectation for
+    // independent errors with mean 0.
     let errors = |gradient_above: f64| {
         let pruned: Vec<_> = (0..DRAWS).map(|step| gradients(gradient_above, step)).collect();
         let of_input = |k: usize| {
@@ -234,7 +244,7 @@ fn pruned_gradients_have_the_expectation_of_exact_ones() {
     let [few, many] = [0.3, 1.0].map(errors);
     for ((name, few, of_few), (_, many, of_many)) in few.into_iter().zip(many) {
         assert!(0.0 < few && few < many && many < 0.5, "{name}: {few} and {many}");
-        // A share b of the error that is the same in all draws would add b · DRAWS.
+        // If a share b of the squared error were the same in all draws, it would add b · DRAWS.
         assert!(of_few < 3.0 && of_many < 3.0, "{name}: {of_few} and {of_many}");
     }
 }
@@ -280,8 +290,15 @@ fn training_has_the_same_bits_for_any_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
             let config = tiny(&[(16, 30), (24, 30)]);
-            let config =
-                Config { density_components: 16, appearance_components: 16, group: 0.1, compact_groups, stop_below: 1e-3, ..config };
+            let config = Config {
+                density_components: 16,
+                appearance_components: 16,
+                group: 0.1,
+                compact_groups,
+                stop_below: 1e-3,
+                gradient_above: 1.0,
+                ..config
+            };
             let objective = Objective::new().with("mse", 1.0, mse);
             let model = Tensorf::<f32>::new(config, BOX, 42).expect("valid settings");
             let mut trainer = Trainer::with_model(model, &train[..], objective, TrainOptions::default()).expect("a trainer");

@@ -38,8 +38,8 @@ pub enum Purpose {
     Importance = 7,
     /// Noise of the density.
     Noise = 8,
-    /// Gradients that are pruned.
-    Pruning = 9,
+    /// Gradients that are used.
+    GradientPruning = 9,
 }
 
 /// Returns 64 random bits for (seed, purpose, step, index).

@@ -164,9 +164,10 @@ pub struct Factored<T: Real> {
     pub grouping: Grouping,
     /// The same in pictures.
     pub grouping_in_pictures: Grouping,
-    /// Threshold of stochastic pruning (Ye et al. 2020) in the adjoint of the fused kernel. With jitter, gradients of the density feature of a sample, and of the
-    /// color of a group, below this share τ of their mean over the same block of rays are used with the probability |g| / τ, and become as large as τ; the
-    /// others count as 0. Their expectation is unchanged. 0 for exact gradients. Gradients that can be differentiated again are always exact.
+    /// Stochastic pruning of gradients (Ye et al. 2020) in the adjoint of the fused kernel. Let g be the gradient of the density feature of a sample, or of the
+    /// color of a group, |g| the sum over its channels, and τ this number times the mean of |g| over a block of rays. With jitter, a gradient with |g| < τ becomes
+    /// τ g / |g| with the probability |g| / τ, and 0 otherwise, so that its expectation is unchanged. 0 for exact gradients. Gradients that can be
+    /// differentiated again are always exact.
     pub gradient_above: f64,
     /// Gradient scaling (Philip and Deschaintre 2023), a length d: the gradients of density and color of a sample at t ([`Samples`]) are multiplied by
     /// min(1, (t / d)²), in the graph and in the kernel; 0 for exact gradients. Gradients of rays become smaller with them. Near a camera, rays are dense and no

@@ -40,7 +40,7 @@ pub struct Kept<T: Real> {
     pub numbers: Vec<u32>,
     /// Their positions, in units of cells.
     at: [Buffer<T>; 3],
-    /// ∂L/∂s of each sample, or the cotangents of the products of each group, `[groups, 3 R]`.
+    /// ∂L/∂s of each, or the cotangents of its products, `[kept, 3 R]`.
     g: Buffer<T>,
     of_density: bool,
     /// They, sorted by the rows of each plane that they read.
@@ -99,7 +99,7 @@ fn plane_size(axis: usize, nodes: [usize; 3]) -> usize {
     PLANE_OF[axis].map(|a| nodes[a]).iter().product()
 }
 
-/// Contributions of all samples of a batch to one plane.
+/// Contributions of the samples or groups of a batch that are kept to one plane.
 #[derive(Debug)]
 struct PlaneSums<T: Real> {
     state: Arc<State<T>>,
@@ -234,9 +234,9 @@ fn part<T: Real>(
     for ((g, &slope), &t) in of_features.iter_mut().zip(block.slope()).zip(block.t()) {
         *g *= slope * gradient_share(t, batch.gradient_scaling);
     }
-    let random = |which| batch.jitter.stream(Purpose::Pruning, block.first).map(|stream| stream.numbered(which));
-    let samples = prune(&mut of_features, 1, batch.gradient_above, random(0));
-    let groups = prune(&mut rgb, 3, batch.gradient_above, random(1));
+    let random = |name| batch.jitter.stream(Purpose::GradientPruning, block.first).map(|stream| stream.numbered(output as u64).named(name));
+    let samples = prune(&mut of_features, 1, batch.gradient_above, random("density"));
+    let groups = prune(&mut rgb, 3, batch.gradient_above, random("color"));
     let OfNetwork { products, input, parameters } =
         tables.network.adjoint(&block.activations.rows(&groups), pruning::rows(&rgb, 3, &groups));
     let of_samples = pruning::rows(&of_features, 1, &samples);
