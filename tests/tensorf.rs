@@ -244,8 +244,9 @@ fn pruned_gradients_have_the_expectation_of_exact_ones() {
     let [few, many] = [0.3, 1.0].map(errors);
     for ((name, few, of_few), (_, many, of_many)) in few.into_iter().zip(many) {
         assert!(0.0 < few && few < many && many < 0.5, "{name}: {few} and {many}");
-        // If a share b of the squared error were the same in all draws, it would add b · DRAWS.
-        assert!(of_few < 3.0 && of_many < 3.0, "{name}: {of_few} and {of_many}");
+        // About three standard deviations if all numbers of an input have the same error. If a share b of the squared error were the same in all draws, it
+        // would add b · DRAWS.
+        assert!(of_few < 10.0 && of_many < 10.0, "{name}: {of_few} and {of_many}");
     }
 }
 
