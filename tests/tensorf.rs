@@ -227,8 +227,8 @@ fn pruned_gradients_have_the_expectation_of_exact_ones() {
         all
     };
     assert_eq!(picture(0.0), picture(1.0));
-    // For each input, the squared norm of the errors, relative to that of the gradients. And that of the sum of all errors, relative to the expectation for
-    // independent errors with mean 0.
+    // Two numbers for each input: the squared norm of the errors, relative to that of the gradients; and the squared norm of the sum of all errors, relative to
+    // its expectation for independent errors with mean 0.
     let errors = |gradient_above: f64| {
         let pruned: Vec<_> = (0..DRAWS).map(|step| gradients(gradient_above, step)).collect();
         let of_input = |k: usize| {

@@ -38,7 +38,7 @@ pub enum Purpose {
     Importance = 7,
     /// Noise of the density.
     Noise = 8,
-    /// Gradients that are used.
+    /// Which small gradients are used.
     GradientPruning = 9,
 }
 

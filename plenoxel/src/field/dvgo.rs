@@ -67,7 +67,7 @@ pub struct DenseGrid<T: Real> {
     pub opacity_above: f64,
     /// Where the color network is evaluated in training, that is with jitter.
     pub grouping: Grouping,
-    /// The same in pictures.
+    /// Where the color network is evaluated in pictures.
     pub grouping_in_pictures: Grouping,
     /// Cells around the nodes outside of which nothing is sampled; `None` for the whole box.
     pub occupied: Option<Occupancy>,

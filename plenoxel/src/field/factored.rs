@@ -162,7 +162,7 @@ pub struct Factored<T: Real> {
     pub occupied: Option<Occupancy>,
     /// Where the color network is evaluated in training, that is with jitter.
     pub grouping: Grouping,
-    /// The same in pictures.
+    /// Where the color network is evaluated in pictures.
     pub grouping_in_pictures: Grouping,
     /// Stochastic pruning of gradients (Ye et al. 2020) in the adjoint of the fused kernel. Let g be the gradient of the density feature of a sample, or of the
     /// color of a group, |g| the sum over its channels, and τ this number times the mean of |g| over a block of rays. With jitter, a gradient with |g| < τ becomes

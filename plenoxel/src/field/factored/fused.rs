@@ -8,7 +8,8 @@
 //! another ([`RowSums`](autograd::RowSums)), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
 //! the sums are bit-identical for any number of threads. Small gradients can be pruned at random ([`Factored::gradient_above`]).
 //!
-//! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of the samples that are kept, and adds them up for each ray.
+//! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of its kept samples, and adds them up for each
+//! ray.
 
 mod adjoint;
 mod densities;

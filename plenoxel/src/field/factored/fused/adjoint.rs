@@ -27,33 +27,32 @@ pub struct Cotangents<T: Real> {
 /// Cotangents of one block.
 #[derive(Debug)]
 struct Part<T: Real> {
-    /// Of the density features of samples.
+    /// Samples, with cotangents of their density features.
     density: Kept<T>,
-    /// Of the products of groups.
+    /// Groups, with cotangents of their products.
     products: Kept<T>,
 }
 
 /// Samples or groups that [`prune`] has kept.
 #[derive(Debug)]
 pub struct Kept<T: Real> {
-    /// Their numbers in the block.
+    /// Numbers of the kept samples or groups in the block.
     pub numbers: Vec<u32>,
-    /// Their positions, in units of cells.
+    /// Positions, in units of cells.
     at: [Buffer<T>; 3],
-    /// ∂L/∂s of each, or the cotangents of its products, `[kept, 3 R]`.
+    /// ∂L/∂s of each sample, `[kept]`, or the cotangents of the products of each group, `[kept, 3 R]`.
     g: Buffer<T>,
-    of_density: bool,
-    /// They, sorted by the rows of each plane that they read.
+    /// Places in these arrays, sorted by the rows of each plane that are read.
     sorted: [Sorted; 3],
 }
 
 impl<T: Real> Kept<T> {
     /// Takes the samples or groups with these numbers, and their cotangents, from the positions `at` of all.
-    fn new(numbers: Vec<u32>, at: [&[T]; 3], g: Buffer<T>, of: Pairs<'_, T>, of_density: bool) -> Self {
+    fn new(numbers: Vec<u32>, at: [&[T]; 3], g: Buffer<T>, of: Pairs<'_, T>) -> Self {
         let at = at.map(|at| pruning::rows(at, 1, &numbers));
         let places = at.each_ref().map(|at| &at[..]);
         let sorted = [0, 1, 2].map(|axis| Sorted::new(axis, places, of.nodes, bucket_shift(axis, of.nodes, of.width)));
-        Kept { numbers, at, g, of_density, sorted }
+        Kept { numbers, at, g, sorted }
     }
 
     pub fn at(&self) -> [&[T]; 3] {
@@ -61,7 +60,7 @@ impl<T: Real> Kept<T> {
     }
 
     pub fn g(&self) -> OfProducts<'_, T> {
-        if self.of_density { OfProducts::Shared(&self.g) } else { OfProducts::Each(&self.g) }
+        if self.g.len() == self.numbers.len() { OfProducts::Shared(&self.g) } else { OfProducts::Each(&self.g) }
     }
 }
 
@@ -99,7 +98,7 @@ fn plane_size(axis: usize, nodes: [usize; 3]) -> usize {
     PLANE_OF[axis].map(|a| nodes[a]).iter().product()
 }
 
-/// Contributions of the samples or groups of a batch that are kept to one plane.
+/// Contributions of the kept samples or groups of a batch to one plane.
 #[derive(Debug)]
 struct PlaneSums<T: Real> {
     state: Arc<State<T>>,
@@ -241,8 +240,8 @@ fn part<T: Real>(
         tables.network.adjoint(&block.activations.rows(&groups), pruning::rows(&rgb, 3, &groups));
     let of_samples = pruning::rows(&of_features, 1, &samples);
     let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
-    let density = Kept::new(samples, block.at(), of_samples, tables.density, true);
-    let products = Kept::new(groups, groups_at, products, tables.appearance, false);
+    let density = Kept::new(samples, block.at(), of_samples, tables.density);
+    let products = Kept::new(groups, groups_at, products, tables.appearance);
     let lines = [lines(tables.density, &density), lines(tables.appearance, &products)];
     let rays = state.tracked.as_ref().map(|tracked| {
         let encoded = tables.network.of_direction(&input);
