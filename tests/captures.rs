@@ -4,7 +4,7 @@ use crate::capture_folders::*;
 use glam::{DAffine3, DMat3, DVec3, dvec3};
 use plenoxel::camera::lens::Lens;
 use plenoxel::camera::{Camera, Intrinsics};
-use plenoxel::dataset::normalize::{CaptureOptions, Center, Orient, Scale, SpaceChoice};
+use plenoxel::dataset::normalize::{CaptureOptions, Center, FormatChoice, Orient, Scale, SpaceChoice};
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split, View};
 use plenoxel::error::Error;
@@ -278,9 +278,16 @@ fn a_folder_of_two_formats_says_which_one_is_read() {
     write_colmap(&folder, &views(), &[]);
     let dataset = open(&folder).unwrap();
     assert!(dataset.format().contains("COLMAP"));
-    assert_eq!(dataset.notes(), ["the folder also has poses_bounds.npy, which is not read"]);
+    assert_eq!(dataset.notes(), ["the folder also has poses_bounds.npy, which --format llff reads"]);
     write_transforms(&folder, &views());
-    assert!(open(&folder).unwrap().notes()[0].contains("a reconstruction of COLMAP and poses_bounds.npy"));
+    assert_eq!(open(&folder).unwrap().notes().len(), 2);
+    let read_as = |format| open_with(&folder, CaptureOptions { format, ..CaptureOptions::default() });
+    for (format, name) in [(FormatChoice::Transforms, "transforms.json"), (FormatChoice::Colmap, "COLMAP"), (FormatChoice::Llff, "LLFF")] {
+        let dataset = read_as(format).unwrap();
+        assert!(dataset.format().contains(name), "{name}: {}", dataset.format());
+        assert!(dataset.notes().iter().all(|note| !note.contains(&format!("--format {format}"))), "{:?}", dataset.notes());
+    }
+    refused(read_as(FormatChoice::Nsvf), 2, &["format", "a reconstruction of COLMAP", "no files of the format nsvf"]);
 }
 
 fn refused<T>(result: Result<T, Error>, code: u8, words: &[&str]) {

@@ -30,7 +30,7 @@ use crate::space::Space;
 use capture::Point;
 use mask::Mask;
 use ndarray::{Array2, Array3};
-use normalize::{CaptureOptions, Normalization};
+use normalize::{CaptureOptions, FormatChoice, Normalization};
 use procedural::ProceduralOptions;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
@@ -191,7 +191,8 @@ enum Source {
 }
 
 /// Opens the dataset in the folder `path`, in the first of these formats that it has: NeRF-synthetic (transforms_train.json,
-/// [`blender`]), transforms.json ([`transforms`]), COLMAP ([`colmap`]), LLFF (poses_bounds.npy, [`llff`]), NSVF (intrinsics.txt, [`nsvf`]).
+/// [`blender`]), transforms.json ([`transforms`]), COLMAP ([`colmap`]), LLFF (poses_bounds.npy, [`llff`]), NSVF (intrinsics.txt, [`nsvf`]);
+/// or in the format that `options` choose.
 ///
 /// Errors if a file is invalid, naming file and frame; also if `options` do not fit the images (a configuration error).
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
@@ -210,7 +211,19 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
     if !metadata.is_dir() {
         return Err(Error::input(path, "this is a file", remedy));
     }
-    let formats = formats(path);
+    let mut formats = formats(path);
+    let asked = options.capture.format;
+    if asked != FormatChoice::Auto {
+        let Some(chosen) = formats.iter().position(|format| format.choice() == asked) else {
+            if formats.is_empty() {
+                return Err(unrecognized(path));
+            }
+            let found = formats.iter().map(Format::what).collect::<Vec<_>>().join(" and ");
+            let problem = format!("{} has {found}, but no files of the format {asked}", path.display());
+            return Err(Error::usage("format", problem, "leave it out, or choose a format that the folder has"));
+        };
+        formats.swap(0, chosen);
+    }
     let mut capture = match formats.first() {
         Some(Format::Blender) => return blender::open(path, options),
         Some(Format::Transforms) => transforms::read(path, options.downscale),
@@ -219,9 +232,8 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
         Some(Format::Nsvf(poses)) => nsvf::read(path, poses),
         None => return Err(unrecognized(path)),
     }?;
-    let others: Vec<&str> = formats[1..].iter().map(Format::what).collect();
-    if !others.is_empty() {
-        capture.notes.push(format!("the folder also has {}, which is not read", others.join(" and ")));
+    for other in &formats[1..] {
+        capture.notes.push(format!("the folder also has {}, which --format {} reads", other.what(), other.choice()));
     }
     capture::dataset(path, capture, options)
 }
@@ -241,6 +253,17 @@ enum Format {
 }
 
 impl Format {
+    /// Returns the choice of this format.
+    fn choice(&self) -> FormatChoice {
+        match self {
+            Format::Blender => FormatChoice::Auto,
+            Format::Transforms => FormatChoice::Transforms,
+            Format::Colmap(_) => FormatChoice::Colmap,
+            Format::Llff => FormatChoice::Llff,
+            Format::Nsvf(_) => FormatChoice::Nsvf,
+        }
+    }
+
     /// Returns what the folder has of this format.
     fn what(&self) -> &'static str {
         match self {

@@ -1,17 +1,21 @@
-//! Flags about a capture: where its scene is, and which views are for testing.
+//! Flags about a capture: which of its files are read, where its scene is, and which views are for testing.
 
 use super::number;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
-use plenoxel::dataset::normalize::{CaptureOptions, Center, Orient, Scale, SpaceChoice};
+use plenoxel::dataset::normalize::{CaptureOptions, Center, FormatChoice, Orient, Scale, SpaceChoice};
 use plenoxel::error::Result;
 use plenoxel::run::settings::Layers;
 use std::fmt::Display;
 use toml::Value;
 
-/// Choices about a capture. By default, all follow from its cameras; `plenoxel info` explains them.
+/// Choices about a capture. By default, they follow from its files and its cameras; `plenoxel info` explains them.
 #[derive(Debug, Args)]
 pub struct CaptureFlags {
+    /// Format of a capture whose folder has several: transforms (transforms.json), colmap, llff, nsvf, or auto, which is the first of these [default: auto]
+    #[arg(long, help_heading = "Scene", value_parser = names(FormatChoice::ALL))]
+    format: Option<String>,
+
     /// Space of a capture: box, ndc (cameras that face forward), contracted (everything else), or auto, by the cameras [default: auto]
     #[arg(long, help_heading = "Scene", value_parser = names(SpaceChoice::ALL))]
     space: Option<String>,
@@ -43,6 +47,7 @@ impl CaptureFlags {
             named => Value::String(named.to_string()),
         });
         for (flag, path, value) in [
+            ("--format", "capture.format", text(&self.format)),
             ("--space", "capture.space", text(&self.space)),
             ("--orient", "capture.orient", text(&self.orient)),
             ("--center", "capture.center", text(&self.center)),
@@ -54,6 +59,11 @@ impl CaptureFlags {
             }
         }
         Ok(())
+    }
+
+    /// Returns true if a format of captures is chosen.
+    pub fn names_format(&self) -> bool {
+        self.format.as_deref().is_some_and(|format| format != FormatChoice::Auto.to_string())
     }
 
     /// Returns the choices, for a command without other settings.

@@ -11,7 +11,7 @@
 mod choice;
 mod frame;
 
-pub use choice::{CaptureOptions, Center, Orient, Scale, SpaceChoice};
+pub use choice::{CaptureOptions, Center, FormatChoice, Orient, Scale, SpaceChoice};
 
 use super::OpenOptions;
 use super::capture::Point;

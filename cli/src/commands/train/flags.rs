@@ -31,7 +31,7 @@ paths in that file, such as stages[0].sampling.step. If stdout is not a terminal
 const POSES: f64 = 0.01;
 
 /// Arguments that conflict with `--resume`, because they are fixed at the start of a run.
-pub const NOT_WHEN_RESUMED: [&str; 27] = [
+pub const NOT_WHEN_RESUMED: [&str; 28] = [
     "out",
     "force",
     "preset",
@@ -54,6 +54,7 @@ pub const NOT_WHEN_RESUMED: [&str; 27] = [
     "engine",
     "refine_poses",
     "tv",
+    "format",
     "space",
     "orient",
     "center",
@@ -256,7 +257,7 @@ impl TrainArgs {
     pub fn config(&self) -> Result<(Config, Option<&str>)> {
         // In equal time, the factored field is better; `fast` is a voxel grid, which other programs read.
         let default = match &self.data {
-            Some(data) if is_capture(data) => "photos",
+            Some(data) if self.capture.names_format() || is_capture(data) => "photos",
             _ if self.time.is_some() => "quality",
             _ => "fast",
         };

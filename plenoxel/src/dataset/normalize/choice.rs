@@ -8,6 +8,8 @@ use std::fmt;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureOptions {
+    /// Format of the files.
+    pub format: FormatChoice,
     /// Space.
     pub space: SpaceChoice,
     /// Orientation, unless the space is NDC.
@@ -24,6 +26,7 @@ pub struct CaptureOptions {
 impl Default for CaptureOptions {
     fn default() -> Self {
         CaptureOptions {
+            format: FormatChoice::default(),
             space: SpaceChoice::default(),
             orient: Orient::default(),
             center: Center::default(),
@@ -65,6 +68,23 @@ impl CaptureOptions {
         }
         Ok(())
     }
+}
+
+/// Format in which the folder of a capture is read.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FormatChoice {
+    /// The first that the folder has, in the order of [`open`](crate::dataset::open).
+    #[default]
+    Auto,
+    /// `transforms.json` of instant-ngp or nerfstudio.
+    Transforms,
+    /// A reconstruction of COLMAP.
+    Colmap,
+    /// `poses_bounds.npy` of LLFF.
+    Llff,
+    /// `intrinsics.txt` and poses of NSVF.
+    Nsvf,
 }
 
 /// Choice of the [`Space`](crate::space::Space) of a capture.
@@ -179,6 +199,7 @@ macro_rules! names {
     };
 }
 
+names!(FormatChoice, Auto "auto", Transforms "transforms", Colmap "colmap", Llff "llff", Nsvf "nsvf");
 names!(SpaceChoice, Auto "auto", Box "box", Ndc "ndc", Contracted "contracted");
 names!(Orient, Up "up", Pca "pca", None "none");
 names!(Center, Auto "auto", Poses "poses", Focus "focus", None "none");

@@ -76,7 +76,7 @@ const FIXED: &[(&str, &[&str])] = &[
             "capture",
         ],
     ),
-    ("capture", &["space", "orient", "center", "scale", "test_every"]),
+    ("capture", &["format", "space", "orient", "center", "scale", "test_every"]),
     ("initial", &["density", "color", "random"]),
     ("optimizer", &["kind", "decay", "beta", "beta1", "beta2", "epsilon"]),
     ("losses", &LOSSES),
