@@ -26,6 +26,11 @@ pub trait Recipe: Send + Sync {
     /// Errors name the setting that is invalid.
     fn validate(&self) -> Result<()>;
 
+    /// Returns warnings about settings that are valid, but slow. `engine` is that of the configuration. Default: none.
+    fn warnings(&self, _engine: Engine) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Returns the stages of training.
     fn stages(&self) -> Vec<StageLength>;
 

@@ -30,11 +30,12 @@ use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, T
 pub use densities::{Densities, densities_at};
 use forward::{Block, Scene, Tables};
 use glam::DVec3;
+pub use lookup::LANES;
 use std::sync::Arc;
 
-/// Returns true if the kernel computes fields of these sizes.
+/// Returns true if the kernel computes fields of these sizes: if the numbers of components are multiples of [`LANES`].
 pub fn supports(shape: &Shape) -> bool {
-    [shape.density_components, shape.appearance_components].iter().all(|count| count % lookup::LANES == 0)
+    [shape.density_components, shape.appearance_components].iter().all(|count| count % LANES == 0)
 }
 
 /// Returns the number of rays in a block, which depends on the size of the batch only.

@@ -5,7 +5,9 @@ use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::field::encoding::Directions;
 use crate::field::factored::Shape;
+use crate::field::factored::fused;
 use crate::model::stage::Stage;
+use crate::render::Engine;
 use crate::space::{Region, Space};
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +15,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Components of each of the three plane-line pairs of the density.
+    /// Components of each of the three plane-line pairs of the density. If this or `appearance_components` is not a multiple of 16, the fused kernel does not
+    /// compute the field, and a step takes about ten times as long.
     pub density_components: usize,
     /// Components of each of the three plane-line pairs of the appearance.
     pub appearance_components: usize,
@@ -225,6 +228,11 @@ impl Config {
             stage.validate(&format!("stages[{i}]"))?;
         }
         Ok(())
+    }
+
+    /// Returns the engine that renders the field if `engine` is asked for.
+    pub(super) fn engine(&self, engine: Engine) -> Engine {
+        if fused::supports(&self.shape()) { engine } else { Engine::Graph }
     }
 
     pub(super) fn shape(&self) -> Shape {

@@ -3,6 +3,7 @@
 use super::{Config, KIND, Short, Stage, Tensorf, total_variation};
 use crate::dataset::View;
 use crate::error::Result;
+use crate::field::factored::fused::LANES;
 use crate::loss::Objective;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
@@ -23,6 +24,18 @@ impl Recipe for Config {
         Config::validate(self)
     }
 
+    fn warnings(&self, engine: Engine) -> Vec<String> {
+        let slow = self.engine(engine) != engine;
+        let text = || {
+            format!(
+                "tensorf.density_components = {}, tensorf.appearance_components = {}: the fused kernel needs multiples of {LANES}. The graph is used, which takes about ten \
+                 times as long",
+                self.density_components, self.appearance_components
+            )
+        };
+        slow.then(text).into_iter().collect()
+    }
+
     fn stages(&self) -> Vec<StageLength> {
         self.lengths(Space::Box)
     }
@@ -36,6 +49,7 @@ impl Recipe for Config {
     }
 
     fn memory(&self, engine: Engine) -> Memory {
+        let engine = self.engine(engine);
         Memory {
             parameters: self.stages.iter().map(|stage| bytes_of_planes(self, stage.resolution)).max().unwrap_or(0),
             ray: bytes_of_ray(self, engine),
@@ -221,6 +235,16 @@ impl Cost {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_of_components_that_the_kernel_does_not_compute_are_warned_of() {
+        let config = Config { appearance_components: 24, ..Config::default() };
+        let warnings = config.warnings(Engine::Fused);
+        assert!(warnings.len() == 1 && warnings[0].contains("tensorf.appearance_components = 24"), "{warnings:?}");
+        assert_eq!(config.memory(Engine::Fused).ray, config.memory(Engine::Graph).ray);
+        // Nothing is slower than was asked for.
+        assert!(config.warnings(Engine::Graph).is_empty() && Config::default().warnings(Engine::Fused).is_empty());
+    }
 
     #[test]
     fn stages_of_a_factored_field_cost_what_they_may_and_short_runs_are_coarser() {

@@ -37,7 +37,7 @@ pub struct NewRun<'s> {
     pub clocks: Clocks,
     /// Expected size of a saved state, in bytes.
     pub saved: u64,
-    /// Warnings about the cameras.
+    /// Warnings about the cameras and the settings.
     pub warnings: Vec<String>,
     /// When the run began.
     pub began: Instant,
@@ -92,9 +92,14 @@ impl<'s> NewRun<'s> {
     ///
     /// Errors: no camera sees the box.
     pub fn check_cameras(&mut self, aabb: Aabb, on: &mut Listener<'_>) -> Result<()> {
-        self.warnings = self.settings.data.check_cameras(&self.dataset, aabb)?;
-        self.warnings.iter().for_each(|warning| on(Event::warning(warning)));
+        self.warn(self.settings.data.check_cameras(&self.dataset, aabb)?, on);
         Ok(())
+    }
+
+    /// Reports warnings, also in the summary of the run.
+    pub fn warn(&mut self, warnings: Vec<String>, on: &mut Listener<'_>) {
+        warnings.iter().for_each(|warning| on(Event::warning(warning)));
+        self.warnings.extend(warnings);
     }
 
     /// Reads the training views, and those that are looked at while training.
