@@ -213,11 +213,8 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Dataset> {
     }
     let mut formats = formats(path);
     let asked = options.capture.format;
-    if asked != FormatChoice::Auto {
+    if asked != FormatChoice::Auto && !formats.is_empty() {
         let Some(chosen) = formats.iter().position(|format| format.choice() == asked) else {
-            if formats.is_empty() {
-                return Err(unrecognized(path));
-            }
             let found = formats.iter().map(Format::what).collect::<Vec<_>>().join(" and ");
             let problem = format!("{} has {found}, but no files of the format {asked}", path.display());
             return Err(Error::usage("format", problem, "leave it out, or choose a format that the folder has"));

@@ -12,7 +12,7 @@ use toml::Value;
 /// Choices about a capture. By default, they follow from its files and its cameras; `plenoxel info` explains them.
 #[derive(Debug, Args)]
 pub struct CaptureFlags {
-    /// Format of a capture whose folder has several: transforms (transforms.json), colmap, llff, nsvf, or auto, which is the first of these [default: auto]
+    /// Format of a capture whose folder has several: transforms (transforms.json), colmap, llff, nsvf, or auto: the first that the folder has [default: auto]
     #[arg(long, help_heading = "Scene", value_parser = names(FormatChoice::ALL))]
     format: Option<String>,
 

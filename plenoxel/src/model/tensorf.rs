@@ -142,7 +142,7 @@ impl<T: Real> Tensorf<T> {
 
     /// Returns true if the fused kernel computes the field.
     fn fuses(&self) -> bool {
-        self.engine == Engine::Fused && fused::supports(self.field.shape())
+        self.config.engine(self.engine) == Engine::Fused
     }
 
     /// Returns the cells whose opacity, or that of a neighbour, is above [`occupied_above`](Config::occupied_above).

@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 
-/// Choices about a capture: its frame, which follows from the cameras by default, and its test views. The table `capture` of a configuration.
+/// Choices about a capture: its format, its frame, which follows from the cameras by default, and its test views. The table `capture` of a configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureOptions {

@@ -131,7 +131,7 @@ pub struct Config {
     /// Settings of Instant-NGP, likewise.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ngp: Option<ngp::Config>,
-    /// Choices about a capture: where its scene is, and which views are for testing.
+    /// Choices about a capture: which of its files are read, where its scene is, and which views are for testing.
     #[serde(default)]
     pub capture: CaptureOptions,
 }

@@ -23,7 +23,7 @@ pub struct Job<'a> {
     pub dataset: &'a Dataset,
     pub record: &'a RunRecord,
     pub options: &'a RunOptions,
-    /// Warnings about its cameras.
+    /// Warnings about its cameras and settings.
     pub warnings: &'a [String],
 }
 

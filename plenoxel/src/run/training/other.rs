@@ -44,7 +44,6 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
     let mut run = NewRun::open(settings, on)?;
     let region = region(&run.dataset, &run.config);
     run.check_cameras(region.aabb, on)?;
-    run.warn(recipe.warnings(run.config.engine), on);
     let estimate = Estimate::of_recipe(&run.config, &recipe, &run.dataset, &settings.options);
     on(Event::note(estimate.describe()));
     estimate.check()?;

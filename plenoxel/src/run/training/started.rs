@@ -88,18 +88,13 @@ impl<'s> NewRun<'s> {
         })
     }
 
-    /// Checks the cameras against the box of the model and reports warnings.
+    /// Checks the cameras against the box of the model, and reports warnings about them and about the settings.
     ///
     /// Errors: no camera sees the box.
     pub fn check_cameras(&mut self, aabb: Aabb, on: &mut Listener<'_>) -> Result<()> {
-        self.warn(self.settings.data.check_cameras(&self.dataset, aabb)?, on);
+        self.warnings = warnings(&self.settings.data, &self.dataset, aabb, &self.config)?;
+        self.warnings.iter().for_each(|warning| on(Event::warning(warning)));
         Ok(())
-    }
-
-    /// Reports warnings, also in the summary of the run.
-    pub fn warn(&mut self, warnings: Vec<String>, on: &mut Listener<'_>) {
-        warnings.iter().for_each(|warning| on(Event::warning(warning)));
-        self.warnings.extend(warnings);
     }
 
     /// Reads the training views, and those that are looked at while training.
@@ -198,7 +193,7 @@ impl<'o> OldRun<'o> {
         on(Event::note(format!("run: {path}, resumed after step {taken} of {total} and {} of training", clock(past.seconds))));
         let as_it_began = !record.is_of_own_model() && config.init_from.is_none();
         let aabb = if as_it_began { Aabb::cube(config.half_width) } else { trainer.model().aabb() };
-        let warnings = record.data.check_cameras(&dataset, aabb)?;
+        let warnings = warnings(&record.data, &dataset, aabb, &config)?;
         let mut job = Job { folder: &folder, config, dataset: &dataset, record: &record, options, warnings: &warnings };
         let learned = match state {
             Some(_) => job.learn(Begun::new(trainer), &mut |_, _| None, (metrics, past), preview, &views, &mut clocks, on)?,
@@ -207,6 +202,15 @@ impl<'o> OldRun<'o> {
         drop(views);
         job.conclude(learned, clocks, on)
     }
+}
+
+/// Checks the cameras, and returns warnings about them and about the settings.
+///
+/// Errors: no camera sees the box.
+fn warnings(data: &DataSource, dataset: &Dataset, aabb: Aabb, config: &Config) -> Result<Vec<String>> {
+    let mut warnings = data.check_cameras(dataset, aabb)?;
+    warnings.extend(config.recipe().into_iter().flat_map(|recipe| recipe.warnings(config.engine)));
+    Ok(warnings)
 }
 
 /// Returns the last stages of a plan, with `steps` steps in total: a run with an initial grid skips coarser stages.
