@@ -4,7 +4,8 @@
 //!     cargo bench --bench workloads -- --data nerf_synthetic/lego W1
 //!
 //! `graph:W1` and so on are the same through the graph of small ops; `scaling:W1` and `scaling:W2` double one size after the other. `scale:RUN` measures what
-//! several machines that train one scene would send (`support/scale.rs`). Without `--data` the rays are of the built-in scene. Peak memory is the process's, so
+//! several machines that train one scene would send (`support/scale.rs`). `pictures:RUN` renders test views of the data with the model of a run, one picture a
+//! repetition, at most eight different ones. Without `--data` the rays are of the built-in scene. Peak memory is the process's, so
 //! give one workload at a time to compare it.
 
 #[path = "support/scale.rs"]
@@ -15,13 +16,16 @@ use autograd::Lattice;
 use autograd::optim::{Optimizer, Rates, Sgd};
 use autograd::{Module, Param, Tensor, value_and_grad};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
+use plenoxel::evaluate::Viewer;
 use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::geometry::Aabb;
 use plenoxel::loss::total_variation;
 use plenoxel::rays::RaySource;
 use plenoxel::render::picture::picture;
 use plenoxel::render::{Engine, RenderOptions, render};
+use plenoxel::run::folder::RunFolder;
 use plenoxel::sampling::{Jitter, Spacing};
+use plenoxel::train::ViewOptions;
 use std::hint::black_box;
 use std::path::Path;
 use support::{Arguments, arguments, median, peak_memory_mb, repeat};
@@ -141,12 +145,28 @@ fn run() {
     for folder in args.names.iter().filter_map(|name| name.strip_prefix("scale:")) {
         scale::run(folder, &open(&args, 1));
     }
+    for folder in args.names.iter().filter_map(|name| name.strip_prefix("pictures:")) {
+        pictures(&args, folder);
+    }
     if args.wants("W3") {
         let lattice = Lattice::bricks([128; 3]);
         let table = Param::from_tensor("grid", Tensor::from_vec(support::numbers(128 * 128 * 128 * 4, 0), &[128 * 128 * 128, 4]));
         let times = repeat(args.repeats, || drop(black_box(value_and_grad(|| total_variation(table.tensor(), &lattice)))));
         print("W3", &times, None, 0);
     }
+}
+
+/// Pictures of the model of a run, from cameras of test views that are evenly spaced among all.
+fn pictures(args: &Arguments, folder: &str) {
+    let cameras = open(args, 1).cameras(Split::Test);
+    let (run, config, _) = RunFolder::open(Path::new(folder)).expect("a run folder");
+    let (model, about) = plenoxel::model::open(&run.existing_checkpoint().expect("a checkpoint"), &config).expect("a model");
+    let viewer = Viewer::of(&*model, &ViewOptions::over(about.background));
+    let step = cameras.len().div_ceil(8);
+    let mut shown = cameras.iter().step_by(step).cycle();
+    let times = repeat(args.repeats, || drop(black_box(viewer.see(shown.next().expect("there is a test view")))));
+    let pixels = cameras[0].intrinsics.width * cameras[0].intrinsics.height;
+    print(&format!("pictures:{folder}"), &times, Some(pixels), 0);
 }
 
 /// W4: a picture.

@@ -10,6 +10,7 @@ pub mod hash_grid;
 pub(crate) mod neighbours;
 pub mod nerf;
 pub mod ngp;
+pub(crate) mod node_table;
 pub mod sh;
 pub mod voxel_grid;
 

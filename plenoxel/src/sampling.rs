@@ -16,10 +16,12 @@ use crate::random::{self, Purpose, Stream, uniform};
 use crate::space::{Bend, Space, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
+use occupancy::Along;
+pub(crate) use occupancy::Look;
 pub use occupancy::Occupancy;
-use occupancy::{Along, Look};
 pub use running::{Refresh, RunningOccupancy};
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 pub use visible::sample_visible;
 
 /// Spacing of samples along a ray.
@@ -182,7 +184,7 @@ impl March {
 
     /// Returns the middles and the lengths of the intervals from `first` on.
     #[inline(always)]
-    fn intervals<const N: usize>(&self, first: usize) -> [[f64; N]; 2] {
+    pub(crate) fn intervals<const N: usize>(&self, first: usize) -> [[f64; N]; 2] {
         // Plain loops vectorise; the compiler does not inline `from_fn` in dispatched loops.
         let (mut middles, mut lengths) = ([0.0; N], [0.0; N]);
         for i in 0..N {
@@ -215,12 +217,30 @@ impl March {
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
         let (along, end) = (cells.along(ray), self.count);
         let intervals_per_cell = if self.is_straight() { 0.0 } else { along.side() / (Bend::steepest(ray) * self.step) };
-        Occupied { march: *self, ray: *ray, along, intervals_per_cell, next: 0, end, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
+        Occupied {
+            march: *self,
+            ray: *ray,
+            along,
+            intervals_per_cell,
+            next: 0,
+            end,
+            lost: true,
+            found: [(0.0, 0.0); LOOKS],
+            taken: 0,
+            count: 0,
+        }
+    }
+
+    /// Returns the numbers of the intervals of a straight ray whose middles may lie between two distances.
+    #[inline]
+    pub(crate) fn between(&self, [from, to]: [f64; 2]) -> Range<usize> {
+        // The last interval of a march is shorter, so that its middle is nearer than that of a whole one.
+        self.before(from)..self.count.min(self.before(to).saturating_add(2))
     }
 
     /// Returns the number of intervals whose middle lies before a distance on a straight ray, or one less.
     #[inline]
-    fn before(&self, distance: f64) -> usize {
+    pub(crate) fn before(&self, distance: f64) -> usize {
         let half = if self.points { 0.0 } else { 0.5 };
         ((distance - self.start) / self.step + half) as usize
     }
@@ -269,6 +289,8 @@ pub(crate) struct Occupied<'a> {
     /// Next interval to test, and the first that is not tested any more.
     next: usize,
     end: usize,
+    /// True if empty bricks are likely to follow: the last test found nothing.
+    lost: bool,
     /// Result of the last test: `count` intervals, of which `taken` were returned.
     found: [(f64, f64); LOOKS],
     taken: usize,
@@ -294,14 +316,13 @@ impl Iterator for Occupied<'_> {
 impl Occupied<'_> {
     /// Leaves out the intervals of a straight ray outside of two distances, none of which lies in an occupied cell ([`Occupancy::section`]).
     #[inline]
-    pub(crate) fn between(self, [from, to]: [f64; 2]) -> Self {
-        let march = &self.march;
-        // The last interval of a march is shorter, so that its middle is nearer than that of a whole one.
-        if march.is_straight() {
-            Self { next: march.before(from), end: self.end.min(march.before(to).saturating_add(2)), ..self }
-        } else {
-            self
+    pub(crate) fn between(self, section: [f64; 2]) -> Self {
+        if !self.march.is_straight() {
+            return self;
         }
+        let Range { start, end } = self.march.between(section);
+        // Occupied cells are near where a section begins.
+        Self { next: start, end, lost: section[0] == 0.0, ..self }
     }
 
     /// Returns a number of intervals of a ray that is not straight, from the next one on, whose middles are in no occupied cell.
@@ -314,8 +335,7 @@ impl Occupied<'_> {
     /// Tests the next intervals, or skips empty bricks.
     fn look(&mut self) {
         let march = &self.march;
-        // If the last test found occupied intervals, more are likely to follow.
-        let lost = self.count == 0;
+        let lost = self.lost;
         (self.taken, self.count) = (0, 0);
         if let Some(bend) = march.bend {
             while lost && self.next < self.end {
@@ -336,6 +356,7 @@ impl Occupied<'_> {
             self.count = occupied_of(march, &self.along, self.next, &mut self.found);
             self.next += LOOKS;
         }
+        self.lost = self.count == 0;
     }
 }
 

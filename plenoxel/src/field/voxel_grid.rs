@@ -178,8 +178,13 @@ impl<T: Real> VoxelGrid<T> {
     /// Returns the cells in which a sample can have a density above 0: cells between voxel centres with trilinear look-up, voxels with
     /// nearest look-up. Leaving out samples in other cells changes no rendered value.
     pub fn matter(&self) -> Occupancy {
-        let density = self.density.tensor().data();
-        self.shape().cells_reading(self.voxels_where(|row| density[row] > T::zero()))
+        self.shape().cells_reading(self.voxels_denser_than(0.0))
+    }
+
+    /// Returns the present voxels whose own density is above a threshold.
+    pub(crate) fn voxels_denser_than(&self, threshold: f64) -> Occupancy {
+        let (density, threshold) = (self.density.tensor().data(), T::lit(threshold));
+        self.voxels_where(|row| density[row] > threshold)
     }
 
     /// Returns the cells in which a sample can have a gradient. A sample whose density is negative has none.
@@ -191,8 +196,7 @@ impl<T: Real> VoxelGrid<T> {
     /// Returns the voxels in which a sample can have a density above `threshold`: the voxel's own density or, with trilinear look-up, a
     /// neighbour's is.
     pub fn occupancy(&self, threshold: f64) -> Occupancy {
-        let (density, threshold) = (self.density.tensor().data(), T::lit(threshold));
-        self.shape().reached_from(&self.voxels_where(|row| density[row] > threshold))
+        self.shape().reached_from(&self.voxels_denser_than(threshold))
     }
 
     /// Returns the present voxels whose rows satisfy `full`.

@@ -39,6 +39,7 @@ use crate::checkpoint::{self, Header};
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::evaluate::Viewer;
+use crate::field::voxel_grid::fused::{PictureTables, render_picture};
 use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
 use crate::field::{Field, sh};
 use crate::geometry::Aabb;
@@ -56,7 +57,8 @@ use serde_json::{Map, Value, json};
 use start::Silhouettes;
 use std::any::Any;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::sync::{Arc, OnceLock};
 
 /// Trainer of [`Plenoxels`].
 pub type Trainer<T> = train::Trainer<T, Plenoxels<T>>;
@@ -74,8 +76,13 @@ pub const KIND: &str = checkpoint::KIND;
 /// It gets one when a corner that it shares with another sample rises above 0.
 const STEPS_PER_LOOK: u64 = 64;
 
-/// Transmittance below which rays of rendered images end. No 8-bit value changes by more than a fortieth of a level.
-const STOP_BELOW: f64 = 1e-4;
+/// Transmittance below which rays of rendered images end, and the sum of the weights along a ray whose colors are those of other samples. No 8-bit value changes
+/// by more than a quarter of a level.
+const STOP_BELOW: f64 = 5e-4;
+/// Opacity of a sample that rendered images leave out.
+const NEGLIGIBLE: f64 = 1e-6;
+/// Number of rays that a viewer renders before it computes tables. The computation takes about as long as these rays.
+const RAYS_BEFORE_TABLE: usize = 1 << 17;
 
 /// A voxel grid, trained as a config describes.
 #[derive(Debug)]
@@ -212,7 +219,8 @@ impl<T: Real> Plenoxels<T> {
 
 /// Creates a viewer of a voxel grid: without jitter, and skipping empty cells, which changes no pixel.
 pub fn grid_viewer<T: Real>(grid: &VoxelGrid<T>, sampling: Sampling, engine: Engine, background: [f32; 3]) -> Viewer<'_, T> {
-    Viewer::new(show(grid, sampling, engine, background), background)
+    let pictures = Pictures::new(grid, sampling, engine, background);
+    Viewer::new(move |rays: &[Ray]| pictures.render(grid, rays), background)
 }
 
 /// Opens the model of a checkpoint for rendering. `config` is the config of its run; its stages are not used.
@@ -233,32 +241,65 @@ fn copy<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
     grid.with_density(grid.density.tensor().detach())
 }
 
+/// Renders rays of a picture through a grid.
+fn picture_of_grid<T: Real>(grid: &VoxelGrid<T>, tables: &PictureTables<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    match const { is_single::<T>() } {
+        true => cast(single::render_picture(cast_ref(grid), cast_ref(tables), rays, options)),
+        false => render_picture(grid, tables, rays, options),
+    }
+}
+
 fn save<T: Real>(grid: &VoxelGrid<T>, path: &Path, about: &About) -> Result<()> {
     checkpoint::save(path, grid, &Header::new(grid, &about.scene, about.background, about.seed, about.step))
 }
 
-/// Returns a function that renders rays through a grid.
-fn show<T: Real>(
-    grid: &VoxelGrid<T>,
+/// Renderer of pictures of a grid, without jitter. It skips empty cells.
+struct Pictures<T: Real> {
     sampling: Sampling,
     engine: Engine,
     background: [f32; 3],
-) -> impl Fn(&[Ray]) -> Rendered<T> + Sync + '_ {
-    let matter = grid.matter();
-    move |rays| show_within(grid, &matter, sampling, engine, background, rays)
+    matter: Occupancy,
+    /// Rays rendered so far.
+    rendered: AtomicUsize,
+    tables: OnceLock<Option<PictureTables<T>>>,
 }
 
-/// Renders rays through a grid, with samples in occupied cells only.
-fn show_within<T: Real>(
-    grid: &VoxelGrid<T>,
-    matter: &Occupancy,
-    sampling: Sampling,
-    engine: Engine,
-    background: [f32; 3],
-    rays: &[Ray],
-) -> Rendered<T> {
-    let (aabb, spacing, occupancy) = (grid.aabb(), sampling.spacing(grid.shape().voxel_side()), Some(matter));
-    render_grid(grid, rays, &RenderOptions { aabb, spacing, jitter: Jitter::None, background, occupancy, engine, stop_below: STOP_BELOW })
+impl<T: Real> Pictures<T> {
+    fn new(grid: &VoxelGrid<T>, sampling: Sampling, engine: Engine, background: [f32; 3]) -> Self {
+        Pictures { sampling, engine, background, matter: grid.matter(), rendered: AtomicUsize::new(0), tables: OnceLock::new() }
+    }
+
+    /// Renders rays through the grid.
+    fn render(&self, grid: &VoxelGrid<T>, rays: &[Ray]) -> Rendered<T> {
+        let options = RenderOptions {
+            aabb: grid.aabb(),
+            spacing: self.sampling.spacing(grid.shape().voxel_side()),
+            jitter: Jitter::None,
+            background: self.background,
+            occupancy: Some(&self.matter),
+            engine: self.engine,
+            stop_below: STOP_BELOW,
+        };
+        let many = self.rendered.fetch_add(rays.len(), Relaxed) >= RAYS_BEFORE_TABLE;
+        let tables = if many && self.engine == Engine::Fused { self.tables_of(grid) } else { None };
+        match tables {
+            Some(tables) => picture_of_grid(grid, tables, rays, &options),
+            None => render_grid(grid, rays, &options),
+        }
+    }
+
+    /// Returns the tables of the grid; `None` for nearest look-up.
+    fn tables_of(&self, grid: &VoxelGrid<T>) -> Option<&PictureTables<T>> {
+        let negligible = NEGLIGIBLE / self.sampling.longest(grid.shape().voxel_side());
+        let compute = || {
+            if const { is_single::<T>() } {
+                cast(single::picture_tables(cast_ref(grid), negligible))
+            } else {
+                PictureTables::new(grid, negligible)
+            }
+        };
+        self.tables.get_or_init(compute).as_ref()
+    }
 }
 
 impl<T: Real> AsRef<VoxelGrid<T>> for Plenoxels<T> {
@@ -295,7 +336,8 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
-        Box::new(show(&self.grid, self.sampling(view), self.config.engine, view.background))
+        let pictures = Pictures::new(&self.grid, self.sampling(view), self.config.engine, view.background);
+        Box::new(move |rays| pictures.render(&self.grid, rays))
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
@@ -353,8 +395,8 @@ impl<T: Real> Model<T> for Plenoxels<T> {
 
     fn frozen(&self, view: &ViewOptions) -> Option<RenderFn<'static, T>> {
         let (grid, sampling, engine, background) = (copy(&self.grid), self.sampling(view), self.config.engine, view.background);
-        let matter = grid.matter();
-        Some(Box::new(move |rays| show_within(&grid, &matter, sampling, engine, background, rays)))
+        let pictures = Pictures::new(&grid, sampling, engine, background);
+        Some(Box::new(move |rays| pictures.render(&grid, rays)))
     }
 
     fn settings(&self) -> Value {

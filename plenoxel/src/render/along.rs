@@ -33,6 +33,43 @@ pub struct Along<'a, T> {
     pub after: &'a [T],
 }
 
+/// Sums over the samples of a ray so far, front to back.
+#[derive(Clone, Copy)]
+pub struct Sums<T> {
+    depth: T,
+    opacity: T,
+    optical_depth: T,
+    distortion: T,
+}
+
+impl<T: Real> Sums<T> {
+    /// Sums over no samples.
+    pub fn new() -> Self {
+        Sums { depth: T::zero(), opacity: T::zero(), optical_depth: T::zero(), distortion: T::zero() }
+    }
+
+    /// Adds a sample of weight w.
+    #[inline(always)]
+    pub fn add(&mut self, w: T, t: T, delta: T, sigma: T) {
+        self.distortion += w * (T::lit(2.0) * (t * self.opacity - self.depth) + w * delta * T::lit(1.0 / 3.0));
+        self.depth += w * t;
+        self.opacity += w;
+        self.optical_depth += sigma * delta;
+    }
+
+    /// Returns the columns of the pixel, from Σ wᵢ cᵢ and the transmittance to the background.
+    #[inline(always)]
+    pub fn pixel(self, rgb: [T; 3], left: T, background: [T; 3]) -> [T; COLUMNS] {
+        let mut pixel = [T::zero(); COLUMNS];
+        (0..3).for_each(|c| pixel[c] = rgb[c] + left * background[c]);
+        pixel[column::DEPTH] = self.depth;
+        pixel[column::OPACITY] = self.opacity;
+        pixel[column::LOG_TRANSMITTANCE] = -self.optical_depth;
+        pixel[column::DISTORTION] = self.distortion;
+        pixel
+    }
+}
+
 impl<T: Real> Along<'_, T> {
     /// Computes the columns of the pixel of a ray with samples `own`. `sigma(i)` is σᵢ, `color(i)` is cᵢ.
     #[inline(always)]
@@ -43,26 +80,15 @@ impl<T: Real> Along<'_, T> {
         sigma: impl Fn(usize) -> T,
         color: impl Fn(usize) -> [T; 3],
     ) -> [T; COLUMNS] {
-        let (mut rgb, mut depth, mut opacity, mut optical_depth, mut distortion, mut moment) =
-            ([T::zero(); 3], T::zero(), T::zero(), T::zero(), T::zero(), T::zero());
         let left = if own.is_empty() { T::one() } else { self.after[own.end - 1] };
+        let (mut columns, mut rgb) = (Sums::new(), [T::zero(); 3]);
         for i in own {
-            let (w, t, delta) = (self.weight[i], self.t[i], self.delta[i]);
+            let w = self.weight[i];
             let c = color(i);
             (0..3).for_each(|a| rgb[a] += w * c[a]);
-            distortion += w * (T::lit(2.0) * (t * opacity - moment) + w * delta * T::lit(1.0 / 3.0));
-            depth += w * t;
-            moment = depth;
-            opacity += w;
-            optical_depth += sigma(i) * delta;
+            columns.add(w, self.t[i], self.delta[i], sigma(i));
         }
-        let mut pixel = [T::zero(); COLUMNS];
-        (0..3).for_each(|c| pixel[c] = rgb[c] + left * background[c]);
-        pixel[column::DEPTH] = depth;
-        pixel[column::OPACITY] = opacity;
-        pixel[column::LOG_TRANSMITTANCE] = -optical_depth;
-        pixel[column::DISTORTION] = distortion;
-        pixel
+        columns.pixel(rgb, left, background)
     }
 
     /// Computes ∂L/∂σᵢ of the samples `own` of a ray, from back to front, from the cotangent g of its pixel.

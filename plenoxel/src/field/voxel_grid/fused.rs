@@ -25,7 +25,9 @@ macro_rules! with_bricks {
 
 mod adjoint;
 mod forward;
+mod from_camera;
 mod lookup;
+mod pictures;
 mod places;
 mod reduced;
 mod seen;
@@ -40,8 +42,9 @@ use crate::render::{self, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Occupancy, Samples};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Param, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
 use forward::{Block, Scene};
+pub use pictures::PictureTables;
 pub use seen::{Seen, largest_weights, seen};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples.
 const BLOCK: usize = 256;
@@ -59,8 +62,8 @@ struct Batch<T: Real> {
     background: [T; 3],
     /// `[n, 3]`
     directions: Tensor<T>,
-    /// Harmonics of each ray's direction, `[n, (degree + 1)²]`; `[n, 0]` for RGB.
-    basis: Tensor<T>,
+    /// Harmonics of each ray's direction. Pictures with colors from a camera do not need them.
+    basis: OnceLock<Tensor<T>>,
 }
 
 /// Rendered batch, with the data that its adjoint needs.
@@ -121,12 +124,16 @@ impl<T: Real> Batch<T> {
     fn new(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Self {
         let n = rays.len();
         let directions = Tensor::from_vec(rays.iter().flat_map(|r| r.direction.to_array()).map(T::lit).collect(), &[n, 3]);
-        let basis = match grid.shape().color {
-            Color::Rgb => Tensor::zeros(&[n, 0]),
-            Color::Sh { degree, .. } => no_grad(|| sh::basis(&directions, degree)),
-        };
         let background = options.background.map(|c| T::lit(f64::from(c)));
-        Batch { layout: grid.layout().clone(), background, directions, basis }
+        Batch { layout: grid.layout().clone(), background, directions, basis: OnceLock::new() }
+    }
+
+    /// Returns the harmonics of each ray's direction, `[n, (degree + 1)²]`; `[n, 0]` for RGB. The first call must not be in a parallel task: it is parallel itself.
+    fn basis(&self) -> &Tensor<T> {
+        self.basis.get_or_init(|| match self.layout.shape.color {
+            Color::Rgb => Tensor::zeros(&[self.directions.shape()[0], 0]),
+            Color::Sh { degree, .. } => no_grad(|| sh::basis(&self.directions, degree)),
+        })
     }
 
     /// Returns the number of harmonics per channel in a row of the color table; 0 if a row holds an RGB color, or the coefficients of
@@ -154,13 +161,27 @@ impl<T: Real> Scene<'_, T> {
 
 /// Renders a batch of rays through a grid.
 pub(super) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    render_with(grid, None, rays, options)
+}
+
+/// Renders a batch of straight rays for a picture, without recording a gradient, with tables of the same grid. The colors of 8-bit images are those of the other
+/// renderer up to a step: see [`PictureTables`].
+pub fn render_picture<T: Real>(grid: &VoxelGrid<T>, tables: &PictureTables<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    no_grad(|| render_with(grid, Some(tables), rays, options))
+}
+
+fn render_with<T: Real>(grid: &VoxelGrid<T>, picture: Option<&PictureTables<T>>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let n = rays.len();
     let batch = Batch::new(grid, rays, options);
     let tables: Vec<&Tensor<T>> = grid.params().map(Param::tensor).collect();
     let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording() && n <= CHUNK;
     let mut pixels = Buffer::stale(n * COLUMNS);
     let packets = !keep && matches!(options.jitter, Jitter::None);
-    let scene = Scene { packets, ..batch.scene(grid, rays, options) };
+    let from_camera = picture.and_then(|tables| tables.from_camera.of(grid, rays));
+    if from_camera.is_none() {
+        batch.basis();
+    }
+    let scene = Scene { packets, picture, from_camera, ..batch.scene(grid, rays, options) };
     let mut sample_count = 0;
     let mut blocks = Vec::new();
     for (chunk, pixels) in pixels.chunks_mut(CHUNK * COLUMNS).enumerate() {
@@ -253,6 +274,7 @@ impl<T: Real> State<T> {
             Kept::Samples(blocks) => f(blocks),
             Kept::Rays(again) => {
                 let Rays { rays, options, cells } = &**again;
+                self.batch.basis();
                 let scene = Scene::new(&self.batch, rays, options, cells.as_ref(), tables);
                 for first in (0..rays.len()).step_by(CHUNK) {
                     let mut pixels = Buffer::stale(CHUNK.min(rays.len() - first) * COLUMNS);

@@ -129,6 +129,12 @@ impl GridShape {
         self.resolution.div_ceil(self.sh_reduction)
     }
 
+    /// Returns scale a and shift b from a world coordinate x to the voxel coordinate a x + b; voxel centres are at whole numbers.
+    pub fn to_voxels(&self) -> [f64; 2] {
+        let scale = 1.0 / self.voxel_side();
+        [scale, self.half_width * scale - 0.5]
+    }
+
     /// Returns scale a and shift b from voxel coordinates u to coordinates of the harmonics, (u + ½) / reduction − ½ = a u + b.
     pub fn to_harmonics(&self) -> [f64; 2] {
         let scale = 1.0 / self.sh_reduction as f64;

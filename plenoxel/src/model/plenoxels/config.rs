@@ -321,6 +321,14 @@ impl Sampling {
         }
     }
 
+    /// Returns a length that samples of a ray do not exceed, from a voxel side in world units. Points of wide lenses may be up to twice as long.
+    pub(super) fn longest(self, voxel_side: f64) -> f64 {
+        match self {
+            Sampling::Step { step } => step * voxel_side,
+            Sampling::Points { samples, far } => far / (samples.max(2) - 1) as f64,
+        }
+    }
+
     /// Returns the spacing for a voxel side in world units.
     pub fn spacing(self, voxel_side: f64) -> Spacing {
         match self {

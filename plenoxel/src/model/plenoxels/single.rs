@@ -9,6 +9,7 @@ use crate::checkpoint::{self, Header};
 use crate::dataset::View;
 use crate::error::Result;
 use crate::field::voxel_grid::VoxelGrid;
+use crate::field::voxel_grid::fused::{self, PictureTables};
 use crate::rays::RaySource;
 use crate::render::{self, RenderOptions, Rendered};
 use crate::sampling::Occupancy;
@@ -51,6 +52,16 @@ pub fn learning(grid: &VoxelGrid<f32>) -> Occupancy {
 #[inline(never)]
 pub fn render(grid: &VoxelGrid<f32>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<f32> {
     render::render(grid, rays, options)
+}
+
+#[inline(never)]
+pub fn picture_tables(grid: &VoxelGrid<f32>, negligible: f64) -> Option<PictureTables<f32>> {
+    PictureTables::new(grid, negligible)
+}
+
+#[inline(never)]
+pub fn render_picture(grid: &VoxelGrid<f32>, tables: &PictureTables<f32>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<f32> {
+    fused::render_picture(grid, tables, rays, options)
 }
 
 #[inline(never)]

@@ -1,40 +1,30 @@
 //! Densities of a field without gradients: at given positions, and as a table for pictures.
 //!
 //! In each cell, the product of a bilinear plane and a linear line is trilinear, and so is the sum of products, the density feature s. A table of s at the nodes
-//! therefore gives the same densities as the factors, up to rounding, and a sample reads eight numbers instead of 18 rows. Nodes are stored in bricks of 4³
-//! cells. Samples whose opacity is surely below a bound are left out.
+//! therefore gives the same densities as the factors, up to rounding, and a sample reads eight numbers instead of 18 rows ([`NodeTable`]). Samples whose opacity
+//! is surely below a bound are left out.
 
 use super::super::{Factored, PLANE_OF, SCALE, SHIFT};
-use super::lookup::{self, Cells, LANES, Pairs, Places, RUN, add_lanes, density_of};
+use super::lookup::{self, LANES, Pairs, Places, RUN, add_lanes, density_of};
+use crate::field::node_table::{self, ENTRIES, NodeTable, SIDE, TOGETHER};
 use crate::geometry::Aabb;
 use crate::render::Field;
 use crate::sampling::Occupancy;
 use autograd::lattice::{BRICK, BrickGrid};
-use autograd::parallel::gathered;
 use autograd::{Real, Tensor, dispatched, no_grad, parallel};
 use glam::DVec3;
 
-/// Nodes along the side of a brick of cells.
-const SIDE: usize = BRICK + 1;
-/// Entries of a brick in the table: its nodes in row-major order, and some that are not used.
-const ENTRIES: usize = 128;
 /// Density feature of bricks that are left out. The density is 0.
 const NOTHING: f64 = -1e3;
 /// Largest size of the table relative to the field. Objects in empty space need 1.0 to 1.2 times as much as the field; captures, whose boxes are full of thin fog,
 /// need 1.8 times as much, and their pictures take 0.98 of the time.
 const MOST: f64 = 1.5;
-/// Bricks that one task computes.
-const TOGETHER: usize = 256;
 
 /// Table of the density features at the nodes of a field.
 #[derive(Debug)]
 pub struct Densities<T> {
-    nodes: [usize; 3],
-    bricks: BrickGrid,
-    /// Place of each brick in the table; 0 for those that are left out.
-    links: Vec<u32>,
     /// s − 10 at the nodes.
-    features: Vec<T>,
+    features: NodeTable<T>,
     cells: Occupancy,
 }
 
@@ -64,43 +54,25 @@ impl<T: Real> Densities<T> {
             reached[range].iter().copied().filter(dense).collect::<Vec<_>>()
         });
         let kept = kept.concat();
-        let size = ENTRIES * (kept.len() + 1);
+        let size = NodeTable::<T>::entries(kept.len());
         let most = (MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64) as usize;
-        // Entries have numbers of 32 bits.
         if size > most.min(u32::MAX as usize) {
             return None;
         }
-        let mut links = vec![0; bricks.len()];
-        for (place, &brick) in (1..).zip(&kept) {
-            links[brick as usize] = place;
-        }
-        let mut table = vec![T::lit(NOTHING); size];
         // The features are computed a second time: keeping those of the first pass would double the memory.
-        parallel::for_each_chunk(&mut table[ENTRIES..], TOGETHER * ENTRIES, |first, values| {
-            for (values, &brick) in values.chunks_exact_mut(ENTRIES).zip(&kept[first / ENTRIES..]) {
-                values.copy_from_slice(&features(brick));
-            }
-        });
-        let table = Densities { nodes, bricks, links, features: table, cells: reach };
-        let cells = table.cells.kept(|aabb| {
+        let table = NodeTable::new(nodes, &kept, T::lit(NOTHING), features);
+        let cells = reach.kept(|aabb| {
             let [low, high] = nodes_around(field, aabb);
             let mut nodes =
                 (low[0]..=high[0]).flat_map(|i| (low[1]..=high[1]).flat_map(move |j| (low[2]..=high[2]).map(move |k| [i, j, k])));
-            nodes.any(|node| table.feature(node) > least)
+            nodes.any(|node| table.value(node) > least)
         });
-        Some(Densities { cells, ..table })
+        Some(Densities { features: table, cells })
     }
 
     /// Returns the cells outside of which all samples are left out.
     pub fn cells(&self) -> &Occupancy {
         &self.cells
-    }
-
-    /// Returns s − 10 at a node.
-    fn feature(&self, node: [usize; 3]) -> T {
-        let place = [0, 1, 2].map(|a| node[a].min(self.nodes[a] - 2) / BRICK);
-        let [i, j, k] = [0, 1, 2].map(|a| node[a] - BRICK * place[a]);
-        self.features[self.links[self.bricks.number(place)] as usize * ENTRIES + (i * SIDE + j) * SIDE + k]
     }
 }
 
@@ -194,46 +166,18 @@ fn features_of<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, low: [usize; 3],
 
 dispatched! {
 /// Reads the densities σ of up to [`RUN`] samples.
-#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 pub fn at<T: Real, const FUSED: bool>(table: &Densities<T>, at: Places<'_, T>, sigma: &mut [T]) {
-    let Cells { node, share, .. } = Cells::new(at, table.nodes);
-    let (mut numbers, mut entries) = ([0; RUN], [0; RUN]);
-    for a in 0..3 {
-        let count = table.bricks.count()[a] as u32;
-        for i in 0..RUN {
-            numbers[i] = numbers[i] * count + node[a][i] / BRICK as u32;
-            entries[i] = entries[i] * SIDE as u32 + node[a][i] % BRICK as u32;
-        }
+    let mut places = [[T::zero(); RUN]; 3];
+    places.iter_mut().zip(at).for_each(|(place, at)| place[..at.len()].copy_from_slice(at));
+    let mut features = [T::zero(); RUN];
+    if !node_table::interpolate::<T, RUN, FUSED>(&table.features, places.each_ref(), &mut features) {
+        sigma.fill(T::zero());
+        return;
     }
-    let links = gathered(&table.links, numbers);
-    for i in 0..RUN {
-        entries[i] += links[i] * ENTRIES as u32;
+    for feature in &mut features {
+        *feature = density_of::<T, FUSED>(*feature).0;
     }
-    // Interpolated along z, then y, then x.
-    let mut of_x = [[T::zero(); RUN]; 2];
-    for x in 0..2 {
-        let mut of_y = [[T::zero(); RUN]; 2];
-        for y in 0..2 {
-            let (mut below, mut above) = (entries, entries);
-            for i in 0..RUN {
-                below[i] += ((x * SIDE + y) * SIDE) as u32;
-                above[i] = below[i] + 1;
-            }
-            let (below, above) = (gathered(&table.features, below), gathered(&table.features, above));
-            for i in 0..RUN {
-                of_y[y][i] = (above[i] - below[i]).multiply_add::<FUSED>(share[2][i], below[i]);
-            }
-        }
-        for i in 0..RUN {
-            of_x[x][i] = (of_y[1][i] - of_y[0][i]).multiply_add::<FUSED>(share[1][i], of_y[0][i]);
-        }
-    }
-    let mut found = [T::zero(); RUN];
-    for i in 0..RUN {
-        let feature = (of_x[1][i] - of_x[0][i]).multiply_add::<FUSED>(share[0][i], of_x[0][i]);
-        found[i] = density_of::<T, FUSED>(feature).0;
-    }
-    sigma.copy_from_slice(&found[..sigma.len()]);
+    sigma.copy_from_slice(&features[..sigma.len()]);
 }
 }
 

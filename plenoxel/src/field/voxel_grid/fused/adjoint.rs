@@ -50,7 +50,7 @@ impl<T: Real> Sums<T> {
             let gradients = Gradients::new(batch, block, cotangent, output);
             gradients.sorted(batch, block, buckets)
         });
-        Sums { count: batch.harmonics(), basis: batch.basis.clone(), blocks }
+        Sums { count: batch.harmonics(), basis: batch.basis().clone(), blocks }
     }
 
     fn is_empty(&self, bucket: usize) -> bool {

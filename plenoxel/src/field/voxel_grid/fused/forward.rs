@@ -1,6 +1,8 @@
 //! Pixels of rays, one block of rays at a time.
 
+use super::from_camera::Colors;
 use super::lookup::{self, Corners, Directions, Group};
+use super::pictures::PictureTables;
 use super::places::{Places, RUN};
 use super::{BLOCK, Batch, COLUMNS};
 use crate::camera::Ray;
@@ -10,6 +12,7 @@ use crate::render::along::{self, Along};
 use crate::sampling::{Occupancy, Sections, march};
 use autograd::lattice::NodeMap;
 use autograd::{Buffer, Real, Tensor, parallel};
+use std::sync::Arc;
 
 /// Samples of a block of rays, with the data that the adjoint needs. Arrays have one entry per sample unless stated otherwise.
 #[derive(Debug)]
@@ -81,6 +84,9 @@ pub(super) struct Scene<'a, T: Real> {
     pub tables: [&'a [T]; 3],
     /// True for pictures, whose rays are those of neighbouring pixels: packets of them skip the empty space around the scene together ([`Sections`]).
     pub packets: bool,
+    /// Tables from which pictures are rendered, and the colors of rows of harmonics from their camera, if they are known.
+    pub picture: Option<&'a PictureTables<T>>,
+    pub from_camera: Option<Arc<Colors<T>>>,
 }
 
 impl<'a, T: Real> Scene<'a, T> {
@@ -92,13 +98,16 @@ impl<'a, T: Real> Scene<'a, T> {
         cells: Option<&'a Occupancy>,
         tables: impl IntoIterator<Item = &'a Tensor<T>>,
     ) -> Self {
-        let mut scene = Scene { batch, rays, options, cells, tables: [&[]; 3], packets: false };
+        let mut scene = Scene { batch, rays, options, cells, tables: [&[]; 3], packets: false, picture: None, from_camera: None };
         scene.tables.iter_mut().zip(tables).for_each(|(table, tensor)| *table = tensor.data());
         scene
     }
 
     /// Renders rays from `first` on, one for each [`COLUMNS`] entries of `pixels`.
     pub fn render(&self, first: usize, pixels: &mut [T], keep: bool) -> Block<T> {
+        if let Some(tables) = self.picture {
+            return Block { first, looked_at: self.show(tables, first, pixels), ..Block::empty() };
+        }
         let (mut block, found) = self.weights(first, pixels.len() / COLUMNS);
         block.color = Buffer::stale(3 * block.len());
         self.colors(&mut block, found.as_ref());
@@ -195,7 +204,7 @@ impl<'a, T: Real> Scene<'a, T> {
     }
 
     /// Computes the color of every sample that would be visible if it were dense, and zero for the others.
-    fn colors(&self, block: &mut Block<T>, found: Option<&Corners<T>>) {
+    pub fn colors(&self, block: &mut Block<T>, found: Option<&Corners<T>>) {
         let mut color = std::mem::replace(&mut block.color, Buffer::stale(0));
         let out = color.as_chunks_mut::<3>().0;
         let seen = block.seen();
@@ -218,7 +227,7 @@ impl<'a, T: Real> Scene<'a, T> {
     pub fn directions(&self, first: usize) -> Option<Directions<'_, T>> {
         let Color::Sh { offset, .. } = self.batch.layout.shape.color else { return None };
         let count = self.batch.harmonics();
-        (count > 0).then(|| Directions { basis: &self.batch.basis.data()[first * count..], count, offset: T::lit(offset) })
+        (count > 0).then(|| Directions { basis: &self.batch.basis().data()[first * count..], count, offset: T::lit(offset) })
     }
 
     /// Computes pixels from weights and colors.
@@ -231,7 +240,7 @@ impl<'a, T: Real> Scene<'a, T> {
 }
 
 impl<T: Real> Block<T> {
-    fn empty() -> Self {
+    pub fn empty() -> Self {
         let none = || Buffer::stale(0);
         Block {
             first: 0,

@@ -25,45 +25,45 @@ pub(super) struct Places<'a, T> {
 impl<'a, T: Real> Places<'a, T> {
     /// Starts at the first sample of a march, or at the first of `occupied`.
     pub fn new(march: March, ray: &'a Ray, occupied: Option<Occupied<'a>>, shape: &GridShape) -> Self {
-        let scale = 1.0 / shape.voxel_side();
-        let to_voxels = [T::lit(scale), T::lit(shape.half_width * scale - 0.5)];
-        Places { ray, to_voxels, march, next: 0, occupied }
+        Places { ray, to_voxels: shape.to_voxels().map(T::lit), march, next: 0, occupied }
     }
 
     /// Writes voxel coordinates, middles and lengths of the next samples, at most [`RUN`]. Returns their number; 0 at the end.
     pub fn next_run(&mut self, out: [&mut [T; RUN]; 5]) -> usize {
-        let mut intervals = [(0.0, 0.0); RUN];
+        let [mut middles, mut lengths] = [[0.0; RUN]; 2];
         let mut count = 0;
         match &mut self.occupied {
             None => {
                 count = RUN.min(self.march.count - self.next);
-                for (i, interval) in intervals.iter_mut().enumerate() {
-                    *interval = self.march.interval(self.next + i);
+                for i in 0..RUN {
+                    (middles[i], lengths[i]) = self.march.interval(self.next + i);
                 }
                 self.next += count;
             }
             Some(occupied) => {
-                for (to, interval) in intervals.iter_mut().zip(occupied) {
-                    *to = interval;
+                for (middle, length) in occupied.take(RUN) {
+                    (middles[count], lengths[count]) = (middle, length);
                     count += 1;
                 }
             }
         }
         if self.march.is_straight() {
-            place(self.ray, &intervals, self.to_voxels, out);
+            place(self.ray, [&middles, &lengths], self.to_voxels, out);
         } else {
-            let at = intervals.map(|(middle, _)| self.march.at(self.ray, middle));
-            place_each(&at, &intervals, self.to_voxels, out);
+            let at = middles.map(|middle| self.march.at(self.ray, middle));
+            place_each(&at, [&middles, &lengths], self.to_voxels, out);
         }
         count
     }
 }
 
 dispatched! {
-fn place<T: Real>(ray: &Ray, intervals: &[(f64, f64); RUN], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
+/// Places the samples of a straight ray in the middles of intervals of these lengths: voxel coordinates, middles and lengths.
+pub(super) fn place<T: Real, const N: usize>(ray: &Ray, [middles, lengths]: [&[f64; N]; 2], to_voxels: [T; 2], out: [&mut [T; N]; 5]) {
     let [x, y, z, t, delta] = out;
     let (o, d) = (ray.origin, ray.direction);
-    for (i, &(middle, length)) in intervals.iter().enumerate() {
+    for i in 0..N {
+        let (middle, length) = (middles[i], lengths[i]);
         x[i] = T::lit(o.x + middle * d.x) * to_voxels[0] + to_voxels[1];
         y[i] = T::lit(o.y + middle * d.y) * to_voxels[0] + to_voxels[1];
         z[i] = T::lit(o.z + middle * d.z) * to_voxels[0] + to_voxels[1];
@@ -74,10 +74,10 @@ fn place<T: Real>(ray: &Ray, intervals: &[(f64, f64); RUN], to_voxels: [T; 2], o
 }
 
 /// Like [`place`], for samples at these positions.
-fn place_each<T: Real>(at: &[DVec3; RUN], intervals: &[(f64, f64); RUN], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
+fn place_each<T: Real>(at: &[DVec3; RUN], [middles, lengths]: [&[f64; RUN]; 2], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
     let [x, y, z, t, delta] = out;
-    for (i, (at, &(middle, length))) in at.iter().zip(intervals).enumerate() {
-        (x[i], y[i], z[i]) = at.to_array().map(|p| T::lit(p) * to_voxels[0] + to_voxels[1]).into();
-        (t[i], delta[i]) = (T::lit(middle), T::lit(length));
+    for i in 0..RUN {
+        (x[i], y[i], z[i]) = at[i].to_array().map(|p| T::lit(p) * to_voxels[0] + to_voxels[1]).into();
+        (t[i], delta[i]) = (T::lit(middles[i]), T::lit(lengths[i]));
     }
 }

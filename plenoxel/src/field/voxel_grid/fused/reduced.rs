@@ -23,7 +23,7 @@ const RUNS_AHEAD: usize = 4;
 type Rgb0<T> = [T; 4];
 
 /// Rows of harmonics that each sample reads, `K` of them.
-trait Look<T: Real, const K: usize>: Sized {
+pub(super) trait Look<T: Real, const K: usize>: Sized {
     fn find(at: [&[T]; 3], lattice: &Lattice, count: usize) -> Self;
     /// Returns rows and weights of a sample.
     fn of(&self, i: usize) -> ([u32; K], [T; K]);
@@ -57,7 +57,7 @@ impl<T: Real> Look<T, 8> for Corners<T> {
 }
 
 /// Finds the rows that the samples of a block read.
-fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lattice, block: &Block<T>) -> L {
+pub(super) fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lattice, block: &Block<T>) -> L {
     let [scale, shift] = batch.layout.shape.to_harmonics().map(T::lit);
     let at = block.at.each_ref().map(|at| {
         let mut to = Buffer::stale(at.len());
@@ -96,8 +96,8 @@ impl<T: Real> Scene<'_, T> {
 
     fn add_found<L: Look<T, K>, const K: usize>(&self, lattice: &Lattice, block: &Block<T>, out: &mut [[T; 3]]) {
         let Color::Sh { offset, .. } = self.batch.layout.shape.color else { unreachable!("plain colors have no harmonics") };
-        let count = self.batch.basis.shape()[1];
-        let basis = &self.batch.basis.data()[block.first * count..];
+        let count = self.batch.basis().shape()[1];
+        let basis = &self.batch.basis().data()[block.first * count..];
         let (found, offset) = (found::<T, L, K>(self.batch, lattice, block), T::lit(offset));
         let look = |i: usize| found.of(i);
         match count {
@@ -222,7 +222,7 @@ impl<T: Real, const K: usize> HarmonicsSums<T, K> {
             let found = found::<T, L, K>(batch, lattice, block);
             Runs::new(block, |i| found.of(i), &cotangent.data().as_chunks().0[block.first..], buckets)
         });
-        HarmonicsSums { basis: batch.basis.clone(), blocks }
+        HarmonicsSums { basis: batch.basis().clone(), blocks }
     }
 }
 

@@ -158,14 +158,14 @@ fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderO
     let least = T::lit(least);
     let batch = Batch::new(grid, rays, options);
     let scene = batch.scene(grid, rays, options);
-    let count = batch.basis.shape()[1];
+    let count = batch.basis().shape()[1];
     // Number of harmonics in a row of the color table; the following harmonics are reduced.
     let here = batch.harmonics().max(1).min(count);
     parallel::map_chunks(rays.len(), BLOCK, |range| {
         let (block, corners) = scene.weights(range.start, range.len());
         let reads = LazyCell::new(|| reduced::reads(&batch, &block));
         for (ray, own) in range.zip(block.rays()) {
-            let (basis, beyond) = batch.basis.data()[ray * count..][..count].split_at(here);
+            let (basis, beyond) = batch.basis().data()[ray * count..][..count].split_at(here);
             for i in own.filter(|&i| block.weight[i] > least) {
                 let weight = block.weight[i];
                 let reduced = || reads.as_ref().map(|reads| reads(i));
