@@ -26,6 +26,7 @@
 pub mod config;
 mod file;
 mod objective;
+mod pictures;
 mod rates;
 mod single;
 mod stages;
@@ -39,26 +40,25 @@ use crate::checkpoint::{self, Header};
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::evaluate::Viewer;
-use crate::field::voxel_grid::fused::{PictureTables, render_picture};
 use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
 use crate::field::{Field, sh};
 use crate::geometry::Aabb;
 use crate::loss;
 use crate::rays::RaySource;
 use crate::render::{Engine, RenderOptions, Rendered, render};
-use crate::sampling::{Jitter, Occupancy};
+use crate::sampling::Occupancy;
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{self, About, Model, Pass, PlannedStage, RenderFn, StageLength, StageProgress, TrainOptions, ViewOptions};
 use autograd::optim::Optimizer;
 use autograd::single::{cast, cast_mut, cast_ref, is_single};
 use autograd::{Module, Param, Real, Tensor};
 use config::{Config, Sampling, Stage};
+use pictures::Pictures;
 use serde_json::{Map, Value, json};
 use start::Silhouettes;
 use std::any::Any;
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 /// Trainer of [`Plenoxels`].
 pub type Trainer<T> = train::Trainer<T, Plenoxels<T>>;
@@ -75,14 +75,6 @@ pub const KIND: &str = checkpoint::KIND;
 /// Number of steps between updates of the mask of cells that can learn. A sample whose corners all have a negative density has no gradient.
 /// It gets one when a corner that it shares with another sample rises above 0.
 const STEPS_PER_LOOK: u64 = 64;
-
-/// Transmittance below which rays of rendered images end, and the sum of the weights along a ray whose colors are those of other samples. No 8-bit value changes
-/// by more than a quarter of a level.
-const STOP_BELOW: f64 = 5e-4;
-/// Opacity of a sample that rendered images leave out.
-const NEGLIGIBLE: f64 = 1e-6;
-/// Number of rays that a viewer renders before it computes tables. The computation takes about as long as these rays.
-const RAYS_BEFORE_TABLE: usize = 1 << 17;
 
 /// A voxel grid, trained as a config describes.
 #[derive(Debug)]
@@ -241,65 +233,8 @@ fn copy<T: Real>(grid: &VoxelGrid<T>) -> VoxelGrid<T> {
     grid.with_density(grid.density.tensor().detach())
 }
 
-/// Renders rays of a picture through a grid.
-fn picture_of_grid<T: Real>(grid: &VoxelGrid<T>, tables: &PictureTables<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
-    match const { is_single::<T>() } {
-        true => cast(single::render_picture(cast_ref(grid), cast_ref(tables), rays, options)),
-        false => render_picture(grid, tables, rays, options),
-    }
-}
-
 fn save<T: Real>(grid: &VoxelGrid<T>, path: &Path, about: &About) -> Result<()> {
     checkpoint::save(path, grid, &Header::new(grid, &about.scene, about.background, about.seed, about.step))
-}
-
-/// Renderer of pictures of a grid, without jitter. It skips empty cells.
-struct Pictures<T: Real> {
-    sampling: Sampling,
-    engine: Engine,
-    background: [f32; 3],
-    matter: Occupancy,
-    /// Rays rendered so far.
-    rendered: AtomicUsize,
-    tables: OnceLock<Option<PictureTables<T>>>,
-}
-
-impl<T: Real> Pictures<T> {
-    fn new(grid: &VoxelGrid<T>, sampling: Sampling, engine: Engine, background: [f32; 3]) -> Self {
-        Pictures { sampling, engine, background, matter: grid.matter(), rendered: AtomicUsize::new(0), tables: OnceLock::new() }
-    }
-
-    /// Renders rays through the grid.
-    fn render(&self, grid: &VoxelGrid<T>, rays: &[Ray]) -> Rendered<T> {
-        let options = RenderOptions {
-            aabb: grid.aabb(),
-            spacing: self.sampling.spacing(grid.shape().voxel_side()),
-            jitter: Jitter::None,
-            background: self.background,
-            occupancy: Some(&self.matter),
-            engine: self.engine,
-            stop_below: STOP_BELOW,
-        };
-        let many = self.rendered.fetch_add(rays.len(), Relaxed) >= RAYS_BEFORE_TABLE;
-        let tables = if many && self.engine == Engine::Fused { self.tables_of(grid) } else { None };
-        match tables {
-            Some(tables) => picture_of_grid(grid, tables, rays, &options),
-            None => render_grid(grid, rays, &options),
-        }
-    }
-
-    /// Returns the tables of the grid; `None` for nearest look-up.
-    fn tables_of(&self, grid: &VoxelGrid<T>) -> Option<&PictureTables<T>> {
-        let negligible = NEGLIGIBLE / self.sampling.longest(grid.shape().voxel_side());
-        let compute = || {
-            if const { is_single::<T>() } {
-                cast(single::picture_tables(cast_ref(grid), negligible))
-            } else {
-                PictureTables::new(grid, negligible)
-            }
-        };
-        self.tables.get_or_init(compute).as_ref()
-    }
 }
 
 impl<T: Real> AsRef<VoxelGrid<T>> for Plenoxels<T> {

@@ -39,7 +39,7 @@ use crate::camera::Ray;
 use crate::field::{Field, sh};
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, RenderOptions, Rendered, composite};
-use crate::sampling::{Jitter, Occupancy, Samples};
+use crate::sampling::{Jitter, Occupancy, RAYS_OF_PACKET, Samples};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Param, Real, RowSparse, RowSums, Tensor, no_grad, parallel};
 use forward::{Block, Scene};
 pub use pictures::PictureTables;
@@ -154,8 +154,10 @@ impl<T: Real> Scene<'_, T> {
         if keep && self.worth_sorting() {
             return self.render_sorted(first, pixels);
         }
-        let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
-        parallel::map_items(parts, |b, pixels| self.render(first + b * BLOCK, pixels, keep))
+        // Pictures have blocks of one packet, which share the work of background and matter among the threads more evenly.
+        let block = if self.picture.is_some() { RAYS_OF_PACKET } else { BLOCK };
+        let parts: Vec<_> = pixels.chunks_mut(block * COLUMNS).collect();
+        parallel::map_items(parts, |b, pixels| self.render(first + b * block, pixels, keep))
     }
 }
 

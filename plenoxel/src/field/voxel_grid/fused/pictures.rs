@@ -4,11 +4,11 @@
 //! [`RenderOptions::stop_below`](crate::render::RenderOptions::stop_below) for each ray, so a color differs from that of [`render`](super::render) by at most
 //! this value times the largest difference between colors along the ray.
 
+use super::COLUMNS;
 use super::forward::{Block, Scene};
 use super::from_camera::FromCamera;
 use super::lookup::{Corners, absorptions};
 use super::places::place;
-use super::{BLOCK, COLUMNS};
 use crate::camera::Ray;
 use crate::field::node_table::{self, ENTRIES, NodeTable, SIDE};
 use crate::field::voxel_grid::{Interpolation, VoxelGrid};
@@ -162,7 +162,7 @@ impl<T: Real> Scene<'_, T> {
                     continue;
                 }
                 if end + RUN > block.weight.len() {
-                    let room = (2 * end).max(16 * BLOCK);
+                    let room = (2 * end).max(16 * rays.len());
                     block.at.iter_mut().chain([&mut block.weight]).for_each(|column| column.grow(room));
                 }
                 for i in 0..own {
@@ -338,7 +338,7 @@ mod tests {
     #[test]
     fn nearest_look_up_has_no_tables() {
         let grid = VoxelGrid::<f64>::uniform(
-            GridShape { resolution: 4, interpolation: Interpolation::Nearest, ..ball(1, Color::Rgb).shape().clone() },
+            GridShape { resolution: 4, interpolation: Interpolation::Nearest, ..*ball(1, Color::Rgb).shape() },
             1.0,
             0.5,
         );
