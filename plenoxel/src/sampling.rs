@@ -217,18 +217,7 @@ impl March {
     pub(crate) fn occupied<'a>(&self, ray: &Ray, cells: &'a Occupancy) -> Occupied<'a> {
         let (along, end) = (cells.along(ray), self.count);
         let intervals_per_cell = if self.is_straight() { 0.0 } else { along.side() / (Bend::steepest(ray) * self.step) };
-        Occupied {
-            march: *self,
-            ray: *ray,
-            along,
-            intervals_per_cell,
-            next: 0,
-            end,
-            lost: true,
-            found: [(0.0, 0.0); LOOKS],
-            taken: 0,
-            count: 0,
-        }
+        Occupied { march: *self, ray: *ray, along, intervals_per_cell, next: 0, end, found: [(0.0, 0.0); LOOKS], taken: 0, count: 0 }
     }
 
     /// Returns the numbers of the intervals of a straight ray whose middles may lie between two distances.
@@ -289,8 +278,6 @@ pub(crate) struct Occupied<'a> {
     /// Next interval to test, and the first that is not tested any more.
     next: usize,
     end: usize,
-    /// True if empty bricks are likely to follow: the last test found nothing.
-    lost: bool,
     /// Result of the last test: `count` intervals, of which `taken` were returned.
     found: [(f64, f64); LOOKS],
     taken: usize,
@@ -321,8 +308,7 @@ impl Occupied<'_> {
             return self;
         }
         let Range { start, end } = self.march.between(section);
-        // Occupied cells are near where a section begins.
-        Self { next: start, end, lost: section[0] == 0.0, ..self }
+        Self { next: start, end, ..self }
     }
 
     /// Returns a number of intervals of a ray that is not straight, from the next one on, whose middles are in no occupied cell.
@@ -335,7 +321,8 @@ impl Occupied<'_> {
     /// Tests the next intervals, or skips empty bricks.
     fn look(&mut self) {
         let march = &self.march;
-        let lost = self.lost;
+        // If the last test found occupied intervals, more are likely to follow.
+        let lost = self.count == 0;
         (self.taken, self.count) = (0, 0);
         if let Some(bend) = march.bend {
             while lost && self.next < self.end {
@@ -356,7 +343,6 @@ impl Occupied<'_> {
             self.count = occupied_of(march, &self.along, self.next, &mut self.found);
             self.next += LOOKS;
         }
-        self.lost = self.count == 0;
     }
 }
 

@@ -168,7 +168,12 @@ dispatched! {
 /// Reads the densities σ of up to [`RUN`] samples.
 pub fn at<T: Real, const FUSED: bool>(table: &Densities<T>, at: Places<'_, T>, sigma: &mut [T]) {
     let mut places = [[T::zero(); RUN]; 3];
-    places.iter_mut().zip(at).for_each(|(place, at)| place[..at.len()].copy_from_slice(at));
+    for (place, at) in places.iter_mut().zip(at) {
+        match at.first_chunk() {
+            Some(whole) => *place = *whole,
+            None => place[..at.len()].copy_from_slice(at),
+        }
+    }
     let mut features = [T::zero(); RUN];
     if !node_table::interpolate::<T, RUN, FUSED>(&table.features, places.each_ref(), &mut features) {
         sigma.fill(T::zero());
@@ -177,7 +182,10 @@ pub fn at<T: Real, const FUSED: bool>(table: &Densities<T>, at: Places<'_, T>, s
     for feature in &mut features {
         *feature = density_of::<T, FUSED>(*feature).0;
     }
-    sigma.copy_from_slice(&features[..sigma.len()]);
+    match sigma.first_chunk_mut() {
+        Some(whole) => *whole = features,
+        None => sigma.copy_from_slice(&features[..sigma.len()]),
+    }
 }
 }
 
