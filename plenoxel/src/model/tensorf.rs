@@ -1,8 +1,9 @@
 //! TensoRF (Chen et al. 2022): a [factored field](crate::field::factored) with a small color network, trained from coarse to fine.
 //!
-//! The numbers of [`Config::authors`] are those of the authors' `configs/lego.txt`, `opt.py` and `models/tensoRF.py`, but for the cells that
-//! are sampled: here they are found anew at the beginning of every stage but the first; the authors find them at steps 2000 and 4000, above
-//! 0.08 without the factor 25, and shrink the box.
+//! The numbers of [`Config::authors`] are those of the authors' `configs/lego.txt`, `opt.py` and `models/tensoRF.py`, with three exceptions. The
+//! cells that are sampled are found anew at the beginning of every stage but the first; the authors find them at steps 2000 and 4000, above
+//! 0.08 without the factor 25, and shrink the box. Adam has ε = 1e-12, where PyTorch's default is 1e-8. Learning rates go on falling when the
+//! planes become larger; the authors' begin anew.
 
 mod config;
 mod recipe;
