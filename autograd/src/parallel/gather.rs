@@ -24,7 +24,7 @@ pub fn gathered<T: Copy, const N: usize>(table: &[T], at: [u32; N]) -> [T; N] {
     found
 }
 
-/// Gathers like [`gathered`], at several offsets from each index: entry k, i is that at `at[i] + offsets[k]`.
+/// Returns `table[at[i] + offsets[k]]` for every k and i.
 ///
 /// Panics if an index is out of range.
 #[inline(always)]

@@ -12,8 +12,8 @@ use autograd::single::{cast, cast_ref, is_single};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// Transmittance below which rays of rendered images end, and the sum of the weights along a ray whose colors are those of other samples. No 8-bit value changes
-/// by more than a quarter of a level.
+/// Transmittance below which rays of rendered images end, and the largest sum of the weights along a ray whose colors are those of other samples. Together they
+/// change an 8-bit value by at most 0.26 of a step.
 const STOP_BELOW: f64 = 5e-4;
 /// Opacity of a sample that rendered images leave out.
 const NEGLIGIBLE: f64 = 1e-6;

@@ -19,6 +19,9 @@ use autograd::lattice::{BRICK, BRICK_ROWS, BrickGrid, STRIDE, bits_where, has, l
 use autograd::{Buffer, Real, dispatched, parallel};
 
 /// Tables of a grid with trilinear look-up, from which pictures are rendered.
+///
+/// Colors differ from those of [`render`](super::render) in two ways. Samples whose weights sum to at most `stop_below` for each ray take the color of a
+/// neighbour. Reduced harmonics are evaluated in the direction from the camera to their row. Together these changed 8-bit values of lego by at most one step.
 #[derive(Debug)]
 pub struct PictureTables<T> {
     densities: NodeTable<T>,
@@ -31,7 +34,8 @@ pub struct PictureTables<T> {
 const AHEAD: [[usize; 3]; 8] = [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]];
 
 impl<T: Real> PictureTables<T> {
-    /// Computes the tables. Samples are left out if the densities of all voxels around them, 1 / length, are at most `negligible`. `None` for nearest look-up.
+    /// Computes the tables. Samples are left out if the densities of all voxels around them, 1 / length, are at most `negligible`. `None` for nearest
+    /// look-up, and for tables of more than 2³² entries.
     pub fn new(grid: &VoxelGrid<T>, negligible: f64) -> Option<Self> {
         let (lattice, density) = (grid.lattice(), grid.density.tensor().data());
         let nodes = lattice.nodes();
@@ -68,7 +72,11 @@ impl<T: Real> PictureTables<T> {
             }
             values
         };
-        let densities = NodeTable::new(nodes, &stored.concat(), T::zero(), values);
+        let stored = stored.concat();
+        if NodeTable::<T>::entries(stored.len()) > u32::MAX as usize {
+            return None;
+        }
+        let densities = NodeTable::new(nodes, &stored, T::zero(), values);
         Some(PictureTables { densities, cells: grid.shape().cells_reading(dense), from_camera: FromCamera::none() })
     }
 }
