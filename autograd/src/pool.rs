@@ -6,27 +6,47 @@
 //!
 //! The contents of a recycled buffer are stale but never uninitialised. The only unsafe code here is the `madvise` call.
 
+use std::collections::{BTreeMap, VecDeque};
 use std::fmt::Debug;
 use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
 
 /// Size of the smallest pooled buffer, in bytes. For smaller buffers the system allocator is as fast.
 const SMALLEST: usize = 4 * 1024;
-/// Number of requests after which an unused free buffer is returned to the system. It spans several typical training steps.
+/// A free buffer is returned to the system when it was not used for this number of requests, and for requests of [`PASSES`] times its size in all. Together
+/// they span several typical training steps: a step has hundreds of small requests, or thousands of them beside a few large ones.
 const LIFETIME: u64 = 1000;
+/// See [`LIFETIME`].
+const PASSES: u64 = 64;
+/// Number of requests between two searches for buffers to be returned to the system.
+const SEARCH_EVERY: u64 = 250;
+
+/// Requests so far.
+#[derive(Clone, Copy, Debug, Default)]
+struct Clock {
+    requests: u64,
+    bytes: u64,
+}
+
+impl Clock {
+    /// Returns true if a buffer with this number of bytes, which was dropped at `then`, is to be returned to the system.
+    fn is_over(&self, then: Clock, bytes: usize) -> bool {
+        self.requests - then.requests > LIFETIME && self.bytes - then.bytes > PASSES * bytes as u64
+    }
+}
 
 /// The free buffers of one element type.
 #[derive(Debug)]
 pub struct Pool<E> {
-    /// Free buffers, each with the value of `clock` at which it was dropped.
-    free: Vec<(u64, Vec<E>)>,
-    /// Number of requests so far.
-    clock: u64,
+    /// Free buffers by their capacity, in the order in which they were dropped, each with the clock at that time. The one that was dropped first is taken first:
+    /// all of them are used from time to time, also those that only the busiest moments of a step need.
+    free: BTreeMap<usize, VecDeque<(Clock, Vec<E>)>>,
+    clock: Clock,
 }
 
 impl<E> Pool<E> {
     const fn new() -> Self {
-        Pool { free: Vec::new(), clock: 0 }
+        Pool { free: BTreeMap::new(), clock: Clock { requests: 0, bytes: 0 } }
     }
 }
 
@@ -139,7 +159,7 @@ impl<E: Pooled> Drop for Buffer<E> {
         if v.capacity() * size_of::<E>() >= SMALLEST {
             let mut pool = E::pool().lock().unwrap_or_else(|e| e.into_inner());
             let now = pool.clock;
-            pool.free.push((now, v));
+            pool.free.entry(v.capacity()).or_default().push_back((now, v));
         }
     }
 }
@@ -156,31 +176,28 @@ pub fn release_free_buffers() {
     clear::<u64>();
 }
 
-/// Takes the smallest free buffer with a capacity from `len` elements to `len` plus a quarter plus 4 KiB. Also frees the buffers that have been unused
-/// for more than [`LIFETIME`] requests.
+/// Takes the smallest free buffer with a capacity from `len` elements to `len` plus a quarter plus 4 KiB. Now and then, it returns buffers to the system that
+/// have been unused for long.
 fn take<E: Pooled>(len: usize) -> Option<Vec<E>> {
-    if len * size_of::<E>() < SMALLEST {
+    let bytes = len * size_of::<E>();
+    if bytes < SMALLEST {
         return None;
     }
-    let mut outdated = Vec::new();
     let mut pool = E::pool().lock().unwrap_or_else(|e| e.into_inner());
-    pool.clock += 1;
+    pool.clock.requests += 1;
+    pool.clock.bytes += bytes as u64;
     let now = pool.clock;
-    let best = pool
-        .free
-        .iter()
-        .enumerate()
-        .filter(|(_, (_, v))| v.capacity() >= len && v.capacity() - len <= len / 4 + SMALLEST / size_of::<E>())
-        .min_by_key(|(_, (_, v))| v.capacity())
-        .map(|(i, _)| i);
-    let found = best.map(|i| pool.free.swap_remove(i).1);
-    let mut i = 0;
-    while i < pool.free.len() {
-        if now - pool.free[i].0 > LIFETIME {
-            outdated.push(pool.free.swap_remove(i));
-        } else {
-            i += 1;
-        }
+    let mut fitting = pool.free.range_mut(len..=len + len / 4 + SMALLEST / size_of::<E>());
+    let found = fitting.find_map(|(_, buffers)| buffers.pop_front()).map(|(_, v)| v);
+    let mut outdated = Vec::new();
+    if now.requests % SEARCH_EVERY == 0 {
+        pool.free.retain(|capacity, buffers| {
+            let bytes = capacity * size_of::<E>();
+            while let Some(buffer) = buffers.pop_front_if(|(then, _)| now.is_over(*then, bytes)) {
+                outdated.push(buffer);
+            }
+            !buffers.is_empty()
+        });
     }
     drop(pool);
     drop(outdated);
