@@ -1,6 +1,7 @@
 //! A network as one [`Kernel`]: all layers for a block of rows, whose activations stay in the cache, then the next block.
 //!
-//! *Forward.* Blocks are independent. The hidden activations are kept for the adjoint up to a limit ([`KEPT`]) and computed again beyond it.
+//! *Forward.* Blocks are independent. The hidden activations of the first blocks are kept for the adjoint, up to a limit ([`KEPT`]); those of the others are
+//! computed again.
 //!
 //! *Adjoint.* A part is a range of blocks, at most [`PARTS`] in all. Each part adds the weight gradients of its blocks in their order, and the sums of
 //! the parts are added in their order. Bounds depend on the number of rows only, so the bits do not depend on the number of threads. A product that no
@@ -18,8 +19,8 @@ use crate::tensor::Tensor;
 const ROWS: usize = 256;
 /// Most partial sums of the gradients of the weights.
 const PARTS: usize = 32;
-/// Most numbers of hidden activations that are kept: 256 MB in `f32`. Computing them again takes a third of the operations of a step without.
-const KEPT: usize = 1 << 26;
+/// Most numbers of hidden activations that are kept: 512 MB in `f32`. Computing them again takes a third of the operations of a step without.
+const KEPT: usize = 1 << 27;
 
 /// An activation function whose derivative is a function of its value.
 #[derive(Clone, Copy, Debug)]
@@ -194,7 +195,7 @@ pub fn forward<T: Real>(mlp: &Mlp<T>, x: &Tensor<T>) -> Option<Tensor<T>> {
     forward_keeping(mlp, x, KEPT)
 }
 
-/// Computes the output as [`forward`] does, and keeps the hidden activations if there are at most `most` numbers.
+/// Computes the output as [`forward`] does, and keeps at most `most` numbers of hidden activations.
 fn forward_keeping<T: Real>(mlp: &Mlp<T>, x: &Tensor<T>, most: usize) -> Option<Tensor<T>> {
     let curve = Curve::of(mlp.activation)?;
     let widths = || mlp.layers.iter().map(|layer| (layer.inputs(), layer.outputs()));
@@ -211,17 +212,17 @@ fn forward_keeping<T: Real>(mlp: &Mlp<T>, x: &Tensor<T>, most: usize) -> Option<
     let rows = x.len() / network.inputs();
     let hidden: usize = network.layers.iter().map(|layer| layer.of_hidden).sum();
     let recorded = crate::graph::recording() && inputs.iter().any(Tensor::is_tracked);
-    let keep = recorded && rows * hidden <= most;
+    let kept_blocks = if recorded { most / (ROWS * hidden).max(1) } else { 0 };
     let mut out = Buffer::stale(rows * network.outputs());
     let blocks: Vec<&mut [T]> = out.chunks_mut(ROWS * network.outputs()).collect();
-    let kept = parallel::map_items(blocks, |b, out| {
-        let m = out.len() / network.outputs();
+    let hidden = parallel::map_items(blocks, |b, out| {
+        let (m, keep) = (out.len() / network.outputs(), b < kept_blocks);
         let hidden = network.forward(&x.data()[b * ROWS * network.inputs()..][..m * network.inputs()], out, keep);
         keep.then_some(hidden)
     });
     let mut shape = x.shape().to_vec();
     shape[x.ndim() - 1] = network.outputs();
-    let kernel = Fused { layers: mlp.layers.len(), activation: mlp.activation, curve, skip: mlp.skip, hidden: kept.into_iter().collect() };
+    let kernel = Fused { layers: mlp.layers.len(), activation: mlp.activation, curve, skip: mlp.skip, hidden };
     Some(Tensor::from_kernel(out, &shape, &inputs.iter().collect::<Vec<_>>(), kernel))
 }
 
@@ -231,8 +232,8 @@ struct Fused<T: Real> {
     activation: Activation,
     curve: Curve<T>,
     skip: Option<usize>,
-    /// Hidden activations of each block, if they are kept.
-    hidden: Option<Vec<Vec<Buffer<T>>>>,
+    /// Hidden activations of each block, unless they are to be computed again.
+    hidden: Vec<Option<Vec<Buffer<T>>>>,
 }
 
 impl<T: Real> Kernel<T> for Fused<T> {
@@ -265,8 +266,8 @@ impl<T: Real> Kernel<T> for Fused<T> {
                 let end = rows.min(start + ROWS);
                 let (x, g) = (&x[start * width..end * width], &g[start * outputs..end * outputs]);
                 let first = start - part * of_part;
-                match &self.hidden {
-                    Some(kept) => network.adjoint(x, &kept[start / ROWS], g, first, &mut to),
+                match &self.hidden[start / ROWS] {
+                    Some(kept) => network.adjoint(x, kept, g, first, &mut to),
                     None => {
                         let mut again = Buffer::stale(g.len());
                         network.adjoint(x, &network.forward(x, &mut again, true), g, first, &mut to);
@@ -390,7 +391,9 @@ mod tests {
             })
         };
         let want = bits(1, KEPT);
-        assert!([(2, KEPT), (3, KEPT), (1, 0), (3, 0)].into_iter().all(|(threads, most)| bits(threads, most) == want));
+        // Of 40 blocks, 20 fit in the last limit.
+        let half = 20 * ROWS * (7 + 5 + 6);
+        assert!([(2, KEPT), (3, KEPT), (1, 0), (3, 0), (2, half)].into_iter().all(|(threads, most)| bits(threads, most) == want));
     }
 
     /// The graph has derivative 1 at the kink, and so has the kernel: units whose input is exactly 0 are alive in both.
