@@ -21,7 +21,7 @@ pub fn prefetch<E: ?Sized>(value: &E) {
             unsafe { _mm_prefetch::<_MM_HINT_T0>(start.add(at)) };
             at += LINE;
         }
-        if size > 1 {
+        if size > align_of_val(value) {
             // A value that does not begin at the start of a cache line may end in one more line.
             // SAFETY: as above.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(start.add(size - 1)) };

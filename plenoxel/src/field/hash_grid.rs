@@ -12,6 +12,7 @@ mod loops;
 mod sums;
 
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
+use loops::{BLOCK, TOGETHER};
 use std::sync::Arc;
 
 /// Sizes of a hash grid.
@@ -140,13 +141,27 @@ impl HashGrid {
         assert_eq!(table.shape(), want, "hash_encode: the table must be {want:?}, got {:?}", table.shape());
         assert!(positions.ndim() == 2 && positions.shape()[1] == 3, "hash_encode: positions must be [m, 3], got {:?}", positions.shape());
         let (m, width) = (positions.shape()[0], self.width());
-        let (places, data) = (positions.data().as_chunks::<3>().0, table.data());
-        let mut out = Buffer::stale(m * width);
-        parallel::for_each_rows(&mut out, width, |first, out| {
-            let places = &places[first..first + out.len() / width];
-            loops::encode(&self.levels, self.shape.features, data, places, out);
-        });
+        let (features, data) = (self.shape.features, table.data());
+        let groups = loops::groups(positions.data().as_chunks::<3>().0);
+        let mut blocks = Buffer::stale(m * width);
+        for (l, level) in self.levels.iter().enumerate() {
+            parallel::for_each_chunk(&mut blocks, BLOCK * width, |start, block| {
+                let count = block.len() / width;
+                let groups = &groups[start / width / TOGETHER..][..count.div_ceil(TOGETHER)];
+                loops::encode(level, features, data, groups, &mut block[l * count * features..][..count * features]);
+            });
+        }
+        let out = self.copied(&blocks, true);
         Tensor::from_kernel(out, &[m, width], &[table, positions], Encode { grid: self.clone() })
+    }
+
+    /// Returns the numbers of blocks in the order of a tensor `[m, levels · features]`, or the reverse.
+    fn copied<T: Real>(&self, numbers: &[T], to_rows: bool) -> Buffer<T> {
+        let mut out = Buffer::stale(numbers.len());
+        parallel::for_each_chunk(&mut out, BLOCK * self.width(), |start, out| {
+            loops::copy_block(self.shape.levels, self.shape.features, to_rows, &numbers[start..start + out.len()], out);
+        });
+        out
     }
 }
 
@@ -188,7 +203,7 @@ impl<T: Real> Kernel<T> for Encode {
         let (positions, g) = (call.input(1), call.cotangent());
         let (places, features) = (positions.data().as_chunks::<3>().0, self.grid.shape.features);
         if call.needs(0) {
-            let sums = sums::HashSums { grid: self.grid.clone(), positions: positions.clone(), g: g.clone() };
+            let sums = sums::HashSums { grid: self.grid.clone(), groups: loops::groups(places), blocks: self.grid.copied(g.data(), false) };
             out.rows(0, RowSparse::deferred(&[self.grid.rows(), features], Arc::new(sums)));
         }
         if call.needs(1) {

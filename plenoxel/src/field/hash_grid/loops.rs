@@ -1,11 +1,16 @@
-//! Inner loops of the hash encoding. Positions are processed in groups of [`TOGETHER`], level by level: the rows of a level are computed and
-//! prefetched while those of the level before are read.
+//! Inner loops of the hash encoding. A loop processes one level, because the rows of one level fit in a cache and those of all levels do not. It processes
+//! groups of [`TOGETHER`] positions: the rows of a group are computed and prefetched while those of the group before are read.
+//!
+//! Between the loops and the tensors `[m, levels · features]`, numbers are in blocks of [`BLOCK`] positions: `[level, position, feature]` in each block.
 
 use super::Level;
 use autograd::{Real, dispatched, parallel};
 
 /// Number of positions that are processed together.
 pub const TOGETHER: usize = 16;
+
+/// Number of positions in a block, except for the last.
+pub const BLOCK: usize = 4096;
 
 /// Calls a loop with the number of features as a constant, in the version for this machine.
 macro_rules! with_features {
@@ -28,8 +33,19 @@ pub(super) use with_features;
 /// Coordinates of a group of positions, one array for each axis, clamped to [0, 1]. Entries beyond the last position are 0.
 pub type Group<T> = [[T; TOGETHER]; 3];
 
+/// Returns the groups of positions.
+pub fn groups<T: Real>(places: &[[T; 3]]) -> Vec<Group<T>> {
+    let mut groups = vec![[[T::zero(); TOGETHER]; 3]; places.len().div_ceil(TOGETHER)];
+    parallel::for_each_chunk(&mut groups, BLOCK / TOGETHER, |first, groups| {
+        for (to, places) in groups.iter_mut().zip(places[first * TOGETHER..].chunks(TOGETHER)) {
+            *to = group(places);
+        }
+    });
+    groups
+}
+
 #[inline(always)]
-pub fn group<T: Real>(places: &[[T; 3]]) -> Group<T> {
+fn group<T: Real>(places: &[[T; 3]]) -> Group<T> {
     let mut group = [[T::zero(); TOGETHER]; 3];
     for (i, place) in places.iter().enumerate() {
         for a in 0..3 {
@@ -80,20 +96,42 @@ impl<T: Real> Cells<T> {
         Cells { rows, shares }
     }
 
-    /// Returns the weights of the corners of a position.
+    /// Returns the weights of the corners.
     #[inline(always)]
-    pub fn weights(&self, i: usize) -> [T; 8] {
-        let [x, y, z] = [0, 1, 2].map(|a| [self.shares[a][0][i], self.shares[a][1][i]]);
-        let xy = [x[0] * y[0], x[1] * y[0], x[0] * y[1], x[1] * y[1]];
-        std::array::from_fn(|c| xy[c & 3] * z[c >> 2])
+    pub fn weights(&self) -> [[T; TOGETHER]; 8] {
+        let [x, y, z] = &self.shares;
+        let mut weights = [[T::zero(); TOGETHER]; 8];
+        for c in 0..8 {
+            for i in 0..TOGETHER {
+                weights[c][i] = x[c & 1][i] * y[c >> 1 & 1][i] * z[c >> 2][i];
+            }
+        }
+        weights
     }
 
-    /// Prefetches the rows of the first `count` positions.
+    /// Returns whether each position is in the cell of the one before, to judge by the rows of its corners.
     #[inline(always)]
-    fn prefetch<const F: usize>(&self, table: &[[T; F]], count: usize) {
+    pub fn continued(&self) -> [bool; TOGETHER] {
+        let mut differ = [0; TOGETHER];
         for rows in &self.rows {
-            for &row in &rows[..count] {
-                parallel::prefetch(&table[row as usize]);
+            for i in 1..TOGETHER {
+                differ[i] |= rows[i] ^ rows[i - 1];
+            }
+        }
+        let mut continued = [false; TOGETHER];
+        for i in 1..TOGETHER {
+            continued[i] = differ[i] == 0;
+        }
+        continued
+    }
+
+    /// Prefetches the rows in a part of the table that begins at row `first`.
+    #[inline(always)]
+    pub fn prefetch<const F: usize>(&self, first: u32, table: &[[T; F]]) {
+        for &row in self.rows.as_flattened() {
+            // Rows do not cross cache lines: their sizes are powers of two.
+            if let Some(row) = table.get(row.wrapping_sub(first) as usize) {
+                parallel::prefetch(&row[0]);
             }
         }
     }
@@ -102,41 +140,59 @@ impl<T: Real> Cells<T> {
 /// Number of bytes of a level above which its rows are prefetched: those of smaller levels stay in the cache.
 const PREFETCHED: usize = 1 << 17;
 
-#[inline(always)]
-fn prefetched<const F: usize, T>(level: &Level) -> bool {
-    level.rows * F * size_of::<T>() > PREFETCHED
-}
-
-/// Encodes positions: `out` is `[places, levels · features]`.
-pub fn encode<T: Real>(levels: &[Level], features: usize, table: &[T], places: &[[T; 3]], out: &mut [T]) {
-    with_features!(features, encode_loop::<T>(levels, table, places, out));
+/// Encodes positions at one level: `out` is `[positions, features]`.
+pub fn encode<T: Real>(level: &Level, features: usize, table: &[T], groups: &[Group<T>], out: &mut [T]) {
+    with_features!(features, encode_loop::<T>(level, table, groups, out));
 }
 
 dispatched! {
-fn encode_loop<T: Real, const F: usize, const FUSED: bool>(levels: &[Level], table: &[T], places: &[[T; 3]], out: &mut [T]) {
+fn encode_loop<T: Real, const F: usize, const FUSED: bool>(level: &Level, table: &[T], groups: &[Group<T>], out: &mut [T]) {
     let table = table.as_chunks::<F>().0;
-    let width = levels.len();
-    for (places, out) in places.chunks(TOGETHER).zip(out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER * width)) {
-        let at = group(places);
-        let mut next = Cells::new::<FUSED>(&levels[0], &at);
-        for l in 0..width {
-            let cells = next;
-            if let Some(level) = levels.get(l + 1) {
-                next = Cells::new::<FUSED>(level, &at);
-                if prefetched::<F, T>(level) {
-                    next.prefetch(table, places.len());
+    let prefetched = level.rows * size_of::<[T; F]>() > PREFETCHED;
+    let mut next = Cells::new::<FUSED>(level, &groups[0]);
+    for (k, out) in out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER).enumerate() {
+        let cells = next;
+        if let Some(group) = groups.get(k + 1) {
+            next = Cells::new::<FUSED>(level, group);
+            if prefetched {
+                next.prefetch(0, table);
+            }
+        }
+        let weights = cells.weights();
+        let mut values = [[T::zero(); F]; TOGETHER];
+        for c in 0..8 {
+            let mut corner = [[T::zero(); F]; TOGETHER];
+            for i in 0..TOGETHER {
+                corner[i] = table[cells.rows[c][i] as usize];
+            }
+            for i in 0..TOGETHER {
+                for f in 0..F {
+                    values[i][f] = corner[i][f].multiply_add::<FUSED>(weights[c][i], values[i][f]);
                 }
             }
-            for i in 0..places.len() {
-                let weights = cells.weights(i);
-                let mut value = [T::zero(); F];
-                for c in 0..8 {
-                    let row = &table[cells.rows[c][i] as usize];
-                    for f in 0..F {
-                        value[f] = row[f].multiply_add::<FUSED>(weights[c], value[f]);
-                    }
-                }
-                out[i * width + l] = value;
+        }
+        for (out, value) in out.iter_mut().zip(values) {
+            *out = value;
+        }
+    }
+}
+}
+
+/// Copies a block to rows of a tensor `[m, levels · features]`, or such rows to a block.
+pub fn copy_block<T: Real>(levels: usize, features: usize, to_rows: bool, from: &[T], to: &mut [T]) {
+    with_features!(features, copy_loop::<T>(levels, to_rows, from, to));
+}
+
+dispatched! {
+fn copy_loop<T: Real, const F: usize, const FUSED: bool>(levels: usize, to_rows: bool, from: &[T], to: &mut [T]) {
+    let (from, to) = (from.as_chunks::<F>().0, to.as_chunks_mut::<F>().0);
+    let count = to.len() / levels;
+    for first in (0..count).step_by(TOGETHER) {
+        for l in 0..levels {
+            for i in first..count.min(first + TOGETHER) {
+                let (in_block, in_rows) = (l * count + i, i * levels + l);
+                let (source, target) = if to_rows { (in_block, in_rows) } else { (in_rows, in_block) };
+                to[target] = from[source];
             }
         }
     }

@@ -1,22 +1,22 @@
 //! Adjoint of the table: sums of contributions to its rows, which the optimizer requests one bucket of rows after another.
 //!
 //! A bucket has as many rows as the largest level, but at most 8 MB in single precision. The contributions of all positions to its levels are computed when they are added;
-//! none is stored. Consecutive positions in the same cell, as along a ray, contribute together. There are about as many tasks as levels that share rows, so more threads than
+//! none is stored. Consecutive positions of a group in the same cell, as along a ray, contribute together. There are about as many tasks as levels that share rows, so more threads than
 //! levels are of no use.
 
-use super::loops::{Cells, TOGETHER, group, with_features};
+use super::loops::{BLOCK, Cells, Group, TOGETHER, with_features};
 use super::{HashGrid, Level};
-use autograd::{Real, RowSums, Tensor, dispatched, parallel};
+use autograd::{Buffer, Real, RowSums, dispatched};
 use std::ops::Range;
 
 /// Sums of the contributions to all rows.
 #[derive(Debug)]
 pub struct HashSums<T: Real> {
     pub grid: HashGrid,
-    /// Positions `[m, 3]`.
-    pub positions: Tensor<T>,
-    /// Cotangents of their encodings `[m, levels · features]`.
-    pub g: Tensor<T>,
+    /// Positions.
+    pub groups: Vec<Group<T>>,
+    /// Cotangents of their encodings, in blocks.
+    pub blocks: Buffer<T>,
 }
 
 impl<T: Real> HashSums<T> {
@@ -33,15 +33,18 @@ impl<T: Real> RowSums<T> for HashSums<T> {
     }
 
     fn is_empty(&self, _bucket: usize) -> bool {
-        self.positions.is_empty()
+        self.groups.is_empty()
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        let (rows, levels) = (self.rows(bucket), &self.grid.levels);
-        let (places, g) = (self.positions.data().as_chunks::<3>().0, self.g.data());
-        for l in 0..levels.len() {
-            if levels[l].first < rows.end && rows.start < levels[l].first + levels[l].rows {
-                with_features!(self.grid.shape.features, add::<T>(levels, l, places, g, rows.clone(), sums, touched));
+        let (rows, features, width) = (self.rows(bucket), self.grid.shape.features, self.grid.width());
+        for (l, level) in self.grid.levels.iter().enumerate() {
+            if level.first < rows.end && rows.start < level.first + level.rows {
+                for (groups, block) in self.groups.chunks(BLOCK / TOGETHER).zip(self.blocks.chunks(BLOCK * width)) {
+                    let numbers = block.len() / self.grid.levels.len();
+                    let g = &block[l * numbers..][..numbers];
+                    with_features!(features, add::<T>(level, groups, g, rows.start as u32, sums, touched));
+                }
             }
         }
     }
@@ -49,36 +52,35 @@ impl<T: Real> RowSums<T> for HashSums<T> {
 
 /// Sums of the rows of a bucket.
 struct Sums<'a, T, const F: usize> {
-    rows: Range<u32>,
-    /// True if all rows of the level are in the bucket.
-    all: bool,
+    first: u32,
     sums: &'a mut [[T; F]],
     touched: &'a mut [u64],
 }
 
 impl<T: Real, const F: usize> Sums<'_, T, F> {
-    /// Prefetches the rows of a group of positions.
+    /// Adds to the corners of the cell of position `i`, as far as their rows are in the bucket.
     #[inline(always)]
-    fn prefetch(&self, cells: &Cells<T>) {
-        for rows in &cells.rows {
-            for &row in rows {
-                if let Some(sum) = self.sums.get(row.wrapping_sub(self.rows.start) as usize) {
-                    parallel::prefetch(sum);
+    fn add(&mut self, cells: &Cells<T>, i: usize, values: &[[T; F]; 8]) {
+        for pair in 0..4 {
+            let [a, b] = [0, 1].map(|c| cells.rows[2 * pair + c][i].wrapping_sub(self.first) as usize);
+            for (row, value) in [(a, &values[2 * pair]), (b, &values[2 * pair + 1])] {
+                if let Some(sum) = self.sums.get_mut(row) {
+                    for f in 0..F {
+                        sum[f] += value[f];
+                    }
                 }
             }
-        }
-    }
-
-    /// Adds to the rows of the corners of a cell that are in the bucket.
-    #[inline(always)]
-    fn add(&mut self, rows: &[u32; 8], values: &[[T; F]; 8]) {
-        for (row, value) in rows.iter().zip(values) {
-            if self.all || self.rows.contains(row) {
-                let row = (row - self.rows.start) as usize;
-                self.touched[row / 64] |= 1 << (row % 64);
-                let sum = &mut self.sums[row];
-                for f in 0..F {
-                    sum[f] += value[f];
+            // Neighbours along x are in the same word, with few exceptions.
+            let [bit_a, bit_b] = [a, b].map(|row| 1u64 << (row % 64));
+            if a / 64 == b / 64 {
+                if let Some(word) = self.touched.get_mut(a / 64) {
+                    *word |= bit_a | bit_b;
+                }
+            } else {
+                for (row, bit) in [(a, bit_a), (b, bit_b)] {
+                    if let Some(word) = self.touched.get_mut(row / 64) {
+                        *word |= bit;
+                    }
                 }
             }
         }
@@ -86,54 +88,42 @@ impl<T: Real, const F: usize> Sums<'_, T, F> {
 }
 
 dispatched! {
-/// Adds the contributions of positions to the rows of level `l` that are in a bucket.
+/// Adds the contributions of positions to the rows of a level that are in the bucket that begins at row `first`. `g` is `[positions, F]`.
 fn add<T: Real, const F: usize, const FUSED: bool>(
-    levels: &[Level],
-    l: usize,
-    places: &[[T; 3]],
+    level: &Level,
+    groups: &[Group<T>],
     g: &[T],
-    rows: Range<usize>,
+    first: u32,
     sums: &mut [T],
     touched: &mut [u64],
 ) {
-    let (g, width, level) = (g.as_chunks::<F>().0, levels.len(), &levels[l]);
-    let all = rows.start <= level.first && level.first + level.rows <= rows.end;
-    let mut bucket = Sums { rows: rows.start as u32..rows.end as u32, all, sums: sums.as_chunks_mut::<F>().0, touched };
-    // Rows and contributions of the current cell, unless it has none.
-    let mut own = [0; 8];
-    let mut values = [[T::zero(); F]; 8];
-    let mut any = false;
-    let mut groups = places.chunks(TOGETHER).zip(g.chunks(TOGETHER * width)).peekable();
-    let mut next = Cells::new::<FUSED>(level, &group(places.chunks(TOGETHER).next().unwrap_or_default()));
-    while let Some((places, g)) = groups.next() {
+    let mut bucket = Sums { first, sums: sums.as_chunks_mut::<F>().0, touched };
+    let mut next = Cells::new::<FUSED>(level, &groups[0]);
+    for (k, g) in g.as_chunks::<F>().0.chunks(TOGETHER).enumerate() {
         let cells = next;
-        // What the next group reads is prefetched.
-        if let Some((places, g)) = groups.peek() {
-            next = Cells::new::<FUSED>(level, &group(places));
-            bucket.prefetch(&next);
-            g.iter().skip(l).step_by(width).for_each(parallel::prefetch);
+        if let Some(group) = groups.get(k + 1) {
+            next = Cells::new::<FUSED>(level, group);
+            next.prefetch(first, bucket.sums);
         }
-        for i in 0..places.len() {
-            let g = &g[i * width + l];
-            if g.iter().all(|&g| g == T::zero()) {
-                continue;
-            }
-            let here = std::array::from_fn(|c| cells.rows[c][i]);
-            if any && here != own {
-                bucket.add(&own, &values);
-                values = [[T::zero(); F]; 8];
-            }
-            (own, any) = (here, true);
-            let weights = cells.weights(i);
-            for c in 0..8 {
-                for f in 0..F {
-                    values[c][f] = g[f].multiply_add::<FUSED>(weights[c], values[c][f]);
+        let (weights, continued) = (cells.weights(), cells.continued());
+        // Contributions to the corners of the current cell, unless it has none.
+        let mut values = [[T::zero(); F]; 8];
+        let mut any = false;
+        for i in 0..g.len() {
+            if g[i].iter().any(|&g| g != T::zero()) {
+                any = true;
+                for c in 0..8 {
+                    for f in 0..F {
+                        values[c][f] = g[i][f].multiply_add::<FUSED>(weights[c][i], values[c][f]);
+                    }
                 }
             }
+            if any && !(i + 1 < g.len() && continued[i + 1]) {
+                bucket.add(&cells, i, &values);
+                values = [[T::zero(); F]; 8];
+                any = false;
+            }
         }
-    }
-    if any {
-        bucket.add(&own, &values);
     }
 }
 }
