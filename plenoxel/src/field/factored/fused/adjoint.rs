@@ -236,8 +236,7 @@ fn part<T: Real>(
     let random = |name| batch.jitter.stream(Purpose::GradientPruning, block.first).map(|stream| stream.numbered(output as u64).named(name));
     let samples = prune(&mut of_features, 1, batch.gradient_above, random("density"));
     let groups = prune(&mut rgb, 3, batch.gradient_above, random("color"));
-    let OfNetwork { products, input, parameters } =
-        tables.network.adjoint(&block.activations.rows(&groups), pruning::rows(&rgb, 3, &groups));
+    let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, &groups, &rgb);
     let of_samples = pruning::rows(&of_features, 1, &samples);
     let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
     let density = Kept::new(samples, block.at(), of_samples, tables.density);

@@ -234,18 +234,18 @@ impl<'a, T: Real> Scene<'a, T> {
     /// Evaluates the color network.
     fn shade(&self, block: &mut Block<T>) {
         let pairs = self.tables.appearance;
-        let mut products = Buffer::stale(block.groups.len() * 3 * pairs.width);
-        for (run, products) in products.chunks_mut(RUN * 3 * pairs.width).enumerate() {
-            let range = run * RUN..run * RUN + products.len() / (3 * pairs.width);
-            let at = block.groups_at.each_ref().map(|at| &at[range.clone()]);
-            if parallel::fused() {
-                lookup::products::<T, true>(pairs, at, products);
-            } else {
-                lookup::products::<T, false>(pairs, at, products);
+        let products = |groups: Range<usize>, out: &mut [T]| {
+            for (first, out) in groups.clone().step_by(RUN).zip(out.chunks_mut(RUN * 3 * pairs.width)) {
+                let at = block.groups_at.each_ref().map(|at| &at[first..groups.end.min(first + RUN)]);
+                if parallel::fused() {
+                    lookup::products::<T, true>(pairs, at, out);
+                } else {
+                    lookup::products::<T, false>(pairs, at, out);
+                }
             }
-        }
+        };
         let (encoded, width) = (self.batch.encoded.data(), self.batch.encoded.shape()[1]);
         let direction = |i: usize| &encoded[block.groups.rays[i] as usize * width..][..width];
-        block.activations = self.tables.network.forward(products, direction);
+        block.activations = self.tables.network.forward(block.groups.len(), products, direction);
     }
 }

@@ -2,7 +2,11 @@
 
 use super::super::Shape;
 use super::pruning;
-use autograd::{Buffer, Matrix, Real, Tensor, dispatched, multiply, parallel};
+use autograd::{Buffer, Matrix, Real, Tensor, add_product, dispatched, multiply, parallel};
+use std::ops::Range;
+
+/// Number of groups that pass through all layers before others: their values stay in the second-level cache.
+const ROWS: usize = 256;
 
 /// Linear layer.
 struct Layer<'a, T> {
@@ -66,37 +70,44 @@ impl<'a, T: Real> Network<'a, T> {
         }
     }
 
-    /// Computes the colors from products and encoded directions: `direction(i)` is the encoded direction of group i.
-    pub fn forward(&self, products: Buffer<T>, direction: impl Fn(usize) -> &'a [T]) -> Activations<T> {
-        let m = products.len() / self.products;
-        let mut features = Buffer::stale(m * self.features);
-        multiply(Matrix::new(&products, m, self.products), Matrix::new(self.basis, self.products, self.features), &mut features);
+    /// Computes the colors of m groups from their products and encoded directions: `products` writes those of a range of groups, and `direction(i)` is the encoded
+    /// direction of group i.
+    pub fn forward(&self, m: usize, products: impl Fn(Range<usize>, &mut [T]), direction: impl Fn(usize) -> &'a [T]) -> Activations<T> {
+        let mut of = Activations {
+            products: Buffer::stale(m * self.products),
+            inputs: self.layers.iter().map(|layer| Buffer::stale(m * layer.inputs)).collect(),
+            rgb: Buffer::stale(3 * m),
+        };
         let width = self.layers[0].inputs;
-        let mut input = Buffer::stale(m * width);
         let encoded = self.features * (1 + 2 * self.octaves);
-        for (i, (input, features)) in input.chunks_exact_mut(width).zip(features.chunks_exact(self.features)).enumerate() {
-            encode(features, self.octaves, &mut input[..encoded]);
-            input[encoded..].copy_from_slice(direction(i));
-        }
-        let mut inputs = vec![input];
-        let mut rgb = Buffer::stale(0);
-        for (l, layer) in self.layers.iter().enumerate() {
-            let mut out = Buffer::stale(m * layer.outputs);
-            multiply(Matrix::new(&inputs[l], m, layer.inputs), Matrix::new(layer.weight, layer.inputs, layer.outputs), &mut out);
-            if l + 1 < self.layers.len() {
-                add_bias::<T, true>(&mut out, layer.bias);
-                inputs.push(out);
-            } else {
-                add_bias::<T, false>(&mut out, layer.bias);
-                if parallel::fused() {
-                    sigmoid::<T, true>(&mut out)
+        let mut features = Buffer::stale(ROWS.min(m) * self.features);
+        for first in (0..m).step_by(ROWS) {
+            let groups = first..m.min(first + ROWS);
+            let count = groups.len();
+            let own = |width: usize| groups.start * width..groups.end * width;
+            let of_products = &mut of.products[own(self.products)];
+            products(groups.clone(), of_products);
+            let features = &mut features[..count * self.features];
+            multiply(Matrix::new(of_products, count, self.products), Matrix::new(self.basis, self.products, self.features), features);
+            let inputs = of.inputs[0][own(width)].chunks_exact_mut(width);
+            for ((i, input), features) in groups.clone().zip(inputs).zip(features.chunks_exact(self.features)) {
+                encode(features, self.octaves, &mut input[..encoded]);
+                input[encoded..].copy_from_slice(direction(i));
+            }
+            for (l, layer) in self.layers.iter().enumerate() {
+                let (below, above) = of.inputs.split_at_mut(l + 1);
+                let input = Matrix::new(&below[l][own(layer.inputs)], count, layer.inputs);
+                let out = &mut above.first_mut().unwrap_or(&mut of.rgb)[own(layer.outputs)];
+                multiply(input, Matrix::new(layer.weight, layer.inputs, layer.outputs), out);
+                if l + 1 < self.layers.len() {
+                    add_bias::<T, true>(out, layer.bias);
                 } else {
-                    sigmoid::<T, false>(&mut out)
+                    add_bias::<T, false>(out, layer.bias);
+                    if parallel::fused() { sigmoid::<T, true>(out) } else { sigmoid::<T, false>(out) }
                 }
-                rgb = out;
             }
         }
-        Activations { products, inputs, rgb }
+        of
     }
 
     /// Returns the cotangents of encoded directions, one row for each group, from those of the input of the first layer.
@@ -105,38 +116,52 @@ impl<'a, T: Real> Network<'a, T> {
         input.chunks_exact(self.layers[0].inputs).map(move |row| &row[encoded..])
     }
 
-    /// Computes the cotangents of the products and of the parameters from those of the colors, `[m, 3]`.
-    pub fn adjoint(&self, activations: &Activations<T>, mut g: Buffer<T>) -> OfNetwork<T> {
+    /// Computes the cotangents of the products and of the parameters for the groups with these numbers, from the cotangents of the colors of all groups.
+    pub fn adjoint(&self, activations: &Activations<T>, numbers: &[u32], of_colors: &[T]) -> OfNetwork<T> {
+        let width = self.layers[0].inputs;
+        let mut lengths = vec![self.basis.len()];
+        lengths.extend(self.layers.iter().flat_map(|layer| [layer.weight.len(), layer.bias.len()]));
+        let mut of = OfNetwork {
+            products: Buffer::stale(numbers.len() * self.products),
+            input: Buffer::stale(numbers.len() * width),
+            parameters: lengths.into_iter().map(Buffer::zeros).collect(),
+        };
+        let products = of.products.chunks_mut(ROWS * self.products);
+        for ((numbers, products), input) in numbers.chunks(ROWS).zip(products).zip(of.input.chunks_mut(ROWS * width)) {
+            self.add_adjoint(&activations.rows(numbers), pruning::rows(of_colors, 3, numbers), products, input, &mut of.parameters);
+        }
+        of
+    }
+
+    /// Computes the cotangents of products and of the input of the first layer for some groups, from those of their colors, and adds those of the parameters.
+    fn add_adjoint(&self, of: &Activations<T>, mut g: Buffer<T>, of_products: &mut [T], of_input: &mut [T], sums: &mut [Buffer<T>]) {
         let m = g.len() / 3;
-        g.iter_mut().zip(activations.rgb.iter()).for_each(|(g, &c)| *g *= c * (T::one() - c));
-        let mut cotangents = Vec::with_capacity(1 + 2 * self.layers.len());
-        for (layer, input) in self.layers.iter().zip(&activations.inputs).rev() {
-            let mut of_bias = Buffer::zeros(layer.outputs);
+        g.iter_mut().zip(of.rgb.iter()).for_each(|(g, &c)| *g *= c * (T::one() - c));
+        let (of_basis, of_layers) = sums.split_at_mut(1);
+        for (l, (layer, input)) in self.layers.iter().zip(&of.inputs).enumerate().rev() {
+            let [of_weight, of_bias] = &mut of_layers.as_chunks_mut::<2>().0[l];
             for row in g.chunks_exact(layer.outputs) {
                 of_bias.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
             }
-            let mut of_weight = Buffer::stale(layer.inputs * layer.outputs);
-            multiply(Matrix::transposed(input, layer.inputs, m), Matrix::new(&g, m, layer.outputs), &mut of_weight);
-            let mut of_input = Buffer::stale(m * layer.inputs);
-            multiply(Matrix::new(&g, m, layer.outputs), Matrix::transposed(layer.weight, layer.outputs, layer.inputs), &mut of_input);
-            cotangents.extend([of_bias, of_weight]);
-            if cotangents.len() < 2 * self.layers.len() {
-                mask(&mut of_input, input);
+            let cotangent = Matrix::new(&g, m, layer.outputs);
+            add_product(Matrix::transposed(input, layer.inputs, m), cotangent, of_weight);
+            let weight = Matrix::transposed(layer.weight, layer.outputs, layer.inputs);
+            if l == 0 {
+                multiply(cotangent, weight, of_input);
+            } else {
+                let mut below = Buffer::stale(m * layer.inputs);
+                multiply(cotangent, weight, &mut below);
+                mask(&mut below, input);
+                g = below;
             }
-            g = of_input;
         }
         let width = self.layers[0].inputs;
         let mut of_features = Buffer::stale(m * self.features);
-        let rows = of_features.chunks_exact_mut(self.features).zip(g.chunks_exact(width)).zip(activations.inputs[0].chunks_exact(width));
+        let rows = of_features.chunks_exact_mut(self.features).zip(of_input.chunks_exact(width)).zip(of.inputs[0].chunks_exact(width));
         rows.for_each(|((out, g), encoded)| encode_adjoint(g, encoded, self.octaves, out));
-        let mut of_basis = Buffer::stale(self.products * self.features);
         let features = Matrix::new(&of_features, m, self.features);
-        multiply(Matrix::transposed(&activations.products, self.products, m), features, &mut of_basis);
-        let mut of_products = Buffer::stale(m * self.products);
-        multiply(features, Matrix::transposed(self.basis, self.features, self.products), &mut of_products);
-        cotangents.push(of_basis);
-        cotangents.reverse();
-        OfNetwork { products: of_products, input: g, parameters: cotangents }
+        add_product(Matrix::transposed(&of.products, self.products, m), features, &mut of_basis[0]);
+        multiply(features, Matrix::transposed(self.basis, self.features, self.products), of_products);
     }
 }
 
