@@ -129,7 +129,7 @@ impl<T: Real> Cells<T> {
     #[inline(always)]
     pub fn prefetch<const F: usize>(&self, first: u32, table: &[[T; F]]) {
         for &row in self.rows.as_flattened() {
-            // Rows do not cross cache lines: their sizes are powers of two.
+            // Rows hardly ever cross cache lines: their sizes are powers of two.
             if let Some(row) = table.get(row.wrapping_sub(first) as usize) {
                 parallel::prefetch(&row[0]);
             }

@@ -13,7 +13,7 @@ use std::ops::Range;
 #[derive(Debug)]
 pub struct HashSums<T: Real> {
     pub grid: HashGrid,
-    /// Positions.
+    /// Positions, clamped to the unit cube.
     pub groups: Vec<Group<T>>,
     /// Cotangents of their encodings, in blocks.
     pub blocks: Buffer<T>,
