@@ -13,23 +13,24 @@ use std::sync::Mutex;
 
 /// Size of the smallest pooled buffer, in bytes. For smaller buffers the system allocator is as fast.
 const SMALLEST: usize = 4 * 1024;
-/// A free buffer is returned to the system when it was not used for this number of requests, and for requests of [`PASSES`] times its size in all. Together
-/// they span several typical training steps: a step has hundreds of small requests, or thousands of them beside a few large ones.
+/// Fewest requests during which a free buffer is unused before it is returned to the system. They span several typical training steps.
 const LIFETIME: u64 = 1000;
-/// See [`LIFETIME`].
+/// Fewest bytes that are requested meanwhile, relative to the size of the buffer: a large buffer outlives a step with thousands of small requests.
 const PASSES: u64 = 64;
 /// Number of requests between two searches for buffers to be returned to the system.
 const SEARCH_EVERY: u64 = 250;
 
 /// Requests so far.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct Clock {
+    /// Number of requests.
     requests: u64,
+    /// Their sizes in all.
     bytes: u64,
 }
 
 impl Clock {
-    /// Returns true if a buffer with this number of bytes, which was dropped at `then`, is to be returned to the system.
+    /// Returns true if a buffer of `bytes` bytes that was dropped at `then` has been unused for too long.
     fn is_over(&self, then: Clock, bytes: usize) -> bool {
         self.requests - then.requests > LIFETIME && self.bytes - then.bytes > PASSES * bytes as u64
     }
@@ -38,8 +39,8 @@ impl Clock {
 /// The free buffers of one element type.
 #[derive(Debug)]
 pub struct Pool<E> {
-    /// Free buffers by their capacity, in the order in which they were dropped, each with the clock at that time. The one that was dropped first is taken first:
-    /// all of them are used from time to time, also those that only the busiest moments of a step need.
+    /// Free buffers by their capacity, in the order in which they were dropped, each with the clock at that time. The one that was dropped first is taken first, so
+    /// that no buffer stays unused while others of its size are in use.
     free: BTreeMap<usize, VecDeque<(Clock, Vec<E>)>>,
     clock: Clock,
 }

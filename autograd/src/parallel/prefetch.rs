@@ -22,7 +22,7 @@ pub fn prefetch<E: ?Sized>(value: &E) {
             at += LINE;
         }
         if size > align_of_val(value) {
-            // A value that does not begin at the start of a cache line may end in one more line.
+            // A value that does not begin at the start of a cache line may end in one more line, unless its size is its alignment.
             // SAFETY: as above.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(start.add(size - 1)) };
         }

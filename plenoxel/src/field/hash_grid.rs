@@ -155,7 +155,7 @@ impl HashGrid {
         Tensor::from_kernel(out, &[m, width], &[table, positions], Encode { grid: self.clone() })
     }
 
-    /// Returns the numbers of blocks in the order of a tensor `[m, levels · features]`, or the reverse.
+    /// Copies the numbers of blocks to the rows of a tensor `[m, levels · features]`, or such rows to blocks.
     fn copied<T: Real>(&self, numbers: &[T], to_rows: bool) -> Buffer<T> {
         let mut out = Buffer::stale(numbers.len());
         parallel::for_each_chunk(&mut out, BLOCK * self.width(), |start, out| {
