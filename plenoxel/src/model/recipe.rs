@@ -105,13 +105,14 @@ pub trait Recipe: Send + Sync {
         0
     }
 
-    /// Returns these settings with another number of steps in the last stage, or with the nearest number for which the first `taken` steps stay the same.
-    /// Called if [`steps_before_length_matters`](Recipe::steps_before_length_matters) is not 0.
-    fn with_last_stage(&self, steps: u64, taken: u64) -> Self
+    /// Returns these settings, which are those of a plan for `asked`, with other stages to come: the steps after the first `taken` cost `left`, in units of
+    /// [`with_cost`](Recipe::with_cost), or come as near as they can while the first `taken` steps stay the same. Called if
+    /// [`steps_before_length_matters`](Recipe::steps_before_length_matters) is not 0. Default: these settings.
+    fn with_left(&self, asked: &Self, model: &Self::Model, left: f64, taken: u64) -> Self
     where
         Self: Sized + Clone,
     {
-        let _ = (steps, taken);
+        let _ = (asked, model, left, taken);
         self.clone()
     }
 

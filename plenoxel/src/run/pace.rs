@@ -1,4 +1,4 @@
-//! Time budget of the models that have a [`Recipe`]: a plan before the run begins ([`plan`]), and adjustments of its last stage ([`Pace`]).
+//! Time budget of the models that have a [`Recipe`]: a plan before the run begins ([`plan`]), and adjustments of its later stages ([`Pace`]).
 //!
 //! A plan is a number of steps for each stage. It is part of the settings of the run, which thus repeat the run bit by bit: neither measured steps that belong to
 //! the plan nor adjustments change what the steps before were ([`Recipe::begins_as`]).
@@ -62,6 +62,8 @@ fn step_cost(stage: &PlannedStage) -> f64 {
 pub struct Planned<R: Recipe> {
     /// The settings.
     pub recipe: R,
+    /// The settings that were asked for, fitted to the training views ([`Recipe::fitted_to`]).
+    pub asked: R,
     /// The trainer whose speed was measured, if its steps belong to the plan.
     pub begun: Option<Begun<R::Model>>,
 }
@@ -123,52 +125,55 @@ fn plan_by<R: Recipe + Clone>(
     let stages = trainer.plan();
     let evaluation = stages.last().map_or(0.0, |last| step / step_cost(&stages[0]) * last.ray_cost * PIXEL_COST * time.evaluated);
     let training = seconds - time.kept_for(evaluation);
-    let planned =
-        |left: f64, taken: u64| recipe.clone().fitted_to(trainer.model(), trainer.views()).with_cost(trainer.model(), left / unit, taken);
+    let asked = recipe.clone().fitted_to(trainer.model(), trainer.views());
+    let planned = |left: f64, taken: u64| asked.with_cost(trainer.model(), left / unit, taken);
     let taken = trainer.steps_taken();
     let continued = (keep && startup < training).then(|| planned(training - startup, taken));
     if let Some(recipe) = continued.filter(|continued| continued.begins_as(&measured, taken)) {
         trainer.replan(|model| recipe.clone().change(model));
-        return Ok(Planned { recipe, begun: Some(Begun { trainer, reports }) });
+        return Ok(Planned { recipe, asked, begun: Some(Begun { trainer, reports }) });
     }
     let left = training - spent - startup;
     if left <= 0.0 {
         let found = format!("{} is too short: beginning to train takes {} or more", clock(time.seconds), clock(time.seconds - left));
         return Err(Error::usage("--time", found, "give it several times as much"));
     }
-    Ok(Planned { recipe: planned(left, 0), begun: None })
+    Ok(Planned { recipe: planned(left, 0), asked, begun: None })
 }
 
 /// Estimates the seconds of the evaluation of a model.
 type Evaluation<M> = Box<dyn Fn(&M) -> f64>;
 
-/// Follows a planned run, and adjusts the length of its last stage so that it ends on time: early, when a wrong plan can still become much shorter,
-/// and in the last stage, whose speed is known then. A run of one stage is adjusted again and again, as long as its length does not matter: the first steps
-/// of a stage are slower. A run that is resumed keeps the plan with which it was saved.
+/// Follows a planned run, and adjusts the stages to come so that it ends on time: after a third of the steps before the length of the run matters
+/// ([`Recipe::steps_before_length_matters`]), after half of the rest, and so on. The first steps of a run tell little: without silhouettes they have several
+/// times as many samples as later ones. A run that is resumed keeps the plan with which it was saved.
 pub struct Pace<R: Recipe> {
     recipe: R,
+    asked: R,
     config: Config,
     time: TimeBudget,
     /// The evaluation, if it is part of the time.
     evaluation: Option<Evaluation<R::Model>>,
     /// Number of steps after which the plan is adjusted next; `None` if it is not.
     adjust_at: Option<u64>,
-    /// True after the first adjustment.
-    adjusted: bool,
     /// Stage and number of steps from which on the speed is measured, and seconds that were spent until then: the first step that was seen of the stage, or the
-    /// last adjustment in a run of one stage.
+    /// last adjustment in it.
     measured_from: Option<(usize, u64, f64)>,
 }
 
 /// Fewest steps of a stage from which the speed is taken.
 const MEASURED: u64 = 10;
 
+/// Fewest steps from one adjustment to the next, as a share of the steps before the length of the run matters.
+const APART: f64 = 1.0 / 16.0;
+
 impl<R: Recipe + Clone> Pace<R> {
-    /// Follows a run with these settings, which are those of `config` for its model, planned for `time`, in which `evaluation` is included.
-    pub fn new(recipe: R, config: Config, time: TimeBudget, evaluation: Option<Evaluation<R::Model>>) -> Self {
+    /// Follows a run with the settings of a plan, which are those of `config` for its model, planned for `time`, in which `evaluation` is included. `asked` are
+    /// the settings that were asked for ([`Planned::asked`]).
+    pub fn new(recipe: R, asked: R, config: Config, time: TimeBudget, evaluation: Option<Evaluation<R::Model>>) -> Self {
         let until = recipe.steps_before_length_matters();
         let adjust_at = (until > 0).then_some(until / 3);
-        Pace { recipe, config, time, evaluation, adjust_at, adjusted: false, measured_from: None }
+        Pace { recipe, asked, config, time, evaluation, adjust_at, measured_from: None }
     }
 
     /// Looks at the time after a step; `now` is how much of it is spent, in seconds. Returns the new configuration if the plan changed.
@@ -186,37 +191,22 @@ impl<R: Recipe + Clone> Pace<R> {
             self.adjust_at = None;
             return None;
         }
-        let (_, from, started) = self.measured_from.filter(|(index, from, _)| *index == stage.index && taken >= from + MEASURED)?;
+        let (index, from, started) = self.measured_from.filter(|(_, from, _)| taken >= from + MEASURED)?;
         let unit = (now - started) / (taken - from) as f64 / step_cost(stage);
-        let (last, earlier) = plan.split_last()?;
+        let last = plan.last()?;
         let evaluation = self.evaluation.as_ref().map_or(0.0, |of| of(trainer.model()) * last.ray_cost / stage.ray_cost);
-        let to_come = |stage: &PlannedStage| stage.steps - taken.saturating_sub(stage.first).min(stage.steps);
-        let before: f64 = earlier.iter().map(|stage| to_come(stage) as f64 * step_cost(stage)).sum();
-        let left = ((self.time.seconds - self.time.kept_for(evaluation) - now) / unit - before) / step_cost(last);
-        let (first, steps) = (last.first, taken.saturating_sub(last.first) + left.round().max(1.0) as u64);
-        let adjusted = self.recipe.with_last_stage(steps, taken);
+        let left = self.time.seconds - self.time.kept_for(evaluation) - now;
+        let adjusted = self.recipe.with_left(&self.asked, trainer.model(), left / unit, taken);
         assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
         trainer.replan(|model| adjusted.clone().change(model));
         self.recipe = adjusted;
+        self.measured_from = Some((index, taken, now));
         let until = self.recipe.steps_before_length_matters();
-        let again = if first == 0 {
-            self.measured_from = Some((0, taken, now));
-            Some(taken.midpoint(until)).filter(|next| *next >= taken + MEASURED)
-        } else {
-            (!self.adjusted).then(|| second_adjustment(first, until))
-        };
-        (self.adjust_at, self.adjusted) = (again, true);
+        let apart = (APART * until as f64).max(MEASURED as f64) as u64;
+        self.adjust_at = Some(taken.midpoint(until)).filter(|next| *next >= taken + apart);
         self.recipe.clone().set(&mut self.config);
         Some(self.config.clone())
     }
-}
-
-/// Returns the number of steps after which a plan is adjusted for the second time; its last stage begins after `first` steps, and its length matters after
-/// `until`.
-fn second_adjustment(first: u64, until: u64) -> u64 {
-    const MANY: u64 = 4 * MEASURED;
-    // After steps from which the speed is known, and before steps that let the stage become shorter.
-    if until > first + MANY { first.midpoint(until) } else { until - until / 12 }
 }
 
 #[cfg(test)]
@@ -274,14 +264,14 @@ mod tests {
     #[test]
     fn measured_steps_of_the_plan_are_those_of_a_run_from_the_beginning() {
         let asked = recipe(&[(8, 2000), (12, 40_000), (40, 100_000)]);
-        let Planned { recipe, begun } = planned(&asked, TimeBudget::of_training(1.0), true).unwrap();
+        let Planned { recipe, begun, .. } = planned(&asked, TimeBudget::of_training(1.0), true).unwrap();
         assert_eq!((recipe.short, recipe.hidden, recipe.group), (None, 4, 0.2));
         let Begun { trainer: begun, reports } = begun.expect("a short plan is what a second leads to");
         assert!(reports.len() as u64 == begun.steps_taken() && reports.len() >= 24 && recipe.stages[0].steps > begun.steps_taken());
         assert!(reports.iter().all(|(report, _)| !report.ends_stage) && reports.is_sorted_by_key(|(_, seconds)| *seconds));
         assert_eq!(begun.model().settings(), serde_json::json!(recipe));
         // Fewer steps at the end, so that the test is short.
-        let less = recipe.with_last_stage(1, begun.steps_taken());
+        let less = recipe.with_left(&recipe, begun.model(), 0.0, begun.steps_taken());
         let mut going_on = begun;
         going_on.replan(|model| less.clone().change(model));
         assert_eq!(trained(going_on), trained(trainer(&less).unwrap()));
@@ -313,7 +303,7 @@ mod tests {
         let asked = recipe(&[(8, 100), (16, 200)]);
         // So long that the network stays, and too long for any steps to be guessed.
         let unlikely = tensorf::Config { short: Some(Short { below: 1e-9, ..asked.short.unwrap() }), last_rate: 0.5, ..asked };
-        let Planned { recipe, begun } = planned(&unlikely, TimeBudget::of_training(1.0), true).unwrap();
+        let Planned { recipe, begun, .. } = planned(&unlikely, TimeBudget::of_training(1.0), true).unwrap();
         assert!(begun.is_none() && recipe.hidden == 8);
         assert!(planned(&unlikely, TimeBudget::of_training(1e-9), true).err().unwrap().to_string().contains("--time"));
     }
@@ -323,7 +313,7 @@ mod tests {
         let with_cool_down = |cool_down: f64| tensorf::Config { short: None, cool_down, ..recipe(&[(8, 30), (8, 200)]) };
         for (cool_down, of_a_step) in [(0.4, 0.2), (0.4, 0.5), (0.4, 1.0), (0.75, 0.2), (0.75, 0.3), (0.75, 10.0)] {
             let asked = with_cool_down(cool_down);
-            let mut pace = Pace::new(asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
+            let mut pace = Pace::new(asked.clone(), asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
             let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
             while trainer.step().unwrap().is_some() {
                 // From the 35th step on, steps take a tenth longer.
@@ -331,7 +321,7 @@ mod tests {
                 let now = of_a_step * (taken + 0.1 * (taken - 35.0).max(0.0));
                 plans.extend(pace.after_step(&mut trainer, now).and_then(|config| config.tensorf));
             }
-            assert_eq!(plans.len(), 2, "{cool_down}, {of_a_step}");
+            assert!((1..5).contains(&plans.len()), "{cool_down}, {of_a_step}: {}", plans.len());
             let took = of_a_step * (1.1 * trainer.steps_taken() as f64 - 3.5);
             assert!((took - 100.0).abs() < 2.0 || of_a_step > 5.0, "{cool_down}, {of_a_step}: {took}");
             let again = super::tests::trainer(plans.last().unwrap()).unwrap();
@@ -339,7 +329,7 @@ mod tests {
         }
         // Rates that fall from the first step on know the whole length.
         let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };
-        assert!(Pace::new(falling, Config::default(), TimeBudget::of_training(100.0), None).adjust_at.is_none());
+        assert!(Pace::new(falling.clone(), falling, Config::default(), TimeBudget::of_training(100.0), None).adjust_at.is_none());
     }
 
     #[test]
@@ -348,7 +338,7 @@ mod tests {
         for (spent, evaluation, trained) in [(0.0, 30.0, 70.0), (0.0, 80.0, 50.0), (20.0, 30.0, 50.0), (20.0, 80.0, 40.0)] {
             let time = TimeBudget { seconds: 100.0, spent, evaluated: 1.0 };
             let asked = tensorf::Config { short: None, ..recipe(&[(8, 30), (8, 200)]) };
-            let mut pace = Pace::new(asked.clone(), Config::default(), time, Some(Box::new(move |_| evaluation)));
+            let mut pace = Pace::new(asked.clone(), asked.clone(), Config::default(), time, Some(Box::new(move |_| evaluation)));
             let mut trainer = trainer(&asked).unwrap();
             while trainer.step().unwrap().is_some() {
                 let now = spent + 0.5 * trainer.steps_taken() as f64;
@@ -374,7 +364,7 @@ mod tests {
             stages: vec![ngp::Stage { steps: 300, rays: 16 }],
             ..ngp::Config::default()
         };
-        let mut pace = Pace::new(asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
+        let mut pace = Pace::new(asked.clone(), asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
         let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
         // The first twenty steps take 0.33 seconds, as the plan expects, and the others 0.1.
         let seconds = |taken: u64| 0.1 * taken as f64 + 0.23 * taken.min(20) as f64;

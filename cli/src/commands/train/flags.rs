@@ -127,7 +127,7 @@ pub struct TrainArgs {
 
     /// Duration of training on this machine, such as 90s, 5m or 1h. The program measures the speed of the machine, scales the lengths of all
     /// stages, and reduces the resolution of the finest stages if the time is short. With the presets quality, tensorf, photos and
-    /// ngp, the length of the last stage is adjusted during training. If the time is short, quality, tensorf and photos have a smaller color
+    /// ngp, the stages to come are adjusted during training. If the time is short, quality, tensorf and photos have a smaller color
     /// network (tensorf.short). The settings record the plan
     #[arg(long, value_name = "DURATION", help_heading = "Settings", value_parser = duration, allow_hyphen_values = true)]
     pub time: Option<f64>,

@@ -76,14 +76,20 @@ impl Recipe for Config {
         self.steps_at_full_rate()
     }
 
-    fn with_last_stage(&self, steps: u64, taken: u64) -> Self {
+    fn with_left(&self, _: &Self, _: &Ngp<f32>, left: f64, taken: u64) -> Self {
         let total: u64 = self.stages.iter().map(|stage| stage.steps).sum();
         let mut stages = self.stages.clone();
         let Some((last, earlier)) = stages.split_last_mut() else { return self.clone() };
         let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
+        let mut first = 0;
+        let to_come = earlier.iter().map(|stage| {
+            first += stage.steps;
+            first.saturating_sub(taken).min(stage.steps) as f64 * stage.rays as f64
+        });
+        let steps = (left - to_come.sum::<f64>()) / last.rays as f64;
         // The rates decay after the steps that were taken.
         let least = (taken + 1) as f64 * total as f64 / self.decay_from.clamp(1, total) as f64;
-        let total_steps = (before + steps).max(least.ceil() as u64 + 1);
+        let total_steps = (before.max(taken) + steps.round().max(1.0) as u64).max(least.ceil() as u64 + 1);
         last.steps = total_steps - before;
         Config { stages, ..self.clone() }.with_decays_of(self, total_steps as f64 / total as f64)
     }

@@ -11,7 +11,7 @@ use crate::render::Engine;
 use crate::space::{Region, Space};
 use crate::train::StageLength;
 use autograd::parallel;
-use std::iter;
+use std::{iter, mem};
 
 impl Recipe for Config {
     type Model = Tensorf<f32>;
@@ -112,12 +112,21 @@ impl Recipe for Config {
         self.steps_at_full_rate()
     }
 
-    fn with_last_stage(&self, steps: u64, taken: u64) -> Self {
-        let mut stages = self.stages.clone();
+    fn with_left(&self, asked: &Self, model: &Tensorf<f32>, left: f64, taken: u64) -> Self {
+        let costs = self.cost_in(model.space);
+        let firsts = self.stages.iter().scan(0, |first, stage| Some(mem::replace(first, *first + stage.steps)));
+        let spent = |(first, stage): (u64, &Stage)| taken.saturating_sub(first).min(stage.steps) as f64 * costs.step(stage);
+        let spent: f64 = firsts.clone().zip(&self.stages).map(spent).sum();
+        let mut stages = costs.scaled(&asked.stages, spent + left.max(0.0), 0);
+        // What has begun stays.
+        let begun = firsts.zip(&self.stages).take_while(|(first, _)| *first <= taken);
+        stages.iter_mut().zip(begun).for_each(|(stage, (_, begun))| *stage = *begun);
         if let Some((last, earlier)) = stages.split_last_mut() {
-            let least = ((taken + 2) as f64 / (1.0 - self.cool_down)).ceil() as u64;
             let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
-            last.steps = steps.max(least.saturating_sub(before));
+            let steps = (spent + left - costs.total(earlier)) / costs.step(last);
+            // The learning rates fall after the steps that were taken.
+            let least = ((taken + 2) as f64 / (1.0 - self.cool_down)).ceil() as u64;
+            last.steps = (steps.round().max(1.0) as u64).max(least.saturating_sub(before));
         }
         Config { stages, ..self.clone() }
     }
@@ -277,5 +286,26 @@ mod tests {
         assert!((costs.total(&planned[0].stages) / (0.2 * whole / 0.7) - 1.0).abs() < 0.05);
         // Without them, a short run has the same network.
         assert_eq!(Config { short: None, ..config }.planned(costs, 0.2 * whole, 0).hidden, 128);
+    }
+
+    #[test]
+    fn stages_to_come_are_those_of_a_plan_that_knew_the_speed_and_begun_ones_stay() {
+        let asked = Config { density_components: 2, appearance_components: 2, short: None, ..Config::default() };
+        let region = Region { space: Space::Box, aabb: crate::geometry::Aabb::cube(1.5) };
+        let model = Recipe::model(&asked, &RunConfig::default(), region).unwrap();
+        let costs = asked.cost_in(Space::Box);
+        let whole = costs.total(&asked.stages);
+        let slow = asked.with_cost(&model, 0.2 * whole, 0);
+        let knowing = asked.with_cost(&model, 0.8 * whole, 0);
+        let taken = slow.stages[0].steps + 5;
+        let spent = costs.total(&slow.stages[..1]) + 5.0 * costs.step(&slow.stages[1]);
+        let adjusted = slow.with_left(&asked, &model, 0.8 * whole - spent, taken);
+        assert_eq!((&adjusted.stages[..2], &adjusted.stages[2..4]), (&slow.stages[..2], &knowing.stages[2..4]));
+        assert!(adjusted.stages[4].resolution == knowing.stages[4].resolution && slow.stages[4].resolution < knowing.stages[4].resolution);
+        assert!((costs.total(&adjusted.stages) / (0.8 * whole) - 1.0).abs() < 0.01);
+        // In the last stage, only its length changes, and no step that was taken.
+        let late = slow.with_left(&asked, &model, 0.0, slow.total_steps() - 50);
+        assert_eq!((&late.stages[..4], late.stages[4].resolution), (&slow.stages[..4], slow.stages[4].resolution));
+        assert!(late.steps_at_full_rate() > slow.total_steps() - 50);
     }
 }

@@ -51,7 +51,7 @@ pub enum Event<'a> {
         /// The history of a resumed run.
         history: &'a History,
     },
-    /// The plan has changed: the last stage was adjusted to the measured speed ([`Pace`](crate::run::pace::Pace)).
+    /// The plan has changed: the stages to come were adjusted to the measured speed ([`Pace`](crate::run::pace::Pace)).
     Planned {
         /// The stages with their steps.
         plan: &'a [PlannedStage],

@@ -57,6 +57,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
         // The schedule of the poses counts all steps of the run.
         let adjusts = !config.losses.contains_key(POSES);
         let planned = clocks.train.time(|| pace::plan(&recipe, time, adjusts, begin))?;
+        let asked = planned.asked;
         (recipe, begun) = (planned.recipe, planned.begun);
         let stages = recipe.stages().into_iter().map(|stage| match stage.resolution {
             Some(resolution) => format!("{} at up to {resolution}³", stage.steps),
@@ -76,7 +77,7 @@ pub fn train<R: Recipe + Clone>(settings: &RunSettings, recipe: &R, losses: &Mak
                 let viewer = Viewer::of(model, &view);
                 start.elapsed().as_secs_f64() + viewer.seconds_for(&evaluated)
             };
-            Pace::new(recipe.clone(), config.clone(), time, settings.with_evaluation.then(|| Box::new(evaluation) as _))
+            Pace::new(recipe.clone(), asked, config.clone(), time, settings.with_evaluation.then(|| Box::new(evaluation) as _))
         });
     }
     let NewRun { config, views, clocks, .. } = &mut run;
