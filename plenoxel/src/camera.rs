@@ -9,6 +9,7 @@ pub mod placement;
 pub(crate) mod projection;
 mod tracked;
 
+use autograd::{Real, Tensor};
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use lens::Lens;
 pub use tracked::TrackedRays;
@@ -122,6 +123,12 @@ pub struct Ray {
     /// is 1 in the image centre and grows towards the corners. For a fisheye, whose rays may be at right angles to the axis, it is 1: depth
     /// is the distance from the camera.
     pub stretch: f64,
+}
+
+/// Returns the directions of rays, `[n, 3]`.
+pub(crate) fn directions<T: Real>(rays: &[Ray]) -> Tensor<T> {
+    let directions: Vec<[T; 3]> = rays.iter().map(|ray| ray.direction.to_array().map(T::lit)).collect();
+    Tensor::from_vec(directions.into_flattened(), &[rays.len(), 3])
 }
 
 /// Camera: intrinsics and pose.

@@ -10,7 +10,7 @@ mod tracked;
 mod visible;
 pub mod walk;
 
-use crate::camera::Ray;
+use crate::camera::{self, Ray};
 use crate::geometry::Aabb;
 use crate::random::{self, Purpose, Stream, uniform};
 use crate::space::{Bend, Space, contract};
@@ -450,12 +450,11 @@ fn packed<T: Real>(rays: &[Ray], counts: impl Iterator<Item = u32>, place: impl 
             place(r, &mut slots);
         }
     });
-    let directions: Vec<T> = rays.iter().flat_map(|r| r.direction.to_array()).map(T::lit).collect();
     Samples {
         t: Tensor::from_buffer(t, &[m]),
         delta: Tensor::from_buffer(delta, &[m]),
         positions: Tensor::from_buffer(positions, &[m, 3]),
-        directions: Tensor::from_vec(directions, &[rays.len(), 3]),
+        directions: camera::directions(rays),
         offsets: offsets.into(),
     }
 }

@@ -20,7 +20,7 @@ mod positions;
 mod pruning;
 
 use super::{Factored, Shape};
-use crate::camera::{Ray, TrackedRays};
+use crate::camera::{self, Ray, TrackedRays};
 use crate::field::grouping::{self, Grouping, Groups};
 use crate::geometry::Aabb;
 use crate::render::along::{COLUMNS, column};
@@ -114,7 +114,7 @@ pub fn render_picture<T: Real>(field: &Factored<T>, densities: &Densities<T>, ra
 
 /// Returns the directions of rays, `[n, 3]`, and their encodings, `[n, e]`.
 fn directions_of<T: Real>(field: &Factored<T>, rays: &[Ray]) -> (Tensor<T>, Tensor<T>) {
-    let directions = Tensor::from_vec(rays.iter().flat_map(|ray| ray.direction.to_array()).map(T::lit).collect(), &[rays.len(), 3]);
+    let directions = camera::directions(rays);
     let encoded = autograd::no_grad(|| field.shape.directions.encode(&directions));
     (directions, encoded)
 }

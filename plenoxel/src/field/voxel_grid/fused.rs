@@ -35,7 +35,7 @@ mod sorted;
 
 use super::layout::Layout;
 use super::{Color, VoxelGrid};
-use crate::camera::Ray;
+use crate::camera::{self, Ray};
 use crate::field::{Field, sh};
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, RenderOptions, Rendered, composite};
@@ -122,10 +122,8 @@ impl<T: Real> render::Columns<T> for Columns<T> {
 
 impl<T: Real> Batch<T> {
     fn new(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Self {
-        let n = rays.len();
-        let directions = Tensor::from_vec(rays.iter().flat_map(|r| r.direction.to_array()).map(T::lit).collect(), &[n, 3]);
         let background = options.background.map(|c| T::lit(f64::from(c)));
-        Batch { layout: grid.layout().clone(), background, directions, basis: OnceLock::new() }
+        Batch { layout: grid.layout().clone(), background, directions: camera::directions(rays), basis: OnceLock::new() }
     }
 
     /// Returns the harmonics of each ray's direction, `[n, (degree + 1)²]`; `[n, 0]` for RGB. The first call must not be in a parallel task: it is parallel itself.
