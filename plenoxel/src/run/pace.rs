@@ -156,9 +156,20 @@ pub struct Pace<R: Recipe> {
     evaluation: Option<Evaluation<R::Model>>,
     /// Number of steps after which the plan is adjusted next; `None` if it is not.
     adjust_at: Option<u64>,
-    /// Stage and number of steps from which on the speed is measured, and seconds that were spent until then: the first step that was seen of the stage, or the
-    /// last adjustment in it.
-    measured_from: Option<(usize, u64, f64)>,
+    /// From where on the speed is measured: from the first step that was seen of a stage, or from the last adjustment but one in it. Speeds since the last
+    /// adjustment alone changed by 5 percent from one to the next on a machine that others use too.
+    measured_from: Option<Mark>,
+    /// The last adjustment.
+    adjusted: Option<Mark>,
+}
+
+/// Place in a run.
+#[derive(Clone, Copy, Debug)]
+struct Mark {
+    stage: usize,
+    /// Steps that were taken in the run, and seconds that were spent.
+    taken: u64,
+    now: f64,
 }
 
 /// Fewest steps of a stage from which the speed is taken.
@@ -173,16 +184,17 @@ impl<R: Recipe + Clone> Pace<R> {
     pub fn new(recipe: R, asked: R, config: Config, time: TimeBudget, evaluation: Option<Evaluation<R::Model>>) -> Self {
         let until = recipe.steps_before_length_matters();
         let adjust_at = (until > 0).then_some(until / 3);
-        Pace { recipe, asked, config, time, evaluation, adjust_at, measured_from: None }
+        Pace { recipe, asked, config, time, evaluation, adjust_at, measured_from: None, adjusted: None }
     }
 
     /// Looks at the time after a step; `now` is how much of it is spent, in seconds. Returns the new configuration if the plan changed.
     pub fn after_step(&mut self, trainer: &mut Trainer<f32, R::Model>, now: f64) -> Option<Config> {
         let (taken, plan) = (trainer.steps_taken(), trainer.plan());
         let stage = plan.iter().find(|stage| taken <= stage.first + stage.steps)?;
+        let here = Mark { stage: stage.index, taken, now };
         // The step that begins a stage is not measured.
-        if self.measured_from.is_none_or(|(index, ..)| index != stage.index) {
-            self.measured_from = Some((stage.index, taken, now));
+        if self.measured_from.is_none_or(|from| from.stage != here.stage) {
+            self.measured_from = Some(here);
         }
         if taken < self.adjust_at? {
             return None;
@@ -191,8 +203,8 @@ impl<R: Recipe + Clone> Pace<R> {
             self.adjust_at = None;
             return None;
         }
-        let (index, from, started) = self.measured_from.filter(|(_, from, _)| taken >= from + MEASURED)?;
-        let unit = (now - started) / (taken - from) as f64 / step_cost(stage);
+        let from = self.measured_from.filter(|from| taken >= from.taken + MEASURED)?;
+        let unit = (now - from.now) / (taken - from.taken) as f64 / step_cost(stage);
         let last = plan.last()?;
         let evaluation = self.evaluation.as_ref().map_or(0.0, |of| of(trainer.model()) * last.ray_cost / stage.ray_cost);
         let left = self.time.seconds - self.time.kept_for(evaluation) - now;
@@ -200,7 +212,8 @@ impl<R: Recipe + Clone> Pace<R> {
         assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
         trainer.replan(|model| adjusted.clone().change(model));
         self.recipe = adjusted;
-        self.measured_from = Some((index, taken, now));
+        self.measured_from = self.adjusted.filter(|last| last.stage == here.stage).or(self.measured_from);
+        self.adjusted = Some(here);
         let until = self.recipe.steps_before_length_matters();
         let apart = (APART * until as f64).max(MEASURED as f64) as u64;
         self.adjust_at = Some(taken.midpoint(until)).filter(|next| *next >= taken + apart);
