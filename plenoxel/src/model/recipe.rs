@@ -100,7 +100,7 @@ pub trait Recipe: Send + Sync {
         false
     }
 
-    /// Returns the number of first steps that stay the same if the last stage becomes longer. Default: 0.
+    /// Returns the number of first steps that stay the same if later stages change. Default: 0.
     fn steps_before_length_matters(&self) -> u64 {
         0
     }

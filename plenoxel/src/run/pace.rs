@@ -206,14 +206,17 @@ impl<R: Recipe + Clone> Pace<R> {
         let from = self.measured_from.filter(|from| taken >= from.taken + MEASURED)?;
         let unit = (now - from.now) / (taken - from.taken) as f64 / step_cost(stage);
         let last = plan.last()?;
+        let start = Instant::now();
         let evaluation = self.evaluation.as_ref().map_or(0.0, |of| of(trainer.model()) * last.ray_cost / stage.ray_cost);
+        // Time that is spent here is not that of a step.
+        let now = now + start.elapsed().as_secs_f64();
         let left = self.time.seconds - self.time.kept_for(evaluation) - now;
         let adjusted = self.recipe.with_left(&self.asked, trainer.model(), left / unit, taken);
         assert!(adjusted.begins_as(&self.recipe, taken), "the steps before belong to both plans");
         trainer.replan(|model| adjusted.clone().change(model));
         self.recipe = adjusted;
         self.measured_from = self.adjusted.filter(|last| last.stage == here.stage).or(self.measured_from);
-        self.adjusted = Some(here);
+        self.adjusted = Some(Mark { now, ..here });
         let until = self.recipe.steps_before_length_matters();
         let apart = (APART * until as f64).max(MEASURED as f64) as u64;
         self.adjust_at = Some(taken.midpoint(until)).filter(|next| *next >= taken + apart);

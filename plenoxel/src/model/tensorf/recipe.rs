@@ -118,9 +118,17 @@ impl Recipe for Config {
         let spent = |(first, stage): (u64, &Stage)| taken.saturating_sub(first).min(stage.steps) as f64 * costs.step(stage);
         let spent: f64 = firsts.clone().zip(&self.stages).map(spent).sum();
         let mut stages = costs.scaled(&asked.stages, spent + left.max(0.0), 0);
-        // What has begun stays.
-        let begun = firsts.zip(&self.stages).take_while(|(first, _)| *first <= taken);
-        stages.iter_mut().zip(begun).for_each(|(stage, (_, begun))| *stage = *begun);
+        // What has begun stays, later stages are not coarser, and steps have the rays of the plan.
+        let mut finest = 0;
+        for (stage, (first, planned)) in stages.iter_mut().zip(firsts.zip(&self.stages)) {
+            if first <= taken {
+                *stage = *planned;
+                finest = planned.resolution;
+            }
+            stage.resolution = stage.resolution.max(finest);
+            stage.steps = (stage.steps as f64 * stage.rays as f64 / planned.rays as f64).round() as u64;
+            stage.rays = planned.rays;
+        }
         if let Some((last, earlier)) = stages.split_last_mut() {
             let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
             let steps = (spent + left - costs.total(earlier)) / costs.step(last);
@@ -307,5 +315,8 @@ mod tests {
         let late = slow.with_left(&asked, &model, 0.0, slow.total_steps() - 50);
         assert_eq!((&late.stages[..4], late.stages[4].resolution), (&slow.stages[..4], slow.stages[4].resolution));
         assert!(late.steps_at_full_rate() > slow.total_steps() - 50);
+        // A slower machine does not make the planes coarser.
+        let slower = slow.with_left(&asked, &model, 1.0, taken + slow.stages[1].steps + slow.stages[2].steps);
+        assert!(slower.stages.is_sorted_by_key(|stage| stage.resolution));
     }
 }
