@@ -25,7 +25,7 @@ const SEARCH_EVERY: u64 = 250;
 struct Clock {
     /// Number of requests.
     requests: u64,
-    /// Their sizes in all.
+    /// Sum of the sizes of the requests.
     bytes: u64,
 }
 

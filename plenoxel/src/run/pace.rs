@@ -156,8 +156,8 @@ pub struct Pace<R: Recipe> {
     evaluation: Option<Evaluation<R::Model>>,
     /// Number of steps after which the plan is adjusted next; `None` if it is not.
     adjust_at: Option<u64>,
-    /// From where on the speed is measured: from the first step that was seen of a stage, or from the last adjustment but one in it. Speeds since the last
-    /// adjustment alone changed by 5 percent from one to the next on a machine that others use too.
+    /// Start of the steps whose speed is measured: the first step that was seen of a stage, or the last adjustment but one in it. The speed after the last
+    /// adjustment alone is less certain: it differed by 5 percent from that of later steps.
     measured_from: Option<Mark>,
     /// The last adjustment.
     adjusted: Option<Mark>,

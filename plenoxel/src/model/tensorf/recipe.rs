@@ -122,12 +122,12 @@ impl Recipe for Config {
         let mut finest = 0;
         for (stage, (first, planned)) in stages.iter_mut().zip(firsts.zip(&self.stages)) {
             if first <= taken {
-                *stage = *planned;
                 finest = planned.resolution;
+                *stage = *planned;
+            } else {
+                let steps = (stage.steps as f64 * stage.rays as f64 / planned.rays as f64).round().max(1.0) as u64;
+                *stage = Stage { resolution: stage.resolution.max(finest), steps, rays: planned.rays };
             }
-            stage.resolution = stage.resolution.max(finest);
-            stage.steps = (stage.steps as f64 * stage.rays as f64 / planned.rays as f64).round() as u64;
-            stage.rays = planned.rays;
         }
         if let Some((last, earlier)) = stages.split_last_mut() {
             let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
