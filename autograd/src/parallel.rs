@@ -10,7 +10,7 @@ mod update;
 
 use crate::pool::Pooled;
 use crate::real::Real;
-pub use gather::{gathered, gathered_around};
+pub use gather::{gathered, pairs_around};
 pub use prefetch::prefetch;
 use rayon::prelude::*;
 pub(crate) use update::update;

@@ -17,8 +17,8 @@ use crate::space::{Bend, Space, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
 use occupancy::Along;
-pub(crate) use occupancy::Look;
 pub use occupancy::Occupancy;
+pub(crate) use occupancy::{Look, distances};
 pub use running::{Refresh, RunningOccupancy};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -115,11 +115,11 @@ impl<T: Real> Samples<T> {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct March {
     pub(crate) count: usize,
-    near: f64,
-    far: f64,
+    pub(crate) near: f64,
+    pub(crate) far: f64,
     /// Start of the step with k = 1 (`Step`), or the first point (`Points`).
-    start: f64,
-    step: f64,
+    pub(crate) start: f64,
+    pub(crate) step: f64,
     points: bool,
     /// Path of the ray, if it is not straight.
     bend: Option<Bend>,
@@ -180,6 +180,15 @@ impl March {
     #[inline(always)]
     fn boundary(&self, k: usize) -> f64 {
         self.start + (f64::from(k as u32) - 1.0) * self.step
+    }
+
+    /// Returns a march with the same intervals that is not one of points: interval k is from `near`, or `start` + (k − 1) `step`, to `start` + k `step`, or `far`.
+    pub(crate) fn of_steps(self) -> Self {
+        if !self.points {
+            return self;
+        }
+        let boundary = |k: f64| self.start + (k - 0.5) * self.step;
+        March { near: boundary(0.0), far: boundary(self.count as f64), start: boundary(1.0), points: false, ..self }
     }
 
     /// Returns the middles and the lengths of the intervals from `first` on.

@@ -3,113 +3,230 @@
 //! Nodes are in bricks of 4³ cells. Bricks share the nodes of their faces, so the eight nodes of a cell are in one brick: a sample reads the place of its brick
 //! once, and eight numbers near each other.
 
+use crate::sampling::distances;
 use autograd::lattice::{BRICK, BrickGrid};
-use autograd::parallel::{gathered, gathered_around};
-use autograd::{Real, dispatched, parallel};
+use autograd::parallel::{gathered, pairs_around};
+use autograd::{Buffer, Real, dispatched, parallel};
+use std::sync::Arc;
 
 /// Nodes along the side of a brick of cells.
 pub const SIDE: usize = BRICK + 1;
 /// Entries of a brick in the table: its nodes in row-major order, and some that are not used.
 pub const ENTRIES: usize = 128;
-/// Offsets of the entries of the nodes of a cell from that of its lowest node; along z first.
-const CORNERS: [u32; 8] = {
-    const X: u32 = (SIDE * SIDE) as u32;
-    const Y: u32 = SIDE as u32;
-    [0, 1, Y, Y + 1, X, X + 1, X + Y, X + Y + 1]
-};
+/// Offsets of the entries of the lower nodes of the edges of a cell along z from that of its lowest node. The upper nodes are the next entries.
+const EDGES: [u32; 4] = [0, SIDE as u32, (SIDE * SIDE) as u32, (SIDE * SIDE + SIDE) as u32];
+/// Number of entries from the lowest node of a cell to the highest.
+const CELL: usize = EDGES[3] as usize + 2;
 /// Bricks that one task computes.
 pub const TOGETHER: usize = 256;
 
-/// Table of a value at the nodes of a grid.
-#[derive(Debug)]
-pub struct NodeTable<T> {
-    nodes: [usize; 3],
-    bricks: BrickGrid,
-    /// Place of each brick in the table; 0 for those that are not stored.
-    links: Vec<u32>,
-    values: Vec<T>,
+/// Smallest link of a brick that is not stored.
+const EMPTY: u32 = 1 << 31;
+
+/// Returns the place of a brick from its link; 0 if it is not stored.
+#[inline(always)]
+fn place_of(link: u32) -> u32 {
+    if link >= EMPTY { 0 } else { link }
 }
 
-impl<T: Real> NodeTable<T> {
+/// Bricks of a grid whose nodes have values in tables.
+#[derive(Debug)]
+pub struct StoredBricks {
+    nodes: [usize; 3],
+    grid: BrickGrid,
+    /// Place of each brick in the tables, from 1 on. For those that are not stored, [`EMPTY`] plus the distance to the nearest stored brick ([`distances`]).
+    links: Buffer<u32>,
+    /// Numbers of the stored bricks.
+    stored: Vec<u32>,
+}
+
+impl StoredBricks {
+    /// Takes the numbers of stored bricks in the [`BrickGrid`] of the cells of a grid, which has two nodes or more along each axis. `None` if a table of them
+    /// has more than 2³² entries.
+    pub fn new(nodes: [usize; 3], stored: Vec<u32>) -> Option<Self> {
+        if Self::entries(stored.len()) > u32::MAX as usize {
+            return None;
+        }
+        let grid = BrickGrid::new(nodes.map(|n| n - 1));
+        let mut masks = vec![0; grid.len()];
+        stored.iter().for_each(|&brick| masks[brick as usize] = 1);
+        let mut links = Buffer::stale(grid.len());
+        links.iter_mut().zip(distances(&masks, grid.count())).for_each(|(link, distance)| *link = EMPTY + u32::from(distance));
+        for (place, &brick) in (1..).zip(&stored) {
+            links[brick as usize] = place;
+        }
+        Some(StoredBricks { nodes, grid, links, stored })
+    }
+
     /// Returns the number of entries of a table with this number of bricks.
     pub fn entries(bricks: usize) -> usize {
         ENTRIES * (bricks + 1)
     }
+}
 
-    /// Computes the table of a grid with two nodes or more along each axis. `stored` has the numbers of bricks in the [`BrickGrid`] of cells; nodes of other
-    /// bricks have the value `elsewhere`. `values(brick)` returns the values of a brick.
-    ///
-    /// Panics if the table has more than 2³² entries.
-    pub fn new(nodes: [usize; 3], stored: &[u32], elsewhere: T, values: impl Fn(u32) -> [T; ENTRIES] + Sync) -> Self {
-        let bricks = BrickGrid::new(nodes.map(|n| n - 1));
-        let entries = Self::entries(stored.len());
-        assert!(entries <= u32::MAX as usize, "a table of {entries} entries: entries have numbers of 32 bits");
-        let mut links = vec![0; bricks.len()];
-        for (place, &brick) in (1..).zip(stored) {
-            links[brick as usize] = place;
-        }
-        let mut table = vec![elsewhere; entries];
-        parallel::for_each_chunk(&mut table[ENTRIES..], TOGETHER * ENTRIES, |first, of_bricks| {
-            for (to, &brick) in of_bricks.chunks_exact_mut(ENTRIES).zip(&stored[first / ENTRIES..]) {
-                to.copy_from_slice(&values(brick));
+/// Table of `WIDTH` numbers at each node of a grid.
+#[derive(Debug)]
+pub struct NodeTable<T: Real, const WIDTH: usize = 1> {
+    bricks: Arc<StoredBricks>,
+    values: Buffer<T>,
+}
+
+impl<T: Real, const WIDTH: usize> NodeTable<T, WIDTH> {
+    /// Computes the table of stored bricks. `values(brick)` returns the values of a brick; nodes of other bricks have the value `elsewhere`.
+    pub fn new(bricks: Arc<StoredBricks>, elsewhere: [T; WIDTH], values: impl Fn(u32) -> [[T; WIDTH]; ENTRIES] + Sync) -> Self {
+        let of_brick = WIDTH * ENTRIES;
+        let mut table = Buffer::stale(WIDTH * StoredBricks::entries(bricks.stored.len()));
+        let (of_others, rest) = table.split_at_mut(of_brick);
+        of_others.as_chunks_mut().0.fill(elsewhere);
+        parallel::for_each_chunk(rest, TOGETHER * of_brick, |first, of_bricks| {
+            for (to, &brick) in of_bricks.chunks_exact_mut(of_brick).zip(&bricks.stored[first / of_brick..]) {
+                to.copy_from_slice(values(brick).as_flattened());
             }
         });
-        NodeTable { nodes, bricks, links, values: table }
+        NodeTable { bricks, values: table }
+    }
+
+    pub fn bricks(&self) -> &Arc<StoredBricks> {
+        &self.bricks
     }
 
     /// Returns the value at a node.
-    pub fn value(&self, node: [usize; 3]) -> T {
-        let place = [0, 1, 2].map(|a| node[a].min(self.nodes[a] - 2) / BRICK);
+    pub fn value(&self, node: [usize; 3]) -> [T; WIDTH] {
+        let StoredBricks { nodes, grid, links, .. } = &*self.bricks;
+        let place = [0, 1, 2].map(|a| node[a].min(nodes[a] - 2) / BRICK);
         let [i, j, k] = [0, 1, 2].map(|a| node[a] - BRICK * place[a]);
-        self.values[self.links[self.bricks.number(place)] as usize * ENTRIES + (i * SIDE + j) * SIDE + k]
+        self.values.as_chunks().0[place_of(links[grid.number(place)]) as usize * ENTRIES + (i * SIDE + j) * SIDE + k]
     }
 }
 
-dispatched! {
-/// Interpolates the values of `N` positions trilinearly. `at` has x, y and z of each, in cells; nodes are at whole numbers. Positions outside of the
-/// nodes are moved to the nearest one inside. Returns false if none of their bricks is stored; the values are then not written.
-#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-pub fn interpolate<T: Real, const N: usize, const FUSED: bool>(table: &NodeTable<T>, at: [&[T; N]; 3], values: &mut [T; N]) -> bool {
-    let mut share = [[T::zero(); N]; 3];
-    let (mut numbers, mut entries) = ([0; N], [0; N]);
-    for a in 0..3 {
-        let (bricks, most) = (table.bricks.count()[a] as u32, table.nodes[a] as u32 - 2);
-        let last = T::lit(f64::from(most + 1));
-        for i in 0..N {
-            let u = at[a][i].max(T::zero()).min(last);
-            let node = u.index().min(most);
-            share[a][i] = u - T::lit(f64::from(node));
-            numbers[i] = numbers[i] * bricks + node / BRICK as u32;
-            entries[i] = entries[i] * SIDE as u32 + node % BRICK as u32;
-        }
-    }
-    let links = gathered(&table.links, numbers);
-    let mut any = 0;
-    for i in 0..N {
-        any |= links[i];
-        entries[i] += links[i] * ENTRIES as u32;
-    }
-    if any == 0 {
-        return false;
-    }
-    // Along z, then y, then x.
-    let corners = gathered_around(&table.values, entries, CORNERS);
-    let mut of_x = [[T::zero(); N]; 2];
-    for x in 0..2 {
-        let mut of_y = [[T::zero(); N]; 2];
-        for y in 0..2 {
-            let (below, above) = (&corners[4 * x + 2 * y], &corners[4 * x + 2 * y + 1]);
+/// Cells that contain `N` positions.
+pub struct Cells<T, const N: usize> {
+    /// Entry of the lowest node of each cell.
+    entries: [u32; N],
+    /// Distances from that node along each axis, in cells.
+    share: [[T; N]; 3],
+    /// Place of the brick along each axis, and its link.
+    bricks: [[u32; N]; 3],
+    links: [u32; N],
+}
+
+impl<T: Real, const N: usize> Cells<T, N> {
+    /// Finds the cells of positions. `at` has x, y and z of each, in cells; nodes are at whole numbers. Positions outside of the nodes are moved to the nearest
+    /// one inside.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+    pub fn find(bricks: &StoredBricks, at: [&[T; N]; 3]) -> Self {
+        let (mut share, mut places) = ([[T::zero(); N]; 3], [[0; N]; 3]);
+        let (mut numbers, mut entries) = ([0; N], [0; N]);
+        for a in 0..3 {
+            let (count, most) = (bricks.grid.count()[a] as u32, bricks.nodes[a] as u32 - 2);
+            let last = T::lit(f64::from(most + 1));
             for i in 0..N {
-                of_y[y][i] = (above[i] - below[i]).multiply_add::<FUSED>(share[2][i], below[i]);
+                let u = at[a][i].max(T::zero()).min(last);
+                let node = u.index().min(most);
+                share[a][i] = u - T::lit(f64::from(node));
+                places[a][i] = node / BRICK as u32;
+                numbers[i] = numbers[i] * count + node / BRICK as u32;
+                entries[i] = entries[i] * SIDE as u32 + node % BRICK as u32;
+            }
+        }
+        let links = gathered(&bricks.links, numbers);
+        for i in 0..N {
+            entries[i] += place_of(links[i]) * ENTRIES as u32;
+        }
+        Cells { entries, share, bricks: places, links }
+    }
+
+    /// Returns the number of positions in stored bricks.
+    #[inline(always)]
+    pub fn stored(&self) -> usize {
+        let mut stored = 0;
+        for i in 0..N {
+            stored += u32::from(self.links[i] < EMPTY);
+        }
+        stored as usize
+    }
+
+    /// Finds along rays, at voxel coordinates origin + t slope with these reciprocals of the slopes, where they leave the bricks around them of which none is
+    /// stored: a lower bound of the distances t. It is −∞ for positions in stored bricks.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+    pub fn exits(&self, origin: &[[f64; N]; 3], per_slope: &[[f64; N]; 3]) -> [f64; N] {
+        let mut exits = [f64::INFINITY; N];
+        for a in 0..3 {
+            for i in 0..N {
+                // All bricks nearer than `free` are empty.
+                let (here, free) = (f64::from(self.bricks[a][i]), f64::from(self.links[i] - EMPTY.min(self.links[i])));
+                let plane = BRICK as f64 * if per_slope[a][i] > 0.0 { here + free } else { here + 1.0 - free };
+                let exit = (plane - origin[a][i]) * per_slope[a][i];
+                exits[i] = if exit < exits[i] { exit } else { exits[i] };
             }
         }
         for i in 0..N {
-            of_x[x][i] = (of_y[1][i] - of_y[0][i]).multiply_add::<FUSED>(share[1][i], of_y[0][i]);
+            exits[i] = if self.links[i] < EMPTY { f64::NEG_INFINITY } else { exits[i] };
         }
+        exits
     }
-    for i in 0..N {
-        values[i] = (of_x[1][i] - of_x[0][i]).multiply_add::<FUSED>(share[0][i], of_x[0][i]);
+
+    /// Interpolates a table of one number a node.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+    pub fn numbers<const FUSED: bool>(&self, table: &NodeTable<T>) -> [T; N] {
+        // Along z, then y, then x.
+        let (edges, share) = (pairs_around(&table.values, self.entries, EDGES), &self.share);
+        let mut of_x = [[T::zero(); N]; 2];
+        for x in 0..2 {
+            let mut of_y = [[T::zero(); N]; 2];
+            for y in 0..2 {
+                let [below, above] = &edges[2 * x + y];
+                for i in 0..N {
+                    of_y[y][i] = (above[i] - below[i]).multiply_add::<FUSED>(share[2][i], below[i]);
+                }
+            }
+            for i in 0..N {
+                of_x[x][i] = (of_y[1][i] - of_y[0][i]).multiply_add::<FUSED>(share[1][i], of_y[0][i]);
+            }
+        }
+        let mut values = [T::zero(); N];
+        for i in 0..N {
+            values[i] = (of_x[1][i] - of_x[0][i]).multiply_add::<FUSED>(share[0][i], of_x[0][i]);
+        }
+        values
     }
-    true
+
+    /// Interpolates a table of four numbers a node at one of the positions.
+    #[inline(always)]
+    pub fn vector<const FUSED: bool>(&self, table: &NodeTable<T, 4>, i: usize) -> [T; 4] {
+        let own: &[[T; 4]; CELL] =
+            table.values.as_chunks().0[self.entries[i] as usize..].first_chunk().expect("the nodes of a cell are in its brick");
+        let [x, y, z] = [self.share[0][i], self.share[1][i], self.share[2][i]];
+        let mut edges = [[T::zero(); 4]; 4];
+        for (edge, &first) in edges.iter_mut().zip(&EDGES) {
+            *edge = between::<T, FUSED>(own[first as usize], own[first as usize + 1], z);
+        }
+        let [low, high] = [between::<T, FUSED>(edges[0], edges[1], y), between::<T, FUSED>(edges[2], edges[3], y)];
+        between::<T, FUSED>(low, high, x)
+    }
+}
+
+/// Returns the vector between two others, at a share of the way.
+#[inline(always)]
+fn between<T: Real, const FUSED: bool>(first: [T; 4], second: [T; 4], share: T) -> [T; 4] {
+    let mut between = [T::zero(); 4];
+    for c in 0..4 {
+        between[c] = (second[c] - first[c]).multiply_add::<FUSED>(share, first[c]);
+    }
+    between
+}
+
+dispatched! {
+/// Interpolates the values of `N` positions trilinearly ([`Cells::find`]). Returns false if none of their bricks is stored; the values are then not written.
+pub fn interpolate<T: Real, const N: usize, const FUSED: bool>(table: &NodeTable<T>, at: [&[T; N]; 3], values: &mut [T; N]) -> bool {
+    let cells = Cells::find(&table.bricks, at);
+    let any = cells.stored() > 0;
+    if any {
+        *values = cells.numbers::<FUSED>(table);
+    }
+    any
 }
 }

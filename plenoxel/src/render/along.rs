@@ -33,40 +33,52 @@ pub struct Along<'a, T> {
     pub after: &'a [T],
 }
 
-/// Sums over the samples of a ray so far, front to back.
+/// Sums over the samples of `N` rays so far, front to back.
 #[derive(Clone, Copy)]
-pub struct Sums<T> {
-    depth: T,
-    opacity: T,
-    optical_depth: T,
-    distortion: T,
+pub struct Sums<T, const N: usize = 1> {
+    depth: [T; N],
+    opacity: [T; N],
+    optical_depth: [T; N],
+    distortion: [T; N],
 }
 
-impl<T: Real> Sums<T> {
+impl<T: Real, const N: usize> Sums<T, N> {
     /// Sums over no samples.
     pub fn new() -> Self {
-        Sums { depth: T::zero(), opacity: T::zero(), optical_depth: T::zero(), distortion: T::zero() }
+        let none = [T::zero(); N];
+        Sums { depth: none, opacity: none, optical_depth: none, distortion: none }
     }
 
-    /// Adds a sample of weight w.
+    /// Adds a sample of weight w to each ray.
     #[inline(always)]
-    pub fn add(&mut self, w: T, t: T, delta: T, sigma: T) {
-        self.distortion += w * (T::lit(2.0) * (t * self.opacity - self.depth) + w * delta * T::lit(1.0 / 3.0));
-        self.depth += w * t;
-        self.opacity += w;
-        self.optical_depth += sigma * delta;
+    pub fn add(&mut self, w: [T; N], t: [T; N], delta: [T; N], sigma: [T; N]) {
+        for i in 0..N {
+            self.distortion[i] += w[i] * (T::lit(2.0) * (t[i] * self.opacity[i] - self.depth[i]) + w[i] * delta[i] * T::lit(1.0 / 3.0));
+            self.depth[i] += w[i] * t[i];
+            self.opacity[i] += w[i];
+            self.optical_depth[i] += sigma[i] * delta[i];
+        }
     }
 
-    /// Returns the columns of the pixel, from Σ wᵢ cᵢ and the transmittance to the background.
+    /// Returns the columns of the pixel of a ray, from Σ wᵢ cᵢ and the transmittance to the background.
     #[inline(always)]
-    pub fn pixel(self, rgb: [T; 3], left: T, background: [T; 3]) -> [T; COLUMNS] {
+    pub fn pixel(&self, ray: usize, rgb: [T; 3], left: T, background: [T; 3]) -> [T; COLUMNS] {
         let mut pixel = [T::zero(); COLUMNS];
         (0..3).for_each(|c| pixel[c] = rgb[c] + left * background[c]);
-        pixel[column::DEPTH] = self.depth;
-        pixel[column::OPACITY] = self.opacity;
-        pixel[column::LOG_TRANSMITTANCE] = -self.optical_depth;
-        pixel[column::DISTORTION] = self.distortion;
+        pixel[column::DEPTH] = self.depth[ray];
+        pixel[column::OPACITY] = self.opacity[ray];
+        pixel[column::LOG_TRANSMITTANCE] = -self.optical_depth[ray];
+        pixel[column::DISTORTION] = self.distortion[ray];
         pixel
+    }
+
+    /// Moves a ray to other sums, and leaves the sums over no samples.
+    pub fn take(&mut self, ray: usize) -> Sums<T> {
+        let mut taken = Sums::new();
+        let all = [&mut self.depth, &mut self.opacity, &mut self.optical_depth, &mut self.distortion];
+        let own = [&mut taken.depth, &mut taken.opacity, &mut taken.optical_depth, &mut taken.distortion];
+        own.into_iter().zip(all).for_each(|(own, all)| std::mem::swap(&mut own[0], &mut all[ray]));
+        taken
     }
 }
 
@@ -81,14 +93,14 @@ impl<T: Real> Along<'_, T> {
         color: impl Fn(usize) -> [T; 3],
     ) -> [T; COLUMNS] {
         let left = if own.is_empty() { T::one() } else { self.after[own.end - 1] };
-        let (mut columns, mut rgb) = (Sums::new(), [T::zero(); 3]);
+        let (mut columns, mut rgb) = (Sums::<T>::new(), [T::zero(); 3]);
         for i in own {
             let w = self.weight[i];
             let c = color(i);
             (0..3).for_each(|a| rgb[a] += w * c[a]);
-            columns.add(w, self.t[i], self.delta[i], sigma(i));
+            columns.add([w], [self.t[i]], [self.delta[i]], [sigma(i)]);
         }
-        columns.pixel(rgb, left, background)
+        columns.pixel(0, rgb, left, background)
     }
 
     /// Computes ∂L/∂σᵢ of the samples `own` of a ray, from back to front, from the cotangent g of its pixel.

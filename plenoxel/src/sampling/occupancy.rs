@@ -17,7 +17,7 @@ pub struct Occupancy {
     bricks: BrickGrid,
     /// Mask of occupied cells of each brick.
     masks: Arc<[u64]>,
-    /// Chebyshev distance, in bricks, to the nearest brick that is not empty, at most [`FAR`]; 0 for a brick that is not empty.
+    /// Result of [`distances`].
     distance: Arc<[u8]>,
 }
 
@@ -273,11 +273,11 @@ fn dilate(masks: &[u64], bricks: BrickGrid, axis: usize, back: bool) -> Vec<u64>
     out
 }
 
-/// Returns the Chebyshev distance of each brick to the nearest brick that is not empty, at most [`FAR`].
+/// Returns the Chebyshev distance of each brick, in bricks, to the nearest brick that is not empty, at most [`FAR`]; 0 for a brick that is not empty.
 ///
 /// The distance is min over all bricks of max |coordinate difference|. It is computed one axis after another: along z as a plain distance,
 /// along y and x as the minimum over k of max(k, distance found k bricks away).
-fn distances(masks: &[u64], count: [usize; 3]) -> Vec<u8> {
+pub(crate) fn distances(masks: &[u64], count: [usize; 3]) -> Vec<u8> {
     let mut distance: Vec<u8> = masks.iter().map(|&m| if m == 0 { FAR } else { 0 }).collect();
     for line in distance.chunks_mut(count[2].max(1)) {
         let mut near = FAR;

@@ -24,8 +24,10 @@ macro_rules! with_bricks {
 }
 
 mod adjoint;
+mod cell_bricks;
 mod forward;
 mod from_camera;
+mod lanes;
 mod lookup;
 mod pictures;
 mod places;
@@ -141,6 +143,12 @@ impl<T: Real> Batch<T> {
         if shape.color == Color::Rgb || shape.is_reduced() { 0 } else { shape.color_width() / 3 }
     }
 
+    /// Returns a color as it is shown: harmonics are clamped at 0.
+    #[inline(always)]
+    fn shown(&self, color: [T; 3]) -> [T; 3] {
+        if self.layout.shape.color == Color::Rgb { color } else { color.map(|c| c.max(T::zero())) }
+    }
+
     fn scene<'a>(&'a self, grid: &'a VoxelGrid<T>, rays: &'a [Ray], options: &'a RenderOptions<'a>) -> Scene<'a, T> {
         Scene::new(self, rays, options, options.occupancy.or(Field::<T>::reach(grid)), grid.params().map(Param::tensor))
     }
@@ -177,7 +185,7 @@ fn render_with<T: Real>(grid: &VoxelGrid<T>, picture: Option<&PictureTables<T>>,
     let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording() && n <= CHUNK;
     let mut pixels = Buffer::stale(n * COLUMNS);
     let packets = !keep && matches!(options.jitter, Jitter::None);
-    let from_camera = picture.and_then(|tables| tables.from_camera.of(grid, rays));
+    let from_camera = picture.and_then(|tables| tables.colors_from_camera(grid, rays));
     if from_camera.is_none() {
         batch.basis();
     }

@@ -6,13 +6,14 @@
 
 use super::super::{Factored, PLANE_OF, SCALE, SHIFT};
 use super::lookup::{self, LANES, Pairs, Places, RUN, add_lanes, density_of};
-use crate::field::node_table::{self, ENTRIES, NodeTable, SIDE, TOGETHER};
+use crate::field::node_table::{self, ENTRIES, NodeTable, SIDE, StoredBricks, TOGETHER};
 use crate::geometry::Aabb;
 use crate::render::Field;
 use crate::sampling::Occupancy;
 use autograd::lattice::{BRICK, BrickGrid};
 use autograd::{Real, Tensor, dispatched, no_grad, parallel};
 use glam::DVec3;
+use std::sync::Arc;
 
 /// Density feature of bricks that are left out. The density is 0.
 const NOTHING: f64 = -1e3;
@@ -22,7 +23,7 @@ const MOST: f64 = 1.5;
 
 /// Table of the density features at the nodes of a field.
 #[derive(Debug)]
-pub struct Densities<T> {
+pub struct Densities<T: Real> {
     /// s − 10 at the nodes.
     features: NodeTable<T>,
     cells: Occupancy,
@@ -54,18 +55,18 @@ impl<T: Real> Densities<T> {
             reached[range].iter().copied().filter(dense).collect::<Vec<_>>()
         });
         let kept = kept.concat();
-        let size = NodeTable::<T>::entries(kept.len());
-        let most = (MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64) as usize;
-        if size > most.min(u32::MAX as usize) {
+        let most = MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64;
+        if StoredBricks::entries(kept.len()) as f64 > most {
             return None;
         }
         // The features are computed a second time: keeping those of the first pass would double the memory.
-        let table = NodeTable::new(nodes, &kept, T::lit(NOTHING), features);
+        let table =
+            NodeTable::new(Arc::new(StoredBricks::new(nodes, kept)?), [T::lit(NOTHING)], |brick| features(brick).map(|value| [value]));
         let cells = reach.kept(|aabb| {
             let [low, high] = nodes_around(field, aabb);
             let mut nodes =
                 (low[0]..=high[0]).flat_map(|i| (low[1]..=high[1]).flat_map(move |j| (low[2]..=high[2]).map(move |k| [i, j, k])));
-            nodes.any(|node| table.value(node) > least)
+            nodes.any(|node| table.value(node)[0] > least)
         });
         Some(Densities { features: table, cells })
     }

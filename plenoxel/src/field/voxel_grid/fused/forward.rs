@@ -61,11 +61,11 @@ impl<T: Real> Block<T> {
         Along { t: &self.t, delta: &self.delta, weight: &self.weight, after: &self.after }
     }
 
-    /// Returns a function to the color of a sample, which is clamped at 0 if it is of harmonics.
+    /// Returns a function to the color of a sample ([`Batch::shown`]).
     #[inline(always)]
-    pub fn shown(&self, batch: &Batch<T>) -> impl Fn(usize) -> [T; 3] + '_ {
-        let (colors, clamped) = (self.color.as_chunks::<3>().0, batch.layout.shape.color != Color::Rgb);
-        move |i| if clamped { colors[i].map(|c| c.max(T::zero())) } else { colors[i] }
+    pub fn shown<'a>(&'a self, batch: &'a Batch<T>) -> impl Fn(usize) -> [T; 3] + 'a {
+        let colors = self.color.as_chunks::<3>().0;
+        |i| batch.shown(colors[i])
     }
 
     /// Returns Σ ln(1 + 2σᵢ²) of each ray.

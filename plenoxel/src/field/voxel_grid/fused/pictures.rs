@@ -5,33 +5,31 @@
 //! this value times the largest difference between colors along the ray.
 
 use super::COLUMNS;
+use super::cell_bricks::CellBricks;
 use super::forward::{Block, Scene};
-use super::from_camera::FromCamera;
-use super::lookup::{Corners, absorptions};
-use super::places::place;
+use super::from_camera::{Colors, FromCamera};
+use super::lanes::{Bounds, Pixel, Shown, lead};
+use super::lookup::Corners;
 use crate::camera::Ray;
-use crate::field::node_table::{self, ENTRIES, NodeTable, SIDE};
+use crate::field::node_table::{NodeTable, StoredBricks};
 use crate::field::voxel_grid::{Interpolation, VoxelGrid};
 use crate::render::RenderOptions;
 use crate::render::along::Sums;
-use crate::sampling::{Look, March, Occupancy, Sections, march};
-use autograd::lattice::{BRICK, BRICK_ROWS, BrickGrid, STRIDE, bits_where, has, local_of};
-use autograd::{Buffer, Real, dispatched, parallel};
+use crate::sampling::{Occupancy, Sections, march};
+use autograd::{Buffer, Real, parallel};
+use std::sync::Arc;
 
 /// Tables of a grid with trilinear look-up, from which pictures are rendered.
 ///
 /// Colors differ from those of [`render`](super::render) in two ways. Samples whose weights sum to at most `stop_below` for each ray take the color of a
 /// neighbour. Reduced harmonics are evaluated in the direction from the camera to their row. Together these changed 8-bit values of lego by at most one step.
 #[derive(Debug)]
-pub struct PictureTables<T> {
+pub struct PictureTables<T: Real> {
     densities: NodeTable<T>,
     /// Cells outside of which samples may be left out.
     cells: Occupancy,
-    pub(super) from_camera: FromCamera<T>,
+    from_camera: FromCamera<T>,
 }
-
-/// Offsets from a brick to itself and to the next ones along the axes.
-const AHEAD: [[usize; 3]; 8] = [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 1]];
 
 impl<T: Real> PictureTables<T> {
     /// Computes the tables. Samples are left out if the densities of all voxels around them, 1 / length, are at most `negligible`. `None` for nearest
@@ -43,204 +41,79 @@ impl<T: Real> PictureTables<T> {
             return None;
         }
         let dense = grid.voxels_denser_than(negligible);
-        // A brick of cells reads the voxels of its own brick, and those at the faces of the next ones.
-        let read = AHEAD.map(|offset| bits_where(!0, |bit| (0..3).all(|a| offset[a] == 0 || local_of(bit)[a] == 0)));
-        let (bricks, count) = (BrickGrid::new(nodes.map(|n| n - 1)), lattice.brick_grid().count());
-        let next = |place: [usize; 3], offset: [usize; 3]| {
-            let next = [0, 1, 2].map(|a| place[a] + offset[a]);
-            (0..3).all(|a| next[a] < count[a]).then_some(next)
-        };
-        let holds = |brick: &u32| {
-            let place = bricks.place(*brick as usize);
-            let masks = AHEAD.iter().zip(read).filter_map(|(&offset, read)| Some((next(place, offset)?, read)));
-            masks.into_iter().any(|(next, read)| dense.masks()[lattice.brick_grid().number(next)] & read != 0)
-        };
-        let stored = parallel::map_chunks(bricks.len(), parallel::CHUNK, |range| {
-            (range.start as u32..range.end as u32).filter(holds).collect::<Vec<_>>()
-        });
-        let values = |brick: u32| {
-            let place = bricks.place(brick as usize);
-            let parts = AHEAD.map(|offset| lattice.brick(next(place, offset)?));
-            let mut values = [T::zero(); ENTRIES];
-            for (entry, value) in values[..SIDE * SIDE * SIDE].iter_mut().enumerate() {
-                let node = [entry / (SIDE * SIDE), entry / SIDE % SIDE, entry % SIDE];
-                let part = node.iter().fold(0, |part, n| 2 * part + n / BRICK);
-                let bit = (0..3).map(|a| node[a] % BRICK * STRIDE[a]).sum();
-                if let Some((number, _)) = parts[part].filter(|(_, mask)| has(*mask, bit)) {
-                    *value = density[number * BRICK_ROWS + bit];
-                }
-            }
-            values
-        };
-        let stored = stored.concat();
-        if NodeTable::<T>::entries(stored.len()) > u32::MAX as usize {
-            return None;
-        }
-        let densities = NodeTable::new(nodes, &stored, T::zero(), values);
+        let bricks = CellBricks::new(lattice);
+        let stored = StoredBricks::new(nodes, bricks.reading(dense.masks()))?;
+        let densities = NodeTable::new(Arc::new(stored), [T::zero()], |brick| bricks.values(brick, [T::zero()], |row| [density[row]]));
         Some(PictureTables { densities, cells: grid.shape().cells_reading(dense), from_camera: FromCamera::none() })
     }
-}
 
-/// Pixel whose samples are found front to back.
-#[derive(Clone, Copy)]
-struct Pixel<T> {
-    sums: Sums<T>,
-    /// Transmittance behind the samples so far.
-    left: T,
-    /// Weight of the samples that take the color of the next one.
-    waiting: T,
-    /// Largest weight that may still wait.
-    allowed: T,
-}
-
-impl<T: Real> Pixel<T> {
-    fn new(allowed: T) -> Self {
-        Pixel { sums: Sums::new(), left: T::one(), waiting: T::zero(), allowed }
-    }
-
-    /// Adds a sample of weight w. Returns the weight that its color gets; `None` if it takes the color of the next sample.
-    #[inline(always)]
-    fn add(&mut self, w: T, t: T, delta: T, sigma: T) -> Option<T> {
-        self.sums.add(w, t, delta, sigma);
-        let all = self.waiting + w;
-        if all <= self.allowed {
-            self.waiting = all;
-            return None;
-        }
-        self.allowed -= self.waiting;
-        self.waiting = T::zero();
-        Some(all)
+    /// Returns the colors of the grid as seen by these rays ([`FromCamera::of`]).
+    pub(super) fn colors_from_camera(&self, grid: &VoxelGrid<T>, rays: &[Ray]) -> Option<Arc<Colors<T>>> {
+        self.from_camera.of(grid, self.densities.bricks(), rays)
     }
 }
 
 impl<T: Real> Scene<'_, T> {
     /// Computes the pixels of rays from `first` on, one for each [`COLUMNS`] entries of `pixels`. Returns the number of samples.
     pub fn show(&self, tables: &PictureTables<T>, first: usize, pixels: &mut [T]) -> usize {
-        let mut shown = vec![Pixel::new(T::lit(self.options.stop_below)); pixels.len() / COLUMNS];
-        let mut block = self.with_color(tables, first, &mut shown);
-        let at = block.at.each_ref().map(|at| &at[..]);
-        let corners = with_bricks!(self.batch.layout.lattice, map => Corners::find(at, map, block.len()));
-        match &self.from_camera {
-            Some(rows) => self.colors_from_camera(rows, &mut block, &corners),
-            None => {
-                block.color = Buffer::stale(3 * block.len());
-                self.colors(&mut block, Some(&corners));
-            }
+        let pixels = pixels.as_chunks_mut::<COLUMNS>().0;
+        let background = self.batch.background;
+        let mut sums = vec![Pixel { sums: Sums::new(), left: T::one(), waiting: T::zero() }; pixels.len()];
+        let mut shown = self.with_color(tables, first, &mut sums);
+        let colors = match &self.from_camera {
+            Some(colors) => colors.at(shown.at.each_ref().map(|at| &at[..]), &self.batch.layout.shape),
+            None => self.colors_along_rays(first, &mut shown, pixels.len()),
+        };
+        // Σ w c of each ray, and its last color.
+        let mut rgb = vec![([T::zero(); 3], background); pixels.len()];
+        for ((&ray, &weight), &color) in shown.of.iter().zip(&shown.weight[..]).zip(colors.as_chunks::<3>().0) {
+            let (sum, last) = &mut rgb[ray as usize];
+            *last = self.batch.shown(color);
+            (0..3).for_each(|c| sum[c] += weight * last[c]);
         }
-        let (color, background) = (block.shown(self.batch), self.batch.background);
-        for ((own, pixel), to) in block.rays().zip(shown).zip(pixels.as_chunks_mut::<COLUMNS>().0) {
-            let (mut rgb, mut last) = ([T::zero(); 3], background);
-            for i in own {
-                last = color(i);
-                (0..3).for_each(|c| rgb[c] += block.weight[i] * last[c]);
-            }
-            (0..3).for_each(|c| rgb[c] += pixel.waiting * last[c]);
-            *to = pixel.sums.pixel(rgb, pixel.left, background);
+        for ((pixel, own), (mut rgb, last)) in pixels.iter_mut().zip(sums).zip(rgb) {
+            (0..3).for_each(|c| rgb[c] += own.waiting * last[c]);
+            *pixel = own.sums.pixel(0, rgb, own.left, background);
         }
-        block.looked_at
+        shown.looked_at
     }
 
-    /// Adds the samples of rays from `first` on to their pixels. Returns those whose color is looked up: positions, and the weights of the colors.
-    fn with_color(&self, tables: &PictureTables<T>, first: usize, pixels: &mut [Pixel<T>]) -> Block<T> {
+    /// Computes the colors of samples, as seen along their rays. Sorts the samples by their rays.
+    fn colors_along_rays(&self, first: usize, shown: &mut Shown<T>, rays: usize) -> Buffer<T> {
+        let offsets = shown.sort(rays);
+        let count = shown.of.len();
+        // All samples are visible.
+        let weight = Buffer::copy_of(&shown.weight);
+        let at = shown.at.each_ref().map(|at| Buffer::copy_of(at));
+        let [density, after] = [Buffer::zeros(count), Buffer::zeros(count)];
+        let mut block = Block { first, offsets, at, weight, density, after, color: Buffer::stale(3 * count), ..Block::empty() };
+        let at = shown.at.each_ref().map(|at| &at[..]);
+        let corners = with_bricks!(self.batch.layout.lattice, map => Corners::find(at, map, count));
+        self.colors(&mut block, Some(&corners));
+        block.color
+    }
+
+    /// Adds the samples of rays from `first` on to their pixels. Returns those whose color is looked up.
+    fn with_color(&self, tables: &PictureTables<T>, first: usize, pixels: &mut [Pixel<T>]) -> Shown<T> {
         let RenderOptions { aabb, spacing, stop_below, .. } = self.options;
-        let (stop, cells) = (T::lit(*stop_below), &tables.cells);
-        let to_voxels = self.batch.layout.shape.to_voxels().map(T::lit);
         let rays = &self.rays[first..first + pixels.len()];
-        let mut sections = Sections::new(Some(cells), *spacing);
-        let (mut run, fused) = (Run::none(), parallel::fused());
-        let mut block = Block { first, ..Block::empty() };
-        let mut end = 0;
-        for (r, (ray, pixel)) in rays.iter().zip(pixels).enumerate() {
-            let section = sections.of(rays, r);
-            let march = march(ray, aabb, *spacing, 0.0);
-            let along = cells.along(ray);
-            let mut rest = march.between(section);
-            // Dense bricks are near where a section begins.
-            let mut lost = section[0] == 0.0;
-            while pixel.left >= stop && !rest.is_empty() {
-                if lost && let Look::EmptyUntil(exit) = along.look(march.interval(rest.start).0) {
-                    rest.start = (rest.start + 1).max(march.before(exit));
-                    continue;
-                }
-                let own = RUN.min(rest.len());
-                run.place(&march, ray, rest.start, to_voxels);
-                rest.start += own;
-                lost = !if fused { run.read::<true>(&tables.densities) } else { run.read::<false>(&tables.densities) };
-                if lost {
-                    continue;
-                }
-                if end + RUN > block.weight.len() {
-                    let room = (2 * end).max(16 * rays.len());
-                    block.at.iter_mut().chain([&mut block.weight]).for_each(|column| column.grow(room));
-                }
-                for i in 0..own {
-                    if pixel.left < stop {
-                        break;
-                    }
-                    block.looked_at += 1;
-                    if run.density[i] <= T::zero() {
-                        continue;
-                    }
-                    let weight = run.absorbed[i] * pixel.left;
-                    pixel.left *= run.through[i];
-                    if let Some(weight) = pixel.add(weight, run.t[i], run.delta[i], run.density[i]) {
-                        block.at.iter_mut().zip(&run.at).for_each(|(column, at)| column[end] = at[i]);
-                        block.weight[end] = weight;
-                        end += 1;
-                    }
-                }
-            }
-            block.offsets.push(end as u32);
+        let mut sections = Sections::new(Some(&tables.cells), *spacing);
+        let mut numbers = 0..rays.len();
+        let next = || {
+            numbers.by_ref().find_map(|r| {
+                let section = sections.of(rays, r);
+                let march = march(&rays[r], aabb, *spacing, 0.0);
+                let intervals = march.between(section);
+                (!intervals.is_empty()).then_some((r, march, intervals))
+            })
+        };
+        let bounds = Bounds { stop: T::lit(*stop_below), waiting: T::lit(*stop_below) };
+        let to_voxels = self.batch.layout.shape.to_voxels();
+        match parallel::fused() {
+            true => lead::<T, true>(&tables.densities, rays, next, to_voxels, bounds, pixels),
+            false => lead::<T, false>(&tables.densities, rays, next, to_voxels, bounds, pixels),
         }
-        block.at.iter_mut().chain([&mut block.weight]).for_each(|column| column.truncate(end));
-        // They are visible.
-        (block.density, block.after) = (Buffer::zeros(end), Buffer::zeros(end));
-        block
     }
-}
-
-/// Number of samples that are looked up together. Rays end after few samples, so that it is less than in training.
-const RUN: usize = 8;
-
-/// Consecutive samples of a ray.
-struct Run<T> {
-    /// Voxel coordinates.
-    at: [[T; RUN]; 3],
-    t: [T; RUN],
-    delta: [T; RUN],
-    density: [T; RUN],
-    /// 1 − exp(−σδ) and exp(−σδ)
-    absorbed: [T; RUN],
-    through: [T; RUN],
-}
-
-impl<T: Real> Run<T> {
-    fn none() -> Self {
-        let none = [T::zero(); RUN];
-        Run { at: [none; 3], t: none, delta: none, density: none, absorbed: none, through: none }
-    }
-
-    /// Places the samples of the intervals from `first` on.
-    fn place(&mut self, march: &March, ray: &Ray, first: usize, to_voxels: [T; 2]) {
-        let [x, y, z] = &mut self.at;
-        place_intervals(march, ray, first, to_voxels, [x, y, z, &mut self.t, &mut self.delta]);
-    }
-
-    /// Reads the densities, and computes what they absorb. Returns false if there is no matter near the samples.
-    fn read<const FUSED: bool>(&mut self, table: &NodeTable<T>) -> bool {
-        let any = node_table::interpolate::<T, RUN, FUSED>(table, self.at.each_ref(), &mut self.density);
-        if any {
-            absorptions::<T, FUSED>(&self.density, &self.delta, &mut self.absorbed, &mut self.through);
-        }
-        any
-    }
-}
-
-dispatched! {
-fn place_intervals<T: Real>(march: &March, ray: &Ray, first: usize, to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
-    let [middles, lengths] = march.intervals::<RUN>(first);
-    place(ray, [&middles, &lengths], to_voxels, out);
-}
 }
 
 #[cfg(test)]
@@ -251,6 +124,7 @@ mod tests {
     use crate::field::voxel_grid::{Color, GridShape};
     use crate::render::{Engine, Rendered};
     use crate::sampling::{Jitter, Spacing};
+    use autograd::lattice::BRICK_ROWS;
     use glam::DVec3;
 
     /// A ball with holes; voxels of every fifth brick have a negative density.

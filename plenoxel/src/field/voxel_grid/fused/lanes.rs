@@ -1,0 +1,286 @@
+//! Rays of a picture in the lanes of vectors.
+//!
+//! Neighbouring samples of a ray depend on each other: by the light that is left, and by whether there is matter at all. So the lanes of a vector are not samples
+//! of one ray, but one sample of each of [`LANES`] rays. A lane in an empty brick skips to where its ray leaves the empty bricks around it. A lane whose ray ends
+//! gets the next one.
+
+use crate::camera::Ray;
+use crate::field::node_table::{Cells, NodeTable};
+use crate::render::along::Sums;
+use crate::sampling::March;
+use autograd::lattice::bits;
+use autograd::{Buffer, Real, dispatched};
+use std::ops::Range;
+
+/// Number of rays that are led together.
+const LANES: usize = 16;
+
+/// Sums along a ray.
+#[derive(Clone, Copy)]
+pub(super) struct Pixel<T> {
+    pub sums: Sums<T>,
+    /// Transmittance behind the samples.
+    pub left: T,
+    /// Weight of the last samples, which take the color of the sample before.
+    pub waiting: T,
+}
+
+/// Samples whose color is looked up, those of each ray front to back.
+pub(super) struct Shown<T: Real> {
+    /// Number of each sample's ray.
+    pub of: Buffer<u32>,
+    /// Voxel coordinates, and the weights of the colors.
+    pub at: [Buffer<T>; 3],
+    pub weight: Buffer<T>,
+    /// Number of samples so far, and of those that were evaluated, with or without a color.
+    count: usize,
+    pub looked_at: usize,
+}
+
+/// Bounds of what is left out along a ray.
+#[derive(Clone, Copy)]
+pub(super) struct Bounds<T> {
+    /// Transmittance below which rays end.
+    pub stop: T,
+    /// Largest sum of the weights of samples that take the color of another.
+    pub waiting: T,
+}
+
+/// Rays that are led together.
+struct Lanes<T> {
+    /// Numbers of the rays.
+    ray: [u32; LANES],
+    /// Next interval, the one after the last that is needed, and the last of the whole march.
+    next: [u32; LANES],
+    end: [u32; LANES],
+    last: [u32; LANES],
+    /// The march ([`March::of_steps`]).
+    near: [f64; LANES],
+    far: [f64; LANES],
+    start: [f64; LANES],
+    step: [f64; LANES],
+    per_step: [f64; LANES],
+    /// Voxel coordinates at distance t along the ray are origin + t slope.
+    origin: [[f64; LANES]; 3],
+    slope: [[f64; LANES]; 3],
+    per_slope: [[f64; LANES]; 3],
+    sums: Sums<T, LANES>,
+    /// Transmittance behind the samples so far; 0 in lanes without a ray.
+    left: [T; LANES],
+    /// Weight of the samples that take the color of the next one, and the largest weight that may still wait.
+    waiting: [T; LANES],
+    allowed: [T; LANES],
+}
+
+/// Leads rays through a table of densities. `next` returns the number of the next ray, its march, and its intervals outside of which all samples are left out;
+/// voxel coordinates are `to_voxels[0]` x + `to_voxels[1]`. `pixels` gets the sums of each ray.
+pub(super) fn lead<T: Real, const FUSED: bool>(
+    densities: &NodeTable<T>,
+    rays: &[Ray],
+    mut next: impl FnMut() -> Option<(usize, March, Range<usize>)>,
+    to_voxels: [f64; 2],
+    bounds: Bounds<T>,
+    pixels: &mut [Pixel<T>],
+) -> Shown<T> {
+    let mut shown = Shown::none();
+    let mut lanes = Lanes::none();
+    let mut idle = (1 << LANES) - 1;
+    loop {
+        for lane in bits(idle) {
+            let Some((ray, march, intervals)) = next() else { break };
+            lanes.begin(lane, (ray, &rays[ray]), march, intervals, to_voxels, bounds);
+            idle &= !(1 << lane);
+        }
+        if idle == (1 << LANES) - 1 {
+            shown.truncate();
+            return shown;
+        }
+        let mut ended = 0;
+        while ended == 0 {
+            shown.make_room();
+            ended = step::<T, FUSED>(&mut lanes, densities, bounds.stop, &mut shown) & !idle;
+        }
+        for lane in bits(ended) {
+            pixels[lanes.ray[lane] as usize] = lanes.end(lane);
+        }
+        idle |= ended;
+    }
+}
+
+impl<T: Real> Lanes<T> {
+    fn none() -> Self {
+        let (numbers, lengths, none) = ([0; LANES], [0.0; LANES], [T::zero(); LANES]);
+        Lanes {
+            ray: numbers,
+            next: numbers,
+            end: numbers,
+            last: numbers,
+            near: lengths,
+            far: lengths,
+            start: lengths,
+            step: lengths,
+            per_step: lengths,
+            origin: [lengths; 3],
+            slope: [lengths; 3],
+            per_slope: [lengths; 3],
+            sums: Sums::new(),
+            left: none,
+            waiting: none,
+            allowed: none,
+        }
+    }
+
+    /// Gives a ray to a lane.
+    fn begin(
+        &mut self,
+        lane: usize,
+        (number, ray): (usize, &Ray),
+        march: March,
+        intervals: Range<usize>,
+        to_voxels: [f64; 2],
+        bounds: Bounds<T>,
+    ) {
+        let march = march.of_steps();
+        self.ray[lane] = number as u32;
+        [self.next[lane], self.end[lane], self.last[lane]] = [intervals.start, intervals.end, march.count - 1].map(|k| k as u32);
+        (self.near[lane], self.far[lane], self.start[lane]) = (march.near, march.far, march.start);
+        (self.step[lane], self.per_step[lane]) = (march.step, march.step.recip());
+        for axis in 0..3 {
+            let slope = ray.direction[axis] * to_voxels[0];
+            self.origin[axis][lane] = ray.origin[axis] * to_voxels[0] + to_voxels[1];
+            (self.slope[axis][lane], self.per_slope[axis][lane]) = (slope, slope.recip());
+        }
+        (self.left[lane], self.waiting[lane], self.allowed[lane]) = (T::one(), T::zero(), bounds.waiting);
+    }
+
+    /// Returns the sums along the ray of a lane, which then has no ray.
+    fn end(&mut self, lane: usize) -> Pixel<T> {
+        let pixel = Pixel { sums: self.sums.take(lane), left: self.left[lane], waiting: self.waiting[lane] };
+        (self.left[lane], self.waiting[lane], self.allowed[lane]) = (T::zero(), T::zero(), T::zero());
+        pixel
+    }
+}
+
+impl<T: Real> Shown<T> {
+    fn none() -> Self {
+        let none = || Buffer::stale(0);
+        Shown { of: Buffer::stale(0), at: [none(), none(), none()], weight: none(), count: 0, looked_at: 0 }
+    }
+
+    /// Makes sure that there is room for one more sample of each lane.
+    #[inline]
+    fn make_room(&mut self) {
+        if self.count + LANES > self.of.len() {
+            let room = (2 * self.of.len()).max(1024);
+            self.of.grow(room);
+            self.at.iter_mut().chain([&mut self.weight]).for_each(|column| column.grow(room));
+        }
+    }
+
+    fn truncate(&mut self) {
+        self.of.truncate(self.count);
+        self.at.iter_mut().chain([&mut self.weight]).for_each(|column| column.truncate(self.count));
+    }
+
+    /// Sorts the samples by their rays, of which there are `rays`. Returns the offsets of the rays' samples.
+    pub fn sort(&mut self, rays: usize) -> Vec<u32> {
+        let mut offsets = vec![0; rays + 1];
+        self.of.iter().for_each(|&ray| offsets[ray as usize + 1] += 1);
+        (0..rays).for_each(|ray| offsets[ray + 1] += offsets[ray]);
+        let mut next = offsets.clone();
+        let mut place = |&ray: &u32| {
+            next[ray as usize] += 1;
+            next[ray as usize] as usize - 1
+        };
+        let places: Vec<usize> = self.of.iter().map(&mut place).collect();
+        for column in self.at.iter_mut().chain([&mut self.weight]) {
+            let unsorted = std::mem::replace(column, Buffer::stale(places.len()));
+            places.iter().zip(&unsorted[..]).for_each(|(&place, &x)| column[place] = x);
+        }
+        for (ray, own) in offsets.windows(2).enumerate() {
+            self.of[own[0] as usize..own[1] as usize].fill(ray as u32);
+        }
+        offsets
+    }
+}
+
+dispatched! {
+/// Takes one sample of each ray, or skips empty bricks. Returns a mask of the lanes whose ray has ended.
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<T>, stop: T, shown: &mut Shown<T>) -> u64 {
+    // Plain loops vectorise, one array after another.
+    let (mut middles, mut t, mut delta) = ([0.0; LANES], [T::zero(); LANES], [T::zero(); LANES]);
+    for i in 0..LANES {
+        let k = f64::from(lanes.next[i]);
+        let begin = if lanes.next[i] == 0 { lanes.near[i] } else { lanes.start[i] + (k - 1.0) * lanes.step[i] };
+        let end = if lanes.next[i] == lanes.last[i] { lanes.far[i] } else { lanes.start[i] + k * lanes.step[i] };
+        middles[i] = 0.5 * (begin + end);
+        (t[i], delta[i]) = (T::lit(middles[i]), T::lit(end - begin));
+    }
+    let mut at = [[T::zero(); LANES]; 3];
+    for a in 0..3 {
+        for i in 0..LANES {
+            at[a][i] = T::lit(lanes.origin[a][i] + middles[i] * lanes.slope[a][i]);
+        }
+    }
+    let cells = Cells::find(densities.bricks(), at.each_ref());
+    let stored = cells.stored();
+    if stored > 0 {
+        shown.looked_at += stored;
+        let density = cells.numbers::<FUSED>(densities);
+        let (mut sigma, mut weight, mut through) = ([T::zero(); LANES], [T::zero(); LANES], [T::zero(); LANES]);
+        for i in 0..LANES {
+            sigma[i] = density[i].max(T::zero());
+        }
+        for i in 0..LANES {
+            (weight[i], through[i]) = (sigma[i] * delta[i]).absorb::<FUSED>();
+        }
+        for i in 0..LANES {
+            weight[i] *= lanes.left[i];
+            lanes.left[i] *= through[i];
+        }
+        lanes.sums.add(weight, t, delta, sigma);
+        let (mut all, mut colored) = ([T::zero(); LANES], 0);
+        for i in 0..LANES {
+            all[i] = lanes.waiting[i] + weight[i];
+        }
+        for i in 0..LANES {
+            colored |= u64::from(all[i] > lanes.allowed[i]) << i;
+        }
+        for i in 0..LANES {
+            let has_color = all[i] > lanes.allowed[i];
+            lanes.allowed[i] -= if has_color { lanes.waiting[i] } else { T::zero() };
+            lanes.waiting[i] = if has_color { T::zero() } else { all[i] };
+        }
+        let count = shown.count;
+        let (of, to_weight) = (&mut shown.of[count..count + LANES], &mut shown.weight[count..count + LANES]);
+        let [x, y, z] = &mut shown.at;
+        let to = [&mut x[count..count + LANES], &mut y[count..count + LANES], &mut z[count..count + LANES]];
+        let mut new = 0;
+        while colored != 0 {
+            let i = colored.trailing_zeros() as usize % LANES;
+            colored &= colored - 1;
+            (of[new], to_weight[new]) = (lanes.ray[i], all[i]);
+            (to[0][new], to[1][new], to[2][new]) = (at[0][i], at[1][i], at[2][i]);
+            new += 1;
+        }
+        shown.count += new;
+    }
+    for i in 0..LANES {
+        lanes.next[i] += 1;
+    }
+    if stored < LANES {
+        let exits = cells.exits(&lanes.origin, &lanes.per_slope);
+        for i in 0..LANES {
+            // The number of intervals whose middle lies before the exit.
+            let before = ((exits[i] - lanes.start[i]) * lanes.per_step[i] + 0.5).max(0.0).min(f64::from(lanes.end[i])).index();
+            lanes.next[i] = lanes.next[i].max(before);
+        }
+    }
+    let mut ended = 0;
+    for i in 0..LANES {
+        ended |= u64::from(lanes.next[i] >= lanes.end[i] || lanes.left[i] < stop) << i;
+    }
+    ended
+}
+}
