@@ -220,7 +220,7 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<
     let mut at = [[T::zero(); LANES]; 3];
     for a in 0..3 {
         for i in 0..LANES {
-            at[a][i] = T::lit(lanes.origin[a][i] + middles[i] * lanes.slope[a][i]);
+            at[a][i] = T::lit(middles[i].multiply_add::<FUSED>(lanes.slope[a][i], lanes.origin[a][i]));
         }
     }
     let cells = Cells::find(densities.bricks(), at.each_ref());
@@ -240,18 +240,24 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<
             lanes.left[i] *= through[i];
         }
         lanes.sums.add(weight, t, delta, sigma);
-        let (mut all, mut colored) = ([T::zero(); LANES], 0);
+        // Numbers instead of conditions, because the compiler would branch.
+        let (mut all, mut has_color, mut colored) = ([T::zero(); LANES], [T::zero(); LANES], [false; LANES]);
         for i in 0..LANES {
             all[i] = lanes.waiting[i] + weight[i];
         }
         for i in 0..LANES {
-            colored |= u64::from(all[i] > lanes.allowed[i]) << i;
+            colored[i] = all[i] > lanes.allowed[i];
         }
         for i in 0..LANES {
-            let has_color = all[i] > lanes.allowed[i];
-            lanes.allowed[i] -= if has_color { lanes.waiting[i] } else { T::zero() };
-            lanes.waiting[i] = if has_color { T::zero() } else { all[i] };
+            has_color[i] = if colored[i] { T::one() } else { T::zero() };
         }
+        for i in 0..LANES {
+            lanes.allowed[i] -= has_color[i] * lanes.waiting[i];
+        }
+        for i in 0..LANES {
+            lanes.waiting[i] = (T::one() - has_color[i]) * all[i];
+        }
+        let mut colored = mask_of(&colored);
         let count = shown.count;
         let (of, to_weight) = (&mut shown.of[count..count + LANES], &mut shown.weight[count..count + LANES]);
         let [x, y, z] = &mut shown.at;
@@ -277,10 +283,23 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<
             lanes.next[i] = lanes.next[i].max(before);
         }
     }
-    let mut ended = 0;
+    let mut ended = [false; LANES];
     for i in 0..LANES {
-        ended |= u64::from(lanes.next[i] >= lanes.end[i] || lanes.left[i] < stop) << i;
+        ended[i] = (lanes.next[i] >= lanes.end[i]) | (lanes.left[i] < stop);
     }
-    ended
+    mask_of(&ended)
 }
+}
+
+/// Returns a mask with a bit for each lane where a condition holds.
+#[inline(always)]
+fn mask_of(holds: &[bool; LANES]) -> u64 {
+    let (mut bits, mut mask) = ([0; LANES], 0);
+    for i in 0..LANES {
+        bits[i] = if holds[i] { 1_u32 << i } else { 0 };
+    }
+    for bit in bits {
+        mask |= bit;
+    }
+    u64::from(mask)
 }
