@@ -171,8 +171,9 @@ mod tests {
 
     #[test]
     fn pictures_are_those_of_the_other_renderer() {
-        for (sh_reduction, color) in KINDS {
-            let (grid, rays, options) = (ball(sh_reduction, color), rays(3.0, 48), options(0.0));
+        let points = Spacing::Points { samples: 80, far: 5.0 };
+        for ((sh_reduction, color), spacing) in KINDS.into_iter().flat_map(|kind| [(kind, options(0.0).spacing), (kind, points)]) {
+            let (grid, rays, options) = (ball(sh_reduction, color), rays(3.0, 48), RenderOptions { spacing, ..options(0.0) });
             let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
             let [want, found] = [render(&grid, &rays, &options), render_picture(&grid, &tables, &rays, &options)];
             assert!(difference(&want, &found) < 1e-10, "{color:?}: {}", difference(&want, &found));

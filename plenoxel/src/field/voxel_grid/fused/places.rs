@@ -59,10 +59,10 @@ impl<'a, T: Real> Places<'a, T> {
 
 dispatched! {
 /// Places the samples of a straight ray in the middles of intervals of these lengths: voxel coordinates, middles and lengths.
-pub(super) fn place<T: Real, const N: usize>(ray: &Ray, [middles, lengths]: [&[f64; N]; 2], to_voxels: [T; 2], out: [&mut [T; N]; 5]) {
+fn place<T: Real>(ray: &Ray, [middles, lengths]: [&[f64; RUN]; 2], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
     let [x, y, z, t, delta] = out;
     let (o, d) = (ray.origin, ray.direction);
-    for i in 0..N {
+    for i in 0..RUN {
         let (middle, length) = (middles[i], lengths[i]);
         x[i] = T::lit(o.x + middle * d.x) * to_voxels[0] + to_voxels[1];
         y[i] = T::lit(o.y + middle * d.y) * to_voxels[0] + to_voxels[1];
