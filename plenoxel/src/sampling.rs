@@ -1,4 +1,5 @@
-//! Positions of samples along rays. This module is the only definition of sample positions.
+//! Positions of samples along rays. This module defines them; pictures of voxel grids compute the same positions in vectors of rays
+//! (`field/voxel_grid/fused/lanes.rs`).
 //!
 //! A sample represents an interval of its ray: its position is the middle of the interval, `delta` the length. Samples of a batch are
 //! packed one ray after another; ray `r` owns `offsets[r]..offsets[r + 1]`. Rays that miss the box have no samples.
@@ -16,9 +17,9 @@ use crate::random::{self, Purpose, Stream, uniform};
 use crate::space::{Bend, Space, contract};
 use autograd::{Buffer, Indices, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
-use occupancy::Along;
 pub use occupancy::Occupancy;
-pub(crate) use occupancy::{Look, distances};
+pub(crate) use occupancy::distances;
+use occupancy::{Along, Look};
 pub use running::{Refresh, RunningOccupancy};
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -115,6 +116,7 @@ impl<T: Real> Samples<T> {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct March {
     pub(crate) count: usize,
+    // `field/voxel_grid/fused/lanes.rs` computes intervals from these four as `interval` does.
     pub(crate) near: f64,
     pub(crate) far: f64,
     /// Start of the step with k = 1 (`Step`), or the first point (`Points`).
@@ -125,7 +127,7 @@ pub(crate) struct March {
     bend: Option<Bend>,
 }
 
-/// Computes the intervals of one ray: the only place that defines sample positions.
+/// Computes the intervals of one ray, which define the positions of its samples.
 pub(crate) fn march(ray: &Ray, aabb: &Aabb, spacing: Spacing, jitter: f64) -> March {
     let none = March { count: 0, near: 0.0, far: 0.0, start: 0.0, step: 1.0, points: false, bend: None };
     let steps = |near: f64, far: f64, step: f64, bend: Option<Bend>| {
@@ -193,7 +195,7 @@ impl March {
 
     /// Returns the middles and the lengths of the intervals from `first` on.
     #[inline(always)]
-    pub(crate) fn intervals<const N: usize>(&self, first: usize) -> [[f64; N]; 2] {
+    fn intervals<const N: usize>(&self, first: usize) -> [[f64; N]; 2] {
         // Plain loops vectorise; the compiler does not inline `from_fn` in dispatched loops.
         let (mut middles, mut lengths) = ([0.0; N], [0.0; N]);
         for i in 0..N {
@@ -238,7 +240,7 @@ impl March {
 
     /// Returns the number of intervals whose middle lies before a distance on a straight ray, or one less.
     #[inline]
-    pub(crate) fn before(&self, distance: f64) -> usize {
+    fn before(&self, distance: f64) -> usize {
         let half = if self.points { 0.0 } else { 0.5 };
         ((distance - self.start) / self.step + half) as usize
     }

@@ -1,7 +1,7 @@
 //! Vector lookups in a table.
 //!
 //! The compiler does not vectorise a loop over `table[at[i]]`, because each load has its own bounds check. With one bounds check for the whole vector, the
-//! loop becomes a gather instruction on machines that have it. The tests compare the function with the safe loop.
+//! loop becomes a gather instruction on machines that have it. The tests compare the functions with safe loops.
 
 #![allow(unsafe_code)]
 
@@ -41,8 +41,8 @@ pub fn pairs_around<T: Real, const N: usize, const K: usize>(table: &[T], at: [u
     for offset in offsets {
         farthest = farthest.max(offset);
     }
-    let end = last as usize + farthest as usize + 1;
-    assert!(end < table.len(), "index {end} is out of range for a table of {} entries", table.len());
+    let end = u64::from(last) + u64::from(farthest) + 1;
+    assert!(end < table.len() as u64, "index {end} is out of range for a table of {} entries", table.len());
     let mut found = [[[table[0]; N]; 2]; K];
     for k in 0..K {
         // One array after another, so that the compiler does not vectorise the outer loop.
@@ -89,10 +89,11 @@ mod tests {
     #[test]
     fn pairs_are_those_at_the_sums() {
         let table: Vec<f32> = (0..101).map(|i| (i * i) as f32).collect();
-        let pairs = [[[0.0, 8100.0, 49.0], [1.0, 8281.0, 64.0]], [[81.0, 9801.0, 256.0], [100.0, 10000.0, 289.0]]];
-        assert_eq!(pairs_around(&table, [0, 90, 7], [0, 9]), pairs);
+        let (at, offsets) = ([0, 90, 7], [0, 9]);
+        let pairs = offsets.map(|offset| [0, 1].map(|next| at.map(|at| table[(at + offset) as usize + next])));
+        assert_eq!(pairs_around(&table, at, offsets), pairs);
         let double: Vec<f64> = table.iter().map(|&x| f64::from(x)).collect();
-        assert_eq!(pairs_around(&double, [0, 90, 7], [0, 9]), pairs.map(|pair| pair.map(|entries| entries.map(f64::from))));
+        assert_eq!(pairs_around(&double, at, offsets), pairs.map(|pair| pair.map(|entries| entries.map(f64::from))));
     }
 
     #[test]

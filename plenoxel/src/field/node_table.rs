@@ -18,7 +18,7 @@ const EDGES: [u32; 4] = [0, SIDE as u32, (SIDE * SIDE) as u32, (SIDE * SIDE + SI
 /// Number of entries from the lowest node of a cell to the highest.
 const CELL: usize = EDGES[3] as usize + 2;
 /// Bricks that one task computes.
-pub const TOGETHER: usize = 256;
+pub const BRICKS_OF_TASK: usize = 256;
 
 /// Smallest link of a brick that is not stored.
 const EMPTY: u32 = 1 << 31;
@@ -78,7 +78,7 @@ impl<T: Real, const WIDTH: usize> NodeTable<T, WIDTH> {
         let mut table = Buffer::stale(WIDTH * StoredBricks::entries(bricks.stored.len()));
         let (of_others, rest) = table.split_at_mut(of_brick);
         of_others.as_chunks_mut().0.fill(elsewhere);
-        parallel::for_each_chunk(rest, TOGETHER * of_brick, |first, of_bricks| {
+        parallel::for_each_chunk(rest, BRICKS_OF_TASK * of_brick, |first, of_bricks| {
             for (to, &brick) in of_bricks.chunks_exact_mut(of_brick).zip(&bricks.stored[first / of_brick..]) {
                 to.copy_from_slice(values(brick).as_flattened());
             }
@@ -105,8 +105,9 @@ pub struct Cells<T, const N: usize> {
     entries: [u32; N],
     /// Distances from that node along each axis, in cells.
     share: [[T; N]; 3],
-    /// Place of the brick along each axis, and its link.
+    /// Place of the brick along each axis.
     bricks: [[u32; N]; 3],
+    /// Link of the brick ([`StoredBricks`]).
     links: [u32; N],
 }
 
@@ -137,14 +138,15 @@ impl<T: Real, const N: usize> Cells<T, N> {
         Cells { entries, share, bricks: places, links }
     }
 
-    /// Returns the number of positions in stored bricks.
+    /// Returns which positions are in stored bricks.
     #[inline(always)]
-    pub fn stored(&self) -> usize {
-        let mut stored = 0;
+    #[allow(clippy::needless_range_loop)] // The compiler does not inline iterators in dispatched loops.
+    pub fn stored(&self) -> [bool; N] {
+        let mut stored = [false; N];
         for i in 0..N {
-            stored += u32::from(self.links[i] < EMPTY);
+            stored[i] = self.links[i] < EMPTY;
         }
-        stored as usize
+        stored
     }
 
     /// Finds along rays, at voxel coordinates origin + t slope with these reciprocals of the slopes, where they leave the bricks around them of which none is
@@ -223,7 +225,10 @@ dispatched! {
 /// Interpolates the values of `N` positions trilinearly ([`Cells::find`]). Returns false if none of their bricks is stored; the values are then not written.
 pub fn interpolate<T: Real, const N: usize, const FUSED: bool>(table: &NodeTable<T>, at: [&[T; N]; 3], values: &mut [T; N]) -> bool {
     let cells = Cells::find(&table.bricks, at);
-    let any = cells.stored() > 0;
+    let mut any = false;
+    for stored in cells.stored() {
+        any |= stored;
+    }
     if any {
         *values = cells.numbers::<FUSED>(table);
     }

@@ -60,18 +60,6 @@ impl<T: Real, const N: usize> Sums<T, N> {
         }
     }
 
-    /// Returns the columns of the pixel of a ray, from Σ wᵢ cᵢ and the transmittance to the background.
-    #[inline(always)]
-    pub fn pixel(&self, ray: usize, rgb: [T; 3], left: T, background: [T; 3]) -> [T; COLUMNS] {
-        let mut pixel = [T::zero(); COLUMNS];
-        (0..3).for_each(|c| pixel[c] = rgb[c] + left * background[c]);
-        pixel[column::DEPTH] = self.depth[ray];
-        pixel[column::OPACITY] = self.opacity[ray];
-        pixel[column::LOG_TRANSMITTANCE] = -self.optical_depth[ray];
-        pixel[column::DISTORTION] = self.distortion[ray];
-        pixel
-    }
-
     /// Moves a ray to other sums, and leaves the sums over no samples.
     pub fn take(&mut self, ray: usize) -> Sums<T> {
         let mut taken = Sums::new();
@@ -79,6 +67,20 @@ impl<T: Real, const N: usize> Sums<T, N> {
         let own = [&mut taken.depth, &mut taken.opacity, &mut taken.optical_depth, &mut taken.distortion];
         own.into_iter().zip(all).for_each(|(own, all)| std::mem::swap(&mut own[0], &mut all[ray]));
         taken
+    }
+}
+
+impl<T: Real> Sums<T> {
+    /// Returns the columns of the pixel, from Σ wᵢ cᵢ and the transmittance to the background.
+    #[inline(always)]
+    pub fn pixel(&self, rgb: [T; 3], left: T, background: [T; 3]) -> [T; COLUMNS] {
+        let mut pixel = [T::zero(); COLUMNS];
+        (0..3).for_each(|c| pixel[c] = rgb[c] + left * background[c]);
+        [pixel[column::DEPTH]] = self.depth;
+        [pixel[column::OPACITY]] = self.opacity;
+        pixel[column::LOG_TRANSMITTANCE] = -self.optical_depth[0];
+        [pixel[column::DISTORTION]] = self.distortion;
+        pixel
     }
 }
 
@@ -100,7 +102,7 @@ impl<T: Real> Along<'_, T> {
             (0..3).for_each(|a| rgb[a] += w * c[a]);
             columns.add([w], [self.t[i]], [self.delta[i]], [sigma(i)]);
         }
-        columns.pixel(0, rgb, left, background)
+        columns.pixel(rgb, left, background)
     }
 
     /// Computes ∂L/∂σᵢ of the samples `own` of a ray, from back to front, from the cotangent g of its pixel.

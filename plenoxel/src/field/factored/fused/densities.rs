@@ -6,7 +6,7 @@
 
 use super::super::{Factored, PLANE_OF, SCALE, SHIFT};
 use super::lookup::{self, LANES, Pairs, Places, RUN, add_lanes, density_of};
-use crate::field::node_table::{self, ENTRIES, NodeTable, SIDE, StoredBricks, TOGETHER};
+use crate::field::node_table::{self, BRICKS_OF_TASK, ENTRIES, NodeTable, SIDE, StoredBricks};
 use crate::geometry::Aabb;
 use crate::render::Field;
 use crate::sampling::Occupancy;
@@ -50,7 +50,7 @@ impl<T: Real> Densities<T> {
             values
         };
         let reached = reached(&reach, bricks, |aabb| nodes_around(field, aabb));
-        let kept = parallel::map_chunks(reached.len(), TOGETHER, |range| {
+        let kept = parallel::map_chunks(reached.len(), BRICKS_OF_TASK, |range| {
             let dense = |brick: &u32| features(*brick).iter().any(|&value| value > least);
             reached[range].iter().copied().filter(dense).collect::<Vec<_>>()
         });

@@ -51,8 +51,8 @@ impl<T: Real> FromCamera<T> {
         FromCamera(Mutex::new(Latest { origin: DVec3::NAN, rays: 0, colors: None, shared: None }))
     }
 
-    /// Returns the colors as seen from the origin of the next rays. Samples are in `bricks`, a part of the bricks of the grid. `None` if the rays have several
-    /// origins, if there were only few of them, if the camera is near the grid, or if harmonics are not reduced.
+    /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if the rays have several origins, if there were only
+    /// few of them, if the camera is near the grid, or if harmonics are not reduced or have one voxel along an axis.
     pub fn of(&self, grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, rays: &[Ray]) -> Option<Arc<Colors<T>>> {
         let lattice = grid.layout().harmonics.as_ref().filter(|lattice| !lattice.nodes().contains(&1))?;
         let origin = rays.first()?.origin;

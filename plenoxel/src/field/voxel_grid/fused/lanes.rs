@@ -14,6 +14,8 @@ use std::ops::Range;
 
 /// Number of rays that are led together.
 const LANES: usize = 16;
+/// Mask of all lanes.
+const ALL: u64 = (1 << LANES) - 1;
 
 /// Sums along a ray.
 #[derive(Clone, Copy)]
@@ -29,30 +31,25 @@ pub(super) struct Pixel<T> {
 pub(super) struct Shown<T: Real> {
     /// Number of each sample's ray.
     pub of: Buffer<u32>,
-    /// Voxel coordinates, and the weights of the colors.
+    /// Voxel coordinates.
     pub at: [Buffer<T>; 3],
+    /// Weights of the colors.
     pub weight: Buffer<T>,
-    /// Number of samples so far, and of those that were evaluated, with or without a color.
+    /// Number of samples so far.
     count: usize,
+    /// Number of all samples in stored bricks, with or without a color.
     pub looked_at: usize,
-}
-
-/// Bounds of what is left out along a ray.
-#[derive(Clone, Copy)]
-pub(super) struct Bounds<T> {
-    /// Transmittance below which rays end.
-    pub stop: T,
-    /// Largest sum of the weights of samples that take the color of another.
-    pub waiting: T,
 }
 
 /// Rays that are led together.
 struct Lanes<T> {
     /// Numbers of the rays.
     ray: [u32; LANES],
-    /// Next interval, the one after the last that is needed, and the last of the whole march.
+    /// Next interval.
     next: [u32; LANES],
+    /// Interval before which the ray ends.
     end: [u32; LANES],
+    /// Last interval of the march.
     last: [u32; LANES],
     /// The march ([`March::of_steps`]).
     near: [f64; LANES],
@@ -67,38 +64,40 @@ struct Lanes<T> {
     sums: Sums<T, LANES>,
     /// Transmittance behind the samples so far; 0 in lanes without a ray.
     left: [T; LANES],
-    /// Weight of the samples that take the color of the next one, and the largest weight that may still wait.
+    /// Weight of the samples that take the color of the next one.
     waiting: [T; LANES],
+    /// Largest weight that may still wait.
     allowed: [T; LANES],
 }
 
-/// Leads rays through a table of densities. `next` returns the number of the next ray, its march, and its intervals outside of which all samples are left out;
-/// voxel coordinates are `to_voxels[0]` x + `to_voxels[1]`. `pixels` gets the sums of each ray.
+/// Leads rays through a table of densities. `next` returns the number of the next ray, its march, and the range of its intervals that can be in matter. Voxel
+/// coordinates are `to_voxels[0]` x + `to_voxels[1]`. Rays end where the transmittance is below `least`; samples whose weights sum to at most `least` for each
+/// ray take the color of another. `pixels` gets the sums of each ray.
 pub(super) fn lead<T: Real, const FUSED: bool>(
     densities: &NodeTable<T>,
     rays: &[Ray],
     mut next: impl FnMut() -> Option<(usize, March, Range<usize>)>,
     to_voxels: [f64; 2],
-    bounds: Bounds<T>,
+    least: T,
     pixels: &mut [Pixel<T>],
 ) -> Shown<T> {
     let mut shown = Shown::none();
     let mut lanes = Lanes::none();
-    let mut idle = (1 << LANES) - 1;
+    let mut idle = ALL;
     loop {
         for lane in bits(idle) {
             let Some((ray, march, intervals)) = next() else { break };
-            lanes.begin(lane, (ray, &rays[ray]), march, intervals, to_voxels, bounds);
+            lanes.begin(lane, (ray, &rays[ray]), march, intervals, to_voxels, least);
             idle &= !(1 << lane);
         }
-        if idle == (1 << LANES) - 1 {
+        if idle == ALL {
             shown.truncate();
             return shown;
         }
         let mut ended = 0;
         while ended == 0 {
             shown.make_room();
-            ended = step::<T, FUSED>(&mut lanes, densities, bounds.stop, &mut shown) & !idle;
+            ended = step::<T, FUSED>(&mut lanes, idle, densities, least, &mut shown);
         }
         for lane in bits(ended) {
             pixels[lanes.ray[lane] as usize] = lanes.end(lane);
@@ -131,16 +130,10 @@ impl<T: Real> Lanes<T> {
     }
 
     /// Gives a ray to a lane.
-    fn begin(
-        &mut self,
-        lane: usize,
-        (number, ray): (usize, &Ray),
-        march: March,
-        intervals: Range<usize>,
-        to_voxels: [f64; 2],
-        bounds: Bounds<T>,
-    ) {
+    fn begin(&mut self, lane: usize, (number, ray): (usize, &Ray), march: March, intervals: Range<usize>, to_voxels: [f64; 2], least: T) {
         let march = march.of_steps();
+        // A lane without a ray goes on along its former one.
+        self.sums.take(lane);
         self.ray[lane] = number as u32;
         [self.next[lane], self.end[lane], self.last[lane]] = [intervals.start, intervals.end, march.count - 1].map(|k| k as u32);
         (self.near[lane], self.far[lane], self.start[lane]) = (march.near, march.far, march.start);
@@ -150,7 +143,7 @@ impl<T: Real> Lanes<T> {
             self.origin[axis][lane] = ray.origin[axis] * to_voxels[0] + to_voxels[1];
             (self.slope[axis][lane], self.per_slope[axis][lane]) = (slope, slope.recip());
         }
-        (self.left[lane], self.waiting[lane], self.allowed[lane]) = (T::one(), T::zero(), bounds.waiting);
+        (self.left[lane], self.waiting[lane], self.allowed[lane]) = (T::one(), T::zero(), least);
     }
 
     /// Returns the sums along the ray of a lane, which then has no ray.
@@ -205,10 +198,10 @@ impl<T: Real> Shown<T> {
 }
 
 dispatched! {
-/// Takes one sample of each ray, or skips empty bricks. Returns a mask of the lanes whose ray has ended.
+/// Takes one sample of each ray, or skips empty bricks; `idle` is a mask of the lanes without a ray. Returns a mask of the lanes whose ray has ended.
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<T>, stop: T, shown: &mut Shown<T>) -> u64 {
-    // Plain loops vectorise, one array after another.
+fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: &NodeTable<T>, stop: T, shown: &mut Shown<T>) -> u64 {
+    // Plain loops vectorise, one array after another. These intervals are those of `March::interval`.
     let (mut middles, mut t, mut delta) = ([0.0; LANES], [T::zero(); LANES], [T::zero(); LANES]);
     for i in 0..LANES {
         let k = f64::from(lanes.next[i]);
@@ -224,13 +217,14 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<
         }
     }
     let cells = Cells::find(densities.bricks(), at.each_ref());
-    let stored = cells.stored();
-    if stored > 0 {
-        shown.looked_at += stored;
+    let stored = mask_of(&cells.stored()) & !idle;
+    if stored != 0 {
+        shown.looked_at += stored.count_ones() as usize;
         let density = cells.numbers::<FUSED>(densities);
         let (mut sigma, mut weight, mut through) = ([T::zero(); LANES], [T::zero(); LANES], [T::zero(); LANES]);
         for i in 0..LANES {
-            sigma[i] = density[i].max(T::zero());
+            // Not `max`, which would make 0 of a density that is not a number.
+            sigma[i] = if density[i] < T::zero() { T::zero() } else { density[i] };
         }
         for i in 0..LANES {
             (weight[i], through[i]) = (sigma[i] * delta[i]).absorb::<FUSED>();
@@ -275,11 +269,11 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<
     for i in 0..LANES {
         lanes.next[i] += 1;
     }
-    if stored < LANES {
+    if stored | idle != ALL {
         let exits = cells.exits(&lanes.origin, &lanes.per_slope);
         for i in 0..LANES {
-            // The number of intervals whose middle lies before the exit.
-            let before = ((exits[i] - lanes.start[i]) * lanes.per_step[i] + 0.5).max(0.0).min(f64::from(lanes.end[i])).index();
+            // The number of intervals whose middle lies before the exit, or at it, where the density is that of an empty brick.
+            let before = ((exits[i] - lanes.start[i]) * lanes.per_step[i] + 1.5).max(0.0).min(f64::from(lanes.end[i])).index();
             lanes.next[i] = lanes.next[i].max(before);
         }
     }
@@ -287,7 +281,7 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, densities: &NodeTable<
     for i in 0..LANES {
         ended[i] = (lanes.next[i] >= lanes.end[i]) | (lanes.left[i] < stop);
     }
-    mask_of(&ended)
+    mask_of(&ended) & !idle
 }
 }
 

@@ -8,7 +8,7 @@ use super::COLUMNS;
 use super::cell_bricks::CellBricks;
 use super::forward::{Block, Scene};
 use super::from_camera::{Colors, FromCamera};
-use super::lanes::{Bounds, Pixel, Shown, lead};
+use super::lanes::{Pixel, Shown, lead};
 use super::lookup::Corners;
 use crate::camera::Ray;
 use crate::field::node_table::{NodeTable, StoredBricks};
@@ -33,7 +33,7 @@ pub struct PictureTables<T: Real> {
 
 impl<T: Real> PictureTables<T> {
     /// Computes the tables. Samples are left out if the densities of all voxels around them, 1 / length, are at most `negligible`. `None` for nearest
-    /// look-up, and for tables of more than 2³² entries.
+    /// look-up, for grids of one voxel along an axis, and for tables of more than 2³² entries.
     pub fn new(grid: &VoxelGrid<T>, negligible: f64) -> Option<Self> {
         let (lattice, density) = (grid.lattice(), grid.density.tensor().data());
         let nodes = lattice.nodes();
@@ -73,22 +73,20 @@ impl<T: Real> Scene<'_, T> {
         }
         for ((pixel, own), (mut rgb, last)) in pixels.iter_mut().zip(sums).zip(rgb) {
             (0..3).for_each(|c| rgb[c] += own.waiting * last[c]);
-            *pixel = own.sums.pixel(0, rgb, own.left, background);
+            *pixel = own.sums.pixel(rgb, own.left, background);
         }
         shown.looked_at
     }
 
-    /// Computes the colors of samples, as seen along their rays. Sorts the samples by their rays.
+    /// Computes the colors of samples, as seen along their rays. Sorts the samples by their rays, and takes their positions.
     fn colors_along_rays(&self, first: usize, shown: &mut Shown<T>, rays: usize) -> Buffer<T> {
         let offsets = shown.sort(rays);
         let count = shown.of.len();
-        // All samples are visible.
-        let weight = Buffer::copy_of(&shown.weight);
-        let at = shown.at.each_ref().map(|at| Buffer::copy_of(at));
+        let corners = with_bricks!(self.batch.layout.lattice, map => Corners::find(shown.at.each_ref().map(|at| &at[..]), map, count));
+        let (at, weight) = (std::mem::take(&mut shown.at), Buffer::copy_of(&shown.weight));
+        // All samples have a weight, so they are visible with any density of 0 or more, whatever the transmittance behind them.
         let [density, after] = [Buffer::zeros(count), Buffer::zeros(count)];
         let mut block = Block { first, offsets, at, weight, density, after, color: Buffer::stale(3 * count), ..Block::empty() };
-        let at = shown.at.each_ref().map(|at| &at[..]);
-        let corners = with_bricks!(self.batch.layout.lattice, map => Corners::find(at, map, count));
         self.colors(&mut block, Some(&corners));
         block.color
     }
@@ -107,11 +105,11 @@ impl<T: Real> Scene<'_, T> {
                 (!intervals.is_empty()).then_some((r, march, intervals))
             })
         };
-        let bounds = Bounds { stop: T::lit(*stop_below), waiting: T::lit(*stop_below) };
+        let least = T::lit(*stop_below);
         let to_voxels = self.batch.layout.shape.to_voxels();
         match parallel::fused() {
-            true => lead::<T, true>(&tables.densities, rays, next, to_voxels, bounds, pixels),
-            false => lead::<T, false>(&tables.densities, rays, next, to_voxels, bounds, pixels),
+            true => lead::<T, true>(&tables.densities, rays, next, to_voxels, least, pixels),
+            false => lead::<T, false>(&tables.densities, rays, next, to_voxels, least, pixels),
         }
     }
 }

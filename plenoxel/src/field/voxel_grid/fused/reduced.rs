@@ -57,7 +57,7 @@ impl<T: Real> Look<T, 8> for Corners<T> {
 }
 
 /// Finds the rows that the samples of a block read.
-pub(super) fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lattice, block: &Block<T>) -> L {
+fn found<T: Real, L: Look<T, K>, const K: usize>(batch: &Batch<T>, lattice: &Lattice, block: &Block<T>) -> L {
     let [scale, shift] = batch.layout.shape.to_harmonics().map(T::lit);
     let at = block.at.each_ref().map(|at| {
         let mut to = Buffer::stale(at.len());
