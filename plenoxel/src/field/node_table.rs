@@ -86,6 +86,7 @@ impl<T: Real, const WIDTH: usize> NodeTable<T, WIDTH> {
         NodeTable { bricks, values: table }
     }
 
+    /// Returns the bricks of the table.
     pub fn bricks(&self) -> &Arc<StoredBricks> {
         &self.bricks
     }

@@ -3,7 +3,7 @@
 //! All rays of a picture begin at its camera, so each row of reduced harmonics is seen in one direction, that from the camera to its voxel. With the color
 //! gᵢ = Σₖ Yₖ(dᵢ) rowᵢₖ of each row, a sample reads Σᵢ vᵢ gᵢ, three numbers a row, instead of Σₖ Yₖ(d) Σᵢ vᵢ rowᵢₖ. The weighted mean of the directions dᵢ is the
 //! direction d of the sample up to second order in the angle of a voxel, so the two differ by that angle times the difference between the slopes of
-//! neighbouring rows.
+//! neighbouring rows. The colors gᵢ and the means are in tables whose bricks share faces ([`NodeTable`]).
 
 use super::cell_bricks::CellBricks;
 use crate::camera::Ray;
@@ -42,7 +42,7 @@ struct Latest<T: Real> {
     /// Rays from there so far.
     rays: usize,
     colors: Option<Arc<Colors<T>>>,
-    /// What is the same for all places: the means, and the bricks of the table of harmonics.
+    /// Parts that do not depend on the place: the means, and the bricks of the table of harmonics.
     shared: Option<(Arc<NodeTable<T, 4>>, Arc<StoredBricks>)>,
 }
 
@@ -67,14 +67,15 @@ impl<T: Real> FromCamera<T> {
         }
         latest.rays += rays.len();
         if latest.colors.is_none() && latest.rays >= ENOUGH {
+            let of_cells = CellBricks::new(lattice);
             if latest.shared.is_none() {
-                let stored = StoredBricks::new(lattice.nodes(), CellBricks::new(lattice).reading(lattice.masks()))?;
+                let stored = StoredBricks::new(lattice.nodes(), of_cells.reading(lattice.masks()))?;
                 latest.shared = Some((Arc::new(means(grid, bricks)?), Arc::new(stored)));
             }
             let (means, stored) = latest.shared.clone()?;
             let rows = colors(grid, origin)?;
             let (rows, none) = (rows.as_chunks::<4>().0, [T::zero(); 4]);
-            let harmonics = NodeTable::new(stored, none, |brick| CellBricks::new(lattice).values(brick, none, |row| rows[row]));
+            let harmonics = NodeTable::new(stored, none, |brick| of_cells.values(brick, none, |row| rows[row]));
             latest.colors = Some(Arc::new(Colors { means, harmonics }));
         }
         latest.colors.clone()

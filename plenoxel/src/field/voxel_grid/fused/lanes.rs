@@ -1,7 +1,7 @@
 //! Rays of a picture in the lanes of vectors.
 //!
-//! Neighbouring samples of a ray depend on each other: by the light that is left, and by whether there is matter at all. So the lanes of a vector are not samples
-//! of one ray, but one sample of each of [`LANES`] rays. A lane in an empty brick skips to where its ray leaves the empty bricks around it. A lane whose ray ends
+//! A sample depends on those before it on the ray: they decide how much light is left, and where empty space is skipped. So the lanes of a vector are not
+//! samples of one ray, but one sample of each of [`LANES`] rays. A lane in an empty brick skips to where its ray leaves the empty bricks around it. A lane whose ray ends
 //! gets the next one.
 
 use crate::camera::Ray;
@@ -9,6 +9,7 @@ use crate::field::node_table::{Cells, NodeTable};
 use crate::render::along::Sums;
 use crate::sampling::March;
 use autograd::lattice::bits;
+use autograd::rows::Buckets;
 use autograd::{Buffer, Real, dispatched};
 use std::ops::Range;
 
@@ -177,21 +178,17 @@ impl<T: Real> Shown<T> {
 
     /// Sorts the samples by their rays, of which there are `rays`. Returns the offsets of the rays' samples.
     pub fn sort(&mut self, rays: usize) -> Vec<u32> {
-        let mut offsets = vec![0; rays + 1];
-        self.of.iter().for_each(|&ray| offsets[ray as usize + 1] += 1);
-        (0..rays).for_each(|ray| offsets[ray + 1] += offsets[ray]);
-        let mut next = offsets.clone();
-        let mut place = |&ray: &u32| {
-            next[ray as usize] += 1;
-            next[ray as usize] as usize - 1
-        };
-        let places: Vec<usize> = self.of.iter().map(&mut place).collect();
+        let mut next = Buckets::count(rays, self.of.iter().map(|&ray| ray as usize));
+        let places: Vec<usize> = self.of.iter().map(|&ray| next.take(ray as usize)).collect();
         for column in self.at.iter_mut().chain([&mut self.weight]) {
             let unsorted = std::mem::replace(column, Buffer::stale(places.len()));
             places.iter().zip(&unsorted[..]).for_each(|(&place, &x)| column[place] = x);
         }
-        for (ray, own) in offsets.windows(2).enumerate() {
-            self.of[own[0] as usize..own[1] as usize].fill(ray as u32);
+        let (sorted, mut offsets) = (next.filled(), vec![0]);
+        for ray in 0..rays {
+            let own = sorted.range(ray);
+            offsets.push(own.end as u32);
+            self.of[own].fill(ray as u32);
         }
         offsets
     }
@@ -223,7 +220,7 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
         let density = cells.numbers::<FUSED>(densities);
         let (mut sigma, mut weight, mut through) = ([T::zero(); LANES], [T::zero(); LANES], [T::zero(); LANES]);
         for i in 0..LANES {
-            // Not `max`, which would make 0 of a density that is not a number.
+            // `max` would turn a density that is not a number into 0.
             sigma[i] = if density[i] < T::zero() { T::zero() } else { density[i] };
         }
         for i in 0..LANES {
@@ -234,7 +231,7 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
             lanes.left[i] *= through[i];
         }
         lanes.sums.add(weight, t, delta, sigma);
-        // Numbers instead of conditions, because the compiler would branch.
+        // The compiler makes branches of conditions, so they are 0 or 1 here.
         let (mut all, mut has_color, mut colored) = ([T::zero(); LANES], [T::zero(); LANES], [false; LANES]);
         for i in 0..LANES {
             all[i] = lanes.waiting[i] + weight[i];
@@ -272,7 +269,7 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
     if stored | idle != ALL {
         let exits = cells.exits(&lanes.origin, &lanes.per_slope);
         for i in 0..LANES {
-            // The number of intervals whose middle lies before the exit, or at it, where the density is that of an empty brick.
+            // The number of intervals whose middle lies before the exit or at it. At the exit, the nodes are still those of an empty brick.
             let before = ((exits[i] - lanes.start[i]) * lanes.per_step[i] + 1.5).max(0.0).min(f64::from(lanes.end[i])).index();
             lanes.next[i] = lanes.next[i].max(before);
         }
