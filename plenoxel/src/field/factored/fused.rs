@@ -154,7 +154,7 @@ fn render_inputs<T: Real>(
         jitter,
     };
     let cells = densities.map(Densities::cells).or(options.occupancy).or(field.reach());
-    let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), densities };
+    let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), densities, keep };
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
     // Without an adjoint, small blocks share the work of background and matter among the threads more evenly. They are whole packets of pixels.
     let size = if keep { block_of(n) } else { block_of(n).div_ceil(4).next_multiple_of(RAYS_OF_PACKET) };

@@ -2,7 +2,7 @@
 
 use super::super::{PLANE_OF, gradient_share};
 use super::forward::{Block, Tables};
-use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, PlaneOf, RUN, add_to_lines, first_rows};
+use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, Places, PlaneOf, RUN, add_to_lines, first_rows};
 use super::network::OfNetwork;
 use super::positions::{self, OfRays};
 use super::pruning::{self, prune};
@@ -47,21 +47,23 @@ pub struct Kept<T: Real> {
 }
 
 impl<T: Real> Kept<T> {
-    /// Takes the samples or groups with these numbers, and their cotangents, from the positions `at` of all.
-    fn new(numbers: Vec<u32>, at: [&[T]; 3], g: Buffer<T>, of: Pairs<'_, T>) -> Self {
-        let at = at.map(|at| pruning::rows(at, 1, &numbers));
-        let places = at.each_ref().map(|at| &at[..]);
-        let sorted = [0, 1, 2].map(|axis| Sorted::new(axis, places, of.nodes, bucket_shift(axis, of.nodes, of.width)));
+    fn new(numbers: Vec<u32>, at: [Buffer<T>; 3], g: Buffer<T>, of: Pairs<'_, T>) -> Self {
+        let sorted = [0, 1, 2].map(|axis| Sorted::new(axis, slices(&at), of.nodes, bucket_shift(axis, of.nodes, of.width)));
         Kept { numbers, at, g, sorted }
     }
 
     pub fn at(&self) -> [&[T]; 3] {
-        self.at.each_ref().map(|at| &at[..])
+        slices(&self.at)
     }
 
     pub fn g(&self) -> OfProducts<'_, T> {
         if self.g.len() == self.numbers.len() { OfProducts::Shared(&self.g) } else { OfProducts::Each(&self.g) }
     }
+}
+
+/// Returns views of positions in columns.
+fn slices<T: Real>(at: &[Buffer<T>; 3]) -> Places<'_, T> {
+    at.each_ref().map(|at| &at[..])
 }
 
 /// Samples sorted by the bucket of rows that they read.
@@ -236,31 +238,30 @@ fn part<T: Real>(
     let random = |name| batch.jitter.stream(Purpose::GradientPruning, block.first).map(|stream| stream.numbered(output as u64).named(name));
     let samples = prune(&mut of_features, 1, batch.gradient_above, random("density"));
     let groups = prune(&mut rgb, 3, batch.gradient_above, random("color"));
-    let OfNetwork { products, input, parameters } = tables.network.adjoint(&block.activations, &groups, &rgb);
-    let of_samples = pruning::rows(&of_features, 1, &samples);
-    let groups_at = block.groups_at.each_ref().map(|at| &at[..]);
-    let density = Kept::new(samples, block.at(), of_samples, tables.density);
+    let of_samples = pruning::picked(&of_features, &samples);
+    let samples_at = block.at().map(|at| pruning::picked(at, &samples));
+    let groups_at = block.groups_at.each_ref().map(|at| pruning::picked(at, &groups));
+    let density_lines = of_density_lines(tables.density, slices(&samples_at), &of_samples);
+    let OfNetwork { products, input, lines, parameters } =
+        tables.network.adjoint(&block.activations, &groups, tables.appearance, slices(&groups_at), &rgb);
+    let density = Kept::new(samples, samples_at, of_samples, tables.density);
     let products = Kept::new(groups, groups_at, products, tables.appearance);
-    let lines = [lines(tables.density, &density), lines(tables.appearance, &products)];
     let rays = state.tracked.as_ref().map(|tracked| {
         let encoded = tables.network.of_direction(&input);
         positions::of_rays(tracked, block, tables, [&density, &products], (encoded, batch.encoded.shape()[1]))
     });
-    (Part { density, products }, lines.into_iter().chain(parameters).collect(), rays)
+    (Part { density, products }, [density_lines, lines].into_iter().chain(parameters).collect(), rays)
 }
 
-/// Returns the cotangents of three lines, one after another.
-fn lines<T: Real>(pairs: Pairs<'_, T>, kept: &Kept<T>) -> Buffer<T> {
-    let mut sums = Buffer::zeros(pairs.nodes.iter().sum::<usize>() * pairs.width);
-    let count = kept.numbers.len();
-    for first in (0..count).step_by(RUN) {
-        let range = first..count.min(first + RUN);
-        let (at, g) = (kept.at().map(|at| &at[range.clone()]), kept.g().of(range.clone(), 3 * pairs.width));
-        if parallel::fused() {
-            add_to_lines::<T, true>(pairs, at, g, &mut sums);
-        } else {
-            add_to_lines::<T, false>(pairs, at, g, &mut sums);
-        }
+/// Returns the cotangents of the three lines of the density, one after another.
+fn of_density_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, g: &[T]) -> Buffer<T> {
+    let mut sums = pairs.zeros_of_lines();
+    let mut planes = Buffer::stale(3 * pairs.width * RUN);
+    for (first, g) in g.chunks(RUN).enumerate() {
+        let at = at.map(|at| &at[first * RUN..][..g.len()]);
+        let planes = &mut planes[..3 * pairs.width * g.len()];
+        lookup::planes(pairs, at, planes);
+        add_to_lines(pairs, at, planes, OfProducts::Shared(g), &mut sums);
     }
     sums
 }

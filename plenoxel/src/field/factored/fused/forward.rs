@@ -111,6 +111,8 @@ pub struct Scene<'a, T: Real> {
     pub tables: Tables<'a, T>,
     /// Table from which densities are read, in pictures.
     pub densities: Option<&'a Densities<T>>,
+    /// True if an adjoint follows.
+    pub keep: bool,
 }
 
 /// Parameters of a field.
@@ -234,18 +236,9 @@ impl<'a, T: Real> Scene<'a, T> {
     /// Evaluates the color network.
     fn shade(&self, block: &mut Block<T>) {
         let pairs = self.tables.appearance;
-        let products = |groups: Range<usize>, out: &mut [T]| {
-            for (first, out) in groups.clone().step_by(RUN).zip(out.chunks_mut(RUN * 3 * pairs.width)) {
-                let at = block.groups_at.each_ref().map(|at| &at[first..groups.end.min(first + RUN)]);
-                if parallel::fused() {
-                    lookup::products::<T, true>(pairs, at, out);
-                } else {
-                    lookup::products::<T, false>(pairs, at, out);
-                }
-            }
-        };
+        let at = block.groups_at.each_ref().map(|at| &at[..]);
         let (encoded, width) = (self.batch.encoded.data(), self.batch.encoded.shape()[1]);
         let direction = |i: usize| &encoded[block.groups.rays[i] as usize * width..][..width];
-        block.activations = self.tables.network.forward(block.groups.len(), products, direction);
+        block.activations = self.tables.network.forward(pairs, at, self.keep, direction);
     }
 }

@@ -4,7 +4,7 @@
 
 use super::super::{PLANE_OF, SCALE, SHIFT};
 use autograd::single::is_single;
-use autograd::{Real, Tensor, dispatched, parallel};
+use autograd::{Buffer, Real, Tensor, dispatched, parallel};
 use std::ops::Range;
 
 /// Number of components that are computed together. The number of components of a field is a multiple of it.
@@ -32,6 +32,11 @@ impl<'a, T: Real> Pairs<'a, T> {
     pub fn of(tables: &'a [Tensor<T>], nodes: [usize; 3], width: usize) -> Self {
         let data = |first: usize| [0, 1, 2].map(|axis| tables[first + axis].data());
         Pairs { planes: data(0), lines: data(3), nodes, width }
+    }
+
+    /// Returns zeros for the nodes of the three lines, one line after another.
+    pub fn zeros_of_lines(&self) -> Buffer<T> {
+        Buffer::zeros(self.nodes.iter().sum::<usize>() * self.width)
     }
 }
 
@@ -256,23 +261,46 @@ pub(super) fn density_of<T: Real, const FUSED: bool>(x: T) -> (T, T) {
     (scale * (x.max(T::zero()) + ln_1p(e)), scale * if x > T::zero() { above } else { e * above })
 }
 
+/// Splits samples, and their rows of `width` values, into runs of up to [`RUN`].
+fn runs<'a, T: Real>(at: Places<'a, T>, values: &'a mut [T], width: usize) -> impl Iterator<Item = (Places<'a, T>, &'a mut [T])> {
+    let firsts = (0..at[0].len()).step_by(RUN);
+    firsts.zip(values.chunks_mut(RUN * width)).map(move |(first, values)| (at.map(|at| &at[first..at.len().min(first + RUN)]), values))
+}
+
+/// Interpolates the three planes at samples: rows of three times `width` values.
+pub fn planes<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
+    for (at, out) in runs(at, out, 3 * pairs.width) {
+        if parallel::fused() { planes_of_run::<T, true>(pairs, at, out) } else { planes_of_run::<T, false>(pairs, at, out) }
+    }
+}
+
+/// Multiplies the values of planes at samples by those of the lines.
+pub fn times_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, values: &mut [T]) {
+    for (at, values) in runs(at, values, 3 * pairs.width) {
+        if parallel::fused() { times_lines_of_run::<T, true>(pairs, at, values) } else { times_lines_of_run::<T, false>(pairs, at, values) }
+    }
+}
+
+/// Computes the products plane · line at samples: rows of three times `width` values.
+pub fn products<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
+    for (at, out) in runs(at, out, 3 * pairs.width) {
+        planes(pairs, at, out);
+        times_lines(pairs, at, out);
+    }
+}
+
 dispatched! {
-/// Computes the products plane · line of up to [`RUN`] samples: rows of three times `width` values.
-pub fn products<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
+fn planes_of_run<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
     let cells = Cells::new(at, pairs.nodes);
     prefetch(pairs, &cells);
     let chunks = pairs.width / LANES;
     let out = out.as_chunks_mut::<LANES>().0;
     for axis in 0..3 {
-        let (plane, line) = (pairs.planes[axis].as_chunks::<LANES>().0, pairs.lines[axis].as_chunks::<LANES>().0);
+        let plane = pairs.planes[axis].as_chunks::<LANES>().0;
         for (i, out) in out.chunks_exact_mut(3 * chunks).enumerate() {
-            let (corner, along) = (cells.corner(axis, i), cells.along(axis, i));
+            let corner = cells.corner(axis, i);
             for (k, out) in out[axis * chunks..][..chunks].iter_mut().enumerate() {
-                let value = plane_at::<T, FUSED>(plane, corner, chunks, k);
-                let factor = line_at::<T, FUSED>(line, along, chunks, k);
-                for l in 0..LANES {
-                    out[l] = value[l] * factor[l];
-                }
+                *out = plane_at::<T, FUSED>(plane, corner, chunks, k);
             }
         }
     }
@@ -280,20 +308,54 @@ pub fn products<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, 
 }
 
 dispatched! {
-/// Adds the adjoint of lines, for up to [`RUN`] samples with the cotangents `g`.
-pub fn add_to_lines<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, g: Cotangents<'_, T>, sums: &mut [T]) {
+fn times_lines_of_run<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, values: &mut [T]) {
     let cells = Cells::new(at, pairs.nodes);
-    prefetch(pairs, &cells);
-    let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
-    let sums = sums.as_chunks_mut::<LANES>().0;
+    let chunks = pairs.width / LANES;
+    let values = values.as_chunks_mut::<LANES>().0;
     for axis in 0..3 {
-        let plane = pairs.planes[axis].as_chunks::<LANES>().0;
+        let line = pairs.lines[axis].as_chunks::<LANES>().0;
+        for (i, values) in values.chunks_exact_mut(3 * chunks).enumerate() {
+            let along = cells.along(axis, i);
+            for (k, value) in values[axis * chunks..][..chunks].iter_mut().enumerate() {
+                let factor = line_at::<T, FUSED>(line, along, chunks, k);
+                let plane = *value;
+                let mut product = [T::zero(); LANES];
+                for l in 0..LANES {
+                    product[l] = plane[l] * factor[l];
+                }
+                *value = product;
+            }
+        }
+    }
+}
+}
+
+/// Adds the adjoint of the lines to `sums`, for samples with the cotangents `g` and the values `planes` of the planes.
+pub fn add_to_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, planes: &[T], g: Cotangents<'_, T>, sums: &mut [T]) {
+    let width = 3 * pairs.width;
+    for first in (0..at[0].len()).step_by(RUN) {
+        let range = first..at[0].len().min(first + RUN);
+        let (at, planes, g) = (at.map(|at| &at[range.clone()]), &planes[range.start * width..], g.of(range.clone(), width));
+        if parallel::fused() {
+            add_run_to_lines::<T, true>(pairs, at, planes, g, sums);
+        } else {
+            add_run_to_lines::<T, false>(pairs, at, planes, g, sums);
+        }
+    }
+}
+
+dispatched! {
+fn add_run_to_lines<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, planes: &[T], g: Cotangents<'_, T>, sums: &mut [T]) {
+    let cells = Cells::new(at, pairs.nodes);
+    let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
+    let (planes, sums) = (planes.as_chunks::<LANES>().0, sums.as_chunks_mut::<LANES>().0);
+    for axis in 0..3 {
         let before = nodes[..axis].iter().sum::<usize>();
         let sums = &mut sums[before * chunks..];
         for i in 0..cells.count {
-            let (corner, along) = (cells.corner(axis, i), cells.along(axis, i));
+            let along = cells.along(axis, i);
             for k in 0..chunks {
-                let value = g.times(i, axis * chunks + k, 3 * chunks, plane_at::<T, FUSED>(plane, corner, chunks, k));
+                let value = g.times(i, axis * chunks + k, 3 * chunks, planes[(3 * i + axis) * chunks + k]);
                 for c in 0..2 {
                     add_to::<T, FUSED>(&mut sums[(along.row + c) * chunks + k], &value, along.weights[c]);
                 }

@@ -1,9 +1,9 @@
 //! The color network on arrays: forward and adjoint for the groups of samples of one block.
 
 use super::super::Shape;
+use super::lookup::{self, Cotangents, Pairs, Places};
 use super::pruning;
 use autograd::{Buffer, Matrix, Real, Tensor, add_product, dispatched, multiply, parallel};
-use std::ops::Range;
 
 /// Number of groups that pass through all layers before others: their values stay in the second-level cache.
 const ROWS: usize = 256;
@@ -28,20 +28,10 @@ pub struct Network<'a, T> {
 /// Values of m groups that the adjoint reads.
 #[derive(Debug, Default)]
 pub struct Activations<T: Real> {
-    /// Products plane · line, `[m, 3 R]`.
-    pub products: Buffer<T>,
-    /// Input of each layer, `[m, inputs]`.
+    /// Input of each layer, `[m, inputs]`; none without an adjoint.
     inputs: Vec<Buffer<T>>,
     /// Colors, `[m, 3]`.
     pub rgb: Buffer<T>,
-}
-
-impl<T: Real> Activations<T> {
-    /// Returns the values of the groups with these numbers.
-    pub fn rows(&self, numbers: &[u32]) -> Self {
-        let of = |all: &Buffer<T>| pruning::rows(all, 3 * all.len() / self.rgb.len().max(1), numbers);
-        Activations { products: of(&self.products), inputs: self.inputs.iter().map(of).collect(), rgb: of(&self.rgb) }
-    }
 }
 
 /// Cotangents of the network for m groups.
@@ -50,6 +40,8 @@ pub struct OfNetwork<T: Real> {
     pub products: Buffer<T>,
     /// Cotangents of the input of the first layer, `[m, inputs]`.
     pub input: Buffer<T>,
+    /// Cotangents of the three lines of the appearance, one after another.
+    pub lines: Buffer<T>,
     /// Cotangents of the matrix and of the layers' weights and biases, in the order of the parameters.
     pub parameters: Vec<Buffer<T>>,
 }
@@ -70,34 +62,36 @@ impl<'a, T: Real> Network<'a, T> {
         }
     }
 
-    /// Computes the colors of m groups from their products and encoded directions: `products` writes those of a range of groups, and `direction(i)` is the encoded
-    /// direction of group i.
-    pub fn forward(&self, m: usize, products: impl Fn(Range<usize>, &mut [T]), direction: impl Fn(usize) -> &'a [T]) -> Activations<T> {
-        let mut of = Activations {
-            products: Buffer::stale(m * self.products),
-            inputs: self.layers.iter().map(|layer| Buffer::stale(m * layer.inputs)).collect(),
-            rgb: Buffer::stale(3 * m),
-        };
+    /// Computes the colors of groups from the planes and lines of the appearance at their positions; `direction(i)` is the encoded direction of group i. The inputs
+    /// of the layers are kept for the adjoint if `keep`.
+    pub fn forward(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, keep: bool, direction: impl Fn(usize) -> &'a [T]) -> Activations<T> {
+        let m = at[0].len();
+        let kept = if keep { m } else { ROWS.min(m) };
+        let mut inputs: Vec<_> = self.layers.iter().map(|layer| Buffer::stale(kept * layer.inputs)).collect();
+        let mut rgb = Buffer::stale(3 * m);
         let width = self.layers[0].inputs;
         let encoded = self.features * (1 + 2 * self.octaves);
-        let mut features = Buffer::stale(ROWS.min(m) * self.features);
+        let [mut products, mut features] = [self.products, self.features].map(|width| Buffer::stale(ROWS.min(m) * width));
         for first in (0..m).step_by(ROWS) {
             let groups = first..m.min(first + ROWS);
             let count = groups.len();
-            let own = |width: usize| groups.start * width..groups.end * width;
-            let of_products = &mut of.products[own(self.products)];
-            products(groups.clone(), of_products);
-            let features = &mut features[..count * self.features];
-            multiply(Matrix::new(of_products, count, self.products), Matrix::new(self.basis, self.products, self.features), features);
-            let inputs = of.inputs[0][own(width)].chunks_exact_mut(width);
-            for ((i, input), features) in groups.clone().zip(inputs).zip(features.chunks_exact(self.features)) {
+            let start = if keep { first } else { 0 };
+            let own = |width: usize| start * width..(start + count) * width;
+            let (products, features) = (&mut products[..count * self.products], &mut features[..count * self.features]);
+            lookup::products(pairs, at.map(|at| &at[groups.clone()]), products);
+            multiply(Matrix::new(products, count, self.products), Matrix::new(self.basis, self.products, self.features), features);
+            let rows = inputs[0][own(width)].chunks_exact_mut(width);
+            for ((i, input), features) in groups.clone().zip(rows).zip(features.chunks_exact(self.features)) {
                 encode(features, self.octaves, &mut input[..encoded]);
                 input[encoded..].copy_from_slice(direction(i));
             }
             for (l, layer) in self.layers.iter().enumerate() {
-                let (below, above) = of.inputs.split_at_mut(l + 1);
+                let (below, above) = inputs.split_at_mut(l + 1);
                 let input = Matrix::new(&below[l][own(layer.inputs)], count, layer.inputs);
-                let out = &mut above.first_mut().unwrap_or(&mut of.rgb)[own(layer.outputs)];
+                let out = match above.first_mut() {
+                    Some(above) => &mut above[own(layer.outputs)],
+                    None => &mut rgb[3 * groups.start..3 * groups.end],
+                };
                 multiply(input, Matrix::new(layer.weight, layer.inputs, layer.outputs), out);
                 if l + 1 < self.layers.len() {
                     add_bias::<T, true>(out, layer.bias);
@@ -107,7 +101,10 @@ impl<'a, T: Real> Network<'a, T> {
                 }
             }
         }
-        of
+        if !keep {
+            inputs.clear();
+        }
+        Activations { inputs, rgb }
     }
 
     /// Returns the cotangents of encoded directions, one row for each group, from those of the input of the first layer.
@@ -116,29 +113,58 @@ impl<'a, T: Real> Network<'a, T> {
         input.chunks_exact(self.layers[0].inputs).map(move |row| &row[encoded..])
     }
 
-    /// Computes the cotangents of the products and of the parameters for the groups with these numbers, from the cotangents of the colors of all groups.
-    pub fn adjoint(&self, activations: &Activations<T>, numbers: &[u32], of_colors: &[T]) -> OfNetwork<T> {
+    /// Computes the cotangents of the products, of the lines and of the parameters for the groups with these numbers and positions, from the cotangents of the colors
+    /// of all groups.
+    pub fn adjoint(
+        &self,
+        activations: &Activations<T>,
+        numbers: &[u32],
+        pairs: Pairs<'_, T>,
+        at: Places<'_, T>,
+        of_colors: &[T],
+    ) -> OfNetwork<T> {
         let width = self.layers[0].inputs;
         let mut lengths = vec![self.basis.len()];
         lengths.extend(self.layers.iter().flat_map(|layer| [layer.weight.len(), layer.bias.len()]));
         let mut of = OfNetwork {
             products: Buffer::stale(numbers.len() * self.products),
             input: Buffer::stale(numbers.len() * width),
+            lines: pairs.zeros_of_lines(),
             parameters: lengths.into_iter().map(Buffer::zeros).collect(),
         };
-        let products = of.products.chunks_mut(ROWS * self.products);
-        for ((numbers, products), input) in numbers.chunks(ROWS).zip(products).zip(of.input.chunks_mut(ROWS * width)) {
-            self.add_adjoint(&activations.rows(numbers), pruning::rows(of_colors, 3, numbers), products, input, &mut of.parameters);
+        let [mut planes, mut products] = [(); 2].map(|()| Buffer::stale(ROWS.min(numbers.len()) * self.products));
+        let mut copies: Vec<_> = self.layers.iter().map(|_| Buffer::stale(0)).collect();
+        for (chunk, numbers) in numbers.chunks(ROWS).enumerate() {
+            let groups = chunk * ROWS..chunk * ROWS + numbers.len();
+            let own = |width: usize| groups.start * width..groups.end * width;
+            let at = at.map(|at| &at[groups.clone()]);
+            let [planes, products] = [&mut planes, &mut products].map(|values| &mut values[..numbers.len() * self.products]);
+            lookup::planes(pairs, at, planes);
+            products.copy_from_slice(planes);
+            lookup::times_lines(pairs, at, products);
+            let layers = activations.inputs.iter().zip(&self.layers).zip(&mut copies);
+            let inputs: Vec<_> = layers.map(|((all, layer), copy)| pruning::rows(all, layer.inputs, numbers, copy)).collect();
+            let of_rgb = of_logits(&activations.rgb, of_colors, numbers);
+            let of_products = &mut of.products[own(self.products)];
+            self.add_adjoint((products, &inputs), of_rgb, of_products, &mut of.input[own(width)], &mut of.parameters);
+            lookup::add_to_lines(pairs, at, planes, Cotangents::Each(of_products), &mut of.lines);
         }
         of
     }
 
-    /// Computes the cotangents of products and of the input of the first layer for some groups, from those of their colors, and adds those of the parameters.
-    fn add_adjoint(&self, of: &Activations<T>, mut g: Buffer<T>, of_products: &mut [T], of_input: &mut [T], sums: &mut [Buffer<T>]) {
+    /// Computes the cotangents of products and of the input of the first layer for some groups with these products and inputs of layers, from those of the output
+    /// of the last layer, and adds those of the parameters.
+    fn add_adjoint(
+        &self,
+        (products, inputs): (&[T], &[&[T]]),
+        mut g: Buffer<T>,
+        of_products: &mut [T],
+        of_input: &mut [T],
+        sums: &mut [Buffer<T>],
+    ) {
         let m = g.len() / 3;
-        g.iter_mut().zip(of.rgb.iter()).for_each(|(g, &c)| *g *= c * (T::one() - c));
         let (of_basis, of_layers) = sums.split_at_mut(1);
-        for (l, (layer, input)) in self.layers.iter().zip(&of.inputs).enumerate().rev() {
+        for (l, (layer, input)) in self.layers.iter().zip(inputs).enumerate().rev() {
             let [of_weight, of_bias] = &mut of_layers.as_chunks_mut::<2>().0[l];
             for row in g.chunks_exact(layer.outputs) {
                 of_bias.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
@@ -157,12 +183,23 @@ impl<'a, T: Real> Network<'a, T> {
         }
         let width = self.layers[0].inputs;
         let mut of_features = Buffer::stale(m * self.features);
-        let rows = of_features.chunks_exact_mut(self.features).zip(of_input.chunks_exact(width)).zip(of.inputs[0].chunks_exact(width));
+        let rows = of_features.chunks_exact_mut(self.features).zip(of_input.chunks_exact(width)).zip(inputs[0].chunks_exact(width));
         rows.for_each(|((out, g), encoded)| encode_adjoint(g, encoded, self.octaves, out));
         let features = Matrix::new(&of_features, m, self.features);
-        add_product(Matrix::transposed(&of.products, self.products, m), features, &mut of_basis[0]);
+        add_product(Matrix::transposed(products, self.products, m), features, &mut of_basis[0]);
         multiply(features, Matrix::transposed(self.basis, self.features, self.products), of_products);
     }
+}
+
+/// Returns the cotangents of the output of the last layer, from the colors sigmoid(output) and their cotangents, for the groups with these numbers.
+fn of_logits<T: Real>(rgb: &[T], of_colors: &[T], numbers: &[u32]) -> Buffer<T> {
+    let mut out = Buffer::stale(3 * numbers.len());
+    let (rgb, of_colors) = (rgb.as_chunks::<3>().0, of_colors.as_chunks::<3>().0);
+    for (out, &i) in out.as_chunks_mut::<3>().0.iter_mut().zip(numbers) {
+        let (c, g) = (rgb[i as usize], of_colors[i as usize]);
+        *out = [0, 1, 2].map(|k| g[k] * (c[k] * (T::one() - c[k])));
+    }
+    out
 }
 
 /// Writes f, and sin and cos of 2ᵏ f for k < `octaves`.

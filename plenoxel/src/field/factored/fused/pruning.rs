@@ -28,15 +28,23 @@ pub fn prune<T: Real>(g: &mut [T], width: usize, share: f64, random: Option<Stre
     kept
 }
 
-/// Returns the rows of `width` values with these numbers.
-pub fn rows<T: Real>(all: &[T], width: usize, numbers: &[u32]) -> Buffer<T> {
-    // Without rows, the width may be unknown.
-    if numbers.is_empty() {
-        return Buffer::stale(0);
+/// Returns the values with these numbers.
+pub fn picked<T: Real>(all: &[T], numbers: &[u32]) -> Buffer<T> {
+    let mut picked = Buffer::stale(numbers.len());
+    picked.iter_mut().zip(numbers).for_each(|(value, &i)| *value = all[i as usize]);
+    picked
+}
+
+/// Returns the rows of `width` values with these increasing numbers: a part of `all` if they follow one another, otherwise `copy`, which is overwritten.
+pub fn rows<'a, T: Real>(all: &'a [T], width: usize, numbers: &[u32], copy: &'a mut Buffer<T>) -> &'a [T] {
+    let [Some(&first), Some(&last)] = [numbers.first(), numbers.last()] else { return &[] };
+    if (last - first) as usize + 1 == numbers.len() {
+        return &all[first as usize * width..][..numbers.len() * width];
     }
-    let mut rows = Buffer::stale(numbers.len() * width);
-    for (row, &i) in rows.chunks_exact_mut(width).zip(numbers) {
+    copy.grow(numbers.len() * width);
+    let copy = &mut copy[..numbers.len() * width];
+    for (row, &i) in copy.chunks_exact_mut(width).zip(numbers) {
         row.copy_from_slice(&all[i as usize * width..][..width]);
     }
-    rows
+    copy
 }
