@@ -1,17 +1,17 @@
-//! Harmonics of a grid as they are seen from one place.
+//! Colors of a grid as they are seen from one place.
 //!
-//! All rays of a picture begin at its camera, so each row of reduced harmonics is seen in one direction, that from the camera to its voxel. With the color
+//! All rays of a picture begin at its camera, so each row of harmonics is seen in one direction, that from the camera to its voxel. With the color
 //! gᵢ = Σₖ Yₖ(dᵢ) rowᵢₖ of each row, a sample reads Σᵢ vᵢ gᵢ, three numbers a row, instead of Σₖ Yₖ(d) Σᵢ vᵢ rowᵢₖ. The weighted mean of the directions dᵢ is the
 //! direction d of the sample up to second order in the angle of a voxel, so the two differ by that angle times the difference between the slopes of
-//! neighbouring rows. The colors gᵢ and the means are in tables whose bricks share faces ([`NodeTable`]).
+//! neighbouring rows. RGB, and the means of reduced harmonics, are the same from every place. All are in tables whose bricks share faces ([`NodeTable`]).
 
 use super::cell_bricks::CellBricks;
 use crate::camera::Ray;
 use crate::field::node_table::{Cells, NodeTable, StoredBricks};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
-use autograd::lattice::TOGETHER;
-use autograd::{Buffer, Real, dispatched, parallel};
+use autograd::lattice::{Lattice, TOGETHER};
+use autograd::{Buffer, Real, Tensor, dispatched, parallel};
 use glam::DVec3;
 use ndarray::Array2;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -26,10 +26,10 @@ const ROWS: usize = 1024;
 /// Colors of a grid from one place, as tables whose interpolated vectors add up to the color of a sample. The fourth number of a vector is 0.
 #[derive(Debug)]
 pub(super) struct Colors<T: Real> {
-    /// offset + Y₀ mean at the voxels.
-    means: Arc<NodeTable<T, 4>>,
-    /// gᵢ at the voxels of harmonics.
-    harmonics: NodeTable<T, 4>,
+    /// RGB, or offset + Y₀ mean of reduced harmonics, at the voxels.
+    fixed: Option<Arc<NodeTable<T, 4>>>,
+    /// gᵢ at the voxels of harmonics, with the offset if they are not reduced.
+    seen: Option<NodeTable<T, 4>>,
 }
 
 /// Colors from the place of the latest rays.
@@ -42,8 +42,15 @@ struct Latest<T: Real> {
     /// Rays from there so far.
     rays: usize,
     colors: Option<Arc<Colors<T>>>,
-    /// Parts that do not depend on the place: the means, and the bricks of the table of harmonics.
-    shared: Option<(Arc<NodeTable<T, 4>>, Arc<StoredBricks>)>,
+    shared: Option<Shared<T>>,
+}
+
+/// Parts of colors that do not depend on the place.
+#[derive(Clone, Debug)]
+struct Shared<T: Real> {
+    fixed: Option<Arc<NodeTable<T, 4>>>,
+    /// Bricks of the table of harmonics.
+    of_harmonics: Option<Arc<StoredBricks>>,
 }
 
 impl<T: Real> FromCamera<T> {
@@ -52,13 +59,10 @@ impl<T: Real> FromCamera<T> {
     }
 
     /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if the rays have several origins, if there were only
-    /// few of them, if the camera is near the grid, or if harmonics are not reduced or have one voxel along an axis.
+    /// few of them, or for harmonics if the camera is near the grid or if they are reduced and have one voxel along an axis.
     pub fn of(&self, grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, rays: &[Ray]) -> Option<Arc<Colors<T>>> {
-        let lattice = grid.layout().harmonics.as_ref().filter(|lattice| !lattice.nodes().contains(&1))?;
         let origin = rays.first()?.origin;
-        let side = grid.shape().voxel_side() * grid.shape().sh_reduction as f64;
-        let aabb = grid.aabb();
-        if rays.iter().any(|ray| ray.origin != origin) || origin.clamp(aabb.min, aabb.max).distance(origin) < FAR * side {
+        if rays.iter().any(|ray| ray.origin != origin) || !supports(grid, origin) {
             return None;
         }
         let mut latest = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -67,59 +71,104 @@ impl<T: Real> FromCamera<T> {
         }
         latest.rays += rays.len();
         if latest.colors.is_none() && latest.rays >= ENOUGH {
-            let of_cells = CellBricks::new(lattice);
             if latest.shared.is_none() {
-                let stored = StoredBricks::new(lattice.nodes(), of_cells.reading(lattice.masks()))?;
-                latest.shared = Some((Arc::new(means(grid, bricks)?), Arc::new(stored)));
+                latest.shared = Some(Shared::new(grid, bricks)?);
             }
-            let (means, stored) = latest.shared.clone()?;
-            let rows = colors(grid, origin)?;
-            let (rows, none) = (rows.as_chunks::<4>().0, [T::zero(); 4]);
-            let harmonics = NodeTable::new(stored, none, |brick| of_cells.values(brick, none, |row| rows[row]));
-            latest.colors = Some(Arc::new(Colors { means, harmonics }));
+            let Shared { fixed, of_harmonics } = latest.shared.clone()?;
+            let seen = of_harmonics.and_then(|bricks| seen(grid, bricks, origin));
+            latest.colors = Some(Arc::new(Colors { fixed, seen }));
         }
         latest.colors.clone()
     }
 }
 
-/// Returns the table of the mean colors in these bricks.
-fn means<T: Real>(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>) -> Option<NodeTable<T, 4>> {
-    let Color::Sh { offset, .. } = grid.shape().color else { return None };
-    let (table, offset, of_cells) = (grid.color.tensor().data().as_chunks::<3>().0, T::lit(offset), CellBricks::new(grid.lattice()));
-    let color = |mean: T| offset + T::lit(sh::Y0) * mean;
-    let absent = [offset, offset, offset, T::zero()];
-    let of_row = |row: usize| {
-        let [r, g, b] = table[row].map(color);
-        [r, g, b, T::zero()]
-    };
-    Some(NodeTable::new(bricks.clone(), absent, |brick| of_cells.values(brick, absent, of_row)))
+/// Returns true if the colors of a grid are nearly those of its voxels as seen from `origin`.
+fn supports<T: Real>(grid: &VoxelGrid<T>, origin: DVec3) -> bool {
+    let (shape, aabb) = (grid.shape(), grid.aabb());
+    let side = shape.voxel_side() * shape.sh_reduction as f64;
+    let is_far = origin.clamp(aabb.min, aabb.max).distance(origin) >= FAR * side;
+    Harmonics::of(grid).is_none_or(|harmonics| is_far && !harmonics.lattice.nodes().contains(&1))
 }
 
-/// Computes the colors of all rows of reduced harmonics, seen from `origin`, as vectors of four numbers.
-fn colors<T: Real>(grid: &VoxelGrid<T>, origin: DVec3) -> Option<Buffer<T>> {
-    let (lattice, table) = (grid.layout().harmonics.as_ref()?, grid.harmonics.as_ref()?.tensor());
-    let Color::Sh { degree, .. } = grid.shape().color else { return None };
+impl<T: Real> Shared<T> {
+    /// Computes the parts for samples in these bricks. `None` if a table has more than 2³² entries.
+    fn new(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>) -> Option<Self> {
+        Some(match (grid.shape().color, &grid.layout().harmonics) {
+            (Color::Rgb, _) => Shared { fixed: Some(Arc::new(fixed(grid, bricks, T::zero(), T::one()))), of_harmonics: None },
+            (Color::Sh { .. }, None) => Shared { fixed: None, of_harmonics: Some(bricks.clone()) },
+            (Color::Sh { offset, .. }, Some(lattice)) => {
+                let means = fixed(grid, bricks, T::lit(offset), T::lit(sh::Y0));
+                let stored = StoredBricks::new(lattice.nodes(), CellBricks::new(lattice).reading(lattice.masks()))?;
+                Shared { fixed: Some(Arc::new(means)), of_harmonics: Some(Arc::new(stored)) }
+            }
+        })
+    }
+}
+
+/// Returns the table of offset + factor x in these bricks, for the numbers x of the color table.
+fn fixed<T: Real>(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, offset: T, factor: T) -> NodeTable<T, 4> {
+    let (table, of_cells) = (grid.color.tensor().data().as_chunks::<3>().0, CellBricks::new(grid.lattice()));
+    let of_row = |row: usize| {
+        let [r, g, b] = table[row].map(|x| offset + factor * x);
+        [r, g, b, T::zero()]
+    };
+    let absent = [offset, offset, offset, T::zero()];
+    NodeTable::new(bricks.clone(), absent, |brick| of_cells.values(brick, absent, of_row))
+}
+
+/// Table of harmonics: of whole colors, or of those without degree 0 if they are reduced.
+struct Harmonics<'a, T: Real> {
+    lattice: &'a Lattice,
+    rows: &'a Tensor<T>,
+    degree: usize,
+    /// Color without harmonics.
+    offset: T,
+}
+
+impl<'a, T: Real> Harmonics<'a, T> {
+    /// Returns the table of a grid; `None` for RGB.
+    fn of(grid: &'a VoxelGrid<T>) -> Option<Self> {
+        let Color::Sh { degree, offset } = grid.shape().color else { return None };
+        Some(match (&grid.layout().harmonics, &grid.harmonics) {
+            (Some(lattice), Some(rows)) => Harmonics { lattice, rows: rows.tensor(), degree, offset: T::zero() },
+            _ => Harmonics { lattice: grid.lattice(), rows: grid.color.tensor(), degree, offset: T::lit(offset) },
+        })
+    }
+
+    /// Computes the colors of all rows as vectors of four numbers; `direction` returns the direction in which a node is seen.
+    fn colors(&self, direction: impl Fn([usize; 3]) -> DVec3 + Sync) -> Buffer<T> {
+        let width = self.rows.shape()[1];
+        let count = width / 3;
+        let mut colors = Buffer::stale(4 * self.lattice.rows());
+        parallel::for_each_chunk(&mut colors, 4 * ROWS, |first, colors| {
+            let (first, colors) = (first / 4, colors.as_chunks_mut::<4>().0);
+            // Rows of absent voxels are not read.
+            let direction = |row: usize| self.lattice.node((first + row) as u32).map_or(DVec3::Z, &direction);
+            let directions: Vec<T> = (0..colors.len()).flat_map(|row| direction(row).to_array().map(T::lit)).collect();
+            let directions = Array2::from_shape_vec((colors.len(), 3), directions).expect("three numbers a row");
+            let basis = sh::values(directions.view(), self.degree);
+            let rows = self.rows.data()[first * width..].chunks_exact(width);
+            for ((color, row), basis) in colors.iter_mut().zip(rows).zip(basis.rows()) {
+                color[3] = T::zero();
+                let functions = basis.len() - count..basis.len();
+                for (color, row) in color.iter_mut().zip(row.chunks_exact(count)) {
+                    *color = self.offset + functions.clone().zip(row).map(|(k, &number)| number * basis[k]).sum();
+                }
+            }
+        });
+        colors
+    }
+}
+
+/// Computes the table of the harmonics of a grid as seen from `origin`, in these bricks.
+fn seen<T: Real>(grid: &VoxelGrid<T>, bricks: Arc<StoredBricks>, origin: DVec3) -> Option<NodeTable<T, 4>> {
+    let harmonics = Harmonics::of(grid)?;
     let ([scale, shift], [of_harmonics, start]) = (grid.shape().to_voxels(), grid.shape().to_harmonics());
     let place = |node: [usize; 3]| DVec3::from_array(node.map(|n| ((n as f64 - start) / of_harmonics - shift) / scale));
-    let width = table.shape()[1];
-    let count = width / 3;
-    let mut colors = Buffer::stale(4 * lattice.rows());
-    parallel::for_each_chunk(&mut colors, 4 * ROWS, |first, colors| {
-        let (first, colors) = (first / 4, colors.as_chunks_mut::<4>().0);
-        // Rows of absent voxels are not read.
-        let direction = |row: usize| lattice.node((first + row) as u32).map_or(DVec3::Z, |node| (place(node) - origin).normalize());
-        let directions: Vec<T> = (0..colors.len()).flat_map(|row| direction(row).to_array().map(T::lit)).collect();
-        let directions = Array2::from_shape_vec((colors.len(), 3), directions).expect("three numbers a row");
-        let basis = sh::values(directions.view(), degree);
-        let rows = table.data()[first * width..].chunks_exact(width);
-        for ((color, row), basis) in colors.iter_mut().zip(rows).zip(basis.rows()) {
-            color[3] = T::zero();
-            for (color, row) in color.iter_mut().zip(row.chunks_exact(count)) {
-                *color = row.iter().zip(basis.iter().skip(1)).map(|(&number, &y)| number * y).sum();
-            }
-        }
-    });
-    Some(colors)
+    let colors = harmonics.colors(|node| (place(node) - origin).normalize());
+    let (rows, of_cells) = (colors.as_chunks::<4>().0, CellBricks::new(harmonics.lattice));
+    let absent = [harmonics.offset, harmonics.offset, harmonics.offset, T::zero()];
+    Some(NodeTable::new(bricks, absent, |brick| of_cells.values(brick, absent, |row| rows[row])))
 }
 
 impl<T: Real> Colors<T> {
@@ -137,10 +186,8 @@ impl<T: Real> Colors<T> {
 
 dispatched! {
 /// Computes the colors of samples.
-#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], [scale, shift]: [T; 2], out: &mut [[T; 3]]) {
+fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], to_harmonics: [T; 2], out: &mut [[T; 3]]) {
     let mut own = [[T::zero(); TOGETHER]; 3];
-    let mut of_harmonics = own;
     for (group, out) in out.chunks_mut(TOGETHER).enumerate() {
         for a in 0..3 {
             let at = &at[a][group * TOGETHER..];
@@ -148,18 +195,33 @@ fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], [scale
                 Some(whole) => own[a] = *whole,
                 None => own[a][..at.len()].copy_from_slice(at),
             }
-            for i in 0..TOGETHER {
-                of_harmonics[a][i] = own[a][i] * scale + shift;
-            }
         }
-        let means = Cells::find(colors.means.bricks(), own.each_ref());
-        let harmonics = Cells::find(colors.harmonics.bricks(), of_harmonics.each_ref());
-        for (i, out) in out.iter_mut().enumerate() {
-            let (mean, rest) = (means.vector::<FUSED>(&colors.means, i), harmonics.vector::<FUSED>(&colors.harmonics, i));
-            for c in 0..3 {
-                out[c] = mean[c] + rest[c];
-            }
+        out.fill([T::zero(); 3]);
+        if let Some(table) = &colors.fixed {
+            add_colors::<T, FUSED>(table, &own, [T::one(), T::zero()], out);
+        }
+        if let Some(table) = &colors.seen {
+            add_colors::<T, FUSED>(table, &own, to_harmonics, out);
         }
     }
 }
+}
+
+/// Adds the interpolated colors of a table at scale x + shift to those of samples at x.
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+fn add_colors<T: Real, const FUSED: bool>(table: &NodeTable<T, 4>, at: &[[T; TOGETHER]; 3], [scale, shift]: [T; 2], out: &mut [[T; 3]]) {
+    let mut own = [[T::zero(); TOGETHER]; 3];
+    for a in 0..3 {
+        for i in 0..TOGETHER {
+            own[a][i] = at[a][i] * scale + shift;
+        }
+    }
+    let cells = Cells::find(table.bricks(), own.each_ref());
+    for (i, out) in out.iter_mut().enumerate() {
+        let color = cells.vector::<FUSED>(table, i);
+        for c in 0..3 {
+            out[c] += color[c];
+        }
+    }
 }
