@@ -172,10 +172,10 @@ fn seen<T: Real>(grid: &VoxelGrid<T>, bricks: Arc<StoredBricks>, origin: DVec3) 
 }
 
 impl<T: Real> Colors<T> {
-    /// Returns the colors at voxel coordinates, three numbers each.
+    /// Returns the colors at voxel coordinates, as vectors of four numbers.
     pub fn at(&self, at: [&[T]; 3], shape: &GridShape) -> Buffer<T> {
-        let mut colors = Buffer::stale(3 * at[0].len());
-        let (to_harmonics, out) = (shape.to_harmonics().map(T::lit), colors.as_chunks_mut::<3>().0);
+        let mut colors = Buffer::stale(4 * at[0].len());
+        let (to_harmonics, out) = (shape.to_harmonics().map(T::lit), colors.as_chunks_mut::<4>().0);
         match parallel::fused() {
             true => look_up::<T, true>(self, at, to_harmonics, out),
             false => look_up::<T, false>(self, at, to_harmonics, out),
@@ -185,8 +185,8 @@ impl<T: Real> Colors<T> {
 }
 
 dispatched! {
-/// Computes the colors of samples.
-fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], to_harmonics: [T; 2], out: &mut [[T; 3]]) {
+/// Computes the colors of samples. All four numbers of a vector are written, because the compiler makes two vectors of three numbers.
+fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], to_harmonics: [T; 2], out: &mut [[T; 4]]) {
     let mut own = [[T::zero(); TOGETHER]; 3];
     for (group, out) in out.chunks_mut(TOGETHER).enumerate() {
         for a in 0..3 {
@@ -196,7 +196,7 @@ fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], to_har
                 None => own[a][..at.len()].copy_from_slice(at),
             }
         }
-        out.fill([T::zero(); 3]);
+        out.fill([T::zero(); 4]);
         if let Some(table) = &colors.fixed {
             add_colors::<T, FUSED>(table, &own, [T::one(), T::zero()], out);
         }
@@ -210,7 +210,7 @@ fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], to_har
 /// Adds the interpolated colors of a table at scale x + shift to those of samples at x.
 #[inline(always)]
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-fn add_colors<T: Real, const FUSED: bool>(table: &NodeTable<T, 4>, at: &[[T; TOGETHER]; 3], [scale, shift]: [T; 2], out: &mut [[T; 3]]) {
+fn add_colors<T: Real, const FUSED: bool>(table: &NodeTable<T, 4>, at: &[[T; TOGETHER]; 3], [scale, shift]: [T; 2], out: &mut [[T; 4]]) {
     let mut own = [[T::zero(); TOGETHER]; 3];
     for a in 0..3 {
         for i in 0..TOGETHER {
@@ -220,7 +220,7 @@ fn add_colors<T: Real, const FUSED: bool>(table: &NodeTable<T, 4>, at: &[[T; TOG
     let cells = Cells::find(table.bricks(), own.each_ref());
     for (i, out) in out.iter_mut().enumerate() {
         let color = cells.vector::<FUSED>(table, i);
-        for c in 0..3 {
+        for c in 0..4 {
             out[c] += color[c];
         }
     }

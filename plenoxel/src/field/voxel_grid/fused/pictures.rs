@@ -60,15 +60,15 @@ impl<T: Real> Scene<'_, T> {
         let background = self.batch.background;
         let mut sums = vec![Pixel { sums: Sums::new(), left: T::one(), waiting: T::zero() }; pixels.len()];
         let mut shown = self.with_color(tables, first, &mut sums);
-        let colors = match &self.from_camera {
-            Some(colors) => colors.at(shown.at.each_ref().map(|at| &at[..]), &self.batch.layout.shape),
-            None => self.colors_along_rays(first, &mut shown, pixels.len()),
+        let (colors, width) = match &self.from_camera {
+            Some(colors) => (colors.at(shown.at.each_ref().map(|at| &at[..]), &self.batch.layout.shape), 4),
+            None => (self.colors_along_rays(first, &mut shown, pixels.len()), 3),
         };
         // Σ w c of each ray, and its last color.
         let mut rgb = vec![([T::zero(); 3], background); pixels.len()];
-        for ((&ray, &weight), &color) in shown.of.iter().zip(&shown.weight[..]).zip(colors.as_chunks::<3>().0) {
+        for ((&ray, &weight), color) in shown.of.iter().zip(&shown.weight[..]).zip(colors.chunks_exact(width)) {
             let (sum, last) = &mut rgb[ray as usize];
-            *last = self.batch.shown(color);
+            *last = self.batch.shown([color[0], color[1], color[2]]);
             (0..3).for_each(|c| sum[c] += weight * last[c]);
         }
         for ((pixel, own), (mut rgb, last)) in pixels.iter_mut().zip(sums).zip(rgb) {
