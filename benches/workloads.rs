@@ -3,7 +3,8 @@
 //!
 //!     cargo bench --bench workloads -- --data nerf_synthetic/lego W1
 //!
-//! `graph:W1` and so on are the same through the graph of small ops; `scaling:W1` and `scaling:W2` double one size after the other. `scale:RUN` measures what
+//! W4 is the path of pictures, with tables that are computed anew for each picture; `exact:W4` is the renderer of training, and the largest difference between both
+//! is printed. `graph:W1` and so on are the same through the graph of small ops; `scaling:W1` and `scaling:W2` double one size after the other. `scale:RUN` measures what
 //! several machines that train one scene would send (`support/scale.rs`). `pictures:RUN` renders test views of the data with the model of a run, one picture a
 //! repetition, at most eight different ones. Without `--data` the rays are of the built-in scene. Peak memory is the process's, so
 //! give one workload at a time to compare it.
@@ -135,8 +136,11 @@ fn run() {
             step(&args, &name, engine, &W2);
         }
         if let Some(name) = row("W4") {
-            image(&args, &name, engine);
+            image(&args, &name, engine, engine == Engine::Fused);
         }
+    }
+    if args.wants("exact:W4") {
+        image(&args, "exact:W4", Engine::Fused, false);
     }
     for (name, work) in [("scaling:W1", W1), ("scaling:W2", W2)] {
         if args.wants(name) {
@@ -170,8 +174,8 @@ fn pictures(args: &Arguments, folder: &str) {
     print(&format!("pictures:{folder}"), &times, Some(pixels), 0);
 }
 
-/// W4: a picture. The fused engine computes its tables anew for each.
-fn image(args: &Arguments, name: &str, engine: Engine) {
+/// W4: a picture, from tables of the grid or through [`render`].
+fn image(args: &Arguments, name: &str, engine: Engine, from_tables: bool) {
     let dataset = open(args, 1);
     let mut camera = dataset.cameras(Split::Test)[0];
     if args.data.is_none() {
@@ -180,13 +184,15 @@ fn image(args: &Arguments, name: &str, engine: Engine) {
     let grid = grid(&W2);
     let pixels = camera.intrinsics.width * camera.intrinsics.height;
     let options = options(W2.points, Jitter::None, engine);
-    let show = || match engine {
-        Engine::Fused => {
-            let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
-            picture_by(|rays| render_picture(&grid, &tables, rays, &options), &camera)
-        }
-        Engine::Graph => picture(&grid, &camera, &options),
+    let exact = || picture(&grid, &camera, &options);
+    let show = || {
+        let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
+        picture_by(|rays| render_picture(&grid, &tables, rays, &options), &camera)
     };
-    let times = repeat(args.repeats.min(3), || drop(black_box(show())));
+    let times = repeat(args.repeats.min(3), || drop(black_box(if from_tables { show() } else { exact() })));
     print(name, &times, Some(pixels), 0);
+    if from_tables {
+        let largest = (show().rgb - exact().rgb).iter().fold(0.0, |largest: f32, difference| largest.max(difference.abs()));
+        eprintln!("{name}: largest difference to exact:{name}: {:.2} 8-bit steps", 255.0 * largest);
+    }
 }

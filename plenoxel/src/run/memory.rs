@@ -14,7 +14,7 @@ use crate::checkpoint;
 use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
-use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use crate::memory;
 use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
 use crate::model::recipe::{Memory, Recipe};
@@ -151,8 +151,8 @@ impl Estimate {
         };
         Estimate {
             images: compare.map_or(0, |(dataset, split, most)| images(dataset, config.downscale, dataset.count(split).min(most))),
-            // The file and the tables read from it.
-            grid: 2 * stored.bytes(),
+            // The file, the tables read from it, and those of pictures.
+            grid: 2 * stored.bytes() + picture_tables(config, stored),
             optimizer: 0,
             step: rendering + compare.map_or(0, |(dataset, split, _)| comparison(dataset, split, COMPARED_BYTES)),
             expected: false,
@@ -481,6 +481,16 @@ fn evaluation_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
     match engine {
         Engine::Graph => 2 * 4 * (15 + color),
         Engine::Fused => 4 * 30,
+    }
+}
+
+/// Bytes of the tables of pictures: a density and a color of four numbers for each entry. A brick of 4³ cells has twice as many entries as cells.
+fn picture_tables(config: &Config, stored: &Stored) -> u64 {
+    match stored {
+        Stored::Grid { shape, voxels } if config.engine == Engine::Fused && shape.interpolation == Interpolation::Trilinear => {
+            2 * (1 + 4) * (voxels * size_of::<f32>()) as u64
+        }
+        _ => 0,
     }
 }
 

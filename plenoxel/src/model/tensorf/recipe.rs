@@ -190,7 +190,9 @@ fn bytes_of_ray(config: &Config, engine: Engine) -> u64 {
     const SAMPLES: u64 = 24;
     const COLORED: u64 = 6;
     let of_sample = 120 + if engine == Engine::Graph { 400 * config.density_components as u64 } else { 0 };
-    let of_color = 4 * (6 * config.appearance_components + 4 * config.features + 4 * config.hidden) as u64;
+    // Products are three for each component; the graph keeps both these and their cotangents.
+    let products = if engine == Engine::Graph { 6 } else { 3 } * config.appearance_components;
+    let of_color = 4 * (products + 4 * config.features + 4 * config.hidden) as u64;
     SAMPLES * of_sample + COLORED * of_color
 }
 

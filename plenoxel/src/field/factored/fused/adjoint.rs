@@ -47,12 +47,13 @@ pub struct Kept<T: Real> {
 }
 
 impl<T: Real> Kept<T> {
+    /// Takes the samples or groups with these numbers and positions, and their cotangents.
     fn new(numbers: Vec<u32>, at: [Buffer<T>; 3], g: Buffer<T>, of: Pairs<'_, T>) -> Self {
         let sorted = [0, 1, 2].map(|axis| Sorted::new(axis, slices(&at), of.nodes, bucket_shift(axis, of.nodes, of.width)));
         Kept { numbers, at, g, sorted }
     }
 
-    pub fn at(&self) -> [&[T]; 3] {
+    pub fn at(&self) -> Places<'_, T> {
         slices(&self.at)
     }
 
@@ -256,12 +257,12 @@ fn part<T: Real>(
 /// Returns the cotangents of the three lines of the density, one after another.
 fn of_density_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, g: &[T]) -> Buffer<T> {
     let mut sums = pairs.zeros_of_lines();
-    let mut planes = Buffer::stale(3 * pairs.width * RUN);
+    let mut of_planes = Buffer::stale(3 * pairs.width * RUN);
     for (first, g) in g.chunks(RUN).enumerate() {
         let at = at.map(|at| &at[first * RUN..][..g.len()]);
-        let planes = &mut planes[..3 * pairs.width * g.len()];
-        lookup::planes(pairs, at, planes);
-        add_to_lines(pairs, at, planes, OfProducts::Shared(g), &mut sums);
+        let of_planes = &mut of_planes[..3 * pairs.width * g.len()];
+        lookup::planes(pairs, at, of_planes);
+        add_to_lines(pairs, at, of_planes, OfProducts::Shared(g), &mut sums);
     }
     sums
 }

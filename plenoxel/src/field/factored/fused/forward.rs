@@ -111,7 +111,7 @@ pub struct Scene<'a, T: Real> {
     pub tables: Tables<'a, T>,
     /// Table from which densities are read, in pictures.
     pub densities: Option<&'a Densities<T>>,
-    /// True if an adjoint follows.
+    /// True if an adjoint follows, which reads the inputs of the layers.
     pub keep: bool,
 }
 

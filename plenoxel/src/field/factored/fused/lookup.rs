@@ -1,4 +1,4 @@
-//! Look-ups in planes and lines, and the adjoint of planes.
+//! Look-ups in planes and lines, and their adjoints.
 //!
 //! A row of a table is a number of chunks of [`LANES`] components.
 
@@ -67,6 +67,7 @@ pub(super) struct Along<T> {
 }
 
 impl<T: Real> Cells<T> {
+    /// Finds the cells of at most [`RUN`] samples.
     #[inline(always)]
     pub fn new(at: Places<'_, T>, nodes: [usize; 3]) -> Self {
         let count = at[0].len();
@@ -190,7 +191,7 @@ fn add_to<T: Real, const FUSED: bool>(sum: &mut [T; LANES], value: &[T; LANES], 
     *sum = new;
 }
 
-/// Positions of up to [`RUN`] samples, in units of cells.
+/// Positions of samples, in units of cells.
 pub type Places<'a, T> = [&'a [T]; 3];
 
 /// Prefetches the plane rows of samples.
@@ -330,32 +331,32 @@ fn times_lines_of_run<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Place
 }
 }
 
-/// Adds the adjoint of the lines to `sums`, for samples with the cotangents `g` and the values `planes` of the planes.
-pub fn add_to_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, planes: &[T], g: Cotangents<'_, T>, sums: &mut [T]) {
+/// Adds the adjoint of the lines to `sums`, for samples with the cotangents `g` and the values `of_planes` of the planes.
+pub fn add_to_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, of_planes: &[T], g: Cotangents<'_, T>, sums: &mut [T]) {
     let width = 3 * pairs.width;
     for first in (0..at[0].len()).step_by(RUN) {
         let range = first..at[0].len().min(first + RUN);
-        let (at, planes, g) = (at.map(|at| &at[range.clone()]), &planes[range.start * width..], g.of(range.clone(), width));
+        let (at, of_planes, g) = (at.map(|at| &at[range.clone()]), &of_planes[range.start * width..], g.of(range.clone(), width));
         if parallel::fused() {
-            add_run_to_lines::<T, true>(pairs, at, planes, g, sums);
+            add_run_to_lines::<T, true>(pairs, at, of_planes, g, sums);
         } else {
-            add_run_to_lines::<T, false>(pairs, at, planes, g, sums);
+            add_run_to_lines::<T, false>(pairs, at, of_planes, g, sums);
         }
     }
 }
 
 dispatched! {
-fn add_run_to_lines<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, planes: &[T], g: Cotangents<'_, T>, sums: &mut [T]) {
+fn add_run_to_lines<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, of_planes: &[T], g: Cotangents<'_, T>, sums: &mut [T]) {
     let cells = Cells::new(at, pairs.nodes);
     let (nodes, chunks) = (pairs.nodes, pairs.width / LANES);
-    let (planes, sums) = (planes.as_chunks::<LANES>().0, sums.as_chunks_mut::<LANES>().0);
+    let (of_planes, sums) = (of_planes.as_chunks::<LANES>().0, sums.as_chunks_mut::<LANES>().0);
     for axis in 0..3 {
         let before = nodes[..axis].iter().sum::<usize>();
         let sums = &mut sums[before * chunks..];
         for i in 0..cells.count {
             let along = cells.along(axis, i);
             for k in 0..chunks {
-                let value = g.times(i, axis * chunks + k, 3 * chunks, planes[(3 * i + axis) * chunks + k]);
+                let value = g.times(i, axis * chunks + k, 3 * chunks, of_planes[(3 * i + axis) * chunks + k]);
                 for c in 0..2 {
                     add_to::<T, FUSED>(&mut sums[(along.row + c) * chunks + k], &value, along.weights[c]);
                 }

@@ -1,4 +1,4 @@
-//! The color network on arrays: forward and adjoint for the groups of samples of one block.
+//! The color network on arrays, from the planes and lines of the appearance to colors: forward and adjoint for the groups of samples of one block.
 
 use super::super::Shape;
 use super::lookup::{self, Cotangents, Pairs, Places};
@@ -25,7 +25,7 @@ pub struct Network<'a, T> {
     layers: Vec<Layer<'a, T>>,
 }
 
-/// Values of m groups that the adjoint reads.
+/// Colors of m groups, and the values that the adjoint reads.
 #[derive(Debug, Default)]
 pub struct Activations<T: Real> {
     /// Input of each layer, `[m, inputs]`; none without an adjoint.
@@ -132,22 +132,22 @@ impl<'a, T: Real> Network<'a, T> {
             lines: pairs.zeros_of_lines(),
             parameters: lengths.into_iter().map(Buffer::zeros).collect(),
         };
-        let [mut planes, mut products] = [(); 2].map(|()| Buffer::stale(ROWS.min(numbers.len()) * self.products));
+        let [mut of_planes, mut products] = [(); 2].map(|()| Buffer::stale(ROWS.min(numbers.len()) * self.products));
         let mut copies: Vec<_> = self.layers.iter().map(|_| Buffer::stale(0)).collect();
         for (chunk, numbers) in numbers.chunks(ROWS).enumerate() {
             let groups = chunk * ROWS..chunk * ROWS + numbers.len();
             let own = |width: usize| groups.start * width..groups.end * width;
             let at = at.map(|at| &at[groups.clone()]);
-            let [planes, products] = [&mut planes, &mut products].map(|values| &mut values[..numbers.len() * self.products]);
-            lookup::planes(pairs, at, planes);
-            products.copy_from_slice(planes);
+            let [of_planes, products] = [&mut of_planes, &mut products].map(|values| &mut values[..numbers.len() * self.products]);
+            lookup::planes(pairs, at, of_planes);
+            products.copy_from_slice(of_planes);
             lookup::times_lines(pairs, at, products);
             let layers = activations.inputs.iter().zip(&self.layers).zip(&mut copies);
             let inputs: Vec<_> = layers.map(|((all, layer), copy)| pruning::rows(all, layer.inputs, numbers, copy)).collect();
             let of_rgb = of_logits(&activations.rgb, of_colors, numbers);
             let of_products = &mut of.products[own(self.products)];
             self.add_adjoint((products, &inputs), of_rgb, of_products, &mut of.input[own(width)], &mut of.parameters);
-            lookup::add_to_lines(pairs, at, planes, Cotangents::Each(of_products), &mut of.lines);
+            lookup::add_to_lines(pairs, at, of_planes, Cotangents::Each(of_products), &mut of.lines);
         }
         of
     }

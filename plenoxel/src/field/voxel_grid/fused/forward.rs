@@ -84,8 +84,9 @@ pub(super) struct Scene<'a, T: Real> {
     pub tables: [&'a [T]; 3],
     /// True for pictures, whose rays are those of neighbouring pixels: packets of them skip the empty space around the scene together ([`Sections`]).
     pub packets: bool,
-    /// Tables from which pictures are rendered, and the colors of rows of harmonics from their camera, if they are known.
+    /// Tables from which pictures are rendered.
     pub picture: Option<&'a PictureTables<T>>,
+    /// Colors as seen from the camera, if they are known.
     pub from_camera: Option<Arc<Colors<T>>>,
 }
 

@@ -3,7 +3,7 @@
 //! All rays of a picture begin at its camera, so each row of harmonics is seen in one direction, that from the camera to its voxel. With the color
 //! gᵢ = Σₖ Yₖ(dᵢ) rowᵢₖ of each row, a sample reads Σᵢ vᵢ gᵢ, three numbers a row, instead of Σₖ Yₖ(d) Σᵢ vᵢ rowᵢₖ. The weighted mean of the directions dᵢ is the
 //! direction d of the sample up to second order in the angle of a voxel, so the two differ by that angle times the difference between the slopes of
-//! neighbouring rows. RGB, and the means of reduced harmonics, are the same from every place. All are in tables whose bricks share faces ([`NodeTable`]).
+//! neighbouring rows. RGB, harmonics of degree 0, and the means of reduced harmonics are the same from every place. All are in tables whose bricks share faces ([`NodeTable`]).
 
 use super::cell_bricks::CellBricks;
 use crate::camera::Ray;
@@ -18,18 +18,20 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Least distance from a camera to the box of the grid, in sides of the voxels of harmonics.
 const FAR: f64 = 32.0;
-/// Number of rays from a camera after which the colors are computed. It takes about as long as these rays.
+/// Least number of rays from a camera after which the colors are computed.
 const ENOUGH: usize = 1 << 14;
+/// Rows whose colors take about as long as those along one ray.
+const ROWS_OF_RAY: usize = 64;
 /// Rows that one task computes.
 const ROWS: usize = 1024;
 
 /// Colors of a grid from one place, as tables whose interpolated vectors add up to the color of a sample. The fourth number of a vector is 0.
 #[derive(Debug)]
 pub(super) struct Colors<T: Real> {
-    /// RGB, or offset + Y₀ mean of reduced harmonics, at the voxels.
-    fixed: Option<Arc<NodeTable<T, 4>>>,
+    /// Colors that are the same from every place, at the voxels.
+    constant: Option<Arc<NodeTable<T, 4>>>,
     /// gᵢ at the voxels of harmonics, with the offset if they are not reduced.
-    seen: Option<NodeTable<T, 4>>,
+    harmonics: Option<NodeTable<T, 4>>,
 }
 
 /// Colors from the place of the latest rays.
@@ -48,7 +50,7 @@ struct Latest<T: Real> {
 /// Parts of colors that do not depend on the place.
 #[derive(Clone, Debug)]
 struct Shared<T: Real> {
-    fixed: Option<Arc<NodeTable<T, 4>>>,
+    constant: Option<Arc<NodeTable<T, 4>>>,
     /// Bricks of the table of harmonics.
     of_harmonics: Option<Arc<StoredBricks>>,
 }
@@ -58,55 +60,53 @@ impl<T: Real> FromCamera<T> {
         FromCamera(Mutex::new(Latest { origin: DVec3::NAN, rays: 0, colors: None, shared: None }))
     }
 
-    /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if the rays have several origins, if there were only
-    /// few of them, or for harmonics if the camera is near the grid or if they are reduced and have one voxel along an axis.
+    /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if there were only few rays, or if a table has more than
+    /// 2³² entries. With harmonics, also `None` if the rays have several origins, if the camera is near the grid, or if there is one voxel of harmonics along an axis.
     pub fn of(&self, grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, rays: &[Ray]) -> Option<Arc<Colors<T>>> {
-        let origin = rays.first()?.origin;
-        if rays.iter().any(|ray| ray.origin != origin) || !supports(grid, origin) {
-            return None;
-        }
+        let harmonics = Harmonics::of(grid);
+        let (origin, enough) = match &harmonics {
+            Some(harmonics) => (harmonics.place_of(rays, grid)?, ENOUGH.max(harmonics.lattice.rows() / ROWS_OF_RAY)),
+            // Any place.
+            None => (DVec3::ZERO, ENOUGH),
+        };
         let mut latest = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if latest.origin != origin {
             (latest.origin, latest.rays, latest.colors) = (origin, 0, None);
         }
         latest.rays += rays.len();
-        if latest.colors.is_none() && latest.rays >= ENOUGH {
+        if latest.colors.is_none() && latest.rays >= enough {
             if latest.shared.is_none() {
-                latest.shared = Some(Shared::new(grid, bricks)?);
+                latest.shared = Some(Shared::new(grid, harmonics.as_ref(), bricks)?);
             }
-            let Shared { fixed, of_harmonics } = latest.shared.clone()?;
-            let seen = of_harmonics.and_then(|bricks| seen(grid, bricks, origin));
-            latest.colors = Some(Arc::new(Colors { fixed, seen }));
+            let Shared { constant, of_harmonics } = latest.shared.clone()?;
+            let harmonics = harmonics.zip(of_harmonics).map(|(harmonics, bricks)| harmonics.seen_from(origin, grid.shape(), bricks));
+            latest.colors = Some(Arc::new(Colors { constant, harmonics }));
         }
         latest.colors.clone()
     }
 }
 
-/// Returns true if the colors of a grid are nearly those of its voxels as seen from `origin`.
-fn supports<T: Real>(grid: &VoxelGrid<T>, origin: DVec3) -> bool {
-    let (shape, aabb) = (grid.shape(), grid.aabb());
-    let side = shape.voxel_side() * shape.sh_reduction as f64;
-    let is_far = origin.clamp(aabb.min, aabb.max).distance(origin) >= FAR * side;
-    Harmonics::of(grid).is_none_or(|harmonics| is_far && !harmonics.lattice.nodes().contains(&1))
-}
-
 impl<T: Real> Shared<T> {
     /// Computes the parts for samples in these bricks. `None` if a table has more than 2³² entries.
-    fn new(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>) -> Option<Self> {
-        Some(match (grid.shape().color, &grid.layout().harmonics) {
-            (Color::Rgb, _) => Shared { fixed: Some(Arc::new(fixed(grid, bricks, T::zero(), T::one()))), of_harmonics: None },
-            (Color::Sh { .. }, None) => Shared { fixed: None, of_harmonics: Some(bricks.clone()) },
-            (Color::Sh { offset, .. }, Some(lattice)) => {
-                let means = fixed(grid, bricks, T::lit(offset), T::lit(sh::Y0));
+    fn new(grid: &VoxelGrid<T>, harmonics: Option<&Harmonics<'_, T>>, bricks: &Arc<StoredBricks>) -> Option<Self> {
+        let constant = || Some(Arc::new(constant(grid, bricks)));
+        Some(match harmonics {
+            None => Shared { constant: constant(), of_harmonics: None },
+            Some(harmonics) if harmonics.is_whole => Shared { constant: None, of_harmonics: Some(bricks.clone()) },
+            Some(Harmonics { lattice, .. }) => {
                 let stored = StoredBricks::new(lattice.nodes(), CellBricks::new(lattice).reading(lattice.masks()))?;
-                Shared { fixed: Some(Arc::new(means)), of_harmonics: Some(Arc::new(stored)) }
+                Shared { constant: constant(), of_harmonics: Some(Arc::new(stored)) }
             }
         })
     }
 }
 
-/// Returns the table of offset + factor x in these bricks, for the numbers x of the color table.
-fn fixed<T: Real>(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, offset: T, factor: T) -> NodeTable<T, 4> {
+/// Returns the table of the color table's RGB, or of offset + Y₀ c for harmonics c of degree 0, in these bricks.
+fn constant<T: Real>(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>) -> NodeTable<T, 4> {
+    let (offset, factor) = match grid.shape().color {
+        Color::Rgb => (T::zero(), T::one()),
+        Color::Sh { offset, .. } => (T::lit(offset), T::lit(sh::Y0)),
+    };
     let (table, of_cells) = (grid.color.tensor().data().as_chunks::<3>().0, CellBricks::new(grid.lattice()));
     let of_row = |row: usize| {
         let [r, g, b] = table[row].map(|x| offset + factor * x);
@@ -116,23 +116,43 @@ fn fixed<T: Real>(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, offset: T, fa
     NodeTable::new(bricks.clone(), absent, |brick| of_cells.values(brick, absent, of_row))
 }
 
-/// Table of harmonics: of whole colors, or of those without degree 0 if they are reduced.
+/// Table of harmonics that depend on the direction: of whole colors, or of those without degree 0 if they are reduced.
 struct Harmonics<'a, T: Real> {
     lattice: &'a Lattice,
     rows: &'a Tensor<T>,
     degree: usize,
+    is_whole: bool,
     /// Color without harmonics.
     offset: T,
 }
 
 impl<'a, T: Real> Harmonics<'a, T> {
-    /// Returns the table of a grid; `None` for RGB.
+    /// Returns the table of a grid; `None` if its colors are the same from every place.
     fn of(grid: &'a VoxelGrid<T>) -> Option<Self> {
-        let Color::Sh { degree, offset } = grid.shape().color else { return None };
+        let Color::Sh { degree: degree @ 1.., offset } = grid.shape().color else { return None };
         Some(match (&grid.layout().harmonics, &grid.harmonics) {
-            (Some(lattice), Some(rows)) => Harmonics { lattice, rows: rows.tensor(), degree, offset: T::zero() },
-            _ => Harmonics { lattice: grid.lattice(), rows: grid.color.tensor(), degree, offset: T::lit(offset) },
+            (Some(lattice), Some(rows)) => Harmonics { lattice, rows: rows.tensor(), degree, is_whole: false, offset: T::zero() },
+            _ => Harmonics { lattice: grid.lattice(), rows: grid.color.tensor(), degree, is_whole: true, offset: T::lit(offset) },
         })
+    }
+
+    /// Returns the origin of all rays, if it is far from the grid.
+    fn place_of(&self, rays: &[Ray], grid: &VoxelGrid<T>) -> Option<DVec3> {
+        let (origin, aabb) = (rays.first()?.origin, grid.aabb());
+        let side = grid.shape().voxel_side() * grid.shape().sh_reduction as f64;
+        let is_far = origin.clamp(aabb.min, aabb.max).distance(origin) >= FAR * side;
+        let is_one = rays.iter().all(|ray| ray.origin == origin);
+        (is_far && is_one && !self.lattice.nodes().contains(&1)).then_some(origin)
+    }
+
+    /// Computes the table of the colors as seen from `origin`, in these bricks.
+    fn seen_from(&self, origin: DVec3, shape: &GridShape, bricks: Arc<StoredBricks>) -> NodeTable<T, 4> {
+        let ([scale, shift], [of_harmonics, start]) = (shape.to_voxels(), shape.to_harmonics());
+        let place = |node: [usize; 3]| DVec3::from_array(node.map(|n| ((n as f64 - start) / of_harmonics - shift) / scale));
+        let colors = self.colors(|node| (place(node) - origin).normalize());
+        let (rows, of_cells) = (colors.as_chunks::<4>().0, CellBricks::new(self.lattice));
+        let absent = [self.offset, self.offset, self.offset, T::zero()];
+        NodeTable::new(bricks, absent, |brick| of_cells.values(brick, absent, |row| rows[row]))
     }
 
     /// Computes the colors of all rows as vectors of four numbers; `direction` returns the direction in which a node is seen.
@@ -160,17 +180,6 @@ impl<'a, T: Real> Harmonics<'a, T> {
     }
 }
 
-/// Computes the table of the harmonics of a grid as seen from `origin`, in these bricks.
-fn seen<T: Real>(grid: &VoxelGrid<T>, bricks: Arc<StoredBricks>, origin: DVec3) -> Option<NodeTable<T, 4>> {
-    let harmonics = Harmonics::of(grid)?;
-    let ([scale, shift], [of_harmonics, start]) = (grid.shape().to_voxels(), grid.shape().to_harmonics());
-    let place = |node: [usize; 3]| DVec3::from_array(node.map(|n| ((n as f64 - start) / of_harmonics - shift) / scale));
-    let colors = harmonics.colors(|node| (place(node) - origin).normalize());
-    let (rows, of_cells) = (colors.as_chunks::<4>().0, CellBricks::new(harmonics.lattice));
-    let absent = [harmonics.offset, harmonics.offset, harmonics.offset, T::zero()];
-    Some(NodeTable::new(bricks, absent, |brick| of_cells.values(brick, absent, |row| rows[row])))
-}
-
 impl<T: Real> Colors<T> {
     /// Returns the colors at voxel coordinates, as vectors of four numbers.
     pub fn at(&self, at: [&[T]; 3], shape: &GridShape) -> Buffer<T> {
@@ -185,7 +194,7 @@ impl<T: Real> Colors<T> {
 }
 
 dispatched! {
-/// Computes the colors of samples. All four numbers of a vector are written, because the compiler makes two vectors of three numbers.
+/// Computes the colors of samples. All four numbers of a vector are written: with three, the compiler splits each operation into two.
 fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], to_harmonics: [T; 2], out: &mut [[T; 4]]) {
     let mut own = [[T::zero(); TOGETHER]; 3];
     for (group, out) in out.chunks_mut(TOGETHER).enumerate() {
@@ -197,10 +206,10 @@ fn look_up<T: Real, const FUSED: bool>(colors: &Colors<T>, at: [&[T]; 3], to_har
             }
         }
         out.fill([T::zero(); 4]);
-        if let Some(table) = &colors.fixed {
+        if let Some(table) = &colors.constant {
             add_colors::<T, FUSED>(table, &own, [T::one(), T::zero()], out);
         }
-        if let Some(table) = &colors.seen {
+        if let Some(table) = &colors.harmonics {
             add_colors::<T, FUSED>(table, &own, to_harmonics, out);
         }
     }
