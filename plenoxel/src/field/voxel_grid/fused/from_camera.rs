@@ -18,9 +18,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Least distance from a camera to the box of the grid, in sides of the voxels of harmonics.
 const FAR: f64 = 32.0;
-/// Least number of rays from a camera after which the colors are computed.
+/// Least number of rays from a camera after which the colors of harmonics are computed.
 const ENOUGH: usize = 1 << 14;
-/// Rows whose colors take about as long as those along one ray.
+/// Rows whose colors take roughly as long as those along one ray, by a profile of 128³ voxels with harmonics of degree 2.
 const ROWS_OF_RAY: usize = 64;
 /// Rows that one task computes.
 const ROWS: usize = 1024;
@@ -60,14 +60,14 @@ impl<T: Real> FromCamera<T> {
         FromCamera(Mutex::new(Latest { origin: DVec3::NAN, rays: 0, colors: None, shared: None }))
     }
 
-    /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if there were only few rays, or if a table has more than
-    /// 2³² entries. With harmonics, also `None` if the rays have several origins, if the camera is near the grid, or if there is one voxel of harmonics along an axis.
+    /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if a table has more than 2³² entries. With harmonics, also
+    /// `None` if there were only few rays, if they have several origins, if the camera is near the grid, or if there is one voxel of harmonics along an axis.
     pub fn of(&self, grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, rays: &[Ray]) -> Option<Arc<Colors<T>>> {
         let harmonics = Harmonics::of(grid);
         let (origin, enough) = match &harmonics {
             Some(harmonics) => (harmonics.place_of(rays, grid)?, ENOUGH.max(harmonics.lattice.rows() / ROWS_OF_RAY)),
-            // Any place.
-            None => (DVec3::ZERO, ENOUGH),
+            // One table serves all places.
+            None => (DVec3::ZERO, 0),
         };
         let mut latest = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if latest.origin != origin {
