@@ -81,6 +81,39 @@ fn the_kernel_agrees_with_its_reference_in_value_and_gradients() {
     }
 }
 
+/// Compares the gradient of the table with the sum of those of single positions.
+fn check_against_single_positions<T: Real>(features: usize, tolerance: f64) {
+    let grid = HashGrid::new(Shape { levels: 5, features, log2_rows: 9, base: 4, growth: 1.3 });
+    let (count, width) = (200, grid.width());
+    // Along a line, so that positions in the same cell follow one another. Every third cotangent is 0, and those of a whole group.
+    let at = |i: usize| [0.1 + 0.004 * i as f64, 0.3, 0.9 - 0.002 * i as f64].map(T::lit);
+    let contributes = |i: usize| !i.is_multiple_of(3) && !(64..128).contains(&i);
+    let g = |i: usize| (0..width).map(move |k| T::lit(if contributes(i) { ((i + k) % 7) as f64 - 2.5 } else { 0.0 }));
+    let table = Tensor::variable(table::<T>(&grid));
+    let gradients = |range: std::ops::Range<usize>| {
+        let encoded = grid.encode(&table, &Tensor::from_vec(range.clone().flat_map(at).collect(), &[range.len(), 3]));
+        encoded.backward_from(&Tensor::from_vec(range.clone().flat_map(g).collect(), &[range.len(), width]))
+    };
+    let all = gradients(0..count);
+    let singly = (0..count).map(|i| gradients(i..i + 1).array(&table)).reduce(|sum, one| sum + one).expect("positions");
+    let found = all.array(&table);
+    let largest = singly.iter().fold(0.0, |largest: f64, x| largest.max(x.as_f64().abs()));
+    for (found, want) in found.iter().zip(&singly) {
+        assert!((*found - *want).as_f64().abs() <= tolerance * largest, "{features} features: {found}, not {want}");
+    }
+    let with_values: Vec<u32> =
+        (0..).zip(found.rows()).filter(|(_, row)| row.iter().any(|&x| x != T::zero())).map(|(row, _)| row).collect();
+    assert_eq!(all.get(&table).and_then(|gradient| gradient.as_rows()).expect("rows").rows(), with_values);
+}
+
+#[test]
+fn positions_of_a_cell_add_up_and_those_without_a_cotangent_are_left_out() {
+    for features in [1, 2, 4, 8] {
+        check_against_single_positions::<f64>(features, 1e-13);
+        check_against_single_positions::<f32>(features, 1e-5);
+    }
+}
+
 #[test]
 fn derivatives_of_both_orders_are_right() {
     let grid = HashGrid::new(Shape { levels: 2, features: 2, log2_rows: 4, base: 2, growth: 2.5 });

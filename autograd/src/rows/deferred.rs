@@ -17,7 +17,7 @@ pub trait RowSums<T: Real>: Debug + Send + Sync {
     fn is_empty(&self, bucket: usize) -> bool;
 
     /// Adds the contributions of a bucket to `sums`, which has one row of values for each row of the bucket, and sets the bit in `touched` of each row that has
-    /// contributions.
+    /// contributions. Rows whose sum is 0 may be left out.
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]);
 }
 

@@ -58,9 +58,15 @@ impl Level {
 
     /// Returns the row of a node, from the products of its coordinates with the [`factors`](Self::factors).
     #[inline(always)]
-    fn row(&self, [x, y, z]: [u32; 3]) -> u32 {
+    fn row(&self, node: [u32; 3]) -> u32 {
+        if self.hashed { self.row_of::<true>(node) } else { self.row_of::<false>(node) }
+    }
+
+    /// Returns the row of a node of a level that is hashed or is not.
+    #[inline(always)]
+    fn row_of<const HASHED: bool>(&self, [x, y, z]: [u32; 3]) -> u32 {
         let rows = self.rows as u32;
-        let row = if self.hashed {
+        let row = if HASHED {
             (x ^ y ^ z) & (rows - 1)
         } else {
             // The outermost node of an axis may be one beyond the grid.

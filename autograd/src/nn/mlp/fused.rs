@@ -152,8 +152,8 @@ impl<'a, T: Real> Network<'a, T> {
         hidden
     }
 
-    /// Adds the cotangents of a block, given its input, its hidden activations and the cotangent of its output. `first` is the first row of the block in
-    /// the cotangent of the input.
+    /// Stores the cotangent of the input of a block and adds those of the parameters, given its input, its hidden activations and the cotangent of its output.
+    /// `first` is the first row of the block in the cotangent of the input.
     fn adjoint(&self, x: &[T], hidden: &[Buffer<T>], g: &[T], first: usize, to: &mut Cotangents<'_, T>) {
         let m = x.len() / self.inputs();
         let needed = |l: usize, to: &Cotangents<'_, T>| {
@@ -163,6 +163,7 @@ impl<'a, T: Real> Network<'a, T> {
         let Some(lowest) = (0..self.layers.len()).find(|&l| needed(l, to)) else { return };
         let mut g = Buffer::copy_of(g);
         drop_tiny(&mut g);
+        let mut unwritten = true;
         for (l, layer) in self.layers.iter().enumerate().skip(lowest).rev() {
             let cotangent = Matrix::new(&g, m, layer.outputs);
             if let Some(sum) = &mut to.of_params[2 * l + 1] {
@@ -178,7 +179,9 @@ impl<'a, T: Real> Network<'a, T> {
                 }
             }
             if let Some(sum) = to.of_input.as_mut().filter(|_| layer.of_input > 0) {
-                add_product(cotangent, layer.upper().transpose(), &mut sum[first * layer.of_input..][..m * layer.of_input]);
+                let (upper, sum) = (layer.upper().transpose(), &mut sum[first * layer.of_input..][..m * layer.of_input]);
+                // The layers are visited from the last to the first: the skip layer, if there is one, before the first layer.
+                if std::mem::take(&mut unwritten) { multiply(cotangent, upper, sum) } else { add_product(cotangent, upper, sum) }
             }
             if l > lowest {
                 let mut below = Buffer::stale(m * layer.of_hidden);
@@ -254,7 +257,8 @@ impl<T: Real> Kernel<T> for Fused<T> {
         let (width, outputs) = (network.inputs(), network.outputs());
         let rows = x.len() / width;
         let of_part = ROWS * rows.div_ceil(ROWS).div_ceil(PARTS).max(1);
-        let mut of_input = call.needs(0).then(|| Buffer::zeros(x.len()));
+        // The first layer stores its product in each row, or the skip layer does.
+        let mut of_input = call.needs(0).then(|| Buffer::stale(x.len()));
         let zeros = || (1..count).map(|i| call.needs(i).then(|| Buffer::zeros(inputs[i].len()))).collect();
         let parts: Vec<Option<&mut [T]>> = match &mut of_input {
             Some(all) => all.chunks_mut(of_part * width).map(Some).collect(),

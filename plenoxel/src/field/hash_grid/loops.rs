@@ -1,16 +1,20 @@
 //! Inner loops of the hash encoding. A loop processes one level, because the rows of one level fit in a cache and those of all levels do not. It processes
-//! groups of [`TOGETHER`] positions: the rows of a group are computed and prefetched while those of the group before are read.
+//! groups of [`TOGETHER`] positions. [`encode`] computes the rows of a group, then reads all corners, then adds them up: only the loop that reads waits for
+//! memory, and it has nothing else to do, so dozens of its reads are under way.
 //!
 //! Between the loops and the tensors `[m, levels · features]`, numbers are in blocks of [`BLOCK`] positions: `[level, position, feature]` in each block.
 
 use super::Level;
 use autograd::{Real, dispatched, parallel};
 
-/// Number of positions that are processed together.
-pub const TOGETHER: usize = 16;
+/// Number of positions that are processed together. Loops of 16 are unrolled before the
+/// compiler looks for vectors, and then have none.
+pub const TOGETHER: usize = 64;
 
 /// Number of positions in a block, except for the last.
 pub const BLOCK: usize = 4096;
+
+const _: () = assert!(BLOCK.is_multiple_of(TOGETHER));
 
 /// Calls a loop with the number of features as a constant, in the version for this machine.
 macro_rules! with_features {
@@ -56,8 +60,9 @@ fn group<T: Real>(places: &[[T; 3]]) -> Group<T> {
 }
 
 /// Cells of a group of positions at one level.
-#[derive(Clone, Copy)]
 pub struct Cells<T> {
+    /// Coordinates of the lowest node of each cell, times the factors of the level.
+    lowest: [[u32; TOGETHER]; 3],
     /// Row of each corner. Bit a of the number of a corner is set if it is the upper node along axis a.
     pub rows: [[u32; TOGETHER]; 8],
     /// Weights of the lower and of the upper node along each axis.
@@ -69,31 +74,17 @@ impl<T: Real> Cells<T> {
     pub fn new<const FUSED: bool>(level: &Level, at: &Group<T>) -> Self {
         let (scale, half, factors) = (T::lit(level.scale), T::lit(0.5), level.factors());
         let mut shares = [[[T::zero(); TOGETHER]; 2]; 3];
-        let mut parts = [[[0; TOGETHER]; 2]; 3];
+        let mut lowest = [[0; TOGETHER]; 3];
         for a in 0..3 {
             for i in 0..TOGETHER {
                 let u = at[a][i].multiply_add::<FUSED>(scale, half);
                 let low = u.floor();
                 (shares[a][0][i], shares[a][1][i]) = (T::one() - (u - low), u - low);
-                let part = low.index().wrapping_mul(factors[a]);
-                (parts[a][0][i], parts[a][1][i]) = (part, part.wrapping_add(factors[a]));
+                lowest[a][i] = low.index().wrapping_mul(factors[a]);
             }
         }
-        let mut rows = [[0; TOGETHER]; 8];
-        for c in 0..8 {
-            let [x, y, z] = [&parts[0][c & 1], &parts[1][c >> 1 & 1], &parts[2][c >> 2]];
-            if level.hashed {
-                let (mask, first) = (level.rows as u32 - 1, level.first as u32);
-                for i in 0..TOGETHER {
-                    rows[c][i] = ((x[i] ^ y[i] ^ z[i]) & mask) + first;
-                }
-            } else {
-                for i in 0..TOGETHER {
-                    rows[c][i] = level.row([x[i], y[i], z[i]]);
-                }
-            }
-        }
-        Cells { rows, shares }
+        let rows = if level.hashed { rows::<true>(level, &lowest) } else { rows::<false>(level, &lowest) };
+        Cells { lowest, rows, shares }
     }
 
     /// Returns the weights of the corners.
@@ -109,36 +100,47 @@ impl<T: Real> Cells<T> {
         weights
     }
 
-    /// Returns whether each position is in the cell of the one before, to judge by the rows of its corners.
+    /// Returns whether each position is in the cell of the one before.
     #[inline(always)]
     pub fn continued(&self) -> [bool; TOGETHER] {
         let mut differ = [0; TOGETHER];
-        for rows in &self.rows {
-            for i in 1..TOGETHER {
-                differ[i] |= rows[i] ^ rows[i - 1];
+        for lowest in &self.lowest {
+            let mut before = [0; TOGETHER];
+            before[1..].copy_from_slice(&lowest[..TOGETHER - 1]);
+            for i in 0..TOGETHER {
+                differ[i] |= lowest[i] ^ before[i];
             }
         }
-        let mut continued = [false; TOGETHER];
-        for i in 1..TOGETHER {
-            continued[i] = differ[i] == 0;
-        }
-        continued
+        differ[0] = 1;
+        differ.map(|differ| differ == 0)
     }
 
-    /// Prefetches the rows in a part of the table that begins at row `first`.
+    /// Reads the corners.
     #[inline(always)]
-    pub fn prefetch<const F: usize>(&self, first: u32, table: &[[T; F]]) {
-        for &row in self.rows.as_flattened() {
-            // Rows hardly ever cross cache lines: their sizes are powers of two.
-            if let Some(row) = table.get(row.wrapping_sub(first) as usize) {
-                parallel::prefetch(&row[0]);
+    pub fn read<const F: usize>(&self, table: &[[T; F]], corners: &mut [[[T; F]; TOGETHER]; 8]) {
+        for ([lower, upper], rows) in corners.as_chunks_mut::<2>().0.iter_mut().zip(self.rows.as_chunks::<2>().0) {
+            for i in 0..TOGETHER {
+                // Neighbors along x, which mostly are in the same cache line.
+                [lower[i], upper[i]] = [0, 1].map(|c| table[rows[c][i] as usize]);
             }
         }
     }
 }
 
-/// Number of bytes of a level above which its rows are prefetched: those of smaller levels stay in the cache.
-const PREFETCHED: usize = 1 << 17;
+/// Returns the rows of the corners of cells, from the coordinates of their lowest nodes times the factors of the level.
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+fn rows<const HASHED: bool>(level: &Level, lowest: &[[u32; TOGETHER]; 3]) -> [[u32; TOGETHER]; 8] {
+    let factors = level.factors();
+    let mut rows = [[0; TOGETHER]; 8];
+    for c in 0..8 {
+        let up = [c & 1, c >> 1 & 1, c >> 2];
+        for i in 0..TOGETHER {
+            rows[c][i] = level.row_of::<HASHED>([0, 1, 2].map(|a| lowest[a][i].wrapping_add(factors[a].wrapping_mul(up[a] as u32))));
+        }
+    }
+    rows
+}
 
 /// Encodes positions at one level: `out` is `[positions, features]`.
 pub fn encode<T: Real>(level: &Level, features: usize, table: &[T], groups: &[Group<T>], out: &mut [T]) {
@@ -148,32 +150,20 @@ pub fn encode<T: Real>(level: &Level, features: usize, table: &[T], groups: &[Gr
 dispatched! {
 fn encode_loop<T: Real, const F: usize, const FUSED: bool>(level: &Level, table: &[T], groups: &[Group<T>], out: &mut [T]) {
     let table = table.as_chunks::<F>().0;
-    let prefetched = level.rows * size_of::<[T; F]>() > PREFETCHED;
-    let mut next = Cells::new::<FUSED>(level, &groups[0]);
-    for (k, out) in out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER).enumerate() {
-        let cells = next;
-        if let Some(group) = groups.get(k + 1) {
-            next = Cells::new::<FUSED>(level, group);
-            if prefetched {
-                next.prefetch(0, table);
-            }
-        }
+    let mut corners = [[[T::zero(); F]; TOGETHER]; 8];
+    for (group, out) in groups.iter().zip(out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER)) {
+        let cells = Cells::new::<FUSED>(level, group);
+        cells.read(table, &mut corners);
         let weights = cells.weights();
         let mut values = [[T::zero(); F]; TOGETHER];
-        for c in 0..8 {
-            let mut corner = [[T::zero(); F]; TOGETHER];
-            for i in 0..TOGETHER {
-                corner[i] = table[cells.rows[c][i] as usize];
-            }
+        for (corner, weights) in corners.iter().zip(&weights) {
             for i in 0..TOGETHER {
                 for f in 0..F {
-                    values[i][f] = corner[i][f].multiply_add::<FUSED>(weights[c][i], values[i][f]);
+                    values[i][f] = corner[i][f].multiply_add::<FUSED>(weights[i], values[i][f]);
                 }
             }
         }
-        for (out, value) in out.iter_mut().zip(values) {
-            *out = value;
-        }
+        out.copy_from_slice(&values[..out.len()]);
     }
 }
 }
@@ -187,9 +177,11 @@ dispatched! {
 fn copy_loop<T: Real, const F: usize, const FUSED: bool>(levels: usize, to_rows: bool, from: &[T], to: &mut [T]) {
     let (from, to) = (from.as_chunks::<F>().0, to.as_chunks_mut::<F>().0);
     let count = to.len() / levels;
-    for first in (0..count).step_by(TOGETHER) {
+    // A few cache lines of each level at a time.
+    const POSITIONS: usize = 16;
+    for first in (0..count).step_by(POSITIONS) {
         for l in 0..levels {
-            for i in first..count.min(first + TOGETHER) {
+            for i in first..count.min(first + POSITIONS) {
                 let (in_block, in_rows) = (l * count + i, i * levels + l);
                 let (source, target) = if to_rows { (in_block, in_rows) } else { (in_rows, in_block) };
                 to[target] = from[source];

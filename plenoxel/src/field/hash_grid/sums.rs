@@ -1,8 +1,8 @@
 //! Adjoint of the table: sums of contributions to its rows, which the optimizer requests one bucket of rows after another.
 //!
-//! A bucket has as many rows as the largest level, but at most 8 MB in single precision. The contributions of all positions to its levels are computed when they are added;
-//! none is stored. Consecutive positions of a group in the same cell, as along a ray, contribute together. There are about as many tasks as levels that share rows, so more threads than
-//! levels are of no use.
+//! A bucket has as many rows as the largest level, but at most 8 MB in single precision. The contributions of all positions to its levels are computed when
+//! they are added; none is stored. Consecutive positions of a group in the same cell, as along a ray, contribute together. The rows whose sum is not 0 are
+//! marked at the end. There are about as many tasks as levels that share rows, so more threads than levels are of no use.
 
 use super::loops::{BLOCK, Cells, Group, TOGETHER, with_features};
 use super::{HashGrid, Level};
@@ -43,87 +43,89 @@ impl<T: Real> RowSums<T> for HashSums<T> {
                 for (groups, block) in self.groups.chunks(BLOCK / TOGETHER).zip(self.blocks.chunks(BLOCK * width)) {
                     let numbers = block.len() / self.grid.levels.len();
                     let g = &block[l * numbers..][..numbers];
-                    with_features!(features, add::<T>(level, groups, g, rows.start as u32, sums, touched));
+                    with_features!(features, add::<T>(level, groups, g, rows.start as u32, sums));
                 }
             }
         }
-    }
-}
-
-/// Sums of the rows of a bucket.
-struct Sums<'a, T, const F: usize> {
-    first: u32,
-    sums: &'a mut [[T; F]],
-    touched: &'a mut [u64],
-}
-
-impl<T: Real, const F: usize> Sums<'_, T, F> {
-    /// Adds to the corners of the cell of position `i`, as far as their rows are in the bucket.
-    #[inline(always)]
-    fn add(&mut self, cells: &Cells<T>, i: usize, values: &[[T; F]; 8]) {
-        for pair in 0..4 {
-            let [a, b] = [0, 1].map(|c| cells.rows[2 * pair + c][i].wrapping_sub(self.first) as usize);
-            for (row, value) in [(a, &values[2 * pair]), (b, &values[2 * pair + 1])] {
-                if let Some(sum) = self.sums.get_mut(row) {
-                    for f in 0..F {
-                        sum[f] += value[f];
-                    }
-                }
-            }
-            // Neighbours along x are in the same word, with few exceptions.
-            let [bit_a, bit_b] = [a, b].map(|row| 1u64 << (row % 64));
-            if a / 64 == b / 64 {
-                if let Some(word) = self.touched.get_mut(a / 64) {
-                    *word |= bit_a | bit_b;
-                }
-            } else {
-                for (row, bit) in [(a, bit_a), (b, bit_b)] {
-                    if let Some(word) = self.touched.get_mut(row / 64) {
-                        *word |= bit;
-                    }
-                }
-            }
-        }
+        with_features!(features, mark::<T>(sums, touched));
     }
 }
 
 dispatched! {
 /// Adds the contributions of positions to the rows of a level that are in the bucket that begins at row `first`. `g` is `[positions, F]`.
-fn add<T: Real, const F: usize, const FUSED: bool>(
-    level: &Level,
-    groups: &[Group<T>],
-    g: &[T],
-    first: u32,
-    sums: &mut [T],
-    touched: &mut [u64],
-) {
-    let mut bucket = Sums { first, sums: sums.as_chunks_mut::<F>().0, touched };
-    let mut next = Cells::new::<FUSED>(level, &groups[0]);
-    for (k, g) in g.as_chunks::<F>().0.chunks(TOGETHER).enumerate() {
-        let cells = next;
-        if let Some(group) = groups.get(k + 1) {
-            next = Cells::new::<FUSED>(level, group);
-            next.prefetch(first, bucket.sums);
+fn add<T: Real, const F: usize, const FUSED: bool>(level: &Level, groups: &[Group<T>], g: &[T], first: u32, sums: &mut [T]) {
+    let sums = sums.as_chunks_mut::<F>().0;
+    for (group, g) in groups.iter().zip(g.as_chunks::<F>().0.chunks(TOGETHER)) {
+        let mut cells = Cells::new::<FUSED>(level, group);
+        let weights = cells.weights();
+        let mut cotangents = [[T::zero(); F]; TOGETHER];
+        cotangents[..g.len()].copy_from_slice(g);
+        let mut values = [[[T::zero(); F]; TOGETHER]; 8];
+        for (values, weights) in values.iter_mut().zip(&weights) {
+            for i in 0..TOGETHER {
+                for f in 0..F {
+                    values[i][f] = weights[i] * cotangents[i][f];
+                }
+            }
         }
-        let (weights, continued) = (cells.weights(), cells.continued());
-        // Contributions to the corners of the current cell, unless it has none.
-        let mut values = [[T::zero(); F]; 8];
-        let mut any = false;
-        for i in 0..g.len() {
-            if g[i].iter().any(|&g| g != T::zero()) {
-                any = true;
-                for c in 0..8 {
+        let count = join(&mut cells, &mut values, &cotangents);
+        for (rows, values) in cells.rows.iter().zip(&values) {
+            for (row, value) in rows[..count].iter().zip(values) {
+                if let Some(sum) = sums.get_mut(row.wrapping_sub(first) as usize) {
                     for f in 0..F {
-                        values[c][f] = g[i][f].multiply_add::<FUSED>(weights[c][i], values[c][f]);
+                        sum[f] += value[f];
                     }
                 }
             }
-            if any && !(i + 1 < g.len() && continued[i + 1]) {
-                bucket.add(&cells, i, &values);
-                values = [[T::zero(); F]; 8];
-                any = false;
-            }
         }
+    }
+}
+}
+
+/// Adds up the contributions of consecutive positions in the same cell and leaves out those with cotangent 0, which do not separate others. Returns how many
+/// are left, at the beginning of the arrays.
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+fn join<T: Real, const F: usize>(cells: &mut Cells<T>, values: &mut [[[T; F]; TOGETHER]; 8], g: &[[T; F]; TOGETHER]) -> usize {
+    let continued = cells.continued();
+    let contributes = g.map(|g| g.iter().fold(false, |any, &g| any | (g != T::zero())));
+    if contributes == [true; TOGETHER] && continued == [false; TOGETHER] {
+        return TOGETHER;
+    }
+    let (mut count, mut begun) = (0, false);
+    for i in 0..TOGETHER {
+        begun &= continued[i];
+        if contributes[i] {
+            for (rows, values) in cells.rows.iter_mut().zip(values.iter_mut()) {
+                if begun {
+                    for f in 0..F {
+                        values[count - 1][f] += values[i][f];
+                    }
+                } else {
+                    (rows[count], values[count]) = (rows[i], values[i]);
+                }
+            }
+            count += usize::from(!begun);
+            begun = true;
+        }
+    }
+    count
+}
+
+dispatched! {
+/// Sets the bits of the rows that are not 0.
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+fn mark<T: Real, const F: usize, const FUSED: bool>(sums: &[T], touched: &mut [u64]) {
+    for (word, rows) in touched.iter_mut().zip(sums.as_chunks::<F>().0.chunks(64)) {
+        let mut bits = 0;
+        for (r, row) in rows.iter().enumerate() {
+            let mut any = false;
+            for f in 0..F {
+                any |= row[f] != T::zero();
+            }
+            bits |= u64::from(any) << r;
+        }
+        *word |= bits;
     }
 }
 }
