@@ -72,15 +72,17 @@ pub struct NodeTable<T: Real, const WIDTH: usize = 1> {
 }
 
 impl<T: Real, const WIDTH: usize> NodeTable<T, WIDTH> {
-    /// Computes the table of stored bricks. `values(brick)` returns the values of a brick; nodes of other bricks have the value `elsewhere`.
-    pub fn new(bricks: Arc<StoredBricks>, elsewhere: [T; WIDTH], values: impl Fn(u32) -> [[T; WIDTH]; ENTRIES] + Sync) -> Self {
+    /// Computes the table of stored bricks. `fill(brick, values)` must write all entries of a brick, which have any values before. Nodes of
+    /// other bricks have the value `elsewhere`.
+    pub fn new(bricks: Arc<StoredBricks>, elsewhere: [T; WIDTH], fill: impl Fn(u32, &mut [[T; WIDTH]; ENTRIES]) + Sync) -> Self {
         let of_brick = WIDTH * ENTRIES;
         let mut table = Buffer::stale(WIDTH * StoredBricks::entries(bricks.stored.len()));
         let (of_others, rest) = table.split_at_mut(of_brick);
         of_others.as_chunks_mut().0.fill(elsewhere);
         parallel::for_each_chunk(rest, BRICKS_OF_TASK * of_brick, |first, of_bricks| {
-            for (to, &brick) in of_bricks.chunks_exact_mut(of_brick).zip(&bricks.stored[first / of_brick..]) {
-                to.copy_from_slice(values(brick).as_flattened());
+            let of_bricks = of_bricks.as_chunks_mut().0.as_chunks_mut().0;
+            for (values, &brick) in of_bricks.iter_mut().zip(&bricks.stored[first / of_brick..]) {
+                fill(brick, values);
             }
         });
         NodeTable { bricks, values: table }

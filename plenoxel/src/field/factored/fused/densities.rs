@@ -60,8 +60,9 @@ impl<T: Real> Densities<T> {
             return None;
         }
         // The features are computed a second time: keeping those of the first pass would double the memory.
-        let table =
-            NodeTable::new(Arc::new(StoredBricks::new(nodes, kept)?), [T::lit(NOTHING)], |brick| features(brick).map(|value| [value]));
+        let table = NodeTable::new(Arc::new(StoredBricks::new(nodes, kept)?), [T::lit(NOTHING)], |brick, values| {
+            *values = features(brick).map(|value| [value])
+        });
         let cells = reach.kept(|aabb| {
             let [low, high] = nodes_around(field, aabb);
             let mut nodes =

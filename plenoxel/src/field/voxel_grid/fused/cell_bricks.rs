@@ -56,16 +56,15 @@ impl<'a> CellBricks<'a> {
         stored.concat()
     }
 
-    /// Returns the values at the nodes of a brick of cells, from those of rows; `absent` for voxels that are not present.
-    pub fn values<V: Copy>(&self, brick: u32, absent: V, of_row: impl Fn(usize) -> V) -> [V; ENTRIES] {
+    /// Stores the values at the nodes of a brick of cells, from those of rows; `absent` for voxels that are not present.
+    pub fn fill<V: Copy>(&self, brick: u32, absent: V, of_row: impl Fn(usize) -> V, values: &mut [V; ENTRIES]) {
         let parts = self.ahead(brick).map(|place| self.lattice.brick(place));
-        let mut values = [absent; ENTRIES];
-        for (value, (part, row)) in values.iter_mut().zip(PLACES) {
-            if let Some((number, _)) = parts[part].filter(|(_, mask)| has(*mask, row)) {
-                *value = of_row(number * BRICK_ROWS + row);
-            }
+        let (of_nodes, unused) = values.split_at_mut(NODES);
+        for (value, (part, row)) in of_nodes.iter_mut().zip(PLACES) {
+            let number = parts[part].filter(|(_, mask)| has(*mask, row));
+            *value = number.map_or(absent, |(number, _)| of_row(number * BRICK_ROWS + row));
         }
-        values
+        unused.fill(absent);
     }
 
     /// Returns the places of the bricks of voxels that a brick of cells reads. Some can be outside of the lattice.

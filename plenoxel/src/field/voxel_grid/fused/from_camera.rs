@@ -11,9 +11,8 @@ use crate::field::node_table::{Cells, NodeTable, StoredBricks};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
 use autograd::lattice::{Lattice, TOGETHER};
-use autograd::{Buffer, Real, Tensor, dispatched, parallel};
+use autograd::{Buffer, Real, Tensor, dispatched, no_grad, parallel};
 use glam::DVec3;
-use ndarray::Array2;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Least distance from a camera to the box of the grid, in sides of the voxels of harmonics.
@@ -113,7 +112,7 @@ fn constant<T: Real>(grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>) -> NodeTab
         [r, g, b, T::zero()]
     };
     let absent = [offset, offset, offset, T::zero()];
-    NodeTable::new(bricks.clone(), absent, |brick| of_cells.values(brick, absent, of_row))
+    NodeTable::new(bricks.clone(), absent, |brick, values| of_cells.fill(brick, absent, of_row, values))
 }
 
 /// Table of harmonics that depend on the direction: of whole colors, or of those without degree 0 if they are reduced.
@@ -148,31 +147,34 @@ impl<'a, T: Real> Harmonics<'a, T> {
     /// Computes the table of the colors as seen from `origin`, in these bricks.
     fn seen_from(&self, origin: DVec3, shape: &GridShape, bricks: Arc<StoredBricks>) -> NodeTable<T, 4> {
         let ([scale, shift], [of_harmonics, start]) = (shape.to_voxels(), shape.to_harmonics());
-        let place = |node: [usize; 3]| DVec3::from_array(node.map(|n| ((n as f64 - start) / of_harmonics - shift) / scale));
-        let colors = self.colors(|node| (place(node) - origin).normalize());
+        // Voxel n of harmonics is at n step + first along each axis.
+        let (step, first) = ((of_harmonics * scale).recip(), -(start / of_harmonics + shift) / scale);
+        let from_camera = DVec3::splat(first) - origin;
+        let colors = self.colors(|node| DVec3::from_array(node.map(|n| n as f64)) * step + from_camera);
         let (rows, of_cells) = (colors.as_chunks::<4>().0, CellBricks::new(self.lattice));
         let absent = [self.offset, self.offset, self.offset, T::zero()];
-        NodeTable::new(bricks, absent, |brick| of_cells.values(brick, absent, |row| rows[row]))
+        NodeTable::new(bricks, absent, |brick, values| of_cells.fill(brick, absent, |row| rows[row], values))
     }
 
-    /// Computes the colors of all rows as vectors of four numbers; `direction` returns the direction in which a node is seen.
-    fn colors(&self, direction: impl Fn([usize; 3]) -> DVec3 + Sync) -> Buffer<T> {
+    /// Computes the colors of all rows as vectors of four numbers; `view` returns the vector from the camera to a node.
+    fn colors(&self, view: impl Fn([usize; 3]) -> DVec3 + Sync) -> Buffer<T> {
         let width = self.rows.shape()[1];
-        let count = width / 3;
+        let (count, functions) = (width / 3, sh::count(self.degree));
         let mut colors = Buffer::stale(4 * self.lattice.rows());
         parallel::for_each_chunk(&mut colors, 4 * ROWS, |first, colors| {
             let (first, colors) = (first / 4, colors.as_chunks_mut::<4>().0);
-            // Rows of absent voxels are not read.
-            let direction = |row: usize| self.lattice.node((first + row) as u32).map_or(DVec3::Z, &direction);
-            let directions: Vec<T> = (0..colors.len()).flat_map(|row| direction(row).to_array().map(T::lit)).collect();
-            let directions = Array2::from_shape_vec((colors.len(), 3), directions).expect("three numbers a row");
-            let basis = sh::values(directions.view(), self.degree);
+            let mut directions = Vec::with_capacity(3 * colors.len());
+            for row in first..first + colors.len() {
+                // Rows of absent voxels are not read.
+                let view = self.lattice.node(row as u32).map_or(DVec3::Z, &view);
+                directions.extend((view * view.length_recip()).to_array().map(T::lit));
+            }
+            let basis = no_grad(|| sh::basis(&Tensor::from_vec(directions, &[colors.len(), 3]), self.degree));
             let rows = self.rows.data()[first * width..].chunks_exact(width);
-            for ((color, row), basis) in colors.iter_mut().zip(rows).zip(basis.rows()) {
+            for ((color, row), basis) in colors.iter_mut().zip(rows).zip(basis.data().chunks_exact(functions)) {
                 color[3] = T::zero();
-                let functions = basis.len() - count..basis.len();
                 for (color, row) in color.iter_mut().zip(row.chunks_exact(count)) {
-                    *color = self.offset + functions.clone().zip(row).map(|(k, &number)| number * basis[k]).sum();
+                    *color = self.offset + basis[functions - count..].iter().zip(row).map(|(&basis, &number)| number * basis).sum();
                 }
             }
         });

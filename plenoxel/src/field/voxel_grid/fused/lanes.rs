@@ -248,20 +248,28 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
         for i in 0..LANES {
             lanes.waiting[i] = (T::one() - has_color[i]) * all[i];
         }
-        let mut colored = mask_of(&colored);
+        let colored = mask_of(&colored);
         let count = shown.count;
         let (of, to_weight) = (&mut shown.of[count..count + LANES], &mut shown.weight[count..count + LANES]);
         let [x, y, z] = &mut shown.at;
         let to = [&mut x[count..count + LANES], &mut y[count..count + LANES], &mut z[count..count + LANES]];
-        let mut new = 0;
-        while colored != 0 {
-            let i = colored.trailing_zeros() as usize % LANES;
-            colored &= colored - 1;
-            (of[new], to_weight[new]) = (lanes.ray[i], all[i]);
-            (to[0][new], to[1][new], to[2][new]) = (at[0][i], at[1][i], at[2][i]);
-            new += 1;
+        shown.count += colored.count_ones() as usize;
+        if colored == ALL {
+            of.copy_from_slice(&lanes.ray);
+            to_weight.copy_from_slice(&all);
+            for a in 0..3 {
+                to[a].copy_from_slice(&at[a]);
+            }
+        } else {
+            let (mut left, mut new) = (colored, 0);
+            while left != 0 {
+                let i = left.trailing_zeros() as usize % LANES;
+                left &= left - 1;
+                (of[new], to_weight[new]) = (lanes.ray[i], all[i]);
+                (to[0][new], to[1][new], to[2][new]) = (at[0][i], at[1][i], at[2][i]);
+                new += 1;
+            }
         }
-        shown.count += new;
     }
     for i in 0..LANES {
         lanes.next[i] += 1;

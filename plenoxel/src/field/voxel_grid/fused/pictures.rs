@@ -44,7 +44,8 @@ impl<T: Real> PictureTables<T> {
         let dense = grid.voxels_denser_than(negligible);
         let bricks = CellBricks::new(lattice);
         let stored = StoredBricks::new(nodes, bricks.reading(dense.masks()))?;
-        let densities = NodeTable::new(Arc::new(stored), [T::zero()], |brick| bricks.values(brick, [T::zero()], |row| [density[row]]));
+        let densities =
+            NodeTable::new(Arc::new(stored), [T::zero()], |brick, values| bricks.fill(brick, [T::zero()], |row| [density[row]], values));
         Some(PictureTables { densities, cells: grid.shape().cells_reading(dense), from_camera: FromCamera::none() })
     }
 
