@@ -121,7 +121,8 @@ impl<T: Real> Cells<T> {
         for ([lower, upper], rows) in corners.as_chunks_mut::<2>().0.iter_mut().zip(self.rows.as_chunks::<2>().0) {
             for i in 0..TOGETHER {
                 // Neighbors along x, which mostly are in the same cache line.
-                [lower[i], upper[i]] = [0, 1].map(|c| table[rows[c][i] as usize]);
+                lower[i] = table[rows[0][i] as usize];
+                upper[i] = table[rows[1][i] as usize];
             }
         }
     }
