@@ -115,9 +115,10 @@ impl<T: Real> Cells<T> {
         differ.map(|differ| differ == 0)
     }
 
-    /// Reads the corners.
+    /// Returns the weighted sums of the corners of all cells. All corners are read before the first is summed: no sum waits for the table.
     #[inline(always)]
-    pub fn read<const F: usize>(&self, table: &[[T; F]], corners: &mut [[[T; F]; TOGETHER]; 8]) {
+    fn sums<const F: usize, const FUSED: bool>(&self, table: &[[T; F]]) -> [[T; F]; TOGETHER] {
+        let mut corners = [[[T::zero(); F]; TOGETHER]; 8];
         for ([lower, upper], rows) in corners.as_chunks_mut::<2>().0.iter_mut().zip(self.rows.as_chunks::<2>().0) {
             for i in 0..TOGETHER {
                 // Neighbors along x, which mostly are in the same cache line.
@@ -125,6 +126,43 @@ impl<T: Real> Cells<T> {
                 upper[i] = table[rows[1][i] as usize];
             }
         }
+        let mut sums = [[T::zero(); F]; TOGETHER];
+        for (corner, weights) in corners.iter().zip(&self.weights()) {
+            for i in 0..TOGETHER {
+                for f in 0..F {
+                    sums[i][f] = corner[i][f].multiply_add::<FUSED>(weights[i], sums[i][f]);
+                }
+            }
+        }
+        sums
+    }
+
+    /// Returns the weighted sums of the corners of one cell after another; the rows of a later cell are prefetched.
+    #[inline(always)]
+    fn sums_one_by_one<const F: usize, const FUSED: bool>(&self, table: &[[T; F]]) -> [[T; F]; TOGETHER] {
+        const AHEAD: usize = 16;
+        let prefetch = |i: usize| {
+            for c in 0..8 {
+                if let Some(row) = table.get(self.rows[c][i] as usize) {
+                    parallel::prefetch(&row[0]);
+                }
+            }
+        };
+        (0..AHEAD).for_each(prefetch);
+        let weights = self.weights();
+        let mut sums = [[T::zero(); F]; TOGETHER];
+        for i in 0..TOGETHER {
+            if i + AHEAD < TOGETHER {
+                prefetch(i + AHEAD);
+            }
+            for c in 0..8 {
+                let row = &table[self.rows[c][i] as usize];
+                for f in 0..F {
+                    sums[i][f] = row[f].multiply_add::<FUSED>(weights[c][i], sums[i][f]);
+                }
+            }
+        }
+        sums
     }
 }
 
@@ -151,19 +189,10 @@ pub fn encode<T: Real>(level: &Level, features: usize, table: &[T], groups: &[Gr
 dispatched! {
 fn encode_loop<T: Real, const F: usize, const FUSED: bool>(level: &Level, table: &[T], groups: &[Group<T>], out: &mut [T]) {
     let table = table.as_chunks::<F>().0;
-    let mut corners = [[[T::zero(); F]; TOGETHER]; 8];
     for (group, out) in groups.iter().zip(out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER)) {
         let cells = Cells::new::<FUSED>(level, group);
-        cells.read(table, &mut corners);
-        let weights = cells.weights();
-        let mut values = [[T::zero(); F]; TOGETHER];
-        for (corner, weights) in corners.iter().zip(&weights) {
-            for i in 0..TOGETHER {
-                for f in 0..F {
-                    values[i][f] = corner[i][f].multiply_add::<FUSED>(weights[i], values[i][f]);
-                }
-            }
-        }
+        // Rows of four features and more are vectors of their own; a buffer for their corners would fill the first-level cache.
+        let values = if const { F <= 2 } { cells.sums::<F, FUSED>(table) } else { cells.sums_one_by_one::<F, FUSED>(table) };
         out.copy_from_slice(&values[..out.len()]);
     }
 }
