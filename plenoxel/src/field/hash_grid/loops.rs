@@ -1,6 +1,6 @@
 //! Inner loops of the hash encoding. A loop processes one level, because the rows of one level fit in a cache and those of all levels do not. It processes
-//! groups of [`TOGETHER`] positions. [`encode`] computes the rows of a group, then reads all corners, then adds them up: only the loop that reads waits for
-//! memory, and it has nothing else to do, so dozens of its reads are under way.
+//! groups of [`TOGETHER`] positions. With one or two features, [`encode`] reads all corners of a group before it adds them up: only the loop that reads waits
+//! for memory, and it has nothing else to do, so dozens of its reads are under way.
 //!
 //! Between the loops and the tensors `[m, levels · features]`, numbers are in blocks of [`BLOCK`] positions: `[level, position, feature]` in each block.
 
