@@ -72,8 +72,8 @@ pub struct NodeTable<T: Real, const WIDTH: usize = 1> {
 }
 
 impl<T: Real, const WIDTH: usize> NodeTable<T, WIDTH> {
-    /// Computes the table of stored bricks. `fill(brick, values)` must write all entries of a brick, which have any values before. Nodes of
-    /// other bricks have the value `elsewhere`.
+    /// Computes the table of stored bricks. `fill(brick, values)` must write all entries of a brick: they hold arbitrary values before.
+    /// Nodes of other bricks have the value `elsewhere`.
     pub fn new(bricks: Arc<StoredBricks>, elsewhere: [T; WIDTH], fill: impl Fn(u32, &mut [[T; WIDTH]; ENTRIES]) + Sync) -> Self {
         let of_brick = WIDTH * ENTRIES;
         let mut table = Buffer::stale(WIDTH * StoredBricks::entries(bricks.stored.len()));

@@ -257,7 +257,7 @@ impl<T: Real> Kernel<T> for Fused<T> {
         let (width, outputs) = (network.inputs(), network.outputs());
         let rows = x.len() / width;
         let of_part = ROWS * rows.div_ceil(ROWS).div_ceil(PARTS).max(1);
-        // The first layer stores its product in each row, or the skip layer does.
+        // Each row is stored by the skip layer, or without one by the first layer.
         let mut of_input = call.needs(0).then(|| Buffer::stale(x.len()));
         let zeros = || (1..count).map(|i| call.needs(i).then(|| Buffer::zeros(inputs[i].len()))).collect();
         let parts: Vec<Option<&mut [T]>> = match &mut of_input {

@@ -7,8 +7,7 @@
 use super::Level;
 use autograd::{Real, dispatched, parallel};
 
-/// Number of positions that are processed together. Loops of 16 are unrolled before the
-/// compiler looks for vectors, and then have none.
+/// Number of positions that are processed together. With 16, the compiler unrolls the loops before it vectorizes, and parts of them stay scalar.
 pub const TOGETHER: usize = 64;
 
 /// Number of positions in a block, except for the last.

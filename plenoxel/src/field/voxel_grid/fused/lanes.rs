@@ -255,6 +255,7 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
         let to = [&mut x[count..count + LANES], &mut y[count..count + LANES], &mut z[count..count + LANES]];
         shown.count += colored.count_ones() as usize;
         if colored == ALL {
+            // Whole vectors, without a loop over the lanes.
             of.copy_from_slice(&lanes.ray);
             to_weight.copy_from_slice(&all);
             for a in 0..3 {
