@@ -8,6 +8,7 @@ use crate::field::voxel_grid::VoxelGrid;
 use crate::random::{Purpose, bits};
 use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, STRIDE, has, previous_in};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, RowSparse, RowSums, Tensor, dispatched, parallel};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Added under the root to make it smooth (source paper).
@@ -115,13 +116,11 @@ fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(
     let bricks = lattice.neighbours();
     let (first, count) = part.unwrap_or((0, bricks.len()));
     let run = Run { first, count, all: bricks.len() };
-    let mut roots = Buffer::<T>::stale(count * BRICK_ROWS * W);
     let values = table.data().as_chunks::<S>().0;
-    let tasks: Vec<_> = roots.as_chunks_mut::<S>().0.chunks_mut(TASK * BRICK).collect();
-    let sums = parallel::map_items(tasks, |task, roots| inverse_roots::<T, W, N, S>(values, bricks, run, task * TASK, roots));
+    let sums = parallel::map_chunks(count, TASK, |range| variation::<T, W, N, S>(values, bricks, run, range));
     let terms = run.bricks().map(|brick| bricks[brick].cells.count_ones() as usize).sum::<usize>() * W;
     let value = sums.into_iter().sum::<T>() / T::lit(terms.max(1) as f64);
-    let kernel = TotalVariation::<T, W, N, S> { lattice: lattice.clone(), run, sparse: part.is_some(), terms, roots };
+    let kernel = TotalVariation::<W, N, S> { lattice: lattice.clone(), run, sparse: part.is_some(), terms };
     Tensor::from_kernel(vec![value].into(), &[], &[table], kernel)
 }
 
@@ -193,7 +192,7 @@ fn check<T: Real>(table: &Tensor<T>, lattice: &Lattice) {
 
 /// Kernel of [`total_variation`].
 #[derive(Debug)]
-struct TotalVariation<T: Real, const W: usize, const N: usize, const S: usize> {
+struct TotalVariation<const W: usize, const N: usize, const S: usize> {
     lattice: Lattice,
     /// Bricks whose cells are included.
     run: Run,
@@ -201,8 +200,6 @@ struct TotalVariation<T: Real, const W: usize, const N: usize, const S: usize> {
     sparse: bool,
     /// Number of cells times channels.
     terms: usize,
-    /// 1 / √(…) of each cell and channel of the run; 0 for nodes without a cell.
-    roots: Buffer<T>,
 }
 
 /// Number of bricks per task.
@@ -210,11 +207,11 @@ const TASK: usize = 256;
 
 /// With q = s / √(…) for each cell and channel, s = cotangent / number of terms, the node of a cell gets −q (dx + dy + dz), and each
 /// neighbour q d. The gradient is computed as a gather: a node collects from its own cell and from the three cells behind it, so no two
-/// tasks write the same node.
+/// tasks write the same node. The roots are not kept from the forward pass: computing them again takes less time than writing and reading them.
 ///
 /// A brick consists of four *slabs* of equal x, a slab of four *lines* of equal y, a line of four nodes along z. The loops run over slabs:
 /// a step along x moves to another slab, a step along y shifts the lines, a step along z shifts the nodes of each line.
-impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for TotalVariation<T, W, N, S> {
+impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for TotalVariation<W, N, S> {
     fn name(&self) -> &'static str {
         "total_variation"
     }
@@ -226,7 +223,7 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
         let table = call.input(0);
         let scale = call.cotangent().item() / T::lit(self.terms.max(1) as f64);
-        let (values, roots) = (table.data().as_chunks::<S>().0, self.roots.as_chunks::<S>().0);
+        let values = table.data().as_chunks::<S>().0;
         let bricks = self.lattice.neighbours();
         let reached: Vec<u32> = match self.sparse {
             false => (0..bricks.len() as u32).collect(),
@@ -240,7 +237,7 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
         };
         let mut gradient = Buffer::<T>::stale(reached.len() * BRICK_ROWS * W);
         parallel::for_each_chunk(gradient.as_chunks_mut::<S>().0, TASK * BRICK, |start, slabs| {
-            gradients::<T, W, N, S>(values, roots, bricks, self.run, &reached[start / BRICK..], scale, slabs);
+            gradients::<T, W, N, S>(values, bricks, self.run, &reached[start / BRICK..][..slabs.len() / BRICK], scale, slabs);
         });
         if !self.sparse {
             return out.dense(0, gradient);
@@ -345,36 +342,88 @@ fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
     (next_x, next_y, next_z)
 }
 
+/// Differences d to the nodes ahead along x, y and z of the nodes of a slab.
+struct Slopes<T, const S: usize> {
+    along: [[T; S]; 3],
+    /// dx² + dy² + dz² + ε
+    square: [T; S],
+    /// 1 / √(…); 0 for nodes without a cell.
+    inverse_root: [T; S],
+}
+
+impl<T: Real, const S: usize> Slopes<T, S> {
+    /// Computes the differences of slab x of a brick.
+    #[inline(always)]
+    fn of<const W: usize, const N: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize, x: usize) -> Self {
+        let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, brick, x, bricks[brick].ahead);
+        let v = &table[brick * BRICK + x];
+        let [mut dx, mut dy, mut dz, mut square, mut inverse_root] = [[T::zero(); S]; 5];
+        for l in 0..S {
+            (dx[l], dy[l], dz[l]) = (next_x[l] - v[l], next_y[l] - v[l], next_z[l] - v[l]);
+            square[l] = dx[l] * dx[l] + dy[l] * dy[l] + dz[l] * dz[l] + T::lit(EPSILON);
+            inverse_root[l] = square[l].inverse_sqrt();
+        }
+        let cells = bricks[brick].cells >> (STRIDE[0] * x) & 0xffff;
+        if cells != 0xffff {
+            for node in (0..16).filter(|&node| !has(cells, node)) {
+                inverse_root[node * W..(node + 1) * W].fill(T::zero());
+            }
+        }
+        Slopes { along: [dx, dy, dz], square, inverse_root }
+    }
+
+    /// Returns q d along each axis for s = 1.
+    #[inline(always)]
+    fn contributions(mut self) -> [[T; S]; 3] {
+        for d in &mut self.along {
+            for l in 0..S {
+                d[l] *= self.inverse_root[l];
+            }
+        }
+        self.along
+    }
+}
+
+/// Prefetches what [`Slopes::of`] reads for a brick. The bricks ahead along x and y are far away in the table, and only parts of them are read, so the
+/// hardware does not prefetch them. Bricks of long rows are not prefetched: they do not fit into the first-level cache.
+#[inline(always)]
+fn prefetch_brick<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize) {
+    if size_of::<[[T; S]; BRICK]>() > PREFETCHED {
+        return;
+    }
+    parallel::prefetch(&table[brick * BRICK..][..BRICK]);
+    let [ahead_x, ahead_y, _] = bricks[brick].ahead;
+    if let Some(slab) = slab(table, ahead_x, 0) {
+        parallel::prefetch(slab);
+    }
+    for x in 0..BRICK {
+        if let Some(slab) = slab(table, ahead_y, x) {
+            parallel::prefetch(&slab[..N]);
+        }
+    }
+}
+
+/// Largest size of a brick that is prefetched, in bytes.
+const PREFETCHED: usize = 4096;
+/// Number of bricks between the one that is read and the one that is prefetched.
+const PREFETCH_AHEAD: usize = 2;
+
 dispatched! {
-/// Computes 1 / √(dx² + dy² + dz² + ε) for the cells of the run's bricks from `first` on, 0 elsewhere. Returns Σ √(…).
-fn inverse_roots<T: Real, const W: usize, const N: usize, const S: usize>(
+/// Returns Σ √(dx² + dy² + dz² + ε) over the cells of a range of the run's bricks.
+fn variation<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
     bricks: &[Neighbours],
     run: Run,
-    first: usize,
-    roots: &mut [[T; S]],
+    range: Range<usize>,
 ) -> T {
     let mut sum = T::zero();
-    for (k, roots) in (first..).zip(roots.as_chunks_mut::<BRICK>().0) {
-        let own = run.brick(k);
+    for k in range {
+        prefetch_brick::<T, N, S>(table, bricks, run.brick((k + PREFETCH_AHEAD).min(run.count - 1)));
         let mut lanes = [T::zero(); S];
         for x in 0..BRICK {
-            let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, own, x, bricks[own].ahead);
-            let (v, q) = (&table[own * BRICK + x], &mut roots[x]);
-            let mut square = [T::zero(); S];
+            let Slopes { square, inverse_root, .. } = Slopes::of::<W, N>(table, bricks, run.brick(k), x);
             for l in 0..S {
-                let (dx, dy, dz) = (next_x[l] - v[l], next_y[l] - v[l], next_z[l] - v[l]);
-                square[l] = dx * dx + dy * dy + dz * dz + T::lit(EPSILON);
-                q[l] = square[l].inverse_sqrt();
-            }
-            let cells = bricks[own].cells >> (STRIDE[0] * x) & 0xffff;
-            if cells != 0xffff {
-                for node in (0..16).filter(|&node| !has(cells, node)) {
-                    q[node * W..(node + 1) * W].fill(T::zero());
-                }
-            }
-            for l in 0..S {
-                lanes[l] += square[l] * q[l];
+                lanes[l] += square[l] * inverse_root[l];
             }
         }
         sum += folded(lanes);
@@ -396,11 +445,46 @@ fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
     lanes[..width].iter().copied().sum()
 }
 
+/// Contributions q d of a brick's cells to the nodes of the bricks ahead along x, y and z, for s = 1: of the last slab, of the last line of each slab, and of the
+/// last node of each line.
+type Passed<T, const S: usize> = [[T; S]; 3];
+
+/// Stores those of the contributions of slab x that leave its brick.
+#[inline(always)]
+fn put<T: Real, const W: usize, const N: usize, const S: usize>(passed: &mut Passed<T, S>, x: usize, [to_x, to_y, to_z]: &[[T; S]; 3]) {
+    if x + 1 == BRICK {
+        passed[0] = *to_x;
+    }
+    passed[1][x * N..(x + 1) * N].copy_from_slice(&to_y[S - N..]);
+    for y in 0..BRICK {
+        let (end, node) = ((y + 1) * N, (x * BRICK + y) * W);
+        passed[2][node..node + W].copy_from_slice(&to_z[end - W..end]);
+    }
+}
+
+/// Computes the contributions of a brick to the brick ahead along one axis.
+#[inline(always)]
+fn pass<T: Real, const W: usize, const N: usize, const S: usize>(
+    table: &[[T; S]],
+    bricks: &[Neighbours],
+    run: Run,
+    brick: usize,
+    axis: usize,
+) -> [T; S] {
+    let mut passed = [[T::zero(); S]; 3];
+    if run.place(brick).is_some() {
+        let first = if axis == 0 { BRICK - 1 } else { 0 };
+        for x in first..BRICK {
+            put::<T, W, N, S>(&mut passed, x, &Slopes::of::<W, N>(table, bricks, brick, x).contributions());
+        }
+    }
+    passed[axis]
+}
+
 dispatched! {
-/// Computes the gradient of some bricks from the roots of their cells and of the cells behind. Cells outside of the run do not contribute.
+/// Computes the gradient of some bricks. Cells outside of the run do not contribute.
 fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
-    roots: &[[T; S]],
     bricks: &[Neighbours],
     run: Run,
     reached: &[u32],
@@ -408,44 +492,38 @@ fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
     out: &mut [[T; S]],
 ) {
     let zeros = [T::zero(); S];
-    let roots_of = |brick: usize, x: usize| run.place(brick).map(|k| &roots[k * BRICK + x]);
-    for (&own, out) in reached.iter().zip(out.as_chunks_mut::<BRICK>().0) {
-        let own = own as usize;
-        let behind = |axis: usize, x: usize| {
-            let brick = bricks[own].behind[axis];
-            slab(table, brick, x).zip(brick.and_then(|brick| roots_of(brick as usize, x)))
-        };
-        // Contributions q d of cells to the node ahead. The value for a cell in the brick is also subtracted at its own node.
-        let mut from_x = [T::zero(); S];
-        if let Some((last, q)) = behind(0, BRICK - 1) {
-            let v = &table[own * BRICK];
-            (0..S).for_each(|l| from_x[l] = q[l] * (v[l] - last[l]));
+    let mut passed = Buffer::<T>::stale(3 * reached.len() * S);
+    let passed: &mut [Passed<T, S>] = passed.as_chunks_mut::<S>().0.as_chunks_mut().0;
+    for (k, (&own, out)) in reached.iter().zip(out.as_chunks_mut::<BRICK>().0).enumerate() {
+        if let Some(&later) = reached.get(k + PREFETCH_AHEAD) {
+            prefetch_brick::<T, N, S>(table, bricks, later as usize);
         }
+        // Most bricks behind were computed before in this call: bricks are consecutive, except in a small run.
+        let behind = |axis: usize| match bricks[own as usize].behind[axis] {
+            None => zeros,
+            Some(brick) => {
+                let before = brick.wrapping_sub(reached[0]) as usize;
+                if before < k && reached[before] == brick { passed[before][axis] } else { pass::<T, W, N, S>(table, bricks, run, brick as usize, axis) }
+            }
+        };
+        let [mut from_x, behind_y, behind_z] = [behind(0), behind(1), behind(2)];
+        let has_cells = run.place(own as usize).is_some();
         for (x, g) in out.iter_mut().enumerate() {
-            let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, own, x, bricks[own].ahead);
-            let (v, q) = (&table[own * BRICK + x], roots_of(own, x).unwrap_or(&zeros));
-            let (mut to_x, mut to_y, mut to_z) = ([T::zero(); S], [T::zero(); S], [T::zero(); S]);
-            for l in 0..S {
-                (to_x[l], to_y[l], to_z[l]) = (q[l] * (next_x[l] - v[l]), q[l] * (next_y[l] - v[l]), q[l] * (next_z[l] - v[l]));
-            }
-            let (mut from_y, mut from_z) = ([T::zero(); S], [T::zero(); S]);
+            let to = if has_cells { Slopes::of::<W, N>(table, bricks, own as usize, x).contributions() } else { [zeros; 3] };
+            let [to_x, to_y, to_z] = &to;
+            let [mut from_y, mut from_z] = [zeros; 2];
+            from_y[..N].copy_from_slice(&behind_y[x * N..(x + 1) * N]);
             from_y[N..].copy_from_slice(&to_y[..S - N]);
-            if let Some((last, q)) = behind(1, x) {
-                (0..N).for_each(|l| from_y[l] = q[S - N + l] * (v[l] - last[S - N + l]));
-            }
-            for start in (0..S).step_by(N) {
-                from_z[start + W..start + N].copy_from_slice(&to_z[start..start + N - W]);
-            }
-            if let Some((last, q)) = behind(2, x) {
-                for start in (0..S).step_by(N) {
-                    let end = start + N - W;
-                    (0..W).for_each(|l| from_z[start + l] = q[end + l] * (v[start + l] - last[end + l]));
-                }
+            for y in 0..BRICK {
+                let (line, node) = (y * N, (x * BRICK + y) * W);
+                from_z[line..line + W].copy_from_slice(&behind_z[node..node + W]);
+                from_z[line + W..line + N].copy_from_slice(&to_z[line..line + N - W]);
             }
             for l in 0..S {
                 g[l] = scale * ((from_x[l] - to_x[l]) + (from_y[l] - to_y[l]) + (from_z[l] - to_z[l]));
             }
-            from_x = to_x;
+            put::<T, W, N, S>(&mut passed[k], x, &to);
+            from_x = *to_x;
         }
     }
 }
