@@ -48,8 +48,8 @@ pub use pictures::PictureTables;
 pub use seen::{Seen, largest_weights, seen};
 use std::sync::{Arc, OnceLock};
 
-/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples.
-const BLOCK: usize = 256;
+/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples, or four packets of a picture.
+const BLOCK: usize = 4 * RAYS_OF_PACKET;
 
 /// Number of rays whose samples are kept, or marched again, at a time. It bounds the memory of a step. A usual batch is an eighth of it.
 pub const CHUNK: usize = 128 * BLOCK;
@@ -160,10 +160,8 @@ impl<T: Real> Scene<'_, T> {
         if keep && self.worth_sorting() {
             return self.render_sorted(first, pixels);
         }
-        // Pictures have blocks of one packet, which share the work of background and matter among the threads more evenly.
-        let block = if self.picture.is_some() { RAYS_OF_PACKET } else { BLOCK };
-        let parts: Vec<_> = pixels.chunks_mut(block * COLUMNS).collect();
-        parallel::map_items(parts, |b, pixels| self.render(first + b * block, pixels, keep))
+        let parts: Vec<_> = pixels.chunks_mut(BLOCK * COLUMNS).collect();
+        parallel::map_items(parts, |b, pixels| self.render(first + b * BLOCK, pixels, keep))
     }
 }
 

@@ -3,14 +3,14 @@
 use super::from_camera::Colors;
 use super::lookup::{self, Corners, Directions, Group};
 use super::pictures::PictureTables;
-use super::places::{Places, RUN};
+use super::places::Places;
 use super::{BLOCK, Batch, COLUMNS};
 use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along};
 use crate::sampling::{Occupancy, Sections, march};
-use autograd::lattice::NodeMap;
+use autograd::lattice::{NodeMap, TOGETHER};
 use autograd::{Buffer, Real, Tensor, parallel};
 use std::sync::Arc;
 
@@ -74,6 +74,9 @@ impl<T: Real> Block<T> {
     }
 }
 
+/// Number of samples that are looked up together if each reads one row and rays do not end early.
+const LONG_RUN: usize = 64;
+
 /// Inputs of rendering a batch.
 pub(super) struct Scene<'a, T: Real> {
     pub batch: &'a Batch<T>,
@@ -121,10 +124,19 @@ impl<'a, T: Real> Scene<'a, T> {
 
     /// Computes the samples of `count` rays from `first` on, without colors. With trilinear look-up, also returns the rows that they read.
     pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
-        with_bricks!(self.batch.layout.lattice, map => self.weights_with(map, first, count))
+        let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
+        with_bricks!(self.batch.layout.lattice, map => {
+            // Rays wait for the densities of each run. Without an early end, longer runs waste nothing.
+            if trilinear || self.options.stop_below > 0.0 {
+                self.weights_with::<TOGETHER>(map, first, count)
+            } else {
+                self.weights_with::<LONG_RUN>(map, first, count)
+            }
+        })
     }
 
-    fn weights_with(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
+    /// Computes the samples `RUN` at a time, at most [`TOGETHER`] with trilinear look-up.
+    fn weights_with<const RUN: usize>(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let RenderOptions { aabb, spacing, jitter, stop_below, .. } = self.options;
         let stop = T::lit(*stop_below);
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
@@ -146,7 +158,7 @@ impl<'a, T: Real> Scene<'a, T> {
                     let room = block.make_room(trilinear);
                     found.iter_mut().for_each(|corners| corners.make_room(room));
                 }
-                let own = places.next_run(block.places(end));
+                let own = places.next_run::<RUN>(block.places(end));
                 if own == 0 {
                     break;
                 }
@@ -275,7 +287,7 @@ impl<T: Real> Block<T> {
     }
 
     /// Returns positions, middles and lengths of the run of samples from `end` on.
-    fn places(&mut self, end: usize) -> [&mut [T; RUN]; 5] {
+    fn places<const RUN: usize>(&mut self, end: usize) -> [&mut [T; RUN]; 5] {
         let [x, y, z, t, delta, ..] = self.columns();
         [x, y, z, t, delta].map(|column| column[end..].first_chunk_mut().expect("there is room for a run"))
     }

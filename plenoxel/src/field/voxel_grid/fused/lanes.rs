@@ -13,8 +13,8 @@ use autograd::rows::Buckets;
 use autograd::{Buffer, Real, dispatched};
 use std::ops::Range;
 
-/// Number of rays that are led together.
-const LANES: usize = 16;
+/// Number of rays that are led together: two vectors of AVX-512, so that the look-ups of one are under way while the other waits.
+const LANES: usize = 32;
 /// Mask of all lanes.
 const ALL: u64 = (1 << LANES) - 1;
 

@@ -3,12 +3,8 @@
 use crate::camera::Ray;
 use crate::field::voxel_grid::GridShape;
 use crate::sampling::{March, Occupied};
-use autograd::lattice::TOGETHER;
 use autograd::{Real, dispatched};
 use glam::DVec3;
-
-/// Number of samples that are looked up together.
-pub(super) const RUN: usize = TOGETHER;
 
 /// Remaining samples of one ray.
 pub(super) struct Places<'a, T> {
@@ -28,8 +24,8 @@ impl<'a, T: Real> Places<'a, T> {
         Places { ray, to_voxels: shape.to_voxels().map(T::lit), march, next: 0, occupied }
     }
 
-    /// Writes voxel coordinates, middles and lengths of the next samples, at most [`RUN`]. Returns their number; 0 at the end.
-    pub fn next_run(&mut self, out: [&mut [T; RUN]; 5]) -> usize {
+    /// Writes voxel coordinates, middles and lengths of the next samples, at most `RUN`. Returns their number; 0 at the end.
+    pub fn next_run<const RUN: usize>(&mut self, out: [&mut [T; RUN]; 5]) -> usize {
         let [mut middles, mut lengths] = [[0.0; RUN]; 2];
         let mut count = 0;
         match &mut self.occupied {
@@ -59,7 +55,7 @@ impl<'a, T: Real> Places<'a, T> {
 
 dispatched! {
 /// Places the samples of a straight ray in the middles of intervals of these lengths: voxel coordinates, middles and lengths.
-fn place<T: Real>(ray: &Ray, [middles, lengths]: [&[f64; RUN]; 2], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
+fn place<T: Real, const RUN: usize>(ray: &Ray, [middles, lengths]: [&[f64; RUN]; 2], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
     let [x, y, z, t, delta] = out;
     let (o, d) = (ray.origin, ray.direction);
     for i in 0..RUN {
@@ -74,7 +70,12 @@ fn place<T: Real>(ray: &Ray, [middles, lengths]: [&[f64; RUN]; 2], to_voxels: [T
 }
 
 /// Like [`place`], for samples at these positions.
-fn place_each<T: Real>(at: &[DVec3; RUN], [middles, lengths]: [&[f64; RUN]; 2], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
+fn place_each<T: Real, const RUN: usize>(
+    at: &[DVec3; RUN],
+    [middles, lengths]: [&[f64; RUN]; 2],
+    to_voxels: [T; 2],
+    out: [&mut [T; RUN]; 5],
+) {
     let [x, y, z, t, delta] = out;
     for i in 0..RUN {
         (x[i], y[i], z[i]) = at[i].to_array().map(|p| T::lit(p) * to_voxels[0] + to_voxels[1]).into();
