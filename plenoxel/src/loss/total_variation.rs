@@ -141,11 +141,11 @@ impl Run {
         if brick < self.all { brick } else { brick - self.all }
     }
 
-    /// Returns the position of a brick in the run, if the run contains it.
+    /// Returns true if the run contains a brick.
     #[inline(always)]
-    fn place(self, brick: usize) -> Option<usize> {
+    fn contains(self, brick: usize) -> bool {
         let k = if brick >= self.first { brick - self.first } else { brick + self.all - self.first };
-        (k < self.count).then_some(k)
+        k < self.count
     }
 
     fn bricks(self) -> impl Iterator<Item = usize> {
@@ -250,7 +250,7 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
 
 /// Returns the nodes of a brick that a cell of the run reads: nodes with a cell, and their forward neighbours.
 fn touched(bricks: &[Neighbours], run: Run, brick: usize) -> u64 {
-    let cells = |brick: usize| run.place(brick).map_or(0, |_| bricks[brick].cells);
+    let cells = |brick: usize| if run.contains(brick) { bricks[brick].cells } else { 0 };
     let own = cells(brick);
     (0..3).fold(own, |touched, axis| {
         let behind = bricks[brick].behind[axis].map_or(0, |behind| cells(behind as usize));
@@ -342,8 +342,8 @@ fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
     (next_x, next_y, next_z)
 }
 
-/// Differences d to the nodes ahead along x, y and z of the nodes of a slab.
-struct Slopes<T, const S: usize> {
+/// Differences d to the nodes ahead along x, y and z of the nodes of a slab, and their roots.
+struct Differences<T, const S: usize> {
     along: [[T; S]; 3],
     /// dx² + dy² + dz² + ε
     square: [T; S],
@@ -351,8 +351,8 @@ struct Slopes<T, const S: usize> {
     inverse_root: [T; S],
 }
 
-impl<T: Real, const S: usize> Slopes<T, S> {
-    /// Computes the differences of slab x of a brick.
+impl<T: Real, const S: usize> Differences<T, S> {
+    /// Computes differences and roots of slab x of a brick.
     #[inline(always)]
     fn of<const W: usize, const N: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize, x: usize) -> Self {
         let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, brick, x, bricks[brick].ahead);
@@ -369,11 +369,12 @@ impl<T: Real, const S: usize> Slopes<T, S> {
                 inverse_root[node * W..(node + 1) * W].fill(T::zero());
             }
         }
-        Slopes { along: [dx, dy, dz], square, inverse_root }
+        Differences { along: [dx, dy, dz], square, inverse_root }
     }
 
     /// Returns q d along each axis for s = 1.
     #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
     fn contributions(mut self) -> [[T; S]; 3] {
         for d in &mut self.along {
             for l in 0..S {
@@ -384,8 +385,7 @@ impl<T: Real, const S: usize> Slopes<T, S> {
     }
 }
 
-/// Prefetches what [`Slopes::of`] reads for a brick. The bricks ahead along x and y are far away in the table, and only parts of them are read, so the
-/// hardware does not prefetch them. Bricks of long rows are not prefetched: they do not fit into the first-level cache.
+/// Prefetches a brick, and the parts of the bricks ahead along x and y that [`Differences::of`] reads. Larger bricks are left to the hardware.
 #[inline(always)]
 fn prefetch_brick<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize) {
     if size_of::<[[T; S]; BRICK]>() > PREFETCHED {
@@ -418,10 +418,12 @@ fn variation<T: Real, const W: usize, const N: usize, const S: usize>(
 ) -> T {
     let mut sum = T::zero();
     for k in range {
-        prefetch_brick::<T, N, S>(table, bricks, run.brick((k + PREFETCH_AHEAD).min(run.count - 1)));
+        if k + PREFETCH_AHEAD < run.count {
+            prefetch_brick::<T, N, S>(table, bricks, run.brick(k + PREFETCH_AHEAD));
+        }
         let mut lanes = [T::zero(); S];
         for x in 0..BRICK {
-            let Slopes { square, inverse_root, .. } = Slopes::of::<W, N>(table, bricks, run.brick(k), x);
+            let Differences { square, inverse_root, .. } = Differences::of::<W, N>(table, bricks, run.brick(k), x);
             for l in 0..S {
                 lanes[l] += square[l] * inverse_root[l];
             }
@@ -445,13 +447,13 @@ fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
     lanes[..width].iter().copied().sum()
 }
 
-/// Contributions q d of a brick's cells to the nodes of the bricks ahead along x, y and z, for s = 1: of the last slab, of the last line of each slab, and of the
-/// last node of each line.
+/// Contributions q d, for s = 1, that leave a brick: those of its last slab to the brick ahead along x, of the last line of each slab along y, and of the last
+/// node of each line along z.
 type Passed<T, const S: usize> = [[T; S]; 3];
 
-/// Stores those of the contributions of slab x that leave its brick.
+/// Stores the contributions of slab x that leave its brick.
 #[inline(always)]
-fn put<T: Real, const W: usize, const N: usize, const S: usize>(passed: &mut Passed<T, S>, x: usize, [to_x, to_y, to_z]: &[[T; S]; 3]) {
+fn pass_on<T: Real, const W: usize, const N: usize, const S: usize>(passed: &mut Passed<T, S>, x: usize, [to_x, to_y, to_z]: &[[T; S]; 3]) {
     if x + 1 == BRICK {
         passed[0] = *to_x;
     }
@@ -464,7 +466,7 @@ fn put<T: Real, const W: usize, const N: usize, const S: usize>(passed: &mut Pas
 
 /// Computes the contributions of a brick to the brick ahead along one axis.
 #[inline(always)]
-fn pass<T: Real, const W: usize, const N: usize, const S: usize>(
+fn passed_along<T: Real, const W: usize, const N: usize, const S: usize>(
     table: &[[T; S]],
     bricks: &[Neighbours],
     run: Run,
@@ -472,10 +474,10 @@ fn pass<T: Real, const W: usize, const N: usize, const S: usize>(
     axis: usize,
 ) -> [T; S] {
     let mut passed = [[T::zero(); S]; 3];
-    if run.place(brick).is_some() {
+    if run.contains(brick) {
         let first = if axis == 0 { BRICK - 1 } else { 0 };
         for x in first..BRICK {
-            put::<T, W, N, S>(&mut passed, x, &Slopes::of::<W, N>(table, bricks, brick, x).contributions());
+            pass_on::<T, W, N, S>(&mut passed, x, &Differences::of::<W, N>(table, bricks, brick, x).contributions());
         }
     }
     passed[axis]
@@ -498,18 +500,22 @@ fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
         if let Some(&later) = reached.get(k + PREFETCH_AHEAD) {
             prefetch_brick::<T, N, S>(table, bricks, later as usize);
         }
-        // Most bricks behind were computed before in this call: bricks are consecutive, except in a small run.
+        // Bricks behind have lower numbers. Most were computed before in this call. Without gaps in `reached`, their place follows from their number.
         let behind = |axis: usize| match bricks[own as usize].behind[axis] {
             None => zeros,
             Some(brick) => {
-                let before = brick.wrapping_sub(reached[0]) as usize;
-                if before < k && reached[before] == brick { passed[before][axis] } else { pass::<T, W, N, S>(table, bricks, run, brick as usize, axis) }
+                let near = brick.wrapping_sub(reached[0]) as usize;
+                let is_near = near < k && reached[near] == brick;
+                match if is_near { Ok(near) } else { reached[..k].binary_search(&brick) } {
+                    Ok(before) => passed[before][axis],
+                    Err(_) => passed_along::<T, W, N, S>(table, bricks, run, brick as usize, axis),
+                }
             }
         };
         let [mut from_x, behind_y, behind_z] = [behind(0), behind(1), behind(2)];
-        let has_cells = run.place(own as usize).is_some();
+        let included = run.contains(own as usize);
         for (x, g) in out.iter_mut().enumerate() {
-            let to = if has_cells { Slopes::of::<W, N>(table, bricks, own as usize, x).contributions() } else { [zeros; 3] };
+            let to = if included { Differences::of::<W, N>(table, bricks, own as usize, x).contributions() } else { [zeros; 3] };
             let [to_x, to_y, to_z] = &to;
             let [mut from_y, mut from_z] = [zeros; 2];
             from_y[..N].copy_from_slice(&behind_y[x * N..(x + 1) * N]);
@@ -522,7 +528,7 @@ fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
             for l in 0..S {
                 g[l] = scale * ((from_x[l] - to_x[l]) + (from_y[l] - to_y[l]) + (from_z[l] - to_z[l]));
             }
-            put::<T, W, N, S>(&mut passed[k], x, &to);
+            pass_on::<T, W, N, S>(&mut passed[k], x, &to);
             from_x = *to_x;
         }
     }

@@ -85,8 +85,8 @@ impl Estimate {
             let chunked = config.engine == Engine::Fused && rays > CHUNK as u64;
             let kept = if chunked { samples / rays * CHUNK as u64 } else { samples };
             let gradient = match whole_grid_losses(config) {
-                // Dense gradients, and the square roots that a total variation keeps for them.
-                true => 2 * tables(index),
+                // Dense gradients.
+                true => tables(index),
                 false => 0,
             };
             // Otherwise it accumulates rows directly for the optimizer.

@@ -126,7 +126,7 @@ impl<'a, T: Real> Scene<'a, T> {
     pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
         with_bricks!(self.batch.layout.lattice, map => {
-            // Rays wait for the densities of each run. Without an early end, longer runs waste nothing.
+            // The weights of a run wait for its densities. Where rays end early, the rest of a long run would be looked up in vain.
             if trilinear || self.options.stop_below > 0.0 {
                 self.weights_with::<TOGETHER>(map, first, count)
             } else {
@@ -135,11 +135,12 @@ impl<'a, T: Real> Scene<'a, T> {
         })
     }
 
-    /// Computes the samples `RUN` at a time, at most [`TOGETHER`] with trilinear look-up.
+    /// Computes the samples in runs of `RUN`, which is at most [`TOGETHER`] with trilinear look-up.
     fn weights_with<const RUN: usize>(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let RenderOptions { aabb, spacing, jitter, stop_below, .. } = self.options;
         let stop = T::lit(*stop_below);
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
+        debug_assert!(!trilinear || RUN <= TOGETHER);
         let mut block = Block { first, ..Block::empty() };
         let mut found = trilinear.then(Corners::none);
         let mut group = Group::none();

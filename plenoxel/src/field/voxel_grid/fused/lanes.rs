@@ -1,6 +1,6 @@
 //! Rays of a picture in the lanes of vectors.
 //!
-//! A sample depends on those before it on the ray: they decide how much light is left, and where empty space is skipped. So the lanes of a vector are not
+//! A sample depends on those before it on the ray: they decide how much light is left, and where empty space is skipped. So the lanes of vectors are not
 //! samples of one ray, but one sample of each of [`LANES`] rays. A lane in an empty brick skips to where its ray leaves the empty bricks around it. A lane whose ray ends
 //! gets the next one.
 
@@ -13,8 +13,9 @@ use autograd::rows::Buckets;
 use autograd::{Buffer, Real, dispatched};
 use std::ops::Range;
 
-/// Number of rays that are led together: two vectors of AVX-512, so that the look-ups of one are under way while the other waits.
+/// Number of rays that are led together: two vectors of `f32` with AVX-512, whose look-ups do not depend on each other.
 const LANES: usize = 32;
+const _: () = assert!(LANES.is_power_of_two() && LANES <= u32::BITS as usize);
 /// Mask of all lanes.
 const ALL: u64 = (1 << LANES) - 1;
 

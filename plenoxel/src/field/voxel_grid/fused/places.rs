@@ -43,6 +43,9 @@ impl<'a, T: Real> Places<'a, T> {
                 }
             }
         }
+        if count == 0 {
+            return 0;
+        }
         if self.march.is_straight() {
             place(self.ray, [&middles, &lengths], self.to_voxels, out);
         } else {
