@@ -342,7 +342,7 @@ fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
     (next_x, next_y, next_z)
 }
 
-/// Differences d to the nodes ahead along x, y and z of the nodes of a slab, and their roots.
+/// For each node of a slab: the differences d to the nodes ahead of it, and their root.
 struct Differences<T, const S: usize> {
     along: [[T; S]; 3],
     /// dx² + dy² + dz² + ε

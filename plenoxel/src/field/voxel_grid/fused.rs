@@ -48,8 +48,8 @@ pub use pictures::PictureTables;
 pub use seen::{Seen, largest_weights, seen};
 use std::sync::{Arc, OnceLock};
 
-/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples, or four packets of a picture, of whose
-/// tiles it is a sixteenth: more threads than that would need smaller blocks, in which more lanes are left without a ray.
+/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples. A tile of a picture has 16 such tasks, so further threads
+/// have none. Smaller blocks leave more lanes without a ray.
 const BLOCK: usize = 4 * RAYS_OF_PACKET;
 
 /// Number of rays whose samples are kept, or marched again, at a time. It bounds the memory of a step. A usual batch is an eighth of it.
