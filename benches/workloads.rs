@@ -23,7 +23,7 @@ use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
 use plenoxel::geometry::Aabb;
 use plenoxel::loss::total_variation;
 use plenoxel::rays::RaySource;
-use plenoxel::render::picture::{picture, picture_by};
+use plenoxel::render::picture::{picture, picture_unless};
 use plenoxel::render::{Engine, RenderOptions, render};
 use plenoxel::run::folder::RunFolder;
 use plenoxel::sampling::{Jitter, Spacing};
@@ -187,7 +187,7 @@ fn image(args: &Arguments, name: &str, engine: Engine, from_tables: bool) {
     let exact = || picture(&grid, &camera, &options);
     let show = || {
         let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
-        picture_by(|rays| render_picture(&grid, &tables, rays, &options), &camera)
+        picture_unless(|rays| render_picture(&grid, &tables, rays, &options), &camera, 256, || false).expect("nothing stops it")
     };
     let times = repeat(args.repeats.min(3), || drop(black_box(if from_tables { show() } else { exact() })));
     print(name, &times, Some(pixels), 0);

@@ -9,7 +9,7 @@ use crate::dataset::mask::Mask;
 use crate::error::Result;
 use crate::metrics;
 use crate::render::Rendered;
-use crate::render::picture::{Picture, picture_by, picture_unless, sampled_packets};
+use crate::render::picture::{Picture, TILE, picture_unless, sampled_packets};
 use crate::train::{Model, RenderFn, ViewOptions};
 use autograd::{Real, no_grad};
 use ndarray::Array3;
@@ -44,27 +44,29 @@ pub(crate) fn pixels(cameras: &[Camera]) -> usize {
 pub struct Viewer<'a, T: Real> {
     show: RenderFn<'a, T>,
     background: [f32; 3],
+    /// Side of the squares of pixels that are rendered at a time.
+    tile: usize,
 }
 
 impl<'a, T: Real> Viewer<'a, T> {
     /// Creates a viewer from a function that renders rays over a background, sRGB in [0, 1].
     pub fn new(show: impl Fn(&[Ray]) -> Rendered<T> + Sync + 'a, background: [f32; 3]) -> Self {
-        Viewer { show: Box::new(show), background }
+        Viewer { show: Box::new(show), background, tile: TILE }
     }
 
     /// Creates a viewer of a model.
     pub fn of(model: &'a (impl Model<T> + ?Sized), options: &ViewOptions) -> Self {
-        Viewer { show: model.viewer(options), background: options.background }
+        Viewer { show: model.viewer(options), background: options.background, tile: model.tile() }
     }
 
     /// Renders the image of a camera.
     pub fn see(&self, camera: &Camera) -> Picture {
-        picture_by(&self.show, camera)
+        self.see_unless(camera, || false).expect("nothing stops it")
     }
 
     /// Renders the image of a camera, unless `stopped` becomes true meanwhile.
     pub fn see_unless(&self, camera: &Camera, stopped: impl Fn() -> bool) -> Option<Picture> {
-        picture_unless(&self.show, camera, stopped)
+        picture_unless(&self.show, camera, self.tile, stopped)
     }
 
     /// Estimates the seconds in which the images of these cameras are rendered, from some packets of their pixels. If rays take long, there are fewer packets.
@@ -78,7 +80,7 @@ impl<'a, T: Real> Viewer<'a, T> {
         let rays = sampled_packets(cameras, PACKETS);
         let start = Instant::now();
         let mut rendered = 0;
-        // As many rays at a time as a tile of a picture has.
+        // As many rays at a time as a usual tile of a picture has.
         for rays in rays.chunks(rays.len().div_ceil(4)) {
             no_grad(|| drop((self.show)(rays)));
             rendered += rays.len();

@@ -255,18 +255,18 @@ pub(crate) const RAYS_OF_PACKET: usize = PACKET * PACKET;
 #[derive(Debug)]
 pub(crate) struct Sections<'a> {
     cells: Option<&'a Occupancy>,
-    section: [f64; 2],
+    section: Option<[f64; 2]>,
 }
 
 impl<'a> Sections<'a> {
     /// Sections of rays through these cells. Without cells, and for rays that are not straight, they are whole rays.
     pub(crate) fn new(cells: Option<&'a Occupancy>, spacing: Spacing) -> Self {
-        Sections { cells: cells.filter(|_| !matches!(spacing, Spacing::Contracted(_))), section: [0.0, f64::INFINITY] }
+        Sections { cells: cells.filter(|_| !matches!(spacing, Spacing::Contracted(_))), section: Some([0.0, f64::INFINITY]) }
     }
 
-    /// Returns the section of ray r, which follows ray r − 1.
+    /// Returns the section of ray r, which follows ray r − 1; `None` if the ray is in no occupied cell.
     #[inline]
-    pub(crate) fn of(&mut self, rays: &[Ray], r: usize) -> [f64; 2] {
+    pub(crate) fn of(&mut self, rays: &[Ray], r: usize) -> Option<[f64; 2]> {
         if let Some(cells) = self.cells.filter(|_| r.is_multiple_of(RAYS_OF_PACKET)) {
             self.section = cells.section(&rays[r..rays.len().min(r + RAYS_OF_PACKET)]);
         }
@@ -312,13 +312,13 @@ impl Iterator for Occupied<'_> {
 }
 
 impl Occupied<'_> {
-    /// Leaves out the intervals of a straight ray outside of two distances, none of which lies in an occupied cell ([`Occupancy::section`]).
+    /// Leaves out the intervals of a straight ray outside of a section, none of which lies in an occupied cell ([`Occupancy::section`]).
     #[inline]
-    pub(crate) fn between(self, section: [f64; 2]) -> Self {
+    pub(crate) fn between(self, section: Option<[f64; 2]>) -> Self {
         if !self.march.is_straight() {
             return self;
         }
-        let Range { start, end } = self.march.between(section);
+        let Range { start, end } = section.map_or(0..0, |section| self.march.between(section));
         Self { next: start, end, ..self }
     }
 

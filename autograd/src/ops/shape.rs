@@ -305,12 +305,22 @@ impl<T: Real> Tensor<T> {
 
 fn copy_rows<'a, T: Real>(out: &mut [T], width: usize, row: impl Fn(usize) -> &'a [T] + Sync) {
     parallel::for_each_rows(out, width, |first, chunk| {
-        for (r, target) in chunk.chunks_exact_mut(width.max(1)).enumerate() {
-            let source = row(first + r);
-            // For short rows, an inline loop is faster than a call to memcpy.
-            if width <= 4 { target.iter_mut().zip(source).for_each(|(t, &s)| *t = s) } else { target.copy_from_slice(source) }
+        let row = |r: usize| row(first + r);
+        match width {
+            1 => copy_short_rows::<T, 1>(chunk, row),
+            2 => copy_short_rows::<T, 2>(chunk, row),
+            3 => copy_short_rows::<T, 3>(chunk, row),
+            4 => copy_short_rows::<T, 4>(chunk, row),
+            _ => chunk.chunks_exact_mut(width.max(1)).enumerate().for_each(|(r, target)| target.copy_from_slice(row(r))),
         }
     });
+}
+
+/// Copies rows of a width that the compiler knows. Otherwise it would call `memcpy` for each row, which takes longer than the copy.
+fn copy_short_rows<'a, T: Real, const WIDTH: usize>(out: &mut [T], row: impl Fn(usize) -> &'a [T]) {
+    for (r, target) in out.as_chunks_mut::<WIDTH>().0.iter_mut().enumerate() {
+        target.copy_from_slice(&row(r)[..WIDTH]);
+    }
 }
 
 /// Copies `x`, read with the given strides in the order of `shape`, to `out`. A stride of 0 repeats values.

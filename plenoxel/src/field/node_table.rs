@@ -156,19 +156,19 @@ impl<T: Real, const N: usize> Cells<T, N> {
     /// stored: a lower bound of the distances t. It is −∞ for positions in stored bricks.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-    pub fn exits(&self, origin: &[[f64; N]; 3], per_slope: &[[f64; N]; 3]) -> [f64; N] {
-        let mut exits = [f64::INFINITY; N];
+    pub fn exits(&self, origin: &[[T; N]; 3], per_slope: &[[T; N]; 3]) -> [T; N] {
+        let mut exits = [T::infinity(); N];
         for a in 0..3 {
             for i in 0..N {
                 // All bricks nearer than `free` are empty.
-                let (here, free) = (f64::from(self.bricks[a][i]), f64::from(self.links[i] - EMPTY.min(self.links[i])));
-                let plane = BRICK as f64 * if per_slope[a][i] > 0.0 { here + free } else { here + 1.0 - free };
-                let exit = (plane - origin[a][i]) * per_slope[a][i];
+                let (here, free) = (self.bricks[a][i], self.links[i] - EMPTY.min(self.links[i]));
+                let plane = if per_slope[a][i] > T::zero() { (here + free) as i32 } else { here as i32 + 1 - free as i32 };
+                let exit = (T::lit(f64::from(BRICK as i32 * plane)) - origin[a][i]) * per_slope[a][i];
                 exits[i] = if exit < exits[i] { exit } else { exits[i] };
             }
         }
         for i in 0..N {
-            exits[i] = if self.links[i] < EMPTY { f64::NEG_INFINITY } else { exits[i] };
+            exits[i] = if self.links[i] < EMPTY { T::neg_infinity() } else { exits[i] };
         }
         exits
     }

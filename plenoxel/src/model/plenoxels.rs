@@ -275,6 +275,10 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         Box::new(move |rays| pictures.render(&self.grid, rays))
     }
 
+    fn tile(&self) -> usize {
+        pictures::TILE
+    }
+
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
         let of_stage = &self.stages[stage.index];
         match const { is_single::<T>() } {

@@ -5,7 +5,9 @@ use crate::camera::{Camera, Ray};
 use crate::sampling::PACKET;
 use crate::space::Space;
 use autograd::{Real, no_grad, parallel};
+use glam::DVec3;
 use ndarray::{Array2, Array3};
+use std::ops::Range;
 
 /// A rendered image.
 #[derive(Debug, Clone)]
@@ -45,8 +47,8 @@ impl Picture {
     }
 }
 
-/// Side of the squares of pixels that are rendered at a time. It bounds the memory.
-const TILE: usize = 64;
+/// Side of the squares of pixels that are rendered at a time, unless a model has its own ([`Model::tile`](crate::train::Model::tile)).
+pub const TILE: usize = 64;
 
 /// Renders an image of a field.
 pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &RenderOptions<'_>) -> Picture {
@@ -55,38 +57,78 @@ pub fn picture<T: Real>(field: &impl Field<T>, camera: &Camera, options: &Render
 
 /// Renders an image with a function from rays to pixels. No gradient is recorded.
 pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Camera) -> Picture {
-    picture_unless(render, camera, || false).expect("nothing stops it")
+    picture_unless(render, camera, TILE, || false).expect("nothing stops it")
 }
 
-/// Renders an image as [`picture_by`] does. Before each tile of rays it asks `stopped`; returns `None` once that is true.
-pub fn picture_unless<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Camera, stopped: impl Fn() -> bool) -> Option<Picture> {
-    let size = [camera.intrinsics.width, camera.intrinsics.height];
-    let [w, h] = size;
-    let mut picture = Picture { rgb: Array3::zeros((h, w, 3)), depth: Array2::zeros((h, w)), opacity: Array2::zeros((h, w)) };
-    for corner in (0..h).step_by(TILE).flat_map(|y| (0..w).step_by(TILE).map(move |x| [x, y])) {
-        if stopped() {
-            return None;
-        }
-        let pixels = pixels_of_tile(corner, size);
-        let rays = parallel::map_indices(pixels.len(), |i| camera.ray(pixels[i][0] as f64 + 0.5, pixels[i][1] as f64 + 0.5));
-        let rendered = no_grad(|| render(&rays));
-        let (rgb, depth, opacity) = (rendered.rgb.data(), rendered.depth(), rendered.opacity.data());
-        let as_f32 = |x: T| x.as_f64() as f32;
-        for (i, &[x, y]) in pixels.iter().enumerate() {
-            (0..3).for_each(|c| picture.rgb[[y, x, c]] = as_f32(rgb[3 * i + c]));
-            picture.depth[[y, x]] = as_f32(depth.data()[i]);
-            picture.opacity[[y, x]] = as_f32(opacity[i]);
+/// Renders an image as [`picture_by`] does, in squares of pixels with this side. Before each square it asks `stopped`; returns `None` once that is true.
+///
+/// Panics if the side is not a multiple of 16.
+pub fn picture_unless<T: Real>(
+    render: impl Fn(&[Ray]) -> Rendered<T>,
+    camera: &Camera,
+    tile: usize,
+    stopped: impl Fn() -> bool,
+) -> Option<Picture> {
+    assert!(tile > 0 && tile.is_multiple_of(BAND), "a picture is rendered in squares whose side is a multiple of {BAND}, not {tile}");
+    let [w, h] = [camera.intrinsics.width, camera.intrinsics.height];
+    let (mut rgb, mut depth, mut opacity) = (vec![0.0; 3 * w * h], vec![0.0; w * h], vec![0.0; w * h]);
+    // Rays of one square, each of which is written before it is read.
+    let mut rays = vec![Ray { origin: DVec3::ZERO, direction: DVec3::Z, stretch: 1.0 }; tile.min(w) * tile.min(h)];
+    for y in (0..h).step_by(tile) {
+        for x in (0..w).step_by(tile) {
+            if stopped() {
+                return None;
+            }
+            let (columns, rows) = (x..w.min(x + tile), y..h.min(y + tile));
+            let of_band = BAND * columns.len();
+            let rays = &mut rays[..columns.len() * rows.len()];
+            parallel::for_each_chunk(rays, of_band, |first, rays| {
+                for_pixels_of_band(&columns, y + first / columns.len(), h, |i, [x, y]| {
+                    rays[i] = camera.ray(x as f64 + 0.5, y as f64 + 0.5)
+                });
+            });
+            let rendered = no_grad(|| render(rays));
+            let (of_rgb, of_depth, of_opacity) = (rendered.rgb.data(), rendered.depth(), rendered.opacity.data());
+            let bands = rgb.chunks_mut(3 * BAND * w).zip(depth.chunks_mut(BAND * w)).zip(opacity.chunks_mut(BAND * w));
+            let bands = bands.skip(y / BAND).take(rows.len().div_ceil(BAND));
+            parallel::for_each_item(bands.collect(), |band, ((rgb, depth), opacity)| {
+                let top = y + band * BAND;
+                for_pixels_of_band(&columns, top, h, |i, [x, y]| {
+                    let (ray, pixel) = (band * of_band + i, (y - top) * w + x);
+                    let as_f32 = |x: T| x.as_f64() as f32;
+                    (0..3).for_each(|c| rgb[3 * pixel + c] = as_f32(of_rgb[3 * ray + c]));
+                    (depth[pixel], opacity[pixel]) = (as_f32(of_depth.data()[ray]), as_f32(of_opacity[ray]));
+                });
+            });
         }
     }
-    Some(picture)
+    let array = |values: Vec<f32>| Array2::from_shape_vec((h, w), values).expect("a value for each pixel");
+    Some(Picture {
+        rgb: Array3::from_shape_vec((h, w, 3), rgb).expect("three values for each pixel"),
+        depth: array(depth),
+        opacity: array(opacity),
+    })
 }
 
-/// Returns the pixels of a tile that lie in an image, packet after packet, so that rays that follow each other see nearly the same part of the scene.
-fn pixels_of_tile(corner: [usize; 2], size: [usize; 2]) -> Vec<[usize; 2]> {
-    let range = |a: usize, from: usize, side: usize| from..(from + side).min(size[a]).min(corner[a] + TILE);
-    let packets = range(1, corner[1], TILE).step_by(PACKET).flat_map(|y| range(0, corner[0], TILE).step_by(PACKET).map(move |x| [x, y]));
-    let pixels = |[x, y]: [usize; 2]| range(1, y, PACKET).flat_map(move |y| range(0, x, PACKET).map(move |x| [x, y]));
-    packets.flat_map(pixels).collect()
+/// Rows of pixels that follow each other in a tile: two packets.
+const BAND: usize = 2 * PACKET;
+
+/// Calls `f(number, [x, y])` for the pixels of an image of `height` rows that lie in these columns and in the band of rows from `top` on. They are numbered so that
+/// pixels that follow each other see nearly the same part of the scene: square after square of four packets, and packet after packet.
+fn for_pixels_of_band(columns: &Range<usize>, top: usize, height: usize, mut f: impl FnMut(usize, [usize; 2])) {
+    let (mut number, bottom) = (0, height.min(top + BAND));
+    for left in columns.clone().step_by(BAND) {
+        for y in (top..bottom).step_by(PACKET) {
+            for x in (left..columns.end.min(left + BAND)).step_by(PACKET) {
+                for y in y..bottom.min(y + PACKET) {
+                    for x in x..columns.end.min(x + PACKET) {
+                        f(number, [x, y]);
+                        number += 1;
+                    }
+                }
+            }
+        }
+    }
 }
 
 /// Returns the rays of `count` packets of pixels, at places that fill the images of some cameras evenly, also the first ones of them.
@@ -109,18 +151,67 @@ pub(crate) fn sampled_packets(cameras: &[Camera], count: usize) -> Vec<Ray> {
 mod tests {
     use super::*;
     use crate::camera::Intrinsics;
-    use glam::DVec3;
+    use crate::render::Columns;
+    use autograd::Tensor;
+    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
     #[test]
-    fn tiles_have_each_pixel_of_an_image_once() {
-        for size in [[1, 1], [64, 64], [65, 130], [100, 61]] {
-            let mut found = vec![0; size[0] * size[1]];
-            for corner in (0..size[1]).step_by(TILE).flat_map(|y| (0..size[0]).step_by(TILE).map(move |x| [x, y])) {
-                pixels_of_tile(corner, size).into_iter().for_each(|[x, y]| found[y * size[0] + x] += 1);
+    fn bands_have_each_pixel_of_some_columns_once() {
+        for (columns, height) in [(0..1, 1), (64..128, 64), (64..65, 130), (0..100, 61)] {
+            let mut found = vec![0; columns.end * height];
+            for top in (0..height).step_by(BAND) {
+                let mut next = 0;
+                for_pixels_of_band(&columns, top, height, |i, [x, y]| {
+                    assert!(columns.contains(&x) && (top..top + BAND).contains(&y) && i == next);
+                    found[y * columns.end + x] += 1;
+                    next += 1;
+                });
             }
-            assert!(found.iter().all(|&count| count == 1), "{size:?}");
+            let want = (0..found.len()).map(|pixel| i32::from(columns.contains(&(pixel % columns.end))));
+            assert!(found.iter().copied().eq(want), "columns {columns:?} of {height} rows");
         }
-        assert_eq!(pixels_of_tile([0, 0], [100, 100])[64..66], [[8, 0], [9, 0]]);
+        let mut pixels = Vec::new();
+        for_pixels_of_band(&(0..100), 32, 100, |_, pixel| pixels.push(pixel));
+        assert_eq!([64, 65, 128, 256].map(|i| pixels[i]), [[8, 32], [9, 32], [0, 40], [16, 32]]);
+    }
+
+    #[test]
+    fn each_pixel_is_that_of_its_ray_whatever_the_tile() {
+        #[derive(Debug)]
+        struct Depth(Tensor<f64>);
+        impl Columns<f64> for Depth {
+            fn depth(&self) -> Tensor<f64> {
+                self.0.clone()
+            }
+            fn sparsity(&self) -> Tensor<f64> {
+                self.0.clone()
+            }
+            fn distortion(&self) -> Tensor<f64> {
+                self.0.clone()
+            }
+        }
+        let camera = Camera::look_at(DVec3::X, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(70, 45, 0.7));
+        let calls = AtomicUsize::new(0);
+        let render = |rays: &[Ray]| {
+            calls.fetch_add(1, Relaxed);
+            let of_rays = |f: fn(&Ray) -> f64| Tensor::from_vec(rays.iter().map(f).collect(), &[rays.len()]);
+            let directions = crate::camera::directions(rays);
+            let [opacity, depth] = [of_rays(|ray| ray.direction.z), of_rays(|ray| ray.stretch)];
+            Rendered::new(directions, opacity.clone(), opacity, 0, Depth(depth))
+        };
+        for (tile, want) in [(16, 15), (32, 6), (64, 2), (256, 1)] {
+            calls.store(0, Relaxed);
+            let picture = picture_unless(render, &camera, tile, || false).expect("nothing stops it");
+            assert_eq!(calls.load(Relaxed), want);
+            for ((y, x), &depth) in picture.depth.indexed_iter() {
+                let ray = camera.ray(x as f64 + 0.5, y as f64 + 0.5);
+                let rgb = [0, 1, 2].map(|c| picture.rgb[[y, x, c]]);
+                assert_eq!(rgb, ray.direction.to_array().map(|d| d as f32), "pixel {x}, {y}");
+                assert_eq!([depth, picture.opacity[[y, x]]], [ray.stretch as f32, ray.direction.z as f32], "pixel {x}, {y}");
+            }
+        }
+        calls.store(0, Relaxed);
+        assert!(picture_unless(render, &camera, 16, || calls.load(Relaxed) == 3).is_none());
     }
 
     #[test]

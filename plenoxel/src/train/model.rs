@@ -5,6 +5,7 @@ use crate::camera::{Ray, TrackedRays};
 use crate::error::Result;
 use crate::geometry::Aabb;
 use crate::rays::RaySource;
+use crate::render::picture::TILE;
 use crate::render::{Rendered, ShadedField};
 use crate::sampling::Jitter;
 use crate::space::Space;
@@ -77,6 +78,12 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
         let pass = Pass { background: view.background, jitter: Jitter::None, keep_samples: false, stage: None };
         Box::new(move |rays| self.render(rays, &pass))
+    }
+
+    /// Returns the side of the squares of pixels that images of the model are rendered in, a multiple of 16. Rays of larger ones take more memory, and threads wait less
+    /// for each other.
+    fn tile(&self) -> usize {
+        TILE
     }
 
     /// Returns the stages of training, in order, for epochs of `rays_per_epoch` rays. Default: a single stage of [`TrainOptions::steps`]

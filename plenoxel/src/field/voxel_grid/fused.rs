@@ -48,8 +48,7 @@ pub use pictures::PictureTables;
 pub use seen::{Seen, largest_weights, seen};
 use std::sync::{Arc, OnceLock};
 
-/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples. A tile of a picture has 16 such tasks, so further threads
-/// have none. Smaller blocks leave more lanes without a ray.
+/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples.
 const BLOCK: usize = 4 * RAYS_OF_PACKET;
 
 /// Number of rays whose samples are kept, or marched again, at a time. It bounds the memory of a step. A usual batch is an eighth of it.
@@ -63,7 +62,7 @@ const BUCKET_SHIFT: u32 = 12;
 struct Batch<T: Real> {
     layout: Layout,
     background: [T; 3],
-    /// `[n, 3]`
+    /// `[n, 3]`; `[0, 3]` for pictures with colors from a camera.
     directions: Tensor<T>,
     /// Harmonics of each ray's direction. Pictures with colors from a camera do not need them.
     basis: OnceLock<Tensor<T>>,
@@ -76,11 +75,12 @@ struct State<T: Real> {
     kept: Kept<T>,
 }
 
-/// Samples of a batch, or its rays if there are too many samples or no gradient is recorded.
+/// Samples of a batch, or its rays if there are too many samples or no gradient is recorded. Pictures from tables keep nothing.
 #[derive(Debug)]
 enum Kept<T: Real> {
     Samples(Vec<Block<T>>),
     Rays(Box<Rays>),
+    Nothing,
 }
 
 /// Data to march the rays of a batch again.
@@ -173,18 +173,20 @@ pub(super) fn render<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &Rende
 
 /// Renders a batch of straight rays for a picture, without recording a gradient, with tables of the same grid. The colors of 8-bit images are those of the other
 /// renderer up to a step: see [`PictureTables`].
+///
+/// The samples are not kept: [`Rendered::sparsity`] of the result panics.
 pub fn render_picture<T: Real>(grid: &VoxelGrid<T>, tables: &PictureTables<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     no_grad(|| render_with(grid, Some(tables), rays, options))
 }
 
 fn render_with<T: Real>(grid: &VoxelGrid<T>, picture: Option<&PictureTables<T>>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let n = rays.len();
-    let batch = Batch::new(grid, rays, options);
+    let from_camera = picture.and_then(|tables| tables.colors_from_camera(grid, rays));
+    let batch = Batch::new(grid, if from_camera.is_some() { &[] } else { rays }, options);
     let tables: Vec<&Tensor<T>> = grid.params().map(Param::tensor).collect();
     let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording() && n <= CHUNK;
     let mut pixels = Buffer::stale(n * COLUMNS);
     let packets = !keep && matches!(options.jitter, Jitter::None);
-    let from_camera = picture.and_then(|tables| tables.colors_from_camera(grid, rays));
     if from_camera.is_none() {
         batch.basis();
     }
@@ -197,6 +199,8 @@ fn render_with<T: Real>(grid: &VoxelGrid<T>, picture: Option<&PictureTables<T>>,
     }
     let kept = if keep {
         Kept::Samples(blocks)
+    } else if picture.is_some() {
+        Kept::Nothing
     } else {
         let options = RenderOptions { occupancy: None, ..options.clone() };
         Kept::Rays(Box::new(Rays { rays: rays.to_vec(), options, cells: scene.cells.cloned() }))
@@ -288,6 +292,7 @@ impl<T: Real> State<T> {
                     f(&scene.render_all(first, &mut pixels, true));
                 }
             }
+            Kept::Nothing => panic!("a picture from tables keeps no samples: use `render` for their sparsity"),
         }
     }
 

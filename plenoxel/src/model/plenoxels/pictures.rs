@@ -19,6 +19,8 @@ const STOP_BELOW: f64 = 5e-4;
 const NEGLIGIBLE: f64 = 1e-6;
 /// Number of rays that a viewer renders before it computes tables. The computation takes about as long as these rays.
 const RAYS_BEFORE_TABLE: usize = 1 << 17;
+/// Side of the squares of pixels that are rendered at a time. A ray of a picture takes little memory.
+pub(super) const TILE: usize = 256;
 
 /// Renderer of pictures of a grid, without jitter. It skips empty cells.
 pub struct Pictures<T: Real> {

@@ -16,38 +16,27 @@ pub(crate) enum Look {
 }
 
 impl Occupancy {
-    /// Returns a distance before which none of some straight rays is in an occupied cell; infinite if they are in none at all. The nearer the rays are to each
-    /// other, the larger it is.
-    ///
-    /// Ray r is in the box around the middle ray, at distance t, whose half sides are a + b t along each axis. Where all bricks nearer than k to the middle ray
-    /// are empty, the rays go on to where their box leaves these bricks.
-    fn free_until(&self, rays: &[Ray]) -> f64 {
-        /// Rounding of positions, in cells.
-        const ROUNDING: f64 = 1e-6;
-        let Some(middle) = rays.get(rays.len() / 2).map(|ray| self.along(ray)) else { return f64::INFINITY };
-        let (mut a, mut b) = (DVec3::splat(ROUNDING), DVec3::ZERO);
-        for along in rays.iter().map(|ray| self.along(ray)) {
-            a = a.max((along.start - middle.start).abs() + ROUNDING);
-            b = b.max((along.slope - middle.slope).abs());
-        }
-        // The lowest and the highest place of the rays along each axis are linear in t.
-        let lowest = |axis: usize| Line { start: middle.start[axis] - a[axis], slope: middle.slope[axis] - b[axis] };
-        let highest = |axis: usize| Line { start: middle.start[axis] + a[axis], slope: middle.slope[axis] + b[axis] };
+    /// Returns a distance before which no ray of a beam is in an occupied cell; infinite if none is in one at all. The nearer the rays are to each other, the larger it
+    /// is: where all bricks nearer than k to the middle of the beam are empty, it goes on to where one of its sides leaves these bricks.
+    fn free_until(&self, beam: &Beam) -> f64 {
         let (count, cells) = (self.bricks.count(), self.cells().map(|n| n as f64));
-        let enters = |axis: usize| highest(axis).until_above(0.0, 0.0).max(lowest(axis).negative().until_above(-cells[axis], 0.0));
+        let enters =
+            |axis: usize| beam.highest[axis].until_above(0.0, 0.0).max(beam.lowest[axis].negative().until_above(-cells[axis], 0.0));
         let mut t = enters(0).max(enters(1)).max(enters(2));
         while t.is_finite() {
-            let at = middle.start + t * middle.slope;
-            let place: [usize; 3] = std::array::from_fn(|axis| (at[axis].max(0.0) as usize / BRICK).min(count[axis] - 1));
+            let place: [usize; 3] = std::array::from_fn(|axis| {
+                let middle = 0.5 * (beam.lowest[axis].at(t) + beam.highest[axis].at(t));
+                (middle.max(0.0) as usize / BRICK).min(count[axis] - 1)
+            });
             let free = usize::from(self.distance[self.bricks.number(place)]);
             let mut exit = f64::INFINITY;
             // There is nothing beyond the box.
             for axis in 0..3 {
                 if place[axis] + free < count[axis] {
-                    exit = exit.min(highest(axis).until_above(((place[axis] + free) * BRICK) as f64, t));
+                    exit = exit.min(beam.highest[axis].until_above(((place[axis] + free) * BRICK) as f64, t));
                 }
                 if place[axis] + 1 > free {
-                    exit = exit.min(lowest(axis).negative().until_above(-(((place[axis] + 1 - free) * BRICK) as f64), t));
+                    exit = exit.min(beam.lowest[axis].negative().until_above(-(((place[axis] + 1 - free) * BRICK) as f64), t));
                 }
             }
             if free == 0 || exit <= t + ROUNDING {
@@ -58,15 +47,40 @@ impl Occupancy {
         t
     }
 
-    /// Returns two distances outside of which none of some straight rays is in an occupied cell ([`free_until`](Self::free_until), from both ends): the first
-    /// is infinite if they are in none at all.
-    pub(crate) fn section(&self, rays: &[Ray]) -> [f64; 2] {
-        let from = self.free_until(rays);
-        let exits = rays.iter().filter_map(|ray| self.aabb.intersect(ray.origin, ray.direction)).map(|(_, exit)| exit);
-        let Some(end) = exits.reduce(f64::max).filter(|_| from.is_finite()) else { return [f64::INFINITY, f64::NEG_INFINITY] };
-        let back: Vec<Ray> =
-            rays.iter().map(|ray| Ray { origin: ray.origin + end * ray.direction, direction: -ray.direction, ..*ray }).collect();
-        [from, end - self.free_until(&back)]
+    /// Returns two distances outside of which none of some straight rays is in an occupied cell ([`free_until`](Self::free_until), from both ends); `None` if they are
+    /// in none at all.
+    pub(crate) fn section(&self, rays: &[Ray]) -> Option<[f64; 2]> {
+        let beam = self.beam(rays);
+        let from = self.free_until(&beam);
+        let leaves = |axis: usize| {
+            let [lowest, behind] = [beam.lowest[axis], beam.highest[axis].negative()];
+            match (lowest.slope > 0.0, behind.slope > 0.0) {
+                (true, _) => lowest.until_above(self.cells()[axis] as f64, 0.0),
+                (_, true) => behind.until_above(0.0, 0.0),
+                _ => f64::INFINITY,
+            }
+        };
+        let end = leaves(0).min(leaves(1)).min(leaves(2));
+        match from.is_finite() {
+            false => None,
+            true if end.is_infinite() => Some([from, end]),
+            true => Some([from, end - self.free_until(&beam.backwards(end))]),
+        }
+    }
+
+    /// Returns the beam of some rays.
+    fn beam(&self, rays: &[Ray]) -> Beam {
+        let [mut origins, mut directions] = [[DVec3::INFINITY, DVec3::NEG_INFINITY]; 2];
+        for ray in rays {
+            origins = [origins[0].min(ray.origin), origins[1].max(ray.origin)];
+            directions = [directions[0].min(ray.direction), directions[1].max(ray.direction)];
+        }
+        let per_length = self.sides().recip();
+        let side = |k: usize, rounding: f64| {
+            let (start, slope) = ((origins[k] - self.aabb.min) * per_length + rounding, directions[k] * per_length);
+            [0, 1, 2].map(|axis| Line::new(start[axis], slope[axis]))
+        };
+        Beam { lowest: side(0, -ROUNDING), highest: side(1, ROUNDING) }
     }
 
     /// Prepares look-ups along a ray.
@@ -77,23 +91,55 @@ impl Occupancy {
         Along { cells: self, per_length, start: (ray.origin - self.aabb.min) * per_length, slope, per_cell: slope.recip() }
     }
 }
+
+/// Rounding of positions, in cells.
+const ROUNDING: f64 = 1e-6;
+
+/// Box around the places of some rays at distance t from their origins, in cells, for all t from 0 on.
+struct Beam {
+    lowest: [Line; 3],
+    highest: [Line; 3],
+}
+
+impl Beam {
+    /// Returns the same beam from a distance backwards.
+    fn backwards(&self, end: f64) -> Self {
+        let back = |lines: &[Line; 3]| lines.map(|line| Line { start: line.at(end), ..line.turned() });
+        Beam { lowest: back(&self.lowest), highest: back(&self.highest) }
+    }
+}
+
 /// A number that is linear in the distance t along a ray: start + t slope.
 #[derive(Clone, Copy)]
 struct Line {
     start: f64,
     slope: f64,
+    per_slope: f64,
 }
 
 impl Line {
+    fn new(start: f64, slope: f64) -> Self {
+        Line { start, slope, per_slope: slope.recip() }
+    }
+
+    fn at(self, t: f64) -> f64 {
+        self.start + t * self.slope
+    }
+
     fn negative(self) -> Self {
-        Line { start: -self.start, slope: -self.slope }
+        Line { start: -self.start, ..self.turned() }
+    }
+
+    /// Returns the line with the same start and the opposite slope.
+    fn turned(self) -> Self {
+        Line { slope: -self.slope, per_slope: -self.per_slope, ..self }
     }
 
     /// Returns the least distance, from `t` on, from which the number is above a limit; infinite if it never is.
     fn until_above(self, limit: f64, t: f64) -> f64 {
         match self.start + t * self.slope > limit {
             true => t,
-            false if self.slope > 0.0 => (limit - self.start) / self.slope,
+            false if self.slope > 0.0 => (limit - self.start) * self.per_slope,
             false => f64::INFINITY,
         }
     }
@@ -253,7 +299,7 @@ mod tests {
                     Ray { origin, direction: (target + spread * point(100 * packet + 6 * k + 9) - origin).normalize(), stretch: 1.0 }
                 };
                 let rays: Vec<Ray> = (0..12).map(ray).collect();
-                let [from, to] = some.section(&rays);
+                let [from, to] = some.section(&rays).unwrap_or([f64::INFINITY, f64::NEG_INFINITY]);
                 for ray in &rays {
                     let Some((near, end)) = aabb.intersect(ray.origin, ray.direction) else { continue };
                     for k in 0..300 {

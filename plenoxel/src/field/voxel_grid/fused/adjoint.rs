@@ -211,7 +211,7 @@ impl<T: Real> RowSums<T> for DensitySums<T> {
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
         self.0.for_each(bucket, |records, range| match &records.at {
             At::Rows(rows) => add_rows::<T, 1>(&rows[range.clone()], &records.density[range], sums, touched),
-            At::Corners(corners) => add_corners::<T, 1>(bucket, corners, range, |i| [records.density[i]], sums, touched),
+            At::Corners(corners) => add_corners::<T, _, 1>(bucket, corners, range, OneNumber(&records.density), sums, touched),
         });
     }
 }
@@ -237,33 +237,64 @@ impl<T: Real> RowSums<T> for ColorSums<T> {
 
 impl<T: Real> ColorSums<T> {
     fn add_of_width<const W: usize>(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        let Sums { basis, count: harmonics, .. } = &*self.0;
-        let (count, harmonic) = (W / 3, *harmonics > 0);
+        let harmonic = self.0.count > 0;
         self.0.for_each(bucket, |records, range| {
             let colors = records.color.as_chunks::<3>().0;
-            let value = |i: usize| -> [T; W] {
-                let c = colors[i];
-                if !harmonic {
-                    return std::array::from_fn(|k| c[k % 3]);
-                }
-                let y = &basis.data()[records.ray[i] as usize * count..][..count];
-                let mut v = [T::zero(); W];
-                for a in 0..3 {
-                    for k in 0..count {
-                        v[a * count + k] = c[a] * y[k];
-                    }
-                }
-                v
-            };
+            let harmonics = Harmonics { colors, rays: &records.ray, basis: self.0.basis.data() };
             match &records.at {
                 At::Rows(rows) if !harmonic => add_rows::<T, W>(&rows[range.clone()], colors[range].as_flattened(), sums, touched),
                 At::Rows(rows) => {
-                    let values: Vec<T> = range.clone().flat_map(value).collect();
+                    let values: Vec<T> = range.clone().flat_map(|i| -> [T; W] { harmonics.of(i) }).collect();
                     add_rows::<T, W>(&rows[range], &values, sums, touched);
                 }
-                At::Corners(corners) => add_corners::<T, W>(bucket, corners, range, value, sums, touched),
+                At::Corners(corners) if !harmonic => add_corners::<T, _, 3>(bucket, corners, range, colors, sums, touched),
+                At::Corners(corners) => add_corners::<T, _, W>(bucket, corners, range, harmonics, sums, touched),
             }
         });
+    }
+}
+
+/// Gradient of the interpolated row of each record. The compiler inlines these methods in dispatched loops, but not closures.
+trait Values<T, const W: usize> {
+    fn of(&self, i: usize) -> [T; W];
+}
+
+struct OneNumber<'a, T>(&'a [T]);
+
+impl<T: Real> Values<T, 1> for OneNumber<'_, T> {
+    #[inline(always)]
+    fn of(&self, i: usize) -> [T; 1] {
+        [self.0[i]]
+    }
+}
+
+impl<T: Real> Values<T, 3> for &[[T; 3]] {
+    #[inline(always)]
+    fn of(&self, i: usize) -> [T; 3] {
+        self[i]
+    }
+}
+
+/// Products of the gradient of a color and the harmonics of its ray.
+struct Harmonics<'a, T> {
+    colors: &'a [[T; 3]],
+    rays: &'a [u32],
+    /// `W` / 3 numbers for each ray.
+    basis: &'a [T],
+}
+
+impl<T: Real, const W: usize> Values<T, W> for Harmonics<'_, T> {
+    #[inline(always)]
+    fn of(&self, i: usize) -> [T; W] {
+        let (color, count) = (self.colors[i], W / 3);
+        let basis = &self.basis[self.rays[i] as usize * count..][..count];
+        let mut value = [T::zero(); W];
+        for c in 0..3 {
+            for k in 0..count {
+                value[c * count + k] = color[c] * basis[k];
+            }
+        }
+        value
     }
 }
 
@@ -283,27 +314,50 @@ fn add_rows<T: Real, const W: usize>(rows: &[u32], values: &[T], sums: &mut [T],
 
 dispatched! {
 /// Adds weighted values to the corner rows of each sample that lie in the bucket.
-fn add_corners<T: Real, const W: usize>(
+fn add_corners<T: Real, V: Values<T, W>, const W: usize>(
     bucket: usize,
     corners: &Corners<T>,
     range: Range<usize>,
-    value: impl Fn(usize) -> [T; W],
+    values: V,
     sums: &mut [T],
     touched: &mut [u64],
 ) {
     let sums = sums.as_chunks_mut::<W>().0;
     for i in range {
         let (rows, weights) = corners.of(i);
-        let value = value(i);
+        let value = values.of(i);
         for c in 0..8 {
             if rows[c] as usize >> BUCKET_SHIFT == bucket {
                 let local = rows[c] as usize & ((1 << BUCKET_SHIFT) - 1);
                 touched[local / 64] |= 1 << (local % 64);
-                for (s, &v) in sums[local].iter_mut().zip(&value) {
-                    *s += weights[c] * v;
-                }
+                add_weighted::<T, W>(weights[c], &value, &mut sums[local]);
             }
         }
     }
 }
+}
+
+/// Adds a weighted value to a row, in whole vectors if the row is long enough. The last vector overlaps the one before: its first numbers are written twice.
+#[inline(always)]
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+fn add_weighted<T: Real, const W: usize>(weight: T, value: &[T; W], row: &mut [T; W]) {
+    /// Length of a vector.
+    const L: usize = 16;
+    if W < L {
+        for k in 0..W {
+            row[k] += weight * value[k];
+        }
+        return;
+    }
+    let mut parts = [[T::zero(); L]; 3];
+    for part in 0..W.div_ceil(L) {
+        let start = (part * L).min(W - L);
+        for l in 0..L {
+            parts[part][l] = row[start + l] + weight * value[start + l];
+        }
+    }
+    for part in 0..W.div_ceil(L) {
+        let start = (part * L).min(W - L);
+        row[start..start + L].copy_from_slice(&parts[part]);
+    }
 }

@@ -13,6 +13,7 @@ use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
 use autograd::lattice::{Lattice, TOGETHER};
 use autograd::{Buffer, Real, Tensor, dispatched, no_grad, parallel};
 use glam::DVec3;
+use std::slice::ChunksExact;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Least distance from a camera to the box of the grid, in sides of the voxels of harmonics.
@@ -170,16 +171,35 @@ impl<'a, T: Real> Harmonics<'a, T> {
                 directions.extend((view * view.length_recip()).to_array().map(T::lit));
             }
             let basis = no_grad(|| sh::basis(&Tensor::from_vec(directions, &[colors.len(), 3]), self.degree));
-            let rows = self.rows.data()[first * width..].chunks_exact(width);
-            for ((color, row), basis) in colors.iter_mut().zip(rows).zip(basis.data().chunks_exact(functions)) {
-                color[3] = T::zero();
-                for (color, row) in color.iter_mut().zip(row.chunks_exact(count)) {
-                    *color = self.offset + basis[functions - count..].iter().zip(row).map(|(&basis, &number)| number * basis).sum();
-                }
+            let (rows, basis) = (&self.rows.data()[first * width..], basis.data().chunks_exact(functions));
+            match count {
+                3 => colors_of_rows::<T, 3>(rows, basis, self.offset, colors),
+                4 => colors_of_rows::<T, 4>(rows, basis, self.offset, colors),
+                8 => colors_of_rows::<T, 8>(rows, basis, self.offset, colors),
+                9 => colors_of_rows::<T, 9>(rows, basis, self.offset, colors),
+                15 => colors_of_rows::<T, 15>(rows, basis, self.offset, colors),
+                _ => colors_of_rows::<T, 16>(rows, basis, self.offset, colors),
             }
         });
         colors
     }
+}
+
+dispatched! {
+/// Computes the colors of rows of 3 × `N` coefficients from the last `N` functions of the basis in the direction of each row.
+fn colors_of_rows<T: Real, const N: usize>(rows: &[T], basis: ChunksExact<'_, T>, offset: T, out: &mut [[T; 4]]) {
+    let rows = rows.as_chunks::<N>().0.as_chunks::<3>().0;
+    for ((out, row), basis) in out.iter_mut().zip(rows).zip(basis) {
+        let basis: &[T; N] = basis.last_chunk().expect("as many functions as coefficients, or more");
+        let mut color = [offset, offset, offset, T::zero()];
+        for c in 0..3 {
+            for k in 0..N {
+                color[c] += row[c][k] * basis[k];
+            }
+        }
+        *out = color;
+    }
+}
 }
 
 impl<T: Real> Colors<T> {

@@ -13,11 +13,10 @@ use autograd::rows::Buckets;
 use autograd::{Buffer, Real, dispatched};
 use std::ops::Range;
 
-/// Number of rays that are led together: two vectors of `f32` with AVX-512, whose look-ups do not depend on each other.
-const LANES: usize = 32;
-const _: () = assert!(LANES.is_power_of_two() && LANES <= u32::BITS as usize);
-/// Mask of all lanes.
-const ALL: u64 = (1 << LANES) - 1;
+/// Number of rays that are led together, one for each bit of a mask: four vectors of `f32` with AVX-512, whose look-ups do not depend on each other.
+const LANES: usize = u64::BITS as usize;
+/// Samples for which there is room from the start: about those of the rays of a usual task.
+const ROOM: usize = 1 << 13;
 
 /// Sums along a ray.
 #[derive(Clone, Copy)]
@@ -54,15 +53,15 @@ struct Lanes<T> {
     /// Last interval of the march.
     last: [u32; LANES],
     /// The march ([`March::of_steps`]).
-    near: [f64; LANES],
-    far: [f64; LANES],
-    start: [f64; LANES],
-    step: [f64; LANES],
-    per_step: [f64; LANES],
+    near: [T; LANES],
+    far: [T; LANES],
+    start: [T; LANES],
+    step: [T; LANES],
+    per_step: [T; LANES],
     /// Voxel coordinates at distance t along the ray are origin + t slope.
-    origin: [[f64; LANES]; 3],
-    slope: [[f64; LANES]; 3],
-    per_slope: [[f64; LANES]; 3],
+    origin: [[T; LANES]; 3],
+    slope: [[T; LANES]; 3],
+    per_slope: [[T; LANES]; 3],
     sums: Sums<T, LANES>,
     /// Transmittance behind the samples so far; 0 in lanes without a ray.
     left: [T; LANES],
@@ -85,14 +84,14 @@ pub(super) fn lead<T: Real, const FUSED: bool>(
 ) -> Shown<T> {
     let mut shown = Shown::none();
     let mut lanes = Lanes::none();
-    let mut idle = ALL;
+    let mut idle = !0;
     loop {
         for lane in bits(idle) {
             let Some((ray, march, intervals)) = next() else { break };
             lanes.begin(lane, (ray, &rays[ray]), march, intervals, to_voxels, least);
             idle &= !(1 << lane);
         }
-        if idle == ALL {
+        if idle == !0 {
             shown.truncate();
             return shown;
         }
@@ -110,20 +109,20 @@ pub(super) fn lead<T: Real, const FUSED: bool>(
 
 impl<T: Real> Lanes<T> {
     fn none() -> Self {
-        let (numbers, lengths, none) = ([0; LANES], [0.0; LANES], [T::zero(); LANES]);
+        let (numbers, none) = ([0; LANES], [T::zero(); LANES]);
         Lanes {
             ray: numbers,
             next: numbers,
             end: numbers,
             last: numbers,
-            near: lengths,
-            far: lengths,
-            start: lengths,
-            step: lengths,
-            per_step: lengths,
-            origin: [lengths; 3],
-            slope: [lengths; 3],
-            per_slope: [lengths; 3],
+            near: none,
+            far: none,
+            start: none,
+            step: none,
+            per_step: none,
+            origin: [none; 3],
+            slope: [none; 3],
+            per_slope: [none; 3],
             sums: Sums::new(),
             left: none,
             waiting: none,
@@ -138,12 +137,12 @@ impl<T: Real> Lanes<T> {
         self.sums.take(lane);
         self.ray[lane] = number as u32;
         [self.next[lane], self.end[lane], self.last[lane]] = [intervals.start, intervals.end, march.count - 1].map(|k| k as u32);
-        (self.near[lane], self.far[lane], self.start[lane]) = (march.near, march.far, march.start);
-        (self.step[lane], self.per_step[lane]) = (march.step, march.step.recip());
+        (self.near[lane], self.far[lane], self.start[lane]) = (T::lit(march.near), T::lit(march.far), T::lit(march.start));
+        (self.step[lane], self.per_step[lane]) = (T::lit(march.step), T::lit(march.step.recip()));
         for axis in 0..3 {
             let slope = ray.direction[axis] * to_voxels[0];
-            self.origin[axis][lane] = ray.origin[axis] * to_voxels[0] + to_voxels[1];
-            (self.slope[axis][lane], self.per_slope[axis][lane]) = (slope, slope.recip());
+            self.origin[axis][lane] = T::lit(ray.origin[axis] * to_voxels[0] + to_voxels[1]);
+            (self.slope[axis][lane], self.per_slope[axis][lane]) = (T::lit(slope), T::lit(slope.recip()));
         }
         (self.left[lane], self.waiting[lane], self.allowed[lane]) = (T::one(), T::zero(), least);
     }
@@ -166,7 +165,7 @@ impl<T: Real> Shown<T> {
     #[inline]
     fn make_room(&mut self) {
         if self.count + LANES > self.of.len() {
-            let room = (2 * self.of.len()).max(1024);
+            let room = (2 * self.of.len()).max(ROOM);
             self.of.grow(room);
             self.at.iter_mut().chain([&mut self.weight]).for_each(|column| column.grow(room));
         }
@@ -200,18 +199,17 @@ dispatched! {
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: &NodeTable<T>, stop: T, shown: &mut Shown<T>) -> u64 {
     // Plain loops vectorise, one array after another. These intervals are those of `March::interval`.
-    let (mut middles, mut t, mut delta) = ([0.0; LANES], [T::zero(); LANES], [T::zero(); LANES]);
+    let (mut t, mut delta) = ([T::zero(); LANES], [T::zero(); LANES]);
     for i in 0..LANES {
-        let k = f64::from(lanes.next[i]);
-        let begin = if lanes.next[i] == 0 { lanes.near[i] } else { lanes.start[i] + (k - 1.0) * lanes.step[i] };
+        let k = T::lit(f64::from(lanes.next[i]));
+        let begin = if lanes.next[i] == 0 { lanes.near[i] } else { lanes.start[i] + (k - T::one()) * lanes.step[i] };
         let end = if lanes.next[i] == lanes.last[i] { lanes.far[i] } else { lanes.start[i] + k * lanes.step[i] };
-        middles[i] = 0.5 * (begin + end);
-        (t[i], delta[i]) = (T::lit(middles[i]), T::lit(end - begin));
+        (t[i], delta[i]) = (T::lit(0.5) * (begin + end), end - begin);
     }
     let mut at = [[T::zero(); LANES]; 3];
     for a in 0..3 {
         for i in 0..LANES {
-            at[a][i] = T::lit(middles[i].multiply_add::<FUSED>(lanes.slope[a][i], lanes.origin[a][i]));
+            at[a][i] = t[i].multiply_add::<FUSED>(lanes.slope[a][i], lanes.origin[a][i]);
         }
     }
     let cells = Cells::find(densities.bricks(), at.each_ref());
@@ -255,7 +253,7 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
         let [x, y, z] = &mut shown.at;
         let to = [&mut x[count..count + LANES], &mut y[count..count + LANES], &mut z[count..count + LANES]];
         shown.count += colored.count_ones() as usize;
-        if colored == ALL {
+        if colored == !0 {
             // Whole vectors, without a loop over the lanes.
             of.copy_from_slice(&lanes.ray);
             to_weight.copy_from_slice(&all);
@@ -276,11 +274,12 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
     for i in 0..LANES {
         lanes.next[i] += 1;
     }
-    if stored | idle != ALL {
+    if stored | idle != !0 {
         let exits = cells.exits(&lanes.origin, &lanes.per_slope);
         for i in 0..LANES {
             // The number of intervals whose middle lies before the exit or at it. At the exit, the nodes are still those of an empty brick.
-            let before = ((exits[i] - lanes.start[i]) * lanes.per_step[i] + 1.5).max(0.0).min(f64::from(lanes.end[i])).index();
+            let end = T::lit(f64::from(lanes.end[i]));
+            let before = ((exits[i] - lanes.start[i]) * lanes.per_step[i] + T::lit(1.5)).max(T::zero()).min(end).index();
             lanes.next[i] = lanes.next[i].max(before);
         }
     }
@@ -297,10 +296,10 @@ fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: 
 fn mask_of(holds: &[bool; LANES]) -> u64 {
     let (mut bits, mut mask) = ([0; LANES], 0);
     for i in 0..LANES {
-        bits[i] = if holds[i] { 1_u32 << i } else { 0 };
+        bits[i] = if holds[i] { 1_u64 << i } else { 0 };
     }
     for bit in bits {
         mask |= bit;
     }
-    u64::from(mask)
+    mask
 }

@@ -101,7 +101,7 @@ impl<T: Real> Scene<'_, T> {
         let mut numbers = 0..rays.len();
         let next = || {
             numbers.by_ref().find_map(|r| {
-                let section = sections.of(rays, r);
+                let section = sections.of(rays, r)?;
                 let march = march(&rays[r], aabb, *spacing, 0.0);
                 let intervals = march.between(section);
                 (!intervals.is_empty()).then_some((r, march, intervals))
