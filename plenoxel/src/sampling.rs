@@ -1,5 +1,5 @@
-//! Positions of samples along rays. This module defines them; pictures of voxel grids compute the same positions in vectors of rays
-//! (`field/voxel_grid/fused/lanes.rs`).
+//! Positions of samples along rays. This module defines them; pictures of voxel grids compute the same positions in vectors of rays,
+//! in the precision of the field (`field/voxel_grid/fused/lanes.rs`).
 //!
 //! A sample represents an interval of its ray: its position is the middle of the interval, `delta` the length. Samples of a batch are
 //! packed one ray after another; ray `r` owns `offsets[r]..offsets[r + 1]`. Rays that miss the box have no samples.

@@ -151,6 +151,11 @@ impl HashGrid {
         let groups = loops::groups(positions.data().as_chunks::<3>().0);
         let mut blocks = Buffer::stale(m * width);
         for (l, level) in self.levels.iter().enumerate() {
+            if 8 * m >= level.rows {
+                // As many reads as there are rows: nearly all lines are read, most of them more than once.
+                let rows = &data[level.first * features..][..level.rows * features];
+                parallel::map_chunks(rows.len(), parallel::CHUNK, |range| parallel::load(&rows[range]));
+            }
             parallel::for_each_chunk(&mut blocks, BLOCK * width, |start, block| {
                 let count = block.len() / width;
                 let groups = &groups[start / width / TOGETHER..][..count.div_ceil(TOGETHER)];

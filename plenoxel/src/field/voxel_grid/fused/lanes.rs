@@ -52,13 +52,13 @@ struct Lanes<T> {
     end: [u32; LANES],
     /// Last interval of the march.
     last: [u32; LANES],
-    /// The march ([`March::of_steps`]).
+    /// The march ([`March::of_steps`]). Its other distances are those from `near`, so that their rounding does not depend on how far the camera is.
     near: [T; LANES],
     far: [T; LANES],
     start: [T; LANES],
     step: [T; LANES],
     per_step: [T; LANES],
-    /// Voxel coordinates at distance t along the ray are origin + t slope.
+    /// Voxel coordinates at distance `near` + s along the ray are origin + s slope.
     origin: [[T; LANES]; 3],
     slope: [[T; LANES]; 3],
     per_slope: [[T; LANES]; 3],
@@ -137,11 +137,12 @@ impl<T: Real> Lanes<T> {
         self.sums.take(lane);
         self.ray[lane] = number as u32;
         [self.next[lane], self.end[lane], self.last[lane]] = [intervals.start, intervals.end, march.count - 1].map(|k| k as u32);
-        (self.near[lane], self.far[lane], self.start[lane]) = (T::lit(march.near), T::lit(march.far), T::lit(march.start));
+        (self.near[lane], self.far[lane]) = (T::lit(march.near), T::lit(march.far - march.near));
+        self.start[lane] = T::lit(march.start - march.near);
         (self.step[lane], self.per_step[lane]) = (T::lit(march.step), T::lit(march.step.recip()));
         for axis in 0..3 {
             let slope = ray.direction[axis] * to_voxels[0];
-            self.origin[axis][lane] = T::lit(ray.origin[axis] * to_voxels[0] + to_voxels[1]);
+            self.origin[axis][lane] = T::lit(ray.origin[axis] * to_voxels[0] + to_voxels[1] + march.near * slope);
             (self.slope[axis][lane], self.per_slope[axis][lane]) = (T::lit(slope), T::lit(slope.recip()));
         }
         (self.left[lane], self.waiting[lane], self.allowed[lane]) = (T::one(), T::zero(), least);
@@ -199,17 +200,18 @@ dispatched! {
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: &NodeTable<T>, stop: T, shown: &mut Shown<T>) -> u64 {
     // Plain loops vectorise, one array after another. These intervals are those of `March::interval`.
-    let (mut t, mut delta) = ([T::zero(); LANES], [T::zero(); LANES]);
+    let (mut middles, mut t, mut delta) = ([T::zero(); LANES], [T::zero(); LANES], [T::zero(); LANES]);
     for i in 0..LANES {
         let k = T::lit(f64::from(lanes.next[i]));
-        let begin = if lanes.next[i] == 0 { lanes.near[i] } else { lanes.start[i] + (k - T::one()) * lanes.step[i] };
+        let begin = if lanes.next[i] == 0 { T::zero() } else { lanes.start[i] + (k - T::one()) * lanes.step[i] };
         let end = if lanes.next[i] == lanes.last[i] { lanes.far[i] } else { lanes.start[i] + k * lanes.step[i] };
-        (t[i], delta[i]) = (T::lit(0.5) * (begin + end), end - begin);
+        middles[i] = T::lit(0.5) * (begin + end);
+        (t[i], delta[i]) = (lanes.near[i] + middles[i], end - begin);
     }
     let mut at = [[T::zero(); LANES]; 3];
     for a in 0..3 {
         for i in 0..LANES {
-            at[a][i] = t[i].multiply_add::<FUSED>(lanes.slope[a][i], lanes.origin[a][i]);
+            at[a][i] = middles[i].multiply_add::<FUSED>(lanes.slope[a][i], lanes.origin[a][i]);
         }
     }
     let cells = Cells::find(densities.bricks(), at.each_ref());

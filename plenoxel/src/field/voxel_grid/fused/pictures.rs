@@ -128,7 +128,7 @@ mod tests {
     use glam::DVec3;
 
     /// A ball with holes; voxels of every fifth brick have a negative density.
-    fn ball(sh_reduction: usize, color: Color) -> VoxelGrid<f64> {
+    fn ball<T: Real>(sh_reduction: usize, color: Color) -> VoxelGrid<T> {
         let shape = GridShape { resolution: 30, half_width: 1.1, interpolation: Interpolation::Trilinear, color, sh_reduction };
         let grid = VoxelGrid::random(shape, 25.0, 0.2, 8);
         let kept = grid.voxels_where(|row| {
@@ -137,7 +137,7 @@ mod tests {
         });
         let grid = grid.pruned(&kept);
         let sign = |row: usize| if (row / BRICK_ROWS).is_multiple_of(5) { -1.0 } else { 1.0 };
-        let density: Vec<f64> = grid.density.tensor().data().iter().enumerate().map(|(row, density)| sign(row) * density).collect();
+        let density: Vec<T> = grid.density.tensor().data().iter().enumerate().map(|(row, &density)| T::lit(sign(row)) * density).collect();
         grid.with_density(autograd::Tensor::from_vec(density, grid.density.tensor().shape()))
     }
 
@@ -173,7 +173,7 @@ mod tests {
     fn pictures_are_those_of_the_other_renderer() {
         let points = Spacing::Points { samples: 80, far: 5.0 };
         for ((sh_reduction, color), spacing) in KINDS.into_iter().flat_map(|kind| [(kind, options(0.0).spacing), (kind, points)]) {
-            let (grid, rays, options) = (ball(sh_reduction, color), rays(3.0, 48), RenderOptions { spacing, ..options(0.0) });
+            let (grid, rays, options) = (ball::<f64>(sh_reduction, color), rays(3.0, 48), RenderOptions { spacing, ..options(0.0) });
             let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
             let [want, found] = [render(&grid, &rays, &options), render_picture(&grid, &tables, &rays, &options)];
             assert!(difference(&want, &found) < 1e-10, "{color:?}: {}", difference(&want, &found));
@@ -182,8 +182,21 @@ mod tests {
     }
 
     #[test]
+    fn single_precision_changes_no_pixel_by_a_tenth_of_a_step_however_far_the_camera_is() {
+        let (grid, single) = (ball::<f64>(1, Color::Rgb), ball::<f32>(1, Color::Rgb));
+        let tables = PictureTables::new(&single, 0.0).expect("trilinear look-up");
+        for distance in [3.0, 3000.0] {
+            let rays = rays(distance, 48);
+            let want = render(&grid, &rays, &options(0.0)).rgb;
+            let found = render_picture(&single, &tables, &rays, &options(0.0)).rgb;
+            let largest = want.data().iter().zip(found.data()).map(|(a, b)| (a - f64::from(*b)).abs()).fold(0.0, f64::max);
+            assert!(largest > 0.0 && largest < 0.1 / 255.0, "{largest} at distance {distance}");
+        }
+    }
+
+    #[test]
     fn colors_of_other_samples_change_a_pixel_by_less_than_the_bound() {
-        let (grid, rays) = (ball(1, Color::Rgb), rays(3.0, 48));
+        let (grid, rays) = (ball::<f64>(1, Color::Rgb), rays(3.0, 48));
         let (options, bound) = (options(0.02), 0.02);
         let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
         let [want, found] = [render(&grid, &rays, &options), render_picture(&grid, &tables, &rays, &options)];
@@ -196,7 +209,7 @@ mod tests {
     #[test]
     fn colors_seen_from_a_far_camera_change_no_pixel_by_half_a_step() {
         for (sh_reduction, color) in KINDS {
-            let (grid, options) = (ball(sh_reduction, color), options(0.0));
+            let (grid, options) = (ball::<f64>(sh_reduction, color), options(0.0));
             let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
             // The nearest camera that is far enough.
             let mut cameras = (20..).map(|tenths| rays(0.1 * f64::from(tenths), 128));
@@ -210,7 +223,7 @@ mod tests {
     #[test]
     fn pictures_have_the_same_bits_for_any_number_of_threads() {
         let (sh_reduction, color) = KINDS[2];
-        let (grid, options, rays) = (ball(sh_reduction, color), options(1e-3), rays(12.0, 128));
+        let (grid, options, rays) = (ball::<f64>(sh_reduction, color), options(1e-3), rays(12.0, 128));
         let bits = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
             pool.install(|| {
@@ -225,7 +238,7 @@ mod tests {
     #[test]
     fn nearest_look_up_has_no_tables() {
         let grid = VoxelGrid::<f64>::uniform(
-            GridShape { resolution: 4, interpolation: Interpolation::Nearest, ..*ball(1, Color::Rgb).shape() },
+            GridShape { resolution: 4, interpolation: Interpolation::Nearest, ..*ball::<f64>(1, Color::Rgb).shape() },
             1.0,
             0.5,
         );

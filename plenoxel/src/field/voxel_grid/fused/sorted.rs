@@ -74,6 +74,12 @@ impl<T: Real> Scene<'_, T> {
         })
     }
 
+    /// Returns the numbers of the color table in a bucket.
+    fn rows_of_color(&self, bucket: usize) -> &[T] {
+        let (table, numbers) = (self.tables[1], (3 * self.batch.harmonics()) << BUCKET_SHIFT);
+        &table[bucket * numbers..table.len().min((bucket + 1) * numbers)]
+    }
+
     /// Computes the colors of the samples of each order.
     fn colors_in_order(&self, blocks: &[Block<T>], orders: &[Order], buckets: usize) -> Vec<Buffer<T>> {
         let directions = self.directions(0).expect("only harmonics are worth sorting");
@@ -87,6 +93,11 @@ impl<T: Real> Scene<'_, T> {
         }
         parallel::for_each_item(tasks, |task, mut parts| {
             for bucket in of_task(task) {
+                let samples: usize = orders.iter().map(|order| order.buckets.range(bucket).len()).sum();
+                if 8 * samples >= 1 << BUCKET_SHIFT {
+                    // As many reads as there are rows: most of them are read, some more than once.
+                    parallel::load(self.rows_of_color(bucket));
+                }
                 for ((block, order), part) in blocks.iter().zip(orders).zip(&mut parts) {
                     let range = order.buckets.range(bucket);
                     if range.is_empty() {
