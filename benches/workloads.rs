@@ -187,7 +187,8 @@ fn image(args: &Arguments, name: &str, engine: Engine, from_tables: bool) {
     let exact = || picture(&grid, &camera, &options);
     let show = || {
         let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
-        picture_unless(|rays| render_picture(&grid, &tables, rays, &options), &camera, 256, || false).expect("nothing stops it")
+        picture_unless(|rays| render_picture(&grid, &tables, rays, &options), &camera, PictureTables::<f32>::TILE, || false)
+            .expect("nothing stops it")
     };
     let times = repeat(args.repeats.min(3), || drop(black_box(if from_tables { show() } else { exact() })));
     print(name, &times, Some(pixels), 0);

@@ -44,7 +44,7 @@ pub(crate) fn pixels(cameras: &[Camera]) -> usize {
 pub struct Viewer<'a, T: Real> {
     show: RenderFn<'a, T>,
     background: [f32; 3],
-    /// Side of the squares of pixels that are rendered at a time.
+    /// Side of the tiles of pixels that are rendered at a time.
     tile: usize,
 }
 
@@ -57,6 +57,11 @@ impl<'a, T: Real> Viewer<'a, T> {
     /// Creates a viewer of a model.
     pub fn of(model: &'a (impl Model<T> + ?Sized), options: &ViewOptions) -> Self {
         Viewer { show: model.viewer(options), background: options.background, tile: model.tile() }
+    }
+
+    /// Renders images in tiles of pixels with this side ([`Model::tile`]).
+    pub fn in_tiles(self, side: usize) -> Self {
+        Viewer { tile: side, ..self }
     }
 
     /// Renders the image of a camera.
@@ -80,7 +85,7 @@ impl<'a, T: Real> Viewer<'a, T> {
         let rays = sampled_packets(cameras, PACKETS);
         let start = Instant::now();
         let mut rendered = 0;
-        // As many rays at a time as a usual tile of a picture has.
+        // As many rays at a time as a tile of `TILE` has. Larger tiles are a few percent faster, with many threads more.
         for rays in rays.chunks(rays.len().div_ceil(4)) {
             no_grad(|| drop((self.show)(rays)));
             rendered += rays.len();

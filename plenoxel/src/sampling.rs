@@ -116,7 +116,7 @@ impl<T: Real> Samples<T> {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct March {
     pub(crate) count: usize,
-    // `field/voxel_grid/fused/lanes.rs` computes intervals from these four as `interval` does.
+    // `field/voxel_grid/fused/lanes.rs` computes intervals from these four as `interval` does, counted from `near`.
     pub(crate) near: f64,
     pub(crate) far: f64,
     /// Start of the step with k = 1 (`Step`), or the first point (`Points`).

@@ -1,4 +1,4 @@
-//! Memory that is read before it is needed.
+//! Memory that is read before it is needed: in order, or by prefetches.
 //!
 //! If there is much work between two lookups in a large table, each lookup waits for memory separately. Where the next rows are known in advance, a prefetch
 //! lets these waits overlap. A prefetch never changes a result.
@@ -10,7 +10,7 @@ use std::hint::black_box;
 /// Size of a cache line, in bytes.
 const LINE: usize = 64;
 
-/// Reads values in order, one of each cache line. Processors fetch such lines much faster than those of look-ups at random places, so the look-ups that follow find
+/// Reads values in order, one of every 64 bytes. Processors fetch such lines much faster than those of look-ups at random places, so the look-ups that follow find
 /// the values in a cache. This pays if they read most of the lines, and if the values fit in the cache.
 pub fn load<E: Copy>(values: &[E]) {
     for line in values.chunks((LINE / size_of::<E>().max(1)).max(1)) {

@@ -151,8 +151,8 @@ impl HashGrid {
         let groups = loops::groups(positions.data().as_chunks::<3>().0);
         let mut blocks = Buffer::stale(m * width);
         for (l, level) in self.levels.iter().enumerate() {
-            if 8 * m >= level.rows {
-                // As many reads as there are rows: nearly all lines are read, most of them more than once.
+            // Measured to pay from about one look-up a row on: such a level is read nearly as a whole.
+            if 8 * m >= level.rows && level.rows * features <= LOADED {
                 let rows = &data[level.first * features..][..level.rows * features];
                 parallel::map_chunks(rows.len(), parallel::CHUNK, |range| parallel::load(&rows[range]));
             }
@@ -175,6 +175,9 @@ impl HashGrid {
         out
     }
 }
+
+/// Most numbers of a level that is read in order before its look-ups: 8 MB in single precision, so that a last-level cache keeps them.
+const LOADED: usize = 1 << 21;
 
 /// Kernel that maps a table and positions to encoded positions.
 #[derive(Debug)]

@@ -153,7 +153,7 @@ impl<T: Real, const N: usize> Cells<T, N> {
     }
 
     /// Finds along rays, at voxel coordinates origin + t slope with these reciprocals of the slopes, where they leave the bricks around them of which none is
-    /// stored: a lower bound of the distances t. It is −∞ for positions in stored bricks.
+    /// stored: a lower bound of the distances t, up to rounding. It is −∞ for positions in stored bricks.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
     pub fn exits(&self, origin: &[[T; N]; 3], per_slope: &[[T; N]; 3]) -> [T; N] {

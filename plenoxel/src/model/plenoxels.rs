@@ -212,7 +212,7 @@ impl<T: Real> Plenoxels<T> {
 /// Creates a viewer of a voxel grid: without jitter, and skipping empty cells, which changes no pixel.
 pub fn grid_viewer<T: Real>(grid: &VoxelGrid<T>, sampling: Sampling, engine: Engine, background: [f32; 3]) -> Viewer<'_, T> {
     let pictures = Pictures::new(grid, sampling, engine, background);
-    Viewer::new(move |rays: &[Ray]| pictures.render(grid, rays), background)
+    Viewer::new(move |rays: &[Ray]| pictures.render(grid, rays), background).in_tiles(pictures::tile(engine))
 }
 
 /// Opens the model of a checkpoint for rendering. `config` is the config of its run; its stages are not used.
@@ -276,7 +276,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn tile(&self) -> usize {
-        pictures::TILE
+        pictures::tile(self.config.engine)
     }
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {

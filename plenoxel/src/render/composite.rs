@@ -147,6 +147,8 @@ impl<T: Real> Rendered<T> {
     }
 
     /// Returns the Cauchy sparsity Σ ln(1 + 2σᵢ²), `[n]` (PlenOctrees, svox2).
+    ///
+    /// Panics for pixels of a picture ([`Model::viewer`](crate::train::Model::viewer)) that were rendered from tables: their samples are not kept.
     pub fn sparsity(&self) -> Tensor<T> {
         self.columns.sparsity()
     }

@@ -47,7 +47,7 @@ impl Picture {
     }
 }
 
-/// Side of the squares of pixels that are rendered at a time, unless a model has its own ([`Model::tile`](crate::train::Model::tile)).
+/// Side of the tiles of pixels that are rendered at a time, unless a model has its own ([`Model::tile`](crate::train::Model::tile)).
 pub const TILE: usize = 64;
 
 /// Renders an image of a field.
@@ -60,19 +60,17 @@ pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Came
     picture_unless(render, camera, TILE, || false).expect("nothing stops it")
 }
 
-/// Renders an image as [`picture_by`] does, in squares of pixels with this side. Before each square it asks `stopped`; returns `None` once that is true.
-///
-/// Panics if the side is not a multiple of 16.
+/// Renders an image as [`picture_by`] does, in tiles of pixels with this side, or slightly more. Before each tile it asks `stopped`; returns `None` once that is true.
 pub fn picture_unless<T: Real>(
     render: impl Fn(&[Ray]) -> Rendered<T>,
     camera: &Camera,
     tile: usize,
     stopped: impl Fn() -> bool,
 ) -> Option<Picture> {
-    assert!(tile > 0 && tile.is_multiple_of(BAND), "a picture is rendered in squares whose side is a multiple of {BAND}, not {tile}");
+    let tile = tile.max(1).next_multiple_of(BAND);
     let [w, h] = [camera.intrinsics.width, camera.intrinsics.height];
     let (mut rgb, mut depth, mut opacity) = (vec![0.0; 3 * w * h], vec![0.0; w * h], vec![0.0; w * h]);
-    // Rays of one square, each of which is written before it is read.
+    // Rays of one tile, each of which is written before it is read.
     let mut rays = vec![Ray { origin: DVec3::ZERO, direction: DVec3::Z, stretch: 1.0 }; tile.min(w) * tile.min(h)];
     for y in (0..h).step_by(tile) {
         for x in (0..w).step_by(tile) {
@@ -199,7 +197,7 @@ mod tests {
             let [opacity, depth] = [of_rays(|ray| ray.direction.z), of_rays(|ray| ray.stretch)];
             Rendered::new(directions, opacity.clone(), opacity, 0, Depth(depth))
         };
-        for (tile, want) in [(16, 15), (32, 6), (64, 2), (256, 1)] {
+        for (tile, want) in [(0, 15), (16, 15), (17, 6), (64, 2), (256, 1)] {
             calls.store(0, Relaxed);
             let picture = picture_unless(render, &camera, tile, || false).expect("nothing stops it");
             assert_eq!(calls.load(Relaxed), want);

@@ -19,7 +19,7 @@ use crate::memory;
 use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
 use crate::model::recipe::{Memory, Recipe};
 use crate::model::{self, plenoxels, recipe};
-use crate::render::Engine;
+use crate::render::{Engine, picture};
 use crate::tensor_file::TensorFile;
 use std::path::Path;
 
@@ -56,8 +56,8 @@ const COMPARED_BYTES: u64 = 82;
 const DRAWN_BYTES: u64 = 130;
 /// Maximum memory for building report.html: its grid of up to 30 MB exists compressed, as text, and as a part of longer texts.
 const PAGE_BYTES: u64 = 150_000_000;
-/// Rays per batch during evaluation.
-const EVALUATION_RAYS: u64 = 4096;
+/// Rays per batch during evaluation. Larger tiles, of fused pictures of voxel grids, keep no samples.
+const EVALUATION_RAYS: u64 = (picture::TILE * picture::TILE) as u64;
 
 impl Estimate {
     /// Estimates a training run and its evaluation; `initial` is the size in bytes of the initial grid (`init_from`), or 0.

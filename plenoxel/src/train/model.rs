@@ -74,14 +74,13 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>>;
 
     /// Returns a function that renders images of the current model, without jitter. It may precompute data for many rays. It is called
-    /// without recording gradients.
+    /// without recording gradients. The pixels need not have a [sparsity](Rendered::sparsity).
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
         let pass = Pass { background: view.background, jitter: Jitter::None, keep_samples: false, stage: None };
         Box::new(move |rays| self.render(rays, &pass))
     }
 
-    /// Returns the side of the squares of pixels that images of the model are rendered in, a multiple of 16. Rays of larger ones take more memory, and threads wait less
-    /// for each other.
+    /// Returns the side of the tiles of pixels that images of the model are rendered in. Larger tiles take more memory, but threads wait less for each other.
     fn tile(&self) -> usize {
         TILE
     }

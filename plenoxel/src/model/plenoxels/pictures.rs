@@ -5,6 +5,7 @@ use super::{render_grid, single};
 use crate::camera::Ray;
 use crate::field::voxel_grid::VoxelGrid;
 use crate::field::voxel_grid::fused::{PictureTables, render_picture};
+use crate::render::picture::TILE;
 use crate::render::{Engine, RenderOptions, Rendered};
 use crate::sampling::{Jitter, Occupancy};
 use autograd::Real;
@@ -19,8 +20,6 @@ const STOP_BELOW: f64 = 5e-4;
 const NEGLIGIBLE: f64 = 1e-6;
 /// Number of rays that a viewer renders before it computes tables. The computation takes about as long as these rays.
 const RAYS_BEFORE_TABLE: usize = 1 << 17;
-/// Side of the squares of pixels that are rendered at a time. A ray of a picture takes little memory.
-pub(super) const TILE: usize = 256;
 
 /// Renderer of pictures of a grid, without jitter. It skips empty cells.
 pub struct Pictures<T: Real> {
@@ -69,6 +68,14 @@ impl<T: Real> Pictures<T> {
             }
         };
         self.tables.get_or_init(compute).as_ref()
+    }
+}
+
+/// Returns the side of the tiles of pixels that are rendered at a time. The graph keeps all samples of a tile.
+pub fn tile(engine: Engine) -> usize {
+    match engine {
+        Engine::Fused => PictureTables::<f32>::TILE,
+        Engine::Graph => TILE,
     }
 }
 

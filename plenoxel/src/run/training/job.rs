@@ -128,7 +128,7 @@ fn compare<M: Model<f32>>(
     let start = Instant::now();
     let mut listening = Stopwatch::default();
     for (stage, show) in learned.kept.drain(..) {
-        let scores = Viewer::new(show, options.background).compare(test, |_, _, _, _| {
+        let scores = Viewer::new(show, options.background).in_tiles(learned.model.tile()).compare(test, |_, _, _, _| {
             done += 1;
             listening.time(|| on(Event::Evaluating { done, total }));
             Ok(())

@@ -68,6 +68,12 @@ impl Occupancy {
         }
     }
 
+    /// Returns the number of cells per length along each axis.
+    #[inline]
+    fn per_length(&self) -> DVec3 {
+        DVec3::from_array(self.cells().map(|n| n as f64)) / (self.aabb.max - self.aabb.min)
+    }
+
     /// Returns the beam of some rays.
     fn beam(&self, rays: &[Ray]) -> Beam {
         let [mut origins, mut directions] = [[DVec3::INFINITY, DVec3::NEG_INFINITY]; 2];
@@ -75,7 +81,7 @@ impl Occupancy {
             origins = [origins[0].min(ray.origin), origins[1].max(ray.origin)];
             directions = [directions[0].min(ray.direction), directions[1].max(ray.direction)];
         }
-        let per_length = self.sides().recip();
+        let per_length = self.per_length();
         let side = |k: usize, rounding: f64| {
             let (start, slope) = ((origins[k] - self.aabb.min) * per_length + rounding, directions[k] * per_length);
             [0, 1, 2].map(|axis| Line::new(start[axis], slope[axis]))
@@ -86,7 +92,7 @@ impl Occupancy {
     /// Prepares look-ups along a ray.
     #[inline]
     pub(crate) fn along(&self, ray: &Ray) -> Along<'_> {
-        let per_length = DVec3::from_array(self.cells().map(|n| n as f64)) / (self.aabb.max - self.aabb.min);
+        let per_length = self.per_length();
         let slope = ray.direction * per_length;
         Along { cells: self, per_length, start: (ray.origin - self.aabb.min) * per_length, slope, per_cell: slope.recip() }
     }
@@ -95,14 +101,14 @@ impl Occupancy {
 /// Rounding of positions, in cells.
 const ROUNDING: f64 = 1e-6;
 
-/// Box around the places of some rays at distance t from their origins, in cells, for all t from 0 on.
+/// Box around the places of some rays at distance t from their origins, in cells.
 struct Beam {
     lowest: [Line; 3],
     highest: [Line; 3],
 }
 
 impl Beam {
-    /// Returns the same beam from a distance backwards.
+    /// Returns the beam whose places at t are those of this one at `end` − t, for t up to `end`.
     fn backwards(&self, end: f64) -> Self {
         let back = |lines: &[Line; 3]| lines.map(|line| Line { start: line.at(end), ..line.turned() });
         Beam { lowest: back(&self.lowest), highest: back(&self.highest) }
@@ -287,18 +293,25 @@ mod tests {
         let aabb = Aabb { min: DVec3::new(-1.0, -0.8, -1.1), max: DVec3::new(0.9, 1.2, 1.0) };
         let number = |k: u64| 2.0 * uniform(5, Purpose::Initial, 1, k) - 1.0;
         let point = |k: u64| DVec3::new(number(k), number(k + 1), number(k + 2));
-        for (share, far_enough, sees_nothing) in [(0.0, 3000, 340), (0.0003, 400, 10), (0.01, 0, 0)] {
+        for (share, far_enough, sees_nothing) in [(0.0, 2400, 340), (0.0003, 300, 10), (0.01, 0, 0)] {
             let some = Occupancy { aabb, ..scattered([70, 52, 66], share) };
             let (mut far, mut back, mut none) = (0, 0, 0);
             for packet in 0..400u64 {
-                let (origin, target) = (3.0 * point(100 * packet).normalize(), point(100 * packet + 3));
+                // Some begin in the box.
+                let distance = if packet % 7 == 3 { 0.5 } else { 3.0 };
+                let (origin, target) = (distance * point(100 * packet).normalize(), point(100 * packet + 3));
                 // Rays of a packet of pixels, and some that have nothing in common.
                 let spread = if packet % 10 == 0 { 1.0 } else { 0.01 };
                 let ray = |k: u64| {
                     let origin = origin + 0.2 * spread * point(100 * packet + 6 * k + 6);
                     Ray { origin, direction: (target + spread * point(100 * packet + 6 * k + 9) - origin).normalize(), stretch: 1.0 }
                 };
-                let rays: Vec<Ray> = (0..12).map(ray).collect();
+                let mut rays: Vec<Ray> = (0..if packet % 4 == 1 { 1 } else { 12 }).map(ray).collect();
+                if packet % 5 == 2 {
+                    // Parallel to an axis.
+                    let axis = [DVec3::X, DVec3::NEG_Y, DVec3::Z][packet as usize % 3];
+                    rays.iter_mut().for_each(|ray| ray.direction = axis);
+                }
                 let [from, to] = some.section(&rays).unwrap_or([f64::INFINITY, f64::NEG_INFINITY]);
                 for ray in &rays {
                     let Some((near, end)) = aabb.intersect(ray.origin, ray.direction) else { continue };

@@ -240,15 +240,15 @@ impl<T: Real> ColorSums<T> {
         let harmonic = self.0.count > 0;
         self.0.for_each(bucket, |records, range| {
             let colors = records.color.as_chunks::<3>().0;
-            let harmonics = Harmonics { colors, rays: &records.ray, basis: self.0.basis.data() };
+            let products = ColorTimesBasis { colors, rays: &records.ray, basis: self.0.basis.data() };
             match &records.at {
                 At::Rows(rows) if !harmonic => add_rows::<T, W>(&rows[range.clone()], colors[range].as_flattened(), sums, touched),
                 At::Rows(rows) => {
-                    let values: Vec<T> = range.clone().flat_map(|i| -> [T; W] { harmonics.of(i) }).collect();
+                    let values: Vec<T> = range.clone().flat_map(|i| -> [T; W] { products.of(i) }).collect();
                     add_rows::<T, W>(&rows[range], &values, sums, touched);
                 }
                 At::Corners(corners) if !harmonic => add_corners::<T, _, 3>(bucket, corners, range, colors, sums, touched),
-                At::Corners(corners) => add_corners::<T, _, W>(bucket, corners, range, harmonics, sums, touched),
+                At::Corners(corners) => add_corners::<T, _, W>(bucket, corners, range, products, sums, touched),
             }
         });
     }
@@ -276,14 +276,14 @@ impl<T: Real> Values<T, 3> for &[[T; 3]] {
 }
 
 /// Products of the gradient of a color and the harmonics of its ray.
-struct Harmonics<'a, T> {
+struct ColorTimesBasis<'a, T> {
     colors: &'a [[T; 3]],
     rays: &'a [u32],
     /// `W` / 3 numbers for each ray.
     basis: &'a [T],
 }
 
-impl<T: Real, const W: usize> Values<T, W> for Harmonics<'_, T> {
+impl<T: Real, const W: usize> Values<T, W> for ColorTimesBasis<'_, T> {
     #[inline(always)]
     fn of(&self, i: usize) -> [T; W] {
         let (color, count) = (self.colors[i], W / 3);

@@ -178,7 +178,8 @@ impl<'a, T: Real> Harmonics<'a, T> {
                 8 => colors_of_rows::<T, 8>(rows, basis, self.offset, colors),
                 9 => colors_of_rows::<T, 9>(rows, basis, self.offset, colors),
                 15 => colors_of_rows::<T, 15>(rows, basis, self.offset, colors),
-                _ => colors_of_rows::<T, 16>(rows, basis, self.offset, colors),
+                16 => colors_of_rows::<T, 16>(rows, basis, self.offset, colors),
+                _ => unreachable!("{count} harmonics per channel"),
             }
         });
         colors

@@ -199,7 +199,7 @@ dispatched! {
 /// Takes one sample of each ray, or skips empty bricks; `idle` is a mask of the lanes without a ray. Returns a mask of the lanes whose ray has ended.
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 fn step<T: Real, const FUSED: bool>(lanes: &mut Lanes<T>, idle: u64, densities: &NodeTable<T>, stop: T, shown: &mut Shown<T>) -> u64 {
-    // Plain loops vectorise, one array after another. These intervals are those of `March::interval`.
+    // Plain loops vectorise, one array after another. These intervals are those of `March::interval`, up to rounding.
     let (mut middles, mut t, mut delta) = ([T::zero(); LANES], [T::zero(); LANES], [T::zero(); LANES]);
     for i in 0..LANES {
         let k = T::lit(f64::from(lanes.next[i]));

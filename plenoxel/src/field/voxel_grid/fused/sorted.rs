@@ -94,8 +94,8 @@ impl<T: Real> Scene<'_, T> {
         parallel::for_each_item(tasks, |task, mut parts| {
             for bucket in of_task(task) {
                 let samples: usize = orders.iter().map(|order| order.buckets.range(bucket).len()).sum();
+                // Measured to pay from about one look-up a row on.
                 if 8 * samples >= 1 << BUCKET_SHIFT {
-                    // As many reads as there are rows: most of them are read, some more than once.
                     parallel::load(self.rows_of_color(bucket));
                 }
                 for ((block, order), part) in blocks.iter().zip(orders).zip(&mut parts) {
