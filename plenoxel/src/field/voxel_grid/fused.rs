@@ -193,10 +193,9 @@ fn render_with<T: Real>(grid: &VoxelGrid<T>, picture: Option<&PictureTables<T>>,
     let scene = Scene { packets, picture, from_camera, ..batch.scene(grid, rays, options) };
     let mut sample_count = 0;
     let mut blocks = Vec::new();
-    // Pictures from tables keep no samples.
-    let size = if picture.is_some() { n.max(1) } else { CHUNK };
-    for (chunk, pixels) in pixels.chunks_mut(size * COLUMNS).enumerate() {
-        blocks = scene.render_all(chunk * size, pixels, keep);
+    // Pictures from tables keep no samples, but were 8 % slower in one chunk of all rays of a tile.
+    for (chunk, pixels) in pixels.chunks_mut(CHUNK * COLUMNS).enumerate() {
+        blocks = scene.render_all(chunk * CHUNK, pixels, keep);
         sample_count += blocks.iter().map(|block| block.looked_at).sum::<usize>();
     }
     let kept = if keep {
