@@ -85,7 +85,7 @@ impl<'a, T: Real> Viewer<'a, T> {
         let rays = sampled_packets(cameras, PACKETS);
         let start = Instant::now();
         let mut rendered = 0;
-        // As many rays at a time as a tile of `TILE` has. Larger tiles are a few percent faster, with many threads more.
+        // As many rays at a time as a tile of side `TILE` has. If the model has larger tiles, the estimate is slightly too high; with many threads, more so.
         for rays in rays.chunks(rays.len().div_ceil(4)) {
             no_grad(|| drop((self.show)(rays)));
             rendered += rays.len();

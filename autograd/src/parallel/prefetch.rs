@@ -10,8 +10,8 @@ use std::hint::black_box;
 /// Size of a cache line, in bytes.
 const LINE: usize = 64;
 
-/// Reads values in order, one of every 64 bytes. Processors fetch such lines much faster than those of look-ups at random places, so the look-ups that follow find
-/// the values in a cache. This pays if they read most of the lines, and if the values fit in the cache.
+/// Reads one value of every 64 bytes, in order. A processor fetches memory much faster in order than at random places, and later look-ups at random places find the
+/// values in a cache. This saves time if most of the values are looked up, and if they fit in the cache.
 pub fn load<E: Copy>(values: &[E]) {
     for line in values.chunks((LINE / size_of::<E>().max(1)).max(1)) {
         black_box(line[0]);

@@ -151,7 +151,7 @@ impl HashGrid {
         let groups = loops::groups(positions.data().as_chunks::<3>().0);
         let mut blocks = Buffer::stale(m * width);
         for (l, level) in self.levels.iter().enumerate() {
-            // Measured to pay from about one look-up a row on: such a level is read nearly as a whole.
+            // From one look-up a row on, nearly all of a level is read. Measured with four look-ups a row.
             if 8 * m >= level.rows && level.rows * features <= LOADED {
                 let rows = &data[level.first * features..][..level.rows * features];
                 parallel::map_chunks(rows.len(), parallel::CHUNK, |range| parallel::load(&rows[range]));
@@ -176,7 +176,7 @@ impl HashGrid {
     }
 }
 
-/// Most numbers of a level that is read in order before its look-ups: 8 MB in single precision, so that a last-level cache keeps them.
+/// Size of the largest level that is read in order before its look-ups, in numbers: 8 MB in single precision, which fit in a last-level cache.
 const LOADED: usize = 1 << 21;
 
 /// Kernel that maps a table and positions to encoded positions.

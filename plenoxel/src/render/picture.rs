@@ -60,7 +60,7 @@ pub fn picture_by<T: Real>(render: impl Fn(&[Ray]) -> Rendered<T>, camera: &Came
     picture_unless(render, camera, TILE, || false).expect("nothing stops it")
 }
 
-/// Renders an image as [`picture_by`] does, in tiles of pixels with this side, or slightly more. Before each tile it asks `stopped`; returns `None` once that is true.
+/// Renders an image as [`picture_by`] does, in tiles of pixels with this side, rounded up to a multiple of 16. Before each tile it asks `stopped`; returns `None` once that is true.
 pub fn picture_unless<T: Real>(
     render: impl Fn(&[Ray]) -> Rendered<T>,
     camera: &Camera,
