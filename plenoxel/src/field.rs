@@ -7,6 +7,7 @@ pub mod encoding;
 pub mod factored;
 pub mod grouping;
 pub mod hash_grid;
+mod lanes;
 pub(crate) mod neighbours;
 pub mod nerf;
 pub mod ngp;

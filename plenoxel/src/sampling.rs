@@ -1,5 +1,5 @@
-//! Positions of samples along rays. This module defines them; pictures of voxel grids compute the same positions in vectors of rays,
-//! in the precision of the field (`field/voxel_grid/fused/lanes.rs`).
+//! Positions of samples along rays. This module defines them; pictures of voxel grids and factored fields compute the same positions in
+//! vectors of rays, in the precision of the field (`field/lanes.rs`).
 //!
 //! A sample represents an interval of its ray: its position is the middle of the interval, `delta` the length. Samples of a batch are
 //! packed one ray after another; ray `r` owns `offsets[r]..offsets[r + 1]`. Rays that miss the box have no samples.
@@ -116,7 +116,7 @@ impl<T: Real> Samples<T> {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct March {
     pub(crate) count: usize,
-    // `field/voxel_grid/fused/lanes.rs` computes intervals from these four as `interval` does, counted from `near`.
+    // `field/lanes.rs` computes intervals from these four as `interval` does, counted from `near`.
     pub(crate) near: f64,
     pub(crate) far: f64,
     /// Start of the step with k = 1 (`Step`), or the first point (`Points`).
@@ -124,7 +124,7 @@ pub(crate) struct March {
     pub(crate) step: f64,
     points: bool,
     /// Path of the ray, if it is not straight.
-    bend: Option<Bend>,
+    pub(crate) bend: Option<Bend>,
 }
 
 /// Computes the intervals of one ray, which define the positions of its samples.

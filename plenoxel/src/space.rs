@@ -221,11 +221,11 @@ pub(crate) fn contract_adjoint(x: DVec3, g: DVec3) -> DVec3 {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bend {
     /// t₁
-    turn: f64,
+    pub(crate) turn: f64,
     /// |d_b|
-    rate: f64,
+    pub(crate) rate: f64,
     /// The value s₀ of the formula at the origin of the ray. It is 0 if the ray begins before or in the slab.
-    start: f64,
+    pub(crate) start: f64,
 }
 
 impl Bend {
@@ -274,7 +274,7 @@ impl Bend {
         1.0 + 2.0 * ray.origin.cross(ray.direction).abs().max_element()
     }
 
-    /// Returns the positions at several s: x, y and z of each.
+    /// Returns the positions at several s: x, y and z of each. `field/lanes/paths.rs` computes those of several rays.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // One short loop for each array: such loops vectorise.
     pub(crate) fn positions<const N: usize>(&self, ray: &Ray, s: &[f64; N]) -> [[f64; N]; 3] {

@@ -6,7 +6,7 @@
 use crate::sampling::distances;
 use autograd::lattice::{BRICK, BrickGrid};
 use autograd::parallel::{gathered, pairs_around};
-use autograd::{Buffer, Real, dispatched, parallel};
+use autograd::{Buffer, Real, parallel};
 use std::sync::Arc;
 
 /// Nodes along the side of a brick of cells.
@@ -173,6 +173,28 @@ impl<T: Real, const N: usize> Cells<T, N> {
         exits
     }
 
+    /// Returns a number of cells: there are no stored bricks nearer than this to the positions `at`, which are those of [`find`](Self::find), along any axis.
+    /// It is negative in stored bricks.
+    #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+    pub fn clearance(&self, at: &[[T; N]; 3]) -> [T; N] {
+        let mut clearance = [T::infinity(); N];
+        for a in 0..3 {
+            for i in 0..N {
+                // All bricks nearer than `free` are empty.
+                let (here, free) = (self.bricks[a][i] as i32, (self.links[i] - EMPTY.min(self.links[i])) as i32);
+                let [low, high] = [here + 1 - free, here + free].map(|plane| T::lit(f64::from(BRICK as i32 * plane)));
+                let (below, above) = (at[a][i] - low, high - at[a][i]);
+                let near = if below < above { below } else { above };
+                clearance[i] = if near < clearance[i] { near } else { clearance[i] };
+            }
+        }
+        for i in 0..N {
+            clearance[i] = if self.links[i] < EMPTY { -T::one() } else { clearance[i] };
+        }
+        clearance
+    }
+
     /// Interpolates a table of one number a node.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
@@ -222,19 +244,4 @@ fn between<T: Real, const FUSED: bool>(first: [T; 4], second: [T; 4], share: T) 
         between[c] = (second[c] - first[c]).multiply_add::<FUSED>(share, first[c]);
     }
     between
-}
-
-dispatched! {
-/// Interpolates the values of `N` positions trilinearly ([`Cells::find`]). Returns false if none of their bricks is stored; the values are then not written.
-pub fn interpolate<T: Real, const N: usize, const FUSED: bool>(table: &NodeTable<T>, at: [&[T; N]; 3], values: &mut [T; N]) -> bool {
-    let cells = Cells::find(&table.bricks, at);
-    let mut any = false;
-    for stored in cells.stored() {
-        any |= stored;
-    }
-    if any {
-        *values = cells.numbers::<FUSED>(table);
-    }
-    any
-}
 }

@@ -139,6 +139,8 @@ pub struct Memory {
     pub ray: u64,
     /// Values of a ray of a batch that a picture needs.
     pub ray_of_picture: u64,
+    /// Tables from which pictures are rendered, at most.
+    pub picture_tables: u64,
     /// Key of the number of rays in a step, for messages.
     pub rays: &'static str,
     /// Key that determines the number of parameters, for messages.

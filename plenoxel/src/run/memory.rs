@@ -222,7 +222,7 @@ impl Estimate {
 
     /// Estimates a training run of another model than the grid, and its evaluation.
     pub fn of_recipe(config: &Config, recipe: &dyn Recipe, dataset: &Dataset, options: &RunOptions) -> Self {
-        let Memory { parameters, ray, ray_of_picture, rays: key_of_rays, size, smaller } = recipe.memory(config.engine);
+        let Memory { parameters, ray, ray_of_picture, picture_tables, rays: key_of_rays, size, smaller } = recipe.memory(config.engine);
         let rays = recipe.stages().iter().map(|stage| stage.rays_per_step.unwrap_or(config.rays_per_step) as u64).max().unwrap_or(0);
         let comparison = if options.test_views > 0 { comparison(dataset, Split::Test, DRAWN_BYTES) } else { 0 };
         let shown = PICTURE_BYTES * options.shown_pixels as u64;
@@ -230,12 +230,13 @@ impl Estimate {
         let hull = if config.hull == Hull::Auto { silhouette_bytes(dataset.count(Split::Train), width * height) } else { 0 };
         let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
         let images = images(dataset, config.downscale, views) + importance(config, dataset);
-        let step = (rays * ray).max(EVALUATION_RAYS * ray_of_picture).max(hull) + comparison;
+        let of_rays = (rays * ray).max(EVALUATION_RAYS * ray_of_picture).max(hull) + comparison;
+        let step = of_rays.max(EVALUATION_RAYS * ray_of_picture + picture_tables + comparison);
         let own = |key: &str| format!("{}.{key}", recipe.kind());
         let parts = [
             (images, "downscale".to_owned(), "reduce the images by a larger factor"),
-            (step, own(key_of_rays), "use fewer rays in a step"),
-            (3 * parameters, own(size), smaller),
+            (of_rays, own(key_of_rays), "use fewer rays in a step"),
+            (3 * parameters + picture_tables, own(size), smaller),
             (shown, "--view".to_owned(), LEAVE_OUT),
         ];
         let (_, key, advice) = parts.into_iter().max_by_key(|(bytes, ..)| *bytes).unwrap_or_default();
@@ -484,13 +485,14 @@ fn evaluation_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
     }
 }
 
-/// Bytes of the tables of pictures: a density and a color of four numbers for each entry. A brick of 4³ cells has twice as many entries as cells.
+/// Bytes of the tables of pictures. Those of a grid have a density and a color of four numbers for each entry, and a brick of 4³ cells has twice as many entries as cells.
 fn picture_tables(config: &Config, stored: &Stored) -> u64 {
     match stored {
         Stored::Grid { shape, voxels } if config.engine == Engine::Fused && shape.interpolation == Interpolation::Trilinear => {
             2 * (1 + 4) * (voxels * size_of::<f32>()) as u64
         }
-        _ => 0,
+        Stored::Grid { .. } => 0,
+        Stored::Other { recipe, .. } => recipe.memory(config.engine).picture_tables,
     }
 }
 

@@ -16,6 +16,7 @@ mod densities;
 mod forward;
 mod lookup;
 mod network;
+mod pictures;
 mod positions;
 mod pruning;
 
@@ -25,9 +26,9 @@ use crate::field::grouping::{self, Grouping, Groups};
 use crate::geometry::Aabb;
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
-use crate::sampling::{Jitter, RAYS_OF_PACKET, Samples, Spacing};
+use crate::sampling::{Jitter, Samples, Spacing};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
-pub use densities::{Densities, densities_at};
+pub use densities::{Densities, MOST as MOST_DENSITIES, densities_at};
 use forward::{Block, Scene, Tables};
 use glam::DVec3;
 pub use lookup::LANES;
@@ -107,8 +108,13 @@ pub fn render<T: Real>(field: &Factored<T>, rays: &[Ray], options: &RenderOption
     render_inputs(field, rays, directions_of(field, rays), &[], (options, None))
 }
 
-/// Renders a batch of rays for a picture, without recording a gradient, with the densities of a table of the same field.
+/// Renders a batch of rays for a picture, without recording a gradient, with the densities of a table of the same field. Positions and distances are computed in the
+/// precision of the field. The box of `options` must be that of the field. [`RenderOptions::occupancy`] is not used: the table has the cells that are reached.
+/// [`Rendered::sparsity`] of the result is 0.
+///
+/// Panics with jitter.
 pub fn render_picture<T: Real>(field: &Factored<T>, densities: &Densities<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
+    assert!(matches!(options.jitter, Jitter::None), "a picture has no jitter");
     autograd::no_grad(|| render_inputs(field, rays, directions_of(field, rays), &[], (options, Some(densities))))
 }
 
@@ -153,16 +159,22 @@ fn render_inputs<T: Real>(
         gradient_scaling: field.gradient_scaling,
         jitter,
     };
-    let cells = densities.map(Densities::cells).or(options.occupancy).or(field.reach());
-    let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), densities, keep };
-    let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::stale(n));
-    // Without an adjoint, small blocks share the work of background and matter among the threads more evenly. They are whole packets of pixels.
-    let size = if keep { block_of(n) } else { block_of(n).div_ceil(4).next_multiple_of(RAYS_OF_PACKET) };
+    let cells = options.occupancy.or(field.reach());
+    let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), keep };
+    let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::zeros(n));
+    // Without an adjoint, small blocks share the work of background and matter among the threads more evenly.
+    let size = match densities {
+        Some(_) => pictures::BLOCK,
+        None if keep => block_of(n),
+        None => block_of(n).div_ceil(4),
+    };
     let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();
-    let blocks = parallel::map_items(parts, |b, (pixels, sparsity)| {
-        let block = scene.render(b * size, pixels, sparsity);
-        let count = block.len();
-        (count, keep.then_some(block))
+    let blocks = parallel::map_items(parts, |b, (pixels, sparsity)| match densities {
+        Some(densities) => (scene.show(densities, b * size, pixels), None),
+        None => {
+            let block = scene.render(b * size, pixels, sparsity);
+            (block.len(), keep.then_some(block))
+        }
     });
     let sample_count = blocks.iter().map(|(count, _)| count).sum();
     let tracked = (keep && !of_rays.is_empty()).then(|| Tracked {

@@ -27,7 +27,6 @@ mod adjoint;
 mod cell_bricks;
 mod forward;
 mod from_camera;
-mod lanes;
 mod lookup;
 mod pictures;
 mod places;

@@ -49,6 +49,7 @@ impl Recipe for Config {
             parameters: (voxels * (1 + self.features) * size_of::<f32>()) as u64,
             ray: SAMPLES * 60 + COLORED * (numbers * size_of::<f32>()) as u64,
             ray_of_picture: SAMPLES * 60 + COLORED * (self.hidden * size_of::<f32>()) as u64,
+            picture_tables: 0,
             rays: "fine[*].rays",
             size: "fine[*].resolution",
             smaller: "use fewer voxels per side",

@@ -35,6 +35,7 @@ impl Recipe for Config {
         let ray_of_picture = (SAMPLES_IN_PICTURES * 2 * self.width * size_of::<f32>() / 4096) as u64;
         Memory {
             ray_of_picture,
+            picture_tables: 0,
             parameters: (weights * size_of::<f32>()) as u64,
             ray: ((2 * self.coarse_samples + self.fine_samples) * 2 * numbers * size_of::<f32>()) as u64,
             rays: "rays",

@@ -38,6 +38,7 @@ impl Recipe for Config {
             parameters: (encoded << self.log2_rows) as u64 * size_of::<f32>() as u64,
             ray: SAMPLES * (numbers * size_of::<f32>()) as u64,
             ray_of_picture: SAMPLES * ((encoded + 2 * self.hidden) * size_of::<f32>()) as u64,
+            picture_tables: 0,
             rays: "stages[*].rays",
             size: "log2_rows",
             smaller: "use fewer rows, levels or features",

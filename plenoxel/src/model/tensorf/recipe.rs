@@ -3,7 +3,7 @@
 use super::{Config, KIND, Short, Stage, Tensorf, total_variation};
 use crate::dataset::View;
 use crate::error::Result;
-use crate::field::factored::fused::LANES;
+use crate::field::factored::fused::{LANES, MOST_DENSITIES};
 use crate::loss::Objective;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
@@ -50,10 +50,12 @@ impl Recipe for Config {
 
     fn memory(&self, engine: Engine) -> Memory {
         let engine = self.engine(engine);
+        let parameters = self.stages.iter().map(|stage| bytes_of_planes(self, stage.resolution)).max().unwrap_or(0);
         Memory {
-            parameters: self.stages.iter().map(|stage| bytes_of_planes(self, stage.resolution)).max().unwrap_or(0),
+            parameters,
             ray: bytes_of_ray(self, engine),
             ray_of_picture: bytes_of_ray(self, engine),
+            picture_tables: if engine == Engine::Fused { (MOST_DENSITIES * parameters as f64) as u64 } else { 0 },
             rays: "stages[*].rays",
             size: "stages[*].resolution",
             smaller: "fewer nodes a side, or fewer components",

@@ -232,7 +232,7 @@ impl Occupancy {
     /// Tests which cells are occupied. `cell(axis, i, n)` is the cell of the i-th place along an axis of n cells.
     #[inline(always)]
     #[allow(clippy::needless_range_loop)] // The compiler does not inline `from_fn` in dispatched loops.
-    fn occupied<const N: usize>(&self, cell: impl Fn(usize, usize, usize) -> u32) -> [bool; N] {
+    pub(crate) fn occupied<const N: usize>(&self, cell: impl Fn(usize, usize, usize) -> u32) -> [bool; N] {
         let Occupancy { bricks, masks, .. } = self;
         let (mut numbers, mut bits) = ([0; N], [0; N]);
         // Like `BrickGrid::split`, one axis after another, because such loops vectorise.

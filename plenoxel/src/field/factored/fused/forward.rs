@@ -1,7 +1,6 @@
 //! Pixels of rays, one block of rays at a time.
 
 use super::Batch;
-use super::densities::{self, Densities};
 use super::lookup::{self, Pairs, RUN};
 use super::network::{Activations, Network};
 use crate::camera::Ray;
@@ -9,7 +8,7 @@ use crate::field::grouping::Groups;
 use crate::geometry::Aabb;
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along, COLUMNS};
-use crate::sampling::{Occupancy, Sections, march};
+use crate::sampling::{Occupancy, march};
 use autograd::{Buffer, Real, Tensor, parallel};
 use glam::DVec3;
 use std::ops::Range;
@@ -48,6 +47,17 @@ pub struct Block<T: Real> {
 }
 
 impl<T: Real> Block<T> {
+    fn new(first: usize, offsets: Vec<u32>, columns: [Buffer<T>; of_sample::COUNT]) -> Self {
+        let groups_at = std::array::from_fn(|_| Buffer::stale(0));
+        Block { first, offsets, columns, groups: Groups::empty(), groups_at, activations: Activations::default() }
+    }
+
+    /// Creates a block without densities and transmittances.
+    pub fn of_weights(first: usize, offsets: Vec<u32>, at: [Buffer<T>; 3], weight: Buffer<T>, [t, delta]: [Buffer<T>; 2]) -> Self {
+        let ([x, y, z], none) = (at, || Buffer::stale(0));
+        Block::new(first, offsets, [x, y, z, t, delta, none(), none(), weight, none()])
+    }
+
     /// Returns the number of samples.
     pub fn len(&self) -> usize {
         self.offsets[self.offsets.len() - 1] as usize
@@ -109,8 +119,6 @@ pub struct Scene<'a, T: Real> {
     /// Cells outside of which nothing is sampled; `None` for the whole box.
     pub cells: Option<&'a Occupancy>,
     pub tables: Tables<'a, T>,
-    /// Table from which densities are read, in pictures.
-    pub densities: Option<&'a Densities<T>>,
     /// True if an adjoint follows, which reads the inputs of the layers.
     pub keep: bool,
 }
@@ -136,13 +144,11 @@ impl<'a, T: Real> Scene<'a, T> {
     /// Renders rays from `first` on, one for each entry of `sparsity`.
     pub fn render(&self, first: usize, pixels: &mut [T], sparsity: &mut [T]) -> Block<T> {
         let mut block = self.samples(first, sparsity.len());
-        self.form_groups(&mut block);
-        self.shade(&mut block);
+        self.compute_colors(&mut block);
         let (along, color, sigma) = (block.along(), block.color(), block.sigma());
         for ((own, pixel), sparsity) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0).zip(sparsity) {
             *pixel = along.pixel(own.clone(), self.batch.background, |i| sigma[i], &color);
-            // Pictures do not need it.
-            *sparsity = if self.densities.is_some() { T::zero() } else { sigma[own].iter().map(|&sigma| along::sparsity(sigma)).sum() };
+            *sparsity = sigma[own].iter().map(|&sigma| along::sparsity(sigma)).sum();
         }
         drop(color);
         block
@@ -157,11 +163,9 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut end = 0;
         let most = DVec3::from_array(self.batch.nodes.map(|n| n as f64 - 1.0));
         let per_length = cells_per_length(self.batch.nodes, aabb);
-        let rays = &self.rays[first..first + count];
-        let mut sections = Sections::new(self.densities.map(Densities::cells), *spacing);
-        for (r, ray) in rays.iter().enumerate() {
+        for (r, ray) in self.rays[first..first + count].iter().enumerate() {
             let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells).between(sections.of(rays, r)));
+            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells));
             let mut all = (0..march.count).map(move |k| march.interval(k));
             let mut next = || occupied.as_mut().map_or_else(|| all.next(), Iterator::next);
             let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
@@ -189,15 +193,11 @@ impl<'a, T: Real> Scene<'a, T> {
                 let (x, y, z, delta) = (&x[run.clone()], &y[run.clone()], &z[run.clone()], &delta[run.clone()]);
                 let (sigma, slope) = (&mut sigma[run.clone()], &mut slope[run.clone()]);
                 let (weight, after) = (&mut weight[run.clone()], &mut after[run]);
-                match (self.densities, parallel::fused()) {
-                    (Some(densities), true) => densities::at::<T, true>(densities, [x, y, z], sigma),
-                    (Some(densities), false) => densities::at::<T, false>(densities, [x, y, z], sigma),
-                    (None, true) => lookup::density::<T, true>(self.tables.density, [x, y, z], sigma, slope),
-                    (None, false) => lookup::density::<T, false>(self.tables.density, [x, y, z], sigma, slope),
-                }
                 if parallel::fused() {
+                    lookup::density::<T, true>(self.tables.density, [x, y, z], sigma, slope);
                     lookup::absorb::<T, true>(sigma, delta, weight, after);
                 } else {
+                    lookup::density::<T, false>(self.tables.density, [x, y, z], sigma, slope);
                     lookup::absorb::<T, false>(sigma, delta, weight, after);
                 }
                 let mut used = 0;
@@ -212,14 +212,13 @@ impl<'a, T: Real> Scene<'a, T> {
             offsets.push(end as u32);
         }
         columns.iter_mut().for_each(|column| column.truncate(end));
-        Block {
-            first,
-            offsets,
-            columns,
-            groups: Groups::empty(),
-            groups_at: std::array::from_fn(|_| Buffer::stale(0)),
-            activations: Activations::default(),
-        }
+        Block::new(first, offsets, columns)
+    }
+
+    /// Computes the colors of samples, from their weights.
+    pub fn compute_colors(&self, block: &mut Block<T>) {
+        self.form_groups(block);
+        self.shade(block);
     }
 
     /// Forms the groups of each ray and computes their positions.

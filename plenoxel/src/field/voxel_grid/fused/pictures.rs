@@ -8,15 +8,14 @@ use super::COLUMNS;
 use super::cell_bricks::CellBricks;
 use super::forward::{Block, Scene};
 use super::from_camera::{Colors, FromCamera};
-use super::lanes::{Pixel, Shown, lead};
 use super::lookup::Corners;
 use crate::camera::Ray;
+use crate::field::lanes::{Guide, LANES, Matter, Shown, Straight};
 use crate::field::node_table::{NodeTable, StoredBricks};
 use crate::field::voxel_grid::{Interpolation, VoxelGrid};
-use crate::render::RenderOptions;
-use crate::render::along::Sums;
-use crate::sampling::{Occupancy, Sections, march};
-use autograd::{Buffer, Real, parallel};
+use crate::sampling::Occupancy;
+use autograd::{Buffer, Real};
+use glam::DVec3;
 use std::sync::Arc;
 
 /// Tables of a grid with trilinear look-up, from which pictures are rendered.
@@ -58,64 +57,49 @@ impl<T: Real> PictureTables<T> {
     }
 }
 
+impl<T: Real> Matter<T> for PictureTables<T> {
+    fn table(&self) -> &NodeTable<T> {
+        &self.densities
+    }
+
+    #[inline(always)]
+    fn sigma<const FUSED: bool>(&self, _: &[[T; LANES]; 3], mut densities: [T; LANES]) -> [T; LANES] {
+        for density in &mut densities {
+            // `max` would turn a density that is not a number into 0.
+            *density = if *density < T::zero() { T::zero() } else { *density };
+        }
+        densities
+    }
+}
+
 impl<T: Real> Scene<'_, T> {
     /// Computes the pixels of rays from `first` on, one for each [`COLUMNS`] entries of `pixels`. Returns the number of samples.
     pub fn show(&self, tables: &PictureTables<T>, first: usize, pixels: &mut [T]) -> usize {
         let pixels = pixels.as_chunks_mut::<COLUMNS>().0;
-        let background = self.batch.background;
-        let mut sums = vec![Pixel { sums: Sums::new(), left: T::one(), waiting: T::zero() }; pixels.len()];
-        let mut shown = self.with_color(tables, first, &mut sums);
+        let (options, to_cells) = (self.options, self.batch.layout.shape.to_voxels().map(DVec3::splat));
+        let guide = Guide { matter: tables, options, cells: &tables.cells, to_cells, merged: options.stop_below };
+        let mut shown = guide.lead::<T, Straight<T>, 4>(&self.rays[first..first + pixels.len()]);
         let (colors, width) = match &self.from_camera {
-            Some(colors) => (colors.at(shown.at.each_ref().map(|at| &at[..]), &self.batch.layout.shape), 4),
-            None => (self.colors_along_rays(first, &mut shown, pixels.len()), 3),
+            Some(colors) => (colors.at(shown.at(), &self.batch.layout.shape), 4),
+            None => (self.colors_along_rays(first, &mut shown), 3),
         };
-        // Σ w c of each ray, and its last color.
-        let mut rgb = vec![([T::zero(); 3], background); pixels.len()];
-        for ((&ray, &weight), color) in shown.of.iter().zip(&shown.weight[..]).zip(colors.chunks_exact(width)) {
-            let (sum, last) = &mut rgb[ray as usize];
-            *last = self.batch.shown([color[0], color[1], color[2]]);
-            (0..3).for_each(|c| sum[c] += weight * last[c]);
-        }
-        for ((pixel, own), (mut rgb, last)) in pixels.iter_mut().zip(sums).zip(rgb) {
-            (0..3).for_each(|c| rgb[c] += own.waiting * last[c]);
-            *pixel = own.sums.pixel(rgb, own.left, background);
-        }
+        let color = |i: usize| self.batch.shown([0, 1, 2].map(|c| colors[i * width + c]));
+        shown.write(shown.weight(), color, self.batch.background, pixels);
         shown.looked_at
     }
 
     /// Computes the colors of samples, as seen along their rays. Sorts the samples by their rays, and takes their positions.
-    fn colors_along_rays(&self, first: usize, shown: &mut Shown<T>, rays: usize) -> Buffer<T> {
-        let offsets = shown.sort(rays);
+    fn colors_along_rays(&self, first: usize, shown: &mut Shown<T, 4>) -> Buffer<T> {
+        let offsets = shown.sort();
         let count = shown.of.len();
-        let corners = with_bricks!(self.batch.layout.lattice, map => Corners::find(shown.at.each_ref().map(|at| &at[..]), map, count));
-        let (at, weight) = (std::mem::take(&mut shown.at), Buffer::copy_of(&shown.weight));
+        let corners = with_bricks!(self.batch.layout.lattice, map => Corners::find(shown.at(), map, count));
+        let [x, y, z, weight] = &mut shown.columns;
+        let (at, weight) = ([x, y, z].map(std::mem::take), Buffer::copy_of(weight));
         // All samples have a weight, so they are visible with any density of 0 or more, whatever the transmittance behind them.
         let [density, after] = [Buffer::zeros(count), Buffer::zeros(count)];
         let mut block = Block { first, offsets, at, weight, density, after, color: Buffer::stale(3 * count), ..Block::empty() };
         self.colors(&mut block, Some(&corners));
         block.color
-    }
-
-    /// Adds the samples of rays from `first` on to their pixels. Returns those whose color is looked up.
-    fn with_color(&self, tables: &PictureTables<T>, first: usize, pixels: &mut [Pixel<T>]) -> Shown<T> {
-        let RenderOptions { aabb, spacing, stop_below, .. } = self.options;
-        let rays = &self.rays[first..first + pixels.len()];
-        let mut sections = Sections::new(Some(&tables.cells), *spacing);
-        let mut numbers = 0..rays.len();
-        let next = || {
-            numbers.by_ref().find_map(|r| {
-                let section = sections.of(rays, r)?;
-                let march = march(&rays[r], aabb, *spacing, 0.0);
-                let intervals = march.between(section);
-                (!intervals.is_empty()).then_some((r, march, intervals))
-            })
-        };
-        let least = T::lit(*stop_below);
-        let to_voxels = self.batch.layout.shape.to_voxels();
-        match parallel::fused() {
-            true => lead::<T, true>(&tables.densities, rays, next, to_voxels, least, pixels),
-            false => lead::<T, false>(&tables.densities, rays, next, to_voxels, least, pixels),
-        }
     }
 }
 
@@ -125,10 +109,9 @@ mod tests {
     use super::*;
     use crate::camera::{Camera, Intrinsics};
     use crate::field::voxel_grid::{Color, GridShape};
-    use crate::render::{Engine, Rendered};
+    use crate::render::{Engine, RenderOptions, Rendered};
     use crate::sampling::{Jitter, Spacing};
     use autograd::lattice::BRICK_ROWS;
-    use glam::DVec3;
 
     /// A ball with holes; voxels of every fifth brick have a negative density.
     fn ball<T: Real>(sh_reduction: usize, color: Color) -> VoxelGrid<T> {
