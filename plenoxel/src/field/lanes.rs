@@ -4,7 +4,7 @@
 //! samples of one ray, but one sample of each of [`LANES`] rays. A lane in an empty brick skips to where its ray leaves the empty bricks around it. A lane whose ray ends
 //! gets the next one.
 //!
-//! What differs between fields are their densities ([`Matter`]), and between spaces the paths of rays ([`Path`]).
+//! Fields differ in their densities ([`Matter`]), spaces in the paths of rays ([`Path`]).
 
 mod paths;
 
@@ -57,7 +57,7 @@ pub(crate) struct Shown<T: Real, const N: usize> {
     pixels: Vec<Pixel<T>>,
 }
 
-/// What rays are led through, and how.
+/// Leads rays through the matter of a field.
 pub(crate) struct Guide<'a, M> {
     pub matter: &'a M,
     pub options: &'a RenderOptions<'a>,
@@ -95,12 +95,12 @@ impl<M> Guide<'_, M> {
             })
         };
         let mut shown = Shown::none(rays.len());
-        let mut lanes = Lanes::<T, P>::none();
+        let mut lanes = Lanes::<T, P>::new(self.to_cells);
         let mut idle = !0;
         loop {
             for lane in bits(idle) {
                 let Some((ray, march, intervals)) = next() else { break };
-                lanes.begin(lane, (ray, &rays[ray]), march, intervals, self.to_cells, merged);
+                lanes.begin(lane, (ray, &rays[ray]), march, intervals, merged);
                 idle &= !(1 << lane);
             }
             if idle == !0 {
@@ -143,7 +143,7 @@ struct Intervals<T> {
     end: [u32; LANES],
     /// Last interval of the march.
     last: [u32; LANES],
-    /// The other distances are those from `near`, so that their rounding does not depend on how far the camera of straight rays is.
+    /// The other distances are counted from `near`: on a straight ray, their rounding does not depend on how far the camera is.
     near: [T; LANES],
     far: [T; LANES],
     start: [T; LANES],
@@ -151,14 +151,15 @@ struct Intervals<T> {
 }
 
 impl<T: Real, P: Path<T>> Lanes<T, P> {
-    fn none() -> Self {
+    /// Lanes without rays.
+    fn new(to_cells: [DVec3; 2]) -> Self {
         let (numbers, none) = ([0; LANES], [T::zero(); LANES]);
         let intervals = Intervals { next: numbers, end: numbers, last: numbers, near: none, far: none, start: none, step: none };
-        Lanes { ray: numbers, intervals, path: P::none(), sums: Sums::new(), left: none, waiting: none, allowed: none }
+        Lanes { ray: numbers, intervals, path: P::new(to_cells), sums: Sums::new(), left: none, waiting: none, allowed: none }
     }
 
     /// Gives a ray to a lane.
-    fn begin(&mut self, lane: usize, (number, ray): (usize, &Ray), march: March, intervals: Range<usize>, to_cells: [DVec3; 2], merged: T) {
+    fn begin(&mut self, lane: usize, (number, ray): (usize, &Ray), march: March, intervals: Range<usize>, merged: T) {
         let march = march.of_steps();
         // A lane without a ray goes on along its former one.
         self.sums.take(lane);
@@ -167,7 +168,7 @@ impl<T: Real, P: Path<T>> Lanes<T, P> {
         [own.next[lane], own.end[lane], own.last[lane]] = [intervals.start, intervals.end, march.count - 1].map(|k| k as u32);
         (own.near[lane], own.far[lane]) = (T::lit(march.near), T::lit(march.far - march.near));
         (own.start[lane], own.step[lane]) = (T::lit(march.start - march.near), T::lit(march.step));
-        self.path.begin(lane, ray, &march, to_cells);
+        self.path.begin(lane, ray, &march);
         (self.left[lane], self.waiting[lane], self.allowed[lane]) = (T::one(), T::zero(), merged);
     }
 

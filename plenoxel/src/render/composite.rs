@@ -148,7 +148,8 @@ impl<T: Real> Rendered<T> {
 
     /// Returns the Cauchy sparsity Σ ln(1 + 2σᵢ²), `[n]` (PlenOctrees, svox2).
     ///
-    /// Panics for pixels of a picture ([`Model::viewer`](crate::train::Model::viewer)) that were rendered from tables: their samples are not kept.
+    /// The samples of a picture ([`Model::viewer`](crate::train::Model::viewer)) that was rendered from tables are not kept: this panics for voxel grids, and is 0 for
+    /// factored fields.
     pub fn sparsity(&self) -> Tensor<T> {
         self.columns.sparsity()
     }

@@ -28,7 +28,7 @@ use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Samples, Spacing};
 use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
-pub use densities::{Densities, MOST as MOST_DENSITIES, densities_at};
+pub use densities::{Densities, densities_at};
 use forward::{Block, Scene, Tables};
 use glam::DVec3;
 pub use lookup::LANES;
@@ -162,10 +162,10 @@ fn render_inputs<T: Real>(
     let cells = options.occupancy.or(field.reach());
     let scene = Scene { batch: &batch, rays, options, cells, tables: Tables::new(&batch, &params), keep };
     let (mut pixels, mut sparsity) = (Buffer::stale(n * COLUMNS), Buffer::zeros(n));
-    // Without an adjoint, small blocks share the work of background and matter among the threads more evenly.
     let size = match densities {
         Some(_) => pictures::BLOCK,
         None if keep => block_of(n),
+        // Small blocks share the work of background and matter among the threads more evenly.
         None => block_of(n).div_ceil(4),
     };
     let parts: Vec<_> = pixels.chunks_mut(size * COLUMNS).zip(sparsity.chunks_mut(size)).collect();

@@ -10,11 +10,11 @@ use glam::DVec3;
 
 /// Paths of [`LANES`] rays. Distances are those from where the march of a ray begins.
 pub(crate) trait Path<T: Real> {
-    /// Paths of no rays.
-    fn none() -> Self;
+    /// Paths of no rays. `to_cells` are factor and summand that map positions in the box to cells.
+    fn new(to_cells: [DVec3; 2]) -> Self;
 
-    /// Gives a lane the path of a ray. Panics if it has another path. `to_cells` are factor and summand that map positions in the box to cells.
-    fn begin(&mut self, lane: usize, ray: &Ray, march: &March, to_cells: [DVec3; 2]);
+    /// Gives a lane the path of a ray. Panics if the ray has another kind of path.
+    fn begin(&mut self, lane: usize, ray: &Ray, march: &March);
 
     /// Returns the positions at distances, in cells.
     fn places<const FUSED: bool>(&self, distance: &[T; LANES]) -> [[T; LANES]; 3];
@@ -32,16 +32,19 @@ pub(crate) struct Straight<T> {
     /// Start of the interval with number 1, and the number of intervals per length.
     start: [T; LANES],
     per_step: [T; LANES],
+    /// Factor and summand that map positions in the box to cells.
+    to_cells: [DVec3; 2],
 }
 
 impl<T: Real> Path<T> for Straight<T> {
-    fn none() -> Self {
+    fn new(to_cells: [DVec3; 2]) -> Self {
         let none = [T::zero(); LANES];
-        Straight { origin: [none; 3], slope: [none; 3], per_slope: [none; 3], start: none, per_step: none }
+        Straight { origin: [none; 3], slope: [none; 3], per_slope: [none; 3], start: none, per_step: none, to_cells }
     }
 
-    fn begin(&mut self, lane: usize, ray: &Ray, march: &March, [factor, summand]: [DVec3; 2]) {
-        debug_assert!(march.is_straight(), "a ray that is not straight");
+    fn begin(&mut self, lane: usize, ray: &Ray, march: &March) {
+        assert!(march.is_straight(), "a straight ray");
+        let [factor, summand] = self.to_cells;
         let slope = ray.direction * factor;
         let origin = ray.origin * factor + summand + march.near * slope;
         for axis in 0..3 {
@@ -89,14 +92,14 @@ pub(crate) struct Bent<T> {
     /// Intervals in which the position changes by at most one cell along any axis.
     intervals_per_cell: [T; LANES],
     /// Factor and summand that map positions in the box to cells.
-    to_cells: [[T; 2]; 3],
+    to_cells: [DVec3; 2],
 }
 
 /// Least u of a sample: t is infinite for 0.
 const LEAST: f64 = 1e-6;
 
 impl<T: Real> Path<T> for Bent<T> {
-    fn none() -> Self {
+    fn new(to_cells: [DVec3; 2]) -> Self {
         let none = [T::zero(); LANES];
         Bent {
             origin: [none; 3],
@@ -107,20 +110,19 @@ impl<T: Real> Path<T> for Bent<T> {
             rate: none,
             per_rate: none,
             intervals_per_cell: none,
-            to_cells: [[T::zero(); 2]; 3],
+            to_cells,
         }
     }
 
-    fn begin(&mut self, lane: usize, ray: &Ray, march: &March, [factor, summand]: [DVec3; 2]) {
+    fn begin(&mut self, lane: usize, ray: &Ray, march: &March) {
         let Bend { turn, rate, start } = march.bend.expect("a ray that is not straight");
         for axis in 0..3 {
             (self.origin[axis][lane], self.direction[axis][lane]) = (T::lit(ray.origin[axis]), T::lit(ray.direction[axis]));
-            self.to_cells[axis] = [T::lit(factor[axis]), T::lit(summand[axis])];
         }
         let first = start + march.near;
         (self.straight[lane], self.first[lane]) = (T::lit(turn - first), T::lit(first));
         (self.turn[lane], self.rate[lane], self.per_rate[lane]) = (T::lit(turn), T::lit(rate), T::lit(rate.recip()));
-        self.intervals_per_cell[lane] = T::lit(1.0 / (factor.max_element() * Bend::steepest(ray) * march.step));
+        self.intervals_per_cell[lane] = T::lit(1.0 / (self.to_cells[0].max_element() * Bend::steepest(ray) * march.step));
     }
 
     #[inline(always)]
@@ -149,7 +151,7 @@ impl<T: Real> Path<T> for Bent<T> {
             scale[i] = (T::lit(2.0) - per_m) * per_m;
         }
         for a in 0..3 {
-            let [factor, summand] = self.to_cells[a];
+            let [factor, summand] = self.to_cells.map(|vector| T::lit(vector[a]));
             for i in 0..LANES {
                 at[a][i] = (at[a][i] * scale[i]).multiply_add::<FUSED>(factor, summand);
             }
@@ -201,9 +203,9 @@ mod tests {
         let table = NodeTable::<f64>::new(Arc::new(StoredBricks::new(NODES, stored).expect("a small table")), [0.0], |_, values| {
             values.fill([1.0])
         });
-        let (rays, mut path) = (rays(), P::none());
+        let (rays, mut path) = (rays(), P::new([factor, summand]));
         let marches: Vec<March> = rays.iter().map(|ray| march(ray, &aabb, spacing, 0.0).of_steps()).collect();
-        (0..LANES).filter(|&i| marches[i].count > 0).for_each(|i| path.begin(i, &rays[i], &marches[i], [factor, summand]));
+        (0..LANES).filter(|&i| marches[i].count > 0).for_each(|i| path.begin(i, &rays[i], &marches[i]));
         let most = marches.iter().map(|march| march.count).max().unwrap_or(0);
         let (mut until, mut skipped, mut met) = ([0.0_f64; LANES], 0, 0);
         for k in 0..most {

@@ -3,7 +3,7 @@
 use super::{Config, KIND, Short, Stage, Tensorf, total_variation};
 use crate::dataset::View;
 use crate::error::Result;
-use crate::field::factored::fused::{LANES, MOST_DENSITIES};
+use crate::field::factored::fused::{Densities, LANES};
 use crate::loss::Objective;
 use crate::model::plenoxels::config::Config as RunConfig;
 use crate::model::recipe::{Memory, Recipe};
@@ -55,7 +55,7 @@ impl Recipe for Config {
             parameters,
             ray: bytes_of_ray(self, engine),
             ray_of_picture: bytes_of_ray(self, engine),
-            picture_tables: if engine == Engine::Fused { (MOST_DENSITIES * parameters as f64) as u64 } else { 0 },
+            picture_tables: if engine == Engine::Fused { (Densities::<f32>::MOST * parameters as f64) as u64 } else { 0 },
             rays: "stages[*].rays",
             size: "stages[*].resolution",
             smaller: "fewer nodes a side, or fewer components",

@@ -18,23 +18,23 @@ use std::sync::Arc;
 
 /// Density feature of bricks that are left out. The density is 0.
 const NOTHING: f64 = -1e3;
-/// Largest size of the table relative to the field. Objects in empty space need 1.0 to 1.2 times as much as the field, captures, whose boxes are full of thin fog,
-/// 1.8 to 2.2 times as much. With a table and rays in lanes, pictures of captures take 0.63 to 0.78 of the time.
-pub const MOST: f64 = 2.5;
-
 /// Table of the density features at the nodes of a field.
 #[derive(Debug)]
 pub struct Densities<T: Real> {
     /// s − 10 at the nodes.
     features: NodeTable<T>,
     cells: Occupancy,
-    /// Factor and summand that map cells of the table to those of `cells`, along each axis.
-    to_cells: [[T; 2]; 3],
+    /// Factor and summand that map positions in cells of the table to cells of `cells`, along each axis.
+    to_occupancy: [[T; 2]; 3],
 }
 
 impl<T: Real> Densities<T> {
+    /// Largest size of the table relative to the field. Objects in empty space need 1.0 to 1.2 times as much as the field, captures, whose boxes are full of thin fog,
+    /// 1.8 to 2.2 times as much. With a table and rays in lanes, pictures of captures take 0.63 to 0.78 of the time.
+    pub const MOST: f64 = 2.5;
+
     /// Computes the table. Samples are left out if the densities of all nodes around them, 1 / length, are at most `negligible`. `None` if the table would need
-    /// more than [`MOST`] times the memory of the field, or more than 2³² entries.
+    /// more than [`MOST`](Self::MOST) times the memory of the field, or more than 2³² entries.
     pub fn new(field: &Factored<T>, negligible: f64) -> Option<Self> {
         let nodes = field.nodes();
         let bricks = BrickGrid::new(nodes.map(|n| n - 1));
@@ -58,7 +58,7 @@ impl<T: Real> Densities<T> {
             reached[range].iter().copied().filter(dense).collect::<Vec<_>>()
         });
         let kept = kept.concat();
-        let most = MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64;
+        let most = Self::MOST * tables.iter().map(Tensor::len).sum::<usize>() as f64;
         if StoredBricks::entries(kept.len()) as f64 > most {
             return None;
         }
@@ -74,8 +74,8 @@ impl<T: Real> Densities<T> {
         });
         let per_side = DVec3::from_array(cells.cells().map(|n| n as f64)) / (cells.aabb().max - cells.aabb().min);
         let (factor, summand) = (field.sides() * per_side, (field.aabb().min - cells.aabb().min) * per_side);
-        let to_cells = [0, 1, 2].map(|a| [factor[a], summand[a]].map(T::lit));
-        Some(Densities { features: table, cells, to_cells })
+        let to_occupancy = [0, 1, 2].map(|a| [factor[a], summand[a]].map(T::lit));
+        Some(Densities { features: table, cells, to_occupancy })
     }
 
     /// Returns the cells outside of which all samples are left out.
@@ -181,7 +181,7 @@ impl<T: Real> Matter<T> for Densities<T> {
     #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
     fn sigma<const FUSED: bool>(&self, at: &[[T; lanes::LANES]; 3], features: [T; lanes::LANES]) -> [T; lanes::LANES] {
         let occupied: [bool; lanes::LANES] = self.cells.occupied(|axis, i, cells| {
-            let [factor, summand] = self.to_cells[axis];
+            let [factor, summand] = self.to_occupancy[axis];
             at[axis][i].multiply_add::<FUSED>(factor, summand).max(T::zero()).min(T::lit((cells - 1) as f64)).index()
         });
         let mut sigma = [T::zero(); lanes::LANES];
