@@ -164,6 +164,20 @@ fn total_variation_of_several_tasks_agrees_with_its_reference() {
 }
 
 #[test]
+fn the_gradient_of_total_variation_can_be_taken_more_than_once() {
+    let lattice = Lattice::bricks([9, 6, 7]);
+    let x = Tensor::variable(numbers(&[lattice.rows(), 3], -1.0, 1.0, 37));
+    for value in [loss::total_variation(&x, &lattice), loss::total_variation_of_bricks(&x, &lattice, 2, 7)] {
+        let weighted: Tensor<f64> = 3.0 * &value;
+        let [first, again, three_times] = [value.backward().array(&x), value.backward().array(&x), weighted.backward().array(&x)];
+        assert_eq!(first, again);
+        assert!(first.iter().zip(&three_times).all(|(a, b)| (3.0 * a - b).abs() < 1e-15));
+    }
+    let recorded = loss::total_variation(&x, &lattice).item();
+    assert_eq!(recorded, autograd::no_grad(|| loss::total_variation(&x, &lattice)).item());
+}
+
+#[test]
 fn an_eikonal_penalty_is_differentiable_through_the_slope_of_the_density() {
     let shape = shape(Interpolation::Trilinear, Color::Rgb);
     // Points off the planes through voxel centres, where the slope jumps.

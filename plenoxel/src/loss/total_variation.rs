@@ -3,13 +3,14 @@
 //! A cell consists of a node and its forward neighbours along x, y and z, all present. Its variation per channel is √(dx² + dy² + dz² + ε).
 //! The total variation is the mean over cells and channels. The gradient is exact.
 
+mod pass;
+
 use super::Step;
 use crate::field::voxel_grid::VoxelGrid;
 use crate::random::{Purpose, bits};
-use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, STRIDE, has, previous_in};
-use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, RowSparse, RowSums, Tensor, dispatched, parallel};
-use std::ops::Range;
-use std::sync::Arc;
+use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, previous_in};
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Lattice, Param, Real, RowSparse, RowSums, Tensor, parallel};
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Added under the root to make it smooth (source paper).
 const EPSILON: f64 = 1e-5;
@@ -91,7 +92,7 @@ fn of_run<T: Real>(table: &Tensor<T>, lattice: &Lattice, part: Option<(usize, us
     match table.shape()[1] {
         1 => with_kernel::<T, 1, 4, 16>(table, lattice, part),
         3 => with_kernel::<T, 3, 12, 48>(table, lattice, part),
-        // No grid has rows of 4 numbers, but workload W3 does: 5.8 ms with the kernel, 126 ms without (`benches/history/2026-11-24.md`).
+        // No grid has rows of 4 numbers, but workload W3 does.
         4 => with_kernel::<T, 4, 16, 64>(table, lattice, part),
         9 => with_kernel::<T, 9, 36, 144>(table, lattice, part),
         12 => with_kernel::<T, 12, 48, 192>(table, lattice, part),
@@ -116,11 +117,20 @@ fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(
     let bricks = lattice.neighbours();
     let (first, count) = part.unwrap_or((0, bricks.len()));
     let run = Run { first, count, all: bricks.len() };
-    let values = table.data().as_chunks::<S>().0;
-    let sums = parallel::map_chunks(count, TASK, |range| variation::<T, W, N, S>(values, bricks, run, range));
+    let reached = match part {
+        None => (0..bricks.len() as u32).collect(),
+        Some(_) => run.reached(bricks),
+    };
     let terms = run.bricks().map(|brick| bricks[brick].cells.count_ones() as usize).sum::<usize>() * W;
-    let value = sums.into_iter().sum::<T>() / T::lit(terms.max(1) as f64);
-    let kernel = TotalVariation::<W, N, S> { lattice: lattice.clone(), run, sparse: part.is_some(), terms };
+    let kernel =
+        TotalVariation::<T, W, N, S> { lattice: lattice.clone(), run, reached, sparse: part.is_some(), terms, gradient: Mutex::default() };
+    let value = if autograd::is_recording() && table.is_tracked() {
+        let (value, gradient) = kernel.pass::<true>(table.data());
+        kernel.keep_gradient(Some(gradient));
+        value
+    } else {
+        kernel.pass::<false>(table.data()).0
+    };
     Tensor::from_kernel(vec![value].into(), &[], &[table], kernel)
 }
 
@@ -135,7 +145,6 @@ struct Run {
 
 impl Run {
     /// Returns the k-th brick of the run.
-    #[inline(always)]
     fn brick(self, k: usize) -> usize {
         let brick = self.first + k;
         if brick < self.all { brick } else { brick - self.all }
@@ -150,6 +159,14 @@ impl Run {
 
     fn bricks(self) -> impl Iterator<Item = usize> {
         (0..self.count).map(move |k| self.brick(k))
+    }
+
+    /// Returns the bricks whose nodes are read by cells of the run: those of the run and the ones ahead of them, in ascending order.
+    fn reached(self, bricks: &[Neighbours]) -> Vec<u32> {
+        let mut reached: Vec<u32> = self.bricks().flat_map(|b| [Some(b as u32)].into_iter().chain(bricks[b].ahead).flatten()).collect();
+        reached.sort_unstable();
+        reached.dedup();
+        reached
     }
 }
 
@@ -192,26 +209,42 @@ fn check<T: Real>(table: &Tensor<T>, lattice: &Lattice) {
 
 /// Kernel of [`total_variation`].
 #[derive(Debug)]
-struct TotalVariation<const W: usize, const N: usize, const S: usize> {
+struct TotalVariation<T: Real, const W: usize, const N: usize, const S: usize> {
     lattice: Lattice,
     /// Bricks whose cells are included.
     run: Run,
+    /// Bricks that get a gradient, in ascending order.
+    reached: Vec<u32>,
     /// True if the gradient is row-sparse.
     sparse: bool,
     /// Number of cells times channels.
     terms: usize,
+    /// Gradient of the value, computed with it. The first backward pass takes it; another one computes it again.
+    gradient: Mutex<Option<Buffer<T>>>,
 }
 
-/// Number of bricks per task.
-const TASK: usize = 256;
+impl<T: Real, const W: usize, const N: usize, const S: usize> TotalVariation<T, W, N, S> {
+    /// Computes the value and, if `GRADIENT` is true, its gradient to the rows of the bricks in `reached`.
+    fn pass<const GRADIENT: bool>(&self, table: &[T]) -> (T, Buffer<T>) {
+        let (table, bricks) = (table.as_chunks::<S>().0, self.lattice.neighbours());
+        let scale = T::one() / T::lit(self.terms.max(1) as f64);
+        let slabs = |bricks: usize| if GRADIENT { bricks * BRICK } else { 0 };
+        let mut gradient = Buffer::<T>::stale(slabs(self.reached.len()) * S);
+        let tasks = self.reached.chunks(pass::task(self.reached.len()));
+        let parts = parallel::split_lengths(gradient.as_chunks_mut::<S>().0, tasks.clone().map(|task| slabs(task.len())));
+        let sums = parallel::map_items(tasks.zip(parts).collect(), |_, (task, part)| {
+            pass::bricks::<T, W, N, S, GRADIENT>(table, bricks, self.run, task, scale, part)
+        });
+        (scale * sums.into_iter().sum::<T>(), gradient)
+    }
 
-/// With q = s / √(…) for each cell and channel, s = cotangent / number of terms, the node of a cell gets −q (dx + dy + dz), and each
-/// neighbour q d. The gradient is computed as a gather: a node collects from its own cell and from the three cells behind it, so no two
-/// tasks write the same node. The roots are not kept from the forward pass: computing them again takes less time than writing and reading them.
-///
-/// A brick consists of four *slabs* of equal x, a slab of four *lines* of equal y, a line of four nodes along z. The loops run over slabs:
-/// a step along x moves to another slab, a step along y shifts the lines, a step along z shifts the nodes of each line.
-impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for TotalVariation<W, N, S> {
+    /// Keeps a gradient for the next backward pass, or takes the one that was kept.
+    fn keep_gradient(&self, gradient: Option<Buffer<T>>) -> Option<Buffer<T>> {
+        std::mem::replace(&mut *self.gradient.lock().unwrap_or_else(PoisonError::into_inner), gradient)
+    }
+}
+
+impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for TotalVariation<T, W, N, S> {
     fn name(&self) -> &'static str {
         "total_variation"
     }
@@ -221,29 +254,17 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
     }
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
-        let table = call.input(0);
-        let scale = call.cotangent().item() / T::lit(self.terms.max(1) as f64);
-        let values = table.data().as_chunks::<S>().0;
-        let bricks = self.lattice.neighbours();
-        let reached: Vec<u32> = match self.sparse {
-            false => (0..bricks.len() as u32).collect(),
-            true => {
-                let ahead = self.run.bricks().flat_map(|b| [Some(b as u32)].into_iter().chain(bricks[b].ahead).flatten());
-                let mut reached: Vec<u32> = ahead.collect();
-                reached.sort_unstable();
-                reached.dedup();
-                reached
-            }
-        };
-        let mut gradient = Buffer::<T>::stale(reached.len() * BRICK_ROWS * W);
-        parallel::for_each_chunk(gradient.as_chunks_mut::<S>().0, TASK * BRICK, |start, slabs| {
-            gradients::<T, W, N, S>(values, bricks, self.run, &reached[start / BRICK..][..slabs.len() / BRICK], scale, slabs);
-        });
+        let (table, cotangent) = (call.input(0), call.cotangent().item());
+        let mut gradient = self.keep_gradient(None).unwrap_or_else(|| self.pass::<true>(table.data()).1);
+        if cotangent != T::one() {
+            parallel::for_each_chunk(&mut gradient, parallel::CHUNK, |_, part| part.iter_mut().for_each(|g| *g *= cotangent));
+        }
         if !self.sparse {
             return out.dense(0, gradient);
         }
-        let touched = reached.iter().map(|&brick| touched(bricks, self.run, brick as usize)).collect();
-        let sums = RowsOfBricks { bricks: Members::new(&reached, bricks.len()), touched, width: W, values: gradient };
+        let bricks = self.lattice.neighbours();
+        let touched = self.reached.iter().map(|&brick| touched(bricks, self.run, brick as usize)).collect();
+        let sums = RowsOfBricks { bricks: Members::new(&self.reached, bricks.len()), touched, width: W, values: gradient };
         out.rows(0, RowSparse::deferred(table.shape(), Arc::new(sums)));
     }
 }
@@ -311,226 +332,4 @@ impl Members {
         let (word, bit) = (self.bits[number / 64], number % 64);
         (word >> bit & 1 == 1).then(|| self.before[number / 64] as usize + (word & ((1 << bit) - 1)).count_ones() as usize)
     }
-}
-
-/// Returns slab x of a brick, if the brick exists.
-#[inline(always)]
-fn slab<T, const S: usize>(table: &[[T; S]], brick: Option<u32>, x: usize) -> Option<&[T; S]> {
-    brick.map(|b| &table[b as usize * BRICK + x])
-}
-
-/// Returns the nodes one step ahead along x, y and z of the nodes of a slab. If a brick is missing, they are arbitrary nodes, which no cell
-/// reads.
-#[inline(always)]
-fn ahead<T: Real, const W: usize, const N: usize, const S: usize>(
-    table: &[[T; S]],
-    own: usize,
-    x: usize,
-    bricks: [Option<u32>; 3],
-) -> (&[T; S], [T; S], [T; S]) {
-    let here = &table[own * BRICK + x];
-    let next_x = if x + 1 < BRICK { &table[own * BRICK + x + 1] } else { slab(table, bricks[0], 0).unwrap_or(here) };
-    let (beyond_y, beyond_z) = (slab(table, bricks[1], x).unwrap_or(here), slab(table, bricks[2], x).unwrap_or(here));
-    let (mut next_y, mut next_z) = (*here, *here);
-    next_y[..S - N].copy_from_slice(&here[N..]);
-    next_y[S - N..].copy_from_slice(&beyond_y[..N]);
-    for y in 0..BRICK {
-        let line = y * N..(y + 1) * N;
-        next_z[line.start..line.end - W].copy_from_slice(&here[line.start + W..line.end]);
-        next_z[line.end - W..line.end].copy_from_slice(&beyond_z[line.start..line.start + W]);
-    }
-    (next_x, next_y, next_z)
-}
-
-/// For each node of a slab: the differences d to the nodes ahead of it, and their root.
-struct Differences<T, const S: usize> {
-    along: [[T; S]; 3],
-    /// dx² + dy² + dz² + ε
-    square: [T; S],
-    /// 1 / √(…); 0 for nodes without a cell.
-    inverse_root: [T; S],
-}
-
-impl<T: Real, const S: usize> Differences<T, S> {
-    /// Computes differences and roots of slab x of a brick.
-    #[inline(always)]
-    fn of<const W: usize, const N: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize, x: usize) -> Self {
-        let (next_x, next_y, next_z) = ahead::<T, W, N, S>(table, brick, x, bricks[brick].ahead);
-        let v = &table[brick * BRICK + x];
-        let [mut dx, mut dy, mut dz, mut square, mut inverse_root] = [[T::zero(); S]; 5];
-        for l in 0..S {
-            (dx[l], dy[l], dz[l]) = (next_x[l] - v[l], next_y[l] - v[l], next_z[l] - v[l]);
-            square[l] = dx[l] * dx[l] + dy[l] * dy[l] + dz[l] * dz[l] + T::lit(EPSILON);
-            inverse_root[l] = square[l].inverse_sqrt();
-        }
-        let cells = bricks[brick].cells >> (STRIDE[0] * x) & 0xffff;
-        if cells != 0xffff {
-            for node in (0..16).filter(|&node| !has(cells, node)) {
-                inverse_root[node * W..(node + 1) * W].fill(T::zero());
-            }
-        }
-        Differences { along: [dx, dy, dz], square, inverse_root }
-    }
-
-    /// Returns q d along each axis for s = 1.
-    #[inline(always)]
-    #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-    fn contributions(mut self) -> [[T; S]; 3] {
-        for d in &mut self.along {
-            for l in 0..S {
-                d[l] *= self.inverse_root[l];
-            }
-        }
-        self.along
-    }
-}
-
-/// Prefetches a brick, and the parts of the bricks ahead along x and y that [`Differences::of`] reads. Larger bricks are left to the hardware.
-#[inline(always)]
-fn prefetch_brick<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize) {
-    if size_of::<[[T; S]; BRICK]>() > PREFETCHED {
-        return;
-    }
-    parallel::prefetch(&table[brick * BRICK..][..BRICK]);
-    let [ahead_x, ahead_y, _] = bricks[brick].ahead;
-    if let Some(slab) = slab(table, ahead_x, 0) {
-        parallel::prefetch(slab);
-    }
-    for x in 0..BRICK {
-        if let Some(slab) = slab(table, ahead_y, x) {
-            parallel::prefetch(&slab[..N]);
-        }
-    }
-}
-
-/// Largest size of a brick that is prefetched, in bytes.
-const PREFETCHED: usize = 4096;
-/// Number of bricks between the one that is read and the one that is prefetched.
-const PREFETCH_AHEAD: usize = 2;
-
-dispatched! {
-/// Returns Σ √(dx² + dy² + dz² + ε) over the cells of a range of the run's bricks.
-fn variation<T: Real, const W: usize, const N: usize, const S: usize>(
-    table: &[[T; S]],
-    bricks: &[Neighbours],
-    run: Run,
-    range: Range<usize>,
-) -> T {
-    let mut sum = T::zero();
-    for k in range {
-        if k + PREFETCH_AHEAD < run.count {
-            prefetch_brick::<T, N, S>(table, bricks, run.brick(k + PREFETCH_AHEAD));
-        }
-        let mut lanes = [T::zero(); S];
-        for x in 0..BRICK {
-            let Differences { square, inverse_root, .. } = Differences::of::<W, N>(table, bricks, run.brick(k), x);
-            for l in 0..S {
-                lanes[l] += square[l] * inverse_root[l];
-            }
-        }
-        sum += folded(lanes);
-    }
-    sum
-}
-}
-
-/// Sums lanes pairwise. Sequential addition would take as long as all other work.
-#[inline(always)]
-fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
-    let mut width = S;
-    while width.is_multiple_of(2) {
-        width /= 2;
-        for l in 0..width {
-            lanes[l] += lanes[width + l];
-        }
-    }
-    lanes[..width].iter().copied().sum()
-}
-
-/// Contributions q d, for s = 1, that leave a brick: those of its last slab to the brick ahead along x, of the last line of each slab along y, and of the last
-/// node of each line along z.
-type Passed<T, const S: usize> = [[T; S]; 3];
-
-/// Stores the contributions of slab x that leave its brick.
-#[inline(always)]
-fn pass_on<T: Real, const W: usize, const N: usize, const S: usize>(passed: &mut Passed<T, S>, x: usize, [to_x, to_y, to_z]: &[[T; S]; 3]) {
-    if x + 1 == BRICK {
-        passed[0] = *to_x;
-    }
-    passed[1][x * N..(x + 1) * N].copy_from_slice(&to_y[S - N..]);
-    for y in 0..BRICK {
-        let (end, node) = ((y + 1) * N, (x * BRICK + y) * W);
-        passed[2][node..node + W].copy_from_slice(&to_z[end - W..end]);
-    }
-}
-
-/// Computes the contributions of a brick to the brick ahead along one axis.
-#[inline(always)]
-fn passed_along<T: Real, const W: usize, const N: usize, const S: usize>(
-    table: &[[T; S]],
-    bricks: &[Neighbours],
-    run: Run,
-    brick: usize,
-    axis: usize,
-) -> [T; S] {
-    let mut passed = [[T::zero(); S]; 3];
-    if run.contains(brick) {
-        let first = if axis == 0 { BRICK - 1 } else { 0 };
-        for x in first..BRICK {
-            pass_on::<T, W, N, S>(&mut passed, x, &Differences::of::<W, N>(table, bricks, brick, x).contributions());
-        }
-    }
-    passed[axis]
-}
-
-dispatched! {
-/// Computes the gradient of some bricks. Cells outside of the run do not contribute.
-fn gradients<T: Real, const W: usize, const N: usize, const S: usize>(
-    table: &[[T; S]],
-    bricks: &[Neighbours],
-    run: Run,
-    reached: &[u32],
-    scale: T,
-    out: &mut [[T; S]],
-) {
-    let zeros = [T::zero(); S];
-    let mut passed = Buffer::<T>::stale(3 * reached.len() * S);
-    let passed: &mut [Passed<T, S>] = passed.as_chunks_mut::<S>().0.as_chunks_mut().0;
-    for (k, (&own, out)) in reached.iter().zip(out.as_chunks_mut::<BRICK>().0).enumerate() {
-        if let Some(&later) = reached.get(k + PREFETCH_AHEAD) {
-            prefetch_brick::<T, N, S>(table, bricks, later as usize);
-        }
-        // Bricks behind have lower numbers. Most were computed before in this call. Without gaps in `reached`, their place follows from their number.
-        let behind = |axis: usize| match bricks[own as usize].behind[axis] {
-            None => zeros,
-            Some(brick) => {
-                let near = brick.wrapping_sub(reached[0]) as usize;
-                let is_near = near < k && reached[near] == brick;
-                match if is_near { Ok(near) } else { reached[..k].binary_search(&brick) } {
-                    Ok(before) => passed[before][axis],
-                    Err(_) => passed_along::<T, W, N, S>(table, bricks, run, brick as usize, axis),
-                }
-            }
-        };
-        let [mut from_x, behind_y, behind_z] = [behind(0), behind(1), behind(2)];
-        let included = run.contains(own as usize);
-        for (x, g) in out.iter_mut().enumerate() {
-            let to = if included { Differences::of::<W, N>(table, bricks, own as usize, x).contributions() } else { [zeros; 3] };
-            let [to_x, to_y, to_z] = &to;
-            let [mut from_y, mut from_z] = [zeros; 2];
-            from_y[..N].copy_from_slice(&behind_y[x * N..(x + 1) * N]);
-            from_y[N..].copy_from_slice(&to_y[..S - N]);
-            for y in 0..BRICK {
-                let (line, node) = (y * N, (x * BRICK + y) * W);
-                from_z[line..line + W].copy_from_slice(&behind_z[node..node + W]);
-                from_z[line + W..line + N].copy_from_slice(&to_z[line..line + N - W]);
-            }
-            for l in 0..S {
-                g[l] = scale * ((from_x[l] - to_x[l]) + (from_y[l] - to_y[l]) + (from_z[l] - to_z[l]));
-            }
-            pass_on::<T, W, N, S>(&mut passed[k], x, &to);
-            from_x = *to_x;
-        }
-    }
-}
 }

@@ -1,0 +1,319 @@
+//! Value and gradient of the total variation in one pass over bricks.
+//!
+//! With q = s / √(…) for each cell and channel, s = 1 / number of terms, the node of a cell gets −q (dx + dy + dz), and each neighbour q d.
+//! A task computes the contributions q d of each of its bricks once. Then every node collects from its own cell and from the three cells behind
+//! it, so no two tasks write the same node.
+//!
+//! A brick consists of four *slabs* of equal x, a slab of four *lines* of equal y, a line of four nodes along z. Loops run over slabs. The nodes
+//! ahead along y and z are loaded at an offset of a line and of a node, once in the brick and once in the brick ahead, and a constant mask
+//! selects between both.
+
+use super::{EPSILON, Run};
+use autograd::lattice::{BRICK, Neighbours, STRIDE, has};
+use autograd::{Buffer, Real, dispatched, parallel};
+use std::hint::select_unpredictable;
+
+/// Returns the number of bricks per task. Larger tasks compute fewer bricks twice, smaller ones leave work for all threads.
+pub(super) fn task(count: usize) -> usize {
+    (count / 16).clamp(256, 4096)
+}
+
+/// Returns S elements from `start` on, or the last S elements.
+#[inline(always)]
+fn window<T, const S: usize>(flat: &[T], start: usize) -> &[T; S] {
+    flat[start.min(flat.len() - S)..].first_chunk().expect("there are S elements")
+}
+
+/// Contributions that leave a brick along each axis: those of its last slab, of the last line of each slab, and of the last node of each line.
+type Leaving<T, const S: usize> = [[T; S]; 3];
+
+/// Contributions q d of the cells of a brick to the nodes ahead, s = 1. Along each axis, those that come from the brick behind are in front, so
+/// that what a slab gets and what it gives are windows of the same array.
+struct Contributions<T, const N: usize, const S: usize> {
+    /// Along x: the last slab of the brick behind, and four slabs.
+    x: [[T; S]; BRICK + 1],
+    /// Along y, for each slab: a line of the brick behind, and four lines.
+    y: [[[T; N]; BRICK + 1]; BRICK],
+    /// Along z: an unused slab, and four slabs.
+    z: [[T; S]; BRICK + 1],
+    /// Along z, at the first node of each line: the last node of a line of the brick behind. Other nodes are unused.
+    behind_z: [[T; S]; BRICK],
+}
+
+impl<T: Real, const N: usize, const S: usize> Contributions<T, N, S> {
+    fn zeros() -> Box<Self> {
+        let zero = T::zero();
+        Box::new(Contributions {
+            x: [[zero; S]; BRICK + 1],
+            y: [[[zero; N]; BRICK + 1]; BRICK],
+            z: [[zero; S]; BRICK + 1],
+            behind_z: [[zero; S]; BRICK],
+        })
+    }
+
+    /// Clears the contributions of a brick without cells.
+    #[inline(always)]
+    fn clear(&mut self) {
+        self.x[1..].fill([T::zero(); S]);
+        self.y.iter_mut().for_each(|lines| lines[1..].fill([T::zero(); N]));
+        self.z.fill([T::zero(); S]);
+    }
+
+    /// Stores what leaves the brick.
+    #[inline(always)]
+    fn store_leaving<const W: usize>(&self, [slab, lines, nodes]: &mut Leaving<T, S>) {
+        *slab = self.x[BRICK];
+        lines.as_chunks_mut().0.iter_mut().zip(&self.y).for_each(|(line, lines)| *line = lines[BRICK]);
+        let lines_along_z = self.z[1..].as_flattened().as_chunks::<N>().0;
+        for (node, line) in nodes.as_chunks_mut::<W>().0.iter_mut().zip(lines_along_z) {
+            *node = *line.last_chunk().expect("a line has four nodes");
+        }
+    }
+
+    /// Takes what leaves the brick behind along an axis.
+    #[inline(always)]
+    fn enter<const W: usize>(&mut self, axis: usize, leaving: &[T; S]) {
+        match axis {
+            0 => self.x[0] = *leaving,
+            1 => self.y.iter_mut().zip(leaving.as_chunks().0).for_each(|(lines, line)| lines[0] = *line),
+            _ => {
+                let lines = self.behind_z.as_flattened_mut().as_chunks_mut::<N>().0;
+                for (line, node) in lines.iter_mut().zip(leaving.as_chunks::<W>().0) {
+                    *line.first_chunk_mut().expect("a line has four nodes") = *node;
+                }
+            }
+        }
+    }
+
+    /// Computes the contributions of slab x of a brick, and adds √(…) of its cells to `roots`.
+    #[inline(always)]
+    fn compute<const W: usize>(
+        &mut self,
+        table: &[[T; S]],
+        bricks: &[Neighbours],
+        brick: usize,
+        x: usize,
+        ones: &[T; S],
+        roots: &mut [T; S],
+    ) {
+        let own = brick * BRICK + x;
+        let (v, flat) = (&table[own], table.as_flattened());
+        // If a brick is missing, these are arbitrary nodes, which no cell reads.
+        let [ahead_x, ahead_y, ahead_z] = bricks[brick].ahead;
+        let beyond = |ahead: Option<u32>, x: usize, offset: usize| match ahead {
+            Some(ahead) => (ahead as usize * BRICK + x) * S - offset,
+            None => own * S,
+        };
+        let next_x = if x + 1 < BRICK { &table[own + 1] } else { window(flat, beyond(ahead_x, 0, 0)) };
+        let near_y: &[T; S] = window(flat, own * S + N);
+        let near_z: &[T; S] = window(flat, own * S + W);
+        let beyond_y: &[T; S] = window(flat, beyond(ahead_y, x, S - N));
+        let beyond_z: &[T; S] = window(flat, beyond(ahead_z, x, N - W));
+
+        let cells = bricks[brick].cells >> (STRIDE[0] * x) & 0xffff;
+        let mut with_cell = [T::zero(); S];
+        let has_cell = if cells == 0xffff {
+            ones
+        } else {
+            for node in (0..16).filter(|&node| has(cells, node)) {
+                with_cell[node * W..(node + 1) * W].fill(T::one());
+            }
+            &with_cell
+        };
+        let to_x = &mut self.x[x + 1];
+        let to_y: &mut [T; S] = self.y[x].as_flattened_mut().last_chunk_mut().expect("there are four lines");
+        let to_z = &mut self.z[x + 1];
+        differences::<T, W, N, S>(v, next_x, [near_y, beyond_y], [near_z, beyond_z], has_cell, to_x, to_y, to_z, roots);
+    }
+}
+
+/// Computes the contributions of a slab to the nodes ahead along each axis, and adds √(…) of its cells to `roots`.
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn differences<T: Real, const W: usize, const N: usize, const S: usize>(
+    v: &[T; S],
+    next_x: &[T; S],
+    [near_y, beyond_y]: [&[T; S]; 2],
+    [near_z, beyond_z]: [&[T; S]; 2],
+    has_cell: &[T; S],
+    to_x: &mut [T; S],
+    to_y: &mut [T; S],
+    to_z: &mut [T; S],
+    roots: &mut [T; S],
+) {
+    for l in 0..S {
+        // All are loaded before one is selected; otherwise, addresses are selected, and each element is loaded by itself.
+        let [y_near, y_beyond, z_near, z_beyond] = [near_y[l], beyond_y[l], near_z[l], beyond_z[l]];
+        let next_y = select_unpredictable(l < S - N, y_near, y_beyond);
+        let next_z = select_unpredictable(Ends::<W, N, S>::LAST[l], z_beyond, z_near);
+        let (dx, dy, dz) = (next_x[l] - v[l], next_y - v[l], next_z - v[l]);
+        let square = dx * dx + dy * dy + dz * dz + T::lit(EPSILON);
+        let inverse_root = has_cell[l] * square.inverse_sqrt();
+        roots[l] += square * inverse_root;
+        to_x[l] = dx * inverse_root;
+        to_y[l] = dy * inverse_root;
+        to_z[l] = dz * inverse_root;
+    }
+}
+
+/// Masks of the first and the last node of each line of a slab.
+struct Ends<const W: usize, const N: usize, const S: usize>;
+
+impl<const W: usize, const N: usize, const S: usize> Ends<W, N, S> {
+    const FIRST: [bool; S] = Self::mask(0);
+    const LAST: [bool; S] = Self::mask(N - W);
+
+    const fn mask(first: usize) -> [bool; S] {
+        let mut mask = [false; S];
+        let mut l = 0;
+        while l < S {
+            mask[l] = l % N >= first && l % N < first + W;
+            l += 1;
+        }
+        mask
+    }
+}
+
+/// Prefetches a brick, and the parts of the bricks ahead that are read with it. Along z, those are in all cache lines of the brick ahead.
+#[inline(always)]
+fn prefetch_brick<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize) {
+    parallel::prefetch(&table[brick * BRICK..][..BRICK]);
+    let [ahead_x, ahead_y, ahead_z] = bricks[brick].ahead;
+    if let Some(ahead) = ahead_x {
+        parallel::prefetch(&table[ahead as usize * BRICK]);
+    }
+    if let Some(ahead) = ahead_y {
+        for x in 0..BRICK {
+            parallel::prefetch(&table[ahead as usize * BRICK + x][..N]);
+        }
+    }
+    if let Some(ahead) = ahead_z {
+        parallel::prefetch(&table[ahead as usize * BRICK..][..BRICK]);
+    }
+}
+
+/// Largest size of a brick that is prefetched, in bytes. Larger ones are left to the hardware.
+const PREFETCHED: usize = 4096;
+/// Number of bricks between the one that is read and the one that is prefetched.
+const PREFETCH_AHEAD: usize = 6;
+
+/// Computes the gradient of a slab from what its nodes get and give.
+#[inline(always)]
+fn collect<T: Real, const W: usize, const N: usize, const S: usize>(
+    g: &mut [T; S],
+    scale: T,
+    [from_x, to_x]: [&[T; S]; 2],
+    [from_y, to_y]: [&[T; S]; 2],
+    [near_z, beyond_z, to_z]: [&[T; S]; 3],
+) {
+    for l in 0..S {
+        let (near, beyond) = (near_z[l], beyond_z[l]);
+        let from_z = select_unpredictable(Ends::<W, N, S>::FIRST[l], beyond, near);
+        g[l] = scale * ((from_x[l] - to_x[l]) + (from_y[l] - to_y[l]) + (from_z - to_z[l]));
+    }
+}
+
+/// Returns the place of a brick behind among those of a task that come before it.
+#[inline(always)]
+fn place(before: &[u32], behind: u32) -> Option<usize> {
+    // Without gaps between the bricks, the place follows from the number.
+    let near = behind.checked_sub(*before.first()?)? as usize;
+    if before.get(near) == Some(&behind) { Some(near) } else { before.binary_search(&behind).ok() }
+}
+
+dispatched! {
+/// Computes what leaves a brick of another task along an axis.
+fn leaving_along<T: Real, const W: usize, const N: usize, const S: usize>(
+    table: &[[T; S]],
+    bricks: &[Neighbours],
+    run: Run,
+    brick: usize,
+    axis: usize,
+    scratch: &mut Contributions<T, N, S>,
+) -> [T; S] {
+    if !run.contains(brick) {
+        return [T::zero(); S];
+    }
+    let ones = [T::one(); S];
+    for x in if axis == 0 { BRICK - 1 } else { 0 }..BRICK {
+        scratch.compute::<W>(table, bricks, brick, x, &ones, &mut [T::zero(); S]);
+    }
+    let mut leaving = [[T::zero(); S]; 3];
+    scratch.store_leaving::<W>(&mut leaving);
+    leaving[axis]
+}
+}
+
+dispatched! {
+/// Returns Σ √(dx² + dy² + dz² + ε) over the cells of some bricks, as far as they are in the run. If `GRADIENT` is true, computes `scale` times
+/// the gradient of the sum over all cells of the run.
+pub(super) fn bricks<T: Real, const W: usize, const N: usize, const S: usize, const GRADIENT: bool>(
+    table: &[[T; S]],
+    bricks: &[Neighbours],
+    run: Run,
+    reached: &[u32],
+    scale: T,
+    gradient: &mut [[T; S]],
+) -> T {
+    let mut sum = T::zero();
+    let ones = [T::one(); S];
+    let mut passed = Buffer::<T>::stale(if GRADIENT { 3 * reached.len() * S } else { 0 });
+    let passed: &mut [Leaving<T, S>] = passed.as_chunks_mut::<S>().0.as_chunks_mut().0;
+    let [mut own, mut scratch] = [Contributions::<T, N, S>::zeros(), Contributions::zeros()];
+    for (k, &brick) in reached.iter().enumerate() {
+        if let Some(&later) = reached.get(k + PREFETCH_AHEAD)
+            && size_of::<[[T; S]; BRICK]>() <= PREFETCHED
+        {
+            prefetch_brick::<T, N, S>(table, bricks, later as usize);
+            if GRADIENT {
+                parallel::prefetch(&gradient[(k + PREFETCH_AHEAD) * BRICK..][..BRICK]);
+            }
+        }
+        let number = brick as usize;
+        if GRADIENT {
+            for (axis, &behind) in bricks[number].behind.iter().enumerate() {
+                match behind.map(|behind| (behind, place(&reached[..k], behind))) {
+                    None => own.enter::<W>(axis, &[T::zero(); S]),
+                    Some((_, Some(place))) => own.enter::<W>(axis, &passed[place][axis]),
+                    Some((behind, None)) => {
+                        let behind = behind as usize;
+                        own.enter::<W>(axis, &leaving_along::<T, W, N, S>(table, bricks, run, behind, axis, &mut scratch));
+                    }
+                }
+            }
+        }
+        let mut roots = [T::zero(); S];
+        if run.contains(number) {
+            for x in 0..BRICK {
+                own.compute::<W>(table, bricks, number, x, &ones, &mut roots);
+            }
+        } else {
+            own.clear();
+        }
+        sum += folded(roots);
+        if GRADIENT {
+            for (x, g) in gradient[k * BRICK..][..BRICK].iter_mut().enumerate() {
+                let (from_x, to_x, y) = (&own.x[x], &own.x[x + 1], own.y[x].as_flattened());
+                let (from_y, to_y): (&[T; S], &[T; S]) = (window(y, 0), window(y, N));
+                let near_z: &[T; S] = window(own.z.as_flattened(), (x + 1) * S - W);
+                collect::<T, W, N, S>(g, scale, [from_x, to_x], [from_y, to_y], [near_z, &own.behind_z[x], &own.z[x + 1]]);
+            }
+            own.store_leaving::<W>(&mut passed[k]);
+        }
+    }
+    sum
+}
+}
+
+/// Sums lanes pairwise. Sequential addition would take as long as all other work.
+#[inline(always)]
+fn folded<T: Real, const S: usize>(mut lanes: [T; S]) -> T {
+    let mut width = S;
+    while width.is_multiple_of(2) {
+        width /= 2;
+        for l in 0..width {
+            lanes[l] += lanes[width + l];
+        }
+    }
+    lanes[..width].iter().copied().sum()
+}
