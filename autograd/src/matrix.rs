@@ -1,8 +1,9 @@
 //! Products of matrices in slices, computed on one thread by the `gemm` crate.
 //!
-//! The crate takes pointers, which requires one unsafe call, in `product`. The tests of the matrix product compare it with a safe triple loop.
+//! The crate takes pointers, which requires one unsafe call, in `product_in_order`. The tests of the matrix product compare it with a safe triple loop.
 #![allow(unsafe_code)]
 
+use crate::pool::Buffer;
 use crate::real::Real;
 
 /// A view of a matrix in a slice.
@@ -77,8 +78,30 @@ pub fn add_product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
     product(a, b, out, true);
 }
 
+/// Largest number of columns of a result that is computed transposed.
+const NARROW: usize = 32;
+
 #[track_caller]
 fn product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool) {
+    let (m, n) = (a.rows, b.cols);
+    assert!(out.len() == m * n);
+    // The library computes up to 64 numbers of a row at once. A narrow result has fewer; its transpose has long rows. They are contiguous in `a` if it is a
+    // transposed view, as for the gradient of a weight.
+    if a.row != 1 || n == 0 || n >= m || n > NARROW {
+        return product_in_order(a, b, out, add);
+    }
+    let mut transposed = Buffer::stale(m * n);
+    product_in_order(b.transpose(), a.transpose(), &mut transposed, false);
+    for (i, row) in out.chunks_exact_mut(n).enumerate() {
+        for (j, entry) in row.iter_mut().enumerate() {
+            let new = transposed[j * m + i];
+            *entry = if add { *entry + new } else { new };
+        }
+    }
+}
+
+#[track_caller]
+fn product_in_order<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool) {
     let (m, k, n) = (a.rows, a.cols, b.cols);
     assert!(b.rows == k && out.len() == m * n && a.reach() <= a.data.len() && b.reach() <= b.data.len());
     if m == 0 || n == 0 || k == 0 {

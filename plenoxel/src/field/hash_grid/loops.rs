@@ -69,11 +69,16 @@ pub struct Cells<T> {
 }
 
 impl<T: Real> Cells<T> {
+    /// Creates cells that [`find`](Self::find) fills.
+    pub fn none() -> Self {
+        Cells { lowest: [[0; TOGETHER]; 3], rows: [[0; TOGETHER]; 8], shares: [[[T::zero(); TOGETHER]; 2]; 3] }
+    }
+
+    /// Finds the cells of a group of positions at a level.
     #[inline(always)]
-    pub fn new<const FUSED: bool>(level: &Level, at: &Group<T>) -> Self {
+    pub fn find<const FUSED: bool>(&mut self, level: &Level, at: &Group<T>) {
+        let Cells { lowest, rows, shares } = self;
         let (scale, half, factors) = (T::lit(level.scale), T::lit(0.5), level.factors());
-        let mut shares = [[[T::zero(); TOGETHER]; 2]; 3];
-        let mut lowest = [[0; TOGETHER]; 3];
         for a in 0..3 {
             for i in 0..TOGETHER {
                 let u = at[a][i].multiply_add::<FUSED>(scale, half);
@@ -82,8 +87,7 @@ impl<T: Real> Cells<T> {
                 lowest[a][i] = low.index().wrapping_mul(factors[a]);
             }
         }
-        let rows = if level.hashed { rows::<true>(level, &lowest) } else { rows::<false>(level, &lowest) };
-        Cells { lowest, rows, shares }
+        if level.hashed { find_rows::<true>(level, lowest, rows) } else { find_rows::<false>(level, lowest, rows) }
     }
 
     /// Returns the weights of the corners.
@@ -104,10 +108,8 @@ impl<T: Real> Cells<T> {
     pub fn continued(&self) -> [bool; TOGETHER] {
         let mut differ = [0; TOGETHER];
         for lowest in &self.lowest {
-            let mut before = [0; TOGETHER];
-            before[1..].copy_from_slice(&lowest[..TOGETHER - 1]);
-            for i in 0..TOGETHER {
-                differ[i] |= lowest[i] ^ before[i];
+            for i in 1..TOGETHER {
+                differ[i] |= lowest[i] ^ lowest[i - 1];
             }
         }
         differ[0] = 1;
@@ -116,8 +118,12 @@ impl<T: Real> Cells<T> {
 
     /// Returns the weighted sums of the corners of all cells. All corners are read before the first is summed: no sum waits for the table.
     #[inline(always)]
-    fn sums<const F: usize, const FUSED: bool>(&self, table: &[[T; F]]) -> [[T; F]; TOGETHER] {
-        let mut corners = [[[T::zero(); F]; TOGETHER]; 8];
+    fn sums<const F: usize, const FUSED: bool>(
+        &self,
+        table: &[[T; F]],
+        corners: &mut [[[T; F]; TOGETHER]; 8],
+        sums: &mut [[T; F]; TOGETHER],
+    ) {
         for ([lower, upper], rows) in corners.as_chunks_mut::<2>().0.iter_mut().zip(self.rows.as_chunks::<2>().0) {
             for i in 0..TOGETHER {
                 // Neighbors along x, which mostly are in the same cache line.
@@ -125,7 +131,7 @@ impl<T: Real> Cells<T> {
                 upper[i] = table[rows[1][i] as usize];
             }
         }
-        let mut sums = [[T::zero(); F]; TOGETHER];
+        *sums = [[T::zero(); F]; TOGETHER];
         for (corner, weights) in corners.iter().zip(&self.weights()) {
             for i in 0..TOGETHER {
                 for f in 0..F {
@@ -133,12 +139,11 @@ impl<T: Real> Cells<T> {
                 }
             }
         }
-        sums
     }
 
     /// Returns the weighted sums of the corners of one cell after another; the rows of a later cell are prefetched.
     #[inline(always)]
-    fn sums_one_by_one<const F: usize, const FUSED: bool>(&self, table: &[[T; F]]) -> [[T; F]; TOGETHER] {
+    fn sums_one_by_one<const F: usize, const FUSED: bool>(&self, table: &[[T; F]], sums: &mut [[T; F]; TOGETHER]) {
         const AHEAD: usize = 16;
         let prefetch = |i: usize| {
             for c in 0..8 {
@@ -149,7 +154,7 @@ impl<T: Real> Cells<T> {
         };
         (0..AHEAD).for_each(prefetch);
         let weights = self.weights();
-        let mut sums = [[T::zero(); F]; TOGETHER];
+        *sums = [[T::zero(); F]; TOGETHER];
         for i in 0..TOGETHER {
             if i + AHEAD < TOGETHER {
                 prefetch(i + AHEAD);
@@ -161,23 +166,20 @@ impl<T: Real> Cells<T> {
                 }
             }
         }
-        sums
     }
 }
 
 /// Returns the rows of the corners of cells, from the coordinates of their lowest nodes times the factors of the level.
 #[inline(always)]
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-fn rows<const HASHED: bool>(level: &Level, lowest: &[[u32; TOGETHER]; 3]) -> [[u32; TOGETHER]; 8] {
+fn find_rows<const HASHED: bool>(level: &Level, lowest: &[[u32; TOGETHER]; 3], rows: &mut [[u32; TOGETHER]; 8]) {
     let factors = level.factors();
-    let mut rows = [[0; TOGETHER]; 8];
     for c in 0..8 {
         let up = [c & 1, c >> 1 & 1, c >> 2];
         for i in 0..TOGETHER {
             rows[c][i] = level.row_of::<HASHED>([0, 1, 2].map(|a| lowest[a][i].wrapping_add(factors[a].wrapping_mul(up[a] as u32))));
         }
     }
-    rows
 }
 
 /// Encodes positions at one level: `out` is `[positions, features]`.
@@ -188,11 +190,16 @@ pub fn encode<T: Real>(level: &Level, features: usize, table: &[T], groups: &[Gr
 dispatched! {
 fn encode_loop<T: Real, const F: usize, const FUSED: bool>(level: &Level, table: &[T], groups: &[Group<T>], out: &mut [T]) {
     let table = table.as_chunks::<F>().0;
+    let (mut cells, mut corners, mut spare) = (Cells::none(), [[[T::zero(); F]; TOGETHER]; 8], [[T::zero(); F]; TOGETHER]);
     for (group, out) in groups.iter().zip(out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER)) {
-        let cells = Cells::new::<FUSED>(level, group);
+        cells.find::<FUSED>(level, group);
+        let count = out.len();
+        let sums = if count == TOGETHER { out.first_chunk_mut().expect("a whole group") } else { &mut spare };
         // Rows of four features and more are vectors of their own; a buffer for their corners would fill the first-level cache.
-        let values = if const { F <= 2 } { cells.sums::<F, FUSED>(table) } else { cells.sums_one_by_one::<F, FUSED>(table) };
-        out.copy_from_slice(&values[..out.len()]);
+        if const { F <= 2 } { cells.sums::<F, FUSED>(table, &mut corners, sums) } else { cells.sums_one_by_one::<F, FUSED>(table, sums) }
+        if count < TOGETHER {
+            out.copy_from_slice(&spare[..count]);
+        }
     }
 }
 }
@@ -229,12 +236,13 @@ dispatched! {
 fn slopes_loop<T: Real, const F: usize, const FUSED: bool>(levels: &[Level], table: &[T], places: &[[T; 3]], g: &[T], out: &mut [T]) {
     let table = table.as_chunks::<F>().0;
     let width = levels.len();
+    let mut cells = Cells::none();
     let groups = places.chunks(TOGETHER).zip(g.as_chunks::<F>().0.chunks(TOGETHER * width));
     for ((places, g), out) in groups.zip(out.as_chunks_mut::<3>().0.chunks_mut(TOGETHER)) {
         let at = group(places);
         out.fill([T::zero(); 3]);
         for (l, level) in levels.iter().enumerate() {
-            let cells = Cells::new::<FUSED>(level, &at);
+            cells.find::<FUSED>(level, &at);
             for (i, out) in out.iter_mut().enumerate() {
                 let g = &g[i * width + l];
                 let [x, y, z] = [0, 1, 2].map(|a| [cells.shares[a][0][i], cells.shares[a][1][i]]);

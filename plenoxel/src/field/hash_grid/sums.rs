@@ -55,12 +55,17 @@ dispatched! {
 /// Adds the contributions of positions to the rows of a level that are in the bucket that begins at row `first`. `g` is `[positions, F]`.
 fn add<T: Real, const F: usize, const FUSED: bool>(level: &Level, groups: &[Group<T>], g: &[T], first: u32, sums: &mut [T]) {
     let sums = sums.as_chunks_mut::<F>().0;
+    let (mut cells, mut values, mut padded) = (Cells::none(), [[[T::zero(); F]; TOGETHER]; 8], [[T::zero(); F]; TOGETHER]);
     for (group, g) in groups.iter().zip(g.as_chunks::<F>().0.chunks(TOGETHER)) {
-        let mut cells = Cells::new::<FUSED>(level, group);
+        cells.find::<FUSED>(level, group);
         let weights = cells.weights();
-        let mut cotangents = [[T::zero(); F]; TOGETHER];
-        cotangents[..g.len()].copy_from_slice(g);
-        let mut values = [[[T::zero(); F]; TOGETHER]; 8];
+        let cotangents = match g.first_chunk() {
+            Some(all) => all,
+            None => {
+                padded[..g.len()].copy_from_slice(g);
+                &padded
+            }
+        };
         for (values, weights) in values.iter_mut().zip(&weights) {
             for i in 0..TOGETHER {
                 for f in 0..F {
@@ -68,7 +73,7 @@ fn add<T: Real, const F: usize, const FUSED: bool>(level: &Level, groups: &[Grou
                 }
             }
         }
-        let count = join(&mut cells, &mut values, &cotangents);
+        let count = join(&mut cells, &mut values, cotangents);
         for (rows, values) in cells.rows.iter().zip(&values) {
             for (row, value) in rows[..count].iter().zip(values) {
                 if let Some(sum) = sums.get_mut(row.wrapping_sub(first) as usize) {
