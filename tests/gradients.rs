@@ -111,9 +111,10 @@ fn lattices() -> Vec<Lattice> {
 
 #[test]
 fn total_variation_over_all_cells_is_the_sampled_one_over_a_run_of_all() {
-    for lattice in lattices() {
+    // Width 3 has a kernel, width 2 has none.
+    for (lattice, width) in lattices().into_iter().flat_map(|lattice| [2, 3].map(|width| (lattice.clone(), width))) {
         let rows = lattice.rows();
-        let table = numbers(&[rows, 2], -1.0, 1.0, 31);
+        let table = numbers(&[rows, width], -1.0, 1.0, 31);
         let whole = |x: &[Tensor<f64>]| loss::total_variation(&x[0], &lattice);
         Gradcheck::new(whole, vec![table.clone()]).named("total variation").order(2).run().unwrap_or_else(|e| panic!("{e}"));
         let x = Tensor::variable(table);
@@ -173,8 +174,10 @@ fn the_gradient_of_total_variation_can_be_taken_more_than_once() {
         assert_eq!(first, again);
         assert!(first.iter().zip(&three_times).all(|(a, b)| (3.0 * a - b).abs() < 1e-15));
     }
-    let recorded = loss::total_variation(&x, &lattice).item();
-    assert_eq!(recorded, autograd::no_grad(|| loss::total_variation(&x, &lattice)).item());
+    let bricks = lattice.rows() / 64;
+    let values =
+        || [loss::total_variation(&x, &lattice), loss::total_variation_of_bricks(&x, &lattice, bricks - 1, 3)].map(|value| value.item());
+    assert_eq!(values(), autograd::no_grad(values));
 }
 
 #[test]

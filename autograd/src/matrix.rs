@@ -87,7 +87,7 @@ fn product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool
     assert!(out.len() == m * n);
     // The library computes up to 64 numbers of a row at once. A narrow result has fewer; its transpose has long rows. They are contiguous in `a` if it is a
     // transposed view, as for the gradient of a weight.
-    if a.row != 1 || n == 0 || n >= m || n > NARROW {
+    if a.row != 1 || a.col == 1 || n == 0 || n >= m || n > NARROW {
         return product_in_order(a, b, out, add);
     }
     let mut transposed = Buffer::stale(m * n);
@@ -135,5 +135,26 @@ fn product_in_order<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], 
             false,
             gemm::Parallelism::None,
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As for the gradient of a weight with few outputs: the result is narrow, and its transpose is computed.
+    #[test]
+    fn narrow_products_with_a_transposed_matrix_are_added() {
+        let numbers = |n: usize| -> Vec<f64> { (0..n).map(|i| (i * 7919 % 1000) as f64 / 500.0 - 1.0).collect() };
+        for (m, k, n) in [(40, 300, 16), (33, 5, 32), (3, 7, 1), (4, 0, 2)] {
+            let (a, b) = (numbers(m * k), numbers(k * n));
+            let mut out = numbers(m * n);
+            let before = out.clone();
+            add_product(Matrix::transposed(&a, m, k), Matrix::new(&b, k, n), &mut out);
+            for (i, (out, before)) in out.iter().zip(before).enumerate() {
+                let want = before + (0..k).map(|l| a[l * m + i / n] * b[l * n + i % n]).sum::<f64>();
+                assert!((out - want).abs() < 1e-9, "{m} × {k} × {n}");
+            }
+        }
     }
 }

@@ -67,7 +67,8 @@ fn tv<T: Real, M>(step: &Step<'_, T, M>, table: &Param<T>, lattice: &Lattice, ce
 }
 
 /// Returns the total variation over all cells of a table `[rows, C]` in bricks, as a scalar. A grid without cells has variation 0. The
-/// gradient is dense for the widths with a kernel, which include those of grids: C = 1, 3, 4, 9, 12, 24, 27, 45, 48.
+/// gradient is dense for the widths with a kernel, which include those of grids: C = 1, 3, 4, 9, 12, 24, 27, 45, 48. For these, a call that is
+/// recorded computes the gradient too, and keeps it until the first backward pass.
 ///
 /// Panics if the layout is row-major, or if the table has another number of rows.
 #[track_caller]
@@ -122,11 +123,11 @@ fn with_kernel<T: Real, const W: usize, const N: usize, const S: usize>(
         Some(_) => run.reached(bricks),
     };
     let terms = run.bricks().map(|brick| bricks[brick].cells.count_ones() as usize).sum::<usize>() * W;
-    let kernel =
+    let mut kernel =
         TotalVariation::<T, W, N, S> { lattice: lattice.clone(), run, reached, sparse: part.is_some(), terms, gradient: Mutex::default() };
     let value = if autograd::is_recording() && table.is_tracked() {
         let (value, gradient) = kernel.pass::<true>(table.data());
-        kernel.keep_gradient(Some(gradient));
+        kernel.gradient = Mutex::new(Some(gradient));
         value
     } else {
         kernel.pass::<false>(table.data()).0
@@ -230,17 +231,17 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> TotalVariation<T, 
         let scale = T::one() / T::lit(self.terms.max(1) as f64);
         let slabs = |bricks: usize| if GRADIENT { bricks * BRICK } else { 0 };
         let mut gradient = Buffer::<T>::stale(slabs(self.reached.len()) * S);
-        let tasks = self.reached.chunks(pass::task(self.reached.len()));
+        let tasks = self.reached.chunks(pass::task::<T, S>(self.reached.len()));
         let parts = parallel::split_lengths(gradient.as_chunks_mut::<S>().0, tasks.clone().map(|task| slabs(task.len())));
         let sums = parallel::map_items(tasks.zip(parts).collect(), |_, (task, part)| {
-            pass::bricks::<T, W, N, S, GRADIENT>(table, bricks, self.run, task, scale, part)
+            pass::value_and_gradient::<T, W, N, S, GRADIENT>(table, bricks, self.run, task, scale, part)
         });
         (scale * sums.into_iter().sum::<T>(), gradient)
     }
 
-    /// Keeps a gradient for the next backward pass, or takes the one that was kept.
-    fn keep_gradient(&self, gradient: Option<Buffer<T>>) -> Option<Buffer<T>> {
-        std::mem::replace(&mut *self.gradient.lock().unwrap_or_else(PoisonError::into_inner), gradient)
+    /// Takes the gradient that was computed with the value, if no backward pass took it before.
+    fn take_gradient(&self) -> Option<Buffer<T>> {
+        self.gradient.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 }
 
@@ -255,16 +256,16 @@ impl<T: Real, const W: usize, const N: usize, const S: usize> Kernel<T> for Tota
 
     fn vjp(&self, call: &KernelCall<'_, T>, out: &mut GradSink<T>) {
         let (table, cotangent) = (call.input(0), call.cotangent().item());
-        let mut gradient = self.keep_gradient(None).unwrap_or_else(|| self.pass::<true>(table.data()).1);
-        if cotangent != T::one() {
-            parallel::for_each_chunk(&mut gradient, parallel::CHUNK, |_, part| part.iter_mut().for_each(|g| *g *= cotangent));
-        }
+        let mut gradient = self.take_gradient().unwrap_or_else(|| self.pass::<true>(table.data()).1);
         if !self.sparse {
+            if cotangent != T::one() {
+                parallel::for_each_chunk(&mut gradient, parallel::CHUNK, |_, part| part.iter_mut().for_each(|g| *g *= cotangent));
+            }
             return out.dense(0, gradient);
         }
         let bricks = self.lattice.neighbours();
         let touched = self.reached.iter().map(|&brick| touched(bricks, self.run, brick as usize)).collect();
-        let sums = RowsOfBricks { bricks: Members::new(&self.reached, bricks.len()), touched, width: W, values: gradient };
+        let sums = RowsOfBricks { bricks: Members::new(&self.reached, bricks.len()), touched, width: W, values: gradient, cotangent };
         out.rows(0, RowSparse::deferred(table.shape(), Arc::new(sums)));
     }
 }
@@ -287,6 +288,8 @@ struct RowsOfBricks<T: Real> {
     touched: Vec<u64>,
     width: usize,
     values: Buffer<T>,
+    /// Factor of the values.
+    cotangent: T,
 }
 
 impl<T: Real> RowSums<T> for RowsOfBricks<T> {
@@ -302,7 +305,7 @@ impl<T: Real> RowSums<T> for RowsOfBricks<T> {
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
         if let Some(k) = self.bricks.place(bucket) {
             let values = &self.values[k * BRICK_ROWS * self.width..][..BRICK_ROWS * self.width];
-            sums.iter_mut().zip(values).for_each(|(sum, &value)| *sum += value);
+            sums.iter_mut().zip(values).for_each(|(sum, &value)| *sum += self.cotangent * value);
             touched[0] |= self.touched[k];
         }
     }

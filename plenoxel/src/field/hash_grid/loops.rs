@@ -116,7 +116,7 @@ impl<T: Real> Cells<T> {
         differ.map(|differ| differ == 0)
     }
 
-    /// Returns the weighted sums of the corners of all cells. All corners are read before the first is summed: no sum waits for the table.
+    /// Computes the weighted sums of the corners of all cells. All corners are read, into `corners`, before the first is summed: no sum waits for the table.
     #[inline(always)]
     fn sums<const F: usize, const FUSED: bool>(
         &self,
@@ -141,7 +141,7 @@ impl<T: Real> Cells<T> {
         }
     }
 
-    /// Returns the weighted sums of the corners of one cell after another; the rows of a later cell are prefetched.
+    /// Computes the weighted sums of the corners of one cell after another; the rows of a later cell are prefetched.
     #[inline(always)]
     fn sums_one_by_one<const F: usize, const FUSED: bool>(&self, table: &[[T; F]], sums: &mut [[T; F]; TOGETHER]) {
         const AHEAD: usize = 16;
@@ -169,7 +169,7 @@ impl<T: Real> Cells<T> {
     }
 }
 
-/// Returns the rows of the corners of cells, from the coordinates of their lowest nodes times the factors of the level.
+/// Finds the rows of the corners of cells, from the coordinates of their lowest nodes times the factors of the level.
 #[inline(always)]
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 fn find_rows<const HASHED: bool>(level: &Level, lowest: &[[u32; TOGETHER]; 3], rows: &mut [[u32; TOGETHER]; 8]) {

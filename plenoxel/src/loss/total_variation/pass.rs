@@ -13,9 +13,11 @@ use autograd::lattice::{BRICK, Neighbours, STRIDE, has};
 use autograd::{Buffer, Real, dispatched, parallel};
 use std::hint::select_unpredictable;
 
-/// Returns the number of bricks per task. Larger tasks compute fewer bricks twice, smaller ones leave work for all threads.
-pub(super) fn task(count: usize) -> usize {
-    (count / 16).clamp(256, 4096)
+/// Returns the number of bricks of a task: a sixty-fourth of all, but enough of them that few are computed twice, and so few that what a task keeps of them
+/// ([`Leaving`]) fits in 2 MB.
+pub(super) fn task<T, const S: usize>(count: usize) -> usize {
+    const LEAST: usize = 256;
+    count.div_ceil(64).clamp(LEAST, ((2 << 20) / size_of::<Leaving<T, S>>()).max(LEAST))
 }
 
 /// Returns S elements from `start` on, or the last S elements.
@@ -27,7 +29,7 @@ fn window<T, const S: usize>(flat: &[T], start: usize) -> &[T; S] {
 /// Contributions that leave a brick along each axis: those of its last slab, of the last line of each slab, and of the last node of each line.
 type Leaving<T, const S: usize> = [[T; S]; 3];
 
-/// Contributions q d of the cells of a brick to the nodes ahead, s = 1. Along each axis, those that come from the brick behind are in front, so
+/// Contributions q d of the cells of a brick to the nodes ahead, s = 1. Along x and y, those that come from the brick behind are in front, so
 /// that what a slab gets and what it gives are windows of the same array.
 struct Contributions<T, const N: usize, const S: usize> {
     /// Along x: the last slab of the brick behind, and four slabs.
@@ -56,7 +58,7 @@ impl<T: Real, const N: usize, const S: usize> Contributions<T, N, S> {
     fn clear(&mut self) {
         self.x[1..].fill([T::zero(); S]);
         self.y.iter_mut().for_each(|lines| lines[1..].fill([T::zero(); N]));
-        self.z.fill([T::zero(); S]);
+        self.z[1..].fill([T::zero(); S]);
     }
 
     /// Stores what leaves the brick.
@@ -98,10 +100,14 @@ impl<T: Real, const N: usize, const S: usize> Contributions<T, N, S> {
     ) {
         let own = brick * BRICK + x;
         let (v, flat) = (&table[own], table.as_flattened());
-        // If a brick is missing, these are arbitrary nodes, which no cell reads.
+        // Bricks ahead have higher numbers, because bricks are in Morton order. So the last slab of the table has no cells, and no other window ends beyond the
+        // table. If a brick is missing, its nodes are arbitrary: no cell reads them.
         let [ahead_x, ahead_y, ahead_z] = bricks[brick].ahead;
         let beyond = |ahead: Option<u32>, x: usize, offset: usize| match ahead {
-            Some(ahead) => (ahead as usize * BRICK + x) * S - offset,
+            Some(ahead) => {
+                debug_assert!(ahead as usize > brick);
+                (ahead as usize * BRICK + x) * S - offset
+            }
             None => own * S,
         };
         let next_x = if x + 1 < BRICK { &table[own + 1] } else { window(flat, beyond(ahead_x, 0, 0)) };
@@ -174,7 +180,8 @@ impl<const W: usize, const N: usize, const S: usize> Ends<W, N, S> {
     }
 }
 
-/// Prefetches a brick, and the parts of the bricks ahead that are read with it. Along z, those are in all cache lines of the brick ahead.
+/// Prefetches a brick, and the parts of the bricks ahead that are read with it. Along z, that is the whole brick: the nodes that are read are in all or most of
+/// its cache lines.
 #[inline(always)]
 fn prefetch_brick<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize) {
     parallel::prefetch(&table[brick * BRICK..][..BRICK]);
@@ -215,7 +222,7 @@ fn collect<T: Real, const W: usize, const N: usize, const S: usize>(
 
 /// Returns the place of a brick behind among those of a task that come before it.
 #[inline(always)]
-fn place(before: &[u32], behind: u32) -> Option<usize> {
+fn place_of(before: &[u32], behind: u32) -> Option<usize> {
     // Without gaps between the bricks, the place follows from the number.
     let near = behind.checked_sub(*before.first()?)? as usize;
     if before.get(near) == Some(&behind) { Some(near) } else { before.binary_search(&behind).ok() }
@@ -245,9 +252,9 @@ fn leaving_along<T: Real, const W: usize, const N: usize, const S: usize>(
 }
 
 dispatched! {
-/// Returns Σ √(dx² + dy² + dz² + ε) over the cells of some bricks, as far as they are in the run. If `GRADIENT` is true, computes `scale` times
-/// the gradient of the sum over all cells of the run.
-pub(super) fn bricks<T: Real, const W: usize, const N: usize, const S: usize, const GRADIENT: bool>(
+/// Returns Σ √(dx² + dy² + dz² + ε) over the cells of a task's bricks `reached`, which ascend, as far as they are in the run. If `GRADIENT` is true, sets
+/// `gradient`, which has their slabs, to `scale` times the gradient of the sum over all cells of the run; otherwise it is empty.
+pub(super) fn value_and_gradient<T: Real, const W: usize, const N: usize, const S: usize, const GRADIENT: bool>(
     table: &[[T; S]],
     bricks: &[Neighbours],
     run: Run,
@@ -272,10 +279,13 @@ pub(super) fn bricks<T: Real, const W: usize, const N: usize, const S: usize, co
         let number = brick as usize;
         if GRADIENT {
             for (axis, &behind) in bricks[number].behind.iter().enumerate() {
-                match behind.map(|behind| (behind, place(&reached[..k], behind))) {
-                    None => own.enter::<W>(axis, &[T::zero(); S]),
-                    Some((_, Some(place))) => own.enter::<W>(axis, &passed[place][axis]),
-                    Some((behind, None)) => {
+                let Some(behind) = behind else {
+                    own.enter::<W>(axis, &[T::zero(); S]);
+                    continue;
+                };
+                match place_of(&reached[..k], behind) {
+                    Some(place) => own.enter::<W>(axis, &passed[place][axis]),
+                    None => {
                         let behind = behind as usize;
                         own.enter::<W>(axis, &leaving_along::<T, W, N, S>(table, bricks, run, behind, axis, &mut scratch));
                     }
