@@ -26,14 +26,15 @@ pub(super) struct Sums<T: Real> {
 struct Records<T: Real> {
     buckets: Buckets,
     at: At<T>,
-    /// ∂L/∂density
-    density: Buffer<T>,
-    /// ∂L/∂rgb of the sample, before multiplication with the harmonics of its ray: three numbers per record. If rows have no harmonics, the
-    /// contribution to the row.
-    color: Buffer<T>,
+    /// [`Slopes`] of each record.
+    slopes: Buffer<T>,
     /// Number of the ray; empty if rows have no harmonics.
     ray: Buffer<u32>,
 }
+
+/// ∂L/∂density and ∂L/∂rgb of a sample, the latter before multiplication with the harmonics of its ray. If rows have no harmonics, it is the contribution to the row
+/// of colors. They are together because records are written in no order, and each to one cache line.
+type Slopes<T> = [T; 4];
 
 #[derive(Debug)]
 enum At<T: Real> {
@@ -132,10 +133,10 @@ impl<T: Real> Gradients<T> {
         let live = (0..block.len()).filter(|&i| block.density[i] >= T::zero());
         let mut places = Buckets::count(buckets, live.flat_map(buckets_of));
         let clamped = batch.layout.shape.color != Color::Rgb;
-        let (mut density, mut color) = (Buffer::stale(most), Buffer::stale(3 * most));
+        let mut slopes = Buffer::stale(4 * most);
         let harmonic = batch.harmonics() > 0;
         let mut ray = Buffer::stale(if harmonic { most } else { 0 });
-        let to = color.as_chunks_mut::<3>().0;
+        let to: &mut [Slopes<T>] = slopes.as_chunks_mut().0;
         let colors = block.color.as_chunks::<3>().0;
         for (r, own) in block.rays().enumerate() {
             let g = self.rgb[r];
@@ -150,8 +151,7 @@ impl<T: Real> Gradients<T> {
                 }
                 for bucket in buckets_of(i) {
                     let place = places.take(bucket);
-                    density[place] = self.sigma[i];
-                    to[place] = c;
+                    to[place] = [self.sigma[i], c[0], c[1], c[2]];
                     if harmonic {
                         ray[place] = (block.first + r) as u32;
                     }
@@ -159,7 +159,7 @@ impl<T: Real> Gradients<T> {
                 }
             }
         }
-        Records { buckets: places.filled(), at: At::Rows(Buffer::stale(0)), density, color, ray }
+        Records { buckets: places.filled(), at: At::Rows(Buffer::stale(0)), slopes, ray }
     }
 }
 
@@ -209,9 +209,12 @@ impl<T: Real> RowSums<T> for DensitySums<T> {
     }
 
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
-        self.0.for_each(bucket, |records, range| match &records.at {
-            At::Rows(rows) => add_rows::<T, 1>(&rows[range.clone()], &records.density[range], sums, touched),
-            At::Corners(corners) => add_corners::<T, _, 1>(bucket, corners, range, OneNumber(&records.density), sums, touched),
+        self.0.for_each(bucket, |records, range| {
+            let of_density = OfDensity(records.slopes.as_chunks().0);
+            match &records.at {
+                At::Rows(rows) => add_rows::<T, _, 1>(rows, range, of_density, sums, touched),
+                At::Corners(corners) => add_corners::<T, _, 1>(bucket, corners, range, of_density, sums, touched),
+            }
         });
     }
 }
@@ -239,15 +242,12 @@ impl<T: Real> ColorSums<T> {
     fn add_of_width<const W: usize>(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
         let harmonic = self.0.count > 0;
         self.0.for_each(bucket, |records, range| {
-            let colors = records.color.as_chunks::<3>().0;
-            let products = ColorTimesBasis { colors, rays: &records.ray, basis: self.0.basis.data() };
+            let of_color = OfColor(records.slopes.as_chunks().0);
+            let products = ColorTimesBasis { of_color, rays: &records.ray, basis: self.0.basis.data() };
             match &records.at {
-                At::Rows(rows) if !harmonic => add_rows::<T, W>(&rows[range.clone()], colors[range].as_flattened(), sums, touched),
-                At::Rows(rows) => {
-                    let values: Vec<T> = range.clone().flat_map(|i| -> [T; W] { products.of(i) }).collect();
-                    add_rows::<T, W>(&rows[range], &values, sums, touched);
-                }
-                At::Corners(corners) if !harmonic => add_corners::<T, _, 3>(bucket, corners, range, colors, sums, touched),
+                At::Rows(rows) if !harmonic => add_rows::<T, _, 3>(rows, range, of_color, sums, touched),
+                At::Rows(rows) => add_rows::<T, _, W>(rows, range, products, sums, touched),
+                At::Corners(corners) if !harmonic => add_corners::<T, _, 3>(bucket, corners, range, of_color, sums, touched),
                 At::Corners(corners) => add_corners::<T, _, W>(bucket, corners, range, products, sums, touched),
             }
         });
@@ -259,25 +259,30 @@ trait Values<T, const W: usize> {
     fn of(&self, i: usize) -> [T; W];
 }
 
-struct OneNumber<'a, T>(&'a [T]);
+#[derive(Clone, Copy)]
+struct OfDensity<'a, T>(&'a [Slopes<T>]);
 
-impl<T: Real> Values<T, 1> for OneNumber<'_, T> {
+impl<T: Real> Values<T, 1> for OfDensity<'_, T> {
     #[inline(always)]
     fn of(&self, i: usize) -> [T; 1] {
-        [self.0[i]]
+        [self.0[i][0]]
     }
 }
 
-impl<T: Real> Values<T, 3> for &[[T; 3]] {
+#[derive(Clone, Copy)]
+struct OfColor<'a, T>(&'a [Slopes<T>]);
+
+impl<T: Real> Values<T, 3> for OfColor<'_, T> {
     #[inline(always)]
     fn of(&self, i: usize) -> [T; 3] {
-        self[i]
+        let [_, r, g, b] = self.0[i];
+        [r, g, b]
     }
 }
 
 /// Products of the gradient of a color and the harmonics of its ray.
 struct ColorTimesBasis<'a, T> {
-    colors: &'a [[T; 3]],
+    of_color: OfColor<'a, T>,
     rays: &'a [u32],
     /// `W` / 3 numbers for each ray.
     basis: &'a [T],
@@ -286,7 +291,7 @@ struct ColorTimesBasis<'a, T> {
 impl<T: Real, const W: usize> Values<T, W> for ColorTimesBasis<'_, T> {
     #[inline(always)]
     fn of(&self, i: usize) -> [T; W] {
-        let (color, count) = (self.colors[i], W / 3);
+        let (color, count) = (self.of_color.of(i), W / 3);
         let basis = &self.basis[self.rays[i] as usize * count..][..count];
         let mut value = [T::zero(); W];
         for c in 0..3 {
@@ -299,13 +304,14 @@ impl<T: Real, const W: usize> Values<T, W> for ColorTimesBasis<'_, T> {
 }
 
 dispatched! {
-/// Adds values to rows of one bucket.
-fn add_rows<T: Real, const W: usize>(rows: &[u32], values: &[T], sums: &mut [T], touched: &mut [u64]) {
+/// Adds the values of a range of samples to the rows of one bucket that they read.
+fn add_rows<T: Real, V: Values<T, W>, const W: usize>(rows: &[u32], range: Range<usize>, values: V, sums: &mut [T], touched: &mut [u64]) {
     let sums = sums.as_chunks_mut::<W>().0;
-    for (&row, value) in rows.iter().zip(values.as_chunks::<W>().0) {
-        let local = row as usize & ((1 << BUCKET_SHIFT) - 1);
+    for i in range {
+        let local = rows[i] as usize & ((1 << BUCKET_SHIFT) - 1);
         touched[local / 64] |= 1 << (local % 64);
-        for (s, &v) in sums[local].iter_mut().zip(value) {
+        let value = values.of(i);
+        for (s, v) in sums[local].iter_mut().zip(value) {
             *s += v;
         }
     }

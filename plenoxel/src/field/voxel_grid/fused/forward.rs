@@ -12,6 +12,7 @@ use crate::render::along::{self, Along};
 use crate::sampling::{Occupancy, Sections, march};
 use autograd::lattice::{NodeMap, TOGETHER};
 use autograd::{Buffer, Real, Tensor, parallel};
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Samples of a block of rays, with the data that the adjoint needs. Arrays have one entry per sample unless stated otherwise.
@@ -45,7 +46,7 @@ impl<T: Real> Block<T> {
     }
 
     /// Returns the samples of each ray.
-    pub fn rays(&self) -> impl DoubleEndedIterator<Item = std::ops::Range<usize>> + '_ {
+    pub fn rays(&self) -> impl DoubleEndedIterator<Item = Range<usize>> + '_ {
         self.offsets.windows(2).map(|o| o[0] as usize..o[1] as usize)
     }
 
@@ -74,8 +75,8 @@ impl<T: Real> Block<T> {
     }
 }
 
-/// Number of samples that are looked up together if each reads one row and rays do not end early.
-const LONG_RUN: usize = 64;
+/// Number of rays whose samples are placed before the first is looked up, if each reads one row and rays do not end early.
+const RAYS_TOGETHER: usize = 32;
 
 /// Inputs of rendering a batch.
 pub(super) struct Scene<'a, T: Real> {
@@ -126,65 +127,88 @@ impl<'a, T: Real> Scene<'a, T> {
     pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
         with_bricks!(self.batch.layout.lattice, map => {
-            // The weights of a run wait for its densities. Where rays end early, the rest of a long run would be looked up in vain.
+            // Where rays end early, samples far behind the end would be looked up in vain.
             if trilinear || self.options.stop_below > 0.0 {
-                self.weights_with::<TOGETHER>(map, first, count)
+                self.weights_in_runs(map, first, count)
             } else {
-                self.weights_with::<LONG_RUN>(map, first, count)
+                (self.weights_of_whole_rays(map, first, count), None)
             }
         })
     }
 
-    /// Computes the samples in runs of `RUN`, which is at most [`TOGETHER`] with trilinear look-up.
-    fn weights_with<const RUN: usize>(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
-        let RenderOptions { aabb, spacing, jitter, stop_below, .. } = self.options;
-        let stop = T::lit(*stop_below);
+    /// Computes the samples of rays that do not end early, with nearest look-up. No ray waits for the densities of the one before.
+    fn weights_of_whole_rays(&self, map: impl NodeMap, first: usize, count: usize) -> Block<T> {
+        let mut block = Block { first, ..Block::empty() };
+        let rays = &self.rays[first..first + count];
+        let mut sections = self.sections();
+        let mut end = 0;
+        for start in (0..count).step_by(RAYS_TOGETHER) {
+            let together = start..count.min(start + RAYS_TOGETHER);
+            let mut placed = end;
+            let mut ends = [0; RAYS_TOGETHER];
+            for r in together.clone() {
+                let mut places = self.places(rays, first, r, &mut sections);
+                loop {
+                    if placed + TOGETHER > block.t.len() {
+                        block.make_room(false);
+                    }
+                    match places.next_run::<TOGETHER>(block.places(placed)) {
+                        0 => break,
+                        own => placed += own,
+                    }
+                }
+                ends[r - start] = placed;
+            }
+            self.look_up_nearest(map, &mut block, end..placed);
+            block.looked_at += placed - end;
+            let mut begin = end;
+            for &ray_end in &ends[..together.len()] {
+                let mut left = T::one();
+                for i in begin..ray_end {
+                    if block.absorb(i, &mut left, end) {
+                        block.rows[end] = block.rows[i];
+                        end += 1;
+                    }
+                }
+                begin = ray_end;
+                block.offsets.push(end as u32);
+            }
+        }
+        block.truncate(end);
+        block
+    }
+
+    /// Computes the samples in runs of at most [`TOGETHER`].
+    fn weights_in_runs(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
+        let stop = T::lit(self.options.stop_below);
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
-        debug_assert!(!trilinear || RUN <= TOGETHER);
         let mut block = Block { first, ..Block::empty() };
         let mut found = trilinear.then(Corners::none);
         let mut group = Group::none();
-        let mut kept = [0; RUN];
+        let mut kept = [0; TOGETHER];
         let mut end = 0;
         let rays = &self.rays[first..first + count];
-        let mut sections = Sections::new(self.cells.filter(|_| self.packets), *spacing);
-        for (r, ray) in rays.iter().enumerate() {
-            let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let occupied = self.cells.map(|cells| march.occupied(ray, cells).between(sections.of(rays, r)));
-            let mut places = Places::new(march, ray, occupied, &self.batch.layout.shape);
+        let mut sections = self.sections();
+        for r in 0..count {
+            let mut places = self.places(rays, first, r, &mut sections);
             let mut left = T::one();
             // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
             while left >= stop {
-                if end + RUN > block.t.len() {
+                if end + TOGETHER > block.t.len() {
                     let room = block.make_room(trilinear);
                     found.iter_mut().for_each(|corners| corners.make_room(room));
                 }
-                let own = places.next_run::<RUN>(block.places(end));
+                let own = places.next_run::<TOGETHER>(block.places(end));
                 if own == 0 {
                     break;
                 }
                 let run = end..end + own;
-                let at = block.at.each_ref().map(|at| &at[run.clone()]);
-                let density = &mut block.density[run.clone()];
-                match found {
-                    Some(_) => {
-                        group.find(at, map);
-                        group.density(self.tables[0], density);
-                    }
-                    None => {
-                        let rows = &mut block.rows[run.clone()];
-                        lookup::nearest_rows(at, map, rows);
-                        // Absent voxels have density -1: no light, and no gradient.
-                        for (density, &row) in density.iter_mut().zip(&*rows) {
-                            *density = self.tables[0].get(row as usize).copied().unwrap_or(-T::one());
-                        }
-                    }
-                }
-                let (delta, weight, after) = (&block.delta[run.clone()], &mut block.weight[run.clone()], &mut block.after[run.clone()]);
-                if parallel::fused() {
-                    lookup::absorptions::<T, true>(density, delta, weight, after);
+                if found.is_some() {
+                    group.find(block.at.each_ref().map(|at| &at[run.clone()]), map);
+                    group.density(self.tables[0], &mut block.density[run.clone()]);
+                    block.find_absorptions(run.clone());
                 } else {
-                    lookup::absorptions::<T, false>(density, delta, weight, after);
+                    self.look_up_nearest(map, &mut block, run.clone());
                 }
                 let before = end;
                 for i in run {
@@ -192,18 +216,10 @@ impl<'a, T: Real> Scene<'a, T> {
                         break;
                     }
                     block.looked_at += 1;
-                    // A sample with negative density absorbs nothing, and no gradient changes it.
-                    if block.density[i] < T::zero() {
-                        continue;
+                    if block.absorb(i, &mut left, end) {
+                        kept[end - before] = i - before;
+                        end += 1;
                     }
-                    block.weight[i] *= left;
-                    left *= block.after[i];
-                    block.after[i] = left;
-                    if i != end {
-                        block.columns().into_iter().for_each(|column| column[end] = column[i]);
-                    }
-                    kept[end - before] = i - before;
-                    end += 1;
                 }
                 let kept = &kept[..end - before];
                 match &mut found {
@@ -215,6 +231,29 @@ impl<'a, T: Real> Scene<'a, T> {
         }
         block.truncate(end);
         (block, found)
+    }
+
+    /// Returns the sections of packets of rays, which are empty if the rays are not those of a picture.
+    fn sections(&self) -> Sections<'a> {
+        Sections::new(self.cells.filter(|_| self.packets), self.options.spacing)
+    }
+
+    /// Returns the samples of ray r of `rays`, the first of which has number `first`.
+    fn places(&self, rays: &'a [Ray], first: usize, r: usize, sections: &mut Sections<'_>) -> Places<'a, T> {
+        let RenderOptions { aabb, spacing, jitter, .. } = self.options;
+        let march = march(&rays[r], aabb, *spacing, jitter.of(first + r));
+        let occupied = self.cells.map(|cells| march.occupied(&rays[r], cells).between(sections.of(rays, r)));
+        Places::new(march, &rays[r], occupied, &self.batch.layout.shape)
+    }
+
+    /// Finds rows, densities and absorptions of some samples with nearest look-up.
+    fn look_up_nearest(&self, map: impl NodeMap, block: &mut Block<T>, samples: Range<usize>) {
+        let at = block.at.each_ref().map(|at| &at[samples.clone()]);
+        let rows = &mut block.rows[samples.clone()];
+        lookup::nearest_rows(at, map, rows);
+        // Absent voxels have density -1: no light, and no gradient.
+        lookup::read_or(self.tables[0], rows, -T::one(), &mut block.density[samples.clone()]);
+        block.find_absorptions(samples);
     }
 
     /// Computes the color of every sample that would be visible if it were dense, and zero for the others.
@@ -291,6 +330,33 @@ impl<T: Real> Block<T> {
     fn places<const RUN: usize>(&mut self, end: usize) -> [&mut [T; RUN]; 5] {
         let [x, y, z, t, delta, ..] = self.columns();
         [x, y, z, t, delta].map(|column| column[end..].first_chunk_mut().expect("there is room for a run"))
+    }
+
+    /// Computes the absorbed and the transmitted fraction of the interval of each sample, from its density, in place of weight and transmittance.
+    fn find_absorptions(&mut self, samples: Range<usize>) {
+        let (density, delta) = (&self.density[samples.clone()], &self.delta[samples.clone()]);
+        let (weight, after) = (&mut self.weight[samples.clone()], &mut self.after[samples]);
+        if parallel::fused() {
+            lookup::absorptions::<T, true>(density, delta, weight, after);
+        } else {
+            lookup::absorptions::<T, false>(density, delta, weight, after);
+        }
+    }
+
+    /// Computes weight and transmittance of sample i, with the transmittance `left` in front of it, and moves the sample to `end`, without its row. Returns false if
+    /// its density is negative: it absorbs nothing, and no gradient changes it.
+    #[inline(always)]
+    fn absorb(&mut self, i: usize, left: &mut T, end: usize) -> bool {
+        if self.density[i] < T::zero() {
+            return false;
+        }
+        self.weight[i] *= *left;
+        *left *= self.after[i];
+        self.after[i] = *left;
+        if i != end {
+            self.columns().into_iter().for_each(|column| column[end] = column[i]);
+        }
+        true
     }
 
     fn truncate(&mut self, count: usize) {

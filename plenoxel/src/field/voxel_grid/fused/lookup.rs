@@ -41,6 +41,30 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 }
 }
 
+dispatched! {
+/// Reads a table of one column at rows that may be absent, [`TOGETHER`] at a time.
+pub(super) fn read_or<T: Real>(table: &[T], rows: &[u32], absent: T, out: &mut [T]) {
+    if table.is_empty() {
+        return out.fill(absent);
+    }
+    let (groups, rest) = rows.as_chunks::<TOGETHER>();
+    let (out_groups, out_rest) = out.as_chunks_mut::<TOGETHER>();
+    for (rows, out) in groups.iter().zip(out_groups) {
+        let mut present = [0; TOGETHER];
+        for i in 0..TOGETHER {
+            present[i] = if rows[i] == u32::MAX { 0 } else { rows[i] };
+        }
+        let found = parallel::gathered(table, present);
+        for i in 0..TOGETHER {
+            out[i] = if rows[i] == u32::MAX { absent } else { found[i] };
+        }
+    }
+    for (&row, out) in rest.iter().zip(out_rest) {
+        *out = table.get(row as usize).copied().unwrap_or(absent);
+    }
+}
+}
+
 impl<T: Real> Group<T> {
     /// Creates an empty group.
     pub fn none() -> Self {
