@@ -32,8 +32,9 @@ struct Records<T: Real> {
     ray: Buffer<u32>,
 }
 
-/// ∂L/∂density and ∂L/∂rgb of a sample, the latter before multiplication with the harmonics of its ray. If rows have no harmonics, it is the contribution to the row
-/// of colors. They are together because records are written in no order, and each to one cache line.
+/// ∂L/∂density, then ∂L/∂rgb before multiplication with the harmonics of the ray. If rows have no harmonics, the latter is the contribution to the row
+/// of colors. The four numbers are together because consecutive samples are in different buckets: two arrays would cost two cache misses for each
+/// record.
 type Slopes<T> = [T; 4];
 
 #[derive(Debug)]
@@ -254,7 +255,8 @@ impl<T: Real> ColorSums<T> {
     }
 }
 
-/// Gradient of the interpolated row of each record. The compiler inlines these methods in dispatched loops, but not closures.
+/// Contribution of each record to the row that it reads, before multiplication with the weights of trilinear look-up. The compiler inlines these
+/// methods in dispatched loops, but not closures.
 trait Values<T, const W: usize> {
     fn of(&self, i: usize) -> [T; W];
 }
@@ -304,7 +306,7 @@ impl<T: Real, const W: usize> Values<T, W> for ColorTimesBasis<'_, T> {
 }
 
 dispatched! {
-/// Adds the values of a range of samples to the rows of one bucket that they read.
+/// Adds the values of a range of records, all of one bucket, to their rows.
 fn add_rows<T: Real, V: Values<T, W>, const W: usize>(rows: &[u32], range: Range<usize>, values: V, sums: &mut [T], touched: &mut [u64]) {
     let sums = sums.as_chunks_mut::<W>().0;
     for i in range {

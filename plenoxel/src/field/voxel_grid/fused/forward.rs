@@ -75,7 +75,7 @@ impl<T: Real> Block<T> {
     }
 }
 
-/// Number of rays whose samples are placed before the first is looked up, if each reads one row and rays do not end early.
+/// Number of rays whose samples are all placed before the first of these samples is looked up, with nearest look-up and if rays do not end early.
 const RAYS_TOGETHER: usize = 32;
 
 /// Inputs of rendering a batch.
@@ -127,7 +127,7 @@ impl<'a, T: Real> Scene<'a, T> {
     pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
         with_bricks!(self.batch.layout.lattice, map => {
-            // Where rays end early, samples far behind the end would be looked up in vain.
+            // Where rays end early, samples far behind the end would be looked up in vain. Trilinear look-up finds corners in groups of `TOGETHER`.
             if trilinear || self.options.stop_below > 0.0 {
                 self.weights_in_runs(map, first, count)
             } else {
@@ -136,7 +136,8 @@ impl<'a, T: Real> Scene<'a, T> {
         })
     }
 
-    /// Computes the samples of rays that do not end early, with nearest look-up. No ray waits for the densities of the one before.
+    /// Computes the samples of rays that do not end early, with nearest look-up. Groups of rays are placed, then looked up, then weighed, so that no ray
+    /// of a group waits for the densities of the one before. Samples that are kept move to the front; `end` never passes the sample that is read.
     fn weights_of_whole_rays(&self, map: impl NodeMap, first: usize, count: usize) -> Block<T> {
         let mut block = Block { first, ..Block::empty() };
         let rays = &self.rays[first..first + count];
@@ -147,12 +148,12 @@ impl<'a, T: Real> Scene<'a, T> {
             let mut placed = end;
             let mut ends = [0; RAYS_TOGETHER];
             for r in together.clone() {
-                let mut places = self.places(rays, first, r, &mut sections);
+                let mut places = self.samples_of(rays, first, r, &mut sections);
                 loop {
                     if placed + TOGETHER > block.t.len() {
                         block.make_room(false);
                     }
-                    match places.next_run::<TOGETHER>(block.places(placed)) {
+                    match places.next_run(block.places(placed)) {
                         0 => break,
                         own => placed += own,
                     }
@@ -165,10 +166,7 @@ impl<'a, T: Real> Scene<'a, T> {
             for &ray_end in &ends[..together.len()] {
                 let mut left = T::one();
                 for i in begin..ray_end {
-                    if block.absorb(i, &mut left, end) {
-                        block.rows[end] = block.rows[i];
-                        end += 1;
-                    }
+                    end += usize::from(block.keep(i, &mut left, end));
                 }
                 begin = ray_end;
                 block.offsets.push(end as u32);
@@ -190,7 +188,7 @@ impl<'a, T: Real> Scene<'a, T> {
         let rays = &self.rays[first..first + count];
         let mut sections = self.sections();
         for r in 0..count {
-            let mut places = self.places(rays, first, r, &mut sections);
+            let mut places = self.samples_of(rays, first, r, &mut sections);
             let mut left = T::one();
             // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
             while left >= stop {
@@ -198,7 +196,7 @@ impl<'a, T: Real> Scene<'a, T> {
                     let room = block.make_room(trilinear);
                     found.iter_mut().for_each(|corners| corners.make_room(room));
                 }
-                let own = places.next_run::<TOGETHER>(block.places(end));
+                let own = places.next_run(block.places(end));
                 if own == 0 {
                     break;
                 }
@@ -216,15 +214,13 @@ impl<'a, T: Real> Scene<'a, T> {
                         break;
                     }
                     block.looked_at += 1;
-                    if block.absorb(i, &mut left, end) {
+                    if block.keep(i, &mut left, end) {
                         kept[end - before] = i - before;
                         end += 1;
                     }
                 }
-                let kept = &kept[..end - before];
-                match &mut found {
-                    Some(corners) => corners.put(before, kept.iter().copied(), &group),
-                    None => kept.iter().enumerate().for_each(|(to, from)| block.rows[before + to] = block.rows[before + from]),
+                if let Some(corners) = &mut found {
+                    corners.put(before, kept[..end - before].iter().copied(), &group);
                 }
             }
             block.offsets.push(end as u32);
@@ -233,13 +229,13 @@ impl<'a, T: Real> Scene<'a, T> {
         (block, found)
     }
 
-    /// Returns the sections of packets of rays, which are empty if the rays are not those of a picture.
+    /// Returns the sections of packets of rays. They are whole rays if the rays are not those of a picture.
     fn sections(&self) -> Sections<'a> {
         Sections::new(self.cells.filter(|_| self.packets), self.options.spacing)
     }
 
-    /// Returns the samples of ray r of `rays`, the first of which has number `first`.
-    fn places(&self, rays: &'a [Ray], first: usize, r: usize, sections: &mut Sections<'_>) -> Places<'a, T> {
+    /// Returns the samples of `rays[r]`. `rays[0]` has number `first` in the batch, on which the jitter depends.
+    fn samples_of(&self, rays: &'a [Ray], first: usize, r: usize, sections: &mut Sections<'_>) -> Places<'a, T> {
         let RenderOptions { aabb, spacing, jitter, .. } = self.options;
         let march = march(&rays[r], aabb, *spacing, jitter.of(first + r));
         let occupied = self.cells.map(|cells| march.occupied(&rays[r], cells).between(sections.of(rays, r)));
@@ -327,12 +323,12 @@ impl<T: Real> Block<T> {
     }
 
     /// Returns positions, middles and lengths of the run of samples from `end` on.
-    fn places<const RUN: usize>(&mut self, end: usize) -> [&mut [T; RUN]; 5] {
+    fn places(&mut self, end: usize) -> [&mut [T; TOGETHER]; 5] {
         let [x, y, z, t, delta, ..] = self.columns();
         [x, y, z, t, delta].map(|column| column[end..].first_chunk_mut().expect("there is room for a run"))
     }
 
-    /// Computes the absorbed and the transmitted fraction of the interval of each sample, from its density, in place of weight and transmittance.
+    /// Computes the absorbed and the transmitted fraction of the interval of each sample from its density, and stores them in `weight` and `after`.
     fn find_absorptions(&mut self, samples: Range<usize>) {
         let (density, delta) = (&self.density[samples.clone()], &self.delta[samples.clone()]);
         let (weight, after) = (&mut self.weight[samples.clone()], &mut self.after[samples]);
@@ -343,10 +339,11 @@ impl<T: Real> Block<T> {
         }
     }
 
-    /// Computes weight and transmittance of sample i, with the transmittance `left` in front of it, and moves the sample to `end`, without its row. Returns false if
-    /// its density is negative: it absorbs nothing, and no gradient changes it.
+    /// Computes weight and transmittance of sample i from the fractions that [`find_absorptions`](Self::find_absorptions) stored and the transmittance
+    /// `left` in front of it, and moves it to `end` <= i. If its density is negative, does nothing and returns false: such a sample absorbs nothing, and
+    /// no gradient changes it.
     #[inline(always)]
-    fn absorb(&mut self, i: usize, left: &mut T, end: usize) -> bool {
+    fn keep(&mut self, i: usize, left: &mut T, end: usize) -> bool {
         if self.density[i] < T::zero() {
             return false;
         }
@@ -355,6 +352,9 @@ impl<T: Real> Block<T> {
         self.after[i] = *left;
         if i != end {
             self.columns().into_iter().for_each(|column| column[end] = column[i]);
+            if !self.rows.is_empty() {
+                self.rows[end] = self.rows[i];
+            }
         }
         true
     }

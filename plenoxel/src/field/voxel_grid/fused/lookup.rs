@@ -42,7 +42,7 @@ pub(super) fn nearest_rows<T: Real, M: NodeMap>(at: [&[T]; 3], map: M, rows: &mu
 }
 
 dispatched! {
-/// Reads a table of one column at rows that may be absent, [`TOGETHER`] at a time.
+/// Reads a table of one column at rows, some of which are absent (`u32::MAX`), [`TOGETHER`] at a time.
 pub(super) fn read_or<T: Real>(table: &[T], rows: &[u32], absent: T, out: &mut [T]) {
     if table.is_empty() {
         return out.fill(absent);
@@ -60,7 +60,7 @@ pub(super) fn read_or<T: Real>(table: &[T], rows: &[u32], absent: T, out: &mut [
         }
     }
     for (&row, out) in rest.iter().zip(out_rest) {
-        *out = table.get(row as usize).copied().unwrap_or(absent);
+        *out = if row == u32::MAX { absent } else { table[row as usize] };
     }
 }
 }

@@ -3,6 +3,7 @@
 use crate::camera::Ray;
 use crate::field::voxel_grid::GridShape;
 use crate::sampling::{March, Occupied};
+use autograd::lattice::TOGETHER;
 use autograd::{Real, dispatched};
 use glam::DVec3;
 
@@ -24,20 +25,20 @@ impl<'a, T: Real> Places<'a, T> {
         Places { ray, to_voxels: shape.to_voxels().map(T::lit), march, next: 0, occupied }
     }
 
-    /// Writes voxel coordinates, middles and lengths of the next samples, at most `RUN`. Returns their number; 0 at the end.
-    pub fn next_run<const RUN: usize>(&mut self, out: [&mut [T; RUN]; 5]) -> usize {
-        let [mut middles, mut lengths] = [[0.0; RUN]; 2];
+    /// Writes voxel coordinates, middles and lengths of the next samples, at most [`TOGETHER`]. Returns their number; 0 at the end.
+    pub fn next_run(&mut self, out: [&mut [T; TOGETHER]; 5]) -> usize {
+        let [mut middles, mut lengths] = [[0.0; TOGETHER]; 2];
         let mut count = 0;
         match &mut self.occupied {
             None => {
-                count = RUN.min(self.march.count - self.next);
-                for i in 0..RUN {
+                count = TOGETHER.min(self.march.count - self.next);
+                for i in 0..TOGETHER {
                     (middles[i], lengths[i]) = self.march.interval(self.next + i);
                 }
                 self.next += count;
             }
             Some(occupied) => {
-                for (middle, length) in occupied.take(RUN) {
+                for (middle, length) in occupied.take(TOGETHER) {
                     (middles[count], lengths[count]) = (middle, length);
                     count += 1;
                 }
@@ -58,10 +59,10 @@ impl<'a, T: Real> Places<'a, T> {
 
 dispatched! {
 /// Places the samples of a straight ray in the middles of intervals of these lengths: voxel coordinates, middles and lengths.
-fn place<T: Real, const RUN: usize>(ray: &Ray, [middles, lengths]: [&[f64; RUN]; 2], to_voxels: [T; 2], out: [&mut [T; RUN]; 5]) {
+fn place<T: Real>(ray: &Ray, [middles, lengths]: [&[f64; TOGETHER]; 2], to_voxels: [T; 2], out: [&mut [T; TOGETHER]; 5]) {
     let [x, y, z, t, delta] = out;
     let (o, d) = (ray.origin, ray.direction);
-    for i in 0..RUN {
+    for i in 0..TOGETHER {
         let (middle, length) = (middles[i], lengths[i]);
         x[i] = T::lit(o.x + middle * d.x) * to_voxels[0] + to_voxels[1];
         y[i] = T::lit(o.y + middle * d.y) * to_voxels[0] + to_voxels[1];
@@ -73,14 +74,9 @@ fn place<T: Real, const RUN: usize>(ray: &Ray, [middles, lengths]: [&[f64; RUN];
 }
 
 /// Like [`place`], for samples at these positions.
-fn place_each<T: Real, const RUN: usize>(
-    at: &[DVec3; RUN],
-    [middles, lengths]: [&[f64; RUN]; 2],
-    to_voxels: [T; 2],
-    out: [&mut [T; RUN]; 5],
-) {
+fn place_each<T: Real>(at: &[DVec3; TOGETHER], [middles, lengths]: [&[f64; TOGETHER]; 2], to_voxels: [T; 2], out: [&mut [T; TOGETHER]; 5]) {
     let [x, y, z, t, delta] = out;
-    for i in 0..RUN {
+    for i in 0..TOGETHER {
         (x[i], y[i], z[i]) = at[i].to_array().map(|p| T::lit(p) * to_voxels[0] + to_voxels[1]).into();
         (t[i], delta[i]) = (T::lit(middles[i]), T::lit(lengths[i]));
     }
