@@ -87,7 +87,8 @@ fn product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool
     assert!(out.len() == m * n);
     // The library computes up to 64 numbers of a row at once. A narrow result has fewer; its transpose has long rows. They are contiguous in `a` if it is a
     // transposed view, as for the gradient of a weight.
-    if a.row != 1 || a.col == 1 || n == 0 || n >= m || n > NARROW {
+    let is_transposed = a.row == 1 && a.col != 1;
+    if !is_transposed || n == 0 || n >= m || n > NARROW {
         return product_in_order(a, b, out, add);
     }
     let mut transposed = Buffer::stale(m * n);

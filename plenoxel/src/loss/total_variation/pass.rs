@@ -1,8 +1,8 @@
 //! Value and gradient of the total variation in one pass over bricks.
 //!
-//! With q = s / √(…) for each cell and channel, s = 1 / number of terms, the node of a cell gets −q (dx + dy + dz), and each neighbour q d.
-//! A task computes the contributions q d of each of its bricks once. Then every node collects from its own cell and from the three cells behind
-//! it, so no two tasks write the same node.
+//! With q = 1 / √(…) for each cell and channel, the node of a cell gets −q (dx + dy + dz), and each neighbour q d, both divided by the number of
+//! terms. A task computes the contributions q d of each of its bricks once. Then every node collects from its own cell and from the three cells
+//! behind it, so no two tasks write the same node.
 //!
 //! A brick consists of four *slabs* of equal x, a slab of four *lines* of equal y, a line of four nodes along z. Loops run over slabs. The nodes
 //! ahead along y and z are loaded at an offset of a line and of a node, once in the brick and once in the brick ahead, and a constant mask
@@ -13,8 +13,8 @@ use autograd::lattice::{BRICK, Neighbours, STRIDE, has};
 use autograd::{Buffer, Real, dispatched, parallel};
 use std::hint::select_unpredictable;
 
-/// Returns the number of bricks of a task: a sixty-fourth of all, but enough of them that few are computed twice, and so few that what a task keeps of them
-/// ([`Leaving`]) fits in 2 MB.
+/// Returns the number of bricks of a task. A large grid has 64 tasks or more. With at least 256 bricks in each, few are computed twice. A task keeps
+/// [`Leaving`] of each brick: at most 2 MB, unless 256 bricks need more.
 pub(super) fn task<T, const S: usize>(count: usize) -> usize {
     const LEAST: usize = 256;
     count.div_ceil(64).clamp(LEAST, ((2 << 20) / size_of::<Leaving<T, S>>()).max(LEAST))
@@ -29,7 +29,7 @@ fn window<T, const S: usize>(flat: &[T], start: usize) -> &[T; S] {
 /// Contributions that leave a brick along each axis: those of its last slab, of the last line of each slab, and of the last node of each line.
 type Leaving<T, const S: usize> = [[T; S]; 3];
 
-/// Contributions q d of the cells of a brick to the nodes ahead, s = 1. Along x and y, those that come from the brick behind are in front, so
+/// Contributions q d of the cells of a brick to the nodes ahead. Along x and y, those that come from the brick behind are in front, so
 /// that what a slab gets and what it gives are windows of the same array.
 struct Contributions<T, const N: usize, const S: usize> {
     /// Along x: the last slab of the brick behind, and four slabs.

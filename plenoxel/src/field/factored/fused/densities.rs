@@ -18,6 +18,7 @@ use std::sync::Arc;
 
 /// Density feature of bricks that are left out. The density is 0.
 const NOTHING: f64 = -1e3;
+
 /// Table of the density features at the nodes of a field.
 #[derive(Debug)]
 pub struct Densities<T: Real> {
