@@ -3,6 +3,8 @@
 //!
 //!     cargo bench --bench ops
 //!     cargo bench --bench ops -- exp gather4 --repeats 21
+//!
+//! `hash_step` and `planes_step` are training steps; `benches/peers` has the same work in PyTorch.
 
 mod support;
 

@@ -7,7 +7,7 @@ use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::along;
 use autograd::rows::Buckets;
-use autograd::{Buffer, Real, RowSums, Tensor, dispatched, parallel};
+use autograd::{Buffer, Pooled, Real, RowSums, Tensor, dispatched, parallel};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -100,7 +100,7 @@ impl<T: Real> Gradients<T> {
         match batch.layout.shape.interpolation {
             Interpolation::Nearest => {
                 let one = |i: usize| [block.rows[i] >> BUCKET_SHIFT];
-                let mut rows = Buffer::stale(block.len());
+                let mut rows = in_cache(block.len());
                 let records = self.records(batch, block, buckets, block.len(), one, |place, i| rows[place] = block.rows[i]);
                 Records { at: At::Rows(rows), ..records }
             }
@@ -134,9 +134,9 @@ impl<T: Real> Gradients<T> {
         let live = (0..block.len()).filter(|&i| block.density[i] >= T::zero());
         let mut places = Buckets::count(buckets, live.flat_map(buckets_of));
         let clamped = batch.layout.shape.color != Color::Rgb;
-        let mut slopes = Buffer::stale(4 * most);
+        let mut slopes = in_cache(4 * most);
         let harmonic = batch.harmonics() > 0;
-        let mut ray = Buffer::stale(if harmonic { most } else { 0 });
+        let mut ray = in_cache(if harmonic { most } else { 0 });
         let to: &mut [Slopes<T>] = slopes.as_chunks_mut().0;
         let colors = block.color.as_chunks::<3>().0;
         for (r, own) in block.rays().enumerate() {
@@ -162,6 +162,13 @@ impl<T: Real> Gradients<T> {
         }
         Records { buckets: places.filled(), at: At::Rows(Buffer::stale(0)), slopes, ray }
     }
+}
+
+/// Returns a buffer of unspecified contents that is in the cache. Records are written in a random order, which would wait for each line of a buffer that is not.
+fn in_cache<E: Pooled>(len: usize) -> Buffer<E> {
+    let buffer = Buffer::stale(len);
+    parallel::load(&buffer);
+    buffer
 }
 
 /// Marker for no bucket: the bucket of row `u32::MAX`, which no table reaches.

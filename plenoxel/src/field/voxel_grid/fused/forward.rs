@@ -9,7 +9,7 @@ use crate::camera::Ray;
 use crate::field::voxel_grid::{Color, Interpolation};
 use crate::render::RenderOptions;
 use crate::render::along::{self, Along};
-use crate::sampling::{Occupancy, Sections, march};
+use crate::sampling::{March, Occupancy, Sections, march};
 use autograd::lattice::{NodeMap, TOGETHER};
 use autograd::{Buffer, Real, Tensor, parallel};
 use std::ops::Range;
@@ -141,6 +141,11 @@ impl<'a, T: Real> Scene<'a, T> {
     fn weights_of_whole_rays(&self, map: impl NodeMap, first: usize, count: usize) -> Block<T> {
         let mut block = Block { first, ..Block::empty() };
         let rays = &self.rays[first..first + count];
+        if self.cells.is_none() {
+            // The number of samples is known, so no array has to grow, which would copy it.
+            let samples: usize = (0..count).map(|r| self.march_of(rays, first, r).count).sum();
+            block.make_room_for(samples + TOGETHER, false);
+        }
         let mut sections = self.sections();
         let mut end = 0;
         for start in (0..count).step_by(RAYS_TOGETHER) {
@@ -234,10 +239,15 @@ impl<'a, T: Real> Scene<'a, T> {
         Sections::new(self.cells.filter(|_| self.packets), self.options.spacing)
     }
 
+    /// Returns the march along `rays[r]`. `rays[0]` has number `first` in the batch, on which the jitter depends.
+    fn march_of(&self, rays: &[Ray], first: usize, r: usize) -> March {
+        let RenderOptions { aabb, spacing, jitter, .. } = self.options;
+        march(&rays[r], aabb, *spacing, jitter.of(first + r))
+    }
+
     /// Returns the samples of `rays[r]`. `rays[0]` has number `first` in the batch, on which the jitter depends.
     fn samples_of(&self, rays: &'a [Ray], first: usize, r: usize, sections: &mut Sections<'_>) -> Places<'a, T> {
-        let RenderOptions { aabb, spacing, jitter, .. } = self.options;
-        let march = march(&rays[r], aabb, *spacing, jitter.of(first + r));
+        let march = self.march_of(rays, first, r);
         let occupied = self.cells.map(|cells| march.occupied(&rays[r], cells).between(sections.of(rays, r)));
         Places::new(march, &rays[r], occupied, &self.batch.layout.shape)
     }
@@ -315,11 +325,16 @@ impl<T: Real> Block<T> {
     /// Doubles the capacity for samples. Returns the new capacity.
     fn make_room(&mut self, trilinear: bool) -> usize {
         let size = (2 * self.t.len()).max(32 * BLOCK);
+        self.make_room_for(size, trilinear);
+        size
+    }
+
+    /// Raises the capacity to `size` samples.
+    fn make_room_for(&mut self, size: usize, trilinear: bool) {
         self.columns().into_iter().for_each(|column| column.grow(size));
         if !trilinear {
             self.rows.grow(size);
         }
-        size
     }
 
     /// Returns positions, middles and lengths of the run of samples from `end` on.
