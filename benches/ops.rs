@@ -4,7 +4,7 @@
 //!     cargo bench --bench ops
 //!     cargo bench --bench ops -- exp gather4 --repeats 21
 //!
-//! `hash_step` and `planes_step` are training steps; `benches/peers` has the same work in PyTorch.
+//! `hash_step` and `planes_step` are training steps; `benches/peers` has them in PyTorch, where Adam updates all rows of the tables, not only those that were read.
 
 mod support;
 
@@ -21,16 +21,11 @@ use plenoxel::geometry::Aabb;
 use plenoxel::render::{Engine, RenderOptions, render};
 use plenoxel::sampling::{Jitter, Spacing};
 use std::hint::black_box;
-use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat};
+use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat, tensor};
 
 const PICKS: usize = 1_000_000;
 const SIDE: usize = 128;
 const ROWS: usize = SIDE * SIDE * SIDE;
-
-fn tensor(shape: &[usize], seed: u64) -> Tensor<f32> {
-    // Through a pooled buffer, as the tables of a model are.
-    Tensor::from_buffer(Buffer::copy_of(&numbers(shape.iter().product(), seed)), shape)
-}
 
 fn row(args: &Arguments, name: &str, inputs: &[&[usize]], f: impl Fn(&[Tensor<f32>]) -> Tensor<f32>) {
     if !args.wants(name) {

@@ -15,7 +15,7 @@ mod support;
 
 use autograd::Lattice;
 use autograd::optim::{Optimizer, Rates, Sgd};
-use autograd::{Buffer, Module, Param, Tensor, value_and_grad};
+use autograd::{Module, Param, value_and_grad};
 use plenoxel::dataset::{self, Dataset, OpenOptions, Split};
 use plenoxel::evaluate::Viewer;
 use plenoxel::field::voxel_grid::fused::{PictureTables, render_picture};
@@ -155,9 +155,7 @@ fn run() {
     }
     if args.wants("W3") {
         let lattice = Lattice::bricks([128; 3]);
-        // A copy, whose memory is that of the pool, like that of the tables of a grid.
-        let numbers = Buffer::copy_of(&support::numbers(128 * 128 * 128 * 4, 0));
-        let table = Param::from_tensor("grid", Tensor::from_buffer(numbers, &[128 * 128 * 128, 4]));
+        let table = Param::from_tensor("grid", support::tensor(&[128 * 128 * 128, 4], 0));
         let times = repeat(args.repeats, || drop(black_box(value_and_grad(|| total_variation(table.tensor(), &lattice)))));
         print("W3", &times, None, 0);
     }

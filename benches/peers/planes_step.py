@@ -1,14 +1,15 @@
-"""The work of `cargo bench --bench ops -- planes_step` in PyTorch: a training step of a factored field (TensoRF).
+"""`cargo bench --bench ops -- planes_step` in PyTorch: a training step of a factored field (TensoRF).
 
     python benches/peers/planes_step.py [--look-up embedding_bag|grid_sample] [--compile] [--threads N] [--repeats N]
 
 4096 rays of 64 samples, each with a color; planes of 300 x 300 nodes with 16 components of density and 48 of appearance; 32 features and 16
-harmonics of the direction; a network of width 128; mean square; Adam. Needs PyTorch.
+harmonics of the direction; a network of width 128; mean square of the colors; Adam. Here Adam updates all rows of the planes. The Rust bench updates those
+that were read, and also computes depth, opacity and distortion. Needs PyTorch.
 """
 
 import argparse
-import statistics
-import time
+
+from protocol import measure, options
 
 import torch
 import torch.nn.functional as F
@@ -82,7 +83,7 @@ class Field(torch.nn.Module):
     def forward(self, x, harmonics, delta):
         places = self.kind.places(x)
         density = sum(part.sum(1) for part in self.density(places))
-        sigma = F.softplus(density - 10).view(RAYS, SAMPLES)
+        sigma = 25 * F.softplus(density - 10).view(RAYS, SAMPLES)
         depth = sigma * delta
         weights = (1 - torch.exp(-depth)) * torch.exp(depth - depth.cumsum(1))
         features = self.basis(torch.cat(self.appearance(places), 1))
@@ -95,28 +96,22 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--look-up", choices=["embedding_bag", "grid_sample"], default="embedding_bag")
     parser.add_argument("--compile", action="store_true")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repeats", type=int, default=15)
-    args = parser.parse_args()
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(1)
+    args = options(parser)
     field = Field(Bags if args.look_up == "embedding_bag" else Grids)
-    forward = torch.compile(field) if args.compile else field
-    optimizer = torch.optim.Adam(field.parameters(), lr=1e-3, fused=True)
+    function = torch.compile(field) if args.compile else field
+    optimizer = torch.optim.Adam(field.parameters(), lr=1e-3, betas=(0.9, 0.99), fused=True)
     across = torch.rand(RAYS, 1, 2).expand(-1, SAMPLES, -1)
     along = ((torch.arange(SAMPLES) + 0.5) / SAMPLES).view(1, -1, 1).expand(RAYS, -1, -1)
     x = torch.cat([across, along], 2).reshape(-1, 3) * (SIDE - 1)
     harmonics = torch.randn(1, HARMONICS).expand(RAYS, -1)
-    times = []
-    for _ in range(args.repeats + 2):
-        start = time.perf_counter()
+    forward = lambda: function(x, harmonics, 2 / SAMPLES)
+
+    def step():
         optimizer.zero_grad(set_to_none=True)
-        forward(x, harmonics, 2 / SAMPLES).square().mean().backward()
+        forward().square().mean().backward()
         optimizer.step()
-        times.append(1e3 * (time.perf_counter() - start))
-    times = times[2:]
-    how = f"{args.look_up}{', compiled' if args.compile else ''}"
-    print(f"planes_step, PyTorch {torch.__version__}, {how}: median {statistics.median(times):.1f} ms, least {min(times):.1f} ms")
+
+    measure("planes_step", args, f"{args.look_up}{', compiled' if args.compile else ''}", forward, step)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 //! The protocol of every benchmark: warm up twice, repeat, report the median, as the scripts it is compared with do.
 //! One JSON line a row. Peak memory is the process's own high-water mark, so workloads that are compared by it run one to a process.
 
+use autograd::{Buffer, Tensor};
 use std::time::Instant;
 
 /// Runs a benchmark as the program runs its commands: on a thread of the pool, so that an op does not wake one up to begin with.
@@ -67,4 +68,10 @@ impl Arguments {
 /// Deterministic numbers in [0, 1).
 pub fn numbers(n: usize, seed: u64) -> Vec<f32> {
     (0..n as u64).map(|i| plenoxel::random::uniform(seed, plenoxel::random::Purpose::Initial, 0, i) as f32).collect()
+}
+
+/// A tensor of such numbers in a pooled buffer, like the tables of a model: on Linux its pages have 2 MB, those of a `Vec` 4 KB.
+#[allow(dead_code)] // `roofline` does not use it.
+pub fn tensor(shape: &[usize], seed: u64) -> Tensor<f32> {
+    Tensor::from_buffer(Buffer::copy_of(&numbers(shape.iter().product(), seed)), shape)
 }

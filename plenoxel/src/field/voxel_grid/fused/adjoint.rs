@@ -33,8 +33,7 @@ struct Records<T: Real> {
 }
 
 /// ∂L/∂density, then ∂L/∂rgb before multiplication with the harmonics of the ray. If rows have no harmonics, the latter is the contribution to the row
-/// of colors. The four numbers are together because consecutive samples are in different buckets: two arrays would cost two cache misses for each
-/// record.
+/// of colors.
 type Slopes<T> = [T; 4];
 
 #[derive(Debug)]
@@ -100,7 +99,7 @@ impl<T: Real> Gradients<T> {
         match batch.layout.shape.interpolation {
             Interpolation::Nearest => {
                 let one = |i: usize| [block.rows[i] >> BUCKET_SHIFT];
-                let mut rows = in_cache(block.len());
+                let mut rows = loaded(block.len());
                 let records = self.records(batch, block, buckets, block.len(), one, |place, i| rows[place] = block.rows[i]);
                 Records { at: At::Rows(rows), ..records }
             }
@@ -134,9 +133,9 @@ impl<T: Real> Gradients<T> {
         let live = (0..block.len()).filter(|&i| block.density[i] >= T::zero());
         let mut places = Buckets::count(buckets, live.flat_map(buckets_of));
         let clamped = batch.layout.shape.color != Color::Rgb;
-        let mut slopes = in_cache(4 * most);
+        let mut slopes = loaded(4 * most);
         let harmonic = batch.harmonics() > 0;
-        let mut ray = in_cache(if harmonic { most } else { 0 });
+        let mut ray = loaded(if harmonic { most } else { 0 });
         let to: &mut [Slopes<T>] = slopes.as_chunks_mut().0;
         let colors = block.color.as_chunks::<3>().0;
         for (r, own) in block.rays().enumerate() {
@@ -164,10 +163,16 @@ impl<T: Real> Gradients<T> {
     }
 }
 
-/// Returns a buffer of unspecified contents that is in the cache. Records are written in a random order, which would wait for each line of a buffer that is not.
-fn in_cache<E: Pooled>(len: usize) -> Buffer<E> {
+/// Size of the largest array that is read in order before records are written to it, in bytes: a part of a core's second-level cache.
+const LOADED: usize = 1 << 18;
+
+/// Returns a buffer of unspecified contents, after reading it in order if it is small. Records are written to many buckets in turn, and each write to a line
+/// outside of the cache would wait.
+fn loaded<E: Pooled>(len: usize) -> Buffer<E> {
     let buffer = Buffer::stale(len);
-    parallel::load(&buffer);
+    if size_of_val(&buffer[..]) <= LOADED {
+        parallel::load(&buffer);
+    }
     buffer
 }
 
