@@ -78,7 +78,7 @@ impl<T: Real> Block<T> {
 /// Number of rays whose samples are all placed before the first of these samples is looked up, with nearest look-up and if rays do not end early.
 const RAYS_TOGETHER: usize = 32;
 
-/// Smallest capacity of the arrays of a block, in samples. Capacities are multiples of it, so that the arrays of one block fit another.
+/// Smallest capacity of the arrays of a block, in samples. Capacities are powers of two, so that the arrays of one block fit another.
 const ROOM: usize = 32 * BLOCK;
 
 /// Inputs of rendering a batch.
@@ -144,11 +144,10 @@ impl<'a, T: Real> Scene<'a, T> {
     fn weights_of_whole_rays(&self, map: impl NodeMap, first: usize, count: usize) -> Block<T> {
         let mut block = Block { first, ..Block::empty() };
         let rays = &self.rays[first..first + count];
-        let marches: Vec<March> = (0..count).map(|r| self.march_of(rays, first, r)).collect();
         if self.cells.is_none() {
             // All samples of the marches are placed. The arrays get their size at once, because to grow is to copy. The last run needs room for a whole one.
-            let samples: usize = marches.iter().map(|march| march.count).sum();
-            block.make_room_for((samples + TOGETHER).next_multiple_of(ROOM), false);
+            let samples: usize = (0..count).map(|r| self.march_of(rays, first, r).count).sum();
+            block.make_room_for((samples + TOGETHER).max(ROOM).next_power_of_two(), false);
         }
         let mut sections = self.sections();
         let mut end = 0;
@@ -157,7 +156,7 @@ impl<'a, T: Real> Scene<'a, T> {
             let mut placed = end;
             let mut ends = [0; RAYS_TOGETHER];
             for r in together.clone() {
-                let mut places = self.samples_of(marches[r], rays, r, &mut sections);
+                let mut places = self.samples_of(rays, first, r, &mut sections);
                 loop {
                     if placed + TOGETHER > block.t.len() {
                         block.make_room(false);
@@ -197,7 +196,7 @@ impl<'a, T: Real> Scene<'a, T> {
         let rays = &self.rays[first..first + count];
         let mut sections = self.sections();
         for r in 0..count {
-            let mut places = self.samples_of(self.march_of(rays, first, r), rays, r, &mut sections);
+            let mut places = self.samples_of(rays, first, r, &mut sections);
             let mut left = T::one();
             // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
             while left >= stop {
@@ -249,8 +248,9 @@ impl<'a, T: Real> Scene<'a, T> {
         march(&rays[r], aabb, *spacing, jitter.of(first + r))
     }
 
-    /// Returns the samples of `rays[r]`, whose march is given.
-    fn samples_of(&self, march: March, rays: &'a [Ray], r: usize, sections: &mut Sections<'_>) -> Places<'a, T> {
+    /// Returns the samples of `rays[r]`; see [`march_of`](Self::march_of).
+    fn samples_of(&self, rays: &'a [Ray], first: usize, r: usize, sections: &mut Sections<'_>) -> Places<'a, T> {
+        let march = self.march_of(rays, first, r);
         let occupied = self.cells.map(|cells| march.occupied(&rays[r], cells).between(sections.of(rays, r)));
         Places::new(march, &rays[r], occupied, &self.batch.layout.shape)
     }
