@@ -4,7 +4,7 @@
 //!     cargo bench --bench ops
 //!     cargo bench --bench ops -- exp gather4 --repeats 21
 //!
-//! `hash_step` and `planes_step` are training steps; `benches/peers` has them in PyTorch, where Adam updates all rows of the tables, not only those that were read.
+//! `hash_step` and `planes_step` are training steps. `benches/peers` has them in PyTorch; there, Adam updates all rows of the tables, here those that were read.
 
 mod support;
 

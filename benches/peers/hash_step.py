@@ -3,7 +3,7 @@
     python benches/peers/hash_step.py [--eager] [--threads N] [--repeats N]
 
 16 levels of two features, 16 to 2048 nodes a side, 2^19 rows a level; the layers 32, 64, 16; 262 144 positions; mean square; Adam. Here Adam
-updates all rows of the table, the Rust bench those that were read, 98 % of the hashed ones. Rows and weights of corners are compiled by `torch.compile`
+updates all rows of the table. The Rust bench updates those that were read: 98 % of the hashed ones. Rows and weights of corners are compiled by `torch.compile`
 unless `--eager` is given. Needs PyTorch.
 """
 
