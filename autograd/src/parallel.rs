@@ -116,15 +116,15 @@ pub fn for_each_chunk<E: Send>(out: &mut [E], size: usize, f: impl Fn(usize, &mu
 // These call a function by reference: the compiler makes one copy of rayon's code for each type of elements, and not for each function.
 
 fn chunks_by<E: Send>(out: &mut [E], size: usize, f: &(dyn Fn(usize, &mut [E]) + Sync)) {
-    out.par_chunks_mut(size).enumerate().for_each(|(i, chunk)| f(i * size, chunk));
+    out.par_chunks_mut(size).with_max_len(1).enumerate().for_each(|(i, chunk)| f(i * size, chunk));
 }
 
 fn indices_by<R: Send>(n: usize, f: &(dyn Fn(usize) -> R + Sync)) -> Vec<R> {
-    (0..n).into_par_iter().map(f).collect()
+    (0..n).into_par_iter().with_max_len(1).map(f).collect()
 }
 
 fn items_by<I: Send, R: Send>(items: Vec<I>, f: &(dyn Fn(usize, I) -> R + Sync)) -> Vec<R> {
-    items.into_par_iter().enumerate().map(|(i, item)| f(i, item)).collect()
+    items.into_par_iter().with_max_len(1).enumerate().map(|(i, item)| f(i, item)).collect()
 }
 
 /// Calls `f(i)` for each i in `0..n`, in parallel, and collects the results in order.

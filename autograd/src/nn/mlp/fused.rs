@@ -45,20 +45,20 @@ impl<T: Real> Curve<T> {
     /// Adds the bias to each row and applies the function.
     fn apply(self, y: &mut [T], bias: &[T]) {
         match self {
-            Curve::Leaky(slope) => add_bias(y, bias, &|z: T| if z < T::zero() { slope * z } else { z + T::zero() }),
-            Curve::Softplus if parallel::fused() => add_bias(y, bias, &softplus::<T, true>),
-            Curve::Softplus => add_bias(y, bias, &softplus::<T, false>),
-            Curve::Tanh => add_bias(y, bias, &T::tanh_),
+            Curve::Leaky(slope) => add_bias(y, bias, move |z: T| if z < T::zero() { slope * z } else { z + T::zero() }),
+            Curve::Softplus if parallel::fused() => add_bias(y, bias, softplus::<T, true>),
+            Curve::Softplus => add_bias(y, bias, softplus::<T, false>),
+            Curve::Tanh => add_bias(y, bias, T::tanh_),
         }
     }
 
     /// Multiplies g by the derivative where the function has the value y.
     fn adjoint(self, g: &mut [T], y: &[T]) {
         match self {
-            Curve::Leaky(slope) => multiply_by(g, y, &|y: T| if y.is_sign_negative() { slope } else { T::one() }),
-            Curve::Softplus if parallel::fused() => multiply_by(g, y, &T::one_minus_exp_neg::<true>),
-            Curve::Softplus => multiply_by(g, y, &T::one_minus_exp_neg::<false>),
-            Curve::Tanh => multiply_by(g, y, &|y: T| T::one() - y * y),
+            Curve::Leaky(slope) => multiply_by(g, y, move |y: T| if y.is_sign_negative() { slope } else { T::one() }),
+            Curve::Softplus if parallel::fused() => multiply_by(g, y, T::one_minus_exp_neg::<true>),
+            Curve::Softplus => multiply_by(g, y, T::one_minus_exp_neg::<false>),
+            Curve::Tanh => multiply_by(g, y, |y: T| T::one() - y * y),
         }
     }
 }
@@ -148,7 +148,7 @@ impl<'a, T: Real> Network<'a, T> {
             hidden.push(y);
         }
         last.products(x, hidden.last().map_or(&[], |h| &h[..]), m, out);
-        add_bias(out, last.bias, &|z| z);
+        add_bias(out, last.bias, |z| z);
         hidden
     }
 
@@ -296,7 +296,7 @@ impl<T: Real> Kernel<T> for Fused<T> {
 
 dispatched! {
 /// Adds the bias to each row and applies a function.
-fn add_bias<T: Real, F: Fn(T) -> T>(y: &mut [T], bias: &[T], f: &F) {
+fn add_bias<T: Real, F: Fn(T) -> T>(y: &mut [T], bias: &[T], f: F) {
     for row in y.chunks_exact_mut(bias.len()) {
         for (y, &b) in row.iter_mut().zip(bias) {
             *y = f(*y + b);
@@ -306,7 +306,7 @@ fn add_bias<T: Real, F: Fn(T) -> T>(y: &mut [T], bias: &[T], f: &F) {
 }
 
 dispatched! {
-fn multiply_by<T: Real, F: Fn(T) -> T>(g: &mut [T], y: &[T], slope: &F) {
+fn multiply_by<T: Real, F: Fn(T) -> T>(g: &mut [T], y: &[T], slope: F) {
     for (g, &y) in g.iter_mut().zip(y) {
         *g *= slope(y);
     }
