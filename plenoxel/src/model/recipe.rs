@@ -100,14 +100,14 @@ pub trait Recipe: Send + Sync {
         false
     }
 
-    /// Returns the number of first steps that stay the same if later stages change. Default: 0.
-    fn steps_before_length_matters(&self) -> u64 {
+    /// Returns the number of first steps during which the stages to come may change; 0 if they may not. Default: 0.
+    fn adjusted_until(&self) -> u64 {
         0
     }
 
     /// Returns these settings, which are those of a plan for `asked`, with other stages to come: the steps after the first `taken` cost `left`, in units of
     /// [`with_cost`](Recipe::with_cost), or come as near as they can while the first `taken` steps stay the same. Called if
-    /// [`steps_before_length_matters`](Recipe::steps_before_length_matters) is not 0. Default: these settings.
+    /// [`adjusted_until`](Recipe::adjusted_until) is not 0. Default: these settings.
     fn with_left(&self, asked: &Self, model: &Self::Model, left: f64, taken: u64) -> Self
     where
         Self: Sized + Clone,

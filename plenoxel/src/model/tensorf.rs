@@ -10,6 +10,7 @@ mod recipe;
 mod total_variation;
 
 pub use super::stage::Stage;
+use config::CoolDown;
 pub use config::{Config, Short};
 
 use super::stage::MOST_NODES;
@@ -36,8 +37,8 @@ use autograd::{Module, Param, Real, Tensor, random::Stream};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering::Relaxed};
-use std::sync::{Arc, OnceLock};
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 
 /// Kind of this model in checkpoints.
 pub const KIND: &str = "tensorf";
@@ -46,8 +47,8 @@ pub const KIND: &str = "tensorf";
 #[derive(Debug)]
 pub struct Tensorf<T: Real> {
     config: Config,
-    /// Number of steps of the run. The learning rates of the current optimizer follow it when a plan changes.
-    total_steps: Arc<AtomicU64>,
+    /// Length of the run. The learning rates of the current optimizer follow it when a plan changes.
+    length: Arc<RwLock<Length>>,
     field: Factored<T>,
     space: Space,
     hull: Hull,
@@ -97,8 +98,8 @@ impl<T: Real> Tensorf<T> {
         field.gradient_above = config.gradient_above;
         // In normalized device coordinates, rays are parallel, and no denser near the camera.
         field.gradient_scaling = if matches!(space, Space::Ndc { .. }) { 0.0 } else { config.gradient_scaling };
-        let total_steps = Arc::new(AtomicU64::new(config.total_steps()));
-        Ok(Tensorf { config, total_steps, field, space, hull: Hull::Auto, engine: Engine::Fused })
+        let length = Arc::new(RwLock::new(Length::of(&config)));
+        Ok(Tensorf { config, length, field, space, hull: Hull::Auto, engine: Engine::Fused })
     }
 
     /// Sets the use of silhouettes. With [`Hull::Auto`], the default, only cells in the visual hull of the training views are sampled, if they have an alpha
@@ -126,7 +127,7 @@ impl<T: Real> Tensorf<T> {
     }
 
     fn set_config(&mut self, config: Config) {
-        self.total_steps.store(config.total_steps(), Relaxed);
+        *self.length.write().unwrap_or_else(PoisonError::into_inner) = Length::of(&config);
         self.config = config;
     }
 
@@ -199,15 +200,27 @@ impl<T: Real> Tensorf<T> {
     }
 }
 
-/// Learning rate that falls exponentially over a run of `total` steps, of which `first` came before, and in the last share `cool_down` of the run also linearly
-/// to 0; 0 for the first `frozen` steps of the run.
+/// What learning rates know of the length of a run.
+#[derive(Debug)]
+struct Length {
+    steps: u64,
+    cool_down: CoolDown,
+}
+
+impl Length {
+    fn of(config: &Config) -> Self {
+        Length { steps: config.total_steps(), cool_down: config.falling() }
+    }
+}
+
+/// Learning rate that falls exponentially over a run, of which `first` steps came before, and that also [cools down](CoolDown); 0 for the first `frozen` steps of
+/// the run.
 #[derive(Debug)]
 struct Falling {
     rate: f64,
     last: f64,
-    cool_down: f64,
     first: u64,
-    total: Arc<AtomicU64>,
+    length: Arc<RwLock<Length>>,
     frozen: u64,
 }
 
@@ -217,9 +230,8 @@ impl Schedule for Falling {
         if step < self.frozen {
             return 0.0;
         }
-        let done = step as f64 / self.total.load(Relaxed) as f64;
-        let left = if self.cool_down > 0.0 { ((1.0 - done) / self.cool_down).clamp(0.0, 1.0) } else { 1.0 };
-        left * self.rate * self.last.powf(done)
+        let length = self.length.read().unwrap_or_else(PoisonError::into_inner);
+        length.cool_down.at(step) * self.rate * self.last.powf(step as f64 / length.steps as f64)
     }
 }
 
@@ -262,14 +274,8 @@ impl<T: Real> Model<T> for Tensorf<T> {
 
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
         let config = &self.config;
-        let falling = |rate: f64, frozen: u64| Falling {
-            rate,
-            last: config.last_rate,
-            cool_down: config.cool_down,
-            first: stage.first,
-            total: self.total_steps.clone(),
-            frozen,
-        };
+        let falling =
+            |rate: f64, frozen: u64| Falling { rate, last: config.last_rate, first: stage.first, length: self.length.clone(), frozen };
         let mut rates = Rates::new(falling(config.factor_rate, 0));
         for name in self.field.network_names() {
             rates = rates.with(name, falling(config.network_rate, 0));

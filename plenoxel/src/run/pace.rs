@@ -109,7 +109,7 @@ fn plan_by<R: Recipe + Clone>(
     while trainer.steps_taken() < (from + 1).min(most) && measured_from < seconds {
         measured_from = step(&mut trainer)?;
     }
-    let measuring = if keep && recipe.steps_before_length_matters() > 0 { MEASURING_FIRST } else { MEASURING };
+    let measuring = if keep && recipe.adjusted_until() > 0 { MEASURING_FIRST } else { MEASURING };
     let enough = (measuring.0 * seconds).min(measuring.1);
     let (mut count, mut spent) = (0, measured_from);
     while trainer.steps_taken() < most && (count < 20 || spent - measured_from < enough) && (count == 0 || spent < seconds) {
@@ -144,9 +144,9 @@ fn plan_by<R: Recipe + Clone>(
 /// Estimates the seconds of the evaluation of a model.
 type Evaluation<M> = Box<dyn Fn(&M) -> f64>;
 
-/// Follows a planned run, and adjusts the stages to come so that it ends on time: after a third of the steps before the length of the run matters
-/// ([`Recipe::steps_before_length_matters`]), after half of the rest, and so on. The first steps of a run tell little: without silhouettes they have several
-/// times as many samples as later ones. A run that is resumed keeps the plan with which it was saved.
+/// Follows a planned run, and adjusts the stages to come so that it ends on time: after a fifth of the steps during which they may change
+/// ([`Recipe::adjusted_until`]), after a third of the rest, and so on. The first steps of a run tell little: without silhouettes they have several times as many
+/// samples as later ones. A run that is resumed keeps the plan with which it was saved.
 pub struct Pace<R: Recipe> {
     recipe: R,
     asked: R,
@@ -175,15 +175,15 @@ struct Mark {
 /// Fewest steps of a stage from which the speed is taken.
 const MEASURED: u64 = 10;
 
-/// Fewest steps from one adjustment to the next, as a share of the steps before the length of the run matters.
-const APART: f64 = 1.0 / 16.0;
+/// Fewest steps from one adjustment to the next, as a share of the steps during which the stages to come may change.
+const APART: f64 = 1.0 / 32.0;
 
 impl<R: Recipe + Clone> Pace<R> {
     /// Follows a run with the settings of a plan, which are those of `config` for its model, planned for `time`, in which `evaluation` is included. `asked` are
     /// the settings that were asked for ([`Planned::asked`]).
     pub fn new(recipe: R, asked: R, config: Config, time: TimeBudget, evaluation: Option<Evaluation<R::Model>>) -> Self {
-        let until = recipe.steps_before_length_matters();
-        let adjust_at = (until > 0).then_some(until / 3);
+        let until = recipe.adjusted_until();
+        let adjust_at = (until > 0).then_some(until / 5);
         Pace { recipe, asked, config, time, evaluation, adjust_at, measured_from: None, adjusted: None }
     }
 
@@ -199,7 +199,7 @@ impl<R: Recipe + Clone> Pace<R> {
         if taken < self.adjust_at? {
             return None;
         }
-        if taken > self.recipe.steps_before_length_matters() {
+        if taken > self.recipe.adjusted_until() {
             self.adjust_at = None;
             return None;
         }
@@ -217,9 +217,9 @@ impl<R: Recipe + Clone> Pace<R> {
         self.recipe = adjusted;
         self.measured_from = self.adjusted.filter(|last| last.stage == here.stage).or(self.measured_from);
         self.adjusted = Some(Mark { now, ..here });
-        let until = self.recipe.steps_before_length_matters();
+        let until = self.recipe.adjusted_until();
         let apart = (APART * until as f64).max(MEASURED as f64) as u64;
-        self.adjust_at = Some(taken.midpoint(until)).filter(|next| *next >= taken + apart);
+        self.adjust_at = Some(taken + until.saturating_sub(taken) / 3).filter(|next| *next >= taken + apart);
         self.recipe.clone().set(&mut self.config);
         Some(self.config.clone())
     }
@@ -327,21 +327,31 @@ mod tests {
     #[test]
     fn the_last_stage_is_adjusted_and_the_run_repeats_from_its_settings() {
         let with_cool_down = |cool_down: f64| tensorf::Config { short: None, cool_down, ..recipe(&[(8, 30), (8, 200)]) };
-        for (cool_down, of_a_step) in [(0.4, 0.2), (0.4, 0.5), (0.4, 1.0), (0.75, 0.2), (0.75, 0.3), (0.75, 10.0)] {
+        // From a step on, steps take longer or shorter: before the learning rates fall, and while they do.
+        for (cool_down, of_a_step, changes_at, factor) in [
+            (0.4, 0.2, 35.0, 1.1),
+            (0.4, 0.5, 35.0, 1.1),
+            (0.4, 1.0, 35.0, 1.1),
+            (0.75, 0.3, 35.0, 1.1),
+            (0.4, 0.4, 170.0, 1.3),
+            (0.4, 0.4, 170.0, 0.7),
+            (0.75, 10.0, 35.0, 1.1),
+        ] {
             let asked = with_cool_down(cool_down);
             let mut pace = Pace::new(asked.clone(), asked.clone(), Config::default(), TimeBudget::of_training(100.0), None);
             let (mut trainer, mut plans) = (trainer(&asked).unwrap(), Vec::new());
+            let seconds = |taken: f64| of_a_step * (taken + (factor - 1.0) * (taken - changes_at).max(0.0));
             while trainer.step().unwrap().is_some() {
-                // From the 35th step on, steps take a tenth longer.
-                let taken = trainer.steps_taken() as f64;
-                let now = of_a_step * (taken + 0.1 * (taken - 35.0).max(0.0));
+                let now = seconds(trainer.steps_taken() as f64);
                 plans.extend(pace.after_step(&mut trainer, now).and_then(|config| config.tensorf));
             }
-            assert!((1..5).contains(&plans.len()), "{cool_down}, {of_a_step}: {}", plans.len());
-            let took = of_a_step * (1.1 * trainer.steps_taken() as f64 - 3.5);
-            assert!((took - 100.0).abs() < 2.0 || of_a_step > 5.0, "{cool_down}, {of_a_step}: {took}");
-            let again = super::tests::trainer(plans.last().unwrap()).unwrap();
-            assert_eq!(trained(trainer), trained(again));
+            let case = (cool_down, of_a_step, changes_at, factor);
+            assert!((1..12).contains(&plans.len()), "{case:?}: {}", plans.len());
+            let took = seconds(trainer.steps_taken() as f64);
+            assert!((took - 100.0).abs() < 2.5 || of_a_step > 5.0, "{case:?}: {took}");
+            let last = plans.last().unwrap();
+            assert!(changes_at < 100.0 || !last.former_lengths.is_empty());
+            assert_eq!(trained(trainer), trained(super::tests::trainer(last).unwrap()));
         }
         // Rates that fall from the first step on know the whole length.
         let falling = tensorf::Config { last_rate: 0.1, ..with_cool_down(0.4) };

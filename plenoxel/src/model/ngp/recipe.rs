@@ -73,7 +73,7 @@ impl Recipe for Config {
         self == other || begin(self) == begin(other) && steps <= self.steps_at_full_rate().min(other.steps_at_full_rate())
     }
 
-    fn steps_before_length_matters(&self) -> u64 {
+    fn adjusted_until(&self) -> u64 {
         self.steps_at_full_rate()
     }
 

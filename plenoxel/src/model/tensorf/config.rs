@@ -73,6 +73,9 @@ pub struct Config {
     pub last_rate: f64,
     /// Share of the steps of the run, at its end, during which the learning rates also fall linearly to 0.
     pub cool_down: f64,
+    /// Numbers of steps for which the run was planned before a time budget changed them, each with the number of first steps that were taken with it. The
+    /// learning rates of those steps are those of a run of that length; from there, they fall to 0 at the next length.
+    pub former_lengths: Vec<[u64; 2]>,
     /// Weight of the L1 norm of the density factors, Σ over planes and lines of the mean absolute value, in the first stage.
     pub density_l1: f64,
     /// Weight of the L1 norm of the density factors in the other stages.
@@ -133,6 +136,7 @@ impl Default for Config {
             network_rate: 5e-3,
             last_rate: 1.0,
             cool_down: 0.4,
+            former_lengths: Vec::new(),
             density_l1: 8e-5,
             density_l1_later: 4e-5,
             density_tv: 0.0,
@@ -206,6 +210,14 @@ impl Config {
         for (key, rate) in [("factor_rate", self.factor_rate), ("network_rate", self.network_rate), ("last_rate", self.last_rate)] {
             check(rate > 0.0 && rate <= 1.0, key, rate, "a number in (0, 1]")?;
         }
+        if !self.former_lengths.iter().is_sorted_by(|a, b| a[1] < b[1]) || self.former_lengths.iter().any(|[steps, taken]| taken >= steps) {
+            let found = format!("{:?}", self.former_lengths);
+            return Err(Error::usage(
+                "former_lengths",
+                found,
+                "pairs of a number of steps and a smaller number, which increases from pair to pair",
+            ));
+        }
         for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
         }
@@ -268,11 +280,39 @@ impl Config {
         self.stages.iter().map(|stage| stage.steps).sum()
     }
 
-    /// Returns the number of first steps whose learning rates do not depend on the number of steps of the run.
-    pub(super) fn steps_at_full_rate(&self) -> u64 {
-        let constant = if self.last_rate == 1.0 { (1.0 - self.cool_down) * self.total_steps() as f64 } else { 0.0 };
-        // One less for rounding.
-        (constant as u64).saturating_sub(1)
+    /// Returns how the learning rates fall at the end of the run.
+    pub(super) fn falling(&self) -> CoolDown {
+        let present = [self.total_steps(), u64::MAX];
+        CoolDown { share: self.cool_down, lengths: self.former_lengths.iter().copied().chain([present]).collect() }
+    }
+}
+
+/// Factor of the learning rates that falls linearly to 0 at the end of a run.
+#[derive(Clone, Debug)]
+pub(super) struct CoolDown {
+    /// Share of the run during which it falls.
+    share: f64,
+    /// The [`former_lengths`](Config::former_lengths) and the length of the run.
+    lengths: Vec<[u64; 2]>,
+}
+
+impl CoolDown {
+    /// Returns the factor of a step.
+    pub fn at(&self, step: u64) -> f64 {
+        let (mut before, mut from) = (1.0, 0.0);
+        if self.share == 0.0 {
+            return before;
+        }
+        for &[total, until] in &self.lengths {
+            let total = total as f64;
+            let begin = ((1.0 - self.share) * total).max(from);
+            let factor = |step: u64| before * ((total - step as f64) / (total - begin)).clamp(0.0, 1.0);
+            if step < until {
+                return factor(step);
+            }
+            (before, from) = (factor(until), until as f64);
+        }
+        0.0
     }
 }
 
@@ -281,6 +321,23 @@ mod tests {
     use super::*;
     use crate::geometry::Aabb;
     use glam::dvec3;
+
+    #[test]
+    fn learning_rates_fall_to_0_from_where_they_were_when_the_length_changed() {
+        let stages = vec![Stage { resolution: 8, steps: 90, rays: 16 }];
+        let config = Config { cool_down: 0.4, former_lengths: vec![[80, 20], [100, 70]], stages, ..Config::default() };
+        let falling = config.falling();
+        let found = [0, 20, 48, 60, 65, 70, 80, 89].map(|step| falling.at(step));
+        let want = [1.0, 1.0, 1.0, 1.0, 0.875, 0.75, 0.375, 0.0375];
+        assert!(found.iter().zip(want).all(|(a, b): (&f64, f64)| (a - b).abs() < 1e-12), "{found:?}");
+        // A run that becomes so short that its rates should have fallen already.
+        let sudden = Config { former_lengths: vec![[1000, 80]], ..config.clone() }.falling();
+        assert_eq!([79, 80, 85, 90].map(|step| sudden.at(step)), [1.0, 1.0, 0.5, 0.0]);
+        assert_eq!(Config { cool_down: 0.0, ..config.clone() }.falling().at(89), 1.0);
+        for lengths in [vec![[80, 20], [90, 20]], vec![[80, 80]]] {
+            assert!(Config { former_lengths: lengths, ..config.clone() }.validate().unwrap_err().to_string().contains("former_lengths"));
+        }
+    }
 
     #[test]
     fn cells_are_longer_along_the_depth_of_normalized_device_coordinates_only() {

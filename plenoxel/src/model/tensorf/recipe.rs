@@ -95,7 +95,7 @@ impl Recipe for Config {
     }
 
     fn begins_as(&self, other: &Self, steps: u64) -> bool {
-        let without_stages = |config: &Config| Config { stages: Vec::new(), ..config.clone() };
+        let without_stages = |config: &Config| Config { stages: Vec::new(), former_lengths: Vec::new(), ..config.clone() };
         // The stages up to the last of these steps; of that one, the length does not matter.
         let stages = |config: &Config| {
             let mut first = 0;
@@ -106,12 +106,16 @@ impl Recipe for Config {
             });
             begun.take_while(|stage| stage.steps > 0).collect::<Vec<Stage>>()
         };
-        let same_rates = self.total_steps() == other.total_steps() || steps <= self.steps_at_full_rate().min(other.steps_at_full_rate());
+        let [own, others] = [self, other].map(Config::falling);
+        let same_length = self.total_steps() == other.total_steps();
+        let same_rates = (self.last_rate == 1.0 || same_length) && (0..steps).all(|step| own.at(step) == others.at(step));
         without_stages(self) == without_stages(other) && stages(self) == stages(other) && same_rates
     }
 
-    fn steps_before_length_matters(&self) -> u64 {
-        self.steps_at_full_rate()
+    fn adjusted_until(&self) -> u64 {
+        // The last adjustment leaves steps for the rates to fall in. Rates that fall exponentially know the whole length.
+        const SHARE: f64 = 0.95;
+        if self.last_rate == 1.0 { (SHARE * self.total_steps() as f64) as u64 } else { 0 }
     }
 
     fn with_left(&self, asked: &Self, model: &Tensorf<f32>, left: f64, taken: u64) -> Self {
@@ -134,11 +138,13 @@ impl Recipe for Config {
         if let Some((last, earlier)) = stages.split_last_mut() {
             let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
             let steps = (spent + left - costs.total(earlier)) / costs.step(last);
-            // The learning rates fall after the steps that were taken.
-            let least = ((taken + 2) as f64 / (1.0 - self.cool_down)).ceil() as u64;
-            last.steps = (steps.round().max(1.0) as u64).max(least.saturating_sub(before));
+            last.steps = (steps.round().max(1.0) as u64).max((taken + 2).saturating_sub(before));
         }
-        Config { stages, ..self.clone() }
+        let mut adjusted = Config { stages, ..self.clone() };
+        if !adjusted.begins_as(self, taken) {
+            adjusted.former_lengths.push([self.total_steps(), taken]);
+        }
+        adjusted
     }
 
     fn change(self, model: &mut Tensorf<f32>) {
@@ -172,7 +178,7 @@ impl Config {
     /// Returns these settings with the changes for a short run, or without any.
     fn shortened(&self, short: Option<Short>) -> Self {
         let (hidden, group) = short.map_or((self.hidden, self.group), |short| (short.hidden, short.group));
-        Config { hidden, group, short: None, ..self.clone() }
+        Config { hidden, group, short: None, former_lengths: Vec::new(), ..self.clone() }
     }
 }
 
@@ -318,7 +324,11 @@ mod tests {
         // In the last stage, only its length changes, and no step that was taken.
         let late = slow.with_left(&asked, &model, 0.0, slow.total_steps() - 50);
         assert_eq!((&late.stages[..4], late.stages[4].resolution), (&slow.stages[..4], slow.stages[4].resolution));
-        assert!(late.steps_at_full_rate() > slow.total_steps() - 50);
+        assert_eq!(
+            (late.total_steps(), &late.former_lengths[..]),
+            (slow.total_steps() - 48, &[[slow.total_steps(), slow.total_steps() - 50]][..])
+        );
+        assert!(late.begins_as(&slow, slow.total_steps() - 50) && !late.begins_as(&slow, slow.total_steps() - 48));
         // A slower machine does not make the planes coarser.
         let slower = slow.with_left(&asked, &model, 1.0, taken + slow.stages[1].steps + slow.stages[2].steps);
         assert!(slower.stages.is_sorted_by_key(|stage| stage.resolution));
