@@ -115,16 +115,25 @@ pub fn for_each_chunk<E: Send>(out: &mut [E], size: usize, f: impl Fn(usize, &mu
 
 // These call a function by reference: the compiler makes one copy of rayon's code for each type of elements, and not for each function.
 
+// A part has one item, or one of 4096 parts of many. Without a bound, two threads get four parts, and one of them waits at the end.
+
+/// Returns the largest number of items in a part.
+fn part_of(items: usize) -> usize {
+    (items / 4096).max(1)
+}
+
 fn chunks_by<E: Send>(out: &mut [E], size: usize, f: &(dyn Fn(usize, &mut [E]) + Sync)) {
-    out.par_chunks_mut(size).with_max_len(1).enumerate().for_each(|(i, chunk)| f(i * size, chunk));
+    let part = part_of(out.len() / size);
+    out.par_chunks_mut(size).with_max_len(part).enumerate().for_each(|(i, chunk)| f(i * size, chunk));
 }
 
 fn indices_by<R: Send>(n: usize, f: &(dyn Fn(usize) -> R + Sync)) -> Vec<R> {
-    (0..n).into_par_iter().with_max_len(1).map(f).collect()
+    (0..n).into_par_iter().with_max_len(part_of(n)).map(f).collect()
 }
 
 fn items_by<I: Send, R: Send>(items: Vec<I>, f: &(dyn Fn(usize, I) -> R + Sync)) -> Vec<R> {
-    items.into_par_iter().with_max_len(1).enumerate().map(|(i, item)| f(i, item)).collect()
+    let part = part_of(items.len());
+    items.into_par_iter().with_max_len(part).enumerate().map(|(i, item)| f(i, item)).collect()
 }
 
 /// Calls `f(i)` for each i in `0..n`, in parallel, and collects the results in order.

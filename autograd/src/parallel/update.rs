@@ -40,7 +40,7 @@ fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
     let groups = RowGroups::new(x[0].len() / width.max(1), bucket_rows);
     let mut parts = x.map(|x| x.chunks_mut((groups.rows_per_group() * width).max(1)));
     let mut parts: Vec<[&mut [T]; N]> = (0..groups.count).map(|_| parts.each_mut().map(|parts| parts.next().unwrap_or_default())).collect();
-    // The last bucket of a hash grid has the most work, and the work that begins first should.
+    // The last bucket of a hash grid has the most work, so it begins first.
     parts.reverse();
     for_each_item(parts, |reversed, mut x| {
         let group = groups.count - 1 - reversed;

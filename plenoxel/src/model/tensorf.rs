@@ -47,8 +47,8 @@ pub const KIND: &str = "tensorf";
 #[derive(Debug)]
 pub struct Tensorf<T: Real> {
     config: Config,
-    /// Length of the run. The learning rates of the current optimizer follow it when a plan changes.
-    length: Arc<RwLock<Length>>,
+    /// The learning rates of the current optimizer follow it when a plan changes.
+    cooling: Arc<RwLock<CoolDown>>,
     field: Factored<T>,
     space: Space,
     hull: Hull,
@@ -98,8 +98,8 @@ impl<T: Real> Tensorf<T> {
         field.gradient_above = config.gradient_above;
         // In normalized device coordinates, rays are parallel, and no denser near the camera.
         field.gradient_scaling = if matches!(space, Space::Ndc { .. }) { 0.0 } else { config.gradient_scaling };
-        let length = Arc::new(RwLock::new(Length::of(&config)));
-        Ok(Tensorf { config, length, field, space, hull: Hull::Auto, engine: Engine::Fused })
+        let cooling = Arc::new(RwLock::new(config.cooling()));
+        Ok(Tensorf { config, cooling, field, space, hull: Hull::Auto, engine: Engine::Fused })
     }
 
     /// Sets the use of silhouettes. With [`Hull::Auto`], the default, only cells in the visual hull of the training views are sampled, if they have an alpha
@@ -114,8 +114,11 @@ impl<T: Real> Tensorf<T> {
     pub fn open(path: &Path) -> Result<(Self, About)> {
         let config: Config = TensorFile::open(path)?.fact("settings")?;
         // Box, nodes and values are in the file.
-        let mut model =
-            Tensorf::new(Config { stages: config.stages.iter().copied().take(1).collect(), ..config.clone() }, Aabb::cube(1.0), 0)?;
+        let mut model = Tensorf::new(
+            Config { stages: config.stages.iter().copied().take(1).collect(), former_lengths: Vec::new(), ..config.clone() },
+            Aabb::cube(1.0),
+            0,
+        )?;
         model.set_config(config);
         let about = model.load(path)?;
         Ok((model, about))
@@ -127,7 +130,7 @@ impl<T: Real> Tensorf<T> {
     }
 
     fn set_config(&mut self, config: Config) {
-        *self.length.write().unwrap_or_else(PoisonError::into_inner) = Length::of(&config);
+        *self.cooling.write().unwrap_or_else(PoisonError::into_inner) = config.cooling();
         self.config = config;
     }
 
@@ -200,19 +203,6 @@ impl<T: Real> Tensorf<T> {
     }
 }
 
-/// What learning rates know of the length of a run.
-#[derive(Debug)]
-struct Length {
-    steps: u64,
-    cool_down: CoolDown,
-}
-
-impl Length {
-    fn of(config: &Config) -> Self {
-        Length { steps: config.total_steps(), cool_down: config.falling() }
-    }
-}
-
 /// Learning rate that falls exponentially over a run, of which `first` steps came before, and that also [cools down](CoolDown); 0 for the first `frozen` steps of
 /// the run.
 #[derive(Debug)]
@@ -220,7 +210,7 @@ struct Falling {
     rate: f64,
     last: f64,
     first: u64,
-    length: Arc<RwLock<Length>>,
+    cooling: Arc<RwLock<CoolDown>>,
     frozen: u64,
 }
 
@@ -230,8 +220,8 @@ impl Schedule for Falling {
         if step < self.frozen {
             return 0.0;
         }
-        let length = self.length.read().unwrap_or_else(PoisonError::into_inner);
-        length.cool_down.at(step) * self.rate * self.last.powf(step as f64 / length.steps as f64)
+        let cooling = self.cooling.read().unwrap_or_else(PoisonError::into_inner);
+        cooling.at(step) * self.rate * self.last.powf(step as f64 / cooling.steps() as f64)
     }
 }
 
@@ -275,7 +265,7 @@ impl<T: Real> Model<T> for Tensorf<T> {
     fn optimizer(&self, stage: &PlannedStage) -> Box<dyn Optimizer<T>> {
         let config = &self.config;
         let falling =
-            |rate: f64, frozen: u64| Falling { rate, last: config.last_rate, first: stage.first, length: self.length.clone(), frozen };
+            |rate: f64, frozen: u64| Falling { rate, last: config.last_rate, first: stage.first, cooling: self.cooling.clone(), frozen };
         let mut rates = Rates::new(falling(config.factor_rate, 0));
         for name in self.field.network_names() {
             rates = rates.with(name, falling(config.network_rate, 0));

@@ -73,8 +73,10 @@ pub struct Config {
     pub last_rate: f64,
     /// Share of the steps of the run, at its end, during which the learning rates also fall linearly to 0.
     pub cool_down: f64,
-    /// Numbers of steps for which the run was planned before a time budget changed them, each with the number of first steps that were taken with it. The
-    /// learning rates of those steps are those of a run of that length; from there, they fall to 0 at the next length.
+    /// Pairs of a number of steps for which the run was planned, and of the steps that were taken when a time budget changed it. From there, the learning rates go on
+    /// from the value that they had: they stay until the last share [`cool_down`](Config::cool_down) of the next length, then fall linearly to 0. Without such
+    /// pairs, the run had its length from the beginning.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub former_lengths: Vec<[u64; 2]>,
     /// Weight of the L1 norm of the density factors, Σ over planes and lines of the mean absolute value, in the first stage.
     pub density_l1: f64,
@@ -210,13 +212,10 @@ impl Config {
         for (key, rate) in [("factor_rate", self.factor_rate), ("network_rate", self.network_rate), ("last_rate", self.last_rate)] {
             check(rate > 0.0 && rate <= 1.0, key, rate, "a number in (0, 1]")?;
         }
-        if !self.former_lengths.iter().is_sorted_by(|a, b| a[1] < b[1]) || self.former_lengths.iter().any(|[steps, taken]| taken >= steps) {
-            let found = format!("{:?}", self.former_lengths);
-            return Err(Error::usage(
-                "former_lengths",
-                found,
-                "pairs of a number of steps and a smaller number, which increases from pair to pair",
-            ));
+        let taken_before_the_end = |[steps, taken]: &[u64; 2]| taken < steps && *taken < self.total_steps();
+        if !self.former_lengths.iter().all(taken_before_the_end) || !self.former_lengths.is_sorted_by(|a, b| a[1] < b[1]) {
+            let expected = "pairs [steps, taken] with increasing taken, below steps and the number of steps of all stages; remove it if you change the stages";
+            return Err(Error::config("former_lengths", format!("{:?}", self.former_lengths), expected));
         }
         for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
             check((0.0..=1.0).contains(&weight), key, weight, "a number in [0, 1]")?;
@@ -280,15 +279,15 @@ impl Config {
         self.stages.iter().map(|stage| stage.steps).sum()
     }
 
-    /// Returns how the learning rates fall at the end of the run.
-    pub(super) fn falling(&self) -> CoolDown {
+    /// Returns how the learning rates fall linearly at the end of the run.
+    pub(super) fn cooling(&self) -> CoolDown {
         let present = [self.total_steps(), u64::MAX];
         CoolDown { share: self.cool_down, lengths: self.former_lengths.iter().copied().chain([present]).collect() }
     }
 }
 
 /// Factor of the learning rates that falls linearly to 0 at the end of a run.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct CoolDown {
     /// Share of the run during which it falls.
     share: f64,
@@ -297,6 +296,11 @@ pub(super) struct CoolDown {
 }
 
 impl CoolDown {
+    /// Returns the number of steps of the run.
+    pub fn steps(&self) -> u64 {
+        self.lengths.last().map_or(0, |[steps, _]| *steps)
+    }
+
     /// Returns the factor of a step.
     pub fn at(&self, step: u64) -> f64 {
         let (mut before, mut from) = (1.0, 0.0);
@@ -326,15 +330,15 @@ mod tests {
     fn learning_rates_fall_to_0_from_where_they_were_when_the_length_changed() {
         let stages = vec![Stage { resolution: 8, steps: 90, rays: 16 }];
         let config = Config { cool_down: 0.4, former_lengths: vec![[80, 20], [100, 70]], stages, ..Config::default() };
-        let falling = config.falling();
-        let found = [0, 20, 48, 60, 65, 70, 80, 89].map(|step| falling.at(step));
+        let cooling = config.cooling();
+        let found = [0, 20, 48, 60, 65, 70, 80, 89].map(|step| cooling.at(step));
         let want = [1.0, 1.0, 1.0, 1.0, 0.875, 0.75, 0.375, 0.0375];
         assert!(found.iter().zip(want).all(|(a, b): (&f64, f64)| (a - b).abs() < 1e-12), "{found:?}");
         // A run that becomes so short that its rates should have fallen already.
-        let sudden = Config { former_lengths: vec![[1000, 80]], ..config.clone() }.falling();
+        let sudden = Config { former_lengths: vec![[1000, 80]], ..config.clone() }.cooling();
         assert_eq!([79, 80, 85, 90].map(|step| sudden.at(step)), [1.0, 1.0, 0.5, 0.0]);
-        assert_eq!(Config { cool_down: 0.0, ..config.clone() }.falling().at(89), 1.0);
-        for lengths in [vec![[80, 20], [90, 20]], vec![[80, 80]]] {
+        assert_eq!(Config { cool_down: 0.0, ..config.clone() }.cooling().at(89), 1.0);
+        for lengths in [vec![[80, 20], [90, 20]], vec![[80, 80]], vec![[200, 90]]] {
             assert!(Config { former_lengths: lengths, ..config.clone() }.validate().unwrap_err().to_string().contains("former_lengths"));
         }
     }

@@ -106,14 +106,14 @@ impl Recipe for Config {
             });
             begun.take_while(|stage| stage.steps > 0).collect::<Vec<Stage>>()
         };
-        let [own, others] = [self, other].map(Config::falling);
-        let same_length = self.total_steps() == other.total_steps();
-        let same_rates = (self.last_rate == 1.0 || same_length) && (0..steps).all(|step| own.at(step) == others.at(step));
-        without_stages(self) == without_stages(other) && stages(self) == stages(other) && same_rates
+        let [own, others] = [self, other].map(Config::cooling);
+        let all = own.steps().max(others.steps());
+        let same_rates = || self.last_rate == 1.0 && (0..steps.min(all)).all(|step| own.at(step) == others.at(step));
+        without_stages(self) == without_stages(other) && stages(self) == stages(other) && (own == others || same_rates())
     }
 
     fn adjusted_until(&self) -> u64 {
-        // The last adjustment leaves steps for the rates to fall in. Rates that fall exponentially know the whole length.
+        // Rates that fall exponentially know the whole length.
         const SHARE: f64 = 0.95;
         if self.last_rate == 1.0 { (SHARE * self.total_steps() as f64) as u64 } else { 0 }
     }
@@ -138,7 +138,9 @@ impl Recipe for Config {
         if let Some((last, earlier)) = stages.split_last_mut() {
             let before: u64 = earlier.iter().map(|stage| stage.steps).sum();
             let steps = (spent + left - costs.total(earlier)) / costs.step(last);
-            last.steps = (steps.round().max(1.0) as u64).max((taken + 2).saturating_sub(before));
+            // Some steps for the rates to fall in, even if the time is over.
+            let least = taken + (self.total_steps() / 20).max(2);
+            last.steps = (steps.round().max(1.0) as u64).max(least.saturating_sub(before));
         }
         let mut adjusted = Config { stages, ..self.clone() };
         if !adjusted.begins_as(self, taken) {
@@ -324,11 +326,9 @@ mod tests {
         // In the last stage, only its length changes, and no step that was taken.
         let late = slow.with_left(&asked, &model, 0.0, slow.total_steps() - 50);
         assert_eq!((&late.stages[..4], late.stages[4].resolution), (&slow.stages[..4], slow.stages[4].resolution));
-        assert_eq!(
-            (late.total_steps(), &late.former_lengths[..]),
-            (slow.total_steps() - 48, &[[slow.total_steps(), slow.total_steps() - 50]][..])
-        );
-        assert!(late.begins_as(&slow, slow.total_steps() - 50) && !late.begins_as(&slow, slow.total_steps() - 48));
+        let whole = slow.total_steps();
+        assert_eq!((late.total_steps(), &late.former_lengths[..]), (whole - 50 + whole / 20, &[[whole, whole - 50]][..]));
+        assert!(late.begins_as(&slow, whole - 50) && !late.begins_as(&slow, whole - 48));
         // A slower machine does not make the planes coarser.
         let slower = slow.with_left(&asked, &model, 1.0, taken + slow.stages[1].steps + slow.stages[2].steps);
         assert!(slower.stages.is_sorted_by_key(|stage| stage.resolution));

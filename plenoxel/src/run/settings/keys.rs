@@ -104,8 +104,11 @@ const FIXED: &[(&str, &[&str])] = &[
 static TABLES: LazyLock<Vec<(&str, Vec<String>)>> = LazyLock::new(|| {
     let fixed = FIXED.iter().map(|(table, keys)| (*table, keys.iter().map(|key| (*key).to_owned()).collect()));
     let of_models = [
-        // The defaults lack `short`. `opaque_steps` is `frozen_steps` in the files of earlier runs.
-        (tensorf::KIND, [keys_of(&tensorf::Config::default()), ["short", "opaque_steps"].map(str::to_owned).to_vec()].concat()),
+        // The defaults lack `short` and `former_lengths`. `opaque_steps` is `frozen_steps` in the files of earlier runs.
+        (
+            tensorf::KIND,
+            [keys_of(&tensorf::Config::default()), ["short", "former_lengths", "opaque_steps"].map(str::to_owned).to_vec()].concat(),
+        ),
         (dvgo::KIND, keys_of(&dvgo::Config::default())),
         // The defaults lack `near_far`.
         (nerf::KIND, keys_of(&nerf::Config::authors())),
