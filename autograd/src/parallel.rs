@@ -113,14 +113,13 @@ pub fn for_each_chunk<E: Send>(out: &mut [E], size: usize, f: impl Fn(usize, &mu
     chunks_by(out, size, &f);
 }
 
-// These call a function by reference: the compiler makes one copy of rayon's code for each type of elements, and not for each function.
-
-// A part has one item, or one of 4096 parts of many. Without a bound, two threads get four parts, and one of them waits at the end.
-
-/// Returns the largest number of items in a part.
+/// Returns the largest number of consecutive items that one thread processes without a break. Without a limit, rayon makes few large parts, and threads wait for
+/// the last of them: two threads get four parts.
 fn part_of(items: usize) -> usize {
     (items / 4096).max(1)
 }
+
+// These call a function by reference: the compiler makes one copy of rayon's code for each type of elements, and not for each function.
 
 fn chunks_by<E: Send>(out: &mut [E], size: usize, f: &(dyn Fn(usize, &mut [E]) + Sync)) {
     let part = part_of(out.len() / size);

@@ -39,11 +39,11 @@ fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
     let bucket_rows = 1usize << rows.bucket_shift();
     let groups = RowGroups::new(x[0].len() / width.max(1), bucket_rows);
     let mut parts = x.map(|x| x.chunks_mut((groups.rows_per_group() * width).max(1)));
-    let mut parts: Vec<[&mut [T]; N]> = (0..groups.count).map(|_| parts.each_mut().map(|parts| parts.next().unwrap_or_default())).collect();
-    // The last bucket of a hash grid has the most work, so it begins first.
+    let mut parts: Vec<(usize, [&mut [T]; N])> =
+        (0..groups.count).map(|group| (group, parts.each_mut().map(|parts| parts.next().unwrap_or_default()))).collect();
+    // The last bucket of a hash grid takes the longest, so it begins first.
     parts.reverse();
-    for_each_item(parts, |reversed, mut x| {
-        let group = groups.count - 1 - reversed;
+    for_each_item(parts, |_, (group, mut x)| {
         let first = group * groups.rows_per_group();
         groups.for_each_bucket(group, width, rows, |bucket, sums, touched| {
             let start = (bucket * bucket_rows - first) * width;

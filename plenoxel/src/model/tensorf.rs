@@ -47,7 +47,7 @@ pub const KIND: &str = "tensorf";
 #[derive(Debug)]
 pub struct Tensorf<T: Real> {
     config: Config,
-    /// The learning rates of the current optimizer follow it when a plan changes.
+    /// Cool-down of the learning rates. The current optimizer shares it, so its rates follow a changed plan.
     cooling: Arc<RwLock<CoolDown>>,
     field: Factored<T>,
     space: Space,

@@ -73,9 +73,9 @@ pub struct Config {
     pub last_rate: f64,
     /// Share of the steps of the run, at its end, during which the learning rates also fall linearly to 0.
     pub cool_down: f64,
-    /// Pairs of a number of steps for which the run was planned, and of the steps that were taken when a time budget changed it. From there, the learning rates go on
-    /// from the value that they had: they stay until the last share [`cool_down`](Config::cool_down) of the next length, then fall linearly to 0. Without such
-    /// pairs, the run had its length from the beginning.
+    /// Earlier lengths of a run with a time budget, as pairs `[steps, taken]`: the run was planned for `steps` steps, and this changed after `taken` steps. The learning
+    /// rates continue from their value at that step. They fall linearly to 0 in the last share [`cool_down`](Config::cool_down) of the next length, of which
+    /// only the steps after `taken` count. Empty if the length never changed.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub former_lengths: Vec<[u64; 2]>,
     /// Weight of the L1 norm of the density factors, Σ over planes and lines of the mean absolute value, in the first stage.
@@ -214,7 +214,7 @@ impl Config {
         }
         let taken_before_the_end = |[steps, taken]: &[u64; 2]| taken < steps && *taken < self.total_steps();
         if !self.former_lengths.iter().all(taken_before_the_end) || !self.former_lengths.is_sorted_by(|a, b| a[1] < b[1]) {
-            let expected = "pairs [steps, taken] with increasing taken, below steps and the number of steps of all stages; remove it if you change the stages";
+            let expected = "pairs [steps, taken] in the order of taken, which is less than steps and less than the steps of all stages; remove this key if you change the stages";
             return Err(Error::config("former_lengths", format!("{:?}", self.former_lengths), expected));
         }
         for (key, weight) in [("density_l1", self.density_l1), ("density_l1_later", self.density_l1_later)] {
