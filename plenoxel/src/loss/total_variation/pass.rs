@@ -9,7 +9,7 @@
 //! selects between both.
 
 use super::{EPSILON, Run};
-use autograd::lattice::{BRICK, Neighbours, STRIDE, has};
+use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, STRIDE, has};
 use autograd::{Buffer, Real, dispatched, parallel};
 use std::hint::select_unpredictable;
 
@@ -153,13 +153,20 @@ fn differences<T: Real, const W: usize, const N: usize, const S: usize>(
         let next_y = select_unpredictable(l < S - N, y_near, y_beyond);
         let next_z = select_unpredictable(Ends::<W, N, S>::LAST[l], z_beyond, z_near);
         let (dx, dy, dz) = (next_x[l] - v[l], next_y - v[l], next_z - v[l]);
-        let square = dx * dx + dy * dy + dz * dz + T::lit(EPSILON);
-        let inverse_root = has_cell[l] * square.inverse_sqrt();
+        let (square, inverse_root) = inverse_root(dx, dy, dz);
+        let inverse_root = has_cell[l] * inverse_root;
         roots[l] += square * inverse_root;
         to_x[l] = dx * inverse_root;
         to_y[l] = dy * inverse_root;
         to_z[l] = dz * inverse_root;
     }
+}
+
+/// Returns r² = dx² + dy² + dz² + ε, and 1 / r.
+#[inline(always)]
+fn inverse_root<T: Real>(dx: T, dy: T, dz: T) -> (T, T) {
+    let square = dx * dx + dy * dy + dz * dz + T::lit(EPSILON);
+    (square, square.inverse_sqrt())
 }
 
 /// Masks of the first and the last node of each line of a slab.
@@ -180,29 +187,30 @@ impl<const W: usize, const N: usize, const S: usize> Ends<W, N, S> {
     }
 }
 
-/// Prefetches a brick, and the parts of the bricks ahead that are read with it. Along z, that is the whole brick: the nodes that are read are in all or most of
+/// Prefetches slab x of a brick, and what is read with it of the bricks ahead. Along z, that is the whole slab: the nodes that are read are in all or most of
 /// its cache lines.
 #[inline(always)]
-fn prefetch_brick<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize) {
-    parallel::prefetch(&table[brick * BRICK..][..BRICK]);
+fn prefetch_slab<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], brick: usize, x: usize) {
+    parallel::prefetch(&table[brick * BRICK + x]);
     let [ahead_x, ahead_y, ahead_z] = bricks[brick].ahead;
-    if let Some(ahead) = ahead_x {
+    if x == 0
+        && let Some(ahead) = ahead_x
+    {
         parallel::prefetch(&table[ahead as usize * BRICK]);
     }
     if let Some(ahead) = ahead_y {
-        for x in 0..BRICK {
-            parallel::prefetch(&table[ahead as usize * BRICK + x][..N]);
-        }
+        parallel::prefetch(&table[ahead as usize * BRICK + x][..N]);
     }
     if let Some(ahead) = ahead_z {
-        parallel::prefetch(&table[ahead as usize * BRICK..][..BRICK]);
+        parallel::prefetch(&table[ahead as usize * BRICK + x]);
     }
 }
 
 /// Largest size of a brick that is prefetched, in bytes. Larger ones are left to the hardware.
 const PREFETCHED: usize = 4096;
-/// Number of bricks between the one that is read and the one that is prefetched.
-const PREFETCH_AHEAD: usize = 6;
+/// Number of bricks between the one that is read and the one that is prefetched. The latter is prefetched slab by slab: a core waits for about 24 cache
+/// lines at most, and a brick, with its gradient, has more.
+const PREFETCH_AHEAD: usize = 2;
 
 /// Computes the gradient of a slab from what its nodes get and give.
 #[inline(always)]
@@ -229,25 +237,40 @@ fn place_of(before: &[u32], behind: u32) -> Option<usize> {
 }
 
 dispatched! {
-/// Computes what leaves a brick of another task along an axis.
-fn leaving_along<T: Real, const W: usize, const N: usize, const S: usize>(
-    table: &[[T; S]],
-    bricks: &[Neighbours],
-    run: Run,
-    brick: usize,
-    axis: usize,
-    scratch: &mut Contributions<T, N, S>,
-) -> [T; S] {
+/// Computes what leaves a brick of another task along an axis: the contributions of the 16 cells of its last layer.
+#[allow(clippy::needless_range_loop)] // Several arrays have the same index.
+fn leaving_along<T: Real, const W: usize, const S: usize>(table: &[[T; S]], bricks: &[Neighbours], run: Run, brick: usize, axis: usize) -> [T; S] {
+    let mut leaving = [T::zero(); S];
     if !run.contains(brick) {
-        return [T::zero(); S];
+        return leaving;
     }
-    let ones = [T::one(); S];
-    for x in if axis == 0 { BRICK - 1 } else { 0 }..BRICK {
-        scratch.compute::<W>(table, bricks, brick, x, &ones, &mut [T::zero(); S]);
+    let rows = table.as_flattened().as_chunks::<W>().0;
+    let Neighbours { cells, ahead, .. } = &bricks[brick];
+    let [b, c] = [[1, 2], [0, 2], [0, 1]][axis];
+    // Differences to the nodes ahead along each axis. They stay 0 where there is no cell, which then contributes 0.
+    let mut d = [[T::zero(); S]; 3];
+    for k in 0..BRICK * BRICK {
+        let local = (BRICK - 1) * STRIDE[axis] + k / BRICK * STRIDE[b] + k % BRICK * STRIDE[c];
+        if !has(*cells, local) {
+            continue;
+        }
+        let v = &rows[brick * BRICK_ROWS + local];
+        for a in 0..3 {
+            let next = match ahead[a] {
+                Some(ahead) if local / STRIDE[a] % BRICK == BRICK - 1 => ahead as usize * BRICK_ROWS + local - (BRICK - 1) * STRIDE[a],
+                _ => brick * BRICK_ROWS + local + STRIDE[a],
+            };
+            let (next, d) = (&rows[next], &mut d[a][k * W..][..W]);
+            for l in 0..W {
+                d[l] = next[l] - v[l];
+            }
+        }
     }
-    let mut leaving = [[T::zero(); S]; 3];
-    scratch.store_leaving::<W>(&mut leaving);
-    leaving[axis]
+    let [dx, dy, dz] = &d;
+    for l in 0..S {
+        leaving[l] = d[axis][l] * inverse_root(dx[l], dy[l], dz[l]).1;
+    }
+    leaving
 }
 }
 
@@ -266,16 +289,9 @@ pub(super) fn value_and_gradient<T: Real, const W: usize, const N: usize, const 
     let ones = [T::one(); S];
     let mut passed = Buffer::<T>::stale(if GRADIENT { 3 * reached.len() * S } else { 0 });
     let passed: &mut [Leaving<T, S>] = passed.as_chunks_mut::<S>().0.as_chunks_mut().0;
-    let [mut own, mut scratch] = [Contributions::<T, N, S>::zeros(), Contributions::zeros()];
+    let mut own = Contributions::<T, N, S>::zeros();
     for (k, &brick) in reached.iter().enumerate() {
-        if let Some(&later) = reached.get(k + PREFETCH_AHEAD)
-            && size_of::<[[T; S]; BRICK]>() <= PREFETCHED
-        {
-            prefetch_brick::<T, N, S>(table, bricks, later as usize);
-            if GRADIENT {
-                parallel::prefetch(&gradient[(k + PREFETCH_AHEAD) * BRICK..][..BRICK]);
-            }
-        }
+        let later = reached.get(k + PREFETCH_AHEAD).filter(|_| size_of::<[[T; S]; BRICK]>() <= PREFETCHED);
         let number = brick as usize;
         if GRADIENT {
             for (axis, &behind) in bricks[number].behind.iter().enumerate() {
@@ -285,16 +301,24 @@ pub(super) fn value_and_gradient<T: Real, const W: usize, const N: usize, const 
                 };
                 match place_of(&reached[..k], behind) {
                     Some(place) => own.enter::<W>(axis, &passed[place][axis]),
-                    None => {
-                        let behind = behind as usize;
-                        own.enter::<W>(axis, &leaving_along::<T, W, N, S>(table, bricks, run, behind, axis, &mut scratch));
-                    }
+                    None => own.enter::<W>(axis, &leaving_along::<T, W, S>(table, bricks, run, behind as usize, axis)),
                 }
             }
         }
         let mut roots = [T::zero(); S];
         if run.contains(number) {
             for x in 0..BRICK {
+                if let Some(&later) = later {
+                    prefetch_slab::<T, N, S>(table, bricks, later as usize, x);
+                    // Of bricks behind that belong to another task, the last layer is read; along x, that is the last slab.
+                    let behind = &bricks[later as usize].behind[usize::from(x + 1 < BRICK)..];
+                    for &behind in behind.iter().flatten().filter(|&&behind| GRADIENT && behind < reached[0]) {
+                        prefetch_slab::<T, N, S>(table, bricks, behind as usize, x);
+                    }
+                    if GRADIENT {
+                        parallel::prefetch(&gradient[(k + PREFETCH_AHEAD) * BRICK + x]);
+                    }
+                }
                 own.compute::<W>(table, bricks, number, x, &ones, &mut roots);
             }
         } else {
