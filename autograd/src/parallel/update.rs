@@ -191,6 +191,50 @@ fn update_slices<T: Real, const N: usize>(
 /// Number of elements, and of short rows, that are updated together.
 const LANES: usize = 8;
 
+/// Rows that are updated together: one row, a run of rows, or for short rows a group of eight.
+struct Unit {
+    /// First row.
+    row: usize,
+    rows: usize,
+    /// True for a group of eight, of which the rows with set `bits` are updated.
+    grouped: bool,
+    bits: u8,
+}
+
+/// Iterates over the rows whose bits are set in a bitmap. `W` is the width, or 0 if it is not constant.
+struct Units<'a, const W: usize> {
+    touched: &'a [u64],
+    /// Number of rows.
+    rows: usize,
+    word: usize,
+    /// Bits of this word that are left.
+    left: u64,
+}
+
+impl<'a, const W: usize> Units<'a, W> {
+    fn new(touched: &'a [u64], rows: usize) -> Self {
+        Units { touched, rows, word: 0, left: touched.first().copied().unwrap_or(0) }
+    }
+
+    #[inline(always)]
+    fn next(&mut self) -> Option<Unit> {
+        while self.left == 0 {
+            self.left = *self.touched.get(self.word + 1)?;
+            self.word += 1;
+        }
+        let bit = self.left.trailing_zeros() as usize;
+        let eight = bit & !(LANES - 1);
+        if const { 1 <= W && W <= 3 } && self.word * 64 + eight + LANES <= self.rows {
+            let bits = (self.left >> eight) as u8;
+            self.left &= !(0xff << eight);
+            return Some(Unit { row: self.word * 64 + eight, rows: LANES, grouped: true, bits });
+        }
+        let rows = if W == 0 { (self.left >> bit).trailing_ones() as usize } else { 1 };
+        self.left &= if bit + rows == 64 { 0 } else { !0 << (bit + rows) };
+        Some(Unit { row: self.word * 64 + bit, rows, grouped: false, bits: 1 })
+    }
+}
+
 dispatched! {
 /// Updates the rows whose bits are set in `touched`, and clears their sums and bits. `sums` has a row for each row of the tables. `W` is the width, or 0 if
 /// the width is known at run time only. Short rows are updated in groups of eight; rows of a group that are not touched keep their values.
@@ -201,49 +245,37 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
     touched: &mut [u64],
     f: &F,
 ) {
+    /// Number of units between the one that is updated and the one that is prefetched. They are prefetched one by one: a core waits for about 24 cache lines
+    /// at most.
+    const AHEAD: usize = 16;
     let width = if W == 0 { width } else { W };
-    let short = (1..=3).contains(&W);
     let rows = sums.len() / width.max(1);
-    prefetch_rows(&x, width, 0, touched[0], short);
-    for w in 0..touched.len() {
-        // The rows of the next word are prefetched while the rows of this word are updated.
-        if let Some(&next) = touched.get(w + 1) {
-            prefetch_rows(&x, width, w + 1, next, short);
-        }
-        let mut left = std::mem::take(&mut touched[w]);
-        while left != 0 {
-            let bit = left.trailing_zeros() as usize;
-            let eight = bit & !(LANES - 1);
-            if short && w * 64 + eight + LANES <= rows {
-                let start = (w * 64 + eight) * W;
-                update_eight::<T, N, W, F>(&mut x, &mut sums[start..][..LANES * W], start, (left >> eight) as u8, f);
-                left &= !(0xff << eight);
-                continue;
-            }
-            let run = if W == 0 { (left >> bit).trailing_ones() as usize } else { 1 };
-            left &= if bit + run == 64 { 0 } else { !0 << (bit + run) };
-            let start = (w * 64 + bit) * width;
-            // The case of a constant length has its own copy of the loop, which is faster.
-            let len = if W == 0 { run * width } else { W };
-            let g = &mut sums[start..][..len];
-            update_slices(&mut x, start, len, |i| g[i], f);
-            g.fill(T::zero());
-        }
+    let [mut units, mut later] = [Units::<W>::new(touched, rows), Units::new(touched, rows)];
+    for _ in 0..AHEAD {
+        prefetch_rows(&x, width, later.next());
     }
+    while let Some(unit) = units.next() {
+        prefetch_rows(&x, width, later.next());
+        let start = unit.row * width;
+        if unit.grouped {
+            update_eight::<T, N, W, F>(&mut x, &mut sums[start..][..LANES * W], start, unit.bits, f);
+            continue;
+        }
+        // The case of a constant length has its own copy of the loop, which is faster.
+        let len = if W == 0 { unit.rows * width } else { W };
+        let g = &mut sums[start..][..len];
+        update_slices(&mut x, start, len, |i| g[i], f);
+        g.fill(T::zero());
+    }
+    touched.fill(0);
 }
 }
 
-/// Prefetches the rows whose bits are set in word number `word` of the bitmap; for short rows, all eight rows of a group.
+/// Prefetches rows of all tables.
 #[inline(always)]
-fn prefetch_rows<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, word: usize, mut left: u64, short: bool) {
-    while left != 0 {
-        let bit = left.trailing_zeros() as usize;
-        let (first, bits) = if short { (bit & !(LANES - 1), 0xff) } else { (bit, 1) };
-        left &= !(bits << first);
-        let start = (word * 64 + first) * width;
-        let len = if short { LANES * width } else { width };
-        x.iter().for_each(|x| prefetch(&x[start..x.len().min(start + len)]));
-    }
+fn prefetch_rows<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, unit: Option<Unit>) {
+    let Some(Unit { row, rows, .. }) = unit else { return };
+    x.iter().for_each(|x| prefetch(&x[row * width..][..rows * width]));
 }
 
 /// Updates the rows whose bits are set among the eight rows from element `start` on, and clears the sums of all eight.
