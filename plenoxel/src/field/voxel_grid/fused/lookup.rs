@@ -236,18 +236,16 @@ pub(super) fn harmonics<T: Real, const K: usize>(
     with_degree!(directions.count, W, N, FUSED => of_rays::<T, K, W, N, FUSED>(table, offsets, directions, look, seen, out));
 }
 
-/// Computes the colors of [`harmonics`] for a list of samples with trilinear look-up. `rays` has the ray of each sample; `out` gets one
-/// color per sample.
+/// Computes the colors of [`harmonics`] at positions with trilinear look-up. `rays` has the ray of each position; `out` gets one color per position.
 pub(super) fn harmonics_of<T: Real>(
     table: &[T],
     at: [&[T]; 3],
     map: impl NodeMap,
-    samples: &[u32],
     rays: &[u32],
     directions: Directions<'_, T>,
     out: &mut [[T; 3]],
 ) {
-    with_degree!(directions.count, W, N, FUSED => of_samples::<T, _, W, N, FUSED>(table, at, map, samples, rays, directions, out));
+    with_degree!(directions.count, W, N, FUSED => of_positions::<T, _, W, N, FUSED>(table, at, map, rays, directions, out));
 }
 
 dispatched! {
@@ -281,25 +279,20 @@ fn of_rays<T: Real, const K: usize, const W: usize, const N: usize, const FUSED:
 }
 
 dispatched! {
-fn of_samples<T: Real, M: NodeMap, const W: usize, const N: usize, const FUSED: bool>(
+fn of_positions<T: Real, M: NodeMap, const W: usize, const N: usize, const FUSED: bool>(
     table: &[T],
     at: [&[T]; 3],
     map: M,
-    samples: &[u32],
     rays: &[u32],
     directions: Directions<'_, T>,
     out: &mut [[T; 3]],
 ) {
     let mut sums = [[T::zero(); W]; TOGETHER];
-    let mut places = [[T::zero(); TOGETHER]; 3];
     let mut group = Group::none();
     let (table, basis) = (table.as_chunks::<W>().0, directions.basis.as_chunks::<N>().0);
-    for ((samples, rays), out) in samples.chunks(TOGETHER).zip(rays.chunks(TOGETHER)).zip(out.chunks_mut(TOGETHER)) {
-        for (places, at) in places.iter_mut().zip(at) {
-            places.iter_mut().zip(samples).for_each(|(place, &sample)| *place = at[sample as usize]);
-        }
-        group.find(places.each_ref().map(|p| &p[..]), map);
-        for (i, sum) in sums[..samples.len()].iter_mut().enumerate() {
+    for (k, (rays, out)) in rays.chunks(TOGETHER).zip(out.chunks_mut(TOGETHER)).enumerate() {
+        group.find(at.map(|at| &at[k * TOGETHER..][..rays.len()]), map);
+        for (i, sum) in sums[..rays.len()].iter_mut().enumerate() {
             let own = group.rows.each_ref().map(|rows| &table[rows[i] as usize]);
             weigh_all::<T, 8, W, FUSED>(own, group.weights.each_ref().map(|weights| weights[i]), sum);
         }

@@ -9,6 +9,7 @@ use super::{BLOCK, BUCKET_SHIFT, COLUMNS};
 use crate::field::voxel_grid::Interpolation;
 use autograd::rows::Buckets;
 use autograd::{Buffer, Real, parallel};
+use std::ops::Range;
 
 /// Number of tasks, each with a range of buckets. There are several per thread, so that a dense part of the scene does not delay the
 /// others.
@@ -19,26 +20,47 @@ const TASKS: usize = 64;
 const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
 
 /// Samples of a block that need a color, sorted by the bucket of their lowest corner.
-struct Order {
+struct Order<T: Real> {
     buckets: Buckets,
     samples: Buffer<u32>,
-    /// Number of the ray of each sample.
+    looked_up: LookedUp<T>,
+}
+
+/// Positions and numbers of the rays of samples whose colors are looked up together.
+struct LookedUp<T: Real> {
+    at: [Buffer<T>; 3],
     rays: Buffer<u32>,
 }
 
-impl Order {
-    fn new<T: Real>(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
+impl<T: Real> LookedUp<T> {
+    fn stale(count: usize) -> Self {
+        LookedUp { at: [0, 1, 2].map(|_| Buffer::stale(count)), rays: Buffer::stale(count) }
+    }
+
+    /// Copies samples of others to those from `start` on.
+    fn copy(&mut self, start: usize, others: &Self, range: Range<usize>) {
+        let own = start..start + range.len();
+        for (at, others) in self.at.iter_mut().zip(&others.at) {
+            at[own.clone()].copy_from_slice(&others[range.clone()]);
+        }
+        self.rays[own].copy_from_slice(&others.rays[range]);
+    }
+}
+
+impl<T: Real> Order<T> {
+    fn new(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
         let seen = block.seen();
         let bucket = |i: usize| (corners.of(i).0[0] >> BUCKET_SHIFT) as usize;
         let mut places = Buckets::count(buckets, (0..block.len()).filter(|&i| seen(i)).map(bucket));
-        let (mut samples, mut rays) = (Buffer::stale(places.total()), Buffer::stale(places.total()));
+        let (mut samples, mut looked_up) = (Buffer::stale(places.total()), LookedUp::stale(places.total()));
         for (r, own) in block.rays().enumerate() {
             for i in own.filter(|&i| seen(i)) {
                 let place = places.take(bucket(i));
-                (samples[place], rays[place]) = (i as u32, (block.first + r) as u32);
+                (samples[place], looked_up.rays[place]) = (i as u32, (block.first + r) as u32);
+                looked_up.at.iter_mut().zip(&block.at).for_each(|(to, at)| to[place] = at[i]);
             }
         }
-        Order { buckets: places.filled(), samples, rays }
+        Order { buckets: places.filled(), samples, looked_up }
     }
 }
 
@@ -63,7 +85,7 @@ impl<T: Real> Scene<'_, T> {
         })
         .into_iter()
         .unzip();
-        let colors = self.colors_in_order(&blocks, &orders, buckets);
+        let colors = self.colors_in_order(&orders, buckets);
         let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(BLOCK * COLUMNS)).collect();
         parallel::map_items(parts, |_, (((mut block, order), sorted), pixels)| {
             block.color = Buffer::zeros(3 * block.len());
@@ -81,35 +103,44 @@ impl<T: Real> Scene<'_, T> {
     }
 
     /// Computes the colors of the samples of each order.
-    fn colors_in_order(&self, blocks: &[Block<T>], orders: &[Order], buckets: usize) -> Vec<Buffer<T>> {
+    fn colors_in_order(&self, orders: &[Order<T>], buckets: usize) -> Vec<Buffer<T>> {
         let directions = self.directions(0).expect("only harmonics are worth sorting");
         let per_task = buckets.div_ceil(TASKS).max(1);
         let of_task = |task: usize| task * per_task..((task + 1) * per_task).min(buckets);
         let mut colors: Vec<Buffer<T>> = orders.iter().map(|order| Buffer::stale(3 * order.samples.len())).collect();
-        let mut tasks: Vec<Vec<&mut [T]>> = (0..buckets.div_ceil(per_task)).map(|_| Vec::with_capacity(blocks.len())).collect();
+        let mut tasks: Vec<Vec<&mut [T]>> = (0..buckets.div_ceil(per_task)).map(|_| Vec::with_capacity(orders.len())).collect();
         for (order, colors) in orders.iter().zip(&mut colors) {
             let lengths = (0..tasks.len()).map(|task| 3 * order.buckets.ranges(of_task(task)).len());
             tasks.iter_mut().zip(parallel::split_lengths(colors, lengths)).for_each(|(task, part)| task.push(part));
         }
         parallel::for_each_item(tasks, |task, mut parts| {
+            let count = |bucket: usize| orders.iter().map(|order| order.buckets.range(bucket).len()).sum::<usize>();
+            // A power of two, so that the arrays of one task fit another.
+            let most = of_task(task).map(count).max().unwrap_or(0).next_power_of_two();
+            let (mut together, mut found) = (LookedUp::stale(most), Buffer::stale(3 * most));
             for bucket in of_task(task) {
-                let samples: usize = orders.iter().map(|order| order.buckets.range(bucket).len()).sum();
+                let samples = count(bucket);
                 // From one look-up a row on, most of a bucket is read. Measured with 1.1 look-ups a row on average.
                 if 8 * samples >= 1 << BUCKET_SHIFT {
                     parallel::load(self.rows_of_color(bucket));
                 }
-                for ((block, order), part) in blocks.iter().zip(orders).zip(&mut parts) {
+                let mut start = 0;
+                for order in orders {
                     let range = order.buckets.range(bucket);
-                    if range.is_empty() {
-                        continue;
-                    }
-                    let (out, rest) = std::mem::take(part).split_at_mut(3 * range.len());
-                    *part = rest;
-                    let at = block.at.each_ref().map(|a| &a[..]);
-                    let (samples, rays) = (&order.samples[range.clone()], &order.rays[range]);
-                    with_bricks!(self.batch.layout.lattice, map => {
-                        lookup::harmonics_of(self.tables[1], at, map, samples, rays, directions, out.as_chunks_mut().0);
-                    });
+                    together.copy(start, &order.looked_up, range.clone());
+                    start += range.len();
+                }
+                let (at, found) = (together.at.each_ref().map(|at| &at[..samples]), &mut found[..3 * samples]);
+                with_bricks!(self.batch.layout.lattice, map => {
+                    lookup::harmonics_of(self.tables[1], at, map, &together.rays[..samples], directions, found.as_chunks_mut().0);
+                });
+                let mut rest = &found[..];
+                for (order, part) in orders.iter().zip(&mut parts) {
+                    let length = 3 * order.buckets.range(bucket).len();
+                    let (own, others) = rest.split_at(length);
+                    let (out, later) = std::mem::take(part).split_at_mut(length);
+                    out.copy_from_slice(own);
+                    (rest, *part) = (others, later);
                 }
             }
         });
