@@ -191,20 +191,19 @@ fn update_slices<T: Real, const N: usize>(
 /// Number of elements, and of short rows, that are updated together.
 const LANES: usize = 8;
 
-/// Rows that are updated together: one row, a run of rows, or for short rows a group of eight.
+/// Rows that are updated together.
 struct Unit {
     /// First row.
     row: usize,
     rows: usize,
-    /// True for a group of eight, of which the rows with set `bits` are updated.
-    grouped: bool,
-    bits: u8,
+    /// If they are a group of eight short rows, the bits of those that are updated.
+    bits: Option<u8>,
 }
 
-/// Iterates over the rows whose bits are set in a bitmap. `W` is the width, or 0 if it is not constant.
+/// Iterates over the rows whose bits are set in a bitmap: in groups of eight if rows are short, in runs of at most eight if `W` is 0, otherwise one by one.
 struct Units<'a, const W: usize> {
     touched: &'a [u64],
-    /// Number of rows.
+    /// Number of rows of the tables.
     rows: usize,
     word: usize,
     /// Bits of this word that are left.
@@ -215,6 +214,10 @@ impl<'a, const W: usize> Units<'a, W> {
     fn new(touched: &'a [u64], rows: usize) -> Self {
         Units { touched, rows, word: 0, left: touched.first().copied().unwrap_or(0) }
     }
+}
+
+impl<const W: usize> Iterator for Units<'_, W> {
+    type Item = Unit;
 
     #[inline(always)]
     fn next(&mut self) -> Option<Unit> {
@@ -225,13 +228,13 @@ impl<'a, const W: usize> Units<'a, W> {
         let bit = self.left.trailing_zeros() as usize;
         let eight = bit & !(LANES - 1);
         if const { 1 <= W && W <= 3 } && self.word * 64 + eight + LANES <= self.rows {
-            let bits = (self.left >> eight) as u8;
+            let bits = Some((self.left >> eight) as u8);
             self.left &= !(0xff << eight);
-            return Some(Unit { row: self.word * 64 + eight, rows: LANES, grouped: true, bits });
+            return Some(Unit { row: self.word * 64 + eight, rows: LANES, bits });
         }
-        let rows = if W == 0 { (self.left >> bit).trailing_ones() as usize } else { 1 };
+        let rows = if W == 0 { ((self.left >> bit).trailing_ones() as usize).min(LANES) } else { 1 };
         self.left &= if bit + rows == 64 { 0 } else { !0 << (bit + rows) };
-        Some(Unit { row: self.word * 64 + bit, rows, grouped: false, bits: 1 })
+        Some(Unit { row: self.word * 64 + bit, rows, bits: None })
     }
 }
 
@@ -245,20 +248,21 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
     touched: &mut [u64],
     f: &F,
 ) {
-    /// Number of units between the one that is updated and the one that is prefetched. They are prefetched one by one: a core waits for about 24 cache lines
-    /// at most.
+    /// Number of units between the one that is updated and the one that is prefetched. In each step one is prefetched, not many at once: a core waits for
+    /// about 24 cache lines at most.
     const AHEAD: usize = 16;
     let width = if W == 0 { width } else { W };
     let rows = sums.len() / width.max(1);
-    let [mut units, mut later] = [Units::<W>::new(touched, rows), Units::new(touched, rows)];
-    for _ in 0..AHEAD {
-        prefetch_rows(&x, width, later.next());
-    }
-    while let Some(unit) = units.next() {
-        prefetch_rows(&x, width, later.next());
+    // Both iterate over the same bits, so the bits are cleared at the end.
+    let mut later = Units::<W>::new(touched, rows);
+    later.by_ref().take(AHEAD).for_each(|unit| prefetch_rows(&x, width, &unit));
+    for unit in Units::<W>::new(touched, rows) {
+        if let Some(later) = later.next() {
+            prefetch_rows(&x, width, &later);
+        }
         let start = unit.row * width;
-        if unit.grouped {
-            update_eight::<T, N, W, F>(&mut x, &mut sums[start..][..LANES * W], start, unit.bits, f);
+        if let Some(bits) = unit.bits {
+            update_eight::<T, N, W, F>(&mut x, &mut sums[start..][..LANES * W], start, bits, f);
             continue;
         }
         // The case of a constant length has its own copy of the loop, which is faster.
@@ -271,11 +275,10 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
 }
 }
 
-/// Prefetches rows of all tables.
+/// Prefetches the rows of a unit in all tables.
 #[inline(always)]
-fn prefetch_rows<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, unit: Option<Unit>) {
-    let Some(Unit { row, rows, .. }) = unit else { return };
-    x.iter().for_each(|x| prefetch(&x[row * width..][..rows * width]));
+fn prefetch_rows<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, unit: &Unit) {
+    x.iter().for_each(|x| prefetch(&x[unit.row * width..][..unit.rows * width]));
 }
 
 /// Updates the rows whose bits are set among the eight rows from element `start` on, and clears the sums of all eight.
@@ -315,6 +318,7 @@ mod tests {
     use super::*;
     use crate::rows::sparse::RowSparse;
     use crate::tensor::Tensor;
+    use std::sync::Arc;
 
     #[test]
     fn updates_of_rows_equal_a_plain_loop_for_every_width_and_leave_the_other_rows_alone() {
@@ -346,6 +350,57 @@ mod tests {
             update([&mut got_x, &mut got_v], &g, true, rule);
             assert!(got_x == x && got_v == v, "all rows of width {width}");
             assert!(v.iter().zip(&start).zip(&dense).all(|((v, s), g)| *v == 0.5 * s + g));
+        }
+    }
+
+    /// Sums of a table of 1500 rows in buckets of 1024: full words, empty words, and words with runs and single rows.
+    #[derive(Debug)]
+    struct Sums {
+        width: usize,
+    }
+
+    impl Sums {
+        const ROWS: usize = 1500;
+
+        fn touches(row: usize) -> bool {
+            row < 200 || (450..500).contains(&row) || row >= 512 && (row % 64 >= 59 || row % 7 < 2)
+        }
+
+        fn number(element: usize) -> f64 {
+            (element % 1000) as f64 + 1.0
+        }
+    }
+
+    impl RowSums<f64> for Sums {
+        fn bucket_shift(&self) -> u32 {
+            10
+        }
+
+        fn is_empty(&self, _: usize) -> bool {
+            false
+        }
+
+        fn add(&self, bucket: usize, sums: &mut [f64], touched: &mut [u64]) {
+            for (local, sums) in sums.chunks_mut(self.width).enumerate() {
+                let row = (bucket << self.bucket_shift()) + local;
+                if Self::touches(row) {
+                    touched[local / 64] |= 1 << (local % 64);
+                    sums.iter_mut().enumerate().for_each(|(c, sum)| *sum += Self::number(row * self.width + c));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn updates_with_sums_for_later_reach_each_touched_row_once_for_every_width() {
+        for width in [1, 2, 3, 4, 5, 12, 16, 24, 27, 48] {
+            let (mut x, mut count) = (vec![0.5; Sums::ROWS * width], vec![0.0; Sums::ROWS * width]);
+            let g = Grad::Rows(RowSparse::deferred(&[Sums::ROWS, width], Arc::new(Sums { width })));
+            update([&mut x, &mut count], &g, false, |[x, count]: [f64; 2], g| [x - g, count + 1.0]);
+            for (at, (&x, &count)) in x.iter().zip(&count).enumerate() {
+                let want = if Sums::touches(at / width) { (0.5 - Sums::number(at), 1.0) } else { (0.5, 0.0) };
+                assert_eq!((x, count), want, "rows of width {width}, element {at}");
+            }
         }
     }
 }

@@ -276,8 +276,8 @@ mod tests {
             || Box::new(Adam::new(0.1, AdamMode::Lazy)),
             || Box::new(Adam::new(0.1, AdamMode::Dense)),
         ];
-        // The widths with specialised loops, and one without.
-        for (make, width) in optimizers.into_iter().flat_map(|make| [1, 2, 3, 24, 27].map(|width| (make, width))) {
+        // Rows that are updated in groups, one by one and, for 5 and 12, in runs.
+        for (make, width) in optimizers.into_iter().flat_map(|make| [1, 2, 3, 5, 12, 27].map(|width| (make, width))) {
             let run = |merge: bool| {
                 let mut param = Param::from_tensor("table", Tensor::full(&[1003, width], 0.5));
                 param.set_bounds(Bounds { low: 0.45, high: 0.55 });

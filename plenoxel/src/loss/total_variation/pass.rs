@@ -2,19 +2,19 @@
 //!
 //! With q = 1 / √(…) for each cell and channel, the node of a cell gets −q (dx + dy + dz), and each neighbour q d, both divided by the number of
 //! terms. A task computes the contributions q d of each of its bricks once. Then every node collects from its own cell and from the three cells
-//! behind it, so no two tasks write the same node.
+//! behind it, so no two tasks write the same node. If a brick behind belongs to another task, its last layer of cells is computed again.
 //!
 //! A brick consists of four *slabs* of equal x, a slab of four *lines* of equal y, a line of four nodes along z. Loops run over slabs. The nodes
 //! ahead along y and z are loaded at an offset of a line and of a node, once in the brick and once in the brick ahead, and a constant mask
 //! selects between both.
 
 use super::{EPSILON, Run};
-use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, STRIDE, has};
+use autograd::lattice::{BRICK, BRICK_ROWS, Neighbours, STRIDE, has, local_of};
 use autograd::{Buffer, Real, dispatched, parallel};
 use std::hint::select_unpredictable;
 
-/// Returns the number of bricks of a task. A large grid has 64 tasks or more. With at least 256 bricks in each, few are computed twice. A task keeps
-/// [`Leaving`] of each brick: at most 2 MB, unless 256 bricks need more.
+/// Returns the number of bricks of a task. A large grid has 64 tasks or more. With at least 256 bricks in each, few have a brick behind in another task. A task
+/// keeps [`Leaving`] of each brick: at most 2 MB, unless 256 bricks need more.
 pub(super) fn task<T, const S: usize>(count: usize) -> usize {
     const LEAST: usize = 256;
     count.div_ceil(64).clamp(LEAST, ((2 << 20) / size_of::<Leaving<T, S>>()).max(LEAST))
@@ -206,10 +206,33 @@ fn prefetch_slab<T: Real, const N: usize, const S: usize>(table: &[[T; S]], bric
     }
 }
 
+/// Prefetches what slab x of a brick reads of the bricks behind that belong to other tasks, before brick `first`: whole slabs of them, and along x only the last
+/// slab.
+#[inline(always)]
+fn prefetch_behind<T: Real, const N: usize, const S: usize>(
+    table: &[[T; S]],
+    bricks: &[Neighbours],
+    run: Run,
+    first: u32,
+    brick: usize,
+    x: usize,
+) {
+    for (axis, behind) in bricks[brick].behind.iter().enumerate() {
+        // Bricks behind have lower numbers.
+        if let &Some(behind) = behind
+            && behind < first
+            && run.contains(behind as usize)
+            && (axis > 0 || x + 1 == BRICK)
+        {
+            prefetch_slab::<T, N, S>(table, bricks, behind as usize, x);
+        }
+    }
+}
+
 /// Largest size of a brick that is prefetched, in bytes. Larger ones are left to the hardware.
 const PREFETCHED: usize = 4096;
 /// Number of bricks between the one that is read and the one that is prefetched. The latter is prefetched slab by slab: a core waits for about 24 cache
-/// lines at most, and a brick, with its gradient, has more.
+/// lines at most. With rows of four numbers, a brick and its gradient have 32.
 const PREFETCH_AHEAD: usize = 2;
 
 /// Computes the gradient of a slab from what its nodes get and give.
@@ -246,29 +269,31 @@ fn leaving_along<T: Real, const W: usize, const S: usize>(table: &[[T; S]], bric
     }
     let rows = table.as_flattened().as_chunks::<W>().0;
     let Neighbours { cells, ahead, .. } = &bricks[brick];
-    let [b, c] = [[1, 2], [0, 2], [0, 1]][axis];
-    // Differences to the nodes ahead along each axis. They stay 0 where there is no cell, which then contributes 0.
-    let mut d = [[T::zero(); S]; 3];
+    let others = [[1, 2], [0, 2], [0, 1]][axis];
+    // Differences to the nodes ahead along x, y and z. They stay 0 where there is no cell, which then contributes 0.
+    let mut differences = [[T::zero(); S]; 3];
     for k in 0..BRICK * BRICK {
-        let local = (BRICK - 1) * STRIDE[axis] + k / BRICK * STRIDE[b] + k % BRICK * STRIDE[c];
-        if !has(*cells, local) {
+        let node = (BRICK - 1) * STRIDE[axis] + k / BRICK * STRIDE[others[0]] + k % BRICK * STRIDE[others[1]];
+        if !has(*cells, node) {
             continue;
         }
-        let v = &rows[brick * BRICK_ROWS + local];
-        for a in 0..3 {
-            let next = match ahead[a] {
-                Some(ahead) if local / STRIDE[a] % BRICK == BRICK - 1 => ahead as usize * BRICK_ROWS + local - (BRICK - 1) * STRIDE[a],
-                _ => brick * BRICK_ROWS + local + STRIDE[a],
+        let value = &rows[brick * BRICK_ROWS + node];
+        for along in 0..3 {
+            let next = if local_of(node)[along] + 1 < BRICK {
+                brick * BRICK_ROWS + node + STRIDE[along]
+            } else {
+                let ahead = ahead[along].expect("a cell has its nodes");
+                ahead as usize * BRICK_ROWS + node - (BRICK - 1) * STRIDE[along]
             };
-            let (next, d) = (&rows[next], &mut d[a][k * W..][..W]);
+            let (next, d) = (&rows[next], &mut differences[along][k * W..][..W]);
             for l in 0..W {
-                d[l] = next[l] - v[l];
+                d[l] = next[l] - value[l];
             }
         }
     }
-    let [dx, dy, dz] = &d;
+    let [dx, dy, dz] = &differences;
     for l in 0..S {
-        leaving[l] = d[axis][l] * inverse_root(dx[l], dy[l], dz[l]).1;
+        leaving[l] = differences[axis][l] * inverse_root(dx[l], dy[l], dz[l]).1;
     }
     leaving
 }
@@ -291,7 +316,7 @@ pub(super) fn value_and_gradient<T: Real, const W: usize, const N: usize, const 
     let passed: &mut [Leaving<T, S>] = passed.as_chunks_mut::<S>().0.as_chunks_mut().0;
     let mut own = Contributions::<T, N, S>::zeros();
     for (k, &brick) in reached.iter().enumerate() {
-        let later = reached.get(k + PREFETCH_AHEAD).filter(|_| size_of::<[[T; S]; BRICK]>() <= PREFETCHED);
+        let later = reached.get(k + PREFETCH_AHEAD).filter(|_| size_of::<[[T; S]; BRICK]>() <= PREFETCHED).map(|&later| later as usize);
         let number = brick as usize;
         if GRADIENT {
             for (axis, &behind) in bricks[number].behind.iter().enumerate() {
@@ -306,22 +331,21 @@ pub(super) fn value_and_gradient<T: Real, const W: usize, const N: usize, const 
             }
         }
         let mut roots = [T::zero(); S];
-        if run.contains(number) {
-            for x in 0..BRICK {
-                if let Some(&later) = later {
-                    prefetch_slab::<T, N, S>(table, bricks, later as usize, x);
-                    // Of bricks behind that belong to another task, the last layer is read; along x, that is the last slab.
-                    let behind = &bricks[later as usize].behind[usize::from(x + 1 < BRICK)..];
-                    for &behind in behind.iter().flatten().filter(|&&behind| GRADIENT && behind < reached[0]) {
-                        prefetch_slab::<T, N, S>(table, bricks, behind as usize, x);
-                    }
-                    if GRADIENT {
-                        parallel::prefetch(&gradient[(k + PREFETCH_AHEAD) * BRICK + x]);
-                    }
+        for x in 0..BRICK {
+            if let Some(later) = later {
+                if run.contains(later) {
+                    prefetch_slab::<T, N, S>(table, bricks, later, x);
                 }
+                if GRADIENT {
+                    prefetch_behind::<T, N, S>(table, bricks, run, reached[0], later, x);
+                    parallel::prefetch(&gradient[(k + PREFETCH_AHEAD) * BRICK + x]);
+                }
+            }
+            if run.contains(number) {
                 own.compute::<W>(table, bricks, number, x, &ones, &mut roots);
             }
-        } else {
+        }
+        if !run.contains(number) {
             own.clear();
         }
         sum += folded(roots);
