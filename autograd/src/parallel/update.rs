@@ -248,8 +248,7 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
     touched: &mut [u64],
     f: &F,
 ) {
-    /// Number of units between the one that is updated and the one that is prefetched. In each step one is prefetched, not many at once: a core waits for
-    /// about 24 cache lines at most.
+    /// Number of units between the one that is updated and the one that is prefetched.
     const AHEAD: usize = 16;
     let width = if W == 0 { width } else { W };
     let rows = sums.len() / width.max(1);

@@ -231,8 +231,8 @@ fn prefetch_behind<T: Real, const N: usize, const S: usize>(
 
 /// Largest size of a brick that is prefetched, in bytes. Larger ones are left to the hardware.
 const PREFETCHED: usize = 4096;
-/// Number of bricks between the one that is read and the one that is prefetched. The latter is prefetched slab by slab: a core waits for about 24 cache
-/// lines at most. With rows of four numbers, a brick and its gradient have 32.
+/// Number of bricks between the one that is read and the one that is prefetched. The latter is prefetched slab by slab: with rows of four numbers, a brick and
+/// its gradient have 32 cache lines, which are too many at once ([`parallel::prefetch`]).
 const PREFETCH_AHEAD: usize = 2;
 
 /// Computes the gradient of a slab from what its nodes get and give.
