@@ -20,8 +20,8 @@ pub fn load<E: Copy>(values: &[E]) {
 
 /// Prefetches the cache lines of a value that will be read soon. On targets other than x86-64 it does nothing.
 ///
-/// Prefetch a few lines at a time, between other work. A core waits for a limited number of lines, 24 on AMD Zen 4; while it waits for as many, further
-/// loads cannot begin.
+/// Prefetch a few lines at a time, between other work. A core can wait for only so many lines at once, 24 on AMD Zen 4; prefetches beyond that hold up the
+/// loads behind them.
 #[inline(always)]
 pub fn prefetch<E: ?Sized>(value: &E) {
     #[cfg(target_arch = "x86_64")]

@@ -330,7 +330,7 @@ pub(super) fn value_and_gradient<T: Real, const W: usize, const N: usize, const 
                 }
             }
         }
-        let mut roots = [T::zero(); S];
+        let (in_run, mut roots) = (run.contains(number), [T::zero(); S]);
         for x in 0..BRICK {
             if let Some(later) = later {
                 if run.contains(later) {
@@ -341,11 +341,11 @@ pub(super) fn value_and_gradient<T: Real, const W: usize, const N: usize, const 
                     parallel::prefetch(&gradient[(k + PREFETCH_AHEAD) * BRICK + x]);
                 }
             }
-            if run.contains(number) {
+            if in_run {
                 own.compute::<W>(table, bricks, number, x, &ones, &mut roots);
             }
         }
-        if !run.contains(number) {
+        if !in_run {
             own.clear();
         }
         sum += folded(roots);

@@ -9,7 +9,6 @@ use super::{BLOCK, BUCKET_SHIFT, COLUMNS};
 use crate::field::voxel_grid::Interpolation;
 use autograd::rows::Buckets;
 use autograd::{Buffer, Real, parallel};
-use std::ops::Range;
 
 /// Number of tasks, each with a range of buckets. There are several per thread, so that a dense part of the scene does not delay the
 /// others.
@@ -20,53 +19,26 @@ const TASKS: usize = 64;
 const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
 
 /// Samples of a block that need a color, sorted by the bucket of their lowest corner.
-struct Order<T: Real> {
+struct Order {
     buckets: Buckets,
     samples: Buffer<u32>,
-    inputs: Inputs<T>,
-}
-
-/// Positions of samples, and the numbers of their rays.
-struct Inputs<T: Real> {
-    at: [Buffer<T>; 3],
+    /// Number of the ray of each sample.
     rays: Buffer<u32>,
 }
 
-impl<T: Real> Inputs<T> {
-    fn stale(count: usize) -> Self {
-        Inputs { at: [0, 1, 2].map(|_| Buffer::stale(count)), rays: Buffer::stale(count) }
-    }
-
-    /// Makes room for `count` samples.
-    fn grow(&mut self, count: usize) {
-        self.at.iter_mut().for_each(|at| at.grow(count));
-        self.rays.grow(count);
-    }
-
-    /// Copies a range of other samples to those from `start` on.
-    fn copy_from(&mut self, start: usize, others: &Self, range: Range<usize>) {
-        let own = start..start + range.len();
-        for (at, others) in self.at.iter_mut().zip(&others.at) {
-            at[own.clone()].copy_from_slice(&others[range.clone()]);
-        }
-        self.rays[own].copy_from_slice(&others.rays[range]);
-    }
-}
-
-impl<T: Real> Order<T> {
-    fn new(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
+impl Order {
+    fn new<T: Real>(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
         let seen = block.seen();
         let bucket = |i: usize| (corners.of(i).0[0] >> BUCKET_SHIFT) as usize;
         let mut places = Buckets::count(buckets, (0..block.len()).filter(|&i| seen(i)).map(bucket));
-        let (mut samples, mut inputs) = (Buffer::stale(places.total()), Inputs::stale(places.total()));
+        let (mut samples, mut rays) = (Buffer::stale(places.total()), Buffer::stale(places.total()));
         for (r, own) in block.rays().enumerate() {
             for i in own.filter(|&i| seen(i)) {
                 let place = places.take(bucket(i));
-                (samples[place], inputs.rays[place]) = (i as u32, (block.first + r) as u32);
-                inputs.at.iter_mut().zip(&block.at).for_each(|(to, at)| to[place] = at[i]);
+                (samples[place], rays[place]) = (i as u32, (block.first + r) as u32);
             }
         }
-        Order { buckets: places.filled(), samples, inputs }
+        Order { buckets: places.filled(), samples, rays }
     }
 }
 
@@ -91,7 +63,7 @@ impl<T: Real> Scene<'_, T> {
         })
         .into_iter()
         .unzip();
-        let colors = self.colors_in_order(&orders, buckets);
+        let colors = self.colors_in_order(&blocks, &orders, buckets);
         let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(BLOCK * COLUMNS)).collect();
         parallel::map_items(parts, |_, (((mut block, order), sorted), pixels)| {
             block.color = Buffer::zeros(3 * block.len());
@@ -108,8 +80,8 @@ impl<T: Real> Scene<'_, T> {
         &table[bucket * numbers..table.len().min((bucket + 1) * numbers)]
     }
 
-    /// Computes the colors of the samples of each order.
-    fn colors_in_order(&self, orders: &[Order<T>], buckets: usize) -> Vec<Buffer<T>> {
+    /// Computes the colors of the samples of each order, one bucket after another for all blocks: a block alone has few samples in a bucket.
+    fn colors_in_order(&self, blocks: &[Block<T>], orders: &[Order], buckets: usize) -> Vec<Buffer<T>> {
         let directions = self.directions(0).expect("only harmonics are worth sorting");
         let per_task = buckets.div_ceil(TASKS).max(1);
         let of_task = |task: usize| task * per_task..((task + 1) * per_task).min(buckets);
@@ -120,7 +92,7 @@ impl<T: Real> Scene<'_, T> {
             tasks.iter_mut().zip(parallel::split_lengths(colors, lengths)).for_each(|(task, part)| task.push(part));
         }
         parallel::for_each_item(tasks, |task, mut parts| {
-            let (mut inputs, mut found) = (Inputs::stale(0), Buffer::stale(0));
+            let (mut at, mut rays, mut found) = ([0, 1, 2].map(|_| Buffer::stale(0)), Buffer::stale(0), Buffer::stale(0));
             for bucket in of_task(task) {
                 let samples: usize = orders.iter().map(|order| order.buckets.range(bucket).len()).sum();
                 if samples == 0 {
@@ -131,15 +103,21 @@ impl<T: Real> Scene<'_, T> {
                     parallel::load(self.rows_of_color(bucket));
                 }
                 // A power of two, so that the arrays of one task fit another.
-                inputs.grow(samples.next_power_of_two());
-                found.grow(3 * samples.next_power_of_two());
+                let room = samples.next_power_of_two();
+                at.iter_mut().for_each(|at| at.grow(room));
+                rays.grow(room);
+                found.grow(3 * room);
                 let mut start = 0;
-                for order in orders {
+                for (block, order) in blocks.iter().zip(orders) {
                     let range = order.buckets.range(bucket);
-                    inputs.copy_from(start, &order.inputs, range.clone());
-                    start += range.len();
+                    let own = start..start + range.len();
+                    for (to, from) in at.iter_mut().zip(&block.at) {
+                        to[own.clone()].iter_mut().zip(&order.samples[range.clone()]).for_each(|(to, &i)| *to = from[i as usize]);
+                    }
+                    start = own.end;
+                    rays[own].copy_from_slice(&order.rays[range]);
                 }
-                let (at, rays) = (inputs.at.each_ref().map(|at| &at[..samples]), &inputs.rays[..samples]);
+                let (at, rays) = (at.each_ref().map(|at| &at[..samples]), &rays[..samples]);
                 with_bricks!(self.batch.layout.lattice, map => {
                     lookup::harmonics_of(self.tables[1], at, map, rays, directions, found[..3 * samples].as_chunks_mut().0);
                 });
