@@ -116,7 +116,8 @@ impl<T: Real> Cells<T> {
         differ.map(|differ| differ == 0)
     }
 
-    /// Computes the weighted sums of the corners of all cells. All corners are read, into `corners`, before the first is summed: no sum waits for the table.
+    /// Interpolates the corners of all cells: along x, then along y, then along z. All corners are read, into `corners`, before the first is interpolated: no
+    /// arithmetic waits for the table.
     #[inline(always)]
     fn sums<const F: usize, const FUSED: bool>(
         &self,
@@ -131,12 +132,13 @@ impl<T: Real> Cells<T> {
                 upper[i] = table[rows[1][i] as usize];
             }
         }
-        *sums = [[T::zero(); F]; TOGETHER];
-        for (corner, weights) in corners.iter().zip(&self.weights()) {
-            for i in 0..TOGETHER {
-                for f in 0..F {
-                    sums[i][f] = corner[i][f].multiply_add::<FUSED>(weights[i], sums[i][f]);
-                }
+        let between = |low: T, high: T, share: T| (high - low).multiply_add::<FUSED>(share, low);
+        let [x, y, z] = self.shares.each_ref().map(|[_, upper]| upper);
+        for i in 0..TOGETHER {
+            for f in 0..F {
+                let along_x = |c: usize| between(corners[c][i][f], corners[c + 1][i][f], x[i]);
+                let along_y = |c: usize| between(along_x(c), along_x(c + 2), y[i]);
+                sums[i][f] = between(along_y(0), along_y(4), z[i]);
             }
         }
     }

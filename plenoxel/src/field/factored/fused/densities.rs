@@ -95,18 +95,23 @@ pub fn densities_at<T: Real>(field: &Factored<T>, positions: &Tensor<T>) -> Tens
     let (pairs, cells) = (Pairs::of(&tables[..6], field.nodes(), field.shape().density_components), cells.data().as_chunks::<3>().0);
     let mut sigma = vec![T::zero(); cells.len()];
     parallel::for_each_chunk(&mut sigma, parallel::CHUNK / RUN * RUN, |first, sigma| {
-        for (cells, sigma) in cells[first..].chunks(RUN).zip(sigma.chunks_mut(RUN)) {
-            let columns = [0, 1, 2].map(|axis| {
-                let mut column = [T::zero(); RUN];
-                column.iter_mut().zip(cells).for_each(|(at, cell)| *at = cell[axis]);
-                column
-            });
-            let at = columns.each_ref().map(|column| &column[..sigma.len()]);
+        let columns = |first: usize| {
+            let mut columns = [[T::zero(); RUN]; 3];
+            for (i, cell) in cells[first.min(cells.len())..].iter().take(RUN).enumerate() {
+                (0..3).for_each(|axis| columns[axis][i] = cell[axis]);
+            }
+            columns
+        };
+        let mut at = columns(first);
+        for (run, sigma) in sigma.chunks_mut(RUN).enumerate() {
+            let next = columns(first + (run + 1) * RUN);
+            let (own, later) = (at.each_ref().map(|column| &column[..sigma.len()]), next.each_ref().map(|column| &column[..]));
             let mut slope = [T::zero(); RUN];
             match parallel::fused() {
-                true => lookup::density::<T, true>(pairs, at, sigma, &mut slope),
-                false => lookup::density::<T, false>(pairs, at, sigma, &mut slope),
+                true => lookup::density::<T, true>(pairs, own, later, sigma, &mut slope),
+                false => lookup::density::<T, false>(pairs, own, later, sigma, &mut slope),
             }
+            at = next;
         }
     });
     Tensor::from_vec(sigma, &[cells.len()])

@@ -111,6 +111,24 @@ impl<T: Real> Block<T> {
     }
 }
 
+/// Samples of a ray that are looked up together.
+struct Run<T> {
+    count: usize,
+    /// Columns up to [`of_sample::DELTA`].
+    columns: [[T; RUN]; of_sample::DELTA + 1],
+}
+
+impl<T: Real> Run<T> {
+    fn empty() -> Self {
+        Run { count: 0, columns: [[T::zero(); RUN]; of_sample::DELTA + 1] }
+    }
+
+    /// Returns the positions of the samples, in units of cells.
+    fn at(&self) -> [&[T]; 3] {
+        [0, 1, 2].map(|axis| &self.columns[axis][..self.count])
+    }
+}
+
 /// Inputs of rendering a batch.
 pub struct Scene<'a, T: Real> {
     pub batch: &'a Batch<T>,
@@ -154,65 +172,86 @@ impl<'a, T: Real> Scene<'a, T> {
         block
     }
 
-    /// Computes densities and weights of the samples of `count` rays from `first` on.
+    /// Computes densities and weights of the samples of `count` rays from `first` on, in runs of at most [`RUN`]. While the densities of a run are looked up,
+    /// the rows of the next one, of this ray or of the next, are prefetched.
     fn samples(&self, first: usize, count: usize) -> Block<T> {
-        let RenderOptions { aabb, spacing, jitter, stop_below, .. } = self.options;
-        let stop = T::lit(*stop_below);
+        let stop = T::lit(self.options.stop_below);
         let mut columns: [Buffer<T>; of_sample::COUNT] = std::array::from_fn(|_| Buffer::stale(0));
         let mut offsets = vec![0];
         let mut end = 0;
-        let most = DVec3::from_array(self.batch.nodes.map(|n| n as f64 - 1.0));
-        let per_length = cells_per_length(self.batch.nodes, aabb);
-        for (r, ray) in self.rays[first..first + count].iter().enumerate() {
-            let march = march(ray, aabb, *spacing, jitter.of(first + r));
-            let mut occupied = self.cells.map(|cells| march.occupied(ray, cells));
-            let mut all = (0..march.count).map(move |k| march.interval(k));
-            let mut next = || occupied.as_mut().map_or_else(|| all.next(), Iterator::next);
-            let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
+        // A ray, and its first run.
+        let open = |r: usize| {
+            (r < count).then(|| {
+                let mut runs = self.runs(first + r);
+                let run = runs();
+                (runs, run)
+            })
+        };
+        let mut opened = None;
+        for r in 0..count {
+            let (mut runs, mut run) = opened.take().or_else(|| open(r)).expect("a ray of the block");
             let mut left = T::one();
-            while left >= stop {
+            while left >= stop && run.count > 0 {
+                let following = if run.count == RUN { runs() } else { Run::empty() };
+                if following.count == 0 {
+                    opened = open(r + 1);
+                }
+                let later = if following.count > 0 { &following } else { opened.as_ref().map_or(&following, |(_, run)| run) };
                 if end + RUN > columns[0].len() {
                     let room = (2 * columns[0].len()).max(32 * count);
                     columns.iter_mut().for_each(|column| column.grow(room));
                 }
-                let [x, y, z, t, delta, sigma, slope, weight, after] = &mut columns;
-                let mut own = 0;
-                while own < RUN
-                    && let Some((middle, length)) = next()
-                {
-                    let place = if march.is_straight() { start + middle * along } else { (march.at(ray, middle) - aabb.min) * per_length };
-                    let place = place.clamp(DVec3::ZERO, most);
-                    (x[end + own], y[end + own], z[end + own]) = (T::lit(place.x), T::lit(place.y), T::lit(place.z));
-                    (t[end + own], delta[end + own]) = (T::lit(middle), T::lit(length));
-                    own += 1;
-                }
-                if own == 0 {
-                    break;
-                }
-                let run = end..end + own;
-                let (x, y, z, delta) = (&x[run.clone()], &y[run.clone()], &z[run.clone()], &delta[run.clone()]);
-                let (sigma, slope) = (&mut sigma[run.clone()], &mut slope[run.clone()]);
-                let (weight, after) = (&mut weight[run.clone()], &mut after[run]);
+                let own = end..end + run.count;
+                columns.iter_mut().zip(&run.columns).for_each(|(column, values)| column[own.clone()].copy_from_slice(&values[..run.count]));
+                let [.., delta, sigma, slope, weight, after] = &mut columns;
+                let (sigma, slope) = (&mut sigma[own.clone()], &mut slope[own.clone()]);
+                let (delta, weight, after) = (&delta[own.clone()], &mut weight[own.clone()], &mut after[own]);
                 if parallel::fused() {
-                    lookup::density::<T, true>(self.tables.density, [x, y, z], sigma, slope);
+                    lookup::density::<T, true>(self.tables.density, run.at(), later.at(), sigma, slope);
                     lookup::absorb::<T, true>(sigma, delta, weight, after);
                 } else {
-                    lookup::density::<T, false>(self.tables.density, [x, y, z], sigma, slope);
+                    lookup::density::<T, false>(self.tables.density, run.at(), later.at(), sigma, slope);
                     lookup::absorb::<T, false>(sigma, delta, weight, after);
                 }
                 let mut used = 0;
-                while used < own && left >= stop {
+                while used < run.count && left >= stop {
                     weight[used] *= left;
                     left *= after[used];
                     after[used] = left;
                     used += 1;
                 }
                 end += used;
+                run = following;
             }
             offsets.push(end as u32);
         }
         columns.iter_mut().for_each(|column| column.truncate(end));
         Block::new(first, offsets, columns)
+    }
+
+    /// Returns a function that returns the next run of ray r at each call, and an empty one after the last.
+    fn runs(&self, r: usize) -> impl FnMut() -> Run<T> {
+        let RenderOptions { aabb, spacing, jitter, .. } = self.options;
+        let (ray, most) = (&self.rays[r], DVec3::from_array(self.batch.nodes.map(|n| n as f64 - 1.0)));
+        let per_length = cells_per_length(self.batch.nodes, aabb);
+        let march = march(ray, aabb, *spacing, jitter.of(r));
+        let mut occupied = self.cells.map(|cells| march.occupied(ray, cells));
+        let mut all = (0..march.count).map(move |k| march.interval(k));
+        let (start, along) = ((ray.origin - aabb.min) * per_length, ray.direction * per_length);
+        move || {
+            let mut run = Run::empty();
+            while run.count < RUN
+                && let Some((middle, length)) = occupied.as_mut().map_or_else(|| all.next(), Iterator::next)
+            {
+                let place = if march.is_straight() { start + middle * along } else { (march.at(ray, middle) - aabb.min) * per_length };
+                let place = place.clamp(DVec3::ZERO, most);
+                for (column, value) in run.columns.iter_mut().zip([place.x, place.y, place.z, middle, length]) {
+                    column[run.count] = T::lit(value);
+                }
+                run.count += 1;
+            }
+            run
+        }
     }
 
     /// Computes the colors of samples, from their weights.

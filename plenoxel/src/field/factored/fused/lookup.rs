@@ -11,7 +11,7 @@ use std::ops::Range;
 pub const LANES: usize = 16;
 
 /// Number of samples between the current one and that whose cotangents are prefetched.
-const AHEAD: usize = 6;
+const AHEAD: usize = 16;
 
 /// Largest number of samples that are looked up together.
 pub const RUN: usize = 16;
@@ -197,13 +197,18 @@ pub type Places<'a, T> = [&'a [T]; 3];
 /// Prefetches the plane rows of samples.
 #[inline(always)]
 pub(super) fn prefetch<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>) {
-    let width = pairs.width;
     for axis in 0..3 {
         for i in 0..cells.count {
-            for row in cells.corner(axis, i).rows {
-                parallel::prefetch(&pairs.planes[axis][row * width..][..2 * width]);
-            }
+            prefetch_rows(pairs, cells, axis, i);
         }
+    }
+}
+
+/// Prefetches the rows of sample i in the plane of an axis. The rows of a run do not fit in the first-level cache.
+#[inline(always)]
+fn prefetch_rows<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>, axis: usize, i: usize) {
+    for row in cells.corner(axis, i).rows {
+        parallel::prefetch_far(&pairs.planes[axis][row * pairs.width..][..2 * pairs.width]);
     }
 }
 
@@ -222,16 +227,27 @@ pub(super) fn add_lanes<T: Real, const N: usize>(sums: &mut [[T; LANES]; N]) {
 }
 
 dispatched! {
-/// Computes the density σ and dσ/ds of up to [`RUN`] samples.
-pub fn density<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, sigma: &mut [T], slope: &mut [T]) {
-    let cells = Cells::new(at, pairs.nodes);
-    prefetch(pairs, &cells);
+/// Computes the density σ and dσ/ds of up to [`RUN`] samples, while the rows of up to [`RUN`] samples that come `later` are prefetched.
+pub fn density<T: Real, const FUSED: bool>(
+    pairs: Pairs<'_, T>,
+    at: Places<'_, T>,
+    later: Places<'_, T>,
+    sigma: &mut [T],
+    slope: &mut [T],
+) {
+    let [cells, later] = [at, later].map(|at| Cells::new(at, pairs.nodes));
     let chunks = pairs.width / LANES;
     let mut sums = [[T::zero(); LANES]; RUN];
     for axis in 0..3 {
         let (plane, line) = (pairs.planes[axis].as_chunks::<LANES>().0, pairs.lines[axis].as_chunks::<LANES>().0);
         for k in 0..chunks {
-            for (i, sum) in sums.iter_mut().enumerate().take(cells.count) {
+            for (i, sum) in sums.iter_mut().enumerate() {
+                if k == 0 && i < later.count {
+                    prefetch_rows(pairs, &later, axis, i);
+                }
+                if i >= cells.count {
+                    continue;
+                }
                 let value = plane_at::<T, FUSED>(plane, cells.corner(axis, i), chunks, k);
                 let factor = line_at::<T, FUSED>(line, cells.along(axis, i), chunks, k);
                 let old = *sum;
@@ -270,9 +286,7 @@ fn runs<'a, T: Real>(at: Places<'a, T>, values: &'a mut [T], width: usize) -> im
 
 /// Interpolates the three planes at samples: rows of three times `width` values.
 pub fn planes<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
-    for (at, out) in runs(at, out, 3 * pairs.width) {
-        if parallel::fused() { planes_of_run::<T, true>(pairs, at, out) } else { planes_of_run::<T, false>(pairs, at, out) }
-    }
+    if parallel::fused() { planes_ahead::<T, true>(pairs, at, out) } else { planes_ahead::<T, false>(pairs, at, out) }
 }
 
 /// Multiplies the values of planes at samples by those of the lines.
@@ -284,26 +298,32 @@ pub fn times_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, values: &mut
 
 /// Computes the products plane · line at samples: rows of three times `width` values.
 pub fn products<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
-    for (at, out) in runs(at, out, 3 * pairs.width) {
-        planes(pairs, at, out);
-        times_lines(pairs, at, out);
-    }
+    planes(pairs, at, out);
+    times_lines(pairs, at, out);
 }
 
 dispatched! {
-fn planes_of_run<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
-    let cells = Cells::new(at, pairs.nodes);
+/// Interpolates the planes at samples, while the rows of the run after this one are prefetched.
+fn planes_ahead<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
+    let (count, chunks) = (at[0].len(), pairs.width / LANES);
+    let mut cells = Cells::new(at.map(|at| &at[..count.min(RUN)]), pairs.nodes);
     prefetch(pairs, &cells);
-    let chunks = pairs.width / LANES;
-    let out = out.as_chunks_mut::<LANES>().0;
-    for axis in 0..3 {
-        let plane = pairs.planes[axis].as_chunks::<LANES>().0;
-        for (i, out) in out.chunks_exact_mut(3 * chunks).enumerate() {
-            let corner = cells.corner(axis, i);
-            for (k, out) in out[axis * chunks..][..chunks].iter_mut().enumerate() {
-                *out = plane_at::<T, FUSED>(plane, corner, chunks, k);
+    for (run, out) in out.as_chunks_mut::<LANES>().0.chunks_mut(RUN * 3 * chunks).enumerate() {
+        let (first, end) = (count.min((run + 1) * RUN), count.min((run + 2) * RUN));
+        let next = Cells::new(at.map(|at| &at[first..end]), pairs.nodes);
+        for axis in 0..3 {
+            let plane = pairs.planes[axis].as_chunks::<LANES>().0;
+            for (i, out) in out.chunks_exact_mut(3 * chunks).enumerate() {
+                if i < next.count {
+                    prefetch_rows(pairs, &next, axis, i);
+                }
+                let corner = cells.corner(axis, i);
+                for (k, out) in out[axis * chunks..][..chunks].iter_mut().enumerate() {
+                    *out = plane_at::<T, FUSED>(plane, corner, chunks, k);
+                }
             }
         }
+        cells = next;
     }
 }
 }
@@ -388,7 +408,7 @@ impl<'a, T: Real> Cotangents<'a, T> {
     #[inline(always)]
     fn prefetch(&self, i: usize, k: usize, chunks: usize, count: usize) {
         if let Cotangents::Each(g) = self {
-            parallel::prefetch(&g[(i * chunks + k) * LANES..][..count * LANES]);
+            parallel::prefetch_far(&g[(i * chunks + k) * LANES..][..count * LANES]);
         }
     }
 

@@ -184,13 +184,13 @@ impl<'a, T: Real> Scene<'a, T> {
         block
     }
 
-    /// Computes the samples in runs of at most [`TOGETHER`].
+    /// Computes the samples in runs of at most [`TOGETHER`]. With trilinear look-up, the rows of the next run are prefetched while this one is looked up.
     fn weights_in_runs(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let stop = T::lit(self.options.stop_below);
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
         let mut block = Block { first, ..Block::empty() };
         let mut found = trilinear.then(Corners::none);
-        let mut group = Group::none();
+        let [mut group, mut next_group] = [Group::none(), Group::none()];
         let mut kept = [0; TOGETHER];
         let mut end = 0;
         let rays = &self.rays[first..first + count];
@@ -198,38 +198,46 @@ impl<'a, T: Real> Scene<'a, T> {
         for r in 0..count {
             let mut places = self.samples_of(rays, first, r, &mut sections);
             let mut left = T::one();
-            // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
-            while left >= stop {
-                if end + TOGETHER > block.t.len() {
+            // Places the run that begins at a sample, and finds its corners.
+            let mut place = |start: usize, block: &mut Block<T>, found: &mut Option<Corners<T>>, group: &mut Group<T>| {
+                if start + TOGETHER > block.t.len() {
                     let room = block.make_room(trilinear);
                     found.iter_mut().for_each(|corners| corners.make_room(room));
                 }
-                let own = places.next_run(block.places(end));
-                if own == 0 {
-                    break;
-                }
-                let run = end..end + own;
-                if found.is_some() {
+                let run = start..start + places.next_run(block.places(start));
+                if trilinear && !run.is_empty() {
                     group.find(block.at.each_ref().map(|at| &at[run.clone()]), map);
+                    group.ask_for(self.tables[0]);
+                }
+                run
+            };
+            let mut run = place(end, &mut block, &mut found, &mut group);
+            // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
+            while left >= stop && !run.is_empty() {
+                let next = place(run.end, &mut block, &mut found, &mut next_group);
+                if trilinear {
                     group.density(self.tables[0], &mut block.density[run.clone()]);
                     block.find_absorptions(run.clone());
                 } else {
                     self.look_up_nearest(map, &mut block, run.clone());
                 }
                 let before = end;
+                let start = run.start;
                 for i in run {
                     if left < stop {
                         break;
                     }
                     block.looked_at += 1;
                     if block.keep(i, &mut left, end) {
-                        kept[end - before] = i - before;
+                        kept[end - before] = i - start;
                         end += 1;
                     }
                 }
                 if let Some(corners) = &mut found {
                     corners.put(before, kept[..end - before].iter().copied(), &group);
                 }
+                run = next;
+                std::mem::swap(&mut group, &mut next_group);
             }
             block.offsets.push(end as u32);
         }
@@ -260,6 +268,7 @@ impl<'a, T: Real> Scene<'a, T> {
         let at = block.at.each_ref().map(|at| &at[samples.clone()]);
         let rows = &mut block.rows[samples.clone()];
         lookup::nearest_rows(at, map, rows);
+        lookup::ask_for(self.tables[0], rows);
         // Absent voxels have density -1: no light, and no gradient.
         lookup::read_or(self.tables[0], rows, -T::one(), &mut block.density[samples.clone()]);
         block.find_absorptions(samples);

@@ -6,12 +6,12 @@ use autograd::{Buffer, Real, dispatched, parallel};
 use std::slice::from_mut;
 
 /// Number of samples between the prefetch of a row and its use.
-pub(super) const AHEAD: usize = 8;
+pub(super) const AHEAD: usize = 32;
 
-/// Prefetches the rows that are in a table.
+/// Prefetches the rows that are in a table, for later.
 #[inline(always)]
 pub(super) fn ask_for<E>(table: &[E], rows: &[u32]) {
-    rows.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch);
+    rows.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch_far);
 }
 
 /// Rows and weights of the eight corners around each sample.
@@ -75,6 +75,11 @@ impl<T: Real> Group<T> {
     #[inline(always)]
     pub fn find(&mut self, at: [&[T]; 3], map: impl NodeMap) {
         corners_of_many(at, map, from_mut(&mut self.rows), from_mut(&mut self.weights));
+    }
+
+    /// Prefetches the corners in a table of one column. Neighbors along the last axis mostly are in the same cache line.
+    pub fn ask_for(&self, table: &[T]) {
+        self.rows.iter().step_by(2).for_each(|rows| ask_for(table, rows));
     }
 
     /// Interpolates a table of one column at each position.
@@ -288,17 +293,24 @@ fn of_positions<T: Real, M: NodeMap, const W: usize, const N: usize, const FUSED
     out: &mut [[T; 3]],
 ) {
     let mut sums = [[T::zero(); W]; TOGETHER];
-    let mut group = Group::none();
+    let [mut group, mut next] = [Group::none(), Group::none()];
     let (table, basis) = (table.as_chunks::<W>().0, directions.basis.as_chunks::<N>().0);
+    let count = rays.len();
+    group.find(at.map(|at| &at[..count.min(TOGETHER)]), map);
     for (k, (rays, out)) in rays.chunks(TOGETHER).zip(out.chunks_mut(TOGETHER)).enumerate() {
-        group.find(at.map(|at| &at[k * TOGETHER..][..rays.len()]), map);
+        let (first, end) = (count.min((k + 1) * TOGETHER), count.min((k + 2) * TOGETHER));
+        next.find(at.map(|at| &at[first..end]), map);
         for (i, sum) in sums[..rays.len()].iter_mut().enumerate() {
+            if i < end - first {
+                next.rows.iter().for_each(|rows| parallel::prefetch_far(&table[rows[i] as usize]));
+            }
             let own = group.rows.each_ref().map(|rows| &table[rows[i] as usize]);
             weigh_all::<T, 8, W, FUSED>(own, group.weights.each_ref().map(|weights| weights[i]), sum);
         }
         for ((out, sum), &ray) in out.iter_mut().zip(&sums).zip(rays) {
             *out = color::<T, W, N, FUSED>(sum, &basis[ray as usize], directions.offset);
         }
+        std::mem::swap(&mut group, &mut next);
     }
 }
 }

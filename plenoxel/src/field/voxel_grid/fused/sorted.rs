@@ -19,26 +19,30 @@ const TASKS: usize = 64;
 const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
 
 /// Samples of a block that need a color, sorted by the bucket of their lowest corner.
-struct Order {
+struct Order<T: Real> {
     buckets: Buckets,
     samples: Buffer<u32>,
+    /// Position of each sample, in columns.
+    at: [Buffer<T>; 3],
     /// Number of the ray of each sample.
     rays: Buffer<u32>,
 }
 
-impl Order {
-    fn new<T: Real>(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
+impl<T: Real> Order<T> {
+    fn new(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
         let seen = block.seen();
         let bucket = |i: usize| (corners.of(i).0[0] >> BUCKET_SHIFT) as usize;
         let mut places = Buckets::count(buckets, (0..block.len()).filter(|&i| seen(i)).map(bucket));
-        let (mut samples, mut rays) = (Buffer::stale(places.total()), Buffer::stale(places.total()));
+        let total = places.total();
+        let (mut samples, mut at, mut rays) = (Buffer::stale(total), [0, 1, 2].map(|_| Buffer::stale(total)), Buffer::stale(total));
         for (r, own) in block.rays().enumerate() {
             for i in own.filter(|&i| seen(i)) {
                 let place = places.take(bucket(i));
                 (samples[place], rays[place]) = (i as u32, (block.first + r) as u32);
+                at.iter_mut().zip(&block.at).for_each(|(to, from)| to[place] = from[i]);
             }
         }
-        Order { buckets: places.filled(), samples, rays }
+        Order { buckets: places.filled(), samples, at, rays }
     }
 }
 
@@ -63,7 +67,7 @@ impl<T: Real> Scene<'_, T> {
         })
         .into_iter()
         .unzip();
-        let colors = self.colors_in_order(&blocks, &orders, buckets);
+        let colors = self.colors_in_order(&orders, buckets);
         let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(BLOCK * COLUMNS)).collect();
         parallel::map_items(parts, |_, (((mut block, order), sorted), pixels)| {
             block.color = Buffer::zeros(3 * block.len());
@@ -81,7 +85,7 @@ impl<T: Real> Scene<'_, T> {
     }
 
     /// Computes the colors of the samples of each order, one bucket after another for all blocks: a block alone has few samples in a bucket.
-    fn colors_in_order(&self, blocks: &[Block<T>], orders: &[Order], buckets: usize) -> Vec<Buffer<T>> {
+    fn colors_in_order(&self, orders: &[Order<T>], buckets: usize) -> Vec<Buffer<T>> {
         let directions = self.directions(0).expect("only harmonics are worth sorting");
         let per_task = buckets.div_ceil(TASKS).max(1);
         let of_task = |task: usize| task * per_task..((task + 1) * per_task).min(buckets);
@@ -108,12 +112,10 @@ impl<T: Real> Scene<'_, T> {
                 rays.grow(room);
                 found.grow(3 * room);
                 let mut start = 0;
-                for (block, order) in blocks.iter().zip(orders) {
+                for order in orders {
                     let range = order.buckets.range(bucket);
                     let own = start..start + range.len();
-                    for (to, from) in at.iter_mut().zip(&block.at) {
-                        to[own.clone()].iter_mut().zip(&order.samples[range.clone()]).for_each(|(to, &i)| *to = from[i as usize]);
-                    }
+                    at.iter_mut().zip(&order.at).for_each(|(to, from)| to[own.clone()].copy_from_slice(&from[range.clone()]));
                     start = own.end;
                     rays[own].copy_from_slice(&order.rays[range]);
                 }
