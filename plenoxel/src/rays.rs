@@ -255,8 +255,14 @@ impl RaySource {
         let of_place = view.chunks_mut(RUN).zip(pixel.chunks_mut(RUN)).zip(weight.chunks_mut(RUN));
         let runs = rays.chunks_mut(RUN).zip(of_image).zip(of_place).collect();
         parallel::for_each_item(runs, |run, ((rays, (target, alpha)), ((view, pixel), weight))| {
-            for (i, (ray, target)) in rays.iter_mut().zip(target.as_chunks_mut::<3>().0).enumerate() {
+            // Pixels are at random places of all images.
+            let prefetched = |i: usize| {
                 let place = place(run * RUN + i);
+                parallel::prefetch_far(views[place.view as usize].image.get_pixel(place.x, place.y));
+                place
+            };
+            let places: Vec<Place> = (0..rays.len()).map(prefetched).collect();
+            for (i, ((ray, target), place)) in rays.iter_mut().zip(target.as_chunks_mut::<3>().0).zip(places).enumerate() {
                 let (seen, x, y) = (&views[place.view as usize], place.x as usize, place.y as usize);
                 *ray = place.ray(views);
                 *target = seen.color(x, y, self.background).map(|c| T::lit(f64::from(c)));
