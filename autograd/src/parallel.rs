@@ -11,7 +11,7 @@ mod update;
 use crate::pool::Pooled;
 use crate::real::Real;
 pub use gather::{gathered, pairs_around};
-pub use prefetch::{load, prefetch, prefetch_far};
+pub use prefetch::{load, prefetch, prefetch_early};
 use rayon::prelude::*;
 pub(crate) use update::update;
 

@@ -255,10 +255,10 @@ impl RaySource {
         let of_place = view.chunks_mut(RUN).zip(pixel.chunks_mut(RUN)).zip(weight.chunks_mut(RUN));
         let runs = rays.chunks_mut(RUN).zip(of_image).zip(of_place).collect();
         parallel::for_each_item(runs, |run, ((rays, (target, alpha)), ((view, pixel), weight))| {
-            // Pixels are at random places of all images.
+            // Pixels are at random places of all images, so those of a run are prefetched before its first ray is computed.
             let prefetched = |i: usize| {
                 let place = place(run * RUN + i);
-                parallel::prefetch_far(views[place.view as usize].image.get_pixel(place.x, place.y));
+                parallel::prefetch_early(views[place.view as usize].image.get_pixel(place.x, place.y));
                 place
             };
             let places: Vec<Place> = (0..rays.len()).map(prefetched).collect();

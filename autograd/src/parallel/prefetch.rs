@@ -29,10 +29,10 @@ pub fn prefetch<E: ?Sized>(value: &E) {
 
 /// Prefetches the cache lines of a value into the second-level cache. On targets other than x86-64 it does nothing.
 ///
-/// Use it for look-ups in tables larger than the caches, some dozens of rows ahead: the lines do not displace what is in use from the first-level cache, and
-/// on AMD Zen 4 a prefetch that finds no free place is dropped, so that it does not hold up loads. For the same reason a burst of such prefetches is useless.
+/// Use it for look-ups in tables larger than the caches, some dozens of rows ahead. The lines do not displace what is in use from the first-level cache. If the
+/// core already waits for as many lines as it can, AMD Zen 4 drops the prefetch, so it does not hold up loads. Most of a burst is therefore dropped.
 #[inline(always)]
-pub fn prefetch_far<E: ?Sized>(value: &E) {
+pub fn prefetch_early<E: ?Sized>(value: &E) {
     prefetch_lines::<E, false>(value);
 }
 

@@ -1,6 +1,6 @@
 //! Elementwise updates of tables by optimizers, for gradients that are dense, row-sparse, or row-sparse with lazy sums.
 
-use super::{CHUNK, dispatched, for_each_item, prefetch_far, rows_per_chunk};
+use super::{CHUNK, dispatched, for_each_item, prefetch_early, rows_per_chunk};
 use crate::gradients::Grad;
 use crate::real::Real;
 use crate::rows::deferred::{RowGroups, RowSums};
@@ -277,7 +277,7 @@ fn update_touched<T: Real, const N: usize, const W: usize, F: Fn([T; N], T) -> [
 /// Prefetches the rows of a unit in all tables.
 #[inline(always)]
 fn prefetch_rows<T: Real, const N: usize>(x: &[&mut [T]; N], width: usize, unit: &Unit) {
-    x.iter().for_each(|x| prefetch_far(&x[unit.row * width..][..unit.rows * width]));
+    x.iter().for_each(|x| prefetch_early(&x[unit.row * width..][..unit.rows * width]));
 }
 
 /// Updates the rows whose bits are set among the eight rows from element `start` on, and clears the sums of all eight.

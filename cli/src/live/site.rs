@@ -131,7 +131,7 @@ impl server::Site for Site {
                 Response::new(JSON, training.status().to_string())
             }
             (Method::Post, "checkpoint", Some(training)) => {
-                training.ask_for_checkpoint();
+                training.prefetch_rows_checkpoint();
                 Response::new(JSON, training.status().to_string())
             }
             _ => Response::refusal(404, "not found"),

@@ -1,5 +1,5 @@
 //! Inner loops of the hash encoding. A loop processes one level, because the rows of one level fit in a cache and those of all levels do not. It processes
-//! groups of [`TOGETHER`] positions. With one or two features, [`encode`] reads all corners of a group before it adds them up: only the loop that reads waits
+//! groups of [`TOGETHER`] positions. With one or two features, [`encode`] reads all corners of a group before it interpolates them: only the loop that reads waits
 //! for memory, and it has nothing else to do, so dozens of its reads are under way.
 //!
 //! Between the loops and the tensors `[m, levels · features]`, numbers are in blocks of [`BLOCK`] positions: `[level, position, feature]` in each block.
@@ -119,11 +119,11 @@ impl<T: Real> Cells<T> {
     /// Interpolates the corners of all cells: along x, then along y, then along z. All corners are read, into `corners`, before the first is interpolated: no
     /// arithmetic waits for the table.
     #[inline(always)]
-    fn sums<const F: usize, const FUSED: bool>(
+    fn interpolate<const F: usize, const FUSED: bool>(
         &self,
         table: &[[T; F]],
         corners: &mut [[[T; F]; TOGETHER]; 8],
-        sums: &mut [[T; F]; TOGETHER],
+        out: &mut [[T; F]; TOGETHER],
     ) {
         for ([lower, upper], rows) in corners.as_chunks_mut::<2>().0.iter_mut().zip(self.rows.as_chunks::<2>().0) {
             for i in 0..TOGETHER {
@@ -138,14 +138,14 @@ impl<T: Real> Cells<T> {
             for f in 0..F {
                 let along_x = |c: usize| between(corners[c][i][f], corners[c + 1][i][f], x[i]);
                 let along_y = |c: usize| between(along_x(c), along_x(c + 2), y[i]);
-                sums[i][f] = between(along_y(0), along_y(4), z[i]);
+                out[i][f] = between(along_y(0), along_y(4), z[i]);
             }
         }
     }
 
-    /// Computes the weighted sums of the corners of one cell after another; the rows of a later cell are prefetched.
+    /// Computes the sums of the weighted corners of one cell after another; the rows of a later cell are prefetched.
     #[inline(always)]
-    fn sums_one_by_one<const F: usize, const FUSED: bool>(&self, table: &[[T; F]], sums: &mut [[T; F]; TOGETHER]) {
+    fn interpolate_one_by_one<const F: usize, const FUSED: bool>(&self, table: &[[T; F]], sums: &mut [[T; F]; TOGETHER]) {
         const AHEAD: usize = 16;
         let prefetch = |i: usize| {
             for c in 0..8 {
@@ -196,9 +196,9 @@ fn encode_loop<T: Real, const F: usize, const FUSED: bool>(level: &Level, table:
     for (group, out) in groups.iter().zip(out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER)) {
         cells.find::<FUSED>(level, group);
         let count = out.len();
-        let sums = if count == TOGETHER { out.first_chunk_mut().expect("a whole group") } else { &mut spare };
+        let values = if count == TOGETHER { out.first_chunk_mut().expect("a whole group") } else { &mut spare };
         // Rows of four features and more are vectors of their own; a buffer for their corners would fill the first-level cache.
-        if const { F <= 2 } { cells.sums::<F, FUSED>(table, &mut corners, sums) } else { cells.sums_one_by_one::<F, FUSED>(table, sums) }
+        if const { F <= 2 } { cells.interpolate::<F, FUSED>(table, &mut corners, values) } else { cells.interpolate_one_by_one::<F, FUSED>(table, values) }
         if count < TOGETHER {
             out.copy_from_slice(&spare[..count]);
         }

@@ -2,8 +2,8 @@
 
 use super::super::{PLANE_OF, gradient_share};
 use super::forward::{Block, Tables};
-use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, Places, PlaneOf, RUN, add_to_lines, first_rows};
-use super::network::OfNetwork;
+use super::lookup::{self, BucketSums, Cotangents as OfProducts, Pairs, Places, PlaneOf, add_to_lines, first_rows};
+use super::network::{OfNetwork, ROWS};
 use super::positions::{self, OfRays};
 use super::pruning::{self, prune};
 use super::{Output, State};
@@ -257,9 +257,9 @@ fn part<T: Real>(
 /// Returns the cotangents of the three lines of the density, one after another.
 fn of_density_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, g: &[T]) -> Buffer<T> {
     let mut sums = pairs.zeros_of_lines();
-    let mut of_planes = Buffer::stale(3 * pairs.width * RUN);
-    for (first, g) in g.chunks(RUN).enumerate() {
-        let at = at.map(|at| &at[first * RUN..][..g.len()]);
+    let mut of_planes = Buffer::stale(3 * pairs.width * ROWS.min(g.len()));
+    for (part, g) in g.chunks(ROWS).enumerate() {
+        let at = at.map(|at| &at[part * ROWS..][..g.len()]);
         let of_planes = &mut of_planes[..3 * pairs.width * g.len()];
         lookup::planes(pairs, at, of_planes);
         add_to_lines(pairs, at, of_planes, OfProducts::Shared(g), &mut sums);

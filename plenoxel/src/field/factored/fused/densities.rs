@@ -95,23 +95,15 @@ pub fn densities_at<T: Real>(field: &Factored<T>, positions: &Tensor<T>) -> Tens
     let (pairs, cells) = (Pairs::of(&tables[..6], field.nodes(), field.shape().density_components), cells.data().as_chunks::<3>().0);
     let mut sigma = vec![T::zero(); cells.len()];
     parallel::for_each_chunk(&mut sigma, parallel::CHUNK / RUN * RUN, |first, sigma| {
-        let columns = |first: usize| {
-            let mut columns = [[T::zero(); RUN]; 3];
-            for (i, cell) in cells[first.min(cells.len())..].iter().take(RUN).enumerate() {
-                (0..3).for_each(|axis| columns[axis][i] = cell[axis]);
-            }
-            columns
-        };
-        let mut at = columns(first);
+        let columns = [0, 1, 2].map(|axis| cells[first..][..sigma.len()].iter().map(|cell| cell[axis]).collect::<Vec<_>>());
+        let at = columns.each_ref().map(|column| &column[..]);
+        let mut slope = [T::zero(); RUN];
         for (run, sigma) in sigma.chunks_mut(RUN).enumerate() {
-            let next = columns(first + (run + 1) * RUN);
-            let (own, later) = (at.each_ref().map(|column| &column[..sigma.len()]), next.each_ref().map(|column| &column[..]));
-            let mut slope = [T::zero(); RUN];
+            let [own, later] = [run, run + 1].map(|run| lookup::run_of(at, run));
             match parallel::fused() {
                 true => lookup::density::<T, true>(pairs, own, later, sigma, &mut slope),
                 false => lookup::density::<T, false>(pairs, own, later, sigma, &mut slope),
             }
-            at = next;
         }
     });
     Tensor::from_vec(sigma, &[cells.len()])
@@ -204,11 +196,16 @@ impl<T: Real> Matter<T> for Densities<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::camera::Ray;
     use crate::field::encoding::Directions;
     use crate::field::factored::Shape;
     use crate::field::node_table::Cells;
+    use crate::render::{Engine, RenderOptions, render};
+    use crate::sampling::{Jitter, Spacing};
     use autograd::random::Stream;
     use autograd::{Module, Param};
+    use std::ops::Range;
+    use std::slice::from_ref;
 
     const BOX: Aabb = Aabb { min: DVec3::new(-1.0, -0.7, -1.2), max: DVec3::new(1.1, 0.9, 0.8) };
 
@@ -260,6 +257,34 @@ mod tests {
                 assert!((want - found).abs() <= 1e-12 * want.abs().max(1.0), "{want} {found}");
             }
         }
+    }
+
+    #[test]
+    fn each_ray_of_a_batch_has_the_densities_that_it_has_alone() {
+        let field = field([30, 17, 24]);
+        // Rays beside the box, through edges and through the middle: with no sample, with less than a run, and with several runs.
+        let ray = |i: usize| {
+            let origin = DVec3::new(0.055 * i as f64 - 1.8, 0.3 - 0.02 * i as f64, 2.0);
+            Ray { origin, direction: DVec3::new(0.2, 0.1, -1.0), stretch: 1.0 }
+        };
+        let rays: Vec<Ray> = (0..64).map(ray).collect();
+        let counts = [0.0, 0.97].map(|stop_below| {
+            let (spacing, jitter, engine) = (Spacing::Step(0.05), Jitter::None, Engine::Fused);
+            let options = RenderOptions { aabb: BOX, spacing, jitter, background: [1.0; 3], occupancy: None, engine, stop_below };
+            let all = render(&field, &rays, &options);
+            let mut counts = Vec::new();
+            for (i, ray) in rays.iter().enumerate() {
+                let one = render(&field, from_ref(ray), &options);
+                assert_eq!(one.opacity.data()[0], all.opacity.data()[i], "ray {i}, stop {stop_below}");
+                assert_eq!(one.depth().data()[0], all.depth().data()[i], "ray {i}, stop {stop_below}");
+                counts.push(one.sample_count);
+            }
+            assert_eq!(counts.iter().sum::<usize>(), all.sample_count);
+            counts
+        });
+        let has = |range: Range<usize>| counts[0].iter().any(|count| range.contains(count));
+        assert!(has(0..1) && has(1..RUN) && has(RUN + 1..2 * RUN) && has(2 * RUN..100), "{:?}", counts[0]);
+        assert!(counts[0].iter().zip(&counts[1]).any(|(all, stopped)| stopped < all), "no ray ends early");
     }
 
     #[test]

@@ -179,22 +179,21 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut columns: [Buffer<T>; of_sample::COUNT] = std::array::from_fn(|_| Buffer::stale(0));
         let mut offsets = vec![0];
         let mut end = 0;
-        // A ray, and its first run.
+        // The runs of a ray behind the first, and the first.
         let open = |r: usize| {
-            (r < count).then(|| {
-                let mut runs = self.runs(first + r);
-                let run = runs();
-                (runs, run)
-            })
+            let mut runs = self.runs(first + r);
+            let run = runs();
+            (runs, run)
         };
+        // The next ray, if it is opened before this one ends.
         let mut opened = None;
         for r in 0..count {
-            let (mut runs, mut run) = opened.take().or_else(|| open(r)).expect("a ray of the block");
+            let (mut runs, mut run) = opened.take().unwrap_or_else(|| open(r));
             let mut left = T::one();
             while left >= stop && run.count > 0 {
                 let following = if run.count == RUN { runs() } else { Run::empty() };
-                if following.count == 0 {
-                    opened = open(r + 1);
+                if following.count == 0 && r + 1 < count {
+                    opened = Some(open(r + 1));
                 }
                 let later = if following.count > 0 { &following } else { opened.as_ref().map_or(&following, |(_, run)| run) };
                 if end + RUN > columns[0].len() {

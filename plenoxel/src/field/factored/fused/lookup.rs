@@ -194,21 +194,25 @@ fn add_to<T: Real, const FUSED: bool>(sum: &mut [T; LANES], value: &[T; LANES], 
 /// Positions of samples, in units of cells.
 pub type Places<'a, T> = [&'a [T]; 3];
 
-/// Prefetches the plane rows of samples.
+/// Returns the rows of sample i in the plane of an axis: two pairs of neighbours.
+#[inline(always)]
+fn rows_of<'a, T: Real>(pairs: Pairs<'a, T>, cells: &Cells<T>, axis: usize, i: usize) -> [&'a [T]; 2] {
+    cells.corner(axis, i).rows.map(|row| &pairs.planes[axis][row * pairs.width..][..2 * pairs.width])
+}
+
+/// Prefetches the rows of sample i in the plane of an axis, for a later run.
+#[inline(always)]
+fn prefetch_early<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>, axis: usize, i: usize) {
+    rows_of(pairs, cells, axis, i).into_iter().for_each(parallel::prefetch_early);
+}
+
+/// Prefetches the plane rows of samples that are looked up next.
 #[inline(always)]
 pub(super) fn prefetch<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>) {
     for axis in 0..3 {
         for i in 0..cells.count {
-            prefetch_rows(pairs, cells, axis, i);
+            rows_of(pairs, cells, axis, i).into_iter().for_each(parallel::prefetch);
         }
-    }
-}
-
-/// Prefetches the rows of sample i in the plane of an axis. The rows of a run do not fit in the first-level cache.
-#[inline(always)]
-fn prefetch_rows<T: Real>(pairs: Pairs<'_, T>, cells: &Cells<T>, axis: usize, i: usize) {
-    for row in cells.corner(axis, i).rows {
-        parallel::prefetch_far(&pairs.planes[axis][row * pairs.width..][..2 * pairs.width]);
     }
 }
 
@@ -227,7 +231,7 @@ pub(super) fn add_lanes<T: Real, const N: usize>(sums: &mut [[T; LANES]; N]) {
 }
 
 dispatched! {
-/// Computes the density σ and dσ/ds of up to [`RUN`] samples, while the rows of up to [`RUN`] samples that come `later` are prefetched.
+/// Computes the density σ and dσ/ds of up to [`RUN`] samples. Meanwhile prefetches the rows of the samples that come `later`, up to [`RUN`].
 pub fn density<T: Real, const FUSED: bool>(
     pairs: Pairs<'_, T>,
     at: Places<'_, T>,
@@ -243,7 +247,7 @@ pub fn density<T: Real, const FUSED: bool>(
         for k in 0..chunks {
             for (i, sum) in sums.iter_mut().enumerate() {
                 if k == 0 && i < later.count {
-                    prefetch_rows(pairs, &later, axis, i);
+                    prefetch_early(pairs, &later, axis, i);
                 }
                 if i >= cells.count {
                     continue;
@@ -280,13 +284,18 @@ pub(super) fn density_of<T: Real, const FUSED: bool>(x: T) -> (T, T) {
 
 /// Splits samples, and their rows of `width` values, into runs of up to [`RUN`].
 fn runs<'a, T: Real>(at: Places<'a, T>, values: &'a mut [T], width: usize) -> impl Iterator<Item = (Places<'a, T>, &'a mut [T])> {
-    let firsts = (0..at[0].len()).step_by(RUN);
-    firsts.zip(values.chunks_mut(RUN * width)).map(move |(first, values)| (at.map(|at| &at[first..at.len().min(first + RUN)]), values))
+    (0..).zip(values.chunks_mut(RUN * width)).map(move |(run, values)| (run_of(at, run), values))
+}
+
+/// Returns a run of samples, which is empty behind the last.
+#[inline(always)]
+pub fn run_of<T>(at: Places<'_, T>, run: usize) -> Places<'_, T> {
+    at.map(|at| &at[at.len().min(run * RUN)..at.len().min((run + 1) * RUN)])
 }
 
 /// Interpolates the three planes at samples: rows of three times `width` values.
 pub fn planes<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
-    if parallel::fused() { planes_ahead::<T, true>(pairs, at, out) } else { planes_ahead::<T, false>(pairs, at, out) }
+    if parallel::fused() { planes_in_runs::<T, true>(pairs, at, out) } else { planes_in_runs::<T, false>(pairs, at, out) }
 }
 
 /// Multiplies the values of planes at samples by those of the lines.
@@ -303,19 +312,22 @@ pub fn products<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) 
 }
 
 dispatched! {
-/// Interpolates the planes at samples, while the rows of the run after this one are prefetched.
-fn planes_ahead<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
-    let (count, chunks) = (at[0].len(), pairs.width / LANES);
-    let mut cells = Cells::new(at.map(|at| &at[..count.min(RUN)]), pairs.nodes);
-    prefetch(pairs, &cells);
+/// Interpolates the planes at samples, run by run. Meanwhile prefetches the rows of the next run.
+fn planes_in_runs<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
+    let chunks = pairs.width / LANES;
+    let mut cells = Cells::new(run_of(at, 0), pairs.nodes);
+    for axis in 0..3 {
+        for i in 0..cells.count {
+            prefetch_early(pairs, &cells, axis, i);
+        }
+    }
     for (run, out) in out.as_chunks_mut::<LANES>().0.chunks_mut(RUN * 3 * chunks).enumerate() {
-        let (first, end) = (count.min((run + 1) * RUN), count.min((run + 2) * RUN));
-        let next = Cells::new(at.map(|at| &at[first..end]), pairs.nodes);
+        let next = Cells::new(run_of(at, run + 1), pairs.nodes);
         for axis in 0..3 {
             let plane = pairs.planes[axis].as_chunks::<LANES>().0;
             for (i, out) in out.chunks_exact_mut(3 * chunks).enumerate() {
                 if i < next.count {
-                    prefetch_rows(pairs, &next, axis, i);
+                    prefetch_early(pairs, &next, axis, i);
                 }
                 let corner = cells.corner(axis, i);
                 for (k, out) in out[axis * chunks..][..chunks].iter_mut().enumerate() {
@@ -408,7 +420,7 @@ impl<'a, T: Real> Cotangents<'a, T> {
     #[inline(always)]
     fn prefetch(&self, i: usize, k: usize, chunks: usize, count: usize) {
         if let Cotangents::Each(g) = self {
-            parallel::prefetch_far(&g[(i * chunks + k) * LANES..][..count * LANES]);
+            parallel::prefetch_early(&g[(i * chunks + k) * LANES..][..count * LANES]);
         }
     }
 
@@ -499,4 +511,30 @@ pub fn add_to_plane<T: Real, const FUSED: bool>(
         }
     }
 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autograd::random::Stream;
+
+    #[test]
+    fn products_of_any_number_of_samples_are_those_of_each() {
+        let (nodes, width) = ([5, 9, 7], 32);
+        let numbers = |rows: usize, seed: u64| Stream::new(seed).uniform_tensor::<f64>(&[rows * width], -1.0, 1.0);
+        let planes = [0, 1, 2].map(|axis| numbers(PLANE_OF[axis].map(|a| nodes[a]).iter().product(), axis as u64));
+        let lines = [0, 1, 2].map(|axis| numbers(nodes[axis], 3 + axis as u64));
+        let pairs = Pairs { planes: planes.each_ref().map(|x| x.data()), lines: lines.each_ref().map(|x| x.data()), nodes, width };
+        for count in [0, 1, RUN - 1, RUN, RUN + 1, 2 * RUN + 3] {
+            let at = [0, 1, 2].map(|axis| Stream::new(7 + axis as u64).uniform_tensor::<f64>(&[count], 0.0, nodes[axis] as f64 - 1.0));
+            let at = at.each_ref().map(|x| x.data());
+            let mut all = vec![0.0; 3 * width * count];
+            products(pairs, at, &mut all);
+            for (i, all) in all.chunks(3 * width).enumerate() {
+                let mut one = vec![0.0; 3 * width];
+                products(pairs, at.map(|at| &at[i..=i]), &mut one);
+                assert_eq!(one, all, "sample {i} of {count}");
+            }
+        }
+    }
 }

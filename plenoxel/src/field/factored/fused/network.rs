@@ -5,8 +5,8 @@ use super::lookup::{self, Cotangents, Pairs, Places};
 use super::pruning;
 use autograd::{Buffer, Matrix, Real, Tensor, add_product, dispatched, multiply, parallel};
 
-/// Number of groups that pass through all layers before others: their values stay in the second-level cache.
-const ROWS: usize = 256;
+/// Number of groups, or of samples, that are processed before others: their values stay in the second-level cache.
+pub const ROWS: usize = 256;
 
 /// Linear layer.
 struct Layer<'a, T> {

@@ -168,7 +168,8 @@ impl<'a, T: Real> Scene<'a, T> {
                 }
                 ends[r - start] = placed;
             }
-            self.look_up_nearest(map, &mut block, end..placed);
+            self.find_nearest(map, &mut block, end..placed);
+            self.read_nearest(&mut block, end..placed);
             block.looked_at += placed - end;
             let mut begin = end;
             for &ray_end in &ends[..together.len()] {
@@ -184,7 +185,7 @@ impl<'a, T: Real> Scene<'a, T> {
         block
     }
 
-    /// Computes the samples in runs of at most [`TOGETHER`]. With trilinear look-up, the rows of the next run are prefetched while this one is looked up.
+    /// Computes the samples in runs of at most [`TOGETHER`]. The densities of the next run are prefetched while this one is looked up.
     fn weights_in_runs(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
         let stop = T::lit(self.options.stop_below);
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
@@ -198,28 +199,31 @@ impl<'a, T: Real> Scene<'a, T> {
         for r in 0..count {
             let mut places = self.samples_of(rays, first, r, &mut sections);
             let mut left = T::one();
-            // Places the run that begins at a sample, and finds its corners.
+            // Places the run that begins at a sample, finds its rows, and prefetches their densities.
             let mut place = |start: usize, block: &mut Block<T>, found: &mut Option<Corners<T>>, group: &mut Group<T>| {
                 if start + TOGETHER > block.t.len() {
                     let room = block.make_room(trilinear);
                     found.iter_mut().for_each(|corners| corners.make_room(room));
                 }
                 let run = start..start + places.next_run(block.places(start));
-                if trilinear && !run.is_empty() {
+                if !trilinear {
+                    self.find_nearest(map, block, run.clone());
+                } else if !run.is_empty() {
                     group.find(block.at.each_ref().map(|at| &at[run.clone()]), map);
-                    group.ask_for(self.tables[0]);
+                    group.prefetch_rows(self.tables[0]);
                 }
                 run
             };
             let mut run = place(end, &mut block, &mut found, &mut group);
-            // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped.
+            // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped. The run behind it is placed
+            // in vain.
             while left >= stop && !run.is_empty() {
                 let next = place(run.end, &mut block, &mut found, &mut next_group);
                 if trilinear {
                     group.density(self.tables[0], &mut block.density[run.clone()]);
                     block.find_absorptions(run.clone());
                 } else {
-                    self.look_up_nearest(map, &mut block, run.clone());
+                    self.read_nearest(&mut block, run.clone());
                 }
                 let before = end;
                 let start = run.start;
@@ -263,14 +267,17 @@ impl<'a, T: Real> Scene<'a, T> {
         Places::new(march, &rays[r], occupied, &self.batch.layout.shape)
     }
 
-    /// Finds rows, densities and absorptions of some samples with nearest look-up.
-    fn look_up_nearest(&self, map: impl NodeMap, block: &mut Block<T>, samples: Range<usize>) {
-        let at = block.at.each_ref().map(|at| &at[samples.clone()]);
+    /// Finds the rows of some samples with nearest look-up, and prefetches their densities.
+    fn find_nearest(&self, map: impl NodeMap, block: &mut Block<T>, samples: Range<usize>) {
         let rows = &mut block.rows[samples.clone()];
-        lookup::nearest_rows(at, map, rows);
-        lookup::ask_for(self.tables[0], rows);
+        lookup::nearest_rows(block.at.each_ref().map(|at| &at[samples.clone()]), map, rows);
+        lookup::prefetch_rows(self.tables[0], rows);
+    }
+
+    /// Reads the densities of rows that were found before, and computes absorptions.
+    fn read_nearest(&self, block: &mut Block<T>, samples: Range<usize>) {
         // Absent voxels have density -1: no light, and no gradient.
-        lookup::read_or(self.tables[0], rows, -T::one(), &mut block.density[samples.clone()]);
+        lookup::read_or(self.tables[0], &block.rows[samples.clone()], -T::one(), &mut block.density[samples.clone()]);
         block.find_absorptions(samples);
     }
 
@@ -389,5 +396,42 @@ impl<T: Real> Block<T> {
     fn truncate(&mut self, count: usize) {
         self.columns().into_iter().for_each(|column| column.truncate(count));
         self.rows.truncate(count);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::render;
+    use crate::camera::Ray;
+    use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+    use crate::geometry::Aabb;
+    use crate::render::{Engine, RenderOptions};
+    use crate::sampling::{Jitter, Spacing};
+    use glam::DVec3;
+    use std::slice::from_ref;
+
+    #[test]
+    fn each_ray_of_a_batch_has_the_pixel_that_it_has_alone() {
+        // Rays beside the box, through edges and through the middle: with no sample, with less than a run, and with several runs.
+        let ray = |i: usize| {
+            let origin = DVec3::new(0.055 * i as f64 - 1.8, 0.3 - 0.02 * i as f64, 2.0);
+            Ray { origin, direction: DVec3::new(0.2, 0.1, -1.0), stretch: 1.0 }
+        };
+        let rays: Vec<Ray> = (0..64).map(ray).collect();
+        for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
+            let shape = GridShape { resolution: 20, half_width: 1.0, interpolation, color: Color::Rgb, sh_reduction: 1 };
+            let grid = VoxelGrid::<f64>::random(shape, 3.0, 0.2, 8);
+            for stop_below in [0.0, 0.3] {
+                let (spacing, jitter, engine) = (Spacing::Step(0.05), Jitter::None, Engine::Fused);
+                let options =
+                    RenderOptions { aabb: Aabb::cube(1.0), spacing, jitter, background: [1.0; 3], occupancy: None, engine, stop_below };
+                let all = render(&grid, &rays, &options);
+                for (i, ray) in rays.iter().enumerate() {
+                    let one = render(&grid, from_ref(ray), &options);
+                    let pixel = &all.rgb.data()[3 * i..3 * i + 3];
+                    assert_eq!(one.rgb.data(), pixel, "{interpolation:?}, ray {i}, stop {stop_below}");
+                }
+            }
+        }
     }
 }

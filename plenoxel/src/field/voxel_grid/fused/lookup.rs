@@ -8,10 +8,10 @@ use std::slice::from_mut;
 /// Number of samples between the prefetch of a row and its use.
 pub(super) const AHEAD: usize = 32;
 
-/// Prefetches the rows that are in a table, for later.
+/// Prefetches the rows that are in a table.
 #[inline(always)]
-pub(super) fn ask_for<E>(table: &[E], rows: &[u32]) {
-    rows.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch_far);
+pub(super) fn prefetch_rows<E>(table: &[E], rows: &[u32]) {
+    rows.iter().filter_map(|&row| table.get(row as usize)).for_each(parallel::prefetch_early);
 }
 
 /// Rows and weights of the eight corners around each sample.
@@ -77,9 +77,10 @@ impl<T: Real> Group<T> {
         corners_of_many(at, map, from_mut(&mut self.rows), from_mut(&mut self.weights));
     }
 
-    /// Prefetches the corners in a table of one column. Neighbors along the last axis mostly are in the same cache line.
-    pub fn ask_for(&self, table: &[T]) {
-        self.rows.iter().step_by(2).for_each(|rows| ask_for(table, rows));
+    /// Prefetches the corners in a table of one column. Neighbors along the last axis mostly are in the same cache line, so only every second corner is
+    /// prefetched.
+    pub fn prefetch_rows(&self, table: &[T]) {
+        self.rows.iter().step_by(2).for_each(|rows| prefetch_rows(table, rows));
     }
 
     /// Interpolates a table of one column at each position.
@@ -178,7 +179,7 @@ pub(super) fn plain<T: Real, const K: usize>(
     let count = out.len();
     for (i, out) in out.iter_mut().enumerate() {
         if i + AHEAD < count {
-            ask_for(table, &look(i + AHEAD).0);
+            prefetch_rows(table, &look(i + AHEAD).0);
         }
         let mut sum = [T::zero(); 3];
         if seen(i) {
@@ -299,10 +300,12 @@ fn of_positions<T: Real, M: NodeMap, const W: usize, const N: usize, const FUSED
     group.find(at.map(|at| &at[..count.min(TOGETHER)]), map);
     for (k, (rays, out)) in rays.chunks(TOGETHER).zip(out.chunks_mut(TOGETHER)).enumerate() {
         let (first, end) = (count.min((k + 1) * TOGETHER), count.min((k + 2) * TOGETHER));
-        next.find(at.map(|at| &at[first..end]), map);
+        if first < end {
+            next.find(at.map(|at| &at[first..end]), map);
+        }
         for (i, sum) in sums[..rays.len()].iter_mut().enumerate() {
             if i < end - first {
-                next.rows.iter().for_each(|rows| parallel::prefetch_far(&table[rows[i] as usize]));
+                next.rows.iter().for_each(|rows| parallel::prefetch_early(&table[rows[i] as usize]));
             }
             let own = group.rows.each_ref().map(|rows| &table[rows[i] as usize]);
             weigh_all::<T, 8, W, FUSED>(own, group.weights.each_ref().map(|weights| weights[i]), sum);

@@ -5,7 +5,7 @@
 //! the other tables.
 
 use super::forward::{Block, Scene};
-use super::lookup::{AHEAD, Corners, ask_for, nearest_rows, weigh_all};
+use super::lookup::{AHEAD, Corners, nearest_rows, prefetch_rows, weigh_all};
 use super::{Batch, COLUMNS};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, Interpolation};
@@ -127,7 +127,7 @@ fn add_to_means<T: Real, const K: usize, const W: usize, const N: usize>(
                 // Consecutive samples mostly read the same rows.
                 let [before, later] = [i + AHEAD - 1, i + AHEAD].map(|i| look(i).0);
                 if later != before {
-                    ask_for(table, &later);
+                    prefetch_rows(table, &later);
                 }
             }
             let (rows, weights) = look(i);
@@ -259,7 +259,7 @@ fn add_runs<T: Real, const K: usize, const N: usize>(
     let numbers = &runs.numbers[runs.buckets.range(bucket)];
     for (k, &number) in numbers.iter().enumerate() {
         if let Some(&later) = numbers.get(k + RUNS_AHEAD) {
-            ask_for(&runs.runs, &[later]);
+            parallel::prefetch(&runs.runs[later as usize]);
         }
         let run = &runs.runs[number as usize];
         let y: &[T; N] = basis[run.ray as usize * (N + 1) + 1..].first_chunk().expect("the harmonics of each ray");

@@ -22,7 +22,7 @@ const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
 struct Order<T: Real> {
     buckets: Buckets,
     samples: Buffer<u32>,
-    /// Position of each sample, in columns.
+    /// Position of each sample, in columns: a copy in this order.
     at: [Buffer<T>; 3],
     /// Number of the ray of each sample.
     rays: Buffer<u32>,
