@@ -131,7 +131,7 @@ impl server::Site for Site {
                 Response::new(JSON, training.status().to_string())
             }
             (Method::Post, "checkpoint", Some(training)) => {
-                training.prefetch_rows_checkpoint();
+                training.ask_for_checkpoint();
                 Response::new(JSON, training.status().to_string())
             }
             _ => Response::refusal(404, "not found"),

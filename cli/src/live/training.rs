@@ -112,7 +112,7 @@ impl Training {
     }
 
     /// Asks for a checkpoint after the next step.
-    pub fn prefetch_rows_checkpoint(&self) {
+    pub fn ask_for_checkpoint(&self) {
         self.wants_checkpoint.store(true, SeqCst);
     }
 

@@ -179,7 +179,7 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut columns: [Buffer<T>; of_sample::COUNT] = std::array::from_fn(|_| Buffer::stale(0));
         let mut offsets = vec![0];
         let mut end = 0;
-        // The runs of a ray behind the first, and the first.
+        // Returns the function for the later runs of a ray, and its first run.
         let open = |r: usize| {
             let mut runs = self.runs(first + r);
             let run = runs();

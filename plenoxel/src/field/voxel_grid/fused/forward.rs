@@ -421,7 +421,7 @@ mod tests {
         for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
             let shape = GridShape { resolution: 20, half_width: 1.0, interpolation, color: Color::Rgb, sh_reduction: 1 };
             let grid = VoxelGrid::<f64>::random(shape, 3.0, 0.2, 8);
-            for stop_below in [0.0, 0.3] {
+            let counts = [0.0, 0.3].map(|stop_below| {
                 let (spacing, jitter, engine) = (Spacing::Step(0.05), Jitter::None, Engine::Fused);
                 let options =
                     RenderOptions { aabb: Aabb::cube(1.0), spacing, jitter, background: [1.0; 3], occupancy: None, engine, stop_below };
@@ -431,7 +431,9 @@ mod tests {
                     let pixel = &all.rgb.data()[3 * i..3 * i + 3];
                     assert_eq!(one.rgb.data(), pixel, "{interpolation:?}, ray {i}, stop {stop_below}");
                 }
-            }
+                all.sample_count
+            });
+            assert!(counts[1] < counts[0], "no ray ends early: {counts:?}");
         }
     }
 }
