@@ -4,14 +4,14 @@
 //!     cargo bench --bench ops
 //!     cargo bench --bench ops -- exp gather4 --repeats 21
 //!
-//! `hash_step` and `planes_step` are training steps. `benches/peers` has them in PyTorch; there, Adam updates all rows of the tables, here those that were read.
+//! `hash_step` and `planes_step` are training steps; names with `_mixed` have products in mixed precision. `benches/peers` has the steps in PyTorch; there, Adam updates all rows of the tables, here those that were read.
 
 mod support;
 
 use autograd::nn::{Activation, Mlp};
 use autograd::optim::{Adam, AdamMode, Optimizer};
 use autograd::random::Stream;
-use autograd::{Buffer, Indices, Module, Param, Real, Tensor, add_rows, impl_module};
+use autograd::{Buffer, Indices, Module, Param, Precision, Real, Tensor, add_rows, impl_module};
 use glam::DVec3;
 use plenoxel::camera::Ray;
 use plenoxel::field::encoding::Directions;
@@ -21,7 +21,7 @@ use plenoxel::geometry::Aabb;
 use plenoxel::render::{Engine, RenderOptions, render};
 use plenoxel::sampling::{Jitter, Spacing};
 use std::hint::black_box;
-use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat, tensor};
+use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat, suffix, tensor};
 
 const PICKS: usize = 1_000_000;
 const SIDE: usize = 128;
@@ -45,12 +45,13 @@ fn row(args: &Arguments, name: &str, inputs: &[&[usize]], f: impl Fn(&[Tensor<f3
 }
 
 /// Eight layers of one width for 65 536 rows of a constant input: forward, and the adjoint of the parameters.
-fn network(args: &Arguments, width: usize) {
-    let (name, layers, rows) = (format!("mlp_8x{width}"), 8, 65_536);
+fn network(args: &Arguments, width: usize, precision: Precision) {
+    let (name, layers, rows) = (format!("mlp_8x{width}{}", suffix(precision)), 8, 65_536);
     if !args.wants(&name) {
         return;
     }
-    let net = Mlp::<f32>::new("net", &vec![width; layers + 1], Activation::Relu, &Stream::new(1));
+    let mut net = Mlp::<f32>::new("net", &vec![width; layers + 1], Activation::Relu, &Stream::new(1));
+    net.precision = precision;
     let (x, cotangent) = (tensor(&[rows, width], 2), tensor(&[rows, width], 3));
     let forward = repeat(args.repeats, || drop(black_box(autograd::no_grad(|| net.forward(&x)))));
     let both = repeat(args.repeats, || drop(black_box(net.forward(&x).backward_from(&cotangent))));
@@ -94,15 +95,16 @@ fn hash_step(args: &Arguments) {
 }
 
 /// A training step of a factored field of the sizes of the preset `quality`, with 300 nodes a side, in thin fog: 4096 rays of 64 samples, each with a color.
-fn planes_step(args: &Arguments) {
-    const NAME: &str = "planes_step";
-    if !args.wants(NAME) {
+fn planes_step(args: &Arguments, precision: Precision) {
+    let name = format!("planes_step{}", suffix(precision));
+    if !args.wants(&name) {
         return;
     }
     let (directions, aabb) = (Directions::Harmonics(3), Aabb { min: DVec3::NEG_ONE, max: DVec3::ONE });
     let shape =
         factored::Shape { density_components: 16, appearance_components: 48, features: 32, hidden: 128, feature_octaves: 0, directions };
     let mut model = Factored::<f32>::new(shape, aabb, [300; 3], &Stream::new(1));
+    model.set_precision(precision);
     let starts = numbers(2 * 4096, 2);
     let origins = starts.as_chunks::<2>().0.iter().map(|&[x, y]| DVec3::new(2.0 * f64::from(x) - 1.0, 2.0 * f64::from(y) - 1.0, 2.0));
     let rays: Vec<Ray> = origins.map(|origin| Ray { origin, direction: DVec3::NEG_Z, stretch: 1.0 }).collect();
@@ -116,7 +118,7 @@ fn planes_step(args: &Arguments) {
         stop_below: 0.0,
     };
     assert_eq!(render(&model, &rays, &options).sample_count, 4096 * 64, "samples of the script it is compared with");
-    training_step(args, NAME, &mut model, |model| render(model, &rays, &options).rgb);
+    training_step(args, &name, &mut model, |model| render(model, &rays, &options).rgb);
 }
 
 fn print(name: &str, forward: Option<f64>, both: &[f64], form: &str, gflop_per_s: Option<f64>) {
@@ -146,10 +148,12 @@ fn run() {
     row(&args, "matmul_1024", &[&[1024, 1024], &[1024, 1024]], |x| x[0].matmul(&x[1]));
     row(&args, "matmul_65536x32x64", &[&[65536, 32], &[32, 64]], |x| x[0].matmul(&x[1]));
     for width in [16, 64, 128, 256] {
-        network(&args, width);
+        network(&args, width, Precision::Full);
+        network(&args, width, Precision::Mixed);
     }
     hash_step(&args);
-    planes_step(&args);
+    planes_step(&args, Precision::Full);
+    planes_step(&args, Precision::Mixed);
     row(&args, "sum_16M", &[&[16_000_000]], |x| x[0].sum());
     for width in [4, 28] {
         let name = format!("scatter_add{width}");

@@ -6,9 +6,9 @@
 
 mod support;
 
-use autograd::{Buffer, Indices, Matrix, Tensor, multiply, parallel};
+use autograd::{Buffer, Indices, Matrix, Precision, Tensor, multiply, parallel};
 use std::hint::black_box;
-use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat};
+use support::{Arguments, arguments, median, numbers, peak_memory_mb, repeat, suffix};
 
 /// Numbers in the arrays that are read and written from end to end: 256 MB.
 const LONG: usize = 64 << 20;
@@ -49,7 +49,8 @@ fn run() {
         gather(&args, side, width);
     }
     for width in [16, 64, 128, 256] {
-        products(&args, width);
+        products(&args, width, Precision::Full);
+        products(&args, width, Precision::Mixed);
     }
 }
 
@@ -74,8 +75,8 @@ fn gather(args: &Arguments, side: usize, width: usize) {
 }
 
 /// Products of 256 rows with a square matrix, on all threads.
-fn products(args: &Arguments, width: usize) {
-    let name = format!("gemm_{width}");
+fn products(args: &Arguments, width: usize, precision: Precision) {
+    let name = format!("gemm_{width}{}", suffix(precision));
     if !args.wants(&name) {
         return;
     }
@@ -84,7 +85,7 @@ fn products(args: &Arguments, width: usize) {
     let mut out = Buffer::<f32>::zeros(blocks * rows * width);
     let times = repeat(args.repeats, || {
         parallel::for_each_chunk(&mut out, rows * width, |_, out| {
-            multiply(Matrix::new(&x, rows, width), Matrix::new(&w, width, width), out)
+            multiply(Matrix::new(&x, rows, width), Matrix::new(&w, width, width), out, precision)
         });
     });
     let ms = median(&times);

@@ -50,7 +50,7 @@ pub use gradients::{Grad, Gradients};
 pub use graph::{no_grad, recording as is_recording};
 pub use index::Indices;
 pub use lattice::Lattice;
-pub use matrix::{Matrix, add_product, multiply};
+pub use matrix::{Matrix, Precision, add_product, multiply};
 #[doc(hidden)]
 pub use multiversion; // `dispatched!` expands to this path in other crates.
 pub use op::{Cotangent, GradSink, Keep, Kernel, KernelCall, Op, Vjp};

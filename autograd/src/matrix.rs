@@ -1,7 +1,10 @@
-//! Products of matrices in slices, computed on one thread by the `gemm` crate.
+//! Products of matrices in slices, computed on one thread by the `gemm` crate, or in mixed precision by [`bf16`].
 //!
 //! The crate takes pointers, which requires one unsafe call, in `product_in_order`. The tests of the matrix product compare it with a safe triple loop.
 #![allow(unsafe_code)]
+
+#[cfg(target_arch = "x86_64")]
+mod bf16;
 
 use crate::pool::Buffer;
 use crate::real::Real;
@@ -17,7 +20,7 @@ pub struct Matrix<'a, T> {
     col: usize,
 }
 
-impl<'a, T> Matrix<'a, T> {
+impl<'a, T: Real> Matrix<'a, T> {
     /// Returns a view of a `rows` × `cols` matrix that is stored in row-major order.
     ///
     /// Panics if the slice has another length.
@@ -56,9 +59,39 @@ impl<'a, T> Matrix<'a, T> {
         Matrix { data: &self.data[(range.start * self.col).min(self.data.len())..], cols: range.len(), ..self }
     }
 
+    /// Returns true if the columns are contiguous, and not the rows.
+    fn is_transposed(&self) -> bool {
+        self.row == 1 && self.col != 1
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    fn as_f32(self) -> Option<Matrix<'a, f32>> {
+        let Matrix { rows, cols, row, col, .. } = self;
+        T::as_f32(self.data).map(|data| Matrix { data, rows, cols, row, col })
+    }
+
     /// Returns the index of the last entry plus one, or 0 for an empty matrix.
     fn reach(&self) -> usize {
         if self.rows == 0 || self.cols == 0 { 0 } else { (self.rows - 1) * self.row + (self.cols - 1) * self.col + 1 }
+    }
+}
+
+/// Precision of products of `f32` matrices.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Precision {
+    /// Factors and sums are `f32`.
+    #[default]
+    Full,
+    /// Factors are rounded to bf16, which has the exponent of `f32` and eight binary digits; sums are `f32`. This is what `torch.autocast` does to products on a
+    /// CPU. A processor with AVX512-BF16 (AMD Zen 4 and later; Intel Cooper Lake, Sapphire Rapids and later) computes them at up to twice the rate; on other processors this
+    /// is [`Precision::Full`]. Products of `f64` matrices are always `f64`.
+    Mixed,
+}
+
+impl Precision {
+    /// Returns `Mixed` if `mixed`, otherwise `Full`.
+    pub fn mixed_if(mixed: bool) -> Self {
+        if mixed { Precision::Mixed } else { Precision::Full }
     }
 }
 
@@ -66,29 +99,36 @@ impl<'a, T> Matrix<'a, T> {
 ///
 /// Panics if the sizes do not fit.
 #[track_caller]
-pub fn multiply<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
-    product(a, b, out, false);
+pub fn multiply<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], precision: Precision) {
+    product(a, b, out, false, precision);
 }
 
 /// Computes out += a · b on this thread, for kernels. `out` is in row-major order.
 ///
 /// Panics if the sizes do not fit.
 #[track_caller]
-pub fn add_product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) {
-    product(a, b, out, true);
+pub fn add_product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], precision: Precision) {
+    product(a, b, out, true, precision);
 }
 
 /// Largest number of columns of a result that is computed transposed.
 const NARROW: usize = 32;
 
 #[track_caller]
-fn product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool) {
+fn product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool, precision: Precision) {
     let (m, n) = (a.rows, b.cols);
-    assert!(out.len() == m * n);
+    assert!(b.rows == a.cols && out.len() == m * n);
+    #[cfg(target_arch = "x86_64")]
+    if precision == Precision::Mixed
+        && bf16::is_available()
+        && let (Some(a), Some(b)) = (a.as_f32(), b.as_f32())
+        && let Some(out) = T::as_f32_mut(out)
+    {
+        return bf16::product(a, b, out, add);
+    }
     // The library computes up to 64 numbers of a row at once. A narrow result has fewer; its transpose has long rows. They are contiguous in `a` if it is a
     // transposed view, as for the gradient of a weight.
-    let is_transposed = a.row == 1 && a.col != 1;
-    if !is_transposed || n == 0 || n >= m || n > NARROW {
+    if !a.is_transposed() || n == 0 || n >= m || n > NARROW {
         return product_in_order(a, b, out, add);
     }
     let mut transposed = Buffer::stale(m * n);
@@ -142,6 +182,7 @@ fn product_in_order<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Stream;
 
     /// As for the gradient of a weight with few outputs: the result is narrow, and its transpose is computed.
     #[test]
@@ -151,11 +192,68 @@ mod tests {
             let (a, b) = (numbers(m * k), numbers(k * n));
             let mut out = numbers(m * n);
             let before = out.clone();
-            add_product(Matrix::transposed(&a, m, k), Matrix::new(&b, k, n), &mut out);
+            add_product(Matrix::transposed(&a, m, k), Matrix::new(&b, k, n), &mut out, Precision::Full);
             for (i, (out, before)) in out.iter().zip(before).enumerate() {
                 let want = before + (0..k).map(|l| a[l * m + i / n] * b[l * n + i % n]).sum::<f64>();
                 assert!((out - want).abs() < 1e-9, "{m} × {k} × {n}");
             }
         }
+    }
+
+    /// The nearest bf16 number, the even one of two.
+    fn rounded(x: f32) -> f64 {
+        let bits = x.to_bits();
+        f64::from(f32::from_bits((bits + 0x7fff + (bits >> 16 & 1)) & 0xffff_0000))
+    }
+
+    #[test]
+    fn mixed_products_are_those_of_rounded_factors() {
+        let random = Stream::new(5);
+        let numbers = |name: &str, n: usize| random.named(name).normal_tensor::<f32>(&[n], 0.0, 1.0).data().to_vec();
+        #[cfg(target_arch = "x86_64")]
+        let is_rounded = bf16::is_available();
+        #[cfg(not(target_arch = "x86_64"))]
+        let is_rounded = false;
+        let factor = |x: f32| if is_rounded { rounded(x) } else { f64::from(x) };
+        let sizes = [
+            (1, 1, 1),
+            (40, 300, 16),
+            (33, 5, 32),
+            (3, 7, 1),
+            (256, 128, 128),
+            (17, 33, 35),
+            (256, 48, 3),
+            (50, 64, 70),
+            (0, 3, 2),
+            (2, 0, 5),
+            (3, 2, 0),
+        ];
+        for (m, k, n) in sizes {
+            let (a, b, before) = (numbers("a", m * k), numbers("b", k * n), numbers("out", m * n));
+            for case in 0..8 {
+                let [is_a_transposed, is_b_transposed, add] = [1, 2, 4].map(|bit| case & bit != 0);
+                let (x, y) = (Matrix::stored(&a, m, k, is_a_transposed), Matrix::stored(&b, k, n, is_b_transposed));
+                let mut out = before.clone();
+                product(x, y, &mut out, add, Precision::Mixed);
+                for (i, (&out, &before)) in out.iter().zip(&before).enumerate() {
+                    let term = |l: usize| factor(a[i / n * x.row + l * x.col]) * factor(b[l * y.row + i % n * y.col]);
+                    let want = (0..k).map(term).sum::<f64>() + if add { f64::from(before) } else { 0.0 };
+                    assert!((f64::from(out) - want).abs() < 2e-5, "{m} × {k} × {n}, case {case}: {out}, {want}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn products_of_f64_are_exact_in_mixed_precision_too() {
+        let mut out = [0.0];
+        multiply(Matrix::new(&[1.0 / 3.0], 1, 1), Matrix::new(&[3.0], 1, 1), &mut out, Precision::Mixed);
+        assert_eq!(out, [1.0]);
+    }
+
+    #[test]
+    #[should_panic]
+    fn sizes_that_do_not_fit_are_refused_in_mixed_precision() {
+        multiply(Matrix::new(&[1.0f32, 2.0], 1, 2), Matrix::new(&[3.0], 1, 1), &mut [0.0], Precision::Mixed);
     }
 }

@@ -65,9 +65,23 @@ pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + 
 
     /// Returns the opacity and the transmittance for an optical depth x, (1 − e⁻ˣ, e⁻ˣ), both without cancellation.
     fn absorb<const FUSED: bool>(self) -> (Self, Self);
+
+    /// Returns the numbers if they are `f32`.
+    fn as_f32(numbers: &[Self]) -> Option<&[f32]>;
+
+    /// Returns the numbers if they are `f32`.
+    fn as_f32_mut(numbers: &mut [Self]) -> Option<&mut [f32]>;
 }
 
 impl Real for f32 {
+    fn as_f32(numbers: &[f32]) -> Option<&[f32]> {
+        Some(numbers)
+    }
+
+    fn as_f32_mut(numbers: &mut [f32]) -> Option<&mut [f32]> {
+        Some(numbers)
+    }
+
     const SINE_LIMIT: Self = sine::LIMIT as f32;
 
     #[inline(always)]
@@ -164,6 +178,14 @@ impl Real for f32 {
 }
 
 impl Real for f64 {
+    fn as_f32(_: &[f64]) -> Option<&[f32]> {
+        None
+    }
+
+    fn as_f32_mut(_: &mut [f64]) -> Option<&mut [f32]> {
+        None
+    }
+
     const SINE_LIMIT: Self = sine::LIMIT;
 
     #[inline(always)]

@@ -1,6 +1,6 @@
 """`cargo bench --bench ops -- planes_step` in PyTorch: a training step of a factored field (TensoRF).
 
-    python benches/peers/planes_step.py [--look-up embedding_bag|grid_sample] [--compile] [--threads N] [--repeats N]
+    python benches/peers/planes_step.py [--look-up embedding_bag|grid_sample] [--compile] [--mixed] [--threads N] [--repeats N]
 
 4096 rays of 64 samples, each with a color; planes of 300 x 300 nodes with 16 components of density and 48 of appearance; 32 features and 16
 harmonics of the direction; a network of width 128; mean square of the colors; Adam. Here Adam updates all rows of the planes. The Rust bench updates those
@@ -73,9 +73,9 @@ class Grids(torch.nn.Module):
 
 
 class Field(torch.nn.Module):
-    def __init__(self, kind):
+    def __init__(self, kind, mixed):
         super().__init__()
-        self.kind, self.density, self.appearance = kind, kind(DENSITY), kind(APPEARANCE)
+        self.mixed, self.kind, self.density, self.appearance = mixed, kind, kind(DENSITY), kind(APPEARANCE)
         self.basis = torch.nn.Linear(3 * APPEARANCE, FEATURES, bias=False)
         layers = [torch.nn.Linear(FEATURES + HARMONICS, WIDTH), torch.nn.Linear(WIDTH, WIDTH), torch.nn.Linear(WIDTH, 3)]
         self.network = torch.nn.Sequential(layers[0], torch.nn.ReLU(True), layers[1], torch.nn.ReLU(True), layers[2])
@@ -86,9 +86,11 @@ class Field(torch.nn.Module):
         sigma = 25 * F.softplus(density - 10).view(RAYS, SAMPLES)
         depth = sigma * delta
         weights = (1 - torch.exp(-depth)) * torch.exp(depth - depth.cumsum(1))
-        features = self.basis(torch.cat(self.appearance(places), 1))
+        products = torch.cat(self.appearance(places), 1)
         directions = harmonics[:, None].expand(-1, SAMPLES, -1).reshape(-1, HARMONICS)
-        color = torch.sigmoid(self.network(torch.cat([features, directions], 1))).view(RAYS, SAMPLES, 3)
+        with torch.autocast("cpu", torch.bfloat16, self.mixed):
+            color = self.network(torch.cat([self.basis(products), directions], 1))
+        color = torch.sigmoid(color.float()).view(RAYS, SAMPLES, 3)
         return (weights[..., None] * color).sum(1) + (1 - weights.sum(1, keepdim=True))
 
 
@@ -96,8 +98,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--look-up", choices=["embedding_bag", "grid_sample"], default="embedding_bag")
     parser.add_argument("--compile", action="store_true")
+    parser.add_argument("--mixed", action="store_true", help="matrix and network under torch.autocast to bfloat16, for `planes_step_mixed`")
     args = options(parser)
-    field = Field(Bags if args.look_up == "embedding_bag" else Grids)
+    field = Field(Bags if args.look_up == "embedding_bag" else Grids, args.mixed)
     function = torch.compile(field) if args.compile else field
     optimizer = torch.optim.Adam(field.parameters(), lr=1e-3, betas=(0.9, 0.99), fused=True)
     across = torch.rand(RAYS, 1, 2).expand(-1, SAMPLES, -1)
@@ -111,7 +114,8 @@ def main():
         forward().square().mean().backward()
         optimizer.step()
 
-    measure("planes_step", args, f"{args.look_up}{', compiled' if args.compile else ''}", forward, step)
+    name = "planes_step_mixed" if args.mixed else "planes_step"
+    measure(name, args, f"{args.look_up}{', compiled' if args.compile else ''}", forward, step)
 
 
 if __name__ == "__main__":

@@ -65,6 +65,12 @@ impl Arguments {
     }
 }
 
+/// Suffix of the names of rows in this precision.
+#[allow(dead_code)] // `workloads` does not use it.
+pub fn suffix(precision: autograd::Precision) -> &'static str {
+    if precision == autograd::Precision::Mixed { "_mixed" } else { "" }
+}
+
 /// Deterministic numbers in [0, 1).
 pub fn numbers(n: usize, seed: u64) -> Vec<f32> {
     (0..n as u64).map(|i| plenoxel::random::uniform(seed, plenoxel::random::Purpose::Initial, 0, i) as f32).collect()

@@ -4,6 +4,7 @@ mod fused;
 
 use super::Linear;
 use crate::impl_module;
+use crate::matrix::Precision;
 use crate::random::Stream;
 use crate::real::Real;
 use crate::tensor::Tensor;
@@ -52,6 +53,9 @@ pub struct Mlp<T: Real> {
     pub activation: Activation,
     /// Index of the layer that reads the input of the network concatenated with the previous activations, `[…, input + hidden]`.
     pub skip: Option<usize>,
+    /// Precision of the products of layers, forward and in the adjoint; [`Precision::Full`] in a new network. With a sine, and for derivatives that are differentiated
+    /// again, products are always in full precision.
+    pub precision: Precision,
 }
 
 impl_module!(Mlp { layers });
@@ -86,7 +90,7 @@ impl<T: Real> Mlp<T> {
             let more = if skip == Some(i) { widths[0] } else { 0 };
             Linear::new(&format!("{name}.{i}"), pair[0] + more, pair[1], random)
         };
-        Mlp { layers: widths.windows(2).enumerate().map(layer).collect(), activation, skip }
+        Mlp { layers: widths.windows(2).enumerate().map(layer).collect(), activation, skip, precision: Precision::Full }
     }
 
     /// Returns the output, of shape `[…, last width]`, for x of shape `[…, first width]` with at least two dimensions.

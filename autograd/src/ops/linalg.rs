@@ -2,7 +2,7 @@
 //!
 //! This module distributes the work over threads in blocks of a fixed size, so the bits do not depend on the number of threads.
 
-use crate::matrix::{Matrix, multiply};
+use crate::matrix::{Matrix, Precision, multiply};
 use crate::op::{Cotangent, Keep, Op, Vjp};
 use crate::parallel;
 use crate::pool::Buffer;
@@ -78,7 +78,7 @@ fn product<T: Real>(a: &Tensor<T>, b: &Tensor<T>, transpose_a: bool, transpose_b
             for (i, c) in chunk.chunks_exact_mut((m * n).max(1)).enumerate() {
                 let x = Matrix::stored(&a.data()[matrix(a, first + i)], m, k, transpose_a);
                 let y = Matrix::stored(&b.data()[matrix(b, first + i)], k, n, transpose_b);
-                multiply(x, y, c);
+                multiply(x, y, c, Precision::Full);
             }
         });
     }
@@ -96,7 +96,7 @@ fn multiply_blocked<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) 
     if k > 4 * m.max(n) && k > DEEP {
         let parts = parallel::map_chunks(k, DEEP, |range| {
             let mut part = Buffer::<T>::stale(m * n);
-            multiply(a.cols(range.clone()), b.rows(range), &mut part);
+            multiply(a.cols(range.clone()), b.rows(range), &mut part, Precision::Full);
             part
         });
         out.fill(T::zero());
@@ -106,7 +106,7 @@ fn multiply_blocked<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T]) 
     } else {
         parallel::for_each_chunk(out, ROWS * n.max(1), |start, rows| {
             let first = start / n;
-            multiply(a.rows(first..first + rows.len() / n), b, rows);
+            multiply(a.rows(first..first + rows.len() / n), b, rows, Precision::Full);
         });
     }
 }

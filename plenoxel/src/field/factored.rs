@@ -18,7 +18,7 @@ use crate::geometry::Aabb;
 use crate::render::{Field, Radiance, RenderOptions, Rendered, ShadedField, weights};
 use crate::sampling::{Occupancy, Samples};
 use autograd::nn::{Activation, Init, Linear, Mlp};
-use autograd::{Indices, Module, Param, Real, Tensor, impl_module, no_grad, random::Stream};
+use autograd::{Indices, Module, Param, Precision, Real, Tensor, impl_module, no_grad, random::Stream};
 use glam::DVec3;
 
 /// Sizes of a factored field, except its resolution.
@@ -212,6 +212,11 @@ impl<T: Real> Factored<T> {
             gradient_above: 0.0,
             gradient_scaling: 0.0,
         }
+    }
+
+    /// Sets the precision of the products of the color network and, with the fused kernel, of the matrix B. It is [`Precision::Full`] in a new field.
+    pub fn set_precision(&mut self, precision: Precision) {
+        self.color.precision = precision;
     }
 
     /// Makes the field opaque: the density feature is set to about s = 13 everywhere.

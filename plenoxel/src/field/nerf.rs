@@ -5,7 +5,7 @@ use super::encoding::{Directions, frequency};
 use crate::render::{Field, Radiance, ShadedField};
 use crate::sampling::Samples;
 use autograd::nn::{Activation, Mlp};
-use autograd::{Real, Tensor, impl_module, random::Stream};
+use autograd::{Precision, Real, Tensor, impl_module, random::Stream};
 use serde::{Deserialize, Serialize};
 
 /// Function from the raw density x to the density, which is not negative.
@@ -67,6 +67,11 @@ impl<T: Real> NerfField<T> {
         let input = shape.width + Directions::Frequency(shape.direction_octaves).width();
         let color = Mlp::new(&name_of("color"), &[input, shape.color_width, 3], Activation::Relu, random);
         NerfField { shape, trunk, color }
+    }
+
+    /// Sets the precision of the products of both networks. It is [`Precision::Full`] in a new field.
+    pub fn set_precision(&mut self, precision: Precision) {
+        (self.trunk.precision, self.color.precision) = (precision, precision);
     }
 
     /// Returns the output of the trunk at world positions `[m, 3]`.

@@ -14,7 +14,7 @@ use crate::geometry::Aabb;
 use crate::render::{Field, Radiance, RenderOptions, Rendered, ShadedField, composite, weights};
 use crate::sampling::{Occupancy, Samples, sample_visible};
 use autograd::nn::{Activation, Init, Mlp};
-use autograd::{Cotangent, Indices, Keep, Op, Param, Real, Tensor, Vjp, impl_module, no_grad, random::Stream};
+use autograd::{Cotangent, Indices, Keep, Op, Param, Precision, Real, Tensor, Vjp, impl_module, no_grad, random::Stream};
 use glam::DVec3;
 
 /// Sizes of a field.
@@ -77,6 +77,11 @@ impl<T: Real> HashField<T> {
             aabb,
             grid,
         }
+    }
+
+    /// Sets the precision of the products of both networks. It is [`Precision::Full`] in a new field.
+    pub fn set_precision(&mut self, precision: Precision) {
+        (self.density.precision, self.color.precision) = (precision, precision);
     }
 
     /// Returns the sizes of the field.

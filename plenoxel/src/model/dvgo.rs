@@ -27,7 +27,7 @@ use crate::sampling::{Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Piecewise, Rates, Scaled, Schedule};
-use autograd::{Module, Param, Real, Tensor, random::Stream};
+use autograd::{Module, Param, Precision, Real, Tensor, random::Stream};
 pub use config::{Config, Stage};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -77,7 +77,8 @@ fn coarse_field<T: Real>(config: &Config, aabb: Aabb, nodes: [usize; 3]) -> Dens
 /// Creates a field of the fine stages: its tables are zero, and its network is random.
 fn fine_field<T: Real>(config: &Config, aabb: Aabb, nodes: [usize; 3], seed: u64) -> DenseGrid<T> {
     let Config { features, directions, hidden, depth, .. } = *config;
-    let network = ColorNetwork::new(features, directions, hidden, depth, &Stream::new(seed));
+    let mut network = ColorNetwork::new(features, directions, hidden, depth, &Stream::new(seed));
+    network.layers.precision = Precision::mixed_if(config.mixed_precision);
     let unit = voxel(aabb, config.fine[config.fine.len() - 1].resolution);
     let mut field = DenseGrid::new(aabb, nodes, features, Some(network), shift_of(config.fine_opacity), unit);
     field.opacity_above = config.fine_above;

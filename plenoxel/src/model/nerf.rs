@@ -23,7 +23,7 @@ use crate::sampling::{Jitter, Occupancy, Samples};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Exponential, Optimizer};
-use autograd::{Module, Real, Tensor, impl_module};
+use autograd::{Module, Precision, Real, Tensor, impl_module};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -53,7 +53,11 @@ impl<T: Real> Nerf<T> {
     pub fn new(config: Config, aabb: Aabb, seed: u64) -> Result<Self> {
         config.validate()?;
         let random = Stream::new(seed);
-        let field = |name: &str| NerfField::new(name, config.shape(), &random);
+        let field = |name: &str| {
+            let mut field = NerfField::new(name, config.shape(), &random);
+            field.set_precision(Precision::mixed_if(config.mixed_precision));
+            field
+        };
         Ok(Nerf { coarse: field("coarse"), fine: field("fine"), config, aabb })
     }
 

@@ -28,7 +28,7 @@ use crate::sampling::{Jitter, Occupancy, Refresh, RunningOccupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
-use autograd::{Module, Param, Real, Tensor, random::Stream};
+use autograd::{Module, Param, Precision, Real, Tensor, random::Stream};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -100,6 +100,9 @@ pub struct Config {
     pub decay_from: u64,
     /// Number of steps between decays.
     pub decay_every: u64,
+    /// True: products of the networks have factors of bf16 and sums of `f32` where the processor has AVX512-BF16 ([`Precision::Mixed`](autograd::Precision::Mixed)), in training
+    /// and in pictures.
+    pub mixed_precision: bool,
     /// Stages.
     pub stages: Vec<Stage>,
 }
@@ -132,6 +135,7 @@ impl Default for Config {
             decay: 0.33,
             decay_from: 1000,
             decay_every: 250,
+            mixed_precision: false,
             stages: vec![Stage { steps: 1500, rays: 4096 }],
         }
     }
@@ -257,6 +261,7 @@ impl<T: Real> Ngp<T> {
         config.validate()?;
         let mut field = HashField::new(config.shape(), aabb, &Stream::new(seed));
         field.color_above = config.color_above;
+        field.set_precision(Precision::mixed_if(config.mixed_precision));
         let decays = Arc::new(Decays::default());
         let mut model =
             Ngp { config: config.clone(), decays, field, running: None, hull: Hull::Auto, seed, first: 0, engine: Engine::Fused };

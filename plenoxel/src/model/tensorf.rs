@@ -33,7 +33,7 @@ use crate::space::{Region, Space};
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Optimizer, Rates, Schedule};
-use autograd::{Module, Param, Real, Tensor, random::Stream};
+use autograd::{Module, Param, Precision, Real, Tensor, random::Stream};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -96,6 +96,7 @@ impl<T: Real> Tensorf<T> {
         let grouping = |weight: f64| Grouping { weight, above: config.color_above, compact: config.compact_groups };
         (field.grouping, field.grouping_in_pictures) = (grouping(config.group), grouping(config.group_in_pictures));
         field.gradient_above = config.gradient_above;
+        field.set_precision(Precision::mixed_if(config.mixed_precision));
         // In normalized device coordinates, rays are parallel, and no denser near the camera.
         field.gradient_scaling = if matches!(space, Space::Ndc { .. }) { 0.0 } else { config.gradient_scaling };
         let cooling = Arc::new(RwLock::new(config.cooling()));

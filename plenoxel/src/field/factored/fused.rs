@@ -27,7 +27,7 @@ use crate::geometry::Aabb;
 use crate::render::along::{COLUMNS, column};
 use crate::render::{self, Field, Radiance, RenderOptions, Rendered, composite};
 use crate::sampling::{Jitter, Samples, Spacing};
-use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Real, RowSparse, Tensor, parallel};
+use autograd::{Buffer, GradSink, Indices, Kernel, KernelCall, Precision, Real, RowSparse, Tensor, parallel};
 pub use densities::{Densities, densities_at};
 use forward::{Block, Scene, Tables};
 use glam::DVec3;
@@ -57,6 +57,7 @@ struct Batch<T: Real> {
     grouping: Grouping,
     gradient_above: f64,
     gradient_scaling: f64,
+    precision: Precision,
     jitter: Jitter,
 }
 
@@ -157,6 +158,7 @@ fn render_inputs<T: Real>(
         grouping,
         gradient_above: field.gradient_above,
         gradient_scaling: field.gradient_scaling,
+        precision: field.color.precision,
         jitter,
     };
     let cells = options.occupancy.or(field.reach());

@@ -58,6 +58,9 @@ pub struct Config {
     pub entropy: [f64; 2],
     /// Weight of the error of the colors of single samples, in the coarse stage and in the fine stages.
     pub sample_color: [f64; 2],
+    /// True: products of the color network have factors of bf16 and sums of `f32` where the processor has AVX512-BF16 ([`Precision::Mixed`](autograd::Precision::Mixed)), in training
+    /// and in pictures.
+    pub mixed_precision: bool,
 }
 
 fn stages<const N: usize>(stages: [(usize, u64, usize); N]) -> Vec<Stage> {
@@ -107,6 +110,7 @@ impl Config {
             tenth_every: 20_000,
             entropy: [0.01, 0.001],
             sample_color: [0.1, 0.01],
+            mixed_precision: false,
         }
     }
 

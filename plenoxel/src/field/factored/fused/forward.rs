@@ -153,7 +153,7 @@ impl<'a, T: Real> Tables<'a, T> {
         Tables {
             density: Pairs::of(&tables[..6], batch.nodes, batch.shape.density_components),
             appearance: Pairs::of(&tables[6..12], batch.nodes, batch.shape.appearance_components),
-            network: Network::new(&batch.shape, &tables[12..]),
+            network: Network::new(&batch.shape, &tables[12..], batch.precision),
         }
     }
 }

@@ -3,7 +3,7 @@
 use super::super::Shape;
 use super::lookup::{self, Cotangents, Pairs, Places};
 use super::pruning;
-use autograd::{Buffer, Matrix, Real, Tensor, add_product, dispatched, multiply, parallel};
+use autograd::{Buffer, Matrix, Precision, Real, Tensor, add_product, dispatched, multiply, parallel};
 
 /// Number of groups, or of samples, that are processed before others: their values stay in the second-level cache.
 pub const ROWS: usize = 256;
@@ -23,6 +23,7 @@ pub struct Network<'a, T> {
     features: usize,
     octaves: usize,
     layers: Vec<Layer<'a, T>>,
+    precision: Precision,
 }
 
 /// Colors of m groups, and the values that the adjoint reads.
@@ -48,7 +49,7 @@ pub struct OfNetwork<T: Real> {
 
 impl<'a, T: Real> Network<'a, T> {
     /// Creates the network from its parameters.
-    pub fn new(shape: &Shape, tables: &'a [Tensor<T>]) -> Self {
+    pub fn new(shape: &Shape, tables: &'a [Tensor<T>], precision: Precision) -> Self {
         let layer = |pair: &'a [Tensor<T>]| {
             let [inputs, outputs] = [0, 1].map(|axis| pair[0].shape()[axis]);
             Layer { weight: pair[0].data(), bias: pair[1].data(), inputs, outputs }
@@ -59,6 +60,7 @@ impl<'a, T: Real> Network<'a, T> {
             features: shape.features,
             octaves: shape.feature_octaves,
             layers: tables[1..].chunks(2).map(layer).collect(),
+            precision,
         }
     }
 
@@ -79,7 +81,12 @@ impl<'a, T: Real> Network<'a, T> {
             let own = |width: usize| start * width..(start + count) * width;
             let (products, features) = (&mut products[..count * self.products], &mut features[..count * self.features]);
             lookup::products(pairs, at.map(|at| &at[groups.clone()]), products);
-            multiply(Matrix::new(products, count, self.products), Matrix::new(self.basis, self.products, self.features), features);
+            multiply(
+                Matrix::new(products, count, self.products),
+                Matrix::new(self.basis, self.products, self.features),
+                features,
+                self.precision,
+            );
             let rows = inputs[0][own(width)].chunks_exact_mut(width);
             for ((i, input), features) in groups.clone().zip(rows).zip(features.chunks_exact(self.features)) {
                 encode(features, self.octaves, &mut input[..encoded]);
@@ -92,7 +99,7 @@ impl<'a, T: Real> Network<'a, T> {
                     Some(above) => &mut above[own(layer.outputs)],
                     None => &mut rgb[3 * groups.start..3 * groups.end],
                 };
-                multiply(input, Matrix::new(layer.weight, layer.inputs, layer.outputs), out);
+                multiply(input, Matrix::new(layer.weight, layer.inputs, layer.outputs), out, self.precision);
                 if l + 1 < self.layers.len() {
                     add_bias::<T, true>(out, layer.bias);
                 } else {
@@ -170,13 +177,13 @@ impl<'a, T: Real> Network<'a, T> {
                 of_bias.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
             }
             let cotangent = Matrix::new(&g, m, layer.outputs);
-            add_product(Matrix::transposed(input, layer.inputs, m), cotangent, of_weight);
+            add_product(Matrix::transposed(input, layer.inputs, m), cotangent, of_weight, self.precision);
             let weight = Matrix::transposed(layer.weight, layer.outputs, layer.inputs);
             if l == 0 {
-                multiply(cotangent, weight, of_input);
+                multiply(cotangent, weight, of_input, self.precision);
             } else {
                 let mut below = Buffer::stale(m * layer.inputs);
-                multiply(cotangent, weight, &mut below);
+                multiply(cotangent, weight, &mut below, self.precision);
                 mask(&mut below, input);
                 g = below;
             }
@@ -186,8 +193,8 @@ impl<'a, T: Real> Network<'a, T> {
         let rows = of_features.chunks_exact_mut(self.features).zip(of_input.chunks_exact(width)).zip(inputs[0].chunks_exact(width));
         rows.for_each(|((out, g), encoded)| encode_adjoint(g, encoded, self.octaves, out));
         let features = Matrix::new(&of_features, m, self.features);
-        add_product(Matrix::transposed(products, self.products, m), features, &mut of_basis[0]);
-        multiply(features, Matrix::transposed(self.basis, self.features, self.products), of_products);
+        add_product(Matrix::transposed(products, self.products, m), features, &mut of_basis[0], self.precision);
+        multiply(features, Matrix::transposed(self.basis, self.features, self.products), of_products, self.precision);
     }
 }
 
