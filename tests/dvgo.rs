@@ -1,7 +1,7 @@
 //! DirectVoxGO: its gradients, the samples that it leaves out, training and resuming.
 
 use crate::own_losses;
-use autograd::{Module, Param, Real, Tensor, gradcheck, no_grad, random::Stream};
+use autograd::{Module, Param, Precision, Real, Tensor, gradcheck, no_grad, random::Stream};
 use glam::DVec3;
 use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::ProceduralOptions;
@@ -184,16 +184,17 @@ fn file(name: &str) -> std::path::PathBuf {
 #[test]
 fn training_has_the_same_bits_for_any_number_of_threads() {
     let (train, _) = views();
-    let trained = |threads: usize| {
+    let trained = |threads: usize, mixed_precision: bool| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
-            let mut trainer = trainer(&train, config(40, [15, 15]));
+            let mut trainer = trainer(&train, Config { mixed_precision, ..config(40, [15, 15]) });
             while trainer.step().expect("a step").is_some() {}
             bits(trainer.model())
         })
     };
-    let want = trained(1);
-    assert!([2, 3].into_iter().all(|threads| trained(threads) == want));
+    let want = [false, true].map(|mixed_precision| trained(1, mixed_precision));
+    assert!([2, 3].into_iter().all(|threads| [false, true].map(|mixed_precision| trained(threads, mixed_precision)) == want));
+    assert!(want[0] != want[1] || !Precision::Mixed.is_available());
 }
 
 #[test]
@@ -226,7 +227,7 @@ fn a_resumed_run_has_the_same_bits_within_stages_and_between_them() {
 #[test]
 fn a_scene_is_learned_and_a_model_that_was_read_shows_the_same_images() {
     let (train, test) = views();
-    let mut trainer = trainer(&train, config(150, [100, 250]));
+    let mut trainer = trainer(&train, Config { mixed_precision: true, ..config(150, [100, 250]) });
     let psnr = |model: &dyn Model<f32>| evaluate(model, &test, &ViewOptions::over([1.0; 3])).psnr().expect("a figure");
     let untrained = psnr(trainer.model());
     while trainer.step().expect("a step").is_some() {}

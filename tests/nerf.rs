@@ -1,6 +1,6 @@
 //! NeRF: its gradients, training, resuming and files.
 
-use autograd::{Module, Param, Tensor, gradcheck, random::Stream};
+use autograd::{Module, Param, Precision, Tensor, gradcheck, random::Stream};
 use glam::DVec3;
 use plenoxel::camera::Ray;
 use plenoxel::dataset::procedural::ProceduralOptions;
@@ -130,16 +130,17 @@ fn bits(model: &Nerf<f32>) -> Vec<u32> {
 #[test]
 fn training_has_the_same_bits_for_any_number_of_threads() {
     let (train, _) = views();
-    let trained = |threads: usize| {
+    let trained = |threads: usize, mixed_precision: bool| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
-            let mut trainer = trainer(Config { steps: 12, noise: 0.5, ..small() }, &train);
+            let mut trainer = trainer(Config { steps: 12, noise: 0.5, mixed_precision, ..small() }, &train);
             while trainer.step().expect("a step").is_some() {}
             bits(trainer.model())
         })
     };
-    let want = trained(1);
-    assert!([2, 3].into_iter().all(|threads| trained(threads) == want));
+    let want = [false, true].map(|mixed_precision| trained(1, mixed_precision));
+    assert!([2, 3].into_iter().all(|threads| [false, true].map(|mixed_precision| trained(threads, mixed_precision)) == want));
+    assert!(want[0] != want[1] || !Precision::Mixed.is_available());
 }
 
 #[test]
@@ -148,7 +149,7 @@ fn a_resumed_run_has_the_same_bits_and_a_file_the_same_pictures() {
     let folder = std::env::temp_dir();
     for stop in [3, 9] {
         // One stop in the cropped steps at the beginning, one after them.
-        let begin = || trainer(Config { steps: 14, crop_steps: 6, noise: 0.5, ..small() }, &train);
+        let begin = || trainer(Config { steps: 14, crop_steps: 6, noise: 0.5, mixed_precision: true, ..small() }, &train);
         let file = folder.join(format!("nerf-{}-{stop}.safetensors", std::process::id()));
         let mut whole = begin();
         (0..stop).for_each(|_| drop(whole.step().expect("a step")));
@@ -168,6 +169,14 @@ fn a_resumed_run_has_the_same_bits_and_a_file_the_same_pictures() {
         assert_eq!(psnr(&*any), psnr(whole.model()));
         std::fs::remove_file(file).expect("removed");
     }
+}
+
+#[test]
+fn a_run_that_was_saved_without_a_setting_continues_with_its_default() {
+    let model = |mixed_precision: bool| Nerf::<f32>::new(Config { mixed_precision, ..tiny() }, BOX, 42).expect("valid settings");
+    let mut saved = model(false).settings();
+    saved.as_object_mut().expect("settings").remove("mixed_precision").expect("a setting");
+    assert!(model(false).continues(&saved, 1) && !model(true).continues(&saved, 1));
 }
 
 #[test]

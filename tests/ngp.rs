@@ -1,7 +1,7 @@
 //! The hash grid and the model on it: gradients, training, resuming and checkpoints.
 
 use crate::own_losses;
-use autograd::{Module, Param, Real, Tensor, check_kernel, gradcheck, random::Stream};
+use autograd::{Module, Param, Precision, Real, Tensor, check_kernel, gradcheck, random::Stream};
 use glam::DVec3;
 use ndarray::ArrayD;
 use plenoxel::camera::Ray;
@@ -247,7 +247,11 @@ fn trainer(views: &[View], model: Ngp<f32>) -> Trainer<f32, Ngp<f32>> {
 }
 
 fn new(stages: &[(u64, usize)]) -> Ngp<f32> {
-    Ngp::new(Config { stop_below: 1e-3, stop_below_in_pictures: 1e-3, color_above: 1e-4, ..tiny(stages) }, BOX, 42).expect("valid settings")
+    Ngp::new(settings(stages), BOX, 42).expect("valid settings")
+}
+
+fn settings(stages: &[(u64, usize)]) -> Config {
+    Config { stop_below: 1e-3, stop_below_in_pictures: 1e-3, color_above: 1e-4, ..tiny(stages) }
 }
 
 fn psnr(model: &Ngp<f32>, views: &[View]) -> f64 {
@@ -257,18 +261,20 @@ fn psnr(model: &Ngp<f32>, views: &[View]) -> f64 {
 #[test]
 fn training_has_the_same_bits_for_any_number_of_threads() {
     let (train, _) = views();
-    let trained = |threads: usize| {
+    let trained = |threads: usize, mixed_precision: bool| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
-            let mut trainer = trainer(&train, new(&[(50, 512)]));
+            let config = Config { mixed_precision, ..settings(&[(50, 512)]) };
+            let mut trainer = trainer(&train, Ngp::new(config, BOX, 42).expect("valid settings"));
             while trainer.step().expect("a step").is_some() {}
             let mut bits = Vec::new();
             trainer.model().visit(&mut |param| bits.extend(param.tensor().data().iter().map(|x| x.to_bits())));
             bits
         })
     };
-    let want = trained(1);
-    assert!([2, 3].into_iter().all(|threads| trained(threads) == want));
+    let want = [false, true].map(|mixed_precision| trained(1, mixed_precision));
+    assert!([2, 3].into_iter().all(|threads| [false, true].map(|mixed_precision| trained(threads, mixed_precision)) == want));
+    assert!(want[0] != want[1] || !Precision::Mixed.is_available());
 }
 
 #[test]

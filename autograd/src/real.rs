@@ -1,6 +1,7 @@
 //! [`Real`]: the trait of the scalar types, `f32` for training and `f64` for gradient checks.
 //!
-//! Precision is a type parameter and never a feature flag, so a gradient check in `f64` runs the same code that trains in `f32`. Some functions of
+//! Precision is a type parameter and never a feature flag, so a gradient check in `f64` runs the same code that trains in `f32`, except for products with
+//! [`Precision::Mixed`](crate::Precision::Mixed). Some functions of
 //! `num_traits::Float` have a second version here, with a trailing underscore, because loops over them must vectorise: these versions are polynomials without
 //! branches. The exceptions are `exp_` and `absorb` for `f64`, which call the standard library.
 //!
@@ -74,14 +75,6 @@ pub trait Real: NdFloat + FromPrimitive + FloatConst + Sum + Default + Pooled + 
 }
 
 impl Real for f32 {
-    fn as_f32(numbers: &[f32]) -> Option<&[f32]> {
-        Some(numbers)
-    }
-
-    fn as_f32_mut(numbers: &mut [f32]) -> Option<&mut [f32]> {
-        Some(numbers)
-    }
-
     const SINE_LIMIT: Self = sine::LIMIT as f32;
 
     #[inline(always)]
@@ -175,17 +168,17 @@ impl Real for f32 {
         let through = (-x).exp_::<FUSED>();
         (if x.abs() < 0.5 { small } else { 1.0 - through }, through)
     }
+
+    fn as_f32(numbers: &[f32]) -> Option<&[f32]> {
+        Some(numbers)
+    }
+
+    fn as_f32_mut(numbers: &mut [f32]) -> Option<&mut [f32]> {
+        Some(numbers)
+    }
 }
 
 impl Real for f64 {
-    fn as_f32(_: &[f64]) -> Option<&[f32]> {
-        None
-    }
-
-    fn as_f32_mut(_: &mut [f64]) -> Option<&mut [f32]> {
-        None
-    }
-
     const SINE_LIMIT: Self = sine::LIMIT;
 
     #[inline(always)]
@@ -243,6 +236,14 @@ impl Real for f64 {
     fn absorb<const FUSED: bool>(self) -> (Self, Self) {
         // Both values are computed by the standard library, as in `exp_`.
         (-(-self).exp_m1(), (-self).exp())
+    }
+
+    fn as_f32(_: &[f64]) -> Option<&[f32]> {
+        None
+    }
+
+    fn as_f32_mut(_: &mut [f64]) -> Option<&mut [f32]> {
+        None
     }
 }
 

@@ -35,7 +35,7 @@ pub fn product(a: Matrix<'_, f32>, b: Matrix<'_, f32>, out: &mut [f32], add: boo
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
 fn product_of_copies(a: Matrix<'_, f32>, b: Matrix<'_, f32>, out: &mut [f32], add: bool) {
     let (pairs, n) = (a.cols.div_ceil(2), b.cols);
-    // An odd number of vectors: the tiles of a power of two would share a few sets of the first-level cache.
+    // Tiles of a power of two of bytes would share a few sets of the first-level cache.
     let depth = pairs.next_multiple_of(LANES) + 1;
     let (of_a, of_b) = (packed::<LANES>(a.transpose(), depth), packed::<COLS>(b, depth));
     for (tile, b) in of_b.chunks_exact(depth * COLS).enumerate() {
@@ -110,7 +110,6 @@ fn packed<const WIDTH: usize>(matrix: Matrix<'_, f32>, depth: usize) -> Buffer<u
             }
         }
     } else {
-        let zeros = if rows % 2 == 1 { Buffer::zeros(cols) } else { Buffer::zeros(0) };
         // Numbers 0, 16, 1, 17, … of 32 numbers of 16 bits.
         let order = _mm512_or_si512(_mm512_slli_epi32::<16>(_mm512_add_epi32(lanes(), _mm512_set1_epi32(16))), lanes());
         for pair in 0..rows.div_ceil(2) {
@@ -119,8 +118,7 @@ fn packed<const WIDTH: usize>(matrix: Matrix<'_, f32>, depth: usize) -> Buffer<u
             for line in (0..2 * cols).step_by(LANES) {
                 _mm_prefetch::<_MM_HINT_T0>(even.as_ptr().wrapping_add(line + AHEAD).cast());
             }
-            let odd = if odd.is_empty() { &zeros } else { odd };
-            for (block, (even, odd)) in even.chunks(LANES).zip(odd.chunks(LANES)).enumerate() {
+            for (block, (even, odd)) in even.chunks(LANES).zip(odd.chunks(LANES).chain(std::iter::repeat(&[][..]))).enumerate() {
                 let both = _mm512_cvtne2ps_pbh(load_part(odd), load_part(even));
                 store(&mut out[place(pair, LANES * block)..], _mm512_permutexvar_epi16(order, as_integers(both)));
             }

@@ -29,6 +29,7 @@ use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, 
 use autograd::optim::{Adam, AdamMode, Optimizer, Piecewise, Rates, Scaled, Schedule};
 use autograd::{Module, Param, Precision, Real, Tensor, random::Stream};
 pub use config::{Config, Stage};
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -275,6 +276,11 @@ impl<T: Real> Model<T> for Dvgo<T> {
 
     fn settings(&self) -> Value {
         json!(self.config)
+    }
+
+    fn continues(&self, saved: &Value, _: u64) -> bool {
+        // Settings that the saved run did not have yet are those of the default.
+        Config::deserialize(saved).is_ok_and(|saved| self.config == saved)
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {

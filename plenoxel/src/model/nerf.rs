@@ -24,6 +24,7 @@ use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params};
 use autograd::optim::{Adam, AdamMode, Exponential, Optimizer};
 use autograd::{Module, Precision, Real, Tensor, impl_module};
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -171,6 +172,11 @@ impl<T: Real> Model<T> for Nerf<T> {
 
     fn settings(&self) -> Value {
         json!(self.config)
+    }
+
+    fn continues(&self, saved: &Value, _: u64) -> bool {
+        // Settings that the saved run did not have yet are those of the default.
+        Config::deserialize(saved).is_ok_and(|saved| self.config == saved)
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {

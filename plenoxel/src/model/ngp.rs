@@ -100,8 +100,7 @@ pub struct Config {
     pub decay_from: u64,
     /// Number of steps between decays.
     pub decay_every: u64,
-    /// True: products of the networks have factors of bf16 and sums of `f32` where the processor has AVX512-BF16 ([`Precision::Mixed`](autograd::Precision::Mixed)), in training
-    /// and in pictures.
+    /// True: products of the networks are computed in [`Precision::Mixed`], in training and in pictures.
     pub mixed_precision: bool,
     /// Stages.
     pub stages: Vec<Stage>,

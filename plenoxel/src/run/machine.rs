@@ -1,6 +1,7 @@
 //! The machine: threads, vector instructions and the time.
 
 use crate::error::{Error, Result};
+use autograd::Precision;
 use std::num::NonZero;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -32,7 +33,7 @@ pub fn time() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |time| time.as_secs_f64())
 }
 
-/// Returns the name of the vector instructions that the numeric loops use on this machine. They are detected at run time.
+/// Returns the name of the vector instructions that the numeric loops and products in mixed precision use on this machine. They are detected at run time.
 pub fn instruction_set() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {
@@ -42,6 +43,7 @@ pub fn instruction_set() -> &'static str {
             && is_x86_feature_detected!("avx512bw")
             && is_x86_feature_detected!("avx512dq");
         match (avx2, avx512) {
+            (true, true) if Precision::Mixed.is_available() => "x86-64 with AVX-512 and BF16",
             (true, true) => "x86-64 with AVX-512",
             (true, false) => "x86-64 with AVX2 and FMA",
             _ => "x86-64 with SSE2",

@@ -58,8 +58,7 @@ pub struct Config {
     pub entropy: [f64; 2],
     /// Weight of the error of the colors of single samples, in the coarse stage and in the fine stages.
     pub sample_color: [f64; 2],
-    /// True: products of the color network have factors of bf16 and sums of `f32` where the processor has AVX512-BF16 ([`Precision::Mixed`](autograd::Precision::Mixed)), in training
-    /// and in pictures.
+    /// True: products of the color network are computed in [`Precision::Mixed`](autograd::Precision::Mixed), in training and in pictures.
     pub mixed_precision: bool,
 }
 

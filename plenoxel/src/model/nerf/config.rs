@@ -44,8 +44,7 @@ pub struct Config {
     pub last_rate: f64,
     /// Steps in which the learning rate falls.
     pub decay_steps: u64,
-    /// True: products of the networks have factors of bf16 and sums of `f32` where the processor has AVX512-BF16 ([`Precision::Mixed`](autograd::Precision::Mixed)), in training
-    /// and in pictures.
+    /// True: products of the networks are computed in [`Precision::Mixed`](autograd::Precision::Mixed), in training and in pictures.
     pub mixed_precision: bool,
 }
 
@@ -68,8 +67,6 @@ impl Default for Config {
             rate: 1e-3,
             steps: 10_000,
             decay_steps: 10_000,
-            // A step takes two thirds of the time on a processor with AVX512-BF16.
-            mixed_precision: true,
             ..Config::authors()
         }
     }

@@ -87,8 +87,8 @@ pub struct Config {
     pub density_tv: f64,
     /// Treatment of rows of planes without a gradient by Adam: true visits only rows with a gradient.
     pub lazy: bool,
-    /// True: products of the color network and of its matrix have factors of bf16 and sums of `f32` where the processor has AVX512-BF16 ([`Precision::Mixed`](autograd::Precision::Mixed)), in training
-    /// and in pictures.
+    /// True: products of the color network are computed in [`Precision::Mixed`](autograd::Precision::Mixed), in training and in pictures;
+    /// with the fused kernel, those of the matrix B too.
     pub mixed_precision: bool,
     /// Changes for a run that is planned for a short time; `None` for none. The settings of a planned run have `None`.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -301,8 +301,8 @@ fn text_of(config: &Config) -> String {
 
 /// True for values of another type that a key also accepts.
 fn is_another_form(path: &str, text: &str) -> bool {
-    let flags = ["aim", "jitter", "project", "initial.random", "tensorf.lazy", "tensorf.compact_groups", "mixed_precision"];
-    text == "true" && flags.iter().any(|flag| path.ends_with(flag))
+    let flags = ["aim", "jitter", "project", "initial.random", "tensorf.lazy", "tensorf.compact_groups"];
+    text == "true" && (flags.contains(&path) || path.ends_with(".mixed_precision"))
         || path == "stages" && text == "[]"
         || path == "capture.scale" && text.parse::<f64>().is_ok()
         || path == "init_from" && text != "\"\""

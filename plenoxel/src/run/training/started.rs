@@ -157,7 +157,7 @@ impl<'o> OldRun<'o> {
         record.data = data.unwrap_or(record.data);
         let dataset = clocks.load.time(|| record.data.open(&config))?;
         if machine::instruction_set() != record.instruction_set {
-            on(Event::note(format!("the run was started with {}: the results differ by rounding only", record.instruction_set)));
+            on(Event::note(format!("the run was started with {}: the results may differ by rounding", record.instruction_set)));
         }
         on(Event::Opened { dataset: &dataset, config: &config });
         Ok(OldRun { folder, config, record, options, dataset, state, views: Arc::new([]), preview: Preview::default(), clocks })
