@@ -465,7 +465,7 @@ fn training_bytes_per_sample(engine: Engine, shape: &GridShape) -> u64 {
     };
     match engine {
         Engine::Graph => 4 * (geometry + color),
-        // Thirteen numbers per sample, one or two gradient entries of twenty numbers, and temporarily sixteen numbers of its corners.
+        // Thirteen numbers per sample, sixteen of its corners, and one or two gradient entries of twenty numbers.
         // Reduced harmonics need 41 more for each group of samples that read the same rows, estimated as (1 + reduction) / 2 samples.
         Engine::Fused if shape.is_reduced() => 4 * (64 + 82 / (1 + shape.sh_reduction as u64)),
         Engine::Fused => 4 * 64,

@@ -104,11 +104,10 @@ impl<T: Real> Gradients<T> {
                 Records { at: At::Rows(rows), ..records }
             }
             Interpolation::Trilinear => {
-                let at = block.at.each_ref().map(|a| &a[..]);
-                let found = with_bricks!(batch.layout.lattice, map => Corners::find(at, map, block.len()));
+                let found = block.trilinear();
                 let mut touched = Buffer::stale(8 * block.len());
                 let touched = touched.as_chunks_mut().0;
-                let most = block.len() + touch_buckets(&found, touched);
+                let most = block.len() + touch_buckets(found, touched);
                 let mut sorted = Corners::none();
                 sorted.make_room(most);
                 let records = self.records(batch, block, buckets, most, |i| touched[i], |place, i| sorted.set(place, found.of(i)));

@@ -30,6 +30,8 @@ pub(super) struct Block<T: Real> {
     pub at: [Buffer<T>; 3],
     /// Row that nearest look-up reads; empty with trilinear look-up.
     pub rows: Buffer<u32>,
+    /// Rows and weights of trilinear look-up; `None` with nearest look-up.
+    pub corners: Option<Corners<T>>,
     pub t: Buffer<T>,
     pub delta: Buffer<T>,
     /// wᵢ = Tᵢ (1 − exp(−σᵢδᵢ))
@@ -55,6 +57,13 @@ impl<T: Real> Block<T> {
     pub fn seen(&self) -> impl Fn(usize) -> bool {
         let (density, after, weight) = (&self.density[..], &self.after[..], &self.weight[..]);
         |i| density[i] >= T::zero() && (after[i] > T::zero() || weight[i] > T::zero())
+    }
+
+    /// Returns the rows and weights of trilinear look-up.
+    ///
+    /// Panics with nearest look-up.
+    pub fn trilinear(&self) -> &Corners<T> {
+        self.corners.as_ref().expect("trilinear look-up has corners")
     }
 
     /// Returns the samples as rendering sees them.
@@ -116,9 +125,9 @@ impl<'a, T: Real> Scene<'a, T> {
         if let Some(tables) = self.picture {
             return Block { first, looked_at: self.show(tables, first, pixels), ..Block::empty() };
         }
-        let (mut block, found) = self.weights(first, pixels.len() / COLUMNS);
+        let mut block = self.weights(first, pixels.len() / COLUMNS);
         block.color = Buffer::stale(3 * block.len());
-        self.colors(&mut block, found.as_ref());
+        self.colors(&mut block);
         self.sum(&block, pixels);
         if !keep {
             return Block { first, looked_at: block.looked_at, offsets: block.offsets, ..Block::empty() };
@@ -126,15 +135,15 @@ impl<'a, T: Real> Scene<'a, T> {
         block
     }
 
-    /// Computes the samples of `count` rays from `first` on, without colors. With trilinear look-up, also returns the rows that they read.
-    pub fn weights(&self, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
+    /// Computes the samples of `count` rays from `first` on, without colors.
+    pub fn weights(&self, first: usize, count: usize) -> Block<T> {
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
         with_bricks!(self.batch.layout.lattice, map => {
             // Where rays end early, samples far behind the end would be looked up in vain. Trilinear look-up finds corners in groups of `TOGETHER`.
             if trilinear || self.options.stop_below > 0.0 {
                 self.weights_in_runs(map, first, count)
             } else {
-                (self.weights_of_whole_rays(map, first, count), None)
+                self.weights_of_whole_rays(map, first, count)
             }
         })
     }
@@ -147,7 +156,7 @@ impl<'a, T: Real> Scene<'a, T> {
         if self.cells.is_none() {
             // All samples of the marches are placed. The arrays get their size at once, because to grow is to copy. The last run needs room for a whole one.
             let samples: usize = (0..count).map(|r| self.march_of(rays, first, r).count).sum();
-            block.make_room_for((samples + TOGETHER).max(ROOM).next_power_of_two(), false);
+            block.make_room_for((samples + TOGETHER).max(ROOM).next_power_of_two());
         }
         let mut sections = self.sections();
         let mut end = 0;
@@ -159,7 +168,7 @@ impl<'a, T: Real> Scene<'a, T> {
                 let mut places = self.samples_of(rays, first, r, &mut sections);
                 loop {
                     if placed + TOGETHER > block.t.len() {
-                        block.make_room(false);
+                        block.make_room();
                     }
                     match places.next_run(block.places(placed)) {
                         0 => break,
@@ -186,11 +195,10 @@ impl<'a, T: Real> Scene<'a, T> {
     }
 
     /// Computes the samples in runs of at most [`TOGETHER`]. The densities of the next run are prefetched while this one is looked up.
-    fn weights_in_runs(&self, map: impl NodeMap, first: usize, count: usize) -> (Block<T>, Option<Corners<T>>) {
+    fn weights_in_runs(&self, map: impl NodeMap, first: usize, count: usize) -> Block<T> {
         let stop = T::lit(self.options.stop_below);
         let trilinear = self.batch.layout.shape.interpolation == Interpolation::Trilinear;
-        let mut block = Block { first, ..Block::empty() };
-        let mut found = trilinear.then(Corners::none);
+        let mut block = Block { first, corners: trilinear.then(Corners::none), ..Block::empty() };
         let [mut group, mut next_group] = [Group::none(), Group::none()];
         let mut kept = [0; TOGETHER];
         let mut end = 0;
@@ -200,10 +208,9 @@ impl<'a, T: Real> Scene<'a, T> {
             let mut places = self.samples_of(rays, first, r, &mut sections);
             let mut left = T::one();
             // Places the run that begins at a sample, finds its rows, and prefetches their densities.
-            let mut place = |start: usize, block: &mut Block<T>, found: &mut Option<Corners<T>>, group: &mut Group<T>| {
+            let mut place = |start: usize, block: &mut Block<T>, group: &mut Group<T>| {
                 if start + TOGETHER > block.t.len() {
-                    let room = block.make_room(trilinear);
-                    found.iter_mut().for_each(|corners| corners.make_room(room));
+                    block.make_room();
                 }
                 let run = start..start + places.next_run(block.places(start));
                 if !trilinear {
@@ -214,11 +221,11 @@ impl<'a, T: Real> Scene<'a, T> {
                 }
                 run
             };
-            let mut run = place(end, &mut block, &mut found, &mut group);
+            let mut run = place(end, &mut block, &mut group);
             // Samples behind the stop are not looked up, except for the rest of the run in which the ray stops; that rest is dropped. The run behind it is placed
             // in vain.
             while left >= stop && !run.is_empty() {
-                let next = place(run.end, &mut block, &mut found, &mut next_group);
+                let next = place(run.end, &mut block, &mut next_group);
                 if trilinear {
                     group.density(self.tables[0], &mut block.density[run.clone()]);
                     block.find_absorptions(run.clone());
@@ -237,7 +244,7 @@ impl<'a, T: Real> Scene<'a, T> {
                         end += 1;
                     }
                 }
-                if let Some(corners) = &mut found {
+                if let Some(corners) = &mut block.corners {
                     corners.put(before, kept[..end - before].iter().copied(), &group);
                 }
                 run = next;
@@ -246,7 +253,7 @@ impl<'a, T: Real> Scene<'a, T> {
             block.offsets.push(end as u32);
         }
         block.truncate(end);
-        (block, found)
+        block
     }
 
     /// Returns the sections of packets of rays. They are whole rays if the rays are not those of a picture.
@@ -282,12 +289,12 @@ impl<'a, T: Real> Scene<'a, T> {
     }
 
     /// Computes the color of every sample that would be visible if it were dense, and zero for the others.
-    pub fn colors(&self, block: &mut Block<T>, found: Option<&Corners<T>>) {
+    pub fn colors(&self, block: &mut Block<T>) {
         let mut color = std::mem::replace(&mut block.color, Buffer::stale(0));
         let out = color.as_chunks_mut::<3>().0;
         let seen = block.seen();
         let nearest = |i: usize| ([block.rows[i]], [T::one()]);
-        match (self.directions(block.first), found) {
+        match (self.directions(block.first), &block.corners) {
             (None, None) => lookup::plain(self.tables[1], nearest, seen, out),
             (None, Some(corners)) => lookup::plain(self.tables[1], |i| corners.of(i), seen, out),
             (Some(directions), None) => lookup::harmonics(self.tables[1], &block.offsets, directions, nearest, seen, out),
@@ -327,6 +334,7 @@ impl<T: Real> Block<T> {
             density: none(),
             at: [none(), none(), none()],
             rows: Buffer::stale(0),
+            corners: None,
             t: none(),
             delta: none(),
             weight: none(),
@@ -341,18 +349,17 @@ impl<T: Real> Block<T> {
         [x, y, z, &mut self.t, &mut self.delta, &mut self.density, &mut self.weight, &mut self.after]
     }
 
-    /// Doubles the capacity for samples. Returns the new capacity.
-    fn make_room(&mut self, trilinear: bool) -> usize {
-        let size = (2 * self.t.len()).max(ROOM);
-        self.make_room_for(size, trilinear);
-        size
+    /// Doubles the capacity for samples.
+    fn make_room(&mut self) {
+        self.make_room_for((2 * self.t.len()).max(ROOM));
     }
 
     /// Raises the capacity to `size` samples.
-    fn make_room_for(&mut self, size: usize, trilinear: bool) {
+    fn make_room_for(&mut self, size: usize) {
         self.columns().into_iter().for_each(|column| column.grow(size));
-        if !trilinear {
-            self.rows.grow(size);
+        match &mut self.corners {
+            Some(corners) => corners.make_room(size),
+            None => self.rows.grow(size),
         }
     }
 
@@ -396,6 +403,7 @@ impl<T: Real> Block<T> {
     fn truncate(&mut self, count: usize) {
         self.columns().into_iter().for_each(|column| column.truncate(count));
         self.rows.truncate(count);
+        self.corners.iter_mut().for_each(|corners| corners.truncate(count));
     }
 }
 

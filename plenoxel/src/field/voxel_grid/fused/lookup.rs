@@ -113,6 +113,12 @@ impl<T: Real> Corners<T> {
         self.weights.grow(8 * count);
     }
 
+    /// Removes all samples but the first `count`.
+    pub fn truncate(&mut self, count: usize) {
+        self.rows.truncate(8 * count);
+        self.weights.truncate(8 * count);
+    }
+
     /// Copies corners of some samples of a group to the samples from `first` on. Panics if the capacity is too small.
     pub fn put(&mut self, first: usize, from: impl ExactSizeIterator<Item = usize> + Clone, group: &Group<T>) {
         let own = first..first + from.len();

@@ -97,8 +97,9 @@ impl<T: Real> Scene<'_, T> {
         let (at, weight) = ([x, y, z].map(std::mem::take), Buffer::copy_of(weight));
         // All samples have a weight, so they are visible with any density of 0 or more, whatever the transmittance behind them.
         let [density, after] = [Buffer::zeros(count), Buffer::zeros(count)];
-        let mut block = Block { first, offsets, at, weight, density, after, color: Buffer::stale(3 * count), ..Block::empty() };
-        self.colors(&mut block, Some(&corners));
+        let mut block =
+            Block { first, offsets, at, corners: Some(corners), weight, density, after, color: Buffer::stale(3 * count), ..Block::empty() };
+        self.colors(&mut block);
         block.color
     }
 }

@@ -162,7 +162,7 @@ fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderO
     // Number of harmonics in a row of the color table; the following harmonics are reduced.
     let here = batch.harmonics().max(1).min(count);
     parallel::map_chunks(rays.len(), BLOCK, |range| {
-        let (block, corners) = scene.weights(range.start, range.len());
+        let block = scene.weights(range.start, range.len());
         let reads = LazyCell::new(|| reduced::reads(&batch, &block));
         for (ray, own) in range.zip(block.rays()) {
             let (basis, beyond) = batch.basis().data()[ray * count..][..count].split_at(here);
@@ -170,7 +170,7 @@ fn for_each_sample<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderO
                 let weight = block.weight[i];
                 let reduced = || reads.as_ref().map(|reads| reads(i));
                 let sample = |own| f(Sample { ray, weight, own, reduced: &reduced, beyond });
-                match &corners {
+                match &block.corners {
                     None => sample(Reads { rows: &block.rows[i..=i], shares: &[T::one()], basis }),
                     Some(corners) => {
                         let (rows, shares) = corners.of(i);

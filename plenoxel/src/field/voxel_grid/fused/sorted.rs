@@ -4,7 +4,7 @@
 //! bucket, samples of different rays find the rows of a bucket in the cache.
 
 use super::forward::{Block, Scene};
-use super::lookup::{self, Corners};
+use super::lookup;
 use super::{BLOCK, BUCKET_SHIFT, COLUMNS};
 use crate::field::voxel_grid::Interpolation;
 use autograd::rows::Buckets;
@@ -29,8 +29,8 @@ struct Order<T: Real> {
 }
 
 impl<T: Real> Order<T> {
-    fn new(block: &Block<T>, corners: &Corners<T>, buckets: usize) -> Self {
-        let seen = block.seen();
+    fn new(block: &Block<T>, buckets: usize) -> Self {
+        let (seen, corners) = (block.seen(), block.trilinear());
         let bucket = |i: usize| (corners.of(i).0[0] >> BUCKET_SHIFT) as usize;
         let mut places = Buckets::count(buckets, (0..block.len()).filter(|&i| seen(i)).map(bucket));
         let total = places.total();
@@ -60,9 +60,8 @@ impl<T: Real> Scene<'_, T> {
         let buckets = self.batch.layout.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
         let count = pixels.len() / COLUMNS;
         let (blocks, orders): (Vec<_>, Vec<_>) = parallel::map_chunks(count, BLOCK, |range| {
-            let (block, corners) = self.weights(first + range.start, range.len());
-            let corners = corners.expect("trilinear look-up has corners");
-            let order = Order::new(&block, &corners, buckets);
+            let block = self.weights(first + range.start, range.len());
+            let order = Order::new(&block, buckets);
             (block, order)
         })
         .into_iter()
