@@ -1,4 +1,4 @@
-//! Products of matrices in slices, computed on one thread by the `gemm` crate, or in mixed precision by [`bf16`].
+//! Products of matrices in slices, computed on one thread by the `gemm` crate, or, in mixed precision, by `bf16.rs`.
 //!
 //! The crate takes pointers, which requires one unsafe call, in `product_in_order`. The tests of the matrix product compare it with a safe triple loop.
 #![allow(unsafe_code)]
@@ -130,7 +130,13 @@ const NARROW: usize = 32;
 #[track_caller]
 fn product<T: Real>(a: Matrix<'_, T>, b: Matrix<'_, T>, out: &mut [T], add: bool, precision: Precision) {
     let (m, n) = (a.rows, b.cols);
-    assert!(b.rows == a.cols && out.len() == m * n);
+    assert!(
+        b.rows == a.cols && out.len() == m * n,
+        "multiply: {m} × {} times {} × {n} into {} numbers; expected [m, k] times [k, n] into m · n numbers",
+        a.cols,
+        b.rows,
+        out.len()
+    );
     #[cfg(not(target_arch = "x86_64"))]
     let _ = precision;
     #[cfg(target_arch = "x86_64")]
@@ -272,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic]
+    #[should_panic(expected = "multiply: 1 × 2 times 1 × 1 into 1 numbers")]
     fn sizes_that_do_not_fit_are_refused_in_mixed_precision() {
         multiply(Matrix::new(&[1.0f32, 2.0], 1, 2), Matrix::new(&[3.0], 1, 1), &mut [0.0], Precision::Mixed);
     }

@@ -7,7 +7,7 @@ mod model;
 pub mod poses;
 mod state;
 
-pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, StageProgress, ViewOptions, read_params};
+pub use model::{CHECKPOINT_FORMAT, Model, Pass, RenderFn, StageLength, StageProgress, ViewOptions, read_params, same_settings};
 pub use state::{About, about};
 
 use crate::camera::Camera;

@@ -25,11 +25,10 @@ use crate::rays::RaySource;
 use crate::render::{Engine, Field, RenderOptions, Rendered, ShadedField, render};
 use crate::sampling::{Occupancy, Spacing};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params};
+use crate::train::{About, Model, Pass, PlannedStage, StageLength, TrainOptions, read_params, same_settings};
 use autograd::optim::{Adam, AdamMode, Optimizer, Piecewise, Rates, Scaled, Schedule};
 use autograd::{Module, Param, Precision, Real, Tensor, random::Stream};
 pub use config::{Config, Stage};
-use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -279,8 +278,7 @@ impl<T: Real> Model<T> for Dvgo<T> {
     }
 
     fn continues(&self, saved: &Value, _: u64) -> bool {
-        // Settings that the saved run did not have yet are those of the default.
-        Config::deserialize(saved).is_ok_and(|saved| self.config == saved)
+        same_settings(&self.config, saved)
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {

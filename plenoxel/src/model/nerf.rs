@@ -21,10 +21,9 @@ use crate::render::{Rendered, ShadedField, composite};
 use crate::sampling::importance::{Section, importance, stratified};
 use crate::sampling::{Jitter, Occupancy, Samples};
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params};
+use crate::train::{About, Model, Pass, PlannedStage, RenderFn, StageLength, TrainOptions, ViewOptions, read_params, same_settings};
 use autograd::optim::{Adam, AdamMode, Exponential, Optimizer};
 use autograd::{Module, Precision, Real, Tensor, impl_module};
-use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -175,8 +174,7 @@ impl<T: Real> Model<T> for Nerf<T> {
     }
 
     fn continues(&self, saved: &Value, _: u64) -> bool {
-        // Settings that the saved run did not have yet are those of the default.
-        Config::deserialize(saved).is_ok_and(|saved| self.config == saved)
+        same_settings(&self.config, saved)
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {

@@ -12,6 +12,7 @@ use crate::space::Space;
 use crate::tensor_file::{TensorFile, TensorWriter};
 use autograd::optim::Optimizer;
 use autograd::{Module, Real};
+use serde::de::DeserializeOwned;
 use serde_json::{Map, Value, json};
 use std::any::Any;
 use std::path::Path;
@@ -203,6 +204,11 @@ pub trait Model<T: Real>: Module<T> + Send + Sync {
         self.read(&mut file, 0)?;
         file.fact("about")
     }
+}
+
+/// Returns true if the settings of a saved run are these. A setting that the saved run did not have yet counts as its default.
+pub fn same_settings<C: DeserializeOwned + PartialEq>(settings: &C, saved: &Value) -> bool {
+    C::deserialize(saved).is_ok_and(|saved| saved == *settings)
 }
 
 /// Reads the values of all parameters by name.

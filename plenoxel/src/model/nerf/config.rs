@@ -45,6 +45,7 @@ pub struct Config {
     /// Steps in which the learning rate falls.
     pub decay_steps: u64,
     /// True: products of the networks are computed in [`Precision::Mixed`](autograd::Precision::Mixed), in training and in pictures.
+    /// The preset `nerf` has true.
     pub mixed_precision: bool,
 }
 

@@ -343,7 +343,7 @@ impl<T: Real> Block<T> {
         }
     }
 
-    /// Returns the columns of each sample, except row and color.
+    /// Returns the columns of each sample, except row, corners and color.
     fn columns(&mut self) -> [&mut Buffer<T>; 8] {
         let [x, y, z] = &mut self.at;
         [x, y, z, &mut self.t, &mut self.delta, &mut self.density, &mut self.weight, &mut self.after]
