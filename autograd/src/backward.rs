@@ -17,6 +17,7 @@ use crate::rows::sum::sum_into_rows;
 use crate::single::{cast, is_single};
 use crate::tensor::Tensor;
 use ndarray::{Dimension, IxDyn};
+use std::cell::OnceCell;
 use std::collections::{BinaryHeap, HashMap};
 use std::sync::Arc;
 
@@ -46,9 +47,9 @@ pub fn grad<T: Real>(y: &Tensor<T>, wrt: &[&Tensor<T>]) -> Vec<Tensor<T>> {
     }
     let mut found: HashMap<u64, Tensor<T>> = HashMap::new();
     while let Some((node, pending)) = pass.pop() {
-        let cotangent = pending.dense(&node.shape);
+        let cotangent = pending.factor(&node.shape);
         if targets.contains(&Some(node.id)) {
-            found.insert(node.id, cotangent.clone());
+            found.insert(node.id, spread(cotangent.clone(), &node.shape));
         }
         pass.propagate(node, cotangent);
     }
@@ -91,7 +92,7 @@ fn to_leaves_of<T: Real>(root: Option<Arc<Node<T>>>, seed: Tensor<T>) -> Gradien
             by_leaf.insert(node.id, pending.finish(&node.shape));
         } else {
             // A row-sparse gradient that reaches an op becomes dense. Models should therefore gather rows first and apply activations afterwards.
-            let cotangent = pending.dense(&node.shape);
+            let cotangent = pending.factor(&node.shape);
             pass.propagate(node, cotangent);
         }
     }
@@ -135,7 +136,8 @@ impl<T: Real> Pass<T> {
         self.needed.as_mut().is_none_or(|needed| needed.contains(node))
     }
 
-    /// Applies the rule of a node: computes the cotangents of its inputs from the cotangent of its output and adds them to the pending sums.
+    /// Applies the rule of a node: computes the cotangents of its inputs from the cotangent of its output, which may be a scalar for all elements, and adds them to
+    /// the pending sums.
     fn propagate(&mut self, node: Arc<Node<T>>, cotangent: Tensor<T>) {
         let needed: Vec<bool> = node.inputs.iter().map(|edge| edge.node.as_ref().is_some_and(|n| self.is_needed(n))).collect();
         if !needed.contains(&true) {
@@ -144,7 +146,8 @@ impl<T: Real> Pass<T> {
         let shares = match &node.rule {
             Rule::Leaf => return,
             Rule::Op(op) => {
-                let shares = op.vjp(&Vjp { node: &node, cotangent: &cotangent, needed: &needed, tracked: self.tracked });
+                let shares =
+                    op.vjp(&Vjp { node: &node, factor: &cotangent, spread: OnceCell::new(), needed: &needed, tracked: self.tracked });
                 assert_eq!(
                     shares.len(),
                     node.inputs.len(),
@@ -165,7 +168,7 @@ impl<T: Real> Pass<T> {
                     kernel.name()
                 );
                 if let Some(reference) = &output.node {
-                    self.push(reference.clone(), Pending::Dense(cotangent));
+                    self.push(reference.clone(), Pending::Dense(spread(cotangent.clone(), &node.shape)));
                 }
                 return;
             }
@@ -175,6 +178,7 @@ impl<T: Real> Pass<T> {
                     shapes: node.inputs.iter().map(|edge| edge.shape.clone()).collect(),
                     slots: node.inputs.iter().map(|_| None).collect(),
                 };
+                let cotangent = spread(cotangent.clone(), &node.shape);
                 kernel.vjp(&KernelCall { node: &node, cotangent: &cotangent, needed: &needed }, &mut sink);
                 sink.slots
             }
@@ -185,6 +189,10 @@ impl<T: Real> Pass<T> {
             let share = match share {
                 Cotangent::Dense(t) if t.shape() == edge.shape.slice() => Pending::Dense(t),
                 Cotangent::Dense(t) => Pending::Dense(t.sum_to(edge.shape.slice())),
+                Cotangent::Uniform(t) => {
+                    assert_eq!(t.len(), 1, "{}: a uniform cotangent of shape {:?}; expected a scalar", node.rule.name(), t.shape());
+                    Pending::Uniform(t)
+                }
                 Cotangent::Rows { rows, values } => Pending::Rows(vec![RowPart::Touches { rows, values }]),
                 Cotangent::Merged(rows) => Pending::Rows(vec![RowPart::Merged(rows)]),
             };
@@ -196,6 +204,8 @@ impl<T: Real> Pass<T> {
 /// The sum of the contributions that have arrived at a node so far.
 enum Pending<T: Real> {
     Dense(Tensor<T>),
+    /// A scalar that is the sum for each element.
+    Uniform(Tensor<T>),
     Rows(Vec<RowPart<T>>),
 }
 
@@ -256,21 +266,36 @@ impl<T: Real> Pending<T> {
     fn dense(self, shape: &IxDyn) -> Tensor<T> {
         match self {
             Pending::Dense(t) => t,
+            Pending::Uniform(t) => spread(t, shape),
             Pending::Rows(parts) => {
                 parts.into_iter().map(|p| p.dense(shape)).reduce(|a, b| &a + &b).unwrap_or_else(|| Tensor::zeros(shape.slice()))
             }
         }
     }
 
+    /// Returns the sum, or the scalar that it is for each element.
+    fn factor(self, shape: &IxDyn) -> Tensor<T> {
+        match self {
+            Pending::Uniform(t) => t,
+            other => other.dense(shape),
+        }
+    }
+
     fn finish(self, shape: &IxDyn) -> Grad<T> {
         match self {
             Pending::Dense(t) => Grad::Dense(t),
+            Pending::Uniform(t) => Grad::Dense(spread(t, shape)),
             Pending::Rows(parts) => match parts.into_iter().map(|p| p.merged(shape)).reduce(RowSparse::plus) {
                 Some(rows) => Grad::Rows(rows),
                 None => Grad::Dense(Tensor::zeros(shape.slice())),
             },
         }
     }
+}
+
+/// Returns a cotangent of which a scalar may be given.
+fn spread<T: Real>(cotangent: Tensor<T>, shape: &IxDyn) -> Tensor<T> {
+    if cotangent.shape() == shape.slice() { cotangent } else { cotangent.broadcast_to(shape.slice()) }
 }
 
 /// Returns a + b. It reuses the buffer of `a` or `b` if one of them is not shared.

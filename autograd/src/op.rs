@@ -12,6 +12,7 @@ use crate::rows::sparse::RowSparse;
 use crate::rows::sum::sum_into_rows;
 use crate::tensor::Tensor;
 use ndarray::Dimension;
+use std::cell::OnceCell;
 use std::fmt::Debug;
 
 /// The set of values that a rule reads. Only these are kept until the backward pass.
@@ -87,6 +88,8 @@ pub trait Kernel<T: Real>: Debug + Send + Sync + 'static {
 pub enum Cotangent<T: Real> {
     /// A dense contribution. Its shape is the shape of the input, or a shape that the input broadcasts to.
     Dense(Tensor<T>),
+    /// A scalar: the same contribution to each element of the input, as from a sum over all elements.
+    Uniform(Tensor<T>),
     /// A row-sparse contribution: row k of `values` is added to row `rows[k]` of the input. Rows may repeat and may have any order.
     Rows {
         /// One row number for each row of `values`.
@@ -101,7 +104,10 @@ pub enum Cotangent<T: Real> {
 /// The arguments of [`Op::vjp`]: the cotangent of the output and the kept values.
 pub struct Vjp<'a, T: Real> {
     pub(crate) node: &'a std::sync::Arc<Node<T>>,
-    pub(crate) cotangent: &'a Tensor<T>,
+    /// Cotangent of the output, or a scalar if all its elements are the same.
+    pub(crate) factor: &'a Tensor<T>,
+    /// The cotangent of which `factor` is the scalar.
+    pub(crate) spread: OnceCell<Tensor<T>>,
     pub(crate) needed: &'a [bool],
     /// True in a differentiable pass: inputs and output are then returned with their graph nodes.
     pub(crate) tracked: bool,
@@ -110,7 +116,14 @@ pub struct Vjp<'a, T: Real> {
 impl<T: Real> Vjp<'_, T> {
     /// Returns the cotangent of the output, which has the shape of the output.
     pub fn cotangent(&self) -> &Tensor<T> {
-        self.cotangent
+        let shape = self.node.shape.slice();
+        if self.factor.shape() == shape { self.factor } else { self.spread.get_or_init(|| self.factor.broadcast_to(shape)) }
+    }
+
+    /// Returns the cotangent of the output as a factor of a tensor with the shape of the output: a scalar if all its elements are the same, as the cotangent of the
+    /// terms of a sum, or else [`Vjp::cotangent`]. A product with a scalar takes less memory traffic.
+    pub fn cotangent_factor(&self) -> &Tensor<T> {
+        self.factor
     }
 
     /// Returns input `i`.
@@ -138,6 +151,11 @@ impl<T: Real> Vjp<'_, T> {
     /// Returns the dense cotangent of input `i`. `f` is called only if this cotangent is needed.
     pub fn wrt(&self, i: usize, f: impl FnOnce() -> Tensor<T>) -> Option<Cotangent<T>> {
         self.needed[i].then(|| Cotangent::Dense(f()))
+    }
+
+    /// Returns the cotangent of input `i`, of which each element is the scalar that `f` returns. `f` is called only if this cotangent is needed.
+    pub fn wrt_uniform(&self, i: usize, f: impl FnOnce() -> Tensor<T>) -> Option<Cotangent<T>> {
+        self.needed[i].then(|| Cotangent::Uniform(f()))
     }
 
     /// Returns the row-sparse cotangent of input `i`. `f` computes the values of the rows and is called only if this cotangent is needed.

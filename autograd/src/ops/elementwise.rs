@@ -56,29 +56,29 @@ macro_rules! apply {
 
 elementwise! {
     /// Returns y = eˣ.   ∂L/∂x = ∂L/∂y · y
-    @exponential exp, Exp, Keep::OUTPUT, T::exp_::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * cx.output();
+    @exponential exp, Exp, Keep::OUTPUT, T::exp_::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent_factor() * cx.output();
 
     /// Returns y = eˣ − 1 without cancellation for small x, accurate to two units in the last place.   ∂L/∂x = ∂L/∂y · eˣ
     ///
     /// The rule computes eˣ again, since y + 1 would lose its digits for large negative x.
-    expm1, Expm1, Keep::INPUTS, T::expm1_, |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).exp();
+    expm1, Expm1, Keep::INPUTS, T::expm1_, |cx: &Vjp<'_, T>| cx.cotangent_factor() * cx.input(0).exp();
 
     /// Returns y = 1 − e⁻ˣ without cancellation for small x: the opacity for an optical depth x.   ∂L/∂x = ∂L/∂y · e⁻ˣ
     ///
     /// The rule computes e⁻ˣ again, since 1 − y would lose its digits where y is near 1.
-    @exponential one_minus_exp_neg, OneMinusExpNeg, Keep::INPUTS, T::one_minus_exp_neg::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent() * (-cx.input(0)).exp();
+    @exponential one_minus_exp_neg, OneMinusExpNeg, Keep::INPUTS, T::one_minus_exp_neg::<FUSED>, |cx: &Vjp<'_, T>| cx.cotangent_factor() * (-cx.input(0)).exp();
 
     /// Returns y = ln x, for x > 0.   ∂L/∂x = ∂L/∂y / x
-    ln, Ln, Keep::INPUTS, |x: T| x.ln(), |cx: &Vjp<'_, T>| cx.cotangent() / cx.input(0);
+    ln, Ln, Keep::INPUTS, |x: T| x.ln(), |cx: &Vjp<'_, T>| cx.cotangent_factor() / cx.input(0);
 
     /// Returns y = √x, for x >= 0. It is not differentiable at 0.   ∂L/∂x = ∂L/∂y / 2y
-    sqrt, Sqrt, Keep::OUTPUT, |x: T| x.sqrt(), |cx: &Vjp<'_, T>| cx.cotangent() / (2.0 * cx.output());
+    sqrt, Sqrt, Keep::OUTPUT, |x: T| x.sqrt(), |cx: &Vjp<'_, T>| cx.cotangent_factor() / (2.0 * cx.output());
 
     /// Returns y = x².   ∂L/∂x = ∂L/∂y · 2x
-    square, Square, Keep::INPUTS, |x: T| x * x, |cx: &Vjp<'_, T>| cx.cotangent() * (2.0 * cx.input(0));
+    square, Square, Keep::INPUTS, |x: T| x * x, |cx: &Vjp<'_, T>| 2.0 * cx.cotangent_factor() * cx.input(0);
 
     /// Returns y = |x|. The gradient at 0 is 0.   ∂L/∂x = ∂L/∂y · sign x
-    abs, Abs, Keep::INPUTS, |x: T| x.abs(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sign();
+    abs, Abs, Keep::INPUTS, |x: T| x.abs(), |cx: &Vjp<'_, T>| cx.cotangent_factor() * cx.input(0).sign();
 
     /// Returns y = 1 / (1 + e⁻ˣ).   ∂L/∂x = ∂L/∂y · y (1 − y)
     @exponential sigmoid, Sigmoid, Keep::OUTPUT,
@@ -90,28 +90,28 @@ elementwise! {
     },
     |cx: &Vjp<'_, T>| {
         let y = cx.output();
-        cx.cotangent() * (&y * (1.0 - &y))
+        cx.cotangent_factor() * (&y * (1.0 - &y))
     };
 
     /// Returns y = ln(1 + eˣ), computed as max(x, 0) + ln(1 + e^−|x|).   ∂L/∂x = ∂L/∂y · sigmoid x
-    @exponential softplus, Softplus, Keep::INPUTS, |x: T| x.max(T::zero()) + (-x.abs()).exp_::<FUSED>().ln_1p(), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).sigmoid();
+    @exponential softplus, Softplus, Keep::INPUTS, |x: T| x.max(T::zero()) + (-x.abs()).exp_::<FUSED>().ln_1p(), |cx: &Vjp<'_, T>| cx.cotangent_factor() * cx.input(0).sigmoid();
 
     /// Returns y = max(x, 0), and NaN where x is NaN.   ∂L/∂x = ∂L/∂y where x >= 0, else 0
     relu, Relu, Keep::INPUTS, |x: T| if x < T::zero() { T::zero() } else { x }, |cx: &Vjp<'_, T>| {
         let x = cx.input(0).detach();
-        cx.cotangent() * x.greater_equal(&Tensor::scalar(T::zero()))
+        cx.cotangent_factor() * x.greater_equal(&Tensor::scalar(T::zero()))
     };
 
     /// Returns y = tanh x, accurate to three units in the last place.   ∂L/∂x = ∂L/∂y · (1 − y²)
-    tanh, Tanh, Keep::OUTPUT, T::tanh_, |cx: &Vjp<'_, T>| cx.cotangent() * (1.0 - cx.output().square());
+    tanh, Tanh, Keep::OUTPUT, T::tanh_, |cx: &Vjp<'_, T>| cx.cotangent_factor() * (1.0 - cx.output().square());
 
     /// Returns y = sin x, accurate to one unit in the last place.   ∂L/∂x = ∂L/∂y · cos x
     ///
     /// For |x| > 2²⁰ the sine is computed by the math library of the system, one number at a time.
-    @periodic sin, Sin, Keep::INPUTS, (T::sin_, |x: T| x.sin()), |cx: &Vjp<'_, T>| cx.cotangent() * cx.input(0).cos();
+    @periodic sin, Sin, Keep::INPUTS, (T::sin_, |x: T| x.sin()), |cx: &Vjp<'_, T>| cx.cotangent_factor() * cx.input(0).cos();
 
     /// Returns y = cos x, computed like [`Tensor::sin`].   ∂L/∂x = −∂L/∂y · sin x
-    @periodic cos, Cos, Keep::INPUTS, (T::cos_, |x: T| x.cos()), |cx: &Vjp<'_, T>| -(cx.cotangent() * cx.input(0).sin());
+    @periodic cos, Cos, Keep::INPUTS, (T::cos_, |x: T| x.cos()), |cx: &Vjp<'_, T>| -(cx.cotangent_factor() * cx.input(0).sin());
 }
 
 /// y = xⁿ.   ∂L/∂x = ∂L/∂y · n xⁿ⁻¹
@@ -126,8 +126,8 @@ impl<T: Real> Op<T> for Powi {
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
         vec![cx.wrt(0, || match self.0 {
-            0 => Tensor::zeros(cx.cotangent().shape()),
-            n => cx.cotangent() * cx.input(0).powi(n - 1).affine(f64::from(n), 0.0),
+            0 => Tensor::zeros(cx.input_shape(0)),
+            n => cx.cotangent_factor() * cx.input(0).powi(n - 1).affine(f64::from(n), 0.0),
         })]
     }
 }
@@ -146,7 +146,7 @@ impl<T: Real> Op<T> for LeakyRelu {
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
         let slope = T::lit(self.slope);
-        vec![cx.wrt(0, || cx.cotangent() * cx.input(0).constant_map(|x| if x < T::zero() { slope } else { T::one() }))]
+        vec![cx.wrt(0, || cx.cotangent_factor() * cx.input(0).constant_map(|x| if x < T::zero() { slope } else { T::one() }))]
     }
 }
 
@@ -165,7 +165,7 @@ impl<T: Real> Op<T> for Clamp {
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
         let (low, high) = (T::lit(self.low), T::lit(self.high));
-        vec![cx.wrt(0, || cx.cotangent() * cx.input(0).constant_map(|x| if x >= low && x <= high { T::one() } else { T::zero() }))]
+        vec![cx.wrt(0, || cx.cotangent_factor() * cx.input(0).constant_map(|x| if x >= low && x <= high { T::one() } else { T::zero() }))]
     }
 }
 

@@ -37,7 +37,7 @@ fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
     f: &F,
 ) {
     let bucket_rows = 1usize << rows.bucket_shift();
-    let groups = RowGroups::new(x[0].len() / width.max(1), bucket_rows);
+    let groups = RowGroups::new(x[0].len() / width.max(1), bucket_rows, width);
     let mut parts = x.map(|x| x.chunks_mut((groups.rows_per_group() * width).max(1)));
     let mut parts: Vec<(usize, [&mut [T]; N])> =
         (0..groups.count).map(|group| (group, parts.each_mut().map(|parts| parts.next().unwrap_or_default()))).collect();
@@ -45,7 +45,7 @@ fn update_deferred<T: Real, const N: usize, F: Fn([T; N], T) -> [T; N] + Sync>(
     parts.reverse();
     for_each_item(parts, |_, (group, mut x)| {
         let first = group * groups.rows_per_group();
-        groups.for_each_bucket(group, width, rows, |bucket, sums, touched| {
+        groups.for_each_bucket(group, rows, |bucket, sums, touched| {
             let start = (bucket * bucket_rows - first) * width;
             let x = x.each_mut().map(|x| &mut x[start..][..sums.len()]);
             match width {

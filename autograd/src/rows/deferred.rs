@@ -5,7 +5,7 @@ use crate::pool::Buffer;
 use crate::real::Real;
 use std::fmt::Debug;
 use std::ops::Range;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// A row-sparse gradient whose sums have not been computed. The sums of each bucket of rows can be computed independently, in an order that depends on the
 /// data only.
@@ -99,19 +99,23 @@ impl<T: Real> RowSums<T> for Known<T> {
 }
 
 /// The buckets of a table, in groups of consecutive buckets. One task processes one group. The number of groups does not depend on the number of threads.
-pub(crate) struct RowGroups {
+pub(crate) struct RowGroups<T: Real> {
     pub(crate) count: usize,
     buckets: usize,
     bucket_rows: usize,
     table_rows: usize,
+    width: usize,
     buckets_per_group: usize,
+    /// Sums and bits of a bucket, all zero, of tasks that have ended. The next task finds them in the cache of its thread.
+    free: Mutex<Vec<(Buffer<T>, Vec<u64>)>>,
 }
 
-impl RowGroups {
-    pub(crate) fn new(table_rows: usize, bucket_rows: usize) -> Self {
+impl<T: Real> RowGroups<T> {
+    pub(crate) fn new(table_rows: usize, bucket_rows: usize, width: usize) -> Self {
         let buckets = table_rows.div_ceil(bucket_rows);
         let buckets_per_group = buckets.div_ceil(64).max(1);
-        RowGroups { count: buckets.div_ceil(buckets_per_group), buckets, bucket_rows, table_rows, buckets_per_group }
+        let count = buckets.div_ceil(buckets_per_group);
+        RowGroups { count, buckets, bucket_rows, table_rows, width, buckets_per_group, free: Mutex::default() }
     }
 
     /// Returns the number of rows of a group; the last group may have fewer.
@@ -119,26 +123,26 @@ impl RowGroups {
         self.buckets_per_group * self.bucket_rows
     }
 
+    fn free(&self) -> MutexGuard<'_, Vec<(Buffer<T>, Vec<u64>)>> {
+        self.free.lock().unwrap_or_else(|e| e.into_inner())
+    }
+
     /// Calls `f(bucket, sums, touched)` for each bucket of a group that has contributions. The sums of rows without contributions are zero. `f` must reset all
     /// sums to zero and clear all bits.
-    pub(crate) fn for_each_bucket<T: Real>(
-        &self,
-        group: usize,
-        width: usize,
-        rows: &dyn RowSums<T>,
-        mut f: impl FnMut(usize, &mut [T], &mut [u64]),
-    ) {
+    pub(crate) fn for_each_bucket(&self, group: usize, rows: &dyn RowSums<T>, mut f: impl FnMut(usize, &mut [T], &mut [u64])) {
         let first = group * self.buckets_per_group;
-        let mut scratch: Option<(Buffer<T>, Vec<u64>)> = None;
-        for bucket in first..(first + self.buckets_per_group).min(self.buckets) {
-            if rows.is_empty(bucket) {
-                continue;
-            }
-            let (sums, touched) =
-                scratch.get_or_insert_with(|| (Buffer::zeros(self.bucket_rows * width), vec![0u64; self.bucket_rows.div_ceil(64)]));
-            let here = self.bucket_rows.min(self.table_rows - bucket * self.bucket_rows);
-            rows.add(bucket, &mut sums[..here * width], touched);
-            f(bucket, &mut sums[..here * width], touched);
+        let mut buckets = (first..(first + self.buckets_per_group).min(self.buckets)).filter(|&bucket| !rows.is_empty(bucket)).peekable();
+        if buckets.peek().is_none() {
+            return;
         }
+        let free = self.free().pop();
+        let (mut sums, mut touched) =
+            free.unwrap_or_else(|| (Buffer::zeros(self.bucket_rows * self.width), vec![0; self.bucket_rows.div_ceil(64)]));
+        for bucket in buckets {
+            let here = self.bucket_rows.min(self.table_rows - bucket * self.bucket_rows);
+            rows.add(bucket, &mut sums[..here * self.width], &mut touched);
+            f(bucket, &mut sums[..here * self.width], &mut touched);
+        }
+        self.free().push((sums, touched));
     }
 }

@@ -140,10 +140,10 @@ impl<T: Real> RowSparse<T> {
             let sums = self.sums.as_deref().expect("sums or their result");
             let (width, rows) = (self.width(), self.shape()[0]);
             let bucket_rows = 1usize << sums.bucket_shift();
-            let groups = RowGroups::new(rows, bucket_rows);
+            let groups = RowGroups::new(rows, bucket_rows, width);
             let parts = parallel::map_indices(groups.count, |group| {
                 let (mut found, mut values) = (Vec::new(), Vec::new());
-                groups.for_each_bucket(group, width, sums, |bucket, sums, touched| {
+                groups.for_each_bucket(group, sums, |bucket, sums, touched| {
                     take_bits(touched, |local| {
                         let row = &mut sums[local * width..][..width];
                         found.push((bucket * bucket_rows + local) as u32);

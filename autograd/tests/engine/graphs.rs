@@ -1,7 +1,7 @@
 //! Lifetime of graphs, and higher derivatives.
 
-use autograd::{Cotangent, GradSink, Kernel, KernelCall, Op, Param, Tensor, Vjp, grad, no_grad, value_and_grad};
-use ndarray::{arr0, arr1};
+use autograd::{Cotangent, GradSink, Indices, Kernel, KernelCall, Op, Param, Tensor, Vjp, grad, no_grad, value_and_grad};
+use ndarray::{ArrayD, arr0, arr1, arr2};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -104,6 +104,43 @@ fn the_gradient_of_the_gradient_of_the_gradient_is_the_third_derivative() {
     // 60 x²
     assert_eq!(third.data(), [240.0, 60.0]);
     assert_eq!(third.sum().backward().array(&x).as_slice(), Some(&[240.0, -120.0][..]));
+}
+
+/// The cotangent of the terms of a sum is a scalar; that of their product with a tensor of ones is a tensor.
+#[test]
+fn the_terms_of_a_sum_have_the_derivatives_of_a_sum_weighted_by_ones() {
+    let x = Tensor::variable(arr2(&[[0.3, -0.7, 1.2], [0.9, 0.2, -1.1]]));
+    let (ones, rows) = (Tensor::<f64>::ones(&[2, 3]), Indices::from(vec![1, 0]));
+    let terms: [(&str, &dyn Fn() -> Tensor<f64>); 14] = [
+        ("x", &|| x.clone()),
+        ("exp", &|| x.exp()),
+        ("expm1", &|| x.expm1()),
+        ("ln", &|| x.square().ln()),
+        ("sqrt", &|| x.square().sqrt()),
+        ("square", &|| x.square()),
+        ("abs", &|| x.abs()),
+        ("sigmoid", &|| x.sigmoid()),
+        ("leaky_relu", &|| x.leaky_relu(0.1)),
+        ("clamp", &|| x.clamp(-1.0, 1.0)),
+        ("powi", &|| x.powi(3)),
+        ("sin", &|| x.sin()),
+        ("gather_rows", &|| x.gather_rows(&rows)),
+        ("a term twice", &|| x.square() + &x + x.square()),
+    ];
+    let close = |a: &ArrayD<f64>, b: &ArrayD<f64>| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-14);
+    for (name, terms) in terms {
+        for divided in [false, true] {
+            let loss = |weighted: bool| {
+                let terms = if weighted { terms() * &ones } else { terms() };
+                if divided { terms.mean() + x.cos().sum() } else { terms.sum() }
+            };
+            let [got, want] = [false, true].map(|weighted| grad(&loss(weighted), &[&x]).remove(0));
+            let [got_once, want_once] = [false, true].map(|weighted| loss(weighted).backward().array(&x));
+            let [got_twice, want_twice] = [got.sin().sum(), want.sin().sum()].map(|y| grad(&y, &[&x]).remove(0).to_array());
+            assert!(close(&got.to_array(), &want.to_array()) && close(&got_once, &want_once), "{name}");
+            assert!(close(&got_twice, &want_twice), "{name}");
+        }
+    }
 }
 
 #[test]

@@ -162,8 +162,9 @@ impl<'a, T: Real> Network<'a, T> {
             of_input || to.of_params[2 * l].is_some() || to.of_params[2 * l + 1].is_some()
         };
         let Some(lowest) = (0..self.layers.len()).find(|&l| needed(l, to)) else { return };
-        let mut g = Buffer::copy_of(g);
-        drop_tiny(&mut g);
+        let mut of_output = Buffer::stale(g.len());
+        drop_tiny(g, &mut of_output);
+        let mut g = of_output;
         let mut unwritten = true;
         for (l, layer) in self.layers.iter().enumerate().skip(lowest).rev() {
             let cotangent = Matrix::new(&g, m, layer.outputs);
@@ -317,12 +318,12 @@ fn multiply_by<T: Real, F: Fn(T) -> T>(g: &mut [T], y: &[T], slope: F) {
 }
 
 dispatched! {
-/// Sets cotangents to 0 that are below 10¹² times the smallest normal number, as those of samples behind opaque matter may be. Products with them may be subnormal,
+/// Copies cotangents, and sets those to 0 that are below 10¹² times the smallest normal number, as those of samples behind opaque matter may be. Products with them may be subnormal,
 /// which takes processors up to 40 times as long: the adjoint of eight layers of 128 took 9200 instead of 220 ms with cotangents of 10⁻³⁶.
-fn drop_tiny<T: Real>(g: &mut [T]) {
+fn drop_tiny<T: Real>(from: &[T], to: &mut [T]) {
     let least = T::min_positive_value() * T::lit(1e12);
-    for g in g {
-        *g = if g.abs() < least { T::zero() } else { *g };
+    for (to, &g) in to.iter_mut().zip(from) {
+        *to = if g.abs() < least { T::zero() } else { g };
     }
 }
 }
