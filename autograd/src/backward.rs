@@ -17,9 +17,8 @@ use crate::rows::sum::sum_into_rows;
 use crate::single::{cast, is_single};
 use crate::tensor::Tensor;
 use ndarray::{Dimension, IxDyn};
-use std::cell::OnceCell;
 use std::collections::{BinaryHeap, HashMap};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Returns the gradients of the scalar `y` with respect to each tensor in `wrt`, as tensors that can be differentiated again. The gradient is zero if
 /// `y` does not depend on the tensor.
@@ -147,7 +146,7 @@ impl<T: Real> Pass<T> {
             Rule::Leaf => return,
             Rule::Op(op) => {
                 let shares =
-                    op.vjp(&Vjp { node: &node, factor: &cotangent, spread: OnceCell::new(), needed: &needed, tracked: self.tracked });
+                    op.vjp(&Vjp { node: &node, factor: &cotangent, spread: OnceLock::new(), needed: &needed, tracked: self.tracked });
                 assert_eq!(
                     shares.len(),
                     node.inputs.len(),
@@ -168,7 +167,7 @@ impl<T: Real> Pass<T> {
                     kernel.name()
                 );
                 if let Some(reference) = &output.node {
-                    self.push(reference.clone(), Pending::Dense(spread(cotangent.clone(), &node.shape)));
+                    self.push(reference.clone(), Pending::Dense(spread(cotangent, &node.shape)));
                 }
                 return;
             }
@@ -191,7 +190,7 @@ impl<T: Real> Pass<T> {
                 Cotangent::Dense(t) => Pending::Dense(t.sum_to(edge.shape.slice())),
                 Cotangent::Uniform(t) => {
                     assert_eq!(t.len(), 1, "{}: a uniform cotangent of shape {:?}; expected a scalar", node.rule.name(), t.shape());
-                    Pending::Uniform(t)
+                    Pending::Uniform(t.reshape(&[]))
                 }
                 Cotangent::Rows { rows, values } => Pending::Rows(vec![RowPart::Touches { rows, values }]),
                 Cotangent::Merged(rows) => Pending::Rows(vec![RowPart::Merged(rows)]),
@@ -249,6 +248,8 @@ impl<T: Real> RowPart<T> {
 impl<T: Real> Pending<T> {
     fn plus(self, other: Self, shape: &IxDyn, tracked: bool) -> Self {
         match (self, other) {
+            (Pending::Uniform(a), Pending::Uniform(b)) => Pending::Uniform(&a + &b),
+            (Pending::Uniform(t), other) | (other, Pending::Uniform(t)) => Pending::Dense(spread(t, shape)).plus(other, shape, tracked),
             (Pending::Rows(mut a), Pending::Rows(b)) => {
                 a.extend(b);
                 Pending::Rows(a)
@@ -293,7 +294,7 @@ impl<T: Real> Pending<T> {
     }
 }
 
-/// Returns a cotangent of which a scalar may be given.
+/// Repeats a uniform cotangent to a shape; returns others as they are.
 fn spread<T: Real>(cotangent: Tensor<T>, shape: &IxDyn) -> Tensor<T> {
     if cotangent.shape() == shape.slice() { cotangent } else { cotangent.broadcast_to(shape.slice()) }
 }

@@ -12,8 +12,8 @@ use crate::rows::sparse::RowSparse;
 use crate::rows::sum::sum_into_rows;
 use crate::tensor::Tensor;
 use ndarray::Dimension;
-use std::cell::OnceCell;
 use std::fmt::Debug;
+use std::sync::OnceLock;
 
 /// The set of values that a rule reads. Only these are kept until the backward pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -63,7 +63,7 @@ pub trait Op<T: Real>: Debug + Send + Sync + 'static {
     }
 
     /// Computes the vector-Jacobian product: the cotangent of each input, given the cotangent of the output. A dense cotangent may have the
-    /// broadcast shape of the output; the engine sums it to the shape of the input. `None` means zero.
+    /// broadcast shape of the output; the engine sums it to the shape of the input. A uniform cotangent is a scalar. `None` means zero.
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>>;
 }
 
@@ -104,10 +104,10 @@ pub enum Cotangent<T: Real> {
 /// The arguments of [`Op::vjp`]: the cotangent of the output and the kept values.
 pub struct Vjp<'a, T: Real> {
     pub(crate) node: &'a std::sync::Arc<Node<T>>,
-    /// Cotangent of the output, or a scalar if all its elements are the same.
+    /// Cotangent of the output, or a scalar if it is known to be uniform.
     pub(crate) factor: &'a Tensor<T>,
-    /// The cotangent of which `factor` is the scalar.
-    pub(crate) spread: OnceCell<Tensor<T>>,
+    /// `factor`, repeated to the shape of the output on first use.
+    pub(crate) spread: OnceLock<Tensor<T>>,
     pub(crate) needed: &'a [bool],
     /// True in a differentiable pass: inputs and output are then returned with their graph nodes.
     pub(crate) tracked: bool,
@@ -120,10 +120,19 @@ impl<T: Real> Vjp<'_, T> {
         if self.factor.shape() == shape { self.factor } else { self.spread.get_or_init(|| self.factor.broadcast_to(shape)) }
     }
 
-    /// Returns the cotangent of the output as a factor of a tensor with the shape of the output: a scalar if all its elements are the same, as the cotangent of the
-    /// terms of a sum, or else [`Vjp::cotangent`]. A product with a scalar takes less memory traffic.
+    /// Returns a factor for products and quotients with tensors of the shape of the output: a scalar if the cotangent is known to be uniform, as that of the terms of
+    /// a sum, or else [`Vjp::cotangent`]. The scalar saves memory traffic.
+    ///
+    /// The result must not be used in any other way: a product with an input that is repeated to the shape of the output (broadcasting) would be too small, and so
+    /// would the factor itself be as the cotangent of an input.
     pub fn cotangent_factor(&self) -> &Tensor<T> {
         self.factor
+    }
+
+    /// Returns the cotangent f(cotangent of the output) of an input with the shape of the output, where `f` does the same to each element.
+    pub(crate) fn wrt_each(&self, i: usize, f: impl FnOnce(&Tensor<T>) -> Tensor<T>) -> Option<Cotangent<T>> {
+        let is_whole = self.factor.shape() == self.node.shape.slice();
+        if is_whole { self.wrt(i, || f(self.factor)) } else { self.wrt_uniform(i, || f(self.factor)) }
     }
 
     /// Returns input `i`.

@@ -31,8 +31,8 @@ impl<T: Real> Op<T> for Powf {
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
         vec![cx.wrt(0, || match self.0 {
-            0.0 => Tensor::zeros(cx.cotangent().shape()),
-            p => cx.cotangent() * (p * cx.input(0).powf(p - 1.0)),
+            0.0 => Tensor::zeros(cx.input_shape(0)),
+            p => cx.cotangent_factor() * (p * cx.input(0).powf(p - 1.0)),
         })]
     }
 }

@@ -20,8 +20,8 @@ impl<T: Real> Op<T> for SumTo {
         Keep::NOTHING
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
-        let g = cx.cotangent();
-        if g.len() == 1 { vec![cx.wrt_uniform(0, || g.reshape(&[]))] } else { vec![cx.wrt(0, || g.broadcast_to(&self.from))] }
+        let g = cx.cotangent_factor();
+        if g.len() == 1 { vec![cx.wrt_uniform(0, || g.clone())] } else { vec![cx.wrt(0, || g.broadcast_to(&self.from))] }
     }
 }
 

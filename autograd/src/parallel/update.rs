@@ -390,12 +390,14 @@ mod tests {
         }
     }
 
+    /// With one thread, the second group of buckets gets the sums of the first.
     #[test]
     fn updates_with_sums_for_later_reach_each_touched_row_once_for_every_width() {
-        for width in [1, 2, 3, 4, 5, 12, 16, 24, 27, 48] {
+        for (width, threads) in [1, 2, 3, 4, 5, 12, 16, 24, 27, 48].into_iter().flat_map(|width| [(width, 1), (width, 2)]) {
             let (mut x, mut count) = (vec![0.5; Sums::ROWS * width], vec![0.0; Sums::ROWS * width]);
             let g = Grad::Rows(RowSparse::deferred(&[Sums::ROWS, width], Arc::new(Sums { width })));
-            update([&mut x, &mut count], &g, false, |[x, count]: [f64; 2], g| [x - g, count + 1.0]);
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+            pool.install(|| update([&mut x, &mut count], &g, false, |[x, count]: [f64; 2], g| [x - g, count + 1.0]));
             for (at, (&x, &count)) in x.iter().zip(&count).enumerate() {
                 let want = if Sums::touches(at / width) { (0.5 - Sums::number(at), 1.0) } else { (0.5, 0.0) };
                 assert_eq!((x, count), want, "rows of width {width}, element {at}");

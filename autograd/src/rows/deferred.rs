@@ -106,8 +106,14 @@ pub(crate) struct RowGroups<T: Real> {
     table_rows: usize,
     width: usize,
     buckets_per_group: usize,
-    /// Sums and bits of a bucket, all zero, of tasks that have ended. The next task finds them in the cache of its thread.
-    free: Mutex<Vec<(Buffer<T>, Vec<u64>)>>,
+    /// Those of tasks that have ended. The next task usually finds them in the cache of its thread.
+    idle: Mutex<Vec<Scratch<T>>>,
+}
+
+/// Sums of the rows of a bucket, and the bits of rows with contributions; all zero between two buckets.
+struct Scratch<T: Real> {
+    sums: Buffer<T>,
+    touched: Vec<u64>,
 }
 
 impl<T: Real> RowGroups<T> {
@@ -115,7 +121,7 @@ impl<T: Real> RowGroups<T> {
         let buckets = table_rows.div_ceil(bucket_rows);
         let buckets_per_group = buckets.div_ceil(64).max(1);
         let count = buckets.div_ceil(buckets_per_group);
-        RowGroups { count, buckets, bucket_rows, table_rows, width, buckets_per_group, free: Mutex::default() }
+        RowGroups { count, buckets, bucket_rows, table_rows, width, buckets_per_group, idle: Mutex::default() }
     }
 
     /// Returns the number of rows of a group; the last group may have fewer.
@@ -123,8 +129,15 @@ impl<T: Real> RowGroups<T> {
         self.buckets_per_group * self.bucket_rows
     }
 
-    fn free(&self) -> MutexGuard<'_, Vec<(Buffer<T>, Vec<u64>)>> {
-        self.free.lock().unwrap_or_else(|e| e.into_inner())
+    fn idle(&self) -> MutexGuard<'_, Vec<Scratch<T>>> {
+        self.idle.lock().unwrap_or_else(|e| e.into_inner())
+    }
+
+    fn scratch(&self) -> Scratch<T> {
+        // The list must be unlocked while zeros are written: threads do that together, and one of them may begin another task meanwhile.
+        let idle = self.idle().pop();
+        let zeros = || Scratch { sums: Buffer::zeros(self.bucket_rows * self.width), touched: vec![0; self.bucket_rows.div_ceil(64)] };
+        idle.unwrap_or_else(zeros)
     }
 
     /// Calls `f(bucket, sums, touched)` for each bucket of a group that has contributions. The sums of rows without contributions are zero. `f` must reset all
@@ -135,14 +148,14 @@ impl<T: Real> RowGroups<T> {
         if buckets.peek().is_none() {
             return;
         }
-        let free = self.free().pop();
-        let (mut sums, mut touched) =
-            free.unwrap_or_else(|| (Buffer::zeros(self.bucket_rows * self.width), vec![0; self.bucket_rows.div_ceil(64)]));
+        let mut scratch = self.scratch();
+        let Scratch { sums, touched } = &mut scratch;
         for bucket in buckets {
             let here = self.bucket_rows.min(self.table_rows - bucket * self.bucket_rows);
-            rows.add(bucket, &mut sums[..here * self.width], &mut touched);
-            f(bucket, &mut sums[..here * self.width], &mut touched);
+            rows.add(bucket, &mut sums[..here * self.width], touched);
+            f(bucket, &mut sums[..here * self.width], touched);
+            debug_assert!(sums.iter().all(|sum| *sum == T::zero()) && touched.iter().all(|bits| *bits == 0));
         }
-        self.free().push((sums, touched));
+        self.idle().push(scratch);
     }
 }

@@ -1,7 +1,7 @@
 //! Lifetime of graphs, and higher derivatives.
 
 use autograd::{Cotangent, GradSink, Indices, Kernel, KernelCall, Op, Param, Tensor, Vjp, grad, no_grad, value_and_grad};
-use ndarray::{ArrayD, arr0, arr1, arr2};
+use ndarray::{Array2, ArrayD, arr0, arr1, arr2};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -106,41 +106,66 @@ fn the_gradient_of_the_gradient_of_the_gradient_is_the_third_derivative() {
     assert_eq!(third.sum().backward().array(&x).as_slice(), Some(&[240.0, -120.0][..]));
 }
 
+fn close(a: &ArrayD<f64>, b: &ArrayD<f64>) -> bool {
+    a.shape() == b.shape() && a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-14)
+}
+
 /// The cotangent of the terms of a sum is a scalar; that of their product with a tensor of ones is a tensor.
 #[test]
 fn the_terms_of_a_sum_have_the_derivatives_of_a_sum_weighted_by_ones() {
-    let x = Tensor::variable(arr2(&[[0.3, -0.7, 1.2], [0.9, 0.2, -1.1]]));
-    let (ones, rows) = (Tensor::<f64>::ones(&[2, 3]), Indices::from(vec![1, 0]));
-    let terms: [(&str, &dyn Fn() -> Tensor<f64>); 14] = [
-        ("x", &|| x.clone()),
-        ("exp", &|| x.exp()),
-        ("expm1", &|| x.expm1()),
-        ("ln", &|| x.square().ln()),
-        ("sqrt", &|| x.square().sqrt()),
-        ("square", &|| x.square()),
-        ("abs", &|| x.abs()),
-        ("sigmoid", &|| x.sigmoid()),
-        ("leaky_relu", &|| x.leaky_relu(0.1)),
-        ("clamp", &|| x.clamp(-1.0, 1.0)),
-        ("powi", &|| x.powi(3)),
-        ("sin", &|| x.sin()),
-        ("gather_rows", &|| x.gather_rows(&rows)),
-        ("a term twice", &|| x.square() + &x + x.square()),
+    let (rows, references) = (Indices::from(vec![1, 0]), Arc::new(AtomicUsize::new(0)));
+    let of_terms: [(&str, &dyn Fn(&Tensor<f64>) -> Tensor<f64>); 25] = [
+        ("x", &|x| x.clone()),
+        ("exp", &|x| x.exp()),
+        ("expm1", &|x| x.expm1()),
+        ("one_minus_exp_neg", &|x| x.one_minus_exp_neg()),
+        ("ln", &|x| x.square().ln()),
+        ("sqrt", &|x| x.square().sqrt()),
+        ("square", &|x| x.square()),
+        ("abs", &|x| x.abs()),
+        ("sigmoid", &|x| x.sigmoid()),
+        ("softplus", &|x| x.softplus()),
+        ("relu", &|x| x.relu()),
+        ("leaky_relu", &|x| x.leaky_relu(0.1)),
+        ("clamp", &|x| x.clamp(-1.0, 1.0)),
+        ("tanh", &|x| x.tanh()),
+        ("powi 0", &|x| x.powi(0)),
+        ("powi 3", &|x| x.powi(3)),
+        ("powf 0", &|x| x.square().powf(0.0)),
+        ("powf 1.5", &|x| x.square().powf(1.5)),
+        ("sin", &|x| x.sin()),
+        ("affine", &|x| 3.0 * x.square() - 1.0),
+        ("sum_axis", &|x| x.square().sum_axis(0)),
+        ("kernel", &|x| cube(x, &references)),
+        ("gather_rows", &|x| x.gather_rows(&rows)),
+        ("rows twice, and all", &|x| x.gather_rows(&rows) + x + x.gather_rows(&rows)),
+        ("a term twice", &|x| x.square() + x + x.square()),
     ];
-    let close = |a: &ArrayD<f64>, b: &ArrayD<f64>| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-14);
-    for (name, terms) in terms {
-        for divided in [false, true] {
+    let tables = [arr2(&[[0.3, -0.7, 1.2], [0.9, 0.2, -1.1]]), arr2(&[[0.4], [-0.6]]), Array2::zeros((2, 0))];
+    for (table, (name, of_terms)) in tables.iter().flat_map(|table| of_terms.map(|terms| (table, terms))) {
+        let x = Tensor::variable(table.clone());
+        for others in [false, true] {
             let loss = |weighted: bool| {
-                let terms = if weighted { terms() * &ones } else { terms() };
-                if divided { terms.mean() + x.cos().sum() } else { terms.sum() }
+                let terms = of_terms(&x);
+                let terms = if weighted { &terms * Tensor::ones(terms.shape()) } else { terms };
+                // Two sums add up to a uniform cotangent of x itself, and the third is another contribution.
+                if others { terms.sum() / 6.0 + x.sum() + x.sum() + x.cos().sum() } else { terms.sum() }
             };
             let [got, want] = [false, true].map(|weighted| grad(&loss(weighted), &[&x]).remove(0));
             let [got_once, want_once] = [false, true].map(|weighted| loss(weighted).backward().array(&x));
-            let [got_twice, want_twice] = [got.sin().sum(), want.sin().sum()].map(|y| grad(&y, &[&x]).remove(0).to_array());
-            assert!(close(&got.to_array(), &want.to_array()) && close(&got_once, &want_once), "{name}");
-            assert!(close(&got_twice, &want_twice), "{name}");
+            let [got_twice, want_twice] = [&got, &want].map(|slope| grad(&slope.sin().sum(), &[&x]).remove(0).to_array());
+            assert!(close(&got.to_array(), &want.to_array()) && close(&got_once, &want_once), "{name}, {:?}", x.shape());
+            assert!(close(&got_twice, &want_twice), "{name}, {:?}", x.shape());
         }
     }
+}
+
+#[test]
+fn grad_with_respect_to_the_terms_of_a_sum_has_their_shape() {
+    let x = Tensor::variable(arr1(&[0.3, -0.7, 1.2]));
+    let terms = x.exp();
+    let [of_terms, of_x] = grad(&terms.sum(), &[&terms, &x]).try_into().expect("two gradients");
+    assert!(close(&of_terms.to_array(), &arr1(&[1.0; 3]).into_dyn()) && close(&of_x.to_array(), &terms.to_array()));
 }
 
 #[test]

@@ -202,6 +202,6 @@ impl<T: Real> Op<T> for Exponential {
     }
 
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
-        vec![cx.wrt(0, || cx.cotangent() * cx.input(0).clamp(-LIMIT, LIMIT).exp())]
+        vec![cx.wrt(0, || cx.cotangent_factor() * cx.input(0).clamp(-LIMIT, LIMIT).exp())]
     }
 }

@@ -305,7 +305,12 @@ impl<T: Real> RowSums<T> for RowsOfBricks<T> {
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]) {
         if let Some(k) = self.bricks.place(bucket) {
             let values = &self.values[k * BRICK_ROWS * self.width..][..BRICK_ROWS * self.width];
-            sums.iter_mut().zip(values).for_each(|(sum, &value)| *sum += self.cotangent * value);
+            // A cotangent that is not finite times 0 is not 0: rows without a contribution are left out.
+            for (r, (sums, values)) in sums.chunks_mut(self.width).zip(values.chunks(self.width)).enumerate() {
+                if self.touched[k] >> r & 1 == 1 {
+                    sums.iter_mut().zip(values).for_each(|(sum, &value)| *sum += self.cotangent * value);
+                }
+            }
             touched[0] |= self.touched[k];
         }
     }
