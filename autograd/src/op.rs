@@ -120,8 +120,8 @@ impl<T: Real> Vjp<'_, T> {
         if self.factor.shape() == shape { self.factor } else { self.spread.get_or_init(|| self.factor.broadcast_to(shape)) }
     }
 
-    /// Returns a factor for products and quotients with tensors of the shape of the output: a scalar if the cotangent is known to be uniform, as that of the terms of
-    /// a sum, or else [`Vjp::cotangent`]. The scalar saves memory traffic.
+    /// Returns a factor for products and quotients with tensors of the shape of the output: a scalar if the cotangent is known to be uniform, as that of the
+    /// terms of a sum, or else [`Vjp::cotangent`]. The scalar saves memory traffic.
     ///
     /// The result must not be used in any other way: a product with an input that is repeated to the shape of the output (broadcasting) would be too small, and so
     /// would the factor itself be as the cotangent of an input.
