@@ -108,8 +108,8 @@ impl<T: Real> Tensor<T> {
 /// Panics if a row number is out of range (unless `width` is 0), or if `values` does not have one row of `width` values for each row number.
 #[track_caller]
 pub fn add_rows<T: Real>(table: &mut [T], width: usize, rows: &[u32], values: &[T]) {
-    if width > 0 {
-        check_rows("add_rows", rows, table.len() / width);
+    if let Some(count) = table.len().checked_div(width) {
+        check_rows("add_rows", rows, count);
     }
     assert_eq!(values.len(), rows.len() * width, "add_rows: {} values for {} rows of {width}", values.len(), rows.len());
     // With more threads, scanning all row numbers on every thread costs more than sorting them.
