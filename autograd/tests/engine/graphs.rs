@@ -106,6 +106,8 @@ fn the_gradient_of_the_gradient_of_the_gradient_is_the_third_derivative() {
     assert_eq!(third.sum().backward().array(&x).as_slice(), Some(&[240.0, -120.0][..]));
 }
 
+type Map<'a> = &'a dyn Fn(&Tensor<f64>) -> Tensor<f64>;
+
 fn close(a: &ArrayD<f64>, b: &ArrayD<f64>) -> bool {
     a.shape() == b.shape() && a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-14)
 }
@@ -114,7 +116,7 @@ fn close(a: &ArrayD<f64>, b: &ArrayD<f64>) -> bool {
 #[test]
 fn the_terms_of_a_sum_have_the_derivatives_of_a_sum_weighted_by_ones() {
     let (rows, references) = (Indices::from(vec![1, 0]), Arc::new(AtomicUsize::new(0)));
-    let of_terms: [(&str, &dyn Fn(&Tensor<f64>) -> Tensor<f64>); 25] = [
+    let of_terms: [(&str, Map<'_>); 25] = [
         ("x", &|x| x.clone()),
         ("exp", &|x| x.exp()),
         ("expm1", &|x| x.expm1()),
