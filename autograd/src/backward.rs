@@ -187,11 +187,8 @@ impl<T: Real> Pass<T> {
             let (Some(share), Some(source)) = (share, &edge.node) else { continue };
             let share = match share {
                 Cotangent::Dense(t) if t.shape() == edge.shape.slice() => Pending::Dense(t),
+                Cotangent::Dense(t) if t.ndim() == 0 => Pending::Uniform(t),
                 Cotangent::Dense(t) => Pending::Dense(t.sum_to(edge.shape.slice())),
-                Cotangent::Uniform(t) => {
-                    assert_eq!(t.len(), 1, "{}: a uniform cotangent of shape {:?}; expected a scalar", node.rule.name(), t.shape());
-                    Pending::Uniform(t.reshape(&[]))
-                }
                 Cotangent::Rows { rows, values } => Pending::Rows(vec![RowPart::Touches { rows, values }]),
                 Cotangent::Merged(rows) => Pending::Rows(vec![RowPart::Merged(rows)]),
             };

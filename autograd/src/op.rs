@@ -63,7 +63,7 @@ pub trait Op<T: Real>: Debug + Send + Sync + 'static {
     }
 
     /// Computes the vector-Jacobian product: the cotangent of each input, given the cotangent of the output. A dense cotangent may have the
-    /// broadcast shape of the output; the engine sums it to the shape of the input. A uniform cotangent is a scalar. `None` means zero.
+    /// broadcast shape of the output; the engine sums it to the shape of the input. `None` means zero.
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>>;
 }
 
@@ -86,10 +86,9 @@ pub trait Kernel<T: Real>: Debug + Send + Sync + 'static {
 
 /// A contribution to the cotangent of an input.
 pub enum Cotangent<T: Real> {
-    /// A dense contribution. Its shape is the shape of the input, or a shape that the input broadcasts to.
+    /// A dense contribution. Its shape is the shape of the input, or a shape that the input broadcasts to; or it is a scalar, which is added to each element of the
+    /// input, as from a sum over all elements.
     Dense(Tensor<T>),
-    /// A scalar: the same contribution to each element of the input, as from a sum over all elements.
-    Uniform(Tensor<T>),
     /// A row-sparse contribution: row k of `values` is added to row `rows[k]` of the input. Rows may repeat and may have any order.
     Rows {
         /// One row number for each row of `values`.
@@ -123,16 +122,10 @@ impl<T: Real> Vjp<'_, T> {
     /// Returns a factor for products and quotients with tensors of the shape of the output: a scalar if the cotangent is known to be uniform, as that of the
     /// terms of a sum, or else [`Vjp::cotangent`]. The scalar saves memory traffic.
     ///
-    /// The result must not be used in any other way: a product with an input that is repeated to the shape of the output (broadcasting) would be too small, and so
-    /// would the factor itself be as the cotangent of an input.
+    /// It is also a cotangent of an input that has the shape of the output. For an input that is repeated to that shape (broadcasting), use [`Vjp::cotangent`]: the
+    /// scalar would leave out the repetitions.
     pub fn cotangent_factor(&self) -> &Tensor<T> {
         self.factor
-    }
-
-    /// Returns the cotangent f(cotangent of the output) of an input with the shape of the output, where `f` does the same to each element.
-    pub(crate) fn wrt_each(&self, i: usize, f: impl FnOnce(&Tensor<T>) -> Tensor<T>) -> Option<Cotangent<T>> {
-        let is_whole = self.factor.shape() == self.node.shape.slice();
-        if is_whole { self.wrt(i, || f(self.factor)) } else { self.wrt_uniform(i, || f(self.factor)) }
     }
 
     /// Returns input `i`.
@@ -160,11 +153,6 @@ impl<T: Real> Vjp<'_, T> {
     /// Returns the dense cotangent of input `i`. `f` is called only if this cotangent is needed.
     pub fn wrt(&self, i: usize, f: impl FnOnce() -> Tensor<T>) -> Option<Cotangent<T>> {
         self.needed[i].then(|| Cotangent::Dense(f()))
-    }
-
-    /// Returns the cotangent of input `i`, of which each element is the scalar that `f` returns. `f` is called only if this cotangent is needed.
-    pub fn wrt_uniform(&self, i: usize, f: impl FnOnce() -> Tensor<T>) -> Option<Cotangent<T>> {
-        self.needed[i].then(|| Cotangent::Uniform(f()))
     }
 
     /// Returns the row-sparse cotangent of input `i`. `f` computes the values of the rows and is called only if this cotangent is needed.

@@ -80,7 +80,7 @@ impl<T: Real> Op<T> for Affine {
         Keep::NOTHING
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
-        vec![cx.wrt_each(0, |g| g.affine(self.scale, 0.0))]
+        vec![cx.wrt(0, || cx.cotangent_factor().affine(self.scale, 0.0))]
     }
 }
 

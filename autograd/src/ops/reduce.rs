@@ -21,7 +21,7 @@ impl<T: Real> Op<T> for SumTo {
     }
     fn vjp(&self, cx: &Vjp<'_, T>) -> Vec<Option<Cotangent<T>>> {
         let g = cx.cotangent_factor();
-        if g.len() == 1 { vec![cx.wrt_uniform(0, || g.clone())] } else { vec![cx.wrt(0, || g.broadcast_to(&self.from))] }
+        vec![cx.wrt(0, || if g.len() == 1 { g.reshape(&[]) } else { g.broadcast_to(&self.from) })]
     }
 }
 

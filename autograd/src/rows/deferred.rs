@@ -17,7 +17,7 @@ pub trait RowSums<T: Real>: Debug + Send + Sync {
     fn is_empty(&self, bucket: usize) -> bool;
 
     /// Adds the contributions of a bucket to `sums`, which has one row of values for each row of the bucket, and sets the bit in `touched` of each row that has
-    /// contributions. Rows whose sum is 0 may be left out.
+    /// contributions. Rows whose sum is 0 may be left out. It must not write to the sums of rows whose bit it does not set.
     fn add(&self, bucket: usize, sums: &mut [T], touched: &mut [u64]);
 }
 
@@ -106,7 +106,7 @@ pub(crate) struct RowGroups<T: Real> {
     table_rows: usize,
     width: usize,
     buckets_per_group: usize,
-    /// Those of tasks that have ended. The next task usually finds them in the cache of its thread.
+    /// Scratch arrays of tasks that have ended. The next task usually finds them in the cache of its thread.
     idle: Mutex<Vec<Scratch<T>>>,
 }
 
