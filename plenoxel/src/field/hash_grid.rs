@@ -59,21 +59,20 @@ impl Level {
     /// Returns the row of a node, from the products of its coordinates with the [`factors`](Self::factors).
     #[inline(always)]
     fn row(&self, node: [u32; 3]) -> u32 {
-        if self.hashed { self.row_of::<true>(node) } else { self.row_of::<false>(node) }
+        self.first as u32 + if self.hashed { self.row_in_level::<true>(node) } else { self.row_in_level::<false>(node) }
     }
 
-    /// Returns the row of a node of a level that is hashed or is not.
+    /// Returns the row of a node, counted from the first one of the level, which is hashed or is not.
     #[inline(always)]
-    fn row_of<const HASHED: bool>(&self, [x, y, z]: [u32; 3]) -> u32 {
+    fn row_in_level<const HASHED: bool>(&self, [x, y, z]: [u32; 3]) -> u32 {
         let rows = self.rows as u32;
-        let row = if HASHED {
+        if HASHED {
             (x ^ y ^ z) & (rows - 1)
         } else {
             // The outermost node of an axis may be one beyond the grid.
             let row = x + y + z;
             if row < rows { row } else { row - rows }
-        };
-        self.first as u32 + row
+        }
     }
 }
 

@@ -74,9 +74,9 @@ impl<T: Real> Cells<T> {
         Cells { lowest: [[0; TOGETHER]; 3], rows: [[0; TOGETHER]; 8], shares: [[[T::zero(); TOGETHER]; 2]; 3] }
     }
 
-    /// Finds the cells of a group of positions at a level.
+    /// Finds the cells of a group of positions at a level whose first row has the number `first`.
     #[inline(always)]
-    pub fn find<const FUSED: bool>(&mut self, level: &Level, at: &Group<T>) {
+    pub fn find<const FUSED: bool>(&mut self, level: &Level, first: u32, at: &Group<T>) {
         let Cells { lowest, rows, shares } = self;
         let (scale, half, factors) = (T::lit(level.scale), T::lit(0.5), level.factors());
         for a in 0..3 {
@@ -87,7 +87,7 @@ impl<T: Real> Cells<T> {
                 lowest[a][i] = low.index().wrapping_mul(factors[a]);
             }
         }
-        if level.hashed { find_rows::<true>(level, lowest, rows) } else { find_rows::<false>(level, lowest, rows) }
+        if level.hashed { find_rows::<true>(level, first, lowest, rows) } else { find_rows::<false>(level, first, lowest, rows) }
     }
 
     /// Returns the weights of the corners.
@@ -103,33 +103,40 @@ impl<T: Real> Cells<T> {
         weights
     }
 
-    /// Returns whether each position is in the cell of the one before.
+    /// Returns whether the two rows of every edge along x follow each other.
     #[inline(always)]
-    pub fn continued(&self) -> [bool; TOGETHER] {
-        let mut differ = [0; TOGETHER];
-        for lowest in &self.lowest {
-            for i in 1..TOGETHER {
-                differ[i] |= lowest[i] ^ lowest[i - 1];
-            }
-        }
-        differ[0] = 1;
-        differ.map(|differ| differ == 0)
+    fn neighbors(&self) -> bool {
+        self.edges().iter().all(|[lower, upper]| (0..TOGETHER).fold(true, |all, i| all & (upper[i].wrapping_sub(lower[i]) == 1)))
+    }
+
+    /// Returns the rows of the lower and of the upper node of the four edges along x.
+    #[inline(always)]
+    pub fn edges(&self) -> &[[[u32; TOGETHER]; 2]; 4] {
+        self.rows.as_chunks().0.as_array().expect("eight corners")
     }
 
     /// Interpolates the corners of all cells: along x, then along y, then along z. All corners are read, into `corners`, before the first is interpolated: no
-    /// arithmetic waits for the table.
+    /// arithmetic waits for the table. Neighbors along x are read together if they follow each other, and otherwise are mostly in the same cache line.
     #[inline(always)]
     fn interpolate<const F: usize, const FUSED: bool>(
         &self,
         table: &[[T; F]],
+        neighbors: bool,
         corners: &mut [[[T; F]; TOGETHER]; 8],
         out: &mut [[T; F]; TOGETHER],
     ) {
-        for ([lower, upper], rows) in corners.as_chunks_mut::<2>().0.iter_mut().zip(self.rows.as_chunks::<2>().0) {
-            for i in 0..TOGETHER {
-                // Neighbors along x, which mostly are in the same cache line.
-                lower[i] = table[rows[0][i] as usize];
-                upper[i] = table[rows[1][i] as usize];
+        for ([lower, upper], rows) in corners.as_chunks_mut::<2>().0.iter_mut().zip(self.edges()) {
+            if neighbors {
+                for i in 0..TOGETHER {
+                    let row = rows[0][i] as usize;
+                    let pair = table[row..row + 2].as_array::<2>().expect("two rows");
+                    (lower[i], upper[i]) = (pair[0], pair[1]);
+                }
+            } else {
+                for i in 0..TOGETHER {
+                    lower[i] = table[rows[0][i] as usize];
+                    upper[i] = table[rows[1][i] as usize];
+                }
             }
         }
         let between = |low: T, high: T, share: T| (high - low).multiply_add::<FUSED>(share, low);
@@ -174,12 +181,13 @@ impl<T: Real> Cells<T> {
 /// Finds the rows of the corners of cells, from the coordinates of their lowest nodes times the factors of the level.
 #[inline(always)]
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-fn find_rows<const HASHED: bool>(level: &Level, lowest: &[[u32; TOGETHER]; 3], rows: &mut [[u32; TOGETHER]; 8]) {
+fn find_rows<const HASHED: bool>(level: &Level, first: u32, lowest: &[[u32; TOGETHER]; 3], rows: &mut [[u32; TOGETHER]; 8]) {
     let factors = level.factors();
     for c in 0..8 {
         let up = [c & 1, c >> 1 & 1, c >> 2];
         for i in 0..TOGETHER {
-            rows[c][i] = level.row_of::<HASHED>([0, 1, 2].map(|a| lowest[a][i].wrapping_add(factors[a].wrapping_mul(up[a] as u32))));
+            let node = [0, 1, 2].map(|a| lowest[a][i].wrapping_add(factors[a].wrapping_mul(up[a] as u32)));
+            rows[c][i] = level.row_in_level::<HASHED>(node).wrapping_add(first);
         }
     }
 }
@@ -191,14 +199,18 @@ pub fn encode<T: Real>(level: &Level, features: usize, table: &[T], groups: &[Gr
 
 dispatched! {
 fn encode_loop<T: Real, const F: usize, const FUSED: bool>(level: &Level, table: &[T], groups: &[Group<T>], out: &mut [T]) {
-    let table = table.as_chunks::<F>().0;
+    let table = &table.as_chunks::<F>().0[level.first..][..level.rows];
     let (mut cells, mut corners, mut spare) = (Cells::none(), [[[T::zero(); F]; TOGETHER]; 8], [[T::zero(); F]; TOGETHER]);
     for (group, out) in groups.iter().zip(out.as_chunks_mut::<F>().0.chunks_mut(TOGETHER)) {
-        cells.find::<FUSED>(level, group);
+        cells.find::<FUSED>(level, 0, group);
         let count = out.len();
         let values = if count == TOGETHER { out.first_chunk_mut().expect("a whole group") } else { &mut spare };
         // Rows of four features and more are vectors of their own; a buffer for their corners would fill the first-level cache.
-        if const { F <= 2 } { cells.interpolate::<F, FUSED>(table, &mut corners, values) } else { cells.interpolate_one_by_one::<F, FUSED>(table, values) }
+        if const { F <= 2 } {
+            cells.interpolate::<F, FUSED>(table, !level.hashed && cells.neighbors(), &mut corners, values);
+        } else {
+            cells.interpolate_one_by_one::<F, FUSED>(table, values);
+        }
         if count < TOGETHER {
             out.copy_from_slice(&spare[..count]);
         }
@@ -244,7 +256,7 @@ fn slopes_loop<T: Real, const F: usize, const FUSED: bool>(levels: &[Level], tab
         let at = group(places);
         out.fill([T::zero(); 3]);
         for (l, level) in levels.iter().enumerate() {
-            cells.find::<FUSED>(level, &at);
+            cells.find::<FUSED>(level, level.first as u32, &at);
             for (i, out) in out.iter_mut().enumerate() {
                 let g = &g[i * width + l];
                 let [x, y, z] = [0, 1, 2].map(|a| [cells.shares[a][0][i], cells.shares[a][1][i]]);

@@ -1,8 +1,7 @@
 //! Adjoint of the table: sums of contributions to its rows, which the optimizer requests one bucket of rows after another.
 //!
 //! A bucket has as many rows as the largest level, but at most 8 MB in single precision. The contributions of all positions to its levels are computed when
-//! they are added; none is stored. Consecutive positions of a group in the same cell, as along a ray, contribute together. The rows whose sum is not 0 are
-//! marked at the end. There are about as many tasks as levels that share rows, so more threads than levels are of no use.
+//! they are added; none is stored. The rows whose sum is not 0 are marked at the end. There are about as many tasks as levels that share rows, so more threads than levels are of no use.
 
 use super::loops::{BLOCK, Cells, Group, TOGETHER, with_features};
 use super::{HashGrid, Level};
@@ -55,66 +54,100 @@ dispatched! {
 /// Adds the contributions of positions to the rows of a level that are in the bucket that begins at row `first`. `g` is `[positions, F]`.
 fn add<T: Real, const F: usize, const FUSED: bool>(level: &Level, groups: &[Group<T>], g: &[T], first: u32, sums: &mut [T]) {
     let sums = sums.as_chunks_mut::<F>().0;
-    let (mut cells, mut values, mut padded) = (Cells::none(), [[[T::zero(); F]; TOGETHER]; 8], [[T::zero(); F]; TOGETHER]);
+    let mut cells = Cells::none();
     for (group, g) in groups.iter().zip(g.as_chunks::<F>().0.chunks(TOGETHER)) {
-        cells.find::<FUSED>(level, group);
-        let weights = cells.weights();
-        let cotangents = match g.first_chunk() {
-            Some(all) => all,
-            None => {
-                padded[..g.len()].copy_from_slice(g);
-                &padded
-            }
-        };
-        for (values, weights) in values.iter_mut().zip(&weights) {
-            for i in 0..TOGETHER {
-                for f in 0..F {
-                    values[i][f] = weights[i] * cotangents[i][f];
-                }
-            }
-        }
-        let count = join(&mut cells, &mut values, cotangents);
-        for (rows, values) in cells.rows.iter().zip(&values) {
-            for (row, value) in rows[..count].iter().zip(values) {
-                if let Some(sum) = sums.get_mut(row.wrapping_sub(first) as usize) {
-                    for f in 0..F {
-                        sum[f] += value[f];
-                    }
-                }
-            }
-        }
+        cells.find::<FUSED>(level, (level.first as u32).wrapping_sub(first), group);
+        let mut padded = [[T::zero(); F]; TOGETHER];
+        let cotangents = g.first_chunk().unwrap_or_else(|| {
+            padded[..g.len()].copy_from_slice(g);
+            &padded
+        });
+        if level.hashed { add_group::<T, F, true>(&cells, cotangents, sums) } else { add_group::<T, F, false>(&cells, cotangents, sums) }
     }
 }
 }
 
-/// Adds up the contributions of consecutive positions in the same cell and leaves out those with cotangent 0, which do not separate others. Returns how many
-/// are left, at the beginning of the arrays.
+/// Adds the contributions of a group of positions. The corners of a cell are those of four edges along x. Where the two rows of each edge are neighbors, they
+/// are updated together: in a level that is not hashed, in all cells but the last ones of an axis; in a hashed level, in every other cell, since the rows of
+/// the nodes 2i and 2i + 1 differ in the last bit only. There, edges 0 and 3 begin with the row of the same end, edges 1 and 2 with that of the other one,
+/// because the factors of y and z are odd.
 #[inline(always)]
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
-fn join<T: Real, const F: usize>(cells: &mut Cells<T>, values: &mut [[[T; F]; TOGETHER]; 8], g: &[[T; F]; TOGETHER]) -> usize {
-    let continued = cells.continued();
-    let contributes = g.map(|g| g.iter().fold(false, |any, &g| any | (g != T::zero())));
-    if contributes == [true; TOGETHER] && continued == [false; TOGETHER] {
-        return TOGETHER;
-    }
-    let (mut count, mut begun) = (0, false);
-    for i in 0..TOGETHER {
-        begun &= continued[i];
-        if contributes[i] {
-            for (rows, values) in cells.rows.iter_mut().zip(values.iter_mut()) {
-                if begun {
-                    for f in 0..F {
-                        values[count - 1][f] += values[i][f];
-                    }
-                } else {
-                    (rows[count], values[count]) = (rows[i], values[i]);
-                }
-            }
-            count += usize::from(!begun);
-            begun = true;
+fn add_group<T: Real, const F: usize, const HASHED: bool>(cells: &Cells<T>, g: &[[T; F]; TOGETHER], sums: &mut [[T; F]]) {
+    let (edges, [x, y, z], count) = (cells.edges(), &cells.shares, sums.len() as u32);
+    let mut apart = [0; TOGETHER];
+    for [lower, upper] in edges {
+        for i in 0..TOGETHER {
+            let difference = if HASHED { lower[i] ^ upper[i] } else { upper[i].wrapping_sub(lower[i]) };
+            apart[i] |= (difference ^ 1) | u32::from(lower[i].max(upper[i]) >= count);
         }
     }
-    count
+    let mut along_x = [[T::zero(); TOGETHER]; 2];
+    for i in 0..TOGETHER {
+        let (lower, upper) = (x[0][i], x[1][i]);
+        let upper_first = HASHED && edges[0][0][i] & 1 > apart[i];
+        along_x[0][i] = if upper_first { upper } else { lower };
+        along_x[1][i] = if upper_first { lower } else { upper };
+    }
+    let mut values = [[[T::zero(); F]; 2]; TOGETHER];
+    for i in 0..TOGETHER {
+        for end in 0..2 {
+            for f in 0..F {
+                values[i][end][f] = along_x[end][i] * g[i][f];
+            }
+        }
+    }
+    let mut weights = [[T::zero(); TOGETHER]; 4];
+    for e in 0..4 {
+        for i in 0..TOGETHER {
+            weights[e][i] = y[e & 1][i] * z[e >> 1][i];
+        }
+    }
+    let (mut neighbors, mut contributes) = (0u64, 0u64);
+    for i in 0..TOGETHER {
+        neighbors |= u64::from(apart[i] == 0) << i;
+        contributes |= u64::from(g[i].iter().fold(false, |any, &g| any | (g != T::zero()))) << i;
+    }
+    for i in ones(neighbors & contributes) {
+        let [first, second] = values[i];
+        for e in 0..4 {
+            let values = if HASHED && (e == 1 || e == 2) { [second, first] } else { [first, second] };
+            let row = if HASHED { edges[e][0][i] & !1 } else { edges[e][0][i] } as usize;
+            if let Some(pair) = sums.get_mut(row..row + 2) {
+                for (sum, value) in pair.iter_mut().zip(&values) {
+                    add_weighted(sum, value, weights[e][i]);
+                }
+            }
+        }
+    }
+    for i in ones(!neighbors & contributes) {
+        for e in 0..4 {
+            for end in 0..2 {
+                if let Some(sum) = sums.get_mut(edges[e][end][i] as usize) {
+                    add_weighted(sum, &values[i][end], weights[e][i]);
+                }
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn add_weighted<T: Real, const F: usize>(sum: &mut [T; F], value: &[T; F], weight: T) {
+    for f in 0..F {
+        sum[f] += value[f] * weight;
+    }
+}
+
+/// Returns the places of the bits that are set.
+#[inline(always)]
+fn ones(mut bits: u64) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let place = bits.trailing_zeros() as usize;
+        (bits != 0).then(|| {
+            bits &= bits - 1;
+            place
+        })
+    })
 }
 
 dispatched! {
