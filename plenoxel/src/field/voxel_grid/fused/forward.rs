@@ -88,7 +88,7 @@ impl<T: Real> Block<T> {
 const RAYS_TOGETHER: usize = 32;
 
 /// Smallest capacity of the arrays of a block, in samples. Capacities are powers of two, so that the arrays of one block fit another.
-const ROOM: usize = 32 * BLOCK;
+const ROOM: usize = 16 * BLOCK;
 
 /// Inputs of rendering a batch.
 pub(super) struct Scene<'a, T: Real> {
@@ -148,16 +148,21 @@ impl<'a, T: Real> Scene<'a, T> {
         })
     }
 
+    /// Makes room for the samples of rays if all samples of their marches are placed. The arrays get their size at once, because to grow is to copy.
+    fn make_room_for_all(&self, block: &mut Block<T>, rays: &[Ray], first: usize) {
+        if self.cells.is_none() && self.options.stop_below == 0.0 {
+            let samples: usize = (0..rays.len()).map(|r| self.march_of(rays, first, r).count).sum();
+            // The last run needs room for a whole one.
+            block.make_room_for((samples + TOGETHER).max(ROOM).next_power_of_two());
+        }
+    }
+
     /// Computes the samples of rays that do not end early, with nearest look-up. Groups of rays are placed, then looked up, then weighed, so that no ray
     /// of a group waits for the densities of the one before. Samples that are kept move to the front; `end` never passes the sample that is read.
     fn weights_of_whole_rays(&self, map: impl NodeMap, first: usize, count: usize) -> Block<T> {
         let mut block = Block { first, ..Block::empty() };
         let rays = &self.rays[first..first + count];
-        if self.cells.is_none() {
-            // All samples of the marches are placed. The arrays get their size at once, because to grow is to copy. The last run needs room for a whole one.
-            let samples: usize = (0..count).map(|r| self.march_of(rays, first, r).count).sum();
-            block.make_room_for((samples + TOGETHER).max(ROOM).next_power_of_two());
-        }
+        self.make_room_for_all(&mut block, rays, first);
         let mut sections = self.sections();
         let mut end = 0;
         for start in (0..count).step_by(RAYS_TOGETHER) {
@@ -203,6 +208,7 @@ impl<'a, T: Real> Scene<'a, T> {
         let mut kept = [0; TOGETHER];
         let mut end = 0;
         let rays = &self.rays[first..first + count];
+        self.make_room_for_all(&mut block, rays, first);
         let mut sections = self.sections();
         for r in 0..count {
             let mut places = self.samples_of(rays, first, r, &mut sections);
