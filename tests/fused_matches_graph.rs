@@ -152,6 +152,27 @@ fn rows_read_in_their_own_order_agree() {
 }
 
 #[test]
+fn the_number_of_threads_changes_no_bit_if_rows_are_read_in_their_own_order() {
+    let color = Color::Sh { degree: 2, offset: 0.5 };
+    let shape =
+        GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+    let grid = VoxelGrid::<f32>::random(shape, 3.0, 0.3, 7);
+    // So many that the blocks of one thread are larger than those of three.
+    let rays = rays_from_above(5, 2100);
+    let options = options(grid.aabb(), Spacing::Step(0.04), Jitter::PerRay { seed: 1, step: 2 }, [1.0, 0.9, 0.2]);
+    let step = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
+        pool.install(|| {
+            let rgb = render(&grid, &rays, &options).rgb;
+            let gradients = rgb.square().sum().backward();
+            (rgb.data().to_vec(), grid.params().map(|table| gradients.array(table.tensor())).collect::<Vec<_>>())
+        })
+    };
+    let want = step(1);
+    assert!(want.1.iter().all(|gradient| gradient.iter().any(|&g| g != 0.0)) && step(3) == want);
+}
+
+#[test]
 fn rays_of_many_samples_agree_with_nearest_look_up() {
     // More samples than the smallest block has room for, in several runs of a ray. A full grid has no occupancy: its samples are counted before. With missing
     // voxels, the block grows.

@@ -63,7 +63,7 @@ pub struct Cells<T> {
     /// Coordinates of the lowest node of each cell, times the factors of the level.
     lowest: [[u32; TOGETHER]; 3],
     /// Row of each corner. Bit a of the number of a corner is set if it is the upper node along axis a.
-    pub rows: [[u32; TOGETHER]; 8],
+    rows: [[u32; TOGETHER]; 8],
     /// Weights of the lower and of the upper node along each axis.
     pub shares: [[[T; TOGETHER]; 2]; 3],
 }
@@ -74,7 +74,7 @@ impl<T: Real> Cells<T> {
         Cells { lowest: [[0; TOGETHER]; 3], rows: [[0; TOGETHER]; 8], shares: [[[T::zero(); TOGETHER]; 2]; 3] }
     }
 
-    /// Finds the cells of a group of positions at a level whose first row has the number `first`.
+    /// Finds the cells of a group of positions at a level. The first row of the level has the number `first`; numbers may wrap around.
     #[inline(always)]
     pub fn find<const FUSED: bool>(&mut self, level: &Level, first: u32, at: &Group<T>) {
         let Cells { lowest, rows, shares } = self;
@@ -92,7 +92,7 @@ impl<T: Real> Cells<T> {
 
     /// Returns the weights of the corners.
     #[inline(always)]
-    pub fn weights(&self) -> [[T; TOGETHER]; 8] {
+    fn weights(&self) -> [[T; TOGETHER]; 8] {
         let [x, y, z] = &self.shares;
         let mut weights = [[T::zero(); TOGETHER]; 8];
         for c in 0..8 {
@@ -116,7 +116,8 @@ impl<T: Real> Cells<T> {
     }
 
     /// Interpolates the corners of all cells: along x, then along y, then along z. All corners are read, into `corners`, before the first is interpolated: no
-    /// arithmetic waits for the table. Neighbors along x are read together if they follow each other, and otherwise are mostly in the same cache line.
+    /// arithmetic waits for the table. With `neighbors`, the two rows of an edge along x follow each other and are read as one; otherwise they mostly are in the
+    /// same cache line.
     #[inline(always)]
     fn interpolate<const F: usize, const FUSED: bool>(
         &self,

@@ -1,7 +1,8 @@
 //! Adjoint of the table: sums of contributions to its rows, which the optimizer requests one bucket of rows after another.
 //!
 //! A bucket has as many rows as the largest level, but at most 8 MB in single precision. The contributions of all positions to its levels are computed when
-//! they are added; none is stored. The rows whose sum is not 0 are marked at the end. There are about as many tasks as levels that share rows, so more threads than levels are of no use.
+//! they are added; none is stored. The rows whose sum is not 0 are marked at the end. There are about as many tasks as levels that share rows, so more threads
+//! than levels are of no use.
 
 use super::loops::{BLOCK, Cells, Group, TOGETHER, with_features};
 use super::{HashGrid, Level};
@@ -67,10 +68,10 @@ fn add<T: Real, const F: usize, const FUSED: bool>(level: &Level, groups: &[Grou
 }
 }
 
-/// Adds the contributions of a group of positions. The corners of a cell are those of four edges along x. Where the two rows of each edge are neighbors, they
-/// are updated together: in a level that is not hashed, in all cells but the last ones of an axis; in a hashed level, in every other cell, since the rows of
-/// the nodes 2i and 2i + 1 differ in the last bit only. There, edges 0 and 3 begin with the row of the same end, edges 1 and 2 with that of the other one,
-/// because the factors of y and z are odd.
+/// Adds the contributions of a group of positions. The corners of a cell are the ends of four edges along x. If the two rows of each edge are neighbors, both
+/// are updated at once. In a level that is not hashed, they are neighbors unless the row number wraps at the end of the level. In a hashed level, they are in
+/// every other cell, because the rows of the nodes 2i and 2i + 1 differ in the last bit only. The factors of y and z are odd, so a step along y or z flips that
+/// bit: if the lower node has the even row on edges 0 and 3, the upper node has it on edges 1 and 2, and vice versa.
 #[inline(always)]
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 fn add_group<T: Real, const F: usize, const HASHED: bool>(cells: &Cells<T>, g: &[[T; F]; TOGETHER], sums: &mut [[T; F]]) {
@@ -85,9 +86,9 @@ fn add_group<T: Real, const F: usize, const HASHED: bool>(cells: &Cells<T>, g: &
     let mut along_x = [[T::zero(); TOGETHER]; 2];
     for i in 0..TOGETHER {
         let (lower, upper) = (x[0][i], x[1][i]);
-        let upper_first = HASHED && edges[0][0][i] & 1 > apart[i];
-        along_x[0][i] = if upper_first { upper } else { lower };
-        along_x[1][i] = if upper_first { lower } else { upper };
+        let upper_is_even = HASHED && (edges[0][0][i] & 1) > apart[i]; // Odd and not apart.
+        along_x[0][i] = if upper_is_even { upper } else { lower };
+        along_x[1][i] = if upper_is_even { lower } else { upper };
     }
     let mut values = [[[T::zero(); F]; 2]; TOGETHER];
     for i in 0..TOGETHER {
@@ -108,19 +109,17 @@ fn add_group<T: Real, const F: usize, const HASHED: bool>(cells: &Cells<T>, g: &
         neighbors |= u64::from(apart[i] == 0) << i;
         contributes |= u64::from(g[i].iter().fold(false, |any, &g| any | (g != T::zero()))) << i;
     }
-    for i in ones(neighbors & contributes) {
+    for i in set_bits(neighbors & contributes) {
         let [first, second] = values[i];
         for e in 0..4 {
             let values = if HASHED && (e == 1 || e == 2) { [second, first] } else { [first, second] };
             let row = if HASHED { edges[e][0][i] & !1 } else { edges[e][0][i] } as usize;
-            if let Some(pair) = sums.get_mut(row..row + 2) {
-                for (sum, value) in pair.iter_mut().zip(&values) {
-                    add_weighted(sum, value, weights[e][i]);
-                }
+            for (sum, value) in sums[row..row + 2].iter_mut().zip(&values) {
+                add_weighted(sum, value, weights[e][i]);
             }
         }
     }
-    for i in ones(!neighbors & contributes) {
+    for i in set_bits(!neighbors & contributes) {
         for e in 0..4 {
             for end in 0..2 {
                 if let Some(sum) = sums.get_mut(edges[e][end][i] as usize) {
@@ -140,7 +139,7 @@ fn add_weighted<T: Real, const F: usize>(sum: &mut [T; F], value: &[T; F], weigh
 
 /// Returns the places of the bits that are set.
 #[inline(always)]
-fn ones(mut bits: u64) -> impl Iterator<Item = usize> {
+fn set_bits(mut bits: u64) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let place = bits.trailing_zeros() as usize;
         (bits != 0).then(|| {

@@ -47,11 +47,11 @@ pub use pictures::PictureTables;
 pub use seen::{Seen, largest_weights, seen};
 use std::sync::{Arc, OnceLock};
 
-/// Number of rays that one task renders and whose gradients it sorts: some ten thousand samples.
-const BLOCK: usize = 8 * RAYS_OF_PACKET;
+/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples.
+const BLOCK: usize = 4 * RAYS_OF_PACKET;
 
 /// Number of rays whose samples are kept, or marched again, at a time. It bounds the memory of a step. A usual batch is an eighth of it.
-pub const CHUNK: usize = 64 * BLOCK;
+pub const CHUNK: usize = 128 * BLOCK;
 
 /// Binary logarithm of the rows in a bucket: 64 bricks, in a dense grid a cube of 16³ voxels.
 const BUCKET_SHIFT: u32 = 12;

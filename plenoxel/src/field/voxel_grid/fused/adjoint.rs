@@ -162,7 +162,7 @@ impl<T: Real> Gradients<T> {
     }
 }
 
-/// Size of the largest array that is read in order before records are written to it, in bytes: a part of a core's second-level cache.
+/// Size of the largest array that is read in order before records are written to it, in bytes: half of a second-level cache of 1 MB.
 const LOADED: usize = 1 << 19;
 
 /// Returns a buffer of unspecified contents, after reading it in order if it is small. Records are written to many buckets in turn, and each write to a line

@@ -88,7 +88,7 @@ impl<T: Real> Block<T> {
 const RAYS_TOGETHER: usize = 32;
 
 /// Smallest capacity of the arrays of a block, in samples. Capacities are powers of two, so that the arrays of one block fit another.
-const ROOM: usize = 16 * BLOCK;
+const ROOM: usize = 32 * BLOCK;
 
 /// Inputs of rendering a batch.
 pub(super) struct Scene<'a, T: Real> {
@@ -148,11 +148,11 @@ impl<'a, T: Real> Scene<'a, T> {
         })
     }
 
-    /// Makes room for the samples of rays if all samples of their marches are placed. The arrays get their size at once, because to grow is to copy.
+    /// Makes room for all samples of rays at once if all samples of their marches are placed: growing copies.
     fn make_room_for_all(&self, block: &mut Block<T>, rays: &[Ray], first: usize) {
-        if self.cells.is_none() && self.options.stop_below == 0.0 {
+        if self.cells.is_none() && self.options.stop_below <= 0.0 {
             let samples: usize = (0..rays.len()).map(|r| self.march_of(rays, first, r).count).sum();
-            // The last run needs room for a whole one.
+            // Every run has room for a whole one, also the last.
             block.make_room_for((samples + TOGETHER).max(ROOM).next_power_of_two());
         }
     }

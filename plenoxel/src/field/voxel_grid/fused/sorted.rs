@@ -18,6 +18,12 @@ const TASKS: usize = 64;
 /// tests.
 const LARGE: usize = if cfg!(debug_assertions) { 64 << 10 } else { 64 << 20 };
 
+/// Returns the number of rays of a block. Buckets have more samples of a larger block in a row, but each thread needs some blocks. Samples and sums have the same
+/// order with blocks of any size, so the number of threads changes no bit.
+fn rays_of_block(rays: usize) -> usize {
+    if rays >= 4 * parallel::threads() * (2 * BLOCK) { 2 * BLOCK } else { BLOCK }
+}
+
 /// Samples of a block that need a color, sorted by the bucket of their lowest corner.
 struct Order<T: Real> {
     buckets: Buckets,
@@ -59,7 +65,8 @@ impl<T: Real> Scene<'_, T> {
     pub fn render_sorted(&self, first: usize, pixels: &mut [T]) -> Vec<Block<T>> {
         let buckets = self.batch.layout.lattice.rows().div_ceil(1 << BUCKET_SHIFT);
         let count = pixels.len() / COLUMNS;
-        let (blocks, orders): (Vec<_>, Vec<_>) = parallel::map_chunks(count, BLOCK, |range| {
+        let rays = rays_of_block(count);
+        let (blocks, orders): (Vec<_>, Vec<_>) = parallel::map_chunks(count, rays, |range| {
             let block = self.weights(first + range.start, range.len());
             let order = Order::new(&block, buckets);
             (block, order)
@@ -67,7 +74,7 @@ impl<T: Real> Scene<'_, T> {
         .into_iter()
         .unzip();
         let colors = self.colors_in_order(&orders, buckets);
-        let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(BLOCK * COLUMNS)).collect();
+        let parts = blocks.into_iter().zip(orders).zip(colors).zip(pixels.chunks_mut(rays * COLUMNS)).collect();
         parallel::map_items(parts, |_, (((mut block, order), sorted), pixels)| {
             block.color = Buffer::zeros(3 * block.len());
             let color = block.color.as_chunks_mut::<3>().0;
