@@ -156,7 +156,7 @@ fn the_number_of_threads_changes_no_bit_if_rows_are_read_in_their_own_order() {
     let color = Color::Sh { degree: 2, offset: 0.5 };
     let shape =
         GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
-    let grid = VoxelGrid::<f32>::random(shape, 3.0, 0.3, 7);
+    let grid = VoxelGrid::<f64>::random(shape, 3.0, 0.3, 7);
     // So many that the blocks of one thread are larger than those of three.
     let rays = rays_from_above(5, 2100);
     let options = options(grid.aabb(), Spacing::Step(0.04), Jitter::PerRay { seed: 1, step: 2 }, [1.0, 0.9, 0.2]);

@@ -103,10 +103,17 @@ impl<T: Real> Cells<T> {
         weights
     }
 
-    /// Returns whether the two rows of every edge along x follow each other.
+    /// Returns 0 for each position whose edges along x have neighboring rows: the upper row is the next one or, in a hashed level, differs in the last bit only.
     #[inline(always)]
-    fn neighbors(&self) -> bool {
-        self.edges().iter().all(|[lower, upper]| (0..TOGETHER).fold(true, |all, i| all & (upper[i].wrapping_sub(lower[i]) == 1)))
+    pub fn apart<const HASHED: bool>(&self) -> [u32; TOGETHER] {
+        let mut apart = [0; TOGETHER];
+        for [lower, upper] in self.edges() {
+            for i in 0..TOGETHER {
+                let difference = if HASHED { lower[i] ^ upper[i] } else { upper[i].wrapping_sub(lower[i]) };
+                apart[i] |= difference ^ 1;
+            }
+        }
+        apart
     }
 
     /// Returns the rows of the lower and of the upper node of the four edges along x.
@@ -208,7 +215,7 @@ fn encode_loop<T: Real, const F: usize, const FUSED: bool>(level: &Level, table:
         let values = if count == TOGETHER { out.first_chunk_mut().expect("a whole group") } else { &mut spare };
         // Rows of four features and more are vectors of their own; a buffer for their corners would fill the first-level cache.
         if const { F <= 2 } {
-            cells.interpolate::<F, FUSED>(table, !level.hashed && cells.neighbors(), &mut corners, values);
+            cells.interpolate::<F, FUSED>(table, !level.hashed && cells.apart::<false>() == [0; TOGETHER], &mut corners, values);
         } else {
             cells.interpolate_one_by_one::<F, FUSED>(table, values);
         }

@@ -6,6 +6,7 @@
 
 use super::loops::{BLOCK, Cells, Group, TOGETHER, with_features};
 use super::{HashGrid, Level};
+use autograd::lattice::bits;
 use autograd::{Buffer, Real, RowSums, dispatched};
 use std::ops::Range;
 
@@ -76,17 +77,16 @@ fn add<T: Real, const F: usize, const FUSED: bool>(level: &Level, groups: &[Grou
 #[allow(clippy::needless_range_loop)] // Several arrays have the same index.
 fn add_group<T: Real, const F: usize, const HASHED: bool>(cells: &Cells<T>, g: &[[T; F]; TOGETHER], sums: &mut [[T; F]]) {
     let (edges, [x, y, z], count) = (cells.edges(), &cells.shares, sums.len() as u32);
-    let mut apart = [0; TOGETHER];
+    let mut apart = cells.apart::<HASHED>();
     for [lower, upper] in edges {
         for i in 0..TOGETHER {
-            let difference = if HASHED { lower[i] ^ upper[i] } else { upper[i].wrapping_sub(lower[i]) };
-            apart[i] |= (difference ^ 1) | u32::from(lower[i].max(upper[i]) >= count);
+            apart[i] |= u32::from(lower[i].max(upper[i]) >= count);
         }
     }
     let mut along_x = [[T::zero(); TOGETHER]; 2];
     for i in 0..TOGETHER {
         let (lower, upper) = (x[0][i], x[1][i]);
-        let upper_is_even = HASHED && (edges[0][0][i] & 1) > apart[i]; // Odd and not apart.
+        let upper_is_even = HASHED && (edges[0][0][i] & 1) > apart[i]; // The lower row is odd, and the rows are not apart.
         along_x[0][i] = if upper_is_even { upper } else { lower };
         along_x[1][i] = if upper_is_even { lower } else { upper };
     }
@@ -109,7 +109,7 @@ fn add_group<T: Real, const F: usize, const HASHED: bool>(cells: &Cells<T>, g: &
         neighbors |= u64::from(apart[i] == 0) << i;
         contributes |= u64::from(g[i].iter().fold(false, |any, &g| any | (g != T::zero()))) << i;
     }
-    for i in set_bits(neighbors & contributes) {
+    for i in bits(neighbors & contributes) {
         let [first, second] = values[i];
         for e in 0..4 {
             let values = if HASHED && (e == 1 || e == 2) { [second, first] } else { [first, second] };
@@ -119,7 +119,7 @@ fn add_group<T: Real, const F: usize, const HASHED: bool>(cells: &Cells<T>, g: &
             }
         }
     }
-    for i in set_bits(!neighbors & contributes) {
+    for i in bits(!neighbors & contributes) {
         for e in 0..4 {
             for end in 0..2 {
                 if let Some(sum) = sums.get_mut(edges[e][end][i] as usize) {
@@ -135,18 +135,6 @@ fn add_weighted<T: Real, const F: usize>(sum: &mut [T; F], value: &[T; F], weigh
     for f in 0..F {
         sum[f] += value[f] * weight;
     }
-}
-
-/// Returns the places of the bits that are set.
-#[inline(always)]
-fn set_bits(mut bits: u64) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        let place = bits.trailing_zeros() as usize;
-        (bits != 0).then(|| {
-            bits &= bits - 1;
-            place
-        })
-    })
 }
 
 dispatched! {

@@ -47,7 +47,7 @@ pub use pictures::PictureTables;
 pub use seen::{Seen, largest_weights, seen};
 use std::sync::{Arc, OnceLock};
 
-/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples.
+/// Number of rays that one task renders and whose gradients it sorts: about ten thousand samples. `sorted::rays_of_block` may double it.
 const BLOCK: usize = 4 * RAYS_OF_PACKET;
 
 /// Number of rays whose samples are kept, or marched again, at a time. It bounds the memory of a step. A usual batch is an eighth of it.
