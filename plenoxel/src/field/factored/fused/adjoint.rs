@@ -91,7 +91,7 @@ impl Sorted {
 
 /// Returns the base-2 logarithm of the rows in a bucket: about a thirty-second of a plane, and not more than fits into a core's cache.
 fn bucket_shift(axis: usize, nodes: [usize; 3], width: usize) -> u32 {
-    const FLOATS: usize = 1 << 15;
+    const FLOATS: usize = 1 << 16;
     let rows = (plane_size(axis, nodes) / 32).min(FLOATS / width).max(64);
     rows.ilog2()
 }
@@ -243,13 +243,14 @@ fn part<T: Real>(
     let samples_at = block.at().map(|at| pruning::picked(at, &samples));
     let groups_at = block.groups_at.each_ref().map(|at| pruning::picked(at, &groups));
     let density_lines = of_density_lines(tables.density, slices(&samples_at), &of_samples);
-    let OfNetwork { products, input, lines, parameters } =
-        tables.network.adjoint(&block.activations, &groups, tables.appearance, slices(&groups_at), &rgb);
+    let directions = (block.directions(&batch.encoded), state.tracked.is_some());
+    let OfNetwork { products, directions, lines, parameters } =
+        tables.network.adjoint(&block.activations, &groups, (tables.appearance, slices(&groups_at)), directions, &rgb);
     let density = Kept::new(samples, samples_at, of_samples, tables.density);
     let products = Kept::new(groups, groups_at, products, tables.appearance);
     let rays = state.tracked.as_ref().map(|tracked| {
-        let encoded = tables.network.of_direction(&input);
-        positions::of_rays(tracked, block, tables, [&density, &products], (encoded, batch.encoded.shape()[1]))
+        let [of_origins, of_directions] = positions::of_rays(tracked, block, tables, [&density, &products]);
+        [directions, of_origins, of_directions]
     });
     (Part { density, products }, [density_lines, lines].into_iter().chain(parameters).collect(), rays)
 }

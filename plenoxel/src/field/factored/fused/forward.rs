@@ -2,7 +2,7 @@
 
 use super::Batch;
 use super::lookup::{self, Pairs, RUN};
-use super::network::{Activations, Network};
+use super::network::{Activations, Directions, Network};
 use crate::camera::Ray;
 use crate::field::grouping::Groups;
 use crate::geometry::Aabb;
@@ -101,6 +101,12 @@ impl<T: Real> Block<T> {
     /// Returns the samples as rendering sees them.
     pub fn along(&self) -> Along<'_, T> {
         Along { t: self.t(), delta: self.delta(), weight: self.weight(), after: &self.columns[of_sample::AFTER][..self.len()] }
+    }
+
+    /// Returns the directions of the groups, from the encoded directions of all rays, `[n, e]`.
+    pub fn directions<'a>(&'a self, encoded: &'a Tensor<T>) -> Directions<'a, T> {
+        let (width, rays) = (encoded.shape()[1], self.first..self.first + self.offsets.len() - 1);
+        Directions { rays: &self.groups.rays, first: self.first, encoded: &encoded.data()[rays.start * width..rays.end * width], width }
     }
 
     /// Returns the color of a sample.
@@ -274,8 +280,7 @@ impl<'a, T: Real> Scene<'a, T> {
     fn shade(&self, block: &mut Block<T>) {
         let pairs = self.tables.appearance;
         let at = block.groups_at.each_ref().map(|at| &at[..]);
-        let (encoded, width) = (self.batch.encoded.data(), self.batch.encoded.shape()[1]);
-        let direction = |i: usize| &encoded[block.groups.rays[i] as usize * width..][..width];
-        block.activations = self.tables.network.forward(pairs, at, self.keep, direction);
+        let directions = block.directions(&self.batch.encoded);
+        block.activations = self.tables.network.forward(pairs, at, self.keep, directions);
     }
 }

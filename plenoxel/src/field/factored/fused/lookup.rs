@@ -282,11 +282,6 @@ pub(super) fn density_of<T: Real, const FUSED: bool>(x: T) -> (T, T) {
     (scale * (x.max(T::zero()) + ln_1p(e)), scale * if x > T::zero() { above } else { e * above })
 }
 
-/// Splits samples, and their rows of `width` values, into runs of up to [`RUN`].
-fn runs<'a, T: Real>(at: Places<'a, T>, values: &'a mut [T], width: usize) -> impl Iterator<Item = (Places<'a, T>, &'a mut [T])> {
-    (0..).zip(values.chunks_mut(RUN * width)).map(move |(run, values)| (run_of(at, run), values))
-}
-
 /// Returns a run of samples, which is empty behind the last.
 #[inline(always)]
 pub fn run_of<T>(at: Places<'_, T>, run: usize) -> Places<'_, T> {
@@ -298,17 +293,17 @@ pub fn planes<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
     if parallel::fused() { planes_in_runs::<T, true>(pairs, at, out) } else { planes_in_runs::<T, false>(pairs, at, out) }
 }
 
-/// Multiplies the values of planes at samples by those of the lines.
-pub fn times_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, values: &mut [T]) {
-    for (at, values) in runs(at, values, 3 * pairs.width) {
-        if parallel::fused() { times_lines_of_run::<T, true>(pairs, at, values) } else { times_lines_of_run::<T, false>(pairs, at, values) }
+/// Computes the products plane · line at samples from the values of the planes: rows of three times `width` values.
+pub fn times_lines<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, of_planes: &[T], out: &mut [T]) {
+    let length = 3 * pairs.width * RUN;
+    for (run, (of_planes, out)) in of_planes.chunks(length).zip(out.chunks_mut(length)).enumerate() {
+        let at = run_of(at, run);
+        if parallel::fused() {
+            times_lines_of_run::<T, true>(pairs, at, of_planes, out);
+        } else {
+            times_lines_of_run::<T, false>(pairs, at, of_planes, out);
+        }
     }
-}
-
-/// Computes the products plane · line at samples: rows of three times `width` values.
-pub fn products<T: Real>(pairs: Pairs<'_, T>, at: Places<'_, T>, out: &mut [T]) {
-    planes(pairs, at, out);
-    times_lines(pairs, at, out);
 }
 
 dispatched! {
@@ -341,22 +336,22 @@ fn planes_in_runs<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_
 }
 
 dispatched! {
-fn times_lines_of_run<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, values: &mut [T]) {
+fn times_lines_of_run<T: Real, const FUSED: bool>(pairs: Pairs<'_, T>, at: Places<'_, T>, of_planes: &[T], out: &mut [T]) {
     let cells = Cells::new(at, pairs.nodes);
     let chunks = pairs.width / LANES;
-    let values = values.as_chunks_mut::<LANES>().0;
+    let (of_planes, out) = (of_planes.as_chunks::<LANES>().0, out.as_chunks_mut::<LANES>().0);
     for axis in 0..3 {
         let line = pairs.lines[axis].as_chunks::<LANES>().0;
-        for (i, values) in values.chunks_exact_mut(3 * chunks).enumerate() {
+        for (i, (of_planes, out)) in of_planes.chunks_exact(3 * chunks).zip(out.chunks_exact_mut(3 * chunks)).enumerate() {
             let along = cells.along(axis, i);
-            for (k, value) in values[axis * chunks..][..chunks].iter_mut().enumerate() {
+            let (of_plane, out) = (&of_planes[axis * chunks..][..chunks], &mut out[axis * chunks..][..chunks]);
+            for k in 0..chunks {
                 let factor = line_at::<T, FUSED>(line, along, chunks, k);
-                let plane = *value;
                 let mut product = [T::zero(); LANES];
                 for l in 0..LANES {
-                    product[l] = plane[l] * factor[l];
+                    product[l] = of_plane[k][l] * factor[l];
                 }
-                *value = product;
+                out[k] = product;
             }
         }
     }
@@ -528,12 +523,14 @@ mod tests {
         for count in [0, 1, RUN - 1, RUN, RUN + 1, 2 * RUN + 3] {
             let at = [0, 1, 2].map(|axis| Stream::new(7 + axis as u64).uniform_tensor::<f64>(&[count], 0.0, nodes[axis] as f64 - 1.0));
             let at = at.each_ref().map(|x| x.data());
-            let mut all = vec![0.0; 3 * width * count];
-            products(pairs, at, &mut all);
-            for (i, all) in all.chunks(3 * width).enumerate() {
-                let mut one = vec![0.0; 3 * width];
-                products(pairs, at.map(|at| &at[i..=i]), &mut one);
-                assert_eq!(one, all, "sample {i} of {count}");
+            let products = |at: Places<'_, f64>| {
+                let [mut of_planes, mut out] = [(); 2].map(|()| vec![0.0; 3 * width * at[0].len()]);
+                super::planes(pairs, at, &mut of_planes);
+                times_lines(pairs, at, &of_planes, &mut out);
+                out
+            };
+            for (i, all) in products(at).chunks(3 * width).enumerate() {
+                assert_eq!(products(at.map(|at| &at[i..=i])), all, "sample {i} of {count}");
             }
         }
     }

@@ -1,4 +1,7 @@
 //! The color network on arrays, from the planes and lines of the appearance to colors: forward and adjoint for the groups of samples of one block.
+//!
+//! All groups of a ray see its encoded direction d. With the input (f, d) of the first layer, x W = f W_f + d W_d: the second product, and its adjoint, are computed
+//! once for each ray.
 
 use super::super::Shape;
 use super::lookup::{self, Cotangents, Pairs, Places};
@@ -22,8 +25,55 @@ pub struct Network<'a, T> {
     products: usize,
     features: usize,
     octaves: usize,
+    /// Layers; the first one without the rows of its weight that encoded directions are multiplied by.
     layers: Vec<Layer<'a, T>>,
+    /// These rows.
+    of_directions: &'a [T],
     precision: Precision,
+}
+
+/// Directions in which the groups of a block are seen.
+#[derive(Clone, Copy)]
+pub struct Directions<'a, T> {
+    /// Number of the ray of each group. The groups of a ray follow one another.
+    pub rays: &'a [u32],
+    /// Number of the first ray of the block.
+    pub first: usize,
+    /// Encoded directions of the rays of the block, `[rays, e]`.
+    pub encoded: &'a [T],
+    /// e.
+    pub width: usize,
+}
+
+/// The rays of some groups.
+struct Rays<T: Real> {
+    /// Numbers in the block.
+    numbers: Vec<usize>,
+    /// Place of the ray of each group in `numbers`.
+    of_groups: Vec<usize>,
+    /// Encoded directions, `[rays, e]`.
+    encoded: Vec<T>,
+}
+
+impl<T: Real> Rays<T> {
+    fn none() -> Self {
+        Rays { numbers: Vec::new(), of_groups: Vec::new(), encoded: Vec::new() }
+    }
+
+    /// Finds the rays of these groups.
+    fn find(&mut self, directions: Directions<'_, T>, groups: impl Iterator<Item = usize>) {
+        self.numbers.clear();
+        self.of_groups.clear();
+        self.encoded.clear();
+        for group in groups {
+            let ray = directions.rays[group] as usize - directions.first;
+            if self.numbers.last() != Some(&ray) {
+                self.numbers.push(ray);
+                self.encoded.extend_from_slice(&directions.encoded[ray * directions.width..][..directions.width]);
+            }
+            self.of_groups.push(self.numbers.len() - 1);
+        }
+    }
 }
 
 /// Colors of m groups, and the values that the adjoint reads.
@@ -39,8 +89,8 @@ pub struct Activations<T: Real> {
 pub struct OfNetwork<T: Real> {
     /// Cotangents of the products, `[m, 3 R]`.
     pub products: Buffer<T>,
-    /// Cotangents of the input of the first layer, `[m, inputs]`.
-    pub input: Buffer<T>,
+    /// Cotangents of the encoded directions of the rays of the block, `[rays, e]`, if they are tracked.
+    pub directions: Buffer<T>,
     /// Cotangents of the three lines of the appearance, one after another.
     pub lines: Buffer<T>,
     /// Cotangents of the matrix and of the layers' weights and biases, in the order of the parameters.
@@ -50,48 +100,60 @@ pub struct OfNetwork<T: Real> {
 impl<'a, T: Real> Network<'a, T> {
     /// Creates the network from its parameters.
     pub fn new(shape: &Shape, tables: &'a [Tensor<T>], precision: Precision) -> Self {
+        let encoded = shape.features * (1 + 2 * shape.feature_octaves);
         let layer = |pair: &'a [Tensor<T>]| {
             let [inputs, outputs] = [0, 1].map(|axis| pair[0].shape()[axis]);
             Layer { weight: pair[0].data(), bias: pair[1].data(), inputs, outputs }
         };
+        let mut layers: Vec<_> = tables[1..].chunks(2).map(layer).collect();
+        let (of_features, of_directions) = layers[0].weight.split_at(encoded * layers[0].outputs);
+        (layers[0].weight, layers[0].inputs) = (of_features, encoded);
         Network {
             basis: tables[0].data(),
             products: tables[0].shape()[0],
             features: shape.features,
             octaves: shape.feature_octaves,
-            layers: tables[1..].chunks(2).map(layer).collect(),
+            layers,
+            of_directions,
             precision,
         }
     }
 
-    /// Computes the colors of groups from the planes and lines of the appearance at their positions; `direction(i)` is the encoded direction of group i. The inputs
-    /// of the layers are kept for the adjoint if `keep`.
-    pub fn forward(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, keep: bool, direction: impl Fn(usize) -> &'a [T]) -> Activations<T> {
+    /// Returns the rows of the first layer's weight that encoded directions are multiplied by, `[e, outputs]`.
+    fn of_directions(&self) -> Matrix<'a, T> {
+        let outputs = self.layers[0].outputs;
+        Matrix::new(self.of_directions, self.of_directions.len() / outputs, outputs)
+    }
+
+    /// Computes the colors of groups from the planes and lines of the appearance at their positions. The inputs of the layers are kept for the adjoint if `keep`.
+    pub fn forward(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, keep: bool, directions: Directions<'_, T>) -> Activations<T> {
         let m = at[0].len();
         let kept = if keep { m } else { ROWS.min(m) };
         let mut inputs: Vec<_> = self.layers.iter().map(|layer| Buffer::stale(kept * layer.inputs)).collect();
         let mut rgb = Buffer::stale(3 * m);
-        let width = self.layers[0].inputs;
-        let encoded = self.features * (1 + 2 * self.octaves);
-        let [mut products, mut features] = [self.products, self.features].map(|width| Buffer::stale(ROWS.min(m) * width));
+        let scratch = |width: usize| Buffer::stale(ROWS.min(m) * width);
+        let [mut of_planes, mut products] = [(); 2].map(|()| scratch(self.products));
+        let [mut features, mut of_rays] = [self.features, self.layers[0].outputs].map(scratch);
+        let mut rays = Rays::none();
         for first in (0..m).step_by(ROWS) {
             let groups = first..m.min(first + ROWS);
             let count = groups.len();
             let start = if keep { first } else { 0 };
             let own = |width: usize| start * width..(start + count) * width;
-            let (products, features) = (&mut products[..count * self.products], &mut features[..count * self.features]);
-            lookup::products(pairs, at.map(|at| &at[groups.clone()]), products);
-            multiply(
-                Matrix::new(products, count, self.products),
-                Matrix::new(self.basis, self.products, self.features),
-                features,
-                self.precision,
-            );
-            let rows = inputs[0][own(width)].chunks_exact_mut(width);
-            for ((i, input), features) in groups.clone().zip(rows).zip(features.chunks_exact(self.features)) {
-                encode(features, self.octaves, &mut input[..encoded]);
-                input[encoded..].copy_from_slice(direction(i));
-            }
+            let at = at.map(|at| &at[groups.clone()]);
+            let [of_planes, products] = [&mut of_planes, &mut products].map(|values| &mut values[..count * self.products]);
+            lookup::planes(pairs, at, of_planes);
+            lookup::times_lines(pairs, at, of_planes, products);
+            let features = &mut features[..count * self.features];
+            let products = Matrix::new(products, count, self.products);
+            multiply(products, Matrix::new(self.basis, self.products, self.features), features, self.precision);
+            let rows = inputs[0][own(self.layers[0].inputs)].chunks_exact_mut(self.layers[0].inputs);
+            rows.zip(features.chunks_exact(self.features)).for_each(|(input, features)| encode(features, self.octaves, input));
+            rays.find(directions, groups.clone());
+            let of_rays = &mut of_rays[..rays.numbers.len() * self.layers[0].outputs];
+            let encoded = Matrix::new(&rays.encoded, rays.numbers.len(), directions.width);
+            multiply(encoded, self.of_directions(), of_rays, self.precision);
+            add_bias::<T, false>(of_rays, self.layers[0].bias);
             for (l, layer) in self.layers.iter().enumerate() {
                 let (below, above) = inputs.split_at_mut(l + 1);
                 let input = Matrix::new(&below[l][own(layer.inputs)], count, layer.inputs);
@@ -100,7 +162,9 @@ impl<'a, T: Real> Network<'a, T> {
                     None => &mut rgb[3 * groups.start..3 * groups.end],
                 };
                 multiply(input, Matrix::new(layer.weight, layer.inputs, layer.outputs), out, self.precision);
-                if l + 1 < self.layers.len() {
+                if l == 0 {
+                    add_of_rays(out, of_rays, &rays.of_groups);
+                } else if l + 1 < self.layers.len() {
                     add_bias::<T, true>(out, layer.bias);
                 } else {
                     add_bias::<T, false>(out, layer.bias);
@@ -114,87 +178,102 @@ impl<'a, T: Real> Network<'a, T> {
         Activations { inputs, rgb }
     }
 
-    /// Returns the cotangents of encoded directions, one row for each group, from those of the input of the first layer.
-    pub fn of_direction<'g>(&self, input: &'g [T]) -> impl Iterator<Item = &'g [T]> {
-        let encoded = self.features * (1 + 2 * self.octaves);
-        input.chunks_exact(self.layers[0].inputs).map(move |row| &row[encoded..])
-    }
-
     /// Computes the cotangents of the products, of the lines and of the parameters for the groups with these numbers and positions, from the cotangents of the colors
-    /// of all groups.
+    /// of all groups; and those of encoded directions if `tracked`.
     pub fn adjoint(
         &self,
         activations: &Activations<T>,
         numbers: &[u32],
-        pairs: Pairs<'_, T>,
-        at: Places<'_, T>,
+        (pairs, at): (Pairs<'_, T>, Places<'_, T>),
+        (directions, tracked): (Directions<'_, T>, bool),
         of_colors: &[T],
     ) -> OfNetwork<T> {
-        let width = self.layers[0].inputs;
         let mut lengths = vec![self.basis.len()];
         lengths.extend(self.layers.iter().flat_map(|layer| [layer.weight.len(), layer.bias.len()]));
+        lengths[1] += self.of_directions.len();
         let mut of = OfNetwork {
             products: Buffer::stale(numbers.len() * self.products),
-            input: Buffer::stale(numbers.len() * width),
+            directions: Buffer::zeros(if tracked { directions.encoded.len() } else { 0 }),
             lines: pairs.zeros_of_lines(),
             parameters: lengths.into_iter().map(Buffer::zeros).collect(),
         };
         let [mut of_planes, mut products] = [(); 2].map(|()| Buffer::stale(ROWS.min(numbers.len()) * self.products));
         let mut copies: Vec<_> = self.layers.iter().map(|_| Buffer::stale(0)).collect();
+        let mut rays = Rays::none();
         for (chunk, numbers) in numbers.chunks(ROWS).enumerate() {
             let groups = chunk * ROWS..chunk * ROWS + numbers.len();
-            let own = |width: usize| groups.start * width..groups.end * width;
             let at = at.map(|at| &at[groups.clone()]);
             let [of_planes, products] = [&mut of_planes, &mut products].map(|values| &mut values[..numbers.len() * self.products]);
             lookup::planes(pairs, at, of_planes);
-            products.copy_from_slice(of_planes);
-            lookup::times_lines(pairs, at, products);
+            lookup::times_lines(pairs, at, of_planes, products);
             let layers = activations.inputs.iter().zip(&self.layers).zip(&mut copies);
             let inputs: Vec<_> = layers.map(|((all, layer), copy)| pruning::rows(all, layer.inputs, numbers, copy)).collect();
-            let of_rgb = of_logits(&activations.rgb, of_colors, numbers);
-            let of_products = &mut of.products[own(self.products)];
-            self.add_adjoint((products, &inputs), of_rgb, of_products, &mut of.input[own(width)], &mut of.parameters);
+            let of_products = &mut of.products[groups.start * self.products..groups.end * self.products];
+            let of_logits = of_logits(&activations.rgb, of_colors, numbers);
+            let of_hidden = self.add_adjoint((products, &inputs), of_logits, of_products, &mut of.parameters);
+            rays.find(directions, numbers.iter().map(|&i| i as usize));
+            self.add_adjoint_of_rays(&rays, &of_hidden, (directions.width, &mut of.directions), &mut of.parameters[1..3]);
             lookup::add_to_lines(pairs, at, of_planes, Cotangents::Each(of_products), &mut of.lines);
         }
         of
     }
 
-    /// Computes the cotangents of products and of the input of the first layer for some groups with these products and inputs of layers, from those of the output
-    /// of the last layer, and adds those of the parameters.
+    /// Computes the cotangents of products for some groups with these products and inputs of layers, from those of the output of the last layer, and adds those of
+    /// the parameters, but for directions and bias in the first layer. Returns the cotangents of the output of the first layer, `[m, outputs]`.
     fn add_adjoint(
         &self,
         (products, inputs): (&[T], &[&[T]]),
         mut g: Buffer<T>,
         of_products: &mut [T],
-        of_input: &mut [T],
         sums: &mut [Buffer<T>],
-    ) {
+    ) -> Buffer<T> {
         let m = g.len() / 3;
         let (of_basis, of_layers) = sums.split_at_mut(1);
         for (l, (layer, input)) in self.layers.iter().zip(inputs).enumerate().rev() {
             let [of_weight, of_bias] = &mut of_layers.as_chunks_mut::<2>().0[l];
-            for row in g.chunks_exact(layer.outputs) {
-                of_bias.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
-            }
             let cotangent = Matrix::new(&g, m, layer.outputs);
-            add_product(Matrix::transposed(input, layer.inputs, m), cotangent, of_weight, self.precision);
-            let weight = Matrix::transposed(layer.weight, layer.outputs, layer.inputs);
-            if l == 0 {
-                multiply(cotangent, weight, of_input, self.precision);
-            } else {
+            add_product(Matrix::transposed(input, layer.inputs, m), cotangent, &mut of_weight[..layer.weight.len()], self.precision);
+            if l > 0 {
+                add_rows(of_bias, &g);
                 let mut below = Buffer::stale(m * layer.inputs);
-                multiply(cotangent, weight, &mut below, self.precision);
+                multiply(cotangent, Matrix::transposed(layer.weight, layer.outputs, layer.inputs), &mut below, self.precision);
                 mask(&mut below, input);
                 g = below;
             }
         }
-        let width = self.layers[0].inputs;
-        let mut of_features = Buffer::stale(m * self.features);
-        let rows = of_features.chunks_exact_mut(self.features).zip(of_input.chunks_exact(width)).zip(inputs[0].chunks_exact(width));
+        let first = &self.layers[0];
+        let [mut of_input, mut of_features] = [first.inputs, self.features].map(|width| Buffer::stale(m * width));
+        let weight = Matrix::transposed(first.weight, first.outputs, first.inputs);
+        multiply(Matrix::new(&g, m, first.outputs), weight, &mut of_input, self.precision);
+        let rows =
+            of_features.chunks_exact_mut(self.features).zip(of_input.chunks_exact(first.inputs)).zip(inputs[0].chunks_exact(first.inputs));
         rows.for_each(|((out, g), encoded)| encode_adjoint(g, encoded, self.octaves, out));
         let features = Matrix::new(&of_features, m, self.features);
         add_product(Matrix::transposed(products, self.products, m), features, &mut of_basis[0], self.precision);
         multiply(features, Matrix::transposed(self.basis, self.features, self.products), of_products, self.precision);
+        g
+    }
+
+    /// Adds the cotangents of bias and of the rows for directions of the first layer, and of the directions if there are any, from those of the output of the
+    /// first layer for the groups of these rays.
+    fn add_adjoint_of_rays(&self, rays: &Rays<T>, of_hidden: &[T], (width, of_directions): (usize, &mut [T]), sums: &mut [Buffer<T>]) {
+        let (first, count) = (&self.layers[0], rays.numbers.len());
+        let mut of_rays = Buffer::zeros(count * first.outputs);
+        for (g, &ray) in of_hidden.chunks_exact(first.outputs).zip(&rays.of_groups) {
+            add_rows(&mut of_rays[ray * first.outputs..][..first.outputs], g);
+        }
+        let [of_weight, of_bias] = sums else { unreachable!("weight and bias") };
+        add_rows(of_bias, &of_rays);
+        let cotangent = Matrix::new(&of_rays, count, first.outputs);
+        add_product(Matrix::transposed(&rays.encoded, width, count), cotangent, &mut of_weight[first.weight.len()..], self.precision);
+        if of_directions.is_empty() {
+            return;
+        }
+        let mut of_encoded = Buffer::stale(count * width);
+        multiply(cotangent, self.of_directions().transpose(), &mut of_encoded, self.precision);
+        for (g, &ray) in of_encoded.chunks_exact(width).zip(&rays.numbers) {
+            add_rows(&mut of_directions[ray * width..][..width], g);
+        }
     }
 }
 
@@ -241,10 +320,35 @@ dispatched! {
 /// Adds the bias to each row, and applies ReLU if asked.
 fn add_bias<T: Real, const RELU: bool>(out: &mut [T], bias: &[T]) {
     for row in out.chunks_exact_mut(bias.len()) {
-        for (x, &b) in row.iter_mut().zip(bias) {
-            let y = *x + b;
-            *x = if RELU && y < T::zero() { T::zero() } else { y };
-        }
+        add_to_row::<T, RELU>(row, bias);
+    }
+}
+}
+
+dispatched! {
+/// Adds to each row that of its ray, and applies ReLU.
+fn add_of_rays<T: Real>(out: &mut [T], of_rays: &[T], rays: &[usize]) {
+    let width = out.len() / rays.len();
+    for (row, &ray) in out.chunks_exact_mut(width).zip(rays) {
+        add_to_row::<T, true>(row, &of_rays[ray * width..][..width]);
+    }
+}
+}
+
+/// Adds values to a row, and applies ReLU if asked.
+#[inline(always)]
+fn add_to_row<T: Real, const RELU: bool>(row: &mut [T], values: &[T]) {
+    for (x, &value) in row.iter_mut().zip(values) {
+        let y = *x + value;
+        *x = if RELU && y < T::zero() { T::zero() } else { y };
+    }
+}
+
+dispatched! {
+/// Adds the rows of a matrix to a sum.
+fn add_rows<T: Real>(sum: &mut [T], rows: &[T]) {
+    for row in rows.chunks_exact(sum.len()) {
+        add_to_row::<T, false>(sum, row);
     }
 }
 }

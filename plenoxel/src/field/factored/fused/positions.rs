@@ -28,27 +28,15 @@ pub fn joined<T: Real>(blocks: &[OfRays<T>]) -> OfRays<T> {
     })
 }
 
-/// Computes the cotangents of the rays of a block from those of the density features of samples, of the products of groups, and of the encoded directions of
-/// these, `width` numbers each. A ray without samples has the cotangent 0.
-pub fn of_rays<'g, T: Real>(
-    tracked: &Tracked,
-    block: &Block<T>,
-    tables: &Tables<'_, T>,
-    [density, products]: [&Kept<T>; 2],
-    (encoded, width): (impl Iterator<Item = &'g [T]>, usize),
-) -> OfRays<T> {
+/// Computes the cotangents of the origins and directions of the rays of a block from those of the density features of samples and of the products of groups. A ray
+/// without samples has the cotangent 0.
+pub fn of_rays<T: Real>(tracked: &Tracked, block: &Block<T>, tables: &Tables<'_, T>, [density, products]: [&Kept<T>; 2]) -> [Buffer<T>; 2] {
     let mut of_samples = slopes(tables.density, density, block.len());
     let of_groups = slopes(tables.appearance, products, block.groups.len());
     for (group, sample, share) in block.groups.shares(block.weight()) {
         (0..3).for_each(|axis| of_samples[axis][sample] += share * of_groups[axis][group]);
     }
     let rays = block.offsets.len() - 1;
-    let mut of_encoded = Buffer::zeros(rays * width);
-    for (row, &group) in encoded.zip(&products.numbers) {
-        let ray = block.groups.rays[group as usize] as usize - block.first;
-        let sums = &mut of_encoded[ray * width..][..width];
-        sums.iter_mut().zip(row).for_each(|(sum, &g)| *sum += g);
-    }
     let (mut of_origins, mut of_directions) = (Buffer::stale(3 * rays), Buffer::stale(3 * rays));
     for (r, (ray, own)) in tracked.rays[block.first..].iter().zip(block.rays()).enumerate() {
         let (mut origin, mut direction) = (DVec3::ZERO, DVec3::ZERO);
@@ -62,7 +50,7 @@ pub fn of_rays<'g, T: Real>(
         of_origins[3 * r..][..3].copy_from_slice(&origin.to_array().map(T::lit));
         of_directions[3 * r..][..3].copy_from_slice(&direction.to_array().map(T::lit));
     }
-    [of_encoded, of_origins, of_directions]
+    [of_origins, of_directions]
 }
 
 impl Tracked {
