@@ -1,7 +1,8 @@
 //! Fused kernel: the pixels of [`composite()`] in one pass over a factored field, with a hand-written adjoint.
 //!
 //! *Forward.* Rays are processed in blocks. Each block computes the densities of its samples and their weights, forms groups
-//! ([`Grouping`]), and evaluates the color network at one position of each group, for all groups of the block together.
+//! ([`Grouping`]), and evaluates the color network at one position of each group, for all groups of the block together. Pictures have densities from a table,
+//! and the linear part of the network at the nodes of cells that contain many groups (`fused/nodes.rs`).
 //!
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
@@ -16,6 +17,7 @@ mod densities;
 mod forward;
 mod lookup;
 mod network;
+mod nodes;
 mod pictures;
 mod positions;
 mod pruning;

@@ -168,7 +168,8 @@ impl<'a, T: Real> Scene<'a, T> {
     /// Renders rays from `first` on, one for each entry of `sparsity`.
     pub fn render(&self, first: usize, pixels: &mut [T], sparsity: &mut [T]) -> Block<T> {
         let mut block = self.samples(first, sparsity.len());
-        self.compute_colors(&mut block);
+        self.form_groups(&mut block);
+        self.shade(&mut block);
         let (along, color, sigma) = (block.along(), block.color(), block.sigma());
         for ((own, pixel), sparsity) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0).zip(sparsity) {
             *pixel = along.pixel(own.clone(), self.batch.background, |i| sigma[i], &color);
@@ -259,14 +260,8 @@ impl<'a, T: Real> Scene<'a, T> {
         }
     }
 
-    /// Computes the colors of samples, from their weights.
-    pub fn compute_colors(&self, block: &mut Block<T>) {
-        self.form_groups(block);
-        self.shade(block);
-    }
-
     /// Forms the groups of each ray and computes their positions.
-    fn form_groups(&self, block: &mut Block<T>) {
+    pub fn form_groups(&self, block: &mut Block<T>) {
         let groups = self.batch.grouping.groups(block.weight(), [block.t(), block.delta()], &block.offsets, block.first, self.batch.jitter);
         let mut means = [0, 1, 2].map(|_| Buffer::zeros(groups.len()));
         let at = block.at();

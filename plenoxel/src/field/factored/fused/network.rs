@@ -5,13 +5,19 @@
 
 use super::super::Shape;
 use super::lookup::{self, Cotangents, Pairs, Places};
+use super::nodes::Nodes;
 use super::pruning;
 use autograd::{Buffer, Matrix, Precision, Real, Tensor, add_product, dispatched, multiply, parallel};
+use std::ops::Range;
 
 /// Number of groups, or of samples, that are processed before others: their values stay in the second-level cache.
 pub const ROWS: usize = 256;
 
+/// Fewest groups in a cell, on average, for which [`Network::forward_by_nodes`] computes values at nodes.
+const GROUPS_OF_CELL: usize = 4;
+
 /// Linear layer.
+#[derive(Clone, Copy)]
 struct Layer<'a, T> {
     weight: &'a [T],
     bias: &'a [T],
@@ -128,27 +134,89 @@ impl<'a, T: Real> Network<'a, T> {
     /// Computes the colors of groups from the planes and lines of the appearance at their positions. The inputs of the layers are kept for the adjoint if `keep`.
     pub fn forward(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, keep: bool, directions: Directions<'_, T>) -> Activations<T> {
         let m = at[0].len();
-        let kept = if keep { m } else { ROWS.min(m) };
-        let mut inputs: Vec<_> = self.layers.iter().map(|layer| Buffer::stale(kept * layer.inputs)).collect();
-        let mut rgb = Buffer::stale(3 * m);
-        let scratch = |width: usize| Buffer::stale(ROWS.min(m) * width);
-        let [mut of_planes, mut products] = [(); 2].map(|()| scratch(self.products));
-        let [mut features, mut of_rays] = [self.features, self.layers[0].outputs].map(scratch);
-        let mut rays = Rays::none();
-        for first in (0..m).step_by(ROWS) {
-            let groups = first..m.min(first + ROWS);
-            let count = groups.len();
-            let start = if keep { first } else { 0 };
-            let own = |width: usize| start * width..(start + count) * width;
-            let at = at.map(|at| &at[groups.clone()]);
+        let mut features_at = self.features_at(pairs, ROWS.min(m));
+        let mut features = Buffer::stale(ROWS.min(m) * self.features);
+        self.layers_of(m, keep, directions, |groups, input, out| {
+            let features = &mut features[..groups.len() * self.features];
+            features_at(at.map(|at| &at[groups.clone()]), features);
+            self.encode(features, input);
+            self.multiply_by_first(input, out);
+        })
+    }
+
+    /// Computes the colors of groups near each other, without an adjoint. What is linear in the products, up to the output of the first layer, or to the features if
+    /// the layer reads sines of them, is computed at the nodes of the groups' cells ([`Nodes`]), unless they are too many.
+    pub fn forward_by_nodes(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, directions: Directions<'_, T>) -> Activations<T> {
+        let m = at[0].len();
+        let Some(nodes) = Nodes::around(at, pairs.nodes, m / GROUPS_OF_CELL) else {
+            return self.forward(pairs, at, false, directions);
+        };
+        let count = nodes.at[0].len();
+        let mut features = Buffer::stale(count * self.features);
+        let mut features_at = self.features_at(pairs, ROWS.min(count));
+        for (chunk, features) in features.chunks_mut(ROWS * self.features).enumerate() {
+            let at = nodes.at.each_ref().map(|at| &at[chunk * ROWS..][..features.len() / self.features]);
+            features_at(at, features);
+        }
+        if self.octaves > 0 {
+            let mut own = Buffer::stale(ROWS.min(m) * self.features);
+            return self.layers_of(m, false, directions, |groups, input, out| {
+                let own = &mut own[..groups.len() * self.features];
+                nodes.interpolate(at, groups.start, &features, self.features, own);
+                self.encode(own, input);
+                self.multiply_by_first(input, out);
+            });
+        }
+        let width = self.layers[0].outputs;
+        let mut values = Buffer::stale(count * width);
+        self.multiply_by_first(&features, &mut values);
+        self.layers_of(m, false, directions, |groups, _, out| nodes.interpolate(at, groups.start, &values, width, out))
+    }
+
+    /// Returns a function that computes the features of up to `most` positions.
+    fn features_at<'b>(&'b self, pairs: Pairs<'b, T>, most: usize) -> impl FnMut(Places<'_, T>, &mut [T]) + 'b {
+        let [mut of_planes, mut products] = [(); 2].map(|()| Buffer::stale(most * self.products));
+        move |at, features| {
+            let count = at[0].len();
             let [of_planes, products] = [&mut of_planes, &mut products].map(|values| &mut values[..count * self.products]);
             lookup::planes(pairs, at, of_planes);
             lookup::times_lines(pairs, at, of_planes, products);
-            let features = &mut features[..count * self.features];
             let products = Matrix::new(products, count, self.products);
             multiply(products, Matrix::new(self.basis, self.products, self.features), features, self.precision);
-            let rows = inputs[0][own(self.layers[0].inputs)].chunks_exact_mut(self.layers[0].inputs);
-            rows.zip(features.chunks_exact(self.features)).for_each(|(input, features)| encode(features, self.octaves, input));
+        }
+    }
+
+    /// Writes the inputs of the first layer from features.
+    fn encode(&self, features: &[T], input: &mut [T]) {
+        let rows = features.chunks_exact(self.features).zip(input.chunks_exact_mut(self.layers[0].inputs));
+        rows.for_each(|(features, input)| encode(features, self.octaves, input));
+    }
+
+    /// Multiplies inputs by the weight of the first layer.
+    fn multiply_by_first(&self, input: &[T], out: &mut [T]) {
+        let Layer { weight, inputs, outputs, .. } = self.layers[0];
+        multiply(Matrix::new(input, input.len() / inputs, inputs), Matrix::new(weight, inputs, outputs), out, self.precision);
+    }
+
+    /// Computes the colors of m groups. `first(groups, input, out)` computes the input of the first layer and its product with the weight; if nothing is kept, it
+    /// need not write the input.
+    fn layers_of(
+        &self,
+        m: usize,
+        keep: bool,
+        directions: Directions<'_, T>,
+        mut first: impl FnMut(Range<usize>, &mut [T], &mut [T]),
+    ) -> Activations<T> {
+        let kept = if keep { m } else { ROWS.min(m) };
+        let mut inputs: Vec<_> = self.layers.iter().map(|layer| Buffer::stale(kept * layer.inputs)).collect();
+        let mut rgb = Buffer::stale(3 * m);
+        let mut of_rays = Buffer::stale(ROWS.min(m) * self.layers[0].outputs);
+        let mut rays = Rays::none();
+        for start in (0..m).step_by(ROWS) {
+            let groups = start..m.min(start + ROWS);
+            let count = groups.len();
+            let place = if keep { start } else { 0 };
+            let own = |width: usize| place * width..(place + count) * width;
             rays.find(directions, groups.clone());
             let of_rays = &mut of_rays[..rays.numbers.len() * self.layers[0].outputs];
             let encoded = Matrix::new(&rays.encoded, rays.numbers.len(), directions.width);
@@ -156,15 +224,19 @@ impl<'a, T: Real> Network<'a, T> {
             add_bias::<T, false>(of_rays, self.layers[0].bias);
             for (l, layer) in self.layers.iter().enumerate() {
                 let (below, above) = inputs.split_at_mut(l + 1);
-                let input = Matrix::new(&below[l][own(layer.inputs)], count, layer.inputs);
+                let input = &mut below[l][own(layer.inputs)];
                 let out = match above.first_mut() {
                     Some(above) => &mut above[own(layer.outputs)],
                     None => &mut rgb[3 * groups.start..3 * groups.end],
                 };
-                multiply(input, Matrix::new(layer.weight, layer.inputs, layer.outputs), out, self.precision);
                 if l == 0 {
+                    first(groups.clone(), input, out);
                     add_of_rays(out, of_rays, &rays.of_groups);
-                } else if l + 1 < self.layers.len() {
+                    continue;
+                }
+                let weight = Matrix::new(layer.weight, layer.inputs, layer.outputs);
+                multiply(Matrix::new(input, count, layer.inputs), weight, out, self.precision);
+                if l + 1 < self.layers.len() {
                     add_bias::<T, true>(out, layer.bias);
                 } else {
                     add_bias::<T, false>(out, layer.bias);
@@ -370,4 +442,46 @@ fn sigmoid<T: Real, const FUSED: bool>(x: &mut [T]) {
         *x = if *x > T::zero() { above } else { e * above };
     }
 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::encoding;
+    use crate::field::factored::Factored;
+    use crate::geometry::Aabb;
+    use autograd::random::Stream;
+
+    #[test]
+    fn colors_by_nodes_are_those_at_the_positions() {
+        const NODES: [usize; 3] = [5, 4, 6];
+        // Widths with and without a remainder after whole chunks; sines of features, which are not linear.
+        for (features, hidden, feature_octaves) in [(4, 32, 0), (4, 20, 0), (18, 8, 2)] {
+            let directions = encoding::Directions::Harmonics(1);
+            let shape = Shape { density_components: 16, appearance_components: 32, features, hidden, feature_octaves, directions };
+            let field = Factored::<f64>::new(shape, Aabb::cube(1.0), NODES, &Stream::new(3));
+            let tables: Vec<_> = field.tables().iter().map(|table| table * 5.0).collect();
+            let pairs = Pairs::of(&tables[6..12], NODES, 32);
+            let network = Network::new(&shape, &tables[12..], Precision::Full);
+            // More groups than are processed together. The last ones are at nodes and faces.
+            let count = ROWS + 300;
+            let column = |axis: usize| {
+                let most = NODES[axis] as f64 - 1.0;
+                let mut at = Stream::new(axis as u64).uniform_tensor::<f64>(&[count], 0.0, most).data().to_vec();
+                (0..12).for_each(|i| at[count - 1 - i] = (i / [1, 2, 3][axis] % NODES[axis]) as f64);
+                at
+            };
+            let columns = [0, 1, 2].map(column);
+            let at = columns.each_ref().map(|column| &column[..]);
+            let rays: Vec<u32> = (0..count as u32).map(|i| 7 + i / 5).collect();
+            let encoded = Stream::new(9).uniform_tensor::<f64>(&[count * 4], -1.0, 1.0);
+            let directions = Directions { rays: &rays, first: 7, encoded: encoded.data(), width: 4 };
+            assert!(Nodes::around(at, NODES, count / GROUPS_OF_CELL).is_some(), "the cells have enough groups");
+            let [want, found] = [network.forward(pairs, at, false, directions), network.forward_by_nodes(pairs, at, directions)];
+            let largest = want.rgb.iter().zip(&found.rgb[..]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(largest < 1e-12, "{features} features: {largest}");
+            let different = want.rgb.iter().filter(|&&x| (x - want.rgb[0]).abs() > 0.01).count();
+            assert!(different > count, "the colors differ: {different} of {}", want.rgb.len());
+        }
+    }
 }

@@ -31,7 +31,10 @@ impl<T: Real> Scene<'_, T> {
             places.iter_mut().for_each(|place| *place = place.max(T::zero()).min(most));
         }
         let mut block = Block::of_weights(first, offsets, [x, y, z], weight, [t, delta]);
-        self.compute_colors(&mut block);
+        self.form_groups(&mut block);
+        let at = block.groups_at.each_ref().map(|at| &at[..]);
+        let directions = block.directions(&self.batch.encoded);
+        block.activations = self.tables.network.forward_by_nodes(self.tables.appearance, at, directions);
         shown.write(block.weight(), block.color(), self.batch.background, pixels);
         shown.looked_at
     }

@@ -1,0 +1,167 @@
+//! Values that are linear in the products plane · line, at many positions near each other.
+//!
+//! In each cell, the product of a bilinear plane and a linear line is trilinear. So the values at the eight nodes of a cell give those at all positions in it, up to
+//! rounding. Rays of neighbouring pixels see the same cells, which have fewer nodes than the rays have positions.
+
+use super::lookup::{Cells, LANES, Places, RUN, run_of};
+use autograd::{Real, dispatched, parallel};
+
+/// Nodes of a cell: bit 2 of the number is the place along x, bit 1 along y, bit 0 along z.
+const CORNERS: usize = 8;
+/// Mark of an unused place.
+const NONE: u32 = u32::MAX;
+
+/// Cells that contain positions, and their nodes.
+pub struct Nodes<T: Real> {
+    /// Positions of the nodes, in units of cells.
+    pub at: [Vec<T>; 3],
+    /// Numbers of the nodes of each cell.
+    corners: Vec<[u32; CORNERS]>,
+    /// Number of the cell of each position.
+    cells: Vec<u32>,
+    /// Nodes of the grid along each axis.
+    grid: [usize; 3],
+}
+
+impl<T: Real> Nodes<T> {
+    /// Finds the nodes around positions, in units of cells, in a grid with these numbers of nodes. `None` if the positions are in more than `most` cells.
+    pub fn around(at: Places<'_, T>, grid: [usize; 3], most: usize) -> Option<Self> {
+        let number = |[i, j, k]: [usize; 3]| (i * grid[1] + j) * grid[2] + k;
+        let (mut cells, mut lowest) = (Vec::with_capacity(at[0].len()), Vec::new());
+        let mut distinct = Distinct::with_room_for(most + 1);
+        for run in 0..at[0].len().div_ceil(RUN) {
+            let own = Cells::new(run_of(at, run), grid);
+            for i in 0..own.count {
+                let low = own.node.map(|node| node[i] as usize);
+                let cell = distinct.number(number(low));
+                if cell as usize == lowest.len() {
+                    if lowest.len() == most {
+                        return None;
+                    }
+                    lowest.push(low);
+                }
+                cells.push(cell);
+            }
+        }
+        let (mut at, mut distinct) = ([(); 3].map(|()| Vec::new()), Distinct::with_room_for(CORNERS * lowest.len()));
+        let corners = lowest.into_iter().map(|low| {
+            let corner = |corner: usize| {
+                let node = [low[0] + (corner >> 2), low[1] + (corner >> 1 & 1), low[2] + (corner & 1)];
+                let found = distinct.number(number(node));
+                if found as usize == at[0].len() {
+                    at.iter_mut().zip(node).for_each(|(at, node)| at.push(T::lit(node as f64)));
+                }
+                found
+            };
+            std::array::from_fn(corner)
+        });
+        let corners = corners.collect();
+        Some(Nodes { at, corners, cells, grid })
+    }
+
+    /// Computes values at positions from `first` on, which are those of [`around`](Self::around), from those at the nodes, `[nodes, width]`.
+    pub fn interpolate(&self, at: Places<'_, T>, first: usize, values: &[T], width: usize, out: &mut [T]) {
+        for (run, out) in out.chunks_mut(RUN * width).enumerate() {
+            let start = first + run * RUN;
+            let own = start..start + out.len() / width;
+            let corners = &mut [[0; CORNERS]; RUN][..own.len()];
+            corners.iter_mut().zip(&self.cells[own.clone()]).for_each(|(corners, &cell)| *corners = self.corners[cell as usize]);
+            let cells = Cells::new(at.map(|at| &at[own.clone()]), self.grid);
+            match parallel::fused() {
+                true => interpolate_run::<T, true>(&cells, corners, values, out),
+                false => interpolate_run::<T, false>(&cells, corners, values, out),
+            }
+        }
+    }
+}
+
+dispatched! {
+fn interpolate_run<T: Real, const FUSED: bool>(cells: &Cells<T>, corners: &[[u32; CORNERS]], values: &[T], out: &mut [T]) {
+    let width = out.len() / corners.len();
+    for (i, (corners, out)) in corners.iter().zip(out.chunks_exact_mut(width)).enumerate() {
+        let [x, y, z] = [cells.share[0][i], cells.share[1][i], cells.share[2][i]];
+        let along = |share: T, upper: usize| if upper == 1 { share } else { T::one() - share };
+        let (mut weights, mut rows) = ([T::zero(); CORNERS], [&values[..0]; CORNERS]);
+        for c in 0..CORNERS {
+            weights[c] = along(x, c >> 2) * along(y, c >> 1 & 1) * along(z, c & 1);
+            rows[c] = &values[corners[c] as usize * width..][..width];
+        }
+        let (chunks, rest) = out.as_chunks_mut::<LANES>();
+        let whole = chunks.len() * LANES;
+        for (k, chunk) in chunks.iter_mut().enumerate() {
+            let mut sum = [T::zero(); LANES];
+            for c in 0..CORNERS {
+                let row: &[T; LANES] = rows[c][k * LANES..].first_chunk().expect("a chunk of each row");
+                let old = sum;
+                for l in 0..LANES {
+                    sum[l] = row[l].multiply_add::<FUSED>(weights[c], old[l]);
+                }
+            }
+            *chunk = sum;
+        }
+        for (l, value) in rest.iter_mut().enumerate() {
+            *value = T::zero();
+            for c in 0..CORNERS {
+                *value = rows[c][whole + l].multiply_add::<FUSED>(weights[c], *value);
+            }
+        }
+    }
+}
+}
+
+/// Numbers of distinct keys, in the order in which they come first: a hash table with open addressing.
+struct Distinct {
+    /// Key and its number.
+    places: Vec<(usize, u32)>,
+    count: u32,
+}
+
+impl Distinct {
+    fn with_room_for(keys: usize) -> Self {
+        Distinct { places: vec![(0, NONE); (2 * keys).next_power_of_two()], count: 0 }
+    }
+
+    /// Returns the number of a key.
+    fn number(&mut self, key: usize) -> u32 {
+        /// 2⁶⁴ divided by the golden ratio.
+        const FACTOR: u64 = 0x9e37_79b9_7f4a_7c15;
+        let last = self.places.len() - 1;
+        let mut place = ((key as u64).wrapping_mul(FACTOR) >> 32) as usize & last;
+        loop {
+            let (found, number) = self.places[place];
+            if number == NONE {
+                self.places[place] = (key, self.count);
+                self.count += 1;
+                return self.count - 1;
+            }
+            if found == key {
+                return number;
+            }
+            place = (place + 1) & last;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use autograd::random::Stream;
+
+    #[test]
+    fn nodes_of_cells_are_found_once_and_many_cells_are_refused() {
+        let grid = [4, 3, 5];
+        let columns = [0, 1, 2].map(|axis| {
+            let most = grid[axis] as f64 - 1.0;
+            Stream::new(axis as u64).uniform_tensor::<f64>(&[2000], 0.0, most).data().to_vec()
+        });
+        let at = columns.each_ref().map(|column| &column[..]);
+        let cells = 3 * 2 * 4;
+        let nodes = Nodes::around(at, grid, cells).expect("as many cells as may be");
+        let mut found: Vec<_> = (0..nodes.at[0].len()).map(|n| nodes.at.each_ref().map(|at| at[n] as usize)).collect();
+        found.sort_unstable();
+        let all: Vec<_> = (0..4).flat_map(|i| (0..3).flat_map(move |j| (0..5).map(move |k| [i, j, k]))).collect();
+        assert_eq!(found, all);
+        assert!(Nodes::around(at, grid, cells - 1).is_none());
+        assert!(Nodes::<f64>::around([&[]; 3], grid, 0).is_some_and(|nodes| nodes.at[0].is_empty()));
+    }
+}
