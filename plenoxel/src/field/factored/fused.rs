@@ -2,15 +2,15 @@
 //!
 //! *Forward.* Rays are processed in blocks. Each block computes the densities of its samples and their weights, forms groups
 //! ([`Grouping`]), and evaluates the color network at one position of each group, for all groups of the block together. Pictures have densities from a table,
-//! and the linear part of the network at the nodes of cells that contain many groups (`fused/nodes.rs`).
+//! and the linear part of the network at the nodes of cells where a block has many groups in each (`fused/nodes.rs`).
 //!
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after
 //! another ([`RowSums`](autograd::RowSums)), and the blocks add their contributions in the order of the rays. No two threads write to the same location, and
 //! the sums are bit-identical for any number of threads. Small gradients can be pruned at random ([`Factored::gradient_above`]).
 //!
-//! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of its kept samples, and adds them up for each
-//! ray.
+//! *Tracked rays.* If gradients flow to the rays, each block also computes the cotangents of the positions of its kept samples and of encoded directions, and adds
+//! them up for each ray.
 
 mod adjoint;
 mod densities;

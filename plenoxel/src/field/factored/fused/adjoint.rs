@@ -243,14 +243,14 @@ fn part<T: Real>(
     let samples_at = block.at().map(|at| pruning::picked(at, &samples));
     let groups_at = block.groups_at.each_ref().map(|at| pruning::picked(at, &groups));
     let density_lines = of_density_lines(tables.density, slices(&samples_at), &of_samples);
-    let directions = (block.directions(&batch.encoded), state.tracked.is_some());
-    let OfNetwork { products, directions, lines, parameters } =
-        tables.network.adjoint(&block.activations, &groups, (tables.appearance, slices(&groups_at)), directions, &rgb);
+    let seen = (block.seen(&batch.encoded), state.tracked.is_some());
+    let OfNetwork { products, encoded, lines, parameters } =
+        tables.network.adjoint(&block.activations, &groups, (tables.appearance, slices(&groups_at)), seen, &rgb);
     let density = Kept::new(samples, samples_at, of_samples, tables.density);
     let products = Kept::new(groups, groups_at, products, tables.appearance);
     let rays = state.tracked.as_ref().map(|tracked| {
         let [of_origins, of_directions] = positions::of_rays(tracked, block, tables, [&density, &products]);
-        [directions, of_origins, of_directions]
+        [encoded, of_origins, of_directions]
     });
     (Part { density, products }, [density_lines, lines].into_iter().chain(parameters).collect(), rays)
 }

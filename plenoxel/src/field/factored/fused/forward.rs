@@ -2,7 +2,7 @@
 
 use super::Batch;
 use super::lookup::{self, Pairs, RUN};
-use super::network::{Activations, Directions, Network};
+use super::network::{Activations, Network, Seen};
 use crate::camera::Ray;
 use crate::field::grouping::Groups;
 use crate::geometry::Aabb;
@@ -104,9 +104,9 @@ impl<T: Real> Block<T> {
     }
 
     /// Returns the directions of the groups, from the encoded directions of all rays, `[n, e]`.
-    pub fn directions<'a>(&'a self, encoded: &'a Tensor<T>) -> Directions<'a, T> {
+    pub fn seen<'a>(&'a self, encoded: &'a Tensor<T>) -> Seen<'a, T> {
         let (width, rays) = (encoded.shape()[1], self.first..self.first + self.offsets.len() - 1);
-        Directions { rays: &self.groups.rays, first: self.first, encoded: &encoded.data()[rays.start * width..rays.end * width], width }
+        Seen { rays: &self.groups.rays, first: self.first, encoded: &encoded.data()[rays.start * width..rays.end * width], width }
     }
 
     /// Returns the color of a sample.
@@ -169,7 +169,7 @@ impl<'a, T: Real> Scene<'a, T> {
     pub fn render(&self, first: usize, pixels: &mut [T], sparsity: &mut [T]) -> Block<T> {
         let mut block = self.samples(first, sparsity.len());
         self.form_groups(&mut block);
-        self.shade(&mut block);
+        self.shade(&mut block, false);
         let (along, color, sigma) = (block.along(), block.color(), block.sigma());
         for ((own, pixel), sparsity) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0).zip(sparsity) {
             *pixel = along.pixel(own.clone(), self.batch.background, |i| sigma[i], &color);
@@ -271,11 +271,11 @@ impl<'a, T: Real> Scene<'a, T> {
         (block.groups, block.groups_at) = (groups, means);
     }
 
-    /// Evaluates the color network.
-    fn shade(&self, block: &mut Block<T>) {
-        let pairs = self.tables.appearance;
+    /// Evaluates the color network; its linear part at the nodes around the groups if `by_nodes`.
+    pub fn shade(&self, block: &mut Block<T>, by_nodes: bool) {
+        let (network, pairs) = (&self.tables.network, self.tables.appearance);
         let at = block.groups_at.each_ref().map(|at| &at[..]);
-        let directions = block.directions(&self.batch.encoded);
-        block.activations = self.tables.network.forward(pairs, at, self.keep, directions);
+        let seen = block.seen(&self.batch.encoded);
+        block.activations = if by_nodes { network.forward_by_nodes(pairs, at, seen) } else { network.forward(pairs, at, self.keep, seen) };
     }
 }

@@ -182,7 +182,7 @@ pub(super) fn line_at<T: Real, const FUSED: bool>(table: &[[T; LANES]], along: A
 
 /// Adds `weight` times a chunk to a sum.
 #[inline(always)]
-fn add_to<T: Real, const FUSED: bool>(sum: &mut [T; LANES], value: &[T; LANES], weight: T) {
+pub(super) fn add_to<T: Real, const FUSED: bool>(sum: &mut [T; LANES], value: &[T; LANES], weight: T) {
     let old = *sum;
     let mut new = [T::zero(); LANES];
     for l in 0..LANES {

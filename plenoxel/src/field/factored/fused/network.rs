@@ -1,7 +1,7 @@
 //! The color network on arrays, from the planes and lines of the appearance to colors: forward and adjoint for the groups of samples of one block.
 //!
-//! All groups of a ray see its encoded direction d. With the input (f, d) of the first layer, x W = f W_f + d W_d: the second product, and its adjoint, are computed
-//! once for each ray.
+//! The input of the first layer is x = (γ(f), e(d)): encoded features f of a group, and the encoded direction d of its ray. So x W = γ(f) W_f + e(d) W_d. The second
+//! product and its adjoint are computed once for each ray of a chunk of groups.
 
 use super::super::Shape;
 use super::lookup::{self, Cotangents, Pairs, Places};
@@ -13,8 +13,8 @@ use std::ops::Range;
 /// Number of groups, or of samples, that are processed before others: their values stay in the second-level cache.
 pub const ROWS: usize = 256;
 
-/// Fewest groups in a cell, on average, for which [`Network::forward_by_nodes`] computes values at nodes.
-const GROUPS_OF_CELL: usize = 4;
+/// Fewest groups for each node, on average, for which [`Network::forward_by_nodes`] computes values at nodes.
+const GROUPS_OF_NODE: usize = 2;
 
 /// Linear layer.
 #[derive(Clone, Copy)]
@@ -33,21 +33,21 @@ pub struct Network<'a, T> {
     octaves: usize,
     /// Layers; the first one without the rows of its weight that encoded directions are multiplied by.
     layers: Vec<Layer<'a, T>>,
-    /// These rows.
-    of_directions: &'a [T],
+    /// Rows of the first layer's weight that encoded directions are multiplied by, `[e, outputs]`.
+    of_directions: Matrix<'a, T>,
     precision: Precision,
 }
 
-/// Directions in which the groups of a block are seen.
+/// The directions in which the groups of a block are seen.
 #[derive(Clone, Copy)]
-pub struct Directions<'a, T> {
+pub struct Seen<'a, T> {
     /// Number of the ray of each group. The groups of a ray follow one another.
     pub rays: &'a [u32],
     /// Number of the first ray of the block.
     pub first: usize,
     /// Encoded directions of the rays of the block, `[rays, e]`.
     pub encoded: &'a [T],
-    /// e.
+    /// Numbers of an encoded direction, e.
     pub width: usize,
 }
 
@@ -67,15 +67,15 @@ impl<T: Real> Rays<T> {
     }
 
     /// Finds the rays of these groups.
-    fn find(&mut self, directions: Directions<'_, T>, groups: impl Iterator<Item = usize>) {
+    fn find(&mut self, seen: Seen<'_, T>, groups: impl Iterator<Item = usize>) {
         self.numbers.clear();
         self.of_groups.clear();
         self.encoded.clear();
         for group in groups {
-            let ray = directions.rays[group] as usize - directions.first;
+            let ray = seen.rays[group] as usize - seen.first;
             if self.numbers.last() != Some(&ray) {
                 self.numbers.push(ray);
-                self.encoded.extend_from_slice(&directions.encoded[ray * directions.width..][..directions.width]);
+                self.encoded.extend_from_slice(&seen.encoded[ray * seen.width..][..seen.width]);
             }
             self.of_groups.push(self.numbers.len() - 1);
         }
@@ -96,7 +96,7 @@ pub struct OfNetwork<T: Real> {
     /// Cotangents of the products, `[m, 3 R]`.
     pub products: Buffer<T>,
     /// Cotangents of the encoded directions of the rays of the block, `[rays, e]`, if they are tracked.
-    pub directions: Buffer<T>,
+    pub encoded: Buffer<T>,
     /// Cotangents of the three lines of the appearance, one after another.
     pub lines: Buffer<T>,
     /// Cotangents of the matrix and of the layers' weights and biases, in the order of the parameters.
@@ -112,8 +112,10 @@ impl<'a, T: Real> Network<'a, T> {
             Layer { weight: pair[0].data(), bias: pair[1].data(), inputs, outputs }
         };
         let mut layers: Vec<_> = tables[1..].chunks(2).map(layer).collect();
-        let (of_features, of_directions) = layers[0].weight.split_at(encoded * layers[0].outputs);
-        (layers[0].weight, layers[0].inputs) = (of_features, encoded);
+        let first = &mut layers[0];
+        let (of_features, of_directions) = first.weight.split_at(encoded * first.outputs);
+        let of_directions = Matrix::new(of_directions, first.inputs - encoded, first.outputs);
+        (first.weight, first.inputs) = (of_features, encoded);
         Network {
             basis: tables[0].data(),
             products: tables[0].shape()[0],
@@ -125,18 +127,12 @@ impl<'a, T: Real> Network<'a, T> {
         }
     }
 
-    /// Returns the rows of the first layer's weight that encoded directions are multiplied by, `[e, outputs]`.
-    fn of_directions(&self) -> Matrix<'a, T> {
-        let outputs = self.layers[0].outputs;
-        Matrix::new(self.of_directions, self.of_directions.len() / outputs, outputs)
-    }
-
     /// Computes the colors of groups from the planes and lines of the appearance at their positions. The inputs of the layers are kept for the adjoint if `keep`.
-    pub fn forward(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, keep: bool, directions: Directions<'_, T>) -> Activations<T> {
+    pub fn forward(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, keep: bool, seen: Seen<'_, T>) -> Activations<T> {
         let m = at[0].len();
         let mut features_at = self.features_at(pairs, ROWS.min(m));
         let mut features = Buffer::stale(ROWS.min(m) * self.features);
-        self.layers_of(m, keep, directions, |groups, input, out| {
+        self.layers_of(m, keep, seen, |groups, input, out| {
             let features = &mut features[..groups.len() * self.features];
             features_at(at.map(|at| &at[groups.clone()]), features);
             self.encode(features, input);
@@ -144,33 +140,39 @@ impl<'a, T: Real> Network<'a, T> {
         })
     }
 
-    /// Computes the colors of groups near each other, without an adjoint. What is linear in the products, up to the output of the first layer, or to the features if
-    /// the layer reads sines of them, is computed at the nodes of the groups' cells ([`Nodes`]), unless they are too many.
-    pub fn forward_by_nodes(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, directions: Directions<'_, T>) -> Activations<T> {
+    /// Computes the colors of groups near each other, without an adjoint. What is linear in the products is computed at the nodes around the groups ([`Nodes`]), unless
+    /// they are too many: the product of the features with the weight of the first layer, or the features if the layer reads sines of them. In mixed precision,
+    /// factors are rounded at the nodes.
+    pub fn forward_by_nodes(&self, pairs: Pairs<'_, T>, at: Places<'_, T>, seen: Seen<'_, T>) -> Activations<T> {
         let m = at[0].len();
-        let Some(nodes) = Nodes::around(at, pairs.nodes, m / GROUPS_OF_CELL) else {
-            return self.forward(pairs, at, false, directions);
+        let Some(nodes) = Nodes::around(at, pairs.nodes, m / GROUPS_OF_NODE) else {
+            return self.forward(pairs, at, false, seen);
         };
-        let count = nodes.at[0].len();
-        let mut features = Buffer::stale(count * self.features);
-        let mut features_at = self.features_at(pairs, ROWS.min(count));
-        for (chunk, features) in features.chunks_mut(ROWS * self.features).enumerate() {
-            let at = nodes.at.each_ref().map(|at| &at[chunk * ROWS..][..features.len() / self.features]);
-            features_at(at, features);
+        let mut features_at = self.features_at(pairs, ROWS.min(nodes.len()));
+        let mut features = Buffer::stale(ROWS.min(m) * self.features);
+        let width = if self.octaves == 0 { self.layers[0].outputs } else { self.features };
+        let mut values = Buffer::stale(nodes.len() * width);
+        for (chunk, values) in values.chunks_mut(ROWS * width).enumerate() {
+            let count = values.len() / width;
+            let places = nodes.places.each_ref().map(|places| &places[chunk * ROWS..][..count]);
+            if self.octaves == 0 {
+                let features = &mut features[..count * self.features];
+                features_at(places, features);
+                self.multiply_by_first(features, values);
+            } else {
+                features_at(places, values);
+            }
         }
-        if self.octaves > 0 {
-            let mut own = Buffer::stale(ROWS.min(m) * self.features);
-            return self.layers_of(m, false, directions, |groups, input, out| {
-                let own = &mut own[..groups.len() * self.features];
-                nodes.interpolate(at, groups.start, &features, self.features, own);
-                self.encode(own, input);
+        self.layers_of(m, false, seen, |groups, input, out| {
+            if self.octaves == 0 {
+                nodes.interpolate(groups.start, &values, out);
+            } else {
+                let features = &mut features[..groups.len() * self.features];
+                nodes.interpolate(groups.start, &values, features);
+                self.encode(features, input);
                 self.multiply_by_first(input, out);
-            });
-        }
-        let width = self.layers[0].outputs;
-        let mut values = Buffer::stale(count * width);
-        self.multiply_by_first(&features, &mut values);
-        self.layers_of(m, false, directions, |groups, _, out| nodes.interpolate(at, groups.start, &values, width, out))
+            }
+        })
     }
 
     /// Returns a function that computes the features of up to `most` positions.
@@ -204,7 +206,7 @@ impl<'a, T: Real> Network<'a, T> {
         &self,
         m: usize,
         keep: bool,
-        directions: Directions<'_, T>,
+        seen: Seen<'_, T>,
         mut first: impl FnMut(Range<usize>, &mut [T], &mut [T]),
     ) -> Activations<T> {
         let kept = if keep { m } else { ROWS.min(m) };
@@ -217,25 +219,23 @@ impl<'a, T: Real> Network<'a, T> {
             let count = groups.len();
             let place = if keep { start } else { 0 };
             let own = |width: usize| place * width..(place + count) * width;
-            rays.find(directions, groups.clone());
+            rays.find(seen, groups.clone());
             let of_rays = &mut of_rays[..rays.numbers.len() * self.layers[0].outputs];
-            let encoded = Matrix::new(&rays.encoded, rays.numbers.len(), directions.width);
-            multiply(encoded, self.of_directions(), of_rays, self.precision);
+            let encoded = Matrix::new(&rays.encoded, rays.numbers.len(), seen.width);
+            multiply(encoded, self.of_directions, of_rays, self.precision);
             add_bias::<T, false>(of_rays, self.layers[0].bias);
-            for (l, layer) in self.layers.iter().enumerate() {
+            let (input, above) = inputs.split_at_mut(1);
+            let out = &mut above[0][own(self.layers[0].outputs)];
+            first(groups.clone(), &mut input[0][own(self.layers[0].inputs)], out);
+            add_of_rays(out, of_rays, &rays.of_groups);
+            for (l, layer) in self.layers.iter().enumerate().skip(1) {
                 let (below, above) = inputs.split_at_mut(l + 1);
-                let input = &mut below[l][own(layer.inputs)];
+                let input = Matrix::new(&below[l][own(layer.inputs)], count, layer.inputs);
                 let out = match above.first_mut() {
                     Some(above) => &mut above[own(layer.outputs)],
                     None => &mut rgb[3 * groups.start..3 * groups.end],
                 };
-                if l == 0 {
-                    first(groups.clone(), input, out);
-                    add_of_rays(out, of_rays, &rays.of_groups);
-                    continue;
-                }
-                let weight = Matrix::new(layer.weight, layer.inputs, layer.outputs);
-                multiply(Matrix::new(input, count, layer.inputs), weight, out, self.precision);
+                multiply(input, Matrix::new(layer.weight, layer.inputs, layer.outputs), out, self.precision);
                 if l + 1 < self.layers.len() {
                     add_bias::<T, true>(out, layer.bias);
                 } else {
@@ -257,15 +257,15 @@ impl<'a, T: Real> Network<'a, T> {
         activations: &Activations<T>,
         numbers: &[u32],
         (pairs, at): (Pairs<'_, T>, Places<'_, T>),
-        (directions, tracked): (Directions<'_, T>, bool),
+        (seen, tracked): (Seen<'_, T>, bool),
         of_colors: &[T],
     ) -> OfNetwork<T> {
         let mut lengths = vec![self.basis.len()];
         lengths.extend(self.layers.iter().flat_map(|layer| [layer.weight.len(), layer.bias.len()]));
-        lengths[1] += self.of_directions.len();
+        lengths[1] += seen.width * self.layers[0].outputs;
         let mut of = OfNetwork {
             products: Buffer::stale(numbers.len() * self.products),
-            directions: Buffer::zeros(if tracked { directions.encoded.len() } else { 0 }),
+            encoded: Buffer::zeros(if tracked { seen.encoded.len() } else { 0 }),
             lines: pairs.zeros_of_lines(),
             parameters: lengths.into_iter().map(Buffer::zeros).collect(),
         };
@@ -283,15 +283,15 @@ impl<'a, T: Real> Network<'a, T> {
             let of_products = &mut of.products[groups.start * self.products..groups.end * self.products];
             let of_logits = of_logits(&activations.rgb, of_colors, numbers);
             let of_hidden = self.add_adjoint((products, &inputs), of_logits, of_products, &mut of.parameters);
-            rays.find(directions, numbers.iter().map(|&i| i as usize));
-            self.add_adjoint_of_rays(&rays, &of_hidden, (directions.width, &mut of.directions), &mut of.parameters[1..3]);
             lookup::add_to_lines(pairs, at, of_planes, Cotangents::Each(of_products), &mut of.lines);
+            rays.find(seen, numbers.iter().map(|&i| i as usize));
+            self.add_adjoint_of_rays(&rays, &of_hidden, seen.width, &mut of);
         }
         of
     }
 
-    /// Computes the cotangents of products for some groups with these products and inputs of layers, from those of the output of the last layer, and adds those of
-    /// the parameters, but for directions and bias in the first layer. Returns the cotangents of the output of the first layer, `[m, outputs]`.
+    /// Computes the cotangents of products for some groups with these products and inputs of layers, from those of the output of the last layer. Adds those of the
+    /// parameters, without the first layer's bias and rows for directions. Returns the cotangents of the output of the first layer, `[m, outputs]`.
     fn add_adjoint(
         &self,
         (products, inputs): (&[T], &[&[T]]),
@@ -326,25 +326,23 @@ impl<'a, T: Real> Network<'a, T> {
         g
     }
 
-    /// Adds the cotangents of bias and of the rows for directions of the first layer, and of the directions if there are any, from those of the output of the
-    /// first layer for the groups of these rays.
-    fn add_adjoint_of_rays(&self, rays: &Rays<T>, of_hidden: &[T], (width, of_directions): (usize, &mut [T]), sums: &mut [Buffer<T>]) {
+    /// Adds the cotangents that the rays of some groups contribute, from those of the output of the first layer for these groups: of its bias, of the rows of its weight
+    /// for directions, and, if rays are tracked, of encoded directions, which have `width` numbers.
+    fn add_adjoint_of_rays(&self, rays: &Rays<T>, of_hidden: &[T], width: usize, of: &mut OfNetwork<T>) {
         let (first, count) = (&self.layers[0], rays.numbers.len());
         let mut of_rays = Buffer::zeros(count * first.outputs);
-        for (g, &ray) in of_hidden.chunks_exact(first.outputs).zip(&rays.of_groups) {
-            add_rows(&mut of_rays[ray * first.outputs..][..first.outputs], g);
-        }
-        let [of_weight, of_bias] = sums else { unreachable!("weight and bias") };
-        add_rows(of_bias, &of_rays);
+        add_to_rays(&mut of_rays, of_hidden, &rays.of_groups);
+        add_rows(&mut of.parameters[2], &of_rays);
         let cotangent = Matrix::new(&of_rays, count, first.outputs);
-        add_product(Matrix::transposed(&rays.encoded, width, count), cotangent, &mut of_weight[first.weight.len()..], self.precision);
-        if of_directions.is_empty() {
+        let of_weight = &mut of.parameters[1][first.weight.len()..];
+        add_product(Matrix::transposed(&rays.encoded, width, count), cotangent, of_weight, self.precision);
+        if of.encoded.is_empty() {
             return;
         }
         let mut of_encoded = Buffer::stale(count * width);
-        multiply(cotangent, self.of_directions().transpose(), &mut of_encoded, self.precision);
+        multiply(cotangent, self.of_directions.transpose(), &mut of_encoded, self.precision);
         for (g, &ray) in of_encoded.chunks_exact(width).zip(&rays.numbers) {
-            add_rows(&mut of_directions[ray * width..][..width], g);
+            add_rows(&mut of.encoded[ray * width..][..width], g);
         }
     }
 }
@@ -407,6 +405,16 @@ fn add_of_rays<T: Real>(out: &mut [T], of_rays: &[T], rays: &[usize]) {
 }
 }
 
+dispatched! {
+/// Adds each row to that of its ray.
+fn add_to_rays<T: Real>(of_rays: &mut [T], rows: &[T], rays: &[usize]) {
+    let width = rows.len() / rays.len();
+    for (row, &ray) in rows.chunks_exact(width).zip(rays) {
+        add_to_row::<T, false>(&mut of_rays[ray * width..][..width], row);
+    }
+}
+}
+
 /// Adds values to a row, and applies ReLU if asked.
 #[inline(always)]
 fn add_to_row<T: Real, const RELU: bool>(row: &mut [T], values: &[T]) {
@@ -447,41 +455,91 @@ fn sigmoid<T: Real, const FUSED: bool>(x: &mut [T]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::encoding;
+    use crate::field::encoding::Directions;
     use crate::field::factored::Factored;
     use crate::geometry::Aabb;
     use autograd::random::Stream;
 
+    const NODES: [usize; 3] = [5, 4, 6];
+    /// More groups than are processed together.
+    const COUNT: usize = ROWS + 300;
+    /// Number of the first ray. Each ray has five groups; one has some in the first chunk and some in the second.
+    const FIRST: usize = 7;
+
+    /// Calls a function with a network, its planes and lines, positions of groups, the last of which are at nodes and faces, and their directions.
+    fn with_network(
+        (features, hidden, feature_octaves): (usize, usize, usize),
+        f: impl Fn(&Network<'_, f64>, Pairs<'_, f64>, Places<'_, f64>, Seen<'_, f64>),
+    ) {
+        let directions = Directions::Harmonics(1);
+        let shape = Shape { density_components: 16, appearance_components: 32, features, hidden, feature_octaves, directions };
+        let field = Factored::<f64>::new(shape, Aabb::cube(1.0), NODES, &Stream::new(3));
+        let tables: Vec<_> = field.tables().iter().map(|table| table * 5.0).collect();
+        let columns = [0, 1, 2].map(|axis| {
+            let most = NODES[axis] as f64 - 1.0;
+            let mut at = Stream::new(axis as u64).uniform_tensor::<f64>(&[COUNT], 0.0, most).data().to_vec();
+            (0..12).for_each(|i| at[COUNT - 1 - i] = (i / [1, 2, 3][axis] % NODES[axis]) as f64);
+            at
+        });
+        let rays: Vec<u32> = (0..COUNT).map(|i| (FIRST + i / 5) as u32).collect();
+        let encoded = Stream::new(9).uniform_tensor::<f64>(&[COUNT.div_ceil(5) * 4], -1.0, 1.0);
+        let seen = Seen { rays: &rays, first: FIRST, encoded: encoded.data(), width: 4 };
+        let pairs = Pairs::of(&tables[6..12], NODES, 32);
+        f(&Network::new(&shape, &tables[12..], Precision::Full), pairs, columns.each_ref().map(|column| &column[..]), seen);
+    }
+
+    /// Group i alone.
+    fn alone<'a>(at: Places<'a, f64>, seen: Seen<'a, f64>, i: usize) -> (Places<'a, f64>, Seen<'a, f64>) {
+        (at.map(|at| &at[i..=i]), Seen { rays: &seen.rays[i..=i], ..seen })
+    }
+
+    fn largest(a: &[f64], b: &[f64]) -> f64 {
+        assert_eq!(a.len(), b.len());
+        a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    }
+
     #[test]
     fn colors_by_nodes_are_those_at_the_positions() {
-        const NODES: [usize; 3] = [5, 4, 6];
         // Widths with and without a remainder after whole chunks; sines of features, which are not linear.
-        for (features, hidden, feature_octaves) in [(4, 32, 0), (4, 20, 0), (18, 8, 2)] {
-            let directions = encoding::Directions::Harmonics(1);
-            let shape = Shape { density_components: 16, appearance_components: 32, features, hidden, feature_octaves, directions };
-            let field = Factored::<f64>::new(shape, Aabb::cube(1.0), NODES, &Stream::new(3));
-            let tables: Vec<_> = field.tables().iter().map(|table| table * 5.0).collect();
-            let pairs = Pairs::of(&tables[6..12], NODES, 32);
-            let network = Network::new(&shape, &tables[12..], Precision::Full);
-            // More groups than are processed together. The last ones are at nodes and faces.
-            let count = ROWS + 300;
-            let column = |axis: usize| {
-                let most = NODES[axis] as f64 - 1.0;
-                let mut at = Stream::new(axis as u64).uniform_tensor::<f64>(&[count], 0.0, most).data().to_vec();
-                (0..12).for_each(|i| at[count - 1 - i] = (i / [1, 2, 3][axis] % NODES[axis]) as f64);
-                at
-            };
-            let columns = [0, 1, 2].map(column);
-            let at = columns.each_ref().map(|column| &column[..]);
-            let rays: Vec<u32> = (0..count as u32).map(|i| 7 + i / 5).collect();
-            let encoded = Stream::new(9).uniform_tensor::<f64>(&[count * 4], -1.0, 1.0);
-            let directions = Directions { rays: &rays, first: 7, encoded: encoded.data(), width: 4 };
-            assert!(Nodes::around(at, NODES, count / GROUPS_OF_CELL).is_some(), "the cells have enough groups");
-            let [want, found] = [network.forward(pairs, at, false, directions), network.forward_by_nodes(pairs, at, directions)];
-            let largest = want.rgb.iter().zip(&found.rgb[..]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-            assert!(largest < 1e-12, "{features} features: {largest}");
-            let different = want.rgb.iter().filter(|&&x| (x - want.rgb[0]).abs() > 0.01).count();
-            assert!(different > count, "the colors differ: {different} of {}", want.rgb.len());
+        for sizes in [(4, 32, 0), (4, 20, 0), (18, 8, 2)] {
+            with_network(sizes, |network, pairs, at, seen| {
+                assert!(Nodes::around(at, NODES, COUNT / GROUPS_OF_NODE).is_some(), "the nodes are few enough");
+                let [want, found] = [network.forward(pairs, at, false, seen), network.forward_by_nodes(pairs, at, seen)];
+                let largest = largest(&want.rgb, &found.rgb);
+                assert!(largest < 1e-12, "{sizes:?}: {largest}");
+                let different = want.rgb.iter().filter(|&&x| (x - want.rgb[0]).abs() > 0.01).count();
+                assert!(different > COUNT, "the colors differ: {different} of {}", want.rgb.len());
+            });
         }
+    }
+
+    #[test]
+    fn colors_and_cotangents_of_many_groups_are_those_of_each_alone() {
+        with_network((4, 20, 0), |network, pairs, at, seen| {
+            let all = network.forward(pairs, at, true, seen);
+            let of_colors = Stream::new(5).uniform_tensor::<f64>(&[3 * COUNT], -1.0, 1.0);
+            // Some groups are pruned.
+            let numbers: Vec<u32> = (0..COUNT as u32).filter(|i| i % 7 != 3).collect();
+            let kept = at.map(|at| numbers.iter().map(|&i| at[i as usize]).collect::<Vec<_>>());
+            let kept = kept.each_ref().map(|column| &column[..]);
+            let found = network.adjoint(&all, &numbers, (pairs, kept), (seen, true), of_colors.data());
+            let mut want = found.parameters.iter().chain([&found.encoded, &found.lines]).map(|x| vec![0.0; x.len()]).collect::<Vec<_>>();
+            let mut products = Vec::new();
+            for &i in &numbers {
+                let i = i as usize;
+                let (at, seen) = alone(at, seen, i);
+                let one = network.forward(pairs, at, true, seen);
+                assert!(largest(&one.rgb, &all.rgb[3 * i..3 * i + 3]) < 1e-12, "group {i}");
+                let one = network.adjoint(&one, &[0], (pairs, at), (seen, true), &of_colors.data()[3 * i..3 * i + 3]);
+                for (sum, own) in want.iter_mut().zip(one.parameters.iter().chain([&one.encoded, &one.lines])) {
+                    sum.iter_mut().zip(&own[..]).for_each(|(sum, x)| *sum += x);
+                }
+                products.extend_from_slice(&one.products);
+            }
+            for (want, found) in want.iter().zip(found.parameters.iter().chain([&found.encoded, &found.lines])) {
+                assert!(want.iter().any(|x| x.abs() > 1e-3) && largest(want, found) < 1e-10, "{}", largest(want, found));
+            }
+            assert!(largest(&products, &found.products) < 1e-12);
+        });
     }
 }

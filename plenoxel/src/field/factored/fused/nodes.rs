@@ -3,7 +3,7 @@
 //! In each cell, the product of a bilinear plane and a linear line is trilinear. So the values at the eight nodes of a cell give those at all positions in it, up to
 //! rounding. Rays of neighbouring pixels see the same cells, which have fewer nodes than the rays have positions.
 
-use super::lookup::{Cells, LANES, Places, RUN, run_of};
+use super::lookup::{Cells, LANES, Places, RUN, add_to, run_of};
 use autograd::{Real, dispatched, parallel};
 
 /// Nodes of a cell: bit 2 of the number is the place along x, bit 1 along y, bit 0 along z.
@@ -11,31 +11,33 @@ const CORNERS: usize = 8;
 /// Mark of an unused place.
 const NONE: u32 = u32::MAX;
 
-/// Cells that contain positions, and their nodes.
-pub struct Nodes<T: Real> {
-    /// Positions of the nodes, in units of cells.
-    pub at: [Vec<T>; 3],
+/// Nodes of the cells that contain positions.
+pub struct Nodes<'a, T: Real> {
+    /// Places of the nodes, in units of cells.
+    pub places: [Vec<T>; 3],
     /// Numbers of the nodes of each cell.
     corners: Vec<[u32; CORNERS]>,
+    /// Positions, in units of cells.
+    at: Places<'a, T>,
     /// Number of the cell of each position.
     cells: Vec<u32>,
     /// Nodes of the grid along each axis.
     grid: [usize; 3],
 }
 
-impl<T: Real> Nodes<T> {
-    /// Finds the nodes around positions, in units of cells, in a grid with these numbers of nodes. `None` if the positions are in more than `most` cells.
-    pub fn around(at: Places<'_, T>, grid: [usize; 3], most: usize) -> Option<Self> {
-        let number = |[i, j, k]: [usize; 3]| (i * grid[1] + j) * grid[2] + k;
+impl<'a, T: Real> Nodes<'a, T> {
+    /// Finds the nodes around positions, in units of cells, in a grid with these numbers of nodes. `None` if there are more nodes than `most`, or half as many cells.
+    pub fn around(at: Places<'a, T>, grid: [usize; 3], most: usize) -> Option<Self> {
+        let index = |[i, j, k]: [usize; 3]| (i * grid[1] + j) * grid[2] + k;
         let (mut cells, mut lowest) = (Vec::with_capacity(at[0].len()), Vec::new());
-        let mut distinct = Distinct::with_room_for(most + 1);
+        let mut distinct = Distinct::with_room_for(most / 2 + 1);
         for run in 0..at[0].len().div_ceil(RUN) {
             let own = Cells::new(run_of(at, run), grid);
             for i in 0..own.count {
                 let low = own.node.map(|node| node[i] as usize);
-                let cell = distinct.number(number(low));
+                let cell = distinct.number(index(low));
                 if cell as usize == lowest.len() {
-                    if lowest.len() == most {
+                    if lowest.len() == most / 2 {
                         return None;
                     }
                     lowest.push(low);
@@ -43,33 +45,45 @@ impl<T: Real> Nodes<T> {
                 cells.push(cell);
             }
         }
-        let (mut at, mut distinct) = ([(); 3].map(|()| Vec::new()), Distinct::with_room_for(CORNERS * lowest.len()));
-        let corners = lowest.into_iter().map(|low| {
-            let corner = |corner: usize| {
+        let (mut places, mut corners) = ([(); 3].map(|()| Vec::new()), Vec::with_capacity(lowest.len()));
+        let mut distinct = Distinct::with_room_for(most + CORNERS);
+        for low in lowest {
+            corners.push(std::array::from_fn(|corner| {
                 let node = [low[0] + (corner >> 2), low[1] + (corner >> 1 & 1), low[2] + (corner & 1)];
-                let found = distinct.number(number(node));
-                if found as usize == at[0].len() {
-                    at.iter_mut().zip(node).for_each(|(at, node)| at.push(T::lit(node as f64)));
+                let number = distinct.number(index(node));
+                if number as usize == places[0].len() {
+                    places.iter_mut().zip(node).for_each(|(places, node)| places.push(T::lit(node as f64)));
                 }
-                found
-            };
-            std::array::from_fn(corner)
-        });
-        let corners = corners.collect();
-        Some(Nodes { at, corners, cells, grid })
+                number
+            }));
+            if places[0].len() > most {
+                return None;
+            }
+        }
+        Some(Nodes { places, corners, at, cells, grid })
     }
 
-    /// Computes values at positions from `first` on, which are those of [`around`](Self::around), from those at the nodes, `[nodes, width]`.
-    pub fn interpolate(&self, at: Places<'_, T>, first: usize, values: &[T], width: usize, out: &mut [T]) {
+    /// Returns the number of nodes.
+    pub fn len(&self) -> usize {
+        self.places[0].len()
+    }
+
+    /// Computes the values at the positions from `first` on that `out` has rows for, from those at the nodes, `[nodes, width]`.
+    pub fn interpolate(&self, first: usize, values: &[T], out: &mut [T]) {
+        if out.is_empty() {
+            return;
+        }
+        let width = values.len() / self.len();
         for (run, out) in out.chunks_mut(RUN * width).enumerate() {
             let start = first + run * RUN;
             let own = start..start + out.len() / width;
             let corners = &mut [[0; CORNERS]; RUN][..own.len()];
             corners.iter_mut().zip(&self.cells[own.clone()]).for_each(|(corners, &cell)| *corners = self.corners[cell as usize]);
-            let cells = Cells::new(at.map(|at| &at[own.clone()]), self.grid);
-            match parallel::fused() {
-                true => interpolate_run::<T, true>(&cells, corners, values, out),
-                false => interpolate_run::<T, false>(&cells, corners, values, out),
+            let cells = Cells::new(self.at.map(|at| &at[own.clone()]), self.grid);
+            if parallel::fused() {
+                interpolate_run::<T, true>(&cells, corners, values, out);
+            } else {
+                interpolate_run::<T, false>(&cells, corners, values, out);
             }
         }
     }
@@ -92,10 +106,7 @@ fn interpolate_run<T: Real, const FUSED: bool>(cells: &Cells<T>, corners: &[[u32
             let mut sum = [T::zero(); LANES];
             for c in 0..CORNERS {
                 let row: &[T; LANES] = rows[c][k * LANES..].first_chunk().expect("a chunk of each row");
-                let old = sum;
-                for l in 0..LANES {
-                    sum[l] = row[l].multiply_add::<FUSED>(weights[c], old[l]);
-                }
+                add_to::<T, FUSED>(&mut sum, row, weights[c]);
             }
             *chunk = sum;
         }
@@ -148,20 +159,24 @@ mod tests {
     use autograd::random::Stream;
 
     #[test]
-    fn nodes_of_cells_are_found_once_and_many_cells_are_refused() {
+    fn nodes_are_found_once_and_too_many_are_refused() {
         let grid = [4, 3, 5];
         let columns = [0, 1, 2].map(|axis| {
             let most = grid[axis] as f64 - 1.0;
             Stream::new(axis as u64).uniform_tensor::<f64>(&[2000], 0.0, most).data().to_vec()
         });
         let at = columns.each_ref().map(|column| &column[..]);
-        let cells = 3 * 2 * 4;
-        let nodes = Nodes::around(at, grid, cells).expect("as many cells as may be");
-        let mut found: Vec<_> = (0..nodes.at[0].len()).map(|n| nodes.at.each_ref().map(|at| at[n] as usize)).collect();
-        found.sort_unstable();
         let all: Vec<_> = (0..4).flat_map(|i| (0..3).flat_map(move |j| (0..5).map(move |k| [i, j, k]))).collect();
+        let nodes = Nodes::around(at, grid, all.len()).expect("as many nodes as may be");
+        let mut found: Vec<_> = (0..nodes.len()).map(|n| nodes.places.each_ref().map(|places| places[n] as usize)).collect();
+        found.sort_unstable();
         assert_eq!(found, all);
-        assert!(Nodes::around(at, grid, cells - 1).is_none());
-        assert!(Nodes::<f64>::around([&[]; 3], grid, 0).is_some_and(|nodes| nodes.at[0].is_empty()));
+        assert!(Nodes::around(at, grid, all.len() - 1).is_none());
+        // Eight cells that have 64 nodes, and three of them.
+        let apart = [0, 1, 2].map(|axis| (0..8).map(|i| f64::from(2 * (i >> axis & 1)) + 0.5).collect::<Vec<_>>());
+        let apart = apart.each_ref().map(|column| &column[..]);
+        assert!(Nodes::around(apart, [4; 3], 63).is_none() && Nodes::around(apart, [4; 3], 64).is_some());
+        assert!(Nodes::around(apart, [4; 3], 15).is_none() && Nodes::around(apart.map(|at| &at[..3]), [4; 3], 24).is_some());
+        assert!(Nodes::<f64>::around([&[]; 3], grid, 0).is_some_and(|nodes| nodes.len() == 0));
     }
 }

@@ -1,4 +1,4 @@
-//! Cotangents of rays: those of the positions of their samples, and of the directions in which samples are seen.
+//! Cotangents of the origins and directions of rays, from those of the positions of their samples.
 
 use super::super::PLANE_OF;
 use super::Tracked;
