@@ -1,8 +1,8 @@
 //! Fused kernel: the pixels of [`composite()`] in one pass over a factored field, with a hand-written adjoint.
 //!
 //! *Forward.* Rays are processed in blocks. Each block computes the densities of its samples and their weights, forms groups
-//! ([`Grouping`]), and evaluates the color network at one position of each group, for all groups of the block together. Pictures have densities from a table,
-//! and the linear part of the network at the nodes of cells where a block has many groups in each (`fused/nodes.rs`).
+//! ([`Grouping`]), and evaluates the color network at one position of each group, for all groups of the block together. Pictures read densities from a
+//! table. If a block of their rays has many groups in few cells, the linear part of the network is computed at the nodes of these cells (`fused/nodes.rs`).
 //!
 //! *Adjoint.* Each block computes the cotangents of densities, of products, of its lines and of its network, and sorts its samples by the
 //! rows of each plane that they read. The sums over the planes' rows are not computed yet: the optimizer requests one range of rows after

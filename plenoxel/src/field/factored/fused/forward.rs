@@ -168,8 +168,7 @@ impl<'a, T: Real> Scene<'a, T> {
     /// Renders rays from `first` on, one for each entry of `sparsity`.
     pub fn render(&self, first: usize, pixels: &mut [T], sparsity: &mut [T]) -> Block<T> {
         let mut block = self.samples(first, sparsity.len());
-        self.form_groups(&mut block);
-        self.shade(&mut block, false);
+        self.compute_colors(&mut block, false);
         let (along, color, sigma) = (block.along(), block.color(), block.sigma());
         for ((own, pixel), sparsity) in block.rays().zip(pixels.as_chunks_mut::<COLUMNS>().0).zip(sparsity) {
             *pixel = along.pixel(own.clone(), self.batch.background, |i| sigma[i], &color);
@@ -260,8 +259,17 @@ impl<'a, T: Real> Scene<'a, T> {
         }
     }
 
+    /// Computes the colors of samples, from their weights; the linear part of the color network at the nodes around the groups if `by_nodes`.
+    pub fn compute_colors(&self, block: &mut Block<T>, by_nodes: bool) {
+        self.form_groups(block);
+        let (network, pairs) = (&self.tables.network, self.tables.appearance);
+        let at = block.groups_at.each_ref().map(|at| &at[..]);
+        let seen = block.seen(&self.batch.encoded);
+        block.activations = if by_nodes { network.forward_by_nodes(pairs, at, seen) } else { network.forward(pairs, at, self.keep, seen) };
+    }
+
     /// Forms the groups of each ray and computes their positions.
-    pub fn form_groups(&self, block: &mut Block<T>) {
+    fn form_groups(&self, block: &mut Block<T>) {
         let groups = self.batch.grouping.groups(block.weight(), [block.t(), block.delta()], &block.offsets, block.first, self.batch.jitter);
         let mut means = [0, 1, 2].map(|_| Buffer::zeros(groups.len()));
         let at = block.at();
@@ -269,13 +277,5 @@ impl<'a, T: Real> Scene<'a, T> {
             (0..3).for_each(|axis| means[axis][group] += share * at[axis][sample]);
         }
         (block.groups, block.groups_at) = (groups, means);
-    }
-
-    /// Evaluates the color network; its linear part at the nodes around the groups if `by_nodes`.
-    pub fn shade(&self, block: &mut Block<T>, by_nodes: bool) {
-        let (network, pairs) = (&self.tables.network, self.tables.appearance);
-        let at = block.groups_at.each_ref().map(|at| &at[..]);
-        let seen = block.seen(&self.batch.encoded);
-        block.activations = if by_nodes { network.forward_by_nodes(pairs, at, seen) } else { network.forward(pairs, at, self.keep, seen) };
     }
 }

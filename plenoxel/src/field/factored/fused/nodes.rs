@@ -26,7 +26,7 @@ pub struct Nodes<'a, T: Real> {
 }
 
 impl<'a, T: Real> Nodes<'a, T> {
-    /// Finds the nodes around positions, in units of cells, in a grid with these numbers of nodes. `None` if there are more nodes than `most`, or half as many cells.
+    /// Finds the nodes around positions, in units of cells, in a grid with these numbers of nodes. `None` if there are more nodes than `most`, or more cells than half of it.
     pub fn around(at: Places<'a, T>, grid: [usize; 3], most: usize) -> Option<Self> {
         let index = |[i, j, k]: [usize; 3]| (i * grid[1] + j) * grid[2] + k;
         let (mut cells, mut lowest) = (Vec::with_capacity(at[0].len()), Vec::new());
@@ -70,9 +70,6 @@ impl<'a, T: Real> Nodes<'a, T> {
 
     /// Computes the values at the positions from `first` on that `out` has rows for, from those at the nodes, `[nodes, width]`.
     pub fn interpolate(&self, first: usize, values: &[T], out: &mut [T]) {
-        if out.is_empty() {
-            return;
-        }
         let width = values.len() / self.len();
         for (run, out) in out.chunks_mut(RUN * width).enumerate() {
             let start = first + run * RUN;

@@ -31,8 +31,7 @@ impl<T: Real> Scene<'_, T> {
             places.iter_mut().for_each(|place| *place = place.max(T::zero()).min(most));
         }
         let mut block = Block::of_weights(first, offsets, [x, y, z], weight, [t, delta]);
-        self.form_groups(&mut block);
-        self.shade(&mut block, true);
+        self.compute_colors(&mut block, true);
         shown.write(block.weight(), block.color(), self.batch.background, pixels);
         shown.looked_at
     }
