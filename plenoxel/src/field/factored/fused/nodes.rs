@@ -5,11 +5,10 @@
 
 use super::lookup::{Cells, LANES, Places, RUN, add_to, run_of};
 use autograd::{Real, dispatched, parallel};
+use rustc_hash::{FxBuildHasher, FxHashMap};
 
 /// Nodes of a cell: bit 2 of the number is the place along x, bit 1 along y, bit 0 along z.
 const CORNERS: usize = 8;
-/// Mark of an unused place.
-const NONE: u32 = u32::MAX;
 
 /// Nodes of the cells that contain positions.
 pub struct Nodes<'a, T: Real> {
@@ -117,36 +116,18 @@ fn interpolate_run<T: Real, const FUSED: bool>(cells: &Cells<T>, corners: &[[u32
 }
 }
 
-/// Numbers of distinct keys, in the order in which they come first: a hash table with open addressing.
-struct Distinct {
-    /// Key and its number.
-    places: Vec<(usize, u32)>,
-    count: u32,
-}
+/// Numbers of distinct nodes, in the order in which they come first.
+struct Distinct(FxHashMap<usize, u32>);
 
 impl Distinct {
-    fn with_room_for(keys: usize) -> Self {
-        Distinct { places: vec![(0, NONE); (2 * keys).next_power_of_two()], count: 0 }
+    fn with_room_for(nodes: usize) -> Self {
+        Distinct(FxHashMap::with_capacity_and_hasher(nodes, FxBuildHasher))
     }
 
-    /// Returns the number of a key.
-    fn number(&mut self, key: usize) -> u32 {
-        /// 2⁶⁴ divided by the golden ratio.
-        const FACTOR: u64 = 0x9e37_79b9_7f4a_7c15;
-        let last = self.places.len() - 1;
-        let mut place = ((key as u64).wrapping_mul(FACTOR) >> 32) as usize & last;
-        loop {
-            let (found, number) = self.places[place];
-            if number == NONE {
-                self.places[place] = (key, self.count);
-                self.count += 1;
-                return self.count - 1;
-            }
-            if found == key {
-                return number;
-            }
-            place = (place + 1) & last;
-        }
+    /// Returns the number of a node from its index in the grid.
+    fn number(&mut self, index: usize) -> u32 {
+        let next = self.0.len() as u32;
+        *self.0.entry(index).or_insert(next)
     }
 }
 
