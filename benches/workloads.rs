@@ -62,7 +62,7 @@ const ENGINES: [(Engine, &str); 2] = [(Engine::Fused, ""), (Engine::Graph, "grap
 
 fn grid(work: &Work) -> VoxelGrid<f32> {
     let Work { resolution, interpolation, color, .. } = *work;
-    let grid = VoxelGrid::random(GridShape { resolution, half_width: HALF_WIDTH, interpolation, color, sh_reduction: 1 }, 1.0, 1.0, 0);
+    let grid = VoxelGrid::random(GridShape::new(resolution, HALF_WIDTH, interpolation, color), 1.0, 1.0, 0);
     if work.occupied == 1.0 {
         return grid;
     }

@@ -63,7 +63,7 @@ fn a_slab_of_fog_shows_its_closed_form_for_any_number_of_samples() {
 #[test]
 fn a_voxel_grid_with_one_value_is_a_slab_of_fog() {
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
-        let shape = GridShape { resolution: 5, half_width: CUBE, interpolation, color: Color::Rgb, sh_reduction: 1 };
+        let shape = GridShape::new(5, CUBE, interpolation, Color::Rgb);
         let grid = VoxelGrid::<f64>::uniform(shape, 0.7, 0.25);
         let rendered = render(&grid, &rays(), &options(Spacing::Step(0.1), Jitter::None));
         let fog = render(&Fog { sigma: 0.7, color: [0.25; 3] }, &rays(), &options(Spacing::Step(10.0), Jitter::None));
@@ -119,11 +119,7 @@ fn a_ball_shows_the_chord_through_it() {
 
 #[test]
 fn an_empty_box_and_a_missed_box_show_the_background() {
-    let empty = VoxelGrid::<f64>::uniform(
-        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 },
-        0.0,
-        0.7,
-    );
+    let empty = VoxelGrid::<f64>::uniform(GridShape::new(4, CUBE, Interpolation::Trilinear, Color::Rgb), 0.0, 0.7);
     let rendered: Rendered<f64> = no_grad(|| render(&empty, &rays(), &options(Spacing::Step(0.05), Jitter::None)));
     for pixel in rendered.rgb.data().chunks(3) {
         for c in 0..3 {
@@ -142,12 +138,7 @@ fn an_empty_box_and_a_missed_box_show_the_background() {
 
 #[test]
 fn distortion_in_linear_time_equals_the_double_sum() {
-    let grid = VoxelGrid::<f64>::random(
-        GridShape { resolution: 4, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 },
-        2.0,
-        1.0,
-        5,
-    );
+    let grid = VoxelGrid::<f64>::random(GridShape::new(4, CUBE, Interpolation::Trilinear, Color::Rgb), 2.0, 1.0, 5);
     let options = RenderOptions { engine: Engine::Graph, ..options(Spacing::Step(0.2), Jitter::None) };
     let rendered = render(&grid, &rays(), &options);
     let s = rendered.samples().expect("the graph keeps them");
@@ -162,7 +153,7 @@ fn distortion_in_linear_time_equals_the_double_sum() {
 
 #[test]
 fn leaving_out_empty_voxels_changes_no_pixel() {
-    let shape = GridShape { resolution: 12, half_width: CUBE, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
+    let shape = GridShape::new(12, CUBE, Interpolation::Trilinear, Color::Rgb);
     let random = VoxelGrid::<f64>::random(shape, 1.0, 1.0, 8);
     // Nine voxels in ten are empty, some of them negative.
     let density: Vec<f64> = random.density.tensor().data().iter().map(|&d| if d > 0.9 { 5.0 * d } else { d - 0.95 }).collect();
@@ -195,7 +186,7 @@ fn leaving_out_empty_voxels_changes_no_pixel() {
 #[test]
 fn samples_where_nothing_learns_change_no_gradient() {
     for interpolation in [Interpolation::Trilinear, Interpolation::Nearest] {
-        let shape = GridShape { resolution: 12, half_width: CUBE, interpolation, color: Color::Rgb, sh_reduction: 1 };
+        let shape = GridShape::new(12, CUBE, interpolation, Color::Rgb);
         let random = VoxelGrid::<f64>::random(shape, 1.0, 1.0, 8);
         // Four voxels in five are below 0, some are 0.
         let density: Vec<f64> =

@@ -69,8 +69,37 @@ fn a_capture_from_all_around_has_a_viewer_and_films() {
     let near = depth.iter().copied().fold(f32::INFINITY, f32::min);
     // After so few steps, the nearest matter depends on the recipe; in units of the run it would be nearer than 0.5.
     assert!(near > 1.0 && depth.iter().any(|depth| (2.5..5.5).contains(depth)), "nearest {near}");
-    plenoxel(&["bake", &run]).refused(3, &["coordinates of a capture (contracted)", "--space box"]);
-    plenoxel(&["export", "ply", &run]).refused(3, &["coordinates of a capture (contracted)", "--space box"]);
+    baked(&run, "contracted");
+}
+
+/// Bakes a run whose space has this name. The grid renders views and films as other runs do, in its space; exports refuse it and the field.
+fn baked(run: &str, space: &str) {
+    plenoxel(&["bake", run, "--resolution=24"]).done();
+    let grid = format!("{run}-baked");
+    let result: Value = serde_json::from_str(&fs::read_to_string(format!("{grid}/result.json")).unwrap()).unwrap();
+    let field: Value = serde_json::from_str(&fs::read_to_string(format!("{run}/result.json")).unwrap()).unwrap();
+    let (of_grid, of_field) = (result["psnr"].as_f64().unwrap(), field["psnr"].as_f64().unwrap());
+    assert!((of_grid - of_field).abs() < 3.0, "{of_grid} dB instead of {of_field} dB");
+    let scene = scene(&grid);
+    assert!(scene["coordinates"]["space"].to_string().contains(space) && scene["grid"]["resolution"] == 24, "{}", scene["coordinates"]);
+    plenoxel(&["evaluate", &grid]).done();
+    plenoxel(&["render", &grid, "--view=0", "--channels=color,depth,normal", "--format=npy"]).done();
+    let depths = [run, &grid].map(|run| {
+        plenoxel(&["render", run, "--view=0", "--channels=depth", "--format=npy"]).done();
+        let name = fs::read_dir(format!("{run}/renders"))
+            .unwrap()
+            .map(|file| file.unwrap().path())
+            .find(|path| path.to_string_lossy().ends_with("_depth.npy"));
+        let mut depths = floats(&fs::read(name.unwrap()).unwrap());
+        depths.sort_by(f32::total_cmp);
+        depths[depths.len() / 2]
+    });
+    assert!((depths[0] / depths[1] - 1.0).abs() < 0.3, "median depths {depths:?}");
+    assert!(plenoxel(&["info", &grid]).done().contains(&format!("of the space `{space}`")));
+    for run in [run, &grid] {
+        plenoxel(&["export", "ply", run]).refused(3, &[&format!("coordinates of a capture ({space})"), "--space box"]);
+    }
+    plenoxel(&["bake", &grid]).refused(3, &["this is a voxel grid already"]);
 }
 
 /// The numbers of an NPY file of 32-bit floats.
@@ -132,4 +161,5 @@ fn a_forward_facing_capture_has_a_viewer_and_the_spiral_of_llff() {
     assert!(coordinates["space"]["ndc"]["a"].is_f64() && coordinates["stretch"][2].as_f64().unwrap() < 0.5, "{coordinates}");
     render(&run, &["spiral", "cameras"]);
     plenoxel(&["render", &run, "--path", "orbit"]).refused(2, &["forward-facing capture", "--path spiral"]);
+    baked(&run, "ndc");
 }

@@ -1,7 +1,8 @@
 //! Grids on disk.
 
 use plenoxel::checkpoint::{self, Header};
-use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use plenoxel::field::voxel_grid::{Color, GridShape, GridSpace, Interpolation, VoxelGrid};
+use plenoxel::space::Space;
 use std::path::PathBuf;
 
 fn folder(name: &str) -> PathBuf {
@@ -11,13 +12,7 @@ fn folder(name: &str) -> PathBuf {
 }
 
 fn grid() -> (VoxelGrid<f32>, Header) {
-    let shape = GridShape {
-        resolution: 5,
-        half_width: 1.4,
-        interpolation: Interpolation::Trilinear,
-        color: Color::Sh { degree: 2, offset: 0.5 },
-        sh_reduction: 1,
-    };
+    let shape = GridShape::new(5, 1.4, Interpolation::Trilinear, Color::Sh { degree: 2, offset: 0.5 });
     let grid = VoxelGrid::random(shape, 3.0, 1.0, 9);
     let header = Header::new(&grid, "still life", [1.0, 1.0, 1.0], 42, 1234);
     (grid, header)
@@ -89,6 +84,30 @@ fn reduced_harmonics_come_back_and_whole_ones_leave_no_trace_of_them() {
         std::fs::write(&path, replace(&bytes, br#"\"sh_reduction\":2"#, br#"\"sh_reduction\":3"#)).unwrap();
         let message = checkpoint::load::<f32>(&path).expect_err("it is damaged").to_string();
         assert!(message.contains("harmonics of other voxels") || message.contains("list of voxels"), "{message}");
+    }
+}
+
+#[test]
+fn coordinates_of_captures_come_back_and_their_numbers_are_checked() {
+    let path = folder("coordinates").join("checkpoint.safetensors");
+    let ndc = GridSpace { space: Space::Ndc { a: 1.75, b: 2.25 }, stretch: [1.0, 1.0, 0.375].into() };
+    let contracted = GridSpace { space: Space::Contracted, ..GridSpace::WORLD };
+    for (coordinates, sh_reduction) in [(ndc, 1), (contracted, 1), (contracted, 2)] {
+        let shape = GridShape { coordinates, sh_reduction, ..*grid().0.shape() };
+        let grid = VoxelGrid::<f32>::random(shape, 3.0, 1.0, 9);
+        let header = Header::new(&grid, "still life", [1.0; 3], 42, 1234);
+        assert_eq!(header.format, checkpoint::SPACE_FORMAT);
+        checkpoint::save(&path, &grid, &header).expect("it is written");
+        let (read, read_header) = checkpoint::load::<f32>(&path).expect("it is read");
+        assert_eq!((read.shape(), &read_header), (grid.shape(), &header));
+        assert!(read.params().zip(grid.params()).all(|(read, written)| read.tensor().shape() == written.tensor().shape()));
+        let bytes = std::fs::read(&path).unwrap();
+        // A program that knows no coordinates must not read such a file as one of the world.
+        for (found, other) in [(&b"plenoxel 4"[..], &b"plenoxel 2"[..]), (b"1.0,1.0,", b"1.0,0.0,"), (b"1.0,1.0,", b"1.0,-1.,")] {
+            std::fs::write(&path, replace(&bytes, found, other)).unwrap();
+            let refused = checkpoint::load::<f32>(&path).expect_err("it is damaged");
+            assert_eq!(refused.exit_code(), 3, "{refused}");
+        }
     }
 }
 

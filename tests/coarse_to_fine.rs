@@ -17,7 +17,7 @@ fn centers(n: usize) -> Vec<[f64; 3]> {
 }
 
 fn sampled(n: usize, f: impl Fn([f64; 3]) -> f64) -> VoxelGrid<f64> {
-    let shape = GridShape { resolution: n, half_width: 1.0, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
+    let shape = GridShape::new(n, 1.0, Interpolation::Trilinear, Color::Rgb);
     let values: Vec<f64> = centers(n).into_iter().map(f).collect();
     let color =
         Tensor::stack(&[0.1, 0.2, 0.3].map(|s| Tensor::from_vec(values.iter().map(|v| s * v).collect(), &[n * n * n])).each_ref(), 1);
@@ -73,12 +73,7 @@ fn a_field_read_in_a_smaller_cube_is_where_it_was() {
 fn upsampling_keeps_a_nearest_field_everywhere_and_a_trilinear_one_at_the_old_centres() {
     // Three new voxels in each old one: the middle one has the old one's centre.
     for (interpolation, offsets) in [(Interpolation::Nearest, 0..3), (Interpolation::Trilinear, 1..2)] {
-        let old = VoxelGrid::<f64>::random(
-            GridShape { resolution: 4, half_width: 1.3, interpolation, color: Color::Rgb, sh_reduction: 1 },
-            1.0,
-            1.0,
-            3,
-        );
+        let old = VoxelGrid::<f64>::random(GridShape::new(4, 1.3, interpolation, Color::Rgb), 1.0, 1.0, 3);
         let new = old.resample(12);
         let at = |grid: &VoxelGrid<f64>, voxel| grid.density.tensor().data()[grid.lattice().row(voxel).expect("present") as usize];
         for voxel in 0..4 * 4 * 4 {
@@ -93,7 +88,7 @@ fn upsampling_keeps_a_nearest_field_everywhere_and_a_trilinear_one_at_the_old_ce
 
 #[test]
 fn a_sparse_nearest_grid_of_twice_the_resolution_has_eight_voxels_for_each() {
-    let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
+    let shape = GridShape::new(8, 1.0, Interpolation::Nearest, Color::Rgb);
     let old = VoxelGrid::<f32>::random(shape, 1.0, 1.0, 4);
     let old = old.pruned(&old.occupancy(0.6));
     let new = old.resample(16);
@@ -109,7 +104,7 @@ fn a_sparse_nearest_grid_of_twice_the_resolution_has_eight_voxels_for_each() {
 
 #[test]
 fn nearest_look_up_reads_the_voxel_a_point_lies_in() {
-    let shape = GridShape { resolution: 4, half_width: 2.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
+    let shape = GridShape::new(4, 2.0, Interpolation::Nearest, Color::Rgb);
     let grid = VoxelGrid::from_tables(shape, Tensor::constant(numbers(&[64, 1], 0.0, 1.0, 1)), Tensor::zeros(&[64, 3]));
     // Voxels are 1 wide: (−1.99, 0.5, 1.99) lies in (0, 2, 3); its faces belong to the next voxel.
     for (at, row) in [([-1.99, 0.5, 1.99], 11), ([-2.0, -2.0, -2.0], 0), ([-1.0, 0.0, 1.0], 16 + 8 + 3), ([2.0, 2.0, 2.0], 63)] {
@@ -148,7 +143,7 @@ fn pruning_keeps_what_is_visible_and_a_pruned_grid_resamples_to_the_same_field()
 #[test]
 fn the_largest_weight_of_a_voxel_is_that_of_the_samples_that_read_it() {
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
-        let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color: Color::Rgb, sh_reduction: 1 };
+        let shape = GridShape::new(6, 1.0, interpolation, Color::Rgb);
         let grid = VoxelGrid::<f64>::random(shape, 3.0, 1.0, 5);
         let options = RenderOptions {
             aabb: grid.aabb(),
@@ -186,7 +181,7 @@ fn the_largest_weight_of_a_voxel_is_that_of_the_samples_that_read_it() {
 
 /// A shape whose harmonics of degree 1 are stored for every fourth voxel.
 fn reduced(resolution: usize, interpolation: Interpolation) -> GridShape {
-    GridShape { resolution, half_width: 1.0, interpolation, color: Color::Sh { degree: 1, offset: 0.5 }, sh_reduction: 4 }
+    GridShape { sh_reduction: 4, ..GridShape::new(resolution, 1.0, interpolation, Color::Sh { degree: 1, offset: 0.5 }) }
 }
 
 /// Pixels of the rays that tests share.

@@ -27,7 +27,7 @@ fn read(bytes: &[u8], scale: f64) -> Result<Imported, Error> {
 }
 
 fn shape(resolution: usize, interpolation: Interpolation, color: Color) -> GridShape {
-    GridShape { resolution, half_width: 1.5, interpolation, color, sh_reduction: 1 }
+    GridShape::new(resolution, 1.5, interpolation, color)
 }
 
 fn harmonics(degree: usize, offset: f64) -> Color {

@@ -99,7 +99,7 @@ impl<T: Real> Scene<T> {
             0 => Color::Rgb,
             d => Color::Sh { degree: d as usize - 1, offset: [0.0, 0.5][pick(3, 2) as usize] },
         };
-        let shape = GridShape { resolution, half_width: 0.7 + draw(4), interpolation, color, sh_reduction: 1 + pick(13, 4) as usize };
+        let shape = GridShape { sh_reduction: 1 + pick(13, 4) as usize, ..GridShape::new(resolution, 0.7 + draw(4), interpolation, color) };
         let present = [1.0, 0.7, 0.15][pick(5, 3) as usize];
         let lattice = Lattice::bricks_where([resolution; 3], |[i, j, k]| {
             (i, j, k) == (0, 0, 0) || uniform(seed, Purpose::Initial, 3, ((i * 64 + j) * 64 + k) as u64) < present
@@ -140,8 +140,7 @@ const BEYOND_THE_CACHES: [usize; 4] = [144, 92, 72, 60];
 #[test]
 fn rows_read_in_their_own_order_agree() {
     let color = Color::Sh { degree: 2, offset: 0.5 };
-    let shape =
-        GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+    let shape = GridShape::new(BEYOND_THE_CACHES[2], 1.0, Interpolation::Trilinear, color);
     let full = VoxelGrid::<f64>::random(shape, 3.0, 0.3, 7);
     // A third of the voxels is missing, in every brick.
     let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
@@ -154,8 +153,7 @@ fn rows_read_in_their_own_order_agree() {
 #[test]
 fn the_number_of_threads_changes_no_bit_if_rows_are_read_in_their_own_order() {
     let color = Color::Sh { degree: 2, offset: 0.5 };
-    let shape =
-        GridShape { resolution: BEYOND_THE_CACHES[2], half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+    let shape = GridShape::new(BEYOND_THE_CACHES[2], 1.0, Interpolation::Trilinear, color);
     let grid = VoxelGrid::<f64>::random(shape, 3.0, 0.3, 7);
     // So many that the blocks of one thread are larger than those of three.
     let rays = rays_from_above(5, 2100);
@@ -176,7 +174,7 @@ fn the_number_of_threads_changes_no_bit_if_rows_are_read_in_their_own_order() {
 fn rays_of_many_samples_agree_with_nearest_look_up() {
     // More samples than the smallest block has room for, in several runs of a ray. A full grid has no occupancy: its samples are counted before. With missing
     // voxels, the block grows.
-    let shape = GridShape { resolution: 30, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
+    let shape = GridShape::new(30, 1.0, Interpolation::Nearest, Color::Rgb);
     let full = VoxelGrid::<f64>::random(shape, 1.0, 0.3, 7);
     let pruned = full.pruned(&full.voxels_where(|row| row % 3 != 0));
     let rays = rays_from_above(5, 150);
@@ -193,7 +191,7 @@ fn a_picture_shows_what_a_training_batch_shows() {
     // Training reads the colors of harmonics in the order of the table, pictures ray by ray.
     for (degree, resolution) in BEYOND_THE_CACHES.into_iter().enumerate() {
         let color = Color::Sh { degree, offset: 0.5 };
-        let shape = GridShape { resolution, half_width: 1.0, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+        let shape = GridShape::new(resolution, 1.0, Interpolation::Trilinear, color);
         let grid = VoxelGrid::<f64>::random(shape, 2.0, 0.3, 7);
         let rays = rays_from_above(4, 600);
         let options = options(grid.aabb(), Spacing::Step(0.03), Jitter::None, [1.0; 3]);
@@ -212,7 +210,7 @@ fn a_batch_too_large_to_be_kept_is_marched_again_chunk_by_chunk() {
     for (interpolation, color, sh_reduction) in
         [(Interpolation::Nearest, Color::Rgb, 1), (Interpolation::Trilinear, harmonics, 1), (Interpolation::Trilinear, harmonics, 4)]
     {
-        let shape = GridShape { resolution: 9, half_width: 1.0, interpolation, color, sh_reduction };
+        let shape = GridShape { sh_reduction, ..GridShape::new(9, 1.0, interpolation, color) };
         let full = VoxelGrid::<f64>::random(shape, 2.0, 1.0, 7);
         let grid = full.pruned(&full.voxels_where(|row| row % 3 != 0));
         let options = options(grid.aabb(), Spacing::Step(0.9), Jitter::PerRay { seed: 1, step: 2 }, [0.2, 0.5, 0.9]);
@@ -261,7 +259,7 @@ fn rays_of_every_kind_agree() {
     let with = |spacing| options(Aabb::cube(1.0), spacing, Jitter::None, [0.3, 0.6, 0.9]);
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
         for color in [Color::Rgb, Color::Sh { degree: 2, offset: 0.5 }] {
-            let shape = GridShape { resolution: 6, half_width: 1.0, interpolation, color, sh_reduction: 1 };
+            let shape = GridShape::new(6, 1.0, interpolation, color);
             let rows = shape.full().rows();
             let opaque = |row: usize| if row == 21 { 1e4 } else { 0.0 };
             let cases: [(&str, VoxelGrid<f64>); 4] = [

@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, HashMap};
 
 /// A trilinear grid of RGB colors in the cube ±1.5 whose density and color are functions of a voxel's centre.
 fn grid(resolution: usize, density: impl Fn(DVec3) -> f64, color: impl Fn(DVec3) -> [f64; 3]) -> VoxelGrid<f64> {
-    let shape = GridShape { resolution, half_width: 1.5, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
+    let shape = GridShape::new(resolution, 1.5, Interpolation::Trilinear, Color::Rgb);
     let n = resolution;
     let centers: Vec<DVec3> = (0..n * n * n).map(|v| shape.center([v / (n * n), v / n % n, v % n].map(|k| k as isize))).collect();
     let densities = centers.iter().map(|&p| density(p)).collect();
@@ -22,7 +22,7 @@ fn grid(resolution: usize, density: impl Fn(DVec3) -> f64, color: impl Fn(DVec3)
 
 /// A sparse grid of opaque voxels, each with its own color.
 fn sparse(resolution: usize, voxels: &[([usize; 3], [u8; 3])]) -> VoxelGrid<f64> {
-    let shape = GridShape { resolution, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
+    let shape = GridShape::new(resolution, 1.0, Interpolation::Nearest, Color::Rgb);
     let lattice = Lattice::bricks_where([resolution; 3], |node| voxels.iter().any(|(voxel, _)| *voxel == node));
     let rows = lattice.rows();
     let (mut density, mut color) = (vec![0.0; rows], vec![0.0; 3 * rows]);
@@ -191,13 +191,7 @@ fn vertices_lie_where_the_density_has_the_level_in_world_coordinates() {
 
 #[test]
 fn a_surface_through_noise_is_closed_and_the_same_for_any_number_of_threads() {
-    let shape = |interpolation| GridShape {
-        resolution: 14,
-        half_width: 1.0,
-        interpolation,
-        color: Color::Sh { degree: 1, offset: 0.5 },
-        sh_reduction: 1,
-    };
+    let shape = |interpolation| GridShape::new(14, 1.0, interpolation, Color::Sh { degree: 1, offset: 0.5 });
     for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
         let noise = VoxelGrid::<f32>::random(shape(interpolation), 1.0, 1.0, 11);
         let options = MeshOptions { level: Some(0.6), ..MeshOptions::default() };
@@ -214,13 +208,7 @@ fn a_surface_through_noise_is_closed_and_the_same_for_any_number_of_threads() {
 #[test]
 fn harmonics_are_seen_against_the_normal_or_along_one_direction() {
     // Red grows along the direction of sight, from the coefficient of −x: c = 0.5 + 0.4886 · 0.5 · x.
-    let shape = GridShape {
-        resolution: 8,
-        half_width: 1.0,
-        interpolation: Interpolation::Nearest,
-        color: Color::Sh { degree: 1, offset: 0.5 },
-        sh_reduction: 1,
-    };
+    let shape = GridShape::new(8, 1.0, Interpolation::Nearest, Color::Sh { degree: 1, offset: 0.5 });
     let n = shape.voxels();
     let inside = |v: usize| [v / 64, v / 8 % 8, v % 8].iter().all(|k| (2..6).contains(k));
     let density = Tensor::from_vec((0..n).map(|v| if inside(v) { 100.0 } else { 0.0 }).collect(), &[n, 1]);
@@ -337,13 +325,7 @@ fn a_decimated_surface_is_closed_and_near_what_it_was() {
 
 #[test]
 fn a_decimated_surface_through_noise_is_closed_and_never_empty() {
-    let shape = GridShape {
-        resolution: 14,
-        half_width: 1.0,
-        interpolation: Interpolation::Trilinear,
-        color: Color::Sh { degree: 1, offset: 0.5 },
-        sh_reduction: 1,
-    };
+    let shape = GridShape::new(14, 1.0, Interpolation::Trilinear, Color::Sh { degree: 1, offset: 0.5 });
     let noise = VoxelGrid::<f32>::random(shape, 1.0, 1.0, 11);
     let options = MeshOptions { level: Some(0.6), min_part: 0, ..MeshOptions::default() };
     let whole = mesh(&noise, &options).unwrap().triangles.len();

@@ -45,7 +45,7 @@ fn run(config: Config, views: &[View]) -> (VoxelGrid<f32>, Vec<Report>) {
 fn test_psnr(grid: &VoxelGrid<f32>) -> f64 {
     let options = RenderOptions {
         aabb: grid.aabb(),
-        spacing: config().evaluation.spacing(grid.shape().voxel_side()),
+        spacing: config().evaluation.spacing(grid.shape()),
         jitter: Jitter::None,
         background: [1.0; 3],
         occupancy: None,
@@ -199,7 +199,7 @@ fn a_pruned_run_is_trained_on_all_that_evaluation_sees() {
     let grid = trainer.grid();
     let looked_at = grid.reach().expect("space was pruned");
     assert!(looked_at.fraction() < 0.9, "{} of the voxels are looked at", looked_at.fraction());
-    let spacing = config.evaluation.spacing(grid.shape().voxel_side());
+    let spacing = config.evaluation.spacing(grid.shape());
     let everywhere = Occupancy::new(grid.aabb(), grid.lattice().nodes(), &vec![true; grid.shape().voxels()]);
     let there = RenderOptions {
         aabb: grid.aabb(),

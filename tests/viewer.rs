@@ -7,13 +7,12 @@ use autograd::Tensor;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
-use plenoxel::bake::GridSpace;
 use plenoxel::camera::lens::Lens;
 use plenoxel::camera::{Camera, Intrinsics};
 use plenoxel::evaluate::Viewer;
 use plenoxel::export::web::WebGrid;
 use plenoxel::field::sh;
-use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use plenoxel::field::voxel_grid::{Color, GridShape, GridSpace, Interpolation, VoxelGrid};
 use plenoxel::model::plenoxels::config::Sampling;
 use plenoxel::model::plenoxels::grid_viewer;
 use plenoxel::render::{Engine, Field};
@@ -76,7 +75,7 @@ fn the_page_reads_a_grid_as_the_library_does() {
         (sh(2), 3, Interpolation::Trilinear, step),
         (sh(3), 1, Interpolation::Trilinear, step),
     ] {
-        let shape = GridShape { resolution: 33, half_width: 1.3, interpolation, color, sh_reduction };
+        let shape = GridShape { sh_reduction, ..GridShape::new(33, 1.3, interpolation, color) };
         let (small, bytes) = WebGrid::within(&matter(shape), usize::MAX).unwrap();
         let grid = small.to_grid();
         let points: Vec<f32> = (0..3 * POINTS).map(|i| (0.6 * f64::sin(1.7 * (i * i) as f64) * shape.half_width) as f32).collect();
@@ -152,7 +151,7 @@ fn the_page_marches_the_rays_of_captures_as_the_library_does() {
         (GridSpace { space: Space::Ndc { a: 1.6, b: 2.1 }, stretch: DVec3::new(1.0, 1.0, 0.3) }, 1.3, &forward),
     ];
     for (coordinates, half_width, cameras) in spaces {
-        let shape = GridShape { resolution: 33, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+        let shape = GridShape { coordinates, ..GridShape::new(33, half_width, Interpolation::Trilinear, color) };
         let (small, bytes) = WebGrid::within(&matter(shape), usize::MAX).unwrap();
         let grid = small.to_grid();
         let background = [0.2, 0.9, 0.4];
@@ -171,7 +170,7 @@ fn the_page_marches_the_rays_of_captures_as_the_library_does() {
         }));
         let Some(answer) = answer else { return };
         let background = background.map(|c| c as f32);
-        let viewer = Viewer::new(coordinates.show(&grid, 0.5 * shape.voxel_side(), background), background);
+        let viewer = grid_viewer(&grid, Sampling::Step { step: 0.5 }, Engine::Fused, background);
         assert_same_pictures(&viewer, cameras, &answer, &coordinates.space.to_string());
     }
 }

@@ -15,17 +15,14 @@
 //!
 //! Harmonics are smoother than a color network, and they are interpolated: pictures of the grid differ from those of the field.
 
-mod grid_space;
 mod visible;
-
-pub use grid_space::GridSpace;
 
 use crate::camera::Camera;
 use crate::error::{Error, Result};
 use crate::field::factored::SCALE;
 use crate::field::sh;
 use crate::field::sh::least_squares::improve;
-use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, GridSpace, Interpolation, VoxelGrid};
 use crate::geometry::Aabb;
 use crate::memory::{allowance, bytes};
 use crate::render::ShadedField;
@@ -35,7 +32,8 @@ use crate::train::Model;
 use autograd::lattice::{BrickGrid, bits_where};
 use autograd::{Buffer, Indices, Lattice, Tensor, no_grad, parallel};
 use glam::DVec3;
-use visible::Sights;
+pub use visible::focus;
+use visible::{Sights, sight};
 
 /// Color of zero coefficients.
 pub const OFFSET: f64 = 0.5;
@@ -93,7 +91,7 @@ impl<'a> Source<'a> {
     }
 
     /// Returns the coordinates of the baked grid.
-    pub fn coordinates(&self) -> GridSpace {
+    fn coordinates(&self) -> GridSpace {
         GridSpace::of(self.space, self.sides())
     }
 
@@ -101,6 +99,12 @@ impl<'a> Source<'a> {
     pub fn resolution(&self) -> usize {
         let cell = (self.sides() * self.coordinates().stretch).element_sum() / 3.0;
         ((2.0 * self.half_width() / cell).ceil() as usize).clamp(LEAST_VOXELS, MOST_VOXELS)
+    }
+
+    /// Returns the rendering weight of voxels that may be left out ([`BakeOptions::least_weight`]): 0 in a box of the world if the field knows its occupied cells, and
+    /// 1/256 elsewhere. Most of what is in other spaces, and of matter of a field that does not know where it was trained, no camera sees.
+    pub fn least_weight(&self) -> f32 {
+        if self.space == Space::Box && self.field.reach().is_some() { 0.0 } else { 1.0 / 256.0 }
     }
 
     /// Returns the sides of voxels that are as fine as the field.
@@ -121,12 +125,11 @@ impl<'a> Source<'a> {
 }
 
 /// Bakes a field. The colors are fitted to the directions of the `cameras`, or to directions all around if there are none.
-/// `progress(done, all)` is called with numbers of table rows. Returns the grid, which is in the [coordinates](Source::coordinates) of the source.
+/// `progress(done, all)` is called with numbers of table rows. Returns the grid, whose [coordinates](GridShape::coordinates) are those of the source.
 ///
 /// Errors: no voxel has a density; there is not enough memory.
 pub fn bake(source: Source<'_>, options: &BakeOptions, cameras: &[Camera], progress: &dyn Fn(usize, usize)) -> Result<VoxelGrid<f32>> {
     let degree = options.degree;
-    let coordinates = source.coordinates();
     let mut resolution = options.resolution;
     let plain = loop {
         let grid = opaque(source, resolution, options.least_weight, cameras)?;
@@ -143,8 +146,8 @@ pub fn bake(source: Source<'_>, options: &BakeOptions, cameras: &[Camera], progr
     let rows = lattice.rows();
     let needed = (rows * (2 * shape.voxel_bytes() + 4 * size_of::<f32>())) as u64;
     check_memory(&format!("baking {} voxels", lattice.present()), needed)?;
-    let sights = (!cameras.is_empty()).then(|| Sights::new(&plain, coordinates, cameras));
-    let painter = Painter { field: source.field, shape: &shape, lattice: &lattice, coordinates, sights, degree };
+    let sights = (!cameras.is_empty()).then(|| Sights::new(&plain, cameras));
+    let painter = Painter { field: source.field, shape: &shape, lattice: &lattice, sights, degree };
     let width = shape.color_width();
     let mut table = Buffer::zeros(rows * width);
     for (first, part) in (0..).step_by(BATCH).zip(table.chunks_mut(BATCH * width)) {
@@ -163,21 +166,24 @@ fn check_memory(what: &str, needed: u64) -> Result<()> {
 
 /// Returns a grid of the present voxels, with densities and without colors. Voxels that the cameras see with less than `least_weight` are absent.
 fn opaque(source: Source<'_>, resolution: usize, least_weight: f32, cameras: &[Camera]) -> Result<VoxelGrid<f32>> {
-    let (coordinates, half_width) = (source.coordinates(), source.half_width());
-    let shape = GridShape { resolution, half_width, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
-    let (lattice, density) = no_grad(|| densities(source, &shape, coordinates))?;
+    let shape = GridShape {
+        coordinates: source.coordinates(),
+        ..GridShape::new(resolution, source.half_width(), Interpolation::Trilinear, Color::Rgb)
+    };
+    let (lattice, density) = no_grad(|| densities(source, &shape))?;
     let rows = lattice.rows();
     let grid = VoxelGrid::with_lattice(shape, lattice, density, Tensor::zeros(&[rows, 3]));
     if least_weight == 0.0 || cameras.is_empty() {
         return Ok(grid);
     }
-    let weights = visible::weights(&grid, coordinates, cameras);
+    let weights = visible::weights(&grid, cameras);
     let seen = grid.voxels_where(|row| weights[row] >= least_weight).dilated(1);
     Ok(grid.pruned(&seen))
 }
 
 /// Returns the present voxels and the table of their densities, `[rows, 1]`.
-fn densities(source: Source<'_>, shape: &GridShape, coordinates: GridSpace) -> Result<(Lattice, Tensor<f32>)> {
+fn densities(source: Source<'_>, shape: &GridShape) -> Result<(Lattice, Tensor<f32>)> {
+    let coordinates = shape.coordinates;
     let (aabb, nodes) = (coordinates.unstretched(Aabb::cube(shape.half_width)), [shape.resolution; 3]);
     // Nothing outside of the occupied cells was trained.
     let sampled = source.field.reach().cloned().unwrap_or_else(|| Occupancy::new(source.aabb, [1; 3], &[true]));
@@ -230,7 +236,6 @@ struct Painter<'a> {
     field: &'a dyn ShadedField<f32>,
     shape: &'a GridShape,
     lattice: &'a Lattice,
-    coordinates: GridSpace,
     sights: Option<Sights>,
     degree: usize,
 }
@@ -258,7 +263,7 @@ impl Painter<'_> {
         let owners = Indices::from(owners.collect::<Vec<_>>());
         let directions = positions(samples.iter().flat_map(|(_, sample)| sample.directions.iter().copied()));
         let colors = self.field.shade(&features.gather_rows(&owners), &directions);
-        let stretched = samples.iter().flat_map(|(_, sample)| sample.directions.iter().map(|d| self.coordinates.stretch * *d));
+        let stretched = samples.iter().flat_map(|(_, sample)| sample.directions.iter().map(|d| self.shape.coordinates.stretch * *d));
         let basis = sh::basis(&positions(stretched), self.degree);
         let (mut colors, mut basis) = (colors.data().chunks_exact(3), basis.data().chunks_exact(count));
         for (r, sample) in &samples {
@@ -277,18 +282,18 @@ impl Painter<'_> {
 
     /// Returns the directions in which the color of a voxel is computed, given its centre in the grid.
     fn sample(&self, center: DVec3) -> Sample {
-        let at = self.coordinates.to_box(center);
+        let at = self.shape.coordinates.to_box(center);
         let Some(sights) = &self.sights else {
             return Sample { center: at, directions: all_around(MOST_DIRECTIONS).collect(), seen: true };
         };
-        let world = self.coordinates.to_world(center);
+        let world = self.shape.coordinates.to_world(center);
         let seen_by = sights.cameras_that_see(world);
         let (cameras, most) = match seen_by.is_empty() {
             true => (sights.cameras().collect(), DIRECTIONS_OF_HIDDEN),
             false => (seen_by, MOST_DIRECTIONS),
         };
         let n = cameras.len().min(most);
-        let direction = |i: usize| self.coordinates.space.ray(&GridSpace::sight(cameras[i * cameras.len() / n], world).0).direction;
+        let direction = |i: usize| self.shape.coordinates.space.ray(&sight(cameras[i * cameras.len() / n], world).0).direction;
         Sample { center: at, directions: (0..n).map(direction).collect(), seen: most == MOST_DIRECTIONS }
     }
 }

@@ -205,7 +205,7 @@ impl<'a> Carving<'a> {
         let CarveOptions { half_width, color, background, seed, config } = self.options;
         let (lattice, rows) = (&self.lattice, self.lattice.rows());
         // Colors are fitted for nearest look-up and without reduction, whatever training uses.
-        let shape = GridShape { resolution: config.resolution, half_width, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
+        let shape = GridShape::new(config.resolution, half_width, Interpolation::Nearest, color);
         let density = config.depth / shape.voxel_side();
         let opaque = Opaque::new(lattice, Aabb::cube(shape.half_width), density);
         let (degree, offset) = color.harmonics();

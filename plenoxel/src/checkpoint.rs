@@ -8,10 +8,12 @@
 //! the coefficients of degree 0. The other harmonics follow in the same form: `harmonics_voxels` `[h]`, where (x, y, z) of m = ⌈n /
 //! reduction⌉ voxels per axis has the number (x m + y) m + z, and `harmonics` `[h, channels − 3]`.
 //!
+//! A grid in other coordinates than those of the world is written as a sparse grid too, and its header has [`coordinates`](Header::coordinates).
+//!
 //! The metadata have one entry, `plenoxel`: a JSON object with the version and every convention that a reader needs.
 
 use crate::error::{Error, Result};
-use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, GridSpace, Interpolation, VoxelGrid};
 use crate::files;
 use crate::memory;
 use crate::tensor_file::{self, Dtype, Entry, RETRAIN, TensorFile, bytes_of};
@@ -30,6 +32,8 @@ pub const FORMAT: &str = "plenoxel 1";
 pub const SPARSE_FORMAT: &str = "plenoxel 2";
 /// Format version of grids with reduced harmonics.
 pub const REDUCED_FORMAT: &str = "plenoxel 3";
+/// Format version of grids in other coordinates than those of the world.
+pub const SPACE_FORMAT: &str = "plenoxel 4";
 /// Position and meaning of a voxel's values, as text.
 pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * half_width / n - half_width; \
     sigma = max(0, density) after interpolation, per world length; \
@@ -40,20 +44,27 @@ pub const CONVENTION: &str = "voxel k of n has its centre at (k + 0.5) * 2 * hal
 const REDUCED_CONVENTION: &str = "; `color` has the means of R, G, B alone; `harmonics` has those of degree 1 and more, in voxels whose sides are \
     sh_reduction times as long and whose box begins at the same corner and may end beyond it; they are looked up as the other values are";
 
+/// Addition to [`CONVENTION`] for other coordinates than those of the world.
+const SPACE_CONVENTION: &str =
+    "; positions are stretch * p, component by component, where p is in the box of the space; sigma is per length of that box";
+
 /// Header of a checkpoint: everything but its tables.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
     /// Kind of model, [`KIND`]. Files of early versions do not have it.
     #[serde(default = "kind")]
     pub kind: String,
-    /// [`FORMAT`], [`SPARSE_FORMAT`] or [`REDUCED_FORMAT`].
+    /// [`FORMAT`], [`SPARSE_FORMAT`], [`REDUCED_FORMAT`] or [`SPACE_FORMAT`].
     pub format: String,
     /// [`CONVENTION`] and additions, for human readers.
     pub convention: String,
     /// Number of voxels along each axis.
     pub resolution: usize,
-    /// Half the side of the cube, in units of the dataset.
+    /// Half the side of the cube, in units of the dataset or in those of other coordinates.
     pub half_width: f64,
+    /// Coordinates of the cube. Not written if they are those of the world.
+    #[serde(default, skip_serializing_if = "is_world")]
+    pub coordinates: GridSpace,
     /// Interpolation between voxel centres.
     pub interpolation: Interpolation,
     /// Degree of the harmonics; `None` for RGB.
@@ -96,6 +107,10 @@ fn is_unreduced(reduction: &usize) -> bool {
     *reduction == 1
 }
 
+fn is_world(coordinates: &GridSpace) -> bool {
+    *coordinates == GridSpace::WORLD
+}
+
 impl Header {
     /// Transform of grids in the frame of the dataset.
     const IDENTITY: [[f64; 4]; 4] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
@@ -107,17 +122,21 @@ impl Header {
             Color::Rgb => (None, 0.0),
             Color::Sh { degree, offset } => (Some(degree), offset),
         };
+        let in_world = is_world(&shape.coordinates);
         let format = match (shape.is_reduced(), grid.lattice().is_full()) {
+            _ if !in_world => SPACE_FORMAT,
             (true, _) => REDUCED_FORMAT,
             (false, true) => FORMAT,
             (false, false) => SPARSE_FORMAT,
         };
+        let additions = [if shape.is_reduced() { REDUCED_CONVENTION } else { "" }, if in_world { "" } else { SPACE_CONVENTION }];
         Header {
             kind: kind(),
             format: format.to_owned(),
-            convention: CONVENTION.to_owned() + if shape.is_reduced() { REDUCED_CONVENTION } else { "" },
+            convention: CONVENTION.to_owned() + &additions.concat(),
             resolution: shape.resolution,
             half_width: shape.half_width,
+            coordinates: shape.coordinates,
             interpolation: shape.interpolation,
             sh_degree,
             sh_offset,
@@ -134,8 +153,8 @@ impl Header {
     /// Returns the shape of the grid.
     pub fn shape(&self) -> GridShape {
         let color = self.sh_degree.map_or(Color::Rgb, |degree| Color::Sh { degree, offset: self.sh_offset });
-        let Header { resolution, half_width, interpolation, sh_reduction, .. } = *self;
-        GridShape { resolution, half_width, interpolation, color, sh_reduction }
+        let Header { resolution, half_width, coordinates, interpolation, sh_reduction, .. } = *self;
+        GridShape { sh_reduction, coordinates, ..GridShape::new(resolution, half_width, interpolation, color) }
     }
 }
 
@@ -216,11 +235,13 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
         ));
     }
     let format = value["format"].as_str().unwrap_or("none");
-    if ![FORMAT, SPARSE_FORMAT, REDUCED_FORMAT].contains(&format) {
+    const KNOWN: [&str; 4] = [FORMAT, SPARSE_FORMAT, REDUCED_FORMAT, SPACE_FORMAT];
+    if !KNOWN.contains(&format) {
+        let known = KNOWN.map(|format| format!("`{format}`")).join(", ");
         return Err(Error::input(
             path,
             format!("format `{format}`"),
-            format!("expected `{FORMAT}`, `{SPARSE_FORMAT}` and `{REDUCED_FORMAT}`; use the program version that wrote the file"),
+            format!("expected one of {known}; use the program version that wrote the file"),
         ));
     }
     let format = format.to_owned();
@@ -233,8 +254,11 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
             "expected a grid whose scene_transform is the identity",
         ));
     }
-    let reduced = (1..=1024).contains(&header.sh_reduction) && header.shape().is_reduced() == (format == REDUCED_FORMAT);
-    if !((1..=1024).contains(&header.resolution) && degree_known && reduced && GridShape::HALF_WIDTHS.contains(&header.half_width)) {
+    let in_world = is_world(&header.coordinates);
+    let as_format_says = if in_world { header.shape().is_reduced() == (format == REDUCED_FORMAT) } else { format == SPACE_FORMAT };
+    let reduced = (1..=1024).contains(&header.sh_reduction) && as_format_says && (format != SPACE_FORMAT || !in_world);
+    let sizes = GridShape::HALF_WIDTHS.contains(&header.half_width) && header.coordinates.is_valid();
+    if !((1..=1024).contains(&header.resolution) && degree_known && reduced && sizes) {
         return Err(Error::input(path, "the header has values out of range", RETRAIN));
     }
     Ok(header)

@@ -28,7 +28,7 @@ pub fn tensor(shape: &[usize], low: f64, high: f64, seed: u64) -> Tensor<f64> {
 
 /// A grid of 4³ voxels in the cube ±1.
 pub fn shape(interpolation: Interpolation, color: Color) -> GridShape {
-    GridShape { resolution: 4, half_width: 1.0, interpolation, color, sh_reduction: 1 }
+    GridShape::new(4, 1.0, interpolation, color)
 }
 
 /// A grid with all voxels whose tables are given tensors, tracked or not, so that whole renders can be differentiated by their tables.

@@ -259,7 +259,7 @@ fn read_cloud(path: &Path, bytes: &[u8]) -> Result<Then, String> {
 
 fn grids() -> [VoxelGrid<f32>; 3] {
     let color = Color::Sh { degree: 1, offset: 0.5 };
-    let shape = GridShape { resolution: 5, half_width: 1.5, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+    let shape = GridShape::new(5, 1.5, Interpolation::Trilinear, color);
     let whole = VoxelGrid::random(shape, 3.0, 1.0, 9);
     let sparse = whole.pruned(&whole.voxels_where(|row| row % 3 == 1));
     [whole, sparse, VoxelGrid::random(GridShape { sh_reduction: 2, ..shape }, 3.0, 1.0, 9)]

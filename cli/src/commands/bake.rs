@@ -1,7 +1,7 @@
 //! `plenoxel bake`: turns the field of a model without voxels into a voxel grid, as a new run.
 
 use super::new_run::loading;
-use super::{beside, check_box, whole};
+use super::{beside, whole};
 use crate::images;
 use crate::progress::Console;
 use crate::report::Report;
@@ -13,7 +13,7 @@ use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::{Scores, ViewScore, Viewer};
 use plenoxel::field::voxel_grid::Interpolation;
 use plenoxel::model::plenoxels::Plenoxels;
-use plenoxel::model::plenoxels::config::{ColorKind, Config};
+use plenoxel::model::plenoxels::config::{ColorKind, Config, Sampling};
 use plenoxel::model::{self, Model};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::evenly_spaced;
@@ -21,6 +21,7 @@ use plenoxel::run::figures::Figures;
 use plenoxel::run::folder::{Baked, NewFolder, RunFolder, RunKind, RunRecord};
 use plenoxel::run::memory::{self, Estimate, Stored};
 use plenoxel::run::training::Stopwatch;
+use plenoxel::space::Space;
 use plenoxel::train::{About, ViewOptions};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -36,6 +37,8 @@ on up to 25 test views. If stdout is not a terminal, its last line is a JSON obj
 
 /// Most voxels of a grid whose resolution is not given.
 const MOST_VOXELS: usize = 8_000_000;
+/// Sampling of the grids of captures. Half the samples of the usual step of half a voxel changed the PSNR of bonsai by 0.03 dB.
+const STEP_OF_CAPTURES: Sampling = Sampling::Step { step: 1.0 };
 /// Most test views on which the field and the grid are compared.
 const COMPARED: usize = 25;
 
@@ -100,13 +103,12 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
             "use a run of preset quality, photos, tensorf, dvgo, ngp or nerf",
         ));
     };
-    check_box(&path, field.space)?;
 
     let options = BakeOptions {
         resolution: args.resolution.unwrap_or_else(|| field.resolution()),
         most_voxels: if args.resolution.is_some() { usize::MAX } else { MOST_VOXELS },
         degree: args.sh_degree,
-        least_weight: 0.0,
+        least_weight: field.least_weight(),
     };
     let mut clock = Stopwatch::default();
     let count = console.count("baking, voxel", 1);
@@ -129,6 +131,7 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
         sh_offset: OFFSET,
         sh_reduction: 1,
         interpolation: Interpolation::Trilinear,
+        evaluation: if field.space == Space::Box { config.evaluation } else { STEP_OF_CAPTURES },
         stages: Vec::new(),
         tensorf: None,
         dvgo: None,

@@ -108,6 +108,7 @@ impl Exported {
             ));
         }
         let (header, voxels) = checkpoint::header(&path)?;
+        check_box(&path, header.coordinates.space)?;
         let estimate = Estimate::of_export(&header.shape(), voxels, bytes_per_voxel);
         console.note(&estimate.describe());
         estimate.check()?;

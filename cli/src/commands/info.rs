@@ -197,8 +197,12 @@ fn of_grid(grid: &VoxelGrid<f32>, header: &Header) -> Lines {
     let (present, all) = (grid.lattice().present() as f64, shape.voxels() as f64);
     let matter = grid.voxels_where(|row| density[row] > 0.0).fraction();
     let largest = density.iter().copied().fold(0.0, f32::max);
+    let of_space = match shape.coordinates.space {
+        Space::Box => String::new(),
+        other => format!(" of the space `{other}`"),
+    };
     vec![
-        ("grid", format!("{n}³ voxels of side {:.5} in [-{w}, {w}]³", shape.voxel_side(), w = shape.half_width)),
+        ("grid", format!("{n}³ voxels of side {:.5} in [-{w}, {w}]³{of_space}", shape.voxel_side(), w = shape.half_width)),
         ("convention", header.convention.clone()),
         ("interpolation", format!("{:?}", shape.interpolation).to_lowercase()),
         ("color", color),

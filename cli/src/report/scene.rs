@@ -5,14 +5,14 @@ use crate::html::{self, escaped};
 use crate::progress::{Console, thousands};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use plenoxel::bake::{BakeOptions, GridSpace, Source, bake};
+use plenoxel::bake::{self, BakeOptions, Source, bake};
 use plenoxel::camera::Camera;
 use plenoxel::camera_path::up_axis;
 use plenoxel::dataset::Split;
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::Viewer;
 use plenoxel::export::web::WebGrid;
-use plenoxel::field::voxel_grid::VoxelGrid;
+use plenoxel::field::voxel_grid::{GridSpace, VoxelGrid};
 use plenoxel::metrics;
 use plenoxel::model::Model;
 use plenoxel::model::plenoxels::config::Sampling;
@@ -38,9 +38,6 @@ const BAKED_VOXELS_OF_CAPTURES: usize = 384;
 const MOST_BAKED: usize = 4_000_000;
 /// Degree of its harmonics.
 const BAKED_DEGREE: usize = 2;
-/// Rendering weight of voxels that are left out of other spaces, and of fields that may have matter where no camera looks. Most of what is in their boxes is
-/// behind walls.
-const LEAST_WEIGHT: f32 = 1.0 / 256.0;
 /// Length of a step in other spaces, in sides of voxels.
 const STEP: f64 = 0.5;
 
@@ -73,8 +70,7 @@ impl Scene {
     /// baked.
     pub fn of(report: &Report<'_>, console: &Console<'_>) -> Result<Option<Self>> {
         let Some(model) = report.model else { return Ok(None) };
-        let source = Source::of(model);
-        let baked = match source.map(|source| baked(source, report, console)) {
+        let baked = match Source::of(model).map(|source| baked(source, report, console)) {
             Some(Ok(grid)) => Some(grid),
             Some(Err(error)) => {
                 console.note(&format!("the field cannot be shown: {error}"));
@@ -83,10 +79,10 @@ impl Scene {
             None => None,
         };
         let Some(grid) = baked.as_ref().or_else(|| model.content()?.downcast_ref()) else { return Ok(None) };
-        let coordinates = source.map_or_else(GridSpace::default, |source| source.coordinates());
         let packed = WebGrid::within(grid, MOST_BYTES);
         let (small, bytes) = packed.map_err(|e| Error::io("report.html", e, "compressing the grid"))?;
-        let shown = Shown { grid: small.to_grid(), coordinates };
+        let shown = Shown { grid: small.to_grid() };
+        let coordinates = shown.coordinates();
         let train = report.dataset.cameras(Split::Train);
         let (split, most) = match coordinates.space {
             Space::Box if report.dataset.count(Split::Test) > 0 => (Split::Test, VIEWS),
@@ -177,28 +173,27 @@ impl Scene {
 /// The grid as the viewer shows it.
 struct Shown {
     grid: VoxelGrid<f32>,
-    coordinates: GridSpace,
 }
 
 impl Shown {
+    fn coordinates(&self) -> GridSpace {
+        self.grid.shape().coordinates
+    }
+
     /// Sampling of the viewer.
     fn sampling(&self, evaluation: Sampling) -> Sampling {
-        if self.coordinates.space == Space::Box { evaluation } else { Sampling::Step { step: STEP } }
+        if self.coordinates().space == Space::Box { evaluation } else { Sampling::Step { step: STEP } }
     }
 
     /// A renderer with the rays and samples of the viewer.
     fn viewer(&self, report: &Report<'_>) -> Viewer<'_, f32> {
-        let background = report.config.background;
-        match self.coordinates.space {
-            Space::Box => grid_viewer(&self.grid, report.config.evaluation, report.config.engine, background),
-            _ => Viewer::new(self.coordinates.show(&self.grid, STEP * self.grid.shape().voxel_side(), background), background),
-        }
+        grid_viewer(&self.grid, self.sampling(report.config.evaluation), report.config.engine, report.config.background)
     }
 
     /// A function to the distance of what a camera looks at; `None` in a box of the world, whose middle is the pivot.
     fn focus(&self) -> impl Fn(&Camera) -> Option<f64> + '_ {
-        let matter = (self.coordinates.space != Space::Box).then(|| self.grid.matter());
-        move |camera| self.coordinates.focus(&self.grid, matter.as_ref()?, camera)
+        let matter = (self.coordinates().space != Space::Box).then(|| self.grid.matter());
+        move |camera| bake::focus(&self.grid, matter.as_ref()?, camera)
     }
 }
 
@@ -227,13 +222,13 @@ impl Cost {
 
 /// Bakes a field for the page.
 fn baked(source: Source<'_>, report: &Report<'_>, console: &Console<'_>) -> Result<VoxelGrid<f32>> {
-    let (most, least_weight) = match source.space {
-        Space::Box if source.field.reach().is_some() => (BAKED_VOXELS, 0.0),
-        // Nothing says where the field was trained.
-        Space::Box => (BAKED_VOXELS, LEAST_WEIGHT),
-        Space::Ndc { .. } | Space::Contracted => (BAKED_VOXELS_OF_CAPTURES, LEAST_WEIGHT),
+    let most = if source.space == Space::Box { BAKED_VOXELS } else { BAKED_VOXELS_OF_CAPTURES };
+    let options = BakeOptions {
+        resolution: source.resolution().min(most),
+        most_voxels: MOST_BAKED,
+        degree: BAKED_DEGREE,
+        least_weight: source.least_weight(),
     };
-    let options = BakeOptions { resolution: source.resolution().min(most), most_voxels: MOST_BAKED, degree: BAKED_DEGREE, least_weight };
     let count = console.count("baking for the viewer, voxel", 1);
     bake(source, &options, &report.dataset.cameras(Split::Train), &|done, all| count.at(done, all))
 }

@@ -1,11 +1,12 @@
 //! Visibility of points from cameras, by depth maps (Williams 1978).
 
-use super::GridSpace;
-use crate::camera::{Camera, Intrinsics};
+use crate::camera::{Camera, Intrinsics, Ray};
 use crate::field::voxel_grid::VoxelGrid;
 use crate::field::voxel_grid::fused::largest_weights;
-use crate::render::RenderOptions;
 use crate::render::picture::picture_by;
+use crate::render::{Engine, RenderOptions, Rendered, render};
+use crate::sampling::{Jitter, Occupancy};
+use crate::space::Space;
 use glam::{DAffine3, DVec3};
 
 /// Most cameras, evenly spaced among all.
@@ -14,14 +15,61 @@ const MOST_CAMERAS: usize = 100;
 const MOST_PIXELS: usize = 256;
 /// Distance behind a surface up to which a point is visible, in sides of voxels.
 const BEHIND: f64 = 2.0;
-/// Transmittance below which rays end.
+/// Transmittance below which rays end, of depth maps and of [`focus`].
 const STOP_BELOW: f64 = 1e-2;
+const STOP_FOCUS_BELOW: f64 = 1e-4;
 /// Opacity of a pixel that shows a surface.
 const OPAQUE: f32 = 0.5;
 
+/// Returns options for rendering a grid with steps of a voxel, without jitter.
+fn options(grid: &VoxelGrid<f32>, stop_below: f64) -> RenderOptions<'static> {
+    RenderOptions {
+        aabb: grid.aabb(),
+        spacing: grid.shape().coordinates.spacing(grid.shape().voxel_side()),
+        jitter: Jitter::None,
+        background: [0.0; 3],
+        occupancy: None,
+        engine: Engine::Fused,
+        stop_below,
+    }
+}
+
+/// Renders rays of the world through a grid.
+fn see(grid: &VoxelGrid<f32>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<f32> {
+    render(grid, &grid.shape().coordinates.rays(rays), options)
+}
+
+/// Returns the ray of the world from a point to another, and their distance.
+pub fn sight(from: DVec3, to: DVec3) -> (Ray, f64) {
+    let distance = from.distance(to);
+    (Ray { origin: from, direction: (to - from).normalize_or(DVec3::Z), stretch: 1.0 }, distance)
+}
+
+/// Returns the distance in the world from a camera to what it looks at: to the surface at the principal point, or the median over points around it. `matter` is
+/// that of the grid. `None` if there is no surface.
+pub fn focus(grid: &VoxelGrid<f32>, matter: &Occupancy, camera: &Camera) -> Option<f64> {
+    const AROUND: i32 = 2;
+    let k = &camera.intrinsics;
+    let apart = 0.05 * k.width.min(k.height) as f64;
+    let at = |i: i32, middle: f64| middle + f64::from(i) * apart;
+    let rays: Vec<Ray> = (-AROUND..=AROUND)
+        .flat_map(|y| (-AROUND..=AROUND).map(move |x| (x, y)))
+        .map(|(x, y)| camera.ray(at(x, 0.5 * k.width as f64), at(y, 0.5 * k.height as f64)))
+        .collect();
+    let options = RenderOptions { occupancy: Some(matter), ..options(grid, STOP_FOCUS_BELOW) };
+    let seen = autograd::no_grad(|| see(grid, &rays, &options));
+    let (depth, opacity, space) = (seen.depth(), seen.opacity.data().to_vec(), grid.shape().coordinates.space);
+    let surface = |((ray, &depth), &opacity): ((&Ray, &f32), &f32)| {
+        (opacity > OPAQUE).then(|| space.distance(ray, f64::from(depth / opacity))).filter(|distance| distance.is_finite())
+    };
+    let mut found: Vec<f64> = rays.iter().zip(depth.data()).zip(&opacity).filter_map(surface).collect();
+    found.sort_by(f64::total_cmp);
+    found.get(found.len() / 2).copied()
+}
+
 /// Cameras and their depth maps.
 pub struct Sights {
-    coordinates: GridSpace,
+    space: Space,
     eyes: Vec<Eye>,
     /// t behind a surface up to which a point is visible.
     behind: f64,
@@ -46,8 +94,8 @@ fn small(cameras: &[Camera]) -> impl Iterator<Item = Camera> + '_ {
 }
 
 /// Returns the largest rendering weight of each row of a grid in pictures of the cameras.
-pub fn weights(grid: &VoxelGrid<f32>, coordinates: GridSpace, cameras: &[Camera]) -> Vec<f32> {
-    let options = RenderOptions { stop_below: STOP_BELOW, ..coordinates.options(grid, grid.shape().voxel_side()) };
+pub fn weights(grid: &VoxelGrid<f32>, cameras: &[Camera]) -> Vec<f32> {
+    let (coordinates, options) = (grid.shape().coordinates, options(grid, STOP_BELOW));
     let rays = small(cameras).map(|camera| {
         let k = camera.intrinsics;
         let pixels = (0..k.width * k.height).map(|p| camera.ray((p % k.width) as f64 + 0.5, (p / k.width) as f64 + 0.5));
@@ -58,11 +106,10 @@ pub fn weights(grid: &VoxelGrid<f32>, coordinates: GridSpace, cameras: &[Camera]
 
 impl Sights {
     /// Renders the depth maps of a grid.
-    pub fn new(grid: &VoxelGrid<f32>, coordinates: GridSpace, cameras: &[Camera]) -> Self {
-        let side = grid.shape().voxel_side();
-        let options = RenderOptions { stop_below: STOP_BELOW, ..coordinates.options(grid, side) };
-        let eyes = small(cameras).map(|camera| Eye::new(&camera, grid, coordinates, &options)).collect();
-        Sights { coordinates, eyes, behind: BEHIND * coordinates.step(side) }
+    pub fn new(grid: &VoxelGrid<f32>, cameras: &[Camera]) -> Self {
+        let (coordinates, options) = (grid.shape().coordinates, options(grid, STOP_BELOW));
+        let eyes = small(cameras).map(|camera| Eye::new(&camera, grid, &options)).collect();
+        Sights { space: coordinates.space, eyes, behind: BEHIND * coordinates.step(grid.shape().voxel_side()) }
     }
 
     /// Returns the positions of all cameras.
@@ -73,8 +120,8 @@ impl Sights {
     /// Returns the positions of the cameras that see a point of the world.
     pub fn cameras_that_see(&self, point: DVec3) -> Vec<DVec3> {
         let place = |eye: &Eye| {
-            let (ray, distance) = GridSpace::sight(eye.position, point);
-            self.coordinates.space.place(&ray, distance)
+            let (ray, distance) = sight(eye.position, point);
+            self.space.place(&ray, distance)
         };
         let sees = |eye: &&Eye| eye.surface(point).is_some_and(|surface| place(eye) <= surface + self.behind);
         self.eyes.iter().filter(sees).map(|eye| eye.position).collect()
@@ -82,8 +129,8 @@ impl Sights {
 }
 
 impl Eye {
-    fn new(camera: &Camera, grid: &VoxelGrid<f32>, coordinates: GridSpace, options: &RenderOptions<'_>) -> Self {
-        let picture = picture_by(|rays| coordinates.render(grid, rays, options), camera);
+    fn new(camera: &Camera, grid: &VoxelGrid<f32>, options: &RenderOptions<'_>) -> Self {
+        let picture = picture_by(|rays| see(grid, rays, options), camera);
         let of_pixel = |(&depth, &opacity): (&f32, &f32)| if opacity > OPAQUE { depth / opacity } else { f32::INFINITY };
         Eye {
             position: camera.position(),
@@ -109,12 +156,11 @@ mod tests {
 
     #[test]
     fn a_camera_sees_the_near_side_of_a_cube_only() {
-        let shape =
-            GridShape { resolution: 16, half_width: 1.0, interpolation: Interpolation::Trilinear, color: Color::Rgb, sh_reduction: 1 };
+        let shape = GridShape::new(16, 1.0, Interpolation::Trilinear, Color::Rgb);
         let cube = VoxelGrid::uniform(shape, 100.0, 0.0);
         let eye = DVec3::new(5.0, 0.3, 0.2);
         let camera = Camera::look_at(eye, DVec3::ZERO, DVec3::Z, Intrinsics::from_fov_x(64, 64, 0.7));
-        let sights = Sights::new(&cube, GridSpace::default(), &[camera]);
+        let sights = Sights::new(&cube, &[camera]);
         assert_eq!(sights.cameras_that_see(DVec3::new(1.1, 0.1, 0.1)), [eye]);
         assert_eq!(sights.cameras_that_see(DVec3::new(0.95, 0.1, 0.1)), [eye]);
         for hidden in [DVec3::ZERO, DVec3::new(-1.0, 0.1, 0.1), DVec3::new(20.0, 0.0, 0.0), DVec3::new(0.0, 5.0, 0.0)] {

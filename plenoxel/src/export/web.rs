@@ -278,7 +278,7 @@ mod tests {
 
     /// Returns a ball of random colors in an empty box.
     fn ball(color: Color, sh_reduction: usize, half_width: f64) -> VoxelGrid<f32> {
-        let shape = GridShape { resolution: 18, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction };
+        let shape = GridShape { sh_reduction, ..GridShape::new(18, half_width, Interpolation::Trilinear, color) };
         let grid = VoxelGrid::random(shape, 1.0, 1.0, 7);
         let density = (0..grid.lattice().rows()).map(|row| {
             let far = grid.lattice().node(row as u32).map_or(9.0, |node| node.map(|k| (k as f32 - 8.5).powi(2)).iter().sum::<f32>().sqrt());

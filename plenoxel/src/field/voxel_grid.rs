@@ -15,6 +15,7 @@
 
 mod appearance;
 pub mod fused;
+mod grid_space;
 pub(crate) mod layout;
 mod recolor;
 mod reshape;
@@ -28,6 +29,7 @@ use crate::render::{RenderOptions, Rendered};
 use crate::sampling::{Occupancy, Samples};
 use autograd::lattice::{BRICK_ROWS, bits_where};
 use autograd::{Bounds, Buffer, Lattice, Module, Param, Real, Tensor, parallel};
+pub use grid_space::GridSpace;
 use layout::Layout;
 use reshape::moved;
 pub use shape::{Color, GridShape, Interpolation};

@@ -65,7 +65,7 @@ pub(super) fn read(file: &mut Npz<'_>, scene_scale: f64) -> Result<Imported> {
         return Err(Error::input(&path, found, "expected 3, 12, 27 or 48"));
     };
     let color = Color::Sh { degree, offset: OFFSET };
-    let shape = GridShape { resolution: n, half_width, interpolation: Interpolation::Trilinear, color, sh_reduction: 1 };
+    let shape = GridShape::new(n, half_width, Interpolation::Trilinear, color);
     check_shape(&path, &shape)?;
 
     if let Some(beyond) = links.values.iter().find(|link| **link >= 0 && **link as usize >= rows) {

@@ -47,6 +47,7 @@ use crate::loss;
 use crate::rays::RaySource;
 use crate::render::{Engine, RenderOptions, Rendered, render};
 use crate::sampling::Occupancy;
+use crate::space::Space;
 use crate::tensor_file::{TensorFile, TensorWriter};
 use crate::train::{self, About, Model, Pass, PlannedStage, RenderFn, StageLength, StageProgress, TrainOptions, ViewOptions};
 use autograd::optim::Optimizer;
@@ -223,7 +224,7 @@ pub fn open(path: &Path, config: &Config) -> Result<(Plenoxels<f32>, About)> {
     Ok((Plenoxels::of_grid(config, grid), header.into()))
 }
 
-/// Renders a batch of rays through a grid.
+/// Renders a batch of rays in the coordinates of a grid.
 fn render_grid<T: Real>(grid: &VoxelGrid<T>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     if const { is_single::<T>() } { cast(single::render(cast_ref(grid), rays, options)) } else { render(grid, rays, options) }
 }
@@ -259,7 +260,11 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn aabb(&self) -> Aabb {
-        self.grid.aabb()
+        self.grid.shape().coordinates.unstretched(self.grid.aabb())
+    }
+
+    fn space(&self) -> Space {
+        self.grid.shape().coordinates.space
     }
 
     fn render(&self, rays: &[Ray], pass: &Pass) -> Rendered<T> {
@@ -267,7 +272,8 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         let occupancy = self.learning.as_ref().filter(|_| pass.stage.is_some());
         let options = self.config.render_options(&self.grid, sampling, pass.jitter);
         let engine = if pass.keep_samples { Engine::Graph } else { options.engine };
-        render_grid(&self.grid, rays, &RenderOptions { occupancy, engine, background: pass.background, ..options })
+        let rays = self.grid.shape().coordinates.rays(rays);
+        render_grid(&self.grid, &rays, &RenderOptions { occupancy, engine, background: pass.background, ..options })
     }
 
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
@@ -327,7 +333,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
         figures.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
     }
 
-    /// Returns the voxel grid, a [`VoxelGrid<T>`].
+    /// Returns the voxel grid, a [`VoxelGrid<T>`]. Its positions have the coordinates of its [shape](GridShape::coordinates).
     fn content(&self) -> Option<&dyn Any> {
         Some(&self.grid)
     }

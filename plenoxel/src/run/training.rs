@@ -210,6 +210,11 @@ fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &m
     // An initial grid has its own box.
     let half_width = known.as_ref().map_or(run.config.half_width, |(header, _)| header.shape().half_width);
     run.dataset.space().require_box(plenoxels::KIND)?;
+    if let (Some((header, _)), Some(path)) = (&known, &initial) {
+        let of_world = header.coordinates.space.require_box("init_from");
+        of_world
+            .map_err(|_| Error::input(path, "the initial grid is in the coordinates of a capture", "start from a grid of the world"))?;
+    }
     run.check_cameras(Aabb::cube(half_width), on)?;
     if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != run.dataset.name()) {
         on(Event::note(format!("the initial grid is of another scene: {}, not {}", header.scene, run.dataset.name())));

@@ -18,7 +18,7 @@ pub fn visibility(grid: &VoxelGrid<f32>, views: Vec<View>, config: &Config, prog
     let occupancy = grid.matter();
     let options = RenderOptions {
         aabb: grid.aabb(),
-        spacing: config.evaluation.spacing(grid.shape().voxel_side()),
+        spacing: config.evaluation.spacing(grid.shape()),
         jitter: Jitter::None,
         background: config.background,
         occupancy: Some(&occupancy),

@@ -108,7 +108,7 @@ mod tests {
     }
 
     fn shape(color: Color) -> GridShape {
-        GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color, sh_reduction: 1 }
+        GridShape::new(4, 1.0, Interpolation::Nearest, color)
     }
 
     #[test]

@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn a_larger_voxel_has_the_harmonics_of_what_absorbs_light_in_it() {
         let color = Color::Sh { degree: 1, offset: 0.5 };
-        let shape = GridShape { resolution: 4, half_width: 1.0, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
+        let shape = GridShape::new(4, 1.0, Interpolation::Nearest, color);
         // In the first of 2³ larger voxels, two of eight voxels absorb light, one of them twice as much. In the others none does.
         let density = |v: usize| match v {
             0 => shape.density_of_alpha(0.4),

@@ -212,7 +212,7 @@ mod tests {
 
     #[test]
     fn the_layer_around_has_the_colors_of_what_it_touches_but_not_of_what_nobody_saw() {
-        let shape = GridShape { resolution: 8, half_width: 1.0, interpolation: Interpolation::Nearest, color: Color::Rgb, sh_reduction: 1 };
+        let shape = GridShape::new(8, 1.0, Interpolation::Nearest, Color::Rgb);
         // Two adjacent voxels with colors and one that no pixel shows; and another such voxel far away.
         let present = [[1, 1, 1], [1, 1, 2], [1, 1, 3], [6, 6, 6]];
         let lattice = Lattice::bricks_where([8; 3], |voxel| present.contains(&voxel));

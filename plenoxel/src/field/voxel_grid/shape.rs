@@ -1,5 +1,6 @@
 //! Shape of a grid and meaning of its values, without the values.
 
+use super::GridSpace;
 use super::layout::Layout;
 use crate::field::{Radiance, sh};
 use crate::sampling::Occupancy;
@@ -88,7 +89,7 @@ impl Color {
 pub struct GridShape {
     /// Number of voxels along each axis.
     pub resolution: usize,
-    /// Half the side of the grid's cube, world length.
+    /// Half the side of the grid's cube, in its coordinates.
     pub half_width: f64,
     /// Interpolation between voxel centres.
     pub interpolation: Interpolation,
@@ -97,11 +98,18 @@ pub struct GridShape {
     /// Reduction of harmonics: coefficients of degree 1 and more are stored for every n-th voxel along each axis, in a separate table. 1
     /// stores all coefficients in the color table. A normalised shape without such coefficients has 1.
     pub sh_reduction: usize,
+    /// Coordinates of the cube. The positions, rays and lengths of a grid are in these coordinates.
+    pub coordinates: GridSpace,
 }
 
 impl GridShape {
     /// Half widths for which voxels can be computed in 32 bits at any resolution.
     pub const HALF_WIDTHS: RangeInclusive<f64> = 1e-9..=1e9;
+
+    /// Returns the shape of a cube of the world whose harmonics are not reduced.
+    pub const fn new(resolution: usize, half_width: f64, interpolation: Interpolation, color: Color) -> Self {
+        GridShape { resolution, half_width, interpolation, color, sh_reduction: 1, coordinates: GridSpace::WORLD }
+    }
 
     /// Returns the shape with `sh_reduction` 1 if there are no harmonics to reduce.
     pub fn normalised(self) -> Self {

@@ -75,7 +75,7 @@ pub(in crate::formats) fn read(file: &mut Npz<'_>, scene_scale: f64) -> Result<I
         }
     };
     let color = Color::Sh { degree, offset: OFFSET };
-    let shape = GridShape { resolution, half_width, interpolation: Interpolation::Nearest, color, sh_reduction: 1 };
+    let shape = GridShape::new(resolution, half_width, Interpolation::Nearest, color);
     check_shape(&path, &shape)?;
 
     let voxels = |leaf: &Leaf| cube.voxels(leaf, &shape);

@@ -321,18 +321,18 @@ impl Sampling {
         }
     }
 
-    /// Returns a length that samples of a ray do not exceed, from a voxel side in world units. Points of wide lenses may be up to twice as long.
-    pub(super) fn longest(self, voxel_side: f64) -> f64 {
+    /// Returns a length that samples of a ray through a grid do not exceed. Points of wide lenses may be up to twice as long.
+    pub(super) fn longest(self, shape: &GridShape) -> f64 {
         match self {
-            Sampling::Step { step } => step * voxel_side,
+            Sampling::Step { step } => shape.coordinates.step(step * shape.voxel_side()),
             Sampling::Points { samples, far } => far / (samples.max(2) - 1) as f64,
         }
     }
 
-    /// Returns the spacing for a voxel side in world units.
-    pub fn spacing(self, voxel_side: f64) -> Spacing {
+    /// Returns the spacing of samples in a grid.
+    pub fn spacing(self, shape: &GridShape) -> Spacing {
         match self {
-            Sampling::Step { step } => Spacing::Step(step * voxel_side),
+            Sampling::Step { step } => shape.coordinates.spacing(step * shape.voxel_side()),
             Sampling::Points { samples, far } => Spacing::Points { samples, far },
         }
     }
@@ -450,7 +450,7 @@ impl Config {
             ColorKind::Sh => Color::Sh { degree: self.sh_degree, offset: self.sh_offset },
         };
         let Config { half_width, interpolation, sh_reduction, .. } = *self;
-        GridShape { resolution, half_width, interpolation, color, sh_reduction }.normalised()
+        GridShape { sh_reduction, ..GridShape::new(resolution, half_width, interpolation, color) }.normalised()
     }
 
     /// Returns the options of carving with these settings.
@@ -484,7 +484,7 @@ impl Config {
     pub(super) fn render_options<T: Real>(&self, grid: &VoxelGrid<T>, sampling: Sampling, jitter: Jitter) -> RenderOptions<'static> {
         RenderOptions {
             aabb: grid.aabb(),
-            spacing: sampling.spacing(grid.shape().voxel_side()),
+            spacing: sampling.spacing(grid.shape()),
             jitter,
             background: self.background,
             occupancy: None,

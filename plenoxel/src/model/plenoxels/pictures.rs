@@ -38,11 +38,12 @@ impl<T: Real> Pictures<T> {
         Pictures { sampling, engine, background, matter: grid.matter(), rendered: AtomicUsize::new(0), tables: OnceLock::new() }
     }
 
-    /// Renders rays through the grid.
+    /// Renders rays of the world through the grid.
     pub fn render(&self, grid: &VoxelGrid<T>, rays: &[Ray]) -> Rendered<T> {
+        let rays = &*grid.shape().coordinates.rays(rays);
         let options = RenderOptions {
             aabb: grid.aabb(),
-            spacing: self.sampling.spacing(grid.shape().voxel_side()),
+            spacing: self.sampling.spacing(grid.shape()),
             jitter: Jitter::None,
             background: self.background,
             occupancy: Some(&self.matter),
@@ -59,7 +60,7 @@ impl<T: Real> Pictures<T> {
 
     /// Returns the tables of the grid; `None` for nearest look-up.
     fn tables_of(&self, grid: &VoxelGrid<T>) -> Option<&PictureTables<T>> {
-        let negligible = NEGLIGIBLE / self.sampling.longest(grid.shape().voxel_side());
+        let negligible = NEGLIGIBLE / self.sampling.longest(grid.shape());
         let compute = || {
             if const { is_single::<T>() } {
                 cast(single::picture_tables(cast_ref(grid), negligible))

@@ -7,13 +7,7 @@ use crate::render::{Engine, RenderOptions};
 use crate::sampling::{Jitter, Spacing};
 use autograd::Tensor;
 
-const SHAPE: GridShape = GridShape {
-    resolution: 8,
-    half_width: 2.0,
-    interpolation: Interpolation::Nearest,
-    color: Color::Sh { degree: 1, offset: 0.5 },
-    sh_reduction: 1,
-};
+const SHAPE: GridShape = GridShape::new(8, 2.0, Interpolation::Nearest, Color::Sh { degree: 1, offset: 0.5 });
 
 /// Creates a grid from functions of density and coefficients.
 fn grid(shape: GridShape, density: impl Fn([usize; 3]) -> f64, color: impl Fn([usize; 3], usize) -> f64) -> VoxelGrid<f64> {

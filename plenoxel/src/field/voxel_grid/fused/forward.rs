@@ -433,7 +433,7 @@ mod tests {
         };
         let rays: Vec<Ray> = (0..64).map(ray).collect();
         for interpolation in [Interpolation::Nearest, Interpolation::Trilinear] {
-            let shape = GridShape { resolution: 20, half_width: 1.0, interpolation, color: Color::Rgb, sh_reduction: 1 };
+            let shape = GridShape::new(20, 1.0, interpolation, Color::Rgb);
             let grid = VoxelGrid::<f64>::random(shape, 3.0, 0.2, 8);
             let counts = [0.0, 0.3].map(|stop_below| {
                 let (spacing, jitter, engine) = (Spacing::Step(0.05), Jitter::None, Engine::Fused);

@@ -10,10 +10,10 @@ use super::forward::{Block, Scene};
 use super::from_camera::{Colors, FromCamera};
 use super::lookup::Corners;
 use crate::camera::Ray;
-use crate::field::lanes::{Guide, LANES, Matter, Shown, Straight};
+use crate::field::lanes::{Bent, Guide, LANES, Matter, Shown, Straight};
 use crate::field::node_table::{NodeTable, StoredBricks};
 use crate::field::voxel_grid::{Interpolation, VoxelGrid};
-use crate::sampling::Occupancy;
+use crate::sampling::{Occupancy, Spacing};
 use autograd::{Buffer, Real};
 use glam::DVec3;
 use std::sync::Arc;
@@ -78,7 +78,11 @@ impl<T: Real> Scene<'_, T> {
         let pixels = pixels.as_chunks_mut::<COLUMNS>().0;
         let (options, to_cells) = (self.options, self.batch.layout.shape.to_voxels().map(DVec3::splat));
         let guide = Guide { matter: tables, options, cells: &tables.cells, to_cells, merged: options.stop_below };
-        let mut shown = guide.lead::<T, Straight<T>, 4>(&self.rays[first..first + pixels.len()]);
+        let rays = &self.rays[first..first + pixels.len()];
+        let mut shown = match options.spacing {
+            Spacing::Contracted(_) => guide.lead::<T, Bent<T>, 4>(rays),
+            Spacing::Step(_) | Spacing::Points { .. } => guide.lead::<T, Straight<T>, 4>(rays),
+        };
         let (colors, width) = match &self.from_camera {
             Some(colors) => (colors.at(shown.at(), &self.batch.layout.shape), 4),
             None => (self.colors_along_rays(first, &mut shown), 3),
@@ -111,12 +115,12 @@ mod tests {
     use crate::camera::{Camera, Intrinsics};
     use crate::field::voxel_grid::{Color, GridShape};
     use crate::render::{Engine, RenderOptions, Rendered};
-    use crate::sampling::{Jitter, Spacing};
+    use crate::sampling::Jitter;
     use autograd::lattice::BRICK_ROWS;
 
     /// A ball with holes; voxels of every fifth brick have a negative density.
     fn ball<T: Real>(sh_reduction: usize, color: Color) -> VoxelGrid<T> {
-        let shape = GridShape { resolution: 30, half_width: 1.1, interpolation: Interpolation::Trilinear, color, sh_reduction };
+        let shape = GridShape { sh_reduction, ..GridShape::new(30, 1.1, Interpolation::Trilinear, color) };
         let grid = VoxelGrid::random(shape, 25.0, 0.2, 8);
         let kept = grid.voxels_where(|row| {
             let at = grid.lattice().node(row as u32).map(|node| DVec3::from_array(node.map(|n| n as f64 - 14.0)));
@@ -158,9 +162,10 @@ mod tests {
 
     #[test]
     fn pictures_are_those_of_the_other_renderer() {
-        let points = Spacing::Points { samples: 80, far: 5.0 };
-        for ((sh_reduction, color), spacing) in KINDS.into_iter().flat_map(|kind| [(kind, options(0.0).spacing), (kind, points)]) {
-            let (grid, rays, options) = (ball::<f64>(sh_reduction, color), rays(3.0, 48), RenderOptions { spacing, ..options(0.0) });
+        // Rays of the contracted space bend beyond 1, in the ball.
+        let spacings = [(options(0.0).spacing, 3.0), (Spacing::Points { samples: 80, far: 5.0 }, 3.0), (Spacing::Contracted(0.06), 1.3)];
+        for ((sh_reduction, color), (spacing, distance)) in KINDS.into_iter().flat_map(|kind| spacings.map(|spacing| (kind, spacing))) {
+            let (grid, rays, options) = (ball::<f64>(sh_reduction, color), rays(distance, 48), RenderOptions { spacing, ..options(0.0) });
             let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up");
             let [want, found] = [render(&grid, &rays, &options), render_picture(&grid, &tables, &rays, &options)];
             assert!(difference(&want, &found) < 1e-10, "{color:?}: {}", difference(&want, &found));
