@@ -42,7 +42,7 @@ Examples:
   plenoxel cameras data/photos --out data/room    compute the cameras of photographs with COLMAP
   plenoxel train data/lego --preset paper    train a NeRF-synthetic scene as in the source paper
   plenoxel carve data/lego                   carve an opaque colored grid from silhouettes
-  plenoxel bake runs/field                   turn a field without voxels into a voxel grid, for exports
+  plenoxel bake runs/field                   turn a field without voxels into a voxel grid, for exports and fast pictures
   plenoxel import ckpt.npz --out runs/lego   turn a checkpoint of svox2, or an octree of PlenOctrees, into a run
   plenoxel evaluate runs/lego-1              compute PSNR and SSIM on the test views
   plenoxel render runs/lego-1 --view 0       render a test view

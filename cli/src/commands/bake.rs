@@ -32,7 +32,7 @@ Examples:
   plenoxel bake runs/field --resolution 256      with fewer voxels
   plenoxel export mesh runs/field-baked
 
-The result is a run folder for evaluate, render, export and report. A grid has smoother colors than the field: the command prints the PSNR of both \
+The result is a run folder for evaluate, render, view, report and, if its space is a box of the world, export. A grid has smoother colors than the field: the command prints the PSNR of both \
 on up to 25 test views. If stdout is not a terminal, its last line is a JSON object with the results.";
 
 /// Most voxels of a grid whose resolution is not given.
@@ -42,7 +42,7 @@ const STEP_OF_CAPTURES: Sampling = Sampling::Step { step: 1.0 };
 /// Most test views on which the field and the grid are compared.
 const COMPARED: usize = 25;
 
-/// Turn the field of a model (presets quality, tensorf, dvgo, ngp, nerf) into a voxel grid with spherical harmonics, for exports
+/// Turn the field of a model (presets quality, photos, tensorf, dvgo, ngp, nerf) into a voxel grid with spherical harmonics, for exports and faster pictures
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES, args_override_self = true)]
 pub struct BakeArgs {
