@@ -181,13 +181,12 @@ pub fn render_picture<T: Real>(grid: &VoxelGrid<T>, tables: &PictureTables<T>, r
 fn render_with<T: Real>(grid: &VoxelGrid<T>, picture: Option<&PictureTables<T>>, rays: &[Ray], options: &RenderOptions<'_>) -> Rendered<T> {
     let n = rays.len();
     let from_camera = picture.and_then(|tables| tables.colors_from_camera(grid, rays));
-    let along_rays = from_camera.as_ref().is_none_or(|colors| colors.may_be_near());
-    let batch = Batch::new(grid, if along_rays { rays } else { &[] }, options);
+    let batch = Batch::new(grid, if from_camera.is_some() { &[] } else { rays }, options);
     let tables: Vec<&Tensor<T>> = grid.params().map(Param::tensor).collect();
     let keep = tables.iter().any(|t| t.is_tracked()) && autograd::is_recording() && n <= CHUNK;
     let mut pixels = Buffer::stale(n * COLUMNS);
     let packets = !keep && matches!(options.jitter, Jitter::None);
-    if along_rays {
+    if from_camera.is_none() {
         batch.basis();
     }
     let scene = Scene { packets, picture, from_camera, ..batch.scene(grid, rays, options) };

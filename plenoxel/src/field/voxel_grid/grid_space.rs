@@ -80,11 +80,6 @@ impl GridSpace {
         self.space.to_world(finite).unwrap_or(finite)
     }
 
-    /// Returns the position in the grid of a position of the world. In normalized device coordinates it must lie before the camera.
-    pub(crate) fn of_world(&self, x: DVec3) -> DVec3 {
-        self.stretch * self.space.to_box(x)
-    }
-
     /// Returns a ray of the world in the coordinates of the grid. Its direction is not a unit vector if the stretch is not 1.
     pub fn ray(&self, ray: &Ray) -> Ray {
         let ray = self.space.ray(ray);

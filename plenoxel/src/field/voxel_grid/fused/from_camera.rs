@@ -3,21 +3,20 @@
 //! All rays of a picture begin at its camera, so each row of harmonics is seen in one direction, that from the camera to its voxel. With the color
 //! gᵢ = Σₖ Yₖ(dᵢ) rowᵢₖ of each row, a sample reads Σᵢ vᵢ gᵢ, three numbers a row, instead of Σₖ Yₖ(d) Σᵢ vᵢ rowᵢₖ. The weighted mean of the directions dᵢ is the
 //! direction d of the sample up to second order in the angle of a voxel, so the two differ by that angle times the difference between the slopes of
-//! neighbouring rows. Samples nearer than 32 voxels of harmonics take their colors along their rays. RGB, harmonics of degree 0, and the means of reduced harmonics are the same from every place. All are in tables whose bricks share faces ([`NodeTable`]).
+//! neighbouring rows. RGB, harmonics of degree 0, and the means of reduced harmonics are the same from every place. All are in tables whose bricks share faces ([`NodeTable`]).
 
 use super::cell_bricks::CellBricks;
 use crate::camera::Ray;
 use crate::field::node_table::{Cells, NodeTable, StoredBricks};
 use crate::field::sh;
 use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
-use crate::space::Space;
 use autograd::lattice::{Lattice, TOGETHER};
 use autograd::{Buffer, Real, Tensor, dispatched, no_grad, parallel};
 use glam::DVec3;
 use std::slice::ChunksExact;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Least distance from a camera to a sample, in sides of the voxels of harmonics.
+/// Least distance from a camera to the box of the grid, in sides of the voxels of harmonics.
 const FAR: f64 = 32.0;
 /// Least number of rays from a camera after which the colors of harmonics are computed.
 const ENOUGH: usize = 1 << 14;
@@ -33,14 +32,6 @@ pub(super) struct Colors<T: Real> {
     constant: Option<Arc<NodeTable<T, 4>>>,
     /// gᵢ at the voxels of harmonics, with the offset if they are not reduced.
     harmonics: Option<NodeTable<T, 4>>,
-    near: Option<Near>,
-}
-
-/// Ball around a camera in which harmonics are not taken from its tables, in voxel coordinates.
-#[derive(Clone, Copy, Debug)]
-struct Near {
-    center: DVec3,
-    radius: f64,
 }
 
 /// Colors from the place of the latest rays.
@@ -70,11 +61,11 @@ impl<T: Real> FromCamera<T> {
     }
 
     /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if a table has more than 2³² entries. With harmonics, also
-    /// `None` if there were only few rays, if they have several origins, or if there is one voxel of harmonics along an axis.
+    /// `None` if there were only few rays, if they have several origins, if the camera is near the grid, or if there is one voxel of harmonics along an axis.
     pub fn of(&self, grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, rays: &[Ray]) -> Option<Arc<Colors<T>>> {
         let harmonics = Harmonics::of(grid);
         let (origin, enough) = match &harmonics {
-            Some(harmonics) => (harmonics.place_of(rays, grid.shape())?, ENOUGH.max(harmonics.lattice.rows() / ROWS_OF_RAY)),
+            Some(harmonics) => (harmonics.place_of(rays, grid)?, ENOUGH.max(harmonics.lattice.rows() / ROWS_OF_RAY)),
             // One table serves all places.
             None => (DVec3::ZERO, 0),
         };
@@ -88,9 +79,8 @@ impl<T: Real> FromCamera<T> {
                 latest.shared = Some(Shared::new(grid, harmonics.as_ref(), bricks)?);
             }
             let Shared { constant, of_harmonics } = latest.shared.clone()?;
-            let near = harmonics.as_ref().and_then(|_| Near::around(origin, grid.shape()));
             let harmonics = harmonics.zip(of_harmonics).map(|(harmonics, bricks)| harmonics.seen_from(origin, grid.shape(), bricks));
-            latest.colors = Some(Arc::new(Colors { constant, harmonics, near }));
+            latest.colors = Some(Arc::new(Colors { constant, harmonics }));
         }
         latest.colors.clone()
     }
@@ -146,11 +136,13 @@ impl<'a, T: Real> Harmonics<'a, T> {
         })
     }
 
-    /// Returns the origin of all rays, if they have one. In normalized device coordinates the rays of a camera do not.
-    fn place_of(&self, rays: &[Ray], shape: &GridShape) -> Option<DVec3> {
-        let origin = rays.first()?.origin;
-        let is_one = rays.iter().all(|ray| ray.origin == origin) && !matches!(shape.coordinates.space, Space::Ndc { .. });
-        (is_one && !self.lattice.nodes().contains(&1)).then_some(origin)
+    /// Returns the origin of all rays, if it is far from the grid.
+    fn place_of(&self, rays: &[Ray], grid: &VoxelGrid<T>) -> Option<DVec3> {
+        let (origin, aabb) = (rays.first()?.origin, grid.aabb());
+        let side = grid.shape().voxel_side() * grid.shape().sh_reduction as f64;
+        let is_far = origin.clamp(aabb.min, aabb.max).distance(origin) >= FAR * side;
+        let is_one = rays.iter().all(|ray| ray.origin == origin);
+        (is_far && is_one && !self.lattice.nodes().contains(&1)).then_some(origin)
     }
 
     /// Computes the table of the colors as seen from `origin`, in these bricks.
@@ -159,11 +151,7 @@ impl<'a, T: Real> Harmonics<'a, T> {
         // Voxel n of harmonics is at n step + first along each axis.
         let (step, first) = ((of_harmonics * scale).recip(), -(start / of_harmonics + shift) / scale);
         let from_camera = DVec3::splat(first) - origin;
-        let scaled = |node: [usize; 3]| DVec3::from_array(node.map(|n| n as f64)) * step;
-        let colors = match shape.coordinates.space {
-            Space::Box => self.colors(|node| scaled(node) + from_camera),
-            _ => self.colors(|node| shape.coordinates.to_world(scaled(node) + first) - origin),
-        };
+        let colors = self.colors(|node| DVec3::from_array(node.map(|n| n as f64)) * step + from_camera);
         let (rows, of_cells) = (colors.as_chunks::<4>().0, CellBricks::new(self.lattice));
         let absent = [self.offset, self.offset, self.offset, T::zero()];
         NodeTable::new(bricks, absent, |brick, values| of_cells.fill(brick, absent, |row| rows[row], values))
@@ -215,30 +203,7 @@ fn colors_of_rows<T: Real, const N: usize>(rows: &[T], basis: ChunksExact<'_, T>
 }
 }
 
-impl Near {
-    /// Returns the ball around a camera at `origin` in the world; `None` if the box of a grid lies outside of it.
-    fn around(origin: DVec3, shape: &GridShape) -> Option<Self> {
-        let [scale, shift] = shape.to_voxels();
-        let near = Near { center: shape.coordinates.of_world(origin) * scale + shift, radius: FAR * shape.sh_reduction as f64 };
-        let [low, high] = [-0.5, shape.resolution as f64 - 0.5].map(DVec3::splat);
-        (near.center.clamp(low, high).distance(near.center) < near.radius).then_some(near)
-    }
-}
-
 impl<T: Real> Colors<T> {
-    /// Returns true if some positions in the grid may be near the camera.
-    pub fn may_be_near(&self) -> bool {
-        self.near.is_some()
-    }
-
-    /// Returns the numbers of the positions, in voxel coordinates, whose colors must be those along their rays, ascending.
-    pub fn near(&self, at: [&[T]; 3]) -> Vec<usize> {
-        let Some(Near { center, radius }) = self.near else { return Vec::new() };
-        let (center, most) = (center.to_array().map(T::lit), T::lit(radius * radius));
-        let squared = |i: usize| (0..3).fold(T::zero(), |sum, a| sum + (at[a][i] - center[a]) * (at[a][i] - center[a]));
-        (0..at[0].len()).filter(|&i| squared(i) < most).collect()
-    }
-
     /// Returns the colors at voxel coordinates, as vectors of four numbers.
     pub fn at(&self, at: [&[T]; 3], shape: &GridShape) -> Buffer<T> {
         let mut colors = Buffer::stale(4 * at[0].len());
