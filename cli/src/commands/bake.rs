@@ -131,6 +131,7 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
         sh_offset: OFFSET,
         sh_reduction: 1,
         interpolation: Interpolation::Trilinear,
+        group_in_pictures: config.tensorf.as_ref().filter(|_| field.space != Space::Box).map_or(0.0, |recipe| recipe.group_in_pictures),
         evaluation: if field.space == Space::Box { config.evaluation } else { STEP_OF_CAPTURES },
         stages: Vec::new(),
         tensorf: None,

@@ -67,6 +67,8 @@ pub(crate) struct Guide<'a, M> {
     pub to_cells: [DVec3; 2],
     /// Largest sum of weights, for each ray, whose samples may take the color of another.
     pub merged: f64,
+    /// Sum of weights of consecutive samples up to which they take the color of the next one, however many there are.
+    pub group: f64,
 }
 
 impl<M> Guide<'_, M> {
@@ -83,7 +85,7 @@ impl<M> Guide<'_, M> {
         M: Matter<T>,
     {
         let RenderOptions { aabb, spacing, stop_below, .. } = self.options;
-        let (stop, merged) = (T::lit(*stop_below), T::lit(self.merged));
+        let [stop, group, merged] = [*stop_below, self.group, self.merged.max(self.group)].map(T::lit);
         let mut sections = Sections::new(Some(self.cells), *spacing);
         let mut numbers = 0..rays.len();
         let mut next = || {
@@ -110,7 +112,7 @@ impl<M> Guide<'_, M> {
             let mut ended = 0;
             while ended == 0 {
                 shown.make_room();
-                ended = step::<T, P, M, N, FUSED>(&mut lanes, idle, self.matter, stop, &mut shown);
+                ended = step::<T, P, M, N, FUSED>(&mut lanes, idle, self.matter, [stop, group], &mut shown);
             }
             for lane in bits(ended) {
                 shown.pixels[lanes.ray[lane] as usize] = lanes.end(lane);
@@ -252,7 +254,7 @@ fn step<T: Real, P: Path<T>, M: Matter<T>, const N: usize, const FUSED: bool>(
     lanes: &mut Lanes<T, P>,
     idle: u64,
     matter: &M,
-    stop: T,
+    [stop, group]: [T; 2],
     shown: &mut Shown<T, N>,
 ) -> u64 {
     // Plain loops vectorise, one array after another. These intervals are those of `March::interval`, up to rounding.
@@ -292,7 +294,7 @@ fn step<T: Real, P: Path<T>, M: Matter<T>, const N: usize, const FUSED: bool>(
             has_color[i] = if colored[i] { T::one() } else { T::zero() };
         }
         for i in 0..LANES {
-            lanes.allowed[i] -= has_color[i] * lanes.waiting[i];
+            lanes.allowed[i] = (lanes.allowed[i] - has_color[i] * lanes.waiting[i]).max(group);
         }
         for i in 0..LANES {
             lanes.waiting[i] = (T::one() - has_color[i]) * all[i];

@@ -199,6 +199,11 @@ impl<T: Real> Plenoxels<T> {
         view.samples.map_or(sampling, |samples| sampling.with_samples(samples, self.grid.shape()))
     }
 
+    /// Returns a renderer of pictures of a grid.
+    fn pictures(&self, grid: &VoxelGrid<T>, view: &ViewOptions) -> Pictures<T> {
+        Pictures::new(grid, self.sampling(view), self.config.engine, view.background).in_groups_of(self.config.group_in_pictures)
+    }
+
     /// Returns the stages to train, fitted to the images. Stages of the scout come first.
     pub fn stages(&self) -> &[Stage] {
         &self.stages
@@ -277,7 +282,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn viewer<'a>(&'a self, view: &ViewOptions) -> RenderFn<'a, T> {
-        let pictures = Pictures::new(&self.grid, self.sampling(view), self.config.engine, view.background);
+        let pictures = self.pictures(&self.grid, view);
         Box::new(move |rays| pictures.render(&self.grid, rays))
     }
 
@@ -339,8 +344,8 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn frozen(&self, view: &ViewOptions) -> Option<RenderFn<'static, T>> {
-        let (grid, sampling, engine, background) = (copy(&self.grid), self.sampling(view), self.config.engine, view.background);
-        let pictures = Pictures::new(&grid, sampling, engine, background);
+        let grid = copy(&self.grid);
+        let pictures = self.pictures(&grid, view);
         Some(Box::new(move |rays| pictures.render(&grid, rays)))
     }
 

@@ -51,6 +51,9 @@ pub struct Config {
     pub engine: Engine,
     /// Transmittance below which training rays end; 0 never ends them early. The engine `graph` ignores it.
     pub stop_below: f64,
+    /// In pictures, consecutive samples of a ray have one color, that of the last of them, until their weights sum to more than this. 0: each sample whose
+    /// color can change an 8-bit value has its own.
+    pub group_in_pictures: f64,
     /// Number of rays per training step.
     pub rays_per_step: usize,
     /// Floor f of the contrast in proportion to which training pixels are drawn: √(σ² + f²), where σ² is the variance of the colors of the
@@ -404,6 +407,7 @@ impl Default for Config {
             sh_offset: 0.5,
             engine: Engine::Fused,
             stop_below: 0.0,
+            group_in_pictures: 0.0,
             rays_per_step: 4096,
             contrast_floor: 0.0,
             patch_size: 1,

@@ -26,6 +26,8 @@ pub struct Pictures<T: Real> {
     sampling: Sampling,
     engine: Engine,
     background: [f32; 3],
+    /// Weight of the samples of a ray that share a color.
+    group: f64,
     matter: Occupancy,
     /// Rays rendered so far.
     rendered: AtomicUsize,
@@ -35,7 +37,12 @@ pub struct Pictures<T: Real> {
 impl<T: Real> Pictures<T> {
     /// Creates a renderer of a grid. The same grid must be given to [`render`](Self::render).
     pub fn new(grid: &VoxelGrid<T>, sampling: Sampling, engine: Engine, background: [f32; 3]) -> Self {
-        Pictures { sampling, engine, background, matter: grid.matter(), rendered: AtomicUsize::new(0), tables: OnceLock::new() }
+        Pictures { sampling, engine, background, group: 0.0, matter: grid.matter(), rendered: AtomicUsize::new(0), tables: OnceLock::new() }
+    }
+
+    /// Sets the weight of the samples of a ray that share a color ([`PictureTables::in_groups_of`]).
+    pub fn in_groups_of(self, weight: f64) -> Self {
+        Pictures { group: weight, ..self }
     }
 
     /// Renders rays of the world through the grid.
@@ -50,7 +57,8 @@ impl<T: Real> Pictures<T> {
             engine: self.engine,
             stop_below: STOP_BELOW,
         };
-        let many = self.rendered.fetch_add(rays.len(), Relaxed) >= RAYS_BEFORE_TABLE;
+        // With groups, the first pixels must be those of the tables too.
+        let many = self.rendered.fetch_add(rays.len(), Relaxed) >= RAYS_BEFORE_TABLE || self.group > 0.0;
         let tables = if many && self.engine == Engine::Fused { self.tables_of(grid) } else { None };
         match tables {
             Some(tables) => picture_of_grid(grid, tables, rays, &options),
@@ -67,6 +75,7 @@ impl<T: Real> Pictures<T> {
             } else {
                 PictureTables::new(grid, negligible)
             }
+            .map(|tables: PictureTables<T>| tables.in_groups_of(self.group))
         };
         self.tables.get_or_init(compute).as_ref()
     }

@@ -49,6 +49,7 @@ const FIXED: &[(&str, &[&str])] = &[
             "sh_offset",
             "engine",
             "stop_below",
+            "group_in_pictures",
             "rays_per_step",
             "contrast_floor",
             "patch_size",

@@ -18,7 +18,7 @@ impl<T: Real> Scene<'_, T> {
         let rays = &self.rays[first..first + pixels.len()];
         let factor = cells_per_length(self.batch.nodes, &self.options.aabb);
         let to_cells: [DVec3; 2] = [factor, -self.options.aabb.min * factor];
-        let guide = Guide { matter: densities, options: self.options, cells: densities.cells(), to_cells, merged: 0.0 };
+        let guide = Guide { matter: densities, options: self.options, cells: densities.cells(), to_cells, merged: 0.0, group: 0.0 };
         let mut shown: Shown<T, 6> = match self.options.spacing {
             Spacing::Contracted(_) => guide.lead::<T, Bent<T>, 6>(rays),
             Spacing::Step(_) | Spacing::Points { .. } => guide.lead::<T, Straight<T>, 6>(rays),

@@ -28,6 +28,7 @@ pub struct PictureTables<T: Real> {
     densities: NodeTable<T>,
     /// Cells outside of which samples may be left out.
     cells: Occupancy,
+    group: f64,
     from_camera: FromCamera<T>,
 }
 
@@ -48,7 +49,12 @@ impl<T: Real> PictureTables<T> {
         let stored = StoredBricks::new(nodes, bricks.reading(dense.masks()))?;
         let densities =
             NodeTable::new(Arc::new(stored), [T::zero()], |brick, values| bricks.fill(brick, [T::zero()], |row| [density[row]], values));
-        Some(PictureTables { densities, cells: grid.shape().cells_reading(dense), from_camera: FromCamera::none() })
+        Some(PictureTables { densities, cells: grid.shape().cells_reading(dense), group: 0.0, from_camera: FromCamera::none() })
+    }
+
+    /// Sets the sum of weights of consecutive samples up to which they take the color of the next one, however many there are. 0 leaves the bound of `stop_below`.
+    pub fn in_groups_of(self, weight: f64) -> Self {
+        PictureTables { group: weight, ..self }
     }
 
     /// Returns the colors of the grid as seen by these rays ([`FromCamera::of`]).
@@ -77,7 +83,7 @@ impl<T: Real> Scene<'_, T> {
     pub fn show(&self, tables: &PictureTables<T>, first: usize, pixels: &mut [T]) -> usize {
         let pixels = pixels.as_chunks_mut::<COLUMNS>().0;
         let (options, to_cells) = (self.options, self.batch.layout.shape.to_voxels().map(DVec3::splat));
-        let guide = Guide { matter: tables, options, cells: &tables.cells, to_cells, merged: options.stop_below };
+        let guide = Guide { matter: tables, options, cells: &tables.cells, to_cells, merged: options.stop_below, group: tables.group };
         let rays = &self.rays[first..first + pixels.len()];
         let mut shown = match options.spacing {
             Spacing::Contracted(_) => guide.lead::<T, Bent<T>, 4>(rays),
@@ -113,9 +119,10 @@ mod tests {
     use super::super::{render, render_picture};
     use super::*;
     use crate::camera::{Camera, Intrinsics};
+    use crate::field::Field;
     use crate::field::voxel_grid::{Color, GridShape};
     use crate::render::{Engine, RenderOptions, Rendered};
-    use crate::sampling::Jitter;
+    use crate::sampling::{Jitter, sample};
     use autograd::lattice::BRICK_ROWS;
 
     /// A ball with holes; voxels of every fifth brick have a negative density.
@@ -216,6 +223,41 @@ mod tests {
             let bounds = if color == Color::Rgb { 0.0..1e-10 } else { 1e-7..0.5 / 255.0 };
             assert!(bounds.contains(&difference(&want, &found)), "{color:?}: {}", difference(&want, &found));
         }
+    }
+
+    #[test]
+    fn samples_of_a_group_have_the_color_of_the_last_one() {
+        const GROUP: f64 = 0.1;
+        let (grid, rays, options) = (ball::<f64>(1, Color::Sh { degree: 1, offset: 0.5 }), rays(3.0, 48), options(0.0));
+        let samples = sample::<f64>(&rays, &options.aabb, options.spacing, Jitter::None, None);
+        let radiance = grid.radiance(&samples);
+        let (sigma, delta, color) = (radiance.sigma.data(), samples.delta.data(), radiance.rgb.data().as_chunks::<3>().0);
+        let pixel = |own: std::ops::Range<usize>| {
+            let (mut left, mut waiting, mut last, mut rgb) = (1.0, 0.0, options.background.map(f64::from), [0.0; 3]);
+            for i in own.filter(|&i| sigma[i] > 0.0) {
+                let through = (-sigma[i] * delta[i]).exp();
+                waiting += left * (1.0 - through);
+                left *= through;
+                if waiting > GROUP {
+                    last = color[i];
+                    (0..3).for_each(|c| rgb[c] += waiting * last[c]);
+                    waiting = 0.0;
+                }
+            }
+            // The last samples take the color before them.
+            [0, 1, 2].map(|c| rgb[c] + waiting * last[c] + left * f64::from(options.background[c]))
+        };
+        let tables = PictureTables::new(&grid, 0.0).expect("trilinear look-up").in_groups_of(GROUP);
+        let [whole, found] = [render(&grid, &rays, &options), render_picture(&grid, &tables, &rays, &options)];
+        let mut changed = 0;
+        for (r, own) in samples.offsets.windows(2).enumerate() {
+            let [whole, found] = [&whole, &found].map(|rendered| rendered.rgb.data().as_chunks::<3>().0[r]);
+            let want = pixel(own[0] as usize..own[1] as usize);
+            assert!((0..3).all(|c| (found[c] - want[c]).abs() < 1e-10), "ray {r}: {found:?}, not {want:?}");
+            changed += usize::from((0..3).any(|c| (found[c] - whole[c]).abs() > 1e-3));
+        }
+        assert!(changed > 100, "{changed}");
+        assert!((&whole.opacity - &found.opacity).data().iter().all(|d| d.abs() < 1e-12));
     }
 
     #[test]

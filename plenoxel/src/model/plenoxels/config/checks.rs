@@ -15,7 +15,7 @@ use crate::train;
 const MOST_STAGES: usize = 100;
 
 /// Settings that only a voxel grid has.
-const OF_GRID: [&str; 18] = [
+const OF_GRID: [&str; 19] = [
     "stages",
     "scout",
     "init_from",
@@ -28,6 +28,7 @@ const OF_GRID: [&str; 18] = [
     "initial",
     "rays_per_step",
     "stop_below",
+    "group_in_pictures",
     "aim",
     "project",
     "pixels_per_voxel",
@@ -64,6 +65,7 @@ impl Config {
         check(floor == 0.0 || (0.005..=1.0).contains(&floor), "contrast_floor", floor, "0.005 to 1, or 0 for none")?;
         check((1..=64).contains(&self.patch_size), "patch_size", self.patch_size, "1 to 64")?;
         decay("stop_below", self.stop_below)?;
+        decay("group_in_pictures", self.group_in_pictures)?;
         density("prune_below", self.prune_below)?;
         check((0.0..=1.0).contains(&self.prune_unseen_below), "prune_unseen_below", self.prune_unseen_below, "a number in [0, 1]")?;
         let nowhere = self.init_from.as_ref().is_some_and(|path| path.as_os_str().is_empty());
