@@ -12,7 +12,7 @@ use plenoxel::model::plenoxels::{Objective, Trainer};
 use plenoxel::render::picture::picture;
 use plenoxel::render::{Engine, RenderOptions};
 use plenoxel::sampling::{Jitter, Occupancy};
-use plenoxel::train::Report;
+use plenoxel::train::{Model, Report};
 use std::collections::BTreeMap;
 
 fn scene() -> Dataset {
@@ -382,4 +382,14 @@ fn training_in_f64_follows_the_same_path_as_in_f32() {
         let b = trainer.step().expect("finite numbers").expect("as many steps");
         assert!((a.loss - b.loss).abs() < 1e-5, "step {}: {} and {}", a.step, a.loss, b.loss);
     }
+}
+
+#[test]
+fn a_saved_run_without_a_later_setting_goes_on_if_the_setting_has_its_default() {
+    let trainer = Trainer::<f32>::new(config(), &views(Split::Train)[..]).unwrap();
+    let mut saved = trainer.model().settings();
+    assert!(saved.as_object_mut().unwrap().remove("group_in_pictures").is_some());
+    assert!(trainer.model().continues(&saved, 0));
+    saved["group_in_pictures"] = 0.1.into();
+    assert!(!trainer.model().continues(&saved, 0));
 }

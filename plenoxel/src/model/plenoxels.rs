@@ -49,7 +49,9 @@ use crate::render::{Engine, RenderOptions, Rendered, render};
 use crate::sampling::Occupancy;
 use crate::space::Space;
 use crate::tensor_file::{TensorFile, TensorWriter};
-use crate::train::{self, About, Model, Pass, PlannedStage, RenderFn, StageLength, StageProgress, TrainOptions, ViewOptions};
+use crate::train::{
+    self, About, Model, Pass, PlannedStage, RenderFn, StageLength, StageProgress, TrainOptions, ViewOptions, same_settings,
+};
 use autograd::optim::Optimizer;
 use autograd::single::{cast, cast_mut, cast_ref, is_single};
 use autograd::{Module, Param, Real, Tensor};
@@ -351,6 +353,10 @@ impl<T: Real> Model<T> for Plenoxels<T> {
 
     fn settings(&self) -> Value {
         serde_json::to_value(&self.config).unwrap_or_default()
+    }
+
+    fn continues(&self, saved: &Value, _: u64) -> bool {
+        same_settings(&self.config, saved)
     }
 
     fn write<'a>(&'a self, file: &mut TensorWriter<'a>) {

@@ -53,6 +53,7 @@ pub struct Config {
     pub stop_below: f64,
     /// In pictures, consecutive samples of a ray have one color, that of the last of them, until their weights sum to more than this. 0: each sample whose
     /// color can change an 8-bit value has its own.
+    #[serde(default)]
     pub group_in_pictures: f64,
     /// Number of rays per training step.
     pub rays_per_step: usize,
