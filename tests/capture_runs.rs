@@ -100,6 +100,12 @@ fn baked(run: &str, space: &str) {
         plenoxel(&["export", "ply", run]).refused(3, &[&format!("coordinates of a capture ({space})"), "--space box"]);
     }
     plenoxel(&["bake", &grid]).refused(3, &["this is a voxel grid already"]);
+    // Points lie on straight rays.
+    let config = fs::read_to_string(format!("{grid}/config.toml")).unwrap();
+    let points = config.replace("[evaluation]\nstep = 1.0", "[evaluation]\nsamples = 64\nfar = 3.0");
+    assert_ne!(points, config);
+    fs::write(format!("{grid}/config.toml"), points).unwrap();
+    plenoxel(&["evaluate", &grid]).refused(2, &["evaluation", space, "evaluation.step"]);
 }
 
 /// The numbers of an NPY file of 32-bit floats.

@@ -49,8 +49,9 @@ pub struct Loaded {
 }
 
 impl Loaded {
-    /// The voxel grid; `what` needs it.
+    /// The voxel grid, which is one of the world; `what` needs it.
     pub fn grid(&self, what: &str) -> Result<&VoxelGrid<f32>> {
+        self.model.space().require_box(what)?;
         model::voxel_grid(&*self.model, &self.path, what)
     }
 }

@@ -40,7 +40,7 @@ use crate::checkpoint::{self, Header};
 use crate::dataset::View;
 use crate::error::{Error, Result};
 use crate::evaluate::Viewer;
-use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, GridSpace, VoxelGrid};
 use crate::field::{Field, sh};
 use crate::geometry::Aabb;
 use crate::loss;
@@ -148,7 +148,11 @@ impl<T: Real> Plenoxels<T> {
 
     /// Starts from an existing grid, trained or carved. The grid keeps its box and is resampled at the resolution of the first stage.
     /// Stages that are coarser than the grid are left out, except the last.
+    ///
+    /// Panics if the grid is not one of the world.
+    #[track_caller]
     pub fn starting_from(self, grid: &VoxelGrid<T>) -> Self {
+        assert_eq!(grid.shape().coordinates, GridSpace::WORLD, "coordinates of an initial grid");
         if const { is_single::<T>() } { cast(single::from(cast(self), cast_ref(grid))) } else { self.from(grid) }
     }
 
@@ -228,6 +232,10 @@ pub fn grid_viewer<T: Real>(grid: &VoxelGrid<T>, sampling: Sampling, engine: Eng
 /// Errors if the file cannot be read; the error names the file and the problem.
 pub fn open(path: &Path, config: &Config) -> Result<(Plenoxels<f32>, About)> {
     let (grid, header) = checkpoint::load(path)?;
+    if let (Sampling::Points { .. }, true) = (config.evaluation, header.coordinates != GridSpace::WORLD) {
+        let found = format!("points on straight rays cannot sample a grid in the space `{}`", header.coordinates.space);
+        return Err(Error::usage("evaluation", found, "set evaluation.step instead of evaluation.samples and evaluation.far"));
+    }
     Ok((Plenoxels::of_grid(config, grid), header.into()))
 }
 

@@ -47,11 +47,14 @@ impl<T: Real> VoxelGrid<T> {
         DVec3::from([0, 1, 2].map(fall)) / 32.0
     }
 
-    /// Returns the grid with the unit normal of each voxel ([`VoxelGrid::outward`]) in place of its color. Rendered over black, a pixel is
+    /// Returns the grid with the unit normal of each voxel in the world, that of [`VoxelGrid::outward`], in place of its color. Rendered over black, a pixel is
     /// Σ wᵢ nᵢ: the mean normal along the ray times its opacity. Voxels without a direction have normal zero.
     pub fn normals(&self) -> Self {
         let rows = self.lattice().rows();
-        let normal = |row: usize| self.lattice().node(row as u32).map_or(DVec3::ZERO, |voxel| self.outward(voxel.map(|k| k as isize)));
+        let normal = |row: usize| {
+            let voxel = self.lattice().node(row as u32).map(|voxel| voxel.map(|k| k as isize));
+            voxel.map_or(DVec3::ZERO, |voxel| self.shape().coordinates.gradient_in_world(self.shape().center(voxel), self.outward(voxel)))
+        };
         let mut normals = Buffer::stale(3 * rows);
         parallel::for_each_chunk(&mut normals, 3 * RUN, |start, chunk| {
             for (row, to) in (start / 3..).zip(chunk.as_chunks_mut::<3>().0) {

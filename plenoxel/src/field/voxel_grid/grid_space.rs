@@ -1,10 +1,11 @@
 //! Coordinates of a grid.
 
+use super::GridShape;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::sampling::Spacing;
-use crate::space::Space;
-use glam::DVec3;
+use crate::space::{Space, contract_adjoint};
+use glam::{DVec3, dvec3};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::borrow::Cow;
 
@@ -53,10 +54,12 @@ impl GridSpace {
         GridSpace { space, stretch: DVec3::new(1.0, 1.0, depth) }
     }
 
-    /// Returns true if the numbers are positive and lie in the range of [`GridShape::HALF_WIDTHS`](super::GridShape::HALF_WIDTHS).
+    /// Returns true if the numbers lie in the range of [`GridShape::HALF_WIDTHS`], and if only normalized device coordinates are stretched.
     pub(crate) fn is_valid(&self) -> bool {
-        let of_space = if let Space::Ndc { a, b } = self.space { [a, b] } else { [1.0; 2] };
-        of_space.iter().chain(&self.stretch.to_array()).all(|x| super::GridShape::HALF_WIDTHS.contains(x))
+        match self.space {
+            Space::Box | Space::Contracted => self.stretch == DVec3::ONE,
+            Space::Ndc { a, b } => [a, b].iter().chain(&self.stretch.to_array()).all(|x| GridShape::HALF_WIDTHS.contains(x)),
+        }
     }
 
     /// Returns the box with these corners in the grid, in the coordinates of the space.
@@ -78,6 +81,17 @@ impl GridSpace {
             Space::Ndc { .. } => p.with_z(p.z.min(1.0 - INFINITY)),
         };
         self.space.to_world(finite).unwrap_or(finite)
+    }
+
+    /// Returns the gradient in the world of a function of the grid, given its gradient g at a position q of the grid: Jᵀ g with the Jacobian J of q over the
+    /// position in the world.
+    pub(crate) fn gradient_in_world(&self, q: DVec3, g: DVec3) -> DVec3 {
+        let (x, g) = (self.to_world(q), self.stretch * g);
+        match self.space {
+            Space::Box => g,
+            Space::Contracted => contract_adjoint(x, g),
+            Space::Ndc { a, b } => dvec3(-a * g.x / x.z, -b * g.y / x.z, (a * x.x * g.x + b * x.y * g.y - 2.0 * g.z) / (x.z * x.z)),
+        }
     }
 
     /// Returns a ray of the world in the coordinates of the grid. Its direction is not a unit vector if the stretch is not 1.
@@ -102,5 +116,31 @@ impl GridSpace {
     /// Returns the spacing of samples whose distance in the grid is `length`.
     pub fn spacing(&self, length: f64) -> Spacing {
         Spacing::even(self.space, self.step(length))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gradients_in_the_world_are_those_of_finite_differences() {
+        let spaces = [
+            GridSpace::WORLD,
+            GridSpace { space: Space::Contracted, ..GridSpace::WORLD },
+            GridSpace { space: Space::Ndc { a: 1.6, b: 2.1 }, stretch: dvec3(1.0, 1.0, 0.3) },
+        ];
+        let g = dvec3(0.7, -1.1, 0.4);
+        for coordinates in spaces {
+            for x in [dvec3(0.3, -0.2, -1.4), dvec3(-2.5, 0.8, -3.0), dvec3(0.4, 5.0, -2.0)] {
+                let in_grid = |x: DVec3| coordinates.stretch * coordinates.space.to_box(x);
+                let found = coordinates.gradient_in_world(in_grid(x), g);
+                for axis in 0..3 {
+                    let step = 1e-5 * DVec3::AXES[axis];
+                    let want = g.dot(in_grid(x + step) - in_grid(x - step)) / 2e-5;
+                    assert!((found[axis] - want).abs() < 1e-7, "{coordinates:?} at {x}, axis {axis}: {} instead of {want}", found[axis]);
+                }
+            }
+        }
     }
 }

@@ -137,7 +137,7 @@ impl GridShape {
         self.resolution.div_ceil(self.sh_reduction)
     }
 
-    /// Returns scale a and shift b from a world coordinate x to the voxel coordinate a x + b; voxel centres are at whole numbers.
+    /// Returns scale a and shift b from a coordinate x of the grid to the voxel coordinate a x + b; voxel centres are at whole numbers.
     pub fn to_voxels(&self) -> [f64; 2] {
         let scale = 1.0 / self.voxel_side();
         [scale, self.half_width * scale - 0.5]
@@ -154,7 +154,7 @@ impl GridShape {
         self.resolution.pow(3)
     }
 
-    /// Returns the side of a voxel, world length.
+    /// Returns the side of a voxel, in the coordinates of the grid.
     pub fn voxel_side(&self) -> f64 {
         2.0 * self.half_width / self.resolution as f64
     }
@@ -170,7 +170,7 @@ impl GridShape {
         -(-alpha).ln_1p() / self.voxel_side()
     }
 
-    /// Returns the world position of a voxel's centre. The voxel may lie outside of the grid.
+    /// Returns the position of a voxel's centre. The voxel may lie outside of the grid.
     pub fn center(&self, voxel: [isize; 3]) -> DVec3 {
         DVec3::from(voxel.map(|k| (k as f64 + 0.5) * self.voxel_side() - self.half_width))
     }

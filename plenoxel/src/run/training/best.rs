@@ -19,6 +19,11 @@ impl<'a> BestModel<'a> {
         BestModel { folder, psnr: step.and_then(|step| past.validation.get(&step)).copied() }
     }
 
+    /// Returns true if there is a best checkpoint whose PSNR is known.
+    pub fn is_kept(&self) -> bool {
+        self.psnr.is_some()
+    }
+
     /// Writes the model as the best checkpoint if its validation PSNR is at least the best so far.
     pub fn saved(&mut self, psnr: Option<f64>, model: &impl Model<f32>, about: &About, on: &mut Listener<'_>) {
         if psnr.is_some() && psnr >= self.psnr {

@@ -3,7 +3,7 @@
 use super::best::BestModel;
 use super::event::Underway;
 use super::job::{Adjust, Clocks, Job, Stopped};
-use super::preview::{GLANCE, Look, Preview};
+use super::preview::{GLANCE, Look, Moment, Preview};
 use super::started::watched;
 use super::{Event, Listener};
 use crate::camera::Camera;
@@ -136,7 +136,13 @@ impl Job<'_> {
             let model = trainer.model();
             let viewer = || Viewer::of(model, &options_of_view);
             let seconds = replayed.unwrap_or_else(|| clocks.train.seconds());
-            let look = preview.look(viewer, report.ends_stage, save, background);
+            let moment = match (last && best.is_kept(), report.ends_stage, save) {
+                (true, _, _) => Moment::Comparison,
+                (_, true, _) => Moment::StageEnd,
+                (_, _, true) => Moment::Checkpoint,
+                _ => Moment::Step,
+            };
+            let look = preview.look(viewer, moment, background);
             let validation_psnr = look.as_ref().and_then(|look| look.psnr);
             let evaluation_seconds = look.as_ref().map(|look| look.evaluation_seconds);
             let observation = Observation { facts: facts.clone(), validation_psnr, seconds, evaluation_seconds };

@@ -26,6 +26,19 @@ const SHARES: [f64; 2] = [0.03, 0.05];
 /// Minimum training time in seconds for that share, so that the stages of short runs have previews too.
 const LEAST: f64 = 20.0;
 
+/// When a preview may be made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Moment {
+    /// After a step, if the interval has passed.
+    Step,
+    /// At a checkpoint.
+    Checkpoint,
+    /// At the end of a stage.
+    StageEnd,
+    /// At the end of a run that has a best checkpoint, with which its last model must be compared: whatever share of the time was taken.
+    Comparison,
+}
+
 /// Periodic previews.
 pub struct Preview {
     views: Vec<View>,
@@ -83,16 +96,10 @@ impl Preview {
         Preview { pace: Pace::new(self.pace.every), camera, evaluated, ..self }
     }
 
-    /// Makes a preview if one is due: at intervals, at checkpoints and at stage ends, within the allowed share of the time.
-    pub fn look<'a>(
-        &mut self,
-        viewer: impl FnOnce() -> Viewer<'a, f32>,
-        ends_stage: bool,
-        saves: bool,
-        background: [f32; 3],
-    ) -> Option<Look> {
+    /// Makes a preview if one is due at this moment, within the allowed share of the time.
+    pub fn look<'a>(&mut self, viewer: impl FnOnce() -> Viewer<'a, f32>, moment: Moment, background: [f32; 3]) -> Option<Look> {
         let nothing = self.views.is_empty() && self.camera.is_none();
-        if nothing || !self.pace.due(self.pace.now(), ends_stage, saves) {
+        if nothing || !self.pace.due(self.pace.now(), moment) {
             return None;
         }
         let start = self.pace.now();
@@ -170,9 +177,15 @@ impl Pace {
         self.began.elapsed().as_secs_f64()
     }
 
-    fn due(&self, now: f64, ends_stage: bool, saves: bool) -> bool {
-        let affordable = self.spent + self.cost <= SHARES[usize::from(ends_stage)] * now.max(LEAST);
-        self.every.is_finite() && affordable && (ends_stage || saves || now - self.last >= self.every)
+    fn due(&self, now: f64, moment: Moment) -> bool {
+        let affordable = |share: f64| self.spent + self.cost <= share * now.max(LEAST);
+        let due = match moment {
+            Moment::Step => now - self.last >= self.every && affordable(SHARES[0]),
+            Moment::Checkpoint => affordable(SHARES[0]),
+            Moment::StageEnd => affordable(SHARES[1]),
+            Moment::Comparison => true,
+        };
+        self.every.is_finite() && due
     }
 
     fn took(&mut self, start: f64, end: f64) {
@@ -194,7 +207,7 @@ mod tests {
             for step in 1..20_000 {
                 now += 0.05;
                 let ends_stage = step % 5_000 == 0;
-                if pace.due(now, ends_stage, false) {
+                if pace.due(now, if ends_stage { Moment::StageEnd } else { Moment::Step }) {
                     pace.took(now, now + cost);
                     now += cost;
                     looks += 1.0;
@@ -207,7 +220,14 @@ mod tests {
             assert!(looks > 0.9 * most - 1.0, "{every} {cost}: {looks} of {most}");
         }
         let never = Pace::new(f64::INFINITY);
-        assert!(!never.due(1e6, true, true) && !never.due(1e6, false, false));
+        assert!([Moment::Step, Moment::Checkpoint, Moment::StageEnd, Moment::Comparison].iter().all(|&moment| !never.due(1e6, moment)));
+    }
+
+    #[test]
+    fn the_last_model_is_compared_with_the_best_though_the_share_is_used_up() {
+        let mut pace = Pace::new(1.0);
+        pace.took(0.0, 2.0);
+        assert!(!pace.due(3.0, Moment::StageEnd) && pace.due(3.0, Moment::Comparison));
     }
 
     #[test]

@@ -9,7 +9,7 @@ use super::cell_bricks::CellBricks;
 use crate::camera::Ray;
 use crate::field::node_table::{Cells, NodeTable, StoredBricks};
 use crate::field::sh;
-use crate::field::voxel_grid::{Color, GridShape, VoxelGrid};
+use crate::field::voxel_grid::{Color, GridShape, GridSpace, VoxelGrid};
 use autograd::lattice::{Lattice, TOGETHER};
 use autograd::{Buffer, Real, Tensor, dispatched, no_grad, parallel};
 use glam::DVec3;
@@ -61,7 +61,7 @@ impl<T: Real> FromCamera<T> {
     }
 
     /// Returns the colors as seen from the origin of the next rays. All samples must lie in `bricks`. `None` if a table has more than 2³² entries. With harmonics, also
-    /// `None` if there were only few rays, if they have several origins, if the camera is near the grid, or if there is one voxel of harmonics along an axis.
+    /// `None` if there were only few rays, if they have several origins, if the camera is near the grid, if the grid is not one of the world, or if there is one voxel of harmonics along an axis.
     pub fn of(&self, grid: &VoxelGrid<T>, bricks: &Arc<StoredBricks>, rays: &[Ray]) -> Option<Arc<Colors<T>>> {
         let harmonics = Harmonics::of(grid);
         let (origin, enough) = match &harmonics {
@@ -136,11 +136,12 @@ impl<'a, T: Real> Harmonics<'a, T> {
         })
     }
 
-    /// Returns the origin of all rays, if it is far from the grid.
+    /// Returns the origin of all rays, if it is far from the grid, which is one of the world.
     fn place_of(&self, rays: &[Ray], grid: &VoxelGrid<T>) -> Option<DVec3> {
         let (origin, aabb) = (rays.first()?.origin, grid.aabb());
         let side = grid.shape().voxel_side() * grid.shape().sh_reduction as f64;
         let is_far = origin.clamp(aabb.min, aabb.max).distance(origin) >= FAR * side;
+        let is_far = is_far && grid.shape().coordinates == GridSpace::WORLD;
         let is_one = rays.iter().all(|ray| ray.origin == origin);
         (is_far && is_one && !self.lattice.nodes().contains(&1)).then_some(origin)
     }

@@ -120,9 +120,10 @@ mod tests {
     use super::*;
     use crate::camera::{Camera, Intrinsics};
     use crate::field::Field;
-    use crate::field::voxel_grid::{Color, GridShape};
+    use crate::field::voxel_grid::{Color, GridShape, GridSpace};
     use crate::render::{Engine, RenderOptions, Rendered};
     use crate::sampling::{Jitter, sample};
+    use crate::space::Space;
     use autograd::lattice::BRICK_ROWS;
 
     /// A ball with holes; voxels of every fifth brick have a negative density.
@@ -222,6 +223,19 @@ mod tests {
             let [want, found] = [render(&grid, &rays, &options), render_picture(&grid, &tables, &rays, &options)];
             let bounds = if color == Color::Rgb { 0.0..1e-10 } else { 1e-7..0.5 / 255.0 };
             assert!(bounds.contains(&difference(&want, &found)), "{color:?}: {}", difference(&want, &found));
+        }
+    }
+
+    #[test]
+    fn far_cameras_of_the_contracted_space_see_colors_along_their_rays() {
+        let color = Color::Sh { degree: 1, offset: 0.5 };
+        let contracted = GridSpace { space: Space::Contracted, ..GridSpace::WORLD };
+        for coordinates in [GridSpace::WORLD, contracted] {
+            let shape = GridShape { coordinates, ..GridShape::new(12, Space::CONTRACTED, Interpolation::Trilinear, color) };
+            let grid = VoxelGrid::<f32>::random(shape, 25.0, 0.2, 8);
+            let (tables, rays) = (PictureTables::new(&grid, 0.0).expect("trilinear look-up"), rays(20.0, 128));
+            let colors = (0..3).filter_map(|_| tables.colors_from_camera(&grid, &rays)).next();
+            assert_eq!(colors.is_some(), coordinates == GridSpace::WORLD);
         }
     }
 
