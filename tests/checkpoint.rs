@@ -93,7 +93,8 @@ fn coordinates_of_captures_come_back_and_their_numbers_are_checked() {
     let ndc = GridSpace { space: Space::Ndc { a: 1.75, b: 2.25 }, stretch: [1.0, 1.0, 0.375].into() };
     let contracted = GridSpace { space: Space::Contracted, ..GridSpace::WORLD };
     for (coordinates, sh_reduction) in [(ndc, 1), (contracted, 1), (contracted, 2)] {
-        let shape = GridShape { coordinates, sh_reduction, ..*grid().0.shape() };
+        let half_width = if coordinates == contracted { Space::CONTRACTED } else { 1.25 };
+        let shape = GridShape { coordinates, sh_reduction, half_width, ..*grid().0.shape() };
         let grid = VoxelGrid::<f32>::random(shape, 3.0, 1.0, 9);
         let header = Header::new(&grid, "still life", [1.0; 3], 42, 1234);
         assert_eq!(header.format, checkpoint::SPACE_FORMAT);
@@ -131,6 +132,8 @@ fn a_damaged_or_foreign_file_is_named_with_what_is_wrong() {
     assert!(text.contains("plenoxel 1"));
     let later: Vec<u8> = replace(&whole, b"plenoxel 1", b"plenoxel 9");
     assert!(message(&later).contains("format `plenoxel 9`"));
+    // The format of coordinates of captures, of a grid of the world.
+    assert!(message(&replace(&whole, b"plenoxel 1", b"plenoxel 4")).contains("out of range"));
     assert!(message(&replace(&whole, br#"\"resolution\":5"#, br#"\"resolution\":7"#)).contains("expected"));
     let foreign = safetensors_without_metadata();
     assert!(message(&foreign).contains("without the key `plenoxel`"));

@@ -254,11 +254,13 @@ fn header_of(path: &Path, file: &TensorFile<'_>) -> Result<Header> {
             "expected a grid whose scene_transform is the identity",
         ));
     }
-    let in_world = is_world(&header.coordinates);
-    let as_format_says = if in_world { header.shape().is_reduced() == (format == REDUCED_FORMAT) } else { format == SPACE_FORMAT };
-    let reduced = (1..=1024).contains(&header.sh_reduction) && as_format_says && (format != SPACE_FORMAT || !in_world);
-    let sizes = GridShape::HALF_WIDTHS.contains(&header.half_width) && header.coordinates.is_valid();
-    if !((1..=1024).contains(&header.resolution) && degree_known && reduced && sizes) {
+    let shape = header.shape();
+    let as_format_says = match &*format {
+        SPACE_FORMAT => !is_world(&shape.coordinates),
+        format => is_world(&shape.coordinates) && shape.is_reduced() == (format == REDUCED_FORMAT),
+    };
+    let reduced = (1..=1024).contains(&header.sh_reduction) && as_format_says;
+    if !((1..=1024).contains(&header.resolution) && degree_known && reduced && shape.has_valid_box()) {
         return Err(Error::input(path, "the header has values out of range", RETRAIN));
     }
     Ok(header)

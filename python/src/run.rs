@@ -25,6 +25,7 @@ use plenoxel::run::folder::{RunFolder, RunRecord};
 use plenoxel::run::memory::{Estimate, Stored};
 use plenoxel::run::metrics;
 use plenoxel::run::visibility::visibility;
+use plenoxel::space::Space;
 use plenoxel::train::ViewOptions;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
@@ -51,7 +52,11 @@ pub struct Loaded {
 impl Loaded {
     /// The voxel grid, which is one of the world; `what` needs it.
     pub fn grid(&self, what: &str) -> Result<&VoxelGrid<f32>> {
-        self.model.space().require_box(what)?;
+        let space = self.model.space();
+        if space != Space::Box {
+            let found = format!("the field is in the coordinates of a capture ({space}), and {what} needs a box of the world");
+            return Err(Error::input(&self.path, found, "train with capture.space=\"box\", and a half_width around the object"));
+        }
         model::voxel_grid(&*self.model, &self.path, what)
     }
 }

@@ -15,6 +15,7 @@ use plenoxel::camera::Camera;
 use plenoxel::dataset::{Dataset, Split};
 use plenoxel::error::{Error, Result};
 use plenoxel::model::plenoxels::Plenoxels;
+use plenoxel::model::plenoxels::config::Config;
 use plenoxel::model::{self, voxel_grid};
 use plenoxel::run::memory::Estimate;
 use std::path::PathBuf;
@@ -117,7 +118,9 @@ fn render(
         args.run.of.load(found, console, |sampling, stored| Estimate::of_pictures(&found.config, sampling, stored, pixels, normals))?;
     prepare()?;
     let grid = || voxel_grid(&*model, found.folder.path(), "rendering normals");
-    let normals = normals.then(|| Ok(Plenoxels::of_grid(&found.config, grid()?.normals()))).transpose()?;
+    // A mean normal is that of all samples.
+    let ungrouped = Config { group_in_pictures: 0.0, ..found.config.clone() };
+    let normals = normals.then(|| Ok(Plenoxels::of_grid(&ungrouped, grid()?.normals()))).transpose()?;
     let pictures = Pictures::new(&*model, normals.as_ref(), &view, 1.0 / found.to_world.scale, &channels, &args.format);
     let count = console.count("rendering", shots.len());
     let start = Instant::now();

@@ -2,7 +2,7 @@
 //
 // It uses the samples of the program (`plenoxel/src/sampling.rs`): intervals of equal length from the entry of a ray into the box, colors and
 // densities at their midpoints, alpha = 1 - exp(-density length). The grid of a capture is one of normalized device coordinates, or of the
-// contracted world, in which rays are bent (`plenoxel/src/space.rs`, `plenoxel/src/bake/grid_space.rs`). Voxels are stored in an atlas of bricks of 4^3 cells, which have 5^3 corners,
+// contracted world, in which rays are bent (`plenoxel/src/space.rs`, `plenoxel/src/field/voxel_grid/grid_space.rs`). Voxels are stored in an atlas of bricks of 4^3 cells, which have 5^3 corners,
 // so that the hardware interpolates. A table of links has the place of each brick, or for an empty brick the distance to the nearest one.
 'use strict';
 

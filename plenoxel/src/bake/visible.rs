@@ -1,4 +1,4 @@
-//! Visibility of points from cameras, by depth maps (Williams 1978).
+//! Visibility of points from cameras, by depth maps (Williams 1978); weights of voxels in the pictures of cameras; and the point that a camera looks at.
 
 use crate::camera::{Camera, Intrinsics, Ray};
 use crate::field::voxel_grid::VoxelGrid;
@@ -15,8 +15,9 @@ const MOST_CAMERAS: usize = 100;
 const MOST_PIXELS: usize = 256;
 /// Distance behind a surface up to which a point is visible, in sides of voxels.
 const BEHIND: f64 = 2.0;
-/// Transmittance below which rays end, of depth maps and of [`focus`].
+/// Transmittance below which rays of depth maps end.
 const STOP_BELOW: f64 = 1e-2;
+/// Transmittance below which rays of [`focus`] end.
 const STOP_FOCUS_BELOW: f64 = 1e-4;
 /// Opacity of a pixel that shows a surface.
 const OPAQUE: f32 = 0.5;

@@ -41,7 +41,7 @@ pub struct VoxelGrid<T: Real> {
     layout: Layout,
     /// Cells in which a sample can read a present voxel; `None` if all cells are.
     reach: Option<Occupancy>,
-    /// Raw density, 1 / world length; σ = max(0, ·) after interpolation.
+    /// Raw density, 1 / length; σ = max(0, ·) after interpolation.
     pub density: Param<T>,
     /// RGB colors or coefficients of harmonics. If harmonics are reduced, the coefficients of degree 0.
     pub color: Param<T>,

@@ -16,7 +16,7 @@ impl<T: Real> VoxelGrid<T> {
         self.voxels_where(|row| density[row] > T::zero() && self.shape().alpha_of_density(density[row].as_f64()) >= min_alpha)
     }
 
-    /// Returns the raw density of a voxel, 1 / world length; 0 if it is absent or outside of the grid.
+    /// Returns the raw density of a voxel, 1 / length; 0 if it is absent or outside of the grid.
     pub fn density_at(&self, voxel: [isize; 3]) -> f64 {
         let inside = voxel.iter().all(|k| (0..self.shape().resolution as isize).contains(k));
         let row = inside.then(|| self.lattice().row(voxel.map(|k| k as usize))).flatten();

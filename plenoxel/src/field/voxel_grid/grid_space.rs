@@ -1,6 +1,5 @@
 //! Coordinates of a grid.
 
-use super::GridShape;
 use crate::camera::Ray;
 use crate::geometry::Aabb;
 use crate::sampling::Spacing;
@@ -11,7 +10,7 @@ use std::borrow::Cow;
 
 /// Coordinates q of a grid: q = stretch ∘ p with p in the box of a [`Space`]. The voxels of a grid are cubes in q.
 ///
-/// The cells of a field in normalized device coordinates are longer along the depth: there the stretch is (1, 1, k) with k < 1, elsewhere it is 1. A ray has the
+/// The cells of a field in normalized device coordinates are longer along the depth: there the stretch is (1, 1, k), elsewhere it is 1. A ray has the
 /// t of the box ([`Samples`](crate::sampling::Samples)), and the density is that per length of the box, so that the opacity of a sample is that of the
 /// field. The harmonics of a color are those of the direction stretch ∘ d, where d is the unit direction of the ray in the box.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,14 +51,6 @@ impl GridSpace {
     pub(crate) fn of(space: Space, sides: DVec3) -> Self {
         let depth = if matches!(space, Space::Ndc { .. }) { 0.5 * (sides.x + sides.y) / sides.z } else { 1.0 };
         GridSpace { space, stretch: DVec3::new(1.0, 1.0, depth) }
-    }
-
-    /// Returns true if the numbers lie in the range of [`GridShape::HALF_WIDTHS`], and if only normalized device coordinates are stretched.
-    pub(crate) fn is_valid(&self) -> bool {
-        match self.space {
-            Space::Box | Space::Contracted => self.stretch == DVec3::ONE,
-            Space::Ndc { a, b } => [a, b].iter().chain(&self.stretch.to_array()).all(|x| GridShape::HALF_WIDTHS.contains(x)),
-        }
     }
 
     /// Returns the box with these corners in the grid, in the coordinates of the space.

@@ -3,7 +3,9 @@
 use super::GridSpace;
 use super::layout::Layout;
 use crate::field::{Radiance, sh};
+use crate::geometry::Aabb;
 use crate::sampling::Occupancy;
+use crate::space::Space;
 use autograd::{Indices, Lattice, Real, Tensor};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -98,7 +100,8 @@ pub struct GridShape {
     /// Reduction of harmonics: coefficients of degree 1 and more are stored for every n-th voxel along each axis, in a separate table. 1
     /// stores all coefficients in the color table. A normalised shape without such coefficients has 1.
     pub sh_reduction: usize,
-    /// Coordinates of the cube. The positions, rays and lengths of a grid are in these coordinates.
+    /// Coordinates of the cube. The positions and rays of a grid are in these coordinates. Lengths along rays, and densities, which are 1 / length, are those of the
+    /// box of their space: world lengths in [`Space::Box`].
     pub coordinates: GridSpace,
 }
 
@@ -159,13 +162,35 @@ impl GridShape {
         2.0 * self.half_width / self.resolution as f64
     }
 
-    /// Returns the fraction α of light that a voxel of raw density σ, 1 / world length, absorbs along an axis: 1 − exp(−max(0, σ) side), in
+    /// Returns the box of the grid in the coordinates of its space, without what lies beyond infinity in normalized device coordinates.
+    pub fn box_in_space(&self) -> Aabb {
+        let Aabb { min, max } = self.coordinates.unstretched(Aabb::cube(self.half_width));
+        match self.coordinates.space {
+            Space::Ndc { .. } => Aabb { min: min.with_z(min.z.max(-1.0)), max: max.with_z(max.z.min(1.0)) },
+            Space::Box | Space::Contracted => Aabb { min, max },
+        }
+    }
+
+    /// Returns true if the numbers of the box lie in the range of [`HALF_WIDTHS`](Self::HALF_WIDTHS), and if they are those of its space: 2 for contracted space, and in
+    /// normalized device coordinates, the only ones that are stretched, factors from 1e-3 to 1e3.
+    pub(crate) fn has_valid_box(&self) -> bool {
+        let GridSpace { space, stretch } = self.coordinates;
+        let straight = stretch.x == 1.0 && stretch.y == 1.0;
+        let of_space = match space {
+            Space::Box => stretch == DVec3::ONE,
+            Space::Contracted => stretch == DVec3::ONE && self.half_width == Space::CONTRACTED,
+            Space::Ndc { a, b } => straight && [a, b, stretch.z].iter().all(|x| (1e-3..=1e3).contains(x)),
+        };
+        Self::HALF_WIDTHS.contains(&self.half_width) && of_space
+    }
+
+    /// Returns the fraction α of light that a voxel of raw density σ, 1 / length, absorbs along an axis: 1 − exp(−max(0, σ) side), in
     /// [0, 1].
     pub fn alpha_of_density(&self, density: f64) -> f64 {
         -(-density.max(0.0) * self.voxel_side()).exp_m1()
     }
 
-    /// Returns the density, 1 / world length, of a voxel that absorbs the fraction `alpha` of the light: −ln(1 − α) / side.
+    /// Returns the density, 1 / length, of a voxel that absorbs the fraction `alpha` of the light: −ln(1 − α) / side.
     pub fn density_of_alpha(&self, alpha: f64) -> f64 {
         -(-alpha).ln_1p() / self.voxel_side()
     }

@@ -14,7 +14,7 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 /// Transmittance below which rays of rendered images end, and the largest sum of the weights along a ray whose colors are those of other samples. Together they
-/// change an 8-bit value by at most 0.26 of a step.
+/// change an 8-bit value by at most 0.26 of a step, without groups ([`Pictures::in_groups_of`]).
 const STOP_BELOW: f64 = 5e-4;
 /// Opacity of a sample that rendered images leave out.
 const NEGLIGIBLE: f64 = 1e-6;

@@ -96,7 +96,7 @@ impl Preview {
         Preview { pace: Pace::new(self.pace.every), camera, evaluated, ..self }
     }
 
-    /// Makes a preview if one is due at this moment, within the allowed share of the time.
+    /// Makes a preview if one is due at this moment, within the allowed share of the time; a comparison is always made.
     pub fn look<'a>(&mut self, viewer: impl FnOnce() -> Viewer<'a, f32>, moment: Moment, background: [f32; 3]) -> Option<Look> {
         let nothing = self.views.is_empty() && self.camera.is_none();
         if nothing || !self.pace.due(self.pace.now(), moment) {
@@ -156,7 +156,7 @@ fn reduced(view: &View, side: usize) -> View {
     View { name: view.name.clone(), camera, image, depth: None, mask: None }.reduced(k as usize)
 }
 
-/// Schedule of previews: at intervals, checkpoints and stage ends, within a small share of the time.
+/// Schedule of previews: at intervals, checkpoints and stage ends, within a small share of the time, and at comparisons.
 struct Pace {
     every: f64,
     began: Instant,

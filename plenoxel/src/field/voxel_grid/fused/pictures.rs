@@ -2,7 +2,7 @@
 //!
 //! Samples of little weight take the color of the next sample, or the last ones that of the sample before. The sum of such weights is at most
 //! [`RenderOptions::stop_below`](crate::render::RenderOptions::stop_below) for each ray, so a color differs from that of [`render`](super::render) by at most
-//! this value times the largest difference between colors along the ray.
+//! this value times the largest difference between colors along the ray. This holds for pictures without groups ([`PictureTables::in_groups_of`]).
 
 use super::COLUMNS;
 use super::cell_bricks::CellBricks;
@@ -52,7 +52,8 @@ impl<T: Real> PictureTables<T> {
         Some(PictureTables { densities, cells: grid.shape().cells_reading(dense), group: 0.0, from_camera: FromCamera::none() })
     }
 
-    /// Sets the sum of weights of consecutive samples up to which they take the color of the next one, however many there are. 0 leaves the bound of `stop_below`.
+    /// Sets the sum of weights of consecutive samples up to which they take the color of the next one, however many there are. The last samples of a ray take the color
+    /// before them, or that of the background. 0 leaves the bound of `stop_below`.
     pub fn in_groups_of(self, weight: f64) -> Self {
         PictureTables { group: weight, ..self }
     }
