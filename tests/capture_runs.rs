@@ -7,8 +7,11 @@ use glam::DVec3;
 use plenoxel::camera::Camera;
 use plenoxel::dataset::procedural::ProceduralOptions;
 use plenoxel::dataset::{Dataset, Split, View};
+use plenoxel::run::folder::RunFolder;
+use plenoxel::run::training::{self, Outcome, RunOptions, RunSettings};
 use serde_json::Value;
 use std::fs;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 /// Views of the built-in scene, from all around.
 fn around() -> Vec<View> {
@@ -99,6 +102,7 @@ fn baked(run: &str, space: &str) {
     for run in [run, &grid] {
         plenoxel(&["export", "ply", run]).refused(3, &[&format!("coordinates of a capture ({space})"), "--space box"]);
     }
+    goes_on(run, &grid);
     plenoxel(&["bake", &grid]).refused(3, &["this is a voxel grid already"]);
     // Points lie on straight rays.
     let config = fs::read_to_string(format!("{grid}/config.toml")).unwrap();
@@ -106,6 +110,31 @@ fn baked(run: &str, space: &str) {
     assert_ne!(points, config);
     fs::write(format!("{grid}/config.toml"), points).unwrap();
     plenoxel(&["evaluate", &grid]).refused(2, &["evaluation", space, "evaluation.step"]);
+}
+
+/// Trains a baked grid on its photographs, without a pause and with one.
+fn goes_on(run: &str, grid: &str) {
+    let record: Value = serde_json::from_slice(&fs::read(format!("{grid}/run.json")).unwrap()).unwrap();
+    let (data, config) = (record["data"]["path"].as_str().unwrap(), format!("{grid}/config.toml"));
+    let (straight, paused) = (format!("{run}-straight"), format!("{run}-paused"));
+    let more = ["--config", &config, "--set=rays_per_step=256", "--set=stages[0].steps=30", "--no-report", "--no-images"];
+    let train = |out: &str, last: &[&str]| plenoxel(&[&["train", data], &more[..], last, &["--out", out]].concat());
+    train(&straight, &[]).refused(2, &["space", "initial grid", "--init-from"]);
+    train(&straight, &["--init-from", grid]).done();
+    let psnr = [grid, &straight].map(|run| plenoxel(&["evaluate", run, "--split", "train"]).json()["psnr"].as_f64().unwrap());
+    assert!(psnr[1] > psnr[0] + 0.1, "{psnr:?} dB");
+    let (_, settings, record) = RunFolder::open(straight.as_ref()).unwrap();
+    let asked = AtomicU64::new(0);
+    let options = RunOptions { stop: Box::new(move || asked.fetch_add(1, Relaxed) >= 11), ..RunOptions::default() };
+    let settings = RunSettings { out: Some(paused.clone().into()), options, ..RunSettings::new(settings, record.data) };
+    assert!(matches!(training::train(&settings, &mut |_| ()), Ok(Outcome::Stopped { .. })));
+    plenoxel(&["train", "--resume", &paused]).done();
+    let [a, b] = [&straight, &paused].map(|run| fs::read(format!("{run}/checkpoint.safetensors")).unwrap());
+    assert!(a == b);
+    plenoxel(&["export", "ply", &straight]).refused(3, &["--space box"]);
+    train(&paused, &["--init-from", grid, "--force", "--set=capture.space=box", "--half-width=2"])
+        .refused(3, &["the initial grid is in the space"]);
+    train(&paused, &["--init-from", grid, "--force", "--set=stages[0].sampling={samples=8, far=3.0}"]).refused(2, &["sampling.step"]);
 }
 
 /// The numbers of an NPY file of 32-bit floats.

@@ -7,11 +7,12 @@ use crate::support;
 use autograd::{Lattice, Real, Tensor, no_grad};
 use plenoxel::camera::Ray;
 use plenoxel::field::sh;
-use plenoxel::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use plenoxel::field::voxel_grid::{Color, GridShape, GridSpace, Interpolation, VoxelGrid};
 use plenoxel::geometry::Aabb;
 use plenoxel::random::{Purpose, bits, uniform};
 use plenoxel::render::{Engine, RenderOptions, Rendered, render};
 use plenoxel::sampling::{Jitter, Spacing};
+use plenoxel::space::Space;
 use support::ray;
 
 const COLUMNS: [(&str, usize); 6] =
@@ -99,7 +100,13 @@ impl<T: Real> Scene<T> {
             0 => Color::Rgb,
             d => Color::Sh { degree: d as usize - 1, offset: [0.0, 0.5][pick(3, 2) as usize] },
         };
-        let shape = GridShape { sh_reduction: 1 + pick(13, 4) as usize, ..GridShape::new(resolution, 0.7 + draw(4), interpolation, color) };
+        let contracted = pick(7, 3) == 2;
+        let (half_width, space) = if contracted { (Space::CONTRACTED, Space::Contracted) } else { (0.7 + draw(4), Space::Box) };
+        let shape = GridShape {
+            sh_reduction: 1 + pick(13, 4) as usize,
+            coordinates: GridSpace { space, ..GridSpace::WORLD },
+            ..GridShape::new(resolution, half_width, interpolation, color)
+        };
         let present = [1.0, 0.7, 0.15][pick(5, 3) as usize];
         let lattice = Lattice::bricks_where([resolution; 3], |[i, j, k]| {
             (i, j, k) == (0, 0, 0) || uniform(seed, Purpose::Initial, 3, ((i * 64 + j) * 64 + k) as u64) < present
@@ -121,9 +128,9 @@ impl<T: Real> Scene<T> {
                 ray(from, [3, 4, 5].map(|a| 0.4 * coordinate(6 * r + a)))
             })
             .collect();
-        let spacing = match pick(7, 2) {
-            0 => Spacing::Step(shape.voxel_side() * (0.2 + 1.5 * draw(8))),
-            _ => Spacing::Points { samples: 5 + pick(9, 60) as usize, far: 8.0 },
+        let spacing = match pick(7, 3) {
+            1 => Spacing::Points { samples: 5 + pick(9, 60) as usize, far: 8.0 },
+            _ => shape.coordinates.spacing(shape.voxel_side() * (0.2 + 1.5 * draw(8))),
         };
         let jitter = [Jitter::None, Jitter::PerRay { seed, step: 3 }][pick(10, 2) as usize];
         Scene { grid, rays, spacing, jitter, background: [draw(11) as f32, draw(12) as f32, 1.0] }

@@ -1,11 +1,11 @@
 //! Baking: a sparse voxel grid with harmonics that resembles a [field](crate::render::ShadedField), for viewers and exports.
 //!
-//! 1. The grid is the smallest cube around the origin that contains the field's occupied cells. A voxel has the raw density r = σ − a
+//! 1. The grid is the smallest cube around the origin that contains the field's occupied cells, and the whole box in contracted space. A voxel has the raw density r = σ − a
 //!    softplus(−x − 6) at its centre. There σ = a softplus(x) is the density of the field, x is not below −10, and a = min(25, 1 / (2 s)) with the side
 //!    s of a voxel. max(0, r) differs from σ by at most 0.05 a: an opacity of 0.025 of a voxel. Unlike σ, r is nearly linear in x, below 0 too. With
 //!    a = 25, x is the density feature of a [factored field](crate::field::factored). Interpolation between voxels places a surface where the field has it. If σ were
 //!    interpolated, every surface would grow by up to half a voxel.
-//! 2. A voxel is present if it or a neighbour has a density above 0.
+//! 2. A voxel is present if it or a neighbour has a density above 0, and if a camera sees it or a neighbour with [enough weight](BakeOptions::least_weight).
 //! 3. The harmonics of a voxel v are the least-squares fit to the field's colors c at its centre, in the directions d of the cameras that see
 //!    it (`bake/visible.rs`):
 //!

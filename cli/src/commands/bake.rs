@@ -12,8 +12,9 @@ use plenoxel::dataset::{Dataset, Split, View};
 use plenoxel::error::{Error, Result};
 use plenoxel::evaluate::{Scores, ViewScore, Viewer};
 use plenoxel::field::voxel_grid::Interpolation;
+use plenoxel::loss::POSES;
 use plenoxel::model::plenoxels::Plenoxels;
-use plenoxel::model::plenoxels::config::{ColorKind, Config, Sampling};
+use plenoxel::model::plenoxels::config::{ColorKind, Config, OptimizerConfig, Sampling, Stage};
 use plenoxel::model::{self, Model};
 use plenoxel::run::data::DataSource;
 use plenoxel::run::evenly_spaced;
@@ -31,6 +32,8 @@ Examples:
   plenoxel bake runs/field                       write runs/field-baked
   plenoxel bake runs/field --resolution 256      with fewer voxels
   plenoxel export mesh runs/field-baked
+  plenoxel train data/lego --config runs/field-baked/config.toml --init-from runs/field-baked --time 2m
+                                                 train the grid on the photographs
 
 The result is a run folder for evaluate, render, view, report and, if its space is a box of the world, export. A grid has smoother colors than the field: the command prints the PSNR of both \
 on up to 25 test views. If stdout is not a terminal, its last line is a JSON object with the results.";
@@ -39,6 +42,23 @@ on up to 25 test views. If stdout is not a terminal, its last line is a JSON obj
 const MOST_VOXELS: usize = 8_000_000;
 /// Sampling of the grids of captures. The usual step of half a voxel has twice the samples, and 0.03 dB more on bonsai.
 const STEP_OF_CAPTURES: Sampling = Sampling::Step { step: 1.0 };
+/// Stage of a run that starts from the grid, about two minutes on two cores. Held-out views of bonsai after 500 steps (4.1 M rays), from 25.20 dB: 26.22 dB with a
+/// color rate of 6e-3, 26.16 dB with 3e-3; 26.15 dB with a density rate of 6; 26.0 dB with harmonics of 27 voxels together.
+const FINE_TUNING: Stage = Stage {
+    resolution: 0,
+    epochs: None,
+    steps: Some(1500),
+    sampling: Sampling::Step { step: 1.0 },
+    image_reduction: 1,
+    density_rate: 0.0,
+    color_rate: 5e-3,
+    harmonics_rate: None,
+    density_warm_up: 0,
+    rate_decay: 0.15,
+    color_decay: None,
+};
+/// Learning rate of densities in that stage, for each voxel per side: the density of an opaque voxel grows with them.
+const DENSITY_RATE: f64 = 7.5e-3;
 /// Most test views on which the field and the grid are compared.
 const COMPARED: usize = 25;
 
@@ -125,21 +145,7 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     console.note(&format!("baked {voxels} voxels at {resolution}³ in {:.1} s", clock.seconds()));
 
     let folder = folder.create()?;
-    let config = Config {
-        color: ColorKind::Sh,
-        sh_degree: options.degree,
-        sh_offset: OFFSET,
-        sh_reduction: 1,
-        interpolation: Interpolation::Trilinear,
-        group_in_pictures: config.tensorf.as_ref().filter(|_| field.space != Space::Box).map_or(0.0, |recipe| recipe.group_in_pictures),
-        evaluation: if field.space == Space::Box { config.evaluation } else { STEP_OF_CAPTURES },
-        stages: Vec::new(),
-        tensorf: None,
-        dvgo: None,
-        ngp: None,
-        nerf: None,
-        ..config
-    };
+    let config = config_of_grid(config, &field, &options, resolution);
     let from = source.path().canonicalize().unwrap_or_else(|_| source.path().to_owned());
     let baked = Baked { run: from, resolution, sh_degree: options.degree };
     let new = RunRecord::new(RunKind::Baked, &dataset, record.preset.as_deref(), &data);
@@ -164,11 +170,46 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     console.result(&summary.sentence())?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.record(&summary)?;
+    let grid = folder.path().display();
+    console.note(&format!(
+        "the grid can be trained on the photographs: plenoxel train {data} --config {grid}/config.toml --init-from {grid} --time 2m"
+    ));
     if !args.no_report {
         let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: Some(&model) };
         console.note(&report.write(console)?);
     }
     Ok(())
+}
+
+/// Returns the config of the grid of a field, with which its training can go on (`init_from`).
+fn config_of_grid(config: Config, field: &Source<'_>, options: &BakeOptions, resolution: usize) -> Config {
+    let in_box = field.space == Space::Box;
+    let mut config = Config {
+        color: ColorKind::Sh,
+        sh_degree: options.degree,
+        sh_offset: OFFSET,
+        sh_reduction: 1,
+        interpolation: Interpolation::Trilinear,
+        group_in_pictures: config.tensorf.as_ref().filter(|_| !in_box).map_or(0.0, |recipe| recipe.group_in_pictures),
+        evaluation: if in_box { config.evaluation } else { STEP_OF_CAPTURES },
+        stages: vec![Stage { resolution, density_rate: DENSITY_RATE * resolution as f64, ..FINE_TUNING }],
+        optimizer: OptimizerConfig::LazyAdam { beta1: 0.5, beta2: 0.99, epsilon: 1e-12 },
+        rays_per_step: 8192,
+        stop_below: 1e-3,
+        // Of 0.04 and 0.1, the larger weight leaves three quarters of the voxels and the same PSNR.
+        prune_from_stage: Some(0),
+        prune_unseen_below: 0.1,
+        scout: None,
+        tensorf: None,
+        dvgo: None,
+        ngp: None,
+        nerf: None,
+        ..config
+    };
+    // Voxels have no gradients of poses.
+    config.losses.remove(POSES);
+    config.loss_rates.remove(POSES);
+    config
 }
 
 /// Scores on the same test views.

@@ -118,7 +118,8 @@ impl<T: Real> Plenoxels<T> {
         let scout = config.scout.as_ref().filter(|_| silhouettes.is_none());
         let of_scout = scout.map_or(&[][..], |scout| &scout.stages);
         let stages: Vec<Stage> = of_scout.iter().chain(&config.stages).copied().collect();
-        let mut shape = config.grid_shape(stages[0].resolution);
+        // An initial grid replaces this one.
+        let mut shape = config.grid_shape(if config.init_from.is_some() { 2 } else { stages[0].resolution });
         if let Some(silhouettes) = &silhouettes {
             shape.half_width = match silhouettes.half_width(shape.half_width) {
                 Some(half_width) => half_width,
@@ -149,18 +150,18 @@ impl<T: Real> Plenoxels<T> {
     /// Starts from an existing grid, trained or carved. The grid keeps its box and is resampled at the resolution of the first stage.
     /// Stages that are coarser than the grid are left out, except the last.
     ///
-    /// Panics if the grid is not one of the world.
-    #[track_caller]
+    /// The grid of a capture keeps its [coordinates](GridShape::coordinates): the rays of the training views are transformed to them. Silhouettes and
+    /// [`Config::aim`] are then not used.
     pub fn starting_from(self, grid: &VoxelGrid<T>) -> Self {
-        assert_eq!(grid.shape().coordinates, GridSpace::WORLD, "coordinates of an initial grid");
         if const { is_single::<T>() } { cast(single::from(cast(self), cast_ref(grid))) } else { self.from(grid) }
     }
 
     fn from(mut self, grid: &VoxelGrid<T>) -> Self {
-        let stages = &self.config.stages;
-        let coarser = stages.iter().take_while(|stage| stage.resolution < grid.shape().resolution).count();
         self.scouts = 0;
-        self.stages = stages[coarser.min(stages.len() - 1)..].to_vec();
+        self.stages = self.config.stages[self.config.stages_left_out(grid.shape().resolution)..].to_vec();
+        if grid.shape().coordinates != GridSpace::WORLD {
+            self.silhouettes = None;
+        }
         self.grid = start::adapted(grid, &self.config.grid_shape(self.stages[0].resolution));
         self
     }
@@ -275,7 +276,7 @@ impl<T: Real> Model<T> for Plenoxels<T> {
     }
 
     fn aabb(&self) -> Aabb {
-        self.grid.shape().coordinates.unstretched(self.grid.aabb())
+        self.grid.shape().box_in_space()
     }
 
     fn space(&self) -> Space {

@@ -10,6 +10,7 @@ use crate::error::{Error, Result};
 use crate::evaluate::PIXEL_COST;
 use crate::model::plenoxels::config::{Config, Stage, Weight};
 use crate::model::plenoxels::{Objective, Trainer, ray_cost};
+use crate::run::training::InitialGrid;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -37,6 +38,8 @@ struct Speed {
     resolution: usize,
     /// Mean duration of a step of the first stage, in seconds.
     step: f64,
+    /// True if training begins in fog, not with an initial grid.
+    from_fog: bool,
     /// Seconds before the first step.
     begin: f64,
     /// Seconds that are not for steps of the run: those of the measurement, and of what else is included in the time.
@@ -48,30 +51,29 @@ struct Speed {
 ///
 /// The result depends on the speed of the machine. It is a number of steps, so a run with these settings repeats bit by bit.
 ///
-/// The measured steps have the `objective` of the config and the number of training views.
+/// The measured steps have the `objective` of the config and the number of training views, and start from the `initial` grid, if there is one. The stages then
+/// keep their resolutions, and those that the grid leaves out their steps.
 ///
-/// Errors: the run starts from another run; the time is too short for the stages; those of `objective` and of [`Trainer::step`].
+/// Errors: the time is too short for the stages; those of `objective` and of [`Trainer::step`].
 pub fn on_time(
-    config: Config,
+    mut config: Config,
     views: &Arc<[View]>,
     time: TimeBudget,
+    initial: Option<&InitialGrid>,
     objective: &dyn Fn(&Config, usize) -> Result<Objective<f32>>,
 ) -> Result<Config> {
-    if config.init_from.is_some() {
-        return Err(Error::usage(
-            "--time",
-            "a run that starts from another run cannot be planned by time",
-            "leave out --time or --init-from",
-        ));
-    }
+    let left_out = initial.filter(|initial| !initial.carved).map_or(0, |initial| config.stages_left_out(initial.grid.shape().resolution));
+    let trained = config.stages.split_off(left_out);
+    let left_out = std::mem::replace(&mut config.stages, trained);
     let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
     let config = config.fitted_to(views.iter().map(|view| &view.camera));
-    let speed = measure(&config, views, time.seconds, objective(&config, views.len())?)?;
+    let speed = measure(&config, views, time.seconds, initial, objective(&config, views.len())?)?;
     let finest = config.stages.last().map_or(0, |stage| stage.resolution);
     let ray = speed.step * ray_cost(finest) / ray_cost(speed.resolution) / config.rays_per_step as f64;
     let otherwise = time.spent + time.kept_for(PIXEL_COST * ray * time.evaluated);
-    planned(config, &steps, time.seconds, &Speed { spent: speed.spent + otherwise, ..speed })
+    let planned = planned(config, &steps, time.seconds, &Speed { spent: speed.spent + otherwise, ..speed })?;
+    Ok(Config { stages: [left_out, planned.stages].concat(), ..planned })
 }
 
 /// The plan for a machine of this speed; `steps` are the configured numbers of steps.
@@ -79,6 +81,7 @@ fn planned(config: Config, steps: &[u64], seconds: f64, speed: &Speed) -> Result
     let factor = |config: &Config| factor(&config.stages, steps, config.rays_per_step, seconds, speed);
     let (config, factor) = match factor(&config) {
         Ok(enough) if enough >= COARSER.0 => (config, enough),
+        enough if !speed.from_fog => (config, enough?),
         _ => {
             let config = coarser(config);
             let factor = factor(&config)?;
@@ -110,14 +113,19 @@ fn coarser(config: Config) -> Config {
 }
 
 /// Measures the speed with steps of the first stage, for a share of the planned `seconds`.
-fn measure(config: &Config, views: &Arc<[View]>, seconds: f64, objective: Objective<f32>) -> Result<Speed> {
+fn measure(config: &Config, views: &Arc<[View]>, seconds: f64, initial: Option<&InitialGrid>, objective: Objective<f32>) -> Result<Speed> {
     let start = Instant::now();
     let endless = Stage { steps: Some(1 << 20), epochs: None, ..config.stages[0] };
-    let mut trainer = Trainer::with_losses(Config { stages: vec![endless], ..config.clone() }, views.clone(), objective, Arc::default())?;
+    let trainer = Trainer::with_losses(Config { stages: vec![endless], ..config.clone() }, views.clone(), objective, Arc::default())?;
+    let mut trainer = match initial {
+        Some(initial) => initial.begin(trainer),
+        None => trainer,
+    };
     // The first step begins the stage; a scout comes before it.
     let last = trainer.plan().len() - 1;
     while trainer.step()?.is_some_and(|report| report.stage < last) {}
-    speed(config.stages[0].resolution, start.elapsed().as_secs_f64(), seconds, || {
+    let from_fog = initial.is_none_or(|initial| initial.carved);
+    speed(config.stages[0].resolution, from_fog, start.elapsed().as_secs_f64(), seconds, || {
         let start = Instant::now();
         trainer.step()?;
         Ok(start.elapsed().as_secs_f64())
@@ -126,15 +134,15 @@ fn measure(config: &Config, views: &Arc<[View]>, seconds: f64, objective: Object
 
 /// Measures the speed of a machine that took `begin` seconds before the first step. `step` takes a step and returns its duration; it is called for a
 /// share of the planned `seconds`.
-fn speed(resolution: usize, begin: f64, seconds: f64, mut step: impl FnMut() -> Result<f64>) -> Result<Speed> {
+fn speed(resolution: usize, from_fog: bool, begin: f64, seconds: f64, mut step: impl FnMut() -> Result<f64>) -> Result<Speed> {
     let enough = (MEASURING.0 * seconds).min(MEASURING.1);
     let (mut count, mut steps, mut taken) = (0, 0.0, 0.0);
     while count < 3 || taken < enough {
         taken += step()?;
         count += 1;
-        steps += in_fog(count);
+        steps += if from_fog { in_fog(count) } else { 1.0 };
     }
-    Ok(Speed { resolution, step: taken / steps, begin, spent: begin + taken })
+    Ok(Speed { resolution, step: taken / steps, from_fog, begin, spent: begin + taken })
 }
 
 /// Cost of the k-th step of the first stage, relative to the mean step.
@@ -170,6 +178,7 @@ mod tests {
     use super::*;
     use crate::dataset::procedural::ProceduralOptions;
     use crate::dataset::{Dataset, Split};
+    use crate::field::voxel_grid::VoxelGrid;
     use crate::model::plenoxels::objective;
 
     #[test]
@@ -207,7 +216,7 @@ mod tests {
                     taken += 1;
                     Ok(slower * recorded(taken))
                 };
-                let speed = speed(128, slower * BEGIN[0], promised, step).unwrap();
+                let speed = speed(128, true, slower * BEGIN[0], promised, step).unwrap();
                 let spent = speed.spent;
                 assert!(spent >= slower * BEGIN[0] + (MEASURING.0 * promised).min(MEASURING.1), "{spent} s");
                 let plan = planned(config.clone(), &asked, promised, &speed).unwrap();
@@ -227,7 +236,7 @@ mod tests {
     fn stages_fill_the_time() {
         let stage = Config::default().stages[0];
         let stages = [64, 128, 256].map(|resolution| Stage { resolution, ..stage });
-        let speed = Speed { resolution: 64, step: 0.01, begin: 0.5, spent: 0.5 };
+        let speed = Speed { resolution: 64, step: 0.01, from_fog: true, begin: 0.5, spent: 0.5 };
         let of = |seconds: f64| factor(&stages, &[100, 200, 400], 10_000, seconds, &speed);
         let factors = [10.0, 100.0, 1000.0].map(|seconds| of(seconds).unwrap());
         assert!(factors.is_sorted_by(|short, long| short < long), "{factors:?}");
@@ -258,11 +267,17 @@ mod tests {
         let losses = [("mse", Weight::Constant(1.0)), ("beta", Weight::Until { weight: 1e-9, until: 250 })];
         let losses = losses.map(|(name, weight)| (name.to_owned(), weight)).into();
         let config = Config { stages: vec![stage], losses, rays_per_step: 16, ..Config::default() };
-        let planned = on_time(config.clone(), &views, TimeBudget::of_training(10.0), &objective::<f32>).unwrap();
+        let planned = on_time(config.clone(), &views, TimeBudget::of_training(10.0), None, &objective::<f32>).unwrap();
         let Stage { steps: Some(steps), density_warm_up, .. } = planned.stages[0] else { panic!("steps are planned") };
         let Weight::Until { until, .. } = planned.losses["beta"] else { panic!("a weight keeps its form") };
         assert!(steps.abs_diff(2 * density_warm_up) <= 2 && density_warm_up.abs_diff(2 * until) <= 2, "{steps} {density_warm_up} {until}");
-        let from = Config { init_from: Some("run".into()), ..config };
-        assert!(on_time(from, &views, TimeBudget::of_training(1.0), &objective::<f32>).unwrap_err().to_string().contains("--init-from"));
+        // From a grid of eight voxels a side, the stage before is left out. A short time leaves the resolution as it is.
+        let grid = VoxelGrid::uniform(config.grid_shape(8), 1.0, 0.5);
+        let stages = vec![Stage { resolution: 4, ..stage }, stage];
+        let from = Config { init_from: Some("run".into()), stages: stages.clone(), ..config };
+        let initial = InitialGrid { grid, carved: false };
+        let planned = on_time(from, &views, TimeBudget::of_training(1.0), Some(&initial), &objective::<f32>).unwrap();
+        assert_eq!((planned.stages[0], planned.stages[1].resolution, planned.stages.len()), (stages[0], 8, 2));
+        assert!(planned.stages[1].steps != stage.steps, "{:?}", planned.stages[1]);
     }
 }

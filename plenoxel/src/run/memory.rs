@@ -15,6 +15,7 @@ use crate::dataset::{Dataset, Split};
 use crate::error::{Error, Result};
 use crate::field::voxel_grid::fused::CHUNK;
 use crate::field::voxel_grid::{Color, GridShape, Interpolation, VoxelGrid};
+use crate::geometry::Aabb;
 use crate::memory;
 use crate::model::plenoxels::config::{Config, Hull, OptimizerConfig, Sampling};
 use crate::model::recipe::{Memory, Recipe};
@@ -60,16 +61,19 @@ const PAGE_BYTES: u64 = 150_000_000;
 const EVALUATION_RAYS: u64 = (picture::TILE * picture::TILE) as u64;
 
 impl Estimate {
-    /// Estimates a training run and its evaluation; `initial` is the size in bytes of the initial grid (`init_from`), or 0.
-    pub fn of_training(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions) -> Self {
+    /// Estimates a training run and its evaluation; `initial` is the initial grid (`init_from`), if there is one.
+    pub fn of_training(config: &Config, dataset: &Dataset, initial: Option<&Stored>, options: &RunOptions) -> Self {
         let states = states(config);
+        let of_initial = initial.map_or(1.0, Stored::share);
+        let share = |config: &Config, stage: usize| share(config, stage).min(of_initial);
         // Bytes of a stage's tables, and of its and the previous stage's tables at its start.
         let tables = |index: usize| (share(config, index) * config.grid_shape(config.stages[index].resolution).bytes() as f64) as u64;
         let begins = |index: usize| {
             let before = share(config, index.saturating_sub(1));
             let outline = OUTLINE as f64 * before * config.grid_shape(config.stages[index].resolution).voxels() as f64;
-            // The first grid is dense.
-            let own = if index == 0 { config.grid_shape(config.stages[0].resolution).bytes() as u64 } else { tables(index) };
+            // The first grid is dense, unless it is the initial one.
+            let dense = index == 0 && initial.is_none();
+            let own = if dense { config.grid_shape(config.stages[0].resolution).bytes() as u64 } else { tables(index) };
             let before = if options.stage_psnr { (0..index).map(tables).sum() } else { index.checked_sub(1).map_or(0, tables) };
             before + (outline as u64).max(own)
         };
@@ -112,7 +116,7 @@ impl Estimate {
         let reporting = (evaluation + comparison.max(page)).saturating_sub(optimizer);
         let views = dataset.count(Split::Train).max(dataset.count(Split::Test).min(options.test_views));
         let images = images(dataset, config.downscale, views) + importance(config, dataset);
-        let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial;
+        let grid = (0..config.stages.len()).map(begins).max().unwrap_or(0) + 2 * initial.map_or(0, Stored::bytes);
         let voxels = (format!("stages[{index}].resolution"), "use fewer voxels per side, a lower sh_degree, or a higher sh_reduction");
         let parts = [
             (images + comparison.max(hull), ("downscale".to_owned(), "reduce the images by a larger factor")),
@@ -333,6 +337,16 @@ pub enum Stored {
 }
 
 impl Stored {
+    /// Returns the largest share of the voxels of its box that a grid has in training, where it gets a layer of empty voxels; 1 for another model.
+    fn share(&self) -> f64 {
+        // A grid of bonsai at 404 voxels per side: 1.26.
+        const GROWN: f64 = 1.5;
+        match self {
+            Stored::Grid { shape, voxels } => (GROWN * *voxels as f64 / shape.voxels() as f64).min(1.0),
+            Stored::Other { .. } => 1.0,
+        }
+    }
+
     /// Reads the header of a checkpoint.
     ///
     /// Errors: the file cannot be read; its kind is not one of [`KINDS`](model::KINDS).
@@ -350,10 +364,13 @@ impl Stored {
         Ok(Stored::Grid { shape: header.shape(), voxels })
     }
 
-    /// Half the longest side of the box, world length.
+    /// Half the longest side of the box, in the coordinates of its space.
     pub fn half_width(&self) -> f64 {
         match self {
-            Stored::Grid { shape, .. } => shape.half_width,
+            Stored::Grid { shape, .. } => {
+                let Aabb { min, max } = shape.box_in_space();
+                0.5 * (max - min).max_element()
+            }
             Stored::Other { half_width, .. } => *half_width,
         }
     }

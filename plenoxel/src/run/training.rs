@@ -16,6 +16,7 @@
 
 mod best;
 mod event;
+mod initial;
 mod job;
 mod learning;
 mod other;
@@ -31,16 +32,17 @@ pub use summary::Summary;
 use super::budget;
 use super::data::DataSource;
 use super::folder::RunFolder;
-use crate::checkpoint;
 use crate::dataset::{Dataset, View};
 use crate::error::{Error, Result};
 use crate::geometry::Aabb;
 use crate::loss;
 use crate::model::plenoxels::config::Config;
-use crate::model::plenoxels::{self, Objective, Trainer, objective};
+use crate::model::plenoxels::{Objective, Trainer, objective};
 use crate::run::pace::Begun;
 use crate::text::clock;
 use crate::train::{self, Model, StageProgress};
+pub(super) use initial::InitialGrid;
+use initial::InitialRun;
 use started::{NewRun, OldRun, estimate, watched};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -203,34 +205,25 @@ type MakeObjective<'o> = dyn Fn(&Config, usize) -> Result<Objective<f32>> + 'o;
 fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &mut Listener<'_>) -> Result<Outcome> {
     settings.config.check_stages()?;
     let mut run = NewRun::open(settings, on)?;
-    let from = run.config.init_from.as_deref().map(RunFolder::open).transpose()?;
-    let carved = from.as_ref().is_some_and(|(_, _, record)| record.is_carved());
-    let initial = from.map(|(folder, ..)| folder.existing_checkpoint()).transpose()?;
-    let known = initial.as_deref().map(checkpoint::header).transpose()?;
+    let from = run.config.init_from.as_deref().map(InitialRun::open).transpose()?;
     // An initial grid has its own box.
-    let half_width = known.as_ref().map_or(run.config.half_width, |(header, _)| header.shape().half_width);
-    run.dataset.space().require_box(plenoxels::KIND)?;
-    if let (Some((header, _)), Some(path)) = (&known, &initial) {
-        let of_world = header.coordinates.space.require_box("init_from");
-        of_world
-            .map_err(|_| Error::input(path, "the initial grid is in the coordinates of a capture", "start from a grid of the world"))?;
-    }
+    let half_width = from.as_ref().map_or(run.config.half_width, |from| from.header.shape().half_width);
+    InitialRun::check_space(from.as_ref(), &run.dataset)?;
     run.check_cameras(Aabb::cube(half_width), on)?;
-    if let Some((header, _)) = known.as_ref().filter(|(header, _)| header.scene != run.dataset.name()) {
+    if let Some(InitialRun { header, .. }) = from.as_ref().filter(|from| from.header.scene != run.dataset.name()) {
         on(Event::note(format!("the initial grid is of another scene: {}, not {}", header.scene, run.dataset.name())));
     }
-    let bytes = known.map_or(0, |(header, voxels)| voxels * header.shape().voxel_bytes());
-    let estimate = estimate(&run.config, &run.dataset, bytes as u64, &settings.options, on)?;
+    let estimate = estimate(&run.config, &run.dataset, from.as_ref().map(InitialRun::stored).as_ref(), &settings.options, on)?;
     let most_rows = estimate.most_rows(&run.config).unwrap_or(usize::MAX);
     run.saved = estimate.saved();
-    let initial = initial.as_deref().map(checkpoint::load).transpose()?.map(|(grid, _)| grid);
+    let initial = from.as_ref().map(InitialRun::load).transpose()?;
     run.read(on)?;
     // Stages that are kept are evaluated too.
     let pictures = if settings.options.stage_psnr { 2.0 } else { 1.0 };
     if let Some(time) = run.time_budget(pictures) {
         on(Event::note("measuring the speed of this machine"));
         let NewRun { config, views, clocks, .. } = &mut run;
-        *config = clocks.train.time(|| budget::on_time(config.clone(), views, time, objective))?;
+        *config = clocks.train.time(|| budget::on_time(config.clone(), views, time, initial.as_ref(), objective))?;
         let stages = config.stages.iter().map(|stage| format!("{} of {}³", stage.steps.unwrap_or_default(), stage.resolution));
         on(Event::note(format!(
             "planned for {}{}: steps {}",
@@ -244,7 +237,10 @@ fn train_plenoxels(settings: &RunSettings, objective: &MakeObjective<'_>, on: &m
     let progress = Arc::new(StageProgress::default());
     let start = || {
         let trainer = Trainer::with_losses(config.clone(), views.clone(), objective, progress.clone())?.with_most_rows(most_rows);
-        Ok(initial.iter().fold(trainer, if carved { Trainer::starting_from_carved } else { Trainer::starting_from }))
+        Ok(match &initial {
+            Some(initial) => initial.begin(trainer),
+            None => trainer,
+        })
     };
     let trainer = clocks.train.time(|| watched(&progress, on, start))?;
     drop(initial);
@@ -332,7 +328,9 @@ fn resume_plenoxels(
         let found = format!("this run has a model of another kind, `{}`", run.record.model);
         return Err(Error::input(path, found, "resume it with the program that started it (run::training::resume_model)"));
     }
-    let estimate = estimate(&run.config, &run.dataset, 0, options, on)?;
+    // The initial run may be gone.
+    let from = run.config.init_from.as_deref().and_then(|path| InitialRun::open(path).ok());
+    let estimate = estimate(&run.config, &run.dataset, from.as_ref().map(InitialRun::stored).as_ref(), options, on)?;
     let most_rows = estimate.most_rows(&run.config).unwrap_or(usize::MAX);
     run.read(on)?;
     let objective = objective(&run.config, run.views.len())?;

@@ -203,7 +203,7 @@ fn bytes_of(job: &Job) -> Result<u64> {
     let estimate = match config.recipe() {
         _ if job.call.command == "carve" => Estimate::of_carving(config, &dataset, 0, true),
         Some(recipe) => Estimate::of_recipe(config, recipe, &dataset, &options),
-        None => Estimate::of_training(&config.fitted_to(&dataset.cameras(plenoxel::dataset::Split::Train)), &dataset, 0, &options),
+        None => Estimate::of_training(&config.fitted_to(&dataset.cameras(plenoxel::dataset::Split::Train)), &dataset, None, &options),
     };
     Ok(estimate.total())
 }

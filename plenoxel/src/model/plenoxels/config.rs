@@ -52,7 +52,7 @@ pub struct Config {
     /// Transmittance below which training rays end; 0 never ends them early. The engine `graph` ignores it.
     pub stop_below: f64,
     /// In pictures, consecutive samples of a ray have one color, that of the last of them, until their weights sum to more than this. 0: each sample whose
-    /// color can change an 8-bit value has its own.
+    /// color can change an 8-bit value has its own. A ray whose weights sum to less has the color of the background. The engine `graph` and nearest look-up ignore it.
     #[serde(default)]
     pub group_in_pictures: f64,
     /// Number of rays per training step.
@@ -456,6 +456,12 @@ impl Config {
         };
         let Config { half_width, interpolation, sh_reduction, .. } = *self;
         GridShape { sh_reduction, ..GridShape::new(resolution, half_width, interpolation, color) }.normalised()
+    }
+
+    /// Returns the number of stages that are left out if training starts from a grid of this resolution: the first ones that are coarser, but not the last.
+    pub(crate) fn stages_left_out(&self, resolution: usize) -> usize {
+        let coarser = self.stages.iter().take_while(|stage| stage.resolution < resolution).count();
+        coarser.min(self.stages.len().saturating_sub(1))
     }
 
     /// Returns the options of carving with these settings.

@@ -68,8 +68,8 @@ pub fn read<T: Real>(model: &mut Plenoxels<T>, file: &mut TensorFile<'_>, stage:
     let stages = stages[left_out.ok_or_else(|| file.damaged("the number of stages does not match the config"))?..].to_vec();
     let current = stages.get(stage).ok_or_else(|| file.damaged("the current stage is not in the plan"))?;
     let shape = facts.grid.shape();
-    let configured = GridShape { half_width: shape.half_width, ..config.grid_shape(current.resolution) };
-    if shape != configured || !GridShape::HALF_WIDTHS.contains(&shape.half_width) {
+    let configured = GridShape { half_width: shape.half_width, coordinates: shape.coordinates, ..config.grid_shape(current.resolution) };
+    if shape != configured || !shape.has_valid_box() {
         return Err(file.damaged("the shape of the grid does not match its stage"));
     }
     let n = [shape.resolution; 3];

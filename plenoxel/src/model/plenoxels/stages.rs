@@ -1,12 +1,12 @@
 //! Changes of the grid between stages: resampling at a finer resolution, and pruning of empty voxels.
 
-use super::config::{Scout, Stage};
+use super::config::{Sampling, Scout, Stage};
 use super::start::Silhouettes;
 use super::{Plenoxels, start};
 use crate::error::{Error, Result};
 use crate::field::Field;
-use crate::field::voxel_grid::VoxelGrid;
 use crate::field::voxel_grid::fused::largest_weights;
+use crate::field::voxel_grid::{GridSpace, VoxelGrid};
 use crate::rays::RaySource;
 use crate::render::RenderOptions;
 use crate::sampling::{Jitter, Occupancy};
@@ -27,6 +27,10 @@ impl<T: Real> Plenoxels<T> {
     /// Prepares the grid and the rays for a stage.
     pub(super) fn begin(&mut self, index: usize, rays: &mut RaySource) -> Result<()> {
         let stage = self.stages[index];
+        if let (Sampling::Points { .. }, true) = (stage.sampling, self.grid.shape().coordinates != GridSpace::WORLD) {
+            let found = "points on straight rays cannot sample a grid of a capture";
+            return Err(Error::usage("stages[*].sampling", found, "set sampling.step"));
+        }
         if let Some(scout) = self.config.scout.as_ref().filter(|_| (1..=self.scouts).contains(&index)) {
             self.grid = self.after_scout(scout, index, rays)?;
         }
@@ -94,9 +98,9 @@ impl<T: Real> Plenoxels<T> {
         Err(Error::usage("prune_unseen_below", found, "increase it, or reduce the resolution of the last stages"))
     }
 
-    /// Restricts training rays to the remaining voxels, if the config sets `aim`.
+    /// Restricts training rays to the remaining voxels, if the config sets `aim` and the grid is one of the world.
     pub(super) fn aim(&self, reach: Option<&Occupancy>, rays: &mut RaySource) {
-        if let Some(reach) = reach.filter(|_| self.config.aim) {
+        if let Some(reach) = reach.filter(|_| self.config.aim && self.grid.shape().coordinates == GridSpace::WORLD) {
             rays.aim_at(reach);
         }
     }
@@ -139,8 +143,12 @@ impl<T: Real> Plenoxels<T> {
         // No sample weighs more than the transmittance before it.
         let stop_below = self.config.stop_below.max(least);
         let options = RenderOptions { stop_below, ..self.config.render_options(grid, stage.sampling, Jitter::None) };
+        let coordinates = grid.shape().coordinates;
+        // In the contracted space a voxel looks at least as large as a cube of its size at the far end of a box of the world, and in normalized device
+        // coordinates about as large with usual lenses.
         let stride = rays.stride(grid.shape().voxel_side(), grid.aabb());
-        let weights = largest_weights(grid, rays.lattice_of_rays(stride, RAYS_PER_BATCH), &options);
+        let rays = rays.lattice_of_rays(stride, RAYS_PER_BATCH).map(|rays| coordinates.rays(&rays).into_owned());
+        let weights = largest_weights(grid, rays, &options);
         grid.voxels_where(|row| f64::from(weights[row]) >= least).dilated(MARGIN)
     }
 }

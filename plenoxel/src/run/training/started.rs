@@ -12,7 +12,7 @@ use crate::model::plenoxels::config::Config;
 use crate::run::data::DataSource;
 use crate::run::folder::{NewFolder, RunFolder, RunKind, RunRecord};
 use crate::run::machine;
-use crate::run::memory::Estimate;
+use crate::run::memory::{Estimate, Stored};
 use crate::run::metrics::{History, MetricsFile};
 use crate::run::pace::{Begun, TimeBudget};
 use crate::run::settings;
@@ -257,7 +257,13 @@ pub fn watched<R>(progress: &StageProgress, on: &mut Listener<'_>, compute: impl
 /// Reports the stages, reduced to the size of the images, and the memory estimate.
 ///
 /// Errors: there is not enough memory.
-pub fn estimate(config: &Config, dataset: &Dataset, initial: u64, options: &RunOptions, on: &mut Listener<'_>) -> Result<Estimate> {
+pub fn estimate(
+    config: &Config,
+    dataset: &Dataset,
+    initial: Option<&Stored>,
+    options: &RunOptions,
+    on: &mut Listener<'_>,
+) -> Result<Estimate> {
     let fitted = config.fitted_to(&dataset.cameras(Split::Train));
     if fitted.stages != config.stages {
         let stages: Vec<String> = fitted.stages.iter().map(|stage| format!("{}³", stage.resolution)).collect();
