@@ -170,10 +170,9 @@ pub fn run(args: &BakeArgs, console: &Console<'_>) -> Result<()> {
     console.result(&summary.sentence())?;
     console.result(&format!("run folder: {}", folder.path().display()))?;
     console.record(&summary)?;
-    let grid = folder.path().display();
-    console.note(&format!(
-        "the grid can be trained on the photographs: plenoxel train {data} --config {grid}/config.toml --init-from {grid} --time 2m"
-    ));
+    let [grid, settings] = [folder.path().to_owned(), folder.path().join("config.toml")].map(|path| DataSource::folder(&path).arguments());
+    let data = data.arguments();
+    console.note(&format!("to train the grid on the photographs: plenoxel train{data} --config{settings} --init-from{grid} --time 2m"));
     if !args.no_report {
         let report = Report { folder: &folder, config: &config, record: &record, dataset: &dataset, model: Some(&model) };
         console.note(&report.write(console)?);
