@@ -62,12 +62,13 @@ pub fn on_time(
     initial: Option<&InitialGrid>,
     objective: &dyn Fn(&Config, usize) -> Result<Objective<f32>>,
 ) -> Result<Config> {
+    // An initial grid leaves out stages by the resolutions that fit the images.
+    config = config.fitted_to(views.iter().map(|view| &view.camera));
     let left_out = initial.filter(|initial| !initial.carved).map_or(0, |initial| config.stages_left_out(initial.grid.shape().resolution));
     let trained = config.stages.split_off(left_out);
     let left_out = std::mem::replace(&mut config.stages, trained);
     let rays = views.iter().map(|view| view.size().iter().product::<usize>() as u64).sum();
     let steps: Vec<u64> = config.stages.iter().map(|stage| stage.step_count(rays, config.rays_per_step)).collect();
-    let config = config.fitted_to(views.iter().map(|view| &view.camera));
     let speed = measure(&config, views, time.seconds, initial, objective(&config, views.len())?)?;
     let finest = config.stages.last().map_or(0, |stage| stage.resolution);
     let ray = speed.step * ray_cost(finest) / ray_cost(speed.resolution) / config.rays_per_step as f64;
